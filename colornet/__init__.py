@@ -1,0 +1,52 @@
+"""The colour network of THOR2: 22 regions of similar colours and how alike they are.
+
+>>> import colornet
+>>> network = colornet.load_default()
+>>> network.n_regions, len(network.edges)
+(22, 55)
+>>> network.similarity.shape
+(22, 22)
+
+`build` makes the same network from scratch (about ten seconds); `colornet.draw` draws it.
+"""
+
+import functools
+from pathlib import Path
+
+from colornet.grid import grid_index
+from colornet.network import ColorNetwork
+
+__all__ = ["ColorNetwork", "build", "grid_index", "load", "load_default", "save"]
+
+
+def build() -> ColorNetwork:
+    """Build the colour network from scratch, with kmapper; the packaged one is the result of this function."""
+    # kmapper, scikit-learn and colour-science take seconds to import; whoever only loads a network does not need them.
+    from colornet.builder import build_network
+
+    return build_network()
+
+
+@functools.cache
+def load_default() -> ColorNetwork:
+    """The packaged colour network."""
+    return load(Path(__file__).with_name("data") / "network.npz")
+
+
+def load(path: str | Path) -> ColorNetwork:
+    """Read a colour network that `save` wrote.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: the file is damaged or holds something else; one line that names the file.
+    """
+    return ColorNetwork.load(path)
+
+
+def save(network: ColorNetwork, path: str | Path) -> None:
+    """Write a colour network to a file (npz); the file appears whole or not at all.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    network.save(path)

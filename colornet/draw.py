@@ -1,0 +1,127 @@
+"""Pictures of the colour network: the regions on the a*-b* plane, and the similarity matrix."""
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Rectangle
+from matplotlib.ticker import FuncFormatter, LogLocator
+from numpy.typing import NDArray
+
+from colornet.files import whole_file
+from colornet.lab import MEAN_WHITE, to_lab
+from colornet.network import ColorNetwork
+
+__all__ = ["draw_network", "draw_similarity"]
+
+_DPI = 150
+_INK = "#222222"
+_EDGE = "#8a8a8a"
+_BESIDE = {"loc": "upper left", "frameon": False, "alignment": "left", "title_fontsize": 11}
+
+
+def draw_network(network: ColorNetwork, path: str | Path) -> None:
+    """Draw the network on the a*-b* plane of CIELAB (PNG).
+
+    A region stands at its mean colour and is filled with it; its area grows with its number of colours. An edge is the thicker the
+    closer its two mean colours are (HyAB); edges that close the hue circle are dashed.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    figure = Figure(figsize=(9.6, 9.0))
+    axes = figure.add_axes((0.08, 0.07, 0.72, 0.88))
+    a, b = to_lab(network.mean_rgb, MEAN_WHITE)[:, 1:].T
+    for (i, j), weight, cyclic in zip(network.edges, network.edge_weights, network.cyclic, strict=True):
+        style = "--" if cyclic else "-"
+        axes.plot(a[[i, j]], b[[i, j]], style, color=_EDGE, linewidth=_width(weight), zorder=1, solid_capstyle="butt")
+    axes.scatter(
+        a, b, s=_area(network.member_counts), c=network.mean_rgb / 255, edgecolors=_INK, linewidths=0.8, zorder=2
+    )
+    for r, (x, y) in enumerate(zip(a, b, strict=True)):
+        ink = _readable(network.mean_rgb[r])
+        axes.text(x, y, str(r), color=ink, ha="center", va="center", fontsize=9, fontweight="bold", zorder=3)
+
+    axes.set_aspect("equal")
+    axes.margins(0.08)
+    axes.set_axisbelow(True)
+    axes.grid(color="#ececec")
+    axes.set_xlabel("a*  (green to red)")
+    axes.set_ylabel("b*  (blue to yellow)")
+    axes.set_title(f"Colour network: {network.n_regions} regions, {len(network.edges)} edges")
+    sizes = [_round_key(count) for count in (100, 5_000, 20_000)]
+    figure.legend(
+        handles=sizes,
+        title="grid colours",
+        labelspacing=1.6,
+        handletextpad=1.2,
+        **_BESIDE,
+        bbox_to_anchor=(0.815, 0.93),
+    )
+    lines = [Line2D([], [], color=_EDGE, linewidth=_width(w), label=str(w)) for w in (25, 50, 100)]
+    lines.append(Line2D([], [], color=_EDGE, linewidth=_width(50), linestyle="--", label="across the\nhue seam"))
+    figure.legend(handles=lines, title="edge: HyAB", labelspacing=1.0, **_BESIDE, bbox_to_anchor=(0.815, 0.66))
+    _save(figure, path)
+
+
+def draw_similarity(network: ColorNetwork, path: str | Path) -> None:
+    """Draw the similarity matrix Delta as a heat map, with the regions' mean colours along its axes (PNG).
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    n = network.n_regions
+    figure = Figure(figsize=(9.6, 8.8))
+    axes = figure.add_axes((0.09, 0.09, 0.77, 0.84))
+    # The diagonal is 1, ten times the next: left out, so that the colours are spent on what differs.
+    others = np.ma.masked_array(network.similarity, np.eye(n, dtype=bool) | (network.similarity == 0))
+    axes.set_facecolor("#e4e4e4")
+    image = axes.imshow(others, cmap="viridis", norm=LogNorm())
+    axes.set_title(f"Similarity of the {n} colour regions (diagonal, grey: 1)")
+    axes.set_xticks([])
+    axes.set_yticks([])
+    along, down = axes.get_xaxis_transform(), axes.get_yaxis_transform()
+    for r, rgb in enumerate(network.mean_rgb):
+        label = {"color": _readable(rgb), "ha": "center", "va": "center", "fontsize": 9, "fontweight": "bold"}
+        patch = {"facecolor": rgb / 255, "edgecolor": "white", "linewidth": 1, "clip_on": False}
+        axes.add_patch(Rectangle((r - 0.5, -0.055), 1, 0.05, transform=along, **patch))
+        axes.text(r, -0.03, str(r), transform=along, **label)
+        axes.add_patch(Rectangle((-0.055, r - 0.5), 0.05, 1, transform=down, **patch))
+        axes.text(-0.03, r, str(r), transform=down, **label)
+    axes.set_xlabel("region (swatch: mean colour)", labelpad=36)
+    axes.set_ylabel("region (swatch: mean colour)", labelpad=36)
+    ticks = LogLocator(subs=(1, 2, 5))
+    beside = figure.add_axes((0.88, 0.09, 0.03, 0.84))
+    bar = figure.colorbar(image, cax=beside, ticks=ticks, format=FuncFormatter(lambda value, _: f"{value:g}"))
+    bar.ax.minorticks_off()
+    bar.set_label("Delta = 1 / (1 + HyAB length of the cheapest path)")
+    _save(figure, path)
+
+
+def _area(counts: NDArray[np.int64] | int) -> NDArray[np.float64]:
+    """Marker area in points squared; it starts where a two-digit number still fits."""
+    return np.asarray(190 + 0.03 * np.asarray(counts, np.float64))
+
+
+def _round_key(count: int) -> Line2D:
+    style = {"marker": "o", "markerfacecolor": "white", "markeredgecolor": _INK}
+    return Line2D([], [], linestyle="", markersize=float(np.sqrt(_area(count))), label=f"{count:,}", **style)
+
+
+def _width(weight: float) -> float:
+    """Line width in points: the inverse of the distance, as the similarity of two neighbours is."""
+    return 90 / float(weight)
+
+
+def _readable(rgb: NDArray[np.float64]) -> str:
+    """Black or white, whichever stands out from a colour."""
+    return "black" if rgb @ [0.299, 0.587, 0.114] > 128 else "white"
+
+
+def _save(figure: Figure, path: str | Path) -> None:
+    FigureCanvasAgg(figure)
+    with whole_file(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=_DPI)

@@ -1,0 +1,65 @@
+"""Files: written whole or not at all, and read with damage told in one line."""
+
+import contextlib
+import uuid
+import zipfile
+import zlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["read_arrays", "whole_file", "write_arrays"]
+
+
+@contextlib.contextmanager
+def whole_file(path: str | Path) -> Iterator[Path]:
+    """Context that yields a temporary name beside `path`, and on success gives what was written there the name `path`.
+
+    On an error nothing is left behind, and a file that `path` had before stays as it was.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    path = Path(path)
+    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
+    try:
+        yield temporary
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_arrays(path: str | Path, arrays: Mapping[str, NDArray[np.generic]]) -> None:
+    """Write named arrays to `path` (npz), compressed; equal arrays give equal bytes.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    with whole_file(path) as temporary, open(temporary, "xb") as stream:
+        np.savez_compressed(stream, **dict(arrays))
+
+
+def read_arrays(path: str | Path) -> dict[str, NDArray[np.generic]]:
+    """Read what `write_arrays` wrote.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: the file is no such file, or is damaged.
+    """
+    with open(path, "rb") as stream:
+        try:
+            with np.load(stream, allow_pickle=False) as archive:
+                return {name: archive[name] for name in archive.files}
+        # A TypeError is a file of one bare array (npy): np.load returns it, and it is no context.
+        except (
+            ValueError,
+            TypeError,
+            EOFError,
+            KeyError,
+            NotImplementedError,
+            zipfile.BadZipFile,
+            zlib.error,
+        ) as error:
+            raise ValueError(f"{path} is damaged or not a file of arrays (npz)") from error

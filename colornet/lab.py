@@ -1,0 +1,39 @@
+"""CIELAB, through colour-science, and the HyAB colour difference.
+
+There are two D65 white points, and the reference values (golden files) come out exactly with both only: colour-science's own for the
+colours of the grid, and one with a fifth digit for the regions' mean colours. It matters for the greys. sRGB's matrix is rounded,
+so greys have a chroma of up to 0.01 and with it one hue, and the fifth digit turns that hue from one interval of the cover into the
+next.
+"""
+
+import colour
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["GRID_WHITE", "MEAN_WHITE", "hyab", "to_lab"]
+
+GRID_WHITE = (0.3127, 0.3290)
+"""Chromaticity of D65 (2 degree observer) for the colours of the grid."""
+
+MEAN_WHITE = (0.31271, 0.32902)
+"""Chromaticity of D65 (2 degree observer) for mean colours."""
+
+
+def to_lab(rgb: NDArray[np.generic], white: tuple[float, float]) -> NDArray[np.float64]:
+    """CIELAB coordinates of sRGB colours.
+
+    Args:
+        rgb: [..., 3] sRGB in 0..255, of any real type (mean colours are not whole numbers).
+        white: chromaticity (x, y) of the reference white.
+
+    Returns:
+        [..., 3] float64: L* in 0..100, a*, b*.
+    """
+    xyz = colour.sRGB_to_XYZ(np.asarray(rgb, np.float64) / 255.0)
+    return np.asarray(colour.XYZ_to_Lab(xyz, np.array(white)), np.float64)
+
+
+def hyab(lab_1: NDArray[np.float64], lab_2: NDArray[np.float64]) -> NDArray[np.float64]:
+    """HyAB colour difference |dL*| + sqrt(da*^2 + db*^2): [..., 3] and [..., 3] (broadcast) to [...] float64."""
+    difference = lab_1 - lab_2
+    return np.asarray(np.abs(difference[..., 0]) + np.hypot(difference[..., 1], difference[..., 2]))

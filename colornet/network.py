@@ -1,0 +1,157 @@
+"""The colour network as a record: regions of similar colours, how they touch, and which regions a colour belongs to.
+
+>>> import colornet, numpy as np
+>>> network = colornet.load_default()
+>>> network.n_regions
+22
+>>> weights = network.membership(np.array([[255, 0, 0]], np.uint8))
+>>> weights.shape, float(weights.sum())
+((1, 22), 1.0)
+"""
+
+import dataclasses
+import functools
+import hashlib
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from colornet.files import read_arrays, write_arrays
+from colornet.grid import GRID_SIZE, grid_index
+
+__all__ = ["ColorNetwork"]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ColorNetwork:
+    """The colour network. Its arrays are read-only copies. R is the number of regions, E of edges.
+
+    Regions are numbered in the order of kmapper's nodes, a joined node taking the place of its first.
+
+    Attributes:
+        mean_rgb: [R, 3] float64, arithmetic mean of the sRGB values of each region's colours, 0..255.
+        member_counts: [R] int64, colours of the grid in each region.
+        edges: [E, 2] int64, pairs of regions i < j, sorted.
+        edge_weights: [E] float64, HyAB distance of the two mean colours.
+        cyclic: [E] bool, edges that close the hue circle where the lens cuts it; the others join regions that share a colour.
+        similarity: [R, R] float64, Delta: 1 / (1 + length of the cheapest path), diagonal 1.
+        region_bits: [140608] uint32, regions of each grid colour (`colornet.grid_index`): bit r is set for region r.
+        n_raw_nodes: Mapper's nodes before redundant ones were joined.
+
+    Raises:
+        ValueError: on construction, an array of another type or shape, or contents that contradict one another.
+    """
+
+    mean_rgb: NDArray[np.float64]
+    member_counts: NDArray[np.int64]
+    edges: NDArray[np.int64]
+    edge_weights: NDArray[np.float64]
+    cyclic: NDArray[np.bool_]
+    similarity: NDArray[np.float64]
+    region_bits: NDArray[np.uint32]
+    n_raw_nodes: int
+
+    def __post_init__(self) -> None:
+        regions, edges = (np.atleast_1d(array).shape[0] for array in (self.mean_rgb, self.edges))
+        expected: dict[str, tuple[type[np.generic], tuple[int, ...]]] = {
+            "mean_rgb": (np.float64, (regions, 3)),
+            "member_counts": (np.int64, (regions,)),
+            "edges": (np.int64, (edges, 2)),
+            "edge_weights": (np.float64, (edges,)),
+            "cyclic": (np.bool_, (edges,)),
+            "similarity": (np.float64, (regions, regions)),
+            "region_bits": (np.uint32, (GRID_SIZE,)),
+        }
+        for name, (dtype, shape) in expected.items():
+            array = np.array(getattr(self, name))
+            if array.dtype != dtype or array.shape != shape:
+                raise ValueError(
+                    f"{name} is {array.dtype} {list(array.shape)}; expected {np.dtype(dtype)} {list(shape)}"
+                )
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+        self._check_contents()
+
+    def _check_contents(self) -> None:
+        if not 1 <= self.n_regions <= 32:
+            raise ValueError(f"mean_rgb has {self.n_regions} regions; region_bits can hold 1 to 32")
+        if not self.region_bits.all():
+            raise ValueError(f"region_bits[{int(np.argmin(self.region_bits))}] is 0; every colour needs a region")
+        if int(self.region_bits.max()) >> self.n_regions:
+            raise ValueError(f"region_bits has {int(self.region_bits.max()):#x}; there are {self.n_regions} regions")
+        counts = [int(np.count_nonzero(self.region_bits >> np.uint32(r) & 1)) for r in range(self.n_regions)]
+        if counts != self.member_counts.tolist():
+            raise ValueError(f"member_counts is {self.member_counts.tolist()}; region_bits gives {counts}")
+        if self.edges.size and not 0 <= self.edges.min() <= self.edges.max() < self.n_regions:
+            ends = f"{int(self.edges.min())} to {int(self.edges.max())}"
+            raise ValueError(f"edges names regions {ends}; there are {self.n_regions} regions")
+        for name in ("mean_rgb", "edge_weights", "similarity"):
+            if not np.isfinite(getattr(self, name)).all():
+                raise ValueError(f"{name} has a value that is not finite")
+        if not (isinstance(self.n_raw_nodes, int) and self.n_raw_nodes >= self.n_regions):
+            raise ValueError(f"n_raw_nodes is {self.n_raw_nodes!r}; there are {self.n_regions} regions")
+
+    @property
+    def n_regions(self) -> int:
+        """Number of colour regions, n_c of the paper (22)."""
+        return len(self.mean_rgb)
+
+    def membership(self, rgb: ArrayLike) -> NDArray[np.float32]:
+        """Region weights of 8-bit colours: weight 1/m in each of the m regions of the nearest grid colour.
+
+        Args:
+            rgb: [..., 3] uint8, sRGB.
+
+        Returns:
+            [..., R] float32, each row summing to 1.
+
+        Raises:
+            ValueError: another type, or a last axis that is not 3.
+        """
+        bits = self.region_bits[grid_index(rgb)]
+        member = (bits[..., None] >> np.arange(self.n_regions, dtype=np.uint32)) & np.uint32(1)
+        return np.asarray(member / member.sum(axis=-1, keepdims=True, dtype=np.float32), np.float32)
+
+    @functools.cached_property
+    def fingerprint(self) -> str:
+        """SHA-256 of the contents, in hexadecimal: the same for two networks exactly if they are the same network.
+
+        Real numbers enter rounded to 1e-9, so that the last bit of a cube root on another processor does not tell apart networks
+        that are equal.
+        """
+        digest = hashlib.sha256(f"colornet 1 {self.n_raw_nodes}".encode())
+        for field in dataclasses.fields(self)[:-1]:
+            array = getattr(self, field.name)
+            if array.dtype == np.float64:
+                array = np.rint(array * 1e9).astype(np.int64)
+            digest.update(f"{field.name} {array.dtype.str} {array.shape}".encode())
+            digest.update(np.ascontiguousarray(array.astype(array.dtype.newbyteorder("<"))).tobytes())
+        return digest.hexdigest()
+
+    def save(self, path: str | Path) -> None:
+        """Write the network to a file (npz) that `load` reads; the file appears whole or not at all.
+
+        Raises:
+            OSError: the file cannot be written.
+        """
+        write_arrays(path, {name: np.asarray(value) for name, value in vars(self).items() if name in _FIELDS})
+
+    @classmethod
+    def load(cls, path: str | Path) -> "ColorNetwork":
+        """Read a network that `save` wrote.
+
+        Raises:
+            OSError: the file cannot be read.
+            ValueError: the file is damaged or holds something else; one line that names the file.
+        """
+        arrays = read_arrays(path)
+        if arrays.keys() != _FIELDS:
+            raise ValueError(f"{path} holds {sorted(arrays)}; a colour network is {sorted(_FIELDS)}")
+        try:
+            return cls(**{**arrays, "n_raw_nodes": arrays["n_raw_nodes"].item()})
+        except ValueError as error:
+            raise ValueError(f"{path} is no colour network: {error}") from error
+
+
+_FIELDS = {field.name for field in dataclasses.fields(ColorNetwork)}

@@ -1,0 +1,79 @@
+"""From Mapper's nodes to colour regions and their similarity (paper, section "Color network")."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components, dijkstra
+
+from colornet.lab import MEAN_WHITE, hyab, to_lab
+
+__all__ = ["join_redundant", "mean_color", "relabel", "similarity"]
+
+_COMMON = 0.95
+
+
+def mean_color(colors: NDArray[np.uint8], members: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Arithmetic mean [3] float64 (0..255) of the sRGB values of the colours that `members` [m] picks from `colors` [n, 3]."""
+    return np.asarray(colors[members].mean(axis=0, dtype=np.float64))
+
+
+def join_redundant(
+    colors: NDArray[np.uint8], members: list[NDArray[np.int64]], eps: float
+) -> tuple[list[NDArray[np.int64]], NDArray[np.int64]]:
+    """Join nodes that stand for the same colours.
+
+    Two nodes are redundant when more than 95 % of the smaller one's members are common and their mean colours are at most `eps`
+    apart (HyAB).
+
+    Args:
+        colors: [n, 3] uint8, sRGB.
+        members: for each node the sorted rows of `colors` in it, int64 [m].
+        eps: largest HyAB distance of mean colours.
+
+    Returns:
+        The members of each region, in the order of the regions' first nodes; and the region of each node, [nodes] int64.
+    """
+    n = len(members)
+    means = to_lab(np.array([mean_color(colors, m) for m in members]), MEAN_WHITE)
+    redundant = np.zeros((n, n), bool)
+    for i in range(n):
+        for j in range(i + 1, n):
+            common = np.intersect1d(members[i], members[j], assume_unique=True).size
+            mostly = common > _COMMON * min(members[i].size, members[j].size)
+            redundant[i, j] = mostly and hyab(means[i], means[j]) <= eps
+    n_regions, component = connected_components(csr_array(redundant), directed=False)
+    _, first = np.unique(component, return_index=True)
+    region = np.argsort(np.argsort(first))[component].astype(np.int64)
+    joined = [
+        np.unique(np.concatenate([m for m, r in zip(members, region, strict=True) if r == k])) for k in range(n_regions)
+    ]
+    return joined, region
+
+
+def relabel(edges: NDArray[np.int64], region: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Edges between nodes as edges between regions: pairs i < j, sorted, each once, none within a region.
+
+    Args:
+        edges: [e, 2] int64, pairs of nodes.
+        region: [nodes] int64, the region of each node.
+    """
+    moved = np.sort(region[edges], axis=1)
+    return np.unique(moved[moved[:, 0] != moved[:, 1]], axis=0)
+
+
+def similarity(n_regions: int, edges: NDArray[np.integer], weights: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Similarity matrix Delta: 1 / (1 + length of the cheapest path); 0 between regions that no path joins.
+
+    Args:
+        n_regions: number of regions n.
+        edges: [e, 2] integers, pairs of regions, each once.
+        weights: [e] float64, positive.
+
+    Returns:
+        [n, n] float64, symmetric, diagonal 1.
+    """
+    graph = csr_array((weights, (edges[:, 0], edges[:, 1])), shape=(n_regions, n_regions))
+    lengths = dijkstra(graph, directed=False)
+    # A path's length is summed in the order of travel: take one direction, so that the matrix is symmetric to the bit.
+    lengths = np.minimum(lengths, lengths.T)
+    return np.asarray(1.0 / (1.0 + lengths))

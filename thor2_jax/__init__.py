@@ -1,0 +1,26 @@
+"""THOR2 (Samani and Banerjee, 2024) as a JAX engine: coloured point clouds to TOPS and TOPS2, and frames to object names."""
+
+from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
+from thor2_jax.descriptor import describe, describe_aligned, describe_strips, diagrams, strips
+from thor2_jax.errors import InputError
+from thor2_jax.types import Descriptors, Diagrams, PointClouds, Strips
+from thor2_jax.view_normalization import align, mirror, turn, view_normalize
+
+__all__ = [
+    "DESCRIPTOR_VERSION",
+    "DescriptorConfig",
+    "Descriptors",
+    "Diagrams",
+    "InputError",
+    "PointClouds",
+    "Strips",
+    "align",
+    "describe",
+    "describe_aligned",
+    "describe_strips",
+    "diagrams",
+    "mirror",
+    "strips",
+    "turn",
+    "view_normalize",
+]

@@ -1,0 +1,109 @@
+"""The whole way from clouds to TOPS and TOPS2 (paper, sections "TOPS" and "TOPS2").
+
+>>> import colornet, thor2_jax as thor2
+>>> network, config = colornet.load_default(), thor2.DescriptorConfig(homology="closed_form")
+>>> clouds = thor2.PointClouds.pack([(np.random.rand(1000, 3) / 10, np.random.rand(1000, 3))])
+>>> thor2.describe(clouds, network, config).tops2.shape
+(1, 11942)
+"""
+
+import functools
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+
+from colornet import ColorNetwork
+from thor2_jax.config import DescriptorConfig
+from thor2_jax.errors import InputError
+from thor2_jax.persistence import diagrams_of_strips
+from thor2_jax.persistence_images import past_window, persistence_image
+from thor2_jax.slicing import strips_of_cloud
+from thor2_jax.types import Descriptors, Diagrams, PointClouds, Strips
+from thor2_jax.view_normalization import align
+
+__all__ = ["describe", "describe_aligned", "describe_strips", "diagrams", "strips"]
+
+
+@functools.lru_cache(maxsize=8)
+def _device_tables(network: ColorNetwork) -> tuple[jax.Array, jax.Array]:
+    return jnp.asarray(network.region_bits), jnp.asarray(network.similarity, jnp.float32)
+
+
+def _check(clouds: PointClouds) -> None:
+    if not isinstance(clouds, PointClouds) or clouds.points.ndim != 3:
+        found = f"points {list(clouds.points.shape)}" if isinstance(clouds, PointClouds) else type(clouds).__name__
+        raise InputError(f"clouds is {found}; expected PointClouds with points [B, N, 3] (see PointClouds.pack)")
+
+
+@partial(jax.jit, static_argnums=(2, 3))
+def _strips(aligned: PointClouds, region_bits: jax.Array, n_regions: int, config: DescriptorConfig) -> Strips:
+    return jax.vmap(lambda cloud: strips_of_cloud(cloud, region_bits, n_regions, config))(aligned)
+
+
+@partial(jax.jit, static_argnums=1)
+def _diagrams(strips: Strips, config: DescriptorConfig) -> Diagrams:
+    return diagrams_of_strips(strips, config)
+
+
+@partial(jax.jit, static_argnums=2)
+def _describe_strips(strips: Strips, similarity: jax.Array, config: DescriptorConfig) -> Descriptors:
+    found = diagrams_of_strips(strips, config)
+    image = partial(persistence_image, config=config)
+    # E^i = (C^i Delta)^T
+    embeddings = jnp.einsum("...jr,rq->...qj", strips.color, similarity, precision=jax.lax.Precision.HIGHEST)
+    return Descriptors(
+        images=jax.vmap(jax.vmap(image))(found),
+        embeddings=embeddings,
+        overflow=strips.overflow + past_window(found, config),
+    )
+
+
+def strips(aligned: PointClouds, network: ColorNetwork, config: DescriptorConfig) -> Strips:
+    """Extremes and colour vectors of every strip: all that the descriptors need of a cloud, and a fraction of their size.
+
+    Args:
+        aligned: scaled units, as `align` returns them.
+        network: gives the colour regions.
+        config: static; another one compiles again, as does another shape of `aligned`.
+    """
+    _check(aligned)
+    return _strips(aligned, _device_tables(network)[0], network.n_regions, config)
+
+
+def describe_strips(strips: Strips, network: ColorNetwork, config: DescriptorConfig) -> Descriptors:
+    """Persistence images and colour embeddings of `strips` (fields [B, S, J])."""
+    return _describe_strips(strips, _device_tables(network)[1], config)
+
+
+def diagrams(aligned: PointClouds, config: DescriptorConfig) -> Diagrams:
+    """Persistence diagrams of aligned clouds, fields [B, S, J]. Colours play no part."""
+    _check(aligned)
+    return _diagrams(_strips(aligned, jnp.zeros(52**3, jnp.uint32), 1, config), config)
+
+
+def describe_aligned(aligned: PointClouds, network: ColorNetwork, config: DescriptorConfig) -> Descriptors:
+    """TOPS, CE and TOPS2 of clouds that are aligned already (scaled units, first octant, turned by alpha).
+
+    Raises:
+        InputError: `aligned` is no batch of clouds.
+    """
+    return describe_strips(strips(aligned, network, config), network, config)
+
+
+def describe(clouds: PointClouds, network: ColorNetwork, config: DescriptorConfig) -> Descriptors:
+    """TOPS, CE and TOPS2 of clouds as the camera saw them: view normalization, turn, slices, diagrams, images, embeddings.
+
+    Args:
+        clouds: [B, N] clouds in metres.
+        network: the colour network; its regions and similarity fix the colour part.
+        config: static; another one compiles again, as does another B or N.
+
+    Returns:
+        Descriptors of the B clouds. An empty cloud's are zero.
+
+    Raises:
+        InputError: `clouds` is no batch of clouds.
+    """
+    _check(clouds)
+    return describe_aligned(align(clouds, config), network, config)

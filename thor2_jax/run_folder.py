@@ -1,0 +1,155 @@
+"""A trained model on disk: everything that recognition needs, checked on loading, written whole or not at all.
+
+    RUN/run.json       format, descriptor version and constants, class names, classifiers, how it was trained, how well it did
+    RUN/network.npz    the colour network whose regions the descriptors use
+    RUN/weights/NAME/  one classifier's parameters and batch statistics (orbax)
+"""
+
+import dataclasses
+import json
+import shutil
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import orbax.checkpoint as ocp
+from flax import nnx
+
+import colornet
+from thor2_jax.classifier import MLP, Feature, check_features
+from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
+from thor2_jax.errors import InputError
+
+__all__ = ["TrainedRun", "input_size", "load_run", "save_run"]
+
+FORMAT = 1
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainedRun:
+    """What a run folder holds.
+
+    Attributes:
+        config: the descriptor's constants.
+        network: the colour network.
+        classes: class names; a classifier's outputs are in this order.
+        classifiers: feature -> trained MLP.
+        record: how the run was made (options, counts, training figures): any JSON.
+    """
+
+    config: DescriptorConfig
+    network: colornet.ColorNetwork
+    classes: tuple[str, ...]
+    classifiers: Mapping[Feature, MLP]
+    record: Mapping[str, Any]
+
+
+def input_size(feature: Feature, config: DescriptorConfig, n_regions: int) -> int:
+    """Floats in the descriptor of that name."""
+    image, embedding = config.image_size**2, n_regions * config.n_strips
+    return config.n_slices * {"ce": embedding, "tops": image, "tops2": image + embedding}[feature]
+
+
+def save_run(run: TrainedRun, path: str | Path) -> None:
+    """Write a run folder. It appears under its name only when it is complete.
+
+    Raises:
+        InputError: the folder exists already.
+        OSError: it cannot be written; nothing is left behind.
+    """
+    path = Path(path).absolute()
+    if path.exists():
+        raise InputError(f"out: {path} exists already; a run folder is never overwritten")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
+    try:
+        partial.chmod(0o755)
+        colornet.save(run.network, partial / "network.npz")
+        with ocp.StandardCheckpointer() as checkpointer:
+            for name, model in run.classifiers.items():
+                state = nnx.to_pure_dict(nnx.state(model, (nnx.Param, nnx.BatchStat)))
+                checkpointer.save(partial / "weights" / name, state)
+            checkpointer.wait_until_finished()
+        description = {
+            "format": FORMAT,
+            "descriptor_version": DESCRIPTOR_VERSION,
+            "descriptor_config": dataclasses.asdict(run.config),
+            "color_network": run.network.fingerprint,
+            "classes": list(run.classes),
+            "classifiers": list(run.classifiers),
+            "record": run.record,
+        }
+        (partial / "run.json").write_text(json.dumps(description, indent=2) + "\n")
+        partial.rename(path)
+    except BaseException:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise
+
+
+def _description(path: Path) -> dict[str, Any]:
+    try:
+        found = json.loads((path / "run.json").read_text())
+    except FileNotFoundError:
+        raise InputError(f"model: {path} is no run folder (it has no run.json)") from None
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise InputError(f"model: {path / 'run.json'} cannot be read: {error}") from None
+    if not isinstance(found, dict) or found.get("format") != FORMAT:
+        given = found.get("format") if isinstance(found, dict) else type(found).__name__
+        raise InputError(f"model: {path / 'run.json'} has format {given!r}; this version reads {FORMAT}")
+    if found.get("descriptor_version") != DESCRIPTOR_VERSION:
+        raise InputError(
+            f"model: {path} was trained on descriptor version {found.get('descriptor_version')!r}; this version computes "
+            f"{DESCRIPTOR_VERSION}; train it again"
+        )
+    return found
+
+
+def load_run(path: str | Path) -> TrainedRun:
+    """Read a run folder.
+
+    Raises:
+        InputError: no run folder, a damaged file, another format or descriptor version, or parts that do not belong together;
+            one line that names the file and what is wrong.
+    """
+    path = Path(path).absolute()
+    found = _description(path)
+    where = f"model: {path / 'run.json'}"
+    try:
+        config = DescriptorConfig(**found["descriptor_config"])
+        classes = tuple(found["classes"])
+        names = check_features(found["classifiers"], "classifiers")
+        fingerprint, record = found["color_network"], found["record"]
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{where}: {type(error).__name__}: {error}") from None
+    if not classes or not all(isinstance(name, str) for name in classes):
+        raise InputError(f"{where}: classes is {classes!r}; expected a list of names")
+    try:
+        network = colornet.load(path / "network.npz")
+    except (OSError, ValueError) as error:
+        raise InputError(f"model: {path / 'network.npz'} cannot be read: {error}") from None
+    if network.fingerprint != fingerprint:
+        raise InputError(f"model: {path / 'network.npz'} is another colour network than run.json names")
+    classifiers = {
+        name: _restore(path / "weights" / name, input_size(name, config, network.n_regions), len(classes))
+        for name in names
+    }
+    return TrainedRun(config, network, classes, classifiers, record)
+
+
+def _restore(path: Path, n_inputs: int, n_classes: int) -> MLP:
+    if not path.is_dir():
+        raise InputError(f"model: {path} is missing")
+    model = MLP(n_inputs, n_classes, rngs=nnx.Rngs(0))
+    state = nnx.state(model, (nnx.Param, nnx.BatchStat))
+    target = jax.tree.map(ocp.utils.to_shape_dtype_struct, nnx.to_pure_dict(state))
+    try:
+        with ocp.StandardCheckpointer() as checkpointer:
+            restored = checkpointer.restore(path, target)
+    except Exception as error:  # orbax raises whatever its storage layers raise
+        reason = str(error).strip().splitlines() or [type(error).__name__]
+        raise InputError(f"model: {path} cannot be read: {reason[0][:300]}") from None
+    nnx.replace_by_pure_dict(state, restored)
+    nnx.update(model, state)
+    return model

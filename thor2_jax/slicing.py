@@ -1,0 +1,85 @@
+"""Slices, strips and their colour vectors (paper, sections "Slicing" and "Colour"): an aligned cloud becomes fixed-size tables."""
+
+import jax
+import jax.numpy as jnp
+
+from thor2_jax.color_membership import region_weights
+from thor2_jax.config import DescriptorConfig
+from thor2_jax.types import PointClouds, Strips
+
+__all__ = ["slice_and_strip", "strip_births", "strips_of_cloud"]
+
+
+def strip_births(config: DescriptorConfig) -> jax.Array:
+    """[J] float32: filtration value at which strip j's vertices enter, j * sigma_2, scaled units."""
+    return jnp.arange(config.n_strips, dtype=jnp.float32) * config.sigma_2
+
+
+def slice_and_strip(points: jax.Array, mask: jax.Array, config: DescriptorConfig) -> tuple[jax.Array, jax.Array]:
+    """Slice and strip number of each point of one aligned cloud: S^i = {i s1 <= z < (i+1) s1}, j of {j s2 <= x < (j+1) s2}.
+
+    Args:
+        points: [N, 3] float32, scaled units, first octant.
+        mask: [N] bool.
+        config: static.
+
+    Returns:
+        Two [N] int32 arrays, not limited to the descriptor's size; what padding holds means nothing.
+    """
+    x, z = points[:, 0], points[:, 2]
+    if config.convention == "paper":
+        return jnp.floor(z / config.sigma_1).astype(jnp.int32), jnp.floor(x / config.sigma_2).astype(jnp.int32)
+    # Rounded to 0.01, x is k / 100; the first edge j / 40 that is not below it has j = ceil(2 k / 5), in whole numbers.
+    strip = (2 * jnp.round(x * 100).astype(jnp.int32) + 4) // 5
+    level = jnp.round(z * 10).astype(jnp.int32)
+    # Levels past twice the descriptor's slices get a number past its end whatever their rank.
+    n_levels = 2 * config.n_slices
+    occurs = jnp.zeros(n_levels, jnp.int32).at[jnp.where(mask, level, n_levels)].set(1, mode="drop")
+    rank = jnp.cumsum(occurs) - 1
+    return jnp.where(level < n_levels, rank[jnp.clip(level, 0, n_levels - 1)], level), strip
+
+
+def strips_of_cloud(
+    cloud: PointClouds, region_bits: jax.Array, n_regions: int, config: DescriptorConfig
+) -> Strips:
+    """Extreme points and colour vectors of every strip of one aligned cloud (no batch axis).
+
+    The extremes are found as point indices and gathered, so that a gradient reaches exactly one point each.
+
+    Args:
+        cloud: points [N, 3], scaled units, first octant.
+        region_bits: [140608] uint32, see `region_weights`.
+        n_regions: R.
+        config: static.
+    """
+    n_points, n_segments = cloud.points.shape[0], config.n_slices * config.n_strips
+    i, j = slice_and_strip(cloud.points, cloud.mask, config)
+    inside = cloud.mask & (i < config.n_slices) & (j < config.n_strips)
+    segment = jnp.where(inside, i * config.n_strips + j, n_segments)  # past the end: dropped by the scatters
+
+    y = cloud.points[:, 1]
+    keys = jax.lax.stop_gradient(jnp.stack([-y, y], axis=-1))
+    best = jnp.full((n_segments, 2), -jnp.inf).at[segment].max(keys, mode="drop")
+    winner = keys >= best[jnp.minimum(segment, n_segments - 1)]
+    number = jnp.where(winner, jnp.arange(n_points, dtype=jnp.int32)[:, None], -1)
+    index = jnp.full((n_segments, 2), -1, jnp.int32).at[segment].max(number, mode="drop")
+    occupied = index[:, 0] >= 0
+    extremes = jnp.where(occupied[:, None], y[jnp.maximum(index, 0)], 0)
+
+    weights = region_weights(cloud.colors, region_bits, n_regions)
+    color = jnp.zeros((n_segments, n_regions), jnp.float32).at[segment].add(weights, mode="drop")
+    if config.convention == "released":
+        # The released code rounds y, then measures; rounding keeps the order, so the extremes stay extreme.
+        extremes = jnp.round(extremes * 100) / 100
+        color = color / jnp.maximum(color.sum(axis=-1, keepdims=True), 1)
+
+    def grid(a: jax.Array) -> jax.Array:
+        return a.reshape(config.n_slices, config.n_strips, *a.shape[1:])
+
+    return Strips(
+        low=grid(extremes[:, 0]),
+        high=grid(extremes[:, 1]),
+        occupied=grid(occupied),
+        color=grid(color),
+        overflow=(cloud.mask & ~inside).sum(dtype=jnp.int32),
+    )

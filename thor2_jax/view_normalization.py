@@ -1,0 +1,128 @@
+"""View normalization: from a cloud as the camera saw it to one that stands the same way whatever the camera's pose (paper, section
+"View normalization"), and the turn by alpha that makes slices of it (section "Slicing").
+
+>>> clouds = PointClouds.pack([(xyz, rgb)])                      # doctest: +SKIP
+>>> normal = view_normalize(clouds, DescriptorConfig())          # doctest: +SKIP
+>>> aligned = turn(normal, DescriptorConfig())                   # doctest: +SKIP   the same as align(clouds, config)
+"""
+
+import dataclasses
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+
+from thor2_jax.bounding_box import HIGHEST, minimal_box_axes
+from thor2_jax.config import DescriptorConfig
+from thor2_jax.types import PointClouds
+
+__all__ = ["align", "mirror", "turn", "view_normalize"]
+
+OCCLUSION_BIN = 0.01
+"""Width in scaled units of the x-bins in which boundary points are counted; two at either end decide."""
+
+
+def _to_first_octant(points: jax.Array, mask: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Points [N, 3] moved so that the least coordinate along each axis is 0 (padding is set to 0), and the shift [3]."""
+    low = jnp.where(mask[:, None], points, jnp.inf).min(axis=0)
+    low = jnp.where(jnp.isfinite(low), low, 0)
+    return jnp.where(mask[:, None], points - low, 0), low
+
+
+def _normalize_one(clouds: PointClouds, sigma_s: float) -> PointClouds:
+    mask, weights = clouds.mask, clouds.mask.astype(jnp.float32)[:, None]
+    count = jnp.maximum(weights.sum(), 1)
+    scaled = clouds.points * sigma_s
+    centre = jnp.where(mask[:, None], scaled, 0).sum(axis=0) / count
+    centred = jnp.where(mask[:, None], scaled - centre, 0)
+    camera = clouds.camera * sigma_s - centre
+
+    axes = minimal_box_axes(centred, mask)
+    turned = jnp.matmul(centred, axes.T, precision=HIGHEST)
+    low = jnp.where(mask[:, None], turned, jnp.inf).min(axis=0)
+    high = jnp.where(mask[:, None], turned, -jnp.inf).max(axis=0)
+    middle = jnp.where(jnp.isfinite(low), (low + high) / 2, 0)
+
+    # The mean is the origin here: the heavier half lies below the middle where the middle is positive.
+    x_sign = jnp.where(middle[0] < 0, -1.0, 1.0)
+    # A half turn about x brings a camera on +z to -z.
+    camera_z = jnp.matmul(axes[2], camera, precision=HIGHEST) - middle[2]
+    z_sign = jnp.where(camera_z > 0, -1.0, 1.0)
+
+    bins = jnp.floor(turned[:, 0] * x_sign / OCCLUSION_BIN - jnp.minimum(low[0] * x_sign, high[0] * x_sign) / OCCLUSION_BIN)
+    last = jnp.where(mask, bins, -1).max()
+    edge = clouds.boundary & mask
+    at_start = (edge & (bins <= 1)).sum()
+    at_end = (edge & (bins >= last - 1)).sum()
+    # A half turn about z takes the occluded end away from the first slice.
+    x_sign = jnp.where(at_start > at_end, -x_sign, x_sign)
+
+    x, z = axes[0] * x_sign, axes[2] * z_sign
+    frame = jax.lax.stop_gradient(jnp.stack([x, jnp.cross(z, x), z]))
+    points, shift = _to_first_octant(jnp.matmul(centred, frame.T, precision=HIGHEST), mask)
+    camera = jnp.matmul(frame, camera, precision=HIGHEST) - shift
+    return dataclasses.replace(clouds, points=points, camera=camera)
+
+
+@partial(jax.jit, static_argnums=1)
+def view_normalize(clouds: PointClouds, config: DescriptorConfig) -> PointClouds:
+    """Rotate each cloud onto its minimal box, longest side along x, seen from -z, in the first octant (paper, "View normalization").
+
+    Steps: (1, 2) axes of an approximately minimal-volume box, longest first (`bounding_box`); (3) a camera on the box's +z side
+    means a half turn about x; (5) what is then free, a half turn about z, puts the heavier half of the cloud (more points) at small
+    x; (4) if the first two x-bins of 0.01 hold more occlusion-boundary points than the last two, a half turn about z keeps
+    the occluded end out of the first slice; (6) translation to the first octant. Every step follows the cloud and the camera: a
+    rigid motion of both changes nothing. Cubes and balls have no unique box; their frame is one of the equal ones.
+
+    Args:
+        clouds: metres, any frame, camera given in the same one.
+        config: only `sigma_s` is used. Static: another config compiles again.
+
+    Returns:
+        Clouds in scaled units; `camera` moved along; colours, mask and boundary as they were.
+    """
+    return jax.vmap(lambda cloud: _normalize_one(cloud, config.sigma_s))(clouds)
+
+
+def _turn_one(cloud: PointClouds, alpha: float) -> PointClouds:
+    c, s = jnp.cos(alpha), jnp.sin(alpha)
+
+    def about_y(p: jax.Array) -> jax.Array:
+        return jnp.stack([c * p[..., 0] - s * p[..., 2], p[..., 1], s * p[..., 0] + c * p[..., 2]], axis=-1)
+
+    points, shift = _to_first_octant(about_y(cloud.points), cloud.mask)
+    return dataclasses.replace(cloud, points=points, camera=about_y(cloud.camera) - shift)
+
+
+@partial(jax.jit, static_argnums=1)
+def turn(normal: PointClouds, config: DescriptorConfig) -> PointClouds:
+    """Turn normalized clouds by -alpha about y, so that the long axis stands at alpha to the x-y plane (paper, "Slicing").
+
+    Args:
+        normal: clouds as `view_normalize` returns them, or mirrored ones.
+        config: only `alpha` is used. Static.
+
+    Returns:
+        The aligned clouds, scaled units, in the first octant.
+    """
+    return jax.vmap(lambda cloud: _turn_one(cloud, config.alpha))(normal)
+
+
+def align(clouds: PointClouds, config: DescriptorConfig) -> PointClouds:
+    """`turn` of `view_normalize`: clouds in metres to aligned clouds in scaled units, ready to be sliced."""
+    return turn(view_normalize(clouds, config), config)
+
+
+@partial(jax.jit, static_argnums=1)
+def mirror(normal: PointClouds, axes: str) -> PointClouds:
+    """Mirror normalized clouds within their boxes (paper, "Training": each view also mirrored in x, y and xy).
+
+    Args:
+        normal: clouds in the first octant.
+        axes: letters of "xyz" to mirror in; "" returns the clouds as they are.
+    """
+    flip = jnp.array([letter in axes for letter in "xyz"])
+    high = jnp.where(normal.mask[..., None], normal.points, 0).max(axis=1, keepdims=True)
+    points = jnp.where(flip & normal.mask[..., None], high - normal.points, normal.points)
+    camera = jnp.where(flip, high[:, 0] - normal.camera, normal.camera)
+    return dataclasses.replace(normal, points=points, camera=camera)
