@@ -1,6 +1,7 @@
 """Pictures of the colour network: the regions on the a*-b* plane, and the similarity matrix."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -20,14 +21,14 @@ __all__ = ["draw_network", "draw_similarity"]
 _DPI = 150
 _INK = "#222222"
 _EDGE = "#8a8a8a"
-_BESIDE = {"loc": "upper left", "frameon": False, "alignment": "left", "title_fontsize": 11}
+_BESIDE: dict[str, Any] = {"loc": "upper left", "frameon": False, "alignment": "left", "title_fontsize": 11}
 
 
 def draw_network(network: ColorNetwork, path: str | Path) -> None:
     """Draw the network on the a*-b* plane of CIELAB (PNG).
 
-    A region stands at its mean colour and is filled with it; its area grows with its number of colours. An edge is the thicker the
-    closer its two mean colours are (HyAB); edges that close the hue circle are dashed.
+    A region stands at its mean colour and is filled with it; its area grows with its number of colours. An edge is the
+    thicker the closer its two mean colours are (HyAB); edges that close the hue circle are dashed.
 
     Raises:
         OSError: the file cannot be written.
@@ -85,8 +86,14 @@ def draw_similarity(network: ColorNetwork, path: str | Path) -> None:
     axes.set_yticks([])
     along, down = axes.get_xaxis_transform(), axes.get_yaxis_transform()
     for r, rgb in enumerate(network.mean_rgb):
-        label = {"color": _readable(rgb), "ha": "center", "va": "center", "fontsize": 9, "fontweight": "bold"}
-        patch = {"facecolor": rgb / 255, "edgecolor": "white", "linewidth": 1, "clip_on": False}
+        label: dict[str, Any] = {
+            "color": _readable(rgb),
+            "ha": "center",
+            "va": "center",
+            "fontsize": 9,
+            "fontweight": "bold",
+        }
+        patch: dict[str, Any] = {"facecolor": rgb / 255, "edgecolor": "white", "linewidth": 1, "clip_on": False}
         axes.add_patch(Rectangle((r - 0.5, -0.055), 1, 0.05, transform=along, **patch))
         axes.text(r, -0.03, str(r), transform=along, **label)
         axes.add_patch(Rectangle((-0.055, r - 0.5), 0.05, 1, transform=down, **patch))
@@ -107,7 +114,7 @@ def _area(counts: NDArray[np.int64] | int) -> NDArray[np.float64]:
 
 
 def _round_key(count: int) -> Line2D:
-    style = {"marker": "o", "markerfacecolor": "white", "markeredgecolor": _INK}
+    style: dict[str, Any] = {"marker": "o", "markerfacecolor": "white", "markeredgecolor": _INK}
     return Line2D([], [], linestyle="", markersize=float(np.sqrt(_area(count))), label=f"{count:,}", **style)
 
 

@@ -13,7 +13,10 @@ from numpy.typing import ArrayLike, NDArray
 __all__ = ["GRID_LEVELS", "GRID_SIZE", "GRID_STEP", "grid_colors", "grid_index"]
 
 GRID_STEP = 5
+"""Distance of neighbouring levels of a channel."""
+
 GRID_LEVELS = 52
+"""Levels of a channel: 0, 5, ..., 255."""
 
 GRID_SIZE = GRID_LEVELS**3
 """Colours in the grid (140,608)."""

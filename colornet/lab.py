@@ -1,9 +1,9 @@
 """CIELAB, through colour-science, and the HyAB colour difference.
 
-There are two D65 white points, and the reference values (golden files) come out exactly with both only: colour-science's own for the
-colours of the grid, and one with a fifth digit for the regions' mean colours. It matters for the greys. sRGB's matrix is rounded,
-so greys have a chroma of up to 0.01 and with it one hue, and the fifth digit turns that hue from one interval of the cover into the
-next.
+There are two D65 white points, and the reference values (golden files) come out exactly with both only: that of
+colour-science for the colours of the grid, and one with a fifth digit for the mean colours of regions. It matters for
+greys: sRGB's matrix is rounded, so greys have a chroma of up to 0.01 and with it one hue, and the fifth digit turns
+that hue from one interval of the cover into the next.
 """
 
 import colour

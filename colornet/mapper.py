@@ -1,8 +1,9 @@
 """Mapper on the colour grid: lens, cover, clusters and nerve (paper, section "Color network").
 
-kmapper covers the lens and joins the clusters; the clusters are DBSCAN's under the HyAB distance. scikit-learn would evaluate a
-Python metric pair by pair (hours) or hold a dense matrix (5 GB), so the neighbourhoods are found exactly and sparsely instead:
-HyAB is never smaller than the Euclidean distance, hence a k-d tree's Euclidean ball holds every HyAB neighbour.
+kmapper covers the lens and joins the clusters; the clusters are DBSCAN's under the HyAB distance. scikit-learn would
+evaluate a Python metric pair by pair (hours) or hold a dense matrix (5 GB), so the neighbourhoods are found exactly and
+sparsely instead: HyAB is never smaller than the Euclidean distance, hence a k-d tree's Euclidean ball holds every HyAB
+neighbour.
 """
 
 import dataclasses
@@ -78,21 +79,17 @@ def hyab_neighbors(lab: NDArray[np.float64], radius: float) -> csr_array:
 class HyabDBSCAN:
     """DBSCAN of CIELAB colours under HyAB, with the part of scikit-learn's estimator interface that kmapper uses."""
 
-    def __init__(self, eps: float = EPS, min_samples: int = MIN_SAMPLES) -> None:
-        self.eps = eps
-        self.min_samples = min_samples
-
     def get_params(self) -> dict[str, Any]:
         """The parameters; kmapper leaves out cubes with fewer than `min_samples` colours."""
-        return {"eps": self.eps, "min_samples": self.min_samples}
+        return {"eps": EPS, "min_samples": MIN_SAMPLES}
 
     def fit_predict(self, lab: NDArray[np.float64]) -> NDArray[np.int64]:
         """Cluster of each colour, [n, 3] CIELAB to [n] int64; -1 where it belongs to none."""
-        graph = hyab_neighbors(lab, self.eps)
+        graph = hyab_neighbors(lab, EPS)
         # Colours are distinct, so no stored distance is 0 and an explicit diagonal completes the graph.
         graph.setdiag(0.0)
         graph = sort_graph_by_row_values(graph, warn_when_not_sorted=False)
-        clusterer = DBSCAN(eps=self.eps, min_samples=self.min_samples, metric="precomputed")
+        clusterer = DBSCAN(eps=EPS, min_samples=MIN_SAMPLES, metric="precomputed")
         return np.asarray(clusterer.fit_predict(graph), np.int64)
 
 

@@ -34,7 +34,8 @@ class ColorNetwork:
         member_counts: [R] int64, colours of the grid in each region.
         edges: [E, 2] int64, pairs of regions i < j, sorted.
         edge_weights: [E] float64, HyAB distance of the two mean colours.
-        cyclic: [E] bool, edges that close the hue circle where the lens cuts it; the others join regions that share a colour.
+        cyclic: [E] bool, edges that close the hue circle where the lens cuts it; the others join regions that share a
+            colour.
         similarity: [R, R] float64, Delta: 1 / (1 + length of the cheapest path), diagonal 1.
         region_bits: [140608] uint32, regions of each grid colour (`colornet.grid_index`): bit r is set for region r.
         n_raw_nodes: Mapper's nodes before redundant ones were joined.
@@ -117,8 +118,8 @@ class ColorNetwork:
     def fingerprint(self) -> str:
         """SHA-256 of the contents, in hexadecimal: the same for two networks exactly if they are the same network.
 
-        Real numbers enter rounded to 1e-9, so that the last bit of a cube root on another processor does not tell apart networks
-        that are equal.
+        Real numbers enter rounded to 1e-9, so that the last bit of a cube root on another processor does not tell apart
+        networks that are equal.
         """
         digest = hashlib.sha256(f"colornet 1 {self.n_raw_nodes}".encode())
         for field in dataclasses.fields(self)[:-1]:

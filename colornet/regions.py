@@ -13,7 +13,15 @@ _COMMON = 0.95
 
 
 def mean_color(colors: NDArray[np.uint8], members: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Arithmetic mean [3] float64 (0..255) of the sRGB values of the colours that `members` [m] picks from `colors` [n, 3]."""
+    """Arithmetic mean of sRGB values.
+
+    Args:
+        colors: [n, 3] uint8, sRGB.
+        members: [m] int64, the rows of `colors` to average.
+
+    Returns:
+        [3] float64, 0..255.
+    """
     return np.asarray(colors[members].mean(axis=0, dtype=np.float64))
 
 
@@ -22,8 +30,8 @@ def join_redundant(
 ) -> tuple[list[NDArray[np.int64]], NDArray[np.int64]]:
     """Join nodes that stand for the same colours.
 
-    Two nodes are redundant when more than 95 % of the smaller one's members are common and their mean colours are at most `eps`
-    apart (HyAB).
+    Two nodes are redundant when more than 95 % of the smaller one's members are common and their mean colours are at
+    most `eps` apart (HyAB).
 
     Args:
         colors: [n, 3] uint8, sRGB.
@@ -31,7 +39,8 @@ def join_redundant(
         eps: largest HyAB distance of mean colours.
 
     Returns:
-        The members of each region, in the order of the regions' first nodes; and the region of each node, [nodes] int64.
+        The members of each region, in the order of the regions' first nodes; and the region of each node, [nodes]
+        int64.
     """
     n = len(members)
     means = to_lab(np.array([mean_color(colors, m) for m in members]), MEAN_WHITE)

@@ -114,7 +114,7 @@ def fit(
         x = feature_of(describe_strips(batch, network, config), feature)
 
         def loss_of(params: Any) -> Any:
-            model = nnx.merge(graph, params, rest)
+            model = nnx.merge(graph, params, rest, copy=True)
             logits = model(x, train=True, rngs=nnx.Rngs(dropout=key))
             loss = optax.softmax_cross_entropy_with_integer_labels(logits, labels).mean()
             return loss, ((logits.argmax(axis=-1) == labels).mean(), nnx.state(model, nnx.Not(nnx.Param)))

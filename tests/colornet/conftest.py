@@ -1,0 +1,64 @@
+"""One build of the colour network from scratch, in a process of its own so that its time and memory can be told."""
+
+import dataclasses
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import colornet
+from colornet.mapper import MapperGraph
+
+_BUILD = """
+import json, resource, sys, time
+import numpy as np
+import colornet, colornet.builder as builder
+
+def recorded(lab, map_colors=builder.map_colors):
+    global graph
+    graph = map_colors(lab)
+    return graph
+
+builder.map_colors = recorded
+start = time.perf_counter()
+network = colornet.build()
+seconds = time.perf_counter() - start
+network.save(sys.argv[1])
+members = {f"members_{k}": m for k, m in enumerate(graph.members)}
+np.savez(sys.argv[2], names=graph.names, nerve=graph.nerve, cyclic=graph.cyclic, **members)
+print(json.dumps({"seconds": seconds, "kib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss}))
+"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Rebuilt:
+    """The network made from scratch, Mapper's graph on the way there, and what it took."""
+
+    network: colornet.ColorNetwork
+    graph: MapperGraph
+    seconds: float
+    mebibytes: float
+
+
+@pytest.fixture(scope="session")
+def rebuilt(tmp_path_factory: pytest.TempPathFactory) -> Rebuilt:
+    """`colornet.build()`, once a session."""
+    folder = tmp_path_factory.mktemp("build")
+    root = Path(colornet.__file__).resolve().parents[1]
+    command = [sys.executable, "-W", "error", "-c", _BUILD, str(folder / "network.npz"), str(folder / "graph.npz")]
+    done = subprocess.run(command, cwd=root, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    with np.load(folder / "graph.npz") as file:
+        members = [file[f"members_{k}"] for k in range(len(file["names"]))]
+        graph = MapperGraph(file["names"].tolist(), members, file["nerve"], file["cyclic"])
+    told = json.loads(done.stdout)
+    return Rebuilt(colornet.load(folder / "network.npz"), graph, told["seconds"], told["kib"] / 1024)
+
+
+@pytest.fixture(scope="session")
+def network() -> colornet.ColorNetwork:
+    """The packaged network."""
+    return colornet.load_default()

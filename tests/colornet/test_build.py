@@ -1,0 +1,97 @@
+"""The network made from scratch: the packaged one to the bit, with the counts that the paper's recipe gives."""
+
+import dataclasses
+
+import numpy as np
+
+import colornet
+from colornet.grid import grid_colors
+from colornet.lab import GRID_WHITE, MEAN_WHITE, hyab, to_lab
+from colornet.mapper import EPS
+from colornet.regions import join_redundant, relabel
+
+from .conftest import Rebuilt
+
+
+def test_packaged_network_is_what_build_gives(rebuilt: Rebuilt, network: colornet.ColorNetwork) -> None:
+    for field in dataclasses.fields(network):
+        made, packaged = getattr(rebuilt.network, field.name), getattr(network, field.name)
+        if np.asarray(packaged).dtype == np.float64:  # another processor may round a cube root the other way
+            np.testing.assert_allclose(made, packaged, rtol=1e-12, err_msg=field.name)
+        else:
+            np.testing.assert_array_equal(made, packaged, err_msg=field.name)
+    assert rebuilt.network.fingerprint == network.fingerprint
+
+
+def test_build_is_quick_and_small(rebuilt: Rebuilt) -> None:
+    assert rebuilt.seconds < 60
+    assert rebuilt.mebibytes < 3 * 1024
+
+
+def test_counts(rebuilt: Rebuilt) -> None:
+    network, graph = rebuilt.network, rebuilt.graph
+    assert network.n_raw_nodes == len(graph.members) == 23
+    assert network.n_regions == 22
+    assert network.edges.shape == (55, 2)
+    assert network.cyclic.sum() == 2
+    assert network.edges[network.cyclic].tolist() == [[0, 7], [8, 15]]
+
+
+def test_exactly_one_pair_of_nodes_is_redundant(rebuilt: Rebuilt) -> None:
+    colors, graph = grid_colors(), rebuilt.graph
+    sets = [set(m.tolist()) for m in graph.members]
+    means = to_lab(np.array([colors[m].mean(axis=0) for m in graph.members]), MEAN_WHITE)
+    found = [
+        (graph.names[i], graph.names[j], len(a & b), len(a), len(b), round(float(hyab(means[i], means[j])), 1))
+        for i, a in enumerate(sets)
+        for j, b in enumerate(sets[:i])
+        if len(a & b) > 0.95 * min(len(a), len(b)) and hyab(means[i], means[j]) <= EPS
+    ]
+    assert found == [("cube19_cluster0", "cube18_cluster0", 841, 853, 1279, 4.4)]
+
+
+def test_regions_are_numbered_as_kmapper_numbers_nodes(rebuilt: Rebuilt) -> None:
+    colors, graph = grid_colors(), rebuilt.graph
+    members, region = join_redundant(colors, graph.members, EPS)
+    kept = [name for name in graph.names if name != "cube19_cluster0"]
+    named = dict(zip(graph.names, region.tolist(), strict=True))
+    assert [named[name] for name in kept] == list(range(22))
+    assert named["cube19_cluster0"] == named["cube18_cluster0"]
+    for r, rows in enumerate(members):
+        np.testing.assert_array_equal(np.flatnonzero(rebuilt.network.region_bits >> np.uint32(r) & 1), rows)
+
+
+def test_edges_are_shared_colours_and_the_seam(rebuilt: Rebuilt) -> None:
+    bits, network = rebuilt.network.region_bits, rebuilt.network
+    sharing = [
+        [i, j]
+        for i in range(22)
+        for j in range(i + 1, 22)
+        if np.any((bits >> np.uint32(i)) & (bits >> np.uint32(j)) & np.uint32(1))
+    ]
+    assert network.edges[~network.cyclic].tolist() == sharing
+    _, region = join_redundant(grid_colors(), rebuilt.graph.members, EPS)
+    assert relabel(rebuilt.graph.cyclic, region).tolist() == network.edges[network.cyclic].tolist()
+
+
+def test_every_node_lies_in_one_cube_of_the_cover(rebuilt: Rebuilt) -> None:
+    """The cover by hand: 3 x 8 intervals of equal length, each widened by its overlap, hue cut at xi - pi."""
+    lab = to_lab(grid_colors(), GRID_WHITE)
+    chroma = np.sqrt(lab[:, 1] ** 2 + lab[:, 2] ** 2)
+    hue = np.arctan2(lab[:, 2], lab[:, 1]) + np.pi / 8
+    cubes = []
+    for members in rebuilt.graph.members:
+        place = []
+        for value, n, overlap in ((chroma, 3, 0.10), (hue, 8, 0.25)):
+            length = np.ptp(value) / n
+            center = value.min() + length * (np.arange(n) + 0.5)
+            half = length / (2 * (1 - overlap))
+            low, high = value[members].min(), value[members].max()
+            inside = np.flatnonzero((center - half <= low) & (high <= center + half))
+            assert inside.size > 0
+            place.append(set(inside.tolist()))
+        cubes.append(place)
+    joined = {(i, j) for i, j in rebuilt.graph.cyclic.tolist()}
+    for i, j in joined:  # the two ends of the hue circle, in one chroma interval
+        assert cubes[i][0] & cubes[j][0]
+        assert {min(cubes[i][1]), max(cubes[j][1])} == {0, 7}

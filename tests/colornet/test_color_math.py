@@ -1,0 +1,93 @@
+"""CIELAB, HyAB and its neighbourhoods against formulas written out by hand and searches by brute force."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
+from sklearn.cluster import DBSCAN
+
+from colornet.grid import grid_colors
+from colornet.lab import GRID_WHITE, MEAN_WHITE, hyab, to_lab
+from colornet.mapper import EPS, MIN_SAMPLES, HyabDBSCAN, hyab_neighbors, lens
+
+WHITES = (GRID_WHITE, MEAN_WHITE)
+
+
+def lab_by_hand(rgb: NDArray[np.generic], white: tuple[float, float]) -> NDArray[np.float64]:
+    """IEC 61966-2-1 and CIE 15, written out."""
+    encoded = np.asarray(rgb, np.float64) / 255
+    linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+    matrix = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+    x, y = white
+    ratio = linear @ matrix.T / np.array([x / y, 1.0, (1 - x - y) / y])
+    f = np.where(ratio > (6 / 29) ** 3, np.cbrt(ratio), ratio / (3 * (6 / 29) ** 2) + 4 / 29)
+    return np.stack([116 * f[..., 1] - 16, 500 * (f[..., 0] - f[..., 1]), 200 * (f[..., 1] - f[..., 2])], axis=-1)
+
+
+def hyab_by_hand(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
+    return float(abs(one[0] - other[0]) + ((one[1] - other[1]) ** 2 + (one[2] - other[2]) ** 2) ** 0.5)
+
+
+def some_colors(n: int) -> NDArray[np.float64]:
+    """Two blocks of near colours and a spread of far ones, in CIELAB."""
+    colors = grid_colors()
+    rows = np.random.default_rng(0).choice(len(colors), n // 3, replace=False)
+    for center in ([180, 90, 60], [40, 60, 200]):
+        near = np.flatnonzero((np.abs(colors.astype(int) - center) <= 15).all(axis=1))[: n // 3]
+        rows = np.union1d(rows, near)
+    return to_lab(colors[rows], GRID_WHITE)
+
+
+@pytest.mark.parametrize("white", WHITES)
+def test_lab_of_the_whole_grid(white: tuple[float, float]) -> None:
+    colors = grid_colors()
+    np.testing.assert_allclose(to_lab(colors, white), lab_by_hand(colors, white), atol=1e-9)
+
+
+def test_lab_of_means_and_of_one_color() -> None:
+    mean = np.array([12.25, 200.5, 99.125])
+    np.testing.assert_allclose(to_lab(mean, MEAN_WHITE), lab_by_hand(mean, MEAN_WHITE), atol=1e-9)
+    assert to_lab(np.zeros((0, 3)), MEAN_WHITE).shape == (0, 3)
+
+
+def test_white_and_black() -> None:
+    lab = to_lab(np.array([[255, 255, 255], [0, 0, 0]], np.uint8), GRID_WHITE)
+    np.testing.assert_allclose(lab, [[100, 0, 0], [0, 0, 0]], atol=0.02)
+
+
+def test_hyab() -> None:
+    lab = some_colors(40)
+    expected = [[hyab_by_hand(one, other) for other in lab] for one in lab]
+    np.testing.assert_allclose(hyab(lab[:, None], lab[None]), expected, atol=1e-12)
+
+
+def test_neighborhoods_are_those_of_brute_force() -> None:
+    lab = some_colors(600)
+    distances = cdist(lab, lab, hyab_by_hand)
+    near = (distances <= EPS) & ~np.eye(len(lab), dtype=bool)
+    found = hyab_neighbors(lab, EPS).toarray()
+    assert near.sum() > 1000
+    np.testing.assert_array_equal(found > 0, near)
+    np.testing.assert_allclose(found[near], distances[near], atol=1e-12)
+
+
+def test_neighborhoods_on_the_border_of_the_ball() -> None:
+    """Differences in lightness alone: HyAB and Euclidean distance are equal, and equal to the radius."""
+    lab = np.array([[10.0, 3.0, 4.0], [17.0, 3.0, 4.0], [17.1, 3.0, 4.0], [24.1, 3.0, 4.0]])
+    found = hyab_neighbors(lab, 7.0).toarray() > 0
+    expected = np.abs(lab[:, None, 0] - lab[None, :, 0]) <= 7.0
+    np.testing.assert_array_equal(found, expected & ~np.eye(4, dtype=bool))
+
+
+def test_clusters_are_those_of_a_dense_matrix() -> None:
+    lab = some_colors(600)
+    dense = DBSCAN(eps=EPS, min_samples=MIN_SAMPLES, metric="precomputed").fit_predict(cdist(lab, lab, hyab_by_hand))
+    found = HyabDBSCAN().fit_predict(lab)
+    assert found.max() >= 1 and found.min() == -1
+    np.testing.assert_array_equal(found, dense)
+
+
+def test_lens() -> None:
+    values = lens(np.array([[50.0, 3.0, 4.0], [50.0, -1.0, 0.0], [0.0, 0.0, 0.0]]))
+    expected = [[5.0, np.pi / 8 + np.arctan(4 / 3)], [1.0, np.pi / 8 + np.pi], [0.0, np.pi / 8]]
+    np.testing.assert_allclose(values, expected, atol=1e-15)

@@ -1,0 +1,37 @@
+"""The pictures: drawn whole, in the regions' own colours, and without a trace in the folder but themselves."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import colornet
+from colornet.draw import draw_network, draw_similarity
+
+DRAW = [draw_network, draw_similarity]
+
+
+@pytest.mark.parametrize("draw", DRAW)
+def test_every_region_shows_its_mean_color(
+    network: colornet.ColorNetwork, tmp_path: Path, draw: Callable[[colornet.ColorNetwork, Path], None]
+) -> None:
+    path = tmp_path / "picture.png"
+    draw(network, path)
+    assert os.listdir(tmp_path) == ["picture.png"]
+    with Image.open(path) as image:
+        pixels = np.asarray(image.convert("RGB")).astype(int)
+    assert min(pixels.shape[:2]) >= 1000
+    for r, mean in enumerate(network.mean_rgb):
+        near = np.abs(pixels - mean).max(axis=-1) <= 1
+        assert near.sum() > 100, f"region {r}"
+
+
+@pytest.mark.parametrize("draw", DRAW)
+def test_no_folder(
+    network: colornet.ColorNetwork, tmp_path: Path, draw: Callable[[colornet.ColorNetwork, Path], None]
+) -> None:
+    with pytest.raises(OSError):
+        draw(network, tmp_path / "nowhere" / "picture.png")

@@ -1,0 +1,167 @@
+"""The network as a record and as a file: read-only, whole or not at all, damage told in one line."""
+
+import dataclasses
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import colornet
+from colornet.files import whole_file, write_arrays
+
+# Changes with the contents of the network, and with nothing else.
+FINGERPRINT = "96981396ff3bc1ce0b440c5b781da4d2a5784b271f72967140e5b4b1bb6c593c"
+
+
+def contents(network: colornet.ColorNetwork) -> dict[str, Any]:
+    return {field.name: getattr(network, field.name) for field in dataclasses.fields(network)}
+
+
+def test_round_trip(network: colornet.ColorNetwork, tmp_path: Path) -> None:
+    path = tmp_path / "network.npz"
+    network.save(path)
+    again = colornet.load(str(path))
+    for name, value in contents(network).items():
+        np.testing.assert_array_equal(getattr(again, name), value, strict=True)
+    assert again.fingerprint == network.fingerprint
+    colornet.save(again, tmp_path / "again.npz")
+    assert (tmp_path / "again.npz").read_bytes() == path.read_bytes()
+    assert sorted(os.listdir(tmp_path)) == ["again.npz", "network.npz"]
+
+
+def test_packaged_file_is_small() -> None:
+    assert (Path(colornet.__file__).parent / "data" / "network.npz").stat().st_size < 300_000
+
+
+def test_arrays_are_read_only_copies(network: colornet.ColorNetwork) -> None:
+    mine = {
+        name: np.array(value) if isinstance(value, np.ndarray) else value for name, value in contents(network).items()
+    }
+    made = colornet.ColorNetwork(**mine)
+    mine["mean_rgb"][0] = 0
+    mine["similarity"][0] = 0
+    assert made.fingerprint == network.fingerprint
+    for name, value in contents(made).items():
+        if isinstance(value, np.ndarray):
+            with pytest.raises(ValueError, match="read-only"):
+                value[0] = 0
+        with pytest.raises(dataclasses.FrozenInstanceError):
+            setattr(made, name, value)
+
+
+def test_fingerprint_tells_networks_apart(network: colornet.ColorNetwork) -> None:
+    assert network.fingerprint == FINGERPRINT
+    seen = {network.fingerprint}
+    for name in ("mean_rgb", "edge_weights", "similarity"):
+        changed = np.array(getattr(network, name))
+        changed.flat[-1] += 1e-6
+        seen.add(dataclasses.replace(network, **{name: changed}).fingerprint)
+    seen.add(dataclasses.replace(network, cyclic=~network.cyclic).fingerprint)
+    seen.add(dataclasses.replace(network, edges=network.edges[:, ::-1]).fingerprint)
+    seen.add(dataclasses.replace(network, n_raw_nodes=24).fingerprint)
+    swapped = np.array(network.region_bits)
+    first, other = 0, int(np.flatnonzero(swapped != swapped[0])[0])
+    swapped[[first, other]] = swapped[[other, first]]
+    seen.add(dataclasses.replace(network, region_bits=swapped).fingerprint)
+    assert len(seen) == 8
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"mean_rgb": np.zeros((22, 4))}, "mean_rgb is float64 [22, 4]; expected float64 [22, 3]"),
+        ({"mean_rgb": np.float64(0)}, "mean_rgb is float64 []; expected"),
+        ({"mean_rgb": np.zeros((0, 3))}, "member_counts is int64 [22]; expected int64 [0]"),
+        ({"edge_weights": np.zeros(55, np.float32)}, "edge_weights is float32 [55]; expected float64 [55]"),
+        ({"edges": np.full((55, 2), 22)}, "edges names regions 22 to 22; there are 22 regions"),
+        ({"edges": np.full((55, 2), -1)}, "edges names regions -1 to -1; there are 22 regions"),
+        ({"region_bits": np.zeros(140608, np.uint32)}, "region_bits[0] is 0"),
+        ({"region_bits": np.full(140608, 1 << 22, np.uint32)}, "region_bits has 0x400000; there are 22 regions"),
+        ({"member_counts": np.zeros(22, np.int64)}, "member_counts is [0, 0"),
+        ({"similarity": np.full((22, 22), np.nan)}, "similarity has a value that is not finite"),
+        ({"n_raw_nodes": 21}, "n_raw_nodes is 21"),
+        ({"n_raw_nodes": 23.0}, "n_raw_nodes is 23.0"),
+    ],
+)
+def test_contradictory_contents_are_refused(
+    network: colornet.ColorNetwork, tmp_path: Path, change: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ValueError) as direct:
+        dataclasses.replace(network, **change)
+    assert str(direct.value).startswith(message)
+    path = tmp_path / "network.npz"
+    write_arrays(path, {name: np.asarray(value) for name, value in {**contents(network), **change}.items()})
+    with pytest.raises(ValueError) as loaded:
+        colornet.load(path)
+    assert str(loaded.value) == f"{path} is no colour network: {direct.value}"
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(OSError, match="nothing-here.npz"):
+        colornet.load(tmp_path / "nothing-here.npz")
+    with pytest.raises(OSError):
+        colornet.load(tmp_path)
+
+
+def test_damaged_and_foreign_files_are_told_in_one_line(network: colornet.ColorNetwork, tmp_path: Path) -> None:
+    path = tmp_path / "network.npz"
+    network.save(path)
+    good = path.read_bytes()
+    bad = {"empty": b"", "text": b"not a network\n" * 9, "half": good[: len(good) // 2], "end cut": good[:-1]}
+    for name, data in bad.items():
+        path.write_bytes(data)
+        with pytest.raises(ValueError, match="is damaged or not a file of arrays") as error:
+            colornet.load(path)
+        assert str(path) in str(error.value) and "\n" not in str(error.value), name
+    with open(path, "wb") as stream:
+        np.save(stream, network.similarity)
+    with pytest.raises(ValueError, match="is damaged or not a file of arrays"):
+        colornet.load(path)
+    write_arrays(path, {"something": np.zeros(3)})
+    with pytest.raises(ValueError, match=r"holds \['something'\]; a colour network is"):
+        colornet.load(path)
+
+
+def test_no_flipped_byte_passes_for_another_network(network: colornet.ColorNetwork, tmp_path: Path) -> None:
+    path = tmp_path / "network.npz"
+    network.save(path)
+    good = path.read_bytes()
+    places = np.random.default_rng(0).choice(len(good), 150, replace=False).tolist() + list(range(-150, 0))
+    refused = 0
+    for place in places:
+        data = bytearray(good)
+        data[place] ^= 0x55
+        path.write_bytes(data)
+        try:
+            assert colornet.load(path).fingerprint == network.fingerprint  # a time stamp, say: nothing that is read
+        except ValueError as error:
+            assert str(path) in str(error) and "\n" not in str(error)
+            refused += 1
+    assert refused > 150
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path: Path) -> None:
+    path = tmp_path / "file"
+    path.write_text("old")
+    with pytest.raises(RuntimeError), whole_file(path) as temporary:
+        temporary.write_text("new, half")
+        raise RuntimeError
+    assert path.read_text() == "old"
+    assert os.listdir(tmp_path) == ["file"]
+
+
+def test_a_network_cannot_be_saved_where_there_is_no_folder(network: colornet.ColorNetwork, tmp_path: Path) -> None:
+    with pytest.raises(OSError):
+        network.save(tmp_path / "nowhere" / "network.npz")
+
+
+def test_loading_needs_neither_kmapper_nor_the_rest_of_the_project() -> None:
+    script = "import colornet, sys; colornet.load_default().membership; print(*sys.modules)"
+    root = Path(colornet.__file__).resolve().parents[1]
+    done = subprocess.run([sys.executable, "-c", script], cwd=root, capture_output=True, text=True, check=True)
+    loaded = set(done.stdout.split())
+    assert not loaded & {"kmapper", "sklearn", "colour", "matplotlib", "jax", "thor2_jax", "training"}

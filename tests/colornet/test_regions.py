@@ -1,0 +1,88 @@
+"""Joining nodes, moving edges, and the similarity matrix on small cases and against Floyd and Warshall."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+import colornet
+from colornet.grid import grid_colors
+from colornet.lab import MEAN_WHITE
+from colornet.regions import join_redundant, mean_color, relabel, similarity
+
+from .test_color_math import hyab_by_hand, lab_by_hand
+
+
+def floyd_warshall(n: int, edges: NDArray[np.int64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
+    length = np.full((n, n), np.inf)
+    np.fill_diagonal(length, 0)
+    for (i, j), weight in zip(edges, weights, strict=True):
+        length[i, j] = length[j, i] = weight
+    for via in range(n):
+        for i in range(n):
+            for j in range(n):
+                length[i, j] = min(length[i, j], length[i, via] + length[via, j])
+    return length
+
+
+def test_similarity_of_the_packaged_network(network: colornet.ColorNetwork) -> None:
+    """From the colours up: means, their CIELAB, edge weights, paths, similarity."""
+    colors = grid_colors().astype(np.float64)
+    member = (network.region_bits[:, None] >> np.arange(22, dtype=np.uint32) & 1).astype(np.float64)
+    means = (member.T @ colors) / member.sum(axis=0)[:, None]
+    np.testing.assert_allclose(network.mean_rgb, means, rtol=1e-13)
+    lab = lab_by_hand(means, MEAN_WHITE)
+    weights = np.array([hyab_by_hand(lab[i], lab[j]) for i, j in network.edges])
+    np.testing.assert_allclose(network.edge_weights, weights, rtol=1e-11)
+    expected = 1 / (1 + floyd_warshall(22, network.edges, weights))
+    np.testing.assert_allclose(network.similarity, expected, rtol=1e-11)
+
+
+def test_similarity_of_random_graphs() -> None:
+    rng = np.random.default_rng(1)
+    for n in (1, 2, 7, 13):
+        pairs = np.array([(i, j) for i in range(n) for j in range(i + 1, n)], np.int64).reshape(-1, 2)
+        edges = pairs[rng.random(len(pairs)) < 0.3]
+        weights = rng.uniform(1, 100, len(edges))
+        found = similarity(n, edges, weights)
+        np.testing.assert_allclose(found, 1 / (1 + floyd_warshall(n, edges, weights)), rtol=1e-13)
+        np.testing.assert_array_equal(found, found.T)
+
+
+def test_regions_without_a_path_are_not_similar() -> None:
+    found = similarity(3, np.array([[0, 2]]), np.array([4.0]))
+    np.testing.assert_array_equal(found, [[1, 0, 0.2], [0, 1, 0], [0.2, 0, 1]])
+
+
+def test_mean_color() -> None:
+    colors = np.array([[0, 0, 0], [255, 0, 10], [254, 1, 0]], np.uint8)
+    np.testing.assert_array_equal(mean_color(colors, np.array([1, 2])), [254.5, 0.5, 5.0])
+
+
+def test_join_only_nodes_that_share_members_and_color() -> None:
+    """40 greys, node sizes around the threshold of 95 % of the smaller one."""
+    colors = np.repeat(np.arange(100, 140, dtype=np.uint8)[:, None], 3, axis=1)
+    whole = np.arange(40)
+    cases = {
+        "apart": ([whole[:20], whole[20:]], [0, 1]),
+        "19 of 20 are not more than 95 %": ([whole[:20], whole[1:22]], [0, 1]),
+        "all of the smaller": ([whole[10:40], whole[20:40]], [0, 0]),
+        "the first keeps its place": ([whole[:21], whole[35:], whole[:20], whole[30:34]], [0, 1, 0, 2]),
+        "alone": ([whole], [0]),
+    }
+    for name, (members, expected) in cases.items():
+        joined, region = join_redundant(colors, members, eps=7.0)
+        assert region.tolist() == expected, name
+        for k, rows in enumerate(joined):
+            union = set().union(*(m.tolist() for m, r in zip(members, expected, strict=True) if r == k))
+            assert rows.tolist() == sorted(union), name
+
+
+def test_do_not_join_nodes_of_another_mean_color() -> None:
+    colors = np.repeat(np.array([0, 250, 251], np.uint8)[:, None], 3, axis=1)
+    _, region = join_redundant(colors, [np.array([0]), np.array([0, 1, 2])], eps=7.0)
+    assert region.tolist() == [0, 1]
+
+
+def test_relabel() -> None:
+    edges = np.array([[0, 1], [1, 2], [0, 2], [2, 3]])
+    assert relabel(edges, np.array([0, 1, 0, 2])).tolist() == [[0, 1], [0, 2]]
+    assert relabel(np.zeros((0, 2), np.int64), np.array([0, 1])).shape == (0, 2)

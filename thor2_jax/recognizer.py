@@ -1,0 +1,199 @@
+"""From an RGB-D frame to object names (paper, section "Recognition"): instance clouds, descriptors, two classifiers, one answer.
+
+>>> recognizer = Recognizer.load("run")                                             # doctest: +SKIP
+>>> frame = read_frame(color="c.png", depth="d.png", labels="l.png", intrinsics="k.json")  # doctest: +SKIP
+>>> [(r.label, r.name, r.confidence) for r in recognizer.recognize(frame)]          # doctest: +SKIP
+[(1, 'mug', 0.98), (2, 'bowl', 0.71)]
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from flax import nnx
+from numpy.typing import NDArray
+
+from thor2_jax.capacity import BATCH_BUCKETS, batch_bucket, point_bucket
+from thor2_jax.classifier import Feature, check_features, feature_of, join
+from thor2_jax.descriptor import describe
+from thor2_jax.errors import InputError
+from thor2_jax.frames import RGBDFrame
+from thor2_jax.instance_clouds import InstanceCloud, instance_clouds
+from thor2_jax.occlusion import boundary_points, is_occluded
+from thor2_jax.run_folder import TrainedRun, load_run
+from thor2_jax.types import Descriptors, PointClouds
+from thor2_jax.voxel_grid import voxel_downsample
+
+__all__ = ["THOR2", "VOXEL", "DescribedFrame", "Recognition", "Recognizer"]
+
+THOR2: tuple[Feature, ...] = ("tops", "tops2")
+"""The two classifiers whose more confident answer is THOR2's."""
+
+VOXEL = 0.01
+"""Voxel side in scaled units of every cloud that is described, in training and in recognition: colour counts depend on it."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Recognition:
+    """What is said of one instance of a frame.
+
+    Attributes:
+        label: its number in the label image.
+        name: the object's name; None if it was not recognized.
+        confidence: the winning classifier's probability.
+        classifier: which one won ("tops" or "tops2").
+        top: classifier -> its five most probable (name, probability) pairs.
+        occluded: the instance is hidden in part by another one, or cut by the image's border.
+        overflow: points and pairs that the descriptor has no room for.
+        points_used: points of the described cloud.
+        kept_by_fallback: the outlier filter would have emptied the cloud and was relaxed.
+        reason: why it is not recognized; None if it is.
+    """
+
+    label: int
+    name: str | None = None
+    confidence: float | None = None
+    classifier: str | None = None
+    top: dict[str, list[tuple[str, float]]] = dataclasses.field(default_factory=dict)
+    occluded: bool = False
+    overflow: int = 0
+    points_used: int = 0
+    kept_by_fallback: bool = False
+    reason: str | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class DescribedFrame:
+    """A frame's instances and the descriptors of the usable ones, row by row.
+
+    Attributes:
+        clouds: every instance; unusable ones carry a reason.
+        usable: indices into `clouds`, one a row of `packed` and `descriptors`.
+        occluded: one flag a row.
+        packed: the described clouds, metres, padded to a batch bucket (rows past `usable` are empty).
+        descriptors: of `packed`.
+    """
+
+    clouds: list[InstanceCloud]
+    usable: list[int]
+    occluded: list[bool]
+    packed: PointClouds
+    descriptors: Descriptors
+
+
+def _voxelled(cloud: InstanceCloud, edge: NDArray[np.bool_], size: float) -> tuple[Any, Any, NDArray[np.bool_]]:
+    """The cloud on the descriptors' voxel grid, and which voxels hold a boundary point; coarser if no bucket holds it."""
+    flags = np.repeat(edge[:, None], 3, axis=1).astype(np.float32)
+    while True:
+        points, colors = voxel_downsample(cloud.points, cloud.colors, size)
+        marks = voxel_downsample(cloud.points, flags, size)[1]
+        try:
+            point_bucket(len(points))
+        except InputError:
+            size *= 2
+            continue
+        return points, colors, marks[:, 0] > 0
+
+
+class Recognizer:
+    """A trained run, compiled and ready. Functions are compiled once a bucket of points and of instances."""
+
+    def __init__(self, run: TrainedRun) -> None:
+        """Ready to answer with every classifier of `run`."""
+        self.run = run
+        self._apply = {name: _compiled(model) for name, model in run.classifiers.items()}
+
+    @classmethod
+    def load(cls, run_dir: str | Path) -> "Recognizer":
+        """Read a run folder (see `run_folder.load_run`, also for what is raised)."""
+        return cls(load_run(run_dir))
+
+    def describe(self, frame: RGBDFrame) -> DescribedFrame:
+        """Clouds and descriptors of a frame's instances, those past the largest batch bucket included."""
+        clouds = instance_clouds(frame)
+        usable = [i for i, cloud in enumerate(clouds) if cloud.reason is None]
+        size = VOXEL / self.run.config.sigma_s
+        parts, edges, occluded = [], [], []
+        for i in usable:
+            occluded.append(is_occluded(frame, clouds[i]))
+            edge = boundary_points(frame, clouds[i])
+            points, colors, marks = _voxelled(clouds[i], edge, size)
+            parts.append((points, colors))
+            edges.append(marks)
+        packed, descriptors = self._describe_clouds(parts, edges)
+        return DescribedFrame(clouds, usable, occluded, packed, descriptors)
+
+    def _describe_clouds(
+        self, parts: Sequence[tuple[Any, Any]], edges: Sequence[NDArray[np.bool_]]
+    ) -> tuple[PointClouds, Descriptors]:
+        limit = BATCH_BUCKETS[-1]
+        capacity = point_bucket(max((len(points) for points, _ in parts), default=1))
+        batches = []
+        for start in range(0, max(len(parts), 1), limit):
+            chunk, marks = list(parts[start : start + limit]), list(edges[start : start + limit])
+            missing = batch_bucket(max(len(chunk), 1)) - len(chunk)
+            chunk += [(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))] * missing
+            marks += [np.zeros(0, bool)] * missing
+            packed = PointClouds.pack(chunk, capacity, boundary=marks)
+            batches.append((packed, describe(packed, self.run.network, self.run.config)))
+        return jax.tree.map(lambda *arrays: np.concatenate(arrays), *batches) if len(batches) > 1 else batches[0]
+
+    def probabilities(self, descriptors: Descriptors) -> dict[Feature, NDArray[np.float32]]:
+        """Feature -> [B, C] class probabilities of its classifier."""
+        return {name: np.asarray(apply(feature_of(descriptors, name))) for name, apply in self._apply.items()}
+
+    def recognize(self, frame: RGBDFrame, classifiers: Sequence[Feature] = THOR2) -> list[Recognition]:
+        """Name every instance of a frame, in the order of its label numbers.
+
+        Args:
+            frame: color, depth, labels, intrinsics.
+            classifiers: those that vote; the paper's two by default.
+
+        Raises:
+            InputError: a classifier that the run does not have. An instance that cannot be named is no error: its `reason` tells.
+        """
+        voting = check_features(classifiers, "classifiers")
+        missing = [name for name in voting if name not in self._apply]
+        if missing:
+            raise InputError(f"classifiers: the run has no {', '.join(missing)}, only {', '.join(self._apply)}")
+        described = self.describe(frame)
+        found = {
+            name: values[: len(described.usable)]
+            for name, values in self.probabilities(described.descriptors).items()
+            if name in voting
+        }
+        joined = join(found)
+        rows = {index: row for row, index in enumerate(described.usable)}
+        answers = []
+        for index, cloud in enumerate(described.clouds):
+            row = rows.get(index)
+            if row is None:
+                answers.append(Recognition(label=cloud.label, reason=cloud.reason))
+                continue
+            answers.append(
+                Recognition(
+                    label=cloud.label,
+                    name=self.run.classes[joined.class_index[row]],
+                    confidence=float(joined.confidence[row]),
+                    classifier=str(joined.classifier[row]),
+                    top={name: self._top(values[row]) for name, values in found.items()},
+                    occluded=described.occluded[row],
+                    overflow=int(described.descriptors.overflow[row]),
+                    points_used=int(described.packed.mask[row].sum()),
+                    kept_by_fallback=cloud.kept_by_fallback,
+                )
+            )
+        return answers
+
+    def _top(self, probabilities: NDArray[np.float32], count: int = 5) -> list[tuple[str, float]]:
+        best = np.argsort(-probabilities, kind="stable")[:count]
+        return [(self.run.classes[i], float(probabilities[i])) for i in best]
+
+
+def _compiled(model: nnx.Module) -> Any:
+    graph, state = nnx.split(model)
+    forward = jax.jit(lambda state, x: jax.nn.softmax(nnx.merge(graph, state)(x)))
+    return lambda x: forward(state, x)

@@ -1,0 +1,70 @@
+"""Camera poses on the view sphere around an object (paper, section "Training"): every azimuth and polar angle in equal steps.
+
+    poses = [camera_pose(azimuth, polar, mesh.centre) for azimuth, polar in view_angles()]   # 2,664 poses
+
+The object's frame is the scan's: z up. Polar angle 0 looks down on the object, pi/2 from the side, pi from below.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thor2_jax.errors import InputError
+
+__all__ = ["DISTANCE", "camera_pose", "view_angles"]
+
+DISTANCE = 1.5
+"""Metres between the camera and the centre of the object's bounding box."""
+
+
+def _steps(name: str, step: float, turn: float) -> int:
+    count = turn / step if math.isfinite(step) and step > 0 else 0.0
+    if round(count) < 1 or abs(count - round(count)) > 1e-6:
+        raise InputError(f"{name} must be degrees that divide {turn:g} evenly, not {step!r}")
+    return round(count)
+
+
+def view_angles(azimuth_step: float = 5.0, polar_step: float = 5.0) -> NDArray[np.float64]:
+    """All views of an object: azimuth from 0 up to, without, 2 pi and polar angle from 0 to pi, both poles included.
+
+    Args:
+        azimuth_step: degrees; divides 360.
+        polar_step: degrees; divides 180.
+
+    Returns:
+        [n, 2] float64, azimuth and polar angle in radians, azimuth varying fastest; 72 x 37 rows by default.
+
+    Raises:
+        InputError: a step that is not positive or does not divide its range.
+    """
+    azimuths = np.arange(n := _steps("azimuth_step", azimuth_step, 360)) * (2 * np.pi / n)
+    polars = np.linspace(0, np.pi, _steps("polar_step", polar_step, 180) + 1)
+    return np.stack([np.tile(azimuths, len(polars)), np.repeat(polars, n)], axis=1)
+
+
+def camera_pose(
+    azimuth: float, polar: float, centre: NDArray[np.float64], distance: float = DISTANCE
+) -> NDArray[np.float64]:
+    """Pose of a camera on the view sphere that looks at `centre`.
+
+    The image's down direction is that of growing polar angle. Away from the poles this is "z is up in the image"; at the poles it
+    is where the meridian of `azimuth` leads, so that the picture turns with the azimuth there.
+
+    Args:
+        azimuth: radians, from the x axis towards the y axis.
+        polar: radians, from the z axis.
+        centre: [3] metres.
+        distance: metres.
+
+    Returns:
+        [4, 4] float64, camera to object frame; columns are the camera's x (right), y (down), z (forward) and position.
+    """
+    ca, sa, cp, sp = math.cos(azimuth), math.sin(azimuth), math.cos(polar), math.sin(polar)
+    outward = np.array([sp * ca, sp * sa, cp])
+    pose = np.eye(4)
+    pose[:3, 0] = -sa, ca, 0.0
+    pose[:3, 1] = cp * ca, cp * sa, -sp
+    pose[:3, 2] = -outward
+    pose[:3, 3] = centre + distance * outward
+    return pose
