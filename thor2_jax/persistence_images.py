@@ -29,7 +29,9 @@ def persistence_image(diagram: Diagrams, config: DescriptorConfig) -> jax.Array:
     """
     persistence = jnp.where(diagram.mask, diagram.deaths - diagram.births, 0)
     by_birth = _pixel_mass(diagram.births, config)
-    by_persistence = _pixel_mass(persistence, config) * persistence[:, None]  # weight = persistence: padding adds nothing
+    by_persistence = (
+        _pixel_mass(persistence, config) * persistence[:, None]
+    )  # weight = persistence: padding adds nothing
     return jnp.matmul(by_birth.T, by_persistence, precision=jax.lax.Precision.HIGHEST)
 
 

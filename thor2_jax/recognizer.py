@@ -22,7 +22,7 @@ from thor2_jax.descriptor import describe
 from thor2_jax.errors import InputError
 from thor2_jax.frames import RGBDFrame
 from thor2_jax.instance_clouds import InstanceCloud, instance_clouds
-from thor2_jax.occlusion import boundary_points, is_occluded
+from thor2_jax.occlusion import find_occlusion
 from thor2_jax.run_folder import TrainedRun, load_run
 from thor2_jax.types import Descriptors, PointClouds
 from thor2_jax.voxel_grid import voxel_downsample
@@ -118,9 +118,9 @@ class Recognizer:
         size = VOXEL / self.run.config.sigma_s
         parts, edges, occluded = [], [], []
         for i in usable:
-            occluded.append(is_occluded(frame, clouds[i]))
-            edge = boundary_points(frame, clouds[i])
-            points, colors, marks = _voxelled(clouds[i], edge, size)
+            found = find_occlusion(frame, clouds[i])
+            occluded.append(found.occluded)
+            points, colors, marks = _voxelled(clouds[i], found.boundary, size)
             parts.append((points, colors))
             edges.append(marks)
         packed, descriptors = self._describe_clouds(parts, edges)

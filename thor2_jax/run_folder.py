@@ -1,8 +1,8 @@
 """A trained model on disk: everything that recognition needs, checked on loading, written whole or not at all.
 
-    RUN/run.json       format, descriptor version and constants, class names, classifiers, how it was trained, how well it did
-    RUN/network.npz    the colour network whose regions the descriptors use
-    RUN/weights/NAME/  one classifier's parameters and batch statistics (orbax)
+RUN/run.json       format, descriptor version and constants, class names, classifiers, how it was trained, how well it did
+RUN/network.npz    the colour network whose regions the descriptors use
+RUN/weights/NAME/  one classifier's parameters and batch statistics (orbax)
 """
 
 import dataclasses

@@ -39,9 +39,7 @@ def slice_and_strip(points: jax.Array, mask: jax.Array, config: DescriptorConfig
     return jnp.where(level < n_levels, rank[jnp.clip(level, 0, n_levels - 1)], level), strip
 
 
-def strips_of_cloud(
-    cloud: PointClouds, region_bits: jax.Array, n_regions: int, config: DescriptorConfig
-) -> Strips:
+def strips_of_cloud(cloud: PointClouds, region_bits: jax.Array, n_regions: int, config: DescriptorConfig) -> Strips:
     """Extreme points and colour vectors of every strip of one aligned cloud (no batch axis).
 
     The extremes are found as point indices and gathered, so that a gradient reaches exactly one point each.

@@ -74,9 +74,7 @@ class PointClouds:
             if boundary is not None and boundary[i] is not None:
                 flags = np.asarray(boundary[i])
                 if flags.shape != (sizes[i],) or flags.dtype != bool:
-                    raise InputError(
-                        f"boundary[{i}] is {flags.dtype} {list(flags.shape)}; expected bool [{sizes[i]}]"
-                    )
+                    raise InputError(f"boundary[{i}] is {flags.dtype} {list(flags.shape)}; expected bool [{sizes[i]}]")
                 edge[i, : sizes[i]] = flags
         position = np.zeros(3, np.float32) if camera is None else np.asarray(camera, np.float32)
         if position.shape not in ((3,), (len(parts), 3)) or not np.isfinite(position).all():

@@ -49,7 +49,9 @@ def _normalize_one(clouds: PointClouds, sigma_s: float) -> PointClouds:
     camera_z = jnp.matmul(axes[2], camera, precision=HIGHEST) - middle[2]
     z_sign = jnp.where(camera_z > 0, -1.0, 1.0)
 
-    bins = jnp.floor(turned[:, 0] * x_sign / OCCLUSION_BIN - jnp.minimum(low[0] * x_sign, high[0] * x_sign) / OCCLUSION_BIN)
+    bins = jnp.floor(
+        turned[:, 0] * x_sign / OCCLUSION_BIN - jnp.minimum(low[0] * x_sign, high[0] * x_sign) / OCCLUSION_BIN
+    )
     last = jnp.where(mask, bins, -1).max()
     edge = clouds.boundary & mask
     at_start = (edge & (bins <= 1)).sum()

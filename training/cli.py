@@ -188,7 +188,9 @@ def _evaluate(frames: Any, model: Path, out: Path | None) -> None:
     table = Table("", "", "instances", *names)
     for attribute, values in summary["accuracy"].items():
         for value, row in values.items():
-            table.add_row(attribute, value, str(row["instances"]), *("" if row[n] is None else f"{row[n]:.3f}" for n in names))
+            table.add_row(
+                attribute, value, str(row["instances"]), *("" if row[n] is None else f"{row[n]:.3f}" for n in names)
+            )
     console.print(table)
     console.print(
         f"{summary['scored']} instances scored, {summary['unanswered']} of them could not be described (counted as wrong); "

@@ -5,29 +5,16 @@ import itertools
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from thor2_jax.classifier import FEATURES, Feature, join
 from thor2_jax.files import write_text
-from thor2_jax.frames import RGBDFrame
 from thor2_jax.recognizer import Recognizer
+from training.readers.labelled import LabelledFrame
 
-__all__ = ["Instance", "LabelledFrame", "evaluate", "joinings", "summarize", "write_report"]
-
-
-class LabelledFrame(Protocol):
-    """What a reader yields: an identifier, the frame, label -> name, and attributes to break accuracy down by."""
-
-    @property
-    def identifier(self) -> str: ...
-    @property
-    def frame(self) -> RGBDFrame: ...
-    @property
-    def truth(self) -> Mapping[int, str]: ...
-    @property
-    def attributes(self) -> Mapping[str, str]: ...
+__all__ = ["Instance", "evaluate", "joinings", "summarize", "write_report"]
 
 
 @dataclasses.dataclass(frozen=True)

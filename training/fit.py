@@ -95,9 +95,7 @@ def fit(
         raise InputError(f"classes is {dataset.classes}; a classifier needs at least two")
     batch_size = min(options.batch_size, len(dataset))
     config = dataclasses.replace(config, homology="closed_form")
-    model = MLP(
-        input_size(feature, config, network.n_regions), len(dataset.classes), rngs=nnx.Rngs(options.seed)
-    )
+    model = MLP(input_size(feature, config, network.n_regions), len(dataset.classes), rngs=nnx.Rngs(options.seed))
     model.input_scale[...] = _input_scale(dataset, network, config, feature)
     graph, params, rest = nnx.split(model, nnx.Param, ...)
 
@@ -135,6 +133,8 @@ def fit(
             totals.append(figures)
         loss, accuracy = np.mean(np.asarray(totals, np.float64), axis=0)
         if not np.isfinite(loss):
-            raise InputError(f"the training loss of {feature} is {loss} in epoch {epoch + 1}; try a smaller learning rate")
+            raise InputError(
+                f"the training loss of {feature} is {loss} in epoch {epoch + 1}; try a smaller learning rate"
+            )
         progress(EpochFigures(epoch + 1, float(loss), float(accuracy)))
     return nnx.merge(graph, params, rest)

@@ -236,7 +236,9 @@ def _mesh_in(folder: Path) -> Path | None:
         if len(choice) == 1:
             return choice[0]
     if files:
-        raise InputError(f"mesh folder {folder}: {len(files)} mesh files ({', '.join(f.name for f in files)}); keep one")
+        raise InputError(
+            f"mesh folder {folder}: {len(files)} mesh files ({', '.join(f.name for f in files)}); keep one"
+        )
     return None
 
 

@@ -1,7 +1,7 @@
 """Training clouds: one coloured point cloud a view of a mesh (paper, section "Training").
 
-    for view in iterate_views({"mug": load_mesh("mug.glb")}, view_angles(), workers=2):
-        view.name, view.azimuth, view.polar, view.xyz, view.rgb
+for view in iterate_views({"mug": load_mesh("mug.glb")}, view_angles(), workers=2):
+    view.name, view.azimuth, view.polar, view.xyz, view.rgb
 """
 
 import collections
@@ -107,9 +107,7 @@ def _render_chunk(name: str, mesh: TexturedMesh, angles: NDArray[np.float64]) ->
     return views
 
 
-def iterate_views(
-    meshes: Mapping[str, TexturedMesh], angles: NDArray[np.float64], workers: int = 1
-) -> Iterator[View]:
+def iterate_views(meshes: Mapping[str, TexturedMesh], angles: NDArray[np.float64], workers: int = 1) -> Iterator[View]:
     """Views of all meshes: all angles of the first mesh in order, then of the second, and so on.
 
     Order and values do not depend on the number of workers.
@@ -128,9 +126,7 @@ def iterate_views(
     return _generate_views(meshes, angles, workers)
 
 
-def _generate_views(
-    meshes: Mapping[str, TexturedMesh], angles: NDArray[np.float64], workers: int
-) -> Iterator[View]:
+def _generate_views(meshes: Mapping[str, TexturedMesh], angles: NDArray[np.float64], workers: int) -> Iterator[View]:
     chunks = [(name, angles[i : i + CHUNK]) for name in meshes for i in range(0, len(angles), CHUNK)]
     if workers == 1:
         for name, part in chunks:

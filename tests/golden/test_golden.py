@@ -9,9 +9,11 @@ import pytest
 import colornet
 import thor2_jax as thor2
 
-FILES = [f"{name}_{i}" for name in (
-    "004_sugar_box", "006_mustard_bottle", "025_mug", "048_hammer", "055_baseball", "061_foam_brick"
-) for i in range(4)]
+FILES = [
+    f"{name}_{i}"
+    for name in ("004_sugar_box", "006_mustard_bottle", "025_mug", "048_hammer", "055_baseball", "061_foam_brick")
+    for i in range(4)
+]
 TOLERANCE = 1e-5
 BORDER = 1e-6
 BACKENDS = ("gudhi", "closed_form")
@@ -81,7 +83,9 @@ def test_colour_matrices(shared: Path, name: str) -> None:
     aligned = pack_scaled(golden["aligned"], golden["colors"])
     color = thor2.strips(aligned, colornet.load_default(), thor2.DescriptorConfig()).color[0]
     _, n_touched = touched_slices(golden)
-    wrong = (np.abs(np.asarray(color) - golden["paper_color"]) > TOLERANCE * np.maximum(1, golden["paper_color"])).any(-1)
+    wrong = (np.abs(np.asarray(color) - golden["paper_color"]) > TOLERANCE * np.maximum(1, golden["paper_color"])).any(
+        -1
+    )
     assert wrong.sum() <= 2 * n_touched
 
 
@@ -89,7 +93,9 @@ def normalized_volumes(shared: Path) -> np.ndarray:
     config, ratios = thor2.DescriptorConfig(), []
     for name in FILES:
         golden = load(shared, name)
-        normal = thor2.view_normalize(thor2.PointClouds.pack([(golden["points"] / config.sigma_s, golden["colors"])]), config)
+        normal = thor2.view_normalize(
+            thor2.PointClouds.pack([(golden["points"] / config.sigma_s, golden["colors"])]), config
+        )
         extents = np.asarray(normal.points[0])[np.asarray(normal.mask[0])].max(axis=0)
         ratios.append(np.prod(extents.astype(np.float64)) / np.prod(golden["box_extent"].astype(np.float64)))
     return np.array(ratios)

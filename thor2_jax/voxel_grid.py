@@ -1,0 +1,54 @@
+"""Voxel grid: one point a cube, the mean of the points in it (the rule of Open3D's `voxel_down_sample`)."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thor2_jax.errors import InputError
+
+__all__ = ["voxel_downsample"]
+
+
+def voxel_downsample(
+    points: NDArray[np.floating[Any]], colors: NDArray[Any], size: float
+) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Replace the points of each cube by their mean, and their colours by theirs.
+
+    The grid starts half a cube below the cloud's least coordinates, as Open3D's does.
+
+    Args:
+        points: [n, 3] floats, n may be 0.
+        colors: [n, c] uint8 or floats.
+        size: side of a cube, in the points' unit.
+
+    Returns:
+        points [m, 3] and colors [m, c] of the types given (uint8 means are rounded, halves up), cubes in lexicographic order.
+
+    Raises:
+        InputError: a size that is not positive, points that are not finite, or other shapes.
+    """
+    if not size > 0:
+        raise InputError(f"size is {size!r}; it must be positive")
+    if points.ndim != 2 or points.shape[1] != 3 or colors.ndim != 2 or len(colors) != len(points):
+        raise InputError(f"points and colors have shapes {points.shape} and {colors.shape}; expected [n, 3] and [n, c]")
+    if len(points) == 0:
+        return points.copy(), colors.copy()
+    if not np.isfinite(points).all():
+        raise InputError(f"points has {int((~np.isfinite(points)).any(axis=1).sum())} points that are not finite")
+    exact = points.astype(np.float64)
+    cubes = np.floor((exact - (exact.min(axis=0) - size / 2)) / size).astype(np.int64)
+    extent = cubes.max(axis=0) + 1
+    if float(extent[0]) * float(extent[1]) * float(extent[2]) >= 2**62:
+        raise InputError(f"size is {size!r}; too small for a cloud that spans {np.ptp(exact, axis=0).tolist()}")
+    key = (cubes[:, 0] * extent[1] + cubes[:, 1]) * extent[2] + cubes[:, 2]
+    _, cube, counts = np.unique(key, return_inverse=True, return_counts=True)
+
+    def mean(values: NDArray[Any]) -> NDArray[np.float64]:
+        columns = [np.bincount(cube, weights=values[:, k]) for k in range(values.shape[1])]
+        return np.stack(columns, axis=1) / counts[:, None]
+
+    mean_colors = mean(colors.astype(np.float64))
+    if colors.dtype == np.uint8:
+        mean_colors = np.floor(mean_colors + 0.5)
+    return mean(exact).astype(points.dtype), mean_colors.astype(colors.dtype)

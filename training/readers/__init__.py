@@ -1,0 +1,7 @@
+"""Datasets of labelled RGB-D frames, read one frame at a time."""
+
+from training.readers.frames import FrameFolder
+from training.readers.labelled import LabelledFrame
+from training.readers.uwis import UWISOccluded
+
+__all__ = ["FrameFolder", "LabelledFrame", "UWISOccluded"]

@@ -1,0 +1,118 @@
+"""UW-IS Occluded (Samani and Banerjee, 2023): videos of cluttered tables in a warehouse and a lounge.
+
+`<video>/images/<frame>_{rgb,depth,labels}.png` and `<frame>_poses.yaml`; 1280 x 720, depth in millimetres.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import yaml
+
+from thor2_jax.errors import InputError
+from thor2_jax.frames import Intrinsics, RGBDFrame, read_color, read_depth, read_labels
+from training.readers.labelled import LabelledFrame
+
+__all__ = ["INTRINSICS", "NOT_SCORED", "UWISOccluded", "Video", "video_attributes"]
+
+INTRINSICS = Intrinsics(920.458618164062, 921.807800292969, 626.486083984375, 358.848205566406)
+"""Of the whole dataset."""
+
+NOT_SCORED = frozenset({"ice_cream", "hot_sauce", "chips_can"})
+"""Names that stand in the dataset and are not scored in the paper."""
+
+_FIRST_LOUNGE = 167
+
+
+class Video(NamedTuple):
+    """A row of the dataset's table of videos: which numbers show what."""
+
+    category: str
+    occlusion: str
+    light: str
+    numbers: tuple[int, ...]
+
+
+_VIDEOS = (
+    Video("kitchen", "none", "1", (41, 42, 176, 177)),
+    Video("food", "none", "1", (32, 33, 167, 168)),
+    Video("tools", "none", "1", (50, 51, 185, 186)),
+    Video("kitchen", "low", "1", (44, 45, 179, 180)),
+    Video("food", "low", "1", (35, 36, 170, 171)),
+    Video("tools", "low", "1", (53, 54, 188, 189)),
+    Video("kitchen", "high", "1", (46, 48, 182, 183)),
+    Video("food", "high", "1", (38, 39, 173, 174)),
+    Video("tools", "high", "1", (56, 57, 191, 192)),
+    Video("kitchen", "none", "2", (68, 69, 203, 204)),
+    Video("food", "none", "2", (77, 78, 212, 213)),
+    Video("tools", "none", "2", (59, 60, 194, 195)),
+    Video("kitchen", "low", "2", (71, 72, 206, 207)),
+    Video("food", "low", "2", (80, 81, 215, 216)),
+    Video("tools", "low", "2", (62, 63, 197, 198)),
+    Video("kitchen", "high", "2", (74, 75, 209, 210)),
+    Video("food", "high", "2", (83, 84, 218, 219)),
+    Video("tools", "high", "2", (65, 66, 200, 201)),
+)
+
+
+def video_attributes(number: int) -> dict[str, str]:
+    """Environment of a video; for the numbers in the dataset's table also object category, occlusion and light."""
+    found = {"environment": "lounge" if number >= _FIRST_LOUNGE else "warehouse"}
+    for video in _VIDEOS:
+        if number in video.numbers:
+            found |= {"category": video.category, "occlusion": video.occlusion, "light": video.light}
+    return found
+
+
+class UWISOccluded:
+    """The frames of the dataset or of a part of it, by video and frame number; iterating reads one at a time."""
+
+    def __init__(self, path: str | Path) -> None:
+        """Finds the frames.
+
+        Raises:
+            InputError: there are none.
+        """
+        path = Path(path)
+        if not path.is_dir():
+            raise InputError(f"dataset: {path} is no folder")
+        videos = sorted((f for f in path.iterdir() if f.name.isdecimal()), key=lambda f: int(f.name))
+        self._frames = [(video, c) for video in videos for c in sorted((video / "images").glob("*_rgb.png"))]
+        if not self._frames:
+            raise InputError(f"dataset: {path} has no <video number>/images/<frame>_rgb.png")
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def __iter__(self) -> Iterator[LabelledFrame]:
+        """Read the frames.
+
+        Raises:
+            InputError: a damaged file, or images that do not fit together; names the file.
+            OSError: a file is missing.
+        """
+        for video, color in self._frames:
+            stem = color.name.removesuffix("_rgb.png")
+            try:
+                frame = RGBDFrame(
+                    read_color(color),
+                    read_depth(color.with_name(f"{stem}_depth.png")),
+                    read_labels(color.with_name(f"{stem}_labels.png")),
+                    INTRINSICS,
+                )
+            except InputError as error:
+                raise InputError(f"{video.name}/{stem}: {error}") from None
+            truth = _truth(color.with_name(f"{stem}_poses.yaml"))
+            yield LabelledFrame(f"{video.name}/{stem}", frame, truth, video_attributes(int(video.name)))
+
+
+def _truth(path: Path) -> dict[int, str]:
+    try:
+        objects = yaml.safe_load(path.read_bytes())
+        truth = {entry["label"]: name for name, entry in objects.items() if name not in NOT_SCORED}
+    except (yaml.YAMLError, KeyError, TypeError, AttributeError, ValueError, RecursionError):
+        raise InputError(f"{path} does not hold <name>: {{label: <number>, ...}}") from None
+    bad = [(label, name) for label, name in truth.items() if type(label) is not int or type(name) is not str]
+    if bad:
+        raise InputError(f"{path}: {bad[0][1]!r} has the label {bad[0][0]!r}; expected a whole number")
+    return truth
