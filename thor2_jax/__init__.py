@@ -1,8 +1,10 @@
-"""THOR2 (Samani and Banerjee, 2024) as a JAX engine: coloured point clouds to TOPS and TOPS2, and frames to object names."""
+"""THOR2 (Samani and Banerjee, 2024) in JAX: coloured point clouds to TOPS and TOPS2, and RGB-D frames to object names."""
 
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
 from thor2_jax.descriptor import describe, describe_aligned, describe_strips, diagrams, strips
 from thor2_jax.errors import InputError
+from thor2_jax.frames import Intrinsics, RGBDFrame, read_frame
+from thor2_jax.recognizer import Recognition, Recognizer
 from thor2_jax.types import Descriptors, Diagrams, PointClouds, Strips
 from thor2_jax.view_normalization import align, mirror, turn, view_normalize
 
@@ -12,7 +14,11 @@ __all__ = [
     "Descriptors",
     "Diagrams",
     "InputError",
+    "Intrinsics",
     "PointClouds",
+    "RGBDFrame",
+    "Recognition",
+    "Recognizer",
     "Strips",
     "align",
     "describe",
@@ -20,6 +26,7 @@ __all__ = [
     "describe_strips",
     "diagrams",
     "mirror",
+    "read_frame",
     "strips",
     "turn",
     "view_normalize",

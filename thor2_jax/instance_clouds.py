@@ -62,5 +62,5 @@ def _instance_cloud(frame: RGBDFrame, label: int, pixels: NDArray[np.intp]) -> I
             f"at least {MIN_POINTS} are needed"
         )
         return InstanceCloud(label, points, colors, len(pixels), reason=reason)
-    kept, relaxed = remove_outliers(points, VOXEL)
+    kept, relaxed = remove_outliers(points)
     return InstanceCloud(label, points[kept], colors[kept], len(pixels), relaxed)

@@ -3,8 +3,9 @@
     objects = builtin_objects()
     objects["mug_blue"].vertices        # metres, z up, standing on z = 0
 
-Two shapes serve to build them: surfaces of rings (turned on a lathe, or swept along a path) and boxes. Paint is a texture whose
-texels are coloured by rules in the surface's own coordinates, so that a stripe is where it would be on the real thing.
+Two shapes serve to build them: surfaces of rings (turned on a lathe, or swept along a path) and boxes. Paint is a
+texture whose texels are coloured by rules in the surface's own coordinates, so that a stripe is where it would be on
+the real thing.
 """
 
 import math
@@ -45,7 +46,7 @@ TEXELS = 192
 
 
 def _texture(base: Color, marks: Sequence[Mark], *coordinates: Array) -> NDArray[np.uint8]:
-    """An image [TEXELS, TEXELS, 3] of `base` with marks over it; coordinates are [TEXELS, TEXELS], first row at the bottom."""
+    """An image [TEXELS, TEXELS, 3] of `base` with marks over it; coordinates are [TEXELS, TEXELS], bottom row first."""
     image = np.empty((TEXELS, TEXELS, 3), np.uint8)
     image[:] = base
     for color, where in marks:
@@ -60,7 +61,7 @@ def _texel_centres() -> tuple[Array, Array]:
 
 
 def _rings(points: Array, v: Array, texture: NDArray[np.uint8]) -> TexturedMesh:
-    """The surface through rings [k, n, 3] (last point of a ring = its first); u runs along a ring, `v` [k] across the rings."""
+    """The surface through rings [k, n, 3] (first point = last); u runs along a ring, `v` [k] across the rings."""
     k, n = points.shape[:2]
     corner = np.arange(k * n).reshape(k, n)
     a, b, c, d = (part.ravel() for part in (corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1]))
@@ -93,7 +94,8 @@ def _lathe(profile: ArrayLike, base: Color, *marks: Mark) -> TexturedMesh:
     Args:
         profile: [k, 2] radius and height, metres; runs up the outside, and for a vessel down the inside.
         base: colour.
-        marks: functions of angle (turns), radius, height, and the share [0, 1] of the surface that comes before in the profile.
+        marks: functions of angle (turns), radius, height, and the share [0, 1] of the surface that comes before in the
+            profile.
     """
     line = np.asarray(profile, np.float64)
     v = _along(line)
@@ -136,8 +138,8 @@ def _box(size: tuple[float, float, float], base: Color, *marks: Mark) -> Texture
     Args:
         size: along x, y, z, metres.
         base: colour.
-        marks: functions of the side (0: -y, the front, 1: +x, 2: +y, 3: -x, 4: top, 5: bottom) and of u (to the right, seen
-            from outside) and v (up) in [0, 1].
+        marks: functions of the side (0: -y, the front, 1: +x, 2: +y, 3: -x, 4: top, 5: bottom) and of u (to the right,
+            seen from outside) and v (up) in [0, 1].
     """
     x, y, z = size[0] / 2, size[1] / 2, size[2]
     ring = np.array([[-x, -y], [x, -y], [x, y], [-x, y]])
@@ -290,11 +292,11 @@ def _apple() -> TexturedMesh:
     body = _lathe(
         np.stack([r.clip(0), z], axis=1),
         RED,
-        (LIME, lambda u, r, z, s: s > 0.93 + 0.025 * np.sin(u * 10 * np.pi)),
+        (LIME, lambda u, r, z, s: s > 0.94 + 0.02 * np.sin(u * 4 * np.pi)),
         (ORANGE, lambda u, r, z, s: ((u - 0.35) / 0.16) ** 2 + ((s - 0.6) / 0.22) ** 2 < 1),
     )
     line = np.array([[0, 0, 0.019], [0.001, 0, 0.026], [0.003, 0, 0.034], [0.006, 0, 0.041], [0.006, 0, 0.0411]])
-    stem = _sweep(line, [[0.0018] * 2, [0.0018] * 2, [0.0018] * 2, [0.0022] * 2, [0, 0]], (0, 1, 0), BROWN, sides=8)
+    stem = _sweep(line, [[0.0022] * 2, [0.0022] * 2, [0.0022] * 2, [0.003] * 2, [0, 0]], (0, 1, 0), BROWN, sides=8)
     return _standing(body, stem)
 
 

@@ -1,9 +1,10 @@
-"""Scanned meshes: reading GLB, OBJ and PLY files, the colour at a point of the surface, and finding them in a folder by name."""
+"""Scanned meshes: reading GLB, OBJ and PLY files, the colour at a point of the surface, finding them in a folder."""
 
 import dataclasses
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -20,15 +21,15 @@ MESH_SUFFIXES = (".glb", ".obj", ".ply")
 
 LARGEST = 2.0
 SMALLEST = 0.001
-"""Plausible longest side of an object, metres. A scan in millimetres or inches falls outside, and the camera stays outside."""
+"""Plausible longest side of an object, metres: a scan in millimetres falls outside, and the camera stays outside it."""
 
 
 @dataclasses.dataclass(frozen=True)
 class TexturedMesh:
     """A coloured triangle mesh. Colours are sRGB as stored in the file, unlit.
 
-    Painted either with textures (`uv`, `textures`, `face_texture`) or with colours at the faces' corners (`corner_colors`); the
-    other kind is None or empty.
+    Painted either with textures (`uv`, `textures`, `face_texture`) or with colours at the faces' corners
+    (`corner_colors`); the other kind is None or empty.
 
     Attributes:
         vertices: [V, 3] float64, metres.
@@ -58,8 +59,9 @@ class TexturedMesh:
     def colors_at(self, face: NDArray[np.integer], barycentric: NDArray[np.floating]) -> NDArray[np.uint8]:
         """SRGB colours of points on the surface.
 
-        Textures are read at the nearest texel: in a training view a pixel spans several texels, so that bilinear weights change
-        nothing that the voxel mean keeps, and a mix across the border of a chart would bring in colours the object does not have.
+        Textures are read at the nearest texel: in a training view a pixel spans several texels, so that bilinear
+        weights change nothing that the voxel mean keeps, and a mix across the border of a chart would bring in colours
+        the object does not have.
 
         Args:
             face: [n] integer, index into `faces`.
@@ -137,7 +139,7 @@ def _part(geometry: trimesh.Trimesh) -> TexturedMesh:
         InputError: it has no colour.
     """
     vertices, faces = np.asarray(geometry.vertices, np.float64), np.asarray(geometry.faces, np.int32)
-    visual = geometry.visual
+    visual: Any = geometry.visual
     if visual.kind == "vertex":
         return TexturedMesh(vertices, faces, corner_colors=np.asarray(visual.vertex_colors, np.uint8)[faces, :3])
     if visual.kind == "face":
@@ -190,8 +192,8 @@ def load_mesh(path: str | Path) -> TexturedMesh:
     Colours are taken as stored, as sRGB; a base colour factor multiplies its texture, or stands alone without one.
 
     Raises:
-        InputError: the file is missing, unreadable, of another kind, without faces or colour, with vertices that are not finite,
-            or of no plausible size for an object in metres.
+        InputError: the file is missing, unreadable, of another kind, without faces or colour, with vertices or
+            texture coordinates that are not finite, or of no plausible size for an object in metres.
     """
     path = Path(path)
     if path.suffix.lower() not in MESH_SUFFIXES:
@@ -210,12 +212,16 @@ def load_mesh(path: str | Path) -> TexturedMesh:
     geometries = [part for part in loaded if isinstance(part, trimesh.Trimesh) and len(part.faces)]
     if not geometries:
         raise InputError(f"mesh {path}: no faces")
+    if any(part.faces.min() < 0 or part.faces.max() >= len(part.vertices) for part in geometries):
+        raise InputError(f"mesh {path}: faces that name vertices it does not have")
     try:
         mesh = merge_meshes([_part(geometry) for geometry in geometries])
     except InputError as error:
         raise InputError(f"mesh {path}: {error}") from error
     if not np.isfinite(mesh.vertices).all():
         raise InputError(f"mesh {path}: {(~np.isfinite(mesh.vertices)).any(axis=1).sum()} vertices are not finite")
+    if mesh.uv is not None and not np.isfinite(mesh.uv).all():
+        raise InputError(f"mesh {path}: texture coordinates are not finite")
     used = mesh.vertices[np.unique(mesh.faces)]
     longest = float(np.ptp(used, axis=0).max())
     if not SMALLEST <= longest <= LARGEST:
@@ -247,10 +253,12 @@ def find_meshes(folder: str | Path, names: Mapping[str, str] | None = None) -> d
 
     Args:
         folder: holds `<scan>.glb` (or .obj, .ply) files, `<scan>/` folders with one mesh file each, or both.
-        names: object name -> scan (a folder's name or a file's stem). Without it every scan is an object under its own name.
+        names: object name -> scan (a folder's name or a file's stem). Without it every scan is an object under its own
+            name.
 
     Raises:
-        InputError: the folder is missing or holds no mesh, a scan is there twice or is ambiguous, or `names` names unknown scans.
+        InputError: the folder is missing or holds no mesh, a scan is there twice or is ambiguous, or `names` names
+            unknown scans.
     """
     folder = Path(folder)
     if not folder.is_dir():

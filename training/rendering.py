@@ -37,7 +37,7 @@ class Camera:
 
     @classmethod
     def from_field_of_view(cls, width: int, height: int, degrees: float) -> "Camera":
-        """A camera with square pixels, its axis through the image's centre, and a horizontal field of view in degrees."""
+        """A camera with square pixels, the axis through the image's centre, a horizontal field of view in degrees."""
         f = width / 2 / math.tan(math.radians(degrees) / 2)
         return cls(width, height, Intrinsics(f, f, (width - 1) / 2, (height - 1) / 2))
 

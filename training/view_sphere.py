@@ -1,4 +1,4 @@
-"""Camera poses on the view sphere around an object (paper, section "Training"): every azimuth and polar angle in equal steps.
+"""Camera poses on the view sphere around an object (paper, section "Training"), azimuth and polar angle in equal steps.
 
     poses = [camera_pose(azimuth, polar, mesh.centre) for azimuth, polar in view_angles()]   # 2,664 poses
 
@@ -48,8 +48,8 @@ def camera_pose(
 ) -> NDArray[np.float64]:
     """Pose of a camera on the view sphere that looks at `centre`.
 
-    The image's down direction is that of growing polar angle. Away from the poles this is "z is up in the image"; at the poles it
-    is where the meridian of `azimuth` leads, so that the picture turns with the azimuth there.
+    The image's down direction is that of growing polar angle. Away from the poles this is "z is up in the image"; at
+    the poles it is where the meridian of `azimuth` leads, so that the picture turns with the azimuth there.
 
     Args:
         azimuth: radians, from the x axis towards the y axis.

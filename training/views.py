@@ -1,7 +1,8 @@
 """Training clouds: one coloured point cloud a view of a mesh (paper, section "Training").
 
-for view in iterate_views({"mug": load_mesh("mug.glb")}, view_angles(), workers=2):
-    view.name, view.azimuth, view.polar, view.xyz, view.rgb
+Example:
+    for view in iterate_views({"mug": load_mesh("mug.glb")}, view_angles(), workers=2):
+        view.name, view.azimuth, view.polar, view.xyz, view.rgb
 """
 
 import collections
@@ -32,7 +33,7 @@ MIN_POINTS = 30
 """Views with fewer points are flagged `sparse`: too little of the object is seen to describe it."""
 
 CHUNK = 128
-"""Views a task of the pool: long against sending a mesh and indexing it (0.03 s), short against a mesh's 2,664 views."""
+"""Views a task of the pool: long against sending a mesh and indexing it (0.03 s), short against its 2,664 views."""
 
 Cloud = tuple[NDArray[np.float32], NDArray[np.uint8]]
 
@@ -43,8 +44,8 @@ def cloud_of(view: RenderedView) -> Cloud:
     Returns:
         xyz [n, 3] float32, metres, camera frame; rgb [n, 3] uint8. n may be 0.
     """
-    # Metres in float32, all else in float64: every fourth millimetre lies on a border between voxels, and this is how the clouds
-    # of the released pipeline fall on either side.
+    # Metres in float32, all else in float64: every fourth millimetre lies on a border between voxels, and this is how
+    # the clouds of the released pipeline fall on either side.
     depth = view.depth.astype(np.float32) / np.float32(1000)
     seen = view.depth > 0
     points = backproject(depth, view.intrinsics)[seen].astype(np.float64) * SIGMA_S
@@ -53,7 +54,7 @@ def cloud_of(view: RenderedView) -> Cloud:
 
 
 def view_cloud(mesh: TexturedMesh, pose: NDArray[np.float64], camera: Camera = TRAINING_CAMERA) -> Cloud:
-    """The training cloud of one view: rendered, depth in steps of 1 mm, back-projected, voxelled at 0.01 scaled units (4 mm).
+    """The training cloud of one view: rendered, depth in steps of 1 mm, back-projected, voxelled at 0.01 scaled units.
 
     Indexes the mesh anew at every call; for many views use `iterate_views`.
 
@@ -115,8 +116,8 @@ def iterate_views(meshes: Mapping[str, TexturedMesh], angles: NDArray[np.float64
     Args:
         meshes: object name -> mesh.
         angles: [n, 2] azimuth and polar angle in radians, as from `view_angles`.
-        workers: processes; 1 renders in this one. With more, the calling script needs the `if __name__ == "__main__"` guard
-            of `multiprocessing`.
+        workers: processes; 1 renders in this one. With more, the calling script needs the `if __name__ == "__main__"`
+            guard of `multiprocessing`.
 
     Raises:
         InputError: `workers` is not positive.
