@@ -1,8 +1,9 @@
 """Approximate minimal-volume oriented bounding box of one masked cloud (paper, "View normalization"; O'Rourke 1985).
 
-Seen along any of its axes, a minimal box is a minimum-area rectangle of the cloud's projection. The search alternates that step:
-fix one axis, turn the other two to the minimum-area rectangle, go on to the next axis. It works on support points (vertices of
-the convex hull in a fixed set of directions), so that only finding those depends on the number of points.
+Seen along any of its axes, a minimal box is a minimum-area rectangle of the cloud's projection. The search alternates
+that step: fix one axis, turn the other two to the minimum-area rectangle, go on to the next axis. It works on support
+points (vertices of the convex hull in a fixed set of directions), so that only finding those depends on the number of
+points.
 """
 
 import itertools
@@ -26,7 +27,8 @@ COARSE = 16
 def _half_sphere(n: int = 4) -> np.ndarray:
     """[33, 3] float32 unit vectors, no two opposite: integer points with |i| + |j| + |k| = n.
 
-    Closed under sign flips of the axes: the frame of a covariance is known only up to those, and the box must not depend on them.
+    Closed under sign flips of the axes: the frame of a covariance is known only up to those, and the box must not
+    depend on them.
     """
     chosen: list[tuple[int, ...]] = []
     for point in itertools.product(range(-n, n + 1), repeat=3):
@@ -42,8 +44,8 @@ _DIRECTIONS = _half_sphere()
 def support_points(points: jax.Array, mask: jax.Array) -> jax.Array:
     """Indices of the extreme points of a centred cloud in 66 directions.
 
-    The directions are spread evenly for the cloud scaled to unit variance along its principal axes: flat and long clouds get as
-    many different vertices as round ones.
+    The directions are spread evenly for the cloud scaled to unit variance along its principal axes: flat and long
+    clouds get as many different vertices as round ones.
 
     Args:
         points: [N, 3] float32, in the principal frame, mean zero.
@@ -96,7 +98,10 @@ def _minimum_area_angle(xy: jax.Array) -> jax.Array:
 
 
 def _search(support: jax.Array, axes: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Alternate minimum-area rectangles from a start. Returns axes [3, 3] (rows) and the volume over `support` [M, 3]."""
+    """Alternate minimum-area rectangles from a start.
+
+    Returns axes [3, 3] (rows) and the volume over `support` [M, 3].
+    """
 
     def sweep(_: int, axes: jax.Array) -> jax.Array:
         turned = jnp.matmul(support, axes.T, precision=HIGHEST)
@@ -113,8 +118,9 @@ def _search(support: jax.Array, axes: jax.Array) -> tuple[jax.Array, jax.Array]:
 def minimal_box_axes(points: jax.Array, mask: jax.Array) -> jax.Array:
     """Axes of an approximately minimal-volume oriented box: rows of a rotation, longest side first, signs arbitrary.
 
-    Two starts, the principal axes of all points and those of the support points (as of the hull's vertices, which is the released
-    rule); the smaller box wins. No gradient flows through the axes: they jump where another face becomes flush.
+    Two starts, the principal axes of all points and those of the support points (as of the hull's vertices, which is
+    the released rule); the smaller box wins. No gradient flows through the axes: they jump where another face becomes
+    flush.
 
     Args:
         points: [N, 3] float32, mean zero over the mask.

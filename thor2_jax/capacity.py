@@ -1,7 +1,7 @@
 """Which padded size a cloud or a batch gets: the one rule shared by training, warm-up and service.
 
-A compiled function is tied to the shapes of its arguments. With sizes drawn from a short list, whatever is warmed up is all that
-will ever be compiled.
+A compiled function is tied to the shapes of its arguments. With sizes drawn from a short list, whatever is warmed up is
+all that will ever be compiled.
 """
 
 from thor2_jax.errors import InputError

@@ -35,9 +35,9 @@ def feature_of(descriptors: Descriptors, name: Feature) -> jax.Array:
 
 
 class MLP(nnx.Module):
-    """512-256-128-64 hidden units, each layer followed by batch normalization, ReLU and dropout of 0.2; then class logits.
+    """512-256-128-64 hidden units, each layer followed by batch normalization, ReLU and dropout of 0.2; then logits.
 
-    Inputs are first scaled by fixed numbers of the training set (`set_input_scale`): images and colour counts differ a
+    Inputs are first scaled by fixed numbers of the training set (`input_scale`): images and colour counts differ a
     thousandfold in size, and the first step of Adam would see only the larger.
     """
 
@@ -51,7 +51,10 @@ class MLP(nnx.Module):
         self.head = nnx.Linear(HIDDEN[-1], n_classes, rngs=rngs)
 
     def __call__(self, x: jax.Array, *, train: bool = False, rngs: nnx.Rngs | None = None) -> jax.Array:
-        """Logits [B, n_classes] of descriptors [B, n_inputs]; `train` uses batch statistics, and dropout from `rngs`."""
+        """Logits [B, n_classes] of descriptors [B, n_inputs].
+
+        `train` uses the batch's own statistics, and dropout drawn from `rngs`.
+        """
         x = x * self.input_scale[...]
         for layer, norm in zip(self.layers, self.norms, strict=True):
             x = nnx.relu(norm(layer(x), use_running_average=not train))

@@ -1,4 +1,7 @@
-"""Region weights of colours on the device (colour network, membership): a bit mask a grid colour, unpacked point by point."""
+"""Region weights of colours on the device (colour network, membership).
+
+A grid colour's regions are a bit mask, unpacked point by point.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -12,14 +15,15 @@ def region_weights(colors: jax.Array, region_bits: jax.Array, n_regions: int) ->
     """Weight 1/m in each of a colour's m regions, looked up at the nearest grid colour.
 
     Args:
-        colors: [..., 3] float32 sRGB in [0, 1]; rounded to 8 bits first.
+        colors: [..., 3] float32 sRGB in [0, 1]; rounded to 8 bits first, halves up.
         region_bits: [140608] uint32, `ColorNetwork.region_bits`.
         n_regions: R.
 
     Returns:
         [..., R] float32; rows sum to 1.
     """
-    level = jnp.round(jnp.round(colors * 255) / GRID_STEP).astype(jnp.int32)
+    eight_bit = jnp.floor(colors * 255 + 0.5).astype(jnp.int32)
+    level = (eight_bit + GRID_STEP // 2) // GRID_STEP
     index = (level[..., 0] * GRID_LEVELS + level[..., 1]) * GRID_LEVELS + level[..., 2]
     bits = region_bits[index]
     member = (bits[..., None] >> jnp.arange(n_regions, dtype=jnp.uint32)) & 1

@@ -20,6 +20,10 @@ DESCRIPTOR_VERSION = 1
 _CHOICES = {"homology": ("gudhi", "closed_form"), "convention": ("paper", "released")}
 
 
+def _is_finite(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
 @dataclasses.dataclass(frozen=True)
 class DescriptorConfig:
     """What turns a coloured cloud into TOPS and TOPS2. Static under jit: another config is another compilation.
@@ -27,7 +31,8 @@ class DescriptorConfig:
     Lengths are scaled units (metres x `sigma_s`) unless said otherwise.
 
     Attributes:
-        homology: where persistence diagrams come from: gudhi through one host callback a batch, or the same pairs in JAX.
+        homology: where persistence diagrams come from: gudhi through one host callback a batch, or the same pairs in
+            JAX.
         convention: the paper's equations, or those of the authors' released code (see `released`).
         sigma_s: scaled units per metre.
         sigma_1: thickness of a slice (along z of the aligned cloud).
@@ -58,12 +63,12 @@ class DescriptorConfig:
             if getattr(self, name) not in allowed:
                 raise InputError(f"DescriptorConfig.{name} is {getattr(self, name)!r}; it must be one of {allowed}")
         for name in ("sigma_s", "sigma_1", "sigma_2", "image_variance"):
-            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
+            if not (_is_finite(getattr(self, name)) and getattr(self, name) > 0):
                 raise InputError(f"DescriptorConfig.{name} is {getattr(self, name)!r}; it must be a positive number")
         for name in ("n_slices", "n_strips", "image_size"):
-            if not (isinstance(getattr(self, name), int) and getattr(self, name) > 0):
+            if type(getattr(self, name)) is not int or getattr(self, name) < 1:
                 raise InputError(f"DescriptorConfig.{name} is {getattr(self, name)!r}; it must be a positive integer")
-        if not math.isfinite(self.alpha):
+        if not _is_finite(self.alpha):
             raise InputError(f"DescriptorConfig.alpha is {self.alpha!r}; it must be a finite angle in radians")
         if self.convention == "released" and (self.sigma_1, self.sigma_2) != (0.1, 0.025):
             raise InputError(
@@ -75,8 +80,9 @@ class DescriptorConfig:
     def released(cls, **changes: Any) -> "DescriptorConfig":
         """The conventions of the authors' released code, on the same aligned cloud.
 
-        x and y rounded to 0.01 and z to 0.1 (half to even); slices are the occurring z levels, renumbered from 0; a strip is
-        numbered, and born, at its upper bin edge; colour vectors are divided by their strip's number of points.
+        x and y rounded to 0.01 and z to 0.1 (half to even); slices are the occurring z levels, renumbered from 0; a
+        strip is numbered, and born, at its upper bin edge; colour vectors are divided by their strip's number of
+        points.
         """
         return cls(convention="released", **changes)
 

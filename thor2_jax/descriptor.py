@@ -27,7 +27,9 @@ __all__ = ["describe", "describe_aligned", "describe_strips", "diagrams", "strip
 
 @functools.lru_cache(maxsize=8)
 def _device_tables(network: ColorNetwork) -> tuple[jax.Array, jax.Array]:
-    return jnp.asarray(network.region_bits), jnp.asarray(network.similarity, jnp.float32)
+    # Kept for later calls, so they must be arrays also when the first call happens while a caller's function is traced.
+    with jax.ensure_compile_time_eval():
+        return jnp.asarray(network.region_bits), jnp.asarray(network.similarity, jnp.float32)
 
 
 def _check(clouds: PointClouds) -> None:
@@ -60,7 +62,7 @@ def _describe_strips(strips: Strips, similarity: jax.Array, config: DescriptorCo
 
 
 def strips(aligned: PointClouds, network: ColorNetwork, config: DescriptorConfig) -> Strips:
-    """Extremes and colour vectors of every strip: all that the descriptors need of a cloud, and a fraction of their size.
+    """Extremes and colour vectors of every strip: all that the descriptors need, and a fraction of their size.
 
     Args:
         aligned: scaled units, as `align` returns them.
@@ -92,7 +94,9 @@ def describe_aligned(aligned: PointClouds, network: ColorNetwork, config: Descri
 
 
 def describe(clouds: PointClouds, network: ColorNetwork, config: DescriptorConfig) -> Descriptors:
-    """TOPS, CE and TOPS2 of clouds as the camera saw them: view normalization, turn, slices, diagrams, images, embeddings.
+    """TOPS, CE and TOPS2 of clouds as the camera saw them.
+
+    View normalization, turn, slices, diagrams, images, embeddings.
 
     Args:
         clouds: [B, N] clouds in metres.

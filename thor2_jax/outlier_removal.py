@@ -21,7 +21,7 @@ RADIUS = 0.05
 NEIGHBORS = 30
 """On a voxel grid of 3 mm. The count goes with 1 / side squared: points lie on a surface."""
 
-DEVIATIONS = 1.5
+DEVIATIONS = 1.75
 """A point is far when its mean distance to `NEIGHBORS` others exceeds the cloud's mean by this many standard deviations."""
 
 GAP = 0.02

@@ -1,8 +1,11 @@
-"""Persistence diagrams of slices (paper, section "Filtration"): gudhi through one host callback a batch, or in closed form.
+"""Persistence diagrams of slices (paper, section "Filtration").
 
-The filtration of a slice: strip j puts in two vertices, its points of least and greatest y, at j s2, and the edge between them at
-j s2 + (y_max - y_min). Each strip is a component of its own: its second vertex dies when the edge comes, the first lives for
-ever. So the finite H0 pairs are (j s2, j s2 + y_max - y_min), one a strip; this is the closed form.
+They come from gudhi, through one host callback a batch, or in closed form.
+
+The filtration of a slice: strip j puts in two vertices, its points of least and greatest y, at j s2, and the edge
+between them at j s2 + (y_max - y_min). Each strip is a component of its own: its second vertex dies when the edge
+comes, the first lives for ever. So the finite H0 pairs are (j s2, j s2 + y_max - y_min), one a strip; this is the
+closed form.
 """
 
 from typing import Any
@@ -40,13 +43,17 @@ def diagrams_of_strips(strips: Strips, config: DescriptorConfig) -> Diagrams:
             _gudhi_pairs, (out, out), *values, strips.occupied, vmap_method="expand_dims"
         )
         # gudhi tells which vertex and which edge make a pair; the values, and so the gradient, are gathered here.
-        vertex, edge = births.reshape(-1)[birth_index], edges.reshape(-1)[death_index]
         found = death_index >= 0
+        vertex = jnp.take_along_axis(births, jnp.maximum(birth_index, 0), axis=-1)
+        edge = jnp.take_along_axis(edges, jnp.maximum(death_index, 0), axis=-1)
     return Diagrams(births=jnp.where(found, vertex, 0), deaths=jnp.where(found, edge, 0), mask=found)
 
 
 def _gudhi_pairs(births: Any, edges: Any, occupied: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Flat indices of the birth vertex's and the death edge's strip, one pair a strip, -1 where there is none."""
+    """Strips, within their slice, of each pair's birth vertex and death edge; -1 where there is no pair.
+
+    Counted within the slice, the numbers hold whatever leading axes `vmap` has added.
+    """
     births, edges, occupied = (np.asarray(a) for a in (births, edges, occupied))
     shape = np.broadcast_shapes(births.shape, edges.shape, occupied.shape)
     strip = np.flatnonzero(np.broadcast_to(occupied, shape)).astype(np.int32)
@@ -61,5 +68,5 @@ def _gudhi_pairs(births: Any, edges: Any, occupied: Any) -> tuple[np.ndarray, np
         tree.compute_persistence(min_persistence=-1)
         pairs = tree.flag_persistence_generators()[0]  # rows: birth vertex, the death edge's two vertices
         death = strip[pairs[:, 1] // 2]
-        birth_index[death], death_index[death] = strip[pairs[:, 0] // 2], death
+        birth_index[death], death_index[death] = strip[pairs[:, 0] // 2] % shape[-1], death % shape[-1]
     return birth_index.reshape(shape), death_index.reshape(shape)

@@ -18,7 +18,9 @@ def _pixel_mass(centres: jax.Array, config: DescriptorConfig) -> jax.Array:
 
 
 def persistence_image(diagram: Diagrams, config: DescriptorConfig) -> jax.Array:
-    """Sum over the pairs of persistence x Gaussian, integrated over each pixel; separable, so one product of two tables.
+    """Sum over the pairs of persistence x Gaussian, integrated over each pixel.
+
+    The Gaussian is separable, so the image is one product of two tables.
 
     Args:
         diagram: one slice's, fields [J].
@@ -29,9 +31,8 @@ def persistence_image(diagram: Diagrams, config: DescriptorConfig) -> jax.Array:
     """
     persistence = jnp.where(diagram.mask, diagram.deaths - diagram.births, 0)
     by_birth = _pixel_mass(diagram.births, config)
-    by_persistence = (
-        _pixel_mass(persistence, config) * persistence[:, None]
-    )  # weight = persistence: padding adds nothing
+    # The weight is the persistence: padding adds nothing.
+    by_persistence = _pixel_mass(persistence, config) * persistence[:, None]
     return jnp.matmul(by_birth.T, by_persistence, precision=jax.lax.Precision.HIGHEST)
 
 

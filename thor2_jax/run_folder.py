@@ -1,6 +1,6 @@
 """A trained model on disk: everything that recognition needs, checked on loading, written whole or not at all.
 
-RUN/run.json       format, descriptor version and constants, class names, classifiers, how it was trained, how well it did
+RUN/run.json       format, descriptor version and constants, class names, classifiers, how it was trained
 RUN/network.npz    the colour network whose regions the descriptors use
 RUN/weights/NAME/  one classifier's parameters and batch statistics (orbax)
 """
@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import orbax.checkpoint as ocp
+import orbax.checkpoint as ocp  # type: ignore[import-untyped]
 from flax import nnx
 
 import colornet
@@ -22,7 +22,7 @@ from thor2_jax.classifier import MLP, Feature, check_features
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
 from thor2_jax.errors import InputError
 
-__all__ = ["TrainedRun", "input_size", "load_run", "save_run"]
+__all__ = ["TrainedRun", "check_new", "input_size", "load_run", "save_run"]
 
 FORMAT = 1
 
@@ -52,16 +52,26 @@ def input_size(feature: Feature, config: DescriptorConfig, n_regions: int) -> in
     return config.n_slices * {"ce": embedding, "tops": image, "tops2": image + embedding}[feature]
 
 
+def check_new(path: str | Path) -> None:
+    """Refuse a name that is taken, by anything but an empty folder; a run folder is never overwritten.
+
+    Raises:
+        InputError: naming the path.
+    """
+    path = Path(path)
+    if path.is_symlink() or (path.exists() and not (path.is_dir() and not any(path.iterdir()))):
+        raise InputError(f"out: {path} exists already; a run folder is never overwritten")
+
+
 def save_run(run: TrainedRun, path: str | Path) -> None:
     """Write a run folder. It appears under its name only when it is complete.
 
     Raises:
-        InputError: the folder exists already.
+        InputError: something of that name exists already and is not an empty folder.
         OSError: it cannot be written; nothing is left behind.
     """
     path = Path(path).absolute()
-    if path.exists():
-        raise InputError(f"out: {path} exists already; a run folder is never overwritten")
+    check_new(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
     try:
@@ -100,8 +110,8 @@ def _description(path: Path) -> dict[str, Any]:
         raise InputError(f"model: {path / 'run.json'} has format {given!r}; this version reads {FORMAT}")
     if found.get("descriptor_version") != DESCRIPTOR_VERSION:
         raise InputError(
-            f"model: {path} was trained on descriptor version {found.get('descriptor_version')!r}; this version computes "
-            f"{DESCRIPTOR_VERSION}; train it again"
+            f"model: {path} was trained on descriptor version {found.get('descriptor_version')!r}; "
+            f"this version computes {DESCRIPTOR_VERSION}; train it again"
         )
     return found
 
@@ -110,8 +120,8 @@ def load_run(path: str | Path) -> TrainedRun:
     """Read a run folder.
 
     Raises:
-        InputError: no run folder, a damaged file, another format or descriptor version, or parts that do not belong together;
-            one line that names the file and what is wrong.
+        InputError: no run folder, a damaged file, another format or descriptor version, or parts that do not belong
+            together; one line that names the file and what is wrong.
     """
     path = Path(path).absolute()
     found = _description(path)
@@ -123,8 +133,8 @@ def load_run(path: str | Path) -> TrainedRun:
         fingerprint, record = found["color_network"], found["record"]
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{where}: {type(error).__name__}: {error}") from None
-    if not classes or not all(isinstance(name, str) for name in classes):
-        raise InputError(f"{where}: classes is {classes!r}; expected a list of names")
+    if not isinstance(found["classes"], list) or not classes or not all(isinstance(name, str) for name in classes):
+        raise InputError(f"{where}: classes is {found['classes']!r}; expected a list of names")
     try:
         network = colornet.load(path / "network.npz")
     except (OSError, ValueError) as error:

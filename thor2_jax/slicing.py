@@ -1,7 +1,11 @@
-"""Slices, strips and their colour vectors (paper, sections "Slicing" and "Colour"): an aligned cloud becomes fixed-size tables."""
+"""Slices, strips and their colour vectors (paper, sections "Slicing" and "Colour").
+
+An aligned cloud becomes tables of a fixed size.
+"""
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from thor2_jax.color_membership import region_weights
 from thor2_jax.config import DescriptorConfig
@@ -12,11 +16,14 @@ __all__ = ["slice_and_strip", "strip_births", "strips_of_cloud"]
 
 def strip_births(config: DescriptorConfig) -> jax.Array:
     """[J] float32: filtration value at which strip j's vertices enter, j * sigma_2, scaled units."""
-    return jnp.arange(config.n_strips, dtype=jnp.float32) * config.sigma_2
+    # A constant, not a product on the device: compilers fuse products with sums, and then bits differ between programs.
+    return jnp.asarray(np.arange(config.n_strips) * config.sigma_2, jnp.float32)
 
 
 def slice_and_strip(points: jax.Array, mask: jax.Array, config: DescriptorConfig) -> tuple[jax.Array, jax.Array]:
-    """Slice and strip number of each point of one aligned cloud: S^i = {i s1 <= z < (i+1) s1}, j of {j s2 <= x < (j+1) s2}.
+    """Slice and strip number of each point of one aligned cloud.
+
+    Slice i is {i s1 <= z < (i+1) s1}, strip j is {j s2 <= x < (j+1) s2}.
 
     Args:
         points: [N, 3] float32, scaled units, first octant.
@@ -30,13 +37,30 @@ def slice_and_strip(points: jax.Array, mask: jax.Array, config: DescriptorConfig
     if config.convention == "paper":
         return jnp.floor(z / config.sigma_1).astype(jnp.int32), jnp.floor(x / config.sigma_2).astype(jnp.int32)
     # Rounded to 0.01, x is k / 100; the first edge j / 40 that is not below it has j = ceil(2 k / 5), in whole numbers.
-    strip = (2 * jnp.round(x * 100).astype(jnp.int32) + 4) // 5
-    level = jnp.round(z * 10).astype(jnp.int32)
+    strip = (2 * _rounded(x, 100).astype(jnp.int32) + 4) // 5
+    level = _rounded(z, 10).astype(jnp.int32)
     # Levels past twice the descriptor's slices get a number past its end whatever their rank.
     n_levels = 2 * config.n_slices
-    occurs = jnp.zeros(n_levels, jnp.int32).at[jnp.where(mask, level, n_levels)].set(1, mode="drop")
+    known = (level >= 0) & (level < n_levels)
+    occurs = jnp.zeros(n_levels, jnp.int32).at[jnp.where(mask & known, level, n_levels)].set(1, mode="drop")
     rank = jnp.cumsum(occurs) - 1
-    return jnp.where(level < n_levels, rank[jnp.clip(level, 0, n_levels - 1)], level), strip
+    return jnp.where(known, rank[jnp.clip(level, 0, n_levels - 1)], level), strip
+
+
+def _rounded(values: jax.Array, scale: int) -> jax.Array:
+    """Whole number nearest to the exact product of `values` and `scale` (below 128), half to even; float32.
+
+    A product rounded to float32 can land on a half that the exact one misses: 0.015 is stored a little smaller, and
+    times 100 is 1.5 in float32. The released code multiplies in float64, where such products are exact.
+    """
+    whole = jnp.floor(values * scale)
+    # Of 24 bits, 12 here and 12 there: each part's product with `scale` is exact, and their sum keeps its sign.
+    upper = jax.lax.bitcast_convert_type(
+        jax.lax.bitcast_convert_type(values, jnp.uint32) & np.uint32(0xFFFFF000), jnp.float32
+    )
+    past_half = (upper * scale - (whole + 0.5)) + (values - upper) * scale
+    up = (past_half > 0) | ((past_half == 0) & (whole % 2 == 1))
+    return whole + up
 
 
 def strips_of_cloud(cloud: PointClouds, region_bits: jax.Array, n_regions: int, config: DescriptorConfig) -> Strips:
@@ -52,7 +76,7 @@ def strips_of_cloud(cloud: PointClouds, region_bits: jax.Array, n_regions: int, 
     """
     n_points, n_segments = cloud.points.shape[0], config.n_slices * config.n_strips
     i, j = slice_and_strip(cloud.points, cloud.mask, config)
-    inside = cloud.mask & (i < config.n_slices) & (j < config.n_strips)
+    inside = cloud.mask & (i >= 0) & (i < config.n_slices) & (j >= 0) & (j < config.n_strips)
     segment = jnp.where(inside, i * config.n_strips + j, n_segments)  # past the end: dropped by the scatters
 
     y = cloud.points[:, 1]
@@ -68,7 +92,7 @@ def strips_of_cloud(cloud: PointClouds, region_bits: jax.Array, n_regions: int, 
     color = jnp.zeros((n_segments, n_regions), jnp.float32).at[segment].add(weights, mode="drop")
     if config.convention == "released":
         # The released code rounds y, then measures; rounding keeps the order, so the extremes stay extreme.
-        extremes = jnp.round(extremes * 100) / 100
+        extremes = _rounded(extremes, 100) / 100
         color = color / jnp.maximum(color.sum(axis=-1, keepdims=True), 1)
 
     def grid(a: jax.Array) -> jax.Array:

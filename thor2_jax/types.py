@@ -1,17 +1,19 @@
 """The records that flow between the stages. Each is frozen, a pytree of arrays, and names its fields' shapes.
 
-B is the number of clouds, N the padded number of points, S slices, J strips, R colour regions, P pixels of an image's side.
+B is the number of clouds, N the padded number of points, S slices, J strips, R colour regions, P pixels of an image's
+side.
 """
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from thor2_jax.capacity import point_bucket
+from thor2_jax.capacity import POINT_BUCKETS, point_bucket
 from thor2_jax.errors import InputError
 
 __all__ = ["Descriptors", "Diagrams", "PointClouds", "Strips"]
@@ -47,23 +49,22 @@ class PointClouds:
         """Pad a list of clouds to one size.
 
         Args:
-            clouds: pairs (xyz [n, 3] metres, rgb [n, 3] sRGB: uint8, or floating in [0, 1]). A cloud may be empty (n = 0): it is
-                all padding, and its descriptor is zero.
+            clouds: pairs (xyz [n, 3] metres, rgb [n, 3] sRGB: uint8, or floating in [0, 1]). A cloud may be empty
+                (n = 0): it is all padding, and its descriptor is zero.
             capacity: padded number of points; by default the bucket of the largest cloud.
             camera: [3] or [B, 3], the camera's position; by default the origin.
             boundary: one [n] bool array (or None) a cloud: the points on the occlusion boundary.
 
         Raises:
-            InputError: no clouds, wrong shapes or types, coordinates that are not finite, colours out of range, a cloud larger
-                than `capacity`, a camera that is not finite or of another shape. The message gives the cloud's index.
+            InputError: no clouds, wrong shapes or types, coordinates that are not finite in float32, colours out of
+                range, a cloud larger than `capacity` or the largest bucket, a capacity that is no positive integer,
+                a camera that is not finite or of another shape. The message gives the cloud's index.
         """
         if len(clouds) == 0:
             raise InputError("clouds is empty; at least one (xyz, rgb) pair is needed")
-        parts = [_checked(xyz, rgb, f"clouds[{i}]") for i, (xyz, rgb) in enumerate(clouds)]
+        parts = [_checked(pair, f"clouds[{i}]") for i, pair in enumerate(clouds)]
         sizes = [len(xyz) for xyz, _ in parts]
-        n = point_bucket(max(sizes)) if capacity is None else capacity
-        if max(sizes) > n:
-            raise InputError(f"capacity is {capacity}, but clouds[{sizes.index(max(sizes))}] has {max(sizes)} points")
+        n = _padded_size(sizes, capacity)
         points = np.zeros((len(parts), n, 3), np.float32)
         colors = np.zeros((len(parts), n, 3), np.float32)
         edge = np.zeros((len(parts), n), bool)
@@ -76,32 +77,65 @@ class PointClouds:
                 if flags.shape != (sizes[i],) or flags.dtype != bool:
                     raise InputError(f"boundary[{i}] is {flags.dtype} {list(flags.shape)}; expected bool [{sizes[i]}]")
                 edge[i, : sizes[i]] = flags
-        position = np.zeros(3, np.float32) if camera is None else np.asarray(camera, np.float32)
-        if position.shape not in ((3,), (len(parts), 3)) or not np.isfinite(position).all():
-            raise InputError(f"camera is {position.tolist()}; expected finite [3] or [{len(parts)}, 3]")
+        position = np.zeros(3, np.float32) if camera is None else _position(camera, len(parts))
         mask = np.arange(n) < np.array(sizes)[:, None]
         position = np.broadcast_to(position, (len(parts), 3))
         return cls(*(jnp.asarray(a) for a in (points, colors, mask, position, edge)))
 
 
-def _checked(xyz: ArrayLike, rgb: ArrayLike, name: str) -> tuple[np.ndarray, np.ndarray]:
-    points, colors = np.asarray(xyz), np.asarray(rgb)
+def _padded_size(sizes: list[int], capacity: int | None) -> int:
+    largest = max(sizes)
+    if capacity is None:
+        if largest > POINT_BUCKETS[-1]:
+            raise InputError(
+                f"clouds[{sizes.index(largest)}] has {largest} points, more than the largest bucket, "
+                f"{POINT_BUCKETS[-1]}; voxel it more coarsely or give a capacity"
+            )
+        return point_bucket(largest)
+    if not isinstance(capacity, int) or isinstance(capacity, bool) or capacity < 1:
+        raise InputError(f"capacity is {capacity!r}; it must be a positive integer")
+    if largest > capacity:
+        raise InputError(f"capacity is {capacity}, but clouds[{sizes.index(largest)}] has {largest} points")
+    return capacity
+
+
+def _position(camera: ArrayLike, n_clouds: int) -> NDArray[np.float32]:
+    try:
+        position = _single(np.asarray(camera, np.float64))
+    except (TypeError, ValueError):
+        raise InputError(f"camera is {camera!r}; expected numbers, [3] or [{n_clouds}, 3]") from None
+    if position.shape not in ((3,), (n_clouds, 3)) or not np.isfinite(position).all():
+        raise InputError(f"camera is {position.tolist()}; expected finite [3] or [{n_clouds}, 3]")
+    return position
+
+
+def _single(values: NDArray[Any]) -> NDArray[np.float32]:
+    """To float32, without a warning where a value is too large: that becomes infinity, which the caller refuses."""
+    with np.errstate(over="ignore"):
+        return values.astype(np.float32)
+
+
+def _checked(pair: tuple[ArrayLike, ArrayLike], name: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    if not isinstance(pair, tuple | list) or len(pair) != 2:
+        raise InputError(f"{name} is a {type(pair).__name__}; expected a pair (xyz, rgb)")
+    points, colors = np.asarray(pair[0]), np.asarray(pair[1])
     if points.ndim != 2 or points.shape[1] != 3 or not np.issubdtype(points.dtype, np.floating):
         raise InputError(f"{name}: xyz is {points.dtype} {list(points.shape)}; expected floating [n, 3], metres")
     if colors.shape != points.shape:
         raise InputError(f"{name}: rgb is {list(colors.shape)}; expected {list(points.shape)}, as xyz")
-    if not np.isfinite(points).all():
-        bad = int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])
-        raise InputError(f"{name}: xyz[{bad}] is {points[bad].tolist()}; every coordinate must be finite")
+    finite = np.isfinite(_single(points)).all(axis=1)
+    if not finite.all():
+        bad = int(np.flatnonzero(~finite)[0])
+        raise InputError(f"{name}: xyz[{bad}] is {points[bad].tolist()}; every coordinate must be finite in float32")
     if colors.dtype == np.uint8:
-        return points, colors.astype(np.float32) / np.float32(255)
+        return _single(points), colors.astype(np.float32) / np.float32(255)
     if not np.issubdtype(colors.dtype, np.floating):
         raise InputError(f"{name}: rgb is {colors.dtype}; expected uint8, or floating in [0, 1]")
     inside = (colors >= 0) & (colors <= 1)
     if not inside.all():
         bad = int(np.flatnonzero(~inside.all(axis=1))[0])
         raise InputError(f"{name}: rgb[{bad}] is {colors[bad].tolist()}; floating colours must lie in [0, 1]")
-    return points, colors
+    return _single(points), _single(colors)
 
 
 @jax.tree_util.register_dataclass
@@ -114,7 +148,7 @@ class Strips:
         high: [..., S, J] float32, greatest y of the strip's points; 0 where the strip is empty.
         occupied: [..., S, J] bool, the strip has a point.
         color: [..., S, J, R] float32, strip colour vectors Phi^j (rows of the colour matrix C^i).
-        overflow: [...] int32, points beyond the last slice or strip.
+        overflow: [...] int32, points outside the slices and strips.
     """
 
     low: jax.Array
@@ -148,8 +182,8 @@ class Descriptors:
     Attributes:
         images: [B, S, P, P] float32, persistence images; axes birth, persistence; zeros for an absent slice.
         embeddings: [B, S, R, J] float32, colour embeddings E^i = (C^i Delta)^T.
-        overflow: [B] int32, points beyond the last slice or strip plus strips whose persistence is past the window. Nothing is
-            dropped in silence: where this is not zero, the descriptor misses that much of the cloud.
+        overflow: [B] int32, points outside the slices and strips plus strips whose persistence is past the window.
+            Nothing is dropped in silence: where this is not zero, the descriptor misses that much of the cloud.
     """
 
     images: jax.Array
@@ -168,7 +202,10 @@ class Descriptors:
 
     @property
     def tops2(self) -> jax.Array:
-        """Shape and colour descriptor TOPS2 [B, S * (P * P + R * J)] (11,942 floats): a slice a block [image | embedding]."""
+        """Shape and colour descriptor TOPS2 [B, S * (P * P + R * J)] (11,942 floats).
+
+        One block [image | embedding] a slice.
+        """
         leading = self.images.shape[:-2]
         blocks = [self.images.reshape(*leading, -1), self.embeddings.reshape(*leading, -1)]
         return jnp.concatenate(blocks, axis=-1).reshape(*self.overflow.shape, -1)

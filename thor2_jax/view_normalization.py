@@ -1,5 +1,6 @@
-"""View normalization: from a cloud as the camera saw it to one that stands the same way whatever the camera's pose (paper, section
-"View normalization"), and the turn by alpha that makes slices of it (section "Slicing").
+"""View normalization and the turn by alpha (paper, sections "View normalization" and "Slicing").
+
+From a cloud as the camera saw it to one that stands the same way whatever the camera's pose; turned, it can be sliced.
 
 >>> clouds = PointClouds.pack([(xyz, rgb)])                      # doctest: +SKIP
 >>> normal = view_normalize(clouds, DescriptorConfig())          # doctest: +SKIP
@@ -14,6 +15,7 @@ import jax.numpy as jnp
 
 from thor2_jax.bounding_box import HIGHEST, minimal_box_axes
 from thor2_jax.config import DescriptorConfig
+from thor2_jax.errors import InputError
 from thor2_jax.types import PointClouds
 
 __all__ = ["align", "mirror", "turn", "view_normalize"]
@@ -23,7 +25,7 @@ OCCLUSION_BIN = 0.01
 
 
 def _to_first_octant(points: jax.Array, mask: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Points [N, 3] moved so that the least coordinate along each axis is 0 (padding is set to 0), and the shift [3]."""
+    """Points [N, 3] moved so that the least coordinate along each axis is 0, and the shift [3]. Padding is set to 0."""
     low = jnp.where(mask[:, None], points, jnp.inf).min(axis=0)
     low = jnp.where(jnp.isfinite(low), low, 0)
     return jnp.where(mask[:, None], points - low, 0), low
@@ -68,13 +70,15 @@ def _normalize_one(clouds: PointClouds, sigma_s: float) -> PointClouds:
 
 @partial(jax.jit, static_argnums=1)
 def view_normalize(clouds: PointClouds, config: DescriptorConfig) -> PointClouds:
-    """Rotate each cloud onto its minimal box, longest side along x, seen from -z, in the first octant (paper, "View normalization").
+    """Rotate each cloud onto its minimal box, longest side along x, seen from -z, in the first octant.
 
-    Steps: (1, 2) axes of an approximately minimal-volume box, longest first (`bounding_box`); (3) a camera on the box's +z side
-    means a half turn about x; (5) what is then free, a half turn about z, puts the heavier half of the cloud (more points) at small
-    x; (4) if the first two x-bins of 0.01 hold more occlusion-boundary points than the last two, a half turn about z keeps
-    the occluded end out of the first slice; (6) translation to the first octant. Every step follows the cloud and the camera: a
-    rigid motion of both changes nothing. Cubes and balls have no unique box; their frame is one of the equal ones.
+    The steps of the paper's section "View normalization": (1, 2) axes of an approximately minimal-volume box, longest
+    first (`bounding_box`); (3) a camera on the +z side of the box's middle means a half turn about x; (5) what is then
+    free, a half turn about z, puts the mean of the points at or below the middle of the box along x, so that the end
+    with more of the cloud comes first; (4) if the first two x-bins of 0.01 hold more occlusion-boundary points than the
+    last two, a half turn about z keeps the occluded end out of the first slice; (6) translation to the first octant.
+    Every step follows the cloud and the camera: a rigid motion of both changes nothing. Cubes and balls have no unique
+    box; their frame is one of the equal ones.
 
     Args:
         clouds: metres, any frame, camera given in the same one.
@@ -98,7 +102,9 @@ def _turn_one(cloud: PointClouds, alpha: float) -> PointClouds:
 
 @partial(jax.jit, static_argnums=1)
 def turn(normal: PointClouds, config: DescriptorConfig) -> PointClouds:
-    """Turn normalized clouds by -alpha about y, so that the long axis stands at alpha to the x-y plane (paper, "Slicing").
+    """Turn normalized clouds by -alpha about y (paper, "Slicing").
+
+    The long axis then stands at alpha to the x-y plane.
 
     Args:
         normal: clouds as `view_normalize` returns them, or mirrored ones.
@@ -121,8 +127,13 @@ def mirror(normal: PointClouds, axes: str) -> PointClouds:
 
     Args:
         normal: clouds in the first octant.
-        axes: letters of "xyz" to mirror in; "" returns the clouds as they are.
+        axes: letters of "xyz" to mirror in; "" returns the clouds as they are. Static.
+
+    Raises:
+        InputError: `axes` has another letter.
     """
+    if not set(axes) <= set("xyz"):
+        raise InputError(f"axes is {axes!r}; expected letters of 'xyz'")
     flip = jnp.array([letter in axes for letter in "xyz"])
     high = jnp.where(normal.mask[..., None], normal.points, 0).max(axis=1, keepdims=True)
     points = jnp.where(flip & normal.mask[..., None], high - normal.points, normal.points)

@@ -112,7 +112,7 @@ def _lathe(profile: ArrayLike, base: Color, *marks: Mark) -> TexturedMesh:
 def _sweep(
     path: ArrayLike, radii: ArrayLike, across: ArrayLike, base: Color, *marks: Mark, sides: int = 24
 ) -> TexturedMesh:
-    """A tube of elliptical section along a path in a plane; closed where its radius is 0.
+    """A tube of elliptical section along a path in a plane, with flat ends.
 
     Args:
         path: [k, 3] metres.
@@ -126,10 +126,11 @@ def _sweep(
     tangent = np.gradient(line, axis=0)
     inward = np.cross(normal, tangent / np.linalg.norm(tangent, axis=1, keepdims=True))
     theta = np.linspace(0, 2 * np.pi, sides + 1)[None, :, None]
-    points = (
-        line[:, None] + size[:, None, :1] * np.cos(theta) * inward[:, None] + size[:, None, 1:] * np.sin(theta) * normal
-    )
-    return _rings(points, _along(line), _texture(base, marks, *_texel_centres()))
+    around = size[:, None, :1] * np.cos(theta) * inward[:, None] + size[:, None, 1:] * np.sin(theta) * normal
+    ends = np.broadcast_to(line[[0, -1], None], (2, sides + 1, 3))
+    points = np.concatenate([ends[:1], line[:, None] + around, ends[1:]])
+    v = np.concatenate([[0.0], _along(line), [1.0]])
+    return _rings(points, v, _texture(base, marks, *_texel_centres()))
 
 
 def _box(size: tuple[float, float, float], base: Color, *marks: Mark) -> TexturedMesh:
@@ -295,8 +296,8 @@ def _apple() -> TexturedMesh:
         (LIME, lambda u, r, z, s: s > 0.94 + 0.02 * np.sin(u * 4 * np.pi)),
         (ORANGE, lambda u, r, z, s: ((u - 0.35) / 0.16) ** 2 + ((s - 0.6) / 0.22) ** 2 < 1),
     )
-    line = np.array([[0, 0, 0.019], [0.001, 0, 0.026], [0.003, 0, 0.034], [0.006, 0, 0.041], [0.006, 0, 0.0411]])
-    stem = _sweep(line, [[0.0022] * 2, [0.0022] * 2, [0.0022] * 2, [0.003] * 2, [0, 0]], (0, 1, 0), BROWN, sides=8)
+    line = np.array([[0, 0, 0.019], [0.001, 0, 0.026], [0.003, 0, 0.034], [0.006, 0, 0.041]])
+    stem = _sweep(line, [[0.0022] * 2, [0.0022] * 2, [0.0022] * 2, [0.003] * 2], (0, 1, 0), BROWN, sides=8)
     return _standing(body, stem)
 
 
@@ -341,9 +342,9 @@ def _screwdriver() -> TexturedMesh:
 
 
 def _hammer() -> TexturedMesh:
-    x = np.array([0, 0, 0.004, 0.10, 0.12, 0.235, 0.235])
-    path = np.stack([x, np.zeros(7), np.zeros(7)], axis=1) + np.linspace(0, 1e-6, 7)[:, None] * [1, 0, 0]
-    radii = [[0, 0], [0.010, 0.013], [0.013, 0.016], [0.011, 0.014], [0.008, 0.010], [0.008, 0.010], [0, 0]]
+    x = np.array([0, 0.004, 0.10, 0.12, 0.235])
+    path = np.stack([x, np.zeros(5), np.zeros(5)], axis=1)
+    radii = [[0.010, 0.013], [0.013, 0.016], [0.011, 0.014], [0.008, 0.010], [0.008, 0.010]]
     handle = _sweep(path, radii, (0, 0, 1), TAN, (ORANGE, lambda u, t: t < 0.45))
     profile = [
         (0, 0),
@@ -360,12 +361,11 @@ def _hammer() -> TexturedMesh:
 
 
 def _wooden_spoon() -> TexturedMesh:
-    x = np.concatenate([[0.0], np.linspace(0.0005, 0.165, 6), np.linspace(0.170, 0.239, 16), [0.24]])
+    x = np.concatenate([np.linspace(0, 0.165, 6), np.linspace(0.170, 0.24, 16)])
     bowl = np.clip((x - 0.165) / 0.075, 0, 1)
     z = 0.006 - 0.012 * np.sin(np.pi * bowl)
     half = np.where(bowl > 0, 0.0045 + 0.0205 * np.sqrt(np.clip(np.sin(np.pi * bowl**0.8), 0, 1)), 0.0055)
     thick = np.where(bowl > 0, 0.0045, 0.0055)
-    half[[0, -1]] = thick[[0, -1]] = 0
     path = np.stack([x, np.zeros_like(x), z], axis=1)
     hollow = lambda u, t: (((t - 0.855) / 0.105) ** 2 + ((u - 0.5) / 0.17) ** 2 < 1) | (t < 0.06)  # noqa: E731
     return _standing(_sweep(path, np.stack([thick, half], axis=1), (0, 1, 0), TAN, (BROWN, hollow)))

@@ -14,16 +14,15 @@ from thor2_jax.descriptor import strips
 from thor2_jax.errors import InputError
 from thor2_jax.types import PointClouds, Strips
 from thor2_jax.view_normalization import mirror, turn, view_normalize
+from training.views import Cloud
 
-__all__ = ["MIRRORS", "Cloud", "StripDataset", "build_dataset"]
+__all__ = ["MIRRORS", "StripDataset", "build_dataset"]
 
 MIRRORS = ("", "x", "y", "xy")
 """Each normalized view is used four times."""
 
 CHUNK = 64
 """Views normalized together."""
-
-Cloud = tuple[NDArray[np.float32], NDArray[np.uint8]]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -106,7 +106,7 @@ def run_demo(out: str | Path, seed: int = 0, progress: Progress = lambda stage, 
     pictures.mkdir(parents=True, exist_ok=True)
     objects = builtin_objects()
     views = render_views(
-        objects, AZIMUTH_STEP, POLAR_STEP, 2, lambda done, total: progress("render views", done, total, "")
+        objects, AZIMUTH_STEP, POLAR_STEP, 1, lambda done, total: progress("render views", done, total, "")
     )
     run = train_run(views, out / "run", FEATURES, FitOptions(epochs=EPOCHS, seed=seed), progress)
 

@@ -1,4 +1,7 @@
-"""Accuracy of a trained run on labelled frames: every joining of classifiers, over all and by attribute (paper, "Results")."""
+"""Accuracy of a trained run on labelled frames (paper, "Results").
+
+Every joining of classifiers, over all frames and by attribute.
+"""
 
 import dataclasses
 import itertools
@@ -50,7 +53,10 @@ def joinings(available: Iterable[Feature]) -> dict[str, tuple[Feature, ...]]:
 def evaluate(
     recognizer: Recognizer, frames: Iterable[LabelledFrame], progress: Callable[[str], object] = lambda identifier: None
 ) -> list[Instance]:
-    """Recognize every labelled instance. Instances whose name is no class of the run are listed with a reason and not scored."""
+    """Recognize every labelled instance.
+
+    Instances whose name is no class of the run are listed with a reason and not scored.
+    """
     groups = joinings(recognizer.run.classifiers)
     classes = recognizer.run.classes
     found: list[Instance] = []
@@ -76,7 +82,10 @@ def evaluate(
 
 
 def summarize(instances: Sequence[Instance], names: Sequence[str]) -> dict[str, Any]:
-    """Accuracy of each joining, over all scored instances and by every attribute's values; the unanswered count as wrong."""
+    """Accuracy of each joining, over all scored instances and by every attribute's values.
+
+    Instances without an answer count as wrong.
+    """
     scored = [i for i in instances if i.reason != "no class of this run"]
 
     def accuracy(part: Sequence[Instance]) -> dict[str, Any]:

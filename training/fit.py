@@ -1,6 +1,7 @@
 """Fitting one classifier (paper, section "Training"): Adam, 1e-2 then 1e-3, categorical cross-entropy."""
 
 import dataclasses
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -8,7 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
+import optax  # type: ignore[import-untyped]
 from flax import nnx
 
 from colornet import ColorNetwork
@@ -23,6 +24,10 @@ from training.dataset import StripDataset
 __all__ = ["EpochFigures", "FitOptions", "fit"]
 
 
+MAX_SEED = 2**31 - 1
+"""JAX takes a seed of 32 bits."""
+
+
 @dataclasses.dataclass(frozen=True)
 class FitOptions:
     """How a classifier is fitted.
@@ -32,6 +37,9 @@ class FitOptions:
         learning_rates: Adam's two step sizes.
         batch_size: samples a step; what is left of an epoch after whole batches is left out (another draw each epoch).
         seed: of initial weights, order and dropout.
+
+    Raises:
+        InputError: a value out of its range, naming the field and the value.
     """
 
     epochs: int = 100
@@ -41,8 +49,13 @@ class FitOptions:
 
     def __post_init__(self) -> None:
         for name, least in (("epochs", 1), ("batch_size", 2), ("seed", 0)):
-            if not (isinstance(getattr(self, name), int) and getattr(self, name) >= least):
+            if type(getattr(self, name)) is not int or getattr(self, name) < least:
                 raise InputError(f"{name} is {getattr(self, name)!r}; it must be a whole number of at least {least}")
+        if self.seed > MAX_SEED:
+            raise InputError(f"seed is {self.seed}; it must be at most {MAX_SEED}")
+        rates = self.learning_rates
+        if len(rates) != 2 or not all(isinstance(rate, int | float) and 0 < rate < math.inf for rate in rates):
+            raise InputError(f"learning_rates is {rates!r}; it must be two positive numbers")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,7 +91,8 @@ def fit(
 ) -> MLP:
     """Train the MLP of one feature.
 
-    Samples are expanded from strips to descriptors a batch at a time, on the device, in closed form (the same values as gudhi's).
+    Samples are expanded from strips to descriptors a batch at a time, on the device, in closed form (the same values as
+    gudhi's).
 
     Args:
         dataset: training samples.
@@ -89,15 +103,18 @@ def fit(
         progress: called after each epoch.
 
     Raises:
-        InputError: fewer samples than two classes or than one batch needs, or a loss that is not finite.
+        InputError: fewer than two classes or two samples, or a loss that is not finite.
     """
     if len(dataset.classes) < 2:
         raise InputError(f"classes is {dataset.classes}; a classifier needs at least two")
+    if len(dataset) < 2:
+        raise InputError(f"dataset has {len(dataset)} samples; batch normalization needs at least two")
     batch_size = min(options.batch_size, len(dataset))
     config = dataclasses.replace(config, homology="closed_form")
     model = MLP(input_size(feature, config, network.n_regions), len(dataset.classes), rngs=nnx.Rngs(options.seed))
     model.input_scale[...] = _input_scale(dataset, network, config, feature)
-    graph, params, rest = nnx.split(model, nnx.Param, ...)
+    split: Any = nnx.split(model, nnx.Param, ...)
+    graph, params, rest = split
 
     steps = len(dataset) // batch_size
     schedule = optax.piecewise_constant_schedule(

@@ -7,9 +7,10 @@ from typing import Any
 import colornet
 from thor2_jax.classifier import MLP, Feature, check_features
 from thor2_jax.config import DescriptorConfig
-from thor2_jax.run_folder import TrainedRun, save_run
-from training.dataset import Cloud, build_dataset
+from thor2_jax.run_folder import TrainedRun, check_new, save_run
+from training.dataset import build_dataset
 from training.fit import EpochFigures, FitOptions, fit
+from training.views import Cloud
 
 __all__ = ["Progress", "train_run"]
 
@@ -29,16 +30,18 @@ def train_run(
 
     Args:
         views: class name -> clouds in metres, camera frame.
-        out: the run folder; must not exist.
+        out: the run folder; must not exist, or be empty.
         features: any of "ce", "tops", "tops2".
         options: of the fit; the same for every classifier.
         progress: told of each step.
         config: the descriptor; by default the paper's, with diagrams in closed form.
 
     Raises:
-        InputError: unknown features, classes without views, `out` exists, a loss that is not finite. Nothing is written then.
+        InputError: unknown features, `out` exists (both told before any work), classes without views, a loss that is
+            not finite. Nothing is written then.
     """
     names = check_features(features, "classifiers")
+    check_new(out)
     config = config or DescriptorConfig(homology="closed_form")
     network = colornet.load_default()
     total, done = sum(len(clouds) for clouds in views.values()), 0

@@ -162,7 +162,8 @@ def render_to_folder(
 
 def _read_object(path: Path, views: int, points: int) -> list[Cloud]:
     try:
-        with np.load(path, allow_pickle=False) as file:
+        # Opened here: numpy leaves a file that it cannot read open.
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             counts, xyz, rgb = (file[key] for key in ("counts", "xyz", "rgb"))
     # numpy and zipfile raise any of these on damaged bytes.
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, NotImplementedError) as error:

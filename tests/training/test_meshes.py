@@ -202,7 +202,16 @@ def put(folder: Path, *names: str) -> None:
 
 
 def test_finding_meshes(tmp_path: Path) -> None:
-    put(tmp_path, "mug.glb", "notes.txt", "can/can.ply", "can/can.png", "box/textured.obj", "box/other.glb", "none/a.txt")
+    put(
+        tmp_path,
+        "mug.glb",
+        "notes.txt",
+        "can/can.ply",
+        "can/can.png",
+        "box/textured.obj",
+        "box/other.glb",
+        "none/a.txt",
+    )
     found = find_meshes(tmp_path)
     assert {name: path.relative_to(tmp_path).as_posix() for name, path in found.items()} == {
         "box": "box/textured.obj",

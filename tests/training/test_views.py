@@ -37,7 +37,7 @@ def test_points_lie_on_the_sphere_with_its_colours() -> None:
 def test_one_point_a_voxel() -> None:
     xyz, _ = view_cloud(ball(), camera_pose(0.4, 1.2, np.zeros(3)))
     voxel = VOXEL / SIGMA_S
-    # The grid starts half a voxel below the least coordinate of the points before the mean: within a pixel of that after it.
+    # The grid starts half a voxel below the least coordinate of the points, which the means only come near.
     cells = np.floor((xyz - xyz.min(axis=0)) / voxel).astype(int)
     assert len(np.unique(cells, axis=0)) > 0.6 * len(xyz)
     surface = 2 * np.pi * 0.05**2 / voxel**2
