@@ -10,6 +10,7 @@ import json
 import math
 from collections.abc import Mapping
 from functools import cached_property
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,13 @@ __all__ = [
     "read_intrinsics",
     "read_labels",
 ]
+
+
+def _is_finite(value: Any) -> bool:
+    try:
+        return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(float(value))
+    except OverflowError:  # an integer past the largest float
+        return False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,7 +64,7 @@ class Intrinsics:
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
-            if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+            if not _is_finite(value):
                 raise InputError(f"intrinsics.{field.name} is {value!r}; it must be a finite number")
             if value <= 0 and field.name not in ("cx", "cy"):
                 raise InputError(f"intrinsics.{field.name} is {value!r}; it must be positive")
@@ -82,8 +90,8 @@ class RGBDFrame:
 
     Attributes:
         color: [H, W, 3] uint8, sRGB.
-        depth: [H, W] unsigned integers in 1 / `intrinsics.depth_scale` metres, or floats in metres; 0 (or not finite) where
-            there is none.
+        depth: [H, W] unsigned integers in 1 / `intrinsics.depth_scale` metres, or floats in metres; 0 (or not finite)
+            where there is none.
         labels: [H, W] integers, at least 0; 0 is background, every other number an instance.
         intrinsics: of the common pixel grid; a mapping (see `Intrinsics.of`) is taken as well.
 
@@ -127,7 +135,7 @@ class RGBDFrame:
 
     @cached_property
     def instance_pixels(self) -> dict[int, NDArray[np.intp]]:
-        """Label number -> its pixels as sorted flat indices (row * W + column), labels in increasing order, without 0."""
+        """Label number -> its pixels, sorted flat indices (row * W + column); labels in increasing order, without 0."""
         flat = self.labels.ravel()
         pixels = np.flatnonzero(flat)
         order = np.argsort(flat[pixels], kind="stable")
@@ -157,8 +165,8 @@ def backproject(depth_m: NDArray[Any], intrinsics: Intrinsics) -> NDArray[Any]:
     return (rays * depth_m.reshape(-1, 1)).astype(depth_m.dtype).reshape(height, width, 3)
 
 
-def _read_image(path: str | Path, argument: str) -> NDArray[Any]:
-    """An image file as an array.
+def _read_image(path: str | Path, argument: str) -> tuple[NDArray[Any], str]:
+    """An image file as an array, and its mode, Pillow's word for what the numbers mean.
 
     Raises:
         InputError: not an image, or damaged; names `argument` and the file.
@@ -167,7 +175,7 @@ def _read_image(path: str | Path, argument: str) -> NDArray[Any]:
     with open(path, "rb") as stream:
         try:
             with Image.open(stream) as image:
-                return np.asarray(image)
+                return np.asarray(image), image.mode
         # Damaged files make the decoders raise several kinds of exception; only bytes are at work here.
         except (
             UnidentifiedImageError,
@@ -182,17 +190,15 @@ def _read_image(path: str | Path, argument: str) -> NDArray[Any]:
 
 def read_color(path: str | Path) -> NDArray[np.uint8]:
     """Read an 8-bit RGB image [H, W, 3]; an alpha channel is dropped. Raises InputError and OSError as `read_frame`."""
-    found = _read_image(path, "color")
-    if found.ndim == 3 and found.shape[2] == 4 and found.dtype == np.uint8:
-        return np.ascontiguousarray(found[..., :3])
-    if found.ndim != 3 or found.shape[2] != 3 or found.dtype != np.uint8:
-        raise InputError(f"color: {path} has shape {found.shape} and type {found.dtype}; expected 8-bit RGB")
-    return found
+    found, mode = _read_image(path, "color")
+    if mode not in ("RGB", "RGBA"):
+        raise InputError(f"color: {path} has the mode {mode}; expected 8-bit RGB")
+    return np.ascontiguousarray(found[..., :3])
 
 
 def read_depth(path: str | Path) -> NDArray[np.uint16]:
     """Read a one-channel 16-bit image [H, W]. Raises InputError and OSError as `read_frame`."""
-    found = _read_image(path, "depth")
+    found, _ = _read_image(path, "depth")
     if found.ndim != 2 or found.dtype not in (np.uint16, np.int32):
         raise InputError(
             f"depth: {path} has shape {found.shape} and type {found.dtype}; expected one channel of 16 bits"
@@ -205,7 +211,7 @@ def read_depth(path: str | Path) -> NDArray[np.uint16]:
 
 def read_labels(path: str | Path) -> NDArray[Any]:
     """Read a one-channel or indexed image [H, W] of whole numbers. Raises InputError and OSError as `read_frame`."""
-    found = _read_image(path, "labels")
+    found, _ = _read_image(path, "labels")
     if found.ndim != 2 or found.dtype.kind not in "ui":
         raise InputError(
             f"labels: {path} has shape {found.shape} and type {found.dtype}; expected one channel of whole numbers"
@@ -240,7 +246,8 @@ def read_frame(*, color: str | Path, depth: str | Path, labels: str | Path, intr
         intrinsics: JSON, see `read_intrinsics`.
 
     Raises:
-        InputError: a file that is damaged or of another kind, or images of different sizes; names the file or the argument.
+        InputError: a file that is damaged or of another kind, or images of different sizes; names the file or the
+            argument.
         OSError: a file cannot be opened.
     """
     return RGBDFrame(read_color(color), read_depth(depth), read_labels(labels), read_intrinsics(intrinsics))

@@ -58,8 +58,8 @@ def _instance_cloud(frame: RGBDFrame, label: int, pixels: NDArray[np.intp]) -> I
     points, colors = voxel_downsample(points, frame.color.reshape(-1, 3)[valid], VOXEL)
     if len(points) < MIN_POINTS:
         reason = (
-            f"{len(points)} points ({len(pixels)} pixels, {len(valid)} of them with depth from {MIN_DEPTH} to {MAX_DEPTH} m); "
-            f"at least {MIN_POINTS} are needed"
+            f"{len(points)} points ({len(pixels)} pixels, {len(valid)} of them with depth "
+            f"from {MIN_DEPTH} to {MAX_DEPTH} m); at least {MIN_POINTS} are needed"
         )
         return InstanceCloud(label, points, colors, len(pixels), reason=reason)
     kept, relaxed = remove_outliers(points)

@@ -1,8 +1,9 @@
 """Which instances are hidden in part, and where (paper, section "Recognition").
 
 A pixel on the contour of an instance's mask belongs to the occlusion boundary if the pixel beside it belongs to another
-instance that is nearer, or if there is none beside it: the image ends. Masks leave gaps between objects and depth cameras give
-no depth along edges, where both are needed, so either side is looked for within a few steps away from the contour.
+instance that is nearer, or if there is none beside it: the image ends. Masks leave gaps between objects and depth
+cameras give no depth along edges, where both are needed, so either side is looked for within a few steps away from the
+contour.
 """
 
 import dataclasses

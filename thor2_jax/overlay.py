@@ -23,14 +23,12 @@ if TYPE_CHECKING:
 
 __all__ = ["COLORS", "UNRECOGNIZED", "draw_overlay"]
 
-COLORS = ((86, 180, 233), (240, 228, 66), (0, 158, 115), (204, 121, 167), (230, 159, 0))
-"""Of recognized instances, in turn: sky blue, yellow, bluish green, reddish purple, orange of Okabe and Ito."""
+COLORS = ((86, 180, 233), (240, 228, 66), (0, 158, 115), (204, 121, 167), (0, 114, 178))
+"""Of recognized instances, in turn: Okabe and Ito's sky blue, yellow, bluish green, reddish purple and blue, which all
+eyes tell apart."""
 
 UNRECOGNIZED = (213, 94, 0)
-"""Of the others: vermilion of the same palette, which the turn leaves out."""
-
-_INK = (0, 0, 0)
-"""Of letters and of the thin line along outlines: at least 5.7 to 1 in contrast to every colour above."""
+"""Of the others: vermilion of the same palette; its orange is not in the turn because it would be too near."""
 
 _SMALLEST = 8
 """Size of the smallest letters that can be read, pixels."""
@@ -52,12 +50,26 @@ class _Mask(NamedTuple):
     pixels: NDArray[np.bool_]
 
 
-def draw_overlay(color: NDArray[np.uint8], labels: NDArray[Any], answers: Sequence[Recognition], path: str | Path) -> None:
+class _Lettering(NamedTuple):
+    """A text of one or two lines as it is drawn: from `start` on, relative to the corner of a box of width x height."""
+
+    text: str
+    font: ImageFont.FreeTypeFont | ImageFont.ImageFont
+    size: int
+    spacing: int
+    start: tuple[float, float]
+    width: int
+    height: int
+
+
+def draw_overlay(
+    color: NDArray[np.uint8], labels: NDArray[Any], answers: Sequence[Recognition], path: str | Path
+) -> None:
     """Draw answers on the photo they are about; the PNG appears under its name whole or not at all.
 
-    A label tells name, confidence, the classifier that decided, and "occluded" where it is; or "unrecognized". Letters and
-    outlines grow with the picture. Labels lie inside it, clear of each other while there is room; letters shrink where a label
-    is wider than the picture, and a label that does not fit even in the smallest legible letters is left out.
+    A label tells name, confidence, the classifier that decided, and "occluded" where it is; or "unrecognized". Letters
+    and outlines grow with the picture. Labels lie inside it, clear of each other while there is room. Letters shrink
+    where a label is wider than the picture; one that does not fit in the smallest legible letters is left out.
 
     Args:
         color: [H, W, 3] uint8, sRGB.
@@ -82,12 +94,13 @@ def draw_overlay(color: NDArray[np.uint8], labels: NDArray[Any], answers: Sequen
     paints = _paints(answers)
     diagonal = math.hypot(*labels.shape)
     thickness = max(1, round(diagonal / 350))
+    size = max(11, round(14 * (diagonal / 800) ** 0.75))  # less than in proportion: large pictures have room to zoom in
 
     pixels = color.copy()
     for mask, paint in zip(masks, paints, strict=True):
         _outline(pixels, mask, paint, thickness)
     picture = Image.fromarray(pixels)
-    _write_labels(picture, labels != 0, masks, paints, [_text(a) for a in answers], max(11, round(diagonal / 55)))
+    _write_labels(picture, labels != 0, masks, paints, [_text(a) for a in answers], size)
     with replacing(path) as temporary:
         picture.save(temporary, format="PNG")
 
@@ -128,13 +141,19 @@ def _eroded(mask: NDArray[np.bool_], steps: int) -> NDArray[np.bool_]:
 
 
 def _outline(pixels: NDArray[np.uint8], mask: _Mask, paint: tuple[int, int, int], thickness: int) -> None:
-    """Draw inwards from the mask's edge, so that no outline hides a neighbour's: a coloured line, within it a thin dark one."""
+    """Draw a coloured line along the mask's edge, inside; along that a thin black or white one."""
     left, top, right, bottom = mask.box
     within = _eroded(mask.pixels, thickness)
     core = _eroded(within, max(1, thickness // 3))
     target = pixels[top:bottom, left:right]
     target[(mask.pixels & ~within)[1:-1, 1:-1]] = paint
-    target[(within & ~core)[1:-1, 1:-1]] = _INK
+    target[(within & ~core)[1:-1, 1:-1]] = _ink(paint)
+
+
+def _ink(paint: tuple[int, int, int]) -> tuple[int, int, int]:
+    """Black or white, whichever stands out better against a colour."""
+    red, green, blue = paint
+    return (0, 0, 0) if 0.299 * red + 0.587 * green + 0.114 * blue > 100 else (255, 255, 255)
 
 
 def _write_labels(
@@ -146,32 +165,40 @@ def _write_labels(
     size: int,
 ) -> None:
     draw = ImageDraw.Draw(picture)
-    font_of = functools.cache(ImageFont.load_default)
     covered = np.pad(instances, ((1, 0), (1, 0))).cumsum(axis=0, dtype=np.int32).cumsum(axis=1, dtype=np.int32)
-    placed: list[_Box] = []
+    placed: list[tuple[_Box, _Lettering, tuple[int, int, int]]] = []
     for mask, paint, text in zip(masks, paints, texts, strict=True):
-        for letters in range(size, _SMALLEST - 1, -1):
-            font, padding = font_of(letters), letters // 4
-            x0, y0, x1, y1 = draw.multiline_textbbox((0, 0), text, font=font, spacing=padding)
-            width, height = math.ceil(x1 - x0) + 2 * padding, math.ceil(y1 - y0) + 2 * padding
-            if width <= picture.width and height <= picture.height:
-                break
-        else:
-            continue
-        box = _place(width, height, mask.box, placed, covered, letters)
-        _leader(draw, box, mask, paint, max(1, letters // 7))
+        lettering = _fitting(draw, text, size, picture.size)
+        if lettering is not None:
+            box = _place(lettering, mask.box, [other for other, _, _ in placed], covered)
+            placed.append((box, lettering, paint))
+            _leader(draw, box, mask, paint, max(1, size // 7))
+    for box, lettering, paint in placed:  # after all leaders, which may cross the place of a label
         draw.rectangle((box.left, box.top, box.right - 1, box.bottom - 1), fill=paint)
-        draw.multiline_text(
-            (box.left + padding - x0, box.top + padding - y0), text, fill=_INK, font=font, spacing=padding
-        )
-        placed.append(box)
+        start = box.left + lettering.start[0], box.top + lettering.start[1]
+        draw.multiline_text(start, lettering.text, _ink(paint), lettering.font, spacing=lettering.spacing)
 
 
-def _place(
-    width: int, height: int, target: _Box, placed: Sequence[_Box], covered: NDArray[np.int32], letters: int
-) -> _Box:
-    """The best place of a grid over the picture: clear of other labels, near its instance, on as few instances as can be."""
+def _fitting(draw: ImageDraw.ImageDraw, text: str, size: int, room: tuple[int, int]) -> _Lettering | None:
+    """The text in letters of `size`, or in the largest smaller ones that `room` (width, height) holds; None if none."""
+    for letters in range(size, _SMALLEST - 1, -1):
+        font, padding = _font(letters), letters // 4
+        left, top, right, bottom = draw.multiline_textbbox((0, 0), text, font, spacing=padding)
+        width, height = math.ceil(right - left) + 2 * padding, math.ceil(bottom - top) + 2 * padding
+        if width <= room[0] and height <= room[1]:
+            return _Lettering(text, font, letters, padding, (padding - left, padding - top), width, height)
+    return None
+
+
+@functools.lru_cache(maxsize=32)
+def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    return ImageFont.load_default(size)
+
+
+def _place(lettering: _Lettering, target: _Box, placed: Sequence[_Box], covered: NDArray[np.int32]) -> _Box:
+    """The best place of a grid over the picture: clear of other labels, near its instance, hiding little of any."""
     rows, columns = covered.shape[0] - 1, covered.shape[1] - 1
+    letters, width, height = lettering.size, lettering.width, lettering.height
     top, left = (
         np.unique(np.append(np.arange(0, room + 1, max(1, letters // 2)), room))
         for room in (rows - height, columns - width)
@@ -182,7 +209,8 @@ def _place(
     gap_y = np.maximum(0, np.maximum(top - target.bottom, target.top - bottom))
     off_centre = np.hypot(left + right - target.left - target.right, top + bottom - target.top - target.bottom)
     hidden = covered[bottom, right] - covered[top, right] - covered[bottom, left] + covered[top, left]
-    cost = np.hypot(gap_x, gap_y) / (4 * letters) + off_centre / (40 * letters) + hidden / (width * height)
+    # In heights of a letter: to hide an instance under a tenth of the label is as bad as to lie four away from it.
+    cost = np.hypot(gap_x, gap_y) / letters + off_centre / (10 * letters) + 40 * hidden / (width * height)
     for other in placed:
         shared_x = np.minimum(right, other.right + 2) - np.maximum(left, other.left - 2)
         shared_y = np.minimum(bottom, other.bottom + 2) - np.maximum(top, other.top - 2)

@@ -33,7 +33,7 @@ THOR2: tuple[Feature, ...] = ("tops", "tops2")
 """The two classifiers whose more confident answer is THOR2's."""
 
 VOXEL = 0.01
-"""Voxel side in scaled units of every cloud that is described, in training and in recognition: colour counts depend on it."""
+"""Voxel side in scaled units of every cloud that is described, in training too: colour counts depend on it."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,7 +85,7 @@ class DescribedFrame:
 
 
 def _voxelled(cloud: InstanceCloud, edge: NDArray[np.bool_], size: float) -> tuple[Any, Any, NDArray[np.bool_]]:
-    """The cloud on the descriptors' voxel grid, and which voxels hold a boundary point; coarser if no bucket holds it."""
+    """The cloud on the descriptors' voxel grid (coarser if no bucket holds it), and which voxels hold boundary points."""
     flags = np.repeat(edge[:, None], 3, axis=1).astype(np.float32)
     while True:
         points, colors = voxel_downsample(cloud.points, cloud.colors, size)
@@ -153,7 +153,8 @@ class Recognizer:
             classifiers: those that vote; the paper's two by default.
 
         Raises:
-            InputError: a classifier that the run does not have. An instance that cannot be named is no error: its `reason` tells.
+            InputError: a classifier that the run does not have. An instance that cannot be named is no error: its
+                `reason` tells.
         """
         voting = check_features(classifiers, "classifiers")
         missing = [name for name in voting if name not in self._apply]

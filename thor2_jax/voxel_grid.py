@@ -23,7 +23,8 @@ def voxel_downsample(
         size: side of a cube, in the points' unit.
 
     Returns:
-        points [m, 3] and colors [m, c] of the types given (uint8 means are rounded, halves up), cubes in lexicographic order.
+        points [m, 3] and colors [m, c] of the types given (uint8 means are rounded, halves up), cubes in lexicographic
+        order.
 
     Raises:
         InputError: a size that is not positive, points that are not finite, or other shapes.

@@ -24,7 +24,8 @@ app = typer.Typer(
 )
 evaluate_app = typer.Typer(no_args_is_help=True, help="Accuracy of a trained run on a labelled dataset.")
 app.add_typer(evaluate_app, name="evaluate")
-console = Console()
+# Not on a terminal there is no width to fit, and rich would cut tables at 80 columns.
+console = Console(width=None if sys.stdout.isatty() else 160)
 
 ModelOption = Annotated[Path, typer.Option("--model", help="Run folder of a trained model.")]
 
@@ -193,8 +194,8 @@ def _evaluate(frames: Any, model: Path, out: Path | None) -> None:
             )
     console.print(table)
     console.print(
-        f"{summary['scored']} instances scored, {summary['unanswered']} of them could not be described (counted as wrong); "
-        f"{summary['not_scored']} are no class of this run"
+        f"{summary['scored']} instances scored, {summary['unanswered']} of them could not be described (counted as "
+        f"wrong); {summary['not_scored']} are no class of this run"
     )
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
@@ -227,7 +228,7 @@ def demo(
     out: Annotated[Path, typer.Option(help="New folder for the report, its pictures and the trained run.")],
     seed: Annotated[int, typer.Option(help="Of weights and scenes.")] = 0,
 ) -> None:
-    """Train on built-in objects, recognize cluttered scenes of them, write a one-page report. No download; a few minutes."""
+    """Train on built-in objects, recognize cluttered scenes of them, write a report. No download; a few minutes."""
     from training.demo import run_demo
 
     _new_folder(out)

@@ -35,6 +35,9 @@ AZIMUTH_STEP, POLAR_STEP = 20.0, 15.0
 
 EPOCHS = 8
 N_SCENES = 40
+LIGHT = 0.4
+"""Scenes are up to this share brighter or darker than the training views: colour alone is then no sure guide."""
+
 N_SHOWN = 6
 NAMES = ("CE", "TOPS", "TOPS2", "THOR2")
 FEATURES = ("ce", "tops", "tops2")
@@ -46,7 +49,7 @@ class DemoFigures:
 
     Attributes:
         names: the recognizers compared.
-        accuracy: part of the instances ("all", "occlusion none", ...) -> accuracy of each recognizer, in the order of `names`.
+        accuracy: part of the instances ("all", "occlusion none", ...) -> one value a recognizer, in the order of `names`.
         instances: part of the instances -> how many.
         seconds: wall time of the whole.
         peak_gib: largest resident memory of this process, GiB.
@@ -64,7 +67,7 @@ def _scenes(objects: Mapping[str, TexturedMesh], seed: int, progress: Progress) 
     seeds = np.random.SeedSequence(seed).spawn(N_SCENES)
     scenes = []
     for number, scene_seed in enumerate(seeds, 1):
-        scenes.append(compose_scene(objects, np.random.default_rng(scene_seed)))
+        scenes.append(compose_scene(objects, np.random.default_rng(scene_seed), light=LIGHT))
         progress("compose scenes", number, N_SCENES, "")
     return scenes
 
@@ -164,14 +167,15 @@ def _write_report(out: Path, figures: DemoFigures, n_objects: int, n_views: int)
         out / "report.html",
         title="THOR2 on built-in objects",
         lead=(
-            f"{n_objects} objects, {n_views:,} synthetic views, {N_SCENES} cluttered scenes that training never saw. "
+            f"{n_objects} objects, {n_views:,} synthetic views, {N_SCENES} cluttered scenes that training never saw, in "
+            f"light up to {LIGHT:.0%} brighter or darker. "
             f"{figures.seconds:.0f} s, {figures.peak_gib:.1f} GiB."
         ),
         sections=[
             (
                 "Accuracy",
-                "Share of instances named rightly. CE reads colour alone, TOPS shape alone, TOPS2 both; THOR2 takes the more "
-                "confident of TOPS and TOPS2. Low occlusion hides 5 to 30 % of an object, high more.",
+                "Share of instances named rightly. CE reads colour alone, TOPS shape alone, TOPS2 both; THOR2 takes the "
+                "more confident of TOPS and TOPS2. Low occlusion hides 5 to 30 % of an object, high more.",
                 (header, rows),
                 [Picture("pictures/accuracy.png", "Accuracy by occlusion.")],
             ),
@@ -184,7 +188,7 @@ def _write_report(out: Path, figures: DemoFigures, n_objects: int, n_views: int)
             ),
             (
                 "From a view to its descriptor",
-                "The cloud in its box, cut into slices; the slices' persistence images (shape); the slices' colour strips.",
+                "The cloud cut into slices; the slices' persistence images (shape); the slices' colour strips.",
                 None,
                 [Picture("pictures/descriptor.png", "One view of the blue mug.")],
             ),

@@ -33,7 +33,8 @@ Section = tuple[str, str, Table | None, Sequence[Picture]]
 
 _STYLE = """
 :root { color-scheme: light; }
-body { font: 16px/1.5 system-ui, sans-serif; color: #222; background: #fff; max-width: 68rem; margin: 0 auto; padding: 1rem; }
+body { font: 16px/1.5 system-ui, sans-serif; color: #222; background: #fff; max-width: 68rem; margin: 0 auto;
+  padding: 1rem; }
 h1 { line-height: 1.2; margin-bottom: .3rem; }
 .lead { color: #555; margin-top: 0; }
 table { border-collapse: collapse; margin: 1rem 0; }

@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
+import trimesh
 
 import colornet
 import thor2_jax as thor2
@@ -14,8 +14,12 @@ FILES = [
     for name in ("004_sugar_box", "006_mustard_bottle", "025_mug", "048_hammer", "055_baseball", "061_foam_brick")
     for i in range(4)
 ]
-TOLERANCE = 1e-5
-BORDER = 1e-6
+TOLERANCE = 1e-6
+"""Largest difference of an image, a diagram or a colour matrix, and relative one of an embedding (float32 sums)."""
+
+NEAR = 1e-7
+"""A point so near to a slice or strip border, in scaled units, may be counted on either side of it."""
+
 BACKENDS = ("gudhi", "closed_form")
 
 
@@ -24,104 +28,90 @@ def load(shared: Path, name: str) -> dict[str, np.ndarray]:
         return dict(file)
 
 
-def pack_scaled(points: np.ndarray, colors: np.ndarray) -> thor2.PointClouds:
-    """Golden clouds are in scaled units already; describe_aligned takes those."""
-    return thor2.PointClouds.pack([(points, colors)])
+def aligned_cloud(golden: dict[str, np.ndarray]) -> thor2.PointClouds:
+    """The released alignment, which is in scaled units already, as describe_aligned takes it."""
+    return thor2.PointClouds.pack([(golden["aligned"], golden["colors"])])
 
 
-def touched_slices(golden: dict[str, np.ndarray]) -> tuple[set[int], int]:
-    """Slices with a point within BORDER of a slice or strip border, and how many strips those points touch."""
-    points = golden["aligned"].astype(np.float64)
-    z, x = points[:, 2] / 0.1, points[:, 0] / 0.025
-    near = (np.abs(z - np.round(z)) * 0.1 < BORDER) | (np.abs(x - np.round(x)) * 0.025 < BORDER)
-    near &= (z > 0.5) | (np.abs(x - np.round(x)) * 0.025 < BORDER)
-    near &= points[:, 2] > 0  # the octant's own faces are borders of nothing
-    near &= points[:, 0] > 0
-    strips = {(int(np.round(a)), int(np.round(b))) for a, b in zip(z[near], x[near], strict=True)}
-    return {s for s, _ in strips} | {s - 1 for s, _ in strips}, len(strips)
+def normalized(golden: dict[str, np.ndarray]) -> tuple[thor2.PointClouds, np.ndarray]:
+    config = thor2.DescriptorConfig()
+    clouds = thor2.PointClouds.pack([(golden["points"] / np.float32(config.sigma_s), golden["colors"])])
+    normal = thor2.view_normalize(clouds, config)
+    return normal, np.asarray(normal.points[0, : len(golden["points"])], np.float64)
+
+
+def test_no_point_lies_on_a_border(shared: Path) -> None:
+    """So that every strip below can be compared, with no allowance for points that fall on the other side."""
+    for name in FILES:
+        points = load(shared, name)["aligned"].astype(np.float64)
+        for axis, width in ((0, 0.025), (2, 0.1)):
+            border = np.round(points[:, axis] / width) * width
+            near = (np.abs(points[:, axis] - border) < NEAR) & (border > 0)
+            assert not near.any(), name
 
 
 @pytest.mark.parametrize("homology", BACKENDS)
 @pytest.mark.parametrize("name", FILES)
-def test_paper_images_and_embeddings(shared: Path, name: str, homology: str) -> None:
-    golden = load(shared, name)
-    aligned = pack_scaled(golden["aligned"], golden["colors"])
-    found = thor2.describe_aligned(aligned, colornet.load_default(), thor2.DescriptorConfig(homology=homology))
-    _, n_touched = touched_slices(golden)
-    assert n_touched <= 2
-    wrong_images = np.abs(np.asarray(found.images[0]) - golden["paper_images"]).max(axis=(1, 2)) > TOLERANCE
-    expected = golden["paper_embedding"].transpose(0, 2, 1)
-    wrong_strips = (
-        np.abs(np.asarray(found.embeddings[0]) - expected) > TOLERANCE * np.maximum(1, np.abs(expected))
-    ).any(axis=1)
-    assert wrong_strips.sum() <= 2 * n_touched
-    assert wrong_images.sum() <= 2 * n_touched
+def test_paper_convention(shared: Path, name: str, homology: str) -> None:
+    golden, network = load(shared, name), colornet.load_default()
+    aligned, config = aligned_cloud(golden), thor2.DescriptorConfig(homology=homology)
+    found = thor2.describe_aligned(aligned, network, config)
+    np.testing.assert_allclose(found.images[0], golden["paper_images"], atol=TOLERANCE)
+    np.testing.assert_allclose(
+        found.embeddings[0], golden["paper_embedding"].transpose(0, 2, 1), rtol=TOLERANCE, atol=TOLERANCE
+    )
+    color = thor2.strips(aligned, network, config).color[0]
+    np.testing.assert_allclose(color, golden["paper_color"], atol=TOLERANCE)
     assert int(found.overflow[0]) == 0
 
 
 @pytest.mark.parametrize("homology", BACKENDS)
 @pytest.mark.parametrize("name", FILES)
-def test_released_preset(shared: Path, name: str, homology: str) -> None:
-    golden = load(shared, name)
-    config = thor2.DescriptorConfig.released(homology=homology)
-    aligned = pack_scaled(golden["aligned"], golden["colors"])
-    found = thor2.describe_aligned(aligned, colornet.load_default(), config)
+def test_released_convention(shared: Path, name: str, homology: str) -> None:
+    golden, network = load(shared, name), colornet.load_default()
+    aligned, config = aligned_cloud(golden), thor2.DescriptorConfig.released(homology=homology)
+    found = thor2.describe_aligned(aligned, network, config)
     np.testing.assert_allclose(found.images[0], golden["released_images"], atol=TOLERANCE)
-    color = thor2.strips(aligned, colornet.load_default(), config).color[0]
+    color = thor2.strips(aligned, network, config).color[0]
     np.testing.assert_allclose(color, golden["released_color"], atol=TOLERANCE)
     diagrams = thor2.diagrams(aligned, config)
     mask = np.asarray(diagrams.mask[0])
-    rows = np.stack(
-        [np.nonzero(mask)[0], np.asarray(diagrams.births[0])[mask], np.asarray(diagrams.deaths[0])[mask]], axis=1
-    )
-    np.testing.assert_allclose(rows, golden["released_diagrams"], atol=TOLERANCE)
+    rows = [np.nonzero(mask)[0], np.asarray(diagrams.births[0])[mask], np.asarray(diagrams.deaths[0])[mask]]
+    np.testing.assert_allclose(np.stack(rows, axis=1), golden["released_diagrams"], atol=TOLERANCE)
+    assert int(found.overflow[0]) == 0
 
 
-@pytest.mark.parametrize("name", FILES)
-def test_colour_matrices(shared: Path, name: str) -> None:
-    golden = load(shared, name)
-    aligned = pack_scaled(golden["aligned"], golden["colors"])
-    color = thor2.strips(aligned, colornet.load_default(), thor2.DescriptorConfig()).color[0]
-    _, n_touched = touched_slices(golden)
-    wrong = (np.abs(np.asarray(color) - golden["paper_color"]) > TOLERANCE * np.maximum(1, golden["paper_color"])).any(
-        -1
-    )
-    assert wrong.sum() <= 2 * n_touched
-
-
-def normalized_volumes(shared: Path) -> np.ndarray:
-    config, ratios = thor2.DescriptorConfig(), []
+def test_boxes_are_no_larger_than_the_released_ones(shared: Path) -> None:
+    ratios = []
     for name in FILES:
         golden = load(shared, name)
-        normal = thor2.view_normalize(
-            thor2.PointClouds.pack([(golden["points"] / config.sigma_s, golden["colors"])]), config
-        )
-        extents = np.asarray(normal.points[0])[np.asarray(normal.mask[0])].max(axis=0)
-        ratios.append(np.prod(extents.astype(np.float64)) / np.prod(golden["box_extent"].astype(np.float64)))
-    return np.array(ratios)
+        ratios.append(np.prod(normalized(golden)[1].max(axis=0)) / np.prod(golden["box_extent"]))
+    assert max(ratios) <= 1.05
+    assert sum(ratio <= 1.0 for ratio in ratios) >= 20
 
 
-def test_box_volume(shared: Path) -> None:
-    ratios = normalized_volumes(shared)
-    assert ratios.max() <= 1.05
-    assert (ratios <= 1.0).sum() >= 20
+def test_boxes_are_about_as_small_as_those_of_an_exhaustive_search(shared: Path) -> None:
+    """trimesh tries every face of the convex hull as a side of the box."""
+    ratios = []
+    for name in FILES:
+        golden = load(shared, name)
+        smallest = np.prod(trimesh.bounds.oriented_bounds(golden["points"].astype(np.float64))[1])
+        ratios.append(np.prod(normalized(golden)[1].max(axis=0)) / smallest)
+    assert np.median(ratios) <= 1.01
+    assert max(ratios) <= 1.05
 
 
 @pytest.mark.parametrize("name", FILES)
 def test_normalization_is_a_rigid_motion_with_the_long_axis_first(shared: Path, name: str) -> None:
-    golden, config = load(shared, name), thor2.DescriptorConfig()
-    clouds = thor2.PointClouds.pack([(golden["points"] / config.sigma_s, golden["colors"])])
-    normal = thor2.view_normalize(clouds, config)
-    n = len(golden["points"])
-    before, after = golden["points"].astype(np.float64), np.asarray(normal.points[0, :n], np.float64)
-    rng = np.random.default_rng(0)
-    i, j = rng.integers(0, n, (2, 500))
-    distances = np.linalg.norm(before[i] - before[j], axis=1)
-    np.testing.assert_allclose(np.linalg.norm(after[i] - after[j], axis=1), distances, atol=1e-5)
+    golden = load(shared, name)
+    normal, after = normalized(golden)
+    before, n = golden["points"].astype(np.float64), len(golden["points"])
     motion, *_ = np.linalg.lstsq(before - before.mean(0), after - after.mean(0), rcond=None)
+    np.testing.assert_allclose(motion @ motion.T, np.eye(3), atol=1e-5)
     assert np.linalg.det(motion) == pytest.approx(1, abs=1e-4)  # a rotation, not a reflection
+    np.testing.assert_allclose((before - before.mean(0)) @ motion, after - after.mean(0), atol=1e-5)
     extents = after.max(axis=0)
     assert (after.min(axis=0) == 0).all()
     assert extents[0] >= extents[1] >= extents[2]
     assert float(normal.camera[0, 2]) < extents[2] / 2
-    assert jnp.asarray(normal.mask).sum() == n
+    assert int(normal.mask.sum()) == n

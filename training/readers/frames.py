@@ -23,7 +23,7 @@ class FrameFolder:
         Raises:
             InputError: there are none.
         """
-        path = Path(path)
+        path = Path(path).absolute()  # so that every frame's folder has a name, that of "." too
         if not path.is_dir():
             raise InputError(f"dataset: {path} is no folder")
         self._folders = sorted(f.parent for f in [*path.glob("labels.json"), *path.glob("*/labels.json")])
@@ -37,26 +37,35 @@ class FrameFolder:
         """Read the frames.
 
         Raises:
-            InputError: a damaged file, or images that do not fit together; names the file.
-            OSError: a file is missing.
+            InputError: a file that is missing or damaged, or images that do not fit together; names the file.
+            OSError: a file cannot be opened.
         """
         for folder in self._folders:
-            frame = read_frame(
-                color=folder / "color.png",
-                depth=folder / "depth.png",
-                labels=folder / "mask.png",
-                intrinsics=folder / "intrinsics.json",
-            )
-            yield LabelledFrame(folder.name, frame, _truth(folder / "labels.json"), {})
+            try:
+                frame = read_frame(
+                    color=folder / "color.png",
+                    depth=folder / "depth.png",
+                    labels=folder / "mask.png",
+                    intrinsics=folder / "intrinsics.json",
+                )
+                truth = _truth(folder / "labels.json")
+            except FileNotFoundError as error:
+                raise InputError(f"{folder.name}: {error.filename} is missing") from None
+            except InputError as error:
+                raise InputError(f"{folder.name}: {error}") from None
+            yield LabelledFrame(folder.name, frame, truth, {})
 
 
 def _truth(path: Path) -> dict[int, str]:
     try:
-        labels = json.loads(path.read_bytes())["labels"]
-        truth = {int(label): name for label, name in labels.items()}
+        entries = [(int(label), name) for label, name in json.loads(path.read_bytes())["labels"].items()]
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         raise InputError(f'{path} does not hold {{"labels": {{"<number>": "<name>", ...}}}}') from None
-    bad = [name for name in truth.values() if not isinstance(name, str)]
-    if bad:
-        raise InputError(f"{path}: {bad[0]!r} is no object name")
+    truth: dict[int, str] = {}
+    for label, name in entries:
+        if not isinstance(name, str):
+            raise InputError(f"{path}: {name!r} is no object name")
+        if label in truth:
+            raise InputError(f"{path}: {truth[label]!r} and {name!r} have the label {label}")
+        truth[label] = name
     return truth

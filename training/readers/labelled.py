@@ -15,7 +15,8 @@ class LabelledFrame:
     Attributes:
         identifier: names the frame within its dataset.
         frame: the images.
-        truth: label number -> object name, of the instances that are scored. An instance may have no pixel in the label image.
+        truth: label number -> object name, of the instances that are scored. An instance may have no pixel in the label
+            image.
         attributes: what accuracy is broken down by, for instance {"occlusion": "high", "light": "1"}.
     """
 

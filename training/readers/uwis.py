@@ -88,8 +88,8 @@ class UWISOccluded:
         """Read the frames.
 
         Raises:
-            InputError: a damaged file, or images that do not fit together; names the file.
-            OSError: a file is missing.
+            InputError: a file that is missing or damaged, or images that do not fit together; names the file.
+            OSError: a file cannot be opened.
         """
         for video, color in self._frames:
             stem = color.name.removesuffix("_rgb.png")
@@ -100,19 +100,25 @@ class UWISOccluded:
                     read_labels(color.with_name(f"{stem}_labels.png")),
                     INTRINSICS,
                 )
+                truth = _truth(color.with_name(f"{stem}_poses.yaml"))
+            except FileNotFoundError as error:
+                raise InputError(f"{video.name}/{stem}: {error.filename} is missing") from None
             except InputError as error:
                 raise InputError(f"{video.name}/{stem}: {error}") from None
-            truth = _truth(color.with_name(f"{stem}_poses.yaml"))
             yield LabelledFrame(f"{video.name}/{stem}", frame, truth, video_attributes(int(video.name)))
 
 
 def _truth(path: Path) -> dict[int, str]:
     try:
         objects = yaml.safe_load(path.read_bytes())
-        truth = {entry["label"]: name for name, entry in objects.items() if name not in NOT_SCORED}
+        entries = [(entry["label"], name) for name, entry in objects.items() if name not in NOT_SCORED]
     except (yaml.YAMLError, KeyError, TypeError, AttributeError, ValueError, RecursionError):
         raise InputError(f"{path} does not hold <name>: {{label: <number>, ...}}") from None
-    bad = [(label, name) for label, name in truth.items() if type(label) is not int or type(name) is not str]
-    if bad:
-        raise InputError(f"{path}: {bad[0][1]!r} has the label {bad[0][0]!r}; expected a whole number")
+    truth: dict[int, str] = {}
+    for label, name in entries:
+        if type(label) is not int or type(name) is not str:
+            raise InputError(f"{path}: {name!r} has the label {label!r}; expected a name and a whole number")
+        if label in truth:
+            raise InputError(f"{path}: {truth[label]!r} and {name!r} have the label {label}")
+        truth[label] = name
     return truth

@@ -1,0 +1,20 @@
+"""Buckets: the smallest that holds, at every border."""
+
+from collections.abc import Callable
+
+import pytest
+
+from thor2_jax import InputError
+from thor2_jax.capacity import BATCH_BUCKETS, POINT_BUCKETS, batch_bucket, point_bucket
+
+
+@pytest.mark.parametrize(("pick", "buckets"), [(point_bucket, POINT_BUCKETS), (batch_bucket, BATCH_BUCKETS)])
+def test_smallest_bucket_that_holds(pick: Callable[[int], int], buckets: tuple[int, ...]) -> None:
+    for n in range(buckets[-1] + 1):
+        assert pick(n) == min(size for size in buckets if size >= n)
+
+
+@pytest.mark.parametrize(("pick", "n", "words"), [(point_bucket, 8193, "points"), (batch_bucket, 257, "clouds")])
+def test_past_the_largest_bucket(pick: Callable[[int], int], n: int, words: str) -> None:
+    with pytest.raises(InputError, match=rf"{n} {words}.*largest bucket"):
+        pick(n)

@@ -1,0 +1,57 @@
+"""The constants of the descriptor: their values, and what is refused."""
+
+import dataclasses
+import math
+
+import pytest
+
+from thor2_jax import DescriptorConfig, InputError
+
+
+def test_the_papers_constants() -> None:
+    config = DescriptorConfig()
+    assert (config.sigma_s, config.sigma_1, config.sigma_2) == (2.5, 0.1, 0.025)
+    assert (config.n_slices, config.n_strips, config.image_size, config.image_variance) == (7, 31, 32, 0.00025)
+    assert config.alpha == math.pi / 4
+    assert (config.homology, config.convention) == ("gudhi", "paper")
+    assert config.window == pytest.approx(0.775)
+
+
+def test_released_changes_the_convention_alone() -> None:
+    assert DescriptorConfig.released() == dataclasses.replace(DescriptorConfig(), convention="released")
+    assert DescriptorConfig.released(homology="closed_form", n_strips=29).n_strips == 29
+
+
+def test_frozen_and_hashable() -> None:
+    config = DescriptorConfig()
+    assert hash(config) == hash(DescriptorConfig()) and config == DescriptorConfig()
+    assert config != DescriptorConfig(homology="closed_form")
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        config.sigma_s = 1.0  # type: ignore[misc]
+
+
+BAD = [
+    *[(name, "ripser") for name in ("homology", "convention")],
+    *[
+        (name, value)
+        for name in ("sigma_s", "sigma_1", "sigma_2", "image_variance")
+        for value in (0, -1.0, math.nan, math.inf, "2.5", None, True)
+    ],
+    *[(name, value) for name in ("n_slices", "n_strips", "image_size") for value in (0, -1, 7.0, "7", True)],
+    *[("alpha", value) for value in (math.nan, -math.inf, "45", None)],
+]
+
+
+@pytest.mark.parametrize(("name", "value"), BAD)
+def test_bad_values_are_refused_by_name(name: str, value: object) -> None:
+    with pytest.raises(InputError) as caught:
+        DescriptorConfig(**{name: value})
+    message = str(caught.value)
+    assert f"DescriptorConfig.{name}" in message and repr(value) in message and "\n" not in message
+
+
+def test_the_released_convention_holds_for_its_own_widths_only() -> None:
+    with pytest.raises(InputError, match=r"sigma_1, sigma_2 are 0\.2, 0\.025"):
+        DescriptorConfig.released(sigma_1=0.2)
+    with pytest.raises(InputError, match=r"sigma_1, sigma_2 are 0\.1, 0\.05"):
+        DescriptorConfig.released(sigma_2=0.05)

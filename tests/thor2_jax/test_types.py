@@ -1,0 +1,122 @@
+"""Packing of clouds, and the layout of the descriptors."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import thor2_jax as thor2
+
+RNG = np.random.default_rng(0)
+
+
+def cloud(n: int) -> tuple[np.ndarray, np.ndarray]:
+    return RNG.random((n, 3)).astype(np.float32), RNG.integers(0, 256, (n, 3), dtype=np.uint8)
+
+
+def test_pack_pads_every_size() -> None:
+    sizes = (0, 1, 2, 7, 513)
+    parts = [cloud(n) for n in sizes]
+    packed = thor2.PointClouds.pack(parts)
+    assert packed.points.shape == packed.colors.shape == (5, 1024, 3)
+    assert packed.points.dtype == packed.colors.dtype == jnp.float32
+    assert packed.mask.dtype == packed.boundary.dtype == jnp.bool_
+    for i, (n, (xyz, rgb)) in enumerate(zip(sizes, parts, strict=True)):
+        np.testing.assert_array_equal(packed.mask[i], np.arange(1024) < n)
+        np.testing.assert_array_equal(packed.points[i, :n], xyz)
+        np.testing.assert_array_equal(packed.points[i, n:], 0)
+        np.testing.assert_allclose(packed.colors[i, :n], rgb / 255.0, atol=1e-7)
+    np.testing.assert_array_equal(packed.camera, np.zeros((5, 3)))
+    assert not np.asarray(packed.boundary).any()
+
+
+def test_pack_takes_float_colours_capacity_camera_and_boundary() -> None:
+    xyz, rgb = RNG.random((5, 3)), RNG.random((5, 3))
+    edge = np.array([True, False, True, False, False])
+    packed = thor2.PointClouds.pack([(xyz, rgb), (xyz, rgb)], capacity=9, camera=[1, 2, 3], boundary=[None, edge])
+    assert packed.points.shape == (2, 9, 3)
+    np.testing.assert_array_equal(packed.colors[0, :5], rgb.astype(np.float32))
+    np.testing.assert_array_equal(packed.camera, [[1, 2, 3]] * 2)
+    np.testing.assert_array_equal(packed.boundary, [[False] * 9, [*edge, *[False] * 4]])
+    each = thor2.PointClouds.pack([(xyz, rgb), (xyz, rgb)], camera=[[1, 2, 3], [4, 5, 6]])
+    np.testing.assert_array_equal(each.camera, [[1, 2, 3], [4, 5, 6]])
+
+
+def test_pack_leaves_its_arguments_alone() -> None:
+    xyz, rgb = cloud(4)
+    before = xyz.copy(), rgb.copy()
+    packed = thor2.PointClouds.pack([(xyz, rgb)])
+    xyz[:] = 9
+    np.testing.assert_array_equal(packed.points[0, :4], before[0])
+    np.testing.assert_array_equal(rgb, before[1])
+
+
+POINTS, COLORS = np.zeros((3, 3)), np.zeros((3, 3))
+
+
+def changed(array: np.ndarray, value: float) -> np.ndarray:
+    array = array.copy()
+    array[1, 2] = value
+    return array
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"clouds": []}, ["clouds is empty"]),
+        ({"clouds": [(POINTS, COLORS), (np.zeros((3, 2)), COLORS)]}, ["clouds[1]", "xyz", "[3, 2]"]),
+        ({"clouds": [(np.zeros(3), COLORS)]}, ["clouds[0]", "xyz", "[3]"]),
+        ({"clouds": [(np.zeros((3, 3), int), COLORS)]}, ["clouds[0]", "xyz", "int64"]),
+        ({"clouds": [(POINTS, np.zeros((2, 3)))]}, ["clouds[0]", "rgb", "[2, 3]"]),
+        ({"clouds": [(POINTS, np.zeros((3, 3), int))]}, ["clouds[0]", "rgb", "int64"]),
+        ({"clouds": [(changed(POINTS, np.nan), COLORS)]}, ["clouds[0]", "xyz[1]", "nan"]),
+        ({"clouds": [(changed(POINTS, -np.inf), COLORS)]}, ["clouds[0]", "xyz[1]", "-inf"]),
+        ({"clouds": [(changed(POINTS, 1e39), COLORS)]}, ["clouds[0]", "xyz[1]", "1e+39"]),
+        ({"clouds": [(POINTS, changed(COLORS, 1.5))]}, ["clouds[0]", "rgb[1]", "1.5"]),
+        ({"clouds": [(POINTS, changed(COLORS, -0.5))]}, ["clouds[0]", "rgb[1]", "-0.5"]),
+        ({"clouds": [(POINTS, changed(COLORS, np.nan))]}, ["clouds[0]", "rgb[1]", "nan"]),
+        ({"clouds": [POINTS]}, ["clouds[0]", "pair"]),
+        ({"clouds": [(POINTS, COLORS, COLORS)]}, ["clouds[0]", "pair"]),
+        ({"capacity": 2}, ["capacity is 2", "clouds[0]", "3 points"]),
+        ({"capacity": 0}, ["capacity is 0"]),
+        ({"capacity": -4}, ["capacity is -4"]),
+        ({"capacity": 8.0}, ["capacity is 8.0"]),
+        ({"clouds": [(np.zeros((8193, 3)), np.zeros((8193, 3)))]}, ["clouds[0]", "8193", "8192"]),
+        ({"camera": [0, 0]}, ["camera", "[0.0, 0.0]"]),
+        ({"camera": [0, 0, np.inf]}, ["camera", "inf"]),
+        ({"camera": np.zeros((2, 3))}, ["camera", "[1, 3]"]),
+        ({"camera": "here"}, ["camera", "here"]),
+        ({"boundary": []}, ["boundary", "0 entries", "1 clouds"]),
+        ({"boundary": [np.zeros(2, bool)]}, ["boundary[0]", "[2]", "[3]"]),
+        ({"boundary": [np.zeros(3)]}, ["boundary[0]", "float64"]),
+    ],
+)
+def test_pack_refuses(arguments: dict, words: list[str]) -> None:
+    with pytest.raises(thor2.InputError) as caught:
+        thor2.PointClouds.pack(**{"clouds": [(POINTS, COLORS)], **arguments})
+    message = str(caught.value)
+    assert "\n" not in message
+    assert [word for word in words if word not in message] == [], message
+
+
+def test_records_are_frozen_pytrees() -> None:
+    packed = thor2.PointClouds.pack([cloud(2)])
+    with pytest.raises(AttributeError):
+        packed.points = packed.colors  # type: ignore[misc]
+    leaves, tree = jax.tree.flatten(packed)
+    assert len(leaves) == 5
+    assert isinstance(jax.tree.unflatten(tree, leaves), thor2.PointClouds)
+
+
+def test_layout_of_the_flat_descriptors() -> None:
+    """TOPS2: a slice a block, image [32, 32] first, then embedding [22, 31], each row by row."""
+    images = RNG.random((2, 7, 32, 32)).astype(np.float32)
+    embeddings = RNG.random((2, 7, 22, 31)).astype(np.float32)
+    found = thor2.Descriptors(jnp.asarray(images), jnp.asarray(embeddings), jnp.zeros(2, jnp.int32))
+    assert found.tops.shape == (2, 7168) and found.color.shape == (2, 4774) and found.tops2.shape == (2, 11942)
+    for b, s, p, q in [(0, 0, 0, 0), (1, 0, 31, 31), (0, 3, 4, 17), (1, 6, 31, 0)]:
+        assert found.tops[b, s * 1024 + p * 32 + q] == images[b, s, p, q]
+        assert found.tops2[b, s * 1706 + p * 32 + q] == images[b, s, p, q]
+    for b, s, r, j in [(0, 0, 0, 0), (1, 0, 21, 30), (0, 3, 4, 17), (1, 6, 21, 0)]:
+        assert found.color[b, s * 682 + r * 31 + j] == embeddings[b, s, r, j]
+        assert found.tops2[b, s * 1706 + 1024 + r * 31 + j] == embeddings[b, s, r, j]

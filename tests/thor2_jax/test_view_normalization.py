@@ -1,0 +1,211 @@
+"""View normalization: a rigid motion that depends on nothing but the object and the camera."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+import thor2_jax as thor2
+from thor2_jax.capacity import POINT_BUCKETS
+
+CONFIG = thor2.DescriptorConfig()
+COLOR = np.float32(0.5)
+
+
+def object_cloud(seed: int, n: int = 400) -> np.ndarray:
+    """A lopsided thing about 0.2 m long, half a metre before the camera: no symmetry leaves its frame open."""
+    rng = np.random.default_rng(seed)
+    body = rng.random((n, 3)) * [0.2, 0.11, 0.05]
+    keep = (body[:, 0] / 0.2 + body[:, 1] / 0.11 < rng.uniform(0.9, 1.3)) | (body[:, 2] < 0.02)
+    return body[keep] @ Rotation.random(random_state=seed).as_matrix().T + [0.02, -0.05, 0.5]
+
+
+def pack(*clouds: np.ndarray, **options: object) -> thor2.PointClouds:
+    return thor2.PointClouds.pack([(points, np.full(points.shape, COLOR)) for points in clouds], **options)
+
+
+def normalized(points: np.ndarray, **options: object) -> np.ndarray:
+    return np.asarray(thor2.view_normalize(pack(points, **options), CONFIG).points[0, : len(points)], np.float64)
+
+
+def rigid_motion(before: np.ndarray, after: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """Rotation and shift with after = before @ rotation + shift, and the largest error (Kabsch)."""
+    u, _, v = np.linalg.svd((before - before.mean(0)).T @ (after - after.mean(0)))
+    rotation = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ v))]) @ v
+    shift = after.mean(0) - before.mean(0) @ rotation
+    return rotation, shift, float(np.abs(before @ rotation + shift - after).max())
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_rotation_and_a_shift_of_cloud_and_camera(seed: int) -> None:
+    points, camera = object_cloud(seed), np.random.default_rng(seed).normal(size=3)
+    normal = thor2.view_normalize(pack(points, camera=camera), CONFIG)
+    after = np.asarray(normal.points[0, : len(points)], np.float64)
+    rotation, shift, error = rigid_motion(points * 2.5, after)
+    assert error < 2e-6
+    np.testing.assert_allclose(normal.camera[0], camera * 2.5 @ rotation + shift, atol=1e-5)
+    sides = after.max(axis=0)
+    np.testing.assert_array_equal(after.min(axis=0), 0)
+    assert sides[0] >= sides[1] >= sides[2]
+    assert np.prod(sides) <= 1.05 * np.prod(trimesh.bounds.oriented_bounds(points * 2.5)[1])
+    assert float(normal.camera[0, 2]) <= sides[2] / 2  # camera side
+    assert after[:, 0].mean() <= sides[0] / 2  # sign rule
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_rigid_motion_of_cloud_and_camera_changes_nothing(seed: int) -> None:
+    points, camera = object_cloud(seed), np.array([0.3, -0.1, 0.05])
+    motion, shift = Rotation.random(random_state=100 + seed).as_matrix(), np.array([-0.3, 0.2, 0.6])
+    moved = normalized(points @ motion.T + shift, camera=camera @ motion.T + shift)
+    np.testing.assert_allclose(moved, normalized(points, camera=camera), atol=5e-6)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_order_duplicates_and_company_change_nothing(seed: int) -> None:
+    points = object_cloud(seed)
+    expected = normalized(points)
+    order = np.random.default_rng(seed).permutation(len(points))
+    np.testing.assert_allclose(normalized(points[order]), expected[order], atol=5e-6)
+    doubled = np.concatenate([points, points])
+    np.testing.assert_allclose(normalized(doubled)[: len(points)], expected, atol=5e-6)
+    others = [object_cloud(50), np.zeros((0, 3)), points, object_cloud(51)]
+    batch = thor2.view_normalize(pack(*others), CONFIG)
+    np.testing.assert_allclose(batch.points[2, : len(points)], expected, atol=5e-6)
+
+
+def test_padding_changes_nothing() -> None:
+    points = object_cloud(0)
+    expected = normalized(points)
+    for capacity in (len(points), 777, POINT_BUCKETS[1]):
+        np.testing.assert_allclose(normalized(points, capacity=capacity), expected, atol=5e-6)
+
+
+def test_padding_stays_zero_and_an_empty_cloud_stays_empty() -> None:
+    points = object_cloud(0)
+    for step in (thor2.view_normalize, thor2.align):
+        found = step(pack(points, np.zeros((0, 3)), capacity=1024), CONFIG)
+        np.testing.assert_array_equal(found.points[0, len(points) :], 0)
+        np.testing.assert_array_equal(found.points[1], 0)
+        assert np.isfinite(np.asarray(found.camera)).all()
+        np.testing.assert_array_equal(np.asarray(found.mask).sum(axis=1), [len(points), 0])
+
+
+DEGENERATE = {
+    "one point": np.array([[0.1, 0.2, 0.9]]),
+    "two points": np.array([[0.1, 0.2, 0.9], [0.2, 0.2, 0.8]]),
+    "all equal": np.full((101, 3), 0.7),
+    "line": np.linspace(0, 0.2, 101)[:, None] * [1.0, 2.0, -1.0] + 0.5,
+    "plane": np.random.default_rng(0).random((101, 2)) @ [[0.1, 0, 0.1], [0, 0.1, 0]] + 0.5,
+    "cube": np.stack(np.meshgrid(*[[-0.1, 0.0, 0.1]] * 3), axis=-1).reshape(-1, 3),
+    "ball": np.asarray(trimesh.creation.icosphere(2, radius=0.1).vertices) + [0, 0, 0.6],
+}
+
+
+@pytest.mark.parametrize("name", DEGENERATE)
+def test_degenerate_clouds_move_rigidly_too(name: str) -> None:
+    points = DEGENERATE[name]
+    after = normalized(points)
+    assert np.isfinite(after).all()
+    between = np.linalg.norm(points[:, None] - points, axis=-1) * 2.5
+    np.testing.assert_allclose(np.linalg.norm(after[:, None] - after, axis=-1), between, atol=3e-6)
+    assert (np.diff(after.max(axis=0)) <= 2e-6).all()
+
+
+def test_the_camera_is_brought_to_the_near_side() -> None:
+    """The same cloud from two opposite sides: a half turn about x apart."""
+    points = object_cloud(3)
+    normal = thor2.view_normalize(pack(points), CONFIG)
+    after = np.asarray(normal.points[0, : len(points)], np.float64)
+    rotation, shift, _ = rigid_motion(points * 2.5, after)
+    sides = after.max(axis=0)
+    opposite = np.array([sides[0] / 2, sides[1] / 2, 3.0])  # far out along +z of the normalized cloud
+    other = normalized(points, camera=(opposite - shift) @ rotation.T / 2.5)
+    np.testing.assert_allclose(other, np.stack([after[:, 0], sides[1] - after[:, 1], sides[2] - after[:, 2]], 1), atol=1e-5)
+
+
+@pytest.mark.parametrize(("at_start", "at_end"), [(3, 2), (1, 0), (2, 2), (0, 0), (2, 3), (0, 5)])
+def test_the_occluded_end_does_not_come_first(at_start: int, at_end: int) -> None:
+    """A half turn about z exactly when the first two bins of 0.01 hold more boundary points than the last two."""
+    points = object_cloud(5, 3000)
+    plain = normalized(points)
+    bins = np.floor(plain[:, 0] / 0.01)
+    first, last = np.flatnonzero(bins <= 1), np.flatnonzero(bins >= bins.max() - 1)
+    middle = np.flatnonzero((bins > 1) & (bins < bins.max() - 1))
+    assert len(first) > 5 and len(last) > 5
+    boundary = np.zeros(len(points), bool)
+    boundary[np.concatenate([first[:at_start], last[:at_end], middle[:40]])] = True
+    found = normalized(points, boundary=[boundary])
+    sides = plain.max(axis=0)
+    turned = np.stack([sides[0] - plain[:, 0], sides[1] - plain[:, 1], plain[:, 2]], axis=1)
+    np.testing.assert_allclose(found, turned if at_start > at_end else plain, atol=1e-5)
+
+
+def test_colours_mask_and_boundary_pass_through() -> None:
+    points = object_cloud(0)
+    colors = np.random.default_rng(0).random(points.shape).astype(np.float32)
+    edge = np.arange(len(points)) % 7 == 0
+    clouds = thor2.PointClouds.pack([(points, colors)], boundary=[edge])
+    found = thor2.align(clouds, CONFIG)
+    for name in ("colors", "mask", "boundary"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(clouds, name))
+
+
+@pytest.mark.parametrize("alpha", [np.pi / 4, 0.0, -0.3])
+def test_turn_is_the_rotation_matrix_about_y_by_minus_alpha(alpha: float) -> None:
+    config = dataclasses.replace(CONFIG, alpha=float(alpha))
+    normal = thor2.view_normalize(pack(object_cloud(1), object_cloud(2)), config)
+    aligned = thor2.turn(normal, config)
+    for i in range(2):
+        mask = np.asarray(normal.mask[i])
+        matrix = Rotation.from_euler("y", -alpha).as_matrix()
+        expected = np.asarray(normal.points[i], np.float64)[mask] @ matrix.T
+        low = expected.min(axis=0)
+        np.testing.assert_allclose(np.asarray(aligned.points[i])[mask], expected - low, atol=1e-6)
+        np.testing.assert_allclose(aligned.camera[i], np.asarray(normal.camera[i]) @ matrix.T - low, atol=1e-5)
+    np.testing.assert_array_equal(thor2.align(pack(object_cloud(1), object_cloud(2)), config).points, aligned.points)
+
+
+@pytest.mark.parametrize("axes", ["", "x", "y", "xy", "xyz"])
+def test_mirror_keeps_the_box(axes: str) -> None:
+    normal = thor2.view_normalize(pack(object_cloud(1), np.zeros((0, 3))), CONFIG)
+    found = thor2.mirror(normal, axes)
+    mask = np.asarray(normal.mask[0])
+    before, after = np.asarray(normal.points[0])[mask], np.asarray(found.points[0])[mask]
+    for k, letter in enumerate("xyz"):
+        expected = before[:, k].max() - before[:, k] if letter in axes else before[:, k]
+        np.testing.assert_array_equal(after[:, k], expected)
+    np.testing.assert_array_equal(found.points[0][~mask], 0)
+    np.testing.assert_array_equal(found.points[1], 0)
+    np.testing.assert_array_equal(thor2.mirror(found, axes).mask, normal.mask)
+
+
+def test_mirror_refuses_another_axis() -> None:
+    with pytest.raises(thor2.InputError, match="axes is 'xw'"):
+        thor2.mirror(thor2.view_normalize(pack(object_cloud(1)), CONFIG), "xw")
+
+
+def test_gradients_are_those_of_the_fixed_frame() -> None:
+    """No gradient goes through the frame: a point's is the rotation, and it is finite for a cube as well."""
+    for points in (object_cloud(4, 60), DEGENERATE["cube"]):
+        clouds = pack(points, capacity=128)
+
+        def height(x: jax.Array, clouds: thor2.PointClouds = clouds) -> jax.Array:
+            return thor2.view_normalize(dataclasses.replace(clouds, points=x), CONFIG).points[0, :, 2].sum()
+
+        gradient = np.asarray(jax.grad(height)(clouds.points))
+        assert np.isfinite(gradient).all() and np.abs(gradient).max() > 0
+        np.testing.assert_allclose(gradient[0, : len(points)].sum(axis=0), 0, atol=1e-3)  # a shift changes nothing
+
+
+def test_large_batches_of_small_rotations_are_exact() -> None:
+    """jax 0.10.2 got this kernel wrong past 32,768 rows on CPUs (jax issue 39103), which is why it is excluded."""
+    matrix = jnp.asarray(Rotation.from_euler("z", 0.0).as_matrix(), jnp.float32)
+    rows = jnp.zeros((40_000, 3)).at[:, 0].set(jnp.arange(40_000.0))
+    kernel = jax.vmap(lambda row: jnp.sum((matrix @ row) ** 2))
+    expected = np.arange(40_000, dtype=np.float64) ** 2
+    np.testing.assert_allclose(jax.jit(kernel)(rows), expected, rtol=1e-6)
+    np.testing.assert_allclose(jax.jit(kernel)(rows[:32_769])[-1], 32_768.0**2, rtol=0)
