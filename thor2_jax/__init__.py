@@ -1,4 +1,4 @@
-"""THOR2 (Samani and Banerjee, 2024) in JAX: coloured point clouds to TOPS and TOPS2, and RGB-D frames to object names."""
+"""THOR2 (Samani and Banerjee, 2024) in JAX: coloured point clouds to TOPS and TOPS2, RGB-D frames to object names."""
 
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
 from thor2_jax.descriptor import describe, describe_aligned, describe_strips, diagrams, strips

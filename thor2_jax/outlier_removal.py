@@ -1,8 +1,8 @@
 """Outlier removal on the cloud of one instance (paper, section "Recognition"): what a depth camera adds to an object.
 
-A mask reaches past its object's edge, where pixels "fly" between it and what lies behind. Three rules, each for one kind:
-points with few others around them, points farther from their neighbours than is usual in this cloud, and small pieces apart
-from the rest.
+A mask reaches past its object's edge, where pixels "fly" between it and what lies behind. Three rules, each for one
+kind: points with few others around them, points farther from their neighbours than is usual in this cloud, and small
+pieces apart from the rest.
 """
 
 from typing import Any
@@ -22,7 +22,7 @@ NEIGHBORS = 30
 """On a voxel grid of 3 mm. The count goes with 1 / side squared: points lie on a surface."""
 
 DEVIATIONS = 1.75
-"""A point is far when its mean distance to `NEIGHBORS` others exceeds the cloud's mean by this many standard deviations."""
+"""A point is far when its mean distance to `NEIGHBORS` others is this many standard deviations above the cloud's."""
 
 GAP = 0.02
 """Metres between pieces: no two of their points are nearer."""
@@ -46,8 +46,8 @@ def remove_outliers(points: NDArray[Any]) -> tuple[NDArray[np.intp], bool]:
         points: [n, 3] metres, on a voxel grid of 3 mm.
 
     Returns:
-        Indices of the points to keep, in increasing order, never none of n > 0; and whether the rule of `RADIUS` was left out
-        because it would have dropped more than half of the object, as of one seen through gaps.
+        Indices of the points to keep, in increasing order, never none of n > 0; and whether the rule of `RADIUS` was
+        left out because it would have dropped more than half of the object, as of one seen through gaps.
     """
     kept = np.arange(len(points))
     if len(points) == 0:

@@ -1,4 +1,4 @@
-"""From an RGB-D frame to object names (paper, section "Recognition"): instance clouds, descriptors, two classifiers, one answer.
+"""From an RGB-D frame to object names (paper, section "Recognition"): clouds, descriptors, two classifiers, one answer.
 
 >>> recognizer = Recognizer.load("run")                                             # doctest: +SKIP
 >>> frame = read_frame(color="c.png", depth="d.png", labels="l.png", intrinsics="k.json")  # doctest: +SKIP
@@ -85,7 +85,7 @@ class DescribedFrame:
 
 
 def _voxelled(cloud: InstanceCloud, edge: NDArray[np.bool_], size: float) -> tuple[Any, Any, NDArray[np.bool_]]:
-    """The cloud on the descriptors' voxel grid (coarser if no bucket holds it), and which voxels hold boundary points."""
+    """The cloud on the descriptors' grid (coarser if no bucket holds it), and which voxels hold boundary points."""
     flags = np.repeat(edge[:, None], 3, axis=1).astype(np.float32)
     while True:
         points, colors = voxel_downsample(cloud.points, cloud.colors, size)

@@ -49,7 +49,7 @@ class DemoFigures:
 
     Attributes:
         names: the recognizers compared.
-        accuracy: part of the instances ("all", "occlusion none", ...) -> one value a recognizer, in the order of `names`.
+        accuracy: part of the instances ("all", "occlusion none", ...) -> one value a recognizer, in order of `names`.
         instances: part of the instances -> how many.
         seconds: wall time of the whole.
         peak_gib: largest resident memory of this process, GiB.
@@ -167,15 +167,15 @@ def _write_report(out: Path, figures: DemoFigures, n_objects: int, n_views: int)
         out / "report.html",
         title="THOR2 on built-in objects",
         lead=(
-            f"{n_objects} objects, {n_views:,} synthetic views, {N_SCENES} cluttered scenes that training never saw, in "
-            f"light up to {LIGHT:.0%} brighter or darker. "
+            f"{n_objects} objects, {n_views:,} synthetic views, {N_SCENES} cluttered scenes that training never saw, "
+            f"in light up to {LIGHT:.0%} brighter or darker. "
             f"{figures.seconds:.0f} s, {figures.peak_gib:.1f} GiB."
         ),
         sections=[
             (
                 "Accuracy",
-                "Share of instances named rightly. CE reads colour alone, TOPS shape alone, TOPS2 both; THOR2 takes the "
-                "more confident of TOPS and TOPS2. Low occlusion hides 5 to 30 % of an object, high more.",
+                "Share of instances named rightly. CE reads colour alone, TOPS shape alone, TOPS2 both; THOR2 takes "
+                "the more confident of TOPS and TOPS2. Low occlusion hides 5 to 30 % of an object, high more.",
                 (header, rows),
                 [Picture("pictures/accuracy.png", "Accuracy by occlusion.")],
             ),

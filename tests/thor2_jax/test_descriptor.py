@@ -101,14 +101,15 @@ def test_describe_is_align_and_then_the_rest() -> None:
 
 
 def test_empty_clouds_in_a_batch_are_zero_and_disturb_nobody() -> None:
-    empty = (np.zeros((0, 3)), np.zeros((0, 3)))
-    for config in (CONFIGS["paper-gudhi"], CONFIGS["released-closed_form"]):
-        found = thor2.describe(thor2.PointClouds.pack([empty, camera_cloud(0), empty]), NETWORK, config)
-        alone = thor2.describe(thor2.PointClouds.pack([camera_cloud(0)]), NETWORK, config)
-        np.testing.assert_array_equal(found.tops2[0], 0)
-        np.testing.assert_array_equal(found.tops2[2], 0)
-        assert found.overflow.tolist()[::2] == [0, 0]
-        np.testing.assert_allclose(found.tops2[1], alone.tops2[0], atol=1e-4)
+    empty, cloud = (np.zeros((0, 3)), np.zeros((0, 3))), camera_cloud(0)
+    config = thor2.DescriptorConfig()
+    found = thor2.describe(thor2.PointClouds.pack([empty, cloud, empty]), NETWORK, config)
+    company = thor2.describe(thor2.PointClouds.pack([cloud, cloud, camera_cloud(1)]), NETWORK, config)
+    np.testing.assert_array_equal(found.tops2[0], 0)
+    np.testing.assert_array_equal(found.tops2[2], 0)
+    assert found.overflow.tolist()[::2] == [0, 0]
+    np.testing.assert_array_equal(found.tops2[1], company.tops2[0])
+    np.testing.assert_array_equal(found.tops2[1], company.tops2[1])
 
 
 @pytest.mark.parametrize("homology", ["gudhi", "closed_form"])
@@ -146,7 +147,7 @@ def test_a_rigid_motion_of_cloud_and_camera(seed: int) -> None:
         CLOSED,
     )
     differ = np.abs(np.asarray(found.embeddings[0] - found.embeddings[1])).max(axis=1) > 1e-3
-    assert differ.sum() <= 2 < 50 < np.asarray(found.embeddings[0]).any(axis=1).sum()
+    assert differ.sum() <= 2 < 30 < np.asarray(found.embeddings[0]).any(axis=1).sum()
     assert (np.abs(np.asarray(found.images[0] - found.images[1])) > 1e-4).mean() < 0.01
 
 

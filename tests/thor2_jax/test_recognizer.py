@@ -2,11 +2,11 @@
 
 import dataclasses
 
-import colornet
 import numpy as np
 import pytest
 from flax import nnx
 
+import colornet
 import thor2_jax as thor2
 from thor2_jax.classifier import FEATURES, MLP, feature_of
 from thor2_jax.recognizer import Recognizer

@@ -1,0 +1,111 @@
+"""The classifier against the same layers in NumPy, float64, and the rule that joins two answers."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+
+import thor2_jax as thor2
+from thor2_jax.classifier import FEATURES, HIDDEN, MLP, check_features, feature_of, join
+
+RNG = np.random.default_rng(0)
+
+
+def settled(n_inputs: int, n_classes: int) -> MLP:
+    """A classifier whose batch statistics and scales are not the ones it was born with."""
+    model = MLP(n_inputs, n_classes, rngs=nnx.Rngs(0))
+    model.input_scale[...] = jnp.asarray(RNG.uniform(0.5, 2, n_inputs), jnp.float32)
+    for norm in model.norms:
+        for values in (norm.mean, norm.bias):
+            values[...] = jnp.asarray(RNG.normal(size=values.shape), jnp.float32)
+        for values in (norm.var, norm.scale):
+            values[...] = jnp.asarray(RNG.uniform(0.5, 2, values.shape), jnp.float32)
+    return model
+
+
+def numpy_logits(model: MLP, x: np.ndarray, own_statistics: bool) -> np.ndarray:
+    x = x.astype(np.float64) * np.asarray(model.input_scale[...])
+    for layer, norm in zip(model.layers, model.norms, strict=True):
+        x = x @ np.asarray(layer.kernel[...]) + np.asarray(layer.bias[...])
+        mean, var = (x.mean(0), x.var(0)) if own_statistics else (np.asarray(norm.mean[...]), np.asarray(norm.var[...]))
+        x = (x - mean) / np.sqrt(var + 1e-5) * np.asarray(norm.scale[...]) + np.asarray(norm.bias[...])
+        x = np.maximum(x, 0)
+    return x @ np.asarray(model.head.kernel[...]) + np.asarray(model.head.bias[...])
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, 7])
+def test_logits_against_numpy(n: int) -> None:
+    model = settled(33, 5)
+    x = RNG.normal(size=(n, 33)).astype(np.float32)
+    found = model(jnp.asarray(x))
+    assert found.shape == (n, 5)
+    np.testing.assert_allclose(found, numpy_logits(model, x, own_statistics=False), rtol=1e-4, atol=1e-4)
+
+
+def test_the_papers_layers() -> None:
+    model = MLP(40, 6, rngs=nnx.Rngs(0))
+    assert HIDDEN == (512, 256, 128, 64)
+    shapes = [layer.kernel[...].shape for layer in [*model.layers, model.head]]
+    assert shapes == [(40, 512), (512, 256), (256, 128), (128, 64), (64, 6)]
+    assert model.dropout.rate == 0.2
+
+
+def test_training_uses_the_batchs_statistics_and_moves_the_running_ones() -> None:
+    model = MLP(33, 5, rngs=nnx.Rngs(0), dropout=0.0)
+    x = RNG.normal(size=(16, 33)).astype(np.float32)
+    expected = numpy_logits(model, x, own_statistics=True)
+    np.testing.assert_allclose(model(jnp.asarray(x), train=True), expected, rtol=1e-3, atol=1e-3)
+    first = x @ np.asarray(model.layers[0].kernel[...]) + np.asarray(model.layers[0].bias[...])
+    np.testing.assert_allclose(model.norms[0].mean[...], 0.1 * first.mean(axis=0), atol=1e-5)
+    np.testing.assert_allclose(model.norms[0].var[...], 0.9 + 0.1 * first.var(axis=0), atol=1e-5)
+
+
+def test_dropout_is_for_training_alone() -> None:
+    model = MLP(33, 5, rngs=nnx.Rngs(0))
+    x = jnp.asarray(RNG.normal(size=(8, 33)), jnp.float32)
+    np.testing.assert_array_equal(model(x), model(x))
+    runs = [np.asarray(model(x, train=True, rngs=nnx.Rngs(dropout=key))) for key in (0, 1, 1)]
+    assert np.abs(runs[0] - runs[1]).max() > 1e-3
+    np.testing.assert_array_equal(runs[1], runs[2])
+
+
+@pytest.mark.parametrize("names", [*itertools.permutations(FEATURES), ("tops",), ["tops2", "ce"]])
+def test_features_come_in_one_order(names: object) -> None:
+    assert check_features(names, "x") == tuple(name for name in ("ce", "tops", "tops2") if name in names)  # type: ignore[operator]
+
+
+@pytest.mark.parametrize("names", [(), [], ["tops", "tops"], ["shape"], "tops", None, ["tops", None], 3])
+def test_bad_features_are_refused(names: object) -> None:
+    with pytest.raises(thor2.InputError) as caught:
+        check_features(names, "classifiers")
+    message = str(caught.value)
+    assert message.startswith(f"classifiers is {names!r}") and "ce, tops, tops2" in message
+
+
+def test_each_feature_is_its_descriptor() -> None:
+    found = thor2.Descriptors(
+        jnp.asarray(RNG.random((2, 7, 32, 32))), jnp.asarray(RNG.random((2, 7, 22, 31))), jnp.zeros(2, jnp.int32)
+    )
+    sizes = {name: feature_of(found, name).shape for name in FEATURES}
+    assert sizes == {"ce": (2, 4774), "tops": (2, 7168), "tops2": (2, 11942)}
+    np.testing.assert_array_equal(feature_of(found, "ce"), found.color)
+
+
+@pytest.mark.parametrize("n", [0, 1, 101])
+def test_join_takes_the_more_confident_classifier(n: int) -> None:
+    tops, tops2 = (np.asarray(jax.nn.softmax(RNG.normal(size=(n, 4)))) for _ in range(2))
+    found = join({"tops": tops, "tops2": tops2})
+    for b in range(n):
+        name, row = max((("tops", tops[b]), ("tops2", tops2[b])), key=lambda pair: pair[1].max())
+        assert found.classifier[b] == name
+        assert found.class_index[b] == row.argmax() and found.confidence[b] == row.max()
+    assert len(found.class_index) == n
+
+
+def test_join_of_a_tie_and_of_one() -> None:
+    first, second = np.array([[0.3, 0.7]]), np.array([[0.7, 0.3]])
+    assert join({"tops": first, "tops2": second}) == (np.array([1]), np.array([0.7]), np.array(["tops"]))
+    assert join({"tops2": second}).classifier.tolist() == ["tops2"]

@@ -1,0 +1,175 @@
+"""Run folders: what comes back is what was saved; anything else is refused in one line."""
+
+import dataclasses
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import orbax.checkpoint as ocp
+import pytest
+from flax import nnx
+
+import colornet
+import thor2_jax as thor2
+from thor2_jax.classifier import FEATURES, MLP
+from thor2_jax.recognizer import Recognizer
+from thor2_jax.run_folder import TrainedRun, input_size, load_run, save_run
+
+CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=2, n_strips=5, image_size=8, alpha=0.5)
+CLASSES = ("a mug", "b", "ç")
+
+
+def make_run(features: tuple[str, ...] = ("tops", "ce")) -> TrainedRun:
+    rng, network = np.random.default_rng(0), colornet.load_default()
+    classifiers = {}
+    for name in features:
+        model = MLP(input_size(name, CONFIG, network.n_regions), len(CLASSES), rngs=nnx.Rngs(1))
+        for norm in model.norms:  # statistics unlike those of a fresh model
+            norm.mean[...] = jnp.asarray(rng.normal(size=norm.mean.shape), jnp.float32)
+        model.input_scale[...] = jnp.asarray(rng.uniform(1, 2, model.input_scale.shape), jnp.float32)
+        classifiers[name] = model
+    return TrainedRun(CONFIG, network, CLASSES, classifiers, {"epochs": 3, "figures": [0.5, 1]})
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("runs") / "deep" / "run"
+    save_run(make_run(), path)
+    return path
+
+
+@pytest.fixture
+def copied(saved: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(saved, tmp_path / "run"))
+
+
+def test_input_sizes() -> None:
+    sizes = {name: input_size(name, thor2.DescriptorConfig(), 22) for name in FEATURES}
+    assert sizes == {"ce": 4774, "tops": 7168, "tops2": 11942}
+
+
+def test_what_comes_back_is_what_was_saved(saved: Path) -> None:
+    run, found = make_run(), load_run(saved)
+    assert (found.config, found.classes, found.record) == (run.config, run.classes, run.record)
+    assert found.network.fingerprint == run.network.fingerprint
+    assert tuple(found.classifiers) == ("ce", "tops")
+    clouds = thor2.PointClouds.pack([(np.random.default_rng(0).random((99, 3)) / 5, np.zeros((99, 3)))])
+    descriptors = thor2.describe(clouds, run.network, run.config)
+    before, after = Recognizer(run).probabilities(descriptors), Recognizer.load(saved).probabilities(descriptors)
+    for name in run.classifiers:
+        assert before[name].shape == (1, 3)
+        np.testing.assert_array_equal(before[name], after[name])
+
+
+def test_a_folder_holds_three_things_and_can_be_read_by_all(saved: Path) -> None:
+    assert sorted(p.name for p in saved.iterdir()) == ["network.npz", "run.json", "weights"]
+    assert sorted(p.name for p in saved.parent.iterdir()) == ["run"]
+    assert saved.stat().st_mode & 0o777 == 0o755
+    description = json.loads((saved / "run.json").read_text())
+    assert description["descriptor_version"] == thor2.DESCRIPTOR_VERSION
+    assert description["descriptor_config"] == dataclasses.asdict(CONFIG)
+
+
+def test_a_name_that_is_taken_is_refused(saved: Path, tmp_path: Path) -> None:
+    before = (saved / "run.json").read_bytes()
+    (tmp_path / "file").write_text("x")
+    for taken in (saved, tmp_path / "file"):
+        with pytest.raises(thor2.InputError, match=f"out: {taken} exists already"):
+            save_run(make_run(), taken)
+    assert (saved / "run.json").read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["file"]
+
+
+def test_an_empty_folder_may_be_filled(tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    save_run(make_run(("ce",)), tmp_path / "run")
+    assert [p.name for p in tmp_path.iterdir()] == ["run"]
+    assert tuple(load_run(tmp_path / "run").classifiers) == ("ce",)
+
+
+@pytest.mark.parametrize("broken", ["network", "weights", "json"])
+def test_nothing_is_left_behind_when_saving_fails(
+    broken: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: Any, **__: Any) -> None:
+        raise OSError("no space left on device")
+
+    run = make_run()
+    if broken == "network":
+        monkeypatch.setattr(colornet, "save", fail)
+    elif broken == "weights":
+        monkeypatch.setattr(ocp.StandardCheckpointer, "save", fail)
+    else:
+        run = dataclasses.replace(run, record={"not JSON": object()})
+    with pytest.raises(TypeError if broken == "json" else OSError):
+        save_run(run, tmp_path / "run")
+    assert list(tmp_path.iterdir()) == []
+
+
+def edited(**changes: Any) -> Callable[[Path], None]:
+    def edit(path: Path) -> None:
+        description = json.loads((path / "run.json").read_text())
+        for key, value in changes.items():
+            if value is None:
+                del description[key]
+            else:
+                description[key] = value
+        (path / "run.json").write_text(json.dumps(description))
+
+    return edit
+
+
+def damage_weights(path: Path) -> None:
+    for file in (path / "weights" / "tops").rglob("*"):
+        if file.is_file():
+            file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+
+
+def other_network(path: Path) -> None:
+    network = colornet.load_default()
+    dataclasses.replace(network, mean_rgb=network.mean_rgb + 1).save(path / "network.npz")
+
+
+CONSTANTS = dataclasses.asdict(CONFIG)
+DAMAGES: dict[str, tuple[Callable[[Path], Any], str]] = {
+    "no folder": (shutil.rmtree, "run is no run folder"),
+    "no run.json": (lambda path: (path / "run.json").unlink(), "run is no run folder"),
+    "cut run.json": (lambda path: (path / "run.json").write_text('{"format": 1,'), "run.json cannot be read"),
+    "binary run.json": (lambda path: (path / "run.json").write_bytes(b"\xff\xfe\x00"), "run.json cannot be read"),
+    "a list": (lambda path: (path / "run.json").write_text("[1]"), "run.json has format 'list'"),
+    "other format": (edited(format=2), "run.json has format 2"),
+    "other version": (edited(descriptor_version=99), "descriptor version 99"),
+    "no classes": (edited(classes=None), "run.json: KeyError: 'classes'"),
+    "empty classes": (edited(classes=[]), "classes is []"),
+    "numbered classes": (edited(classes=[1, 2, 3]), "classes is [1, 2, 3]"),
+    "one string": (edited(classes="abc"), "classes is 'abc'"),
+    "more classes": (edited(classes=["a", "b", "c", "d"]), "weights/ce"),
+    "unknown classifier": (edited(classifiers=["shape"]), "classifiers is ['shape']"),
+    "missing classifier": (edited(classifiers=["ce", "tops", "tops2"]), "weights/tops2 is missing"),
+    "unknown constant": (edited(descriptor_config={**CONSTANTS, "beta": 1}), "beta"),
+    "bad constant": (edited(descriptor_config={**CONSTANTS, "sigma_s": -1}), "DescriptorConfig.sigma_s is -1"),
+    "other constant": (edited(descriptor_config={**CONSTANTS, "n_slices": 3}), "weights/ce"),
+    "no network": (lambda path: (path / "network.npz").unlink(), "network.npz cannot be read"),
+    "cut network": (lambda path: (path / "network.npz").write_bytes(b"PK\x03\x04"), "network.npz cannot be read"),
+    "other network": (other_network, "network.npz is another colour network"),
+    "cut weights": (damage_weights, "weights/tops cannot be read"),
+    "no weights": (lambda path: shutil.rmtree(path / "weights" / "tops"), "weights/tops is missing"),
+    "empty weights": (
+        lambda path: (shutil.rmtree(path / "weights" / "tops"), (path / "weights" / "tops").mkdir()),
+        "weights/tops cannot be read",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGES)
+def test_damaged_folders_are_refused_in_one_line(name: str, copied: Path) -> None:
+    damage, words = DAMAGES[name]
+    damage(copied)
+    with pytest.raises(thor2.InputError) as caught:
+        load_run(copied)
+    message = str(caught.value)
+    assert message.startswith("model: ") and words in message and "\n" not in message and len(message) < 700
