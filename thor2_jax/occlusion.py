@@ -59,7 +59,7 @@ def find_occlusion(frame: RGBDFrame, cloud: InstanceCloud) -> Occlusion:
     pixels = frame.instance_pixels[cloud.label]
     on_contour, on_boundary, own_depth = _contour(frame, cloud.label, pixels)
     boundary = np.zeros(len(cloud.points), bool)
-    occluded = int(on_boundary.sum()) >= max(1, MIN_SHARE * int(on_contour.sum()))
+    occluded = bool(on_boundary.sum() >= MIN_SHARE * on_contour.sum())
     seen = on_boundary & (own_depth > 0)
     if occluded and seen.any() and len(cloud.points):
         edge = pixel_rays(pixels[seen], frame.labels.shape[1], frame.intrinsics) * own_depth[seen, None]
@@ -86,7 +86,7 @@ def _contour(
         for k in range(2, GAP + 2):
             other = np.where(other == BACKGROUND, _label_at(frame, r + k * down, c + k * right), other)
         theirs = _first_depth(frame, r + down, c + right, (down, right), other)
-        hides = (other > BACKGROUND) & (other != label) & (own > 0) & (theirs > 0) & (theirs < own - NEARER)
+        hides = (other != label) & (theirs > 0) & (theirs < own - NEARER)
         on_boundary[edge[hides | (beside[edge] == OUTSIDE)]] = True
     return on_contour, on_boundary, own_depth
 

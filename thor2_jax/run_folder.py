@@ -1,11 +1,12 @@
 """A trained model on disk: everything that recognition needs, checked on loading, written whole or not at all.
 
-RUN/run.json       format, descriptor version and constants, class names, classifiers, how it was trained
+RUN/run.json       format, descriptor version and constants, class names, classifiers with digests, how it was trained
 RUN/network.npz    the colour network whose regions the descriptors use
 RUN/weights/NAME/  one classifier's parameters and batch statistics (orbax)
 """
 
 import dataclasses
+import hashlib
 import json
 import shutil
 import tempfile
@@ -63,6 +64,21 @@ def check_new(path: str | Path) -> None:
         raise InputError(f"out: {path} exists already; a run folder is never overwritten")
 
 
+def _digest(path: Path, n_inputs: int, n_classes: int) -> str:
+    """SHA-256 of a classifier's files and sizes, in hexadecimal.
+
+    Checked before orbax reads anything: it does not notice every damage, and where it does, its unfinished reads go on
+    to print tracebacks from their threads.
+    """
+    digest = hashlib.sha256(f"{n_inputs} {n_classes}".encode())
+    for file in sorted(path.rglob("*")):
+        if file.is_file():
+            content = file.read_bytes()
+            digest.update(f"{file.relative_to(path).as_posix()} {len(content)}".encode())
+            digest.update(content)
+    return digest.hexdigest()
+
+
 def save_run(run: TrainedRun, path: str | Path) -> None:
     """Write a run folder. It appears under its name only when it is complete.
 
@@ -82,6 +98,9 @@ def save_run(run: TrainedRun, path: str | Path) -> None:
                 state = nnx.to_pure_dict(nnx.state(model, (nnx.Param, nnx.BatchStat)))
                 checkpointer.save(partial / "weights" / name, state)
             checkpointer.wait_until_finished()
+        sizes = {
+            name: (input_size(name, run.config, run.network.n_regions), len(run.classes)) for name in run.classifiers
+        }
         description = {
             "format": FORMAT,
             "descriptor_version": DESCRIPTOR_VERSION,
@@ -89,6 +108,7 @@ def save_run(run: TrainedRun, path: str | Path) -> None:
             "color_network": run.network.fingerprint,
             "classes": list(run.classes),
             "classifiers": list(run.classifiers),
+            "weights": {name: _digest(partial / "weights" / name, *sizes[name]) for name in run.classifiers},
             "record": run.record,
         }
         (partial / "run.json").write_text(json.dumps(description, indent=2) + "\n")
@@ -131,6 +151,7 @@ def load_run(path: str | Path) -> TrainedRun:
         classes = tuple(found["classes"])
         names = check_features(found["classifiers"], "classifiers")
         fingerprint, record = found["color_network"], found["record"]
+        digests = dict(found.get("weights", {}))  # folders written before there were digests are read without
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{where}: {type(error).__name__}: {error}") from None
     if not isinstance(found["classes"], list) or not classes or not all(isinstance(name, str) for name in classes):
@@ -141,16 +162,18 @@ def load_run(path: str | Path) -> TrainedRun:
         raise InputError(f"model: {path / 'network.npz'} cannot be read: {error}") from None
     if network.fingerprint != fingerprint:
         raise InputError(f"model: {path / 'network.npz'} is another colour network than run.json names")
-    classifiers = {
-        name: _restore(path / "weights" / name, input_size(name, config, network.n_regions), len(classes))
-        for name in names
-    }
+    classifiers = {}
+    for name in names:
+        n_inputs = input_size(name, config, network.n_regions)
+        classifiers[name] = _restore(path / "weights" / name, n_inputs, len(classes), digests.get(name))
     return TrainedRun(config, network, classes, classifiers, record)
 
 
-def _restore(path: Path, n_inputs: int, n_classes: int) -> MLP:
+def _restore(path: Path, n_inputs: int, n_classes: int, digest: str | None) -> MLP:
     if not path.is_dir():
         raise InputError(f"model: {path} is missing")
+    if digest is not None and digest != _digest(path, n_inputs, n_classes):
+        raise InputError(f"model: {path} is damaged, or not of {n_inputs} inputs and {n_classes} classes")
     model = MLP(n_inputs, n_classes, rngs=nnx.Rngs(0))
     state = nnx.state(model, (nnx.Param, nnx.BatchStat))
     target = jax.tree.map(ocp.utils.to_shape_dtype_struct, nnx.to_pure_dict(state))

@@ -1,5 +1,6 @@
 """Every stage against stage-by-stage outputs computed outside this project, on views of real scans."""
 
+import functools
 from pathlib import Path
 
 import numpy as np
@@ -28,9 +29,17 @@ def load(shared: Path, name: str) -> dict[str, np.ndarray]:
         return dict(file)
 
 
-def aligned_cloud(golden: dict[str, np.ndarray]) -> thor2.PointClouds:
-    """The released alignment, which is in scaled units already, as describe_aligned takes it."""
-    return thor2.PointClouds.pack([(golden["aligned"], golden["colors"])])
+@functools.cache
+def described(shared: Path, config: thor2.DescriptorConfig) -> tuple[thor2.Descriptors, thor2.Strips, thor2.Diagrams]:
+    """All views in one batch, in the released alignment; it is in scaled units already, as describe_aligned takes it."""
+    golden = [load(shared, name) for name in FILES]
+    aligned = thor2.PointClouds.pack([(view["aligned"], view["colors"]) for view in golden])
+    network = colornet.load_default()
+    return (
+        thor2.describe_aligned(aligned, network, config),
+        thor2.strips(aligned, network, config),
+        thor2.diagrams(aligned, config),
+    )
 
 
 def normalized(golden: dict[str, np.ndarray]) -> tuple[thor2.PointClouds, np.ndarray]:
@@ -53,32 +62,26 @@ def test_no_point_lies_on_a_border(shared: Path) -> None:
 @pytest.mark.parametrize("homology", BACKENDS)
 @pytest.mark.parametrize("name", FILES)
 def test_paper_convention(shared: Path, name: str, homology: str) -> None:
-    golden, network = load(shared, name), colornet.load_default()
-    aligned, config = aligned_cloud(golden), thor2.DescriptorConfig(homology=homology)
-    found = thor2.describe_aligned(aligned, network, config)
-    np.testing.assert_allclose(found.images[0], golden["paper_images"], atol=TOLERANCE)
-    np.testing.assert_allclose(
-        found.embeddings[0], golden["paper_embedding"].transpose(0, 2, 1), rtol=TOLERANCE, atol=TOLERANCE
-    )
-    color = thor2.strips(aligned, network, config).color[0]
-    np.testing.assert_allclose(color, golden["paper_color"], atol=TOLERANCE)
-    assert int(found.overflow[0]) == 0
+    golden, row = load(shared, name), FILES.index(name)
+    found, strips, _ = described(shared, thor2.DescriptorConfig(homology=homology))
+    np.testing.assert_allclose(found.images[row], golden["paper_images"], atol=TOLERANCE)
+    embeddings = golden["paper_embedding"].transpose(0, 2, 1)
+    np.testing.assert_allclose(found.embeddings[row], embeddings, rtol=TOLERANCE, atol=TOLERANCE)
+    np.testing.assert_allclose(strips.color[row], golden["paper_color"], atol=TOLERANCE)
+    assert int(found.overflow[row]) == 0
 
 
 @pytest.mark.parametrize("homology", BACKENDS)
 @pytest.mark.parametrize("name", FILES)
 def test_released_convention(shared: Path, name: str, homology: str) -> None:
-    golden, network = load(shared, name), colornet.load_default()
-    aligned, config = aligned_cloud(golden), thor2.DescriptorConfig.released(homology=homology)
-    found = thor2.describe_aligned(aligned, network, config)
-    np.testing.assert_allclose(found.images[0], golden["released_images"], atol=TOLERANCE)
-    color = thor2.strips(aligned, network, config).color[0]
-    np.testing.assert_allclose(color, golden["released_color"], atol=TOLERANCE)
-    diagrams = thor2.diagrams(aligned, config)
-    mask = np.asarray(diagrams.mask[0])
-    rows = [np.nonzero(mask)[0], np.asarray(diagrams.births[0])[mask], np.asarray(diagrams.deaths[0])[mask]]
-    np.testing.assert_allclose(np.stack(rows, axis=1), golden["released_diagrams"], atol=TOLERANCE)
-    assert int(found.overflow[0]) == 0
+    golden, row = load(shared, name), FILES.index(name)
+    found, strips, diagrams = described(shared, thor2.DescriptorConfig.released(homology=homology))
+    np.testing.assert_allclose(found.images[row], golden["released_images"], atol=TOLERANCE)
+    np.testing.assert_allclose(strips.color[row], golden["released_color"], atol=TOLERANCE)
+    births, deaths, mask = (np.asarray(a[row]) for a in (diagrams.births, diagrams.deaths, diagrams.mask))
+    pairs = np.stack([np.nonzero(mask)[0], births[mask], deaths[mask]], axis=1)
+    np.testing.assert_allclose(pairs, golden["released_diagrams"], atol=TOLERANCE)
+    assert int(found.overflow[row]) == 0
 
 
 def test_boxes_are_no_larger_than_the_released_ones(shared: Path) -> None:
@@ -91,7 +94,7 @@ def test_boxes_are_no_larger_than_the_released_ones(shared: Path) -> None:
 
 
 def test_boxes_are_about_as_small_as_those_of_an_exhaustive_search(shared: Path) -> None:
-    """trimesh tries every face of the convex hull as a side of the box."""
+    """The search of trimesh tries every face of the convex hull as a side of the box."""
     ratios = []
     for name in FILES:
         golden = load(shared, name)

@@ -51,8 +51,9 @@ def voxels_by_loop(frame: RGBDFrame, label: int) -> np.ndarray:
     # The clouds are float32, and a point at a cube's face must fall on the same side.
     array = np.array(points, np.float32).astype(np.float64)
     cubes: dict[tuple[int, ...], list[np.ndarray]] = {}
-    for point in array:
-        cubes.setdefault(tuple(np.floor((point - array.min(axis=0) + 0.0015) / 0.003).astype(int)), []).append(point)
+    keys = np.floor((array - (array.min(axis=0) - 0.0015)) / 0.003).astype(int)
+    for key, point in zip(map(tuple, keys), array, strict=True):
+        cubes.setdefault(key, []).append(point)
     return np.array([np.mean(cubes[key], axis=0) for key in sorted(cubes)])
 
 
@@ -241,6 +242,15 @@ def test_outliers_against_loops(count: int, side: float) -> None:
     np.testing.assert_array_equal(kept, expected)
     assert relaxed == expected_relaxed
     np.testing.assert_array_equal(points, before)
+
+
+@pytest.mark.parametrize("speck", range(84, 124, 4))
+def test_pieces_of_a_tenth_against_loops(speck: int) -> None:
+    rng = np.random.default_rng(speck)
+    points = rng.uniform(-0.02, 0.02, (900 + speck, 3))
+    points[900:] = points[900:] / 2 + 0.2
+    kept, _ = remove_outliers(points)
+    np.testing.assert_array_equal(kept, kept_by_loops(points)[0])
 
 
 def test_outliers_of_no_points() -> None:

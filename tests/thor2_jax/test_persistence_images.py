@@ -16,7 +16,7 @@ TOLERANCE = 1e-6
 
 
 def imager() -> persim.PersistenceImager:
-    """The window of the paper; setting the pixel after the ranges widens both to [-0.025, 0.775]. sigma is a variance."""
+    """The window of the paper, set last: the size of a pixel would move it. What is called sigma is a variance."""
     made = persim.PersistenceImager(
         birth_range=(0, 0.75),
         pers_range=(0, 0.75),
@@ -90,7 +90,8 @@ def test_pairs_past_the_window_are_counted() -> None:
     persistence = rng.uniform(0, 1.5, births.shape).astype(np.float32)
     persistence = np.where(np.abs(persistence - 0.775) < 1e-4, 0, persistence)
     mask = rng.random(births.shape) < 0.6
-    found = past_window(thor2.Diagrams(jnp.asarray(births), jnp.asarray(births + persistence), jnp.asarray(mask)), CONFIG)
+    pairs = thor2.Diagrams(jnp.asarray(births), jnp.asarray(births + persistence), jnp.asarray(mask))
+    found = past_window(pairs, CONFIG)
     np.testing.assert_array_equal(found, (mask & (persistence > 0.775)).sum(axis=(1, 2)))
     assert found.dtype == jnp.int32
 
@@ -104,9 +105,11 @@ def test_gradient_against_finite_differences() -> None:
         tables = np.diff(ndtr((edges - np.stack([births, d - births])[..., None]) / np.sqrt(0.00025)))
         return float(np.einsum("kp,kq,k,pq->", *tables, d - births, probe))
 
-    gradient = jax.grad(
-        lambda d: (persistence_image(thor2.Diagrams(jnp.asarray(births, jnp.float32), d, jnp.ones(6, bool)), CONFIG) * probe).sum()
-    )(jnp.asarray(deaths, jnp.float32))
+    def found(d: jax.Array) -> jax.Array:
+        pairs = thor2.Diagrams(jnp.asarray(births, jnp.float32), d, jnp.ones(6, bool))
+        return (persistence_image(pairs, CONFIG) * jnp.asarray(probe, jnp.float32)).sum()
+
+    gradient = jax.grad(found)(jnp.asarray(deaths, jnp.float32))
     for k in range(6):
         step = np.eye(6)[k] * 1e-6
         expected = (value(deaths + step) - value(deaths - step)) / 2e-6
