@@ -6,13 +6,16 @@ points (vertices of the convex hull in a fixed set of directions), so that only 
 points.
 """
 
+import functools
 import itertools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-__all__ = ["minimal_box_axes", "support_points"]
+from thor2_jax.reductions import ROWS, argmax, largest, smallest, total
+
+__all__ = ["minimal_box_axes", "rotate", "support_points"]
 
 HIGHEST = jax.lax.Precision.HIGHEST
 """TF32 would lose three digits of a coordinate on recent GPUs."""
@@ -41,41 +44,51 @@ def _half_sphere(n: int = 4) -> np.ndarray:
 _DIRECTIONS = _half_sphere()
 
 
-def support_points(points: jax.Array, mask: jax.Array) -> jax.Array:
-    """Indices of the extreme points of a centred cloud in 66 directions.
+def support_points(points: jax.Array) -> jax.Array:
+    """The extreme points of a centred cloud in 66 directions.
 
     The directions are spread evenly for the cloud scaled to unit variance along its principal axes: flat and long
     clouds get as many different vertices as round ones.
 
     Args:
-        points: [N, 3] float32, in the principal frame, mean zero.
-        mask: [N] bool.
+        points: [3, N] float32, in the principal frame, mean zero; padding at the origin, which is never beyond the
+            cloud's hull. N is a multiple of 16.
 
     Returns:
-        [66] int32, with repetitions; all 0 for an empty cloud.
+        [3, 66] float32, with repetitions.
     """
-    spread = jnp.sqrt(jnp.where(mask[:, None], points**2, 0).sum(axis=0))
+    spread = jnp.sqrt(total(points**2))[:, None]
     scaled = points / jnp.where(spread > 0, spread, 1)
-    # Explicit sums, not a matmul: the reductions below then read each product once, with no [K, N] array in between.
-    d = jnp.asarray(_DIRECTIONS)
-    projected = d[:, :1] * scaled[:, 0] + d[:, 1:2] * scaled[:, 1] + d[:, 2:] * scaled[:, 2]
-    index = jnp.arange(points.shape[0], dtype=jnp.int32)
 
-    def last_extreme(values: jax.Array) -> jax.Array:
-        # Two plain reductions: an argmax is not vectorized on CPUs.
-        values = jnp.where(mask, values, -jnp.inf)
-        best = values.max(axis=1, keepdims=True)
-        return jnp.where(mask & (values >= best), index, 0).max(axis=1)
+    def along(d: jax.Array, rows: jax.Array) -> jax.Array:
+        # Explicit sums, not a matmul: a reduction of them reads each product once, with no [K, N] array in between.
+        return d[:, :1] * rows[0] + d[:, 1:2] * rows[1] + d[:, 2:] * rows[2]
 
-    return jnp.concatenate([last_extreme(projected), last_extreme(-projected)])
+    # First the best of all residues of a point's index modulo N / 16, then the best of the 16 points of that residue.
+    half = jnp.asarray(_DIRECTIONS)
+    rows = scaled.reshape(3, ROWS, -1)
+    each = [along(half, rows[:, k]) for k in range(ROWS)]
+    extremes = [functools.reduce(jnp.maximum, each), -functools.reduce(jnp.minimum, each)]
+    residue = argmax(jnp.concatenate(extremes))
+    candidates = jnp.swapaxes(rows, 1, 2)[:, residue]
+    row = argmax(along(jnp.concatenate([half, -half]), candidates))
+    return points[:, row * rows.shape[2] + residue]
 
 
-def principal_axes(points: jax.Array, weights: jax.Array) -> jax.Array:
-    """Rows: eigenvectors of the weighted covariance, largest eigenvalue first. [3, 3]."""
-    total = jnp.maximum(weights.sum(), 1)
-    centred = points - jnp.matmul(weights, points, precision=HIGHEST) / total
-    covariance = jnp.matmul((centred * weights[:, None]).T, centred, precision=HIGHEST) / total
-    return jnp.linalg.eigh(covariance)[1].T[::-1]
+def rotate(axes: jax.Array, points: jax.Array) -> jax.Array:
+    """Coordinates [3, N] of `points` [3, N] along the rows of `axes` [3, 3]."""
+    # Explicit sums: exact in float32 on every device, and faster than a product with a side of 3.
+    return axes[:, :1] * points[0] + axes[:, 1:2] * points[1] + axes[:, 2:] * points[2]
+
+
+def _eigenvectors(moments: jax.Array) -> jax.Array:
+    """Rows: eigenvectors of a symmetric [3, 3], largest eigenvalue first."""
+    return jnp.linalg.eigh(moments)[1].T[::-1]
+
+
+def _moments(points: jax.Array) -> jax.Array:
+    """[3, 3], sums of products of the coordinates of centred points [3, N], N a multiple of 16."""
+    return jnp.stack([total(points[k] * points) for k in range(3)])
 
 
 def _rectangle_areas(xy: jax.Array, angles: jax.Array) -> jax.Array:
@@ -117,7 +130,7 @@ def _search(support: jax.Array, axes: jax.Array) -> tuple[jax.Array, jax.Array]:
     return axes, jnp.prod(turned.max(axis=0) - turned.min(axis=0))
 
 
-def minimal_box_axes(points: jax.Array, mask: jax.Array) -> jax.Array:
+def minimal_box_axes(points: jax.Array) -> jax.Array:
     """Axes of an approximately minimal-volume oriented box: rows of a rotation, longest side first, signs arbitrary.
 
     Two starts, the principal axes of all points and those of the support points (as of the hull's vertices, which is
@@ -125,20 +138,20 @@ def minimal_box_axes(points: jax.Array, mask: jax.Array) -> jax.Array:
     flush.
 
     Args:
-        points: [N, 3] float32, mean zero over the mask.
-        mask: [N] bool.
+        points: [3, N] float32, mean zero, padding at the origin; N is a multiple of 16.
 
     Returns:
         [3, 3] float32, orthonormal.
     """
-    points, weights = jax.lax.stop_gradient(points), mask.astype(points.dtype)
-    frame = principal_axes(points, weights)
-    principal = jnp.matmul(points, frame.T, precision=HIGHEST)
-    support = principal[support_points(principal, mask)]
-    starts = jnp.stack([jnp.eye(3, dtype=points.dtype), principal_axes(support, jnp.ones(len(support), points.dtype))])
+    points = jax.lax.stop_gradient(points)
+    frame = _eigenvectors(_moments(points))
+    principal = rotate(frame, points)
+    support = support_points(principal).T
+    centred = support - support.mean(axis=0)
+    of_support = _eigenvectors(jnp.matmul(centred.T, centred, precision=HIGHEST))
+    starts = jnp.stack([jnp.eye(3, dtype=points.dtype), of_support])
     found, volumes = jax.vmap(lambda start: _search(support, start))(starts)
     axes = found[jnp.argmin(volumes)]
-    turned = jnp.matmul(principal, axes.T, precision=HIGHEST)
-    low = jnp.where(mask[:, None], turned, jnp.inf).min(axis=0)
-    high = jnp.where(mask[:, None], turned, -jnp.inf).max(axis=0)
-    return jnp.matmul(axes[jnp.argsort(low - high)], frame, precision=HIGHEST)
+    turned = rotate(axes, principal)
+    sides = largest(turned) - smallest(turned)
+    return jnp.matmul(axes[jnp.argsort(-sides)], frame, precision=HIGHEST)

@@ -14,6 +14,8 @@ import jax
 import jax.numpy as jnp
 
 from colornet import ColorNetwork
+from colornet.grid import GRID_SIZE
+from thor2_jax.color_membership import RegionSets, region_sets
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
 from thor2_jax.persistence import diagrams_of_strips
@@ -26,10 +28,10 @@ __all__ = ["describe", "describe_aligned", "describe_strips", "diagrams", "strip
 
 
 @functools.lru_cache(maxsize=8)
-def _device_tables(network: ColorNetwork) -> tuple[jax.Array, jax.Array]:
+def _device_tables(network: ColorNetwork) -> tuple[RegionSets, jax.Array]:
     # Kept for later calls, so they must be arrays also when the first call happens while a caller's function is traced.
     with jax.ensure_compile_time_eval():
-        return jnp.asarray(network.region_bits), jnp.asarray(network.similarity, jnp.float32)
+        return region_sets(network), jnp.asarray(network.similarity, jnp.float32)
 
 
 def _check(clouds: PointClouds) -> None:
@@ -38,9 +40,9 @@ def _check(clouds: PointClouds) -> None:
         raise InputError(f"clouds is {found}; expected PointClouds with points [B, N, 3] (see PointClouds.pack)")
 
 
-@partial(jax.jit, static_argnums=(2, 3))
-def _strips(aligned: PointClouds, region_bits: jax.Array, n_regions: int, config: DescriptorConfig) -> Strips:
-    return jax.vmap(lambda cloud: strips_of_cloud(cloud, region_bits, n_regions, config))(aligned)
+@partial(jax.jit, static_argnums=2)
+def _strips(aligned: PointClouds, sets: RegionSets, config: DescriptorConfig) -> Strips:
+    return jax.vmap(lambda cloud: strips_of_cloud(cloud, sets, config))(aligned)
 
 
 @partial(jax.jit, static_argnums=1)
@@ -70,7 +72,7 @@ def strips(aligned: PointClouds, network: ColorNetwork, config: DescriptorConfig
         config: static; another one compiles again, as does another shape of `aligned`.
     """
     _check(aligned)
-    return _strips(aligned, _device_tables(network)[0], network.n_regions, config)
+    return _strips(aligned, _device_tables(network)[0], config)
 
 
 def describe_strips(strips: Strips, network: ColorNetwork, config: DescriptorConfig) -> Descriptors:
@@ -81,7 +83,8 @@ def describe_strips(strips: Strips, network: ColorNetwork, config: DescriptorCon
 def diagrams(aligned: PointClouds, config: DescriptorConfig) -> Diagrams:
     """Persistence diagrams of aligned clouds, fields [B, S, J]. Colours play no part."""
     _check(aligned)
-    return _diagrams(_strips(aligned, jnp.zeros(52**3, jnp.uint32), 1, config), config)
+    one_set = RegionSets(jnp.zeros(GRID_SIZE, jnp.int32), jnp.ones((1, 1), jnp.float32))
+    return _diagrams(_strips(aligned, one_set, config), config)
 
 
 def describe_aligned(aligned: PointClouds, network: ColorNetwork, config: DescriptorConfig) -> Descriptors:

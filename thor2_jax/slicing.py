@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from thor2_jax.color_membership import region_weights
+from thor2_jax.color_membership import RegionSets, color_sets
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.types import PointClouds, Strips
 
@@ -63,15 +63,14 @@ def _rounded(values: jax.Array, scale: int) -> jax.Array:
     return whole + up
 
 
-def strips_of_cloud(cloud: PointClouds, region_bits: jax.Array, n_regions: int, config: DescriptorConfig) -> Strips:
+def strips_of_cloud(cloud: PointClouds, sets: RegionSets, config: DescriptorConfig) -> Strips:
     """Extreme points and colour vectors of every strip of one aligned cloud (no batch axis).
 
     The extremes are found as point indices and gathered, so that a gradient reaches exactly one point each.
 
     Args:
         cloud: points [N, 3], scaled units, first octant.
-        region_bits: [140608] uint32, see `region_weights`.
-        n_regions: R.
+        sets: of the colour network's regions.
         config: static.
     """
     n_points, n_segments = cloud.points.shape[0], config.n_slices * config.n_strips
@@ -88,8 +87,11 @@ def strips_of_cloud(cloud: PointClouds, region_bits: jax.Array, n_regions: int, 
     occupied = index[:, 0] >= 0
     extremes = jnp.where(occupied[:, None], y[jnp.maximum(index, 0)], 0)
 
-    weights = region_weights(cloud.colors, region_bits, n_regions)
-    color = jnp.zeros((n_segments, n_regions), jnp.float32).at[segment].add(weights, mode="drop")
+    # Counted by set first: one addition a point instead of one a point and region.
+    n_sets = sets.weights.shape[0]
+    cell = segment * n_sets + color_sets(cloud.colors, sets)
+    counts = jnp.zeros(n_segments * n_sets, jnp.float32).at[cell].add(1, mode="drop")
+    color = jnp.matmul(counts.reshape(n_segments, n_sets), sets.weights, precision=jax.lax.Precision.HIGHEST)
     if config.convention == "released":
         # The released code rounds y, then measures; rounding keeps the order, so the extremes stay extreme.
         extremes = _rounded(extremes, 100) / 100

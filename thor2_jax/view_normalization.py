@@ -13,9 +13,10 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
-from thor2_jax.bounding_box import HIGHEST, minimal_box_axes
+from thor2_jax.bounding_box import HIGHEST, minimal_box_axes, rotate
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
+from thor2_jax.reductions import ROWS, largest, smallest, total
 from thor2_jax.types import PointClouds
 
 __all__ = ["align", "mirror", "turn", "view_normalize"]
@@ -24,26 +25,31 @@ OCCLUSION_BIN = 0.01
 """Width in scaled units of the x-bins in which boundary points are counted; two at either end decide."""
 
 
+def _planes(cloud: PointClouds) -> tuple[jax.Array, jax.Array]:
+    """Coordinates [3, M] and mask [M] of a cloud; M is N, rounded up to what reductions need."""
+    missing = -cloud.mask.shape[0] % ROWS
+    return jnp.pad(cloud.points, ((0, missing), (0, 0))).T, jnp.pad(cloud.mask, (0, missing))
+
+
 def _to_first_octant(points: jax.Array, mask: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Points [N, 3] moved so that the least coordinate along each axis is 0, and the shift [3]. Padding is set to 0."""
-    low = jnp.where(mask[:, None], points, jnp.inf).min(axis=0)
+    """Points [3, M] moved so that the least coordinate along each axis is 0, and the shift [3]. Padding is set to 0."""
+    low = smallest(jnp.where(mask, points, jnp.inf))
     low = jnp.where(jnp.isfinite(low), low, 0)
-    return jnp.where(mask[:, None], points - low, 0), low
+    return jnp.where(mask, points - low[:, None], 0), low
 
 
-def _normalize_one(clouds: PointClouds, sigma_s: float) -> PointClouds:
-    mask, weights = clouds.mask, clouds.mask.astype(jnp.float32)[:, None]
-    count = jnp.maximum(weights.sum(), 1)
-    scaled = clouds.points * sigma_s
-    centre = jnp.where(mask[:, None], scaled, 0).sum(axis=0) / count
-    centred = jnp.where(mask[:, None], scaled - centre, 0)
-    camera = clouds.camera * sigma_s - centre
+def _normalize_one(cloud: PointClouds, sigma_s: float) -> PointClouds:
+    points, mask = _planes(cloud)
+    scaled = points * sigma_s
+    centre = total(jnp.where(mask, scaled, 0)) / jnp.maximum(mask.sum(), 1)
+    # Padding moves to the mean: within the hull of the cloud, it never is an extreme.
+    centred = jnp.where(mask, scaled - centre[:, None], 0)
+    camera = cloud.camera * sigma_s - centre
 
-    axes = minimal_box_axes(centred, mask)
-    turned = jnp.matmul(centred, axes.T, precision=HIGHEST)
-    low = jnp.where(mask[:, None], turned, jnp.inf).min(axis=0)
-    high = jnp.where(mask[:, None], turned, -jnp.inf).max(axis=0)
-    middle = jnp.where(jnp.isfinite(low), (low + high) / 2, 0)
+    axes = minimal_box_axes(centred)
+    turned = rotate(axes, centred)
+    low, high = smallest(turned), largest(turned)
+    middle = (low + high) / 2
 
     # The mean is the origin here: the heavier half lies below the middle where the middle is positive.
     x_sign = jnp.where(middle[0] < 0, -1.0, 1.0)
@@ -51,11 +57,10 @@ def _normalize_one(clouds: PointClouds, sigma_s: float) -> PointClouds:
     camera_z = jnp.matmul(axes[2], camera, precision=HIGHEST) - middle[2]
     z_sign = jnp.where(camera_z > 0, -1.0, 1.0)
 
-    bins = jnp.floor(
-        turned[:, 0] * x_sign / OCCLUSION_BIN - jnp.minimum(low[0] * x_sign, high[0] * x_sign) / OCCLUSION_BIN
-    )
-    last = jnp.where(mask, bins, -1).max()
-    edge = clouds.boundary & mask
+    x_low = jnp.minimum(low[0] * x_sign, high[0] * x_sign)
+    bins = jnp.floor(turned[0] * x_sign / OCCLUSION_BIN - x_low / OCCLUSION_BIN)
+    last = largest(jnp.where(mask, bins, -1))
+    edge = jnp.pad(cloud.boundary, (0, len(mask) - len(cloud.boundary))) & mask
     at_start = (edge & (bins <= 1)).sum()
     at_end = (edge & (bins >= last - 1)).sum()
     # A half turn about z takes the occluded end away from the first slice.
@@ -63,9 +68,9 @@ def _normalize_one(clouds: PointClouds, sigma_s: float) -> PointClouds:
 
     x, z = axes[0] * x_sign, axes[2] * z_sign
     frame = jax.lax.stop_gradient(jnp.stack([x, jnp.cross(z, x), z]))
-    points, shift = _to_first_octant(jnp.matmul(centred, frame.T, precision=HIGHEST), mask)
+    points, shift = _to_first_octant(rotate(frame, centred), mask)
     camera = jnp.matmul(frame, camera, precision=HIGHEST) - shift
-    return dataclasses.replace(clouds, points=points, camera=camera)
+    return dataclasses.replace(cloud, points=points.T[: len(cloud.mask)], camera=camera)
 
 
 @partial(jax.jit, static_argnums=1)
@@ -92,12 +97,11 @@ def view_normalize(clouds: PointClouds, config: DescriptorConfig) -> PointClouds
 
 def _turn_one(cloud: PointClouds, alpha: float) -> PointClouds:
     c, s = jnp.cos(alpha), jnp.sin(alpha)
-
-    def about_y(p: jax.Array) -> jax.Array:
-        return jnp.stack([c * p[..., 0] - s * p[..., 2], p[..., 1], s * p[..., 0] + c * p[..., 2]], axis=-1)
-
-    points, shift = _to_first_octant(about_y(cloud.points), cloud.mask)
-    return dataclasses.replace(cloud, points=points, camera=about_y(cloud.camera) - shift)
+    about_y = jnp.array([[c, 0, -s], [0, 1, 0], [s, 0, c]])
+    points, mask = _planes(cloud)
+    points, shift = _to_first_octant(rotate(about_y, points), mask)
+    camera = jnp.matmul(about_y, cloud.camera, precision=HIGHEST) - shift
+    return dataclasses.replace(cloud, points=points.T[: len(cloud.mask)], camera=camera)
 
 
 @partial(jax.jit, static_argnums=1)

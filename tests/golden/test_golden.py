@@ -31,7 +31,7 @@ def load(shared: Path, name: str) -> dict[str, np.ndarray]:
 
 @functools.cache
 def described(shared: Path, config: thor2.DescriptorConfig) -> tuple[thor2.Descriptors, thor2.Strips, thor2.Diagrams]:
-    """All views in one batch, in the released alignment; it is in scaled units already, as describe_aligned takes it."""
+    """All views in one batch, in the released alignment, which is in scaled units as describe_aligned takes it."""
     golden = [load(shared, name) for name in FILES]
     aligned = thor2.PointClouds.pack([(view["aligned"], view["colors"]) for view in golden])
     network = colornet.load_default()

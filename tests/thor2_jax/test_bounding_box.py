@@ -13,17 +13,16 @@ from scipy.spatial.transform import Rotation
 from thor2_jax.bounding_box import minimal_box_axes, support_points
 
 
-def padded(points: np.ndarray, capacity: int = 512) -> tuple[np.ndarray, np.ndarray]:
-    """Centred points and their mask; the padding holds large numbers, which must not matter."""
-    out = np.full((capacity, 3), 1e3, np.float32)
-    out[: len(points)] = points - (points.mean(axis=0) if len(points) else 0)
-    mask = np.arange(capacity) < len(points)
-    return out, mask
+def padded(points: np.ndarray, capacity: int = 512) -> np.ndarray:
+    """Centred points, [3, N], padded with zeros."""
+    out = np.zeros((3, capacity), np.float32)
+    out[:, : len(points)] = (points - (points.mean(axis=0) if len(points) else 0)).T
+    return out
 
 
 def box_of(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Axes, float64, and the side lengths along them."""
-    axes = np.asarray(jax.jit(minimal_box_axes)(*padded(points)), np.float64)
+    axes = np.asarray(jax.jit(minimal_box_axes)(padded(points)), np.float64)
     turned = points @ axes.T
     return axes, np.ptp(turned, axis=0) if len(points) else np.zeros(3)
 
@@ -101,16 +100,27 @@ def test_seen_along_each_axis_the_box_is_a_minimum_area_rectangle() -> None:
 
 
 def test_support_points_are_vertices_of_the_hull() -> None:
+    find = jax.jit(support_points)
     for points in shapes():
-        centred, mask = padded(points)
-        frame = np.linalg.svd(centred[mask].astype(np.float64), full_matrices=False)[2]
-        principal = np.where(mask[:, None], centred @ frame.T, 0).astype(np.float32)
-        chosen = set(np.asarray(support_points(principal, mask)).tolist())
-        assert chosen <= set(ConvexHull(principal[mask]).vertices.tolist())
-        assert len(chosen) >= 15
+        centred = padded(points).astype(np.float64)
+        frame = np.linalg.svd(centred.T, full_matrices=False)[2]
+        principal = (frame @ centred).astype(np.float32)
+        found = np.asarray(find(principal))
+        assert found.shape == (3, 66)
+        cloud = principal[:, : len(points)].T
+        corners = {tuple(row) for row in cloud[ConvexHull(cloud).vertices].tolist()}
+        chosen = {tuple(row) for row in found.T.tolist()}
+        assert chosen <= corners and len(chosen) >= 15
         for axis in range(3):  # among them the extremes of each axis
-            assert {int(principal[mask, axis].argmin()), int(principal[mask, axis].argmax())} <= chosen
+            assert {tuple(cloud[k].tolist()) for k in (cloud[:, axis].argmin(), cloud[:, axis].argmax())} <= chosen
 
 
 def test_support_points_of_an_empty_cloud() -> None:
-    np.testing.assert_array_equal(support_points(np.zeros((8, 3), np.float32), np.zeros(8, bool)), np.zeros(66))
+    np.testing.assert_array_equal(support_points(np.zeros((3, 16), np.float32)), np.zeros((3, 66)))
+
+
+@pytest.mark.parametrize("capacity", [512, 528, 1024])
+def test_padding_does_not_change_the_box(capacity: int) -> None:
+    points = shapes()[1]
+    axes = np.asarray(minimal_box_axes(padded(points, capacity)), np.float64)
+    np.testing.assert_allclose(np.abs(axes @ box_of(points)[0].T), np.eye(3), atol=1e-4)

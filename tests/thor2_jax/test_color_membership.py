@@ -5,14 +5,14 @@ import numpy as np
 import pytest
 
 import colornet
-from thor2_jax.color_membership import region_weights
+from thor2_jax.color_membership import color_sets, region_sets
 
 NETWORK = colornet.load_default()
 
 
 def weights(colors: np.ndarray) -> np.ndarray:
-    apply = jax.jit(region_weights, static_argnums=2)
-    return np.asarray(apply(colors, NETWORK.region_bits, NETWORK.n_regions))
+    sets = region_sets(NETWORK)
+    return np.asarray(sets.weights[jax.jit(color_sets)(colors, sets)])
 
 
 def eight_bit(colors: np.ndarray) -> np.ndarray:
