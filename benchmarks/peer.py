@@ -1,7 +1,7 @@
 """The same descriptor from the libraries that one would pick otherwise, one cloud at a time, in float64.
 
-Open3D's oriented box (PCA of the convex hull) and OpenCV's minimum-area rectangle for view normalization, NumPy loops over
-slices and strips, persim's PersistenceImager, NumPy colour matrices. The equations are those of the product.
+Open3D's oriented box (PCA of the convex hull) and OpenCV's minimum-area rectangle for view normalization, NumPy loops
+over slices and strips, persim's PersistenceImager, NumPy colour matrices. The equations are those of the product.
 """
 
 import math
@@ -27,7 +27,10 @@ class Peer:
         self.network = colornet.load_default()
         # persim's sigma is a variance.
         self.imager = PersistenceImager(
-            birth_range=(-0.025, 0.775), pers_range=(-0.025, 0.775), pixel_size=SIGMA_2, kernel_params={"sigma": 0.00025}
+            birth_range=(-0.025, 0.775),
+            pers_range=(-0.025, 0.775),
+            pixel_size=SIGMA_2,
+            kernel_params={"sigma": 0.00025},
         )
 
     def normalize(self, xyz: NDArray[np.float32]) -> NDArray[np.float64]:

@@ -1,7 +1,7 @@
 """Colour regions of points on the device (colour network, membership).
 
-The network's regions overlap in few ways: its 140,608 grid colours belong to 62 different sets of regions. A point needs
-one number, that of its set; weights come in once points have been counted.
+The network's regions overlap in few ways: its 140,608 grid colours belong to 62 different sets of regions. A point
+needs one number, that of its set; weights come in once points have been counted.
 """
 
 import dataclasses

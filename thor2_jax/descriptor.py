@@ -19,7 +19,7 @@ from thor2_jax.color_membership import RegionSets, region_sets
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
 from thor2_jax.persistence import diagrams_of_strips
-from thor2_jax.persistence_images import past_window, persistence_image
+from thor2_jax.persistence_images import past_window, persistence_images
 from thor2_jax.slicing import strips_of_cloud
 from thor2_jax.types import Descriptors, Diagrams, PointClouds, Strips
 from thor2_jax.view_normalization import align
@@ -53,11 +53,10 @@ def _diagrams(strips: Strips, config: DescriptorConfig) -> Diagrams:
 @partial(jax.jit, static_argnums=2)
 def _describe_strips(strips: Strips, similarity: jax.Array, config: DescriptorConfig) -> Descriptors:
     found = diagrams_of_strips(strips, config)
-    image = partial(persistence_image, config=config)
     # E^i = (C^i Delta)^T
     embeddings = jnp.einsum("...jr,rq->...qj", strips.color, similarity, precision=jax.lax.Precision.HIGHEST)
     return Descriptors(
-        images=jax.vmap(jax.vmap(image))(found),
+        images=persistence_images(found, config),
         embeddings=embeddings,
         overflow=strips.overflow + past_window(found, config),
     )

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.frames import RGBDFrame, pixel_rays
-from thor2_jax.outlier_removal import remove_outliers
+from thor2_jax.outlier_removal import flying_pixels, remove_outliers
 from thor2_jax.voxel_grid import voxel_downsample
 
 __all__ = ["MAX_DEPTH", "MIN_DEPTH", "MIN_POINTS", "InstanceCloud", "instance_clouds"]
@@ -33,7 +33,7 @@ class InstanceCloud:
         points: [n, 3] float32, metres, OpenCV camera frame.
         colors: [n, 3] uint8, sRGB.
         n_pixels: pixels of its mask.
-        kept_by_fallback: the rule of the fewest neighbours would have dropped most of it and was left out.
+        kept_by_fallback: a rule of outlier removal would have dropped most of it and was left out.
         reason: why the cloud cannot be used; None if it can.
     """
 
@@ -53,6 +53,10 @@ def instance_clouds(frame: RGBDFrame) -> list[InstanceCloud]:
 def _instance_cloud(frame: RGBDFrame, label: int, pixels: NDArray[np.intp]) -> InstanceCloud:
     depth = frame.depth_m.ravel()[pixels]
     trusted = (depth >= MIN_DEPTH) & (depth <= MAX_DEPTH)
+    flying = flying_pixels(frame, pixels)
+    steep = 2 * int((trusted & ~flying).sum()) < int(trusted.sum())
+    if not steep:
+        trusted &= ~flying
     valid, depth = pixels[trusted], depth[trusted]
     points = (pixel_rays(valid, frame.labels.shape[1], frame.intrinsics) * depth[:, None]).astype(np.float32)
     points, colors = voxel_downsample(points, frame.color.reshape(-1, 3)[valid], VOXEL)
@@ -63,4 +67,4 @@ def _instance_cloud(frame: RGBDFrame, label: int, pixels: NDArray[np.intp]) -> I
         )
         return InstanceCloud(label, points, colors, len(pixels), reason=reason)
     kept, relaxed = remove_outliers(points)
-    return InstanceCloud(label, points[kept], colors[kept], len(pixels), relaxed)
+    return InstanceCloud(label, points[kept], colors[kept], len(pixels), steep or relaxed)

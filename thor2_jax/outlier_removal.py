@@ -1,8 +1,8 @@
-"""Outlier removal on the cloud of one instance (paper, section "Recognition"): what a depth camera adds to an object.
+"""Outlier removal on one instance (paper, section "Recognition"): what a depth camera and a mask add to an object.
 
-A mask reaches past its object's edge, where pixels "fly" between it and what lies behind. Three rules, each for one
-kind: points with few others around them, points farther from their neighbours than is usual in this cloud, and small
-pieces apart from the rest.
+A mask reaches past its object's edge, onto the background and onto pixels that "fly" between the two. Three rules:
+pixels at a step in depth fly; points with too few others around them are strays; small pieces apart from the rest are
+background.
 """
 
 from typing import Any
@@ -13,28 +13,62 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-__all__ = ["remove_outliers"]
+from thor2_jax.frames import RGBDFrame
 
-RADIUS = 0.05
-"""Metres around a point within which it needs `NEIGHBORS` others."""
+__all__ = ["flying_pixels", "remove_outliers"]
+
+STEEPEST = 15.0
+"""Steepest depth, in pixel widths a pixel, that a surface is seen at (86 degrees from facing the camera)."""
 
 NEIGHBORS = 30
-"""On a voxel grid of 3 mm. The count goes with 1 / side squared: points lie on a surface."""
+"""On a voxel grid of 3 mm. On a plane so many lie within 9 mm, at its corners within 19 mm."""
 
-DEVIATIONS = 1.75
-"""A point is far when its mean distance to `NEIGHBORS` others is this many standard deviations above the cloud's."""
+FARTHEST = 0.016
+"""Metres: largest mean distance of a point to its `NEIGHBORS` nearest others. At the corner of a plane it is 12 mm."""
 
-GAP = 0.02
-"""Metres between pieces: no two of their points are nearer."""
+CELL = 0.01
+"""Metres: side of the cells in which pieces are looked for. Cells that touch, also at a corner, are one piece."""
 
 MIN_SHARE = 0.1
 """Pieces with a smaller share of the largest piece's points are dropped."""
 
 
+def flying_pixels(frame: RGBDFrame, pixels: NDArray[np.intp]) -> NDArray[np.bool_]:
+    """Pixels behind a step in depth from one of the four beside them, within the same instance: no surface is so steep.
+
+    Args:
+        frame: the frame.
+        pixels: [n] flat indices of pixels of one instance.
+
+    Returns:
+        [n] bool; False where there is no depth.
+    """
+    height, width = frame.labels.shape
+    labels, depth = frame.labels.ravel(), frame.depth_m.ravel()
+    row, column = np.divmod(pixels, width)
+    step = STEEPEST * depth[pixels] / frame.intrinsics.fx
+    flying = np.zeros(len(pixels), bool)
+    for down, right in ((0, 1), (0, -1), (1, 0), (-1, 0)):
+        r, c = row + down, column + right
+        inside = (r >= 0) & (r < height) & (c >= 0) & (c < width)
+        beside = np.where(inside, r * width + c, pixels)
+        same = (labels[beside] == labels[pixels]) & (depth[beside] > 0)
+        flying |= same & (depth[pixels] - depth[beside] > step)
+    return flying
+
+
+def _among_others(points: NDArray[Any]) -> NDArray[np.bool_]:
+    if len(points) <= NEIGHBORS:
+        return np.zeros(len(points), bool)
+    distances = KDTree(points).query(points, k=NEIGHBORS + 1)[0][:, 1:]
+    return np.asarray(distances.mean(axis=1) <= FARTHEST)
+
+
 def _in_large_piece(points: NDArray[Any]) -> NDArray[np.bool_]:
-    i, j = KDTree(points).query_pairs(GAP, output_type="ndarray").T
-    graph = coo_array((np.ones(len(i), np.int8), (i, j)), shape=(len(points), len(points)))
-    piece = connected_components(graph, directed=False)[1]
+    cells, cell = np.unique(np.floor(points / CELL).astype(np.int64), axis=0, return_inverse=True)
+    i, j = KDTree(cells).query_pairs(1.8, output_type="ndarray").T  # 1.73: touching at a corner
+    graph = coo_array((np.ones(len(i), np.int8), (i, j)), shape=(len(cells), len(cells)))
+    piece = connected_components(graph, directed=False)[1][cell]
     size = np.bincount(piece)
     return np.asarray(size[piece] >= MIN_SHARE * size.max())
 
@@ -46,19 +80,14 @@ def remove_outliers(points: NDArray[Any]) -> tuple[NDArray[np.intp], bool]:
         points: [n, 3] metres, on a voxel grid of 3 mm.
 
     Returns:
-        Indices of the points to keep, in increasing order, never none of n > 0; and whether the rule of `RADIUS` was
-        left out because it would have dropped more than half of the object, as of one seen through gaps.
+        Indices of the points to keep, in increasing order, never none of n > 0; and whether the rule of `NEIGHBORS` was
+        left out because it would have dropped more than half of the object, as of a small one or one seen through gaps.
     """
     kept = np.arange(len(points))
     if len(points) == 0:
         return kept, False
-    relaxed = False
-    if len(points) > NEIGHBORS:
-        distances = KDTree(points).query(points, k=NEIGHBORS + 1)[0][:, 1:]
-        crowded = distances[:, -1] <= RADIUS
-        relaxed = 2 * int(crowded.sum()) < len(points)
-        if not relaxed:
-            kept, distances = kept[crowded], distances[crowded]
-        mean = distances.mean(axis=1)
-        kept = kept[mean <= mean.mean() + DEVIATIONS * mean.std()]
+    among = _among_others(points)
+    relaxed = 2 * int(among.sum()) < len(points)
+    if not relaxed:
+        kept = kept[among]
     return kept[_in_large_piece(points[kept])], relaxed

@@ -8,7 +8,7 @@ import pytest
 from scipy.special import ndtr
 
 import thor2_jax as thor2
-from thor2_jax.persistence_images import past_window, persistence_image
+from thor2_jax.persistence_images import past_window, persistence_images
 
 CONFIG = thor2.DescriptorConfig()
 TOLERANCE = 1e-6
@@ -29,10 +29,15 @@ def imager() -> persim.PersistenceImager:
     return made
 
 
+def strip_of(births: np.ndarray) -> np.ndarray:
+    return np.rint(np.asarray(births) / 0.025).astype(int)
+
+
 def diagram(births: np.ndarray, deaths: np.ndarray, n_strips: int = 31) -> thor2.Diagrams:
-    out = np.zeros((2, n_strips), np.float32)
-    out[:, : len(births)] = births, deaths
-    return thor2.Diagrams(jnp.asarray(out[0]), jnp.asarray(out[1]), jnp.arange(n_strips) < len(births))
+    """One slice's: a pair stands where its strip does."""
+    out, mask = np.zeros((2, n_strips), np.float32), np.zeros(n_strips, bool)
+    out[:, strip_of(births)], mask[strip_of(births)] = (births, deaths), True
+    return thor2.Diagrams(jnp.asarray(out[0]), jnp.asarray(out[1]), jnp.asarray(mask))
 
 
 def random_pairs(seed: int, n: int) -> tuple[np.ndarray, np.ndarray]:
@@ -44,7 +49,7 @@ def random_pairs(seed: int, n: int) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("n", [1, 2, 7, 31])
 def test_against_persim(n: int) -> None:
     births, deaths = random_pairs(n, n)
-    found = jax.jit(persistence_image, static_argnums=1)(diagram(births, deaths), CONFIG)
+    found = jax.jit(persistence_images, static_argnums=1)(diagram(births, deaths), CONFIG)
     expected = imager().transform(np.stack([births, deaths], axis=1), skew=True)
     assert expected.shape == found.shape == (32, 32)
     np.testing.assert_allclose(found, expected, atol=TOLERANCE)
@@ -57,13 +62,13 @@ def test_against_normal_cdfs_in_float64() -> None:
     for birth, persistence in zip(births, deaths - births, strict=True):
         across, up = (np.diff(ndtr((edges - centre) / np.sqrt(0.00025))) for centre in (birth, persistence))
         expected += persistence * np.outer(across, up)
-    np.testing.assert_allclose(persistence_image(diagram(births, deaths), CONFIG), expected, atol=TOLERANCE)
+    np.testing.assert_allclose(persistence_images(diagram(births, deaths), CONFIG), expected, atol=TOLERANCE)
 
 
 def test_an_empty_diagram_and_pairs_of_length_zero_are_black() -> None:
-    np.testing.assert_array_equal(persistence_image(diagram(np.zeros(0), np.zeros(0)), CONFIG), 0)
+    np.testing.assert_array_equal(persistence_images(diagram(np.zeros(0), np.zeros(0)), CONFIG), 0)
     births = np.arange(5) * 0.1
-    np.testing.assert_array_equal(persistence_image(diagram(births, births), CONFIG), 0)
+    np.testing.assert_array_equal(persistence_images(diagram(births, births), CONFIG), 0)
 
 
 def test_padding_adds_nothing_whatever_it_holds() -> None:
@@ -72,7 +77,7 @@ def test_padding_adds_nothing_whatever_it_holds() -> None:
     dirty = thor2.Diagrams(
         jnp.where(clean.mask, clean.births, 0.3), jnp.where(clean.mask, clean.deaths, 0.6), clean.mask
     )
-    np.testing.assert_array_equal(persistence_image(dirty, CONFIG), persistence_image(clean, CONFIG))
+    np.testing.assert_array_equal(persistence_images(dirty, CONFIG), persistence_images(clean, CONFIG))
 
 
 def test_another_size_of_image() -> None:
@@ -81,7 +86,7 @@ def test_another_size_of_image() -> None:
     edges = (np.arange(18) - 1) * 0.025
     tables = [np.diff(ndtr((edges - np.stack([births, deaths - births])[..., None]) / np.sqrt(0.001)))]
     expected = np.einsum("kp,kq,k->pq", *tables[0], deaths - births)
-    np.testing.assert_allclose(persistence_image(diagram(births, deaths), config), expected, atol=TOLERANCE)
+    np.testing.assert_allclose(persistence_images(diagram(births, deaths), config), expected, atol=TOLERANCE)
 
 
 def test_pairs_past_the_window_are_counted() -> None:
@@ -106,11 +111,21 @@ def test_gradient_against_finite_differences() -> None:
         return float(np.einsum("kp,kq,k,pq->", *tables, d - births, probe))
 
     def found(d: jax.Array) -> jax.Array:
-        pairs = thor2.Diagrams(jnp.asarray(births, jnp.float32), d, jnp.ones(6, bool))
-        return (persistence_image(pairs, CONFIG) * jnp.asarray(probe, jnp.float32)).sum()
+        pairs = diagram(births, deaths)
+        pairs = thor2.Diagrams(pairs.births, pairs.deaths.at[strip_of(births)].set(d), pairs.mask)
+        return (persistence_images(pairs, CONFIG) * jnp.asarray(probe, jnp.float32)).sum()
 
     gradient = jax.grad(found)(jnp.asarray(deaths, jnp.float32))
     for k in range(6):
         step = np.eye(6)[k] * 1e-6
         expected = (value(deaths + step) - value(deaths - step)) / 2e-6
         assert float(gradient[k]) == pytest.approx(expected, rel=1e-3, abs=1e-4)
+
+
+def test_any_number_of_slices_at_once() -> None:
+    one = [diagram(*random_pairs(seed, 9)) for seed in range(6)]
+    stacked = jax.tree.map(lambda *fields: jnp.stack(fields).reshape(2, 3, 31), *one)
+    found = persistence_images(stacked, CONFIG)
+    assert found.shape == (2, 3, 32, 32)
+    for k, pairs in enumerate(one):
+        np.testing.assert_allclose(found[k // 3, k % 3], persistence_images(pairs, CONFIG), atol=TOLERANCE)
