@@ -24,6 +24,7 @@ class Peer:
     """Descriptor of one cloud after another."""
 
     def __init__(self) -> None:
+        cv2.setNumThreads(1)
         self.network = colornet.load_default()
         # persim's sigma is a variance.
         self.imager = PersistenceImager(

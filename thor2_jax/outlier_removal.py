@@ -26,6 +26,10 @@ NEIGHBORS = 30
 FARTHEST = 0.016
 """Metres: largest mean distance of a point to its `NEIGHBORS` nearest others. At the corner of a plane it is 12 mm."""
 
+INNER_CELL = 0.006
+"""Metres: side of the cells that tell surrounded points. More than `NEIGHBORS` in a cell and those it touches are, at 12 mm
+at most along each axis, near enough whatever their places."""
+
 CELL = 0.01
 """Metres: side of the cells in which pieces are looked for. Cells that touch, also at a corner, are one piece."""
 
@@ -57,20 +61,37 @@ def flying_pixels(frame: RGBDFrame, pixels: NDArray[np.intp]) -> NDArray[np.bool
     return flying
 
 
+def _cells(points: NDArray[Any], size: float) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+    """Cell of each point [n] on a grid, number of points in each cell [m], and pairs [p, 2] of cells that touch."""
+    place = np.floor(points / size).astype(np.int64)
+    place -= place.min(axis=0)
+    extent = place.max(axis=0) + 1
+    keys, cell, counts = np.unique(np.ravel_multi_index(place.T, extent), return_inverse=True, return_counts=True)
+    centres = np.stack(np.unravel_index(keys, extent), axis=1)
+    return cell, counts, KDTree(centres).query_pairs(1.8, output_type="ndarray")  # 1.73: touching at a corner
+
+
 def _among_others(points: NDArray[Any]) -> NDArray[np.bool_]:
     if len(points) <= NEIGHBORS:
         return np.zeros(len(points), bool)
-    distances = KDTree(points).query(points, k=NEIGHBORS + 1)[0][:, 1:]
-    return np.asarray(distances.mean(axis=1) <= FARTHEST)
+    # Most points are surrounded on all sides. Only the others, along edges, are worth the search for neighbours.
+    cell, counts, pairs = _cells(points, INNER_CELL)
+    i, j = pairs.T
+    around = counts + np.bincount(i, counts[j], len(counts)) + np.bincount(j, counts[i], len(counts))
+    among = around[cell] > NEIGHBORS
+    rest = np.flatnonzero(~among)
+    distances = KDTree(points).query(points[rest], k=NEIGHBORS + 1)[0][:, 1:]
+    among[rest] = distances.mean(axis=1) <= FARTHEST
+    return among
 
 
 def _in_large_piece(points: NDArray[Any]) -> NDArray[np.bool_]:
-    cells, cell = np.unique(np.floor(points / CELL).astype(np.int64), axis=0, return_inverse=True)
-    i, j = KDTree(cells).query_pairs(1.8, output_type="ndarray").T  # 1.73: touching at a corner
-    graph = coo_array((np.ones(len(i), np.int8), (i, j)), shape=(len(cells), len(cells)))
-    piece = connected_components(graph, directed=False)[1][cell]
-    size = np.bincount(piece)
-    return np.asarray(size[piece] >= MIN_SHARE * size.max())
+    cell, counts, pairs = _cells(points, CELL)
+    i, j = pairs.T
+    graph = coo_array((np.ones(len(i), np.int8), (i, j)), shape=(len(counts), len(counts)))
+    piece = connected_components(graph, directed=False)[1]
+    size = np.bincount(piece, counts)
+    return np.asarray(size[piece[cell]] >= MIN_SHARE * size.max())
 
 
 def remove_outliers(points: NDArray[Any]) -> tuple[NDArray[np.intp], bool]:

@@ -86,16 +86,16 @@ class DescribedFrame:
 
 def _voxelled(cloud: InstanceCloud, edge: NDArray[np.bool_], size: float) -> tuple[Any, Any, NDArray[np.bool_]]:
     """The cloud on the descriptors' grid (coarser if no bucket holds it), and which voxels hold boundary points."""
-    flags = np.repeat(edge[:, None], 3, axis=1).astype(np.float32)
+    # The mark is a fourth channel; its mean over a voxel is above 0 where one point has it.
+    marked = np.column_stack([cloud.colors, edge * np.uint8(255)])
     while True:
-        points, colors = voxel_downsample(cloud.points, cloud.colors, size)
-        marks = voxel_downsample(cloud.points, flags, size)[1]
+        points, colors = voxel_downsample(cloud.points, marked, size)
         try:
             point_bucket(len(points))
         except InputError:
             size *= 2
             continue
-        return points, colors, marks[:, 0] > 0
+        return points, colors[:, :3], colors[:, 3] > 0
 
 
 class Recognizer:
@@ -104,7 +104,7 @@ class Recognizer:
     def __init__(self, run: TrainedRun) -> None:
         """Ready to answer with every classifier of `run`."""
         self.run = run
-        self._apply = {name: _compiled(model) for name, model in run.classifiers.items()}
+        self._apply = {name: _compiled(name, model) for name, model in run.classifiers.items()}
 
     @classmethod
     def load(cls, run_dir: str | Path) -> "Recognizer":
@@ -141,9 +141,12 @@ class Recognizer:
             batches.append((packed, describe(packed, self.run.network, self.run.config)))
         return jax.tree.map(lambda *arrays: np.concatenate(arrays), *batches) if len(batches) > 1 else batches[0]
 
-    def probabilities(self, descriptors: Descriptors) -> dict[Feature, NDArray[np.float32]]:
-        """Feature -> [B, C] class probabilities of its classifier."""
-        return {name: np.asarray(apply(feature_of(descriptors, name))) for name, apply in self._apply.items()}
+    def probabilities(
+        self, descriptors: Descriptors, names: Sequence[Feature] | None = None
+    ) -> dict[Feature, NDArray[np.float32]]:
+        """Feature -> [B, C] class probabilities of its classifier; of all classifiers unless `names` picks some."""
+        running = {name: self._apply[name](descriptors) for name in (self._apply if names is None else names)}
+        return {name: np.asarray(values) for name, values in running.items()}
 
     def recognize(self, frame: RGBDFrame, classifiers: Sequence[Feature] = THOR2) -> list[Recognition]:
         """Name every instance of a frame, in the order of its label numbers.
@@ -163,8 +166,7 @@ class Recognizer:
         described = self.describe(frame)
         found = {
             name: values[: len(described.usable)]
-            for name, values in self.probabilities(described.descriptors).items()
-            if name in voting
+            for name, values in self.probabilities(described.descriptors, voting).items()
         }
         joined = join(found)
         rows = {index: row for row, index in enumerate(described.usable)}
@@ -194,7 +196,7 @@ class Recognizer:
         return [(self.run.classes[i], float(probabilities[i])) for i in best]
 
 
-def _compiled(model: nnx.Module) -> Any:
+def _compiled(name: Feature, model: nnx.Module) -> Any:
     graph, state = nnx.split(model)
-    forward = jax.jit(lambda state, x: jax.nn.softmax(nnx.merge(graph, state)(x)))
-    return lambda x: forward(state, x)
+    forward = jax.jit(lambda state, found: jax.nn.softmax(nnx.merge(graph, state)(feature_of(found, name))))
+    return lambda found: forward(state, found)

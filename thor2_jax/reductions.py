@@ -21,7 +21,7 @@ _SHORT = 8
 
 def fold(values: jax.Array, op: Callable[[jax.Array, jax.Array], jax.Array]) -> jax.Array:
     """[..., N] to [..., N / 16]: entry k is `op` over the entries k, k + N / 16, k + 2 N / 16, ..."""
-    rows = values.reshape(*values.shape[:-1], ROWS, -1)
+    rows = values.reshape(*values.shape[:-1], ROWS, values.shape[-1] // ROWS)
     return functools.reduce(op, (rows[..., k, :] for k in range(ROWS)))
 
 

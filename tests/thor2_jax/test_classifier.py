@@ -12,6 +12,8 @@ import thor2_jax as thor2
 from thor2_jax.classifier import FEATURES, HIDDEN, MLP, check_features, feature_of, join
 
 RNG = np.random.default_rng(0)
+apply = nnx.jit(lambda model, x: model(x))
+train = nnx.jit(lambda model, x, rngs=None: model(x, train=True, rngs=rngs))
 
 
 def settled(n_inputs: int, n_classes: int) -> MLP:
@@ -26,6 +28,11 @@ def settled(n_inputs: int, n_classes: int) -> MLP:
     return model
 
 
+@pytest.fixture(scope="module")
+def model() -> MLP:
+    return settled(33, 5)
+
+
 def numpy_logits(model: MLP, x: np.ndarray, own_statistics: bool) -> np.ndarray:
     x = x.astype(np.float64) * np.asarray(model.input_scale[...])
     for layer, norm in zip(model.layers, model.norms, strict=True):
@@ -37,10 +44,9 @@ def numpy_logits(model: MLP, x: np.ndarray, own_statistics: bool) -> np.ndarray:
 
 
 @pytest.mark.parametrize("n", [0, 1, 2, 7])
-def test_logits_against_numpy(n: int) -> None:
-    model = settled(33, 5)
+def test_logits_against_numpy(n: int, model: MLP) -> None:
     x = RNG.normal(size=(n, 33)).astype(np.float32)
-    found = model(jnp.asarray(x))
+    found = apply(model, jnp.asarray(x))
     assert found.shape == (n, 5)
     np.testing.assert_allclose(found, numpy_logits(model, x, own_statistics=False), rtol=1e-4, atol=1e-4)
 
@@ -57,7 +63,7 @@ def test_training_uses_the_batchs_statistics_and_moves_the_running_ones() -> Non
     model = MLP(33, 5, rngs=nnx.Rngs(0), dropout=0.0)
     x = RNG.normal(size=(16, 33)).astype(np.float32)
     expected = numpy_logits(model, x, own_statistics=True)
-    np.testing.assert_allclose(model(jnp.asarray(x), train=True), expected, rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(train(model, jnp.asarray(x)), expected, rtol=1e-3, atol=1e-3)
     first = x @ np.asarray(model.layers[0].kernel[...]) + np.asarray(model.layers[0].bias[...])
     np.testing.assert_allclose(model.norms[0].mean[...], 0.1 * first.mean(axis=0), atol=1e-5)
     np.testing.assert_allclose(model.norms[0].var[...], 0.9 + 0.1 * first.var(axis=0), atol=1e-5)
@@ -65,9 +71,9 @@ def test_training_uses_the_batchs_statistics_and_moves_the_running_ones() -> Non
 
 def test_dropout_is_for_training_alone() -> None:
     model = MLP(33, 5, rngs=nnx.Rngs(0))
-    x = jnp.asarray(RNG.normal(size=(8, 33)), jnp.float32)
-    np.testing.assert_array_equal(model(x), model(x))
-    runs = [np.asarray(model(x, train=True, rngs=nnx.Rngs(dropout=key))) for key in (0, 1, 1)]
+    x = jnp.asarray(RNG.normal(size=(7, 33)), jnp.float32)
+    np.testing.assert_array_equal(apply(model, x), apply(model, x))
+    runs = [np.asarray(train(model, x, nnx.Rngs(dropout=key))) for key in (0, 1, 1)]
     assert np.abs(runs[0] - runs[1]).max() > 1e-3
     np.testing.assert_array_equal(runs[1], runs[2])
 

@@ -100,7 +100,7 @@ def test_with_and_without_jit_and_vmap(n_clouds: int) -> None:
     expected = diagrams_of_strips(strips, CLOSED)
     for config in (GUDHI, CLOSED):
         plain = partial(diagrams_of_strips, config=config)
-        functions = [plain, jax.jit(plain), jax.vmap(plain), jax.jit(jax.vmap(jax.vmap(plain)))]
+        functions = [plain, jax.jit(plain), jax.jit(jax.vmap(plain)), jax.jit(jax.vmap(jax.vmap(plain)))]
         for function in functions if n_clouds else functions[:2]:
             assert_same(function(strips), expected)
 
@@ -122,6 +122,7 @@ def test_gradients_are_the_same_from_both_backends() -> None:
         return (diagrams_of_strips(moved, config).deaths * weights).sum()
 
     for config in (GUDHI, CLOSED):
-        low, high = jax.grad(loss, argnums=(0, 1))(strips.low, strips.high, config)
+        gradient = jax.jit(jax.grad(loss, argnums=(0, 1)), static_argnums=2)
+        low, high = gradient(strips.low, strips.high, config)
         np.testing.assert_allclose(high, np.where(strips.occupied, weights, 0), atol=1e-7)
         np.testing.assert_allclose(low, -np.where(strips.occupied, weights, 0), atol=1e-7)

@@ -43,7 +43,7 @@ def tilted(labels: np.ndarray, seed: int = 0, nearest: int = 600) -> thor2.RGBDF
 def patches() -> np.ndarray:
     labels = np.zeros((240, 320), np.uint8)
     labels[20:100, 20:90] = 3
-    labels[20:60, 150:300] = 7
+    labels[20:60, 150:260] = 7
     labels[200:203, 10:13] = 5  # nine pixels: too few
     labels[120:230, 100:160] = 200
     return labels
@@ -111,6 +111,20 @@ def test_a_cloud_past_the_largest_bucket_is_made_coarser(recognizer: Recognizer)
     assert answer.overflow > 0
 
 
+def test_more_instances_than_a_batch_holds(recognizer: Recognizer, monkeypatch: pytest.MonkeyPatch) -> None:
+    labels = np.zeros((240, 320), np.uint8)
+    for number in range(9):  # two batches of four, then one
+        labels[20:80, 5 + 34 * number : 35 + 34 * number] = number + 1
+    parts = [np.where((labels >= first) & (labels < first + 4), labels, 0) for first in (1, 5, 9)]
+    expected = [answer for part in parts for answer in recognizer.recognize(tilted(part))]
+    monkeypatch.setattr("thor2_jax.recognizer.BATCH_BUCKETS", (1, 2, 4))
+    found = recognizer.recognize(tilted(labels))
+    assert [a.label for a in found] == list(range(1, 10)) and all(a.reason is None for a in found)
+    assert [(a.name, a.points_used) for a in found] == [(a.name, a.points_used) for a in expected]
+    assert [a.confidence for a in found] == pytest.approx([a.confidence for a in expected], abs=1e-5)
+
+
+@pytest.mark.slow
 def test_more_instances_than_the_largest_batch(recognizer: Recognizer) -> None:
     labels = np.zeros((240, 320), np.uint16)
     side = 12

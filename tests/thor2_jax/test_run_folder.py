@@ -58,8 +58,9 @@ def test_what_comes_back_is_what_was_saved(saved: Path) -> None:
     assert (found.config, found.classes, found.record) == (run.config, run.classes, run.record)
     assert found.network.fingerprint == run.network.fingerprint
     assert tuple(found.classifiers) == ("ce", "tops")
-    clouds = thor2.PointClouds.pack([(np.random.default_rng(0).random((99, 3)) / 5, np.zeros((99, 3)))])
-    descriptors = thor2.describe(clouds, run.network, run.config)
+    rng = np.random.default_rng(0)
+    images, color = rng.random((1, 2, 8, 8), np.float32), rng.random((1, 2, 22, 5), np.float32)
+    descriptors = thor2.Descriptors(jnp.asarray(images), jnp.asarray(color), jnp.zeros(1, jnp.int32))
     before, after = Recognizer(run).probabilities(descriptors), Recognizer.load(saved).probabilities(descriptors)
     for name in run.classifiers:
         assert before[name].shape == (1, 3)

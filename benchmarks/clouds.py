@@ -1,0 +1,52 @@
+"""Clouds to measure on: views of real scans where they are at hand, else of the built-in objects."""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thor2_jax.frames import backproject
+from training.builtin_objects import builtin_objects
+from training.meshes import TexturedMesh, find_meshes, load_mesh
+from training.rendering import RayCaster, render_view
+from training.view_sphere import camera_pose
+
+__all__ = ["SCANS", "sample_clouds"]
+
+SCANS = Path(__file__).resolve().parents[2] / "shared" / "data" / "meshes"
+N_OBJECTS, N_VIEWS = 24, 8
+
+Cloud = tuple[NDArray[np.float32], NDArray[np.uint8]]
+
+
+def _objects() -> tuple[str, list[TexturedMesh]]:
+    if SCANS.is_dir():
+        found = list(find_meshes(SCANS).values())
+        step = max(1, len(found) // N_OBJECTS)
+        return "views of real scans", [load_mesh(path) for path in found[::step][:N_OBJECTS]]
+    return "views of built-in objects", list(builtin_objects().values())
+
+
+def sample_clouds(count: int, n_points: int, seed: int = 0) -> tuple[str, list[Cloud]]:
+    """Clouds of exactly `n_points` points, and what they are.
+
+    Points are pixels of a view drawn at random, without repetition where the view has enough of them; beyond that many
+    clouds, views repeat with another draw.
+    """
+    rng = np.random.default_rng(seed)
+    name, meshes = _objects()
+    views = []
+    for mesh in meshes:
+        caster = RayCaster([mesh])
+        for _ in range(N_VIEWS):
+            pose = camera_pose(rng.uniform(0, 2 * np.pi), rng.uniform(0.3, 2.8), mesh.centre)
+            view = render_view(caster, pose)
+            seen = view.depth > 0
+            points = backproject(view.depth.astype(np.float32) / np.float32(1000), view.intrinsics)[seen]
+            views.append((points, view.color[seen]))
+    clouds = []
+    for k in range(count):
+        points, colors = views[k % len(views)]
+        pick = rng.choice(len(points), n_points, replace=len(points) < n_points)
+        clouds.append((points[pick], colors[pick]))
+    return name, clouds

@@ -1,0 +1,190 @@
+"""The engine beside its peer, in one run on the same clouds: `python -m benchmarks.run [--out FOLDER] [--quick]`.
+
+Prints tables; writes cpu.json and cpu.png. Compile time is apart, and every figure is the median of repeated calls. The
+peer runs in two processes.
+"""
+
+import argparse
+import json
+import multiprocessing
+import os
+import platform
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from flax import nnx
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+import colornet
+import thor2_jax as thor2
+from benchmarks.clouds import sample_clouds
+from benchmarks.timing import time_calls
+from thor2_jax.classifier import FEATURES, MLP
+from thor2_jax.run_folder import TrainedRun, input_size
+from training.builtin_objects import builtin_objects
+from training.scenes import compose_scene
+
+NETWORK = colornet.load_default()
+CLOSED = thor2.DescriptorConfig(homology="closed_form")
+GUDHI = thor2.DescriptorConfig(homology="gudhi")
+BATCH, N_POINTS = 256, 2048
+PEER_CLOUDS, PEER_PROCESSES = 64, 2
+
+
+def peer_start() -> None:
+    """Make a peer once a process."""
+    global peer
+    from benchmarks.peer import Peer
+
+    peer = Peer()
+
+
+def peer_describe(cloud: Any) -> float:
+    return float(peer.describe(*cloud)[1].sum())
+
+
+def peer_agrees(clouds: list[Any]) -> float:
+    """Largest difference of the two on the same aligned clouds, relative to the largest entry."""
+    from benchmarks.peer import Peer
+
+    other, worst = Peer(), 0.0
+    aligned = thor2.align(thor2.PointClouds.pack(clouds), CLOSED)
+    found = np.asarray(thor2.describe_aligned(aligned, NETWORK, CLOSED).tops2)
+    for k, (_, rgb) in enumerate(clouds):
+        points = np.asarray(aligned.points[k])[np.asarray(aligned.mask[k])].astype(np.float64)
+        expected = other.describe_aligned(points, rgb)[1]
+        worst = max(worst, float(np.abs(found[k] - expected).max() / np.abs(expected).max()))
+    return worst
+
+
+def peer_rate(clouds: list[Any]) -> float:
+    """Clouds a second of the peer in two processes, warm."""
+    with multiprocessing.get_context("spawn").Pool(PEER_PROCESSES, peer_start) as pool:
+        pool.map(peer_describe, clouds[:8], chunksize=4)
+        times = []
+        for _ in range(3):
+            start = time.perf_counter()
+            pool.map(peer_describe, clouds, chunksize=8)
+            times.append(time.perf_counter() - start)
+    return len(clouds) / sorted(times)[1]
+
+
+def engine_rates(clouds: list[Any]) -> dict[str, Any]:
+    """Clouds a second of the whole way and of its parts."""
+    packed = thor2.PointClouds.pack(clouds, N_POINTS)
+    aligned = thor2.align(packed, CLOSED)
+    strips = thor2.strips(aligned, NETWORK, CLOSED)
+
+    def whole(config: thor2.DescriptorConfig) -> Any:
+        found = thor2.describe(packed, NETWORK, config)
+        return found.tops, found.tops2
+
+    parts = {
+        "whole, closed form": lambda: whole(CLOSED),
+        "whole, gudhi": lambda: whole(GUDHI),
+        "align": lambda: thor2.align(packed, CLOSED),
+        "strips": lambda: thor2.strips(aligned, NETWORK, CLOSED),
+        "images and embeddings, closed form": lambda: thor2.describe_strips(strips, NETWORK, CLOSED),
+        "images and embeddings, gudhi": lambda: thor2.describe_strips(strips, NETWORK, GUDHI),
+    }
+    rates = {}
+    for name, call in parts.items():
+        timing = time_calls(call)
+        rates[name] = {"clouds_per_s": len(clouds) / timing.median, "first_call_s": timing.first}
+    return rates
+
+
+def against_size(quick: bool) -> dict[str, list[list[float]]]:
+    """Median seconds of `describe` (closed form) by number of points at 64 clouds, and by number of clouds."""
+    by_points, by_clouds = [], []
+    for n in (512, 1024, 2048) if quick else (512, 1024, 2048, 4096, 8192):
+        packed = thor2.PointClouds.pack(sample_clouds(64, n)[1], n)
+        by_points.append([n, time_calls(lambda p=packed: thor2.describe(p, NETWORK, CLOSED), 1.0).median])
+    for b in (1, 16, 256) if quick else (1, 4, 16, 64, 256, 1024, 4096):
+        packed = thor2.PointClouds.pack(sample_clouds(b, N_POINTS)[1], N_POINTS)
+        by_clouds.append([b, time_calls(lambda p=packed: thor2.describe(p, NETWORK, CLOSED), 1.0, 3).median])
+    return {"points": by_points, "clouds": by_clouds}
+
+
+def frame_latency(calls: int) -> dict[str, float]:
+    """Milliseconds from decoded arrays to names, a frame of 640 x 480 with six objects, three classifiers loaded."""
+    classifiers = {name: MLP(input_size(name, CLOSED, NETWORK.n_regions), 17, rngs=nnx.Rngs(0)) for name in FEATURES}
+    run = TrainedRun(CLOSED, NETWORK, tuple(map(str, range(17))), classifiers, {})
+    recognizer = thor2.Recognizer(run)
+    objects = builtin_objects()
+    frames = []
+    for seed in range(40):
+        frame = compose_scene(objects, np.random.default_rng(seed), n_objects=6).frame
+        if len(frame.instances) == 6:
+            frames.append(frame)
+    times = []
+    for frame in frames:
+        recognizer.recognize(thor2.RGBDFrame(frame.color, frame.depth, frame.labels, frame.intrinsics))
+    for k in range(calls):
+        f = frames[k % len(frames)]
+        start = time.perf_counter()
+        recognizer.recognize(thor2.RGBDFrame(f.color, f.depth, f.labels, f.intrinsics))
+        times.append((time.perf_counter() - start) * 1e3)
+    return {"frames": len(frames), "p50_ms": float(np.percentile(times, 50)), "p99_ms": float(np.percentile(times, 99))}
+
+
+def draw(sizes: dict[str, list[list[float]]], path: Path) -> None:
+    """Time against the number of points and of clouds, both logarithmic, with the line of a cost in proportion."""
+    figure = Figure(figsize=(9, 3.8), layout="constrained")
+    FigureCanvasAgg(figure)
+    for axes, (name, rows) in zip(figure.subplots(1, 2), sizes.items(), strict=True):
+        x, seconds = np.array(rows).T
+        axes.loglog(x, seconds * 1e3, "o-", color="#0072b2", label="describe, closed form")
+        axes.loglog(x, seconds[-1] * 1e3 * x / x[-1], "--", color="#888888", label="in proportion")
+        axes.set_xlabel("points a cloud (64 clouds)" if name == "points" else f"clouds ({N_POINTS} points each)")
+        axes.set_ylabel("milliseconds")
+        axes.grid(color="#e5e5e5", which="both")
+        axes.legend(frameon=False)
+    figure.savefig(path, dpi=130)
+
+
+def main() -> None:
+    """Measure, print, write."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
+    parser.add_argument("--quick", action="store_true", help="fewer sizes and calls")
+    options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
+    name, clouds = sample_clouds(BATCH, N_POINTS)
+    print(f"{BATCH} clouds of {N_POINTS} points, {name}; {os.cpu_count()} cores")
+    rates = engine_rates(clouds)
+    for part, rate in rates.items():
+        print(f"{part:38s} {rate['clouds_per_s']:10,.0f} clouds/s   first call {rate['first_call_s']:.1f} s")
+    share = rates["whole, closed form"]["clouds_per_s"] / rates["align"]["clouds_per_s"]
+    print(f"alignment alone is {share:.0%} of the whole (closed form)")
+    result: dict[str, Any] = {
+        "machine": {"cores": os.cpu_count(), "processor": platform.machine(), "jax": jax.__version__},
+        "clouds": {"count": BATCH, "points": N_POINTS, "what": name},
+        "engine": rates,
+        "align_share": share,
+    }
+    try:
+        agreement = peer_agrees(clouds[:8])
+    except ImportError as error:
+        print(f"peer: not measured ({error}); it needs open3d, opencv and persim")
+    else:
+        rate = peer_rate(clouds[:PEER_CLOUDS])
+        print(f"{'peer, two processes':38s} {rate:10,.0f} clouds/s   same aligned clouds: differs by {agreement:.1e}")
+        ratios = {k: rates[f"whole, {k}"]["clouds_per_s"] / rate for k in ("closed form", "gudhi")}
+        print("times as fast as the peer: " + ", ".join(f"{k} {v:.1f}" for k, v in ratios.items()))
+        result["peer"] = {"clouds_per_s": rate, "difference": agreement, "ratio": ratios}
+    result["frame"] = frame_latency(40 if options.quick else 200)
+    print("frame of six objects: p50 {p50_ms:.1f} ms, p99 {p99_ms:.1f} ms".format(**result["frame"]))
+    result["sizes"] = against_size(options.quick)
+    for what, rows in result["sizes"].items():
+        print(f"by {what}: " + ", ".join(f"{int(x)}: {s * 1e3:.1f} ms" for x, s in rows))
+    draw(result["sizes"], options.out / "cpu.png")
+    (options.out / "cpu.json").write_text(json.dumps(result, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,35 @@
+"""Time of a function on a device: first call apart, then the fastest and the median of repeated calls."""
+
+import dataclasses
+import statistics
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+
+__all__ = ["Timing", "time_calls"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Timing:
+    """Seconds: `first` holds compilation, `best` and `median` are of later calls."""
+
+    first: float
+    best: float
+    median: float
+
+
+def time_calls(function: Callable[[], Any], seconds: float = 2.0, least: int = 5) -> Timing:
+    """Call `function` until `seconds` have passed and `least` calls are done; results are waited for."""
+
+    def once() -> float:
+        start = time.perf_counter()
+        jax.block_until_ready(function())
+        return time.perf_counter() - start
+
+    first = once()
+    calls: list[float] = []
+    while len(calls) < least or sum(calls) < seconds:
+        calls.append(once())
+    return Timing(first, min(calls), statistics.median(calls))
