@@ -99,6 +99,15 @@ def kept_by_loops(points: np.ndarray) -> tuple[np.ndarray, bool]:
     return index[[int((piece == k).sum()) * 10 >= largest for k in piece]], bool(relaxed)
 
 
+def assert_as_by_loops(points: np.ndarray) -> int:
+    """And how many are kept."""
+    kept, relaxed = remove_outliers(points)
+    expected, expected_relaxed = kept_by_loops(points)
+    np.testing.assert_array_equal(kept, expected)
+    assert relaxed is expected_relaxed
+    return len(kept)
+
+
 @pytest.mark.parametrize("count", [1, 2, 30, 31, 32, 101, 400])
 @pytest.mark.parametrize("side", [0.01, 0.03, 0.06, 0.2])
 @pytest.mark.parametrize("kind", [np.float32, np.float64])
@@ -107,17 +116,41 @@ def test_outliers_against_loops(count: int, side: float, kind: Any) -> None:
     rng = np.random.default_rng(count)
     points = (rng.normal(size=(count, 3)) * side * rng.uniform(0.1, 1, (count, 1))).astype(kind)
     before = points.copy()
-    kept, relaxed = remove_outliers(points)
-    expected, expected_relaxed = kept_by_loops(points)
-    np.testing.assert_array_equal(kept, expected)
-    assert relaxed is expected_relaxed and len(kept) > 0
+    assert assert_as_by_loops(points) > 0
     np.testing.assert_array_equal(points, before)
+
+
+@pytest.mark.parametrize("share", [0.02, 0.06, 0.1, 0.15, 0.3, 1.0])
+@pytest.mark.parametrize("depth", [1, 4, 10])
+def test_clouds_on_the_voxel_grid_against_loops(share: float, depth: int) -> None:
+    """One point in some of the cubes of 3 mm of a slab, thin or thick, from nearly empty to full."""
+    rng = np.random.default_rng(depth)
+    cubes = np.argwhere(rng.random((20, 20, depth)) < share)
+    cubes = cubes[rng.permutation(len(cubes))[:1200]]
+    points = (cubes + rng.random(cubes.shape)) * 0.003 - [0.03, 0.01, -0.8]
+    assert_as_by_loops(points)
 
 
 def grid(rows: int, columns: int, spacing: float = 0.003) -> np.ndarray:
     """A plane of rows x columns points, its corner at the origin."""
     row, column = np.mgrid[:rows, :columns]
     return np.stack([column, row, np.zeros_like(row)], axis=-1).reshape(-1, 3) * spacing
+
+
+@pytest.mark.parametrize("start", [0.0, 0.0017, 0.0031, 0.0052])
+def test_a_point_that_leaves_a_block_along_its_diagonal(start: float) -> None:
+    """31 points or more in the cells around it are not enough if they are at the far end of them."""
+    block = np.argwhere(np.ones((4, 4, 4))) * 0.003
+    away = np.arange(0.001, 0.02, 0.0005)
+    counts = [assert_as_by_loops(np.concatenate([block, [[-d] * 3]]) + start) for d in away]
+    assert counts[0] == 65 and counts[-1] == 64
+
+
+def test_small_clusters_stay_from_thirty_others_on() -> None:
+    plane, cube = grid(15, 15), np.argwhere(np.ones((4, 3, 3))) * 0.003 + [0.1, 0.1, 0.8]
+    sizes = np.arange(22, 36)
+    counts = [assert_as_by_loops(np.concatenate([plane, cube[:size]])) - 225 for size in sizes]
+    np.testing.assert_array_equal(counts, np.where(sizes > 30, sizes, 0))
 
 
 def test_strays_go() -> None:

@@ -43,9 +43,9 @@ def tilted(labels: np.ndarray, seed: int = 0, nearest: int = 600) -> thor2.RGBDF
 def patches() -> np.ndarray:
     labels = np.zeros((240, 320), np.uint8)
     labels[20:100, 20:90] = 3
-    labels[20:60, 150:260] = 7
+    labels[20:60, 150:250] = 7
     labels[200:203, 10:13] = 5  # nine pixels: too few
-    labels[120:230, 100:160] = 200
+    labels[120:220, 100:150] = 200
     return labels
 
 
