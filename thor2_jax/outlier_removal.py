@@ -27,7 +27,7 @@ FARTHEST = 0.016
 """Metres: largest mean distance of a point to its `NEIGHBORS` nearest others. At the corner of a plane it is 12 mm."""
 
 INNER_CELL = 0.006
-"""Metres: side of the cells that tell points which are surrounded: more than `NEIGHBORS` in a cell and those it touches.
+"""Metres: side of the cells that tell surrounded points: more than `NEIGHBORS` in a cell and those that it touches.
 On a grid of 3 mm their mean distance is 14 mm or less, so they need no search."""
 
 CELL = 0.01
