@@ -23,6 +23,9 @@ STEPS = 6
 GAP = 3
 """Background pixels between two masks that are passed over."""
 
+MARGIN = max(STEPS, GAP + 1)
+"""Pixels past the contour that are ever looked at."""
+
 NEARER = 0.01
 """Metres by which the other instance must be nearer: more than depth noise between two that touch."""
 
@@ -68,43 +71,51 @@ def find_occlusion(frame: RGBDFrame, cloud: InstanceCloud) -> Occlusion:
     return Occlusion(occluded, boundary)
 
 
+def _window(
+    frame: RGBDFrame, pixels: NDArray[np.intp]
+) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.intp]]:
+    """Labels and depth around a mask, `MARGIN` pixels more on every side, and the mask's flat indices there."""
+    height, width = frame.labels.shape
+    row, column = np.divmod(pixels, width)
+    slices, missing = [], []
+    for places, size in ((row, height), (column, width)):
+        first, last = int(places.min()) - MARGIN, int(places.max()) + 1 + MARGIN
+        slices.append(slice(max(first, 0), min(last, size)))
+        missing.append((max(-first, 0), max(last - size, 0)))
+    labels = np.pad(frame.labels[*slices].astype(np.int64), missing, constant_values=OUTSIDE)
+    depth = np.pad(frame.depth_m[*slices], missing)
+    places = (row - row.min() + MARGIN) * labels.shape[1] + (column - column.min() + MARGIN)
+    return labels, depth, places
+
+
 def _contour(
     frame: RGBDFrame, label: int, pixels: NDArray[np.intp]
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.float32]]:
     """For each pixel of the mask: is it on the contour, on the occlusion boundary, and how deep is the object there."""
-    width = frame.labels.shape[1]
-    row, column = np.divmod(pixels, width)
+    window, depth, places = _window(frame, pixels)
+    labels, depth = window.ravel(), depth.ravel()
+
+    def first_depth(start: NDArray[np.intp], step: int, wanted: NDArray[np.int64] | int) -> NDArray[np.float32]:
+        """First valid depth of an instance from each place on along `step`; 0 where none is within `STEPS` pixels."""
+        found = np.zeros(len(start), np.float32)
+        for k in range(STEPS):
+            at = start + k * step
+            found = np.where((found == 0) & (labels[at] == wanted), depth[at], found)
+        return found
+
     on_contour, on_boundary = np.zeros(len(pixels), bool), np.zeros(len(pixels), bool)
     own_depth = np.zeros(len(pixels), np.float32)
-    for down, right in ((0, 1), (0, -1), (1, 0), (-1, 0)):
-        beside = _label_at(frame, row + down, column + right)
-        edge = np.flatnonzero(beside != label)
+    for step in (1, -1, window.shape[1], -window.shape[1]):
+        edge = np.flatnonzero(labels[places + step] != label)
         on_contour[edge] = True
-        r, c, other = row[edge], column[edge], beside[edge]
-        own = _first_depth(frame, r, c, (-down, -right), np.full(len(edge), label))
+        here = places[edge]
+        own = first_depth(here, -step, label)
         own_depth[edge] = np.where(own > 0, own, own_depth[edge])
+        beside = labels[here + step]
+        other = beside
         for k in range(2, GAP + 2):
-            other = np.where(other == BACKGROUND, _label_at(frame, r + k * down, c + k * right), other)
-        theirs = _first_depth(frame, r + down, c + right, (down, right), other)
+            other = np.where(other == BACKGROUND, labels[here + k * step], other)
+        theirs = np.where(other > BACKGROUND, first_depth(here + step, step, other), 0)
         hides = (other != label) & (theirs > 0) & (theirs < own - NEARER)
-        on_boundary[edge[hides | (beside[edge] == OUTSIDE)]] = True
+        on_boundary[edge[hides | (beside == OUTSIDE)]] = True
     return on_contour, on_boundary, own_depth
-
-
-def _label_at(frame: RGBDFrame, row: NDArray[np.intp], column: NDArray[np.intp]) -> NDArray[np.int64]:
-    height, width = frame.labels.shape
-    inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
-    found = frame.labels[np.where(inside, row, 0), np.where(inside, column, 0)].astype(np.int64)
-    return np.where(inside, found, OUTSIDE)
-
-
-def _first_depth(
-    frame: RGBDFrame, row: NDArray[np.intp], column: NDArray[np.intp], step: tuple[int, int], label: NDArray[np.int64]
-) -> NDArray[np.float32]:
-    """First valid depth of `label` from each pixel on along `step`; 0 where there is none within `STEPS` pixels."""
-    found = np.zeros(len(row), np.float32)
-    for k in range(STEPS):
-        r, c = row + k * step[0], column + k * step[1]
-        usable = (found == 0) & (_label_at(frame, r, c) == label) & (label > BACKGROUND)
-        found[usable] = frame.depth_m[r[usable], c[usable]]
-    return found
