@@ -16,7 +16,7 @@ import numpy as np
 from flax import nnx
 from numpy.typing import NDArray
 
-from thor2_jax.capacity import BATCH_BUCKETS, batch_bucket, point_bucket
+from thor2_jax.capacity import BATCH_BUCKETS, POINT_BUCKETS, batch_bucket, point_bucket
 from thor2_jax.classifier import Feature, check_features, feature_of, join
 from thor2_jax.descriptor import describe
 from thor2_jax.errors import InputError
@@ -111,6 +111,25 @@ class Recognizer:
         """Read a run folder (see `run_folder.load_run`, also for what is raised)."""
         return cls(load_run(run_dir))
 
+    def warm_up(self, max_points: int = 2048, max_instances: int = 16) -> int:
+        """Compile everything for frames of up to `max_instances` instances with up to `max_points` points each.
+
+        No such frame compiles anything afterwards. Points are counted on the descriptors' voxel grid (4 mm).
+
+        Returns:
+            The number of shapes compiled for.
+
+        Raises:
+            InputError: numbers below 1 or past the largest buckets.
+        """
+        points = [n for n in POINT_BUCKETS if n <= point_bucket(max_points)]
+        batches = [b for b in BATCH_BUCKETS if b <= batch_bucket(max_instances)]
+        for n in points:
+            for b in batches:
+                nothing = (np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
+                self.probabilities(describe(PointClouds.pack([nothing] * b, n), self.run.network, self.run.config))
+        return len(points) * len(batches)
+
     def describe(self, frame: RGBDFrame) -> DescribedFrame:
         """Clouds and descriptors of a frame's instances, those past the largest batch bucket included."""
         clouds = instance_clouds(frame)
@@ -170,6 +189,8 @@ class Recognizer:
         }
         joined = join(found)
         rows = {index: row for row, index in enumerate(described.usable)}
+        overflow = np.asarray(described.descriptors.overflow)
+        points_used = np.asarray(described.packed.mask).sum(axis=1)
         answers = []
         for index, cloud in enumerate(described.clouds):
             row = rows.get(index)
@@ -184,8 +205,8 @@ class Recognizer:
                     classifier=str(joined.classifier[row]),
                     top={name: self._top(values[row]) for name, values in found.items()},
                     occluded=described.occluded[row],
-                    overflow=int(described.descriptors.overflow[row]),
-                    points_used=int(described.packed.mask[row].sum()),
+                    overflow=int(overflow[row]),
+                    points_used=int(points_used[row]),
                     kept_by_fallback=cloud.kept_by_fallback,
                 )
             )

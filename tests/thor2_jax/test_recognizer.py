@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax
 import numpy as np
 import pytest
 from flax import nnx
@@ -151,3 +152,25 @@ def test_a_missing_classifier_is_named(run: TrainedRun) -> None:
     assert {a.classifier for a in answers if a.reason is None} == {"tops"}
     with pytest.raises(thor2.InputError, match="shape"):
         shape_only.recognize(tilted(patches()), classifiers=("shape",))  # type: ignore[arg-type]
+
+
+def test_nothing_compiles_after_warm_up(run: TrainedRun) -> None:
+    """Compilations counted by JAX's own monitoring, with a recognizer that no other test has used."""
+    compiled: list[str] = []
+
+    def listen(event: str, duration: float, **_: object) -> None:
+        if event == "/jax/core/compile/backend_compile_duration":
+            compiled.append(event)
+
+    fresh = Recognizer(run)
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        assert fresh.warm_up(max_points=1000, max_instances=3) == 2 * 3
+        assert compiled
+        compiled.clear()
+        for count in (1, 2, 3):
+            chosen = np.isin(patches(), (3, 7, 200)[:count])
+            assert len(fresh.recognize(tilted(np.where(chosen, patches(), 0).astype(np.uint8)))) == count
+        assert compiled == []
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
