@@ -1,9 +1,10 @@
 """THOR2 (Samani and Banerjee, 2024) in JAX: coloured point clouds to TOPS and TOPS2, RGB-D frames to object names."""
 
-from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
+from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig, Relaxation
 from thor2_jax.descriptor import describe, describe_aligned, describe_strips, diagrams, strips
 from thor2_jax.errors import InputError
 from thor2_jax.frames import Intrinsics, RGBDFrame, read_frame
+from thor2_jax.parameters import Parameters
 from thor2_jax.recognizer import Recognition, Recognizer
 from thor2_jax.types import Descriptors, Diagrams, PointClouds, Strips
 from thor2_jax.view_normalization import align, mirror, turn, view_normalize
@@ -15,10 +16,12 @@ __all__ = [
     "Diagrams",
     "InputError",
     "Intrinsics",
+    "Parameters",
     "PointClouds",
     "RGBDFrame",
     "Recognition",
     "Recognizer",
+    "Relaxation",
     "Strips",
     "align",
     "describe",

@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 from thor2_jax.errors import InputError
 
-__all__ = ["DESCRIPTOR_VERSION", "DescriptorConfig"]
+__all__ = ["DESCRIPTOR_VERSION", "DescriptorConfig", "Relaxation"]
 
 DESCRIPTOR_VERSION = 1
 """Raised by one with every change that alters a descriptor's values; stored in run folders, which refuse to mix."""
@@ -22,6 +22,32 @@ _CHOICES = {"homology": ("gudhi", "closed_form"), "convention": ("paper", "relea
 
 def _is_finite(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+@dataclasses.dataclass(frozen=True)
+class Relaxation:
+    """Temperatures of the soft descriptor (`relaxation`). Towards zero, all together, it becomes the hard one.
+
+    Attributes:
+        slice: width of the sigmoid at a slice's borders, scaled units along z.
+        strip: width of the sigmoid at a strip's borders, scaled units along x.
+        extremum: of the log-sum-exp over a strip's points, scaled units along y.
+        color: of the softmax over colours, units of the HyAB distance in CIELAB.
+
+    Raises:
+        InputError: a temperature that is no positive number, naming the field and the value.
+    """
+
+    slice: float = 0.01
+    strip: float = 0.0025
+    extremum: float = 0.005
+    color: float = 1.0
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if not (_is_finite(value) and value > 0):
+                raise InputError(f"Relaxation.{field.name} is {value!r}; it must be a positive number")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,6 +68,8 @@ class DescriptorConfig:
         n_strips: strips kept in a slice, n_s^max of the paper (31 for UW-IS Occluded, 29 for OCID).
         image_size: pixels along either side of a persistence image; the window starts at -`sigma_2`.
         image_variance: variance of the Gaussian at each point of a diagram.
+        persistence_weight: exponent n of a point's weight in an image, persistence**n; the paper's is 1.
+        relaxation: temperatures of soft slices, strips, extremes and colours; None is the paper's hard descriptor.
 
     Raises:
         InputError: a value out of its range, naming the field and the value.
@@ -57,12 +85,14 @@ class DescriptorConfig:
     n_strips: int = 31
     image_size: int = 32
     image_variance: float = 0.00025
+    persistence_weight: float = 1.0
+    relaxation: Relaxation | None = None
 
     def __post_init__(self) -> None:
         for name, allowed in _CHOICES.items():
             if getattr(self, name) not in allowed:
                 raise InputError(f"DescriptorConfig.{name} is {getattr(self, name)!r}; it must be one of {allowed}")
-        for name in ("sigma_s", "sigma_1", "sigma_2", "image_variance"):
+        for name in ("sigma_s", "sigma_1", "sigma_2", "image_variance", "persistence_weight"):
             if not (_is_finite(getattr(self, name)) and getattr(self, name) > 0):
                 raise InputError(f"DescriptorConfig.{name} is {getattr(self, name)!r}; it must be a positive number")
         for name in ("n_slices", "n_strips", "image_size"):
@@ -70,6 +100,12 @@ class DescriptorConfig:
                 raise InputError(f"DescriptorConfig.{name} is {getattr(self, name)!r}; it must be a positive integer")
         if not _is_finite(self.alpha):
             raise InputError(f"DescriptorConfig.alpha is {self.alpha!r}; it must be a finite angle in radians")
+        if not (self.relaxation is None or isinstance(self.relaxation, Relaxation)):
+            raise InputError(f"DescriptorConfig.relaxation is {self.relaxation!r}; it must be a Relaxation or None")
+        if self.convention == "released" and self.relaxation is not None:
+            raise InputError(
+                f"DescriptorConfig.relaxation is {self.relaxation}; the released convention rounds and has no soft form"
+            )
         if self.convention == "released" and (self.sigma_1, self.sigma_2) != (0.1, 0.025):
             raise InputError(
                 f"DescriptorConfig.sigma_1, sigma_2 are {self.sigma_1}, {self.sigma_2}; the released convention rounds "

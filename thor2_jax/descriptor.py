@@ -18,6 +18,7 @@ from colornet.grid import GRID_SIZE
 from thor2_jax.color_membership import RegionSets, region_sets
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
+from thor2_jax.parameters import Parameters
 from thor2_jax.persistence import diagrams_of_strips
 from thor2_jax.persistence_images import past_window, persistence_images
 from thor2_jax.slicing import strips_of_cloud
@@ -28,10 +29,13 @@ __all__ = ["describe", "describe_aligned", "describe_strips", "diagrams", "strip
 
 
 @functools.lru_cache(maxsize=8)
-def _device_tables(network: ColorNetwork) -> tuple[RegionSets, jax.Array]:
+def _region_sets(network: ColorNetwork) -> RegionSets:
     # Kept for later calls, so they must be arrays also when the first call happens while a caller's function is traced.
     with jax.ensure_compile_time_eval():
-        return region_sets(network), jnp.asarray(network.similarity, jnp.float32)
+        return region_sets(network)
+
+
+_default_parameters = functools.lru_cache(maxsize=8)(Parameters.of)
 
 
 def _check(clouds: PointClouds) -> None:
@@ -51,12 +55,12 @@ def _diagrams(strips: Strips, config: DescriptorConfig) -> Diagrams:
 
 
 @partial(jax.jit, static_argnums=2)
-def _describe_strips(strips: Strips, similarity: jax.Array, config: DescriptorConfig) -> Descriptors:
+def _describe_strips(strips: Strips, parameters: Parameters, config: DescriptorConfig) -> Descriptors:
     found = diagrams_of_strips(strips, config)
     # E^i = (C^i Delta)^T
-    embeddings = jnp.einsum("...jr,rq->...qj", strips.color, similarity, precision=jax.lax.Precision.HIGHEST)
+    embeddings = jnp.einsum("...jr,rq->...qj", strips.color, parameters.similarity, precision=jax.lax.Precision.HIGHEST)
     return Descriptors(
-        images=persistence_images(found, config),
+        images=persistence_images(found, config, parameters.image_variance, parameters.persistence_weight),
         embeddings=embeddings,
         overflow=strips.overflow + past_window(found, config),
     )
@@ -71,12 +75,14 @@ def strips(aligned: PointClouds, network: ColorNetwork, config: DescriptorConfig
         config: static; another one compiles again, as does another shape of `aligned`.
     """
     _check(aligned)
-    return _strips(aligned, _device_tables(network)[0], config)
+    return _strips(aligned, _region_sets(network), config)
 
 
-def describe_strips(strips: Strips, network: ColorNetwork, config: DescriptorConfig) -> Descriptors:
-    """Persistence images and colour embeddings of `strips` (fields [B, S, J])."""
-    return _describe_strips(strips, _device_tables(network)[1], config)
+def describe_strips(
+    strips: Strips, network: ColorNetwork, config: DescriptorConfig, parameters: Parameters | None = None
+) -> Descriptors:
+    """Persistence images and colour embeddings of `strips` (fields [B, S, J]); the rest as in `describe`."""
+    return _describe_strips(strips, _default_parameters(network, config) if parameters is None else parameters, config)
 
 
 def diagrams(aligned: PointClouds, config: DescriptorConfig) -> Diagrams:
@@ -86,24 +92,33 @@ def diagrams(aligned: PointClouds, config: DescriptorConfig) -> Diagrams:
     return _diagrams(_strips(aligned, one_set, config), config)
 
 
-def describe_aligned(aligned: PointClouds, network: ColorNetwork, config: DescriptorConfig) -> Descriptors:
+def describe_aligned(
+    aligned: PointClouds, network: ColorNetwork, config: DescriptorConfig, parameters: Parameters | None = None
+) -> Descriptors:
     """TOPS, CE and TOPS2 of clouds that are aligned already (scaled units, first octant, turned by alpha).
+
+    The arguments are those of `describe`.
 
     Raises:
         InputError: `aligned` is no batch of clouds.
     """
-    return describe_strips(strips(aligned, network, config), network, config)
+    return describe_strips(strips(aligned, network, config), network, config, parameters)
 
 
-def describe(clouds: PointClouds, network: ColorNetwork, config: DescriptorConfig) -> Descriptors:
+def describe(
+    clouds: PointClouds, network: ColorNetwork, config: DescriptorConfig, parameters: Parameters | None = None
+) -> Descriptors:
     """TOPS, CE and TOPS2 of clouds as the camera saw them.
 
-    View normalization, turn, slices, diagrams, images, embeddings.
+    View normalization, turn, slices, diagrams, images, embeddings. Gradients reach points, colours and parameters; the
+    frame of the view normalization counts as fixed. What points and parameters change through the choice of slices,
+    strips and colour regions alone has a gradient of exactly zero (colours, alpha) unless the config relaxes it.
 
     Args:
         clouds: [B, N] clouds in metres.
         network: the colour network; its regions and similarity fix the colour part.
         config: static; another one compiles again, as does another B or N.
+        parameters: take the place of the network's and the config's where given. Other values compile nothing.
 
     Returns:
         Descriptors of the B clouds. An empty cloud's are zero.
@@ -112,4 +127,4 @@ def describe(clouds: PointClouds, network: ColorNetwork, config: DescriptorConfi
         InputError: `clouds` is no batch of clouds.
     """
     _check(clouds)
-    return describe_aligned(align(clouds, config), network, config)
+    return describe_aligned(align(clouds, config, parameters), network, config, parameters)

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 from jax.scipy.special import ndtr
+from jax.typing import ArrayLike
 
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.slicing import strip_births
@@ -11,15 +12,25 @@ from thor2_jax.types import Diagrams
 __all__ = ["past_window", "persistence_images"]
 
 
-def _pixel_mass(centres: jax.Array, config: DescriptorConfig) -> jax.Array:
+def _pixel_mass(centres: jax.Array, variance: ArrayLike, config: DescriptorConfig) -> jax.Array:
     """Integral of the Gaussian at each of `centres` [..., J] over each pixel of an axis: [..., P, J]."""
     edges = (jnp.arange(config.image_size + 1) - 1) * config.sigma_2
-    z = (edges.astype(centres.dtype)[:, None] - centres[..., None, :]) / jnp.sqrt(config.image_variance)
+    z = (edges.astype(centres.dtype)[:, None] - centres[..., None, :]) * (1 / jnp.sqrt(variance))
     return jnp.diff(ndtr(z), axis=-2)
 
 
-def persistence_images(diagrams: Diagrams, config: DescriptorConfig) -> jax.Array:
-    """Sum over the pairs of persistence x Gaussian, integrated over each pixel.
+def _weight(persistence: jax.Array, exponent: ArrayLike) -> jax.Array:
+    """persistence**exponent; 0 at 0, with a finite gradient for any exponent, and the number itself for 1."""
+    return persistence * jnp.exp((exponent - 1) * jnp.log(jnp.where(persistence > 0, persistence, 1)))
+
+
+def persistence_images(
+    diagrams: Diagrams,
+    config: DescriptorConfig,
+    variance: ArrayLike | None = None,
+    persistence_weight: ArrayLike | None = None,
+) -> jax.Array:
+    """Sum over the pairs of persistence**n x Gaussian, integrated over each pixel; the paper's n is 1.
 
     The Gaussian is separable, so an image is one product of two tables. The one for births is the same for all slices:
     pair j is born with strip j.
@@ -27,15 +38,19 @@ def persistence_images(diagrams: Diagrams, config: DescriptorConfig) -> jax.Arra
     Args:
         diagrams: of any number of slices, fields [..., J].
         config: static.
+        variance: [], of the Gaussian; by default the config's `image_variance`.
+        persistence_weight: [], the exponent n; by default the config's.
 
     Returns:
         [..., P, P] float32, axes birth and persistence, both over [-sigma_2, (P - 1) sigma_2]; zeros for an empty
         diagram.
     """
     persistence = jnp.where(diagrams.mask, diagrams.deaths - diagrams.births, 0)
-    # The weight is the persistence: padding adds nothing.
-    by_persistence = _pixel_mass(persistence, config) * persistence[..., None, :]
-    by_birth = _pixel_mass(strip_births(config), config)
+    variance = config.image_variance if variance is None else variance
+    # No persistence, no weight: padding adds nothing.
+    weight = _weight(persistence, config.persistence_weight if persistence_weight is None else persistence_weight)
+    by_persistence = _pixel_mass(persistence, variance, config) * weight[..., None, :]
+    by_birth = _pixel_mass(strip_births(config), variance, config)
     images = jnp.matmul(by_persistence, by_birth.T, precision=jax.lax.Precision.HIGHEST)
     return jnp.swapaxes(images, -1, -2)
 

@@ -20,7 +20,7 @@ from flax import nnx
 
 import colornet
 from thor2_jax.classifier import MLP, Feature, check_features
-from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
+from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig, Relaxation
 from thor2_jax.errors import InputError
 
 __all__ = ["TrainedRun", "check_new", "input_size", "load_run", "save_run"]
@@ -136,6 +136,11 @@ def _description(path: Path) -> dict[str, Any]:
     return found
 
 
+def _config(constants: Mapping[str, Any]) -> DescriptorConfig:
+    relaxation = constants.get("relaxation")  # folders written before there was one are hard
+    return DescriptorConfig(**{**constants, "relaxation": None if relaxation is None else Relaxation(**relaxation)})
+
+
 def load_run(path: str | Path) -> TrainedRun:
     """Read a run folder.
 
@@ -147,12 +152,12 @@ def load_run(path: str | Path) -> TrainedRun:
     found = _description(path)
     where = f"model: {path / 'run.json'}"
     try:
-        config = DescriptorConfig(**found["descriptor_config"])
+        config = _config(found["descriptor_config"])
         classes = tuple(found["classes"])
         names = check_features(found["classifiers"], "classifiers")
         fingerprint, record = found["color_network"], found["record"]
         digests = dict(found.get("weights", {}))  # folders written before there were digests are read without
-    except (KeyError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{where}: {type(error).__name__}: {error}") from None
     if not isinstance(found["classes"], list) or not classes or not all(isinstance(name, str) for name in classes):
         raise InputError(f"{where}: classes is {found['classes']!r}; expected a list of names")

@@ -9,6 +9,7 @@ import numpy as np
 
 from thor2_jax.color_membership import RegionSets, color_sets
 from thor2_jax.config import DescriptorConfig
+from thor2_jax.relaxation import relaxed_strips
 from thor2_jax.types import PointClouds, Strips
 
 __all__ = ["slice_and_strip", "strip_births", "strips_of_cloud"]
@@ -66,7 +67,8 @@ def _rounded(values: jax.Array, scale: int) -> jax.Array:
 def strips_of_cloud(cloud: PointClouds, sets: RegionSets, config: DescriptorConfig) -> Strips:
     """Extreme points and colour vectors of every strip of one aligned cloud (no batch axis).
 
-    The extremes are found as point indices and gathered, so that a gradient reaches exactly one point each.
+    The extremes are found as point indices and gathered, so that a gradient reaches exactly one point each. A config
+    with a relaxation gives the soft ones (`relaxation`).
 
     Args:
         cloud: points [N, 3], scaled units, first octant.
@@ -76,6 +78,9 @@ def strips_of_cloud(cloud: PointClouds, sets: RegionSets, config: DescriptorConf
     n_points, n_segments = cloud.points.shape[0], config.n_slices * config.n_strips
     i, j = slice_and_strip(cloud.points, cloud.mask, config)
     inside = cloud.mask & (i >= 0) & (i < config.n_slices) & (j >= 0) & (j < config.n_strips)
+    overflow = (cloud.mask & ~inside).sum(dtype=jnp.int32)
+    if config.relaxation is not None:
+        return relaxed_strips(cloud, sets, config, overflow)
     segment = jnp.where(inside, i * config.n_strips + j, n_segments)  # past the end: dropped by the scatters
 
     y = cloud.points[:, 1]
@@ -105,5 +110,5 @@ def strips_of_cloud(cloud: PointClouds, sets: RegionSets, config: DescriptorConf
         high=grid(extremes[:, 1]),
         occupied=grid(occupied),
         color=grid(color),
-        overflow=(cloud.mask & ~inside).sum(dtype=jnp.int32),
+        overflow=overflow,
     )

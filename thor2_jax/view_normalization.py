@@ -12,10 +12,12 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from thor2_jax.bounding_box import HIGHEST, minimal_box_axes, rotate
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
+from thor2_jax.parameters import Parameters
 from thor2_jax.reductions import ROWS, largest, smallest, total
 from thor2_jax.types import PointClouds
 
@@ -38,7 +40,7 @@ def _to_first_octant(points: jax.Array, mask: jax.Array) -> tuple[jax.Array, jax
     return jnp.where(mask, points - low[:, None], 0), low
 
 
-def _normalize_one(cloud: PointClouds, sigma_s: float) -> PointClouds:
+def _normalize_one(cloud: PointClouds, sigma_s: jax.Array) -> PointClouds:
     points, mask = _planes(cloud)
     scaled = points * sigma_s
     centre = total(jnp.where(mask, scaled, 0)) / jnp.maximum(mask.sum(), 1)
@@ -73,8 +75,12 @@ def _normalize_one(cloud: PointClouds, sigma_s: float) -> PointClouds:
     return dataclasses.replace(cloud, points=points.T[: len(cloud.mask)], camera=camera)
 
 
-@partial(jax.jit, static_argnums=1)
-def view_normalize(clouds: PointClouds, config: DescriptorConfig) -> PointClouds:
+@jax.jit
+def _view_normalize(clouds: PointClouds, sigma_s: jax.Array) -> PointClouds:
+    return jax.vmap(lambda cloud: _normalize_one(cloud, sigma_s))(clouds)
+
+
+def view_normalize(clouds: PointClouds, config: DescriptorConfig, parameters: Parameters | None = None) -> PointClouds:
     """Rotate each cloud onto its minimal box, longest side along x, seen from -z, in the first octant.
 
     The steps of the paper's section "View normalization": (1, 2) axes of an approximately minimal-volume box, longest
@@ -83,19 +89,21 @@ def view_normalize(clouds: PointClouds, config: DescriptorConfig) -> PointClouds
     with more of the cloud comes first; (4) if the first two x-bins of 0.01 hold more occlusion-boundary points than the
     last two, a half turn about z keeps the occluded end out of the first slice; (6) translation to the first octant.
     Every step follows the cloud and the camera: a rigid motion of both changes nothing. Cubes and balls have no unique
-    box; their frame is one of the equal ones.
+    box; their frame is one of the equal ones. A gradient sees the frame as fixed: it jumps where another face of the
+    box becomes flush, and equal eigenvalues have no derivative.
 
     Args:
         clouds: metres, any frame, camera given in the same one.
-        config: only `sigma_s` is used. Static: another config compiles again.
+        config: only `sigma_s` is used.
+        parameters: take the place of the config's where given. Other values compile nothing.
 
     Returns:
         Clouds in scaled units; `camera` moved along; colours, mask and boundary as they were.
     """
-    return jax.vmap(lambda cloud: _normalize_one(cloud, config.sigma_s))(clouds)
+    return _view_normalize(clouds, np.float32(config.sigma_s) if parameters is None else parameters.sigma_s)
 
 
-def _turn_one(cloud: PointClouds, alpha: float) -> PointClouds:
+def _turn_one(cloud: PointClouds, alpha: jax.Array) -> PointClouds:
     c, s = jnp.cos(alpha), jnp.sin(alpha)
     about_y = jnp.array([[c, 0, -s], [0, 1, 0], [s, 0, c]])
     points, mask = _planes(cloud)
@@ -104,25 +112,30 @@ def _turn_one(cloud: PointClouds, alpha: float) -> PointClouds:
     return dataclasses.replace(cloud, points=points.T[: len(cloud.mask)], camera=camera)
 
 
-@partial(jax.jit, static_argnums=1)
-def turn(normal: PointClouds, config: DescriptorConfig) -> PointClouds:
+@jax.jit
+def _turn(normal: PointClouds, alpha: jax.Array) -> PointClouds:
+    return jax.vmap(lambda cloud: _turn_one(cloud, alpha))(normal)
+
+
+def turn(normal: PointClouds, config: DescriptorConfig, parameters: Parameters | None = None) -> PointClouds:
     """Turn normalized clouds by -alpha about y (paper, "Slicing").
 
     The long axis then stands at alpha to the x-y plane.
 
     Args:
         normal: clouds as `view_normalize` returns them, or mirrored ones.
-        config: only `alpha` is used. Static.
+        config: only `alpha` is used.
+        parameters: take the place of the config's where given. Other values compile nothing.
 
     Returns:
         The aligned clouds, scaled units, in the first octant.
     """
-    return jax.vmap(lambda cloud: _turn_one(cloud, config.alpha))(normal)
+    return _turn(normal, np.float32(config.alpha) if parameters is None else parameters.alpha)
 
 
-def align(clouds: PointClouds, config: DescriptorConfig) -> PointClouds:
+def align(clouds: PointClouds, config: DescriptorConfig, parameters: Parameters | None = None) -> PointClouds:
     """`turn` of `view_normalize`: clouds in metres to aligned clouds in scaled units, ready to be sliced."""
-    return turn(view_normalize(clouds, config), config)
+    return turn(view_normalize(clouds, config, parameters), config, parameters)
 
 
 @partial(jax.jit, static_argnums=1)

@@ -5,7 +5,7 @@ import math
 
 import pytest
 
-from thor2_jax import DescriptorConfig, InputError
+from thor2_jax import DescriptorConfig, InputError, Relaxation
 
 
 def test_the_papers_constants() -> None:
@@ -14,6 +14,7 @@ def test_the_papers_constants() -> None:
     assert (config.n_slices, config.n_strips, config.image_size, config.image_variance) == (7, 31, 32, 0.00025)
     assert config.alpha == math.pi / 4
     assert (config.homology, config.convention) == ("gudhi", "paper")
+    assert config.persistence_weight == 1 and config.relaxation is None
     assert config.window == pytest.approx(0.775)
 
 
@@ -34,11 +35,12 @@ BAD = [
     *[(name, "ripser") for name in ("homology", "convention")],
     *[
         (name, value)
-        for name in ("sigma_s", "sigma_1", "sigma_2", "image_variance")
+        for name in ("sigma_s", "sigma_1", "sigma_2", "image_variance", "persistence_weight")
         for value in (0, -1.0, math.nan, math.inf, "2.5", None, True)
     ],
     *[(name, value) for name in ("n_slices", "n_strips", "image_size") for value in (0, -1, 7.0, "7", True)],
     *[("alpha", value) for value in (math.nan, -math.inf, "45", None)],
+    *[("relaxation", value) for value in (0.1, "soft", {"slice": 0.1})],
 ]
 
 
@@ -55,3 +57,23 @@ def test_the_released_convention_holds_for_its_own_widths_only() -> None:
         DescriptorConfig.released(sigma_1=0.2)
     with pytest.raises(InputError, match=r"sigma_1, sigma_2 are 0\.1, 0\.05"):
         DescriptorConfig.released(sigma_2=0.05)
+
+
+@pytest.mark.parametrize("name", [field.name for field in dataclasses.fields(Relaxation)])
+@pytest.mark.parametrize("value", [0, -1.0, math.nan, math.inf, "1", None, True])
+def test_bad_temperatures_are_refused_by_name(name: str, value: object) -> None:
+    with pytest.raises(InputError) as caught:
+        Relaxation(**{name: value})
+    message = str(caught.value)
+    assert f"Relaxation.{name}" in message and repr(value) in message and "\n" not in message
+
+
+def test_a_relaxed_config_is_hashable_and_another_one() -> None:
+    relaxed = DescriptorConfig(relaxation=Relaxation(color=2.0))
+    assert hash(relaxed) == hash(DescriptorConfig(relaxation=Relaxation(color=2.0)))
+    assert len({relaxed, DescriptorConfig(), DescriptorConfig(relaxation=Relaxation())}) == 3
+
+
+def test_the_released_convention_has_no_soft_form() -> None:
+    with pytest.raises(InputError, match="relaxation is Relaxation.*no soft form"):
+        DescriptorConfig.released(relaxation=Relaxation())

@@ -180,16 +180,6 @@ def test_degenerate_clouds_give_finite_numbers() -> None:
     np.testing.assert_array_equal(described, [len(points) > 0 for points in DEGENERATE.values()])
 
 
-@pytest.mark.slow
-def test_degenerate_clouds_have_finite_gradients() -> None:
-    clouds = degenerate()
-
-    def total(points: jax.Array) -> jax.Array:
-        return thor2.describe(dataclasses.replace(clouds, points=points), NETWORK, CLOSED).images.sum()
-
-    assert np.isfinite(np.asarray(jax.grad(total)(clouds.points))).all()
-
-
 @pytest.mark.parametrize("homology", ["gudhi", "closed_form"])
 def test_inside_a_callers_jit_and_vmap(homology: str) -> None:
     """With a network never seen before, so that nothing of the first trace may be kept for the calls after it."""

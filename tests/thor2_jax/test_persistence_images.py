@@ -1,5 +1,7 @@
 """Persistence images against persim, and against a quadrature of the Gaussian."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -129,3 +131,16 @@ def test_any_number_of_slices_at_once() -> None:
     assert found.shape == (2, 3, 32, 32)
     for k, pairs in enumerate(one):
         np.testing.assert_allclose(found[k // 3, k % 3], persistence_images(pairs, CONFIG), atol=TOLERANCE)
+
+
+@pytest.mark.parametrize("exponent", [0.5, 1.0, 2.0])
+@pytest.mark.parametrize("variance", [0.00025, 0.001])
+def test_other_weights_and_variances(exponent: float, variance: float) -> None:
+    births, deaths = random_pairs(4, 9)
+    edges = (np.arange(33) - 1) * 0.025
+    tables = np.diff(ndtr((edges - np.stack([births, deaths - births])[..., None]) / np.sqrt(variance)))
+    expected = np.einsum("kp,kq,k->pq", *tables, (deaths - births) ** exponent)
+    by_config = dataclasses.replace(CONFIG, image_variance=variance, persistence_weight=exponent)
+    pairs = diagram(births, deaths)
+    for found in (persistence_images(pairs, by_config), persistence_images(pairs, CONFIG, variance, exponent)):
+        np.testing.assert_allclose(found, np.broadcast_to(expected, found.shape), atol=TOLERANCE)

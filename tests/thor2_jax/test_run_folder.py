@@ -22,6 +22,7 @@ from thor2_jax.run_folder import TrainedRun, input_size, load_run, save_run
 
 CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=2, n_strips=5, image_size=8, alpha=0.5)
 CLASSES = ("a mug", "b", "ç")
+CONSTANTS = dataclasses.asdict(CONFIG)
 
 
 def make_run(features: tuple[str, ...] = ("tops", "ce")) -> TrainedRun:
@@ -135,6 +136,19 @@ def damage_data(path: Path) -> None:
         file.write_bytes(file.read_bytes()[:-1000])
 
 
+@pytest.mark.parametrize("relaxation", [None, thor2.Relaxation(color=2.0)], ids=["hard", "relaxed"])
+def test_every_constant_comes_back(relaxation: thor2.Relaxation | None, tmp_path: Path) -> None:
+    config = dataclasses.replace(CONFIG, relaxation=relaxation, persistence_weight=1.5)
+    save_run(dataclasses.replace(make_run(("ce",)), config=config), tmp_path / "run")
+    assert load_run(tmp_path / "run").config == config
+
+
+def test_folders_without_the_later_constants_are_read(copied: Path) -> None:
+    older = {name: value for name, value in CONSTANTS.items() if name not in ("relaxation", "persistence_weight")}
+    edited(descriptor_config=older)(copied)
+    assert load_run(copied).config == CONFIG
+
+
 def flip_a_bit(path: Path) -> None:
     file = max((path / "weights" / "ce").rglob("d/*"), key=lambda file: file.stat().st_size)
     content = bytearray(file.read_bytes())
@@ -147,7 +161,6 @@ def other_network(path: Path) -> None:
     dataclasses.replace(network, mean_rgb=network.mean_rgb + 1).save(path / "network.npz")
 
 
-CONSTANTS = dataclasses.asdict(CONFIG)
 DAMAGES: dict[str, tuple[Callable[[Path], Any], str]] = {
     "no folder": (shutil.rmtree, "run is no run folder"),
     "no run.json": (lambda path: (path / "run.json").unlink(), "run is no run folder"),
@@ -164,6 +177,9 @@ DAMAGES: dict[str, tuple[Callable[[Path], Any], str]] = {
     "unknown classifier": (edited(classifiers=["shape"]), "classifiers is ['shape']"),
     "missing classifier": (edited(classifiers=["ce", "tops", "tops2"]), "weights/tops2 is missing"),
     "unknown constant": (edited(descriptor_config={**CONSTANTS, "beta": 1}), "beta"),
+    "bad relaxation": (edited(descriptor_config={**CONSTANTS, "relaxation": {"slice": 0}}), "Relaxation.slice is 0"),
+    "no relaxation": (edited(descriptor_config={**CONSTANTS, "relaxation": 5}), "run.json: TypeError"),
+    "list of constants": (edited(descriptor_config=[1]), "run.json: AttributeError"),
     "bad constant": (edited(descriptor_config={**CONSTANTS, "sigma_s": -1}), "DescriptorConfig.sigma_s is -1"),
     "other constant": (edited(descriptor_config={**CONSTANTS, "n_slices": 3}), "not of 330 inputs and 3 classes"),
     "no network": (lambda path: (path / "network.npz").unlink(), "network.npz cannot be read"),

@@ -1,0 +1,186 @@
+"""Gradients of the descriptor against finite differences in float64, away from ties; both backends; jit and vmap."""
+
+import dataclasses
+import logging
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import colornet
+import thor2_jax as thor2
+from thor2_jax import view_normalization
+
+NETWORK = colornet.load_default()
+SMALL = {"n_slices": 3, "n_strips": 8, "image_size": 12}
+CLOSED, GUDHI = (thor2.DescriptorConfig(homology=name, **SMALL) for name in ("closed_form", "gudhi"))
+SOFT = dataclasses.replace(CLOSED, relaxation=thor2.Relaxation())
+CONFIGS = {
+    "closed_form": CLOSED,
+    "gudhi": GUDHI,
+    "relaxed": SOFT,
+    "relaxed-gudhi": dataclasses.replace(GUDHI, relaxation=thor2.Relaxation()),
+}
+COUNT, CAPACITY = 44, 48
+Loss = Callable[..., jax.Array]
+
+
+@pytest.fixture
+def x64() -> Iterator[None]:
+    with jax.enable_x64(True):
+        yield
+
+
+def in_cells(seed: int) -> np.ndarray:
+    """Points of the first octant, none near a border of slices and strips, so that no small step crosses one."""
+    rng = np.random.default_rng(seed)
+    cells = rng.integers(0, [8, 1, 3], (COUNT, 3))
+    return (cells + rng.uniform(0.1, 0.9, (COUNT, 3))) * [0.025, 0.25, 0.1]
+
+
+def in_metres(seed: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    points = rng.random((COUNT, 3)) * [0.09, 0.06, 0.03]
+    points = points[np.argsort(points[:, 0])] @ np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    return points + [0.02, 0.1, 0.6]
+
+
+def clouds_of(make: Callable[[int], np.ndarray], count: int = 2, dtype: Any = np.float64) -> thor2.PointClouds:
+    packed = thor2.PointClouds.pack([(make(k), np.zeros((COUNT, 3))) for k in range(count)], CAPACITY)
+    points = np.zeros(packed.points.shape)
+    points[:, :COUNT] = [make(k) for k in range(count)]
+    colors = np.random.default_rng(9).uniform(0.05, 0.95, points.shape)
+    return dataclasses.replace(packed, points=jnp.asarray(points, dtype), colors=jnp.asarray(colors, dtype))
+
+
+def parameters_of(config: thor2.DescriptorConfig, dtype: Any = np.float64) -> thor2.Parameters:
+    exact = thor2.Parameters.of(NETWORK, dataclasses.replace(config, persistence_weight=1.3))
+    return jax.tree.map(lambda a: jnp.asarray(a, dtype), exact)
+
+
+def probed(found: thor2.Descriptors) -> jax.Array:
+    """A sum with weights of either sign over every output."""
+    probe = jnp.asarray(np.random.default_rng(5).normal(size=found.tops2.shape[-1]), found.tops2.dtype)
+    return (found.tops2 * probe).sum()
+
+
+def loss_of(describe: Loss, clouds: thor2.PointClouds, config: thor2.DescriptorConfig) -> Loss:
+    def loss(points: jax.Array, colors: jax.Array, parameters: thor2.Parameters) -> jax.Array:
+        moved = dataclasses.replace(clouds, points=points, colors=colors)
+        return probed(describe(moved, NETWORK, config, parameters))
+
+    return loss
+
+
+def assert_differences_agree(loss: Loss, *arguments: Any, step: float = 1e-6) -> list[float]:
+    """Each leaf's gradient along a random direction against a central difference; returns the derivatives found."""
+    leaves, tree = jax.tree.flatten(arguments)
+    value = jax.jit(lambda *leaves: loss(*jax.tree.unflatten(tree, leaves)))
+    gradients = jax.tree.leaves(jax.jit(jax.grad(loss, argnums=tuple(range(len(arguments)))))(*arguments))
+    rng, found = np.random.default_rng(1), []
+    for k, (leaf, gradient) in enumerate(zip(leaves, gradients, strict=True)):
+        assert gradient.dtype == np.float64
+        direction = rng.normal(size=leaf.shape) * float(step * jnp.abs(leaf).max())
+        ends = [value(*leaves[:k], leaf + sign * direction, *leaves[k + 1 :]) for sign in (1, -1)]
+        expected = float(ends[0] - ends[1]) / 2 / step
+        along = float((gradient * direction).sum()) / step
+        assert along == pytest.approx(expected, rel=2e-5, abs=1e-6), f"argument {k}"
+        found.append(along)
+    return found
+
+
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("name", ["closed_form", "gudhi", "relaxed"])
+def test_aligned_clouds_against_finite_differences(name: str) -> None:
+    config, aligned = CONFIGS[name], clouds_of(in_cells)
+    loss = loss_of(thor2.describe_aligned, aligned, config)
+    found = assert_differences_agree(loss, aligned.points, aligned.colors, parameters_of(config))
+    points, colors, similarity, alpha, sigma_s, variance, weight = found
+    assert 0 not in (points, similarity, variance, weight) and alpha == sigma_s == 0  # what is aligned stays so
+    assert (colors != 0) == (config.relaxation is not None)
+
+
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("name", ["closed_form", "relaxed"])
+def test_the_whole_way_against_finite_differences(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a frame that stands still: no gradient goes through it."""
+    config, clouds = CONFIGS[name], clouds_of(in_metres, 1)
+    frame = jnp.asarray(np.linalg.qr(np.random.default_rng(2).normal(size=(3, 3)))[0])
+    monkeypatch.setattr(view_normalization, "minimal_box_axes", lambda points: frame)
+
+    def describe(
+        clouds: thor2.PointClouds, network: Any, config: thor2.DescriptorConfig, parameters: thor2.Parameters
+    ) -> thor2.Descriptors:
+        normal = jax.vmap(lambda cloud: view_normalization._normalize_one(cloud, parameters.sigma_s))(clouds)
+        aligned = thor2.turn(normal, config, parameters)
+        return thor2.describe_aligned(aligned, network, config, parameters)
+
+    loss = loss_of(describe, clouds, config)
+    found = assert_differences_agree(loss, clouds.points, clouds.colors, parameters_of(config))
+    points, colors, similarity, alpha, sigma_s, variance, weight = found
+    assert 0 not in (points, similarity, sigma_s, variance, weight)
+    for value in (colors, alpha):
+        assert (value != 0) == (config.relaxation is not None)
+
+
+@pytest.mark.usefixtures("x64")
+def test_points_and_scale_agree_on_scaling() -> None:
+    """All points scaled about the camera turn no frame: the same change as that of sigma_s, frame search included."""
+    clouds, parameters = clouds_of(in_metres), parameters_of(CLOSED)
+    loss = loss_of(thor2.describe, clouds, CLOSED)
+    points, gradients = jax.jit(jax.grad(loss, argnums=(0, 2)))(clouds.points, clouds.colors, parameters)
+    by_scale = float(gradients.sigma_s * parameters.sigma_s)
+    assert float((points * clouds.points).sum()) == pytest.approx(by_scale, rel=1e-9)
+    value = jax.jit(lambda s: loss(clouds.points, clouds.colors, dataclasses.replace(parameters, sigma_s=s)))
+    ends = [float(value(parameters.sigma_s * (1 + step))) for step in (1e-6, -1e-6)]
+    assert by_scale == pytest.approx((ends[0] - ends[1]) / 2e-6, rel=1e-5)
+
+
+RELAXED = pytest.param(("relaxed", "relaxed-gudhi"), marks=pytest.mark.slow, id="relaxed")
+
+
+@pytest.mark.parametrize("names", [pytest.param(("closed_form", "gudhi"), id="hard"), RELAXED])
+def test_both_backends_and_one_cloud_at_a_time_give_the_same_gradient(names: tuple[str, str]) -> None:
+    clouds = clouds_of(in_cells, 3, np.float32)
+    parameters = parameters_of(CLOSED, np.float32)
+    whole = []
+    for name in names:
+        loss = loss_of(thor2.describe_aligned, clouds, CONFIGS[name])
+        whole.append(jax.jit(jax.grad(loss, argnums=(0, 1, 2)))(clouds.points, clouds.colors, parameters))
+
+    def alone(cloud: thor2.PointClouds) -> Any:
+        one = jax.tree.map(lambda a: a[None], cloud)
+        loss = loss_of(thor2.describe_aligned, one, CONFIGS[names[1]])
+        points, colors, rest = jax.grad(loss, argnums=(0, 1, 2))(one.points, one.colors, parameters)
+        return points[0], colors[0], rest
+
+    points, colors, rest = jax.jit(jax.vmap(alone))(clouds)
+    whole.append((points, colors, jax.tree.map(lambda a: a.sum(axis=0), rest)))
+    for other in whole[1:]:
+        for a, b in zip(jax.tree.leaves(whole[0]), jax.tree.leaves(other), strict=True):
+            assert np.isfinite(np.asarray(a)).all()
+            np.testing.assert_allclose(b, a, rtol=1e-4, atol=2e-6 * float(1 + jnp.abs(a).max()))
+
+
+def test_default_parameters_are_those_of_network_and_config() -> None:
+    clouds = clouds_of(in_metres, 2, np.float32)
+    config = dataclasses.replace(CLOSED, alpha=0.6, sigma_s=2.0, image_variance=0.0005, persistence_weight=1.5)
+    plain = thor2.describe(clouds, NETWORK, config)
+    given = thor2.describe(clouds, NETWORK, CLOSED, thor2.Parameters.of(NETWORK, config))
+    for name in ("images", "embeddings", "overflow"):
+        np.testing.assert_array_equal(getattr(given, name), getattr(plain, name))
+    assert np.abs(np.asarray(plain.tops2 - thor2.describe(clouds, NETWORK, CLOSED).tops2)).max() > 0.01
+
+
+def test_other_values_compile_nothing(caplog: pytest.LogCaptureFixture) -> None:
+    clouds, parameters = clouds_of(in_metres, 2, np.float32), thor2.Parameters.of(NETWORK, CLOSED)
+    thor2.describe(clouds, NETWORK, CLOSED)
+    others = [jax.tree.map(lambda a, k=k: a * (1 + 0.1 * k), parameters) for k in range(3)]
+    with jax.log_compiles(), caplog.at_level(logging.WARNING):
+        found = [np.asarray(thor2.describe(clouds, NETWORK, CLOSED, other).tops2) for other in others]
+    compiled = [record.getMessage() for record in caplog.records if "Finished XLA compilation" in record.getMessage()]
+    assert not [line for line in compiled if "reshape" not in line and "concatenate" not in line], compiled
+    assert np.abs(found[0] - found[1]).max() > 0 and np.abs(found[1] - found[2]).max() > 0

@@ -1,0 +1,168 @@
+"""The soft descriptor: towards zero temperature it is the hard one; above, nothing jumps and every gradient flows."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import colornet
+import thor2_jax as thor2
+from colornet.lab import GRID_WHITE
+from colornet.lab import hyab as exact_hyab
+from colornet.lab import to_lab as exact_lab
+from thor2_jax.color_membership import region_sets
+from thor2_jax.relaxation import hyab, interval_weights, soft_regions, to_lab
+
+NETWORK = colornet.load_default()
+HARD = thor2.DescriptorConfig(homology="closed_form")
+SETS = region_sets(NETWORK)
+
+
+def relaxed(factor: float) -> thor2.DescriptorConfig:
+    temperatures = {name: factor * value for name, value in dataclasses.asdict(thor2.Relaxation()).items()}
+    return dataclasses.replace(HARD, relaxation=thor2.Relaxation(**temperatures))
+
+
+def cloud_in_cells(seed: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points at least a fifth of a width from every border, but for some on the two planes that aligned clouds touch.
+
+    Few strips, so that there are many points in some, and heights far apart in neighbouring ones.
+    """
+    rng = np.random.default_rng(seed)
+    cells = rng.integers(0, rng.integers(1, [32, 2, 8]), (count, 3))
+    points = (cells + rng.uniform(0.2, 0.8, (count, 3))) * [0.025, 0.5, 0.1]
+    points[rng.random(count) < 0.1, 0] = 0
+    points[rng.random(count) < 0.1, 2] = 0
+    return points.astype(np.float32), rng.integers(0, 256, (count, 3), dtype=np.uint8)
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), count=st.integers(0, 200))
+def test_it_converges_to_the_hard_descriptor(seed: int, count: int) -> None:
+    clouds = thor2.PointClouds.pack([cloud_in_cells(seed, count)], 200)
+    hard = thor2.describe_aligned(clouds, NETWORK, HARD)
+    for name in ("images", "embeddings"):
+        errors = []
+        for factor in (1, 0.1, 0.01):
+            soft = thor2.describe_aligned(clouds, NETWORK, relaxed(factor))
+            errors.append(float(jnp.abs(getattr(soft, name) - getattr(hard, name)).max()))
+            np.testing.assert_array_equal(soft.overflow, hard.overflow)
+        assert errors[2] < 1e-3, (name, errors)
+        for warmer, colder in zip(errors, errors[1:], strict=False):
+            assert colder <= max(warmer, 1e-5), (name, errors)
+
+
+def test_points_that_hard_slices_leave_out_are_left_out() -> None:
+    points = np.array(
+        [[0.01, 0.1, 0.05], [0.012, 0.3, 0.05], [-0.1, 0, 0.05], [0.1, 0, -0.2], [0.9, 0, 0], [0.1, 0, 2]]
+    )
+    clouds = thor2.PointClouds.pack([(points, np.full((6, 3), 0.2))], 16)
+    hard, soft = (thor2.describe_aligned(clouds, NETWORK, config) for config in (HARD, relaxed(0.01)))
+    np.testing.assert_allclose(soft.tops2, hard.tops2, atol=1e-3)
+    assert int(soft.overflow[0]) == int(hard.overflow[0]) == 4
+
+
+def test_weights_of_intervals_are_differences_of_sigmoids() -> None:
+    at = np.linspace(0, 1.2, 500)
+    lower, upper = (0.1 * (np.arange(7) + k) for k in (0, 1))
+    for temperature in (0.003, 0.05, 1.0):
+
+        def below(edge: np.ndarray, temperature: float = temperature) -> np.ndarray:
+            return 1 / (1 + np.exp(-(at[:, None] - edge) / temperature))
+
+        expected = np.where(lower > 0, below(lower), 1) - below(upper)
+        found = np.exp(interval_weights(jnp.asarray(at, jnp.float32), 0.1, 7, temperature))
+        np.testing.assert_allclose(found, expected, atol=2e-5)
+        np.testing.assert_allclose(found.sum(axis=1), 1 - below(upper[-1:])[:, 0], atol=2e-5)
+
+
+def test_lab_and_hyab_against_colour_science() -> None:
+    rng = np.random.default_rng(0)
+    rgb = np.concatenate([rng.integers(0, 256, (2000, 3)), np.repeat(np.arange(256)[:, None], 3, axis=1)])
+    expected = exact_lab(rgb, GRID_WHITE)
+    found = to_lab(jnp.asarray(rgb / 255, jnp.float32))
+    np.testing.assert_allclose(found, expected, atol=2e-4)
+    np.testing.assert_allclose(hyab(found, found[::-1]), exact_hyab(expected, expected[::-1]), atol=1e-3)
+
+
+def test_cold_colours_are_in_the_hard_regions() -> None:
+    """Also where another grid colour is nearer by HyAB, and at the ends of the channels."""
+    rgb = np.random.default_rng(0).integers(0, 256, (4000, 3), dtype=np.uint8)
+    rgb[:1000] = np.random.default_rng(1).choice([0, 1, 2, 253, 254, 255], (1000, 3))
+    colors = jnp.asarray(rgb / 255, jnp.float32)
+    for temperature in (0.05, 0.001, 1e-6):
+        np.testing.assert_allclose(soft_regions(colors, SETS, temperature), NETWORK.membership(rgb), atol=1e-5)
+
+
+def test_warm_colours_are_shared_by_the_softmax() -> None:
+    """On a grid colour, against a loop in float64 over the 27 around."""
+    temperature, reach = 4.0, 0.5 + 4 / 5
+    for rgb in ([120, 35, 200], [0, 255, 5], [0, 0, 0]):
+        total, expected = 0.0, np.zeros(NETWORK.n_regions)
+        for offset in np.ndindex(3, 3, 3):
+            steps = np.array(offset) - 1
+            other = np.array(rgb) + 5 * steps
+            if (other >= 0).all() and (other <= 255).all():
+                distance = exact_hyab(exact_lab(np.array(rgb), GRID_WHITE), exact_lab(other, GRID_WHITE))
+                share = np.exp(-float(distance) / temperature) * np.prod((1 - (steps / reach) ** 2) ** 2)
+                total += share
+                expected += share * NETWORK.membership(other.astype(np.uint8))
+        found = soft_regions(jnp.asarray([rgb], jnp.float32) / 255, SETS, temperature)[0]
+        np.testing.assert_allclose(found, expected / total, atol=1e-5)
+
+
+@pytest.mark.parametrize("temperature", [0.3, 2.0, 30.0])
+def test_regions_change_without_a_jump_along_a_path_of_colours(temperature: float) -> None:
+    path = jnp.linspace(0, 1, 40_001)[:, None] * jnp.array([1.1, 0.7, -0.8]) + jnp.array([-0.05, 0.1, 0.9])
+    weights = np.asarray(jax.jit(lambda colors: soft_regions(colors, SETS, temperature))(path))
+    np.testing.assert_allclose(weights.sum(axis=1), 1, atol=1e-5)
+    assert 0 < np.abs(np.diff(weights, axis=0)).max() < 0.03
+
+
+def test_a_strip_that_is_left_vanishes_without_a_jump() -> None:
+    """A slab with a wide range of y moves through four strips and two slices; nothing of the descriptor jumps."""
+    rng = np.random.default_rng(0)
+    points = rng.random((24, 3)) * [0.002, 0.4, 0.002]
+    shifts = np.linspace(0, 1, 801)[:, None] * [0.1, 0, 0.15]
+    clouds = thor2.PointClouds.pack([(points + shift, np.full((24, 3), 0.4)) for shift in shifts], 32)
+    for config, largest in ((HARD, 10), (relaxed(1), 0.02)):
+        config = dataclasses.replace(config, n_slices=2, n_strips=6)
+        images = np.asarray(thor2.describe_aligned(clouds, NETWORK, config).images)
+        steps = np.abs(np.diff(images, axis=0)).max(axis=(1, 2, 3))
+        assert (steps.max() < largest) and (images.sum(axis=(1, 2, 3)) > 0).all()
+        assert (steps.max() > 0.1) == (config.relaxation is None)
+
+
+def test_gradients_flow_where_the_hard_ones_are_zero() -> None:
+    points, rgb = cloud_in_cells(3, 200)
+    normal = thor2.PointClouds.pack([(points[:, [2, 1, 0]], rgb)], 208)
+    parameters = thor2.Parameters.of(NETWORK, HARD)
+    probe = jnp.asarray(np.random.default_rng(0).normal(size=11942), jnp.float32)
+    for config in (HARD, relaxed(1)):
+
+        @jax.jit
+        @jax.grad
+        def gradient(
+            moved: tuple[jax.Array, jax.Array], config: thor2.DescriptorConfig = config
+        ) -> tuple[jax.Array, jax.Array]:
+            alpha, colors = moved
+            other = dataclasses.replace(parameters, alpha=alpha)
+            changed = thor2.turn(dataclasses.replace(normal, colors=colors), config, other)
+            return (thor2.describe_aligned(changed, NETWORK, config, other).tops2[0] * probe).sum()
+
+        for found in gradient((parameters.alpha, normal.colors)):
+            assert np.isfinite(np.asarray(found)).all()
+            assert bool(np.asarray(found).any()) == (config.relaxation is not None)
+
+
+def test_both_backends_agree() -> None:
+    clouds = thor2.PointClouds.pack([cloud_in_cells(k, n) for k, n in enumerate((200, 0, 1, 37))], 208)
+    first, second = (
+        thor2.describe_aligned(clouds, NETWORK, dataclasses.replace(relaxed(1), homology=name))
+        for name in ("closed_form", "gudhi")
+    )
+    np.testing.assert_allclose(first.tops2, second.tops2, atol=1e-6)
