@@ -1,6 +1,5 @@
 """The whole way from clouds to TOPS and TOPS2 against NumPy in float64, and what must not matter."""
 
-import dataclasses
 import logging
 from pathlib import Path
 
