@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
 from thor2_jax.files import replacing, write_text
+from thor2_jax.recognizer import VOXEL
 from training.meshes import TexturedMesh, load_mesh
 from training.view_sphere import view_angles
-from training.views import MIN_POINTS, SIGMA_S, VOXEL, Cloud, iterate_views
+from training.views import MIN_POINTS, SIGMA_S, Cloud, iterate_views
 
 __all__ = ["read_view_folder", "render_to_folder", "render_views"]
 

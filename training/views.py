@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
 from thor2_jax.frames import backproject
+from thor2_jax.recognizer import VOXEL
 from thor2_jax.voxel_grid import voxel_downsample
 from training.meshes import TexturedMesh
 from training.rendering import TRAINING_CAMERA, Camera, RayCaster, RenderedView, render_view
@@ -25,9 +26,6 @@ from training.view_sphere import camera_pose
 __all__ = ["MIN_POINTS", "View", "cloud_of", "iterate_views", "view_cloud"]
 
 SIGMA_S = DescriptorConfig().sigma_s
-
-VOXEL = 0.01
-"""Side of a voxel of a training cloud, scaled units."""
 
 MIN_POINTS = 30
 """Views with fewer points are flagged `sparse`: too little of the object is seen to describe it."""
