@@ -141,6 +141,8 @@ def draw(sizes: dict[str, list[list[float]]], path: Path) -> None:
         axes.loglog(x, seconds * 1e3, "o-", color="#0072b2", label="describe, closed form")
         axes.loglog(x, seconds[-1] * 1e3 * x / x[-1], "--", color="#888888", label="in proportion")
         axes.set_xlabel("points a cloud (64 clouds)" if name == "points" else f"clouds ({N_POINTS} points each)")
+        axes.set_xticks(x, [f"{int(size):,}" for size in x])
+        axes.minorticks_off()
         axes.set_ylabel("milliseconds")
         axes.grid(color="#e5e5e5", which="both")
         axes.legend(frameon=False)
