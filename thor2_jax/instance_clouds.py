@@ -12,7 +12,7 @@ from thor2_jax.frames import RGBDFrame, pixel_rays
 from thor2_jax.outlier_removal import flying_pixels, remove_outliers
 from thor2_jax.voxel_grid import voxel_downsample
 
-__all__ = ["MAX_DEPTH", "MIN_DEPTH", "MIN_POINTS", "InstanceCloud", "instance_clouds"]
+__all__ = ["MAX_DEPTH", "MIN_DEPTH", "MIN_POINTS", "InstanceCloud", "instance_cloud", "instance_clouds"]
 
 MIN_DEPTH, MAX_DEPTH = 0.26, 2.5
 """Metres between which depth is trusted."""
@@ -47,10 +47,17 @@ class InstanceCloud:
 
 def instance_clouds(frame: RGBDFrame) -> list[InstanceCloud]:
     """The clouds of all instances, in the order of `frame.instances`, those that cannot be used included."""
-    return [_instance_cloud(frame, label, pixels) for label, pixels in frame.instance_pixels.items()]
+    return [instance_cloud(frame, label) for label in frame.instances]
 
 
-def _instance_cloud(frame: RGBDFrame, label: int, pixels: NDArray[np.intp]) -> InstanceCloud:
+def instance_cloud(frame: RGBDFrame, label: int) -> InstanceCloud:
+    """The cloud of one instance, which may be one that cannot be used.
+
+    Args:
+        frame: the frame.
+        label: one of `frame.instances`.
+    """
+    pixels = frame.instance_pixels[label]
     depth = frame.depth_m.ravel()[pixels]
     trusted = (depth >= MIN_DEPTH) & (depth <= MAX_DEPTH)
     flying = flying_pixels(frame, pixels)

@@ -97,11 +97,10 @@ def _contour(
 
     def first_depth(start: NDArray[np.intp], step: int, wanted: NDArray[np.int64] | int) -> NDArray[np.float32]:
         """First valid depth of an instance from each place on along `step`; 0 where none is within `STEPS` pixels."""
-        found = np.zeros(len(start), np.float32)
-        for k in range(STEPS):
-            at = start + k * step
-            found = np.where((found == 0) & (labels[at] == wanted), depth[at], found)
-        return found
+        at = start + step * np.arange(STEPS)[:, None]
+        usable = (labels[at] == wanted) & (depth[at] > 0)
+        first = at[usable.argmax(axis=0), np.arange(len(start))]
+        return np.where(usable.any(axis=0), depth[first], 0)
 
     on_contour, on_boundary = np.zeros(len(pixels), bool), np.zeros(len(pixels), bool)
     own_depth = np.zeros(len(pixels), np.float32)

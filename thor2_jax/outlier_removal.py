@@ -5,12 +5,12 @@ pixels at a step in depth fly; points with too few others around them are strays
 background.
 """
 
+import math
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+from scipy import ndimage
 from scipy.spatial import KDTree
 
 from thor2_jax.frames import RGBDFrame
@@ -33,6 +33,10 @@ On a grid of 3 mm their mean distance is 14 mm or less, so they need no search."
 CELL = 0.01
 """Metres: side of the cells in which pieces are looked for. Cells that touch, also at a corner, are one piece."""
 
+REACH = 100
+"""Cells from the middle of the cloud, along each axis, that a grid has at most; a point past them is in none. So grids
+stay small. Of the larger cells these are 1 m, and all that lies farther counts as one piece."""
+
 MIN_SHARE = 0.1
 """Pieces with a smaller share of the largest piece's points are dropped."""
 
@@ -50,48 +54,67 @@ def flying_pixels(frame: RGBDFrame, pixels: NDArray[np.intp]) -> NDArray[np.bool
     height, width = frame.labels.shape
     labels, depth = frame.labels.ravel(), frame.depth_m.ravel()
     row, column = np.divmod(pixels, width)
-    step = STEEPEST * depth[pixels] / frame.intrinsics.fx
+    here = depth[pixels]
+    # Nearer than this beside a pixel, and it flies; at 0 there is no depth. Past the image, a pixel is beside itself.
+    nearest = here - STEEPEST / frame.intrinsics.fx * here
     flying = np.zeros(len(pixels), bool)
-    for down, right in ((0, 1), (0, -1), (1, 0), (-1, 0)):
-        r, c = row + down, column + right
-        inside = (r >= 0) & (r < height) & (c >= 0) & (c < width)
-        beside = np.where(inside, r * width + c, pixels)
-        same = (labels[beside] == labels[pixels]) & (depth[beside] > 0)
-        flying |= same & (depth[pixels] - depth[beside] > step)
+    for beside in (
+        pixels + (column < width - 1),
+        pixels - (column > 0),
+        pixels + width * (row < height - 1),
+        pixels - width * (row > 0),
+    ):
+        there = depth[beside]
+        flying |= (there < nearest) & (there > 0) & (labels[beside] == labels[pixels])
     return flying
 
 
-def _cells(points: NDArray[Any], size: float) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
-    """Cell of each point [n] on a grid, number of points in each cell [m], and pairs [p, 2] of cells that touch."""
-    place = np.floor(points / size).astype(np.int64)
-    place -= place.min(axis=0)
-    extent = place.max(axis=0) + 1
-    keys, cell, counts = np.unique(np.ravel_multi_index(place.T, extent), return_inverse=True, return_counts=True)
-    centres = np.stack(np.unravel_index(keys, extent), axis=1)
-    return cell, counts, KDTree(centres).query_pairs(1.8, output_type="ndarray")  # 1.73: touching at a corner
+def _grid(points: NDArray[Any], size: float) -> tuple[NDArray[np.int64], tuple[int, ...]]:
+    """Place of each point [n] on a flat grid of cells, and the grid's shape; 0 for points past `REACH`.
+
+    Two layers of cells on every side are empty, so that no cell touches the first.
+    """
+    place = np.floor(points.T.copy() / size)
+    place -= np.floor(np.median(place, axis=1, keepdims=True))
+    near = (np.abs(place) <= REACH).all(axis=0)
+    cells = np.where(near, place, 0).astype(np.int64)
+    cells -= cells.min(axis=1, keepdims=True) - 2
+    shape = tuple((cells.max(axis=1) + 3).tolist())
+    return np.where(near, np.ravel_multi_index(tuple(cells), shape), 0), shape
+
+
+def _points_around(points: NDArray[Any], size: float) -> NDArray[np.int64]:
+    """Number of points [n] in each point's cell and the 26 that it touches; 0 for points past `REACH`."""
+    cell, shape = _grid(points, size)
+    counts = np.bincount(cell, minlength=math.prod(shape))
+    counts[0] = 0
+    for step in (1, shape[2], shape[1] * shape[2]):
+        row = counts.copy()
+        row[step:] += counts[:-step]
+        row[:-step] += counts[step:]
+        counts = row
+    return counts[cell]
 
 
 def _among_others(points: NDArray[Any]) -> NDArray[np.bool_]:
     if len(points) <= NEIGHBORS:
         return np.zeros(len(points), bool)
     # Most points are surrounded on all sides. Only the others, along edges, are worth the search for neighbours.
-    cell, counts, pairs = _cells(points, INNER_CELL)
-    i, j = pairs.T
-    around = counts + np.bincount(i, counts[j], len(counts)) + np.bincount(j, counts[i], len(counts))
-    among = around[cell] > NEIGHBORS
+    among = _points_around(points, INNER_CELL) > NEIGHBORS
     rest = np.flatnonzero(~among)
-    distances = KDTree(points).query(points[rest], k=NEIGHBORS + 1)[0][:, 1:]
+    distances = KDTree(points, balanced_tree=False).query(points[rest], k=NEIGHBORS + 1)[0][:, 1:]
     among[rest] = distances.mean(axis=1) <= FARTHEST
     return among
 
 
 def _in_large_piece(points: NDArray[Any]) -> NDArray[np.bool_]:
-    cell, counts, pairs = _cells(points, CELL)
-    i, j = pairs.T
-    graph = coo_array((np.ones(len(i), np.int8), (i, j)), shape=(len(counts), len(counts)))
-    piece = connected_components(graph, directed=False)[1]
-    size = np.bincount(piece, counts)
-    return np.asarray(size[piece[cell]] >= MIN_SHARE * size.max())
+    cell, shape = _grid(points, CELL)
+    full = np.zeros(shape, bool)
+    full.ravel()[cell[cell > 0]] = True
+    pieces, _ = ndimage.label(full, structure=np.ones((3, 3, 3)))
+    piece = pieces.ravel()[cell]
+    size = np.bincount(piece)
+    return np.asarray(size[piece] >= MIN_SHARE * size.max())
 
 
 def remove_outliers(points: NDArray[Any]) -> tuple[NDArray[np.intp], bool]:

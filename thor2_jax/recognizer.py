@@ -21,7 +21,7 @@ from thor2_jax.classifier import Feature, check_features, feature_of, join
 from thor2_jax.descriptor import describe
 from thor2_jax.errors import InputError
 from thor2_jax.frames import RGBDFrame
-from thor2_jax.instance_clouds import InstanceCloud, instance_clouds
+from thor2_jax.instance_clouds import InstanceCloud, instance_cloud
 from thor2_jax.occlusion import find_occlusion
 from thor2_jax.run_folder import TrainedRun, load_run
 from thor2_jax.types import Descriptors, PointClouds
@@ -84,6 +84,27 @@ class DescribedFrame:
     descriptors: Descriptors
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Part:
+    """What is described of an instance: points, colours and boundary marks on the descriptors' grid."""
+
+    occluded: bool
+    points: NDArray[np.float32]
+    colors: NDArray[np.uint8]
+    boundary: NDArray[np.bool_]
+
+
+NO_PART = _Part(False, np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), np.zeros(0, bool))
+
+
+def _prepare(frame: RGBDFrame, label: int, size: float) -> tuple[InstanceCloud, _Part]:
+    cloud = instance_cloud(frame, label)
+    if cloud.reason is not None:
+        return cloud, NO_PART
+    found = find_occlusion(frame, cloud)
+    return cloud, _Part(found.occluded, *_voxelled(cloud, found.boundary, size))
+
+
 def _voxelled(cloud: InstanceCloud, edge: NDArray[np.bool_], size: float) -> tuple[Any, Any, NDArray[np.bool_]]:
     """The cloud on the descriptors' grid (coarser if no bucket holds it), and which voxels hold boundary points."""
     # The mark is a fourth channel; its mean over a voxel is above 0 where one point has it.
@@ -126,37 +147,29 @@ class Recognizer:
         batches = [b for b in BATCH_BUCKETS if b <= batch_bucket(max_instances)]
         for n in points:
             for b in batches:
-                nothing = (np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
-                self.probabilities(describe(PointClouds.pack([nothing] * b, n), self.run.network, self.run.config))
+                nothing = PointClouds.pack([(NO_PART.points, NO_PART.colors)] * b, n)
+                self.probabilities(describe(nothing, self.run.network, self.run.config))
         return len(points) * len(batches)
 
     def describe(self, frame: RGBDFrame) -> DescribedFrame:
         """Clouds and descriptors of a frame's instances, those past the largest batch bucket included."""
-        clouds = instance_clouds(frame)
-        usable = [i for i, cloud in enumerate(clouds) if cloud.reason is None]
         size = VOXEL / self.run.config.sigma_s
-        parts, edges, occluded = [], [], []
-        for i in usable:
-            found = find_occlusion(frame, clouds[i])
-            occluded.append(found.occluded)
-            points, colors, marks = _voxelled(clouds[i], found.boundary, size)
-            parts.append((points, colors))
-            edges.append(marks)
-        packed, descriptors = self._describe_clouds(parts, edges)
-        return DescribedFrame(clouds, usable, occluded, packed, descriptors)
+        prepared = [_prepare(frame, label, size) for label in frame.instances]
+        clouds = [cloud for cloud, _ in prepared]
+        usable = [i for i, cloud in enumerate(clouds) if cloud.reason is None]
+        parts = [prepared[i][1] for i in usable]
+        packed, descriptors = self._describe_parts(parts)
+        return DescribedFrame(clouds, usable, [part.occluded for part in parts], packed, descriptors)
 
-    def _describe_clouds(
-        self, parts: Sequence[tuple[Any, Any]], edges: Sequence[NDArray[np.bool_]]
-    ) -> tuple[PointClouds, Descriptors]:
+    def _describe_parts(self, parts: Sequence[_Part]) -> tuple[PointClouds, Descriptors]:
         limit = BATCH_BUCKETS[-1]
-        capacity = point_bucket(max((len(points) for points, _ in parts), default=1))
+        capacity = point_bucket(max((len(part.points) for part in parts), default=1))
         batches = []
         for start in range(0, max(len(parts), 1), limit):
-            chunk, marks = list(parts[start : start + limit]), list(edges[start : start + limit])
-            missing = batch_bucket(max(len(chunk), 1)) - len(chunk)
-            chunk += [(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))] * missing
-            marks += [np.zeros(0, bool)] * missing
-            packed = PointClouds.pack(chunk, capacity, boundary=marks)
+            chunk = list(parts[start : start + limit])
+            chunk += [NO_PART] * (batch_bucket(max(len(chunk), 1)) - len(chunk))
+            clouds = [(part.points, part.colors) for part in chunk]
+            packed = PointClouds.pack(clouds, capacity, boundary=[part.boundary for part in chunk])
             batches.append((packed, describe(packed, self.run.network, self.run.config)))
         return jax.tree.map(lambda *arrays: np.concatenate(arrays), *batches) if len(batches) > 1 else batches[0]
 
