@@ -15,7 +15,7 @@ import jax.numpy as jnp
 
 from colornet import ColorNetwork
 from colornet.grid import GRID_SIZE
-from thor2_jax.color_membership import RegionSets, region_sets
+from thor2_jax.color_membership import RegionSets, color_sets, region_sets
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
 from thor2_jax.parameters import Parameters
@@ -25,7 +25,7 @@ from thor2_jax.slicing import strips_of_cloud
 from thor2_jax.types import Descriptors, Diagrams, PointClouds, Strips
 from thor2_jax.view_normalization import align
 
-__all__ = ["describe", "describe_aligned", "describe_strips", "diagrams", "strips"]
+__all__ = ["describe", "describe_aligned", "describe_strips", "diagrams", "strips", "strips_by_sets"]
 
 
 @functools.lru_cache(maxsize=8)
@@ -44,9 +44,18 @@ def _check(clouds: PointClouds) -> None:
         raise InputError(f"clouds is {found}; expected PointClouds with points [B, N, 3] (see PointClouds.pack)")
 
 
-@partial(jax.jit, static_argnums=2)
-def _strips(aligned: PointClouds, sets: RegionSets, config: DescriptorConfig) -> Strips:
-    return jax.vmap(lambda cloud: strips_of_cloud(cloud, sets, config))(aligned)
+# Apart from `_strips_of`: fused into its scatter, the look-up would be made again and again, one number at a time.
+_color_sets = jax.jit(color_sets)
+
+
+@partial(jax.jit, static_argnums=3)
+def _strips_of(aligned: PointClouds, set_of_point: jax.Array, sets: RegionSets, config: DescriptorConfig) -> Strips:
+    return jax.vmap(lambda cloud, of_point: strips_of_cloud(cloud, of_point, sets, config))(aligned, set_of_point)
+
+
+def strips_by_sets(aligned: PointClouds, sets: RegionSets, config: DescriptorConfig) -> Strips:
+    """`strips` with any weights of the sets that colours belong to, in place of a network's."""
+    return _strips_of(aligned, _color_sets(aligned.colors, sets), sets, config)
 
 
 @partial(jax.jit, static_argnums=1)
@@ -75,7 +84,7 @@ def strips(aligned: PointClouds, network: ColorNetwork, config: DescriptorConfig
         config: static; another one compiles again, as does another shape of `aligned`.
     """
     _check(aligned)
-    return _strips(aligned, _region_sets(network), config)
+    return strips_by_sets(aligned, _region_sets(network), config)
 
 
 def describe_strips(
@@ -89,7 +98,7 @@ def diagrams(aligned: PointClouds, config: DescriptorConfig) -> Diagrams:
     """Persistence diagrams of aligned clouds, fields [B, S, J]. Colours play no part."""
     _check(aligned)
     one_set = RegionSets(jnp.zeros(GRID_SIZE, jnp.int32), jnp.ones((1, 1), jnp.float32))
-    return _diagrams(_strips(aligned, one_set, config), config)
+    return _diagrams(strips_by_sets(aligned, one_set, config), config)
 
 
 def describe_aligned(

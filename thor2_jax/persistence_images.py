@@ -2,7 +2,7 @@
 
 import jax
 import jax.numpy as jnp
-from jax.scipy.special import ndtr
+from jax.scipy.special import erf
 from jax.typing import ArrayLike
 
 from thor2_jax.config import DescriptorConfig
@@ -15,8 +15,9 @@ __all__ = ["past_window", "persistence_images"]
 def _pixel_mass(centres: jax.Array, variance: ArrayLike, config: DescriptorConfig) -> jax.Array:
     """Integral of the Gaussian at each of `centres` [..., J] over each pixel of an axis: [..., P, J]."""
     edges = (jnp.arange(config.image_size + 1) - 1) * config.sigma_2
-    z = (edges.astype(centres.dtype)[:, None] - centres[..., None, :]) * (1 / jnp.sqrt(variance))
-    return jnp.diff(ndtr(z), axis=-2)
+    z = (edges.astype(centres.dtype)[:, None] - centres[..., None, :]) * jax.lax.rsqrt(2 * variance)
+    # A quarter of the cost of `ndtr`, which keeps far tails to more digits than an image has.
+    return jnp.diff(erf(z), axis=-2) / 2
 
 
 def _weight(persistence: jax.Array, exponent: ArrayLike) -> jax.Array:

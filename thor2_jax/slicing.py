@@ -3,11 +3,14 @@
 An aligned cloud becomes tables of a fixed size.
 """
 
+from functools import partial
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from thor2_jax.color_membership import RegionSets, color_sets
+from thor2_jax.color_membership import RegionSets
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.relaxation import relaxed_strips
 from thor2_jax.types import PointClouds, Strips
@@ -64,18 +67,45 @@ def _rounded(values: jax.Array, scale: int) -> jax.Array:
     return whole + up
 
 
-def strips_of_cloud(cloud: PointClouds, sets: RegionSets, config: DescriptorConfig) -> Strips:
+@partial(jax.custom_jvp, nondiff_argnums=(2,))
+def _extremes(y: jax.Array, segment: jax.Array, n_segments: int) -> tuple[jax.Array, jax.Array]:
+    """Least and greatest of `y` [N] in each segment, [n_segments] twice; inf and -inf where there is none.
+
+    Points of other segment numbers (past the end) are dropped. A gradient reaches exactly one point an extreme, also
+    where several are equal.
+    """
+    keys = jnp.stack([-y, y], axis=-1)
+    best = jnp.full((n_segments, 2), -jnp.inf, y.dtype).at[segment].max(keys, mode="drop")
+    return -best[:, 0], best[:, 1]
+
+
+@_extremes.defjvp
+def _extremes_jvp(n_segments: int, primals: Any, tangents: Any) -> Any:
+    y, segment = primals
+    found = _extremes(y, segment, n_segments)
+    at = jnp.minimum(segment, n_segments - 1)
+    number = jnp.arange(len(y), dtype=jnp.int32)
+
+    def tangent(values: jax.Array) -> jax.Array:
+        winner = jnp.where(y == values[at], number, -1)
+        index = jnp.full(n_segments, -1, jnp.int32).at[segment].max(winner, mode="drop")
+        return jnp.where(index >= 0, tangents[0][jnp.maximum(index, 0)], 0)
+
+    return found, tuple(tangent(values) for values in found)
+
+
+def strips_of_cloud(cloud: PointClouds, set_of_point: jax.Array, sets: RegionSets, config: DescriptorConfig) -> Strips:
     """Extreme points and colour vectors of every strip of one aligned cloud (no batch axis).
 
-    The extremes are found as point indices and gathered, so that a gradient reaches exactly one point each. A config
-    with a relaxation gives the soft ones (`relaxation`).
+    A config with a relaxation gives the soft ones (`relaxation`).
 
     Args:
         cloud: points [N, 3], scaled units, first octant.
+        set_of_point: [N] int32, the set of each point's colour, as of `color_sets`.
         sets: of the colour network's regions.
         config: static.
     """
-    n_points, n_segments = cloud.points.shape[0], config.n_slices * config.n_strips
+    n_segments = config.n_slices * config.n_strips
     i, j = slice_and_strip(cloud.points, cloud.mask, config)
     inside = cloud.mask & (i >= 0) & (i < config.n_slices) & (j >= 0) & (j < config.n_strips)
     overflow = (cloud.mask & ~inside).sum(dtype=jnp.int32)
@@ -83,18 +113,13 @@ def strips_of_cloud(cloud: PointClouds, sets: RegionSets, config: DescriptorConf
         return relaxed_strips(cloud, sets, config, overflow)
     segment = jnp.where(inside, i * config.n_strips + j, n_segments)  # past the end: dropped by the scatters
 
-    y = cloud.points[:, 1]
-    keys = jax.lax.stop_gradient(jnp.stack([-y, y], axis=-1))
-    best = jnp.full((n_segments, 2), -jnp.inf).at[segment].max(keys, mode="drop")
-    winner = keys >= best[jnp.minimum(segment, n_segments - 1)]
-    number = jnp.where(winner, jnp.arange(n_points, dtype=jnp.int32)[:, None], -1)
-    index = jnp.full((n_segments, 2), -1, jnp.int32).at[segment].max(number, mode="drop")
-    occupied = index[:, 0] >= 0
-    extremes = jnp.where(occupied[:, None], y[jnp.maximum(index, 0)], 0)
+    low, high = _extremes(cloud.points[:, 1], segment, n_segments)
+    occupied = low <= high
+    extremes = jnp.where(occupied[:, None], jnp.stack([low, high], axis=-1), 0)
 
     # Counted by set first: one addition a point instead of one a point and region.
     n_sets = sets.weights.shape[0]
-    cell = segment * n_sets + color_sets(cloud.colors, sets)
+    cell = segment * n_sets + set_of_point
     counts = jnp.zeros(n_segments * n_sets, jnp.float32).at[cell].add(1, mode="drop")
     color = jnp.matmul(counts.reshape(n_segments, n_sets), sets.weights, precision=jax.lax.Precision.HIGHEST)
     if config.convention == "released":
