@@ -1,5 +1,6 @@
 """THOR2 (Samani and Banerjee, 2024) in JAX: coloured point clouds to TOPS and TOPS2, RGB-D frames to object names."""
 
+import thor2_jax.jax_version  # noqa: F401  first: it refuses versions of jax that give wrong numbers
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig, Relaxation
 from thor2_jax.descriptor import describe, describe_aligned, describe_strips, diagrams, strips
 from thor2_jax.errors import InputError

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from thor2_jax.reductions import ROWS, argmax, largest, smallest, total
+from thor2_jax.reductions import ROWS, argmax, larger, largest, smaller, smallest, total
 
 __all__ = ["minimal_box_axes", "rotate", "support_points"]
 
@@ -68,7 +68,7 @@ def support_points(points: jax.Array) -> jax.Array:
     half = jnp.asarray(_DIRECTIONS)
     rows = scaled.reshape(3, ROWS, -1)
     each = [along(half, rows[:, k]) for k in range(ROWS)]
-    extremes = [functools.reduce(jnp.maximum, each), -functools.reduce(jnp.minimum, each)]
+    extremes = [functools.reduce(larger, each), -functools.reduce(smaller, each)]
     residue = argmax(jnp.concatenate(extremes))
     candidates = jnp.swapaxes(rows, 1, 2)[:, residue]
     row = argmax(along(jnp.concatenate([half, -half]), candidates))
@@ -88,7 +88,9 @@ def _eigenvectors(moments: jax.Array) -> jax.Array:
 
 def _moments(points: jax.Array) -> jax.Array:
     """[3, 3], sums of products of the coordinates of centred points [3, N], N a multiple of 16."""
-    return jnp.stack([total(points[k] * points) for k in range(3)])
+    x, y, z = points
+    xx, xy, xz, yy, yz, zz = total(jnp.stack([x * x, x * y, x * z, y * y, y * z, z * z]))
+    return jnp.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz]).reshape(3, 3)
 
 
 def _rectangle_areas(xy: jax.Array, angles: jax.Array) -> jax.Array:

@@ -12,7 +12,17 @@ from numpy.typing import NDArray
 from thor2_jax.errors import InputError
 from thor2_jax.types import Descriptors
 
-__all__ = ["FEATURES", "HIDDEN", "Feature", "Joined", "MLP", "check_features", "feature_of", "join"]
+__all__ = [
+    "FEATURES",
+    "HIDDEN",
+    "Feature",
+    "Joined",
+    "MLP",
+    "check_features",
+    "class_probabilities",
+    "feature_of",
+    "join",
+]
 
 Feature = Literal["ce", "tops", "tops2"]
 FEATURES: tuple[Feature, ...] = ("ce", "tops", "tops2")
@@ -60,6 +70,11 @@ class MLP(nnx.Module):
             x = nnx.relu(norm(layer(x), use_running_average=not train))
             x = self.dropout(x, deterministic=not train, rngs=rngs)
         return self.head(x)
+
+
+def class_probabilities(model: MLP, descriptors: Descriptors, name: Feature) -> jax.Array:
+    """Softmax [B, n_classes] of a trained classifier of that name."""
+    return jax.nn.softmax(model(feature_of(descriptors, name)))
 
 
 class Joined(NamedTuple):

@@ -17,7 +17,7 @@ from flax import nnx
 from numpy.typing import NDArray
 
 from thor2_jax.capacity import BATCH_BUCKETS, POINT_BUCKETS, batch_bucket, point_bucket
-from thor2_jax.classifier import Feature, check_features, feature_of, join
+from thor2_jax.classifier import MLP, Feature, check_features, class_probabilities, join
 from thor2_jax.descriptor import describe
 from thor2_jax.errors import InputError
 from thor2_jax.frames import RGBDFrame
@@ -230,7 +230,7 @@ class Recognizer:
         return [(self.run.classes[i], float(probabilities[i])) for i in best]
 
 
-def _compiled(name: Feature, model: nnx.Module) -> Any:
+def _compiled(name: Feature, model: MLP) -> Any:
     graph, state = nnx.split(model)
-    forward = jax.jit(lambda state, found: jax.nn.softmax(nnx.merge(graph, state)(feature_of(found, name))))
+    forward = jax.jit(lambda state, found: class_probabilities(nnx.merge(graph, state), found, name))
     return lambda found: forward(state, found)

@@ -133,9 +133,16 @@ def turn(normal: PointClouds, config: DescriptorConfig, parameters: Parameters |
     return _turn(normal, np.float32(config.alpha) if parameters is None else parameters.alpha)
 
 
+@jax.jit
+def _align(clouds: PointClouds, sigma_s: jax.Array, alpha: jax.Array) -> PointClouds:
+    return jax.vmap(lambda cloud: _turn_one(_normalize_one(cloud, sigma_s), alpha))(clouds)
+
+
 def align(clouds: PointClouds, config: DescriptorConfig, parameters: Parameters | None = None) -> PointClouds:
     """`turn` of `view_normalize`: clouds in metres to aligned clouds in scaled units, ready to be sliced."""
-    return turn(view_normalize(clouds, config, parameters), config, parameters)
+    if parameters is None:
+        return _align(clouds, np.float32(config.sigma_s), np.float32(config.alpha))
+    return _align(clouds, parameters.sigma_s, parameters.alpha)
 
 
 @partial(jax.jit, static_argnums=1)

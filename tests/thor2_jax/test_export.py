@@ -1,0 +1,73 @@
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from flax import nnx
+
+import colornet
+import thor2_jax as thor2
+from thor2_jax.classifier import FEATURES, MLP
+from thor2_jax.export import export_recognizer
+from thor2_jax.run_folder import TrainedRun, input_size
+
+CONFIG = thor2.DescriptorConfig()
+
+
+@pytest.fixture(scope="module")
+def run() -> TrainedRun:
+    network = colornet.load_default()
+    classifiers = {name: MLP(input_size(name, CONFIG, network.n_regions), 3, rngs=nnx.Rngs(7)) for name in FEATURES}
+    return TrainedRun(CONFIG, network, ("a", "b", "c"), classifiers, {})
+
+
+LOADER = """
+import sys
+import jax, jax.export, numpy as np
+exported = jax.export.deserialize(bytearray(open(sys.argv[1], "rb").read()))
+fields = np.load(sys.argv[2])
+found = exported.call(*(fields[name] for name in ("points", "colors", "mask", "camera", "boundary")))
+assert not any(name.split(".")[0] in ("thor2_jax", "colornet", "flax", "gudhi") for name in sys.modules)
+np.savez(sys.argv[3], **found)
+"""
+
+
+def test_what_is_exported_gives_the_same_answers_without_this_code(run: TrainedRun, tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    sizes = [(0.2, 0.1, 0.06), (0.1, 0.1, 0.02), (0.3, 0.05, 0.05)]
+    clouds = [
+        (rng.uniform(0, s, (n, 3)) + [0, 0, 0.6], rng.random((n, 3))) for n, s in zip((500, 31, 0), sizes, strict=True)
+    ]
+    packed = thor2.PointClouds.pack([*clouds, clouds[0]], 512)
+    blob = export_recognizer(run, n_points=512, n_clouds=4)
+    (tmp_path / "loader.py").write_text(LOADER)
+    (tmp_path / "recognizer.jax").write_bytes(blob)
+    names = ("points", "colors", "mask", "camera", "boundary")
+    np.savez(tmp_path / "clouds.npz", **{name: np.asarray(getattr(packed, name)) for name in names})
+    arguments = [str(tmp_path / name) for name in ("loader.py", "recognizer.jax", "clouds.npz", "found.npz")]
+    done = subprocess.run([sys.executable, *arguments], capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    found = np.load(tmp_path / "found.npz")
+    assert set(found) == {*FEATURES, "overflow"}
+
+    described = thor2.describe(packed, run.network, CONFIG)  # gudhi: the other backend
+    np.testing.assert_array_equal(found["overflow"], described.overflow)
+    expected = thor2.Recognizer(run).probabilities(described)
+    for name in FEATURES:
+        np.testing.assert_allclose(found[name], expected[name], rtol=0, atol=1e-6)
+        np.testing.assert_allclose(found[name].sum(axis=1), 1, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("given", "complaint"),
+    [
+        ({"n_points": 500}, "n_points is 500"),
+        ({"n_clouds": 3}, "n_clouds is 3"),
+        ({"platforms": ("abacus",)}, "platforms is"),
+        ({"platforms": ()}, "platforms is"),
+    ],
+)
+def test_sizes_and_platforms_that_are_refused(run: TrainedRun, given: dict, complaint: str) -> None:
+    with pytest.raises(thor2.InputError, match=complaint):
+        export_recognizer(run, **{"n_points": 512, "n_clouds": 1, **given})
