@@ -1,0 +1,112 @@
+"""PCD files packed byte by byte, whole and damaged."""
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from thor2_jax.errors import InputError
+from training.readers.pcd import read_organized_points
+
+HEADER = (
+    "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS x y z rgba label\nSIZE 4 4 4 4 4\n"
+    "TYPE F F F U U\nCOUNT 1 1 1 1 1\nWIDTH 3\nHEIGHT 2\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 6\nDATA {}\n"
+)
+ROWS = [(0.5 * k, -0.25 * k, float("nan") if k == 4 else 1.0 + k, 0xFF102030, k) for k in range(6)]
+POINTS = np.array([row[:3] for row in ROWS]).reshape(2, 3, 3)
+DATA = {
+    "binary": b"".join(struct.pack("<fffII", *row) for row in ROWS),
+    "ascii": "".join("{} {} {} {} {}\n".format(*row) for row in ROWS).encode(),
+}
+
+
+def write(path: Path, data: str, old: str = "", new: str = "") -> Path:
+    header = HEADER.format(data)
+    assert old in header
+    path.write_bytes(header.replace(old, new).encode() + DATA[data])
+    return path
+
+
+@pytest.mark.parametrize("data", DATA)
+def test_points(tmp_path: Path, data: str) -> None:
+    found = read_organized_points(write(tmp_path / "cloud.pcd", data))
+    assert found.dtype == np.float64
+    np.testing.assert_array_equal(found, POINTS)
+    np.testing.assert_array_equal(
+        read_organized_points(write(tmp_path / "cloud.pcd", data, "COUNT 1 1 1 1 1\n", "")), POINTS
+    )
+
+
+def test_points_among_other_fields(tmp_path: Path) -> None:
+    """A field of several numbers, padding, doubles and shorts, axes out of order; lines end in CR LF."""
+    path = tmp_path / "cloud.pcd"
+    header = (
+        "VERSION .7\r\nFIELDS _ z normal x _ y\r\nSIZE 1 8 4 4 2 4\r\nTYPE U F F F I F\r\nCOUNT 3 1 3 1 1 1\r\n"
+        "WIDTH 2\r\nHEIGHT 1\r\nPOINTS 2\r\nDATA {}\r\n"
+    )
+    rows = [(0, 1, 2, 3.5, 9.0, 9.0, 9.0, 1.5, -7, 2.5), (0, 1, 2, float("nan"), 9.0, 9.0, 9.0, 4.0, -7, 5.0)]
+    path.write_bytes(header.format("binary").encode() + b"".join(struct.pack("<3Bd3ffhf", *row) for row in rows))
+    expected = [[[1.5, 2.5, 3.5], [4.0, 5.0, np.nan]]]
+    np.testing.assert_array_equal(read_organized_points(path), expected)
+    text = "\r\n".join(" ".join(map(str, row)) for row in rows)
+    path.write_bytes((header.format("ascii") + text).encode())
+    np.testing.assert_array_equal(read_organized_points(path), expected)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("DATA", "DATA any"),
+        ("DATA", "DATE"),
+        ("FIELDS x y z", "FIELDS x y w"),
+        ("FIELDS x y z rgba label", "FIELDS x y z"),
+        ("SIZE 4", "SIZE 3"),
+        ("SIZE 4", "SIZE -4"),
+        ("SIZE 4", "SIZE four"),
+        ("TYPE F", "TYPE X"),
+        ("TYPE F F F U U\n", ""),
+        ("COUNT 1", "COUNT 2"),
+        ("COUNT 1", "COUNT 0"),
+        ("COUNT 1", "COUNT -1"),
+        ("COUNT 1 1 1 1 1", "COUNT 1 1 1 1 9999999999999999999999"),
+        ("COUNT 1 1 1 1 1", "COUNT 1 1 1 1 2000000000"),
+        ("WIDTH 3", "WIDTH 0"),
+        ("WIDTH 3", "WIDTH -3"),
+        ("WIDTH 3", "WIDTH 3.0"),
+        ("WIDTH 3", "WIDTH"),
+        ("HEIGHT 2", "HEIGHT 3"),
+        ("HEIGHT 2", "HEIGHT 99999999999999999999"),
+        ("HEIGHT 2\n", ""),
+    ],
+)
+@pytest.mark.parametrize("data", DATA)
+def test_headers_that_are_damaged(tmp_path: Path, data: str, old: str, new: str) -> None:
+    path = write(tmp_path / "cloud.pcd", data, old, new)
+    with pytest.raises(InputError) as caught:
+        read_organized_points(path)
+    assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_clouds_that_are_compressed(tmp_path: Path) -> None:
+    path = write(tmp_path / "cloud.pcd", "binary", "DATA binary", "DATA binary_compressed")
+    with pytest.raises(InputError, match=r"has DATA binary_compressed; expected ascii or binary$"):
+        read_organized_points(path)
+
+
+@pytest.mark.parametrize("data", DATA)
+@pytest.mark.parametrize("lacking", [1, 30, 10_000])
+def test_files_that_are_cut_off(tmp_path: Path, data: str, lacking: int) -> None:
+    path = write(tmp_path / "cloud.pcd", data)
+    lacking += data == "ascii"  # the last line break alone is not missed
+    path.write_bytes(path.read_bytes()[:-lacking])
+    with pytest.raises(InputError, match=r"cloud\.pcd (is cut off|does not hold 6 lines of 5 numbers|is no PCD file)"):
+        read_organized_points(path)
+
+
+@pytest.mark.parametrize("word", ["", "x", "1,5", "1 2"])
+def test_numbers_that_are_damaged(tmp_path: Path, word: str) -> None:
+    path = tmp_path / "cloud.pcd"
+    path.write_bytes(HEADER.format("ascii").encode() + DATA["ascii"].replace(b"2.5 ", f"{word} ".encode()))
+    with pytest.raises(InputError, match=r"cloud\.pcd does not hold 6 lines of 5 numbers$"):
+        read_organized_points(path)

@@ -1,0 +1,172 @@
+"""Datasets in the scene-wise format of BOP, the Benchmark for 6D Object Pose Estimation: YCB-Video and others.
+
+`<scene>/{rgb,depth}/<image>.png`, `<scene>/mask_visib/<image>_<instance>.png`, `scene_camera.json`, `scene_gt.json`
+and, if it is there, `scene_gt_info.json`; see docs/bop_datasets_format.md of github.com/thodan/bop_toolkit. The format
+numbers its objects; a YAML or JSON file names them, obj_id -> name.
+"""
+
+import math
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thor2_jax.errors import InputError
+from thor2_jax.frames import Intrinsics, RGBDFrame, read_color, read_depth, read_labels
+from training.readers.files import complaints_about, read_table
+from training.readers.labelled import LabelledFrame
+
+__all__ = ["BOP", "SMALLEST_VISIBLE"]
+
+SMALLEST_VISIBLE = 0.1
+"""Visible part of a silhouette from which on an instance is scored, as in BOP's own evaluation."""
+
+
+class BOP:
+    """The frames of a split (`test`), or those of the one scene that the folder is; iterating reads one at a time.
+
+    Label k + 1 is instance k of `scene_gt.json`. Masks may overlap, since BOP makes them with a tolerance in depth and
+    counts pixels without depth as visible: a pixel of several masks belongs to the smallest of them. Instances with an
+    empty mask are not scored, nor are those of which `scene_gt_info.json` says that less than `SMALLEST_VISIBLE` is to
+    be seen; these keep their pixels, as they occlude others.
+    """
+
+    def __init__(self, path: str | Path, names: str | Path | None = None) -> None:
+        """Finds the frames.
+
+        Args:
+            path: folder of scenes, or of one scene.
+            names: YAML or JSON file, obj_id -> name. Default: obj_000001 and so on.
+
+        Raises:
+            InputError: there are no frames, or `names` is damaged.
+            OSError: `names` cannot be opened.
+        """
+        path = Path(path).absolute()  # so that a scene's folder has a name, that of "." too
+        if not path.is_dir():
+            raise InputError(f"dataset: {path} is no folder")
+        scenes = sorted(f.parent for f in [*path.glob("scene_camera.json"), *path.glob("*/scene_camera.json")])
+        self._images = {scene: _images(scene / "rgb") for scene in scenes}
+        if len(self) == 0:
+            raise InputError(
+                f"dataset: {path} has no scene_camera.json beside rgb/<number>.png or .jpg, nor a folder in it"
+            )
+        self._names_file = names
+        self._names = None if names is None else _names(Path(names))
+
+    def __len__(self) -> int:
+        return sum(len(images) for images in self._images.values())
+
+    def __iter__(self) -> Iterator[LabelledFrame]:
+        """Read the frames.
+
+        Raises:
+            InputError: a file that is missing or damaged, an image or object that a table lacks, or images that do not
+                fit together; names the file.
+            OSError: a file cannot be opened.
+        """
+        for folder, images in self._images.items():
+            with complaints_about(folder.name):
+                scene = _Scene(folder)
+            for image in images:
+                identifier = f"{folder.name}/{image.stem}"
+                with complaints_about(identifier):
+                    frame, objects = scene.read(image)
+                    truth = {label: self._name(obj_id) for label, obj_id in objects.items()}
+                yield LabelledFrame(identifier, frame, truth, {"scene": folder.name})
+
+    def _name(self, obj_id: int) -> str:
+        if self._names is None:
+            return f"obj_{obj_id:06d}"
+        if obj_id not in self._names:
+            raise InputError(f"{self._names_file} lacks the obj_id {obj_id}")
+        return self._names[obj_id]
+
+
+class _Scene:
+    """The tables of a scene, and the images that they tell of."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._cameras = read_table(folder / "scene_camera.json")
+        self._objects = read_table(folder / "scene_gt.json")
+        info = folder / "scene_gt_info.json"
+        self._visible = read_table(info) if info.exists() else None
+
+    def read(self, image: Path) -> tuple[RGBDFrame, dict[int, int]]:
+        """The frame of a colour image, and label -> obj_id of the instances that are scored."""
+        number = str(int(image.stem))
+        with complaints_about(str(self._folder / "scene_camera.json")):
+            intrinsics = _intrinsics(_entry(self._cameras, number))
+        with complaints_about(str(self._folder / "scene_gt.json")):
+            objects = _values(_entry(self._objects, number), "obj_id", int)
+        visible: list[float] = [1.0] * len(objects)
+        if self._visible is not None:
+            with complaints_about(str(self._folder / "scene_gt_info.json")):
+                visible = _values(_entry(self._visible, number), "visib_fract", (int, float))
+                if len(visible) != len(objects):
+                    raise InputError(f"it has {len(visible)} instances in image {number}, scene_gt.json {len(objects)}")
+        depth = read_depth(self._folder / "depth" / f"{image.stem}.png")
+        masks = [self._mask(f"{image.stem}_{k:06d}.png", depth.shape) for k in range(len(objects))]
+        sizes = [int(mask.sum()) for mask in masks]
+        labels = np.zeros(depth.shape, np.int32)
+        for k in sorted(range(len(masks)), key=lambda k: -sizes[k]):
+            labels[masks[k]] = k + 1
+        scored = [k for k in range(len(objects)) if sizes[k] > 0 and visible[k] >= SMALLEST_VISIBLE]
+        return RGBDFrame(read_color(image), depth, labels, intrinsics), {k + 1: objects[k] for k in scored}
+
+    def _mask(self, name: str, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+        path = self._folder / "mask_visib" / name
+        mask = read_labels(path) > 0
+        if mask.shape != shape:
+            raise InputError(f"{path} has shape {mask.shape}; depth has {shape}")
+        return mask
+
+
+def _images(folder: Path) -> list[Path]:
+    files = (f for f in folder.glob("*") if f.suffix in (".png", ".jpg") and f.stem.isdecimal())
+    return sorted(files, key=lambda f: int(f.stem))
+
+
+def _names(path: Path) -> dict[int, str]:
+    names: dict[int, str] = {}
+    for obj_id, name in read_table(path).items():
+        # In JSON the keys are text.
+        if not str(obj_id).isdecimal() or not isinstance(name, str) or not name:
+            raise InputError(f"{path}: {obj_id!r} is {name!r}; expected an obj_id and a name")
+        names[int(obj_id)] = name
+    return names
+
+
+def _entry(table: Mapping[Any, Any], number: str) -> Any:
+    if number not in table:
+        raise InputError(f"it has no image {number}")
+    return table[number]
+
+
+def _values(instances: Any, key: str, kind: type | tuple[type, ...]) -> list[Any]:
+    """The value of `key` of each instance of an image."""
+    try:
+        values = [instance[key] for instance in instances]
+    except (TypeError, KeyError):
+        raise InputError(f"an image's entry is not a list of {{{key}: <number>, ...}}") from None
+    wrong = [value for value in values if not isinstance(value, kind) or isinstance(value, bool)]
+    if wrong:
+        raise InputError(f"{key} is {wrong[0]!r}; expected a number")
+    return values
+
+
+def _intrinsics(entry: Any) -> Intrinsics:
+    try:
+        matrix, scale = entry["cam_K"], entry["depth_scale"]
+        fx, skew, cx, a, fy, cy, b, c, one = matrix
+    except (TypeError, KeyError, ValueError):
+        raise InputError("an image's entry is not {cam_K: <9 numbers>, depth_scale: <number>, ...}") from None
+    if [skew, a, b, c, one] != [0, 0, 0, 0, 1]:
+        raise InputError(f"cam_K is {matrix!r}; expected fx, 0, cx, 0, fy, cy, 0, 0, 1")
+    if not isinstance(scale, (int, float)) or not 0 < scale < math.inf:
+        raise InputError(f"depth_scale is {scale!r}; it must be a positive number")
+    # The format gives millimetres a unit of depth, Intrinsics take units a metre.
+    return Intrinsics(fx, fy, cx, cy, 1000 / scale)

@@ -1,0 +1,164 @@
+"""OCID, Object Clutter Indoor Dataset (Suchi et al., 2019), its subset YCB10: clutter that grows by an object a frame.
+
+`{table,floor}/{bottom,top}/{cuboid,curved,mixed}/<sequence>/{rgb,depth,label,pcd}`; 640 x 480, depth in millimetres.
+Two cameras film each sequence, the lower (`bottom`) and the upper (`top`) one. The dataset names no objects: a YAML or
+JSON file does, sequence -> names in the order in which the objects were placed, which is that of their labels:
+
+    seq36: [mug, bowl, banana]                      # of both cameras
+    table/top/mixed/seq21: [bowl, tomato_soup]      # the sequence's folder, or the end of its path
+
+The dataset tells no intrinsics. They are fitted to each frame's organized point cloud, whose points lie on the rays of
+their pixels.
+"""
+
+import itertools
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thor2_jax.errors import InputError
+from thor2_jax.frames import Intrinsics, RGBDFrame, read_color, read_depth, read_labels
+from training.readers.files import complaints_about, read_table
+from training.readers.labelled import LabelledFrame
+from training.readers.pcd import read_organized_points
+
+__all__ = ["OCID", "fit_intrinsics"]
+
+_FIRST_OBJECT = {"table": 3, "floor": 2}
+"""Label of the object placed first. 0 is a pixel without depth, 1 the surroundings; on a table 2 is the table."""
+
+_CAMERAS = {"bottom": "lower", "top": "upper"}
+
+_Sequence = tuple[str, str, str, str]  # place, camera, type, name: its folder
+
+_LARGEST_RESIDUAL = 5.0
+"""Pixels, root mean square. Depth noise of the sensor makes about one, another kind of cloud hundreds."""
+
+
+class OCID:
+    """The frames of the subset, by sequence and time; iterating reads one at a time.
+
+    The objects that have a pixel in a frame are its truth.
+    """
+
+    def __init__(self, path: str | Path, names: str | Path) -> None:
+        """Finds the frames and the names of their objects.
+
+        Args:
+            path: folder `YCB10`, or the one that holds it.
+            names: YAML or JSON file, see the module.
+
+        Raises:
+            InputError: there are no frames, or `names` is damaged or lacks sequences; it says which.
+            OSError: `names` cannot be opened.
+        """
+        path = Path(path)
+        if not path.is_dir():
+            raise InputError(f"dataset: {path} is no folder")
+        self._root = path / "YCB10" if (path / "YCB10").is_dir() else path
+        self._images: dict[_Sequence, list[Path]] = {}
+        for place, camera in itertools.product(_FIRST_OBJECT, _CAMERAS):
+            for folder in sorted((self._root / place / camera).glob("*/*")):
+                images = sorted((folder / "rgb").glob("*.png"))
+                if images:
+                    self._images[place, camera, folder.parent.name, folder.name] = images
+        if not self._images:
+            raise InputError(f"dataset: {path} has no {{table,floor}}/{{bottom,top}}/<type>/<sequence>/rgb/*.png")
+        self._names = _names(Path(names), self._images)
+
+    def __len__(self) -> int:
+        return sum(len(images) for images in self._images.values())
+
+    def __iter__(self) -> Iterator[LabelledFrame]:
+        """Read the frames.
+
+        Raises:
+            InputError: a file that is missing or damaged, images that do not fit together, a cloud that gives no
+                intrinsics, or a label without a name; names the file.
+            OSError: a file cannot be opened.
+        """
+        for sequence, images in self._images.items():
+            place, camera, kind, _ = sequence
+            attributes = {"place": place, "camera": _CAMERAS[camera], "type": kind}
+            for image in images:
+                identifier = "/".join((*sequence, image.stem))
+                with complaints_about(identifier):
+                    frame, truth = _read(image, _FIRST_OBJECT[place], self._names[sequence])
+                yield LabelledFrame(identifier, frame, truth, attributes)
+
+
+def _names(path: Path, sequences: Iterable[_Sequence]) -> dict[_Sequence, list[str]]:
+    """The names of each sequence's objects; the longest end of its path that the table has is its key."""
+    table = read_table(path)
+    named: dict[_Sequence, list[str]] = {}
+    lacking = []
+    for sequence in sequences:
+        ends = ("/".join(sequence[start:]) for start in range(len(sequence)))
+        key = next((end for end in ends if end in table), None)
+        if key is None:
+            lacking.append("/".join(sequence))
+            continue
+        names = table[key]
+        if not isinstance(names, list) or not all(isinstance(name, str) and name for name in names):
+            raise InputError(f"{path}: {key} is {names!r}; expected a list of names")
+        named[sequence] = names
+    if lacking:
+        raise InputError(f"{path} lacks the sequences {', '.join(lacking)}")
+    return named
+
+
+def _read(image: Path, first_object: int, names: list[str]) -> tuple[RGBDFrame, dict[int, str]]:
+    """The frame of a colour image, and the names of its labels."""
+    folder = image.parent.parent
+    color = read_color(image)
+    label_file = folder / "label" / image.name
+    labels = read_labels(label_file)
+    cloud_file = folder / "pcd" / f"{image.stem}.pcd"
+    points = read_organized_points(cloud_file)
+    with complaints_about(str(cloud_file)):
+        if points.shape[:2] != color.shape[:2]:
+            raise InputError(f"the cloud has {points.shape[:2]} points; color has {color.shape[:2]} (rows, columns)")
+        intrinsics = fit_intrinsics(points)
+    depth = read_depth(folder / "depth" / image.name)
+    frame = RGBDFrame(color, depth, labels * (labels >= first_object), intrinsics)
+    unnamed = [label for label in frame.instances if label - first_object >= len(names)]
+    if unnamed:
+        raise InputError(
+            f"{label_file} has the label {unnamed[0]}; the sequence has {len(names)} names, for the labels from "
+            f"{first_object} on"
+        )
+    return frame, {label: names[label - first_object] for label in frame.instances}
+
+
+def fit_intrinsics(points: NDArray[np.float64]) -> Intrinsics:
+    """The pinhole camera of an organized cloud [H, W, 3] in the OpenCV camera frame; points without depth are NaN.
+
+    Least squares of x / z over the columns, x / z = (column - cx) / fx, and of y / z over the rows. The pixel is exact
+    and the ratio is not: in the dataset's clouds z is a mean over time, x and y are not.
+
+    Raises:
+        InputError: the points are too few, or do not lie on the rays of such a camera; tells the fit.
+    """
+    row, column = np.nonzero(np.isfinite(points).all(axis=-1) & (points[..., 2] > 0))
+    if len(row) == 0 or np.ptp(row) == 0 or np.ptp(column) == 0:
+        raise InputError(f"the cloud has {len(row)} points with depth; expected several rows and columns of them")
+    x, y, z = points[row, column].T
+    with np.errstate(all="ignore"):  # a degenerate fit is told by its values
+        fx, cx, across = _line(column, x / z)
+        fy, cy, down = _line(row, y / z)
+    if not (fx > 0 and fy > 0 and max(across, down) < _LARGEST_RESIDUAL):
+        raise InputError(
+            f"the cloud is not that of a pinhole camera: fx {fx:g}, fy {fy:g}, residuals {across:g} and {down:g} pixels"
+        )
+    return Intrinsics(fx, fy, cx, cy)
+
+
+def _line(pixel: NDArray[np.intp], ratio: NDArray[np.float64]) -> tuple[float, float, float]:
+    """Focal length, principal point and root mean square residual, in pixels."""
+    centred = pixel - pixel.mean()
+    slope = np.mean(centred * ratio) / np.var(pixel)
+    residual = ratio - ratio.mean() - slope * centred
+    focal = 1 / slope
+    return float(focal), float(pixel.mean() - ratio.mean() * focal), float(np.sqrt(np.mean(residual**2)) * abs(focal))
