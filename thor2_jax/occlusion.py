@@ -66,7 +66,7 @@ def find_occlusion(frame: RGBDFrame, cloud: InstanceCloud) -> Occlusion:
     seen = on_boundary & (own_depth > 0)
     if occluded and seen.any() and len(cloud.points):
         edge = pixel_rays(pixels[seen], frame.labels.shape[1], frame.intrinsics) * own_depth[seen, None]
-        distance, nearest = KDTree(cloud.points).query(edge)
+        distance, nearest = KDTree(cloud.points, balanced_tree=False).query(edge)
         boundary[nearest[distance <= REACH]] = True
     return Occlusion(occluded, boundary)
 
@@ -104,10 +104,12 @@ def _contour(
 
     on_contour, on_boundary = np.zeros(len(pixels), bool), np.zeros(len(pixels), bool)
     own_depth = np.zeros(len(pixels), np.float32)
+    mask = labels == label
     for step in (1, -1, window.shape[1], -window.shape[1]):
-        edge = np.flatnonzero(labels[places + step] != label)
+        # The window's margin is wider than a step, so that nothing of the mask comes around its end.
+        here = np.flatnonzero(mask & ~np.roll(mask, -step))
+        edge = np.searchsorted(places, here)
         on_contour[edge] = True
-        here = places[edge]
         own = first_depth(here, -step, label)
         own_depth[edge] = np.where(own > 0, own, own_depth[edge])
         beside = labels[here + step]

@@ -174,6 +174,13 @@ class Diagrams:
     mask: jax.Array
 
 
+@jax.jit
+def _side_by_side(images: jax.Array, embeddings: jax.Array) -> jax.Array:
+    """[..., S, P, P] and [..., S, R, J] to [..., S * (P * P + R * J)], slice by slice."""
+    blocks = [a.reshape(*a.shape[:-2], -1) for a in (images, embeddings)]
+    return jnp.concatenate(blocks, axis=-1).reshape(*images.shape[:-3], -1)
+
+
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Descriptors:
@@ -206,6 +213,4 @@ class Descriptors:
 
         One block [image | embedding] a slice.
         """
-        leading = self.images.shape[:-2]
-        blocks = [self.images.reshape(*leading, -1), self.embeddings.reshape(*leading, -1)]
-        return jnp.concatenate(blocks, axis=-1).reshape(*self.overflow.shape, -1)
+        return _side_by_side(self.images, self.embeddings)
