@@ -25,7 +25,7 @@ from thor2_jax.instance_clouds import InstanceCloud, instance_cloud
 from thor2_jax.occlusion import find_occlusion
 from thor2_jax.run_folder import TrainedRun, load_run
 from thor2_jax.types import Descriptors, PointClouds
-from thor2_jax.voxel_grid import voxel_downsample
+from thor2_jax.voxel_grid import downsample_to_fit
 
 __all__ = ["THOR2", "VOXEL", "DescribedFrame", "Recognition", "Recognizer"]
 
@@ -109,14 +109,8 @@ def _voxelled(cloud: InstanceCloud, edge: NDArray[np.bool_], size: float) -> tup
     """The cloud on the descriptors' grid (coarser if no bucket holds it), and which voxels hold boundary points."""
     # The mark is a fourth channel; its mean over a voxel is above 0 where one point has it.
     marked = np.column_stack([cloud.colors, edge * np.uint8(255)])
-    while True:
-        points, colors = voxel_downsample(cloud.points, marked, size)
-        try:
-            point_bucket(len(points))
-        except InputError:
-            size *= 2
-            continue
-        return points, colors[:, :3], colors[:, 3] > 0
+    points, colors = downsample_to_fit(cloud.points, marked, size)
+    return points, colors[:, :3], colors[:, 3] > 0
 
 
 class Recognizer:

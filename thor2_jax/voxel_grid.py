@@ -5,9 +5,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from thor2_jax.capacity import point_bucket
 from thor2_jax.errors import InputError
 
-__all__ = ["voxel_downsample"]
+__all__ = ["downsample_to_fit", "voxel_downsample"]
 
 
 def voxel_downsample(
@@ -52,3 +53,17 @@ def voxel_downsample(
     if colors.dtype == np.uint8:
         mean_colors = np.floor(mean_colors + 0.5)
     return mean(exact).astype(points.dtype), mean_colors.astype(colors.dtype)
+
+
+def downsample_to_fit(
+    points: NDArray[np.floating[Any]], colors: NDArray[Any], size: float
+) -> tuple[NDArray[Any], NDArray[Any]]:
+    """`voxel_downsample`, with a side twice as large as long as no bucket holds the cloud."""
+    while True:
+        found = voxel_downsample(points, colors, size)
+        try:
+            point_bucket(len(found[0]))
+        except InputError:
+            size *= 2
+        else:
+            return found

@@ -3,11 +3,13 @@
 Bad input ends with one line on standard error and exit code 2; nothing half-written stays behind.
 """
 
+import hashlib
 import json
 import sys
-from collections.abc import Callable
+import tempfile
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 from rich.console import Console
@@ -22,11 +24,12 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Name the objects on a cluttered table from an RGB-D frame, trained on synthetic views (THOR2 in JAX).",
 )
-evaluate_app = typer.Typer(no_args_is_help=True, help="Accuracy of a trained run on a labelled dataset.")
+evaluate_app = typer.Typer(no_args_is_help=True, help="Accuracy of trained runs on a labelled dataset.")
 app.add_typer(evaluate_app, name="evaluate")
 # Not on a terminal there is no width to fit, and rich would cut tables at 80 columns.
 console = Console(width=None if sys.stdout.isatty() else 160)
 
+EngineName = Literal["local", "ray"]
 ModelOption = Annotated[Path, typer.Option("--model", help="Run folder of a trained model.")]
 
 
@@ -70,26 +73,49 @@ def colornet(out: Annotated[Path, typer.Option(help="Folder for network.npz and 
 @app.command()
 def render(
     meshes: Annotated[Path, typer.Option(help="Folder of meshes (GLB, OBJ, PLY), one a file or sub-folder.")],
-    out: Annotated[Path, typer.Option(help="New folder for the views.")],
+    out: Annotated[Path, typer.Option(help="Folder for the views: new, or one that this command has begun.")],
     names: Annotated[Path | None, typer.Option(help="JSON or YAML table: object name -> mesh. Default: all.")] = None,
     azimuth_step: Annotated[float, typer.Option(help="Degrees between cameras around the object.")] = 5.0,
     polar_step: Annotated[float, typer.Option(help="Degrees between cameras from pole to pole.")] = 5.0,
-    workers: Annotated[int, typer.Option(min=1, help="Processes that render.")] = 2,
+    workers: Annotated[int, typer.Option(min=1, help="Processes that render; with Ray, tasks at a time.")] = 2,
+    engine: Annotated[EngineName, typer.Option(help="This machine, or a Ray cluster (extra `cluster`).")] = "local",
+    address: Annotated[str | None, typer.Option(help="Of the Ray cluster. Default: one on this machine.")] = None,
+    illumination: Annotated[bool, typer.Option("--illumination", help="Varied copies: light and camera.")] = False,
+    sensor: Annotated[bool, typer.Option("--sensor", help="Varied copies: noise and faults of depth.")] = False,
+    occlusion: Annotated[bool, typer.Option("--occlusion", help="Varied copies: another object in front.")] = False,
+    segmentation: Annotated[bool, typer.Option("--segmentation", help="Varied copies: inexact masks.")] = False,
+    copies: Annotated[int, typer.Option(help="Varied copies of each view, if there are variations.")] = 2,
+    seed: Annotated[int, typer.Option(help="Of the variations.")] = 0,
 ) -> None:
-    """Render views of meshes to a folder of clouds that `train --dataset` reads."""
+    """Render views of meshes to a dataset that `train --dataset` reads. Interrupted, it goes on when called again."""
+    from training.engines import local, on_ray
     from training.meshes import find_meshes, read_names
-    from training.view_files import render_to_folder
+    from training.render_job import render_dataset
+    from training.variations import Illumination, Occlusion, Segmentation, Sensor, Variations
 
-    _new_folder(out)
+    if address is not None and engine != "ray":
+        raise InputError(f"address is {address}; it goes with --engine ray")
     found = find_meshes(meshes, read_names(names) if names else None)
+    place = local(workers) if engine == "local" else on_ray(workers, address)
+    variations = Variations(
+        illumination=Illumination() if illumination else None,
+        sensor=Sensor() if sensor else None,
+        occlusion=Occlusion() if occlusion else None,
+        segmentation=Segmentation() if segmentation else None,
+        copies=copies,
+    )
     with _bar() as bar:
-        task = bar.add_task("render", total=None, note="")
-        render_to_folder(found, out, azimuth_step, polar_step, workers, _advance(bar, task))
+        show = _stages(bar)
+        progress = lambda done, total: show("render", done, total, "")  # noqa: E731
+        dataset = render_dataset(found, out, azimuth_step, polar_step, place, progress, variations or None, seed)
+    console.print(
+        f"{len(dataset)} views of {len(dataset.classes)} objects ({dataset.manifest.left_out} left out) in {out}"
+    )
 
 
 @app.command()
 def train(
-    out: Annotated[Path, typer.Option(help="New run folder.")],
+    out: Annotated[Path, typer.Option(help="Run folder: new, or one that this command has begun.")],
     meshes: Annotated[Path | None, typer.Option(help="Folder of meshes (GLB, OBJ, PLY) to render.")] = None,
     dataset: Annotated[Path | None, typer.Option(help="Folder that `thor2 render` wrote, instead of --meshes.")] = None,
     names: Annotated[Path | None, typer.Option(help="JSON or YAML table: object name -> mesh. Default: all.")] = None,
@@ -99,15 +125,26 @@ def train(
     epochs: Annotated[int, typer.Option(help="Half at a learning rate of 1e-2, half at 1e-3.")] = 100,
     batch_size: Annotated[int, typer.Option(help="Samples a step.")] = 128,
     seed: Annotated[int, typer.Option(help="Of weights, order and dropout.")] = 0,
+    folds: Annotated[int, typer.Option(min=1, help="More than 1: a model each, its own views held out.")] = 1,
     workers: Annotated[int, typer.Option(min=1, help="Processes that render.")] = 2,
+    coordinator: Annotated[str | None, typer.Option(help="HOST:PORT of process 0, if there are several.")] = None,
+    processes: Annotated[int, typer.Option(min=1, help="Processes that train together.")] = 1,
+    process: Annotated[int, typer.Option(min=0, help="Number of this one.")] = 0,
 ) -> None:
-    """Train a recognizer on synthetic views of meshes."""
+    """Train a recognizer on synthetic views of meshes. Interrupted, it goes on when called again."""
+    import jax
+
+    if coordinator is not None:
+        jax.distributed.initialize(coordinator, processes, process)
+    from thor2_jax.config import DescriptorConfig
     from training.fit import FitOptions
     from training.meshes import find_meshes, read_names
-    from training.train import train_run
-    from training.view_files import read_view_folder, render_views
+    from training.train import check_out, train_run
+    from training.view_dataset import ViewDataset
+    from training.view_source import MemoryViews, ViewSource
+    from training.views import render_views
 
-    _new_folder(out)
+    check_out(out)
     options = FitOptions(epochs=epochs, batch_size=batch_size, seed=seed)
     features = [name.strip() for name in classifiers.split(",")]
     if (meshes is None) == (dataset is None):
@@ -117,11 +154,15 @@ def train(
         with _bar() as bar:
             task = bar.add_task("render", total=None, note="")
             views = render_views(found, azimuth_step, polar_step, workers, _advance(bar, task))
+        source: ViewSource = MemoryViews(views, DescriptorConfig())
     else:
         assert dataset is not None
-        views = read_view_folder(dataset)
+        source = ViewDataset.open(dataset)
     with _bar() as bar:
-        train_run(views, out, features, options, _stages(bar))
+        runs = train_run(source, out, features, options, _stages(bar), folds=folds)
+    for run in runs:
+        for name, accuracy in run.record["held_out_accuracy"].items():
+            console.print(f"fold {run.record['fold']}: {name} names {accuracy:.3f} of the views held out rightly")
     console.print(f"run written to {out}")
 
 
@@ -135,7 +176,8 @@ def _stages(bar: Progress) -> Callable[[str, int, int, str], None]:
 
     def show(stage: str, done: int, total: int, note: str) -> None:
         if stage not in tasks:
-            tasks[stage] = bar.add_task(stage, total=total, note=note)
+            # Begun at what is done already: the time left is that of the rest.
+            tasks[stage] = bar.add_task(stage, total=total, completed=done, note=note)
         bar.update(tasks[stage], completed=done, total=total, note=note)
 
     return show
@@ -176,51 +218,83 @@ def recognize(
         console.print(f"written to {out}")
 
 
-def _evaluate(frames: Any, model: Path, out: Path | None) -> None:
-    from thor2_jax.recognizer import Recognizer
-    from training.evaluate import evaluate, joinings, summarize, write_report
+def _evaluate(kind: str, frames: Any, dataset: Path, models: Sequence[Path], out: Path | None, **files: Any) -> None:
+    from training.evaluation.job import evaluate_dataset
+    from training.evaluation.page import accuracy_table
+    from training.evaluation.runs import load_runs
 
-    recognizer = Recognizer.load(model)
-    with _bar() as bar:
-        task = bar.add_task("evaluate", total=len(frames), note="")
-        instances = evaluate(recognizer, frames, lambda name: bar.update(task, advance=1, note=name))
-    names = list(joinings(recognizer.run.classifiers))
-    summary = summarize(instances, names)
-    table = Table("", "", "instances", *names)
-    for attribute, values in summary["accuracy"].items():
-        for value, row in values.items():
-            table.add_row(
-                attribute, value, str(row["instances"]), *("" if row[n] is None else f"{row[n]:.3f}" for n in names)
-            )
-    console.print(table)
+    description = {"kind": kind, "path": str(dataset.resolve())}
+    description |= {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in files.items() if path}
+    with tempfile.TemporaryDirectory() as nowhere, _bar() as bar:
+        runs = load_runs(models)
+        found = evaluate_dataset(runs, frames, description, out or Path(nowhere) / "report", _stages(bar))
+    counts, speed = found["instances"], found["speed"]
+    if found["joinings"]:
+        header, rows = accuracy_table(found["accuracy"]["larger"], found["joinings"])
+        table = Table(*header)
+        for row in rows:
+            table.add_row(*row)
+        console.print(table)
     console.print(
-        f"{summary['scored']} instances scored, {summary['unanswered']} of them could not be described (counted as "
-        f"wrong); {summary['not_scored']} are no class of this run"
+        f"{counts['scored']} instances scored, {sum(counts['not_described'].values())} of them could not be described "
+        f"(counted as wrong); {sum(counts['no_class'].values())} are no class of the runs"
     )
+    if speed["frames_per_second"]:
+        console.print(f"{speed['frames']} frames, {speed['frames_per_second']:.2f} a second")
     if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
-        write_report(out / "evaluation.json", summary, instances)
-        console.print(f"written to {out}")
+        console.print(f"report: {out / 'report.html'}")
 
 
 DatasetArgument = Annotated[Path, typer.Argument(help="The dataset's folder.")]
-ReportOption = Annotated[Path | None, typer.Option("--out", help="Folder for evaluation.json.")]
+ModelsOption = Annotated[list[Path], typer.Option("--model", help="Run folder, or one with the folds of a training.")]
+MoreModels = Annotated[list[Path] | None, typer.Argument(metavar="[RUN]...", help="Further run folders.")]
+ReportOption = Annotated[
+    Path | None, typer.Option("--out", help="Folder for report.html and report.json; one that was begun goes on.")
+]
 
 
 @evaluate_app.command()
-def uwis(dataset: DatasetArgument, model: ModelOption, out: ReportOption = None) -> None:
+def uwis(dataset: DatasetArgument, model: ModelsOption, runs: MoreModels = None, out: ReportOption = None) -> None:
     """UW-IS Occluded: <video>/images/<id>_{rgb,depth,labels}.png and <id>_poses.yaml."""
     from training.readers.uwis import UWISOccluded
 
-    _evaluate(UWISOccluded(dataset), model, out)
+    _evaluate("uwis", UWISOccluded(dataset), dataset, [*model, *(runs or [])], out)
 
 
 @evaluate_app.command()
-def frames(dataset: DatasetArgument, model: ModelOption, out: ReportOption = None) -> None:
+def frames(dataset: DatasetArgument, model: ModelsOption, runs: MoreModels = None, out: ReportOption = None) -> None:
     """Single frames: <frame>/{color,depth,mask}.png, intrinsics.json, labels.json."""
     from training.readers.frames import FrameFolder
 
-    _evaluate(FrameFolder(dataset), model, out)
+    _evaluate("frames", FrameFolder(dataset), dataset, [*model, *(runs or [])], out)
+
+
+@evaluate_app.command()
+def ocid(
+    dataset: DatasetArgument,
+    model: ModelsOption,
+    names: Annotated[Path, typer.Option(help="YAML or JSON table: sequence -> object names in the order of placing.")],
+    runs: MoreModels = None,
+    out: ReportOption = None,
+) -> None:
+    """OCID, subset YCB10: {table,floor}/{bottom,top}/<type>/<sequence>/{rgb,depth,label,pcd}."""
+    from training.readers.ocid import OCID
+
+    _evaluate("ocid", OCID(dataset, names), dataset, [*model, *(runs or [])], out, names=names)
+
+
+@evaluate_app.command()
+def bop(
+    dataset: DatasetArgument,
+    model: ModelsOption,
+    names: Annotated[Path | None, typer.Option(help="YAML or JSON table: obj_id -> name. Default: obj_000001.")] = None,
+    runs: MoreModels = None,
+    out: ReportOption = None,
+) -> None:
+    """BOP format (YCB-Video and others): <scene>/{rgb,depth,mask_visib}, scene_camera.json and scene_gt.json."""
+    from training.readers.bop import BOP
+
+    _evaluate("bop", BOP(dataset, names), dataset, [*model, *(runs or [])], out, names=names)
 
 
 @app.command()

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from thor2_jax.config import DescriptorConfig
 from thor2_jax.files import write_text
 from thor2_jax.overlay import draw_overlay
 from thor2_jax.recognizer import Recognizer
@@ -26,7 +27,8 @@ from training.readers.labelled import LabelledFrame
 from training.report import Picture, write_page
 from training.scenes import Scene, compose_scene
 from training.train import Progress, train_run
-from training.view_files import render_views
+from training.view_source import MemoryViews
+from training.views import render_views
 
 __all__ = ["DemoFigures", "run_demo"]
 
@@ -111,7 +113,8 @@ def run_demo(out: str | Path, seed: int = 0, progress: Progress = lambda stage, 
     views = render_views(
         objects, AZIMUTH_STEP, POLAR_STEP, 1, lambda done, total: progress("render views", done, total, "")
     )
-    run = train_run(views, out / "run", FEATURES, FitOptions(epochs=EPOCHS, seed=seed), progress)
+    source = MemoryViews(views, DescriptorConfig())
+    (run,) = train_run(source, out / "run", FEATURES, FitOptions(epochs=EPOCHS, seed=seed), progress)
 
     scenes = _scenes(objects, seed, progress)
     recognizer = Recognizer.load(out / "run")

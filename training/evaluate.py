@@ -1,23 +1,23 @@
-"""Accuracy of a trained run on labelled frames (paper, "Results").
+"""Accuracy of one trained run on labelled frames in memory; `evaluation` does more, on datasets of any size.
 
-Every joining of classifiers, over all frames and by attribute.
+Every joining of classifiers by the paper's rule, over all frames and by attribute.
 """
 
 import dataclasses
-import itertools
-import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from thor2_jax.classifier import FEATURES, Feature, join
-from thor2_jax.files import write_text
 from thor2_jax.recognizer import Recognizer
+from training.evaluation.accuracy import parts
+from training.evaluation.answers import answer_frame
+from training.evaluation.joining import join_by, joinings
 from training.readers.labelled import LabelledFrame
 
-__all__ = ["Instance", "evaluate", "joinings", "summarize", "write_report"]
+__all__ = ["Instance", "evaluate", "summarize"]
+
+NO_CLASS = "no class of this run"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,13 +43,6 @@ class Instance:
     reason: str | None = None
 
 
-def joinings(available: Iterable[Feature]) -> dict[str, tuple[Feature, ...]]:
-    """Every combination of the classifiers at hand, by the paper's names: CE, TOPS, ..., THOR2 (= TOPS + TOPS2)."""
-    names = [name for name in FEATURES if name in set(available)]
-    groups = [group for size in range(1, len(names) + 1) for group in itertools.combinations(names, size)]
-    return {"THOR2" if group == ("tops", "tops2") else "+".join(group).upper(): group for group in groups}
-
-
 def evaluate(
     recognizer: Recognizer, frames: Iterable[LabelledFrame], progress: Callable[[str], object] = lambda identifier: None
 ) -> list[Instance]:
@@ -61,22 +54,17 @@ def evaluate(
     classes = recognizer.run.classes
     found: list[Instance] = []
     for item in frames:
-        described = recognizer.describe(item.frame)
-        probabilities = recognizer.probabilities(described.descriptors)
-        joined = {name: join({f: probabilities[f] for f in group}) for name, group in groups.items()}
-        rows = {described.clouds[index].label: row for row, index in enumerate(described.usable)}
-        reasons = {cloud.label: cloud.reason for cloud in described.clouds}
-        for label, truth in sorted(item.truth.items()):
-            row = rows.get(label)
-            base = Instance(item.identifier, label, truth, dict(item.attributes), {})
-            if truth not in classes:
-                base = dataclasses.replace(base, reason="no class of this run")
-            elif row is None:
-                base = dataclasses.replace(base, reason=reasons.get(label) or "no pixels in the label image")
-            else:
-                answers = {n: (classes[j.class_index[row]], float(j.confidence[row])) for n, j in joined.items()}
-                base = dataclasses.replace(base, answers=answers, occluded=described.occluded[row])
-            found.append(base)
+        for answer in answer_frame([recognizer], item):
+            reason = answer.reason if answer.truth in classes else NO_CLASS
+            answers: dict[str, tuple[str, float]] = {}
+            if reason is None and answer.probabilities is not None:
+                rows = dict(zip(recognizer.run.classifiers, answer.probabilities[:, None], strict=True))
+                for name, group in groups.items():
+                    index, confidence = join_by("larger", {feature: rows[feature] for feature in group})
+                    answers[name] = classes[index[0]], float(confidence[0])
+            attributes = dict(item.attributes)
+            occluded = answer.occluded and bool(answers)
+            found.append(Instance(item.identifier, answer.label, answer.truth, attributes, answers, occluded, reason))
         progress(item.identifier)
     return found
 
@@ -86,25 +74,20 @@ def summarize(instances: Sequence[Instance], names: Sequence[str]) -> dict[str, 
 
     Instances without an answer count as wrong.
     """
-    scored = [i for i in instances if i.reason != "no class of this run"]
+    scored = [i for i in instances if i.reason != NO_CLASS]
 
     def accuracy(part: Sequence[Instance]) -> dict[str, Any]:
         right = {n: [i.answers.get(n, (None,))[0] == i.truth for i in part] for n in names}
         return {"instances": len(part), **{n: float(np.mean(v)) if v else None for n, v in right.items()}}
 
     table: dict[str, Any] = {"all": {"all": accuracy(scored)}}
-    for attribute in sorted({key for i in scored for key in i.attributes}):
-        values = sorted({i.attributes[attribute] for i in scored if attribute in i.attributes})
-        table[attribute] = {v: accuracy([i for i in scored if i.attributes.get(attribute) == v]) for v in values}
+    attributes = [i.attributes for i in scored]
+    for attribute in sorted({key for each in attributes for key in each}):
+        cells = parts(attributes, (attribute,))
+        table[attribute] = {value: accuracy([scored[k] for k in rows]) for (value,), rows in cells.items()}
     return {
         "accuracy": table,
         "scored": len(scored),
         "unanswered": sum(not i.answers for i in scored),
         "not_scored": len(instances) - len(scored),
     }
-
-
-def write_report(path: str | Path, summary: Mapping[str, Any], instances: Sequence[Instance]) -> None:
-    """Write the summary and every instance as one JSON file; it appears whole or not at all."""
-    rows = [dataclasses.asdict(i) for i in instances]
-    write_text(path, json.dumps({**summary, "instances": rows}, indent=1) + "\n")

@@ -21,13 +21,26 @@ from training.meshes import TexturedMesh
 from training.rendering import RayCaster, render_view
 from training.view_sphere import camera_pose
 
-__all__ = ["draw_accuracy", "draw_confusion", "draw_curves", "draw_descriptor", "draw_objects"]
+__all__ = [
+    "draw_accuracy",
+    "draw_confusion",
+    "draw_confusion_counts",
+    "draw_curves",
+    "draw_descriptor",
+    "draw_objects",
+    "save_figure",
+]
 
 _DPI = 130
 _BARS = ("#56b4e9", "#e69f00", "#009e73", "#222222")  # Okabe and Ito: told apart by all eyes
 
 
-def _save(figure: Figure, path: str | Path) -> None:
+def save_figure(figure: Figure, path: str | Path) -> None:
+    """Write a figure as PNG; it appears whole or not at all.
+
+    Raises:
+        OSError: it cannot be written.
+    """
     FigureCanvasAgg(figure)
     with replacing(path) as temporary:
         figure.savefig(temporary, dpi=_DPI, format="png")
@@ -52,7 +65,7 @@ def draw_objects(objects: Mapping[str, TexturedMesh], path: str | Path) -> None:
         axes.set_title(name, fontsize=9, y=-0.12)
     for axes in figure.axes:
         axes.set_axis_off()
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def draw_accuracy(
@@ -82,7 +95,7 @@ def draw_accuracy(
     axes.set_ylabel("accuracy")
     axes.spines[["top", "right"]].set_visible(False)
     figure.legend(loc="outside right upper", frameon=False)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def draw_confusion(instances: Sequence[Instance], classes: Sequence[str], name: str, path: str | Path) -> None:
@@ -103,6 +116,18 @@ def draw_confusion(instances: Sequence[Instance], classes: Sequence[str], name: 
         if instance.truth in classes:
             answer = instance.answers.get(name, ("none",))[0]
             counts[classes.index(instance.truth), columns.index(answer)] += 1
+    draw_confusion_counts(counts, classes, name, path)
+
+
+def draw_confusion_counts(
+    counts: NDArray[np.integer[Any]], classes: Sequence[str], name: str, path: str | Path
+) -> None:
+    """Draw a confusion matrix [C, C + 1]: rows the truth, columns the answers, the last one those without an answer.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    columns = [*classes, "none"]
     if not counts[:, -1].any():
         columns, counts = columns[:-1], counts[:, :-1]
     share = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
@@ -117,14 +142,15 @@ def draw_confusion(instances: Sequence[Instance], classes: Sequence[str], name: 
     axes.set_yticks(range(len(classes)), classes, fontsize=8)
     axes.set_xlabel(f"named by {name}")
     axes.set_ylabel("truth")
-    _save(figure, path)
+    save_figure(figure, path)
 
 
-def draw_curves(curves: Mapping[str, Sequence[Mapping[str, float]]], path: str | Path) -> None:
-    """Draw loss and accuracy on the training samples by epoch, a line for each classifier.
+def draw_curves(curves: Mapping[str, Sequence[Mapping[str, Any]]], path: str | Path) -> None:
+    """Draw loss and accuracy by epoch: a colour for each classifier, a line for each of its folds.
 
     Args:
-        curves: classifier -> one record an epoch with "epoch", "loss", "accuracy".
+        curves: classifier -> records with "epoch", "loss", "accuracy"; optionally "fold", and "held_out_accuracy",
+            which is dashed.
         path: of the picture.
 
     Raises:
@@ -132,19 +158,34 @@ def draw_curves(curves: Mapping[str, Sequence[Mapping[str, float]]], path: str |
     """
     figure = Figure(figsize=(5.5, 5.5), layout="constrained")
     upper, lower = figure.subplots(2, 1, sharex=True)
+    dashed = False
     for k, (name, records) in enumerate(curves.items()):
-        style: dict[str, Any] = {"label": name.upper(), "color": _BARS[k % len(_BARS)], "marker": "o", "markersize": 3}
-        epochs = [r["epoch"] for r in records]
-        upper.plot(epochs, [r["loss"] for r in records], **style)
-        lower.plot(epochs, [r["accuracy"] for r in records], **style)
+        folds = sorted({record.get("fold", 0) for record in records})
+        for fold in folds or [0]:
+            mine = [record for record in records if record.get("fold", 0) == fold]
+            style: dict[str, Any] = {"color": _BARS[k % len(_BARS)], "linewidth": 1.5 if len(folds) < 2 else 0.8}
+            if len(mine) < 30:
+                style |= {"marker": "o", "markersize": 3}
+            epochs = [record["epoch"] for record in mine]
+            label = name.upper() if fold == (folds or [0])[0] else None
+            upper.plot(epochs, [record["loss"] for record in mine], label=label, **style)
+            lower.plot(epochs, [record["accuracy"] for record in mine], **style)
+            held_out = [record.get("held_out_accuracy") for record in mine]
+            if held_out and None not in held_out:
+                lower.plot(epochs, held_out, linestyle="--", **style)
+                dashed = True
     upper.set_yscale("log")
     upper.set_ylabel("loss (cross-entropy)")
-    lower.set_ylabel("accuracy, with dropout")
+    lower.set_ylabel("accuracy" if dashed else "accuracy, with dropout")
     lower.set_xlabel("epoch")
+    if dashed:
+        lower.plot([], [], color="#888888", label="in training, with dropout")
+        lower.plot([], [], color="#888888", linestyle="--", label="views held out")
+        lower.legend(frameon=False)
     upper.legend(frameon=False)
     for axes in (upper, lower):
         axes.spines[["top", "right"]].set_visible(False)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def draw_descriptor(
@@ -209,4 +250,4 @@ def draw_descriptor(
         else:
             shape.set_yticklabels([])
             strip.set_yticklabels([])
-    _save(figure, path)
+    save_figure(figure, path)

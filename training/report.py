@@ -21,11 +21,13 @@ class Picture:
         path: relative to the page.
         caption: what it shows; also read out where it cannot be seen.
         half: two of them stand side by side on a wide screen.
+        small: many of them stand side by side, on a narrow screen two.
     """
 
     path: str
     caption: str
     half: bool = False
+    small: bool = False
 
 
 Section = tuple[str, str, Table | None, Sequence[Picture]]
@@ -37,12 +39,14 @@ body { font: 16px/1.5 system-ui, sans-serif; color: #222; background: #fff; max-
   padding: 1rem; }
 h1 { line-height: 1.2; margin-bottom: .3rem; }
 .lead { color: #555; margin-top: 0; }
+.scroll { overflow-x: auto; }
 table { border-collapse: collapse; margin: 1rem 0; }
 th, td { padding: .3rem .9rem; text-align: right; border-bottom: 1px solid #ddd; font-variant-numeric: tabular-nums; }
 th:first-child, td:first-child { text-align: left; }
 .pictures { display: flex; flex-wrap: wrap; gap: 1rem; }
 figure { margin: 0; flex: 1 1 100%; }
 figure.half { flex: 1 1 26rem; max-width: calc(50% - .5rem); }
+figure.small { flex: 0 1 10rem; max-width: calc(50% - .5rem); }
 @media (max-width: 56rem) { figure.half { max-width: 100%; } }
 img { max-width: 100%; height: auto; display: block; }
 figcaption { color: #555; font-size: .9rem; }
@@ -53,12 +57,12 @@ def _table(table: Table) -> str:
     header, rows = table
     head = "".join(f'<th scope="col">{html.escape(cell)}</th>' for cell in header)
     body = "".join("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
-    return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+    return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
 
 
 def _figure(picture: Picture) -> str:
     path, caption = html.escape(picture.path), html.escape(picture.caption)
-    kind = ' class="half"' if picture.half else ""
+    kind = ' class="half"' if picture.half else ' class="small"' if picture.small else ""
     return f'<figure{kind}><img src="{path}" alt="{caption}"><figcaption>{caption}</figcaption></figure>'
 
 

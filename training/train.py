@@ -1,77 +1,240 @@
-"""From rendered views to a run folder: dataset, one classifier a feature, record."""
+"""From labelled views to a run folder: samples, one classifier a feature and fold, figures, curves, record.
 
+RUN/run.json, network.npz, weights/   the trained model (`run_folder`); of several folds, RUN/fold-0/run.json and so on
+RUN/metrics.jsonl                     a line an epoch, classifier and fold
+RUN/curves.png                        the same, drawn
+RUN/checkpoints/                      while it is in the making: what it was begun with, and how far it is
+
+A run that was stopped goes on when it is asked for again. It is a run folder once run.json is there, which comes last.
+"""
+
+import dataclasses
+import json
+import shutil
+import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
+import numpy as np
+from jax.experimental import multihost_utils
+from numpy.typing import NDArray
+
 import colornet
 from thor2_jax.classifier import MLP, Feature, check_features
-from thor2_jax.config import DescriptorConfig
-from thor2_jax.run_folder import TrainedRun, check_new, save_run
-from training.dataset import build_dataset
-from training.fit import EpochFigures, FitOptions, fit
-from training.views import Cloud
+from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
+from thor2_jax.errors import InputError
+from thor2_jax.files import write_text
+from thor2_jax.run_folder import TrainedRun, check_new, load_run, save_run
+from thor2_jax.sharding import batch_mesh
+from training.checkpoints import Checkpoints
+from training.dataset import Samples, build_samples
+from training.fit import Figures, FitOptions, check_batch_size, fit
+from training.folds import fold_of_samples
+from training.metrics import append_figures, forget_after, read_figures
+from training.pictures import draw_curves
+from training.view_source import ViewSource
 
-__all__ = ["Progress", "train_run"]
+__all__ = ["Progress", "check_out", "train_run"]
 
 Progress = Callable[[str, int, int, str], object]
 """Called with (stage, done, total, note)."""
 
+CHECKPOINTS = "checkpoints"
+BEGUN = "begun.json"
+METRICS = "metrics.jsonl"
+CURVES = "curves.png"
+RUN = "run.json"
+
+CURVE = ("epoch", "loss", "accuracy", "held_out_accuracy")
+"""What a record keeps of an epoch's figures: what another run gives again."""
+
+
+def check_out(out: str | Path) -> None:
+    """Refuse a name that is taken, by anything but an empty folder or a run in the making.
+
+    Raises:
+        InputError: naming the path.
+    """
+    if not (Path(out) / CHECKPOINTS / BEGUN).is_file():
+        check_new(out)
+
+
+def _check_same(out: Path, begun: Mapping[str, Any]) -> None:
+    path = out / CHECKPOINTS / BEGUN
+    if not path.is_file():
+        return
+    try:
+        found = dict(json.loads(path.read_bytes()))
+    except (OSError, ValueError) as error:
+        raise InputError(f"out: {path} cannot be read: {error}") from None
+    for name, value in begun.items():
+        if found.get(name) != value:
+            raise InputError(
+                f"out: {out} holds a run in the making with {name} {found.get(name)!r}, not {value!r}; "
+                "go on with the same, or name another folder"
+            )
+
+
+def _begin(out: Path, begun: Mapping[str, Any]) -> None:
+    """Make the folder of a run in the making; it appears whole or not at all."""
+    if (out / CHECKPOINTS / BEGUN).is_file():
+        return
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as partial:
+        new = Path(partial) / out.name
+        (new / CHECKPOINTS).mkdir(parents=True)
+        write_text(new / CHECKPOINTS / BEGUN, json.dumps(begun, indent=1) + "\n")
+        new.rename(out)
+
+
+def _together(point: str) -> None:
+    """Wait until all processes are here, so that none reads what the first has not written."""
+    if jax.process_count() > 1:
+        multihost_utils.sync_global_devices(point)
+
 
 def train_run(
-    views: Mapping[str, Sequence[Cloud]],
+    source: ViewSource,
     out: str | Path,
     features: Sequence[str],
     options: FitOptions,
     progress: Progress = lambda stage, done, total, note: None,
     config: DescriptorConfig | None = None,
-) -> TrainedRun:
-    """Train one classifier a feature on rendered views and write the run folder.
+    folds: int = 1,
+) -> list[TrainedRun]:
+    """Train one classifier a feature and fold, and write the run folder or folders; or go on where that was stopped.
+
+    Trains on all devices of all processes; each process is called with the same arguments and sees the same files.
 
     Args:
-        views: class name -> clouds in metres, camera frame.
-        out: the run folder; must not exist, or be empty.
+        source: of labelled views.
+        out: the run folder; must not exist, be empty, or hold the same run in the making.
         features: any of "ce", "tops", "tops2".
         options: of the fit; the same for every classifier.
         progress: told of each step.
         config: the descriptor; by default the paper's, with diagrams in closed form.
+        folds: with more than one, a model each (`out`/fold-0, ...), trained on the views of the others and measured on
+            its own.
+
+    Returns:
+        The run of each fold, as read back.
 
     Raises:
-        InputError: unknown features, `out` exists (both told before any work), classes without views, a loss that is
-            not finite. Nothing is written then.
+        InputError: unknown features, `out` holds something else, or a run in the making with other options or views
+            (told before any work); classes without views, or with fewer than folds; a batch that does not divide among
+            the devices: nothing is written then. A loss that is not finite: the checkpoints so far stay.
+        OSError: something cannot be written; the last complete checkpoints stay.
     """
     names = check_features(features, "classifiers")
-    check_new(out)
     config = config or DescriptorConfig(homology="closed_form")
     network = colornet.load_default()
-    total, done = sum(len(clouds) for clouds in views.values()), 0
+    out = Path(out).absolute()
+    begun = {
+        "descriptor_version": DESCRIPTOR_VERSION,
+        "descriptor_config": dataclasses.asdict(config),
+        "color_network": network.fingerprint,
+        "dataset": source.digest,
+        "classifiers": list(names),
+        "folds": folds,
+        "epochs": options.epochs,
+        "learning_rates": list(options.learning_rates),
+        "batch_size": options.batch_size,
+        "seed": options.seed,
+    }
+    check_out(out)
+    _check_same(out, begun)
+    check_batch_size(options.batch_size, batch_mesh())
+    done, total = 0, sum(shard.views for shard in source.shards)
 
     def described(count: int) -> None:
         nonlocal done
         done += count
         progress("describe", done, total, "views")
 
-    dataset = build_dataset(views, network, config, progress=described)
+    samples = build_samples(source, network, config, described)
+    fold_of = fold_of_samples(samples, folds, options.seed)
+    _together("checked")
+    if jax.process_index() == 0:
+        _begin(out, begun)
+    _together("begun")
+
+    runs = []
+    for fold in range(folds):
+        folder = out if folds == 1 else out / f"fold-{fold}"
+        if not (folder / RUN).is_file():
+            held_out = fold_of == fold if folds > 1 else None
+            classifiers, kept = _fit_fold(samples, held_out, out, fold, network, config, names, options, progress)
+            if jax.process_index() == 0:
+                rows = read_figures(out / METRICS)
+                draw_curves({name: [row for row in rows if row["classifier"] == name] for name in names}, out / CURVES)
+                record = begun | {"dataset": source.record, "samples": len(samples), "fold": fold}
+                record |= _outcome([row for row in rows if row["fold"] == fold], kept)
+                run = TrainedRun(config, network, samples.classes, classifiers, record)
+                _publish(run, out / CHECKPOINTS / f"fold-{fold}" / "run", folder)
+            _together("published")
+        runs.append(load_run(folder))
+    _together("trained")
+    if jax.process_index() == 0:
+        shutil.rmtree(out / CHECKPOINTS)
+    return runs
+
+
+def _fit_fold(
+    samples: Samples,
+    held_out: NDArray[np.bool_] | None,
+    out: Path,
+    fold: int,
+    network: colornet.ColorNetwork,
+    config: DescriptorConfig,
+    names: Sequence[Feature],
+    options: FitOptions,
+    progress: Progress,
+) -> tuple[dict[Feature, MLP], dict[Feature, int]]:
+    """The classifiers of a fold, and which epochs they are of."""
+    first = jax.process_index() == 0
     classifiers: dict[Feature, MLP] = {}
-    curves: dict[str, list[dict[str, Any]]] = {}
+    kept: dict[Feature, int] = {}
     for name in names:
-        curve = curves.setdefault(name, [])
+        stage = f"fit {name}" if held_out is None else f"fold {fold}: fit {name}"
 
-        def report(figures: EpochFigures, name: str = name, curve: list[dict[str, Any]] = curve) -> None:
-            curve.append({"epoch": figures.epoch, "loss": figures.loss, "accuracy": figures.accuracy})
-            note = f"loss {figures.loss:.3f}, accuracy {figures.accuracy:.3f}"
-            progress(f"fit {name}", figures.epoch, options.epochs, note)
+        def told(done: int, total: int, figures: Figures, stage: str = stage) -> None:
+            note = (
+                f"epoch {figures.epoch}/{options.epochs}, loss {figures.loss:.3f}, accuracy {figures.accuracy:.3f}, "
+                f"{figures.samples_per_second:,.0f} samples/s"
+            )
+            progress(stage, done, total, note)
 
-        classifiers[name] = fit(dataset, network, config, name, options, report)
-    record = {
-        "views": {name: len(clouds) for name, clouds in views.items()},
-        "samples": len(dataset),
-        "epochs": options.epochs,
-        "learning_rates": list(options.learning_rates),
-        "batch_size": options.batch_size,
-        "seed": options.seed,
-        "curves": curves,
-    }
-    run = TrainedRun(config, network, dataset.classes, classifiers, record)
-    save_run(run, out)
-    return run
+        def epoch_done(figures: Figures, name: Feature = name) -> None:
+            if first:
+                append_figures(out / METRICS, fold, name, figures)
+
+        with Checkpoints(out / CHECKPOINTS / f"fold-{fold}" / name) as checkpoints:
+            if first:
+                forget_after(out / METRICS, fold, name, checkpoints.last_epoch)
+            classifiers[name], kept[name] = fit(
+                samples, network, config, name, options, checkpoints, held_out, told, epoch_done
+            )
+    return classifiers, kept
+
+
+def _outcome(rows: Sequence[Mapping[str, Any]], kept: Mapping[Feature, int]) -> dict[str, Any]:
+    """What a fold's record tells of its classifiers: curves, the epoch kept, and its accuracy on the views held out."""
+    curves: dict[str, list[dict[str, Any]]] = {name: [] for name in kept}
+    held_out: dict[str, float] = {}
+    for row in rows:
+        curves[row["classifier"]].append({key: row[key] for key in CURVE if row[key] is not None})
+        if row["epoch"] == kept[row["classifier"]] and row["held_out_accuracy"] is not None:
+            held_out[row["classifier"]] = row["held_out_accuracy"]
+    return {"kept_epochs": dict(kept), "held_out_accuracy": held_out, "curves": curves}
+
+
+def _publish(run: TrainedRun, whole: Path, folder: Path) -> None:
+    """Write a run folder to `whole` and move its parts into `folder`; run.json, the last, makes that a run folder."""
+    shutil.rmtree(whole, ignore_errors=True)  # of a process that was stopped just here
+    save_run(run, whole)
+    folder.mkdir(exist_ok=True)
+    shutil.rmtree(folder / "weights", ignore_errors=True)
+    for name in ("weights", "network.npz", RUN):
+        (whole / name).rename(folder / name)

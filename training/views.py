@@ -1,15 +1,17 @@
 """Training clouds: one coloured point cloud a view of a mesh (paper, section "Training").
 
-Example:
-    for view in iterate_views({"mug": load_mesh("mug.glb")}, view_angles(), workers=2):
-        view.name, view.azimuth, view.polar, view.xyz, view.rgb
+    views = render_views(find_meshes("meshes"), azimuth_step=5, polar_step=5, workers=2)     # name -> clouds
+
+For more views than memory holds: `render_dataset`.
 """
 
-import collections
 import dataclasses
-import multiprocessing
-from collections.abc import Iterator, Mapping
-from concurrent.futures import Future, ProcessPoolExecutor
+import hashlib
+import itertools
+import operator
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import closing
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,26 +20,44 @@ from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
 from thor2_jax.frames import backproject
 from thor2_jax.recognizer import VOXEL
-from thor2_jax.voxel_grid import voxel_downsample
-from training.meshes import TexturedMesh
+from thor2_jax.voxel_grid import downsample_to_fit
+from training.engines import local
+from training.meshes import TexturedMesh, load_mesh
 from training.rendering import TRAINING_CAMERA, Camera, RayCaster, RenderedView, render_view
-from training.view_sphere import camera_pose
+from training.variations import Variations, vary
+from training.view_sphere import camera_pose, view_angles
 
-__all__ = ["MIN_POINTS", "View", "cloud_of", "iterate_views", "view_cloud"]
+__all__ = [
+    "MIN_POINTS",
+    "Cloud",
+    "Progress",
+    "ViewCloud",
+    "ViewTask",
+    "checked_meshes",
+    "clouds_per_view",
+    "cloud_of",
+    "render_task",
+    "render_views",
+    "view_cloud",
+    "view_tasks",
+]
 
 SIGMA_S = DescriptorConfig().sigma_s
 
 MIN_POINTS = 30
-"""Views with fewer points are flagged `sparse`: too little of the object is seen to describe it."""
+"""Views with fewer points are left out: too little of the object is seen to describe it."""
 
-CHUNK = 128
-"""Views a task of the pool: long against sending a mesh and indexing it (0.03 s), short against its 2,664 views."""
+CHUNK = 256
+"""Views a task: long against sending a mesh and indexing it (0.03 s), short against its 2,664 views."""
 
 Cloud = tuple[NDArray[np.float32], NDArray[np.uint8]]
 
+Progress = Callable[[int, int], object]
+"""Called with (views done, views in all)."""
+
 
 def cloud_of(view: RenderedView) -> Cloud:
-    """Back-project a rendered view and voxel it at 0.01 scaled units.
+    """Back-project a rendered view and voxel it at 0.01 scaled units; coarser, as in recognition, to fit a bucket.
 
     Returns:
         xyz [n, 3] float32, metres, camera frame; rgb [n, 3] uint8. n may be 0.
@@ -47,14 +67,14 @@ def cloud_of(view: RenderedView) -> Cloud:
     depth = view.depth.astype(np.float32) / np.float32(1000)
     seen = view.depth > 0
     points = backproject(depth, view.intrinsics)[seen].astype(np.float64) * SIGMA_S
-    points, colors = voxel_downsample(points, view.color[seen].astype(np.float64), VOXEL)
+    points, colors = downsample_to_fit(points, view.color[seen].astype(np.float64), VOXEL)
     return (points / SIGMA_S).astype(np.float32), np.rint(colors).astype(np.uint8)
 
 
 def view_cloud(mesh: TexturedMesh, pose: NDArray[np.float64], camera: Camera = TRAINING_CAMERA) -> Cloud:
     """The training cloud of one view: rendered, depth in steps of 1 mm, back-projected, voxelled at 0.01 scaled units.
 
-    Indexes the mesh anew at every call; for many views use `iterate_views`.
+    Indexes the mesh anew at every call; for many views use `render_views`.
 
     Args:
         mesh: metres, z up.
@@ -74,73 +94,139 @@ def view_cloud(mesh: TexturedMesh, pose: NDArray[np.float64], camera: Camera = T
 
 
 @dataclasses.dataclass(frozen=True)
-class View:
-    """One view of one object.
+class ViewTask:
+    """Views of one object to be rendered by one process.
 
     Attributes:
         name: of the object.
-        azimuth: radians.
-        polar: radians.
+        mesh: metres, z up.
+        angles: [n, 2] azimuth and polar angle in radians.
+        first: index of the first among all angles of its object.
+        variations: makes varied copies of each view; None makes none.
+        seed: of the variations.
+    """
+
+    name: str
+    mesh: TexturedMesh
+    angles: NDArray[np.float64]
+    first: int = 0
+    variations: Variations | None = None
+    seed: int = 0
+
+
+@dataclasses.dataclass(frozen=True)
+class ViewCloud:
+    """The cloud of one view.
+
+    Attributes:
+        view: index of the angles among all of its object.
+        copy: 0 is as rendered, others are varied.
         xyz: [n, 3] float32, metres, camera frame.
         rgb: [n, 3] uint8.
     """
 
-    name: str
-    azimuth: float
-    polar: float
+    view: int
+    copy: int
     xyz: NDArray[np.float32]
     rgb: NDArray[np.uint8]
 
-    @property
-    def sparse(self) -> bool:
-        """Fewer than `MIN_POINTS` points: leave the view out of a training set, and say so."""
-        return len(self.xyz) < MIN_POINTS
+
+def clouds_per_view(variations: Variations | None) -> int:
+    """The view as rendered, and its varied copies."""
+    return 1 + variations.copies if variations else 1
 
 
-def _render_chunk(name: str, mesh: TexturedMesh, angles: NDArray[np.float64]) -> list[View]:
-    caster, centre = RayCaster([mesh]), mesh.centre
-    views = []
-    for azimuth, polar in angles.tolist():
-        xyz, rgb = cloud_of(render_view(caster, camera_pose(azimuth, polar, centre)))
-        views.append(View(name, azimuth, polar, xyz, rgb))
-    return views
+def _seed_of(name: str) -> int:
+    """A number that stays with the name, whatever other objects there are."""
+    return int.from_bytes(hashlib.sha256(name.encode(errors="surrogatepass")).digest()[:8], "little")
 
 
-def iterate_views(meshes: Mapping[str, TexturedMesh], angles: NDArray[np.float64], workers: int = 1) -> Iterator[View]:
-    """Views of all meshes: all angles of the first mesh in order, then of the second, and so on.
+def _all_clouds(task: ViewTask) -> Iterator[ViewCloud]:
+    caster, centre, name = RayCaster([task.mesh]), task.mesh.centre, _seed_of(task.name)
+    for number, (azimuth, polar) in enumerate(task.angles.tolist(), task.first):
+        view = render_view(caster, camera_pose(azimuth, polar, centre))
+        yield ViewCloud(number, 0, *cloud_of(view))
+        for copy in range(1, clouds_per_view(task.variations)):
+            assert task.variations is not None
+            rng = np.random.default_rng([task.seed, name, number, copy])
+            yield ViewCloud(number, copy, *cloud_of(vary(view, task.variations, rng)))
 
-    Order and values do not depend on the number of workers.
 
-    Args:
-        meshes: object name -> mesh.
-        angles: [n, 2] azimuth and polar angle in radians, as from `view_angles`.
-        workers: processes; 1 renders in this one. With more, the calling script needs the `if __name__ == "__main__"`
-            guard of `multiprocessing`.
+def render_task(task: ViewTask) -> list[ViewCloud]:
+    """The clouds of a task with `MIN_POINTS` points or more, view by view, the copies of a view one after the other."""
+    return [cloud for cloud in _all_clouds(task) if len(cloud.xyz) >= MIN_POINTS]
+
+
+def _mesh(source: Path | TexturedMesh) -> TexturedMesh:
+    return source if isinstance(source, TexturedMesh) else load_mesh(source)
+
+
+def checked_meshes(
+    found: Mapping[str, Path | TexturedMesh], angles: NDArray[np.float64]
+) -> Iterator[tuple[str, TexturedMesh]]:
+    """Each object's name and mesh, one in memory at a time, to be told of a useless one before an hour of rendering.
 
     Raises:
-        InputError: `workers` is not positive.
+        InputError: no meshes, or one that cannot be read or has no view of `MIN_POINTS` points or more.
     """
-    if workers < 1:
-        raise InputError(f"workers must be at least 1, not {workers}")
-    return _generate_views(meshes, angles, workers)
+    if not found:
+        raise InputError("found is empty; at least one mesh is needed")
+    for name, source in found.items():
+        mesh = _mesh(source)
+        if not any(len(cloud.xyz) >= MIN_POINTS for cloud in _all_clouds(ViewTask(name, mesh, angles))):
+            raise InputError(f"object {name!r}: none of its {len(angles)} views has {MIN_POINTS} points or more")
+        yield name, mesh
 
 
-def _generate_views(meshes: Mapping[str, TexturedMesh], angles: NDArray[np.float64], workers: int) -> Iterator[View]:
-    chunks = [(name, angles[i : i + CHUNK]) for name in meshes for i in range(0, len(angles), CHUNK)]
-    if workers == 1:
-        for name, part in chunks:
-            yield from _render_chunk(name, meshes[name], part)
-        return
-    # Not forked: JAX has threads, and a copy of them in a child can hang.
-    context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(min(workers, len(chunks) or 1), mp_context=context)
-    try:
-        pending: collections.deque[Future[list[View]]] = collections.deque()
-        for name, part in chunks:
-            pending.append(pool.submit(_render_chunk, name, meshes[name], part))
-            if len(pending) > 2 * workers:
-                yield from pending.popleft().result()
-        while pending:
-            yield from pending.popleft().result()
-    finally:
-        pool.shutdown(cancel_futures=True)
+def view_tasks(
+    found: Mapping[str, Path | TexturedMesh],
+    angles: NDArray[np.float64],
+    parts: Iterable[tuple[str, int]],
+    size: int,
+    variations: Variations | None = None,
+    seed: int = 0,
+) -> Iterator[ViewTask]:
+    """A task for each part, which is an object's name and the index of the first of its `size` angles.
+
+    A mesh is read when the first of the consecutive parts of its object is asked for.
+    """
+    for name, group in itertools.groupby(parts, key=operator.itemgetter(0)):
+        mesh = _mesh(found[name])
+        for _, first in group:
+            yield ViewTask(name, mesh, angles[first : first + size], first, variations, seed)
+
+
+def render_views(
+    found: Mapping[str, Path | TexturedMesh],
+    azimuth_step: float = 5.0,
+    polar_step: float = 5.0,
+    workers: int = 1,
+    progress: Progress = lambda done, total: None,
+) -> dict[str, list[Cloud]]:
+    """Training clouds of every object, in memory (a view of a scan takes about 15 kB).
+
+    Args:
+        found: object name -> mesh file, as from `find_meshes`, or mesh.
+        azimuth_step: degrees; divides 360.
+        polar_step: degrees; divides 180.
+        workers: processes that render; the result does not depend on their number. With more than 1, the calling script
+            needs the `if __name__ == "__main__"` guard of `multiprocessing`.
+        progress: called from time to time.
+
+    Returns:
+        name -> clouds (xyz [n, 3] float32 metres in the camera frame, rgb [n, 3] uint8), in the order of `found` and of
+        `view_angles`; views of fewer than `MIN_POINTS` points are left out.
+
+    Raises:
+        InputError: no meshes, a mesh that cannot be read or is never seen, or steps or workers that do not fit.
+    """
+    angles, engine = view_angles(azimuth_step, polar_step), local(workers)
+    views: dict[str, list[Cloud]] = {name: [] for name, _ in checked_meshes(found, angles)}
+    parts = [(name, first) for name in found for first in range(0, len(angles), CHUNK)]
+    done, total = 0, len(angles) * len(found)
+    with closing(engine(render_task, view_tasks(found, angles, parts, CHUNK))) as results:
+        for (name, first), clouds in zip(parts, results, strict=True):
+            views[name] += [(cloud.xyz, cloud.rgb) for cloud in clouds]
+            done += len(angles[first : first + CHUNK])
+            progress(done, total)
+    return views

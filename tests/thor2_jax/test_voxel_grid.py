@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from thor2_jax.errors import InputError
-from thor2_jax.voxel_grid import voxel_downsample
+from thor2_jax.voxel_grid import downsample_to_fit, voxel_downsample
 
 
 def by_dictionary(points: np.ndarray, values: np.ndarray, size: float) -> tuple[np.ndarray, np.ndarray]:
@@ -108,3 +108,13 @@ def test_points_that_are_not_finite(value: float) -> None:
 def test_shapes_that_do_not_fit(points: tuple[int, ...], colors: tuple[int, ...]) -> None:
     with pytest.raises(InputError, match=r"^points and colors have shapes"):
         voxel_downsample(np.zeros(points), np.zeros(colors), 0.01)
+
+
+@pytest.mark.parametrize(("side", "doublings"), [(20, 0), (21, 1), (50, 2)])
+def test_a_cloud_that_no_bucket_holds_gets_a_grid_twice_as_coarse(side: int, doublings: int) -> None:
+    points = np.stack(np.meshgrid(*[np.arange(side)] * 3, indexing="ij"), axis=-1).reshape(-1, 3).astype(np.float64)
+    colors = np.zeros((len(points), 3))
+    found, _ = downsample_to_fit(points, colors, 1.0)
+    expected, _ = voxel_downsample(points, colors, 2.0**doublings)
+    np.testing.assert_array_equal(found, expected)
+    assert len(found) <= 8192

@@ -108,7 +108,9 @@ def one_line(err: str) -> str:
 
 
 def test_run_folder(model: Path) -> None:
-    assert sorted(p.name for p in model.iterdir()) == ["network.npz", "run.json", "weights"]
+    found = ["curves.png", "metrics.jsonl", "network.npz", "run.json", "weights"]
+    assert sorted(p.name for p in model.iterdir()) == found
+    assert len((model / "metrics.jsonl").read_text().splitlines()) == 18
     description = json.loads((model / "run.json").read_text())
     assert sorted(description["classes"]) == sorted(NAMES)
     assert description["descriptor_version"] == 1
@@ -125,12 +127,28 @@ def test_recognize(model: Path, images: Path, scene: Scene, tmp_path: Path, run:
 
 
 def test_evaluate_frames(model: Path, images: Path, scene: Scene, tmp_path: Path, run: Run) -> None:
-    code, out, _ = run("evaluate", "frames", images.parent, "--model", model, "--out", tmp_path / "report")
-    assert code == 0 and "THOR2" in out
-    report = json.loads((tmp_path / "report" / "evaluation.json").read_text())
-    right = np.mean([i["answers"]["THOR2"][0] == i["truth"] for i in report["instances"]])
-    assert report["scored"] == len(scene.truth)
-    assert report["accuracy"]["all"]["all"]["THOR2"] == pytest.approx(right)
+    """Figures of the report against the answers of `recognize`; two runs; the same command again goes on."""
+    other = tmp_path / "other"
+    shutil.copytree(model, other)
+    description = json.loads((other / "run.json").read_text())
+    (other / "run.json").write_text(json.dumps(description | {"record": {"another": "run"}}))
+    command = ("evaluate", "frames", images.parent, "--model", model, other, "--out", tmp_path / "report")
+    code, out, _ = run(*command)
+    assert code == 0 and "THOR2" in out and "a second" in out
+    report = json.loads((tmp_path / "report" / "report.json").read_text())
+    run("recognize", "--model", model, *recognize(images), "--out", tmp_path / "answer")
+    answers = json.loads((tmp_path / "answer" / "recognition.json").read_text())
+    right = np.mean([a["name"] == scene.truth[a["label"]] for a in answers])
+    whole = report["accuracy"]["larger"][0]["cells"][0]
+    assert report["instances"]["scored"] == whole["instances"] == len(scene.truth)
+    assert whole["accuracy"]["THOR2"] == {"mean": pytest.approx(right), "std": 0.0, "runs": 2}
+    before = (tmp_path / "report" / "answers.jsonl").read_bytes()
+    assert run(*command)[0] == 0
+    assert (tmp_path / "report" / "answers.jsonl").read_bytes() == before
+    code, _, err = run("evaluate", "frames", images.parent, "--model", model, "--out", tmp_path / "report")
+    assert code == 2 and "runs" in one_line(err)
+    code, _, err = run("evaluate", "frames", images.parent, "--model", model, "--out", tmp_path / "answer")
+    assert code == 2 and "exists already" in one_line(err)
 
 
 def test_render_then_train_is_train(meshes: Path, model: Path, tmp_path: Path) -> None:
@@ -141,6 +159,17 @@ def test_render_then_train_is_train(meshes: Path, model: Path, tmp_path: Path) -
     assert call("train", "--dataset", tmp_path / "views", "--out", tmp_path / "run", *options) == 0
     first, second = (json.loads((f / "run.json").read_text()) for f in (model, tmp_path / "run"))
     assert first["record"]["curves"] == second["record"]["curves"]
+
+
+def test_train_by_folds(meshes: Path, tmp_path: Path, run: Run) -> None:
+    steps = ("--azimuth-step", 90, "--polar-step", 45, "--workers", 1)
+    options = ("--epochs", 1, "--batch-size", 16, "--classifiers", "ce", "--folds", 2)
+    arguments = ("train", "--meshes", meshes, "--out", tmp_path / "run", *steps, *options)
+    code, out, _ = run(*arguments)
+    assert code == 0 and "fold 0: ce names" in out and "fold 1: ce names" in out
+    assert sorted(p.name for p in (tmp_path / "run" / "fold-1").iterdir()) == ["network.npz", "run.json", "weights"]
+    code, _, err = run(*arguments)
+    assert code == 2 and "exists already" in one_line(err)
 
 
 def test_one_bad_instance_among_many(model: Path, images: Path, scene: Scene, tmp_path: Path, run: Run) -> None:
@@ -247,6 +276,7 @@ def test_bad_training_input(meshes: Path, tmp_path: Path, run: Run) -> None:
         "unknown classifier": (["--meshes", meshes, "--out", out, "--classifiers", "shape"], "shape"),
         "no epochs": (["--meshes", meshes, "--out", out, "--epochs", 0], "epochs"),
         "no dataset": (["--dataset", tmp_path / "absent", "--out", out], "absent"),
+        "too many folds": (["--meshes", meshes, "--out", out, *coarse, "--folds", 99], "99"),
         "folder in use": (["--meshes", meshes, "--out", full], "full"),
     }
     for case, (arguments, said) in cases.items():

@@ -8,9 +8,11 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from thor2_jax.errors import InputError
+from training import views
 from training.meshes import TexturedMesh, find_meshes, load_mesh
+from training.variations import Illumination, Variations
 from training.view_sphere import DISTANCE, camera_pose, view_angles
-from training.views import MIN_POINTS, SIGMA_S, VOXEL, iterate_views, view_cloud
+from training.views import MIN_POINTS, SIGMA_S, VOXEL, Cloud, ViewTask, render_task, render_views, view_cloud
 
 GOLDEN = ["004_sugar_box", "006_mustard_bottle", "025_mug", "048_hammer", "055_baseball", "061_foam_brick"]
 
@@ -49,32 +51,86 @@ def test_nothing_seen() -> None:
         view_cloud(ball(), camera_pose(0.0, 1.0, np.array([0, 0, 9.0])))
 
 
-def test_views_in_order_whatever_the_number_of_workers() -> None:
-    angles = view_angles(120, 90)
-    meshes = {"ball": ball(), "speck": ball(0.004)}
-    alone = list(iterate_views(meshes, angles))
-    assert [view.name for view in alone] == ["ball"] * 9 + ["speck"] * 9
-    assert np.array_equal([[view.azimuth, view.polar] for view in alone], np.tile(angles, (2, 1)))
-    assert not any(view.sparse for view in alone[:9])
-    assert all(view.sparse and len(view.xyz) < MIN_POINTS for view in alone[9:])
-    xyz, rgb = view_cloud(meshes["ball"], camera_pose(*angles[4], np.zeros(3)))
-    assert np.array_equal(alone[4].xyz, xyz) and np.array_equal(alone[4].rgb, rgb)
+def check_same(one: dict[str, list[Cloud]], other: dict[str, list[Cloud]]) -> None:
+    assert list(one) == list(other)
+    for name in one:
+        assert len(one[name]) == len(other[name])
+        for (xyz, rgb), (other_xyz, other_rgb) in zip(one[name], other[name], strict=True):
+            assert xyz.dtype == other_xyz.dtype == np.float32 and rgb.dtype == other_rgb.dtype == np.uint8
+            assert np.array_equal(xyz, other_xyz) and np.array_equal(rgb, other_rgb)
+
+
+def test_all_views_of_all_objects_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(views, "CHUNK", 4)
+    seen: list[tuple[int, int]] = []
+    meshes = {"ball": ball(), "marble": ball(0.02)}
+    found = render_views(meshes, 120, 90, 1, lambda done, total: seen.append((done, total)))
+    assert seen == [(done, 18) for done in (4, 8, 9, 13, 17, 18)]
+    expected = {
+        name: [view_cloud(mesh, camera_pose(*angles, np.zeros(3))) for angles in view_angles(120, 90)]
+        for name, mesh in meshes.items()
+    }
+    check_same(found, expected)
 
 
 @pytest.mark.slow
-def test_workers_give_the_same_views() -> None:
-    angles = view_angles(20, 15)
-    alone, shared_out = (list(iterate_views({"a": ball(), "b": ball(0.03)}, angles, n)) for n in (1, 2))
-    assert len(alone) == len(shared_out) == 2 * len(angles)
-    for one, other in zip(alone, shared_out, strict=True):
-        assert (one.name, one.azimuth, one.polar) == (other.name, other.azimuth, other.polar)
-        assert np.array_equal(one.xyz, other.xyz) and np.array_equal(one.rgb, other.rgb)
+def test_workers_give_the_same_views(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(views, "CHUNK", 50)
+    check_same(*(render_views({"a": ball(), "b": ball(0.03)}, 20, 15, workers) for workers in (1, 2)))
 
 
-def test_no_meshes_and_no_workers() -> None:
-    assert list(iterate_views({}, view_angles(180, 90))) == []
-    with pytest.raises(InputError, match="workers must be at least 1, not 0"):
-        iterate_views({"ball": ball()}, view_angles(180, 90), 0)
+def test_files_of_meshes_and_meshes_give_the_same(tmp_path: Path) -> None:
+    colors = np.full((4, 3), 99, np.uint8)
+    corners = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]])
+    faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+    trimesh.Trimesh(corners, faces, vertex_colors=colors, process=False).export(tmp_path / "corner.ply")
+    mesh = TexturedMesh(
+        corners.astype(np.float32).astype(np.float64), faces.astype(np.int32), corner_colors=colors[faces]
+    )
+    check_same(render_views({"a": tmp_path / "corner.ply"}, 180, 90), render_views({"a": mesh}, 180, 90))
+
+
+def test_views_of_few_points_are_left_out() -> None:
+    sheet = ball(0.03)
+    sheet.vertices[:, 2] *= 0.005  # seen edge on from the side
+    clouds = render_views({"sheet": sheet}, 180, 90)["sheet"]
+    assert len(clouds) == 4 and min(len(xyz) for xyz, _ in clouds) >= MIN_POINTS
+
+
+def test_bad_requests(tmp_path: Path) -> None:
+    (tmp_path / "bad.ply").write_text("not a mesh")
+    for found, steps, workers, message in [
+        ({}, (60, 45), 1, "found is empty"),
+        ({"ball": ball()}, (0, 45), 1, "azimuth_step"),
+        ({"ball": ball()}, (60, -45), 1, "polar_step"),
+        ({"ball": ball()}, (60, 45), 0, "workers must be at least 1, not 0"),
+        ({"ball": ball(), "z": tmp_path / "bad.ply"}, (60, 45), 1, "bad.ply"),
+        ({"z": tmp_path / "absent.ply"}, (60, 45), 1, "absent.ply: no such file"),
+        ({"speck": ball(0.003)}, (180, 90), 1, "object 'speck': none of its 6 views has 30 points"),
+    ]:
+        with pytest.raises(InputError, match=message):
+            render_views(found, *steps, workers)
+
+
+def test_varied_copies_follow_the_view_and_the_name_alone() -> None:
+    """Whatever part of the angles a task has: a seed of their own makes copies, and the view itself stays."""
+    angles, variations = view_angles(90, 90), Variations(illumination=Illumination(), copies=2)
+    whole = render_task(ViewTask("ball", ball(), angles, 0, variations, 7))
+    assert [(cloud.view, cloud.copy) for cloud in whole] == [(view, copy) for view in range(12) for copy in range(3)]
+    part = render_task(ViewTask("ball", ball(), angles[5:7], 5, variations, 7))
+    for cloud, other in zip(part, whole[15:21], strict=True):
+        assert (cloud.view, cloud.copy) == (other.view, other.copy)
+        assert np.array_equal(cloud.xyz, other.xyz) and np.array_equal(cloud.rgb, other.rgb)
+    plain = render_task(ViewTask("ball", ball(), angles))
+    for cloud, other in zip(plain, whole[::3], strict=True):
+        assert np.array_equal(cloud.xyz, other.xyz) and np.array_equal(cloud.rgb, other.rgb)
+    others = [
+        render_task(ViewTask("bowl", ball(), angles[:1], 0, variations, 7)),
+        render_task(ViewTask("ball", ball(), angles[:1], 0, variations, 8)),
+        render_task(ViewTask("ball", ball(), angles[:1], 1, variations, 7)),
+    ]
+    copies = [clouds[copy].rgb.tobytes() for clouds in (whole, *others) for copy in (1, 2)]
+    assert len(set(copies)) == len(copies)
 
 
 @pytest.mark.parametrize("name", GOLDEN)

@@ -1,0 +1,33 @@
+"""Fixtures shared by the tests of training."""
+
+import numpy as np
+import pytest
+
+import colornet
+from thor2_jax.color_membership import region_sets
+from training.dataset import Samples
+
+
+@pytest.fixture
+def separable() -> Samples:
+    """48 samples of 2 x 5 strips: three classes, short strips of one colour, long ones of it, long ones of another."""
+    n, strips = 48, 10
+    rng = np.random.default_rng(0)
+    label = np.arange(n, dtype=np.int32) % 3
+    length = np.where(label == 0, 0.05, 0.2)[:, None] + rng.random((n, strips)) * 0.01
+    weights = np.asarray(region_sets(colornet.load_default()).weights)
+    only_8, only_3 = (int(np.flatnonzero(weights[:, region] == 1)[0]) for region in (8, 3))
+    color_set = np.repeat(np.where(label == 2, only_3, only_8), strips)
+    every = np.tile(np.arange(strips, dtype=np.uint16), n)
+    return Samples(
+        strip_start=np.arange(n + 1) * strips,
+        color_start=np.arange(n + 1) * strips,
+        strip=every,
+        length=length.reshape(-1).astype(np.float32),
+        color_strip=every,
+        color_set=color_set.astype(np.uint16),
+        color_count=rng.integers(8, 12, n * strips).astype(np.float32),
+        label=label,
+        view=np.arange(n, dtype=np.int32),
+        classes=("a", "b", "c"),
+    )

@@ -1,0 +1,162 @@
+"""An evaluation as one page for people: `report.html` and its pictures."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from training.evaluation.gallery import Gallery
+from training.evaluation.joining import RULES
+from training.evaluation.pictures import draw_reliability
+from training.evaluation.published import published, published_seconds
+from training.evaluation.results import COVERAGE
+from training.pictures import draw_accuracy, draw_confusion_counts
+from training.report import Picture, Section, Table, write_page
+
+__all__ = ["accuracy_table", "figure_text", "write_report_page"]
+
+WORST = 12
+"""Confusions shown."""
+
+BARS = ("CE", "TOPS", "TOPS2", "THOR2")
+MOST_BARS = 8
+"""Cells that fit into a picture."""
+
+
+def figure_text(figure: Mapping[str, Any]) -> str:
+    """Mean, and standard deviation if there are several runs."""
+    if figure["mean"] is None:
+        return "–"
+    return f"{figure['mean']:.3f}" + ("" if figure["std"] is None else f" ± {figure['std']:.3f}")
+
+
+def accuracy_table(tables: Sequence[Mapping[str, Any]], joinings: Sequence[str], methods: Sequence[str] = ()) -> Table:
+    """Header and rows of tables as `results` gives them; `methods` are publications' that stand beside."""
+    header = ["", "instances", *joinings, *methods]
+    rows = []
+    for table in tables:
+        for cell in table["cells"]:
+            others = [cell["published"].get(method) for method in methods]
+            rows.append(
+                [
+                    ", ".join(f"{name} {value}" for name, value in cell["where"].items()) or "all",
+                    f"{cell['instances']:,}",
+                    *(figure_text(cell["accuracy"][name]) for name in joinings),
+                    *("–" if value is None else f"{value:.3f}" for value in others),
+                ]
+            )
+    return header, rows
+
+
+def write_report_page(found: Mapping[str, Any], gallery: Gallery, out: Path) -> None:
+    """Draw the pictures and write the page, which appears whole or not at all.
+
+    Args:
+        found: what `results` gives, with "dataset" (kind, path), "worst" (confusions) and "shown" (names of the
+            gallery's frames) added.
+        gallery: of the pictures taken on the way.
+        out: folder of the page; that of the gallery.
+
+    Raises:
+        OSError: something cannot be written.
+    """
+    sections: list[Section] = []
+    if found["joinings"]:
+        sections += [
+            *_accuracy(found, out),
+            _joined(found),
+            _confidence(found, out),
+            _confusions(found, gallery, out),
+        ]
+    pictures = [
+        Picture(_relative(gallery.frame(number), out), f"Frame {name}.", half=True)
+        for number, name in zip(gallery.shown, found["shown"], strict=True)
+    ]
+    text = "Green: named rightly. Red: the answer, and in brackets the truth. Answers of the first run."
+    sections += [("Frames", text, None, pictures), _measured(found)]
+    dataset, counts = found["dataset"], found["instances"]
+    runs = f"{len(found['runs'])} trained {'run' if len(found['runs']) == 1 else 'runs'}"
+    lead = f"{found['speed']['frames']:,} frames, {counts['scored']:,} instances scored, {runs}, {dataset['path']}"
+    write_page(out / "report.html", title=f"Evaluation on {dataset['kind']}", lead=lead, sections=sections)
+
+
+def _relative(path: Path, out: Path) -> str:
+    return path.relative_to(out).as_posix()
+
+
+def _accuracy(found: Mapping[str, Any], out: Path) -> list[Section]:
+    known = published(found["dataset"]["kind"])
+    methods = known.methods if known else ()
+    text = "Share of instances named rightly; those that could not be described count as wrong. CE reads colour alone, "
+    text += "TOPS shape alone, TOPS2 both; the larger top-1 probability decides between classifiers. "
+    if len(found["runs"]) > 1:
+        text += f"Mean and sample standard deviation over {len(found['runs'])} runs. "
+    if known:
+        text += f"{', '.join(methods)}: {known.source}. Not found, so not shown: {known.missing}."
+    whole, *tables = found["accuracy"]["larger"]
+    sections: list[Section] = [("Accuracy", text, accuracy_table([whole], found["joinings"], methods), [])]
+    names = [name for name in BARS if name in found["joinings"]]
+    for number, table in enumerate(tables):
+        pictures = []
+        if names and 1 < len(table["cells"]) <= MOST_BARS:
+            cells = {"\n".join(cell["where"].values()): cell for cell in table["cells"]}
+            file = out / f"accuracy-{number}.png"
+            heights = {part: [cell["accuracy"][n]["mean"] for n in names] for part, cell in cells.items()}
+            draw_accuracy(names, heights, {part: cell["instances"] for part, cell in cells.items()}, file)
+            pictures = [Picture(file.name, f"Accuracy by {' and '.join(table['by'])}.")]
+        heading = f"By {' and '.join(table['by'])}"
+        sections.append((heading, "", accuracy_table([table], found["joinings"], methods), pictures))
+    return sections
+
+
+def _joined(found: Mapping[str, Any]) -> Section:
+    cells = {rule: found["accuracy"][rule][0]["cells"][0]["accuracy"] for rule in RULES}
+    rows = [[n, *(figure_text(cells[rule][n]) for rule in RULES)] for n in found["joinings"] if n not in BARS[:3]]
+    text = "The paper's rule takes the classifier with the larger top-1 probability; the others take the largest mean "
+    text += "of the probabilities, or of their logarithms."
+    return "Ways to join classifiers", text, (["", *RULES], rows), []
+
+
+def _confidence(found: Mapping[str, Any], out: Path) -> Section:
+    columns = {
+        "expected calibration error": "expected_calibration_error",
+        "AUROC right or wrong": "auroc_right",
+        f"accuracy of the surest {COVERAGE:.0%}": "accuracy_at_coverage",
+        "their least confidence": "threshold_at_coverage",
+        "AUROC known or unknown": "auroc_known",
+    }
+    rows = [[n, *(figure_text(values[key]) for key in columns.values())] for n, values in found["confidence"].items()]
+    text = "Calibration error over 15 bins of equal width. AUROC: the chance that a right answer is surer than a wrong "
+    text += "one, or that to an object of the training surer than that to another object."
+    draw_reliability(found["reliability"], found["main"], out / "reliability.png")
+    caption = f"How often {found['main']} is right, by its confidence."
+    return "Confidence", text, (["", *columns], rows), [Picture("reliability.png", caption, half=True)]
+
+
+def _confusions(found: Mapping[str, Any], gallery: Gallery, out: Path) -> Section:
+    counts, classes, main = np.array(found["confusion"]), found["classes"], found["main"]
+    draw_confusion_counts(counts, classes, main, out / "confusion.png")
+    pictures = [Picture("confusion.png", f"Counts of {main}'s answers, all runs together.")]
+    rows = []
+    for worst in found["worst"]:
+        truth, answer = worst["truth"], worst["answer"]
+        rows.append([f"{truth} named {answer}", f"{worst['count']}", f"{worst['share']:.0%}"])
+        crop = gallery.confusion(truth, answer)
+        if crop.is_file():
+            pictures.append(Picture(_relative(crop, out), f"{truth} named {answer}", small=True))
+    text = "The most frequent confusions, each with the instance that the wrong answer was surest of."
+    return "Confusions", text, (["", "answers", "of all to this object"], rows), pictures
+
+
+def _measured(found: Mapping[str, Any]) -> Section:
+    speed, counts = found["speed"], found["instances"]
+    rate = f"{speed['frames_per_second']:.2f}" if speed["frames_per_second"] else "–"
+    text = f"{rate} frames a second from files to all answers of all runs, compilation included"
+    if speed["median_seconds"]:
+        text += f"; median {speed['median_seconds']:.2f} s a frame"
+    text += "." + "".join(f" {name}: {seconds} s a frame." for name, seconds in published_seconds().items())
+    rows = [[f"run {run}", ""] for run in found["runs"]]
+    rows += [[f"not described: {reason}", f"{n:,}"] for reason, n in counts["not_described"].items()]
+    rows += [[f"not scored, no class of the runs: {name}", f"{n:,}"] for name, n in counts["no_class"].items()]
+    return "How it was measured", text, (["", "instances"], rows), []

@@ -1,0 +1,188 @@
+"""From the answers to every figure of a report, as one table that JSON holds."""
+
+import dataclasses
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thor2_jax.classifier import Feature
+from training.evaluation.accuracy import over_runs, parts, tables_of
+from training.evaluation.answers import FrameAnswers, InstanceAnswer
+from training.evaluation.confidence import accuracy_at_coverage, auroc, expected_calibration_error, reliability
+from training.evaluation.joining import RULES, Rule, join_by, joinings, main_joining
+from training.evaluation.published import published
+
+__all__ = ["COVERAGE", "Answered", "answered", "results", "wrong_answers"]
+
+COVERAGE = 0.95
+"""Share of the answers that is kept where the least confident are called unknown."""
+
+Columns = Sequence[tuple[int, Feature]]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Answered:
+    """The answers of one run's joining to the instances that were described.
+
+    Attributes:
+        answer: [N] class indices.
+        confidence: [N].
+    """
+
+    answer: NDArray[np.intp]
+    confidence: NDArray[np.floating[Any]]
+
+
+def answered(
+    instances: Sequence[InstanceAnswer], columns: Columns, rule: Rule = "larger"
+) -> dict[str, dict[int, Answered]]:
+    """Joining -> run -> answers to `instances`, all of which must have been described."""
+    table = np.stack([i.probabilities for i in instances if i.probabilities is not None])  # [N, M, C]
+    found: dict[str, dict[int, Answered]] = {name: {} for name in joinings(feature for _, feature in columns)}
+    for run in sorted({run for run, _ in columns}):
+        mine = {feature: table[:, k] for k, (r, feature) in enumerate(columns) if r == run}
+        for name, group in joinings(mine).items():
+            found[name][run] = Answered(*join_by(rule, {feature: mine[feature] for feature in group}))
+    return {name: by_run for name, by_run in found.items() if by_run}
+
+
+def wrong_answers(
+    frame: FrameAnswers, columns: Columns, classes: Sequence[str]
+) -> Iterable[tuple[InstanceAnswer, str, float]]:
+    """Instance, answer and confidence of every wrong answer of the main joining of any run, where there was a right."""
+    described = [i for i in frame.instances if i.probabilities is not None and i.truth in classes]
+    if described:
+        found = answered(described, columns)
+        for given in found[main_joining(found)].values():
+            for instance, answer, confidence in zip(described, given.answer, given.confidence, strict=True):
+                if classes[answer] != instance.truth:
+                    yield instance, classes[answer], float(confidence)
+
+
+def _attributes(kind: str, frame: FrameAnswers) -> dict[str, str]:
+    # OCID's tables go by sequence: the folder of the frame.
+    sequence = {"sequence": frame.frame.rpartition("/")[0]} if kind == "ocid" else {}
+    return {**frame.attributes, **sequence}
+
+
+def results(
+    kind: str, frames: Sequence[FrameAnswers], columns: Columns, runs: Sequence[str], classes: Sequence[str]
+) -> dict[str, Any]:
+    """Every figure.
+
+    An instance that is a class of the runs is scored; one that could not be described counts as wrong. What is told of
+    confidence concerns the instances that were described.
+
+    Args:
+        kind: of the dataset: "uwis", "ocid", "bop", "frames".
+        frames: their answers.
+        columns: of the answers.
+        runs: names.
+        classes: names, in the order of the probabilities.
+    """
+    labelled = [(i, _attributes(kind, frame)) for frame in frames for i in frame.instances]
+    scored = [(i, attributes) for i, attributes in labelled if i.truth in classes]
+    described = [i for i, _ in scored if i.probabilities is not None]
+    strangers = [i for i, _ in labelled if i.truth not in classes and i.probabilities is not None]
+    position = np.array([n for n, (i, _) in enumerate(scored) if i.probabilities is not None], np.intp)
+    truth = np.array([classes.index(i.truth) for i in described], np.intp)
+    seconds = [frame.seconds for frame in frames]
+    found: dict[str, Any] = {
+        "runs": list(runs),
+        "classes": list(classes),
+        "instances": {
+            "labelled": len(labelled),
+            "scored": len(scored),
+            "not_described": dict(Counter(i.reason for i, _ in scored if i.probabilities is None)),
+            "no_class": dict(Counter(i.truth for i, _ in labelled if i.truth not in classes)),
+        },
+        "speed": {
+            "frames": len(frames),
+            "seconds": sum(seconds),
+            "frames_per_second": len(frames) / sum(seconds) if sum(seconds) else None,
+            "median_seconds": float(np.median(seconds)) if seconds else None,
+        },
+        "joinings": [],
+    }
+    if not described:
+        return found
+    by_rule = {rule: answered(described, columns, rule) for rule in RULES}
+    found["joinings"] = list(by_rule["larger"])
+    tables = tables_of(kind, [attributes for _, attributes in scored])
+    found["accuracy"] = {
+        rule: [_table(kind, names, scored, position, truth, given) for names in tables]
+        for rule, given in by_rule.items()
+    }
+    given = by_rule["larger"]
+    unknown = answered(strangers, columns) if strangers else {}
+    found["confidence"] = {name: _confidence(by_run, truth, unknown.get(name, {})) for name, by_run in given.items()}
+    found["main"] = main = main_joining(given)
+    confidence = np.concatenate([a.confidence for a in given[main].values()])
+    right = np.concatenate([a.answer == truth for a in given[main].values()])
+    bins = reliability(np.minimum(confidence, 1), right)
+    found["reliability"] = {
+        "answers": bins.answers.tolist(),
+        "accuracy": [None if np.isnan(v) else float(v) for v in bins.accuracy],
+        "confidence": [None if np.isnan(v) else float(v) for v in bins.confidence],
+    }
+    missed = Counter(i.truth for i, _ in scored if i.probabilities is None)
+    found["confusion"] = _confusion(given[main], truth, [missed[name] for name in classes]).tolist()
+    return found
+
+
+def _table(
+    kind: str,
+    names: Sequence[str],
+    scored: Sequence[tuple[InstanceAnswer, Mapping[str, str]]],
+    position: NDArray[np.intp],
+    truth: NDArray[np.intp],
+    given: Mapping[str, Mapping[int, Answered]],
+) -> dict[str, Any]:
+    """Accuracy of each joining in each cell; those of publications beside it."""
+    right: dict[str, list[NDArray[np.bool_]]] = {name: [] for name in given}
+    for name, by_run in given.items():
+        for a in by_run.values():
+            marks = np.zeros(len(scored), bool)
+            marks[position] = a.answer == truth
+            right[name].append(marks)
+    known = published(kind)
+    cells = []
+    for values, rows in parts([attributes for _, attributes in scored], names).items():
+        where = dict(zip(names, values, strict=True))
+        accuracy = {n: dataclasses.asdict(over_runs([m[rows].mean() for m in marks])) for n, marks in right.items()}
+        others = known.of(where) if known else {}
+        cells.append({"where": where, "instances": len(rows), "accuracy": accuracy, "published": others})
+    return {"by": list(names), "cells": cells}
+
+
+def _confidence(by_run: Mapping[int, Answered], truth: NDArray[np.intp], unknown: Mapping[int, Answered]) -> Any:
+    rows: dict[str, list[float]] = {
+        "expected_calibration_error": [],
+        "auroc_right": [],
+        "threshold_at_coverage": [],
+        "accuracy_at_coverage": [],
+        "auroc_known": [],
+    }
+    for run, a in by_run.items():
+        confidence, right = np.minimum(a.confidence, 1), a.answer == truth
+        kept = accuracy_at_coverage(confidence, right, COVERAGE)
+        rows["expected_calibration_error"].append(expected_calibration_error(confidence, right))
+        rows["auroc_right"].append(auroc(confidence, right))
+        rows["threshold_at_coverage"].append(kept.threshold)
+        rows["accuracy_at_coverage"].append(kept.accuracy)
+        if unknown:
+            everything = np.concatenate([confidence, np.minimum(unknown[run].confidence, 1)])
+            rows["auroc_known"].append(auroc(everything, np.arange(len(everything)) < len(confidence)))
+    return {name: dataclasses.asdict(over_runs(values)) for name, values in rows.items()}
+
+
+def _confusion(by_run: Mapping[int, Answered], truth: NDArray[np.intp], missed: Sequence[int]) -> NDArray[np.intp]:
+    """[C, C + 1] counts over all runs: rows the truth, columns the answers, the last one those not described."""
+    counts = np.zeros((len(missed), len(missed) + 1), np.intp)
+    for a in by_run.values():
+        np.add.at(counts, (truth, a.answer), 1)
+    counts[:, -1] = np.array(missed) * len(by_run)
+    return counts
