@@ -15,6 +15,8 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 import orbax.checkpoint as ocp  # type: ignore[import-untyped]
 from flax import nnx
 
@@ -45,6 +47,13 @@ class TrainedRun:
     classes: tuple[str, ...]
     classifiers: Mapping[Feature, MLP]
     record: Mapping[str, Any]
+
+
+def _checkpointer() -> Any:
+    """Orbax for this process alone: in a job of several it would wait for the others."""
+    me = jax.process_index()
+    alone = ocp.options.MultiprocessingOptions(primary_host=me, active_processes={me})
+    return ocp.StandardCheckpointer(multiprocessing_options=alone)
 
 
 def input_size(feature: Feature, config: DescriptorConfig, n_regions: int) -> int:
@@ -93,10 +102,10 @@ def save_run(run: TrainedRun, path: str | Path) -> None:
     try:
         partial.chmod(0o755)
         colornet.save(run.network, partial / "network.npz")
-        with ocp.StandardCheckpointer() as checkpointer:
+        with _checkpointer() as checkpointer:
             for name, model in run.classifiers.items():
                 state = nnx.to_pure_dict(nnx.state(model, (nnx.Param, nnx.BatchStat)))
-                checkpointer.save(partial / "weights" / name, state)
+                checkpointer.save(partial / "weights" / name, jax.tree.map(np.asarray, state))
             checkpointer.wait_until_finished()
         sizes = {
             name: (input_size(name, run.config, run.network.n_regions), len(run.classes)) for name in run.classifiers
@@ -181,13 +190,13 @@ def _restore(path: Path, n_inputs: int, n_classes: int, digest: str | None) -> M
         raise InputError(f"model: {path} is damaged, or not of {n_inputs} inputs and {n_classes} classes")
     model = MLP(n_inputs, n_classes, rngs=nnx.Rngs(0))
     state = nnx.state(model, (nnx.Param, nnx.BatchStat))
-    target = jax.tree.map(ocp.utils.to_shape_dtype_struct, nnx.to_pure_dict(state))
+    target = jax.tree.map(np.asarray, nnx.to_pure_dict(state))
     try:
-        with ocp.StandardCheckpointer() as checkpointer:
+        with _checkpointer() as checkpointer:
             restored = checkpointer.restore(path, target)
     except Exception as error:  # orbax raises whatever its storage layers raise
         reason = str(error).strip().splitlines() or [type(error).__name__]
         raise InputError(f"model: {path} cannot be read: {reason[0][:300]}") from None
-    nnx.replace_by_pure_dict(state, restored)
+    nnx.replace_by_pure_dict(state, jax.tree.map(jnp.asarray, restored))
     nnx.update(model, state)
     return model

@@ -230,17 +230,24 @@ def _evaluate(kind: str, frames: Any, dataset: Path, models: Sequence[Path], out
         found = evaluate_dataset(runs, frames, description, out or Path(nowhere) / "report", _stages(bar))
     counts, speed = found["instances"], found["speed"]
     if found["joinings"]:
-        header, rows = accuracy_table(found["accuracy"]["larger"], found["joinings"])
-        table = Table(*header)
-        for row in rows:
-            table.add_row(*row)
-        console.print(table)
+        shown = Table("", "instances", *found["joinings"])
+        for table in found["accuracy"]["larger"]:
+            header, rows = accuracy_table(table, found["joinings"])
+            shown.add_section()
+            if header[0]:
+                shown.add_row(f"by {header[0]}", style="bold")
+            for row in rows:
+                shown.add_row(*row)
+        console.print(shown)
     console.print(
         f"{counts['scored']} instances scored, {sum(counts['not_described'].values())} of them could not be described "
         f"(counted as wrong); {sum(counts['no_class'].values())} are no class of the runs"
     )
     if speed["frames_per_second"]:
-        console.print(f"{speed['frames']} frames, {speed['frames_per_second']:.2f} a second")
+        console.print(
+            f"{speed['frames']} frames, {speed['frames_per_second']:.2f} a second with compilation; "
+            f"median {speed['median_seconds']:.2f} s a frame"
+        )
     if out is not None:
         console.print(f"report: {out / 'report.html'}")
 

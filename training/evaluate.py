@@ -15,7 +15,7 @@ from training.evaluation.answers import answer_frame
 from training.evaluation.joining import join_by, joinings
 from training.readers.labelled import LabelledFrame
 
-__all__ = ["Instance", "evaluate", "summarize"]
+__all__ = ["Instance", "evaluate", "joinings", "summarize"]
 
 NO_CLASS = "no class of this run"
 

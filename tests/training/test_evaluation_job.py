@@ -26,7 +26,7 @@ CLASSES = ("bowl", "can", "mug")
 
 
 class ToyDataset:
-    """Frame k has the labels 1 to 3, of which 3 is of no class; each fourth lacks 2. Its first pixel tells its number."""
+    """Frame k has the labels 1 to 3, of which 3 is of no class; each fourth lacks 2. The first pixel is k."""
 
     def __init__(self, n: int, prefix: str = "frame") -> None:
         self.n, self.prefix = n, prefix
@@ -176,6 +176,20 @@ def test_page_of_datasets_of_any_size(tmp_path: Path, n: int) -> None:
         with Image.open(report / str(picture["src"])) as image:
             image.load()
             assert max(image.size) <= 2000
+
+
+def test_page_of_instances_none_of_which_is_described_or_known(tmp_path: Path) -> None:
+    for name, truth in (("undescribed", {1: "mug"}), ("unknown", {1: "dragon"})):
+        frame = thor2.RGBDFrame(
+            np.zeros((8, 8, 3), np.uint8),
+            np.zeros((8, 8), np.uint16),
+            np.zeros((8, 8), np.uint8),
+            thor2.Intrinsics(1.0, 1.0, 0.0, 0.0),
+        )
+        dataset: Any = [LabelledFrame("f", frame, truth, {})]
+        description = {"kind": "frames", "path": name}
+        evaluate_dataset(toys(tmp_path / "log"), dataset, description, tmp_path / name)
+        assert Page((tmp_path / name / "report.html").read_text()).open == []
 
 
 def test_gallery_is_green_where_right_and_red_where_wrong(tmp_path: Path) -> None:

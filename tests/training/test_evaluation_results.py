@@ -52,7 +52,7 @@ def test_joinings_carry_the_papers_names() -> None:
 
 
 def test_rules_of_joining_by_hand() -> None:
-    """The larger top-1 is b's 0.62; the means are 0.31, 0.34, 0.35; the products 0, 0.12 x 0.56 < 0.7 x 0.08."""
+    """The larger top-1 is 0.7; the means are 0.31, 0.34, 0.35; only the second class is above 0 in both."""
     both = {"tops": np.array([[0.0, 0.3, 0.7]]), "tops2": np.array([[0.62, 0.38, 0.0]])}
     index, confidence = join_by("larger", both)  # type: ignore[arg-type]
     assert (index[0], confidence[0]) == (2, 0.7)
@@ -136,6 +136,15 @@ def test_nothing_or_one_instance(kept: int) -> None:
         assert found["confidence"]["THOR2"]["auroc_right"] == {"mean": None, "std": None, "runs": 0}
 
 
+def test_what_cannot_be_described_is_wrong() -> None:
+    frame = FrameAnswers("f", {}, 1.0, [InstanceAnswer(1, "mug", reason="too few points")])
+    found = results("frames", [frame], COLUMNS, ["a", "b"], CLASSES)
+    accuracy = found["accuracy"]["log-mean"][0]["cells"][0]["accuracy"]
+    assert accuracy["THOR2"] == {"mean": 0.0, "std": 0.0, "runs": 2}
+    assert found["confusion"] == [[0] * 4, [0] * 4, [0, 0, 0, 2]]
+    assert found["confidence"]["THOR2"]["expected_calibration_error"]["mean"] is None
+
+
 def test_parts_and_tables() -> None:
     attributes = [{"a": "x", "b": "high"}, {"a": "x", "b": "none"}, {"a": "y"}, {"a": "x", "b": "high"}]
     found = parts(attributes, ("a", "b"))
@@ -148,18 +157,12 @@ def test_parts_and_tables() -> None:
 
 
 def test_sequences_of_ocid() -> None:
-    probabilities = np.eye(3, dtype=np.float32)[:2]
-    frames = [
-        FrameAnswers(f"table/bottom/mixed/{s}/{k}", {"camera": "lower"}, 1.0, [InstanceAnswer(1, "mug", False, None, probabilities)])
-        for s in ("seq1", "seq2")
-        for k in range(2)
-    ]  # fmt: skip
+    answer = InstanceAnswer(1, "mug", probabilities=np.eye(3, dtype=np.float32)[:2])
+    names = ["table/bottom/mixed/seq1", "table/bottom/mixed/seq2"]
+    frames = [FrameAnswers(f"{name}/{k}", {"camera": "lower"}, 1.0, [answer]) for name in names for k in range(2)]
     tables = results("ocid", frames, COLUMNS[:2], ["a"], CLASSES)["accuracy"]["larger"]
     assert tables[-1]["by"] == ["sequence"]
-    assert [c["where"]["sequence"] for c in tables[-1]["cells"]] == [
-        "table/bottom/mixed/seq1",
-        "table/bottom/mixed/seq2",
-    ]
+    assert [cell["where"]["sequence"] for cell in tables[-1]["cells"]] == names
     assert tables[1]["cells"][0]["published"]["SimpleView"] == pytest.approx(0.6254)
 
 

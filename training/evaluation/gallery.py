@@ -64,11 +64,10 @@ class Gallery:
         known = [i for i in frame.instances if i.truth in self._classes]
         judged = {i.label: (False, f"none ({i.truth})") for i in known}
         described = [i for i in known if i.probabilities is not None]
-        if described:
-            found = answered(described, self._columns)
-            first = next(iter(found[main_joining(found)].values()))
-            for instance, index in zip(described, first.answer, strict=True):
-                answer = self._classes[index]
-                right = answer == instance.truth
-                judged[instance.label] = right, answer if right else f"{answer} ({instance.truth})"
+        found = answered(described, self._columns)
+        first = next(iter(found[main_joining(found)].values()))
+        for instance, index in zip(described, first.answer, strict=True):
+            answer = self._classes[index]
+            right = answer == instance.truth
+            judged[instance.label] = right, answer if right else f"{answer} ({instance.truth})"
         return judged

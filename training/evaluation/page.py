@@ -31,21 +31,20 @@ def figure_text(figure: Mapping[str, Any]) -> str:
     return f"{figure['mean']:.3f}" + ("" if figure["std"] is None else f" ± {figure['std']:.3f}")
 
 
-def accuracy_table(tables: Sequence[Mapping[str, Any]], joinings: Sequence[str], methods: Sequence[str] = ()) -> Table:
-    """Header and rows of tables as `results` gives them; `methods` are publications' that stand beside."""
-    header = ["", "instances", *joinings, *methods]
+def accuracy_table(table: Mapping[str, Any], joinings: Sequence[str], methods: Sequence[str] = ()) -> Table:
+    """Header and rows of a table as `results` gives it; `methods` are publications' that stand beside."""
+    header = [", ".join(table["by"]), "instances", *joinings, *(f"{method}, published" for method in methods)]
     rows = []
-    for table in tables:
-        for cell in table["cells"]:
-            others = [cell["published"].get(method) for method in methods]
-            rows.append(
-                [
-                    ", ".join(f"{name} {value}" for name, value in cell["where"].items()) or "all",
-                    f"{cell['instances']:,}",
-                    *(figure_text(cell["accuracy"][name]) for name in joinings),
-                    *("–" if value is None else f"{value:.3f}" for value in others),
-                ]
-            )
+    for cell in table["cells"]:
+        others = [cell["published"].get(method) for method in methods]
+        rows.append(
+            [
+                ", ".join(cell["where"].values()) or "all",
+                f"{cell['instances']:,}",
+                *(figure_text(cell["accuracy"][name]) for name in joinings),
+                *("–" if value is None else f"{value:.3f}" for value in others),
+            ]
+        )
     return header, rows
 
 
@@ -93,9 +92,10 @@ def _accuracy(found: Mapping[str, Any], out: Path) -> list[Section]:
     if len(found["runs"]) > 1:
         text += f"Mean and sample standard deviation over {len(found['runs'])} runs. "
     if known:
-        text += f"{', '.join(methods)}: {known.source}. Not found, so not shown: {known.missing}."
+        text += f"Published figures: {known.source}. They are of {known.concerns}; only the same frames compare. "
+        text += f"Not found, so not shown: {known.missing}."
     whole, *tables = found["accuracy"]["larger"]
-    sections: list[Section] = [("Accuracy", text, accuracy_table([whole], found["joinings"], methods), [])]
+    sections: list[Section] = [("Accuracy", text, accuracy_table(whole, found["joinings"], methods), [])]
     names = [name for name in BARS if name in found["joinings"]]
     for number, table in enumerate(tables):
         pictures = []
@@ -106,7 +106,7 @@ def _accuracy(found: Mapping[str, Any], out: Path) -> list[Section]:
             draw_accuracy(names, heights, {part: cell["instances"] for part, cell in cells.items()}, file)
             pictures = [Picture(file.name, f"Accuracy by {' and '.join(table['by'])}.")]
         heading = f"By {' and '.join(table['by'])}"
-        sections.append((heading, "", accuracy_table([table], found["joinings"], methods), pictures))
+        sections.append((heading, "", accuracy_table(table, found["joinings"], methods), pictures))
     return sections
 
 

@@ -54,16 +54,26 @@ def draw_judged(
         pixels[mask & ~inner] = RIGHT if judged[label][0] else WRONG
     picture = Image.fromarray(pixels)
     draw, font = ImageDraw.Draw(picture), ImageFont.load_default(max(11, labels.shape[1] // 48))
-    for label in sorted(masks, key=lambda label: -judged[label][0]):  # the wrong ones last, over the others
+    taken: list[tuple[float, float, float, float]] = []
+    for label in sorted(masks, key=lambda label: judged[label][0]):  # the wrong ones choose their place first
         rows, across = np.nonzero(masks[label])
         if len(rows):
             right, text = judged[label]
-            _, _, width, height = draw.textbbox((0, 0), text, font)
-            x = min(max(0, across.mean() - width / 2), max(0, labels.shape[1] - width - 4))
-            y = max(0, rows.min() - height - 5)
-            draw.rectangle((x, y, x + width + 3, y + height + 3), fill=RIGHT if right else WRONG)
-            draw.text((x + 2, y + 1), text, "white", font)
+            _, _, width, height = (side + 4 for side in draw.textbbox((0, 0), text, font))
+            x = min(max(0, across.mean() - width / 2), max(0, labels.shape[1] - width))
+            above, below = rows.min() - height - 2, rows.max() + 2
+            tries = [y for k in range(4) for y in (above - k * height, below + k * height)]
+            boxes = [(x, y, x + width, y + height) for y in tries if 0 <= y <= labels.shape[0] - height]
+            free = [box for box in boxes if not any(_overlap(box, other) for other in taken)]
+            box = (free or boxes or [(x, 0, x + width, height)])[0]
+            taken.append(box)
+            draw.rectangle(box, fill=RIGHT if right else WRONG)
+            draw.text((box[0] + 2, box[1] + 1), text, "white", font)
     _save(picture, path)
+
+
+def _overlap(a: tuple[float, float, float, float], b: tuple[float, float, float, float]) -> bool:
+    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
 
 
 def draw_crop(color: NDArray[np.uint8], mask: NDArray[np.bool_], path: Path) -> None:

@@ -15,11 +15,13 @@ class Published:
 
     Attributes:
         source: where the figures were seen.
+        concerns: the frames that they are of.
         missing: which figures of the papers were not found.
         methods: names of all methods, in the order of the file.
     """
 
     source: str
+    concerns: str
     missing: str
     methods: tuple[str, ...]
     _cells: Mapping[frozenset[tuple[str, str]], Mapping[str, float]]
@@ -41,7 +43,7 @@ def published(kind: str) -> Published | None:
         return None
     cells = {frozenset(cell["where"].items()): cell["accuracy"] for cell in table["cells"]}
     methods = tuple(dict.fromkeys(method for accuracy in cells.values() for method in accuracy))
-    return Published(table["source"], table["missing"], methods, cells)
+    return Published(table["source"], table["concerns"], table["missing"], methods, cells)
 
 
 def published_seconds() -> dict[str, float]:

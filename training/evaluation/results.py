@@ -39,8 +39,9 @@ class Answered:
 def answered(
     instances: Sequence[InstanceAnswer], columns: Columns, rule: Rule = "larger"
 ) -> dict[str, dict[int, Answered]]:
-    """Joining -> run -> answers to `instances`, all of which must have been described."""
-    table = np.stack([i.probabilities for i in instances if i.probabilities is not None])  # [N, M, C]
+    """Joining -> run -> answers to those of `instances` that were described."""
+    described = [i.probabilities for i in instances if i.probabilities is not None]
+    table = np.stack(described) if described else np.zeros((0, len(columns), 1), np.float32)  # [N, M, C]
     found: dict[str, dict[int, Answered]] = {name: {} for name in joinings(feature for _, feature in columns)}
     for run in sorted({run for run, _ in columns}):
         mine = {feature: table[:, k] for k, (r, feature) in enumerate(columns) if r == run}
@@ -54,12 +55,11 @@ def wrong_answers(
 ) -> Iterable[tuple[InstanceAnswer, str, float]]:
     """Instance, answer and confidence of every wrong answer of the main joining of any run, where there was a right."""
     described = [i for i in frame.instances if i.probabilities is not None and i.truth in classes]
-    if described:
-        found = answered(described, columns)
-        for given in found[main_joining(found)].values():
-            for instance, answer, confidence in zip(described, given.answer, given.confidence, strict=True):
-                if classes[answer] != instance.truth:
-                    yield instance, classes[answer], float(confidence)
+    found = answered(described, columns)
+    for given in found[main_joining(found)].values():
+        for instance, answer, confidence in zip(described, given.answer, given.confidence, strict=True):
+            if classes[answer] != instance.truth:
+                yield instance, classes[answer], float(confidence)
 
 
 def _attributes(kind: str, frame: FrameAnswers) -> dict[str, str]:
@@ -107,7 +107,7 @@ def results(
         },
         "joinings": [],
     }
-    if not described:
+    if not scored:
         return found
     by_rule = {rule: answered(described, columns, rule) for rule in RULES}
     found["joinings"] = list(by_rule["larger"])
