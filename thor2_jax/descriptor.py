@@ -15,6 +15,7 @@ import jax.numpy as jnp
 
 from colornet import ColorNetwork
 from colornet.grid import GRID_SIZE
+from thor2_jax.capacity import BATCH_BUCKETS
 from thor2_jax.color_membership import RegionSets, color_sets, region_sets
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
@@ -136,4 +137,22 @@ def describe(
         InputError: `clouds` is no batch of clouds.
     """
     _check(clouds)
+    # Tables of more clouds than that do not stay in a CPU's caches, and a cloud costs twice as much.
+    if len(clouds.mask) > BATCH_BUCKETS[-1] and jax.default_backend() == "cpu":
+        return _describe_in_parts(clouds, network, config, parameters)
     return describe_aligned(align(clouds, config, parameters), network, config, parameters)
+
+
+@partial(jax.jit, static_argnums=(1, 2))
+def _describe_in_parts(
+    clouds: PointClouds, network: ColorNetwork, config: DescriptorConfig, parameters: Parameters | None
+) -> Descriptors:
+    size = BATCH_BUCKETS[-1]
+    n_parts = len(clouds.mask) // size
+    whole = jax.tree.map(lambda a: a[: n_parts * size].reshape(n_parts, size, *a.shape[1:]), clouds)
+    found = jax.lax.map(lambda part: describe(part, network, config, parameters), whole)
+    found = jax.tree.map(lambda a: a.reshape(n_parts * size, *a.shape[2:]), found)
+    if n_parts * size == len(clouds.mask):
+        return found
+    rest = describe(jax.tree.map(lambda a: a[n_parts * size :], clouds), network, config, parameters)
+    return jax.tree.map(lambda *arrays: jnp.concatenate(arrays), found, rest)

@@ -1,5 +1,6 @@
 """The whole way from clouds to TOPS and TOPS2 against NumPy in float64, and what must not matter."""
 
+import dataclasses
 import logging
 from pathlib import Path
 
@@ -109,6 +110,24 @@ def test_empty_clouds_in_a_batch_are_zero_and_disturb_nobody() -> None:
     assert found.overflow.tolist()[::2] == [0, 0]
     np.testing.assert_array_equal(found.tops2[1], company.tops2[0])
     np.testing.assert_array_equal(found.tops2[1], company.tops2[1])
+
+
+@pytest.mark.parametrize(("homology", "count"), [("gudhi", 512), ("closed_form", 257)])
+def test_batches_past_the_largest_bucket(homology: str, count: int) -> None:
+    """Each cloud as in a small batch, in value and in gradient; with and without a rest after whole parts."""
+    config = thor2.DescriptorConfig(homology=homology)
+    few = thor2.PointClouds.pack([camera_cloud(seed, 300) for seed in range(8)], 512)
+    order = np.arange(count) % 8
+    many = jax.tree.map(lambda a: a[order], few)
+    expected, found = thor2.describe(few, NETWORK, config), thor2.describe(many, NETWORK, config)
+    for name in ("images", "embeddings", "overflow"):
+        np.testing.assert_allclose(getattr(found, name), np.asarray(getattr(expected, name))[order], atol=1e-6)
+
+    def mass(points: jax.Array, clouds: thor2.PointClouds) -> jax.Array:
+        return thor2.describe(dataclasses.replace(clouds, points=points), NETWORK, config).images.sum()
+
+    gradient = jax.grad(mass)(many.points, many)
+    np.testing.assert_allclose(gradient, np.asarray(jax.grad(mass)(few.points, few))[order], atol=1e-5)
 
 
 @pytest.mark.parametrize("homology", ["gudhi", "closed_form"])
