@@ -53,7 +53,7 @@ PAIRS = np.triu_indices(NETWORK.n_regions, 1)
 RATE = 0.01
 """Largest step of Adam for what is learned, with a cosine decay; all of it is logarithms or logits."""
 
-N_SCENES, LIGHT = 24, 0.4
+N_SCENES, LIGHT = 20, 0.4
 """Scenes of built-in objects, and how much brighter or darker than the training views they are at most."""
 
 LOOK_ALIKES = sorted({name for pair in COLOR_PAIRS + SHAPE_PAIRS for name in pair})
@@ -177,7 +177,7 @@ def arguments() -> tuple[argparse.ArgumentParser, argparse.Namespace]:
     parser.add_argument("--seeds", type=int, default=3, help="each is one training of THOR2 and one of THOR2-L")
     parser.add_argument("--epochs", type=int, default=3)
     parser.add_argument("--azimuth-step", type=float, default=40.0, help="degrees between training views")
-    parser.add_argument("--polar-step", type=float, default=30.0, help="degrees between training views")
+    parser.add_argument("--polar-step", type=float, default=45.0, help="degrees between training views")
     parser.add_argument("--meshes", type=Path, help="folder of meshes, in place of the built-in objects")
     parser.add_argument("--names", type=Path, help="table: object name -> mesh (default: all meshes)")
     parser.add_argument("--evaluate-uwis", type=Path, nargs="+", default=[], help="in UW-IS Occluded's layout")

@@ -17,6 +17,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.frames import backproject
 from training import cli
 from training.evaluate import evaluate, summarize
+from training.evaluation.runs import Run as EvaluatedRun
 from training.readers import BOP, FrameFolder
 
 SHAPE = (6, 9)
@@ -410,12 +411,12 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
             return int(stop.code or 0)
         return 0
 
-    monkeypatch.setattr("thor2_jax.recognizer.Recognizer.load", lambda path: LabelIsClass())
+    monkeypatch.setattr("training.evaluation.runs.load_runs", lambda paths: [EvaluatedRun("run", "0", LabelIsClass())])
     dataset, model = write_dataset(tmp_path), ("--model", tmp_path / "run")
     assert call(dataset, *model, "--names", tmp_path / "names.yaml", "--out", tmp_path / "report") == 0
     assert "5 instances scored" in capsys.readouterr().out
-    assert json.loads((tmp_path / "report" / "evaluation.json").read_text())["scored"] == 5
+    assert json.loads((tmp_path / "report" / "report.json").read_text())["instances"]["scored"] == 5
     assert call(dataset, *model) == 0  # obj_000014 is no class of the run
-    assert "5 are no class of this run" in capsys.readouterr().out
+    assert "5 are no class of the runs" in capsys.readouterr().out
     assert call(tmp_path / "absent", *model) == 2
     assert capsys.readouterr().err == f"error: dataset: {tmp_path / 'absent'} is no folder\n"

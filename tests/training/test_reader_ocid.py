@@ -17,6 +17,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.frames import Intrinsics, backproject
 from training import cli
 from training.evaluate import evaluate, summarize
+from training.evaluation.runs import Run as EvaluatedRun
 from training.readers import OCID, FrameFolder
 from training.readers.ocid import fit_intrinsics
 
@@ -374,12 +375,14 @@ def test_accuracy_by_condition(tmp_path: Path) -> None:
 def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     write_frame(tmp_path / "YCB10")
     names = write_names(tmp_path)
-    monkeypatch.setattr("thor2_jax.recognizer.Recognizer.load", lambda path: NamesInOrder())
+    monkeypatch.setattr("training.evaluation.runs.load_runs", lambda paths: [EvaluatedRun("run", "0", NamesInOrder())])
     options = ("--model", tmp_path / "run", "--names", names)
     assert call(monkeypatch, "evaluate", "ocid", tmp_path, *options, "--out", tmp_path / "report") == 0
     assert "2 instances scored" in capsys.readouterr().out
-    report = json.loads((tmp_path / "report" / "evaluation.json").read_text())
-    assert report["accuracy"]["all"]["all"] == {"instances": 2, "TOPS": 1.0} and report["not_scored"] == 1
+    report = json.loads((tmp_path / "report" / "report.json").read_text())
+    assert report["instances"]["scored"] == 2 and sum(report["instances"]["no_class"].values()) == 1
+    cell = report["accuracy"]["larger"][0]["cells"][0]
+    assert cell["instances"] == 2 and cell["accuracy"]["TOPS"]["mean"] == 1.0
     names.unlink()
     assert call(monkeypatch, "evaluate", "ocid", tmp_path, *options) == 2
     assert capsys.readouterr().err == f"error: {names}: No such file or directory\n"
