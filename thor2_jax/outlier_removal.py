@@ -26,16 +26,12 @@ NEIGHBORS = 30
 FARTHEST = 0.016
 """Metres: largest mean distance of a point to its `NEIGHBORS` nearest others. At the corner of a plane it is 12 mm."""
 
-INNER_CELL = 0.006
-"""Metres: side of the cells that tell surrounded points: more than `NEIGHBORS` in a cell and those that it touches.
-On a grid of 3 mm their mean distance is 14 mm or less, so they need no search."""
-
 CELL = 0.01
-"""Metres: side of the cells in which pieces are looked for. Cells that touch, also at a corner, are one piece."""
+"""Metres: side of the cells of grids. Those that touch, also at a corner, are one piece."""
 
 REACH = 100
 """Cells from the middle of the cloud, along each axis, that a grid has at most; a point past them is in none. So grids
-stay small. Of the larger cells these are 1 m, and all that lies farther counts as one piece."""
+stay small. These are 1 m, and all that lies farther counts as one piece."""
 
 MIN_SHARE = 0.1
 """Pieces with a smaller share of the largest piece's points are dropped."""
@@ -83,27 +79,36 @@ def _grid(points: NDArray[Any], size: float) -> tuple[NDArray[np.int64], tuple[i
     return np.where(near, np.ravel_multi_index(tuple(cells), shape), 0), shape
 
 
-def _points_around(points: NDArray[Any], size: float) -> NDArray[np.int64]:
-    """Number of points [n] in each point's cell and the 26 that it touches; 0 for points past `REACH`."""
-    cell, shape = _grid(points, size)
-    counts = np.bincount(cell, minlength=math.prod(shape))
-    counts[0] = 0
+def _surrounded(points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Points [n] sure to be among others: told by the number and the moments of the points in cells, without a search.
+
+    Where more than `NEIGHBORS` points lie in a point's cell and those that it touches, the mean distance to the nearest
+    of them is at most the root of the mean square distance to all of them.
+    """
+    cell, shape = _grid(points, CELL)
+    points = points - points.mean(axis=0)
+    square = np.einsum("na,na->n", points, points)
+    sums = np.stack([np.bincount(cell, weights=w, minlength=math.prod(shape)) for w in (None, *points.T, square)])
+    sums[:, 0] = 0
     for step in (1, shape[2], shape[1] * shape[2]):
-        row = counts.copy()
-        row[step:] += counts[:-step]
-        row[:-step] += counts[step:]
-        counts = row
-    return counts[cell]
+        row = sums.copy()
+        row[:, step:] += sums[:, :-step]
+        row[:, :-step] += sums[:, step:]
+        sums = row
+    count, x, y, z, squares = sums[:, cell]
+    total = squares - 2 * (points.T * (x, y, z)).sum(axis=0) + count * square
+    others = count - 1
+    return np.asarray((others >= NEIGHBORS) & (total <= others * FARTHEST**2))
 
 
-def _among_others(points: NDArray[Any]) -> NDArray[np.bool_]:
+def _among_others(points: NDArray[np.float64]) -> NDArray[np.bool_]:
     if len(points) <= NEIGHBORS:
         return np.zeros(len(points), bool)
-    # Most points are surrounded on all sides. Only the others, along edges, are worth the search for neighbours.
-    among = _points_around(points, INNER_CELL) > NEIGHBORS
+    among = _surrounded(points)
     rest = np.flatnonzero(~among)
-    distances = KDTree(points, balanced_tree=False).query(points[rest], k=NEIGHBORS + 1)[0][:, 1:]
-    among[rest] = distances.mean(axis=1) <= FARTHEST
+    if len(rest):
+        distances = KDTree(points, balanced_tree=False).query(points[rest], k=NEIGHBORS + 1)[0][:, 1:]
+        among[rest] = distances.mean(axis=1) <= FARTHEST
     return among
 
 
@@ -130,7 +135,7 @@ def remove_outliers(points: NDArray[Any]) -> tuple[NDArray[np.intp], bool]:
     kept = np.arange(len(points))
     if len(points) == 0:
         return kept, False
-    among = _among_others(points)
+    among = _among_others(points.astype(np.float64))
     relaxed = 2 * int(among.sum()) < len(points)
     if not relaxed:
         kept = kept[among]
