@@ -5,6 +5,7 @@ Bad input ends with one line on standard error and exit code 2; nothing half-wri
 
 import hashlib
 import json
+import shutil
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
@@ -105,8 +106,7 @@ def render(
         copies=copies,
     )
     with _bar() as bar:
-        show = _stages(bar)
-        progress = lambda done, total: show("render", done, total, "")  # noqa: E731
+        progress = _stage(bar, "render")
         dataset = render_dataset(found, out, azimuth_step, polar_step, place, progress, variations or None, seed)
     console.print(
         f"{len(dataset)} views of {len(dataset.classes)} objects ({dataset.manifest.left_out} left out) in {out}"
@@ -119,55 +119,96 @@ def train(
     meshes: Annotated[Path | None, typer.Option(help="Folder of meshes (GLB, OBJ, PLY) to render.")] = None,
     dataset: Annotated[Path | None, typer.Option(help="Folder that `thor2 render` wrote, instead of --meshes.")] = None,
     names: Annotated[Path | None, typer.Option(help="JSON or YAML table: object name -> mesh. Default: all.")] = None,
-    azimuth_step: Annotated[float, typer.Option(help="Degrees between cameras around the object.")] = 5.0,
-    polar_step: Annotated[float, typer.Option(help="Degrees between cameras from pole to pole.")] = 5.0,
+    paper: Annotated[bool, typer.Option(help="The paper's protocol.")] = False,
+    azimuth_step: Annotated[
+        float | None, typer.Option(help="Degrees between cameras around the object. (20; 5)")
+    ] = None,
+    polar_step: Annotated[float | None, typer.Option(help="Degrees between cameras from pole to pole. (15; 5)")] = None,
     classifiers: Annotated[str, typer.Option(help="Comma-separated: tops, tops2, ce.")] = "tops,tops2,ce",
-    epochs: Annotated[int, typer.Option(help="Half at a learning rate of 1e-2, half at 1e-3.")] = 100,
-    batch_size: Annotated[int, typer.Option(help="Samples a step.")] = 128,
-    seed: Annotated[int, typer.Option(help="Of weights, order and dropout.")] = 0,
+    epochs: Annotated[int | None, typer.Option(help="Half at a learning rate of 1e-2, half at 1e-3. (24; 100)")] = None,
+    batch_size: Annotated[int | None, typer.Option(help="Samples a step. (256; 128)")] = None,
+    seed: Annotated[int, typer.Option(help="Of varied views, weights, order and dropout.")] = 0,
     folds: Annotated[int, typer.Option(min=1, help="More than 1: a model each, its own views held out.")] = 1,
+    baselines: Annotated[str, typer.Option(help="Comma-separated: thor, forest, pointnet. To compare with.")] = "",
+    leave_out: Annotated[str, typer.Option(help="Comma-separated: objects that are not trained.")] = "",
     workers: Annotated[int, typer.Option(min=1, help="Processes that render.")] = 2,
     coordinator: Annotated[str | None, typer.Option(help="HOST:PORT of process 0, if there are several.")] = None,
     processes: Annotated[int, typer.Option(min=1, help="Processes that train together.")] = 1,
     process: Annotated[int, typer.Option(min=0, help="Number of this one.")] = 0,
 ) -> None:
-    """Train a recognizer on synthetic views of meshes. Interrupted, it goes on when called again."""
+    """Train a recognizer on synthetic views of meshes. Interrupted, it goes on when called again.
+
+    Of --meshes, each view is used as rendered and in two varied copies: under another light, partly hidden, with the
+    errors of a depth camera and of a mask. A --dataset has the copies that it was rendered with. --paper trains as the
+    paper does: on plain views only, more of them, each in four mirrors, for longer; its defaults stand second.
+
+    With --baselines, a run that is finished gets those that it lacks.
+    """
     import jax
 
-    if coordinator is not None:
-        jax.distributed.initialize(coordinator, processes, process)
-    from thor2_jax.config import DescriptorConfig
-    from training.fit import FitOptions
-    from training.meshes import find_meshes, read_names
-    from training.train import check_out, train_run
-    from training.view_dataset import ViewDataset
-    from training.view_source import MemoryViews, ViewSource
-    from training.views import render_views
-
-    check_out(out)
-    options = FitOptions(epochs=epochs, batch_size=batch_size, seed=seed)
-    features = [name.strip() for name in classifiers.split(",")]
     if (meshes is None) == (dataset is None):
         raise InputError("give exactly one of --meshes and --dataset")
+    if coordinator is not None:
+        if meshes is not None:
+            raise InputError("coordinator: several processes train from a --dataset that all of them can read")
+        jax.distributed.initialize(coordinator, processes, process)
+    from thor2_jax.classifier import check_features
+    from training.baselines.job import check_baselines, is_finished, train_baselines
+    from training.engines import local
+    from training.fit import FitOptions
+    from training.left_out import WithoutClasses
+    from training.meshes import find_meshes, read_names
+    from training.protocol import DEFAULT, PAPER
+    from training.render_job import render_dataset
+    from training.train import VIEWS, check_out, train_run
+    from training.view_dataset import ViewDataset
+    from training.view_source import ViewSource
+
+    compared = check_baselines(_listed(baselines))
+    finished = bool(compared) and is_finished(out)
+    if not finished:
+        check_out(out)
+    protocol = PAPER if paper else DEFAULT
+    options = FitOptions(
+        epochs=protocol.fit.epochs if epochs is None else epochs,
+        batch_size=protocol.fit.batch_size if batch_size is None else batch_size,
+        seed=seed,
+    )
+    features = check_features(_listed(classifiers), "classifiers")
     if meshes is not None:
         found = find_meshes(meshes, read_names(names) if names else None)
+        steps = (
+            protocol.azimuth_step if azimuth_step is None else azimuth_step,
+            protocol.polar_step if polar_step is None else polar_step,
+        )
         with _bar() as bar:
-            task = bar.add_task("render", total=None, note="")
-            views = render_views(found, azimuth_step, polar_step, workers, _advance(bar, task))
-        source: ViewSource = MemoryViews(views, DescriptorConfig())
+            progress = _stage(bar, "render")
+            source: ViewSource = render_dataset(
+                found, out / VIEWS, *steps, local(workers), progress, protocol.variations, seed
+            )
     else:
         assert dataset is not None
         source = ViewDataset.open(dataset)
+    if leave_out:
+        source = WithoutClasses(source, _listed(leave_out))
     with _bar() as bar:
-        runs = train_run(source, out, features, options, _stages(bar), folds=folds)
+        runs = (
+            []
+            if finished
+            else train_run(source, out, features, options, _stages(bar), folds=folds, mirrors=protocol.mirrors)
+        )
+        if jax.process_index() == 0:
+            train_baselines(out, source, compared, _stages(bar))
+            if meshes is not None:
+                shutil.rmtree(out / VIEWS)
     for run in runs:
         for name, accuracy in run.record["held_out_accuracy"].items():
             console.print(f"fold {run.record['fold']}: {name} names {accuracy:.3f} of the views held out rightly")
     console.print(f"run written to {out}")
 
 
-def _advance(bar: Progress, task: Any) -> Callable[[int, int], None]:
-    return lambda done, total: bar.update(task, completed=done, total=total)
+def _listed(names: str) -> list[str]:
+    return [name.strip() for name in names.split(",")] if names else []
 
 
 def _stages(bar: Progress) -> Callable[[str, int, int, str], None]:
@@ -181,6 +222,11 @@ def _stages(bar: Progress) -> Callable[[str, int, int, str], None]:
         bar.update(tasks[stage], completed=done, total=total, note=note)
 
     return show
+
+
+def _stage(bar: Progress, stage: str) -> Callable[[int, int], None]:
+    show = _stages(bar)
+    return lambda done, total: show(stage, done, total, "")
 
 
 @app.command()
@@ -302,6 +348,31 @@ def bop(
     from training.readers.bop import BOP
 
     _evaluate("bop", BOP(dataset, names), dataset, [*model, *(runs or [])], out, names=names)
+
+
+@app.command()
+def serve(
+    model: ModelOption,
+    host: Annotated[str, typer.Option(help="Address to listen at; 0.0.0.0 for other machines.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="0 takes a free one; the log tells.")] = 8080,
+    workers: Annotated[int, typer.Option(min=1, help="Server processes; each has the model and its own queue.")] = 1,
+    processes: Annotated[int, typer.Option(min=1, help="Of each worker, that decode images and make clouds.")] = 2,
+    queue: Annotated[int, typer.Option(min=1, help="Requests a worker has at a time; more get status 429.")] = 32,
+    deadline: Annotated[float, typer.Option(help="Seconds a request may take; then it gets status 504.")] = 5.0,
+    max_batch: Annotated[int, typer.Option(help="Most clouds in a batch of the device.")] = 32,
+    token: Annotated[str | None, typer.Option(envvar="THOR2_TOKEN", help="Bearer token that callers need.")] = None,
+) -> None:
+    """Answer recognition over HTTP (extra `serve`); see /openapi.json."""
+    try:
+        from thor2_jax.service.server import serve as serve_forever
+    except ModuleNotFoundError as error:
+        if (error.name or "").startswith("thor2_jax"):
+            raise
+        raise InputError(f"{error.name} is not installed; serve needs: pip install 'thor2-jax[serve]'") from None
+    from thor2_jax.service.settings import Settings
+
+    settings = Settings(model, token, queue, deadline, max_batch, processes=processes)
+    serve_forever(settings, host, port, workers)
 
 
 @app.command()

@@ -10,7 +10,7 @@ strip's points have each set of colour regions; some hundred bytes in place of t
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -28,10 +28,13 @@ from thor2_jax.view_normalization import mirror, turn
 from training.normalized_views import padded_batches
 from training.view_source import ViewSource
 
-__all__ = ["MIRRORS", "Batch", "Samples", "build_samples", "expand"]
+__all__ = ["MIRRORS", "PAPER_MIRRORS", "Batch", "Samples", "build_samples", "expand"]
 
-MIRRORS = ("", "x", "y", "xy")
-"""Each normalized view is used four times."""
+MIRRORS = ("", "x")
+"""Mirrors of a normalized view with different descriptors: a mirror in y changes no strip's length and no count."""
+
+PAPER_MIRRORS = ("", "x", "y", "xy")
+"""The paper uses each view four times."""
 
 CHUNK = 64
 """Views computed together."""
@@ -128,6 +131,7 @@ def build_samples(
     network: ColorNetwork,
     config: DescriptorConfig,
     progress: Callable[[int], object] = lambda n: None,
+    mirrors: Sequence[str] = MIRRORS,
 ) -> Samples:
     """Mirror every view and keep its strips; one shard of views is in memory at a time.
 
@@ -136,6 +140,7 @@ def build_samples(
         network: gives the colour regions.
         config: static.
         progress: called with the number of views done since the last call.
+        mirrors: each in the letters of its axes; a sample each.
 
     Raises:
         InputError: fewer than two classes, a class without views, or a file of the source that cannot be read.
@@ -153,7 +158,7 @@ def build_samples(
         views = source.read(index)
         done = 0
         for count, normal in padded_batches(views.clouds(), CHUNK):
-            for axes in MIRRORS:
+            for axes in mirrors:
                 found = strips_by_sets(turn(mirror(normal, axes), config), counting, config)
                 part = _compact(jax.tree.map(lambda a: np.asarray(a)[:count], found))  # noqa: B023
                 part["label"] = np.full(count, shard.label, np.int32)

@@ -7,6 +7,7 @@ figures.accuracy["all"]            # CE, TOPS, TOPS2, THOR2 in the order of figu
 import dataclasses
 import json
 import resource
+import shutil
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -14,28 +15,27 @@ from typing import Any
 
 import numpy as np
 
-from thor2_jax.config import DescriptorConfig
 from thor2_jax.files import write_text
 from thor2_jax.overlay import draw_overlay
 from thor2_jax.recognizer import Recognizer
 from training.builtin_objects import builtin_objects
 from training.evaluate import Instance, evaluate, summarize
-from training.fit import FitOptions
 from training.meshes import TexturedMesh
 from training.pictures import draw_accuracy, draw_confusion, draw_curves, draw_descriptor, draw_objects
+from training.protocol import DEFAULT
 from training.readers.labelled import LabelledFrame
+from training.render_job import render_dataset
 from training.report import Picture, write_page
 from training.scenes import Scene, compose_scene
-from training.train import Progress, train_run
-from training.view_source import MemoryViews
-from training.views import render_views
+from training.train import VIEWS, Progress, train_run
+from training.view_sphere import camera_pose
+from training.views import view_cloud
 
 __all__ = ["DemoFigures", "run_demo"]
 
-AZIMUTH_STEP, POLAR_STEP = 20.0, 15.0
-"""Degrees between training views: 18 x 13 = 234 an object."""
+EPOCHS = 6
+"""A quarter of the default's: as many as a demonstration's minutes allow."""
 
-EPOCHS = 8
 N_SCENES = 40
 LIGHT = 0.4
 """Scenes are up to this share brighter or darker than the training views: colour alone is then no sure guide."""
@@ -110,11 +110,18 @@ def run_demo(out: str | Path, seed: int = 0, progress: Progress = lambda stage, 
     pictures = out / "pictures"
     pictures.mkdir(parents=True, exist_ok=True)
     objects = builtin_objects()
-    views = render_views(
-        objects, AZIMUTH_STEP, POLAR_STEP, 1, lambda done, total: progress("render views", done, total, "")
+    dataset = render_dataset(
+        objects,
+        out / "run" / VIEWS,
+        DEFAULT.azimuth_step,
+        DEFAULT.polar_step,
+        progress=lambda done, total: progress("render views", done, total, ""),
+        variations=DEFAULT.variations,
+        seed=seed,
     )
-    source = MemoryViews(views, DescriptorConfig())
-    (run,) = train_run(source, out / "run", FEATURES, FitOptions(epochs=EPOCHS, seed=seed), progress)
+    options = dataclasses.replace(DEFAULT.fit, epochs=EPOCHS, seed=seed)
+    (run,) = train_run(dataset, out / "run", FEATURES, options, progress, mirrors=DEFAULT.mirrors)
+    shutil.rmtree(out / "run" / VIEWS)
 
     scenes = _scenes(objects, seed, progress)
     recognizer = Recognizer.load(out / "run")
@@ -134,7 +141,8 @@ def run_demo(out: str | Path, seed: int = 0, progress: Progress = lambda stage, 
     draw_accuracy(NAMES, accuracy, counts, pictures / "accuracy.png")
     draw_confusion(instances, run.classes, "THOR2", pictures / "confusion.png")
     draw_curves(run.record["curves"], pictures / "training.png")
-    xyz, rgb = views["mug_blue"][len(views["mug_blue"]) // 2]
+    mug = objects["mug_blue"]
+    xyz, rgb = view_cloud(mug, camera_pose(0.8, 1.2, mug.centre))
     draw_descriptor(xyz, rgb, run.network, run.config, "mug_blue", pictures / "descriptor.png")
     for number, scene in enumerate(scenes[:N_SHOWN]):
         draw_overlay(scene.frame.color, scene.frame.labels, recognizer.recognize(scene.frame), _scene(pictures, number))
@@ -148,7 +156,7 @@ def run_demo(out: str | Path, seed: int = 0, progress: Progress = lambda stage, 
         )
         + "\n",
     )
-    _write_report(out, figures, len(objects), sum(map(len, views.values())))
+    _write_report(out, figures, len(objects), len(dataset))
     return figures
 
 

@@ -13,6 +13,7 @@ from thor2_jax.recognizer import Recognizer
 from training.evaluation.accuracy import parts
 from training.evaluation.answers import answer_frame
 from training.evaluation.joining import join_by, joinings
+from training.evaluation.runs import Run
 from training.readers.labelled import LabelledFrame
 
 __all__ = ["Instance", "evaluate", "joinings", "summarize"]
@@ -52,9 +53,10 @@ def evaluate(
     """
     groups = joinings(recognizer.run.classifiers)
     classes = recognizer.run.classes
+    run = Run("", "", recognizer)
     found: list[Instance] = []
     for item in frames:
-        for answer in answer_frame([recognizer], item):
+        for answer in answer_frame([run], item):
             reason = answer.reason if answer.truth in classes else NO_CLASS
             answers: dict[str, tuple[str, float]] = {}
             if reason is None and answer.probabilities is not None:

@@ -1,19 +1,19 @@
 """Scanned meshes: reading GLB, OBJ and PLY files, the colour at a point of the surface, finding them in a folder."""
 
 import dataclasses
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import trimesh
-import yaml
 from numpy.typing import NDArray
 from PIL import Image
 from trimesh.visual.material import PBRMaterial, SimpleMaterial, empty_material
 
 from thor2_jax.errors import InputError
+from thor2_jax.frames import MOST_PIXELS
+from training.readers.files import parse_json, parse_yaml
 
 __all__ = ["MESH_SUFFIXES", "TexturedMesh", "find_meshes", "load_mesh", "merge_meshes", "read_names"]
 
@@ -136,7 +136,7 @@ def _part(geometry: trimesh.Trimesh) -> TexturedMesh:
     """One geometry of a file.
 
     Raises:
-        InputError: it has no colour.
+        InputError: it has no colour, or one that would fill memory.
     """
     vertices, faces = np.asarray(geometry.vertices, np.float64), np.asarray(geometry.faces, np.int32)
     visual: Any = geometry.visual
@@ -159,6 +159,8 @@ def _part(geometry: trimesh.Trimesh) -> TexturedMesh:
     factor = np.full(3, 255, np.uint8) if factor is None else np.asarray(factor, np.uint8)[:3]
     if image is None or visual.uv is None:
         return _solid(vertices, faces, factor)
+    if isinstance(image, Image.Image) and image.width * image.height > MOST_PIXELS:
+        raise InputError(f"a texture of {image.width} x {image.height} pixels; at most {MOST_PIXELS} are read")
     texture = np.asarray(image.convert("RGB") if isinstance(image, Image.Image) else image, np.uint8)
     if (factor < 255).any():
         texture = np.rint(texture * (factor / 255.0)).astype(np.uint8)
@@ -208,7 +210,7 @@ def load_mesh(path: str | Path) -> TexturedMesh:
     except InputError:
         raise
     except Exception as error:  # trimesh raises whatever its parsers do
-        raise InputError(f"mesh {path}: cannot be read ({error})") from error
+        raise InputError(f"mesh {path}: cannot be read ({' '.join(str(error).split())})") from error
     geometries = [part for part in loaded if isinstance(part, trimesh.Trimesh) and len(part.faces)]
     if not geometries:
         raise InputError(f"mesh {path}: no faces")
@@ -218,6 +220,8 @@ def load_mesh(path: str | Path) -> TexturedMesh:
         mesh = merge_meshes([_part(geometry) for geometry in geometries])
     except InputError as error:
         raise InputError(f"mesh {path}: {error}") from error
+    except Exception as error:  # textures are decoded now, and attributes may be of another number than vertices
+        raise InputError(f"mesh {path}: cannot be read ({' '.join(str(error).split())})") from error
     if not np.isfinite(mesh.vertices).all():
         raise InputError(f"mesh {path}: {(~np.isfinite(mesh.vertices)).any(axis=1).sum()} vertices are not finite")
     if mesh.uv is not None and not np.isfinite(mesh.uv).all():
@@ -299,12 +303,12 @@ def read_names(path: str | Path) -> dict[str, str]:
     if suffix not in (".json", ".yaml", ".yml"):
         raise InputError(f"names file {path}: the extension must be .json, .yaml or .yml")
     try:
-        text = path.read_text(encoding="utf-8")
-        table = json.loads(text) if suffix == ".json" else yaml.safe_load(text)
+        content = path.read_bytes()
+        table = parse_json(content) if suffix == ".json" else parse_yaml(content)
     except OSError as error:
         raise InputError(f"names file {path}: {error.strerror}") from error
-    except (ValueError, yaml.YAMLError) as error:
-        raise InputError(f"names file {path}: {' '.join(str(error).split())}") from error
+    except ValueError as error:
+        raise InputError(f"names file {path}: {error}") from error
     if not isinstance(table, dict) or not table:
         raise InputError(f"names file {path}: expected a table of object name: scan")
     for name, scan in table.items():

@@ -11,6 +11,8 @@ from training.fit import Figures
 
 __all__ = ["append_figures", "forget_after", "read_figures"]
 
+_WHOSE = {"fold", "classifier"}
+
 
 def append_figures(path: Path, fold: int, classifier: str, figures: Figures) -> None:
     """Add one line."""
@@ -25,11 +27,16 @@ def read_figures(path: Path) -> list[dict[str, Any]]:
     Raises:
         InputError: another line is no record.
     """
-    text = path.read_text(encoding="utf-8") if path.exists() else ""
+    content = path.read_bytes() if path.exists() else b""
     try:
-        return [json.loads(line) for line in text.split("\n")[:-1]]
-    except ValueError as error:
+        rows = [json.loads(line) for line in content.split(b"\n")[:-1]]
+        if not all(
+            isinstance(row, dict) and isinstance(row.get("epoch"), int) and _WHOSE <= row.keys() for row in rows
+        ):
+            raise ValueError("a line is no record")
+    except (ValueError, RecursionError) as error:
         raise InputError(f"out: {path} is damaged ({error})") from None
+    return rows
 
 
 def forget_after(path: Path, fold: int, classifier: str, epoch: int) -> None:

@@ -8,10 +8,9 @@ neither on the number of workers nor on where they are, and a job that was inter
 
 import contextlib
 import dataclasses
-import fcntl
 import hashlib
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +22,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.files import replacing
 from thor2_jax.recognizer import VOXEL
 from training.engines import IN_PROCESS, Engine
+from training.locking import LOCK, locked
 from training.meshes import TexturedMesh
 from training.normalized_views import LARGEST, STEP, normalize_views
 from training.rendering import TRAINING_CAMERA
@@ -46,7 +46,6 @@ SHARD = 256
 """Clouds of a shard, some less where copies do not come out even: a few megabytes, a second of rendering."""
 
 SUFFIX = ".safetensors"
-LOCK = ".lock"
 
 
 def _digest(mesh: TexturedMesh) -> str:
@@ -110,17 +109,6 @@ def _make_folder(folder: Path) -> None:
     others = set(folder.iterdir()) - _leftovers(folder) - {folder / LOCK}
     if others and folder / MANIFEST not in others:
         raise InputError(f"out: {folder} exists already and holds files, but no {MANIFEST}")
-
-
-@contextlib.contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """Keep other processes from writing to the folder. The lock ends with this process, however that ends."""
-    with (folder / LOCK).open("w") as stream:
-        try:
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise InputError(f"out: another process is writing to {folder}") from None
-        yield
 
 
 def _is_whole(shard: Shard, folder: Path) -> bool:
@@ -240,7 +228,7 @@ def render_dataset(
         progress(sum(shard.views + shard.left_out for shard in done.values()), copies * len(angles) * len(objects))
 
     _make_folder(out)
-    with _locked(out):
+    with locked(out):
         done.update((shard.file, shard) for shard in _begin(out, job).shards)
         show_progress()
         missing = [file for file in plan if file not in done]

@@ -4,14 +4,15 @@ RUN/run.json, network.npz, weights/   the trained model (`run_folder`); of sever
 RUN/metrics.jsonl                     a line an epoch, classifier and fold
 RUN/curves.png                        the same, drawn
 RUN/checkpoints/                      while it is in the making: what it was begun with, and how far it is
+RUN/views/                            the same: its views, where they were rendered for this run alone
 
 A run that was stopped goes on when it is asked for again. It is a run folder once run.json is there, which comes last.
 """
 
+import contextlib
 import dataclasses
 import json
 import shutil
-import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -28,19 +29,22 @@ from thor2_jax.errors import InputError
 from thor2_jax.files import write_text
 from thor2_jax.run_folder import TrainedRun, check_new, load_run, save_run
 from thor2_jax.sharding import batch_mesh
+from training.calibration import temperatures
 from training.checkpoints import Checkpoints
-from training.dataset import Samples, build_samples
+from training.dataset import MIRRORS, Samples, build_samples
 from training.fit import Figures, FitOptions, check_batch_size, fit
 from training.folds import fold_of_samples
+from training.locking import locked
 from training.metrics import append_figures, forget_after, read_figures
 from training.pictures import draw_curves
 from training.view_source import ViewSource
 
-__all__ = ["Progress", "check_out", "train_run"]
+__all__ = ["VIEWS", "Progress", "check_out", "train_run"]
 
 Progress = Callable[[str, int, int, str], object]
 """Called with (stage, done, total, note)."""
 
+VIEWS = "views"
 CHECKPOINTS = "checkpoints"
 BEGUN = "begun.json"
 METRICS = "metrics.jsonl"
@@ -57,8 +61,10 @@ def check_out(out: str | Path) -> None:
     Raises:
         InputError: naming the path.
     """
-    if not (Path(out) / CHECKPOINTS / BEGUN).is_file():
-        check_new(out)
+    out = Path(out)
+    if not out.is_dir() or any(path.name not in (VIEWS, CHECKPOINTS) for path in out.iterdir()):
+        if not (out / CHECKPOINTS / BEGUN).is_file():
+            check_new(out)
 
 
 def _check_same(out: Path, begun: Mapping[str, Any]) -> None:
@@ -67,7 +73,7 @@ def _check_same(out: Path, begun: Mapping[str, Any]) -> None:
         return
     try:
         found = dict(json.loads(path.read_bytes()))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, TypeError, RecursionError) as error:
         raise InputError(f"out: {path} cannot be read: {error}") from None
     for name, value in begun.items():
         if found.get(name) != value:
@@ -78,15 +84,8 @@ def _check_same(out: Path, begun: Mapping[str, Any]) -> None:
 
 
 def _begin(out: Path, begun: Mapping[str, Any]) -> None:
-    """Make the folder of a run in the making; it appears whole or not at all."""
-    if (out / CHECKPOINTS / BEGUN).is_file():
-        return
-    out.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as partial:
-        new = Path(partial) / out.name
-        (new / CHECKPOINTS).mkdir(parents=True)
-        write_text(new / CHECKPOINTS / BEGUN, json.dumps(begun, indent=1) + "\n")
-        new.rename(out)
+    if not (out / CHECKPOINTS / BEGUN).is_file():
+        write_text(out / CHECKPOINTS / BEGUN, json.dumps(begun, indent=1) + "\n")
 
 
 def _together(point: str) -> None:
@@ -103,6 +102,7 @@ def train_run(
     progress: Progress = lambda stage, done, total, note: None,
     config: DescriptorConfig | None = None,
     folds: int = 1,
+    mirrors: Sequence[str] = MIRRORS,
 ) -> list[TrainedRun]:
     """Train one classifier a feature and fold, and write the run folder or folders; or go on where that was stopped.
 
@@ -117,14 +117,16 @@ def train_run(
         config: the descriptor; by default the paper's, with diagrams in closed form.
         folds: with more than one, a model each (`out`/fold-0, ...), trained on the views of the others and measured on
             its own.
+        mirrors: in which each view is used.
 
     Returns:
         The run of each fold, as read back.
 
     Raises:
-        InputError: unknown features, `out` holds something else, or a run in the making with other options or views
-            (told before any work); classes without views, or with fewer than folds; a batch that does not divide among
-            the devices: nothing is written then. A loss that is not finite: the checkpoints so far stay.
+        InputError: unknown features, `out` holds something else, a run in the making with other options or views
+            (told before any work) or one that another process trains; classes without views, or with fewer than folds;
+            a batch that does not divide among the devices: nothing is written then. A loss that is not finite: the
+            checkpoints so far stay.
         OSError: something cannot be written; the last complete checkpoints stay.
     """
     names = check_features(features, "classifiers")
@@ -138,6 +140,7 @@ def train_run(
         "dataset": source.digest,
         "classifiers": list(names),
         "folds": folds,
+        "mirrors": list(mirrors),
         "epochs": options.epochs,
         "learning_rates": list(options.learning_rates),
         "batch_size": options.batch_size,
@@ -153,32 +156,45 @@ def train_run(
         done += count
         progress("describe", done, total, "views")
 
-    samples = build_samples(source, network, config, described)
-    fold_of = fold_of_samples(samples, folds, options.seed)
-    _together("checked")
-    if jax.process_index() == 0:
-        _begin(out, begun)
-    _together("begun")
+    with contextlib.ExitStack() as held:
+        first, before = jax.process_index() == 0, (out / CHECKPOINTS).is_dir()
+        if first and before:
+            held.enter_context(locked(out / CHECKPOINTS))
+        samples = build_samples(source, network, config, described, mirrors)
+        fold_of = fold_of_samples(samples, folds, options.seed)
+        _together("checked")
+        if first:
+            if not before:
+                check_out(out)  # another process may have been quicker
+                (out / CHECKPOINTS).mkdir(parents=True, exist_ok=True)
+                held.enter_context(locked(out / CHECKPOINTS))
+                _check_same(out, begun)
+            _begin(out, begun)
+        _together("begun")
 
-    runs = []
-    for fold in range(folds):
-        folder = out if folds == 1 else out / f"fold-{fold}"
-        if not (folder / RUN).is_file():
-            held_out = fold_of == fold if folds > 1 else None
-            classifiers, kept = _fit_fold(samples, held_out, out, fold, network, config, names, options, progress)
-            if jax.process_index() == 0:
-                rows = read_figures(out / METRICS)
-                draw_curves({name: [row for row in rows if row["classifier"] == name] for name in names}, out / CURVES)
-                record = begun | {"dataset": source.record, "samples": len(samples), "fold": fold}
-                record |= _outcome([row for row in rows if row["fold"] == fold], kept)
-                run = TrainedRun(config, network, samples.classes, classifiers, record)
-                _publish(run, out / CHECKPOINTS / f"fold-{fold}" / "run", folder)
-            _together("published")
-        runs.append(load_run(folder))
-    _together("trained")
-    if jax.process_index() == 0:
-        shutil.rmtree(out / CHECKPOINTS)
-    return runs
+        runs = []
+        for fold in range(folds):
+            folder = out if folds == 1 else out / f"fold-{fold}"
+            if not (folder / RUN).is_file():
+                held_out = fold_of == fold if folds > 1 else None
+                classifiers, kept = _fit_fold(samples, held_out, out, fold, network, config, names, options, progress)
+                calibrated = temperatures(classifiers, samples, held_out, network, config)
+                if first:
+                    rows = read_figures(out / METRICS)
+                    draw_curves(
+                        {name: [row for row in rows if row["classifier"] == name] for name in names}, out / CURVES
+                    )
+                    record = begun | {"dataset": source.record, "samples": len(samples), "fold": fold}
+                    record |= _outcome([row for row in rows if row["fold"] == fold], kept)
+                    record["temperatures"] = calibrated
+                    run = TrainedRun(config, network, samples.classes, classifiers, record)
+                    _publish(run, out / CHECKPOINTS / f"fold-{fold}" / "run", folder)
+                _together("published")
+            runs.append(load_run(folder))
+        _together("trained")
+        if first:
+            shutil.rmtree(out / CHECKPOINTS)
+        return runs
 
 
 def _fit_fold(

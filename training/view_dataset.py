@@ -72,6 +72,13 @@ class Shard:
     left_out: int
     points: int
 
+    def __post_init__(self) -> None:
+        numbers = (self.label, self.views, self.left_out, self.points)
+        if not all(type(number) is int and number >= 0 for number in numbers):
+            raise ValueError(f"label, views, left_out, points are {numbers!r}; expected whole numbers")
+        if not isinstance(self.file, str) or Path(self.file).name != self.file:
+            raise ValueError(f"file is {self.file!r}; expected a name in the folder")
+
     def content(self, folder: Path) -> bytes:
         """The bytes of the file.
 
@@ -149,7 +156,15 @@ class Manifest:
                 checksum = table.pop("sha256")
                 if checksum != hashlib.sha256(_dump(table).encode()).hexdigest():
                     raise ValueError("its checksum is not its own")
-                return cls(table["job"], tuple(Shard(**shard) for shard in table["shards"]))
+                found = cls(table["job"], tuple(Shard(**shard) for shard in table["shards"]))
+                names = [entry["name"] for entry in found.job["objects"]]
+                if not all(isinstance(name, str) for name in names):
+                    raise ValueError(f"its objects are named {names!r}")
+                if any(shard.label >= len(names) for shard in found.shards):
+                    raise ValueError(f"it has shards of other objects than its {len(names)}")
+                if type(found.job["shards"]) is not int or "descriptor_version" not in found.job:
+                    raise ValueError("its job lacks the number of shards or the descriptor's version")
+                return found
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise InputError(f"dataset: {path} is damaged ({type(error).__name__}: {error})") from None
         raise InputError(f"dataset: {path} has format {table['format']!r}; this version reads {FORMAT}")

@@ -155,8 +155,10 @@ def test_render_then_train_is_train(meshes: Path, model: Path, tmp_path: Path) -
     """Views written by `render` and read back train the same model as views rendered by `train`."""
     steps = ("--azimuth-step", 60, "--polar-step", 45, "--workers", 1)
     options = ("--epochs", 6, "--batch-size", 16, "--classifiers", "tops,tops2,ce")
-    assert call("render", "--meshes", meshes, "--out", tmp_path / "views", *steps) == 0
+    varied = ("--illumination", "--sensor", "--occlusion", "--segmentation")
+    assert call("render", "--meshes", meshes, "--out", tmp_path / "views", *steps, *varied) == 0
     assert call("train", "--dataset", tmp_path / "views", "--out", tmp_path / "run", *options) == 0
+    assert not (model / "views").exists()
     first, second = (json.loads((f / "run.json").read_text()) for f in (model, tmp_path / "run"))
     assert first["record"]["curves"] == second["record"]["curves"]
 
@@ -276,7 +278,6 @@ def test_bad_training_input(meshes: Path, tmp_path: Path, run: Run) -> None:
         "unknown classifier": (["--meshes", meshes, "--out", out, "--classifiers", "shape"], "shape"),
         "no epochs": (["--meshes", meshes, "--out", out, "--epochs", 0], "epochs"),
         "no dataset": (["--dataset", tmp_path / "absent", "--out", out], "absent"),
-        "too many folds": (["--meshes", meshes, "--out", out, *coarse, "--folds", 99], "99"),
         "folder in use": (["--meshes", meshes, "--out", full], "full"),
     }
     for case, (arguments, said) in cases.items():
@@ -284,6 +285,24 @@ def test_bad_training_input(meshes: Path, tmp_path: Path, run: Run) -> None:
         assert code == 2, case
         assert said in one_line(err), case
         assert not out.exists(), case
+    # The views are good for another try.
+    code, _, err = run("train", "--meshes", meshes, "--out", out, *coarse, "--folds", 99)
+    assert code == 2 and "99" in one_line(err)
+    assert [p.name for p in out.iterdir()] == ["views"]
+    assert run("train", "--meshes", meshes, "--out", out, *coarse, "--epochs", 1, "--classifiers", "ce")[0] == 0
+
+
+def test_paper_protocol(meshes: Path, tmp_path: Path) -> None:
+    """Plain views, each in four mirrors; what is given takes the place of the protocol's numbers."""
+    options = ("--azimuth-step", 90, "--polar-step", 45, "--workers", 1, "--epochs", 1, "--classifiers", "ce")
+    for name, paper in (("paper", ["--paper"]), ("default", [])):
+        assert call("train", "--meshes", meshes, "--out", tmp_path / name, *options, *paper) == 0
+    of = {name: json.loads((tmp_path / name / "run.json").read_text())["record"] for name in ("paper", "default")}
+    assert of["paper"]["samples"] == 4 * of["paper"]["dataset"]["views"] == 4 * 3 * 4 * 5
+    assert of["paper"]["batch_size"] == 128 and of["default"]["batch_size"] > 100
+    # Of the varied copies, those with too few points are left out.
+    assert 2 * 3 * 4 * 5 < of["default"]["samples"] / 2 <= 3 * 3 * 4 * 5
+    assert of["default"]["samples"] == 2 * of["default"]["dataset"]["views"]
 
 
 def test_bad_datasets(model: Path, tmp_path: Path, run: Run) -> None:

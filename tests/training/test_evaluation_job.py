@@ -5,7 +5,6 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,32 +19,40 @@ from thor2_jax.errors import InputError
 from training.evaluation.answers import AnswerFile
 from training.evaluation.job import evaluate_dataset
 from training.evaluation.runs import Run
-from training.readers.labelled import LabelledFrame
+from training.readers.labelled import LabelledFrame, LabelledFrames
 
 CLASSES = ("bowl", "can", "mug")
 
 
-class ToyDataset:
+class ToyDataset(LabelledFrames):
     """Frame k has the labels 1 to 3, of which 3 is of no class; each fourth lacks 2. The first pixel is k."""
 
     def __init__(self, n: int, prefix: str = "frame") -> None:
-        self.n, self.prefix = n, prefix
+        self.identifiers = [f"{prefix}{k}" for k in range(n)]
+        self.read: list[int] = []
 
-    def __len__(self) -> int:
-        return self.n
+    def __getitem__(self, number: int) -> LabelledFrame:
+        self.read.append(number)
+        color = np.random.default_rng(number).integers(0, 255, (48, 64, 3), dtype=np.uint8)
+        color[0, 0] = number
+        labels = np.zeros((48, 64), np.uint8)
+        labels[5:20, 5:25] = 1
+        labels[25:40, 20:60] = 2 if number % 4 else 0
+        labels[2:9, 40:60] = 3
+        depth = np.full((48, 64), 800, np.uint16)
+        frame = thor2.RGBDFrame(color, depth, labels, thor2.Intrinsics(50.0, 50.0, 32.0, 24.0))
+        truth = {1: CLASSES[number % 3], 2: "mug", 3: "dragon"}
+        return LabelledFrame(self.identifiers[number], frame, truth, {"light": str(number % 2)})
 
-    def __iter__(self) -> Iterator[LabelledFrame]:
-        for k in range(self.n):
-            color = np.random.default_rng(k).integers(0, 255, (48, 64, 3), dtype=np.uint8)
-            color[0, 0] = k
-            labels = np.zeros((48, 64), np.uint8)
-            labels[5:20, 5:25] = 1
-            labels[25:40, 20:60] = 2 if k % 4 else 0
-            labels[2:9, 40:60] = 3
-            depth = np.full((48, 64), 800, np.uint16)
-            frame = thor2.RGBDFrame(color, depth, labels, thor2.Intrinsics(50.0, 50.0, 32.0, 24.0))
-            truth = {1: CLASSES[k % 3], 2: "mug", 3: "dragon"}
-            yield LabelledFrame(f"{self.prefix}{k}", frame, truth, {"light": str(k % 2)})
+
+class OneFrame(LabelledFrames):
+    """A dataset of one frame."""
+
+    def __init__(self, item: LabelledFrame) -> None:
+        self.identifiers, self.item = [item.identifier], item
+
+    def __getitem__(self, number: int) -> LabelledFrame:
+        return self.item
 
 
 class ToyRecognizer:
@@ -108,6 +115,15 @@ def test_killed_and_resumed_is_the_same_and_computes_nothing_twice(tmp_path: Pat
     assert without_times(evaluate_toys(tmp_path / "killed", 9)) == without_times(whole)
     assert len((tmp_path / "killed" / "log").read_text().split()) == 9
     assert not [p for p in report.rglob(".*")]
+
+
+def test_what_is_answered_is_not_read_again(tmp_path: Path) -> None:
+    evaluate_toys(tmp_path, 6)
+    answers = tmp_path / "report" / "answers.jsonl"
+    answers.write_text("".join(answers.read_text().splitlines(keepends=True)[: 1 + 4]))
+    dataset = ToyDataset(6)
+    evaluate_dataset(toys(tmp_path / "log"), dataset, {"kind": "frames", "path": "toys"}, tmp_path / "report")
+    assert dataset.read == [4, 5]
 
 
 def test_report_of_runs_of_which_one_lacks_a_classifier(tmp_path: Path) -> None:
@@ -186,7 +202,7 @@ def test_page_of_instances_none_of_which_is_described_or_known(tmp_path: Path) -
             np.zeros((8, 8), np.uint8),
             thor2.Intrinsics(1.0, 1.0, 0.0, 0.0),
         )
-        dataset: Any = [LabelledFrame("f", frame, truth, {})]
+        dataset = OneFrame(LabelledFrame("f", frame, truth, {}))
         description = {"kind": "frames", "path": name}
         evaluate_dataset(toys(tmp_path / "log"), dataset, description, tmp_path / name)
         assert Page((tmp_path / name / "report.html").read_text()).open == []

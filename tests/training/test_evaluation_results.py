@@ -14,6 +14,7 @@ from training.evaluation.results import results, wrong_answers
 
 CLASSES = ("bowl", "can", "mug")
 COLUMNS: tuple[tuple[int, Any], ...] = ((0, "tops"), (0, "tops2"), (1, "ce"), (1, "tops"), (1, "tops2"))
+NONE: list[dict[str, float]] = [{}, {}]
 
 
 def made_up(n: int = 60) -> list[FrameAnswers]:
@@ -46,6 +47,11 @@ def test_joinings_carry_the_papers_names() -> None:
         "CE+TOPS+TOPS2": ("ce", "tops", "tops2"),
     }
     assert joinings(["tops"]) == {"TOPS": ("tops",)}
+    assert list(joinings(["thor", "tops", "pointnet", "tops2", "forest"])) == [
+        "forest", "PointNet", "THOR", "TOPS", "TOPS2", "THOR2",
+    ]  # fmt: skip
+    assert joinings(["thor", "ce"])["THOR"] == ("thor",)
+    assert main_joining(joinings(["thor", "ce"])) == "CE"
     assert joinings([]) == {}
     assert main_joining(joinings(["ce", "tops", "tops2"])) == "THOR2"
     assert main_joining(joinings(["ce", "tops"])) == "CE+TOPS"
@@ -54,20 +60,56 @@ def test_joinings_carry_the_papers_names() -> None:
 def test_rules_of_joining_by_hand() -> None:
     """The larger top-1 is 0.7; the means are 0.31, 0.34, 0.35; only the second class is above 0 in both."""
     both = {"tops": np.array([[0.0, 0.3, 0.7]]), "tops2": np.array([[0.62, 0.38, 0.0]])}
-    index, confidence = join_by("larger", both)  # type: ignore[arg-type]
+    index, confidence = join_by("larger", both)
     assert (index[0], confidence[0]) == (2, 0.7)
-    index, confidence = join_by("mean", both)  # type: ignore[arg-type]
+    index, confidence = join_by("mean", both)
     assert (index[0], confidence[0]) == (2, pytest.approx(0.35))
-    index, confidence = join_by("log-mean", both)  # type: ignore[arg-type]
+    index, confidence = join_by("log-mean", both)
     assert index[0] == 1 and confidence[0] == pytest.approx(1.0)
     equal = {"tops": np.array([[0.2, 0.8]]), "tops2": np.array([[0.6, 0.4]])}
     roots = np.sqrt([0.2 * 0.6, 0.8 * 0.4])
-    assert join_by("log-mean", equal)[1] == pytest.approx(roots[1] / roots.sum())  # type: ignore[arg-type]
+    assert join_by("log-mean", equal)[1] == pytest.approx(roots[1] / roots.sum())
+
+
+def test_temperatures_decide_whom_to_believe() -> None:
+    """At a temperature of 4, 0.9 against 0.1 becomes 9 ** 0.25 to 1, or 0.634: less than 0.8."""
+    both = {"tops": np.array([[0.9, 0.1]]), "tops2": np.array([[0.2, 0.8]])}
+    assert join_by("larger", both)[0][0] == 0
+    index, confidence = join_by("calibrated", both, {"tops": 4.0, "tops2": 1.0})
+    assert (index[0], confidence[0]) == (1, pytest.approx(0.8))
+    index, confidence = join_by("calibrated", {"tops": both["tops"]}, {"tops": 4.0})
+    assert confidence[0] == pytest.approx(9**0.25 / (9**0.25 + 1))
+
+
+def test_calibration_error_before_and_after() -> None:
+    """Answers with 0.99 that are right in 3 of 4 cases; a temperature makes 0.75 of 0.99, and the error zero."""
+    rows = [np.array([[0.99, 0.01]] * 2, np.float32)] * 40
+    instances = [InstanceAnswer(k, "can" if k % 4 == 0 else "bowl", probabilities=p) for k, p in enumerate(rows)]
+    unknown = [InstanceAnswer(99, "dragon", probabilities=np.array([[0.6, 0.4]] * 2, np.float32))]
+    frame = FrameAnswers("f", {}, 1.0, instances + unknown)
+    right = np.log(99) / np.log(3)
+    columns = ((0, "tops"), (1, "tops"))
+    found = results("frames", [frame], columns, ["a", "b"], ("bowl", "can"), [{"tops": right}, {}])
+    before, after = found["confidence"]["TOPS"], found["calibrated_confidence"]["TOPS"]
+    assert before["expected_calibration_error"]["mean"] == pytest.approx(0.24, abs=1e-6)
+    assert before["expected_calibration_error"]["runs"] == 2
+    assert after["expected_calibration_error"]["mean"] == pytest.approx(0, abs=1e-6)
+    assert after["expected_calibration_error"]["runs"] == 1  # the other run was not calibrated
+    assert before["auroc_known"]["mean"] == after["auroc_known"]["mean"] == 1
+    assert before["unknown_refused"]["mean"] == 1 and before["accuracy_at_coverage"]["mean"] == 0.75
+    assert found["temperatures"]["tops"] == {"mean": pytest.approx(right), "std": None, "runs": 1}
+    assert found["accuracy"]["calibrated"][0]["cells"][0]["accuracy"]["TOPS"]["mean"] == 0.75
+
+
+def test_runs_without_temperatures_have_no_calibrated_figures() -> None:
+    found = results("uwis", made_up(), COLUMNS, ["a", "b"], CLASSES, NONE)
+    assert found["accuracy"]["calibrated"][0]["cells"][0]["accuracy"] == {}
+    assert found["calibrated_confidence"] == {} and found["temperatures"]["ce"]["runs"] == 0
 
 
 def test_figures_against_numpy_and_sklearn() -> None:
     frames = made_up()
-    found = results("uwis", frames, COLUMNS, ["a", "b"], CLASSES)
+    found = results("uwis", frames, COLUMNS, ["a", "b"], CLASSES, NONE)
     everything = [(i, f) for f in frames for i in f.instances]
     scored = [(i, f) for i, f in everything if i.truth != "dragon"]
     assert found["instances"]["labelled"] == 120 and found["instances"]["scored"] == len(scored)
@@ -128,7 +170,7 @@ def test_wrong_answers_are_those_of_the_main_joining_of_every_run() -> None:
 @pytest.mark.parametrize("kept", [0, 1])
 def test_nothing_or_one_instance(kept: int) -> None:
     frame = FrameAnswers("f", {}, 0.0, [InstanceAnswer(1, "mug", probabilities=np.eye(3, dtype=np.float32)[:2])][:kept])
-    found = results("frames", [frame], COLUMNS[:2], ["a"], CLASSES)
+    found = results("frames", [frame], COLUMNS[:2], ["a"], CLASSES, NONE)
     assert found["instances"]["scored"] == kept and found["speed"]["frames_per_second"] is None
     assert found["joinings"] == (["TOPS", "TOPS2", "THOR2"] if kept else [])
     if kept:
@@ -138,7 +180,7 @@ def test_nothing_or_one_instance(kept: int) -> None:
 
 def test_what_cannot_be_described_is_wrong() -> None:
     frame = FrameAnswers("f", {}, 1.0, [InstanceAnswer(1, "mug", reason="too few points")])
-    found = results("frames", [frame], COLUMNS, ["a", "b"], CLASSES)
+    found = results("frames", [frame], COLUMNS, ["a", "b"], CLASSES, NONE)
     accuracy = found["accuracy"]["log-mean"][0]["cells"][0]["accuracy"]
     assert accuracy["THOR2"] == {"mean": 0.0, "std": 0.0, "runs": 2}
     assert found["confusion"] == [[0] * 4, [0] * 4, [0, 0, 0, 2]]
@@ -160,7 +202,7 @@ def test_sequences_of_ocid() -> None:
     answer = InstanceAnswer(1, "mug", probabilities=np.eye(3, dtype=np.float32)[:2])
     names = ["table/bottom/mixed/seq1", "table/bottom/mixed/seq2"]
     frames = [FrameAnswers(f"{name}/{k}", {"camera": "lower"}, 1.0, [answer]) for name in names for k in range(2)]
-    tables = results("ocid", frames, COLUMNS[:2], ["a"], CLASSES)["accuracy"]["larger"]
+    tables = results("ocid", frames, COLUMNS[:2], ["a"], CLASSES, NONE)["accuracy"]["larger"]
     assert tables[-1]["by"] == ["sequence"]
     assert [cell["where"]["sequence"] for cell in tables[-1]["cells"]] == names
     assert tables[1]["cells"][0]["published"]["SimpleView"] == pytest.approx(0.6254)

@@ -22,6 +22,7 @@ from thor2_jax.errors import InputError
 from training import cli, render_job
 from training.builtin_objects import builtin_objects
 from training.engines import local, on_ray
+from training.locking import locked
 from training.meshes import TexturedMesh
 from training.render_job import render_dataset
 from training.variations import Illumination, Variations
@@ -291,7 +292,7 @@ def test_folders_in_use_are_kept(tmp_path: Path) -> None:
 
 
 def test_two_processes_in_one_folder(whole: Path, copied: Path) -> None:
-    with render_job._locked(copied), pytest.raises(InputError, match=f"another process is writing to {copied}"):
+    with locked(copied), pytest.raises(InputError, match=f"another process is writing to {copied}"):
         render_dataset(OBJECTS, copied, *STEPS)
     render_dataset(OBJECTS, copied, *STEPS)
     assert contents(copied) == contents(whole)

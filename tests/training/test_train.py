@@ -32,7 +32,7 @@ OPTIONS = FitOptions(epochs=3, batch_size=4)
 FINISHED = ["curves.png", "metrics.jsonl", "network.npz", "run.json", "weights"]
 
 
-def clouds(seed: int = 0, views: int = 3) -> dict[str, list[Cloud]]:
+def clouds(seed: int = 0, views: int = 6) -> dict[str, list[Cloud]]:
     rng = np.random.default_rng(seed)
     out: dict[str, list[Cloud]] = {}
     for name, size, level in (("red brick", (0.1, 0.05, 0.03), 0), ("stick", (0.2, 0.01, 0.01), 255)):
@@ -43,7 +43,7 @@ def clouds(seed: int = 0, views: int = 3) -> dict[str, list[Cloud]]:
     return out
 
 
-def source(seed: int = 0, views: int = 3) -> MemoryViews:
+def source(seed: int = 0, views: int = 6) -> MemoryViews:
     return MemoryViews(clouds(seed, views), CONFIG)
 
 
@@ -94,13 +94,13 @@ def test_a_run_is_written_and_told_of(tmp_path: Path) -> None:
     run = train(out, progress=progress)
     assert run.classes == ("red brick", "stick") and tuple(run.classifiers) == ("tops",)
     fit_steps = [("fit tops", done, 18) for done in range(1, 19)]
-    assert told == [("describe", 3, 6), ("describe", 6, 6), *fit_steps]
+    assert told == [("describe", 6, 12), ("describe", 12, 12), *fit_steps]
     assert names(out) == FINISHED
     found = load_run(out)
     assert (found.classes, found.config, found.record) == (run.classes, CONFIG, run.record)
     record = found.record
     assert (record["samples"], record["batch_size"], record["folds"], record["held_out_accuracy"]) == (24, 4, 1, {})
-    assert record["dataset"] == source().record and record["dataset"]["views"] == 6
+    assert record["dataset"] == source().record and record["dataset"]["views"] == 12
     curve = record["curves"]["tops"]
     assert [row["epoch"] for row in curve] == [1, 2, 3]
     assert record["kept_epochs"] == {"tops": min(curve, key=lambda row: row["loss"])["epoch"]}
@@ -129,7 +129,7 @@ def test_bad_input_is_told_before_any_work(tmp_path: Path, monkeypatch: pytest.M
         ({}, 1, "views of 0 classes"),
         ({"mug": [], "box": clouds()["stick"]}, 1, "class 'mug' has no views"),
         ({"mug": clouds()["stick"]}, 1, "views of 1 classes"),
-        (clouds(), 4, "folds is 4, but class 'red brick' has only 3 views"),
+        (clouds(views=3), 4, "folds is 4, but class 'red brick' has only 3 views"),
     ],
 )
 def test_nothing_is_written_for_bad_views(

@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thor2_jax.classifier import Feature
 from thor2_jax.errors import InputError
 from thor2_jax.files import write_text
-from thor2_jax.recognizer import Recognizer
+from thor2_jax.recognizer import DescribedFrame
+from training.baselines.baseline import Seen, seen_in
+from training.evaluation.runs import Run
 from training.readers.labelled import LabelledFrame
 
 __all__ = ["AnswerFile", "FrameAnswers", "InstanceAnswer", "answer_frame", "columns"]
@@ -31,7 +32,8 @@ class InstanceAnswer:
         truth: its name; may be no class of the runs.
         occluded: by the recognizer's rule.
         reason: why it could not be described; None if it was.
-        probabilities: [M, C] float32, a row a classifier in the order of `columns`; None if it was not described.
+        probabilities: [M, C] float32, a row a classifier or baseline in the order of `columns`; None if it was not
+            described.
     """
 
     label: int
@@ -58,16 +60,18 @@ class FrameAnswers:
     instances: Sequence[InstanceAnswer]
 
 
-def columns(recognizers: Sequence[Recognizer]) -> tuple[tuple[int, Feature], ...]:
-    """(Number of the run, classifier) of every classifier at hand."""
-    return tuple((r, name) for r, recognizer in enumerate(recognizers) for name in recognizer.run.classifiers)
+def columns(runs: Sequence[Run]) -> tuple[tuple[int, str], ...]:
+    """(Number of the run, name) of every classifier and baseline at hand."""
+    return tuple((r, name) for r, run in enumerate(runs) for name in run.asked)
 
 
-def answer_frame(recognizers: Sequence[Recognizer], item: LabelledFrame) -> list[InstanceAnswer]:
-    """Describe a frame once, with the first recognizer, and classify it with all of them."""
-    described = recognizers[0].describe(item.frame)
-    found = [recognizer.probabilities(described.descriptors) for recognizer in recognizers]
-    table = np.stack([found[r][name] for r, name in columns(recognizers)], axis=1)  # [B, M, C]
+def answer_frame(runs: Sequence[Run], item: LabelledFrame) -> list[InstanceAnswer]:
+    """Describe a frame once, with the first recognizer, and classify it with all classifiers and baselines."""
+    described = runs[0].recognizer.describe(item.frame)
+    compared = any(run.baselines for run in runs)
+    seen = seen_in(described, runs[0].recognizer.run.config) if compared else None
+    found = [_said(run, described, seen) for run in runs]
+    table = np.stack([found[r][name] for r, name in columns(runs)], axis=1)  # [B, M, C]
     rows = {described.clouds[index].label: row for row, index in enumerate(described.usable)}
     reasons = {cloud.label: cloud.reason for cloud in described.clouds}
     answers = []
@@ -79,6 +83,13 @@ def answer_frame(recognizers: Sequence[Recognizer], item: LabelledFrame) -> list
             reason = reasons.get(label) or "no pixels in the label image"
             answers.append(InstanceAnswer(label, truth, reason=reason))
     return answers
+
+
+def _said(run: Run, described: DescribedFrame, seen: Seen | None) -> dict[str, NDArray[np.float32]]:
+    said = {str(name): found for name, found in run.recognizer.probabilities(described.descriptors).items()}
+    if seen is not None:
+        said |= {name: baseline.probabilities(seen) for name, baseline in run.baselines.items()}
+    return said
 
 
 class AnswerFile:

@@ -3,7 +3,6 @@
 Guo et al., "On Calibration of Modern Neural Networks" (ICML 2017), for temperature and expected calibration error.
 """
 
-import dataclasses
 import math
 from typing import Any, NamedTuple
 
@@ -17,12 +16,10 @@ from thor2_jax.errors import InputError
 
 __all__ = [
     "BINS",
-    "Calibration",
     "Coverage",
     "Reliability",
     "accuracy_at_coverage",
     "auroc",
-    "calibrate",
     "expected_calibration_error",
     "fit_temperature",
     "negative_log_likelihood",
@@ -131,35 +128,6 @@ def fit_temperature(probabilities: Floats, truth: NDArray[np.integer[Any]]) -> f
         options={"xatol": 1e-6},
     )
     return math.exp(found.x)
-
-
-@dataclasses.dataclass(frozen=True)
-class Calibration:
-    """What a temperature fitted on held-out views does to other answers.
-
-    Attributes:
-        temperature: the one fitted.
-        ece_before: expected calibration error without it.
-        ece_after: and with it.
-    """
-
-    temperature: float
-    ece_before: float
-    ece_after: float
-
-
-def calibrate(
-    held_out: Floats, held_out_truth: NDArray[np.integer[Any]], answers: Floats, truth: NDArray[np.integer[Any]]
-) -> Calibration:
-    """Fit a temperature on held-out views [N, C], tell what it does to answers [K, C]; raises as `fit_temperature`."""
-    temperature = fit_temperature(held_out, held_out_truth)
-    right = answers.argmax(axis=1) == truth
-    after = with_temperature(answers, temperature).max(axis=1)
-    return Calibration(
-        temperature,
-        expected_calibration_error(answers.max(axis=1), right),
-        expected_calibration_error(after, right),
-    )
 
 
 def auroc(confidence: ArrayLike, positive: ArrayLike) -> float:

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 
-from thor2_jax.classifier import Feature
 from training.evaluation.answers import FrameAnswers
 from training.evaluation.joining import main_joining
 from training.evaluation.pictures import draw_crop, draw_judged
@@ -24,7 +23,7 @@ class Gallery:
     `frames/<number>.jpg`, counted from 0; `confusions/<truth>-<answer>.jpg`, numbers of the classes.
     """
 
-    def __init__(self, out: Path, columns: Sequence[tuple[int, Feature]], classes: Sequence[str], frames: int) -> None:
+    def __init__(self, out: Path, columns: Sequence[tuple[int, str]], classes: Sequence[str], frames: int) -> None:
         """Pictures in `out` of a dataset of so many frames; answers are in the order of `columns`."""
         self._out, self._columns, self._classes = out, columns, classes
         self.shown = sorted({int(n) for n in np.linspace(0, frames - 1, SHOWN)})

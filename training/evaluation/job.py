@@ -6,9 +6,9 @@ REPORT/report.json, report.html    written last
 
 import json
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from thor2_jax.config import DESCRIPTOR_VERSION
 from thor2_jax.errors import InputError
@@ -18,26 +18,16 @@ from training.evaluation.gallery import Gallery
 from training.evaluation.page import WORST, write_report_page
 from training.evaluation.results import results
 from training.evaluation.runs import Run
-from training.readers.labelled import LabelledFrame
+from training.readers.labelled import LabelledFrames
 
-__all__ = ["Dataset", "evaluate_dataset"]
+__all__ = ["evaluate_dataset"]
 
 ANSWERS = "answers.jsonl"
 
 
-class Dataset(Protocol):
-    """What readers are: frames in an order that is always the same."""
-
-    def __len__(self) -> int:
-        """How many frames."""
-
-    def __iter__(self) -> Iterator[LabelledFrame]:
-        """Read them one at a time."""
-
-
 def evaluate_dataset(
     runs: Sequence[Run],
-    frames: Dataset,
+    frames: LabelledFrames,
     dataset: Mapping[str, str],
     out: Path,
     progress: Callable[[str, int, int, str], object] = lambda stage, done, total, note: None,
@@ -63,8 +53,7 @@ def evaluate_dataset(
     """
     if out.exists() and not (out / ANSWERS).is_file() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"out: {out} exists already and is neither empty nor an evaluation")
-    recognizers = [run.recognizer for run in runs]
-    classes, asked = recognizers[0].run.classes, columns(recognizers)
+    classes, asked = runs[0].recognizer.run.classes, columns(runs)
     description = {**dataset, "frames": len(frames)}
     file = AnswerFile(
         out / ANSWERS,
@@ -75,16 +64,22 @@ def evaluate_dataset(
             "classifiers": [[r, name] for r, name in asked],
         },
     )
+    for number, (answers, identifier) in enumerate(zip(file.frames, frames.identifiers, strict=False)):
+        if answers.frame != identifier:
+            raise InputError(
+                f"out: the answers to frame {number} are to {answers.frame!r}, but the dataset has {identifier!r} "
+                "there; name another folder"
+            )
     gallery = Gallery(out, asked, classes, len(frames))
     for answers in file.frames:
         gallery.recall(answers)
     progress("evaluate", len(file.frames), len(frames), "")
-    if len(file.frames) < len(frames):
-        _answer_rest(runs, frames, file, gallery, progress)
+    _answer_rest(runs, frames, file, gallery, progress)
+    temperatures = [run.temperatures for run in runs]
     found = {
         "dataset": description,
         "digests": [run.digest for run in runs],
-        **results(dataset["kind"], file.frames, asked, [run.name for run in runs], classes),
+        **results(dataset["kind"], file.frames, asked, [run.name for run in runs], classes, temperatures),
     }
     found["worst"] = _worst(found)
     found["shown"] = [file.frames[number].frame for number in gallery.shown]
@@ -95,31 +90,21 @@ def evaluate_dataset(
 
 def _answer_rest(
     runs: Sequence[Run],
-    frames: Dataset,
+    frames: LabelledFrames,
     file: AnswerFile,
     gallery: Gallery,
     progress: Callable[[str, int, int, str], object],
 ) -> None:
-    recognizers = [run.recognizer for run in runs]
-    begun, before = time.perf_counter(), len(file.frames)
-    start = begun
-    for number, item in enumerate(frames):
-        if number < before:
-            if file.frames[number].frame != item.identifier:
-                raise InputError(
-                    f"out: the answers to frame {number} are to {file.frames[number].frame!r}, but the dataset has "
-                    f"{item.identifier!r} there; name another folder"
-                )
-            start = begun = time.perf_counter()
-            continue
-        instances = answer_frame(recognizers, item)
-        seconds = time.perf_counter() - start
-        answers = FrameAnswers(item.identifier, item.attributes, seconds, instances)
+    before, begun = len(file.frames), time.perf_counter()
+    for number in range(before, len(frames)):
+        start = time.perf_counter()
+        item = frames[number]
+        instances = answer_frame(runs, item)
+        answers = FrameAnswers(item.identifier, item.attributes, time.perf_counter() - start, instances)
         gallery.add(number, item, answers)  # before the frame counts as done
         file.append(answers)
         rate = (number + 1 - before) / (time.perf_counter() - begun)
         progress("evaluate", number + 1, len(frames), f"{rate:.2f} frames/s, {item.identifier}")
-        start = time.perf_counter()
 
 
 def _worst(found: Mapping[str, Any]) -> list[dict[str, Any]]:

@@ -2,26 +2,33 @@
 
 import itertools
 from collections.abc import Iterable, Mapping
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.classifier import FEATURES, Feature, join
+from training.baselines.baseline import TITLES
+from training.evaluation.confidence import with_temperature
 
 __all__ = ["RULES", "Rule", "join_by", "joinings", "main_joining"]
 
-Rule = Literal["larger", "mean", "log-mean"]
-RULES: tuple[Rule, ...] = ("larger", "mean", "log-mean")
-"""Larger top-1 probability (the paper's); mean of the probabilities; their geometric mean."""
+Rule = Literal["larger", "mean", "log-mean", "calibrated"]
+RULES: tuple[Rule, ...] = ("larger", "mean", "log-mean", "calibrated")
+"""Larger top-1 probability (the paper's); mean of the probabilities; their geometric mean; larger top-1 probability
+after each classifier's own temperature, fitted on held-out views."""
 
 
-def joinings(available: Iterable[Feature]) -> dict[str, tuple[Feature, ...]]:
-    """Every combination of the classifiers at hand, by the paper's names: CE, TOPS, ..., THOR2 (= TOPS + TOPS2)."""
+def joinings(available: Iterable[str]) -> dict[str, tuple[str, ...]]:
+    """The baselines at hand, each by itself, and every combination of classifiers.
+
+    These have the paper's names: CE, TOPS, ..., THOR2 (= TOPS + TOPS2).
+    """
     given = set(available)
     names = [name for name in FEATURES if name in given]
     groups = [group for size in range(1, len(names) + 1) for group in itertools.combinations(names, size)]
-    return {"THOR2" if group == ("tops", "tops2") else "+".join(group).upper(): group for group in groups}
+    alone: dict[str, tuple[str, ...]] = {title: (name,) for name, title in TITLES.items() if name in given}
+    return alone | {"THOR2" if group == ("tops", "tops2") else "+".join(group).upper(): group for group in groups}
 
 
 def main_joining(names: Iterable[str]) -> str:
@@ -31,11 +38,20 @@ def main_joining(names: Iterable[str]) -> str:
 
 
 def join_by(
-    rule: Rule, probabilities: Mapping[Feature, NDArray[np.floating[Any]]]
+    rule: Rule, probabilities: Mapping[str, NDArray[np.floating[Any]]], temperatures: Mapping[str, float] | None = None
 ) -> tuple[NDArray[np.intp], NDArray[np.floating[Any]]]:
-    """Winning class [B] and its probability [B] of the [B, C] probabilities of each classifier."""
-    if rule == "larger":
-        joined = join(probabilities)
+    """Winning class [B] and its probability [B].
+
+    Args:
+        rule: how to join.
+        probabilities: [B, C] of each classifier.
+        temperatures: of each, for "calibrated".
+    """
+    if rule == "calibrated":
+        assert temperatures is not None
+        probabilities = {name: with_temperature(found, temperatures[name]) for name, found in probabilities.items()}
+    if rule in ("larger", "calibrated"):
+        joined = join(cast(Mapping[Feature, NDArray[np.floating[Any]]], probabilities))
         return joined.class_index, joined.confidence
     stacked = np.stack(list(probabilities.values())).astype(np.float64)  # [M, B, C]
     if rule == "mean":

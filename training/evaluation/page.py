@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from training.baselines.baseline import TITLES
 from training.evaluation.gallery import Gallery
 from training.evaluation.joining import RULES
 from training.evaluation.pictures import draw_reliability
@@ -19,7 +20,9 @@ __all__ = ["accuracy_table", "figure_text", "write_report_page"]
 WORST = 12
 """Confusions shown."""
 
-BARS = ("CE", "TOPS", "TOPS2", "THOR2")
+NOTHING = {"mean": None, "std": None}
+
+BARS = ("forest", "PointNet", "THOR", "CE", "TOPS", "TOPS2", "THOR2")
 MOST_BARS = 8
 """Cells that fit into a picture."""
 
@@ -89,6 +92,11 @@ def _accuracy(found: Mapping[str, Any], out: Path) -> list[Section]:
     methods = known.methods if known else ()
     text = "Share of instances named rightly; those that could not be described count as wrong. CE reads colour alone, "
     text += "TOPS shape alone, TOPS2 both; the larger top-1 probability decides between classifiers. "
+    if not set(found["joinings"]).isdisjoint(TITLES.values()):
+        text += (
+            "Trained on the same views and asked about the same described instances: THOR, the predecessor, a library "
+        )
+        text += "of classifiers of shape; a random forest on colour histogram and extents; a coloured PointNet. "
     if len(found["runs"]) > 1:
         text += f"Mean and sample standard deviation over {len(found['runs'])} runs. "
     if known:
@@ -112,26 +120,46 @@ def _accuracy(found: Mapping[str, Any], out: Path) -> list[Section]:
 
 def _joined(found: Mapping[str, Any]) -> Section:
     cells = {rule: found["accuracy"][rule][0]["cells"][0]["accuracy"] for rule in RULES}
-    rows = [[n, *(figure_text(cells[rule][n]) for rule in RULES)] for n in found["joinings"] if n not in BARS[:3]]
+    joined = [n for n in found["joinings"] if "+" in n or n == "THOR2"]
+    rows = [[n, *(figure_text(cells[rule].get(n, NOTHING)) for rule in RULES)] for n in joined]
     text = "The paper's rule takes the classifier with the larger top-1 probability; the others take the largest mean "
-    text += "of the probabilities, or of their logarithms."
+    text += (
+        "of the probabilities, or of their logarithms; \"calibrated\" is the paper's rule after each classifier's own "
+    )
+    text += "temperature."
     return "Ways to join classifiers", text, (["", *RULES], rows), []
 
 
 def _confidence(found: Mapping[str, Any], out: Path) -> Section:
     columns = {
-        "expected calibration error": "expected_calibration_error",
-        "AUROC right or wrong": "auroc_right",
-        f"accuracy of the surest {COVERAGE:.0%}": "accuracy_at_coverage",
-        "their least confidence": "threshold_at_coverage",
-        "AUROC known or unknown": "auroc_known",
+        "expected calibration error": ("confidence", "expected_calibration_error"),
+        "calibrated": ("calibrated_confidence", "expected_calibration_error"),
+        "AUROC right or wrong": ("confidence", "auroc_right"),
+        f"accuracy of the surest {COVERAGE:.0%}": ("confidence", "accuracy_at_coverage"),
+        "their least confidence": ("confidence", "threshold_at_coverage"),
+        "AUROC known or unknown": ("confidence", "auroc_known"),
+        "after calibration": ("calibrated_confidence", "auroc_known"),
+        "unknown below that confidence": ("confidence", "unknown_refused"),
     }
-    rows = [[n, *(figure_text(values[key]) for key in columns.values())] for n, values in found["confidence"].items()]
-    text = "Calibration error over 15 bins of equal width. AUROC: the chance that a right answer is surer than a wrong "
-    text += "one, or that to an object of the training surer than that to another object."
+    rows = [
+        [name, *(figure_text(found[table].get(name, {}).get(key, NOTHING)) for table, key in columns.values())]
+        for name in found["confidence"]
+    ]
+    text = (
+        "Calibration error over 15 bins of equal width, before and after temperatures fitted on the synthetic views "
+        f"that each run's training held out{_temperatures(found)}. AUROC: the chance that a right answer is surer than "
+        "a wrong one, or that to an object of the training surer than that to another object. Where the least sure "
+        f"{1 - COVERAGE:.0%} of the answers to objects of the training are called unknown, the last column tells how "
+        "many of the other objects are."
+    )
     draw_reliability(found["reliability"], found["main"], out / "reliability.png")
     caption = f"How often {found['main']} is right, by its confidence."
     return "Confidence", text, (["", *columns], rows), [Picture("reliability.png", caption, half=True)]
+
+
+def _temperatures(found: Mapping[str, Any]) -> str:
+    known = [f"{name} {figure_text(t)}" for name, t in found["temperatures"].items() if t["runs"]]
+    return f" ({', '.join(known)})" if known else "; these runs held out none"
 
 
 def _confusions(found: Mapping[str, Any], gallery: Gallery, out: Path) -> Section:

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thor2_jax.classifier import Feature
 from training.evaluation.accuracy import over_runs, parts, tables_of
 from training.evaluation.answers import FrameAnswers, InstanceAnswer
 from training.evaluation.confidence import accuracy_at_coverage, auroc, expected_calibration_error, reliability
@@ -20,7 +19,10 @@ __all__ = ["COVERAGE", "Answered", "answered", "results", "wrong_answers"]
 COVERAGE = 0.95
 """Share of the answers that is kept where the least confident are called unknown."""
 
-Columns = Sequence[tuple[int, Feature]]
+Columns = Sequence[tuple[int, str]]
+
+Temperatures = Sequence[Mapping[str, float]]
+"""A table a run: classifier or baseline -> temperature. Those that were not calibrated are not in it."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -37,17 +39,25 @@ class Answered:
 
 
 def answered(
-    instances: Sequence[InstanceAnswer], columns: Columns, rule: Rule = "larger"
+    instances: Sequence[InstanceAnswer], columns: Columns, rule: Rule = "larger", temperatures: Temperatures = ()
 ) -> dict[str, dict[int, Answered]]:
-    """Joining -> run -> answers to those of `instances` that were described."""
+    """Joining -> run -> answers to those of `instances` that were described.
+
+    The rule "calibrated" leaves out what lacks a temperature.
+    """
     described = [i.probabilities for i in instances if i.probabilities is not None]
     table = np.stack(described) if described else np.zeros((0, len(columns), 1), np.float32)  # [N, M, C]
-    found: dict[str, dict[int, Answered]] = {name: {} for name in joinings(feature for _, feature in columns)}
+    found: dict[str, dict[int, Answered]] = {title: {} for title in joinings(name for _, name in columns)}
     for run in sorted({run for run, _ in columns}):
-        mine = {feature: table[:, k] for k, (r, feature) in enumerate(columns) if r == run}
-        for name, group in joinings(mine).items():
-            found[name][run] = Answered(*join_by(rule, {feature: mine[feature] for feature in group}))
-    return {name: by_run for name, by_run in found.items() if by_run}
+        known = temperatures[run] if rule == "calibrated" else {}
+        mine = {
+            name: table[:, k]
+            for k, (r, name) in enumerate(columns)
+            if r == run and (rule != "calibrated" or name in known)
+        }
+        for title, group in joinings(mine).items():
+            found[title][run] = Answered(*join_by(rule, {name: mine[name] for name in group}, known))
+    return {title: by_run for title, by_run in found.items() if by_run}
 
 
 def wrong_answers(
@@ -69,7 +79,12 @@ def _attributes(kind: str, frame: FrameAnswers) -> dict[str, str]:
 
 
 def results(
-    kind: str, frames: Sequence[FrameAnswers], columns: Columns, runs: Sequence[str], classes: Sequence[str]
+    kind: str,
+    frames: Sequence[FrameAnswers],
+    columns: Columns,
+    runs: Sequence[str],
+    classes: Sequence[str],
+    temperatures: Temperatures,
 ) -> dict[str, Any]:
     """Every figure.
 
@@ -82,6 +97,7 @@ def results(
         columns: of the answers.
         runs: names.
         classes: names, in the order of the probabilities.
+        temperatures: of the runs.
     """
     labelled = [(i, _attributes(kind, frame)) for frame in frames for i in frame.instances]
     scored = [(i, attributes) for i, attributes in labelled if i.truth in classes]
@@ -109,7 +125,7 @@ def results(
     }
     if not scored:
         return found
-    by_rule = {rule: answered(described, columns, rule) for rule in RULES}
+    by_rule = {rule: answered(described, columns, rule, temperatures) for rule in RULES}
     found["joinings"] = list(by_rule["larger"])
     tables = tables_of(kind, [attributes for _, attributes in scored])
     found["accuracy"] = {
@@ -117,8 +133,14 @@ def results(
         for rule, given in by_rule.items()
     }
     given = by_rule["larger"]
-    unknown = answered(strangers, columns) if strangers else {}
-    found["confidence"] = {name: _confidence(by_run, truth, unknown.get(name, {})) for name, by_run in given.items()}
+    found["temperatures"] = {
+        name: dataclasses.asdict(over_runs([known[name] for known in temperatures if name in known]))
+        for name in dict.fromkeys(name for _, name in columns)
+    }
+    rules: dict[str, Rule] = {"confidence": "larger", "calibrated_confidence": "calibrated"}
+    for key, rule in rules.items():
+        unknown = answered(strangers, columns, rule, temperatures)
+        found[key] = {name: _confidence(by_run, truth, unknown[name]) for name, by_run in by_rule[rule].items()}
     found["main"] = main = main_joining(given)
     confidence = np.concatenate([a.confidence for a in given[main].values()])
     right = np.concatenate([a.answer == truth for a in given[main].values()])
@@ -159,12 +181,14 @@ def _table(
 
 
 def _confidence(by_run: Mapping[int, Answered], truth: NDArray[np.intp], unknown: Mapping[int, Answered]) -> Any:
+    """Of a joining: how far to trust it on objects of the training, and on others (`unknown`)."""
     rows: dict[str, list[float]] = {
         "expected_calibration_error": [],
         "auroc_right": [],
         "threshold_at_coverage": [],
         "accuracy_at_coverage": [],
         "auroc_known": [],
+        "unknown_refused": [],
     }
     for run, a in by_run.items():
         confidence, right = np.minimum(a.confidence, 1), a.answer == truth
@@ -173,8 +197,10 @@ def _confidence(by_run: Mapping[int, Answered], truth: NDArray[np.intp], unknown
         rows["auroc_right"].append(auroc(confidence, right))
         rows["threshold_at_coverage"].append(kept.threshold)
         rows["accuracy_at_coverage"].append(kept.accuracy)
-        if unknown:
-            everything = np.concatenate([confidence, np.minimum(unknown[run].confidence, 1)])
+        strange = np.minimum(unknown[run].confidence, 1)
+        if len(strange):
+            rows["unknown_refused"].append(float((strange < kept.threshold).mean()))
+            everything = np.concatenate([confidence, strange])
             rows["auroc_known"].append(auroc(everything, np.arange(len(everything)) < len(confidence)))
     return {name: dataclasses.asdict(over_runs(values)) for name, values in rows.items()}
 

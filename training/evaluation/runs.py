@@ -2,11 +2,14 @@
 
 import dataclasses
 import hashlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from thor2_jax.errors import InputError
 from thor2_jax.recognizer import Recognizer
+from training.baselines.baseline import Baseline
+from training.baselines.files import baseline_file
+from training.baselines.load import load_baselines
 
 __all__ = ["Run", "load_runs", "run_folders"]
 
@@ -19,11 +22,20 @@ class Run:
         name: its folder's; of a fold, its training's folder too.
         digest: SHA-256 of what the folder holds of the model.
         recognizer: reads the run.
+        baselines: those that the folder has.
+        temperatures: of the classifiers and baselines that were calibrated on held-out views.
     """
 
     name: str
     digest: str
     recognizer: Recognizer
+    baselines: Mapping[str, Baseline] = dataclasses.field(default_factory=dict)
+    temperatures: Mapping[str, float] = dataclasses.field(default_factory=dict)
+
+    @property
+    def asked(self) -> tuple[str, ...]:
+        """Classifiers and baselines, in the order of their answers."""
+        return (*self.recognizer.run.classifiers, *self.baselines)
 
 
 def run_folders(paths: Iterable[Path]) -> list[Path]:
@@ -46,7 +58,9 @@ def run_folders(paths: Iterable[Path]) -> list[Path]:
 
 def _digest(path: Path) -> str:
     digest = hashlib.sha256()
-    for file in [path / "run.json", path / "network.npz", *sorted((path / "weights").rglob("*"))]:
+    baselines = baseline_file(path, "*")
+    weights = [*sorted((path / "weights").rglob("*")), *sorted(baselines.parent.glob(baselines.name))]
+    for file in [path / "run.json", path / "network.npz", *weights]:
         if file.is_file():
             digest.update(f"{file.relative_to(path).as_posix()}\0{file.stat().st_size}\0".encode())
             digest.update(file.read_bytes())
@@ -62,7 +76,7 @@ def load_runs(paths: Sequence[Path]) -> list[Run]:
     folders = run_folders(paths)
     if not folders:
         raise InputError("model: no run folder is given")
-    runs = [Run(_name(folder), _digest(folder), Recognizer.load(folder)) for folder in folders]
+    runs = [_load(folder) for folder in folders]
     first = runs[0].recognizer.run
     seen: dict[str, Path] = {}
     for folder, run in zip(folders, runs, strict=True):
@@ -79,6 +93,13 @@ def load_runs(paths: Sequence[Path]) -> list[Run]:
         if other.config != first.config or other.network.fingerprint != first.network.fingerprint:
             raise InputError(f"model: {folders[0]} and {folder} have different descriptors or colour networks")
     return runs
+
+
+def _load(folder: Path) -> Run:
+    recognizer = Recognizer.load(folder)
+    baselines, temperatures = load_baselines(folder, recognizer.run)
+    temperatures |= recognizer.run.record.get("temperatures", {})
+    return Run(_name(folder), _digest(folder), recognizer, baselines, temperatures)
 
 
 def _name(folder: Path) -> str:

@@ -5,8 +5,9 @@ and, if it is there, `scene_gt_info.json`; see docs/bop_datasets_format.md of gi
 numbers its objects; a YAML or JSON file names them, obj_id -> name.
 """
 
+import functools
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from thor2_jax.errors import InputError
 from thor2_jax.frames import Intrinsics, RGBDFrame, read_color, read_depth, read_labels
 from training.readers.files import complaints_about, read_table
-from training.readers.labelled import LabelledFrame
+from training.readers.labelled import LabelledFrame, LabelledFrames
 
 __all__ = ["BOP", "SMALLEST_VISIBLE"]
 
@@ -24,8 +25,8 @@ SMALLEST_VISIBLE = 0.1
 """Visible part of a silhouette from which on an instance is scored, as in BOP's own evaluation."""
 
 
-class BOP:
-    """The frames of a split (`test`), or those of the one scene that the folder is; iterating reads one at a time.
+class BOP(LabelledFrames):
+    """The frames of a split (`test`), or those of the one scene that the folder is.
 
     Label k + 1 is instance k of `scene_gt.json`. Masks may overlap, since BOP makes them with a tolerance in depth and
     counts pixels without depth as visible: a pixel of several masks belongs to the smallest of them. Instances with an
@@ -48,34 +49,26 @@ class BOP:
         if not path.is_dir():
             raise InputError(f"dataset: {path} is no folder")
         scenes = sorted(f.parent for f in [*path.glob("scene_camera.json"), *path.glob("*/scene_camera.json")])
-        self._images = {scene: _images(scene / "rgb") for scene in scenes}
-        if len(self) == 0:
+        self._images = [(scene, image) for scene in scenes for image in _images(scene / "rgb")]
+        self.identifiers = [f"{scene.name}/{image.stem}" for scene, image in self._images]
+        if not self._images:
             raise InputError(
                 f"dataset: {path} has no scene_camera.json beside rgb/<number>.png or .jpg, nor a folder in it"
             )
+        # Its tables are read once a scene, as frames are asked for scene by scene.
+        self._scene = functools.lru_cache(maxsize=1)(_Scene)
         self._names_file = names
         self._names = None if names is None else _names(Path(names))
 
-    def __len__(self) -> int:
-        return sum(len(images) for images in self._images.values())
-
-    def __iter__(self) -> Iterator[LabelledFrame]:
-        """Read the frames.
-
-        Raises:
-            InputError: a file that is missing or damaged, an image or object that a table lacks, or images that do not
-                fit together; names the file.
-            OSError: a file cannot be opened.
-        """
-        for folder, images in self._images.items():
-            with complaints_about(folder.name):
-                scene = _Scene(folder)
-            for image in images:
-                identifier = f"{folder.name}/{image.stem}"
-                with complaints_about(identifier):
-                    frame, objects = scene.read(image)
-                    truth = {label: self._name(obj_id) for label, obj_id in objects.items()}
-                yield LabelledFrame(identifier, frame, truth, {"scene": folder.name})
+    def __getitem__(self, number: int) -> LabelledFrame:
+        """Read a frame; also refuses an image or object that a table lacks."""
+        folder, image = self._images[number]
+        with complaints_about(folder.name):
+            scene = self._scene(folder)
+        with complaints_about(self.identifiers[number]):
+            frame, objects = scene.read(image)
+            truth = {label: self._name(obj_id) for label, obj_id in objects.items()}
+        return LabelledFrame(self.identifiers[number], frame, truth, {"scene": folder.name})
 
     def _name(self, obj_id: int) -> str:
         if self._names is None:

@@ -1,18 +1,17 @@
 """Single labelled frames, a folder each: color.png, depth.png, mask.png, intrinsics.json, labels.json."""
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
 
 from thor2_jax.errors import InputError
 from thor2_jax.frames import read_frame
-from training.readers.labelled import LabelledFrame
+from training.readers.labelled import LabelledFrame, LabelledFrames
 
 __all__ = ["FrameFolder"]
 
 
-class FrameFolder:
-    """The frames of a folder, or the one frame that it is; iterating reads one at a time.
+class FrameFolder(LabelledFrames):
+    """The frames of a folder, or the one frame that it is.
 
     `labels.json` holds {"labels": {"1": "mug", ...}}; other entries are passed over.
     """
@@ -29,31 +28,24 @@ class FrameFolder:
         self._folders = sorted(f.parent for f in [*path.glob("labels.json"), *path.glob("*/labels.json")])
         if not self._folders:
             raise InputError(f"dataset: {path} has no frame, neither labels.json nor */labels.json")
+        self.identifiers = [folder.name for folder in self._folders]
 
-    def __len__(self) -> int:
-        return len(self._folders)
-
-    def __iter__(self) -> Iterator[LabelledFrame]:
-        """Read the frames.
-
-        Raises:
-            InputError: a file that is missing or damaged, or images that do not fit together; names the file.
-            OSError: a file cannot be opened.
-        """
-        for folder in self._folders:
-            try:
-                frame = read_frame(
-                    color=folder / "color.png",
-                    depth=folder / "depth.png",
-                    labels=folder / "mask.png",
-                    intrinsics=folder / "intrinsics.json",
-                )
-                truth = _truth(folder / "labels.json")
-            except FileNotFoundError as error:
-                raise InputError(f"{folder.name}: {error.filename} is missing") from None
-            except InputError as error:
-                raise InputError(f"{folder.name}: {error}") from None
-            yield LabelledFrame(folder.name, frame, truth, {})
+    def __getitem__(self, number: int) -> LabelledFrame:
+        """Read a frame."""
+        folder = self._folders[number]
+        try:
+            frame = read_frame(
+                color=folder / "color.png",
+                depth=folder / "depth.png",
+                labels=folder / "mask.png",
+                intrinsics=folder / "intrinsics.json",
+            )
+            truth = _truth(folder / "labels.json")
+        except FileNotFoundError as error:
+            raise InputError(f"{folder.name}: {error.filename} is missing") from None
+        except InputError as error:
+            raise InputError(f"{folder.name}: {error}") from None
+        return LabelledFrame(folder.name, frame, truth, {})
 
 
 def _truth(path: Path) -> dict[int, str]:

@@ -1,11 +1,12 @@
-"""A frame with the truth about it."""
+"""Frames with the truth about them, and what every reader of a dataset is."""
 
+import abc
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 from thor2_jax.frames import RGBDFrame
 
-__all__ = ["LabelledFrame"]
+__all__ = ["LabelledFrame", "LabelledFrames"]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -24,3 +25,30 @@ class LabelledFrame:
     frame: RGBDFrame
     truth: Mapping[int, str]
     attributes: Mapping[str, str]
+
+
+class LabelledFrames(abc.ABC):
+    """The frames of a dataset, in an order that is always the same; each is read when it is asked for.
+
+    Attributes:
+        identifiers: of the frames, known without reading them.
+    """
+
+    identifiers: Sequence[str]
+
+    def __len__(self) -> int:
+        return len(self.identifiers)
+
+    @abc.abstractmethod
+    def __getitem__(self, number: int) -> LabelledFrame:
+        """Read a frame.
+
+        Raises:
+            IndexError: there is none of that number.
+            InputError: a file that is missing or damaged, or files that do not fit together; names the file.
+            OSError: a file cannot be opened.
+        """
+
+    def __iter__(self) -> Iterator[LabelledFrame]:
+        """Read them one at a time; raises as `[]`."""
+        return (self[number] for number in range(len(self)))

@@ -12,7 +12,7 @@ their pixels.
 """
 
 import itertools
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from thor2_jax.errors import InputError
 from thor2_jax.frames import Intrinsics, RGBDFrame, read_color, read_depth, read_labels
 from training.readers.files import complaints_about, read_table
-from training.readers.labelled import LabelledFrame
+from training.readers.labelled import LabelledFrame, LabelledFrames
 from training.readers.pcd import read_organized_points
 
 __all__ = ["OCID", "fit_intrinsics"]
@@ -37,8 +37,8 @@ _LARGEST_RESIDUAL = 5.0
 """Pixels, root mean square. Depth noise of the sensor makes about one, another kind of cloud hundreds."""
 
 
-class OCID:
-    """The frames of the subset, by sequence and time; iterating reads one at a time.
+class OCID(LabelledFrames):
+    """The frames of the subset, by sequence and time.
 
     The objects that have a pixel in a frame are its truth.
     """
@@ -58,35 +58,24 @@ class OCID:
         if not path.is_dir():
             raise InputError(f"dataset: {path} is no folder")
         self._root = path / "YCB10" if (path / "YCB10").is_dir() else path
-        self._images: dict[_Sequence, list[Path]] = {}
+        self._images: list[tuple[_Sequence, Path]] = []
         for place, camera in itertools.product(_FIRST_OBJECT, _CAMERAS):
             for folder in sorted((self._root / place / camera).glob("*/*")):
-                images = sorted((folder / "rgb").glob("*.png"))
-                if images:
-                    self._images[place, camera, folder.parent.name, folder.name] = images
+                sequence = place, camera, folder.parent.name, folder.name
+                self._images += [(sequence, image) for image in sorted((folder / "rgb").glob("*.png"))]
         if not self._images:
             raise InputError(f"dataset: {path} has no {{table,floor}}/{{bottom,top}}/<type>/<sequence>/rgb/*.png")
-        self._names = _names(Path(names), self._images)
+        self._names = _names(Path(names), dict.fromkeys(sequence for sequence, _ in self._images))
+        self.identifiers = ["/".join((*sequence, image.stem)) for sequence, image in self._images]
 
-    def __len__(self) -> int:
-        return sum(len(images) for images in self._images.values())
-
-    def __iter__(self) -> Iterator[LabelledFrame]:
-        """Read the frames.
-
-        Raises:
-            InputError: a file that is missing or damaged, images that do not fit together, a cloud that gives no
-                intrinsics, or a label without a name; names the file.
-            OSError: a file cannot be opened.
-        """
-        for sequence, images in self._images.items():
-            place, camera, kind, _ = sequence
-            attributes = {"place": place, "camera": _CAMERAS[camera], "type": kind}
-            for image in images:
-                identifier = "/".join((*sequence, image.stem))
-                with complaints_about(identifier):
-                    frame, truth = _read(image, _FIRST_OBJECT[place], self._names[sequence])
-                yield LabelledFrame(identifier, frame, truth, attributes)
+    def __getitem__(self, number: int) -> LabelledFrame:
+        """Read a frame; also refuses a cloud that gives no intrinsics, and a label without a name."""
+        sequence, image = self._images[number]
+        place, camera, kind, _ = sequence
+        with complaints_about(self.identifiers[number]):
+            frame, truth = _read(image, _FIRST_OBJECT[place], self._names[sequence])
+        attributes = {"place": place, "camera": _CAMERAS[camera], "type": kind}
+        return LabelledFrame(self.identifiers[number], frame, truth, attributes)
 
 
 def _names(path: Path, sequences: Iterable[_Sequence]) -> dict[_Sequence, list[str]]:

@@ -3,15 +3,13 @@
 `<video>/images/<frame>_{rgb,depth,labels}.png` and `<frame>_poses.yaml`; 1280 x 720, depth in millimetres.
 """
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-import yaml
-
 from thor2_jax.errors import InputError
 from thor2_jax.frames import Intrinsics, RGBDFrame, read_color, read_depth, read_labels
-from training.readers.labelled import LabelledFrame
+from training.readers.files import parse_yaml
+from training.readers.labelled import LabelledFrame, LabelledFrames
 
 __all__ = ["INTRINSICS", "NOT_SCORED", "UWISOccluded", "Video", "video_attributes"]
 
@@ -64,8 +62,8 @@ def video_attributes(number: int) -> dict[str, str]:
     return found
 
 
-class UWISOccluded:
-    """The frames of the dataset or of a part of it, by video and frame number; iterating reads one at a time."""
+class UWISOccluded(LabelledFrames):
+    """The frames of the dataset or of a part of it, by video and frame number."""
 
     def __init__(self, path: str | Path) -> None:
         """Finds the frames.
@@ -80,39 +78,36 @@ class UWISOccluded:
         self._frames = [(video, c) for video in videos for c in sorted((video / "images").glob("*_rgb.png"))]
         if not self._frames:
             raise InputError(f"dataset: {path} has no <video number>/images/<frame>_rgb.png")
+        self.identifiers = [f"{video.name}/{_stem(color)}" for video, color in self._frames]
 
-    def __len__(self) -> int:
-        return len(self._frames)
+    def __getitem__(self, number: int) -> LabelledFrame:
+        """Read a frame."""
+        video, color = self._frames[number]
+        stem, identifier = _stem(color), self.identifiers[number]
+        try:
+            frame = RGBDFrame(
+                read_color(color),
+                read_depth(color.with_name(f"{stem}_depth.png")),
+                read_labels(color.with_name(f"{stem}_labels.png")),
+                INTRINSICS,
+            )
+            truth = _truth(color.with_name(f"{stem}_poses.yaml"))
+        except FileNotFoundError as error:
+            raise InputError(f"{identifier}: {error.filename} is missing") from None
+        except InputError as error:
+            raise InputError(f"{identifier}: {error}") from None
+        return LabelledFrame(identifier, frame, truth, video_attributes(int(video.name)))
 
-    def __iter__(self) -> Iterator[LabelledFrame]:
-        """Read the frames.
 
-        Raises:
-            InputError: a file that is missing or damaged, or images that do not fit together; names the file.
-            OSError: a file cannot be opened.
-        """
-        for video, color in self._frames:
-            stem = color.name.removesuffix("_rgb.png")
-            try:
-                frame = RGBDFrame(
-                    read_color(color),
-                    read_depth(color.with_name(f"{stem}_depth.png")),
-                    read_labels(color.with_name(f"{stem}_labels.png")),
-                    INTRINSICS,
-                )
-                truth = _truth(color.with_name(f"{stem}_poses.yaml"))
-            except FileNotFoundError as error:
-                raise InputError(f"{video.name}/{stem}: {error.filename} is missing") from None
-            except InputError as error:
-                raise InputError(f"{video.name}/{stem}: {error}") from None
-            yield LabelledFrame(f"{video.name}/{stem}", frame, truth, video_attributes(int(video.name)))
+def _stem(color: Path) -> str:
+    return color.name.removesuffix("_rgb.png")
 
 
 def _truth(path: Path) -> dict[int, str]:
     try:
-        objects = yaml.safe_load(path.read_bytes())
+        objects = parse_yaml(path.read_bytes())
         entries = [(entry["label"], name) for name, entry in objects.items() if name not in NOT_SCORED]
-    except (yaml.YAMLError, KeyError, TypeError, AttributeError, ValueError, RecursionError):
+    except (KeyError, TypeError, AttributeError, ValueError):
         raise InputError(f"{path} does not hold <name>: {{label: <number>, ...}}") from None
     truth: dict[int, str] = {}
     for label, name in entries:

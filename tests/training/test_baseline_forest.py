@@ -1,0 +1,69 @@
+"""Measures against numpy, trees as arrays against scikit-learn's own."""
+
+import numpy as np
+import pytest
+from sklearn.ensemble import RandomForestClassifier
+
+import colornet
+import thor2_jax as thor2
+from training.baselines.baseline import Seen
+from training.baselines.forest import Forest, _nodes_of, forest_features
+
+NETWORK = colornet.load_default()
+CONFIG = thor2.DescriptorConfig(homology="closed_form")
+
+
+def normal(sizes: tuple[int, ...]) -> thor2.PointClouds:
+    rng = np.random.default_rng(1)
+    clouds = [
+        ((rng.random((n, 3)) * [0.2, 0.1, 0.05]).astype(np.float32), rng.integers(0, 256, (n, 3), dtype=np.uint8))
+        for n in sizes
+    ]
+    clouds = [(xyz - xyz.min(axis=0) if len(xyz) else xyz, rgb) for xyz, rgb in clouds]
+    return thor2.view_normalize(thor2.PointClouds.pack(clouds, camera=[0, 0, -3]), CONFIG)
+
+
+def test_measures_of_clouds() -> None:
+    clouds = normal((400, 1, 0, 57))
+    found = forest_features(clouds, NETWORK, CONFIG)
+    assert found.shape == (4, 22 + 3 + 14)
+    aligned = np.asarray(thor2.turn(clouds, CONFIG).points, np.float64)
+    points, mask = np.asarray(clouds.points, np.float64), np.asarray(clouds.mask)
+    colors = np.rint(np.asarray(clouds.colors) * 255).astype(np.uint8)
+    for row, (n, features) in enumerate(zip((400, 1, 0, 57), found, strict=True)):
+        here = mask[row]
+        assert here.sum() == n
+        if not n:
+            np.testing.assert_array_equal(features, 0)
+            continue
+        np.testing.assert_allclose(features[:22], NETWORK.membership(colors[row, here]).mean(axis=0), atol=1e-5)
+        np.testing.assert_allclose(features[22:25], points[row, here].max(axis=0), rtol=1e-6)
+        x, y, z = aligned[row, here].T
+        for k in range(7):
+            inside = np.floor(z / CONFIG.sigma_1) == k
+            strips = np.floor(x[inside] / CONFIG.sigma_2)
+            wide = (np.ptp(strips) + 1) * CONFIG.sigma_2 if inside.any() else 0
+            deep = np.ptp(y[inside]) if inside.any() else 0
+            assert features[25 + k] == pytest.approx(wide, abs=1e-6)
+            assert features[32 + k] == pytest.approx(deep, abs=1e-6)
+
+
+@pytest.mark.parametrize("depth", [None, 1])
+def test_trees_answer_as_scikit_learns(depth: int | None) -> None:
+    rng = np.random.default_rng(0)
+    x = rng.random((300, 5)).astype(np.float32)
+    y = (x[:, 0] * 3).astype(int) + (x[:, 1] > 0.5)
+    grown = RandomForestClassifier(9, min_samples_leaf=2, max_depth=depth, random_state=0).fit(x, y)
+    forest = Forest(_nodes_of(grown), NETWORK, CONFIG)
+    asked = np.concatenate([x, rng.random((50, 5)).astype(np.float32)])
+    np.testing.assert_allclose(forest.of_features(asked), grown.predict_proba(asked), atol=1e-6)
+
+
+def test_trees_of_one_leaf_and_missing_arrays() -> None:
+    grown = RandomForestClassifier(2, random_state=0).fit(np.zeros((4, 39), np.float32), [0, 0, 0, 1])
+    nodes = _nodes_of(grown)
+    forest = Forest(nodes, NETWORK, CONFIG)
+    seen = Seen(normal((60, 0)), np.zeros((2, 1), np.float32))
+    np.testing.assert_allclose(forest.probabilities(seen), grown.predict_proba(np.zeros((2, 39))), atol=1e-6)
+    with pytest.raises(ValueError, match="root is missing"):
+        Forest({name: nodes[name] for name in nodes if name != "root"}, NETWORK, CONFIG)

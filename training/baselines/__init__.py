@@ -1,0 +1,1 @@
+"""Other recognizers, to compare with: trained on a run's views, asked about the same described frames."""
