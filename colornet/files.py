@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 
 __all__ = ["read_arrays", "whole_file", "write_arrays"]
 
+MOST_BYTES = 2**26
+"""Of arrays that are read: zeros take up a thousandth in the file."""
+
 
 @contextlib.contextmanager
 def whole_file(path: str | Path) -> Iterator[Path]:
@@ -51,7 +54,12 @@ def read_arrays(path: str | Path) -> dict[str, NDArray[Any]]:
     data = Path(path).read_bytes()
     try:
         with np.load(io.BytesIO(data), allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
+            if sum(member.file_size for member in archive.zip.infolist()) > MOST_BYTES:
+                raise ValueError("its arrays would fill memory")
+            arrays = {name: archive[name] for name in archive.files}
+        if not all(isinstance(array, np.ndarray) for array in arrays.values()):
+            raise ValueError("a member is no array")
+        return arrays
     # Damaged bytes make zipfile, zlib and NumPy raise a dozen kinds of exception; nothing but bytes is at work here.
     except Exception as error:
         raise ValueError(f"{path} is damaged or not a file of arrays (npz)") from error

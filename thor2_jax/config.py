@@ -21,7 +21,10 @@ _CHOICES = {"homology": ("gudhi", "closed_form"), "convention": ("paper", "relea
 
 
 def _is_finite(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    try:
+        return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    except OverflowError:  # an integer past the largest float
+        return False
 
 
 @dataclasses.dataclass(frozen=True)

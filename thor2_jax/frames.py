@@ -16,11 +16,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from thor2_jax.errors import InputError
 
 __all__ = [
+    "MOST_PIXELS",
     "Intrinsics",
     "RGBDFrame",
     "backproject",
@@ -31,6 +32,13 @@ __all__ = [
     "read_intrinsics",
     "read_labels",
 ]
+
+
+FORMATS = ("PNG", "JPEG", "TIFF")
+"""Of images that are read. Some of the others that Pillow knows run programs."""
+
+MOST_PIXELS = 2**26
+"""Of an image that is read: a small file can tell of a large one, and fill memory."""
 
 
 def _is_finite(value: Any) -> bool:
@@ -169,23 +177,19 @@ def _read_image(path: str | Path, argument: str) -> tuple[NDArray[Any], str]:
     """An image file as an array, and its mode, Pillow's word for what the numbers mean.
 
     Raises:
-        InputError: not an image, or damaged; names `argument` and the file.
+        InputError: none of `FORMATS`, damaged, or of more than `MOST_PIXELS`; names `argument` and the file.
         OSError: it cannot be opened.
     """
     with open(path, "rb") as stream:
         try:
-            with Image.open(stream) as image:
+            with Image.open(stream, formats=FORMATS) as image:
+                if image.width * image.height > MOST_PIXELS:
+                    raise ValueError(f"{image.width} x {image.height} pixels; at most {MOST_PIXELS} are read")
                 return np.asarray(image), image.mode
-        # Damaged files make the decoders raise several kinds of exception; only bytes are at work here.
-        except (
-            UnidentifiedImageError,
-            OSError,
-            ValueError,
-            SyntaxError,
-            EOFError,
-            Image.DecompressionBombError,
-        ) as error:
-            raise InputError(f"{argument}: {path} is damaged or no image ({error})") from None
+        # Damaged files make the decoders raise a dozen kinds of exception; only bytes are at work here.
+        except Exception as error:
+            reason = " ".join(str(error).split()) or type(error).__name__
+            raise InputError(f"{argument}: {path} is damaged or no image ({reason})") from None
 
 
 def read_color(path: str | Path) -> NDArray[np.uint8]:

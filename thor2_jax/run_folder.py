@@ -132,7 +132,7 @@ def _description(path: Path) -> dict[str, Any]:
         found = json.loads((path / "run.json").read_text())
     except FileNotFoundError:
         raise InputError(f"model: {path} is no run folder (it has no run.json)") from None
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"model: {path / 'run.json'} cannot be read: {error}") from None
     if not isinstance(found, dict) or found.get("format") != FORMAT:
         given = found.get("format") if isinstance(found, dict) else type(found).__name__
@@ -188,12 +188,19 @@ def _restore(path: Path, n_inputs: int, n_classes: int, digest: str | None) -> M
         raise InputError(f"model: {path} is missing")
     if digest is not None and digest != _digest(path, n_inputs, n_classes):
         raise InputError(f"model: {path} is damaged, or not of {n_inputs} inputs and {n_classes} classes")
-    model = MLP(n_inputs, n_classes, rngs=nnx.Rngs(0))
-    state = nnx.state(model, (nnx.Param, nnx.BatchStat))
-    target = jax.tree.map(np.asarray, nnx.to_pure_dict(state))
+    return _restore_weights(path, n_inputs, n_classes)
+
+
+def _restore_weights(path: Path, n_inputs: int, n_classes: int) -> MLP:
     try:
         with _checkpointer() as checkpointer:
-            restored = checkpointer.restore(path, target)
+            # Before a model is made: a damaged description of a folder without digests can tell of any size.
+            (stored,) = checkpointer.metadata(path).item_metadata.tree["input_scale"].shape
+            if stored != n_inputs:
+                raise ValueError(f"it is of {stored} inputs, not {n_inputs}")
+            model = MLP(n_inputs, n_classes, rngs=nnx.Rngs(0))
+            state = nnx.state(model, (nnx.Param, nnx.BatchStat))
+            restored = checkpointer.restore(path, jax.tree.map(np.asarray, nnx.to_pure_dict(state)))
     except Exception as error:  # orbax raises whatever its storage layers raise
         reason = str(error).strip().splitlines() or [type(error).__name__]
         raise InputError(f"model: {path} cannot be read: {reason[0][:300]}") from None

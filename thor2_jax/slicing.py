@@ -17,6 +17,9 @@ from thor2_jax.types import PointClouds, Strips
 
 __all__ = ["slice_and_strip", "strip_births", "strips_of_cloud"]
 
+_FAR = 2.0**20
+"""Scaled units, far past any descriptor: coordinates limited to it, hundredths stay within 32 bits."""
+
 
 def strip_births(config: DescriptorConfig) -> jax.Array:
     """[J] float32: filtration value at which strip j's vertices enter, j * sigma_2, scaled units."""
@@ -41,7 +44,7 @@ def slice_and_strip(points: jax.Array, mask: jax.Array, config: DescriptorConfig
     if config.convention == "paper":
         return jnp.floor(z / config.sigma_1).astype(jnp.int32), jnp.floor(x / config.sigma_2).astype(jnp.int32)
     # Rounded to 0.01, x is k / 100; the first edge j / 40 that is not below it has j = ceil(2 k / 5), in whole numbers.
-    strip = (2 * _rounded(x, 100).astype(jnp.int32) + 4) // 5
+    strip = (2 * _rounded(jnp.clip(x, -_FAR, _FAR), 100).astype(jnp.int32) + 4) // 5
     level = _rounded(z, 10).astype(jnp.int32)
     # Levels past twice the descriptor's slices get a number past its end whatever their rank.
     n_levels = 2 * config.n_slices
@@ -107,7 +110,9 @@ def strips_of_cloud(cloud: PointClouds, set_of_point: jax.Array, sets: RegionSet
     """
     n_segments = config.n_slices * config.n_strips
     i, j = slice_and_strip(cloud.points, cloud.mask, config)
-    inside = cloud.mask & (i >= 0) & (i < config.n_slices) & (j >= 0) & (j < config.n_strips)
+    # What is no number would become slice and strip 0.
+    inside = cloud.mask & jnp.isfinite(cloud.points).all(axis=-1)
+    inside &= (i >= 0) & (i < config.n_slices) & (j >= 0) & (j < config.n_strips)
     overflow = (cloud.mask & ~inside).sum(dtype=jnp.int32)
     if config.relaxation is not None:
         return relaxed_strips(cloud, sets, config, overflow)
@@ -124,7 +129,7 @@ def strips_of_cloud(cloud: PointClouds, set_of_point: jax.Array, sets: RegionSet
     color = jnp.matmul(counts.reshape(n_segments, n_sets), sets.weights, precision=jax.lax.Precision.HIGHEST)
     if config.convention == "released":
         # The released code rounds y, then measures; rounding keeps the order, so the extremes stay extreme.
-        extremes = _rounded(extremes, 100) / 100
+        extremes = _rounded(jnp.clip(extremes, -_FAR, _FAR), 100) / 100
         color = color / jnp.maximum(color.sum(axis=-1, keepdims=True), 1)
 
     def grid(a: jax.Array) -> jax.Array:

@@ -6,8 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 import colornet
 import thor2_jax as thor2
@@ -38,22 +36,6 @@ def cloud_in_cells(seed: int, count: int) -> tuple[np.ndarray, np.ndarray]:
     points[rng.random(count) < 0.1, 0] = 0
     points[rng.random(count) < 0.1, 2] = 0
     return points.astype(np.float32), rng.integers(0, 256, (count, 3), dtype=np.uint8)
-
-
-@settings(max_examples=15, deadline=None)
-@given(seed=st.integers(0, 2**32 - 1), count=st.integers(0, 200))
-def test_it_converges_to_the_hard_descriptor(seed: int, count: int) -> None:
-    clouds = thor2.PointClouds.pack([cloud_in_cells(seed, count)], 200)
-    hard = thor2.describe_aligned(clouds, NETWORK, HARD)
-    for name in ("images", "embeddings"):
-        errors = []
-        for factor in (1, 0.1, 0.01):
-            soft = thor2.describe_aligned(clouds, NETWORK, relaxed(factor))
-            errors.append(float(jnp.abs(getattr(soft, name) - getattr(hard, name)).max()))
-            np.testing.assert_array_equal(soft.overflow, hard.overflow)
-        assert errors[2] < 1e-3, (name, errors)
-        for warmer, colder in zip(errors, errors[1:], strict=False):
-            assert colder <= max(warmer, 1e-5), (name, errors)
 
 
 def test_points_that_hard_slices_leave_out_are_left_out() -> None:

@@ -1,0 +1,128 @@
+"""Two trainings of one run, and commands that are killed while they write."""
+
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import thor2_jax as thor2
+from thor2_jax.run_folder import TrainedRun, load_run
+from training.fit import FitOptions
+from training.train import train_run
+from training.view_source import MemoryViews
+
+CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=3, n_strips=8, image_size=8)
+OPTIONS = FitOptions(epochs=2, batch_size=4)
+
+
+def source() -> MemoryViews:
+    rng = np.random.default_rng(0)
+    clouds = {
+        name: [
+            ((rng.random((200, 3)) * size + [0, 0, 0.5]).astype(np.float32), np.full((200, 3), level, np.uint8))
+            for _ in range(3)
+        ]
+        for name, size, level in (("brick", (0.1, 0.05, 0.03), 0), ("stick", (0.2, 0.01, 0.01), 255))
+    }
+    return MemoryViews(clouds, CONFIG)
+
+
+def train(out: Path, **more: Any) -> TrainedRun:
+    (run,) = train_run(source(), out, ("tops",), OPTIONS, config=CONFIG, **more)
+    return run
+
+
+def contents(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_two_trainings_of_one_run(tmp_path: Path) -> None:
+    """The second is refused at once, at whatever stage the first is, and changes nothing."""
+    out, refused = tmp_path / "run", []
+
+    def meanwhile(stage: str, done: int, total: int, note: str) -> None:
+        if stage == "describe" or done not in (1, total):
+            return
+        before = contents(out)
+        with pytest.raises(thor2.InputError, match=f"another process is writing to {out}") as caught:
+            train(out)
+        refused.append(str(caught.value))
+        assert contents(out) == before
+
+    train(out, progress=meanwhile)
+    assert refused and load_run(out).classes == ("brick", "stick")
+    assert not list(out.rglob(".lock"))
+
+
+def test_a_training_that_began_while_another_described_its_views(tmp_path: Path) -> None:
+    """Neither had begun the folder when it looked: the slower one is refused, or goes on with what the other left."""
+    out, done = tmp_path / "run", []
+
+    def quicker(stage: str, count: int, total: int, note: str) -> None:
+        if stage == "describe" and not done:
+            done.append(train(out))
+
+    with pytest.raises(thor2.InputError, match="exists already; a run folder is never overwritten"):
+        train(out, progress=quicker)
+    assert load_run(out).record == done[0].record
+
+    other, begun = tmp_path / "other", []
+
+    class Stopped(BaseException):
+        pass
+
+    def stopped(stage: str, count: int, total: int, note: str) -> None:
+        if stage == "fit tops":
+            raise Stopped
+
+    def dies(stage: str, count: int, total: int, note: str) -> None:
+        if stage == "describe" and not begun:
+            begun.append(1)
+            with pytest.raises(Stopped):
+                train(other, progress=stopped)
+
+    assert train(other, progress=dies).record == done[0].record  # goes on with what the other began
+
+
+KILLED = """
+import os, signal, sys
+import colornet
+colornet.build = colornet.load_default
+left = int(sys.argv.pop(1))
+
+def killing(function):
+    def called(*arguments):
+        global left
+        for step in (lambda: None, lambda: function(*arguments)):
+            step()
+            left -= 1
+            if left == 0:
+                os.kill(os.getpid(), signal.SIGKILL)
+    return called
+
+os.replace = killing(os.replace)
+from training.cli import main
+main()
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kill", [1, 2, 3, 6])
+def test_the_colour_network_s_command_is_killed(kill: int, tmp_path: Path) -> None:
+    """What has a name is whole; the folder is then refused, by name, and the same command makes another."""
+    names, out = ("network.npz", "network.png", "similarity.png"), tmp_path / "out"
+    command = [sys.executable, "-c", KILLED, str(kill), "colornet", "--out", str(out)]
+    assert subprocess.run(command, capture_output=True, timeout=200).returncode == -signal.SIGKILL
+    found = {path.name for path in out.iterdir() if not path.name.startswith(".")}
+    assert found == set(names[: kill // 2])
+    command[3] = "0"
+    again = subprocess.run(command, capture_output=True, text=True, timeout=200)
+    assert again.returncode == 2 and f"out: {out} exists already" in again.stderr and "Traceback" not in again.stderr
+    shutil.rmtree(out)
+    assert subprocess.run(command, capture_output=True, timeout=200).returncode == 0
+    assert {path.name for path in out.iterdir()} == set(names)

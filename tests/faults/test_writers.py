@@ -1,0 +1,119 @@
+"""Every writer, with a disk that is full or read-only at every step of it: nothing half-written, nothing lost."""
+
+import dataclasses
+import errno
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from flax import nnx
+
+import colornet
+import thor2_jax as thor2
+from colornet.draw import draw_similarity
+from thor2_jax.classifier import MLP
+from thor2_jax.files import write_text
+from thor2_jax.overlay import draw_overlay
+from thor2_jax.run_folder import TrainedRun, input_size, load_run, save_run
+from training.evaluation.answers import AnswerFile, FrameAnswers
+from training.fit import Figures
+from training.metrics import append_figures, forget_after, read_figures
+from training.view_dataset import MANIFEST, Manifest
+
+CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=2, n_strips=5, image_size=8)
+NETWORK = colornet.load_default()
+PHOTO = np.zeros((40, 50, 3), np.uint8)
+LABELS = np.ones((40, 50), np.uint8)
+
+
+def make_run() -> TrainedRun:
+    return TrainedRun(CONFIG, NETWORK, ("a", "b"), {"ce": MLP(input_size("ce", CONFIG, 22), 2, rngs=nnx.Rngs(0))}, {})
+
+
+WRITERS: dict[str, Callable[[Path], Any]] = {
+    "network.npz": NETWORK.save,
+    "similarity.png": lambda path: draw_similarity(NETWORK, path),
+    "text.json": lambda path: write_text(path, "new" * 1000),
+    "overlay.png": lambda path: draw_overlay(
+        PHOTO, LABELS, [thor2.Recognition(label=1, name="mug", confidence=1.0)], path
+    ),
+    MANIFEST: lambda path: Manifest({"shards": 0, "objects": []}).write(path.parent),
+}
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS], ids=["full", "read-only"])
+@pytest.mark.parametrize("name", WRITERS)
+def test_files_appear_whole_or_not_at_all(name: str, number: int, tmp_path: Path, disk: Any) -> None:
+    path = tmp_path / name
+    path.write_bytes(b"old")
+    for step in range(1, 100) if number == errno.ENOSPC else (1, 2, 99):
+        disk.again(step, number)
+        try:
+            WRITERS[name](path)
+        except OSError as error:
+            assert error.errno == number
+            assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
+        else:
+            break
+    assert step > 2 and path.read_bytes() != b"old" and list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS], ids=["full", "read-only"])
+def test_a_run_folder_appears_whole_or_not_at_all(number: int, tmp_path: Path, disk: Any) -> None:
+    run = make_run()
+    disk.again(0, 0)
+    save_run(run, tmp_path / "whole")
+    steps = disk.count
+    for step in sorted({1, 2, 3, 5, 8, 13, steps // 2, steps - 2, steps - 1, steps} - {0}):
+        disk.again(step, number)
+        with pytest.raises(OSError):
+            save_run(run, tmp_path / "run")
+        assert [path.name for path in tmp_path.iterdir()] == ["whole"]
+    disk.again(0, 0)
+    save_run(run, tmp_path / "run")
+    assert load_run(tmp_path / "run").classes == ("a", "b")
+
+
+def answers(k: int) -> FrameAnswers:
+    return FrameAnswers(f"frame{k}", {"light": "1"}, 0.5, [])
+
+
+def test_answers_go_on_after_a_full_disk(tmp_path: Path, disk: Any) -> None:
+    path, asked = tmp_path / "report" / "answers.jsonl", {"runs": ["digest"]}
+    AnswerFile(path, asked).append(answers(0))
+    kept = 1
+    for step in range(1, 4):
+        file = AnswerFile(path, asked)
+        assert [found.frame for found in file.frames] == [f"frame{k}" for k in range(kept)]
+        disk.again(step, errno.ENOSPC)
+        try:
+            file.append(answers(kept))
+        except OSError:
+            pass
+        else:
+            kept += 1
+        disk.again(0, 0)
+    assert kept == 2
+    AnswerFile(path, asked).append(answers(kept))
+    assert len(AnswerFile(path, asked).frames) == 3
+
+
+def test_figures_go_on_after_a_full_disk(tmp_path: Path, disk: Any) -> None:
+    path = tmp_path / "metrics.jsonl"
+    append_figures(path, 0, "ce", _figures(1))
+    for step in (1, 2):
+        disk.again(step, errno.ENOSPC)
+        with pytest.raises(OSError):
+            append_figures(path, 0, "ce", _figures(2))
+        disk.again(0, 0)
+        assert [row["epoch"] for row in read_figures(path)] == [1]
+        forget_after(path, 0, "ce", 1)  # as a training that goes on does
+    append_figures(path, 0, "ce", _figures(2))
+    assert [row["epoch"] for row in read_figures(path)] == [1, 2]
+
+
+def _figures(epoch: int) -> Figures:
+    values: dict[str, Any] = {field.name: 0.5 for field in dataclasses.fields(Figures)}
+    return Figures(**(values | {"epoch": epoch}))

@@ -1,0 +1,79 @@
+"""Readers under limits of time and memory, and how many damaged files each gets."""
+
+import contextlib
+import resource
+import signal
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, settings
+
+from thor2_jax.errors import InputError
+
+for tier, examples in (("quick-fuzz", 150), ("thorough-fuzz", 3000)):
+    settings.register_profile(
+        tier,
+        max_examples=examples,
+        deadline=None,
+        derandomize=True,
+        database=None,
+        suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
+    )
+
+SECONDS = 5
+MEMORY = 2**30
+"""Bytes that a reader may take from the system beyond what the process has."""
+
+
+class TookTooLong(BaseException):
+    """Past every `except Exception`."""
+
+
+@contextlib.contextmanager
+def limits() -> Iterator[None]:
+    def stop(*_: Any) -> None:
+        raise TookTooLong
+
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    handler = signal.signal(signal.SIGALRM, stop)
+    signal.setitimer(signal.ITIMER_REAL, SECONDS)
+    resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + MEMORY, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, before)
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, handler)
+
+
+@pytest.fixture(scope="session")
+def attempt() -> Callable[..., Any]:
+    """Calls a reader under the limits: its answer, or None where it refuses in one line of bounded length."""
+
+    def call(read: Callable[[], Any], refusals: Any = (InputError, OSError)) -> Any:
+        with warnings.catch_warnings(), limits():
+            warnings.simplefilter("ignore")  # of decoders, about what is damaged
+            try:
+                return read()
+            except refusals as error:
+                message = str(error)
+        assert message and "\n" not in message and len(message) < 20_000, message[:3000]
+        return None
+
+    return call
+
+
+def pytest_collectstart(collector: pytest.Collector) -> None:
+    """The slow tier tries twenty times as many files."""
+    if isinstance(collector, pytest.Module):
+        quick = "not slow" in collector.config.getoption("markexpr")
+        settings.load_profile("quick-fuzz" if quick else "thorough-fuzz")
+
+
+def pytest_collectreport() -> None:
+    """Other folders' tests have Hypothesis as they know it."""
+    settings.load_profile("default")

@@ -1,0 +1,131 @@
+"""Damaged frames: PNG and JPEG images, intrinsics."""
+
+import io
+import json
+import struct
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+
+from thor2_jax.errors import InputError
+from thor2_jax.frames import read_color, read_depth, read_intrinsics, read_labels
+from thor2_jax.testing import damaged
+
+RNG = np.random.default_rng(0)
+SHAPE = (24, 17)
+
+
+def encoded(pixels: np.ndarray, kind: str, **options: Any) -> bytes:
+    stream = io.BytesIO()
+    Image.fromarray(pixels).save(stream, kind, **options)
+    return stream.getvalue()
+
+
+COLOR = RNG.integers(0, 256, (*SHAPE, 3), dtype=np.uint8)
+PALETTE = Image.fromarray(RNG.integers(0, 4, SHAPE, dtype=np.uint8)).convert("P")
+FILES: dict[str, tuple[Callable[[Path], Any], bytes]] = {
+    "color.png": (read_color, encoded(COLOR, "PNG")),
+    "alpha.png": (read_color, encoded(np.dstack([COLOR, COLOR[..., 0]]), "PNG")),
+    "color.jpg": (read_color, encoded(COLOR, "JPEG")),
+    "depth.png": (read_depth, encoded(RNG.integers(0, 2**16, SHAPE).astype(np.uint16), "PNG")),
+    "depth.tiff": (read_depth, encoded(RNG.integers(0, 2**16, SHAPE).astype(np.uint16), "TIFF")),
+    "labels.png": (read_labels, encoded(RNG.integers(0, 9, SHAPE, dtype=np.uint8), "PNG")),
+}
+
+
+def chunks(content: bytes) -> list[tuple[bytes, bytes]]:
+    found, at = [], 8
+    while at + 8 <= len(content):
+        (length,) = struct.unpack(">I", content[at : at + 4])
+        found.append((content[at + 4 : at + 8], content[at + 8 : at + 8 + length]))
+        at += 12 + length
+    return found
+
+
+def png(parts: list[tuple[bytes, bytes]]) -> bytes:
+    """A PNG file of chunks with the right lengths and checksums, whatever is in them."""
+    body = (struct.pack(">I", len(d)) + k + d + struct.pack(">I", zlib.crc32(k + d)) for k, d in parts)
+    return b"\x89PNG\r\n\x1a\n" + b"".join(body)
+
+
+@pytest.mark.parametrize("name", FILES)
+@given(data=st.data())
+def test_images(name: str, data: st.DataObject, attempt: Any, tmp_path: Path) -> None:
+    read, content = FILES[name]
+    path = tmp_path / name
+    path.write_bytes(data.draw(damaged(content)))
+    found = attempt(lambda: read(path))
+    if found is not None:
+        assert found.ndim in (2, 3) and found.dtype.kind == "u" and found.size > 0
+
+
+@pytest.mark.parametrize("name", [name for name in FILES if name.endswith("png")])
+@given(data=st.data())
+def test_png_chunks_with_right_checksums(name: str, data: st.DataObject, attempt: Any, tmp_path: Path) -> None:
+    read, content = FILES[name]
+    parts = chunks(content)
+    k = data.draw(st.integers(0, len(parts) - 1))
+    kind, body = parts[k]
+    if kind == b"IDAT" and data.draw(st.booleans()):
+        body = zlib.compress(data.draw(damaged(zlib.decompress(body))))
+    elif body:
+        body = data.draw(damaged(body, 1))
+    path = tmp_path / name
+    path.write_bytes(png([*parts[:k], (kind, body), *parts[k + 1 :]]))
+    attempt(lambda: read(path))
+
+
+@pytest.mark.parametrize("size", [(65_000, 65_000), (2**31 - 1, 2**31 - 1), (13_000, 13_000), (170_000_000, 1)])
+def test_an_image_that_would_fill_memory_is_refused(size: tuple[int, int], attempt: Any, tmp_path: Path) -> None:
+    """With all its rows of zeros: a few hundred kilobytes of file, or as few as the header alone."""
+    rows = zlib.compress(bytes(min((size[0] * 3 + 1) * size[1], 2**26)), 9)
+    path = tmp_path / "bomb.png"
+    path.write_bytes(png([(b"IHDR", struct.pack(">IIBBBBB", *size, 8, 2, 0, 0, 0)), (b"IDAT", rows), (b"IEND", b"")]))
+    assert attempt(lambda: read_color(path)) is None
+    with pytest.raises(InputError, match="bomb.png"):
+        read_color(path)
+
+
+def test_text_that_would_fill_memory(attempt: Any, tmp_path: Path) -> None:
+    parts = chunks(FILES["color.png"][1])
+    bomb = (b"zTXt", b"key\0\0" + zlib.compress(bytes(2**26), 9))
+    path = tmp_path / "bomb.png"
+    path.write_bytes(png([parts[0], bomb, *parts[1:]]))
+    attempt(lambda: read_color(path))
+
+
+def test_other_kinds_of_images_are_refused(tmp_path: Path) -> None:
+    """Of what Pillow opens, some formats run other programs, and none is documented."""
+    for kind in ("BMP", "GIF", "PPM", "EPS"):
+        path = tmp_path / "color.png"
+        path.write_bytes(encoded(COLOR, kind))
+        with pytest.raises(InputError, match="color.png is damaged or no image"):
+            read_color(path)
+
+
+INTRINSICS = json.dumps({"fx": 600.5, "fy": 601.0, "cx": 320, "cy": 240.25, "depth_scale": 1000.0}).encode()
+
+
+@given(content=damaged(INTRINSICS))
+def test_intrinsics(content: bytes, attempt: Any, tmp_path: Path) -> None:
+    path = tmp_path / "k.json"
+    path.write_bytes(content)
+    found = attempt(lambda: read_intrinsics(path))
+    if found is not None:
+        assert found.fx > 0 and np.isfinite([found.fx, found.fy, found.cx, found.cy, found.depth_scale]).all()
+
+
+@pytest.mark.parametrize(
+    "content", [b"[" * 10**6, b"1" * 10**5, b'{"fx": ' * 10**5, INTRINSICS.replace(b"600.5", b"9" * 400)]
+)
+def test_odd_json(content: bytes, attempt: Any, tmp_path: Path) -> None:
+    path = tmp_path / "k.json"
+    path.write_bytes(content)
+    assert attempt(lambda: read_intrinsics(path)) is None

@@ -1,0 +1,104 @@
+"""Damaged run folders, and the lines that a training and an evaluation keep."""
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from flax import nnx
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import colornet
+import thor2_jax as thor2
+from thor2_jax.classifier import MLP
+from thor2_jax.run_folder import TrainedRun, input_size, load_run, save_run
+from thor2_jax.testing import damaged
+from training.metrics import read_figures
+
+CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=2, n_strips=5, image_size=8)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("runs") / "run"
+    model = MLP(input_size("ce", CONFIG, 22), 2, rngs=nnx.Rngs(0))
+    save_run(TrainedRun(CONFIG, colornet.load_default(), ("mug", "bowl"), {"ce": model}, {"epochs": 3}), path)
+    return path
+
+
+def damaged_and_back(path: Path, content: bytes, read: Any, attempt: Any) -> Any:
+    before = path.read_bytes()
+    path.write_bytes(content)
+    try:
+        return attempt(read)
+    finally:
+        path.write_bytes(before)
+
+
+@given(data=st.data())
+def test_descriptions(data: st.DataObject, run: Path, attempt: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Weights are not read: their digest, of their sizes too, is checked before."""
+    content = (run / "run.json").read_bytes()
+    if data.draw(st.booleans()):
+        other = data.draw(damaged(content))
+    else:
+        table = json.loads(content)
+        key = data.draw(st.sampled_from(sorted(table)))
+        part = data.draw(damaged(json.dumps(table[key]).encode()))
+        other = json.dumps(table | {key: "PART"}).encode().replace(b'"PART"', part)
+    with monkeypatch.context() as patch:
+        patch.setattr("thor2_jax.run_folder._restore_weights", lambda path, n_inputs, n_classes: None)
+        found = damaged_and_back(run / "run.json", other, lambda: load_run(run), attempt)
+    assert found is None or (found.config == CONFIG and len(found.classes) == 2)
+
+
+@settings(max_examples=30)
+@given(data=st.data())
+def test_files_of_weights_and_network(data: st.DataObject, run: Path, attempt: Any) -> None:
+    files = sorted(p for p in run.rglob("*") if p.is_file() and p.name != "run.json" and p.stat().st_size)
+    path = data.draw(st.sampled_from(files))
+    other = data.draw(damaged(path.read_bytes()))
+    same = other == path.read_bytes()
+    found = damaged_and_back(path, other, lambda: same or load_run(run), attempt)
+    assert (found is None) == (not same)
+
+
+@pytest.mark.parametrize("value", ["9" * 5000, "[" * 10**5, "1e400", "-1", "null"])
+def test_odd_numbers(value: str, run: Path, attempt: Any) -> None:
+    for key in ("n_slices", "sigma_s", "image_size"):
+        table = json.loads((run / "run.json").read_bytes())
+        table["descriptor_config"][key] = "PART"
+        other = json.dumps(table).replace('"PART"', value).encode()
+        assert damaged_and_back(run / "run.json", other, lambda: load_run(run), attempt) is None
+
+
+def test_a_run_without_digests_that_would_fill_memory(run: Path, attempt: Any, tmp_path: Path) -> None:
+    """As folders were written before there were digests: sizes are compared before anything of theirs is made."""
+    path = Path(shutil.copytree(run, tmp_path / "run"))
+    for key in ("n_slices", "n_strips"):
+        table = json.loads((run / "run.json").read_bytes())
+        del table["weights"]
+        table["descriptor_config"][key] = 10**7
+        (path / "run.json").write_text(json.dumps(table))
+        assert attempt(lambda: load_run(path)) is None
+
+
+ROWS = b"".join(
+    json.dumps({"fold": 0, "classifier": "ce", "epoch": k, "loss": 0.5, "accuracy": 0.75}).encode() + b"\n"
+    for k in range(3)
+)
+
+
+@given(content=damaged(ROWS))
+def test_figures(content: bytes, attempt: Any, tmp_path_factory: Any) -> None:
+    path = tmp_path_factory.getbasetemp() / "metrics.jsonl"
+    path.write_bytes(content)
+    found = attempt(lambda: read_figures(path))
+    assert found is None or all((row["fold"], row["classifier"], row["epoch"]) for row in found)
+
+
+def test_whole_runs_are_read(run: Path) -> None:
+    assert load_run(run).classes == ("mug", "bowl") and np.isfinite(load_run(run).config.sigma_s)

@@ -1,0 +1,258 @@
+"""Damaged datasets: tables in JSON and YAML, point clouds, views; and the colour network."""
+
+import hashlib
+import io
+import json
+import shutil
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+import colornet
+from thor2_jax.testing import damaged, networks
+from training.meshes import read_names
+from training.normalized_views import NormalizedViews
+from training.readers.bop import BOP
+from training.readers.files import read_table
+from training.readers.frames import FrameFolder
+from training.readers.ocid import OCID
+from training.readers.pcd import read_organized_points
+from training.readers.uwis import UWISOccluded
+from training.view_dataset import MANIFEST, Manifest, Shard, ViewDataset, encode
+
+HEIGHT, WIDTH = 6, 8
+LAUGHS = "\n".join(
+    ["a0: &a0 [x, x, x, x, x, x, x, x]"] + [f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 8)}]" for k in range(1, 12)]
+).encode()
+"""A few hundred bytes of YAML that are 8^12 words when they are written out."""
+
+
+def save(path: Path, pixels: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(pixels).save(path)
+
+
+def images(labels: int = 2) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(0)
+    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+    mask[2:5, 2:6] = labels
+    return rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8), np.full((HEIGHT, WIDTH), 700, np.uint16), mask
+
+
+def pcd(kind: str) -> bytes:
+    row, column = np.mgrid[:HEIGHT, :WIDTH]
+    z = np.full((HEIGHT, WIDTH), 0.7)
+    points = np.stack([(column - 3.5) / 9 * z, (row - 2.5) / 9 * z, z, np.zeros_like(z)], axis=-1).reshape(-1, 4)
+    header = (
+        "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z rgb\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\n"
+        f"WIDTH {WIDTH}\nHEIGHT {HEIGHT}\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {HEIGHT * WIDTH}\nDATA {kind}\n"
+    ).encode()
+    text = "".join(" ".join(f"{v:.6g}" for v in point) + "\n" for point in points)
+    return header + (points.astype("<f4").tobytes() if kind == "binary" else text.encode())
+
+
+def bop(path: Path) -> tuple[Any, list[str]]:
+    color, depth, mask = images()
+    save(path / "rgb" / "000001.png", color)
+    save(path / "depth" / "000001.png", depth)
+    save(path / "mask_visib" / "000001_000000.png", mask)
+    tables = {
+        "scene_camera.json": {"1": {"cam_K": [9.0, 0, 3.5, 0, 9.0, 2.5, 0, 0, 1], "depth_scale": 1.0}},
+        "scene_gt.json": {"1": [{"obj_id": 3, "cam_t_m2c": [0, 0, 700.5]}]},
+        "scene_gt_info.json": {"1": [{"visib_fract": 0.75}]},
+    }
+    for name, table in tables.items():
+        (path / name).write_text(json.dumps(table))
+    (path / "names.yaml").write_text("3: mug\n4: bowl\n")
+    return (lambda: list(BOP(path, path / "names.yaml"))), [*tables, "names.yaml"]
+
+
+def ocid(path: Path) -> tuple[Any, list[str]]:
+    folder = path / "table" / "top" / "mixed" / "seq01"
+    color, depth, mask = images(3)
+    for name, pixels in (("rgb", color), ("depth", depth), ("label", mask)):
+        save(folder / name / "a.png", pixels)
+    (folder / "pcd").mkdir()
+    (folder / "pcd" / "a.pcd").write_bytes(pcd("binary"))
+    (path / "names.yaml").write_text("seq01: [mug, bowl]\n")
+    return (lambda: list(OCID(path, path / "names.yaml"))), [
+        "names.yaml",
+        str((folder / "pcd/a.pcd").relative_to(path)),
+    ]
+
+
+def uwis(path: Path) -> tuple[Any, list[str]]:
+    for name, pixels in zip(("rgb", "depth", "labels"), images(), strict=True):
+        save(path / "41" / "images" / f"000001_{name}.png", pixels)
+    (path / "41" / "images" / "000001_poses.yaml").write_text(
+        "mug:\n  label: 2\n  pose: [[1.0, 0, 0], [0, 1, 0]]\nbowl:\n  label: 4\n"
+    )
+    return (lambda: list(UWISOccluded(path))), ["41/images/000001_poses.yaml"]
+
+
+def folders(path: Path) -> tuple[Any, list[str]]:
+    for name, pixels in zip(("color", "depth", "mask"), images(), strict=True):
+        save(path / "one" / f"{name}.png", pixels)
+    (path / "one" / "intrinsics.json").write_text('{"fx": 9.0, "fy": 9.5, "cx": 3.5, "cy": 2.5}')
+    (path / "one" / "labels.json").write_text('{"labels": {"2": "mug"}, "light": 1}')
+    return (lambda: list(FrameFolder(path))), ["one/labels.json", "one/intrinsics.json"]
+
+
+@pytest.mark.parametrize("make", [bop, ocid, uwis, folders], ids=lambda make: make.__name__)
+def test_datasets(make: Any, attempt: Any, tmp_path_factory: pytest.TempPathFactory) -> None:
+    """One table or cloud of a small dataset is damaged; the whole is read."""
+    path = tmp_path_factory.mktemp(make.__name__)
+    read, names = make(path)
+    assert len(read()) == 1
+    whole = {name: (path / name).read_bytes() for name in names}
+
+    @settings(settings.get_profile("quick-fuzz"))
+    @given(data=st.data(), name=st.sampled_from(names))
+    def law(data: st.DataObject, name: str) -> None:
+        (path / name).write_bytes(data.draw(damaged(whole[name])))
+        try:
+            found = attempt(read)
+        finally:
+            (path / name).write_bytes(whole[name])
+        assert found is None or all(type(v) is str for item in found for v in item.truth.values())
+
+    law()
+    for name in names:
+        for content in (LAUGHS, b"[" * 5000, b"!!int ''", b"!!timestamp 2020-99-99", b"? [a]\n: b", b"2: &a [*a]"):
+            (path / name).write_bytes(content)
+            attempt(read)
+            (path / name).write_bytes(whole[name])
+
+
+@pytest.mark.parametrize("content", [LAUGHS, b"a: " + b"[" * 5000, b"!!int ''", b"a: &b [*b]", b"a: !!float ''"])
+def test_odd_yaml(content: bytes, attempt: Any, tmp_path: Path) -> None:
+    path = tmp_path / "table.yaml"
+    path.write_bytes(content)
+    for read in (read_table, read_names):
+        found = attempt(lambda read=read: read(path))
+        assert found is None
+
+
+@pytest.mark.parametrize("kind", ["ascii", "binary"])
+@given(data=st.data())
+def test_point_clouds(kind: str, data: st.DataObject, attempt: Any, tmp_path_factory: Any) -> None:
+    path = tmp_path_factory.getbasetemp() / "a.pcd"
+    path.write_bytes(data.draw(damaged(pcd(kind))))
+    found = attempt(lambda: read_organized_points(path))
+    assert found is None or (found.ndim == 3 and found.shape[2] == 3)
+
+
+@pytest.fixture(scope="module")
+def views(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("views")
+    rng = np.random.default_rng(0)
+    counts = np.array([5, 7])
+    xyz = rng.integers(0, 2**14, (12, 3)).astype(np.float32) / 2**14
+    numbers = np.array([0, 1], np.int32)
+    found = NormalizedViews(
+        xyz, rng.integers(0, 256, (12, 3), dtype=np.uint8), counts, 0, numbers, np.zeros(2, np.int32)
+    )
+    content = encode(found)
+    (path / "0000-0000.safetensors").write_bytes(content)
+    shard = Shard("0000-0000.safetensors", hashlib.sha256(content).hexdigest(), 0, 2, 0, 12)
+    Manifest({"descriptor_version": 1, "objects": [{"name": "mug", "mesh": "0"}], "shards": 1}, (shard,)).write(path)
+    return path
+
+
+def read_views(path: Path) -> list[Any]:
+    dataset = ViewDataset.open(path)
+    assert dataset.record
+    return [dataset.classes, len(dataset), *(dataset.read(k) for k in range(len(dataset.shards)))]
+
+
+@pytest.mark.parametrize("name", [MANIFEST, "0000-0000.safetensors"])
+@given(data=st.data())
+def test_views(name: str, data: st.DataObject, views: Path, attempt: Any) -> None:
+    content = (views / name).read_bytes()
+    other = data.draw(damaged(content))
+    (views / name).write_bytes(other)
+    try:
+        found = attempt(lambda: read_views(views))
+    finally:
+        (views / name).write_bytes(content)
+    assert (found is None) == (other != content)
+
+
+@given(data=st.data())
+def test_a_manifest_with_a_right_checksum(data: st.DataObject, views: Path, attempt: Any) -> None:
+    """As of another program: the table is whole, and says something else."""
+    content = (views / MANIFEST).read_bytes()
+    table = json.loads(content)
+    del table["sha256"]
+    try:
+        other = json.loads(data.draw(damaged(json.dumps(table, indent=1).encode(), 1)))
+    except (ValueError, RecursionError):
+        return
+    if isinstance(other, dict):
+        other["sha256"] = hashlib.sha256((json.dumps(other, indent=1) + "\n").encode()).hexdigest()
+    (views / MANIFEST).write_text(json.dumps(other, indent=1) + "\n")
+    try:
+        attempt(lambda: read_views(views))
+    finally:
+        (views / MANIFEST).write_bytes(content)
+
+
+@given(data=st.data())
+def test_networks(data: st.DataObject, attempt: Any, tmp_path_factory: Any) -> None:
+    """The whole file, or one of its arrays in an archive with the right checksums."""
+    path = tmp_path_factory.getbasetemp() / "network.npz"
+    content = NETWORK_FILE
+    if data.draw(st.booleans()):
+        content = data.draw(damaged(content))
+    else:
+        stream = io.BytesIO()
+        with zipfile.ZipFile(io.BytesIO(content)) as source, zipfile.ZipFile(stream, "w") as target:
+            name = data.draw(st.sampled_from(source.namelist()))
+            for member in source.namelist():
+                part = source.read(member)
+                head = part[:256]
+                target.writestr(member, data.draw(damaged(head, 1)) + part[256:] if member == name else part)
+        content = stream.getvalue()
+    path.write_bytes(content)
+    found = attempt(lambda: colornet.load(path), (ValueError, OSError))
+    if found is not None:
+        weights = found.membership(np.arange(300, dtype=np.uint16).astype(np.uint8).reshape(-1, 3))
+        np.testing.assert_allclose(weights.sum(axis=1), 1, rtol=1e-6)
+
+
+NETWORK_FILE = (Path(colornet.__file__).parent / "data" / "network.npz").read_bytes()
+
+
+@pytest.mark.parametrize("times", [400, 4000])
+def test_an_archive_that_would_fill_memory(times: int, attempt: Any, tmp_path: Path) -> None:
+    """Zeros: a thousandth of their size in the file."""
+    path = tmp_path / "bomb.npz"
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": (times * 2**17,)})
+    with (
+        zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive,
+        archive.open("mean_rgb.npy", "w", force_zip64=True) as member,
+    ):
+        member.write(header.getvalue())
+        for _ in range(min(times, 1000)):
+            member.write(bytes(2**20))
+    with pytest.raises(ValueError, match="bomb.npz"):
+        attempt(lambda: colornet.load(path), ())
+
+
+@settings(max_examples=10)
+@given(network=networks())
+def test_networks_come_back(network: colornet.ColorNetwork, tmp_path_factory: Any) -> None:
+    path = tmp_path_factory.getbasetemp() / "network.npz"
+    network.save(path)
+    assert colornet.load(path).fingerprint == network.fingerprint
+
+
+def test_copies(views: Path, tmp_path: Path) -> None:
+    assert len(read_views(Path(shutil.copytree(views, tmp_path / "views")))) == 3

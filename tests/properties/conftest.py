@@ -1,0 +1,111 @@
+"""The ways of calling the software that every law is held to, and how many examples of each are drawn."""
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import pytest
+from hypothesis import HealthCheck, settings
+
+import colornet
+import thor2_jax as thor2
+
+NETWORK = colornet.load_default()
+SIZE = 4
+"""Clouds in a batch; two batches of two under vmap."""
+
+for tier, examples in (("quick", 4), ("thorough", 60)):
+    settings.register_profile(
+        tier,
+        max_examples=examples,
+        deadline=None,
+        derandomize=True,
+        database=None,
+        suppress_health_check=[HealthCheck.too_slow],
+    )
+
+
+def pytest_collectstart(collector: pytest.Collector) -> None:
+    """The slow tier draws fifteen times as many examples of every law."""
+    if isinstance(collector, pytest.Module):
+        settings.load_profile("quick" if "not slow" in collector.config.getoption("markexpr") else "thorough")
+
+
+def pytest_collectreport() -> None:
+    """Other folders' tests have Hypothesis as they know it."""
+    settings.load_profile("default")
+
+
+@dataclasses.dataclass(frozen=True)
+class Pipeline:
+    """The functions under test, called plainly, under jit, or under vmap, with clouds padded to one capacity."""
+
+    config: thor2.DescriptorConfig
+    mode: str
+    capacity: int
+
+    def _called(self, function: Any, *arguments: Any) -> Any:
+        return _compiled(function, self.config, self.mode)(*arguments)
+
+    def describe(self, clouds: thor2.PointClouds, parameters: thor2.Parameters | None = None) -> thor2.Descriptors:
+        return self._called(thor2.describe, clouds, parameters or thor2.Parameters.of(NETWORK, self.config))
+
+    def describe_aligned(
+        self, aligned: thor2.PointClouds, parameters: thor2.Parameters | None = None
+    ) -> thor2.Descriptors:
+        return self._called(thor2.describe_aligned, aligned, parameters or thor2.Parameters.of(NETWORK, self.config))
+
+
+@functools.cache
+def _compiled(function: Any, config: thor2.DescriptorConfig, mode: str) -> Any:
+    def call(clouds: thor2.PointClouds, parameters: thor2.Parameters) -> Any:
+        return function(clouds, NETWORK, config, parameters)
+
+    if mode == "plain":
+        return call
+    if mode == "jit":
+        return jax.jit(call)
+    mapped = jax.vmap(call, in_axes=(0, None))
+
+    def in_pairs(clouds: thor2.PointClouds, parameters: thor2.Parameters) -> Any:
+        pairs = jax.tree.map(lambda a: a.reshape(-1, 2, *a.shape[1:]), clouds)
+        return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), mapped(pairs, parameters))
+
+    return in_pairs
+
+
+QUICK = {
+    ("closed_form", "plain", 512),
+    ("gudhi", "plain", 512),
+    ("gudhi", "jit", 512),
+    ("closed_form", "vmap", 512),
+    ("gudhi", "vmap", 1024),
+}
+
+
+def ways(*capacities: int) -> list[Any]:
+    """Backends, ways of calling and buckets: each with each in the slow tier, each at least once in the quick one."""
+    found = []
+    for n in capacities:
+        for mode in ("plain", "jit", "vmap"):
+            for homology in ("closed_form", "gudhi"):
+                marks = () if (homology, mode, n) in QUICK else pytest.mark.slow
+                found.append(pytest.param((homology, mode, n), marks=marks, id=f"{homology}-{mode}-{n}"))
+    return found
+
+
+def pipeline_of(way: tuple[Any, str, int]) -> Pipeline:
+    return Pipeline(thor2.DescriptorConfig(homology=way[0]), way[1], way[2])
+
+
+@pytest.fixture(scope="session", params=ways(512, 1024))
+def pipeline(request: pytest.FixtureRequest) -> Pipeline:
+    """Backend, way of calling and bucket."""
+    return pipeline_of(request.param)
+
+
+@pytest.fixture(scope="session", params=ways(512))
+def small_pipeline(request: pytest.FixtureRequest) -> Pipeline:
+    """Backend and way of calling, in the smallest bucket."""
+    return pipeline_of(request.param)

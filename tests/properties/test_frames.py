@@ -1,0 +1,17 @@
+"""Laws on the way from a frame to its clouds."""
+
+from hypothesis import given
+
+from thor2_jax import testing as laws
+from thor2_jax.frames import RGBDFrame
+from thor2_jax.instance_clouds import instance_clouds
+
+
+@given(frame=laws.frames(), seed=laws.seeds())
+def test_label_numbers_are_names(frame: RGBDFrame, seed: int) -> None:
+    laws.assert_labels_are_names(instance_clouds, frame, seed)
+
+
+@given(frame=laws.frames())
+def test_units_of_depth(frame: RGBDFrame) -> None:
+    laws.assert_depth_units_agree(instance_clouds, frame)

@@ -1,0 +1,96 @@
+"""What must not change a descriptor: every law over both backends, plainly, under jit and vmap, in two buckets."""
+
+import dataclasses
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+import colornet
+import thor2_jax as thor2
+from thor2_jax import testing as laws
+
+NETWORK = colornet.load_default()
+CONFIG = thor2.DescriptorConfig()
+SIZE = 4
+
+
+def draw(data: st.DataObject, clouds: Any, capacity: int) -> thor2.PointClouds:
+    return data.draw(laws.packed(clouds, SIZE, capacity))
+
+
+@given(data=st.data(), seed=laws.seeds())
+def test_order_of_points(pipeline: Any, data: st.DataObject, seed: int) -> None:
+    aligned = draw(data, laws.aligned_clouds(CONFIG), pipeline.capacity)
+    laws.assert_permutation_invariant(pipeline.describe_aligned, aligned, seed, CONFIG)
+    clouds = draw(data, laws.decided_clouds(CONFIG), pipeline.capacity)
+    drift = laws.alignment_drift(clouds, CONFIG)
+    laws.assert_permutation_invariant(pipeline.describe, clouds, seed, CONFIG, drift)
+
+
+@given(data=st.data())
+def test_padding(small_pipeline: Any, data: st.DataObject) -> None:
+    aligned = draw(data, laws.aligned_clouds(CONFIG), 512)
+    laws.assert_padding_invariant(small_pipeline.describe_aligned, aligned, 1024, CONFIG)
+    clouds = draw(data, laws.decided_clouds(CONFIG), 512)
+    drift = laws.alignment_drift(clouds, CONFIG)
+    laws.assert_padding_invariant(small_pipeline.describe, clouds, 1024, CONFIG, drift)
+
+
+@given(data=st.data())
+def test_company(pipeline: Any, data: st.DataObject) -> None:
+    for strategy, describe in (
+        (laws.camera_clouds(), pipeline.describe),
+        (laws.aligned_clouds(CONFIG, reach=1.5), pipeline.describe_aligned),
+    ):
+        laws.assert_company_invariant(
+            describe, draw(data, strategy, pipeline.capacity), draw(data, strategy, pipeline.capacity)
+        )
+
+
+@given(data=st.data(), steps=st.tuples(*[st.integers(-2048, 2048)] * 3))
+def test_translation(pipeline: Any, data: st.DataObject, steps: tuple[int, int, int]) -> None:
+    clouds = draw(data, laws.lattice_clouds(), pipeline.capacity)
+    laws.assert_translation_invariant(pipeline.describe, clouds, np.array(steps) / 2048)
+
+
+@given(data=st.data(), rotation=laws.rotations(), shift=st.tuples(*[st.floats(-1, 1)] * 3))
+def test_rigid_motion(pipeline: Any, data: st.DataObject, rotation: np.ndarray, shift: tuple[float, ...]) -> None:
+    clouds = draw(data, laws.decided_clouds(CONFIG), pipeline.capacity)
+    away = dataclasses.replace(clouds, points=jnp.asarray(np.asarray(clouds.points) @ rotation.T + shift, jnp.float32))
+    drift = max(laws.alignment_drift(placed, CONFIG) for placed in (clouds, away))
+    laws.assert_rigid_motion_invariant(pipeline.describe, clouds, rotation, shift, CONFIG, drift)
+
+
+@given(data=st.data(), exponent=st.integers(-4, 4), sigma_s=st.floats(0.5, 5, width=32))
+def test_metric_scale(pipeline: Any, data: st.DataObject, exponent: int, sigma_s: float) -> None:
+    parameters = thor2.Parameters.of(NETWORK, CONFIG)
+
+    def describe_at(clouds: thor2.PointClouds, sigma_s: float) -> thor2.Descriptors:
+        return pipeline.describe(clouds, dataclasses.replace(parameters, sigma_s=jnp.float32(sigma_s)))
+
+    clouds = draw(data, laws.camera_clouds(), pipeline.capacity)
+    laws.assert_scale_invariant(describe_at, clouds, sigma_s, exponent)
+
+
+@given(data=st.data())
+def test_duplicates(pipeline: Any, data: st.DataObject) -> None:
+    aligned = draw(data, laws.aligned_clouds(CONFIG, max_points=256), pipeline.capacity)
+    laws.assert_duplicates_count_twice(pipeline.describe_aligned, aligned, CONFIG)
+    clouds = draw(data, laws.decided_clouds(CONFIG, max_points=256), pipeline.capacity)
+    drift = laws.alignment_drift(clouds, CONFIG)
+    laws.assert_duplicates_count_twice(pipeline.describe, clouds, CONFIG, drift)
+
+
+@given(data=st.data(), seed=laws.seeds())
+def test_colours_of_the_same_regions(pipeline: Any, data: st.DataObject, seed: int) -> None:
+    clouds = draw(data, laws.camera_clouds(), pipeline.capacity)
+    laws.assert_same_regions_alike(pipeline.describe, clouds, NETWORK, seed)
+
+
+@given(data=st.data(), m=st.integers(0, 7))
+def test_object_unity(pipeline: Any, data: st.DataObject, m: int) -> None:
+    aligned = draw(data, laws.aligned_clouds(CONFIG, reach=1.3), pipeline.capacity)
+    laws.assert_object_unity(pipeline.describe_aligned, aligned, CONFIG, m)

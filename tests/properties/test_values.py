@@ -1,0 +1,166 @@
+"""What a descriptor's numbers are: masses, linearity, stability, the equations, the limit of the relaxation."""
+
+import dataclasses
+import math
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import colornet
+import thor2_jax as thor2
+from thor2_jax import testing as laws
+
+NETWORK = colornet.load_default()
+CONFIG = thor2.DescriptorConfig(homology="closed_form")
+SIZE = 4
+
+
+def aligned_batches(max_points: int = 512, margin: float = 0.1, reach: float = 1.0) -> Any:
+    return laws.packed(laws.aligned_clouds(CONFIG, max_points=max_points, margin=margin, reach=reach), SIZE, 512)
+
+
+@given(clouds=laws.packed(laws.camera_clouds(), SIZE, 512), aligned=aligned_batches(reach=1.5))
+def test_gudhi_is_the_closed_form(clouds: thor2.PointClouds, aligned: thor2.PointClouds) -> None:
+    for function, batch in ((thor2.describe, clouds), (thor2.describe_aligned, aligned)):
+        for config in (CONFIG, thor2.DescriptorConfig.released(homology="closed_form")):
+            both = [dataclasses.replace(config, homology=name) for name in ("closed_form", "gudhi")]
+            first, second = (lambda clouds, c=c, f=function: f(clouds, NETWORK, c) for c in both)
+            laws.assert_backends_agree(first, second, batch)
+
+
+@given(data=st.data())
+def test_image_mass(pipeline: Any, data: st.DataObject) -> None:
+    aligned = data.draw(laws.packed(laws.aligned_clouds(CONFIG, reach=1.5), SIZE, pipeline.capacity))
+    images = pipeline.describe_aligned(aligned).images
+    laws.assert_image_mass(images, thor2.diagrams(aligned, pipeline.config), CONFIG)
+
+
+@given(aligned=aligned_batches(reach=1.5), network=laws.networks())
+def test_colour_mass(aligned: thor2.PointClouds, network: colornet.ColorNetwork) -> None:
+    for of_colors in (NETWORK, network):
+        laws.assert_color_mass(thor2.strips(aligned, of_colors, CONFIG), aligned)
+
+
+@given(data=st.data(), seed=laws.seeds(), factors=st.tuples(*[st.integers(-8, 8).map(lambda k: k / 4)] * 2))
+def test_embedding_is_linear_in_similarity(
+    pipeline: Any, data: st.DataObject, seed: int, factors: tuple[float, float]
+) -> None:
+    parameters = thor2.Parameters.of(NETWORK, CONFIG)
+
+    def describe_with(clouds: thor2.PointClouds, similarity: np.ndarray) -> thor2.Descriptors:
+        return pipeline.describe_aligned(clouds, dataclasses.replace(parameters, similarity=jnp.asarray(similarity)))
+
+    rng = np.random.default_rng(seed)
+    pair = tuple(rng.normal(size=(22, 22)).astype(np.float32) for _ in range(2))
+    aligned = data.draw(laws.packed(laws.aligned_clouds(CONFIG), SIZE, pipeline.capacity))
+    laws.assert_embedding_linear(describe_with, aligned, pair, factors)
+
+
+@given(data=st.data())
+def test_embedding_is_linear_in_counts(pipeline: Any, data: st.DataObject) -> None:
+    strategy = laws.packed(laws.aligned_clouds(CONFIG, max_points=256), SIZE, pipeline.capacity)
+    laws.assert_embedding_additive(pipeline.describe_aligned, data.draw(strategy), data.draw(strategy))
+
+
+@given(aligned=aligned_batches(), network=laws.networks(), seed=laws.seeds())
+def test_other_networks(aligned: thor2.PointClouds, network: colornet.ColorNetwork, seed: int) -> None:
+    def describe(clouds: thor2.PointClouds) -> thor2.Descriptors:
+        return thor2.describe_aligned(clouds, network, CONFIG)
+
+    laws.assert_same_regions_alike(describe, aligned, network, seed)
+    laws.assert_follows_equations(describe, aligned, network, CONFIG)
+
+
+@pytest.mark.parametrize("convention", ["paper", "released"])
+@given(data=st.data(), reach=st.sampled_from([1.0, 1.6]))
+def test_equations(convention: Any, pipeline: Any, data: st.DataObject, reach: float) -> None:
+    """The released preset among them; overflow is told by the same count."""
+    ways = dataclasses.replace(pipeline, config=dataclasses.replace(pipeline.config, convention=convention))
+    aligned = data.draw(laws.packed(laws.aligned_clouds(CONFIG, reach=reach), SIZE, pipeline.capacity))
+    laws.assert_follows_equations(ways.describe_aligned, aligned, NETWORK, ways.config)
+
+
+@given(aligned=aligned_batches(), exponent=st.integers(1, 37), seed=laws.seeds())
+def test_overflow_is_never_silent(aligned: thor2.PointClouds, exponent: int, seed: int) -> None:
+    """Points anywhere that float32 can say: strays as far as 10^37, on either side of the origin."""
+    rng = np.random.default_rng(seed)
+    points = np.asarray(aligned.points, np.float64)
+    stray = rng.random(points.shape[:2]) < 0.05
+    points[stray] = (
+        rng.choice([-1, 1], (int(stray.sum()), 3)) * rng.uniform(1, 9.9, (int(stray.sum()), 3)) * 10.0**exponent
+    )
+    clouds = dataclasses.replace(aligned, points=jnp.asarray(points * np.asarray(aligned.mask)[..., None], jnp.float32))
+    laws.assert_overflow_told(lambda clouds: thor2.describe_aligned(clouds, NETWORK, CONFIG), clouds, NETWORK, CONFIG)
+
+
+@pytest.mark.parametrize("far", [1e7, 1e8, 1e37])
+def test_what_is_too_far_to_be_sliced_overflows(far: float) -> None:
+    """Hundredths of it do not fit into 32 bits; squares of a cloud as large are infinite, its frame no numbers."""
+    points = np.array([[0.1, 0.1, 0.15], [far, 0.1, 0.15], [-far, 0.1, 0.15], [0.1, 0.2, far]])
+    clouds = thor2.PointClouds.pack([(points, np.zeros((4, 3)))], 512)
+    whole = np.random.default_rng(0).random((40, 3)) * far * 1e13 if far < 1e20 else np.full((40, 3), far)
+    for config in (CONFIG, thor2.DescriptorConfig.released(homology="closed_form")):
+        found = thor2.describe_aligned(clouds, NETWORK, config)
+        assert int(found.overflow[0]) == 3 and np.isfinite(np.asarray(found.tops2)).all()
+        moved = thor2.describe(thor2.PointClouds.pack([(whole, np.zeros((40, 3)))], 512), NETWORK, config)
+        assert int(moved.overflow[0]) == 40 and not np.asarray(moved.tops2).any()
+
+
+@given(aligned=aligned_batches(), axis=st.sampled_from("xyz"))
+def test_mirrored_strips(aligned: thor2.PointClouds, axis: str) -> None:
+    laws.assert_mirrored_strips(lambda clouds: thor2.strips(clouds, NETWORK, CONFIG), aligned, CONFIG, axis)
+
+
+def test_a_hidden_end_turns_the_cloud() -> None:
+    seen: set[int] = set()
+
+    @settings(settings.get_profile("quick"), max_examples=15)
+    @given(clouds=laws.packed(laws.camera_clouds(), SIZE, 512), seed=laws.seeds())
+    def law(clouds: thor2.PointClouds, seed: int) -> None:
+        found = laws.assert_flip_follows_rule(lambda clouds: thor2.view_normalize(clouds, CONFIG), clouds, seed)
+        seen.update(found.tolist())
+
+    law()
+    assert {0, 1} <= seen
+
+
+@given(data=st.data(), seed=laws.seeds(), eps=st.floats(1e-4, 0.0025))
+def test_stability(pipeline: Any, data: st.DataObject, seed: int, eps: float) -> None:
+    aligned = data.draw(laws.packed(laws.aligned_clouds(CONFIG), SIZE, pipeline.capacity))
+    moved = laws.moved_within_strips(aligned, CONFIG, seed, eps)
+    share = laws.assert_stable(
+        pipeline.describe_aligned, lambda c: thor2.diagrams(c, pipeline.config), aligned, moved, eps, CONFIG
+    )
+    assert share <= 1 / math.sqrt(5) + 0.01
+
+
+def test_how_tight_the_theorem_is() -> None:
+    """The larger a persistence, the nearer to 1 / sqrt(5) of the bound; the rest is for births that move."""
+
+    def share(height: float) -> float:
+        both = [
+            thor2.PointClouds.pack([(np.array([[0.4, 0, 0.05], [0.4, y, 0.05]]), np.zeros((2, 3)))], 512)
+            for y in (height, height + 0.002)
+        ]
+        return laws.assert_stable(
+            lambda clouds: thor2.describe_aligned(clouds, NETWORK, CONFIG),
+            lambda clouds: thor2.diagrams(clouds, CONFIG),
+            *both,
+            0.001,
+            CONFIG,
+        )
+
+    shares = [share(height) for height in (0.05, 0.2, 0.5)]
+    assert shares == sorted(shares) and 0.38 < shares[-1] < 1 / math.sqrt(5), shares
+
+
+@given(aligned=aligned_batches(max_points=256, margin=0.2), factor=st.sampled_from([0.02, 0.01]))
+def test_the_relaxation_becomes_the_hard_descriptor(aligned: thor2.PointClouds, factor: float) -> None:
+    def describe_at(clouds: thor2.PointClouds, config: thor2.DescriptorConfig) -> thor2.Descriptors:
+        return thor2.describe_aligned(clouds, NETWORK, config)
+
+    laws.assert_relaxation_converges(describe_at, aligned, NETWORK, CONFIG, factor)

@@ -1,0 +1,100 @@
+"""A Hypothesis strategy for damaged files, to hold readers to: an error of theirs or a right answer, nothing else.
+
+@given(damaged(path.read_bytes()))
+def test_reader(content):
+    ...
+"""
+
+from collections.abc import Callable
+
+import hypothesis.strategies as st
+import numpy as np
+
+from thor2_jax.testing.clouds import seeds
+
+__all__ = ["damaged"]
+
+_NUMBERS = [b"-1", b"0", b"1e400", b"nan", b"4294967296", b"9" * 30, b"null", b"[]", b'""', b"{}", b"true", b"1" * 5000]
+"""In the place of a number in a text."""
+
+_EXTREMES = [0, 1, 2**7, 2**8 - 1, 2**15, 2**16 - 1, 2**31 - 1, 2**31, 2**32 - 1]
+"""In the place of a number in a binary header."""
+
+
+def _place(content: bytearray, rng: np.random.Generator) -> int:
+    """Anywhere, half of the time among the first bytes, where headers are."""
+    return int(rng.integers(min(len(content), 128) if rng.random() < 0.5 else len(content)))
+
+
+def _flip(content: bytearray, rng: np.random.Generator) -> bytearray:
+    for _ in range(int(rng.integers(1, 9))):
+        content[_place(content, rng)] ^= 1 << int(rng.integers(8))
+    return content
+
+
+def _cut(content: bytearray, rng: np.random.Generator) -> bytearray:
+    return content[: int(rng.integers(len(content)))]
+
+
+def _splice(content: bytearray, rng: np.random.Generator) -> bytearray:
+    """A piece of the file in the place of another, or in between, or gone."""
+    source, target = _place(content, rng), _place(content, rng)
+    length = int(rng.integers(1, 65))
+    piece = content[source : source + length] if rng.random() < 0.7 else bytearray()
+    return content[:target] + piece + content[target + length * int(rng.integers(2)) :]
+
+
+def _extreme(content: bytearray, rng: np.random.Generator) -> bytearray:
+    at, size = _place(content, rng), int(rng.choice([1, 2, 4]))
+    value = int(rng.choice(_EXTREMES)) % 256**size
+    content[at : at + size] = value.to_bytes(size, "big" if rng.random() < 0.5 else "little")
+    return content
+
+
+def _number(content: bytearray, rng: np.random.Generator) -> bytearray:
+    """Another number, or something else, where a text has one."""
+    digits = np.flatnonzero((np.frombuffer(bytes(content), np.uint8) - 48) < 10)
+    if len(digits) == 0:
+        return _flip(content, rng)
+    start = end = int(rng.choice(digits))
+    while end < len(content) and chr(content[end]) in "0123456789.":
+        end += 1
+    return content[:start] + _NUMBERS[int(rng.integers(len(_NUMBERS)))] + content[end:]
+
+
+def _lines(content: bytearray, rng: np.random.Generator) -> bytearray:
+    """A line left out, doubled, or exchanged with another."""
+    lines = content.split(b"\n")
+    a, b = rng.integers(len(lines), size=2)
+    way = int(rng.integers(3))
+    if way == 0:
+        del lines[a]
+    elif way == 1:
+        lines.insert(b, lines[a])
+    else:
+        lines[a], lines[b] = lines[b], lines[a]
+    return bytearray(b"\n").join(lines)
+
+
+_WAYS: list[Callable[[bytearray, np.random.Generator], bytearray]] = [_flip, _cut, _splice, _extreme, _number, _lines]
+
+
+def _damage(content: bytes, seed: int, times: int) -> bytes:
+    rng, found = np.random.default_rng(seed), bytearray(content)
+    for _ in range(times):
+        if found:
+            found = _WAYS[int(rng.integers(len(_WAYS)))](found, rng)
+    return bytes(found)
+
+
+def damaged(content: bytes, times: int = 3) -> st.SearchStrategy[bytes]:
+    """The bytes of a file after one or more damages.
+
+    Bits flipped, the end cut off, pieces moved, left out or doubled, extreme numbers in binary headers and in texts,
+    lines left out, doubled or exchanged.
+
+    Args:
+        content: of a valid file.
+        times: the most damages.
+    """
+    return st.builds(_damage, st.just(content), seeds(), st.integers(1, times))

@@ -1,0 +1,258 @@
+"""Laws on what a descriptor's numbers are: masses, linearity, stability, the equations themselves, and their limits."""
+
+import dataclasses
+import math
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colornet import ColorNetwork
+from thor2_jax.config import DescriptorConfig, Relaxation
+from thor2_jax.testing.comparing import cloud_of, joined, with_points
+from thor2_jax.testing.reference import Reference, pixel_masses, reference_descriptor
+from thor2_jax.testing.tolerances import UNIT, embedding_rounding, image_lipschitz, image_rounding
+from thor2_jax.types import Descriptors, Diagrams, PointClouds, Strips
+
+__all__ = [
+    "assert_color_mass",
+    "assert_embedding_additive",
+    "assert_embedding_linear",
+    "assert_follows_equations",
+    "assert_image_mass",
+    "assert_overflow_told",
+    "assert_relaxation_converges",
+    "assert_stable",
+    "moved_within_strips",
+]
+
+Describe = Callable[[PointClouds], Descriptors]
+
+
+def assert_image_mass(images: NDArray[np.floating], diagrams: Diagrams, config: DescriptorConfig) -> None:
+    """An image's pixels sum to the persistences, each times the share of its Gaussian within the window.
+
+    Never more than their sum, and all of it but for pairs about 3 sigma from the window's border. The shares are
+    computed in float64; the tolerance is the image's rounding.
+
+    Args:
+        images: [..., S, P, P].
+        diagrams: fields [..., S, J], of the same clouds.
+        config: with a persistence weight of 1.
+    """
+    births, deaths = (np.asarray(a, np.float64) for a in (diagrams.births, diagrams.deaths))
+    persistence = np.where(diagrams.mask, deaths - births, 0)
+    inside = [pixel_masses(centres, config).sum(axis=-1) for centres in (births, persistence)]
+    expected = (persistence * inside[0] * inside[1]).sum(axis=-1)
+    total, most = np.asarray(images, np.float64).sum(axis=(-2, -1)), persistence.sum(axis=-1)
+    # Births and deaths have been rounded: their difference is off by 2 u of the death.
+    off = image_rounding(most, config) + 2 * UNIT * (deaths * image_lipschitz(persistence, config)).sum(axis=-1)
+    assert (np.abs(total - expected) <= off).all(), f"mass is off by {np.abs(total - expected).max():.3g}"
+    assert (total <= most + off).all()
+
+
+def assert_color_mass(strips: Strips, clouds: PointClouds) -> None:
+    """Every point counts once: colour vectors sum to the number of points, but for those that overflow.
+
+    Weights 1/m are rounded, relative u, and so are sums of at most 32 of them a strip and of all strips.
+    """
+    points = np.asarray(clouds.mask).sum(axis=1)
+    total = np.asarray(strips.color, np.float64).sum(axis=(-3, -2, -1)) + np.asarray(strips.overflow)
+    assert (np.abs(total - points) <= embedding_rounding(strips.color.shape[-1]) * points).all(), (total, points)
+
+
+def assert_embedding_linear(
+    describe_with: Callable[[PointClouds, NDArray[np.float32]], Descriptors],
+    clouds: PointClouds,
+    similarities: tuple[NDArray[np.float32], NDArray[np.float32]],
+    factors: tuple[float, float],
+) -> None:
+    """E = (C Delta)^T is linear in Delta, and images do not depend on it.
+
+    The tolerance is the rounding of products with entries of either sign: the counts times the sizes of the entries.
+
+    Args:
+        describe_with: from clouds and a similarity [R, R].
+        clouds: any.
+        similarities: two, of any sign.
+        factors: a and b of the combination.
+    """
+    combined = factors[0] * similarities[0] + factors[1] * similarities[1]
+    first, second, found = (describe_with(clouds, np.asarray(s, np.float32)) for s in (*similarities, combined))
+    size = sum(abs(f) * np.abs(s) for f, s in zip(factors, similarities, strict=True))
+    bound = np.asarray(describe_with(clouds, np.asarray(size, np.float32)).embeddings, np.float64)
+    expected = sum(f * np.asarray(d.embeddings, np.float64) for f, d in zip(factors, (first, second), strict=True))
+    off = np.abs(np.asarray(found.embeddings, np.float64) - expected)
+    assert (off <= 2 * embedding_rounding(found.embeddings.shape[-2]) * bound).all(), f"off by {off.max():.3g}"
+    for other in (first, second):
+        np.testing.assert_array_equal(other.images, found.images)
+
+
+def assert_embedding_additive(describe: Describe, first: PointClouds, second: PointClouds) -> None:
+    """Counts add up: the embedding of two aligned clouds in one is the sum of theirs (the paper's convention).
+
+    Args:
+        describe: from aligned clouds.
+        first: clouds, and
+        second: as many, of the same capacity; at most half full, both.
+    """
+    half = first.mask.shape[1] // 2
+    parts = [
+        dataclasses.replace(c, **{n: getattr(c, n)[:, :half] for n in ("points", "colors", "mask", "boundary")})
+        for c in (first, second)
+    ]
+    a, b, both = (np.asarray(describe(c).embeddings, np.float64) for c in (first, second, joined(*parts)))
+    off = np.abs(a + b - both)
+    assert (off <= 2 * embedding_rounding(both.shape[-2]) * both).all(), f"off by {off.max():.3g}"
+
+
+def moved_within_strips(aligned: PointClouds, config: DescriptorConfig, seed: int, eps: float) -> PointClouds:
+    """Every point moved by at most `eps` along each axis, x and z not out of their cell (of which `eps` is a tenth)."""
+    rng = np.random.default_rng(seed)
+    points = np.asarray(aligned.points, np.float64)
+    # Ends of strips all outwards now and then: the worst case.
+    step = (
+        rng.uniform(-eps, eps, points.shape)
+        if rng.random() < 0.5
+        else eps * np.sign(points - points.mean(axis=1, keepdims=True))
+    )
+    for axis, width in ((0, config.sigma_2), (2, config.sigma_1)):
+        low = np.floor(points[..., axis] / width) * width
+        least = np.where(points[..., axis] == 0, 0, low + 0.02 * width)
+        step[..., axis] = np.clip(points[..., axis] + step[..., axis], least, low + 0.98 * width) - points[..., axis]
+    return with_points(aligned, points + step)
+
+
+def assert_stable(
+    describe: Describe,
+    diagrams: Callable[[PointClouds], Diagrams],
+    before: PointClouds,
+    after: PointClouds,
+    eps: float,
+    config: DescriptorConfig,
+) -> float:
+    """Points that move by at most eps within their strips move each image by at most a constant times 2 eps a pair.
+
+    Births stay and each extreme moves by at most eps, so the 1-Wasserstein distance of the diagrams is at most 2 eps a
+    pair. By the theorem for Gaussians of Adams et al. (JMLR 2017) images then differ, summed over pixels, by at most
+    (sqrt(5) |f'| + sqrt(10 / pi) |f| / sigma) W1, with the weight f = p: |f'| = 1, |f| the largest persistence. The law
+    checks both steps, and that the tighter constant for births that stay, sqrt(5) times smaller, holds pair by pair.
+
+    Args:
+        describe: from aligned clouds.
+        diagrams: of aligned clouds.
+        before: `settled` clouds.
+        after: the same, moved (`moved_within_strips`).
+        eps: scaled units.
+        config: with a persistence weight of 1.
+
+    Returns:
+        The largest quotient of a move of an image and the theorem's bound: at most 1 / sqrt(5) but for rounding.
+    """
+    found = [diagrams(clouds) for clouds in (before, after)]
+    np.testing.assert_array_equal(found[0].mask, found[1].mask)
+    np.testing.assert_array_equal(found[0].births, found[1].births)
+    p, q = (np.where(d.mask, np.asarray(d.deaths, np.float64) - np.asarray(d.births, np.float64), 0) for d in found)
+    largest = np.maximum(p, q)
+    rounding = 8 * UNIT * (1 + np.abs(np.asarray(before.points)).max(initial=0))
+    moves = np.abs(p - q)
+    assert moves.max(initial=0) <= 2 * eps + rounding, f"a pair moves by {moves.max():.3g}, points by {eps:.3g}"
+    images = [np.asarray(describe(clouds).images, np.float64) for clouds in (before, after)]
+    off = np.abs(images[0] - images[1]).sum(axis=(-2, -1))
+    slack = 2 * image_rounding(largest.sum(axis=-1), config) + rounding * image_lipschitz(largest, config).sum(axis=-1)
+    tight = (moves * image_lipschitz(largest, config)).sum(axis=-1)
+    assert (off <= tight + slack).all(), f"an image moves by {off.max():.3g}"
+    constant = math.sqrt(5) * image_lipschitz(largest.max(axis=-1, initial=0), config)
+    bound = constant * moves.sum(axis=-1)
+    assert (off <= bound + slack).all()
+    return float((off / np.where(bound > 100 * slack, bound, np.inf)).max(initial=0))
+
+
+def _references(aligned: PointClouds, network: ColorNetwork, config: DescriptorConfig) -> list[Reference]:
+    return [reference_descriptor(*cloud_of(aligned, b), network, config) for b in range(aligned.mask.shape[0])]
+
+
+def assert_follows_equations(
+    describe: Describe, aligned: PointClouds, network: ColorNetwork, config: DescriptorConfig
+) -> None:
+    """The descriptor is that of NumPy in float64: the paper's equations, or the released code's rounding and numbering.
+
+    By the released convention for every cloud, the paper's for `settled` ones: on a border of a strip, a quotient
+    rounded to float32 can fall on the other side. Coordinates below 2 are off by 2 u on the way to a persistence.
+
+    Args:
+        describe: from aligned clouds.
+        aligned: clouds.
+        network: gives regions and similarity.
+        config: without relaxation.
+    """
+    found = describe(aligned)
+    for b, expected in enumerate(_references(aligned, network, config)):
+        assert int(found.overflow[b]) == expected.overflow
+        off = np.abs(np.asarray(found.images[b], np.float64) - expected.images).sum(axis=(-2, -1))
+        drift = 8 * UNIT * image_lipschitz(expected.persistence, config).sum(axis=-1)
+        assert (off <= image_rounding(expected.persistence.sum(axis=-1), config) + drift).all(), (
+            f"image: {off.max():.3g}"
+        )
+        off = np.abs(np.asarray(found.embeddings[b], np.float64) - expected.embeddings)
+        assert (off <= 2 * embedding_rounding(network.n_regions) * expected.embeddings).all(), (
+            f"colour: {off.max():.3g}"
+        )
+
+
+def assert_overflow_told(
+    describe: Describe, aligned: PointClouds, network: ColorNetwork, config: DescriptorConfig
+) -> None:
+    """Nothing is dropped in silence: `overflow` counts the points and pairs that the descriptor misses, and no others.
+
+    The same count in NumPy. Where it is 0, every point is in the embedding and every pair in the window.
+    """
+    counted = [reference.overflow for reference in _references(aligned, network, config)]
+    found = describe(aligned)
+    assert np.asarray(found.overflow).tolist() == counted
+    for name in ("images", "embeddings"):
+        assert np.isfinite(np.asarray(getattr(found, name))).all(), name
+
+
+def assert_relaxation_converges(
+    describe_at: Callable[[PointClouds, DescriptorConfig], Descriptors],
+    aligned: PointClouds,
+    network: ColorNetwork,
+    config: DescriptorConfig,
+    factor: float,
+) -> None:
+    """Towards zero temperature the relaxed descriptor is the hard one, at a rate: its bias is of the size of T log n.
+
+    On `settled` clouds, whose points have weights of 1 within exp(-margin / T): with the default temperatures times a
+    `factor` of at most 0.02 that is exp(-25) or less. Each extreme of a strip of n points is then within T log(2 n) of
+    the hard one, T the extremum's temperature: the log-sum-exp lies between the greatest term, less T log 2 or itself,
+    and T log n more. 8-bit colours are at least 0.1 levels from a tie and get the hard regions.
+
+    Args:
+        describe_at: from aligned clouds and a config.
+        aligned: settled with a margin of 0.2 or more.
+        network: gives the regions.
+        config: hard.
+        factor: of the default temperatures, at most 0.02.
+    """
+    soft = Relaxation(**{name: factor * value for name, value in dataclasses.asdict(Relaxation()).items()})
+    found = describe_at(aligned, dataclasses.replace(config, relaxation=soft))
+    hard = describe_at(aligned, config)
+    np.testing.assert_array_equal(found.overflow, hard.overflow)
+    leak = math.exp(-0.2 * min(config.sigma_2 / soft.strip, config.sigma_1 / soft.slice))
+    for b, expected in enumerate(_references(aligned, network, config)):
+        n = expected.counts.sum()
+        bias = 2 * soft.extremum * np.log(2 * np.maximum(expected.counts, 1)) * (expected.counts > 0)
+        moved = bias + 2 * n * leak + 16 * UNIT
+        constant = image_lipschitz(expected.persistence + moved, config)
+        off = np.abs(np.asarray(found.images[b], np.float64) - np.asarray(hard.images[b], np.float64)).sum(
+            axis=(-2, -1)
+        )
+        most = (expected.persistence + moved).sum(axis=-1)
+        assert (off <= (moved * constant).sum(axis=-1) + 2 * image_rounding(most, config)).all(), (
+            f"image: {off.max():.3g}"
+        )
+        off = np.abs(np.asarray(found.embeddings[b]) - np.asarray(hard.embeddings[b]))
+        # Weights are sums of n exponentials and softmaxes of 27, each good to a few units.
+        bound = 100 * UNIT * np.asarray(hard.embeddings[b]) + n * leak
+        assert (off <= bound + n * 64 * UNIT).all(), f"colour: {off.max():.3g}"
