@@ -7,7 +7,7 @@
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,7 @@ from thor2_jax.run_folder import TrainedRun, load_run
 from thor2_jax.types import Descriptors, PointClouds
 from thor2_jax.voxel_grid import downsample_to_fit
 
-__all__ = ["THOR2", "VOXEL", "DescribedFrame", "Recognition", "Recognizer"]
+__all__ = ["NO_PART", "THOR2", "VOXEL", "DescribedFrame", "Part", "Recognition", "Recognizer", "prepare"]
 
 THOR2: tuple[Feature, ...] = ("tops", "tops2")
 """The two classifiers whose more confident answer is THOR2's."""
@@ -65,28 +65,16 @@ class Recognition:
     reason: str | None = None
 
 
-@dataclasses.dataclass(frozen=True)
-class DescribedFrame:
-    """A frame's instances and the descriptors of the usable ones, row by row.
+@dataclasses.dataclass(frozen=True, eq=False)
+class Part:
+    """What is described of an instance, on the descriptors' grid.
 
     Attributes:
-        clouds: every instance; unusable ones carry a reason.
-        usable: indices into `clouds`, one a row of `packed` and `descriptors`.
-        occluded: one flag a row.
-        packed: the described clouds, metres, padded to a batch bucket (rows past `usable` are empty).
-        descriptors: of `packed`.
+        occluded: it is hidden in part.
+        points: [n, 3] float32, metres.
+        colors: [n, 3] uint8, sRGB.
+        boundary: [n] bool, points on the occlusion boundary.
     """
-
-    clouds: list[InstanceCloud]
-    usable: list[int]
-    occluded: list[bool]
-    packed: PointClouds
-    descriptors: Descriptors
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Part:
-    """What is described of an instance: points, colours and boundary marks on the descriptors' grid."""
 
     occluded: bool
     points: NDArray[np.float32]
@@ -94,15 +82,43 @@ class _Part:
     boundary: NDArray[np.bool_]
 
 
-NO_PART = _Part(False, np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), np.zeros(0, bool))
+@dataclasses.dataclass(frozen=True)
+class DescribedFrame:
+    """A frame's instances and the descriptors of the usable ones, row by row.
+
+    Attributes:
+        clouds: every instance; unusable ones carry a reason.
+        usable: indices into `clouds`, one a row of `packed` and `descriptors`.
+        parts: what was described, one a row.
+        packed: the described clouds, metres, padded to a batch bucket (rows past `usable` are empty).
+        descriptors: of `packed`.
+    """
+
+    clouds: list[InstanceCloud]
+    usable: list[int]
+    parts: list[Part]
+    packed: PointClouds
+    descriptors: Descriptors
+
+    @property
+    def occluded(self) -> list[bool]:
+        """One flag a row."""
+        return [part.occluded for part in self.parts]
 
 
-def _prepare(frame: RGBDFrame, label: int, size: float) -> tuple[InstanceCloud, _Part]:
+NO_PART = Part(False, np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), np.zeros(0, bool))
+
+
+def prepare(frame: RGBDFrame, label: int, sigma_s: float) -> tuple[InstanceCloud, Part]:
+    """One instance's cloud, and what will be described of it (`NO_PART` if the cloud cannot be used).
+
+    Pure NumPy: it may run in another process, and both results can be pickled.
+    """
     cloud = instance_cloud(frame, label)
     if cloud.reason is not None:
         return cloud, NO_PART
     found = find_occlusion(frame, cloud)
-    return cloud, _Part(found.occluded, *_voxelled(cloud, found.boundary, size))
+    return cloud, Part(found.occluded, *_voxelled(cloud, found.boundary, VOXEL / sigma_s))
 
 
 def _voxelled(cloud: InstanceCloud, edge: NDArray[np.bool_], size: float) -> tuple[Any, Any, NDArray[np.bool_]]:
@@ -147,15 +163,14 @@ class Recognizer:
 
     def describe(self, frame: RGBDFrame) -> DescribedFrame:
         """Clouds and descriptors of a frame's instances, those past the largest batch bucket included."""
-        size = VOXEL / self.run.config.sigma_s
-        prepared = [_prepare(frame, label, size) for label in frame.instances]
+        prepared = [prepare(frame, label, self.run.config.sigma_s) for label in frame.instances]
         clouds = [cloud for cloud, _ in prepared]
         usable = [i for i, cloud in enumerate(clouds) if cloud.reason is None]
         parts = [prepared[i][1] for i in usable]
         packed, descriptors = self._describe_parts(parts)
-        return DescribedFrame(clouds, usable, [part.occluded for part in parts], packed, descriptors)
+        return DescribedFrame(clouds, usable, parts, packed, descriptors)
 
-    def _describe_parts(self, parts: Sequence[_Part]) -> tuple[PointClouds, Descriptors]:
+    def _describe_parts(self, parts: Sequence[Part]) -> tuple[PointClouds, Descriptors]:
         limit = BATCH_BUCKETS[-1]
         capacity = point_bucket(max((len(part.points) for part in parts), default=1))
         batches = []
@@ -190,34 +205,51 @@ class Recognizer:
         if missing:
             raise InputError(f"classifiers: the run has no {', '.join(missing)}, only {', '.join(self._apply)}")
         described = self.describe(frame)
-        found = {
-            name: values[: len(described.usable)]
-            for name, values in self.probabilities(described.descriptors, voting).items()
-        }
-        joined = join(found)
+        found = self.probabilities(described.descriptors, voting)
         rows = {index: row for row, index in enumerate(described.usable)}
         overflow = np.asarray(described.descriptors.overflow)
-        points_used = np.asarray(described.packed.mask).sum(axis=1)
-        answers = []
-        for index, cloud in enumerate(described.clouds):
-            row = rows.get(index)
-            if row is None:
-                answers.append(Recognition(label=cloud.label, reason=cloud.reason))
-                continue
-            answers.append(
-                Recognition(
-                    label=cloud.label,
-                    name=self.run.classes[joined.class_index[row]],
-                    confidence=float(joined.confidence[row]),
-                    classifier=str(joined.classifier[row]),
-                    top={name: self._top(values[row]) for name, values in found.items()},
-                    occluded=described.occluded[row],
-                    overflow=int(overflow[row]),
-                    points_used=int(points_used[row]),
-                    kept_by_fallback=cloud.kept_by_fallback,
-                )
+        return [
+            self.name(
+                cloud.label,
+                described.parts[rows[index]],
+                {name: values[rows[index]] for name, values in found.items()},
+                int(overflow[rows[index]]),
+                cloud.kept_by_fallback,
             )
-        return answers
+            if index in rows
+            else Recognition(label=cloud.label, reason=cloud.reason)
+            for index, cloud in enumerate(described.clouds)
+        ]
+
+    def name(
+        self,
+        label: int,
+        part: Part,
+        probabilities: Mapping[Feature, NDArray[np.float32]],
+        overflow: int,
+        kept_by_fallback: bool,
+    ) -> Recognition:
+        """The answer for one instance that was described.
+
+        Args:
+            label: its number in the label image.
+            part: what was described of it.
+            probabilities: classifier -> [C] class probabilities.
+            overflow: the descriptor's.
+            kept_by_fallback: as in `InstanceCloud`.
+        """
+        joined = join({name: values[None] for name, values in probabilities.items()})
+        return Recognition(
+            label=label,
+            name=self.run.classes[joined.class_index[0]],
+            confidence=float(joined.confidence[0]),
+            classifier=str(joined.classifier[0]),
+            top={name: self._top(values) for name, values in probabilities.items()},
+            occluded=part.occluded,
+            overflow=overflow,
+            points_used=len(part.points),
+            kept_by_fallback=kept_by_fallback,
+        )
 
     def _top(self, probabilities: NDArray[np.float32], count: int = 5) -> list[tuple[str, float]]:
         best = np.argsort(-probabilities, kind="stable")[:count]

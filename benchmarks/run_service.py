@@ -1,0 +1,255 @@
+"""The service under load over loopback: `python -m benchmarks.run_service [--out FILE] [--soak N]`.
+
+Frames of six objects: a plain loop, callers one after another, then requests at a fixed rate that waits for no answer
+(latency counts from when a request was due), and twice the highest rate whose p99 stays under 250 ms. Options that are
+not known here go to `thor2 serve`.
+"""
+
+import argparse
+import asyncio
+import io
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+import urllib.request
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from flax import nnx
+from PIL import Image
+
+import colornet
+import thor2_jax as thor2
+from thor2_jax.classifier import FEATURES, MLP
+from thor2_jax.client import multipart
+from thor2_jax.run_folder import TrainedRun, input_size, save_run
+from thor2_jax.service.decoding import frame_of
+from training.builtin_objects import builtin_objects
+from training.scenes import compose_scene
+
+LIMIT_MS = 250.0
+RATES = (30, 35, 40, 45, 50)
+
+Files = dict[str, bytes]
+
+
+def make_run(folder: Path) -> None:
+    """A run with random weights: the way is what is measured."""
+    config, network = thor2.DescriptorConfig(homology="closed_form"), colornet.load_default()
+    classifiers = {name: MLP(input_size(name, config, network.n_regions), 17, rngs=nnx.Rngs(0)) for name in FEATURES}
+    save_run(TrainedRun(config, network, tuple(map(str, range(17))), classifiers, {}), folder)
+
+
+def make_frames(count: int, n_objects: int) -> list[Files]:
+    """Rendered frames of 640 x 480, as files."""
+
+    def png(image: Any) -> bytes:
+        stream = io.BytesIO()
+        Image.fromarray(image).save(stream, "PNG")
+        return stream.getvalue()
+
+    objects, found, seed = builtin_objects(), [], 0
+    while len(found) < count:
+        frame = compose_scene(objects, np.random.default_rng(seed), n_objects=n_objects).frame
+        seed += 1
+        if len(frame.instances) == n_objects:
+            camera = {name: getattr(frame.intrinsics, name) for name in ("fx", "fy", "cx", "cy", "depth_scale")}
+            images = {name: png(getattr(frame, name)) for name in ("color", "depth")}
+            found.append(
+                {**images, "labels": png(frame.labels.astype(np.uint8)), "intrinsics": json.dumps(camera).encode()}
+            )
+    return found
+
+
+def spread(milliseconds: list[float]) -> dict[str, float]:
+    return {f"p{p}_ms": round(float(np.percentile(milliseconds, p)), 1) if milliseconds else 0.0 for p in (50, 99)}
+
+
+def plain_loop(run: Path, frames: list[Files], calls: int) -> dict[str, float]:
+    """Decode and recognize one frame after another in this process."""
+    recognizer, times = thor2.Recognizer.load(run), []
+    for files in frames:
+        recognizer.recognize(frame_of(**files))
+    for k in range(calls):
+        start = time.perf_counter()
+        recognizer.recognize(frame_of(**frames[k % len(frames)]))
+        times.append((time.perf_counter() - start) * 1e3)
+    return {"frames_per_s": round(1e3 * calls / sum(times), 1), **spread(times)}
+
+
+class Server:
+    """`thor2 serve` on a free port."""
+
+    def __init__(self, run: Path, *options: str) -> None:
+        with socket.create_server(("127.0.0.1", 0)) as free:
+            self.port = free.getsockname()[1]
+        command = [sys.executable, "-m", "training.cli", "serve", "--model", str(run), "--port", str(self.port)]
+        self.process = subprocess.Popen([*command, *options])
+        start = time.monotonic()
+        while time.monotonic() - start < 300:
+            time.sleep(0.2)
+            try:
+                self.get("/readyz")
+                break
+            except OSError:
+                if self.process.poll() is not None:
+                    raise RuntimeError("the server ended") from None
+        self.ready_after = time.monotonic() - start
+
+    def get(self, path: str) -> str:
+        """Text of a page."""
+        with urllib.request.urlopen(f"http://127.0.0.1:{self.port}{path}", timeout=10) as answer:
+            return answer.read().decode()
+
+    def memory(self) -> float:
+        """MiB of the server and the processes it started, shared pages counted once (Pss)."""
+        total, waiting = 0, [self.process.pid]
+        while waiting:
+            pid = waiting.pop()
+            for task in Path(f"/proc/{pid}/task").iterdir():
+                waiting += map(int, (task / "children").read_text().split())
+            lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
+            total += sum(int(line.split()[1]) for line in lines if line.startswith("Pss:"))
+        return round(total / 1024, 1)
+
+    def stop(self) -> None:
+        """Ask it to end, and wait."""
+        self.process.send_signal(signal.SIGTERM)
+        self.process.wait(60)
+
+
+async def ask(port: int, request: bytes) -> int:
+    """Status of one request on a connection of its own; 0 if there was no whole answer."""
+    try:
+        reader, writer = await asyncio.open_connection("127.0.0.1", port)
+        writer.write(request)
+        head = await reader.readuntil(b"\r\n\r\n")
+        length = int(head.lower().split(b"content-length:")[1].split(b"\r\n")[0])
+        await reader.readexactly(length)
+        writer.close()
+        return int(head.split()[1])
+    except (OSError, EOFError):
+        return 0
+
+
+async def callers(port: int, requests: list[bytes], count: int, at_once: int) -> dict[str, Any]:
+    """`at_once` callers, each waiting for its answer before it asks again."""
+    times, statuses, numbers = [], Counter[int](), iter(range(count))
+
+    async def caller() -> None:
+        for k in numbers:
+            start = time.perf_counter()
+            statuses[await ask(port, requests[k % len(requests)])] += 1
+            times.append((time.perf_counter() - start) * 1e3)
+
+    start = time.perf_counter()
+    await asyncio.gather(*(caller() for _ in range(at_once)))
+    rate = count / (time.perf_counter() - start)
+    return {"callers": at_once, "frames_per_s": round(rate, 1), **spread(times), "statuses": dict(statuses)}
+
+
+async def at_rate(port: int, requests: list[bytes], rate: float, seconds: float) -> dict[str, Any]:
+    """Requests at a fixed rate, whatever happens to earlier ones."""
+    accepted, statuses = [], Counter[int]()
+
+    async def one(k: int, due: float) -> None:
+        await asyncio.sleep(due - time.perf_counter())
+        status = await ask(port, requests[k % len(requests)])
+        statuses[status] += 1
+        if status == 200:
+            accepted.append((time.perf_counter() - due) * 1e3)
+
+    start = time.perf_counter() + 0.1
+    await asyncio.gather(*(one(k, start + k / rate) for k in range(int(rate * seconds))))
+    elapsed = time.perf_counter() - start
+    return {
+        "rate": rate,
+        "answered_per_s": round(len(accepted) / elapsed, 1),
+        **spread(accepted),
+        "statuses": dict(statuses),
+    }
+
+
+def sustained(found: dict[str, Any]) -> bool:
+    return set(found["statuses"]) == {200} and found["p99_ms"] < LIMIT_MS
+
+
+def main() -> None:
+    """Measure, print, write."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, help="JSON file for the figures")
+    parser.add_argument("--seconds", type=float, default=4.0, help="of each rate")
+    parser.add_argument("--rates", type=float, nargs="+", default=RATES)
+    parser.add_argument("--soak", type=int, default=0, help="instead, so many frames of one object, with the memory")
+    options, serve_options = parser.parse_known_args()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # so that the server ends with this
+    with tempfile.TemporaryDirectory() as folder:
+        run = Path(folder) / "run"
+        make_run(run)
+        n_objects = 1 if options.soak else 6
+        frames = make_frames(8, n_objects)
+        result: dict[str, Any] = {"cores": os.cpu_count(), "objects": n_objects, "serve_options": serve_options}
+        requests = [multipart_request(files) for files in frames]
+        if not options.soak:
+            result["plain_loop"] = plain_loop(run, frames, 60)
+            print("plain loop", result["plain_loop"])
+        server = Server(run, *serve_options)
+        try:
+            print(f"ready after {server.ready_after:.1f} s")
+            asyncio.run(callers(server.port, requests, 32, 4))
+            if options.soak:
+                result["soak"] = soak(server, requests, options.soak)
+            else:
+                result |= measure(server, requests, options.rates, options.seconds)
+            compiled = server.get("/metrics").split("\nthor2_compilations_after_warm_up_total ")[1].split()[0]
+            result["compilations_after_warm_up"] = float(compiled)
+            print(f"compilations after warm-up: {compiled}")
+        finally:
+            server.stop()
+    if options.out:
+        options.out.write_text(json.dumps(result, indent=1) + "\n")
+
+
+def multipart_request(files: Files) -> bytes:
+    kind, body = multipart(files)
+    head = f"POST /v1/recognize HTTP/1.1\r\nHost: x\r\nConnection: close\r\nContent-Type: {kind}\r\n"
+    return f"{head}Content-Length: {len(body)}\r\n\r\n".encode() + body
+
+
+def measure(server: Server, requests: list[bytes], rates: list[float], seconds: float) -> dict[str, Any]:
+    result: dict[str, Any] = {"service": [], "rates": []}
+    for at_once in (1, 8):
+        result["service"].append(asyncio.run(callers(server.port, requests, 100, at_once)))
+        print("service", result["service"][-1])
+    for rate in rates:
+        result["rates"].append(asyncio.run(at_rate(server.port, requests, rate, seconds)))
+        print("rate", result["rates"][-1])
+        if not sustained(result["rates"][-1]):
+            break
+    highest = max((found["rate"] for found in result["rates"] if sustained(found)), default=rates[0])
+    result["sustained_rate"] = highest
+    result["twice"] = asyncio.run(at_rate(server.port, requests, 2 * highest, seconds))
+    print("twice", result["twice"])
+    return result
+
+
+def soak(server: Server, requests: list[bytes], count: int) -> dict[str, Any]:
+    before, parts, statuses = server.memory(), [], Counter[int]()
+    print(f"0 requests: {before} MiB")
+    for done in range(0, count, count // 10):
+        found = asyncio.run(callers(server.port, requests, count // 10, 8))
+        statuses.update(found["statuses"])
+        parts.append(server.memory())
+        print(f"{done + count // 10} requests: {parts[-1]} MiB, {found['frames_per_s']} frames/s")
+    return {"requests": count, "statuses": dict(statuses), "mib_before": before, "mib": parts}
+
+
+if __name__ == "__main__":
+    main()

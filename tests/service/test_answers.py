@@ -1,0 +1,148 @@
+"""What a running service says of good requests, against the library on the same run."""
+
+import io
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+from PIL import Image
+
+import colornet
+import thor2_jax as thor2
+from thor2_jax.client import Client, ServiceError
+
+
+@pytest.fixture(scope="module")
+def expected(run_folder: Path, frame: thor2.RGBDFrame) -> list[thor2.Recognition]:
+    return thor2.Recognizer.load(run_folder).recognize(frame)
+
+
+def test_a_frame_is_answered_as_by_the_library(
+    server: Any, frame: thor2.RGBDFrame, files: dict[str, bytes], expected: list[thor2.Recognition]
+) -> None:
+    found = Client(server.url).recognize(**files)
+    assert [one.label for one in found] == [3, 5, 7, 200]
+    for one, other in zip(found, expected, strict=True):
+        assert (one.name, one.classifier, one.reason) == (other.name, other.classifier, other.reason)
+        assert (one.occluded, one.overflow, one.points_used) == (other.occluded, other.overflow, other.points_used)
+        assert one.kept_by_fallback == other.kept_by_fallback
+        assert one.confidence == pytest.approx(other.confidence, abs=1e-5)
+        assert one.top.keys() == other.top.keys()
+        for name, best in one.top.items():
+            assert len(best) == 5
+            assert [name for name, _ in best] == [name for name, _ in other.top[name]]
+            assert [p for _, p in best] == pytest.approx([p for _, p in other.top[name]], abs=1e-5)
+
+
+def test_the_json_has_reasons_and_timings(ask: httpx.Client, files: dict[str, bytes]) -> None:
+    answer = ask.post("/v1/recognize", files=files).json()
+    small = answer["instances"][1]
+    assert small["label"] == 5 and small["name"] is None and "at least 30" in small["unrecognized"]
+    assert set(answer["timings"]) == {"upload", "decode", "clouds", "device", "total"}
+    assert answer["timings"]["total"] >= answer["timings"]["decode"] + answer["timings"]["clouds"] > 0
+
+
+def test_color_as_jpeg_and_intrinsics_as_a_plain_field(
+    ask: httpx.Client, frame: thor2.RGBDFrame, files: dict[str, bytes]
+) -> None:
+    stream = io.BytesIO()
+    Image.fromarray(frame.color).save(stream, "JPEG")
+    images = {"color": stream.getvalue(), "depth": files["depth"], "labels": files["labels"]}
+    answer = ask.post("/v1/recognize", files=images, data={"intrinsics": files["intrinsics"].decode()})
+    assert answer.status_code == 200 and len(answer.json()["instances"]) == 4
+
+
+def test_no_instances_and_no_depth(ask: httpx.Client, files: dict[str, bytes], encode: Callable[..., bytes]) -> None:
+    empty = encode(np.zeros((240, 320), np.uint8))
+    assert ask.post("/v1/recognize", files=files | {"labels": empty}).json()["instances"] == []
+    blind = encode(np.zeros((240, 320), np.uint16))
+    instances = ask.post("/v1/recognize", files=files | {"depth": blind}).json()["instances"]
+    assert len(instances) == 4 and all(one["unrecognized"] for one in instances)
+
+
+def clouds(count: int) -> list[tuple[np.ndarray, np.ndarray]]:
+    rng = np.random.default_rng(1)
+    return [
+        ((rng.random((n, 3)) * (0.2, 0.1, 0.05)).astype(np.float32), rng.integers(0, 256, (n, 3), dtype=np.uint8))
+        for n in (100 + 700 * np.arange(count)).tolist()
+    ]
+
+
+def test_descriptors_are_those_of_the_library(server: Any, ask: httpx.Client) -> None:
+    given = clouds(11)  # more than a batch, up to 7,100 points
+    config = thor2.DescriptorConfig(homology="closed_form")
+    expected = thor2.describe(thor2.PointClouds.pack(given), colornet.load_default(), config)
+    found = Client(server.url).describe(given)
+    np.testing.assert_allclose(found["images"], expected.images, atol=1e-5)
+    np.testing.assert_allclose(found["embeddings"], expected.embeddings, rtol=1e-5, atol=1e-4)
+    np.testing.assert_array_equal(found["overflow"], expected.overflow)
+    body = {"clouds": [{"points": xyz.tolist(), "colors": rgb.tolist()} for xyz, rgb in given[:2]]}
+    answer = ask.post("/v1/describe", json=body).json()
+    assert set(answer["timings"]) == {"upload", "decode", "device", "total"}
+    for k, one in enumerate(answer["descriptors"]):
+        np.testing.assert_allclose(one["images"], expected.images[k], atol=1e-5)
+        np.testing.assert_allclose(one["embeddings"], expected.embeddings[k], rtol=1e-5, atol=1e-4)
+        assert one["overflow"] == expected.overflow[k]
+
+
+def test_empty_and_degenerate_clouds_are_described(server: Any, ask: httpx.Client) -> None:
+    nothing = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
+    one_point = np.ones((1, 3), np.float32), np.zeros((1, 3), np.uint8)
+    far_apart = np.array([[-100, 0, 0], [100, 0, 0], [0, 100, 1e-30]], np.float32), np.zeros((3, 3), np.uint8)
+    found = Client(server.url).describe([nothing, one_point, far_apart])
+    assert not found["images"][0].any() and not found["embeddings"][0].any()
+    assert all(np.isfinite(values).all() for values in found.values())
+    assert ask.post("/v1/describe", json={"clouds": [{"points": [], "colors": []}]}).status_code == 200
+
+
+def test_the_model_and_the_color_network(server: Any, ask: httpx.Client) -> None:
+    network = colornet.load_default()
+    model = Client(server.url).model()
+    assert model["classes"] == list("abcdefg") and set(model["classifiers"]) == {"ce", "tops", "tops2"}
+    assert model["descriptor"]["n_slices"] == 7 and model["color_network"] == network.fingerprint
+    assert "path" not in str(model)
+    found = ask.get("/v1/colornet").json()
+    np.testing.assert_allclose(found["mean_rgb"], network.mean_rgb)
+    np.testing.assert_allclose(found["similarity"], network.similarity)
+    assert len(found["edges"]) == len(found["edge_weights"]) == len(network.edges)
+
+
+def test_health_page_and_unknown_paths(ask: httpx.Client) -> None:
+    assert ask.get("/healthz").json() == {"status": "alive"} and ask.get("/readyz").json() == {"status": "ready"}
+    assert ask.get("/").headers["content-type"].startswith("text/html")
+    for path in ("/nothing", "/../app.py", "/%2e%2e/app.py"):
+        missing = ask.get(path)
+        assert missing.status_code == 404 and set(missing.json()) == {"field", "message"}
+    wrong = ask.get("/v1/recognize")
+    assert wrong.status_code == 405 and wrong.headers["allow"] == "POST"
+
+
+def test_the_client_tells_what_was_refused(server: Any, files: dict[str, bytes]) -> None:
+    with pytest.raises(ServiceError, match="depth") as refused:
+        Client(server.url).recognize(**files | {"depth": b"nothing"})
+    assert (refused.value.status, refused.value.field, refused.value.retry_after) == (422, "depth", None)
+
+
+def test_the_client_reads_files(server: Any, files: dict[str, bytes], tmp_path: Path) -> None:
+    for name, content in files.items():
+        (tmp_path / name).write_bytes(content)
+    found = Client(server.url).recognize(**{name: tmp_path / name for name in files})
+    assert len(found) == 4
+    camera = {"fx": 600, "fy": 600, "cx": 159.5, "cy": 119.5}
+    again = Client(server.url).recognize(
+        **{name: files[name] for name in ("color", "depth", "labels")}, intrinsics=camera
+    )
+    assert [one.confidence for one in again] == [one.confidence for one in found]
+
+
+def test_nothing_was_compiled_for_a_request(ask: httpx.Client, files: dict[str, bytes]) -> None:
+    """Last in this file: all sizes above have been asked for."""
+    assert ask.post("/v1/recognize", files=files).status_code == 200
+    lines = ask.get("/metrics").text.splitlines()
+    values = dict(line.rsplit(" ", 1) for line in lines if not line.startswith("#"))
+    assert float(values["thor2_compilations_after_warm_up_total"]) == 0
+    assert float(values['thor2_requests_total{path="/v1/recognize",status="200"}']) >= 1
+    assert float(values["thor2_batch_clouds_count"]) >= 1

@@ -1,0 +1,261 @@
+"""Whatever is sent: a 4xx whose JSON names the field, and the next good request is answered."""
+
+import io
+import json
+import socket
+import struct
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+from PIL import Image
+
+from thor2_jax.service.settings import MAX_BODY
+
+Files = dict[str, bytes]
+
+
+@pytest.fixture(autouse=True)
+def still_answering(ask: httpx.Client, files: Files) -> Iterator[None]:
+    yield
+    assert ask.post("/v1/recognize", files=files).status_code == 200
+
+
+def refused(answer: httpx.Response, status: int, field: str | None, *words: str) -> None:
+    assert answer.status_code == status, answer.text
+    problem = answer.json()
+    assert set(problem) == {"field", "message"} and problem["field"] == field, problem
+    for word in words:
+        assert word in problem["message"]
+    for secret in ("Traceback", "/", "0x", ".py", "Error"):
+        assert secret not in problem["message"].replace("application/json", "").replace("multipart/form-data", "")
+
+
+def png_bomb(width: int, height: int, kind: int = 2, bits: int = 8) -> bytes:
+    """Header of a large image, and little else: a deflated run of zeros."""
+
+    def chunk(name: bytes, content: bytes) -> bytes:
+        return struct.pack(">I", len(content)) + name + content + struct.pack(">I", zlib.crc32(name + content))
+
+    header = struct.pack(">IIBBBBB", width, height, bits, kind, 0, 0, 0)
+    data = zlib.compress(bytes(10**7), 9)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
+
+
+@pytest.mark.parametrize("field", ["color", "depth", "labels"])
+def test_images_that_are_damaged_cut_short_too_large_or_none(ask: httpx.Client, files: Files, field: str) -> None:
+    good = files[field]
+    for bad in (b"", b"nothing", good[:20], good[: len(good) // 2], good[:-40]):
+        refused(ask.post("/v1/recognize", files=files | {field: bad}), 422, field)
+    for place in range(8, len(good), len(good) // 20):  # what can still be read as an image is one
+        flipped = good[:place] + bytes([good[place] ^ 0xFF]) + good[place + 1 :]
+        answer = ask.post("/v1/recognize", files=files | {field: flipped})
+        assert answer.status_code in (200, 413, 422), answer.text
+    for width, height in ((50_000, 50_000), (2**31 - 1, 1), (8000, 8000)):
+        answer = ask.post("/v1/recognize", files=files | {field: png_bomb(width, height)})
+        assert answer.status_code in (413, 422) and answer.json()["field"] == field
+
+
+def test_images_of_other_kinds(ask: httpx.Client, files: Files, frame: Any, encode: Callable[..., bytes]) -> None:
+    gif = io.BytesIO()
+    Image.fromarray(frame.labels).save(gif, "GIF")
+    for field, content in (
+        ("color", files["labels"]),
+        ("color", gif.getvalue()),
+        ("depth", files["color"]),
+        ("depth", files["labels"]),
+        ("labels", files["color"]),
+        ("labels", gif.getvalue()),
+    ):
+        refused(ask.post("/v1/recognize", files=files | {field: content}), 422, field)
+
+
+def test_images_of_other_sizes(ask: httpx.Client, files: Files, encode: Callable[..., bytes]) -> None:
+    for field, kind in (("depth", np.uint16), ("labels", np.uint8)):
+        small = encode(np.ones((120, 160), kind))
+        refused(ask.post("/v1/recognize", files=files | {field: small}), 422, field, "(120, 160)", "(240, 320)")
+
+
+def test_too_many_labels(ask: httpx.Client, files: Files, encode: Callable[..., bytes]) -> None:
+    many = np.arange(240 * 320).astype(np.uint16).reshape(240, 320)  # 65,535 and zeros
+    refused(ask.post("/v1/recognize", files=files | {"labels": encode(many)}), 422, "labels", "65535 instances")
+
+
+def test_intrinsics(ask: httpx.Client, files: Files) -> None:
+    good = json.loads(files["intrinsics"])
+    texts = [json.dumps(good | {"fx": value}) for value in (float("nan"), float("inf"), 0, -1, "600", None, [1], True)]
+    texts += ["", "{", "[]", "null", "{}", '{"fx": 1e999, "fy": 1, "cx": 0, "cy": 0}', "[" * 2000, '{"fx":' * 500]
+    texts += [json.dumps(good | {"fx": 10**400}), '{"fx": ' + "1" * 3000 + ', "fy": 1, "cx": 0, "cy": 0}']
+    for text in texts:
+        refused(ask.post("/v1/recognize", files=files | {"intrinsics": text.encode()}), 422, "intrinsics")
+    refused(ask.post("/v1/recognize", files=files | {"intrinsics": b"\xff\xfe\x00"}), 422, "intrinsics")
+    refused(ask.post("/v1/recognize", files=files | {"intrinsics": b" " * 5000}), 413, "intrinsics", "5000")
+    for extreme in ({"fx": 1e-300}, {"cx": 1e300}, {"fx": 1e300, "fy": 1e300}, {"depth_scale": 1e-300}):
+        answer = ask.post("/v1/recognize", files=files | {"intrinsics": json.dumps(good | extreme).encode()})
+        assert answer.status_code == 200 or answer.json()["field"] == "intrinsics"
+
+
+def test_forms(ask: httpx.Client, files: Files) -> None:
+    for name in files:
+        left = {other: content for other, content in files.items() if other != name}
+        refused(ask.post("/v1/recognize", files=left), 422, name, "missing")
+    twice = [*files.items(), ("depth", files["depth"])]
+    refused(ask.post("/v1/recognize", files=twice), 422, "depth", "more than once")
+    refused(ask.post("/v1/recognize", json={"color": "x"}), 415, "body")
+    refused(ask.post("/v1/recognize", content=b"x"), 415, "body")
+    for kind in ("multipart/form-data", "multipart/form-data; boundary=", "multipart/form-data; boundary=" + "x" * 500):
+        answer = ask.post("/v1/recognize", content=b"--x\r\n\r\n", headers={"content-type": kind})
+        assert answer.status_code in (400, 422) and answer.json()["field"] in ("body", "color")
+    headers = {"content-type": "multipart/form-data; boundary=x; charset=raw_unicode_escape"}
+    broken = b"".join(
+        b'--x\r\nContent-Disposition: form-data; name="%s"\r\n\r\n\\ud800\r\n' % name.encode() for name in files
+    )
+    refused(ask.post("/v1/recognize", content=broken + b"--x--\r\n", headers=headers), 422, "intrinsics")
+    many = [(f"part{k}", b"") for k in range(1000)]
+    refused(ask.post("/v1/recognize", files=many), 400, "body")
+
+
+def test_bodies_past_the_limit(ask: httpx.Client, files: Files) -> None:
+    refused(ask.post("/v1/recognize", files=files | {"color": bytes(MAX_BODY)}), 413, "body")
+    refused(ask.post("/v1/describe", content=bytes(MAX_BODY + 1), headers=NPZ), 413, "body")
+
+    def endless() -> Iterator[bytes]:  # in chunks: no length is declared
+        for _ in range(MAX_BODY // 2**16 + 1):
+            yield bytes(2**16)
+
+    refused(ask.post("/v1/describe", content=endless(), headers=NPZ), 413, "body")
+
+
+def test_a_body_that_never_comes(server: Any) -> None:
+    """Only the connection waits, and it ends."""
+    host, port = server.url.removeprefix("http://").split(":")
+    with socket.create_connection((host, int(port)), timeout=30) as slow:
+        slow.sendall(
+            b"POST /v1/describe HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\nContent-Length: 9\r\n\r\n"
+        )
+        assert b" 408 " in slow.recv(4096).split(b"\r\n")[0]
+
+
+NPZ = {"content-type": "application/octet-stream"}
+
+
+def npz(**arrays: Any) -> bytes:
+    stream = io.BytesIO()
+    np.savez_compressed(stream, **arrays)
+    return stream.getvalue()
+
+
+POINTS, COLORS = np.zeros((4, 3), np.float32), np.zeros((4, 3), np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        ({"points": np.zeros((4, 3), np.int64)}, "points"),
+        ({"points": np.zeros((4, 2), np.float32)}, "points"),
+        ({"points": np.zeros(12, np.float32)}, "points"),
+        ({"points": np.full((4, 3), np.nan, np.float32)}, "points"),
+        ({"points": np.full((4, 3), 1e30, np.float32)}, "points"),
+        ({"points": np.array([object()] * 4)}, "points"),
+        ({"points": np.array(["a", "b"])}, "points"),
+        ({"points": np.zeros(4, [("x", "f4")])}, "points"),
+        ({"colors": np.zeros((5, 3), np.uint8)}, "colors"),
+        ({"colors": np.zeros((4, 3), np.float32)}, "colors"),
+        ({"sizes": np.array([3])}, "sizes"),
+        ({"sizes": np.array([5, -1])}, "sizes"),
+        ({"sizes": np.array([2**62, 2**62, 2**62, 2**62 + 4])}, "sizes"),
+        ({"sizes": np.array([], int)}, "sizes"),
+        ({"sizes": np.zeros(1000, int)}, "sizes"),
+        ({"sizes": np.array([4.0])}, "sizes"),
+        ({"sizes": np.array(4)}, "sizes"),
+    ],
+)
+def test_npz_of_other_arrays(ask: httpx.Client, change: dict[str, Any], field: str) -> None:
+    arrays = {"points": POINTS, "colors": COLORS, "sizes": np.array([4])} | change
+    refused(ask.post("/v1/describe", content=npz(**arrays), headers=NPZ), 422, field)
+
+
+def test_npz_that_are_damaged_or_bombs(ask: httpx.Client) -> None:
+    good = npz(points=POINTS, colors=COLORS, sizes=np.array([4]))
+    for bad in (b"", b"nothing", good[:100], good[:-30], good[:40] + b"\xff" * 40 + good[80:]):
+        answer = ask.post("/v1/describe", content=bad, headers=NPZ)
+        assert answer.status_code == 422 and answer.json()["field"] in ("body", "points"), answer.text
+    refused(ask.post("/v1/describe", content=npz(points=POINTS, colors=COLORS), headers=NPZ), 422, "sizes", "missing")
+
+    bomb = npz(points=np.zeros((20_000_000, 3), np.float32), colors=COLORS, sizes=np.array([4]))
+    assert len(bomb) < 10**6
+    refused(ask.post("/v1/describe", content=bomb, headers=NPZ), 413, "body")
+
+    def archive(points: bytes, method: int = zipfile.ZIP_DEFLATED) -> bytes:
+        stream = io.BytesIO()
+        with zipfile.ZipFile(stream, "w", method) as file:
+            file.writestr("points.npy", points)
+            for name, array in (("colors", COLORS), ("sizes", np.array([4]))):
+                with file.open(f"{name}.npy", "w") as entry:
+                    np.lib.format.write_array(entry, array)
+        return stream.getvalue()
+
+    # A header that tells of an array that is not there: nothing of that size may be made.
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(header, {"descr": "<f4", "fortran_order": False, "shape": (10**12, 3)})
+    refused(ask.post("/v1/describe", content=archive(header.getvalue()), headers=NPZ), 422, "points")
+    deep = b"\x93NUMPY\x01\x00" + struct.pack("<H", 9000) + b"(" * 9000
+    refused(ask.post("/v1/describe", content=archive(deep), headers=NPZ), 422, "points")
+    refused(ask.post("/v1/describe", content=archive(b"", zipfile.ZIP_LZMA), headers=NPZ), 422, "body")
+
+    # A directory that tells of fewer bytes than come out.
+    lying = bytearray(archive(bytes(50_000_000)))
+    place = lying.rindex(b"PK\x01\x02", 0, lying.rindex(b"points.npy"))
+    lying[place + 24 : place + 28] = struct.pack("<I", 1000)
+    refused(ask.post("/v1/describe", content=bytes(lying), headers=NPZ), 422, "points")
+
+
+@pytest.mark.parametrize(
+    ("body", "field"),
+    [
+        (b"", "body"),
+        (b"{", "body"),
+        (b"[" * 100_000, "body"),
+        (b'{"clouds":' * 10_000, "body"),
+        (b"[]", "body"),
+        (b"{}", "clouds"),
+        (b'{"clouds": []}', "clouds"),
+        (b'{"clouds": 3}', "clouds"),
+        (b'{"clouds": [{"points": [[0, 0, 0]], "colors": []}]}', "clouds.0.colors"),
+        (b'{"clouds": [{"points": [[0, 0, NaN]], "colors": [[0, 0, 0]]}]}', "clouds.0.points.0.2"),
+        (b'{"clouds": [{"points": [[0, 0, 1e9]], "colors": [[0, 0, 0]]}]}', "clouds.0.points.0.2"),
+        (b'{"clouds": [{"points": [[0, 0]], "colors": [[0, 0, 0]]}]}', "clouds.0.points.0.2"),
+        (b'{"clouds": [{"points": [[0, 0, 0]], "colors": [[0, 0, 256]]}]}', "clouds.0.colors.0.2"),
+        (b'{"clouds": [{"points": [[0, 0, 0]], "colors": [[0, 0, 0.5]]}]}', "clouds.0.colors.0.2"),
+        (b'{"clouds": [{"points": [], "colors": [], "other": 1}]}', "clouds.0.other"),
+        (b'{"clouds": [' + b",".join([b'{"points": [], "colors": []}'] * 33) + b"]}", "clouds"),
+        (b'{"clouds": [{"points": [' + b",".join([b"[0,0,0]"] * 8193) + b'], "colors": []}]}', "clouds.0.points"),
+        (b"\xff\xfe", "body"),
+    ],
+)
+def test_json_of_other_shapes(ask: httpx.Client, body: bytes, field: str) -> None:
+    answer = ask.post("/v1/describe", content=body, headers={"content-type": "application/json"})
+    refused(answer, 422, field)
+
+
+def test_other_types_of_bodies(ask: httpx.Client) -> None:
+    for kind in ("text/plain", "application/x-www-form-urlencoded", ""):
+        assert ask.post("/v1/describe", content=b"{}", headers={"content-type": kind}).status_code == 415
+
+
+def test_a_frame_that_takes_too_long(ask: httpx.Client, files: Files, encode: Callable[..., bytes]) -> None:
+    """Noise over the largest image: every point is a voxel. It is answered or cut off in bounds, and hurts nobody."""
+    rng = np.random.default_rng(0)
+    shape = (1080, 1920)
+    images = {
+        "color": encode(np.zeros((*shape, 3), np.uint8)),
+        "depth": encode(rng.integers(260, 2500, shape).astype(np.uint16)),
+        "labels": encode(np.ones(shape, np.uint8)),
+    }
+    answer = ask.post("/v1/recognize", files=files | images)
+    assert answer.status_code in (200, 504)
+    assert answer.elapsed.total_seconds() < 20  # the deadline is 5

@@ -1,0 +1,100 @@
+"""The recognizer's part on the device, in batches of few sizes that are all compiled before the first request."""
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thor2_jax.capacity import BATCH_BUCKETS, POINT_BUCKETS, batch_bucket, point_bucket
+from thor2_jax.classifier import Feature
+from thor2_jax.descriptor import describe
+from thor2_jax.errors import InputError
+from thor2_jax.recognizer import NO_PART, THOR2, Part, Recognition, Recognizer
+from thor2_jax.run_folder import load_run
+from thor2_jax.service.preparing import PreparedInstance
+from thor2_jax.service.settings import Settings
+from thor2_jax.types import PointClouds
+
+__all__ = ["Engine", "Row"]
+
+LEAST_POINTS, LEAST_CLOUDS = 2048, 8
+"""Smaller batches are padded to this: they take the device hardly less time, and each size takes seconds to compile."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Row:
+    """What the device says of one cloud.
+
+    Attributes:
+        images: [S, P, P] float32, persistence images.
+        embeddings: [S, R, J] float32, colour embeddings.
+        overflow: points and pairs that the descriptor has no room for.
+        probabilities: classifier -> [C] float32.
+    """
+
+    images: NDArray[np.float32]
+    embeddings: NDArray[np.float32]
+    overflow: int
+    probabilities: dict[Feature, NDArray[np.float32]]
+
+
+class Engine:
+    """A trained run on the device. Not to be called from several threads at once."""
+
+    def __init__(self, settings: Settings) -> None:
+        """Read the run.
+
+        Raises:
+            InputError: it cannot be read, or lacks a classifier that THOR2 needs.
+        """
+        run = load_run(settings.model)
+        missing = [name for name in THOR2 if name not in run.classifiers]
+        if missing:
+            raise InputError(f"model: {settings.model} has no classifier {', '.join(missing)}")
+        # The same pairs as gudhi's, without a call back from the device.
+        self.run = dataclasses.replace(run, config=dataclasses.replace(run.config, homology="closed_form"))
+        self.max_batch = settings.max_batch
+        self._recognizer = Recognizer(self.run)
+
+    def warm_up(self) -> Iterator[tuple[int, int]]:
+        """Compile for every size that `rows` can meet, one (points, clouds) at each step of the iterator."""
+        for n_points in (n for n in POINT_BUCKETS if n >= LEAST_POINTS):
+            for n_clouds in (b for b in BATCH_BUCKETS if LEAST_CLOUDS <= b <= _batch_size(self.max_batch)):
+                self._rows([NO_PART] * n_clouds, n_points)
+                yield n_points, n_clouds
+
+    def rows(self, parts: Sequence[Part]) -> list[Row]:
+        """Describe and classify clouds, at most `max_batch` of them."""
+        padded = [*parts, *[NO_PART] * (_batch_size(len(parts)) - len(parts))]
+        largest = max(len(part.points) for part in parts)
+        return self._rows(padded, max(point_bucket(largest), LEAST_POINTS))[: len(parts)]
+
+    def _rows(self, parts: Sequence[Part], n_points: int) -> list[Row]:
+        clouds = [(part.points, part.colors) for part in parts]
+        packed = PointClouds.pack(clouds, n_points, boundary=[part.boundary for part in parts])
+        found = describe(packed, self.run.network, self.run.config)
+        probabilities = self._recognizer.probabilities(found, THOR2)
+        images, embeddings, overflow = (np.asarray(a) for a in (found.images, found.embeddings, found.overflow))
+        return [
+            Row(images[k], embeddings[k], int(overflow[k]), {name: p[k] for name, p in probabilities.items()})
+            for k in range(len(parts))
+        ]
+
+    def recognitions(self, instances: Sequence[PreparedInstance], rows: Sequence[Row]) -> list[Recognition]:
+        """Answers for a frame's instances; `rows` are those of the usable ones, in order."""
+        following = iter(rows)
+        answers = []
+        for one in instances:
+            if one.reason is not None:
+                answers.append(Recognition(label=one.label, reason=one.reason))
+                continue
+            row = next(following)
+            answers.append(
+                self._recognizer.name(one.label, one.part, row.probabilities, row.overflow, one.kept_by_fallback)
+            )
+        return answers
+
+
+def _batch_size(n_clouds: int) -> int:
+    return max(batch_bucket(n_clouds), LEAST_CLOUDS)
