@@ -19,6 +19,7 @@ from thor2_jax.errors import InputError
 from training.evaluation.answers import AnswerFile
 from training.evaluation.job import evaluate_dataset
 from training.evaluation.runs import Run
+from training.locking import LOCK, locked
 from training.readers.labelled import LabelledFrame, LabelledFrames
 
 CLASSES = ("bowl", "can", "mug")
@@ -114,7 +115,7 @@ def test_killed_and_resumed_is_the_same_and_computes_nothing_twice(tmp_path: Pat
 
     assert without_times(evaluate_toys(tmp_path / "killed", 9)) == without_times(whole)
     assert len((tmp_path / "killed" / "log").read_text().split()) == 9
-    assert not [p for p in report.rglob(".*")]
+    assert [p.name for p in report.rglob(".*")] == [LOCK]
 
 
 def test_what_is_answered_is_not_read_again(tmp_path: Path) -> None:
@@ -257,7 +258,7 @@ def test_a_dataset_whose_frames_changed_is_refused(tmp_path: Path) -> None:
         )
 
 
-@pytest.mark.parametrize("content", ["", "[1]\n", "{}\n{}\n", '{"a": 1}\nnonsense\n'])
+@pytest.mark.parametrize("content", ["", "[1]\n", "[" * 100_000 + "\n", "{}\n{}\n", '{"a": 1}\nnonsense\n'])
 def test_a_damaged_file_of_answers_is_refused(tmp_path: Path, content: str) -> None:
     (tmp_path / "answers.jsonl").write_text(content)
     with pytest.raises(InputError, match="damaged"):
@@ -271,3 +272,10 @@ def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="exists already"):
         evaluate_toys(tmp_path, 1)
     assert [p.name for p in (tmp_path / "report").iterdir()] == ["thesis.tex"]
+
+
+def test_of_two_evaluations_into_one_folder_the_second_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "report").mkdir()
+    with locked(tmp_path / "report"), pytest.raises(InputError, match="another process is writing"):
+        evaluate_toys(tmp_path, 2)
+    evaluate_toys(tmp_path, 2)

@@ -123,7 +123,7 @@ class AnswerFile:
             first, *lines = content[:whole].splitlines() or [b""]
             found = dict(json.loads(first))
             self.frames = [_decoded(line) for line in lines]
-        except (ValueError, KeyError, TypeError) as error:
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise InputError(f"out: {path} is damaged ({error}); remove it to begin again") from None
         for name, value in asked.items():
             if found.get(name) != value:

@@ -18,6 +18,7 @@ from training.evaluation.gallery import Gallery
 from training.evaluation.page import WORST, write_report_page
 from training.evaluation.results import results
 from training.evaluation.runs import Run
+from training.locking import LOCK, locked
 from training.readers.labelled import LabelledFrames
 
 __all__ = ["evaluate_dataset"]
@@ -47,12 +48,25 @@ def evaluate_dataset(
         What is in report.json.
 
     Raises:
-        InputError: `out` holds something else, or answers of other runs, another dataset or another descriptor; or a
-            frame that cannot be read. Answers so far stay.
+        InputError: `out` holds something else, or answers of other runs, another dataset or another descriptor; another
+            process evaluates into it; or a frame cannot be read. Answers so far stay.
         OSError: something cannot be written.
     """
-    if out.exists() and not (out / ANSWERS).is_file() and (not out.is_dir() or any(out.iterdir())):
-        raise InputError(f"out: {out} exists already and is neither empty nor an evaluation")
+    if out.exists() and not (out / ANSWERS).is_file():
+        if not out.is_dir() or any(path.name != LOCK for path in out.iterdir()):
+            raise InputError(f"out: {out} exists already and is neither empty nor an evaluation")
+    out.mkdir(parents=True, exist_ok=True)
+    with locked(out):
+        return _evaluate(runs, frames, dataset, out, progress)
+
+
+def _evaluate(
+    runs: Sequence[Run],
+    frames: LabelledFrames,
+    dataset: Mapping[str, str],
+    out: Path,
+    progress: Callable[[str, int, int, str], object],
+) -> dict[str, Any]:
     classes, asked = runs[0].recognizer.run.classes, columns(runs)
     description = {**dataset, "frames": len(frames)}
     file = AnswerFile(
