@@ -32,7 +32,8 @@ __all__ = [
 ]
 
 _DPI = 130
-_BARS = ("#56b4e9", "#e69f00", "#009e73", "#222222")  # Okabe and Ito: told apart by all eyes
+_BARS = ("#56b4e9", "#e69f00", "#009e73", "#222222", "#cc79a7", "#0072b2", "#d55e00", "#f0e442")
+"""Okabe and Ito's palette: told apart by all eyes."""
 
 
 def save_figure(figure: Figure, path: str | Path) -> None:
@@ -74,7 +75,7 @@ def draw_accuracy(
     """Draw a group of bars for each part of the instances, a bar for each recognizer.
 
     Args:
-        names: of the recognizers, at most four.
+        names: of the recognizers, at most eight.
         accuracy: part -> one value a name.
         counts: part -> number of instances.
         path: of the picture.
@@ -85,13 +86,15 @@ def draw_accuracy(
     figure = Figure(figsize=(9, 3.6), layout="constrained")
     axes = figure.add_subplot()
     width = 0.8 / len(names)
+    crowded = len(names) * len(accuracy) > 16
     for k, name in enumerate(names):
         places = np.arange(len(accuracy)) + (k - (len(names) - 1) / 2) * width
         heights = [values[k] for values in accuracy.values()]
         bars = axes.bar(places, heights, width * 0.92, label=name, color=_BARS[k % len(_BARS)])
-        axes.bar_label(bars, fmt="%.2f", fontsize=8, padding=1)
+        axes.bar_label(bars, fmt="%.2f", fontsize=8, padding=2 if crowded else 1, rotation=90 if crowded else 0)
     axes.set_xticks(range(len(accuracy)), [f"{part}\n{counts[part]} instances" for part in accuracy])
-    axes.set_ylim(0, 1.08)
+    axes.set_ylim(0, 1.15 if crowded else 1.08)
+    axes.set_yticks(np.arange(0, 1.01, 0.2))
     axes.set_ylabel("accuracy")
     axes.spines[["top", "right"]].set_visible(False)
     figure.legend(loc="outside right upper", frameon=False)
