@@ -17,10 +17,10 @@ from training.scenes import compose_scene
 __all__ = ["write_sample_frames"]
 
 SAMPLES = (
-    ("crockery", "Crockery and a can", 1, 6),
-    ("breakfast", "Mugs before cereals", 3, 5),
+    ("crockery", "A laid table", 1, 6),
+    ("breakfast", "Mugs and a can in line", 3, 5),
     ("tools", "Tools and a sponge", 4, 5),
-    ("clutter", "Seven, most in part hidden", 6, 7),
+    ("clutter", "Seven close together", 6, 7),
 )
 """Folder, title, seed and number of objects of each; picked by eye."""
 

@@ -35,7 +35,8 @@ def figure_text(figure: Mapping[str, Any]) -> str:
 
 
 def accuracy_table(table: Mapping[str, Any], joinings: Sequence[str], methods: Sequence[str] = ()) -> Table:
-    """Header and rows of a table as `results` gives it; `methods` are publications' that stand beside."""
+    """Header and rows of a table as `results` gives it; beside it, what is published of `methods` for its cells."""
+    methods = [method for method in methods if any(method in cell["published"] for cell in table["cells"])]
     header = [", ".join(table["by"]), "instances", *joinings, *(f"{method}, published" for method in methods)]
     rows = []
     for cell in table["cells"]:
