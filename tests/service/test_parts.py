@@ -174,7 +174,8 @@ def frame_request(files: dict[str, bytes]) -> Callable[[httpx.AsyncClient], Any]
 
 
 def test_the_token_is_needed_for_all_but_health(app: FastAPI) -> None:
-    guarded = [("POST", "/v1/recognize"), ("POST", "/v1/describe"), ("GET", "/v1/model"), ("GET", "/v1/colornet")]
+    guarded = [("POST", f"/v1/{name}") for name in ("recognize", "explain", "describe")]
+    guarded += [("GET", "/v1/model"), ("GET", "/v1/colornet")]
     for method, path in [*guarded, ("GET", "/metrics")]:
         for value in ("", "Bearer", "Bearer wrong", "Basic secret", "Bearer s\xe9cret", "Bearer secret secret"):
             headers = {"Authorization": value.encode("latin-1")}

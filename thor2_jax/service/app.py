@@ -6,7 +6,6 @@ import secrets
 import signal
 import threading
 from collections.abc import AsyncIterator, Callable, Iterator, Sequence
-from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
@@ -17,13 +16,13 @@ from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
-from starlette.staticfiles import StaticFiles
 
 from thor2_jax.config import DESCRIPTOR_VERSION
-from thor2_jax.recognizer import Recognition
 from thor2_jax.service import schemas
+from thor2_jax.service.answers import instance
 from thor2_jax.service.engine import Row
 from thor2_jax.service.metrics import RequestCounting
+from thor2_jax.service.page_files import PageFiles
 from thor2_jax.service.problem import Problem, RequestError, documented
 from thor2_jax.service.running import Service
 from thor2_jax.service.schemas import NPZ
@@ -32,8 +31,8 @@ from thor2_jax.service.uploads import read_body, read_form
 
 __all__ = ["create_app"]
 
-PAGE = Path(__file__).parent / "page"
-"""Static files, served at /."""
+FRAME = ("color", "depth", "labels", "intrinsics")
+"""Parts of a form that is a frame."""
 
 
 def create_app(settings: Settings) -> FastAPI:
@@ -63,7 +62,7 @@ def create_app(settings: Settings) -> FastAPI:
     app.add_middleware(RequestCounting, metrics=service.metrics)
     app.include_router(_open_routes(service))
     app.include_router(_guarded_routes(service))
-    app.router.default = StaticFiles(directory=PAGE, html=True)
+    app.router.default = PageFiles()
     app.add_exception_handler(RequestError, _on_request_error)
     app.add_exception_handler(HTTPException, _on_http_error)
     app.add_exception_handler(ClientDisconnect, _on_disconnect)
@@ -125,9 +124,24 @@ def _guarded_routes(service: Service) -> APIRouter:
         """Name every instance of a frame."""
         async with service.request() as ticket:
             with ticket.stage("upload"):
-                files = await read_form(request, ("color", "depth", "labels", "intrinsics"))
+                files = await read_form(request, FRAME)
             found = await service.recognize(files, ticket)
-        return schemas.FrameAnswer(instances=[_instance(one) for one in found], timings=ticket.milliseconds())
+        return schemas.FrameAnswer(instances=[instance(one) for one in found], timings=ticket.milliseconds())
+
+    @guarded.post(
+        "/v1/explain",
+        response_model=schemas.ExplainedFrame,
+        responses=documented(400, 408, 413, 415, 422, 429, 503, 504),
+        openapi_extra={"requestBody": schemas.FRAME_FORM},
+    )
+    async def explain(request: Request) -> Response:
+        """Name every instance of a frame, and show what the names rest on: clouds, persistence images, colours."""
+        async with service.request() as ticket:
+            with ticket.stage("upload"):
+                files = await read_form(request, FRAME)
+            answer = await service.explain(files, ticket)
+            content = await run_in_threadpool(answer.model_dump_json)
+        return Response(content, media_type="application/json")
 
     @guarded.post(
         "/v1/describe",
@@ -192,25 +206,6 @@ def _check(token: str) -> Callable[..., Any]:
             raise RequestError(401, "Authorization", "The bearer token is missing or wrong.")
 
     return check
-
-
-def _instance(found: Recognition) -> schemas.Instance:
-    top = {
-        name: [schemas.Candidate(name=candidate, probability=p) for candidate, p in best]
-        for name, best in found.top.items()
-    }
-    return schemas.Instance(
-        label=found.label,
-        name=found.name,
-        confidence=found.confidence,
-        classifier=found.classifier,
-        top=top,
-        occluded=found.occluded,
-        overflow=found.overflow,
-        points_used=found.points_used,
-        kept_by_fallback=found.kept_by_fallback,
-        unrecognized=found.reason,
-    )
 
 
 def _json(rows: Sequence[Row], timings: dict[str, float]) -> bytes:

@@ -71,11 +71,16 @@ def _image(field: str, content: bytes, formats: tuple[str, ...], modes: tuple[st
     if width * height > MAX_PIXELS:
         raise bad(413, f"has {width} x {height} pixels; at most {MAX_PIXELS} are taken")
     if image.mode not in modes:
-        raise bad(422, f"has the mode {image.mode}; expected {' or '.join(modes)}")
+        raise bad(422, f"is {_kind(image.mode)}; expected {' or '.join(map(_kind, modes))}")
     try:
         return np.asarray(image)
     except Exception:  # as above
         raise bad(422, "is damaged or cut short") from None
+
+
+def _kind(mode: str) -> str:
+    kinds = {"1": "black and white", "L": "8-bit grey", "I;16": "16-bit grey", "I": "32-bit grey", "P": "indexed"}
+    return kinds.get(mode, mode)
 
 
 def clouds_of_json(content: bytes) -> CloudArrays:

@@ -8,13 +8,14 @@ from numpy.typing import NDArray
 
 from thor2_jax.capacity import BATCH_BUCKETS, POINT_BUCKETS, batch_bucket, point_bucket
 from thor2_jax.classifier import Feature
-from thor2_jax.descriptor import describe
+from thor2_jax.descriptor import describe_strips, strips
 from thor2_jax.errors import InputError
 from thor2_jax.recognizer import NO_PART, THOR2, Part, Recognition, Recognizer
 from thor2_jax.run_folder import load_run
 from thor2_jax.service.preparing import PreparedInstance
 from thor2_jax.service.settings import Settings
 from thor2_jax.types import PointClouds
+from thor2_jax.view_normalization import align
 
 __all__ = ["Engine", "Row"]
 
@@ -31,12 +32,16 @@ class Row:
         embeddings: [S, R, J] float32, colour embeddings.
         overflow: points and pairs that the descriptor has no room for.
         probabilities: classifier -> [C] float32.
+        aligned: [N, 3] float32, the aligned cloud and padding, scaled units.
+        strip_colors: [S, J, R] float32, strip colour vectors.
     """
 
     images: NDArray[np.float32]
     embeddings: NDArray[np.float32]
     overflow: int
     probabilities: dict[Feature, NDArray[np.float32]]
+    aligned: NDArray[np.float32]
+    strip_colors: NDArray[np.float32]
 
 
 class Engine:
@@ -73,11 +78,21 @@ class Engine:
     def _rows(self, parts: Sequence[Part], n_points: int) -> list[Row]:
         clouds = [(part.points, part.colors) for part in parts]
         packed = PointClouds.pack(clouds, n_points, boundary=[part.boundary for part in parts])
-        found = describe(packed, self.run.network, self.run.config)
+        aligned = align(packed, self.run.config)
+        in_strips = strips(aligned, self.run.network, self.run.config)
+        found = describe_strips(in_strips, self.run.network, self.run.config)
         probabilities = self._recognizer.probabilities(found, THOR2)
-        images, embeddings, overflow = (np.asarray(a) for a in (found.images, found.embeddings, found.overflow))
+        arrays = (found.images, found.embeddings, found.overflow, aligned.points, in_strips.color)
+        images, embeddings, overflow, points, colors = (np.asarray(a) for a in arrays)
         return [
-            Row(images[k], embeddings[k], int(overflow[k]), {name: p[k] for name, p in probabilities.items()})
+            Row(
+                images[k],
+                embeddings[k],
+                int(overflow[k]),
+                {name: p[k] for name, p in probabilities.items()},
+                points[k],
+                colors[k],
+            )
             for k in range(len(parts))
         ]
 

@@ -17,11 +17,14 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
 from thor2_jax.recognizer import Part, prepare
 from thor2_jax.service.decoding import clouds_of_json, clouds_of_npz, frame_of
 from thor2_jax.service.problem import RequestError, late
+from thor2_jax.service.schemas import LabelMap
+from thor2_jax.service.settings import MAX_RUNS
 
 __all__ = ["Prepared", "PreparedInstance", "Preparers", "prepare_clouds", "prepare_frame"]
 
@@ -41,13 +44,14 @@ class PreparedInstance:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Prepared:
-    """What a process gives back: the instances, and seconds a stage."""
+    """What a process gives back: the instances, seconds a stage, and the frame's label map if it was asked for."""
 
     instances: list[PreparedInstance]
     seconds: dict[str, float]
+    label_map: LabelMap | None = None
 
 
-def prepare_frame(files: dict[str, bytes], sigma_s: float) -> Prepared:
+def prepare_frame(files: dict[str, bytes], sigma_s: float, with_map: bool) -> Prepared:
     """Decode a frame and make the clouds of its instances. Raises RequestError."""
     start = time.perf_counter()
     frame = frame_of(**files)
@@ -59,7 +63,21 @@ def prepare_frame(files: dict[str, bytes], sigma_s: float) -> Prepared:
             instances.append(PreparedInstance(label, cloud.reason, cloud.kept_by_fallback, part))
     except InputError:  # images and numbers are right one by one: the camera puts the points out of all bounds
         raise RequestError(422, "intrinsics", "intrinsics put the points of an instance too far apart.") from None
-    return Prepared(instances, {"decode": decoded - start, "clouds": time.perf_counter() - decoded})
+    label_map = _label_map(frame.labels) if with_map else None
+    return Prepared(instances, {"decode": decoded - start, "clouds": time.perf_counter() - decoded}, label_map)
+
+
+def _label_map(labels: NDArray[Any]) -> LabelMap:
+    step = 1
+    while True:
+        coarse = labels[::step, ::step]
+        flat = coarse.ravel()
+        starts = np.flatnonzero(np.diff(flat, prepend=~flat[0]))
+        if len(starts) <= MAX_RUNS:
+            height, width = coarse.shape
+            lengths = np.diff(starts, append=flat.size)
+            return LabelMap(width=width, height=height, labels=flat[starts].tolist(), lengths=lengths.tolist())
+        step *= 2
 
 
 def prepare_clouds(content: bytes, as_npz: bool) -> Prepared:

@@ -8,11 +8,13 @@ import time
 from collections.abc import AsyncIterator, Iterator
 
 from thor2_jax.recognizer import Part, Recognition
+from thor2_jax.service.answers import explained_frame
 from thor2_jax.service.batching import Batcher
 from thor2_jax.service.engine import Engine, Row
 from thor2_jax.service.metrics import CompilationWatch, Metrics
 from thor2_jax.service.preparing import Prepared, Preparers, prepare_clouds, prepare_frame
 from thor2_jax.service.problem import RequestError, late
+from thor2_jax.service.schemas import ExplainedFrame
 from thor2_jax.service.settings import Settings
 
 __all__ = ["Service", "Ticket"]
@@ -121,10 +123,21 @@ class Service:
 
     async def recognize(self, files: dict[str, bytes], ticket: Ticket) -> list[Recognition]:
         """Answers for the frame in `files` (the arguments of `decoding.frame_of`). Raises RequestError."""
-        call = self._preparers.submit(ticket.deadline, prepare_frame, files, self.engine.run.config.sigma_s)
-        prepared = await asyncio.wrap_future(call)
-        rows = await self._rows(prepared, ticket)
+        prepared, rows = await self._frame(files, False, ticket)
         return self.engine.recognitions(prepared.instances, rows)
+
+    async def explain(self, files: dict[str, bytes], ticket: Ticket) -> ExplainedFrame:
+        """As `recognize`, with what the answers rest on. Raises RequestError."""
+        prepared, rows = await self._frame(files, True, ticket)
+        found = self.engine.recognitions(prepared.instances, rows)
+        config = self.engine.run.config
+        return await asyncio.to_thread(explained_frame, prepared, found, rows, config, ticket.milliseconds())
+
+    async def _frame(self, files: dict[str, bytes], with_map: bool, ticket: Ticket) -> tuple[Prepared, list[Row]]:
+        sigma_s = self.engine.run.config.sigma_s
+        call = self._preparers.submit(ticket.deadline, prepare_frame, files, sigma_s, with_map)
+        prepared = await asyncio.wrap_future(call)
+        return prepared, await self._rows(prepared, ticket)
 
     async def describe(self, content: bytes, as_npz: bool, ticket: Ticket) -> list[Row]:
         """A row for each cloud of a body, npz or JSON. Raises RequestError."""

@@ -5,7 +5,7 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field
 
 from thor2_jax.capacity import POINT_BUCKETS
-from thor2_jax.service.settings import FARTHEST, MAX_CLOUDS
+from thor2_jax.service.settings import FARTHEST, MAX_CLOUDS, MAX_DETAILED
 
 __all__ = [
     "CLOUDS_BODY",
@@ -16,10 +16,16 @@ __all__ = [
     "ColorNetworkAnswer",
     "DescribeAnswer",
     "Descriptor",
+    "Details",
+    "ExplainedFrame",
+    "ExplainedInstance",
     "FrameAnswer",
     "Health",
     "Instance",
+    "LabelMap",
     "ModelAnswer",
+    "Slice",
+    "Strip",
 ]
 
 NPZ = "application/octet-stream"
@@ -56,6 +62,58 @@ class FrameAnswer(BaseModel):
     """All instances of a frame, in the order of their labels."""
 
     instances: list[Instance]
+    timings: Milliseconds = Field(description="Milliseconds a stage: upload, decode, clouds, device, total.")
+
+
+class Strip(BaseModel):
+    """The points of one strip of a slice by colour region."""
+
+    strip: int
+    regions: list[int]
+    weights: list[float] = Field(description="Points in each of these regions; one of m regions counts 1/m in each.")
+
+
+class Slice(BaseModel):
+    """One slice of a cloud, as the descriptor sees it."""
+
+    image: list[list[int]] = Field(description="[P, P] persistence image, 255 at image_peak; axes birth, persistence.")
+    strips: list[Strip] = Field(description="Those with points.")
+
+
+class Details(BaseModel):
+    """What a name rests on. Lengths are scaled units."""
+
+    points: list[tuple[float, float, float]] = Field(
+        description="The aligned cloud: slices lie along z, strips along x. A random part of a large one."
+    )
+    colors: list[tuple[int, int, int]] = Field(description="sRGB of these points.")
+    slice_borders: list[tuple[float, float]] = Field(description="Where along z each slice begins and ends.")
+    image_peak: float = Field(description="Largest value of the persistence images.")
+    slices: list[Slice]
+
+
+class ExplainedInstance(Instance):
+    """An instance with what its name rests on."""
+
+    details: Details | None = Field(
+        description=f"null if it was not recognized, and past the first {MAX_DETAILED} instances."
+    )
+
+
+class LabelMap(BaseModel):
+    """The label image in runs, row after row. A ragged one is made coarser: rows and columns are left out evenly."""
+
+    width: int
+    height: int
+    labels: list[int]
+    lengths: list[int] = Field(description="Pixels that each of `labels` holds on for.")
+
+
+class ExplainedFrame(BaseModel):
+    """All instances of a frame, in the order of their labels, with what their names rest on."""
+
+    instances: list[ExplainedInstance]
+    label_map: LabelMap
     timings: Milliseconds = Field(description="Milliseconds a stage: upload, decode, clouds, device, total.")
 
 

@@ -6,7 +6,17 @@ from pathlib import Path
 from thor2_jax.capacity import BATCH_BUCKETS
 from thor2_jax.errors import InputError
 
-__all__ = ["FARTHEST", "MAX_BODY", "MAX_CLOUDS", "MAX_INSTANCES", "MAX_PIXELS", "MAX_TEXT", "Settings"]
+__all__ = [
+    "FARTHEST",
+    "MAX_BODY",
+    "MAX_CLOUDS",
+    "MAX_DETAILED",
+    "MAX_INSTANCES",
+    "MAX_PIXELS",
+    "MAX_RUNS",
+    "MAX_TEXT",
+    "Settings",
+]
 
 FARTHEST = 100.0
 """Metres: largest coordinate of a cloud."""
@@ -19,6 +29,12 @@ MAX_PIXELS = 1920 * 1080
 
 MAX_INSTANCES = 256
 """Instances in a frame."""
+
+MAX_DETAILED = 32
+"""Instances of a frame that are explained."""
+
+MAX_RUNS = 50_000
+"""Runs in the label map of an explained frame."""
 
 MAX_CLOUDS = 32
 """Clouds in a request."""

@@ -1,0 +1,320 @@
+"""The page as people use it, in headless Chromium."""
+
+import io
+import json
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+from PIL import Image
+from playwright.sync_api import Browser, Locator, Page, Route, expect, sync_playwright
+
+import thor2_jax
+
+Files = dict[str, bytes]
+SAMPLES = Path(thor2_jax.__file__).parent / "service" / "page" / "samples"
+FIELDS = {"color": "image/png", "depth": "image/png", "labels": "image/png", "intrinsics": "application/json"}
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    chromium = shutil.which("chromium")
+    if chromium is None:
+        pytest.skip("no chromium to drive the page with: apt-get install chromium")
+    with sync_playwright() as playwright:
+        yield playwright.chromium.launch(executable_path=chromium)
+
+
+@pytest.fixture
+def open_page(browser: Browser, server: Any) -> Iterator[Callable[..., Page]]:
+    """Open the page in a fresh profile. At the end: nothing was asked of another address, and no script failed."""
+    contexts, asked, wrong = [], [], []
+
+    def open_one(route: Callable[[Route], None] | None = None, **options: Any) -> Page:
+        contexts.append(browser.new_context(**options))
+        page = contexts[-1].new_page()
+        page.set_default_timeout(15_000)
+        page.on("request", lambda request: asked.append(request.url))
+        page.on("pageerror", lambda error: wrong.append(str(error)))
+        # A refused request is a line in the console too; the page must say it, and tests look there.
+        page.on("console", lambda line: wrong.append(line.text) if "status of" not in line.text else None)
+        if route is not None:
+            page.route("**/v1/**", route)
+        page.goto(server.url)
+        expect(page.locator("#samples button")).to_have_count(4)
+        return page
+
+    yield open_one
+    for context in contexts:
+        context.close()
+    assert asked and all(url.startswith(f"{server.url}/") for url in asked)
+    assert wrong == []
+
+
+def choose_sample(page: Page) -> np.ndarray:
+    """Have the first sample recognized; its labels."""
+    page.locator("#samples button").first.click()
+    expect(page.locator("#objects button").first).to_be_visible()
+    folder = json.loads((SAMPLES / "index.json").read_text())[0]["folder"]
+    return np.asarray(Image.open(SAMPLES / folder / "labels.png"))
+
+
+def upload(page: Page, files: Files, color_name: str = "color.png") -> None:
+    if not page.locator("#upload-form").is_visible():
+        page.get_by_text("Upload a frame of your own").click()
+    for field, kind in FIELDS.items():
+        name = color_name if field == "color" else field
+        page.locator(f"#{field}").set_input_files({"name": name, "mimeType": kind, "buffer": files[field]})
+    page.get_by_role("button", name="Recognize", exact=True).click()
+
+
+def pixels(canvas: Locator) -> np.ndarray:
+    """What is drawn on a canvas, [H, W, 3]."""
+    canvas.scroll_into_view_if_needed()
+    return np.asarray(Image.open(io.BytesIO(canvas.screenshot())).convert("RGB")).astype(int)
+
+
+def test_a_sample_is_outlined_and_named(open_page: Callable[..., Page]) -> None:
+    page = open_page(viewport={"width": 1280, "height": 900})
+    expect(page.locator("#ready")).to_have_text("Ready")
+    labels = choose_sample(page)
+    count = len(np.unique(labels)) - 1
+    buttons = page.locator("#objects button")
+    expect(buttons).to_have_count(count)
+    expect(page.get_by_role("status")).to_contain_text(f"{count} objects")
+    assert set(page.locator("#objects .name").all_inner_texts()) <= set("abcdefg")
+    drawn = pixels(page.locator("#overlay"))
+    across = drawn.shape[1] / labels.shape[1]
+    assert drawn.shape[0] == pytest.approx(labels.shape[0] * across, abs=2)
+    for k in range(count):
+        red, green, blue = (
+            int(v) for v in page.evaluate(f"getComputedStyle(document.querySelectorAll('#objects .swatch')[{k}])"
+                                          ".backgroundColor.match(/\\d+/g)")
+        )  # fmt: skip
+        painted = np.argwhere((np.abs(drawn - (red, green, blue)) < 12).all(axis=2)) / across
+        inside = np.argwhere(labels == int(buttons.nth(k).get_attribute("data-label") or 0))
+        low, high = inside.min(axis=0) - 4, inside.max(axis=0) + 5
+        around = ((painted >= low) & (painted <= high)).all(axis=1).sum() * across**2
+        assert around > 2 * (high - low).max(), f"object {k} has no outline"
+
+
+def test_a_click_shows_what_a_name_rests_on(open_page: Callable[..., Page]) -> None:
+    page = open_page(viewport={"width": 1280, "height": 900})
+    labels = choose_sample(page)
+    overlay = page.locator("#overlay")
+    box = overlay.bounding_box()
+    assert box is not None
+    scale = box["width"] / labels.shape[1]
+    for label in (4, 6):
+        inside = np.argwhere(labels == label)
+        y, x = inside[np.abs(inside - inside.mean(axis=0)).sum(axis=1).argmin()]
+        overlay.click(position={"x": float((x + 0.5) * scale), "y": float((y + 0.5) * scale)})
+        chosen = page.locator('#objects button[aria-pressed="true"]')
+        expect(chosen).to_have_count(1)
+        expect(chosen).to_have_attribute("data-label", str(label))
+        expect(page.locator("#details-facts")).to_contain_text(f"Label {label} ")
+        expect(page.locator("#details-title")).to_have_text(chosen.locator(".name").inner_text())
+    overlay.click(position={"x": 2, "y": 2})  # background
+    expect(page.locator('#objects button[aria-pressed="true"]')).to_have_attribute("data-label", "6")
+
+    assert len(np.unique(pixels(page.locator("#cloud")).reshape(-1, 3), axis=0)) > 20
+    for kind in (".image", ".strips"):
+        canvases = page.locator(f"#slices {kind}")
+        expect(canvases).to_have_count(7)
+        assert pixels(canvases.first).std() > 1
+        assert all(text.endswith(".") for text in canvases.evaluate_all("all => all.map(one => one.ariaLabel)"))
+    tables = page.locator("#classifiers table")
+    expect(tables).to_have_count(2)
+    for k in range(2):
+        shown = tables.nth(k).locator("tr:not(.bar) td").all_inner_texts()
+        shares = [float(text.removesuffix("%").strip()) for text in shown]
+        assert len(shares) == 5 and shares == sorted(shares, reverse=True)
+    expect(page.locator(".badge")).to_have_count(1)
+
+
+def test_by_keyboard_alone(open_page: Callable[..., Page]) -> None:
+    page = open_page()
+
+    def tab_to(selector: str) -> None:
+        for _ in range(30):
+            page.keyboard.press("Tab")
+            if page.evaluate("selector => document.activeElement.matches(selector)", selector):
+                ring = page.evaluate("parseFloat(getComputedStyle(document.activeElement).outlineWidth)")
+                style = page.evaluate("getComputedStyle(document.activeElement).outlineStyle")
+                assert ring >= 2 and style == "solid", "the focus cannot be seen"
+                return
+        raise AssertionError(f"{selector} is not reached")
+
+    tab_to("#samples button:nth-child(2)")
+    page.keyboard.press("Enter")
+    expect(page.locator("#objects button").first).to_be_visible()
+    tab_to("#objects li:nth-child(3) button")
+    page.keyboard.press("Space")
+    expect(page.locator("#objects li:nth-child(3) button")).to_have_attribute("aria-pressed", "true")
+    page.keyboard.press("Tab")
+    tab_to("#model-title")
+    page.keyboard.press("Enter")
+    expect(page.locator("#classes li")).to_have_count(7)
+
+
+def test_an_uploaded_frame(open_page: Callable[..., Page], files: Files) -> None:
+    page = open_page()
+    upload(page, files, color_name="<b>x</b>.png")
+    status = page.get_by_role("status")
+    expect(status).to_contain_text("<b>x</b>.png: 4 objects, 1 of them not recognized.")
+    expect(page.locator('#samples button[aria-pressed="true"]')).to_have_count(0)
+    small = page.locator('#objects button[data-label="5"]')
+    expect(small).to_contain_text("unrecognized")
+    expect(small).to_contain_text("at least 30")
+    small.click()
+    expect(page.locator("#details-reason")).to_contain_text("at least 30")
+    expect(page.locator("#evidence")).to_be_hidden()
+    page.locator('#objects button[data-label="7"]').click()
+    expect(page.locator("#evidence")).to_be_visible()
+
+
+def test_no_objects(open_page: Callable[..., Page], files: Files, encode: Callable[..., bytes]) -> None:
+    page = open_page()
+    upload(page, files | {"labels": encode(np.zeros((240, 320), np.uint8))})
+    expect(page.get_by_role("status")).to_contain_text("no objects")
+    expect(page.locator("#details")).to_be_hidden()
+
+
+def test_what_is_wrong_stands_beside_its_field(open_page: Callable[..., Page], ask: httpx.Client, files: Files) -> None:
+    page = open_page()
+    page.get_by_text("Upload a frame of your own").click()
+    page.get_by_role("button", name="Recognize", exact=True).click()
+    for field in FIELDS:
+        expect(page.locator(f"#{field}-error")).to_have_text("Choose a file.")
+    expect(page.locator("#color")).to_be_focused()
+
+    for field in FIELDS:
+        bad = files | {field: files["depth" if field == "color" else "color"]}
+        upload(page, bad)
+        said = ask.post("/v1/explain", files=bad).json()
+        assert said["field"] == field
+        expect(page.locator(f"#{field}-error")).to_have_text(said["message"])
+        expect(page.locator(f"#{field}")).to_have_attribute("aria-invalid", "true")
+        expect(page.locator(f"#{field}")).to_be_focused()
+        assert f"{field}-error" in (page.locator(f"#{field}").get_attribute("aria-describedby") or "")
+        expect(page.locator(".error:not(:empty)")).to_have_count(1)
+        expect(page.locator("#result")).to_be_hidden()
+    upload(page, files)
+    expect(page.locator("#objects button")).to_have_count(4)
+    expect(page.locator(".error:not(:empty), [aria-invalid]")).to_have_count(0)
+
+
+def test_a_token_is_asked_for(open_page: Callable[..., Page]) -> None:
+    def guard(route: Route) -> None:
+        if route.request.headers.get("authorization") == "Bearer secret":
+            route.continue_()
+        else:
+            problem = {"field": "Authorization", "message": "The bearer token is missing or wrong."}
+            route.fulfill(status=401, json=problem)
+
+    page = open_page(guard)
+    field, error = page.get_by_label("Bearer token"), page.locator("#token-error")
+    expect(field).to_be_focused()
+    expect(error).to_be_empty()
+    field.fill("wrong")
+    field.press("Enter")
+    expect(error).to_have_text("The bearer token is missing or wrong.")
+    field.fill("secret")
+    page.get_by_role("button", name="Use token").click()
+    expect(field).to_be_hidden()
+    choose_sample(page)
+
+
+@pytest.mark.parametrize(
+    ("answer", "said"),
+    [
+        (
+            {"status": 429, "headers": {"Retry-After": "1"}, "json": {"field": None, "message": "Too many wait."}},
+            "Too many wait. Try again in a moment.",
+        ),
+        ({"status": 502, "body": "<html>"}, "The service answered with status 502."),
+        ({"status": 413, "json": {"field": "body", "message": "The body is too large."}}, "The body is too large."),
+    ],
+)
+def test_a_service_that_refuses(open_page: Callable[..., Page], answer: Any, said: str) -> None:
+    page = open_page(lambda route: route.fulfill(**answer) if "explain" in route.request.url else route.continue_())
+    page.locator("#samples button").first.click()
+    expect(page.get_by_role("alert")).to_have_text(said)
+    expect(page.locator("#result")).to_be_hidden()
+    page.unroute("**/v1/**")
+    choose_sample(page)
+    expect(page.get_by_role("alert")).to_be_hidden()
+
+
+def test_files_that_are_too_large(open_page: Callable[..., Page], files: Files, tmp_path: Path) -> None:
+    page = open_page()
+    upload(page, files)
+    expect(page.locator("#objects button")).to_have_count(4)
+    (tmp_path / "large").write_bytes(bytes(20 * 2**20))
+    page.locator("#color").set_input_files(tmp_path / "large")
+    page.get_by_role("button", name="Recognize", exact=True).click()
+    expect(page.get_by_role("alert")).to_contain_text("bytes")
+
+
+def test_a_phones_width(open_page: Callable[..., Page], files: Files) -> None:
+    page = open_page(viewport={"width": 360, "height": 740}, is_mobile=True, has_touch=True)
+
+    def fits() -> None:
+        assert page.evaluate("document.documentElement.scrollWidth") <= 360
+        assert page.evaluate(
+            "[...document.querySelectorAll('button, input, canvas, td, p')].every(one => {"
+            " const box = one.getBoundingClientRect(); return box.left >= 0 && box.right <= 360; })"
+        )
+        heights = page.evaluate(
+            "[...document.querySelectorAll('button, input, summary')].map(one => one.offsetHeight).filter(Boolean)"
+        )
+        assert min(heights) >= 24
+
+    fits()
+    page.get_by_text("Upload a frame of your own").tap()
+    page.get_by_role("button", name="Recognize", exact=True).tap()
+    fits()
+    upload(page, files)
+    expect(page.locator("#objects button")).to_have_count(4)
+    expect(page.locator("#status")).to_be_in_viewport()
+    page.locator('#objects button[data-label="200"]').tap()
+    expect(page.locator("#slices li")).to_have_count(7)
+    fits()
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_text_can_be_read_in_both_schemes(open_page: Callable[..., Page], scheme: str) -> None:
+    page = open_page(color_scheme=scheme)
+    values = page.evaluate(
+        "(() => { const style = getComputedStyle(document.documentElement);"
+        " return Object.fromEntries(['text', 'muted', 'accent', 'on-accent', 'error', 'page', 'card', 'chosen',"
+        " 'error-well'].map(name => [name, style.getPropertyValue('--' + name).trim()])); })()"
+    )
+
+    def luminance(name: str) -> float:
+        channels = np.array([int(values[name][k : k + 2], 16) for k in (1, 3, 5)]) / 255
+        linear = np.where(channels <= 0.04045, channels / 12.92, ((channels + 0.055) / 1.055) ** 2.4)
+        return float(linear @ (0.2126, 0.7152, 0.0722))
+
+    assert (luminance("page") > 0.5) == (scheme == "light")
+    pairs = [(ink, ground) for ink in ("text", "muted") for ground in ("page", "card", "chosen")]
+    for ink, ground in [
+        *pairs,
+        ("accent", "card"),
+        ("on-accent", "accent"),
+        ("error", "card"),
+        ("error", "error-well"),
+    ]:
+        high, low = sorted((luminance(ink), luminance(ground)), reverse=True)
+        assert (high + 0.05) / (low + 0.05) >= 4.5, (ink, ground)
+
+
+def test_headers_keep_the_page_to_its_server(ask: httpx.Client) -> None:
+    for path in ("/", "/app.js", "/style.css", "/samples/index.json"):
+        policy = ask.get(path).headers["content-security-policy"]
+        assert "default-src 'none'" in policy and "unsafe" not in policy and "http" not in policy
+        assert ask.get(path).headers["x-content-type-options"] == "nosniff"

@@ -1,0 +1,44 @@
+// What all drawings share: canvases as sharp as the screen, drawn again when their size or the colour scheme changes.
+
+const drawn = new WeakMap();
+const watch = new ResizeObserver((entries) => {
+  for (const { target } of entries) {
+    if (target.isConnected) draw(target);
+    else watch.unobserve(target);
+  }
+});
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
+  [...document.querySelectorAll("canvas")].filter((canvas) => drawn.has(canvas)).forEach(draw);
+});
+
+function draw(canvas) {
+  const scale = devicePixelRatio;
+  const { clientWidth: width, clientHeight: height } = canvas;
+  if (!width || !height) return;
+  canvas.width = Math.round(width * scale);
+  canvas.height = Math.round(height * scale);
+  const context = canvas.getContext("2d");
+  context.scale(scale, scale);
+  drawn.get(canvas)(context, width, height);
+}
+
+/** Draw with `paint(context, width, height)`, in CSS pixels, now and whenever it is needed. */
+export function keepDrawn(canvas, paint) {
+  drawn.set(canvas, paint);
+  watch.observe(canvas);
+  draw(canvas);
+}
+
+/** A colour of the style sheet, for example `--muted`. */
+export const themed = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+
+export const rgb = ([red, green, blue]) => `rgb(${red} ${green} ${blue})`;
+
+export const percent = (share) => `${(100 * share).toFixed(share < 0.0995 ? 1 : 0)}\u00a0%`;
+
+/** An element with properties and children. */
+export function element(tag, properties = {}, ...children) {
+  const made = Object.assign(document.createElement(tag), properties);
+  made.append(...children);
+  return made;
+}

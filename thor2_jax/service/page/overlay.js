@@ -1,0 +1,235 @@
+// The colour image with the outlines and names of its objects, and which object lies where.
+
+import { keepDrawn, percent, rgb } from "./drawing.js";
+
+// Okabe and Ito's palette, as in the pictures of the command line.
+const PAINTS = [[86, 180, 233], [240, 228, 66], [0, 158, 115], [204, 121, 167], [0, 114, 178]];
+const UNRECOGNIZED = [213, 94, 0];
+
+const SMALL = 480; // CSS pixels: narrower pictures get smaller letters and thinner lines
+
+/** A colour for each instance. */
+export function paints(instances) {
+  let named = 0;
+  return instances.map(({ name }) => (name === null ? UNRECOGNIZED : PAINTS[named++ % PAINTS.length]));
+}
+
+const ink = ([red, green, blue]) => (0.299 * red + 0.587 * green + 0.114 * blue > 100 ? "#000" : "#fff");
+
+export class Overlay {
+  /** On `canvas`; `onSelect(label)` is called when an object is clicked. */
+  constructor(canvas, onSelect) {
+    this.canvas = canvas;
+    this.regions = null;
+    this.tags = [];
+    canvas.addEventListener("click", (event) => {
+      const label = this.labelAt(event.offsetX, event.offsetY);
+      if (label !== 0) onSelect(label);
+    });
+    canvas.addEventListener("pointermove", (event) => {
+      canvas.style.cursor = this.labelAt(event.offsetX, event.offsetY) ? "pointer" : "default";
+    });
+  }
+
+  show(bitmap, instances, labelMap, selected) {
+    Object.assign(this, { bitmap, instances, selected, colors: paints(instances), regions: new Regions(labelMap) });
+    this.canvas.style.aspectRatio = `${bitmap.width} / ${bitmap.height}`;
+    const names = instances.map(({ name }) => name ?? "unrecognized").join(", ");
+    this.canvas.setAttribute("aria-label", `Colour image with the outlines of its objects: ${names || "none"}.`);
+    this.redraw();
+  }
+
+  select(label) {
+    this.selected = label;
+    this.redraw();
+  }
+
+  redraw() {
+    keepDrawn(this.canvas, (context, width, height) => this.paint(context, width, height));
+  }
+
+  /** The label of the object at a place in CSS pixels, 0 if there is none. Names lie on top. */
+  labelAt(x, y) {
+    if (!this.regions) return 0;
+    const tag = this.tags.find(({ box }) => x >= box.x && x < box.x + box.width && y >= box.y && y < box.y + box.height);
+    return tag ? tag.label : this.regionAt(x, y);
+  }
+
+  regionAt(x, y) {
+    const { width, height } = this.regions;
+    return this.regions.at(
+      Math.floor((x * width) / this.canvas.clientWidth),
+      Math.floor((y * height) / this.canvas.clientHeight),
+    );
+  }
+
+  paint(context, width, height) {
+    context.imageSmoothingQuality = "high";
+    context.drawImage(this.bitmap, 0, 0, width, height);
+    const across = width / this.regions.width;
+    const down = height / this.regions.height;
+    const toScreen = new DOMMatrix().scale(across, down);
+    const onScreen = (path) => {
+      const scaled = new Path2D();
+      scaled.addPath(path, toScreen);
+      return scaled;
+    };
+    context.lineCap = context.lineJoin = "round";
+    const order = this.instances.map((one, k) => k).sort((a, b) => this.isSelected(a) - this.isSelected(b));
+    for (const k of order) {
+      const region = this.regions.of(this.instances[k].label);
+      if (!region) continue;
+      const outline = onScreen(region.outline);
+      if (this.isSelected(k)) {
+        context.fillStyle = "rgb(255 255 255 / 25%)";
+        context.fill(onScreen(region.area));
+      }
+      const line = (this.isSelected(k) ? 4 : 2) * (width < SMALL ? 0.75 : 1);
+      context.strokeStyle = "rgb(0 0 0 / 70%)";
+      context.lineWidth = line + 2;
+      context.stroke(outline);
+      context.strokeStyle = rgb(this.colors[k]);
+      context.lineWidth = line;
+      context.stroke(outline);
+    }
+    this.placeTags(context, width, height, across, down);
+    for (const k of order) this.paintTag(context, this.tags[k]);
+  }
+
+  isSelected(k) {
+    return this.instances[k].label === this.selected;
+  }
+
+  placeTags(context, width, height, across, down) {
+    const small = width < SMALL;
+    const size = small ? 11 : 13;
+    context.font = `600 ${size}px system-ui, sans-serif`;
+    this.tags = [];
+    this.instances.forEach(({ label, name, confidence }, k) => {
+      const text = name === null ? "unrecognized" : small ? name : `${name} ${percent(confidence)}`;
+      const box = { width: Math.min(width, context.measureText(text).width + size), height: size + 8 };
+      const region = this.regions.of(label);
+      const around = {
+        x: region.left * across,
+        y: region.top * down,
+        width: (region.right - region.left) * across,
+        height: (region.bottom - region.top) * down,
+      };
+      Object.assign(box, this.bestPlace(label, box, around, width, height));
+      this.tags.push({ label, text, box, color: this.colors[k], font: context.font, isSelected: this.isSelected(k) });
+    });
+  }
+
+  /** Above, below or on the object, wherever it hides least of the other names and objects. */
+  bestPlace(label, box, around, width, height) {
+    let best = null;
+    const middle = around.y + (around.height - box.height) / 2;
+    for (const [far, y] of [[0, around.y - box.height - 3], [0.3, around.y + around.height + 3], [0.6, middle]]) {
+      for (const part of [0.5, 0.25, 0.75, 0, 1]) {
+        const place = {
+          x: Math.max(0, Math.min(width - box.width, around.x + around.width * part - box.width / 2)),
+          y: Math.max(0, Math.min(height - box.height, y)),
+        };
+        const covered = this.tags.reduce((sum, { box: other }) => sum + shared({ ...box, ...place }, other), 0);
+        const cost = 10 * covered + 3 * this.hidden(label, { ...box, ...place }) + far + Math.abs(part - 0.5);
+        if (!best || cost < best.cost) best = { cost, place };
+      }
+    }
+    return best.place;
+  }
+
+  /** How much of a box lies on other objects than `label`, from 0 to 1. */
+  hidden(label, box) {
+    let hits = 0;
+    for (let k = 0; k < 27; k++) {
+      const under = this.regionAt(box.x + (box.width * ((k % 9) + 0.5)) / 9, box.y + (box.height * (Math.floor(k / 9) + 0.5)) / 3);
+      if (under !== 0 && under !== label) hits++;
+    }
+    return hits / 27;
+  }
+
+  paintTag(context, { text, box, color, font, isSelected }) {
+    context.font = font;
+    context.fillStyle = rgb(color);
+    context.strokeStyle = isSelected ? "#fff" : "rgb(0 0 0 / 70%)";
+    context.lineWidth = isSelected ? 3 : 1;
+    context.beginPath();
+    context.roundRect(box.x, box.y, box.width, box.height, 4);
+    context.stroke();
+    context.fill();
+    context.fillStyle = ink(color);
+    context.textAlign = "center";
+    context.textBaseline = "middle";
+    context.fillText(text, box.x + box.width / 2, box.y + box.height / 2 + 0.5, box.width - 4);
+  }
+}
+
+/** Pixels that two boxes share. */
+function shared(a, b) {
+  const across = Math.min(a.x + a.width, b.x + b.width) - Math.max(a.x, b.x);
+  const down = Math.min(a.y + a.height, b.y + b.height) - Math.max(a.y, b.y);
+  return Math.max(0, across) * Math.max(0, down);
+}
+
+/** The label map unpacked: each label's area, outline and box, in pixels of the map. */
+class Regions {
+  constructor({ width, height, labels, lengths }) {
+    Object.assign(this, { width, height });
+    this.map = new Int32Array(width * height);
+    this.found = new Map();
+    let start = 0;
+    labels.forEach((label, k) => {
+      const end = start + lengths[k];
+      this.map.fill(label, start, end);
+      if (label !== 0) this.addRun(label, start, end);
+      start = end;
+    });
+    this.trace();
+  }
+
+  at(x, y) {
+    return x >= 0 && x < this.width && y >= 0 && y < this.height ? this.map[y * this.width + x] : 0;
+  }
+
+  of(label) {
+    return this.found.get(label);
+  }
+
+  addRun(label, start, end) {
+    if (!this.found.has(label)) {
+      const box = { left: this.width, top: this.height, right: 0, bottom: 0 };
+      this.found.set(label, { area: new Path2D(), outline: new Path2D(), ...box });
+    }
+    const region = this.found.get(label);
+    while (start < end) {
+      const y = Math.floor(start / this.width);
+      const x = start - y * this.width;
+      const length = Math.min(end - start, this.width - x);
+      region.area.rect(x, y, length, 1);
+      region.left = Math.min(region.left, x);
+      region.right = Math.max(region.right, x + length);
+      region.top = Math.min(region.top, y);
+      region.bottom = Math.max(region.bottom, y + 1);
+      start += length;
+    }
+  }
+
+  /** Marching squares: between each four neighbouring pixels, a line where one label ends. */
+  trace() {
+    for (let y = -1; y < this.height; y++) {
+      for (let x = -1; x < this.width; x++) {
+        const corners = [this.at(x, y), this.at(x + 1, y), this.at(x + 1, y + 1), this.at(x, y + 1)];
+        if (corners.every((label) => label === corners[0])) continue;
+        const middles = [[x + 1, y + 0.5], [x + 1.5, y + 1], [x + 1, y + 1.5], [x + 0.5, y + 1]];
+        for (const label of new Set(corners)) {
+          if (label === 0) continue;
+          const crossed = middles.filter((_, k) => (corners[k] === label) !== (corners[(k + 1) % 4] === label));
+          for (let k = 0; k < crossed.length; k += 2) {
+            this.found.get(label).outline.moveTo(...crossed[k]);
+            this.found.get(label).outline.lineTo(...crossed[k + 1]);
+          }
+        }
+      }
+    }
+  }
+}
