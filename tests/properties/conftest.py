@@ -27,9 +27,9 @@ for tier, examples in (("quick", 4), ("thorough", 60)):
 
 
 def pytest_collectstart(collector: pytest.Collector) -> None:
-    """The slow tier draws fifteen times as many examples of every law."""
+    """With --thorough, fifteen times as many examples of every law."""
     if isinstance(collector, pytest.Module):
-        settings.load_profile("quick" if "not slow" in collector.config.getoption("markexpr") else "thorough")
+        settings.load_profile("thorough" if collector.config.getoption("thorough") else "quick")
 
 
 def pytest_collectreport() -> None:
@@ -85,12 +85,12 @@ QUICK = {
 
 
 def ways(*capacities: int) -> list[Any]:
-    """Backends, ways of calling and buckets: each with each in the slow tier, each at least once in the quick one."""
+    """Backends, ways of calling and buckets: each with each if --thorough, otherwise each at least once."""
     found = []
     for n in capacities:
         for mode in ("plain", "jit", "vmap"):
             for homology in ("closed_form", "gudhi"):
-                marks = () if (homology, mode, n) in QUICK else pytest.mark.slow
+                marks = () if (homology, mode, n) in QUICK else pytest.mark.thorough
                 found.append(pytest.param((homology, mode, n), marks=marks, id=f"{homology}-{mode}-{n}"))
     return found
 
