@@ -33,8 +33,8 @@ from training.views import view_cloud
 
 __all__ = ["DemoFigures", "run_demo"]
 
-EPOCHS = 6
-"""A quarter of the default's: as many as a demonstration's minutes allow."""
+PROTOCOL = dataclasses.replace(DEFAULT, fit=dataclasses.replace(DEFAULT.fit, epochs=6))
+"""The default with a quarter of its epochs: as many as a demonstration's minutes allow."""
 
 N_SCENES = 40
 LIGHT = 0.4
@@ -113,14 +113,14 @@ def run_demo(out: str | Path, seed: int = 0, progress: Progress = lambda stage, 
     dataset = render_dataset(
         objects,
         out / "run" / VIEWS,
-        DEFAULT.azimuth_step,
-        DEFAULT.polar_step,
+        PROTOCOL.azimuth_step,
+        PROTOCOL.polar_step,
         progress=lambda done, total: progress("render views", done, total, ""),
-        variations=DEFAULT.variations,
+        variations=PROTOCOL.variations,
         seed=seed,
     )
-    options = dataclasses.replace(DEFAULT.fit, epochs=EPOCHS, seed=seed)
-    (run,) = train_run(dataset, out / "run", FEATURES, options, progress, mirrors=DEFAULT.mirrors)
+    options = dataclasses.replace(PROTOCOL.fit, seed=seed)
+    (run,) = train_run(dataset, out / "run", FEATURES, options, progress, mirrors=PROTOCOL.mirrors)
     shutil.rmtree(out / "run" / VIEWS)
 
     scenes = _scenes(objects, seed, progress)

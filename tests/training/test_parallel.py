@@ -28,7 +28,7 @@ from training.view_source import MemoryViews
 rng = np.random.default_rng(0)
 def clouds(size, low, high):
     return [((rng.random((150, 3)) * size + (0, 0, 0.5)).astype(np.float32),
-             rng.integers(low, high, (150, 3), dtype=np.uint8)) for _ in range(8)]
+             rng.integers(low, high, (150, 3), dtype=np.uint8)) for _ in range(16)]
 
 config = thor2.DescriptorConfig(homology="closed_form", n_slices=3, n_strips=8, image_size=8)
 views = {"brick": clouds((0.1, 0.05, 0.03), 0, 99), "stick": clouds((0.2, 0.02, 0.02), 99, 255)}

@@ -13,6 +13,7 @@ import thor2_jax as thor2
 from training import demo
 from training.builtin_objects import builtin_objects
 from training.evaluate import Instance
+from training.fit import FitOptions
 from training.pictures import draw_accuracy, draw_confusion, draw_curves, draw_descriptor, draw_objects
 from training.report import Picture, write_page
 
@@ -90,9 +91,8 @@ def test_demo_in_small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     everything = builtin_objects()
     monkeypatch.setattr(demo, "builtin_objects", lambda: {name: everything[name] for name in names})
     monkeypatch.setattr(demo, "N_SCENES", 6)
-    monkeypatch.setattr(demo, "EPOCHS", 4)
-    monkeypatch.setattr(demo, "AZIMUTH_STEP", 45.0)
-    monkeypatch.setattr(demo, "POLAR_STEP", 30.0)
+    small = {"azimuth_step": 45.0, "polar_step": 30.0, "fit": FitOptions(epochs=4, batch_size=128)}
+    monkeypatch.setattr(demo, "PROTOCOL", dataclasses.replace(demo.PROTOCOL, **small))
     stages: dict[str, tuple[int, int]] = {}
     figures = demo.run_demo(tmp_path, 1, lambda stage, done, total, note: stages.update({stage: (done, total)}))
     assert all(done == total for done, total in stages.values()) and len(stages) == 7
