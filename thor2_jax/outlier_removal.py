@@ -65,12 +65,12 @@ def flying_pixels(frame: RGBDFrame, pixels: NDArray[np.intp]) -> NDArray[np.bool
     return flying
 
 
-def _grid(points: NDArray[Any], size: float) -> tuple[NDArray[np.int64], tuple[int, ...]]:
-    """Place of each point [n] on a flat grid of cells, and the grid's shape; 0 for points past `REACH`.
+def _grid(points: NDArray[Any]) -> tuple[NDArray[np.int64], tuple[int, ...]]:
+    """Place of each point [n] on a flat grid of `CELL`s, and the grid's shape; 0 for points past `REACH`.
 
     Two layers of cells on every side are empty, so that no cell touches the first.
     """
-    place = np.floor(points.T.copy() / size)
+    place = np.floor(points.T.copy() / CELL)
     place -= np.floor(np.median(place, axis=1, keepdims=True))
     near = (np.abs(place) <= REACH).all(axis=0)
     cells = np.where(near, place, 0).astype(np.int64)
@@ -85,7 +85,7 @@ def _surrounded(points: NDArray[np.float64]) -> NDArray[np.bool_]:
     Where more than `NEIGHBORS` points lie in a point's cell and those that it touches, the mean distance to the nearest
     of them is at most the root of the mean square distance to all of them.
     """
-    cell, shape = _grid(points, CELL)
+    cell, shape = _grid(points)
     points = points - points.mean(axis=0)
     square = np.einsum("na,na->n", points, points)
     sums = np.stack([np.bincount(cell, weights=w, minlength=math.prod(shape)) for w in (None, *points.T, square)])
@@ -113,7 +113,7 @@ def _among_others(points: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 def _in_large_piece(points: NDArray[Any]) -> NDArray[np.bool_]:
-    cell, shape = _grid(points, CELL)
+    cell, shape = _grid(points)
     full = np.zeros(shape, bool)
     full.ravel()[cell[cell > 0]] = True
     pieces, _ = ndimage.label(full, structure=np.ones((3, 3, 3)))

@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 
 from colornet import ColorNetwork
 from thor2_jax.classifier import MLP, Feature, class_probabilities
-from thor2_jax.color_membership import region_sets
 from thor2_jax.config import DescriptorConfig
-from thor2_jax.descriptor import describe_strips
-from training.dataset import Batch, Samples, expand
+from training.dataset import Batch, Samples
 from training.evaluation.confidence import fit_temperature
+from training.steps import describe_batch
 
 __all__ = ["sample_probabilities", "temperatures"]
 
@@ -28,8 +27,7 @@ CHUNK = 256
 def _probabilities(
     graph: Any, state: Any, batch: Batch, feature: Feature, network: ColorNetwork, config: DescriptorConfig
 ) -> jax.Array:
-    found = describe_strips(expand(batch, region_sets(network).weights, config), network, config)
-    return class_probabilities(nnx.merge(graph, state), found, feature)
+    return class_probabilities(nnx.merge(graph, state), describe_batch(batch, network, config), feature)
 
 
 def sample_probabilities(

@@ -25,7 +25,16 @@ from thor2_jax.sharding import AXIS
 from thor2_jax.types import Descriptors
 from training.dataset import Batch, expand
 
-__all__ = ["FitState", "Setting", "count_right", "initial_state", "scale_inputs", "spread", "train_step"]
+__all__ = [
+    "FitState",
+    "Setting",
+    "count_right",
+    "describe_batch",
+    "initial_state",
+    "scale_inputs",
+    "spread",
+    "train_step",
+]
 
 
 class FitState(NamedTuple):
@@ -79,7 +88,8 @@ def spread(tree: Any, mesh: Mesh, split: bool) -> Any:
     return jax.tree.map(lambda a: jax.make_array_from_process_local_data(sharding, np.asarray(a)), tree)
 
 
-def _describe(batch: Batch, network: ColorNetwork, config: DescriptorConfig) -> Descriptors:
+def describe_batch(batch: Batch, network: ColorNetwork, config: DescriptorConfig) -> Descriptors:
+    """Descriptors of the samples of a batch."""
     return describe_strips(expand(batch, region_sets(network).weights, config), network, config)
 
 
@@ -104,7 +114,7 @@ def train_step(
     Returns:
         The state after it, and the batch's loss and accuracy before it.
     """
-    x = feature_of(_describe(batch, setting.network, setting.config), setting.feature)
+    x = feature_of(describe_batch(batch, setting.network, setting.config), setting.feature)
     key = jax.random.fold_in(jax.random.key(seed), step)
 
     def loss_of(params: Any) -> Any:
@@ -123,7 +133,7 @@ def train_step(
 def count_right(setting: Setting, state: FitState, batch: Batch, count: ArrayLike) -> jax.Array:
     """How many of the first `count` samples of a batch are named rightly."""
     model = nnx.merge(setting.graph, state.params, state.rest, copy=True)
-    logits = model(feature_of(_describe(batch, setting.network, setting.config), setting.feature))
+    logits = model(feature_of(describe_batch(batch, setting.network, setting.config), setting.feature))
     right = (logits.argmax(axis=-1) == batch.label) & (jnp.arange(len(logits)) < count)
     return _everywhere(right.sum(), setting.mesh)
 
@@ -131,7 +141,7 @@ def count_right(setting: Setting, state: FitState, batch: Batch, count: ArrayLik
 @partial(jax.jit, static_argnums=(1, 2, 3))
 def scale_inputs(sample: Batch, feature: Feature, network: ColorNetwork, config: DescriptorConfig) -> jax.Array:
     """1 / root mean square of each block of the descriptor (image, embedding) over a sample, for its entries: [F]."""
-    found = _describe(sample, network, config)
+    found = describe_batch(sample, network, config)
     block = dataclasses.replace(
         found,
         images=jnp.full(found.images.shape[1:], jnp.sqrt((found.images**2).mean()))[None],
