@@ -1,6 +1,7 @@
 """A trained model on disk: everything that recognition needs, checked on loading, written whole or not at all.
 
-RUN/run.json       format, descriptor version and constants, class names, classifiers with digests, how it was trained
+RUN/run.json       format, descriptor version and constants, class names, classifiers with digests, how it was trained,
+                   and a digest of all that
 RUN/network.npz    the colour network whose regions the descriptors use
 RUN/weights/NAME/  one classifier's parameters and batch statistics (orbax)
 """
@@ -25,7 +26,7 @@ from thor2_jax.classifier import MLP, Feature, check_features
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig, Relaxation
 from thor2_jax.errors import InputError
 
-__all__ = ["TrainedRun", "check_new", "input_size", "load_run", "save_run"]
+__all__ = ["TrainedRun", "check_new", "description_digest", "input_size", "load_run", "save_run"]
 
 FORMAT = 1
 
@@ -88,6 +89,12 @@ def _digest(path: Path, n_inputs: int, n_classes: int) -> str:
     return digest.hexdigest()
 
 
+def description_digest(description: Mapping[str, Any]) -> str:
+    """SHA-256 of what run.json says, however it is laid out: a changed constant reads as well as the right one."""
+    said = {key: value for key, value in description.items() if key != "digest"}
+    return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
+
+
 def save_run(run: TrainedRun, path: str | Path) -> None:
     """Write a run folder. It appears under its name only when it is complete.
 
@@ -120,6 +127,7 @@ def save_run(run: TrainedRun, path: str | Path) -> None:
             "weights": {name: _digest(partial / "weights" / name, *sizes[name]) for name in run.classifiers},
             "record": run.record,
         }
+        description["digest"] = description_digest(description)
         (partial / "run.json").write_text(json.dumps(description, indent=2) + "\n")
         partial.rename(path)
     except BaseException:
@@ -142,11 +150,13 @@ def _description(path: Path) -> dict[str, Any]:
             f"model: {path} was trained on descriptor version {found.get('descriptor_version')!r}; "
             f"this version computes {DESCRIPTOR_VERSION}; train it again"
         )
+    if found.get("digest") != description_digest(found):
+        raise InputError(f"model: {path / 'run.json'} is damaged, or was changed after the training")
     return found
 
 
 def _config(constants: Mapping[str, Any]) -> DescriptorConfig:
-    relaxation = constants.get("relaxation")  # folders written before there was one are hard
+    relaxation = constants["relaxation"]
     return DescriptorConfig(**{**constants, "relaxation": None if relaxation is None else Relaxation(**relaxation)})
 
 
@@ -165,8 +175,8 @@ def load_run(path: str | Path) -> TrainedRun:
         classes = tuple(found["classes"])
         names = check_features(found["classifiers"], "classifiers")
         fingerprint, record = found["color_network"], found["record"]
-        digests = dict(found.get("weights", {}))  # folders written before there were digests are read without
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        digests = {name: found["weights"][name] for name in names}
+    except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{where}: {type(error).__name__}: {error}") from None
     if not isinstance(found["classes"], list) or not classes or not all(isinstance(name, str) for name in classes):
         raise InputError(f"{where}: classes is {found['classes']!r}; expected a list of names")
@@ -179,14 +189,14 @@ def load_run(path: str | Path) -> TrainedRun:
     classifiers = {}
     for name in names:
         n_inputs = input_size(name, config, network.n_regions)
-        classifiers[name] = _restore(path / "weights" / name, n_inputs, len(classes), digests.get(name))
+        classifiers[name] = _restore(path / "weights" / name, n_inputs, len(classes), digests[name])
     return TrainedRun(config, network, classes, classifiers, record)
 
 
-def _restore(path: Path, n_inputs: int, n_classes: int, digest: str | None) -> MLP:
+def _restore(path: Path, n_inputs: int, n_classes: int, digest: str) -> MLP:
     if not path.is_dir():
         raise InputError(f"model: {path} is missing")
-    if digest is not None and digest != _digest(path, n_inputs, n_classes):
+    if digest != _digest(path, n_inputs, n_classes):
         raise InputError(f"model: {path} is damaged, or not of {n_inputs} inputs and {n_classes} classes")
     return _restore_weights(path, n_inputs, n_classes)
 
@@ -194,10 +204,6 @@ def _restore(path: Path, n_inputs: int, n_classes: int, digest: str | None) -> M
 def _restore_weights(path: Path, n_inputs: int, n_classes: int) -> MLP:
     try:
         with _checkpointer() as checkpointer:
-            # Before a model is made: a damaged description of a folder without digests can tell of any size.
-            (stored,) = checkpointer.metadata(path).item_metadata.tree["input_scale"].shape
-            if stored != n_inputs:
-                raise ValueError(f"it is of {stored} inputs, not {n_inputs}")
             model = MLP(n_inputs, n_classes, rngs=nnx.Rngs(0))
             state = nnx.state(model, (nnx.Param, nnx.BatchStat))
             restored = checkpointer.restore(path, jax.tree.map(np.asarray, nnx.to_pure_dict(state)))

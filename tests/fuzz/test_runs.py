@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 import colornet
 import thor2_jax as thor2
 from thor2_jax.classifier import MLP
-from thor2_jax.run_folder import TrainedRun, input_size, load_run, save_run
+from thor2_jax.run_folder import TrainedRun, description_digest, input_size, load_run, save_run
 from thor2_jax.testing import damaged
 from training.metrics import read_figures
 
@@ -40,7 +40,7 @@ def damaged_and_back(path: Path, content: bytes, read: Any, attempt: Any) -> Any
 
 @given(data=st.data())
 def test_descriptions(data: st.DataObject, run: Path, attempt: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Weights are not read: their digest, of their sizes too, is checked before."""
+    """Weights are not read: the description's digest is checked before."""
     content = (run / "run.json").read_bytes()
     if data.draw(st.booleans()):
         other = data.draw(damaged(content))
@@ -52,7 +52,7 @@ def test_descriptions(data: st.DataObject, run: Path, attempt: Any, monkeypatch:
     with monkeypatch.context() as patch:
         patch.setattr("thor2_jax.run_folder._restore_weights", lambda path, n_inputs, n_classes: None)
         found = damaged_and_back(run / "run.json", other, lambda: load_run(run), attempt)
-    assert found is None or (found.config == CONFIG and len(found.classes) == 2)
+    assert found is None or (found.config, found.classes, found.record) == (CONFIG, ("mug", "bowl"), {"epochs": 3})
 
 
 @settings(max_examples=30)
@@ -75,13 +75,13 @@ def test_odd_numbers(value: str, run: Path, attempt: Any) -> None:
         assert damaged_and_back(run / "run.json", other, lambda: load_run(run), attempt) is None
 
 
-def test_a_run_without_digests_that_would_fill_memory(run: Path, attempt: Any, tmp_path: Path) -> None:
-    """As folders were written before there were digests: sizes are compared before anything of theirs is made."""
+def test_sizes_that_would_fill_memory(run: Path, attempt: Any, tmp_path: Path) -> None:
+    """Of a description whose digest fits: the weights' own is compared before anything of theirs is made."""
     path = Path(shutil.copytree(run, tmp_path / "run"))
     for key in ("n_slices", "n_strips"):
         table = json.loads((run / "run.json").read_bytes())
-        del table["weights"]
         table["descriptor_config"][key] = 10**7
+        table["digest"] = description_digest(table)
         (path / "run.json").write_text(json.dumps(table))
         assert attempt(lambda: load_run(path)) is None
 

@@ -18,7 +18,7 @@ import colornet
 import thor2_jax as thor2
 from thor2_jax.classifier import FEATURES, MLP
 from thor2_jax.recognizer import Recognizer
-from thor2_jax.run_folder import TrainedRun, input_size, load_run, save_run
+from thor2_jax.run_folder import TrainedRun, description_digest, input_size, load_run, save_run
 
 CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=2, n_strips=5, image_size=8, alpha=0.5)
 CLASSES = ("a mug", "b", "ç")
@@ -112,6 +112,8 @@ def test_nothing_is_left_behind_when_saving_fails(broken: str, tmp_path: Path, m
 
 
 def edited(**changes: Any) -> Callable[[Path], None]:
+    """As another version might have written it: the digest fits."""
+
     def edit(path: Path) -> None:
         description = json.loads((path / "run.json").read_text())
         for key, value in changes.items():
@@ -119,6 +121,7 @@ def edited(**changes: Any) -> Callable[[Path], None]:
                 del description[key]
             else:
                 description[key] = value
+        description["digest"] = description_digest(description)
         (path / "run.json").write_text(json.dumps(description))
 
     return edit
@@ -143,9 +146,18 @@ def test_every_constant_comes_back(relaxation: thor2.Relaxation | None, tmp_path
     assert load_run(tmp_path / "run").config == config
 
 
-def test_folders_without_the_later_constants_are_read(copied: Path) -> None:
-    older = {name: value for name, value in CONSTANTS.items() if name not in ("relaxation", "persistence_weight")}
-    edited(descriptor_config=older)(copied)
+def replaced(old: str, new: str) -> Callable[[Path], None]:
+    def edit(path: Path) -> None:
+        content = (path / "run.json").read_text()
+        assert old in content
+        (path / "run.json").write_text(content.replace(old, new))
+
+    return edit
+
+
+def test_a_description_may_be_laid_out_anew(copied: Path) -> None:
+    description = json.loads((copied / "run.json").read_text())
+    (copied / "run.json").write_text(json.dumps(dict(reversed(description.items())), indent=None))
     assert load_run(copied).config == CONFIG
 
 
@@ -169,17 +181,20 @@ DAMAGES: dict[str, tuple[Callable[[Path], Any], str]] = {
     "a list": (lambda path: (path / "run.json").write_text("[1]"), "run.json has format 'list'"),
     "other format": (edited(format=2), "run.json has format 2"),
     "other version": (edited(descriptor_version=99), "descriptor version 99"),
+    "changed constant": (replaced('"alpha": 0.5', '"alpha": 0.25'), "run.json is damaged, or was changed"),
+    "changed record": (replaced('"epochs": 3', '"epochs": 4'), "run.json is damaged, or was changed"),
+    "no digest": (replaced('"digest"', '"other"'), "run.json is damaged, or was changed"),
     "no classes": (edited(classes=None), "run.json: KeyError: 'classes'"),
     "empty classes": (edited(classes=[]), "classes is []"),
     "numbered classes": (edited(classes=[1, 2, 3]), "classes is [1, 2, 3]"),
     "one string": (edited(classes="abc"), "classes is 'abc'"),
     "more classes": (edited(classes=["a", "b", "c", "d"]), "weights/ce is damaged, or not of 220 inputs and 4 classes"),
     "unknown classifier": (edited(classifiers=["shape"]), "classifiers is ['shape']"),
-    "missing classifier": (edited(classifiers=["ce", "tops", "tops2"]), "weights/tops2 is missing"),
+    "missing classifier": (edited(classifiers=["ce", "tops", "tops2"]), "run.json: KeyError: 'tops2'"),
     "unknown constant": (edited(descriptor_config={**CONSTANTS, "beta": 1}), "beta"),
     "bad relaxation": (edited(descriptor_config={**CONSTANTS, "relaxation": {"slice": 0}}), "Relaxation.slice is 0"),
     "no relaxation": (edited(descriptor_config={**CONSTANTS, "relaxation": 5}), "run.json: TypeError"),
-    "list of constants": (edited(descriptor_config=[1]), "run.json: AttributeError"),
+    "list of constants": (edited(descriptor_config=[1]), "run.json: TypeError"),
     "bad constant": (edited(descriptor_config={**CONSTANTS, "sigma_s": -1}), "DescriptorConfig.sigma_s is -1"),
     "other constant": (edited(descriptor_config={**CONSTANTS, "n_slices": 3}), "not of 330 inputs and 3 classes"),
     "no network": (lambda path: (path / "network.npz").unlink(), "network.npz cannot be read"),

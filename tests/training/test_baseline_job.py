@@ -1,5 +1,6 @@
 """Baselines of a run folder: trained, kept in files, calibrated on held-out views, asked beside the classifiers."""
 
+import dataclasses
 import json
 from pathlib import Path
 from types import SimpleNamespace
@@ -135,8 +136,10 @@ def test_refusals(trained: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="baselines is forest, tree; expected"):
         check_baselines(["forest", "tree"])
     assert check_baselines(["pointnet", "thor"]) == ("thor", "pointnet") and check_baselines([]) == ()
-    folder = write_run(tmp_path / "run")
-    (folder / "run.json").write_text((folder / "run.json").read_text().replace(SOURCE.digest, MEMORY.digest))
+    original = load_run(write_run(tmp_path / "original"))
+    record = {**original.record, "dataset": dict(MEMORY.record)}
+    folder = tmp_path / "run"
+    save_run(dataclasses.replace(original, record=record), folder)
     with pytest.raises(InputError, match="thor needs the cameras' angles"):
         train_baselines(folder, MEMORY, ["thor"])
 

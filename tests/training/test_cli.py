@@ -1,5 +1,6 @@
 """The command line as a user meets it: one small model trained once, then every command and every kind of bad input."""
 
+import dataclasses
 import json
 import shutil
 import sys
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from thor2_jax.run_folder import load_run, save_run
 from training import cli
 from training.builtin_objects import builtin_objects
 from training.scenes import Scene, compose_scene
@@ -129,9 +131,7 @@ def test_recognize(model: Path, images: Path, scene: Scene, tmp_path: Path, run:
 def test_evaluate_frames(model: Path, images: Path, scene: Scene, tmp_path: Path, run: Run) -> None:
     """Figures of the report against the answers of `recognize`; two runs; the same command again goes on."""
     other = tmp_path / "other"
-    shutil.copytree(model, other)
-    description = json.loads((other / "run.json").read_text())
-    (other / "run.json").write_text(json.dumps(description | {"record": {"another": "run"}}))
+    save_run(dataclasses.replace(load_run(model), record={"another": "run"}), other)
     command = ("evaluate", "frames", images.parent, "--model", model, other, "--out", tmp_path / "report")
     code, out, _ = run(*command)
     assert code == 0 and "THOR2" in out and "a second" in out

@@ -1,7 +1,7 @@
 """A trained baseline as one file, RUN/baselines/NAME.safetensors: arrays and a few words about them, no code.
 
 What it says of itself: the format, the classes, the temperature (`calibration`; none if no views were held out), the
-seconds that training took, and the digest of the arrays.
+seconds that training took, and the digest of all that and the arrays.
 """
 
 import dataclasses
@@ -47,8 +47,9 @@ class Stored:
     seconds: float
 
 
-def _digest(arrays: Mapping[str, NDArray[Any]]) -> str:
-    digest = hashlib.sha256()
+def _digest(arrays: Mapping[str, NDArray[Any]], about: Mapping[str, Any]) -> str:
+    said = {key: value for key, value in about.items() if key != "digest"}
+    digest = hashlib.sha256(json.dumps(said, sort_keys=True).encode())
     for name in sorted(arrays):
         digest.update(f"{name} {arrays[name].dtype} {arrays[name].shape}\0".encode())
         digest.update(np.ascontiguousarray(arrays[name]).tobytes())
@@ -66,8 +67,8 @@ def write_baseline(path: Path, stored: Stored, classes: Sequence[str]) -> None:
         "classes": list(classes),
         "temperature": stored.temperature,
         "seconds": round(stored.seconds, 1),
-        "digest": _digest(stored.arrays),
     }
+    about["digest"] = _digest(stored.arrays, about)
     arrays = {name: np.ascontiguousarray(array) for name, array in stored.arrays.items()}
     path.parent.mkdir(exist_ok=True)
     with replacing(path) as temporary:
@@ -90,8 +91,8 @@ def read_baseline(path: Path, classes: Sequence[str]) -> Stored:
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         if about["format"] != FORMAT:
             raise InputError(f"model: {path} has format {about['format']!r}; this version reads {FORMAT}")
-        if about["digest"] != _digest(arrays):
-            raise ValueError("its digest is not that of its arrays")
+        if about["digest"] != _digest(arrays, about):
+            raise ValueError("its digest is not that of what it holds")
         if about["classes"] != list(classes):
             raise InputError(f"model: {path} is not of its run's classes")
         return Stored(arrays, about["temperature"], about["seconds"])
