@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from thor2_jax.reductions import ROWS, argmax, larger, largest, smaller, smallest, total
+from thor2_jax.reductions import ROWS, argmax, fold, larger, largest, smaller, smallest
 
 __all__ = ["minimal_box_axes", "rotate", "support_points"]
 
@@ -22,6 +22,9 @@ HIGHEST = jax.lax.Precision.HIGHEST
 
 SWEEPS = 6
 """Minimum-area rectangles a start: twice about each axis. More did not shrink the boxes of real scans."""
+
+LANES = 16
+"""Support points turned at a time."""
 
 COARSE = 17
 """Angles tried over a quarter turn; two finer rounds of 9 around the best leave a step of 0.33 degrees."""
@@ -57,16 +60,15 @@ def support_points(points: jax.Array) -> jax.Array:
     Returns:
         [3, 66] float32, with repetitions.
     """
-    spread = jnp.sqrt(total(points**2))[:, None]
-    scaled = points / jnp.where(spread > 0, spread, 1)
+    rows = points.reshape(3, ROWS, -1)
+    spread = jnp.sqrt(sum(rows[:, k] ** 2 for k in range(ROWS)).sum(axis=-1))
+    half = _DIRECTIONS / jnp.where(spread > 0, spread, 1)
 
     def along(d: jax.Array, rows: jax.Array) -> jax.Array:
         # Explicit sums, not a matmul: a reduction of them reads each product once, with no [K, N] array in between.
         return d[:, :1] * rows[0] + d[:, 1:2] * rows[1] + d[:, 2:] * rows[2]
 
     # First the best of all residues of a point's index modulo N / 16, then the best of the 16 points of that residue.
-    half = jnp.asarray(_DIRECTIONS)
-    rows = scaled.reshape(3, ROWS, -1)
     each = [along(half, rows[:, k]) for k in range(ROWS)]
     extremes = [functools.reduce(larger, each), -functools.reduce(smaller, each)]
     residue = argmax(jnp.concatenate(extremes))
@@ -88,20 +90,26 @@ def _eigenvectors(moments: jax.Array) -> jax.Array:
 
 def _moments(points: jax.Array) -> jax.Array:
     """[3, 3], sums of products of the coordinates of centred points [3, N], N a multiple of 16."""
-    x, y, z = points
-    xx, xy, xz, yy, yz, zz = total(jnp.stack([x * x, x * y, x * z, y * y, y * z, z * z]))
+    # Products of rows, not rows of products: those would all be stored first.
+    rows = points.reshape(3, ROWS, -1)
+    pairs = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]
+    xx, xy, xz, yy, yz, zz = (sum(rows[i, k] * rows[j, k] for k in range(ROWS)).sum() for i, j in pairs)
     return jnp.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz]).reshape(3, 3)
 
 
 def _rectangle_areas(xy: jax.Array, angles: jax.Array) -> jax.Array:
-    """Areas [A] of the bounding rectangles of `xy` [M, 2] turned by `angles` [A]."""
+    """Areas [A] of the bounding rectangles of `xy` [2, M] turned by `angles` [A]; M is a multiple of 16."""
     c, s = jnp.cos(angles)[:, None], jnp.sin(angles)[:, None]
-    u, v = c * xy[:, 0] + s * xy[:, 1], c * xy[:, 1] - s * xy[:, 0]
-    return (u.max(axis=1) - u.min(axis=1)) * (v.max(axis=1) - v.min(axis=1))
+    u, v = c * xy[0] + s * xy[1], c * xy[1] - s * xy[0]
+    rows = xy.shape[1] // LANES
+    # The four extremes in one reduction: the turned points are then made once, and sixteen at a time.
+    ends = jnp.stack([fold(u, larger, rows), -fold(u, smaller, rows), fold(v, larger, rows), -fold(v, smaller, rows)])
+    right, left, top, bottom = ends.max(axis=-1)
+    return (right + left) * (top + bottom)
 
 
 def _minimum_area_angle(xy: jax.Array) -> jax.Array:
-    """Angle in radians, within about an eighth turn either way, of the minimum-area rectangle of `xy` [M, 2]."""
+    """Angle in radians, within about an eighth turn either way, of the minimum-area rectangle of `xy` [2, M]."""
     step = np.pi / 2 / COARSE
     best = jnp.zeros(())
     # An odd number of angles, symmetric about 0 and without the eighth turns: if the frame comes with another sign, the
@@ -117,19 +125,18 @@ def _minimum_area_angle(xy: jax.Array) -> jax.Array:
 def _search(support: jax.Array, axes: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Alternate minimum-area rectangles from a start.
 
-    Returns axes [3, 3] (rows) and the volume over `support` [M, 3].
+    Returns axes [3, 3] (rows) and the volume over `support` [3, M], M a multiple of 16.
     """
 
     def sweep(_: int, axes: jax.Array) -> jax.Array:
-        turned = jnp.matmul(support, axes.T, precision=HIGHEST)
-        angle = _minimum_area_angle(turned[:, :2])
+        angle = _minimum_area_angle(rotate(axes, support)[:2])
         c, s = jnp.cos(angle), jnp.sin(angle)
         # The cyclic shift of the rows brings the next axis into the last place, where the turn leaves it fixed.
         return jnp.stack([c * axes[1] - s * axes[0], axes[2], c * axes[0] + s * axes[1]])
 
     axes = jax.lax.fori_loop(0, SWEEPS, sweep, axes)
-    turned = jnp.matmul(support, axes.T, precision=HIGHEST)
-    return axes, jnp.prod(turned.max(axis=0) - turned.min(axis=0))
+    turned = rotate(axes, support)
+    return axes, jnp.prod(turned.max(axis=1) - turned.min(axis=1))
 
 
 def minimal_box_axes(points: jax.Array) -> jax.Array:
@@ -148,9 +155,10 @@ def minimal_box_axes(points: jax.Array) -> jax.Array:
     points = jax.lax.stop_gradient(points)
     frame = _eigenvectors(_moments(points))
     principal = rotate(frame, points)
-    support = support_points(principal).T
-    centred = support - support.mean(axis=0)
-    of_support = _eigenvectors(jnp.matmul(centred.T, centred, precision=HIGHEST))
+    support = support_points(principal)
+    centred = support - support.mean(axis=1, keepdims=True)
+    of_support = _eigenvectors(jnp.matmul(centred, centred.T, precision=HIGHEST))
+    support = jnp.pad(support, ((0, 0), (0, -support.shape[1] % LANES)), mode="edge")
     starts = jnp.stack([jnp.eye(3, dtype=points.dtype), of_support])
     found, volumes = jax.vmap(lambda start: _search(support, start))(starts)
     axes = found[jnp.argmin(volumes)]

@@ -68,10 +68,10 @@ def _diagrams(strips: Strips, config: DescriptorConfig) -> Diagrams:
 def _describe_strips(strips: Strips, parameters: Parameters, config: DescriptorConfig) -> Descriptors:
     found = diagrams_of_strips(strips, config)
     # E^i = (C^i Delta)^T
-    embeddings = jnp.einsum("...jr,rq->...qj", strips.color, parameters.similarity, precision=jax.lax.Precision.HIGHEST)
+    embeddings = jnp.matmul(strips.color, parameters.similarity, precision=jax.lax.Precision.HIGHEST)
     return Descriptors(
         images=persistence_images(found, config, parameters.image_variance, parameters.persistence_weight),
-        embeddings=embeddings,
+        embeddings=jnp.swapaxes(embeddings, -1, -2),
         overflow=strips.overflow + past_window(found, config),
     )
 

@@ -29,10 +29,10 @@ def smaller(a: jax.Array, b: jax.Array) -> jax.Array:
     return jnp.where(a < b, a, b)
 
 
-def fold(values: jax.Array, op: Callable[[jax.Array, jax.Array], jax.Array]) -> jax.Array:
-    """[..., N] to [..., N / 16]: entry k is `op` over the entries k, k + N / 16, k + 2 N / 16, ..."""
-    rows = values.reshape(*values.shape[:-1], ROWS, values.shape[-1] // ROWS)
-    return functools.reduce(op, (rows[..., k, :] for k in range(ROWS)))
+def fold(values: jax.Array, op: Callable[[jax.Array, jax.Array], jax.Array], rows: int = ROWS) -> jax.Array:
+    """[..., N] to [..., N / rows]: entry k is `op` over the entries k, k + N / rows, k + 2 N / rows, ..."""
+    folded = values.reshape(*values.shape[:-1], rows, values.shape[-1] // rows)
+    return functools.reduce(op, (folded[..., k, :] for k in range(rows)))
 
 
 def total(values: jax.Array) -> jax.Array:

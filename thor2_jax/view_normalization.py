@@ -134,15 +134,20 @@ def turn(normal: PointClouds, config: DescriptorConfig, parameters: Parameters |
 
 
 @jax.jit
-def _align(clouds: PointClouds, sigma_s: jax.Array, alpha: jax.Array) -> PointClouds:
-    return jax.vmap(lambda cloud: _turn_one(_normalize_one(cloud, sigma_s), alpha))(clouds)
+def _align(clouds: PointClouds, sigma_s: jax.Array, alpha: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def points_and_camera(cloud: PointClouds) -> tuple[jax.Array, jax.Array]:
+        aligned = _turn_one(_normalize_one(cloud, sigma_s), alpha)
+        return aligned.points, aligned.camera  # the rest of the cloud would be copied
+
+    return jax.vmap(points_and_camera)(clouds)
 
 
 def align(clouds: PointClouds, config: DescriptorConfig, parameters: Parameters | None = None) -> PointClouds:
     """`turn` of `view_normalize`: clouds in metres to aligned clouds in scaled units, ready to be sliced."""
-    if parameters is None:
-        return _align(clouds, np.float32(config.sigma_s), np.float32(config.alpha))
-    return _align(clouds, parameters.sigma_s, parameters.alpha)
+    sigma_s = np.float32(config.sigma_s) if parameters is None else parameters.sigma_s
+    alpha = np.float32(config.alpha) if parameters is None else parameters.alpha
+    points, camera = _align(clouds, sigma_s, alpha)
+    return dataclasses.replace(clouds, points=points, camera=camera)
 
 
 @partial(jax.jit, static_argnums=1)
