@@ -1,4 +1,4 @@
-"""Fixtures shared by all tests, and the thorough tier."""
+"""Fixtures shared by all tests, the thorough tier, and the slow tier's time."""
 
 from pathlib import Path
 
@@ -16,6 +16,15 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         left_out = [item for item in items if item.get_closest_marker("thorough")]
         config.hook.pytest_deselected(items=left_out)
         items[:] = [item for item in items if item not in left_out]
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    reports = [r for group in terminalreporter.stats.values() for r in group if isinstance(r, pytest.TestReport)]
+    slow = [report for report in reports if "slow" in report.keywords]
+    if slow:
+        seconds, whole = (sum(report.duration for report in some) for some in (slow, reports))
+        n_tests = len({report.nodeid for report in slow})
+        terminalreporter.write_line(f"slow tier: {n_tests} tests, {seconds:.0f} of {whole:.0f} seconds")
 
 
 @pytest.fixture(scope="session")

@@ -61,8 +61,8 @@ def support_points(points: jax.Array) -> jax.Array:
         [3, 66] float32, with repetitions.
     """
     rows = points.reshape(3, ROWS, -1)
-    spread = jnp.sqrt(sum(rows[:, k] ** 2 for k in range(ROWS)).sum(axis=-1))
-    half = _DIRECTIONS / jnp.where(spread > 0, spread, 1)
+    spread = jnp.sqrt(functools.reduce(jnp.add, (rows[:, k] ** 2 for k in range(ROWS))).sum(axis=-1))
+    half = jnp.asarray(_DIRECTIONS) / jnp.where(spread > 0, spread, 1)
 
     def along(d: jax.Array, rows: jax.Array) -> jax.Array:
         # Explicit sums, not a matmul: a reduction of them reads each product once, with no [K, N] array in between.
@@ -92,9 +92,8 @@ def _moments(points: jax.Array) -> jax.Array:
     """[3, 3], sums of products of the coordinates of centred points [3, N], N a multiple of 16."""
     # Products of rows, not rows of products: those would all be stored first.
     rows = points.reshape(3, ROWS, -1)
-    pairs = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]
-    xx, xy, xz, yy, yz, zz = (sum(rows[i, k] * rows[j, k] for k in range(ROWS)).sum() for i, j in pairs)
-    return jnp.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz]).reshape(3, 3)
+    products = (rows[np.array([0, 0, 0, 1, 1, 2]), k] * rows[np.array([0, 1, 2, 1, 2, 2]), k] for k in range(ROWS))
+    return functools.reduce(jnp.add, products).sum(axis=-1)[np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])]
 
 
 def _rectangle_areas(xy: jax.Array, angles: jax.Array) -> jax.Array:

@@ -66,7 +66,7 @@ def find_occlusion(frame: RGBDFrame, cloud: InstanceCloud) -> Occlusion:
     seen = on_boundary & (own_depth > 0)
     if occluded and seen.any() and len(cloud.points):
         edge = pixel_rays(pixels[seen], frame.labels.shape[1], frame.intrinsics) * own_depth[seen, None]
-        distance, nearest = KDTree(cloud.points, balanced_tree=False).query(edge)
+        distance, nearest = KDTree(cloud.points, leafsize=32, balanced_tree=False).query(edge)
         boundary[nearest[distance <= REACH]] = True
     return Occlusion(occluded, boundary)
 

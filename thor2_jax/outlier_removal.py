@@ -107,7 +107,7 @@ def _among_others(points: NDArray[np.float64]) -> NDArray[np.bool_]:
     among = _surrounded(points)
     rest = np.flatnonzero(~among)
     if len(rest):
-        distances = KDTree(points, balanced_tree=False).query(points[rest], k=NEIGHBORS + 1)[0][:, 1:]
+        distances = KDTree(points, leafsize=32, balanced_tree=False).query(points[rest], k=NEIGHBORS + 1)[0][:, 1:]
         among[rest] = distances.mean(axis=1) <= FARTHEST
     return among
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import colornet
-from colornet.files import whole_file, write_arrays
+from colornet.files import MOST_BYTES, read_arrays, whole_file, write_arrays
 
 # Changes with the contents of the network, and with nothing else.
 FINGERPRINT = "96981396ff3bc1ce0b440c5b781da4d2a5784b271f72967140e5b4b1bb6c593c"
@@ -124,6 +124,32 @@ def test_damaged_and_foreign_files_are_told_in_one_line(network: colornet.ColorN
     write_arrays(path, {"something": np.zeros(3)})
     with pytest.raises(ValueError, match=r"holds \['something'\]; a colour network is"):
         colornet.load(path)
+
+
+def test_a_pickled_object_in_a_file_is_not_made(tmp_path: Path) -> None:
+    class Hostile:
+        def __reduce__(self) -> tuple[Any, ...]:
+            return os.mkdir, (str(tmp_path / "made"),)
+
+    np.savez(tmp_path / "file.npz", mean_rgb=np.array([Hostile()], object))
+    with pytest.raises(ValueError, match="is damaged or not a file of arrays"):
+        read_arrays(tmp_path / "file.npz")
+    assert os.listdir(tmp_path) == ["file.npz"]
+
+
+def test_arrays_up_to_the_limit_are_read(tmp_path: Path) -> None:
+    assert MOST_BYTES == 64 * 1024**2
+    for size, is_read in ((MOST_BYTES - 128, True), (MOST_BYTES - 127, False)):  # an array's header takes 128 bytes
+        write_arrays(tmp_path / "file.npz", {"zeros": np.zeros(size, np.uint8)})
+        if is_read:
+            assert read_arrays(tmp_path / "file.npz")["zeros"].shape == (size,)
+        else:
+            with pytest.raises(ValueError, match="is damaged or not a file of arrays"):
+                read_arrays(tmp_path / "file.npz")
+
+
+def test_the_packaged_network_is_read_once() -> None:
+    assert colornet.load_default() is colornet.load_default()
 
 
 def test_no_flipped_byte_passes_for_another_network(network: colornet.ColorNetwork, tmp_path: Path) -> None:
