@@ -42,7 +42,7 @@ class Recognition:
 
     Attributes:
         label: its number in the label image.
-        name: the object's name; None if it was not recognized.
+        name: the object's name; None if it was not recognized or is unknown.
         confidence: the winning classifier's probability.
         classifier: which one won ("tops" or "tops2").
         top: classifier -> its five most probable (name, probability) pairs.
@@ -50,7 +50,7 @@ class Recognition:
         overflow: points and pairs that the descriptor has no room for.
         points_used: points of the described cloud.
         kept_by_fallback: the outlier filter would have emptied the cloud and was relaxed.
-        reason: why it is not recognized; None if it is.
+        reason: why it has no name; None if it has one.
     """
 
     label: int
@@ -132,15 +132,27 @@ def _voxelled(cloud: InstanceCloud, edge: NDArray[np.bool_], size: float) -> tup
 class Recognizer:
     """A trained run, compiled and ready. Functions are compiled once a bucket of points and of instances."""
 
-    def __init__(self, run: TrainedRun) -> None:
-        """Ready to answer with every classifier of `run`."""
+    def __init__(self, run: TrainedRun, unknown_below: float = 0.0) -> None:
+        """Ready to answer with every classifier of `run`.
+
+        Args:
+            run: the trained run.
+            unknown_below: confidence from 0 to 1 that an answer needs to have a name; an object of no trained class
+                tends to get less. A report of `thor2 evaluate` tells which keeps 95 % of the answers.
+
+        Raises:
+            InputError: a confidence outside 0 to 1.
+        """
+        if not 0 <= unknown_below <= 1:
+            raise InputError(f"unknown_below is {unknown_below}; it must be from 0 to 1")
         self.run = run
+        self.unknown_below = unknown_below
         self._apply = {name: _compiled(name, model) for name, model in run.classifiers.items()}
 
     @classmethod
-    def load(cls, run_dir: str | Path) -> "Recognizer":
+    def load(cls, run_dir: str | Path, unknown_below: float = 0.0) -> "Recognizer":
         """Read a run folder (see `run_folder.load_run`, also for what is raised)."""
-        return cls(load_run(run_dir))
+        return cls(load_run(run_dir), unknown_below)
 
     def warm_up(self, max_points: int = 2048, max_instances: int = 16) -> int:
         """Compile everything for frames of up to `max_instances` instances with up to `max_points` points each.
@@ -239,16 +251,19 @@ class Recognizer:
             kept_by_fallback: as in `InstanceCloud`.
         """
         joined = join({name: values[None] for name, values in probabilities.items()})
+        confidence = float(joined.confidence[0])
+        unknown = confidence < self.unknown_below
         return Recognition(
             label=label,
-            name=self.run.classes[joined.class_index[0]],
-            confidence=float(joined.confidence[0]),
+            name=None if unknown else self.run.classes[joined.class_index[0]],
+            confidence=confidence,
             classifier=str(joined.classifier[0]),
             top={name: self._top(values) for name, values in probabilities.items()},
             occluded=part.occluded,
             overflow=overflow,
             points_used=len(part.points),
             kept_by_fallback=kept_by_fallback,
+            reason=f"unknown: a confidence of {confidence:.3f}, below {self.unknown_below:g}" if unknown else None,
         )
 
     def _top(self, probabilities: NDArray[np.float32], count: int = 5) -> list[tuple[str, float]]:

@@ -31,6 +31,9 @@ app.add_typer(evaluate_app, name="evaluate")
 console = Console(width=None if sys.stdout.isatty() else 160)
 
 EngineName = Literal["local", "ray"]
+UnknownOption = Annotated[
+    float, typer.Option("--unknown-below", help="Confidence that an answer needs to have a name (a report tells one).")
+]
 ModelOption = Annotated[Path, typer.Option("--model", help="Run folder of a trained model.")]
 
 
@@ -236,6 +239,7 @@ def recognize(
     depth: Annotated[Path, typer.Option(help="Depth image, 16-bit PNG.")],
     labels: Annotated[Path, typer.Option(help="Instance labels, PNG; 0 is background.")],
     intrinsics: Annotated[Path, typer.Option(help="JSON with fx, fy, cx, cy (pixels), optionally depth_scale.")],
+    unknown_below: UnknownOption = 0.0,
     out: Annotated[Path | None, typer.Option(help="Folder for recognition.json and overlay.png.")] = None,
 ) -> None:
     """Name every instance of one RGB-D frame."""
@@ -247,7 +251,7 @@ def recognize(
     from thor2_jax.recognizer import Recognizer
 
     frame = read_frame(color=color, depth=depth, labels=labels, intrinsics=intrinsics)
-    answers = Recognizer.load(model).recognize(frame)
+    answers = Recognizer.load(model, unknown_below).recognize(frame)
     table = Table("label", "name", "confidence", "classifier", "occluded", "points", "overflow", "note")
     for a in answers:
         sure = "" if a.confidence is None else f"{a.confidence:.3f}"
@@ -360,6 +364,7 @@ def serve(
     queue: Annotated[int, typer.Option(min=1, help="Requests a worker has at a time; more get status 429.")] = 32,
     deadline: Annotated[float, typer.Option(help="Seconds a request may take; then it gets status 504.")] = 5.0,
     max_batch: Annotated[int, typer.Option(help="Most clouds in a batch of the device.")] = 32,
+    unknown_below: UnknownOption = 0.0,
     token: Annotated[str | None, typer.Option(envvar="THOR2_TOKEN", help="Bearer token that callers need.")] = None,
 ) -> None:
     """Answer recognition over HTTP (extra `serve`); see /openapi.json."""
@@ -371,7 +376,7 @@ def serve(
         raise InputError(f"{error.name} is not installed; serve needs: pip install 'thor2-jax[serve]'") from None
     from thor2_jax.service.settings import Settings
 
-    settings = Settings(model, token, queue, deadline, max_batch, processes=processes)
+    settings = Settings(model, token, queue, deadline, max_batch, processes=processes, unknown_below=unknown_below)
     serve_forever(settings, host, port, workers)
 
 

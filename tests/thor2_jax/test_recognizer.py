@@ -72,6 +72,21 @@ def test_the_more_confident_classifier_wins(recognizer: Recognizer) -> None:
                 assert shares == sorted(shares, reverse=True) and sum(shares) == pytest.approx(1, abs=1e-5)
 
 
+def test_answers_below_a_confidence_have_no_name(recognizer: Recognizer, run: TrainedRun) -> None:
+    all_named = recognizer.recognize(tilted(patches()))
+    sure = sorted(answer.confidence for answer in all_named if answer.confidence is not None)
+    assert len(set(sure)) == 3
+    for answer, named in zip(Recognizer(run, sure[1]).recognize(tilted(patches())), all_named, strict=True):
+        if named.confidence is None or named.confidence >= sure[1]:
+            assert answer == named
+        else:
+            assert answer.name is None and answer.reason is not None and answer.reason.startswith("unknown: ")
+            assert dataclasses.replace(answer, name=named.name, reason=None) == named
+    for value in (-0.1, 1.5, float("nan")):
+        with pytest.raises(thor2.InputError, match=f"unknown_below is {value}"):
+            Recognizer(run, value)
+
+
 def test_probabilities_are_the_classifiers_on_the_descriptors(recognizer: Recognizer, run: TrainedRun) -> None:
     """Against the same layers in NumPy, float64."""
     described = recognizer.describe(tilted(patches()))

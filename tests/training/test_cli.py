@@ -128,6 +128,13 @@ def test_recognize(model: Path, images: Path, scene: Scene, tmp_path: Path, run:
         assert overlay.size == scene.frame.color.shape[1::-1]
 
 
+def test_recognize_calls_what_it_is_not_sure_of_unknown(model: Path, images: Path, run: Run) -> None:
+    code, out, _ = run("recognize", "--model", model, *recognize(images), "--unknown-below", 1)
+    assert code == 0 and "unrecognized" in out and "unknown" in out
+    code, _, err = run("recognize", "--model", model, *recognize(images), "--unknown-below", 1.5)
+    assert code == 2 and one_line(err) == "error: unknown_below is 1.5; it must be from 0 to 1"
+
+
 def test_evaluate_frames(model: Path, images: Path, scene: Scene, tmp_path: Path, run: Run) -> None:
     """Figures of the report against the answers of `recognize`; two runs; the same command again goes on."""
     other = tmp_path / "other"

@@ -51,7 +51,7 @@ class Engine:
         """Read the run.
 
         Raises:
-            InputError: it cannot be read, or lacks a classifier that THOR2 needs.
+            InputError: it cannot be read, or lacks a classifier that THOR2 needs; or as `Recognizer`.
         """
         run = load_run(settings.model)
         missing = [name for name in THOR2 if name not in run.classifiers]
@@ -60,7 +60,7 @@ class Engine:
         # The same pairs as gudhi's, without a call back from the device.
         self.run = dataclasses.replace(run, config=dataclasses.replace(run.config, homology="closed_form"))
         self.max_batch = settings.max_batch
-        self._recognizer = Recognizer(self.run)
+        self._recognizer = Recognizer(self.run, settings.unknown_below)
 
     def warm_up(self) -> Iterator[tuple[int, int]]:
         """Compile for every size that `rows` can meet, one (points, clouds) at each step of the iterator."""

@@ -55,6 +55,7 @@ class Settings:
         max_batch: largest batch on the device, one of `capacity.BATCH_BUCKETS`.
         window: seconds that a batch waits for the instances of requests that are being prepared.
         processes: that decode images and make clouds.
+        unknown_below: confidence that an answer needs to have a name, as in `Recognizer`.
 
     Raises:
         InputError: a value out of its range.
@@ -67,6 +68,7 @@ class Settings:
     max_batch: int = 32
     window: float = 0.01
     processes: int = 2
+    unknown_below: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("queue", "deadline", "processes"):
