@@ -34,7 +34,7 @@ def region_sets(network: ColorNetwork) -> RegionSets:
     """The sets of a network's regions, as device arrays."""
     bits, of_color = np.unique(network.region_bits, return_inverse=True)
     member = (bits[:, None] >> np.arange(network.n_regions, dtype=np.uint32)) & 1
-    weights = member / np.maximum(member.sum(axis=1, keepdims=True), 1)
+    weights = member / member.sum(axis=1, keepdims=True)
     return RegionSets(jnp.asarray(of_color, np.min_scalar_type(len(bits))), jnp.asarray(weights, jnp.float32))
 
 

@@ -365,6 +365,7 @@ def serve(
     deadline: Annotated[float, typer.Option(help="Seconds a request may take; then it gets status 504.")] = 5.0,
     max_batch: Annotated[int, typer.Option(help="Most clouds in a batch of the device.")] = 32,
     unknown_below: UnknownOption = 0.0,
+    cache: Annotated[Path | None, typer.Option(help="Folder for compiled programs: the next start is quicker.")] = None,
     token: Annotated[str | None, typer.Option(envvar="THOR2_TOKEN", help="Bearer token that callers need.")] = None,
 ) -> None:
     """Answer recognition over HTTP (extra `serve`); see /openapi.json."""
@@ -376,7 +377,9 @@ def serve(
         raise InputError(f"{error.name} is not installed; serve needs: pip install 'thor2-jax[serve]'") from None
     from thor2_jax.service.settings import Settings
 
-    settings = Settings(model, token, queue, deadline, max_batch, processes=processes, unknown_below=unknown_below)
+    settings = Settings(
+        model, token, queue, deadline, max_batch, processes=processes, unknown_below=unknown_below, cache=cache
+    )
     serve_forever(settings, host, port, workers)
 
 

@@ -2,7 +2,6 @@
 
 import io
 import json
-import os
 import re
 import signal
 import subprocess
@@ -73,16 +72,10 @@ class Server:
     def __init__(self, run: Path, log: Path, cache: Path, *options: str) -> None:
         self.log = log
         command = [sys.executable, "-m", "training.cli", "serve", "--model", str(run), "--port", "0"]
-        # Programs that one server has compiled are read from the cache by the next.
-        environment = os.environ | {
-            "JAX_COMPILATION_CACHE_DIR": str(cache),
-            "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
-        }
         with log.open("wb") as stream:
             self.process = subprocess.Popen(
-                [*command, "--max-batch", "8", *options],
+                [*command, "--max-batch", "8", "--cache", str(cache), *options],
                 cwd=Path(__file__).parents[2],
-                env=environment,
                 stdout=stream,
                 stderr=stream,
             )

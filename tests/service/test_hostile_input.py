@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from thor2_jax.service.connections import HEAD_SECONDS
 from thor2_jax.service.settings import MAX_BODY
 
 Files = dict[str, bytes]
@@ -33,6 +34,18 @@ def refused(answer: httpx.Response, status: int, field: str | None, *words: str)
         assert word in problem["message"]
     for secret in ("Traceback", "/", "0x", ".py", "Error"):
         assert secret not in problem["message"].replace("application/json", "").replace("multipart/form-data", "")
+
+
+def test_a_head_that_does_not_end(server: Any) -> None:
+    host, port = server.url.removeprefix("http://").split(":")
+    whole = b"GET /healthz HTTP/1.1\r\nHost: x\r\n\r\n"
+    for sent in (b"", b"GET /healthz HTTP/1.1\r\nHost:", whole + b"GET /healthz HTTP/1.1\r\n"):
+        with socket.create_connection((host, int(port)), timeout=HEAD_SECONDS + 10) as connection:
+            connection.sendall(sent)
+            answer = b""
+            while received := connection.recv(4096):
+                answer += received
+            assert answer.count(b"HTTP/1.1 200") == sent.count(b"\r\n\r\n")
 
 
 def png_bomb(width: int, height: int, kind: int = 2, bits: int = 8) -> bytes:

@@ -2,7 +2,9 @@
 
 import dataclasses
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 
+import jax
 import numpy as np
 from numpy.typing import NDArray
 
@@ -53,6 +55,8 @@ class Engine:
         Raises:
             InputError: it cannot be read, or lacks a classifier that THOR2 needs; or as `Recognizer`.
         """
+        if settings.cache is not None:
+            _keep_compiled(settings.cache)
         run = load_run(settings.model)
         missing = [name for name in THOR2 if name not in run.classifiers]
         if missing:
@@ -109,6 +113,13 @@ class Engine:
                 self._recognizer.name(one.label, one.part, row.probabilities, row.overflow, one.kept_by_fallback)
             )
         return answers
+
+
+def _keep_compiled(folder: Path) -> None:
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    # By default only what takes a second to compile, and is large, is kept.
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
 
 
 def _batch_size(n_clouds: int) -> int:

@@ -15,6 +15,7 @@ from uvicorn.config import LOGGING_CONFIG
 from uvicorn.supervisors import Multiprocess
 
 from thor2_jax.service.app import create_app
+from thor2_jax.service.connections import TimedConnection
 from thor2_jax.service.engine import Engine
 from thor2_jax.service.settings import Settings
 
@@ -42,7 +43,7 @@ def serve(settings: Settings, host: str = "127.0.0.1", port: int = 8080, workers
         functools.partial(create_app, settings),
         factory=True,
         workers=workers,
-        http="httptools",
+        http=TimedConnection,
         ws="none",
         access_log=False,
         server_header=False,

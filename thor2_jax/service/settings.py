@@ -56,6 +56,7 @@ class Settings:
         window: seconds that a batch waits for the instances of requests that are being prepared.
         processes: that decode images and make clouds.
         unknown_below: confidence that an answer needs to have a name, as in `Recognizer`.
+        cache: folder for compiled programs, so that the next start need not compile; None keeps none.
 
     Raises:
         InputError: a value out of its range.
@@ -69,6 +70,7 @@ class Settings:
     window: float = 0.01
     processes: int = 2
     unknown_below: float = 0.0
+    cache: Path | None = None
 
     def __post_init__(self) -> None:
         for name in ("queue", "deadline", "processes"):
