@@ -33,8 +33,9 @@ import colornet
 import thor2_jax as thor2
 from thor2_jax.classifier import MLP, feature_of
 from thor2_jax.color_membership import region_sets
+from thor2_jax.files import check_new
 from thor2_jax.recognizer import THOR2
-from thor2_jax.run_folder import TrainedRun, check_new, input_size, save_run
+from thor2_jax.run_folder import TrainedRun, input_size, save_run
 from training.builtin_objects import COLOR_PAIRS, SHAPE_PAIRS, builtin_objects
 from training.dataset import Batch, Samples, build_samples, expand
 from training.evaluate import evaluate, joinings, summarize

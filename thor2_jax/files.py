@@ -6,7 +6,20 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-__all__ = ["replacing", "write_text"]
+from thor2_jax.errors import InputError
+
+__all__ = ["check_new", "replacing", "write_text"]
+
+
+def check_new(path: str | Path) -> None:
+    """Refuse a folder to write to whose name is taken, by anything but an empty folder: nothing is overwritten.
+
+    Raises:
+        InputError: naming the path.
+    """
+    path = Path(path)
+    if path.is_symlink() or (path.exists() and not (path.is_dir() and not any(path.iterdir()))):
+        raise InputError(f"out: {path} exists already and is not an empty folder")
 
 
 @contextlib.contextmanager

@@ -25,10 +25,13 @@ import colornet
 from thor2_jax.classifier import MLP, Feature, check_features
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig, Relaxation
 from thor2_jax.errors import InputError
+from thor2_jax.files import check_new
 
-__all__ = ["TrainedRun", "check_new", "description_digest", "input_size", "load_run", "save_run"]
+__all__ = ["RUN_FILE", "TrainedRun", "description_digest", "input_size", "load_run", "save_run"]
 
 FORMAT = 1
+
+RUN_FILE = "run.json"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,17 +64,6 @@ def input_size(feature: Feature, config: DescriptorConfig, n_regions: int) -> in
     """Floats in the descriptor of that name."""
     image, embedding = config.image_size**2, n_regions * config.n_strips
     return config.n_slices * {"ce": embedding, "tops": image, "tops2": image + embedding}[feature]
-
-
-def check_new(path: str | Path) -> None:
-    """Refuse a name that is taken, by anything but an empty folder; a run folder is never overwritten.
-
-    Raises:
-        InputError: naming the path.
-    """
-    path = Path(path)
-    if path.is_symlink() or (path.exists() and not (path.is_dir() and not any(path.iterdir()))):
-        raise InputError(f"out: {path} exists already; a run folder is never overwritten")
 
 
 def _digest(path: Path, n_inputs: int, n_classes: int) -> str:
@@ -128,7 +120,7 @@ def save_run(run: TrainedRun, path: str | Path) -> None:
             "record": run.record,
         }
         description["digest"] = description_digest(description)
-        (partial / "run.json").write_text(json.dumps(description, indent=2) + "\n")
+        (partial / RUN_FILE).write_text(json.dumps(description, indent=2) + "\n")
         partial.rename(path)
     except BaseException:
         shutil.rmtree(partial, ignore_errors=True)
@@ -137,7 +129,7 @@ def save_run(run: TrainedRun, path: str | Path) -> None:
 
 def _description(path: Path) -> dict[str, Any]:
     try:
-        found = json.loads((path / "run.json").read_text())
+        found = json.loads((path / RUN_FILE).read_text())
     except FileNotFoundError:
         raise InputError(f"model: {path} is no run folder (it has no run.json)") from None
     except (OSError, ValueError, RecursionError) as error:

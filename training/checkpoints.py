@@ -29,7 +29,10 @@ from orbax.checkpoint import checkpoint_managers
 from thor2_jax.errors import InputError
 from thor2_jax.files import write_text
 
-__all__ = ["Checkpoints"]
+__all__ = ["CHECKPOINTS", "Checkpoints"]
+
+CHECKPOINTS = "checkpoints"
+"""Folder of a run in the making."""
 
 DIGEST = "sha256"
 

@@ -49,19 +49,14 @@ def _bar() -> Progress:
     )
 
 
-def _new_folder(path: Path) -> None:
-    """Refuse a folder that holds something already, before any work is done."""
-    if path.exists() and (not path.is_dir() or any(path.iterdir())):
-        raise InputError(f"out: {path} exists already and is not an empty folder")
-
-
 @app.command()
 def colornet(out: Annotated[Path, typer.Option(help="Folder for network.npz and two pictures.")]) -> None:
     """Build the colour network from scratch and draw it."""
     import colornet as colornet_package
     from colornet.draw import draw_network, draw_similarity
+    from thor2_jax.files import check_new
 
-    _new_folder(out)
+    check_new(out)
     network = colornet_package.build()
     out.mkdir(parents=True, exist_ok=True)
     network.save(out / "network.npz")
@@ -156,14 +151,14 @@ def train(
             raise InputError("coordinator: several processes train from a --dataset that all of them can read")
         jax.distributed.initialize(coordinator, processes, process)
     from thor2_jax.classifier import check_features
-    from training.baselines.job import check_baselines, is_finished, train_baselines
+    from training.baselines.job import check_baselines, train_baselines
     from training.engines import local
     from training.fit import FitOptions
     from training.left_out import WithoutClasses
     from training.meshes import find_meshes, read_names
     from training.protocol import DEFAULT, PAPER
     from training.render_job import render_dataset
-    from training.train import VIEWS, check_out, train_run
+    from training.train import VIEWS, check_out, is_finished, train_run
     from training.view_dataset import ViewDataset
     from training.view_source import ViewSource
 
@@ -385,13 +380,15 @@ def serve(
 
 @app.command()
 def demo(
-    out: Annotated[Path, typer.Option(help="New folder for the report, its pictures and the trained run.")],
+    out: Annotated[Path, typer.Option(help="Folder for the report, its pictures and the trained run.")],
     seed: Annotated[int, typer.Option(help="Of weights and scenes.")] = 0,
 ) -> None:
-    """Train on built-in objects, recognize cluttered scenes of them, write a report. No download; a few minutes."""
+    """Train on built-in objects, recognize cluttered scenes of them, write a report. No download; a few minutes.
+
+    Interrupted, it goes on when called again.
+    """
     from training.demo import run_demo
 
-    _new_folder(out)
     with _bar() as bar:
         figures = run_demo(out, seed, _stages(bar))
     table = Table("", *figures.names)

@@ -15,9 +15,11 @@ from typing import Any
 
 import numpy as np
 
+from thor2_jax.errors import InputError
 from thor2_jax.files import write_text
 from thor2_jax.overlay import draw_overlay
 from thor2_jax.recognizer import Recognizer
+from thor2_jax.run_folder import RUN_FILE, TrainedRun, load_run
 from training.builtin_objects import builtin_objects
 from training.evaluate import Instance, evaluate, summarize
 from training.meshes import TexturedMesh
@@ -91,38 +93,57 @@ def _parts(summary: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]
             yield f"occlusion {degree}", summary["accuracy"]["occlusion"][degree]
 
 
+def _check_out(out: Path) -> None:
+    """Refuse a folder with anything that a demonstration does not leave when it is stopped."""
+    begun = ("run", "pictures", "demo.json")
+    if out.exists() and not (
+        out.is_dir() and all(path.name in begun or path.name.startswith(".") for path in out.iterdir())
+    ):
+        raise InputError(f"out: {out} exists already and is no demonstration that was stopped")
+
+
+def _trained(objects: Mapping[str, TexturedMesh], out: Path, seed: int, progress: Progress) -> TrainedRun:
+    if (out / RUN_FILE).is_file():
+        run = load_run(out)
+        if run.record["seed"] != seed:
+            raise InputError(f"seed is {seed}; {out} was trained with {run.record['seed']}")
+    else:
+        dataset = render_dataset(
+            objects,
+            out / VIEWS,
+            PROTOCOL.azimuth_step,
+            PROTOCOL.polar_step,
+            progress=lambda done, total: progress("render views", done, total, ""),
+            variations=PROTOCOL.variations,
+            seed=seed,
+        )
+        options = dataclasses.replace(PROTOCOL.fit, seed=seed)
+        (run,) = train_run(dataset, out, FEATURES, options, progress, mirrors=PROTOCOL.mirrors)
+    shutil.rmtree(out / VIEWS, ignore_errors=True)
+    return run
+
+
 def run_demo(out: str | Path, seed: int = 0, progress: Progress = lambda stage, done, total, note: None) -> DemoFigures:
-    """Train on the built-in objects, recognize scenes of them, write a report.
+    """Train on the built-in objects, recognize scenes of them, write a report; or go on where that was stopped.
 
     Writes `run/` (the trained run), `pictures/`, `demo.json` and, last, `report.html` in `out`.
 
     Args:
-        out: folder, made if it is missing.
+        out: folder: new, or one that a demonstration has begun.
         seed: of the scenes and of the training.
         progress: told of each step.
 
     Raises:
-        InputError: `out` holds a run already.
+        InputError: `out` holds something else, a finished demonstration, or one of another seed.
         OSError: `out` cannot be written.
     """
     start = time.perf_counter()
     out = Path(out)
+    _check_out(out)
     pictures = out / "pictures"
     pictures.mkdir(parents=True, exist_ok=True)
     objects = builtin_objects()
-    dataset = render_dataset(
-        objects,
-        out / "run" / VIEWS,
-        PROTOCOL.azimuth_step,
-        PROTOCOL.polar_step,
-        progress=lambda done, total: progress("render views", done, total, ""),
-        variations=PROTOCOL.variations,
-        seed=seed,
-    )
-    options = dataclasses.replace(PROTOCOL.fit, seed=seed)
-    (run,) = train_run(dataset, out / "run", FEATURES, options, progress, mirrors=PROTOCOL.mirrors)
-    shutil.rmtree(out / "run" / VIEWS)
-
+    run = _trained(objects, out / "run", seed, progress)
     scenes = _scenes(objects, seed, progress)
     recognizer = Recognizer.load(out / "run")
     done = 0
@@ -156,7 +177,7 @@ def run_demo(out: str | Path, seed: int = 0, progress: Progress = lambda stage, 
         )
         + "\n",
     )
-    _write_report(out, figures, len(objects), len(dataset))
+    _write_report(out, figures, len(objects), run.record["dataset"]["views"])
     return figures
 
 

@@ -26,11 +26,11 @@ import colornet
 from thor2_jax.classifier import MLP, Feature, check_features
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
 from thor2_jax.errors import InputError
-from thor2_jax.files import write_text
-from thor2_jax.run_folder import TrainedRun, check_new, load_run, save_run
+from thor2_jax.files import check_new, write_text
+from thor2_jax.run_folder import RUN_FILE, TrainedRun, load_run, save_run
 from thor2_jax.sharding import batch_mesh
 from training.calibration import temperatures
-from training.checkpoints import Checkpoints
+from training.checkpoints import CHECKPOINTS, Checkpoints
 from training.dataset import MIRRORS, Samples, build_samples
 from training.fit import Figures, FitOptions, check_batch_size, fit
 from training.folds import fold_of_samples
@@ -39,17 +39,15 @@ from training.metrics import append_figures, forget_after, read_figures
 from training.pictures import draw_curves
 from training.view_source import ViewSource
 
-__all__ = ["VIEWS", "Progress", "check_out", "train_run"]
+__all__ = ["VIEWS", "Progress", "check_out", "is_finished", "train_run"]
 
 Progress = Callable[[str, int, int, str], object]
 """Called with (stage, done, total, note)."""
 
 VIEWS = "views"
-CHECKPOINTS = "checkpoints"
 BEGUN = "begun.json"
 METRICS = "metrics.jsonl"
 CURVES = "curves.png"
-RUN = "run.json"
 
 CURVE = ("epoch", "loss", "accuracy", "held_out_accuracy")
 """What a record keeps of an epoch's figures: what another run gives again."""
@@ -65,6 +63,12 @@ def check_out(out: str | Path) -> None:
     if not out.is_dir() or any(path.name not in (VIEWS, CHECKPOINTS) for path in out.iterdir()):
         if not (out / CHECKPOINTS / BEGUN).is_file():
             check_new(out)
+
+
+def is_finished(out: Path) -> bool:
+    """Whether a folder holds a trained run, or all folds of one."""
+    found = any((folder / RUN_FILE).is_file() for folder in (out, *out.glob("fold-*")))
+    return found and not (out / CHECKPOINTS).exists()
 
 
 def _check_same(out: Path, begun: Mapping[str, Any]) -> None:
@@ -175,7 +179,7 @@ def train_run(
         runs = []
         for fold in range(folds):
             folder = out if folds == 1 else out / f"fold-{fold}"
-            if not (folder / RUN).is_file():
+            if not (folder / RUN_FILE).is_file():
                 held_out = fold_of == fold if folds > 1 else None
                 classifiers, kept = _fit_fold(samples, held_out, out, fold, network, config, names, options, progress)
                 calibrated = temperatures(classifiers, samples, held_out, network, config)
@@ -252,5 +256,5 @@ def _publish(run: TrainedRun, whole: Path, folder: Path) -> None:
     save_run(run, whole)
     folder.mkdir(exist_ok=True)
     shutil.rmtree(folder / "weights", ignore_errors=True)
-    for name in ("weights", "network.npz", RUN):
+    for name in ("weights", "network.npz", RUN_FILE):
         (whole / name).rename(folder / name)

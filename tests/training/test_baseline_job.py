@@ -20,13 +20,14 @@ from thor2_jax.errors import InputError
 from thor2_jax.run_folder import TrainedRun, load_run, save_run
 from training.baselines import job
 from training.baselines.baseline import seen_in
-from training.baselines.job import BASELINES, check_baselines, is_finished, train_baselines
+from training.baselines.job import BASELINES, check_baselines, train_baselines
 from training.baselines.load import load_baselines
 from training.cli import app
 from training.evaluation.runs import load_runs
 from training.folds import fold_of_views
 from training.left_out import WithoutClasses
 from training.normalized_views import normalize_views
+from training.train import is_finished
 from training.view_source import MemoryViews
 from training.views import Cloud
 

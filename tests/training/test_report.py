@@ -93,9 +93,37 @@ def test_demo_in_small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(demo, "N_SCENES", 6)
     small = {"azimuth_step": 45.0, "polar_step": 30.0, "fit": FitOptions(epochs=4, batch_size=128)}
     monkeypatch.setattr(demo, "PROTOCOL", dataclasses.replace(demo.PROTOCOL, **small))
+
+    class Stopped(BaseException):
+        pass
+
+    def stopped_at(last: str) -> list[str]:
+        """Stop there; the stages until then."""
+        stages = []
+
+        def told(stage: str, done: int, total: int, note: str) -> None:
+            stages.append(stage)
+            if stage == last:
+                raise Stopped
+
+        with pytest.raises(Stopped):
+            demo.run_demo(tmp_path, 1, told)
+        return list(dict.fromkeys(stages))
+
+    assert stopped_at("render views") == ["render views"]
+    assert stopped_at("fit tops")[-3:] == ["describe", "fit ce", "fit tops"]
+    assert "fit ce" not in stopped_at("recognize scenes")
+    assert not (tmp_path / "report.html").exists()
+    with pytest.raises(thor2.InputError, match="seed is 2; .* was trained with 1"):
+        demo.run_demo(tmp_path, 2)
     stages: dict[str, tuple[int, int]] = {}
     figures = demo.run_demo(tmp_path, 1, lambda stage, done, total, note: stages.update({stage: (done, total)}))
-    assert all(done == total for done, total in stages.values()) and len(stages) == 7
+    assert stages == {"compose scenes": (6, 6), "recognize scenes": (6, 6)}
+    assert sorted(path.name for path in (tmp_path / "run").iterdir()) == [
+        "curves.png", "metrics.jsonl", "network.npz", "run.json", "weights",
+    ]  # fmt: skip
+    with pytest.raises(thor2.InputError, match="exists already and is no demonstration that was stopped"):
+        demo.run_demo(tmp_path, 1)
     assert figures.names == ("CE", "TOPS", "TOPS2", "THOR2")
     parts = {part: count for part, count in figures.instances.items() if part != "all"}
     assert figures.instances["all"] == sum(parts.values()) > 6

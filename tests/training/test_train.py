@@ -164,7 +164,7 @@ def test_a_run_goes_on_and_ends_as_if_it_had_not_been_stopped(whole: tuple[Path,
     assert run.record == whole[1].record
     assert told_of(out) == told_of(whole[0])
     assert names(out) == FINISHED
-    with pytest.raises(thor2.InputError, match="exists already; a run folder is never overwritten"):
+    with pytest.raises(thor2.InputError, match="exists already and is not an empty folder"):
         train(out, ("tops", "ce"))
 
 

@@ -17,7 +17,7 @@ from training.evaluation.runs import run_folders
 from training.fit import FitOptions
 from training.view_source import ViewSource
 
-__all__ = ["BASELINES", "check_baselines", "is_finished", "train_baselines"]
+__all__ = ["BASELINES", "check_baselines", "train_baselines"]
 
 _TRAIN: dict[str, Callable[[Task], Fitted]] = {"thor": train_thor, "forest": train_forest, "pointnet": train_pointnet}
 
@@ -29,12 +29,6 @@ def check_baselines(names: Sequence[str]) -> tuple[str, ...]:
     if not set(names) <= set(BASELINES) or len(set(names)) != len(names):
         raise InputError(f"baselines is {', '.join(names)}; expected different ones of {', '.join(BASELINES)}")
     return tuple(name for name in BASELINES if name in names)
-
-
-def is_finished(path: Path) -> bool:
-    """Whether a folder holds a run, or all folds of one, so that nothing but baselines can be missing."""
-    found = any((folder / "run.json").is_file() for folder in (path, *path.glob("fold-*")))
-    return found and not (path / "checkpoints").exists()
 
 
 def train_baselines(

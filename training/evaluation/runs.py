@@ -7,9 +7,11 @@ from pathlib import Path
 
 from thor2_jax.errors import InputError
 from thor2_jax.recognizer import Recognizer
+from thor2_jax.run_folder import RUN_FILE
 from training.baselines.baseline import Baseline
 from training.baselines.files import baseline_file
 from training.baselines.load import load_baselines
+from training.checkpoints import CHECKPOINTS
 
 __all__ = ["Run", "load_runs", "run_folders"]
 
@@ -46,10 +48,10 @@ def run_folders(paths: Iterable[Path]) -> list[Path]:
     """
     folders: list[Path] = []
     for path in map(Path, paths):
-        folds = [f.parent for f in path.glob("fold-*/run.json") if f.parent.name[5:].isdecimal()]
-        if (path / "run.json").is_file() or not folds:
+        folds = [f.parent for f in path.glob(f"fold-*/{RUN_FILE}") if f.parent.name[5:].isdecimal()]
+        if (path / RUN_FILE).is_file() or not folds:
             folders.append(path)  # what is no run folder is refused when it is read
-        elif (path / "checkpoints").exists():
+        elif (path / CHECKPOINTS).exists():
             raise InputError(f"model: the training of {path} is not finished; finish it, or name single folds of it")
         else:
             folders += sorted(folds, key=lambda fold: int(fold.name[5:]))
@@ -60,7 +62,7 @@ def _digest(path: Path) -> str:
     digest = hashlib.sha256()
     baselines = baseline_file(path, "*")
     weights = [*sorted((path / "weights").rglob("*")), *sorted(baselines.parent.glob(baselines.name))]
-    for file in [path / "run.json", path / "network.npz", *weights]:
+    for file in [path / RUN_FILE, path / "network.npz", *weights]:
         if file.is_file():
             digest.update(f"{file.relative_to(path).as_posix()}\0{file.stat().st_size}\0".encode())
             digest.update(file.read_bytes())
