@@ -13,11 +13,14 @@ from thor2_jax.errors import InputError
 from thor2_jax.types import Descriptors
 
 __all__ = [
+    "DEFAULT_RULE",
     "FEATURES",
     "HIDDEN",
+    "RULES",
     "Feature",
     "Joined",
     "MLP",
+    "Rule",
     "check_features",
     "class_probabilities",
     "feature_of",
@@ -37,6 +40,14 @@ def check_features(names: object, argument: str) -> tuple[Feature, ...]:
     if not values or len(set(values)) != len(values) or not set(values) <= set(FEATURES):
         raise InputError(f"{argument} is {names!r}; expected one or more different ones of {', '.join(FEATURES)}")
     return tuple(name for name in FEATURES if name in values)
+
+
+Rule = Literal["larger", "mean", "log-mean"]
+RULES: tuple[Rule, ...] = ("larger", "mean", "log-mean")
+"""Ways to make one answer of several classifiers; see `join`."""
+
+DEFAULT_RULE: Rule = "log-mean"
+"""Names more synthetic views that were held out than the paper's rule, "larger"."""
 
 
 def feature_of(descriptors: Descriptors, name: Feature) -> jax.Array:
@@ -78,12 +89,12 @@ def class_probabilities(model: MLP, descriptors: Descriptors, name: Feature) -> 
 
 
 class Joined(NamedTuple):
-    """The more confident classifier's answer, one a cloud.
+    """The answer of several classifiers together, one a cloud.
 
     Attributes:
         class_index: [B] int, the winning class.
-        confidence: [B] float, its probability.
-        classifier: [B] str, the feature whose classifier won.
+        confidence: [B] float, its joint probability.
+        classifier: [B] str, the feature whose classifier is surest of it.
     """
 
     class_index: NDArray[np.intp]
@@ -91,14 +102,23 @@ class Joined(NamedTuple):
     classifier: NDArray[np.str_]
 
 
-def join(probabilities: Mapping[Feature, NDArray[np.floating[Any]]]) -> Joined:
-    """The larger top-1 probability names the object (paper, "Recognition"); the first classifier wins a tie.
+def join(probabilities: Mapping[Feature, NDArray[np.floating[Any]]], rule: Rule = DEFAULT_RULE) -> Joined:
+    """One answer of several classifiers (paper, "Recognition", for the rule "larger").
 
     Args:
         probabilities: feature -> [B, C] class probabilities of its classifier.
+        rule: "larger", the classifier with the larger top-1 probability answers, the first one if they are equal;
+            "mean" of the probabilities; "log-mean", their geometric mean, so that both have to find a class likely.
     """
     names = np.array(list(probabilities))
     stacked = np.stack([probabilities[name] for name in probabilities])  # [M, B, C]
-    winner = stacked.max(axis=2).argmax(axis=0)
-    chosen = stacked[winner, np.arange(stacked.shape[1])]
-    return Joined(chosen.argmax(axis=1), chosen.max(axis=1), names[winner])
+    clouds = np.arange(stacked.shape[1])
+    if rule == "larger":
+        together = stacked[stacked.max(axis=2).argmax(axis=0), clouds]
+    elif rule == "mean":
+        together = stacked.astype(np.float64).mean(axis=0)
+    else:
+        together = np.exp(np.log(np.maximum(stacked, np.finfo(np.float32).tiny, dtype=np.float64)).mean(axis=0))
+        together /= together.sum(axis=1, keepdims=True)
+    index = together.argmax(axis=1)
+    return Joined(index, together.max(axis=1), names[stacked[:, clouds, index].argmax(axis=0)])

@@ -67,7 +67,7 @@ def draw_overlay(
 ) -> None:
     """Draw answers on the photo they are about; the PNG appears under its name whole or not at all.
 
-    A label tells name, confidence, the classifier that decided, and "occluded" where it is; or "unrecognized". Letters
+    A label tells name, confidence, the classifier that is surest, and "occluded" where it is; or "unrecognized". Letters
     and outlines grow with the picture. Labels lie inside it, clear of each other while there is room. Letters shrink
     where a label is wider than the picture; one that does not fit in the smallest legible letters is left out.
 
@@ -118,8 +118,8 @@ def _text(answer: Recognition) -> str:
     if answer.name is None:
         return "\n".join(["unrecognized", *occluded])
     sure = "" if answer.confidence is None else f" {answer.confidence:.2f}"
-    decided = [] if answer.classifier is None else [answer.classifier.upper()]
-    return f"{answer.name}{sure}\n{', '.join(decided + occluded)}".rstrip()
+    surest = [] if answer.classifier is None else [answer.classifier.upper()]
+    return f"{answer.name}{sure}\n{', '.join(surest + occluded)}".rstrip()
 
 
 def _cut_out(labels: NDArray[Any], label: int) -> _Mask:

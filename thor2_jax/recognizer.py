@@ -17,7 +17,16 @@ from flax import nnx
 from numpy.typing import NDArray
 
 from thor2_jax.capacity import BATCH_BUCKETS, POINT_BUCKETS, batch_bucket, point_bucket
-from thor2_jax.classifier import MLP, Feature, check_features, class_probabilities, join
+from thor2_jax.classifier import (
+    DEFAULT_RULE,
+    MLP,
+    RULES,
+    Feature,
+    Rule,
+    check_features,
+    class_probabilities,
+    join,
+)
 from thor2_jax.descriptor import describe
 from thor2_jax.errors import InputError
 from thor2_jax.frames import RGBDFrame
@@ -30,7 +39,7 @@ from thor2_jax.voxel_grid import downsample_to_fit
 __all__ = ["NO_PART", "THOR2", "VOXEL", "DescribedFrame", "Part", "Recognition", "Recognizer", "prepare"]
 
 THOR2: tuple[Feature, ...] = ("tops", "tops2")
-"""The two classifiers whose more confident answer is THOR2's."""
+"""The two classifiers whose joint answer is THOR2's."""
 
 VOXEL = 0.01
 """Voxel side in scaled units of every cloud that is described, in training too: colour counts depend on it."""
@@ -43,8 +52,8 @@ class Recognition:
     Attributes:
         label: its number in the label image.
         name: the object's name; None if it was not recognized or is unknown.
-        confidence: the winning classifier's probability.
-        classifier: which one won ("tops" or "tops2").
+        confidence: the name's probability by all classifiers asked together.
+        classifier: which of them is surest of the name ("tops" or "tops2").
         top: classifier -> its five most probable (name, probability) pairs.
         occluded: the instance is hidden in part by another one, or cut by the image's border.
         overflow: points and pairs that the descriptor has no room for.
@@ -132,27 +141,31 @@ def _voxelled(cloud: InstanceCloud, edge: NDArray[np.bool_], size: float) -> tup
 class Recognizer:
     """A trained run, compiled and ready. Functions are compiled once a bucket of points and of instances."""
 
-    def __init__(self, run: TrainedRun, unknown_below: float = 0.0) -> None:
+    def __init__(self, run: TrainedRun, unknown_below: float = 0.0, rule: Rule = DEFAULT_RULE) -> None:
         """Ready to answer with every classifier of `run`.
 
         Args:
             run: the trained run.
             unknown_below: confidence from 0 to 1 that an answer needs to have a name; an object of no trained class
                 tends to get less. A report of `thor2 evaluate` tells which keeps 95 % of the answers.
+            rule: how classifiers are joined, see `classifier.join`; the paper's is "larger".
 
         Raises:
-            InputError: a confidence outside 0 to 1.
+            InputError: a confidence outside 0 to 1, or an unknown rule.
         """
+        if rule not in RULES:
+            raise InputError(f"rule is {rule!r}; expected one of {', '.join(RULES)}")
         if not 0 <= unknown_below <= 1:
             raise InputError(f"unknown_below is {unknown_below}; it must be from 0 to 1")
         self.run = run
         self.unknown_below = unknown_below
+        self.rule: Rule = rule
         self._apply = {name: _compiled(name, model) for name, model in run.classifiers.items()}
 
     @classmethod
-    def load(cls, run_dir: str | Path, unknown_below: float = 0.0) -> "Recognizer":
+    def load(cls, run_dir: str | Path, unknown_below: float = 0.0, rule: Rule = DEFAULT_RULE) -> "Recognizer":
         """Read a run folder (see `run_folder.load_run`, also for what is raised)."""
-        return cls(load_run(run_dir), unknown_below)
+        return cls(load_run(run_dir), unknown_below, rule)
 
     def warm_up(self, max_points: int = 2048, max_instances: int = 16) -> int:
         """Compile everything for frames of up to `max_instances` instances with up to `max_points` points each.
@@ -250,7 +263,7 @@ class Recognizer:
             overflow: the descriptor's.
             kept_by_fallback: as in `InstanceCloud`.
         """
-        joined = join({name: values[None] for name, values in probabilities.items()})
+        joined = join({name: values[None] for name, values in probabilities.items()}, self.rule)
         confidence = float(joined.confidence[0])
         unknown = confidence < self.unknown_below
         return Recognition(

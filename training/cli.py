@@ -276,7 +276,7 @@ def _evaluate(kind: str, frames: Any, dataset: Path, models: Sequence[Path], out
     counts, speed = found["instances"], found["speed"]
     if found["joinings"]:
         shown = Table("", "instances", *found["joinings"])
-        for table in found["accuracy"]["larger"]:
+        for table in found["accuracy"][found["rule"]]:
             header, rows = accuracy_table(table, found["joinings"])
             shown.add_section()
             if header[0]:

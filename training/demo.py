@@ -192,7 +192,9 @@ def _write_report(out: Path, figures: DemoFigures, n_objects: int, n_views: int)
         for part, values in figures.accuracy.items()
     ]
     shown = [
-        Picture(f"pictures/scene-{number}.png", "Outline, name, confidence and the classifier that decided.", half=True)
+        Picture(
+            f"pictures/scene-{number}.png", "Outline, name, confidence and the classifier that is surer.", half=True
+        )
         for number in range(N_SHOWN)
     ]
     write_page(
@@ -206,8 +208,8 @@ def _write_report(out: Path, figures: DemoFigures, n_objects: int, n_views: int)
         sections=[
             (
                 "Accuracy",
-                "Share of instances named rightly. CE reads colour alone, TOPS shape alone, TOPS2 both; THOR2 takes "
-                "the more confident of TOPS and TOPS2. Low occlusion hides 5 to 30 % of an object, high more.",
+                "Share of instances named rightly. CE reads colour alone, TOPS shape alone, TOPS2 both; THOR2 joins "
+                "TOPS and TOPS2. Low occlusion hides 5 to 30 % of an object, high more.",
                 (header, rows),
                 [Picture("pictures/accuracy.png", "Accuracy by occlusion.")],
             ),

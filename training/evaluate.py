@@ -1,6 +1,6 @@
 """Accuracy of one trained run on labelled frames in memory; `evaluation` does more, on datasets of any size.
 
-Every joining of classifiers by the paper's rule, over all frames and by attribute.
+Every joining of classifiers by the default rule, over all frames and by attribute.
 """
 
 import dataclasses
@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from thor2_jax.classifier import DEFAULT_RULE
 from thor2_jax.recognizer import Recognizer
 from training.evaluation.accuracy import parts
 from training.evaluation.answers import answer_frame
@@ -62,7 +63,7 @@ def evaluate(
             if reason is None and answer.probabilities is not None:
                 rows = dict(zip(recognizer.run.classifiers, answer.probabilities[:, None], strict=True))
                 for name, group in groups.items():
-                    index, confidence = join_by("larger", {feature: rows[feature] for feature in group})
+                    index, confidence = join_by(DEFAULT_RULE, {feature: rows[feature] for feature in group})
                     answers[name] = classes[index[0]], float(confidence[0])
             attributes = dict(item.attributes)
             occluded = answer.occluded and bool(answers)

@@ -7,9 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import nnx
+from scipy.stats import gmean
 
 import thor2_jax as thor2
-from thor2_jax.classifier import FEATURES, HIDDEN, MLP, check_features, feature_of, join
+from thor2_jax.classifier import FEATURES, HIDDEN, MLP, Rule, check_features, feature_of, join
 
 RNG = np.random.default_rng(0)
 apply = nnx.jit(lambda model, x: model(x))
@@ -101,9 +102,29 @@ def test_each_feature_is_its_descriptor() -> None:
 
 
 @pytest.mark.parametrize("n", [0, 1, 101])
+@pytest.mark.parametrize("rule", ["mean", "log-mean"])
+def test_join_by_means(n: int, rule: Rule) -> None:
+    tops, tops2 = (np.asarray(jax.nn.softmax(RNG.normal(size=(n, 4)))) for _ in range(2))
+    found = join({"tops": tops, "tops2": tops2}, rule)
+    for b in range(n):
+        pair = tops[b].astype(np.float64), tops2[b].astype(np.float64)
+        together = (pair[0] + pair[1]) / 2 if rule == "mean" else gmean(pair) / gmean(pair).sum()
+        best = found.class_index[b]
+        assert best == together.argmax() and found.confidence[b] == pytest.approx(together[best], rel=1e-12)
+        assert found.classifier[b] == ("tops" if tops[b, best] >= tops2[b, best] else "tops2")
+    assert len(found.class_index) == n
+
+
+def test_a_class_that_one_classifier_rules_out_is_not_named() -> None:
+    """Both say 0 of the third class: a probability of 0 has a logarithm all the same."""
+    found = join({"tops": np.array([[0.9, 0.1, 0.0]], np.float32), "tops2": np.array([[0.0, 1.0, 0.0]], np.float32)})
+    assert found.class_index[0] == 1 and found.confidence[0] == pytest.approx(1) and found.classifier[0] == "tops2"
+
+
+@pytest.mark.parametrize("n", [0, 1, 101])
 def test_join_takes_the_more_confident_classifier(n: int) -> None:
     tops, tops2 = (np.asarray(jax.nn.softmax(RNG.normal(size=(n, 4)))) for _ in range(2))
-    found = join({"tops": tops, "tops2": tops2})
+    found = join({"tops": tops, "tops2": tops2}, "larger")
     for b in range(n):
         name, row = max((("tops", tops[b]), ("tops2", tops2[b])), key=lambda pair: pair[1].max())
         assert found.classifier[b] == name
@@ -113,5 +134,5 @@ def test_join_takes_the_more_confident_classifier(n: int) -> None:
 
 def test_join_of_a_tie_and_of_one() -> None:
     first, second = np.array([[0.3, 0.7]]), np.array([[0.7, 0.3]])
-    assert join({"tops": first, "tops2": second}) == (np.array([1]), np.array([0.7]), np.array(["tops"]))
+    assert join({"tops": first, "tops2": second}, "larger") == (np.array([1]), np.array([0.7]), np.array(["tops"]))
     assert join({"tops2": second}).classifier.tolist() == ["tops2"]

@@ -60,8 +60,23 @@ def test_every_instance_is_answered_in_the_order_of_labels(recognizer: Recognize
         assert answer.points_used > 30 and answer.overflow >= 0
 
 
-def test_the_more_confident_classifier_wins(recognizer: Recognizer) -> None:
-    for answer in recognizer.recognize(tilted(patches())):
+def test_what_both_find_likely_wins(recognizer: Recognizer) -> None:
+    described = recognizer.describe(tilted(patches()))
+    found = recognizer.probabilities(described.descriptors, ("tops", "tops2"))
+    named = [answer for answer in recognizer.recognize(tilted(patches())) if answer.reason is None]
+    assert len(named) == 3
+    for row, answer in enumerate(named):
+        together = np.sqrt(found["tops"][row].astype(np.float64) * found["tops2"][row])
+        best = int(together.argmax())
+        assert answer.name == CLASSES[best]
+        assert answer.confidence == pytest.approx(together[best] / together.sum(), rel=1e-6)
+        assert answer.classifier == max(("tops", "tops2"), key=lambda name: found[name][row][best])
+
+
+def test_by_the_paper_s_rule_the_more_confident_classifier_wins(run: TrainedRun) -> None:
+    with pytest.raises(thor2.InputError, match="rule is 'least'; expected one of larger, mean, log-mean"):
+        Recognizer(run, rule="least")  # type: ignore[arg-type]
+    for answer in Recognizer(run, rule="larger").recognize(tilted(patches())):
         if answer.reason is None:
             first = {name: top[0] for name, top in answer.top.items()}
             assert set(first) == {"tops", "tops2"}

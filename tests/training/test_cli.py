@@ -146,7 +146,7 @@ def test_evaluate_frames(model: Path, images: Path, scene: Scene, tmp_path: Path
     run("recognize", "--model", model, *recognize(images), "--out", tmp_path / "answer")
     answers = json.loads((tmp_path / "answer" / "recognition.json").read_text())
     right = np.mean([a["name"] == scene.truth[a["label"]] for a in answers])
-    whole = report["accuracy"]["larger"][0]["cells"][0]
+    whole = report["accuracy"][report["rule"]][0]["cells"][0]
     assert report["instances"]["scored"] == whole["instances"] == len(scene.truth)
     assert whole["accuracy"]["THOR2"] == {"mean": pytest.approx(right), "std": 0.0, "runs": 2}
     before = (tmp_path / "report" / "answers.jsonl").read_bytes()

@@ -48,8 +48,8 @@ class Instance(BaseModel):
 
     label: int = Field(description="Its number in the label image.")
     name: str | None = Field(description="The object's name; null if it was not recognized.")
-    confidence: float | None = Field(description="The deciding classifier's probability.")
-    classifier: str | None = Field(description="The classifier that decided: tops or tops2.")
+    confidence: float | None = Field(description="The name's probability by both classifiers together.")
+    classifier: str | None = Field(description="The classifier that is surer of the name: tops or tops2.")
     top: dict[str, list[Candidate]] = Field(description="Each classifier's five most probable classes.")
     occluded: bool = Field(description="Hidden in part by another instance, or cut by the image's border.")
     overflow: int = Field(description="Points and pairs that the descriptor has no room for.")

@@ -7,16 +7,17 @@ from typing import Any, Literal, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from thor2_jax.classifier import FEATURES, Feature, join
+from thor2_jax import classifier
+from thor2_jax.classifier import FEATURES
 from training.baselines.baseline import TITLES
 from training.evaluation.confidence import with_temperature
 
 __all__ = ["RULES", "Rule", "join_by", "joinings", "main_joining"]
 
-Rule = Literal["larger", "mean", "log-mean", "calibrated"]
-RULES: tuple[Rule, ...] = ("larger", "mean", "log-mean", "calibrated")
-"""Larger top-1 probability (the paper's); mean of the probabilities; their geometric mean; larger top-1 probability
-after each classifier's own temperature, fitted on held-out views."""
+Rule = classifier.Rule | Literal["calibrated"]
+RULES: tuple[Rule, ...] = (*classifier.RULES, "calibrated")
+"""Those of `thor2_jax.classifier.join`, the paper's first; and the paper's after each classifier's own temperature,
+fitted on held-out views."""
 
 
 def joinings(available: Iterable[str]) -> dict[str, tuple[str, ...]]:
@@ -50,13 +51,6 @@ def join_by(
     if rule == "calibrated":
         assert temperatures is not None
         probabilities = {name: with_temperature(found, temperatures[name]) for name, found in probabilities.items()}
-    if rule in ("larger", "calibrated"):
-        joined = join(cast(Mapping[Feature, NDArray[np.floating[Any]]], probabilities))
-        return joined.class_index, joined.confidence
-    stacked = np.stack(list(probabilities.values())).astype(np.float64)  # [M, B, C]
-    if rule == "mean":
-        together = stacked.mean(axis=0)
-    else:
-        together = np.exp(np.log(np.maximum(stacked, np.finfo(np.float32).tiny)).mean(axis=0))
-        together /= together.sum(axis=1, keepdims=True)
-    return together.argmax(axis=1), together.max(axis=1)
+        rule = "larger"
+    joined = classifier.join(cast(Mapping[classifier.Feature, NDArray[np.floating[Any]]], probabilities), rule)
+    return joined.class_index, joined.confidence

@@ -92,7 +92,7 @@ def _accuracy(found: Mapping[str, Any], out: Path) -> list[Section]:
     known = published(found["dataset"]["kind"])
     methods = known.methods if known else ()
     text = "Share of instances named rightly; those that could not be described count as wrong. CE reads colour alone, "
-    text += "TOPS shape alone, TOPS2 both; the larger top-1 probability decides between classifiers. "
+    text += f"TOPS shape alone, TOPS2 both; several are joined by {found['rule']} (below, ways to join are compared). "
     if not set(found["joinings"]).isdisjoint(TITLES.values()):
         text += (
             "Trained on the same views and asked about the same described instances: THOR, the predecessor, a library "
@@ -103,7 +103,7 @@ def _accuracy(found: Mapping[str, Any], out: Path) -> list[Section]:
     if known:
         text += f"Published figures: {known.source}. They are of {known.concerns}; only the same frames compare. "
         text += f"Not found, so not shown: {known.missing}."
-    whole, *tables = found["accuracy"]["larger"]
+    whole, *tables = found["accuracy"][found["rule"]]
     sections: list[Section] = [("Accuracy", text, accuracy_table(whole, found["joinings"], methods), [])]
     names = [name for name in BARS if name in found["joinings"]]
     for number, table in enumerate(tables):
@@ -123,11 +123,11 @@ def _joined(found: Mapping[str, Any]) -> Section:
     cells = {rule: found["accuracy"][rule][0]["cells"][0]["accuracy"] for rule in RULES}
     joined = [n for n in found["joinings"] if "+" in n or n == "THOR2"]
     rows = [[n, *(figure_text(cells[rule].get(n, NOTHING)) for rule in RULES)] for n in joined]
-    text = "The paper's rule takes the classifier with the larger top-1 probability; the others take the largest mean "
-    text += (
+    text = (
+        "The paper's rule takes the classifier with the larger top-1 probability; the others take the largest mean "
         "of the probabilities, or of their logarithms; \"calibrated\" is the paper's rule after each classifier's own "
+        f"temperature. `thor2 recognize` and the tables of this page use {found['rule']}."
     )
-    text += "temperature."
     return "Ways to join classifiers", text, (["", *RULES], rows), []
 
 

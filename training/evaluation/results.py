@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from thor2_jax.classifier import DEFAULT_RULE
 from training.evaluation.accuracy import over_runs, parts, tables_of
 from training.evaluation.answers import FrameAnswers, InstanceAnswer
 from training.evaluation.confidence import accuracy_at_coverage, auroc, expected_calibration_error, reliability
@@ -39,7 +40,7 @@ class Answered:
 
 
 def answered(
-    instances: Sequence[InstanceAnswer], columns: Columns, rule: Rule = "larger", temperatures: Temperatures = ()
+    instances: Sequence[InstanceAnswer], columns: Columns, rule: Rule = DEFAULT_RULE, temperatures: Temperatures = ()
 ) -> dict[str, dict[int, Answered]]:
     """Joining -> run -> answers to those of `instances` that were described.
 
@@ -109,6 +110,7 @@ def results(
     found: dict[str, Any] = {
         "runs": list(runs),
         "classes": list(classes),
+        "rule": DEFAULT_RULE,
         "instances": {
             "labelled": len(labelled),
             "scored": len(scored),
@@ -126,18 +128,18 @@ def results(
     if not scored:
         return found
     by_rule = {rule: answered(described, columns, rule, temperatures) for rule in RULES}
-    found["joinings"] = list(by_rule["larger"])
+    found["joinings"] = list(by_rule[DEFAULT_RULE])
     tables = tables_of(kind, [attributes for _, attributes in scored])
     found["accuracy"] = {
         rule: [_table(kind, names, scored, position, truth, given) for names in tables]
         for rule, given in by_rule.items()
     }
-    given = by_rule["larger"]
+    given = by_rule[DEFAULT_RULE]
     found["temperatures"] = {
         name: dataclasses.asdict(over_runs([known[name] for known in temperatures if name in known]))
         for name in dict.fromkeys(name for _, name in columns)
     }
-    rules: dict[str, Rule] = {"confidence": "larger", "calibrated_confidence": "calibrated"}
+    rules: dict[str, Rule] = {"confidence": DEFAULT_RULE, "calibrated_confidence": "calibrated"}
     for key, rule in rules.items():
         unknown = answered(strangers, columns, rule, temperatures)
         found[key] = {name: _confidence(by_run, truth, unknown[name]) for name, by_run in by_rule[rule].items()}

@@ -96,7 +96,7 @@ function show(what, answer, bitmap) {
 
 function objectButton(instance, color) {
   const { label, name, confidence, classifier, occluded, unrecognized } = instance;
-  const facts = name === null ? unrecognized : `${classifier.toUpperCase()} decided${occluded ? " · hidden in part" : ""}`;
+  const facts = name === null ? unrecognized : `${classifier.toUpperCase()} is surer${occluded ? " · hidden in part" : ""}`;
   const swatch = element("span", { className: "swatch" });
   swatch.style.setProperty("--paint", rgb(color));
   const button = element(

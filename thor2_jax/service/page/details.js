@@ -51,9 +51,9 @@ function topFive(instance, which) {
     ];
   });
   const title = element("h3", {}, TITLES[which] ?? which.toUpperCase());
-  const decided = instance.classifier === which;
-  if (decided) title.append(element("span", { className: "badge" }, "decided"));
-  return element("div", { className: decided ? "decided" : "" }, title, element("table", {}, element("tbody", {}, ...rows)));
+  const surer = instance.classifier === which;
+  if (surer) title.append(element("span", { className: "badge" }, "surer"));
+  return element("div", { className: surer ? "surer" : "" }, title, element("table", {}, element("tbody", {}, ...rows)));
 }
 
 function drawCloud(context, width, height, { details, points_used }) {
