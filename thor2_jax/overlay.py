@@ -67,8 +67,8 @@ def draw_overlay(
 ) -> None:
     """Draw answers on the photo they are about; the PNG appears under its name whole or not at all.
 
-    A label tells name, confidence, the classifier that is surest, and "occluded" where it is; or "unrecognized". Letters
-    and outlines grow with the picture. Labels lie inside it, clear of each other while there is room. Letters shrink
+    A label tells name, confidence, the surest classifier, and "occluded" where it is; or "unrecognized". Letters and
+    outlines grow with the picture. Labels lie inside it, clear of each other while there is room. Letters shrink
     where a label is wider than the picture; one that does not fit in the smallest legible letters is left out.
 
     Args:
