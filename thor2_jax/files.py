@@ -1,14 +1,17 @@
 """Writing files so that they appear under their name whole or not at all."""
 
 import contextlib
+import hashlib
+import json
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 from thor2_jax.errors import InputError
 
-__all__ = ["check_new", "replacing", "write_text"]
+__all__ = ["check_new", "json_digest", "replacing", "write_text"]
 
 
 def check_new(path: str | Path) -> None:
@@ -20,6 +23,15 @@ def check_new(path: str | Path) -> None:
     path = Path(path)
     if path.is_symlink() or (path.exists() and not (path.is_dir() and not any(path.iterdir()))):
         raise InputError(f"out: {path} exists already and is not an empty folder")
+
+
+def json_digest(table: Mapping[str, Any]) -> str:
+    """SHA-256, in hexadecimal, of what a JSON table says but for its own "digest", however it is laid out.
+
+    A changed number reads as well as the right one; its digest tells.
+    """
+    said = {key: value for key, value in table.items() if key != "digest"}
+    return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
 
 
 @contextlib.contextmanager

@@ -25,9 +25,9 @@ import colornet
 from thor2_jax.classifier import MLP, Feature, check_features
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig, Relaxation
 from thor2_jax.errors import InputError
-from thor2_jax.files import check_new
+from thor2_jax.files import check_new, json_digest
 
-__all__ = ["RUN_FILE", "TrainedRun", "description_digest", "input_size", "load_run", "save_run"]
+__all__ = ["RUN_FILE", "TrainedRun", "input_size", "load_run", "save_run"]
 
 FORMAT = 1
 
@@ -81,12 +81,6 @@ def _digest(path: Path, n_inputs: int, n_classes: int) -> str:
     return digest.hexdigest()
 
 
-def description_digest(description: Mapping[str, Any]) -> str:
-    """SHA-256 of what run.json says, however it is laid out: a changed constant reads as well as the right one."""
-    said = {key: value for key, value in description.items() if key != "digest"}
-    return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
-
-
 def save_run(run: TrainedRun, path: str | Path) -> None:
     """Write a run folder. It appears under its name only when it is complete.
 
@@ -119,7 +113,7 @@ def save_run(run: TrainedRun, path: str | Path) -> None:
             "weights": {name: _digest(partial / "weights" / name, *sizes[name]) for name in run.classifiers},
             "record": run.record,
         }
-        description["digest"] = description_digest(description)
+        description["digest"] = json_digest(description)
         (partial / RUN_FILE).write_text(json.dumps(description, indent=2) + "\n")
         partial.rename(path)
     except BaseException:
@@ -142,7 +136,7 @@ def _description(path: Path) -> dict[str, Any]:
             f"model: {path} was trained on descriptor version {found.get('descriptor_version')!r}; "
             f"this version computes {DESCRIPTOR_VERSION}; train it again"
         )
-    if found.get("digest") != description_digest(found):
+    if found.get("digest") != json_digest(found):
         raise InputError(f"model: {path / 'run.json'} is damaged, or was changed after the training")
     return found
 

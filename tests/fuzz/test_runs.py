@@ -14,8 +14,11 @@ from hypothesis import strategies as st
 import colornet
 import thor2_jax as thor2
 from thor2_jax.classifier import MLP
-from thor2_jax.run_folder import TrainedRun, description_digest, input_size, load_run, save_run
+from thor2_jax.files import json_digest
+from thor2_jax.run_folder import TrainedRun, input_size, load_run, save_run
 from thor2_jax.testing import damaged
+from training.baselines.files import Stored, read_baseline, write_baseline
+from training.evaluation.answers import AnswerFile, FrameAnswers, InstanceAnswer
 from training.metrics import read_figures
 
 CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=2, n_strips=5, image_size=8)
@@ -81,9 +84,50 @@ def test_sizes_that_would_fill_memory(run: Path, attempt: Any, tmp_path: Path) -
     for key in ("n_slices", "n_strips"):
         table = json.loads((run / "run.json").read_bytes())
         table["descriptor_config"][key] = 10**7
-        table["digest"] = description_digest(table)
+        table["digest"] = json_digest(table)
         (path / "run.json").write_text(json.dumps(table))
         assert attempt(lambda: load_run(path)) is None
+
+
+ASKED = {"runs": ["a"], "classes": ["mug", "bowl"]}
+
+
+@pytest.fixture(scope="module")
+def answers(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    path = tmp_path_factory.mktemp("answers") / "answers.jsonl"
+    file = AnswerFile(path, ASKED)
+    for number in range(2):
+        said = InstanceAnswer(1, "mug", probabilities=np.array([[0.25, 0.75]], np.float32))
+        file.append(
+            FrameAnswers(f"frame {number}", {"light": "1"}, 0.5, [said, InstanceAnswer(2, "can", reason="few")])
+        )
+    return path.read_bytes()
+
+
+@given(data=st.data())
+def test_answers(data: st.DataObject, answers: bytes, attempt: Any, tmp_path_factory: Any) -> None:
+    """What was asked is compared, and may hold more; a frame is read as it was written, or not at all."""
+    path = tmp_path_factory.getbasetemp() / "answers.jsonl"
+    path.write_bytes(data.draw(damaged(answers)))
+    found = attempt(lambda: AnswerFile(path, ASKED))
+    if found is not None:
+        right = {json.loads(line)["digest"]: line for line in answers.splitlines()[1:]}
+        for line in path.read_bytes().splitlines()[1:]:
+            assert json.loads(line) == json.loads(right[json.loads(line)["digest"]])
+        for frame in found.frames:
+            assert frame.instances[0].probabilities.tolist() == [[0.25, 0.75]]
+
+
+@given(data=st.data())
+def test_baselines(data: st.DataObject, attempt: Any, tmp_path_factory: Any) -> None:
+    path = tmp_path_factory.getbasetemp() / "baselines" / "forest.safetensors"
+    stored = Stored({"a": np.arange(6.0).reshape(2, 3), "b": np.array([1], np.int32)}, 1.5, 2.0)
+    write_baseline(path, stored, ["mug"])
+    path.write_bytes(data.draw(damaged(path.read_bytes())))
+    found = attempt(lambda: read_baseline(path, ["mug"]))
+    if found is not None:
+        assert (found.temperature, found.seconds) == (1.5, 2.0) and found.arrays.keys() == stored.arrays.keys()
+        assert all(np.array_equal(found.arrays[name], array) for name, array in stored.arrays.items())
 
 
 ROWS = b"".join(

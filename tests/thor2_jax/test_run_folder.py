@@ -17,8 +17,9 @@ from flax import nnx
 import colornet
 import thor2_jax as thor2
 from thor2_jax.classifier import FEATURES, MLP
+from thor2_jax.files import json_digest
 from thor2_jax.recognizer import Recognizer
-from thor2_jax.run_folder import TrainedRun, description_digest, input_size, load_run, save_run
+from thor2_jax.run_folder import TrainedRun, input_size, load_run, save_run
 
 CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=2, n_strips=5, image_size=8, alpha=0.5)
 CLASSES = ("a mug", "b", "ç")
@@ -121,7 +122,7 @@ def edited(**changes: Any) -> Callable[[Path], None]:
                 del description[key]
             else:
                 description[key] = value
-        description["digest"] = description_digest(description)
+        description["digest"] = json_digest(description)
         (path / "run.json").write_text(json.dumps(description))
 
     return edit

@@ -20,7 +20,7 @@ from flax import nnx
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
-from thor2_jax.files import replacing
+from thor2_jax.files import json_digest, replacing
 
 __all__ = ["Stored", "arrays_of", "baseline_file", "model_with", "read_baseline", "write_baseline"]
 
@@ -48,8 +48,7 @@ class Stored:
 
 
 def _digest(arrays: Mapping[str, NDArray[Any]], about: Mapping[str, Any]) -> str:
-    said = {key: value for key, value in about.items() if key != "digest"}
-    digest = hashlib.sha256(json.dumps(said, sort_keys=True).encode())
+    digest = hashlib.sha256(json_digest(about).encode())
     for name in sorted(arrays):
         digest.update(f"{name} {arrays[name].dtype} {arrays[name].shape}\0".encode())
         digest.update(np.ascontiguousarray(arrays[name]).tobytes())

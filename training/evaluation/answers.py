@@ -1,7 +1,7 @@
 """What every classifier of every run says of every labelled instance, kept frame by frame as it comes.
 
-`answers.jsonl`: the first line tells what was asked, each further line holds a frame. A file that a crash cut off is
-good up to its last whole line.
+`answers.jsonl`: the first line tells what was asked, each further line holds a frame and a digest of what it says. A
+file that a crash cut off is good up to its last whole line.
 """
 
 import dataclasses
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
-from thor2_jax.files import write_text
+from thor2_jax.files import json_digest, write_text
 from thor2_jax.recognizer import DescribedFrame
 from training.baselines.baseline import Seen, seen_in
 from training.evaluation.runs import Run
@@ -153,18 +153,19 @@ def _encoded(answers: FrameAnswers) -> str:
         }
         for i in answers.instances
     ]
-    return json.dumps(
-        {
-            "frame": answers.frame,
-            "attributes": dict(answers.attributes),
-            "seconds": round(answers.seconds, 4),
-            "instances": instances,
-        }
-    )
+    said = {
+        "frame": answers.frame,
+        "attributes": dict(answers.attributes),
+        "seconds": round(answers.seconds, 4),
+        "instances": instances,
+    }
+    return json.dumps({**said, "digest": json_digest(said)})
 
 
 def _decoded(line: str | bytes) -> FrameAnswers:
     values = json.loads(line)
+    if values["digest"] != json_digest(values):
+        raise ValueError(f"the digest of frame {values.get('frame')!r} is not that of what it says")
     instances = []
     for instance in values["instances"]:
         rows = instance["probabilities"]
