@@ -3,6 +3,21 @@
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, settings
+
+EXAMPLES = {"properties": (4, 60), "fuzz": (150, 3000)}
+"""Folder of tests -> examples that Hypothesis draws for each, and those with --thorough."""
+
+for folder, numbers in EXAMPLES.items():
+    for tier, number in zip(("quick", "thorough"), numbers, strict=True):
+        settings.register_profile(
+            f"{folder}-{tier}",
+            max_examples=number,
+            deadline=None,
+            derandomize=True,
+            database=None,
+            suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
+        )
 
 SHARED = Path(__file__).resolve().parents[1].parent / "shared"
 
@@ -25,6 +40,18 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
         seconds, whole = (sum(report.duration for report in some) for some in (slow, reports))
         n_tests = len({report.nodeid for report in slow})
         terminalreporter.write_line(f"slow tier: {n_tests} tests, {seconds:.0f} of {whole:.0f} seconds")
+
+
+def pytest_collectstart(collector: pytest.Collector) -> None:
+    """A test takes the settings that hold while its file is imported."""
+    folder = collector.path.parent.name if isinstance(collector, pytest.Module) else ""
+    if folder in EXAMPLES:
+        settings.load_profile(f"{folder}-{'thorough' if collector.config.getoption('thorough') else 'quick'}")
+
+
+def pytest_collectreport() -> None:
+    """Other folders' tests have Hypothesis as they know it."""
+    settings.load_profile("default")
 
 
 @pytest.fixture(scope="session")

@@ -1,4 +1,4 @@
-"""Readers under limits of time and memory, and how many damaged files each gets."""
+"""Readers under limits of time and memory."""
 
 import contextlib
 import resource
@@ -9,19 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import HealthCheck, settings
 
 from thor2_jax.errors import InputError
-
-for tier, examples in (("quick-fuzz", 150), ("thorough-fuzz", 3000)):
-    settings.register_profile(
-        tier,
-        max_examples=examples,
-        deadline=None,
-        derandomize=True,
-        database=None,
-        suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
-    )
 
 SECONDS = 5
 MEMORY = 2**30
@@ -65,14 +54,3 @@ def attempt() -> Callable[..., Any]:
         return None
 
     return call
-
-
-def pytest_collectstart(collector: pytest.Collector) -> None:
-    """With --thorough, twenty times as many files."""
-    if isinstance(collector, pytest.Module):
-        settings.load_profile("thorough-fuzz" if collector.config.getoption("thorough") else "quick-fuzz")
-
-
-def pytest_collectreport() -> None:
-    """Other folders' tests have Hypothesis as they know it."""
-    settings.load_profile("default")

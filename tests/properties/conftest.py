@@ -1,4 +1,4 @@
-"""The ways of calling the software that every law is held to, and how many examples of each are drawn."""
+"""The ways of calling the software that every law is held to."""
 
 import dataclasses
 import functools
@@ -6,7 +6,6 @@ from typing import Any
 
 import jax
 import pytest
-from hypothesis import HealthCheck, settings
 
 import colornet
 import thor2_jax as thor2
@@ -14,27 +13,6 @@ import thor2_jax as thor2
 NETWORK = colornet.load_default()
 SIZE = 4
 """Clouds in a batch; two batches of two under vmap."""
-
-for tier, examples in (("quick", 4), ("thorough", 60)):
-    settings.register_profile(
-        tier,
-        max_examples=examples,
-        deadline=None,
-        derandomize=True,
-        database=None,
-        suppress_health_check=[HealthCheck.too_slow],
-    )
-
-
-def pytest_collectstart(collector: pytest.Collector) -> None:
-    """With --thorough, fifteen times as many examples of every law."""
-    if isinstance(collector, pytest.Module):
-        settings.load_profile("thorough" if collector.config.getoption("thorough") else "quick")
-
-
-def pytest_collectreport() -> None:
-    """Other folders' tests have Hypothesis as they know it."""
-    settings.load_profile("default")
 
 
 @dataclasses.dataclass(frozen=True)
