@@ -27,6 +27,8 @@ __all__ = ["ColorNetwork"]
 class ColorNetwork:
     """The colour network. Its arrays are read-only copies. R is the number of regions, E of edges.
 
+    Networks of the same contents are equal: what is compiled for one serves another that was read from the same file.
+
     Regions are numbered in the order of kmapper's nodes, a joined node taking the place of its first.
 
     Attributes:
@@ -92,6 +94,12 @@ class ColorNetwork:
                 raise ValueError(f"{name} has a value that is not finite")
         if not (isinstance(self.n_raw_nodes, int) and self.n_raw_nodes >= self.n_regions):
             raise ValueError(f"n_raw_nodes is {self.n_raw_nodes!r}; there are {self.n_regions} regions")
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, ColorNetwork) and self.fingerprint == other.fingerprint
+
+    def __hash__(self) -> int:
+        return hash(self.fingerprint)
 
     @property
     def n_regions(self) -> int:

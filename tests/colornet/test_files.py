@@ -55,6 +55,9 @@ def test_arrays_are_read_only_copies(network: colornet.ColorNetwork) -> None:
 
 def test_fingerprint_tells_networks_apart(network: colornet.ColorNetwork) -> None:
     assert network.fingerprint == FINGERPRINT
+    again = dataclasses.replace(network)
+    assert again is not network and again == network and hash(again) == hash(network) and network != "network"
+    assert dataclasses.replace(network, n_raw_nodes=24) != network
     seen = {network.fingerprint}
     for name in ("mean_rgb", "edge_weights", "similarity"):
         changed = np.array(getattr(network, name))
@@ -76,8 +79,13 @@ def test_fingerprint_tells_networks_apart(network: colornet.ColorNetwork) -> Non
         ({"mean_rgb": np.zeros((22, 4))}, "mean_rgb is float64 [22, 4]; expected float64 [22, 3]"),
         ({"mean_rgb": np.float64(0)}, "mean_rgb is float64 []; expected"),
         ({"mean_rgb": np.zeros((0, 3))}, "member_counts is int64 [22]; expected int64 [0]"),
+        (
+            {"mean_rgb": np.zeros((33, 3)), "member_counts": np.zeros(33, np.int64), "similarity": np.zeros((33, 33))},
+            "mean_rgb has 33 regions; region_bits can hold 1 to 32",
+        ),
         ({"edge_weights": np.zeros(55, np.float32)}, "edge_weights is float32 [55]; expected float64 [55]"),
         ({"edges": np.full((55, 2), 22)}, "edges names regions 22 to 22; there are 22 regions"),
+        ({"edges": np.full((55, 2), 23)}, "edges names regions 23 to 23; there are 22 regions"),
         ({"edges": np.full((55, 2), -1)}, "edges names regions -1 to -1; there are 22 regions"),
         ({"region_bits": np.zeros(140608, np.uint32)}, "region_bits[0] is 0"),
         ({"region_bits": np.full(140608, 1 << 22, np.uint32)}, "region_bits has 0x400000; there are 22 regions"),
