@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 import colornet
 from colornet.grid import grid_colors
-from colornet.lab import MEAN_WHITE
+from colornet.lab import MEAN_WHITE, hyab, to_lab
 from colornet.regions import join_redundant, mean_color, relabel, similarity
 
 from .test_color_math import hyab_by_hand, lab_by_hand
@@ -80,6 +80,14 @@ def test_do_not_join_nodes_of_another_mean_color() -> None:
     colors = np.repeat(np.array([0, 250, 251], np.uint8)[:, None], 3, axis=1)
     _, region = join_redundant(colors, [np.array([0]), np.array([0, 1, 2])], eps=7.0)
     assert region.tolist() == [0, 1]
+
+
+def test_mean_colors_at_the_limit_join() -> None:
+    colors = np.repeat(np.array([100, 110, 120], np.uint8)[:, None], 3, axis=1)
+    members = [np.array([0]), np.array([0, 1, 2])]
+    limit = float(hyab(*to_lab(np.array([[100.0] * 3, [110.0] * 3]), MEAN_WHITE)))
+    for eps, regions in ((limit, [0, 0]), (np.nextafter(limit, 0), [0, 1])):
+        assert join_redundant(colors, members, eps)[1].tolist() == regions
 
 
 def test_relabel() -> None:

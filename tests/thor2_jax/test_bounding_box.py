@@ -10,7 +10,7 @@ import trimesh
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from thor2_jax.bounding_box import minimal_box_axes, support_points
+from thor2_jax.bounding_box import _minimum_area_angle, minimal_box_axes, support_points
 
 compiled_axes, compiled_support = jax.jit(minimal_box_axes), jax.jit(support_points)
 
@@ -125,3 +125,13 @@ def test_padding_does_not_change_the_box(capacity: int) -> None:
     points = shapes()[1]
     axes = np.asarray(compiled_axes(padded(points, capacity)), np.float64)
     np.testing.assert_allclose(np.abs(axes @ box_of(points)[0].T), np.eye(3), atol=1e-4)
+
+
+def test_a_mirrored_projection_turns_the_other_way() -> None:
+    """So the signs of the frame that the search starts from do not matter."""
+    angle = jax.jit(_minimum_area_angle)
+    for seed in range(5):
+        xy = np.random.default_rng(seed).normal(size=(2, 80)).astype(np.float32)
+        found = float(angle(xy))
+        assert 0 < abs(found) < np.pi / 4
+        assert float(angle(xy * np.array([[1], [-1]], np.float32))) == pytest.approx(-found, abs=1e-6)

@@ -14,7 +14,12 @@ def test_smallest_bucket_that_holds(pick: Callable[[int], int], buckets: tuple[i
         assert pick(n) == min(size for size in buckets if size >= n)
 
 
+def test_buckets_double() -> None:
+    assert POINT_BUCKETS == tuple(512 * 2**k for k in range(5))
+    assert BATCH_BUCKETS == tuple(2**k for k in range(9))
+
+
 @pytest.mark.parametrize(("pick", "n", "words"), [(point_bucket, 8193, "points"), (batch_bucket, 257, "clouds")])
 def test_past_the_largest_bucket(pick: Callable[[int], int], n: int, words: str) -> None:
-    with pytest.raises(InputError, match=rf"{n} {words}.*largest bucket"):
+    with pytest.raises(InputError, match=rf"{n} {words}.*largest bucket, {n - 1}$"):
         pick(n)

@@ -77,3 +77,11 @@ def test_a_relaxed_config_is_hashable_and_another_one() -> None:
 def test_the_released_convention_has_no_soft_form() -> None:
     with pytest.raises(InputError, match="relaxation is Relaxation.*no soft form"):
         DescriptorConfig.released(relaxation=Relaxation())
+
+
+@pytest.mark.parametrize(
+    ("record", "name"), [(DescriptorConfig, "sigma_s"), (DescriptorConfig, "alpha"), (Relaxation, "color")]
+)
+def test_integers_past_the_largest_float_are_refused(record: type, name: str) -> None:
+    with pytest.raises(InputError, match=f"{name} is 1000"):
+        record(**{name: 10**400})

@@ -316,7 +316,7 @@ def test_depth_files_of_16_bit(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("value", [-1, 65_536])
 def test_depth_files_of_32_bit(tmp_path: Path, value: int) -> None:
-    depth = np.array([[1, 65_535]], np.int32)
+    depth = np.array([[0, 65_535]], np.int32)
     Image.fromarray(depth).save(tmp_path / "d.tiff")
     np.testing.assert_array_equal(read_depth(tmp_path / "d.tiff"), depth)
     depth[0, 0] = value

@@ -116,6 +116,15 @@ def test_a_few_pixels_are_no_occlusion() -> None:
         assert occlusion.occluded == occluded and occlusion.boundary.any() == occluded
 
 
+def test_exactly_the_least_share_is_occlusion() -> None:
+    """The contour of the narrowed block is 200 pixels long."""
+    for touching, occluded in ((9, False), (10, True)):
+        depth, labels = scene()
+        labels[:, 30:38] = 0
+        labels[40 + touching :, 80:130] = 0
+        assert occlusions(depth, labels)[BACK][1].occluded == occluded
+
+
 # What cameras and masks leave out
 
 

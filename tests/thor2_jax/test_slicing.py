@@ -97,6 +97,14 @@ def test_padding_does_not_occupy_levels_in_the_released_rule() -> None:
     np.testing.assert_array_equal(i[:2], [0, 1])
 
 
+def test_levels_from_twice_the_slices_on_are_past_the_end_in_the_released_rule() -> None:
+    """Whatever their rank: 1.3 is the last level that counts, 1.4 the first that does not."""
+    for far, number in ((1.3, 1), (1.4, 14)):
+        points = jnp.array([[0.1, 0.1, 0], [0.1, 0.1, far]], jnp.float32)
+        i, _ = slice_and_strip(points, jnp.ones(2, bool), RELEASED)
+        np.testing.assert_array_equal(i, [0, number])
+
+
 @pytest.mark.parametrize("config", [PAPER, RELEASED], ids=["paper", "released"])
 @pytest.mark.parametrize("size", [(0.7, 0.4, 1.2), (1.3, 0.4, 0.6), (1.6, 0.4, 1.3)])
 def test_overflow_is_the_number_of_points_left_out(

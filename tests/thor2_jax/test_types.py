@@ -1,11 +1,18 @@
 """Packing of clouds, and the layout of the descriptors."""
 
+import dataclasses
+import importlib
+import pkgutil
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import colornet
 import thor2_jax as thor2
+from thor2_jax.instance_clouds import InstanceCloud
+from thor2_jax.occlusion import Occlusion
 
 RNG = np.random.default_rng(0)
 
@@ -120,3 +127,22 @@ def test_layout_of_the_flat_descriptors() -> None:
     for b, s, r, j in [(0, 0, 0, 0), (1, 0, 21, 30), (0, 3, 4, 17), (1, 6, 21, 0)]:
         assert found.color[b, s * 682 + r * 31 + j] == embeddings[b, s, r, j]
         assert found.tops2[b, s * 1706 + 1024 + r * 31 + j] == embeddings[b, s, r, j]
+
+
+def test_records_are_frozen() -> None:
+    modules = [
+        importlib.import_module(f"{package.__name__}.{module.name}")
+        for package in (colornet, thor2)
+        for module in pkgutil.iter_modules(package.__path__)
+    ]
+    records = {item for module in modules for item in vars(module).values() if isinstance(item, type)}
+    records = set(filter(dataclasses.is_dataclass, records))
+    assert len(records) > 10
+    for record in records:
+        assert record.__dataclass_params__.frozen, record
+
+
+@pytest.mark.parametrize("record", [InstanceCloud, Occlusion, thor2.RGBDFrame])
+def test_records_of_numpy_arrays_are_equal_to_themselves_alone(record: type) -> None:
+    """Comparing arrays would raise."""
+    assert record.__eq__ is object.__eq__ and record.__hash__ is object.__hash__

@@ -1,6 +1,7 @@
 """The voxel grid against a dictionary of cubes, filled point by point."""
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -91,9 +92,16 @@ def test_sizes_that_are_not_positive(size: float) -> None:
         voxel_downsample(np.zeros((2, 3)), np.zeros((2, 3)), size)
 
 
-def test_a_size_too_small_to_number_the_cubes() -> None:
-    with pytest.raises(InputError, match=r"^size is 1e-12; too small"):
-        voxel_downsample(np.array([[0.0, 0, 0], [1, 1, 1]]), np.zeros((2, 3)), 1e-12)
+@pytest.mark.parametrize("turns", range(3))
+def test_as_many_cubes_as_numbers_of_63_bits(turns: int) -> None:
+    """2^61 are numbered, 2^62 are not; the axes differ in length."""
+    span = np.roll(np.array([2.0**10, 2.0**30, 2.0**21]) - 1, turns)
+    points = np.stack([np.zeros(3), span])
+    np.testing.assert_array_equal(voxel_downsample(points, points, 1.0)[0], points)
+    points[1, turns] = 2**11 - 1
+    message = f"size is 1.0; too small for a cloud that spans {points[1].tolist()}"
+    with pytest.raises(InputError, match=f"^{re.escape(message)}$"):
+        voxel_downsample(points, points, 1.0)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
