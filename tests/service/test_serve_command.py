@@ -31,6 +31,7 @@ def test_a_port_that_is_taken(run_folder: Path) -> None:
 
 def test_an_option_out_of_range(run_folder: Path) -> None:
     assert "max_batch is 7" in serve("--model", str(run_folder), "--max-batch", "7")
+    assert "unknown_below is 2.0" in serve("--model", str(run_folder), "--unknown-below", "2")
 
 
 def test_a_missing_package_names_the_extra(
