@@ -188,7 +188,7 @@ def test_page_of_datasets_of_any_size(tmp_path: Path, n: int) -> None:
     crops = {str(p["src"]) for p in page.pictures if str(p["src"]).startswith("confusions/")}
     assert len(crops) == len(found["worst"])
     whole = found["accuracy"][found["rule"]][0]["cells"][0]["accuracy"]["THOR2"]
-    assert f"{whole['mean']:.3f} ± {whole['std']:.3f}" in page.text
+    assert f"{whole['mean']:.3f} ±\u00a0{whole['std']:.3f}" in page.text
     for picture in page.pictures:
         with Image.open(report / str(picture["src"])) as image:
             image.load()

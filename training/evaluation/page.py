@@ -31,7 +31,7 @@ def figure_text(figure: Mapping[str, Any]) -> str:
     """Mean, and standard deviation if there are several runs."""
     if figure["mean"] is None:
         return "–"
-    return f"{figure['mean']:.3f}" + ("" if figure["std"] is None else f" ± {figure['std']:.3f}")
+    return f"{figure['mean']:.3f}" + ("" if figure["std"] is None else f" ±\u00a0{figure['std']:.3f}")
 
 
 def accuracy_table(table: Mapping[str, Any], joinings: Sequence[str], methods: Sequence[str] = ()) -> Table:
@@ -126,7 +126,7 @@ def _joined(found: Mapping[str, Any]) -> Section:
     text = (
         "The paper's rule takes the classifier with the larger top-1 probability; the others take the largest mean "
         "of the probabilities, or of their logarithms; \"calibrated\" is the paper's rule after each classifier's own "
-        f"temperature. `thor2 recognize` and the tables of this page use {found['rule']}."
+        f"temperature. thor2 recognize and the tables of this page use {found['rule']}."
     )
     return "Ways to join classifiers", text, (["", *RULES], rows), []
 
