@@ -112,7 +112,7 @@ def test_datasets(make: Any, attempt: Any, tmp_path_factory: pytest.TempPathFact
     assert len(read()) == 1
     whole = {name: (path / name).read_bytes() for name in names}
 
-    @settings(settings.get_profile("quick-fuzz"))
+    @settings(settings.get_profile("fuzz-quick"))
     @given(data=st.data(), name=st.sampled_from(names))
     def law(data: st.DataObject, name: str) -> None:
         (path / name).write_bytes(data.draw(damaged(whole[name])))

@@ -83,7 +83,8 @@ def test_cold_colours_are_in_the_hard_regions() -> None:
 def test_warm_colours_are_shared_by_the_softmax() -> None:
     """On a grid colour, against a loop in float64 over the 27 around."""
     temperature, reach = 4.0, 0.5 + 4 / 5
-    for rgb in ([120, 35, 200], [0, 255, 5], [0, 0, 0]):
+    ends = np.random.default_rng(0).choice([0, 5, 10, 245, 250, 255], (12, 3)).tolist()
+    for rgb in ([120, 35, 200], [0, 255, 5], [0, 0, 0], *ends):
         total, expected = 0.0, np.zeros(NETWORK.n_regions)
         for offset in np.ndindex(3, 3, 3):
             steps = np.array(offset) - 1

@@ -118,7 +118,7 @@ def test_mirrored_strips(aligned: thor2.PointClouds, axis: str) -> None:
 def test_a_hidden_end_turns_the_cloud() -> None:
     seen: set[int] = set()
 
-    @settings(settings.get_profile("quick"), max_examples=15)
+    @settings(settings.get_profile("properties-quick"), max_examples=15)
     @given(clouds=laws.packed(laws.camera_clouds(), SIZE, 512), seed=laws.seeds())
     def law(clouds: thor2.PointClouds, seed: int) -> None:
         found = laws.assert_flip_follows_rule(lambda clouds: thor2.view_normalize(clouds, CONFIG), clouds, seed)
