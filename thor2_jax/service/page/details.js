@@ -22,11 +22,11 @@ export function showDetails(instance, model, regions) {
   showSlices(details, model, regions);
 }
 
-function facts({ name, label, confidence, classifier, occluded, points_used, overflow, kept_by_fallback }) {
+function facts({ name, label, confidence, occluded, points_used, overflow, kept_by_fallback }) {
   if (name === null) return `Label ${label}`;
   return [
     `Label ${label}`,
-    `${percent(confidence)} sure by ${classifier.toUpperCase()}`,
+    `${percent(confidence)} sure`,
     occluded ? "hidden in part" : "wholly seen",
     `${points_used} points`,
     ...(overflow ? [`${overflow} points or pairs do not fit the descriptor`] : []),
