@@ -127,17 +127,17 @@ def _description(path: Path) -> dict[str, Any]:
     except FileNotFoundError:
         raise InputError(f"model: {path} is no run folder (it has no run.json)") from None
     except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"model: {path / 'run.json'} cannot be read: {error}") from None
+        raise InputError(f"model: {path / RUN_FILE} cannot be read: {error}") from None
     if not isinstance(found, dict) or found.get("format") != FORMAT:
         given = found.get("format") if isinstance(found, dict) else type(found).__name__
-        raise InputError(f"model: {path / 'run.json'} has format {given!r}; this version reads {FORMAT}")
+        raise InputError(f"model: {path / RUN_FILE} has format {given!r}; this version reads {FORMAT}")
     if found.get("descriptor_version") != DESCRIPTOR_VERSION:
         raise InputError(
             f"model: {path} was trained on descriptor version {found.get('descriptor_version')!r}; "
             f"this version computes {DESCRIPTOR_VERSION}; train it again"
         )
     if found.get("digest") != json_digest(found):
-        raise InputError(f"model: {path / 'run.json'} is damaged, or was changed after the training")
+        raise InputError(f"model: {path / RUN_FILE} is damaged, or was changed after the training")
     return found
 
 
@@ -155,7 +155,7 @@ def load_run(path: str | Path) -> TrainedRun:
     """
     path = Path(path).absolute()
     found = _description(path)
-    where = f"model: {path / 'run.json'}"
+    where = f"model: {path / RUN_FILE}"
     try:
         config = _config(found["descriptor_config"])
         classes = tuple(found["classes"])
