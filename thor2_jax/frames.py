@@ -7,7 +7,6 @@ points = backproject(frame.depth_m, frame.intrinsics)      # [H, W, 3] metres, O
 
 import dataclasses
 import json
-import math
 from collections.abc import Mapping
 from functools import cached_property
 from numbers import Real
@@ -41,9 +40,13 @@ MOST_PIXELS = 2**26
 """Of an image that is read: a small file can tell of a large one, and fill memory."""
 
 
-def _is_finite(value: Any) -> bool:
+LARGEST = 10**9
+"""Of a number of the intrinsics, in size: past it, it is none of a camera, and integers soon fit no array."""
+
+
+def _is_number(value: Any) -> bool:
     try:
-        return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(float(value))
+        return isinstance(value, Real) and not isinstance(value, bool) and abs(float(value)) <= LARGEST
     except OverflowError:  # an integer past the largest float
         return False
 
@@ -60,7 +63,8 @@ class Intrinsics:
         depth_scale: depth units a metre (1000: millimetres).
 
     Raises:
-        InputError: a value that is no finite number, or a focal length or depth scale that is not positive.
+        InputError: a value that is no finite number or past `LARGEST`, or a focal length or depth scale that is not
+            positive.
     """
 
     fx: float
@@ -72,8 +76,10 @@ class Intrinsics:
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
-            if not _is_finite(value):
-                raise InputError(f"intrinsics.{field.name} is {value!r}; it must be a finite number")
+            if not _is_number(value):
+                raise InputError(
+                    f"intrinsics.{field.name} is {value!r}; it must be a finite number, at most {LARGEST:.0e} in size"
+                )
             if value <= 0 and field.name not in ("cx", "cy"):
                 raise InputError(f"intrinsics.{field.name} is {value!r}; it must be positive")
 
@@ -145,7 +151,7 @@ class RGBDFrame:
     def instance_pixels(self) -> dict[int, NDArray[np.intp]]:
         """Label number -> its pixels, sorted flat indices (row * W + column); labels in increasing order, without 0."""
         flat = self.labels.ravel()
-        pixels = np.flatnonzero(flat)
+        pixels = np.flatnonzero(flat != 0)  # of booleans: several times as fast
         order = np.argsort(flat[pixels], kind="stable")
         pixels = pixels[order]
         found, first = np.unique(flat[pixels], return_index=True)

@@ -7,6 +7,7 @@ contour.
 """
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,7 +67,7 @@ def find_occlusion(frame: RGBDFrame, cloud: InstanceCloud) -> Occlusion:
     seen = on_boundary & (own_depth > 0)
     if occluded and seen.any() and len(cloud.points):
         edge = pixel_rays(pixels[seen], frame.labels.shape[1], frame.intrinsics) * own_depth[seen, None]
-        distance, nearest = KDTree(cloud.points, leafsize=32, balanced_tree=False).query(edge)
+        distance, nearest = KDTree(cloud.points, leafsize=32, balanced_tree=False, compact_nodes=False).query(edge)
         boundary[nearest[distance <= REACH]] = True
     return Occlusion(occluded, boundary)
 
@@ -77,15 +78,13 @@ def _window(
     """Labels and depth around a mask, `MARGIN` pixels more on every side, and the mask's flat indices there."""
     height, width = frame.labels.shape
     row, column = np.divmod(pixels, width)
-    slices, missing = [], []
-    for places, size in ((row, height), (column, width)):
-        first, last = int(places.min()) - MARGIN, int(places.max()) + 1 + MARGIN
-        slices.append(slice(max(first, 0), min(last, size)))
-        missing.append((max(-first, 0), max(last - size, 0)))
-    labels = np.pad(frame.labels[*slices].astype(np.int64), missing, constant_values=OUTSIDE)
-    depth = np.pad(frame.depth_m[*slices], missing)
-    places = (row - row.min() + MARGIN) * labels.shape[1] + (column - column.min() + MARGIN)
-    return labels, depth, places
+    top, left = row.min() - MARGIN, column.min() - MARGIN
+    shape = row.max() - top + MARGIN + 1, column.max() - left + MARGIN + 1
+    inside = slice(max(top, 0), min(top + shape[0], height)), slice(max(left, 0), min(left + shape[1], width))
+    here = tuple(slice(part.start - first, part.stop - first) for part, first in zip(inside, (top, left), strict=True))
+    labels, depth = np.full(shape, OUTSIDE, np.int64), np.zeros(shape, np.float32)
+    labels[here], depth[here] = frame.labels[inside], frame.depth_m[inside]
+    return labels, depth, (row - top) * shape[1] + column - left
 
 
 def _contour(
@@ -94,29 +93,29 @@ def _contour(
     """For each pixel of the mask: is it on the contour, on the occlusion boundary, and how deep is the object there."""
     window, depth, places = _window(frame, pixels)
     labels, depth = window.ravel(), depth.ravel()
+    steps = (1, -1, window.shape[1], -window.shape[1])
+    edges = [np.flatnonzero(labels[places + step] != label) for step in steps]
+    edge, step = np.concatenate(edges), np.repeat(steps, [len(found) for found in edges])
+    here = places[edge]
 
-    def first_depth(start: NDArray[np.intp], step: int, wanted: NDArray[np.int64] | int) -> NDArray[np.float32]:
-        """First valid depth of an instance from each place on along `step`; 0 where none is within `STEPS` pixels."""
+    def first_depth(start: NDArray[np.intp], step: NDArray[np.intp], wanted: Any) -> NDArray[np.float32]:
+        """First valid depth of an instance from each place on along its step; 0 where none is within `STEPS` pixels."""
         at = start + step * np.arange(STEPS)[:, None]
         usable = (labels[at] == wanted) & (depth[at] > 0)
         first = at[usable.argmax(axis=0), np.arange(len(start))]
         return np.where(usable.any(axis=0), depth[first], 0)
 
+    own = first_depth(here, -step, label)
+    beside = labels[here + step]
+    other = beside
+    for k in range(2, GAP + 2):
+        other = np.where(other == BACKGROUND, labels[here + k * step], other)
+    theirs = np.where(other > BACKGROUND, first_depth(here + step, step, other), 0)
+    hides = (other != label) & (theirs > 0) & (theirs < own - NEARER)
+
     on_contour, on_boundary = np.zeros(len(pixels), bool), np.zeros(len(pixels), bool)
     own_depth = np.zeros(len(pixels), np.float32)
-    mask = labels == label
-    for step in (1, -1, window.shape[1], -window.shape[1]):
-        # The window's margin is wider than a step, so that nothing of the mask comes around its end.
-        here = np.flatnonzero(mask & ~np.roll(mask, -step))
-        edge = np.searchsorted(places, here)
-        on_contour[edge] = True
-        own = first_depth(here, -step, label)
-        own_depth[edge] = np.where(own > 0, own, own_depth[edge])
-        beside = labels[here + step]
-        other = beside
-        for k in range(2, GAP + 2):
-            other = np.where(other == BACKGROUND, labels[here + k * step], other)
-        theirs = np.where(other > BACKGROUND, first_depth(here + step, step, other), 0)
-        hides = (other != label) & (theirs > 0) & (theirs < own - NEARER)
-        on_boundary[edge[hides | (beside == OUTSIDE)]] = True
+    on_contour[edge] = True
+    on_boundary[edge[hides | (beside == OUTSIDE)]] = True
+    own_depth[edge[own > 0]] = own[own > 0]
     return on_contour, on_boundary, own_depth

@@ -50,7 +50,7 @@ def flying_pixels(frame: RGBDFrame, pixels: NDArray[np.intp]) -> NDArray[np.bool
     height, width = frame.labels.shape
     labels, depth = frame.labels.ravel(), frame.depth_m.ravel()
     row, column = np.divmod(pixels, width)
-    here = depth[pixels]
+    here, instance = depth[pixels], labels[pixels]
     # Nearer than this beside a pixel, and it flies; at 0 there is no depth. Past the image, a pixel is beside itself.
     nearest = here - STEEPEST / frame.intrinsics.fx * here
     flying = np.zeros(len(pixels), bool)
@@ -61,16 +61,16 @@ def flying_pixels(frame: RGBDFrame, pixels: NDArray[np.intp]) -> NDArray[np.bool
         pixels - width * (row > 0),
     ):
         there = depth[beside]
-        flying |= (there < nearest) & (there > 0) & (labels[beside] == labels[pixels])
+        flying |= (there < nearest) & (there > 0) & (labels[beside] == instance)
     return flying
 
 
-def _grid(points: NDArray[Any]) -> tuple[NDArray[np.int64], tuple[int, ...]]:
-    """Place of each point [n] on a flat grid of `CELL`s, and the grid's shape; 0 for points past `REACH`.
+def _grid(points: NDArray[np.float64]) -> tuple[NDArray[np.int64], tuple[int, ...]]:
+    """Place [n] of each of `points` [3, n] on a flat grid of `CELL`s, and its shape; 0 for points past `REACH`.
 
     Two layers of cells on every side are empty, so that no cell touches the first.
     """
-    place = np.floor(points.T.copy() / CELL)
+    place = np.floor(points / CELL)
     place -= np.floor(np.median(place, axis=1, keepdims=True))
     near = (np.abs(place) <= REACH).all(axis=0)
     cells = np.where(near, place, 0).astype(np.int64)
@@ -79,16 +79,15 @@ def _grid(points: NDArray[Any]) -> tuple[NDArray[np.int64], tuple[int, ...]]:
     return np.where(near, np.ravel_multi_index(tuple(cells), shape), 0), shape
 
 
-def _surrounded(points: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Points [n] sure to be among others: told by the number and the moments of the points in cells, without a search.
+def _surrounded(points: NDArray[np.float64], cell: NDArray[np.int64], shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Which of `points` [3, n] are sure to be among others, by the number and the moments of the points in cells.
 
     Where more than `NEIGHBORS` points lie in a point's cell and those that it touches, the mean distance to the nearest
     of them is at most the root of the mean square distance to all of them.
     """
-    cell, shape = _grid(points)
-    points = points - points.mean(axis=0)
-    square = np.einsum("na,na->n", points, points)
-    sums = np.stack([np.bincount(cell, weights=w, minlength=math.prod(shape)) for w in (None, *points.T, square)])
+    points = points - points.mean(axis=1, keepdims=True)
+    square = (points**2).sum(axis=0)
+    sums = np.stack([np.bincount(cell, weights=w, minlength=math.prod(shape)) for w in (None, *points, square)])
     sums[:, 0] = 0
     for step in (1, shape[2], shape[1] * shape[2]):
         row = sums.copy()
@@ -96,24 +95,25 @@ def _surrounded(points: NDArray[np.float64]) -> NDArray[np.bool_]:
         row[:, :-step] += sums[:, step:]
         sums = row
     count, x, y, z, squares = sums[:, cell]
-    total = squares - 2 * (points.T * (x, y, z)).sum(axis=0) + count * square
+    total = squares - 2 * (points * (x, y, z)).sum(axis=0) + count * square
     others = count - 1
     return np.asarray((others >= NEIGHBORS) & (total <= others * FARTHEST**2))
 
 
-def _among_others(points: NDArray[np.float64]) -> NDArray[np.bool_]:
-    if len(points) <= NEIGHBORS:
-        return np.zeros(len(points), bool)
-    among = _surrounded(points)
+def _among_others(points: NDArray[np.float64], cell: NDArray[np.int64], shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    n_points = points.shape[1]
+    if n_points <= NEIGHBORS:
+        return np.zeros(n_points, bool)
+    among = _surrounded(points, cell, shape)
     rest = np.flatnonzero(~among)
     if len(rest):
-        distances = KDTree(points, leafsize=32, balanced_tree=False).query(points[rest], k=NEIGHBORS + 1)[0][:, 1:]
+        tree = KDTree(points.T, leafsize=32, balanced_tree=False, compact_nodes=False)  # quick to build
+        distances = tree.query(points[:, rest].T, k=NEIGHBORS + 1)[0][:, 1:]
         among[rest] = distances.mean(axis=1) <= FARTHEST
     return among
 
 
-def _in_large_piece(points: NDArray[Any]) -> NDArray[np.bool_]:
-    cell, shape = _grid(points)
+def _in_large_piece(cell: NDArray[np.int64], shape: tuple[int, ...]) -> NDArray[np.bool_]:
     full = np.zeros(shape, bool)
     full.ravel()[cell[cell > 0]] = True
     pieces, _ = ndimage.label(full, structure=np.ones((3, 3, 3)))
@@ -135,8 +135,10 @@ def remove_outliers(points: NDArray[Any]) -> tuple[NDArray[np.intp], bool]:
     kept = np.arange(len(points))
     if len(points) == 0:
         return kept, False
-    among = _among_others(points.astype(np.float64))
+    planes = points.T.astype(np.float64, order="C")
+    cell, shape = _grid(planes)
+    among = _among_others(planes, cell, shape)
     relaxed = 2 * int(among.sum()) < len(points)
     if not relaxed:
         kept = kept[among]
-    return kept[_in_large_piece(points[kept])], relaxed
+    return kept[_in_large_piece(cell[kept], shape)], relaxed

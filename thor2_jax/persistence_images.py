@@ -13,7 +13,7 @@ __all__ = ["past_window", "persistence_images"]
 
 
 def _at_edges(centres: jax.Array, variance: ArrayLike, config: DescriptorConfig) -> jax.Array:
-    """Twice the normal CDF, less 1, about each of `centres` [..., J] at the edges of an axis' pixels: [..., P + 1, J]."""
+    """Twice the normal CDF about `centres` [..., J], less 1, at the edges of an axis' pixels: [..., P + 1, J]."""
     edges = (jnp.arange(config.image_size + 1) - 1) * config.sigma_2
     # A quarter of the cost of `ndtr`, which keeps far tails to more digits than an image has.
     return erf((edges.astype(centres.dtype)[:, None] - centres[..., None, :]) * jax.lax.rsqrt(2 * variance))

@@ -9,12 +9,12 @@
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import jax
 import numpy as np
 from flax import nnx
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from thor2_jax.capacity import BATCH_BUCKETS, POINT_BUCKETS, batch_bucket, point_bucket
 from thor2_jax.classifier import (
@@ -36,7 +36,7 @@ from thor2_jax.run_folder import TrainedRun, load_run
 from thor2_jax.types import Descriptors, PointClouds
 from thor2_jax.voxel_grid import downsample_to_fit
 
-__all__ = ["NO_PART", "THOR2", "VOXEL", "DescribedFrame", "Part", "Recognition", "Recognizer", "prepare"]
+__all__ = ["NO_PART", "THOR2", "VOXEL", "DescribedFrame", "Part", "Recognition", "Recognizer", "pack_parts", "prepare"]
 
 THOR2: tuple[Feature, ...] = ("tops", "tops2")
 """The two classifiers whose joint answer is THOR2's."""
@@ -97,23 +97,42 @@ class DescribedFrame:
 
     Attributes:
         clouds: every instance; unusable ones carry a reason.
-        usable: indices into `clouds`, one a row of `packed` and `descriptors`.
+        usable: indices into `clouds`, one a row of `descriptors`.
         parts: what was described, one a row.
-        packed: the described clouds, metres, padded to a batch bucket (rows past `usable` are empty).
-        descriptors: of `packed`.
+        descriptors: NumPy arrays, padded to a batch bucket; rows past `parts` are of no cloud.
     """
 
     clouds: list[InstanceCloud]
     usable: list[int]
     parts: list[Part]
-    packed: PointClouds
     descriptors: Descriptors
+
+    @property
+    def packed(self) -> PointClouds:
+        """The described clouds, metres, padded as `descriptors` are."""
+        return pack_parts(self.parts, len(self.descriptors.overflow))
 
     @property
     def occluded(self) -> list[bool]:
         """One flag a row."""
         return [part.occluded for part in self.parts]
 
+
+class Instance(Protocol):
+    """What an answer says of an instance beside its name."""
+
+    @property
+    def label(self) -> int: ...  # noqa: D102
+
+    @property
+    def kept_by_fallback(self) -> bool: ...  # noqa: D102
+
+    @property
+    def reason(self) -> str | None: ...  # noqa: D102
+
+
+AT_ONCE = 4
+"""Instances described at a time: while the device works on them, the next ones are prepared."""
 
 NO_PART = Part(False, np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), np.zeros(0, bool))
 
@@ -179,33 +198,33 @@ class Recognizer:
             InputError: numbers below 1 or past the largest buckets.
         """
         points = [n for n in POINT_BUCKETS if n <= point_bucket(max_points)]
-        batches = [b for b in BATCH_BUCKETS if b <= batch_bucket(max_instances)]
-        for n in points:
-            for b in batches:
-                nothing = PointClouds.pack([(NO_PART.points, NO_PART.colors)] * b, n)
-                self.probabilities(describe(nothing, self.run.network, self.run.config))
-        return len(points) * len(batches)
+        rows = [b for b in BATCH_BUCKETS if b <= batch_bucket(max_instances)]
+        at_once = [b for b in rows if b <= AT_ONCE]
+        found = [describe(pack_parts([], b, n), self.run.network, self.run.config) for n in points for b in at_once]
+        for b in rows:
+            self.probabilities(_together(found[:1], b))
+        return len(found) + len(rows)
 
     def describe(self, frame: RGBDFrame) -> DescribedFrame:
         """Clouds and descriptors of a frame's instances, those past the largest batch bucket included."""
-        prepared = [prepare(frame, label, self.run.config.sigma_s) for label in frame.instances]
-        clouds = [cloud for cloud, _ in prepared]
+        clouds: list[InstanceCloud] = []
+        parts: list[Part] = []
+        found: list[Descriptors] = []
+        for label in frame.instances:
+            cloud, part = prepare(frame, label, self.run.config.sigma_s)
+            clouds.append(cloud)
+            if cloud.reason is None:
+                parts.append(part)
+                if len(parts) % AT_ONCE == 0:
+                    found.append(self._describe_parts(parts[-AT_ONCE:]))
+        rest = len(parts) % AT_ONCE
+        if rest or not parts:
+            found.append(self._describe_parts(parts[len(parts) - rest :]))
         usable = [i for i, cloud in enumerate(clouds) if cloud.reason is None]
-        parts = [prepared[i][1] for i in usable]
-        packed, descriptors = self._describe_parts(parts)
-        return DescribedFrame(clouds, usable, parts, packed, descriptors)
+        return DescribedFrame(clouds, usable, parts, _together(found, _rows(len(parts))))
 
-    def _describe_parts(self, parts: Sequence[Part]) -> tuple[PointClouds, Descriptors]:
-        limit = BATCH_BUCKETS[-1]
-        capacity = point_bucket(max((len(part.points) for part in parts), default=1))
-        batches = []
-        for start in range(0, max(len(parts), 1), limit):
-            chunk = list(parts[start : start + limit])
-            chunk += [NO_PART] * (batch_bucket(max(len(chunk), 1)) - len(chunk))
-            clouds = [(part.points, part.colors) for part in chunk]
-            packed = PointClouds.pack(clouds, capacity, boundary=[part.boundary for part in chunk])
-            batches.append((packed, describe(packed, self.run.network, self.run.config)))
-        return jax.tree.map(lambda *arrays: np.concatenate(arrays), *batches) if len(batches) > 1 else batches[0]
+    def _describe_parts(self, parts: Sequence[Part]) -> Descriptors:
+        return describe(pack_parts(parts, _rows(len(parts))), self.run.network, self.run.config)
 
     def probabilities(
         self, descriptors: Descriptors, names: Sequence[Feature] | None = None
@@ -231,57 +250,78 @@ class Recognizer:
             raise InputError(f"classifiers: the run has no {', '.join(missing)}, only {', '.join(self._apply)}")
         described = self.describe(frame)
         found = self.probabilities(described.descriptors, voting)
-        rows = {index: row for row, index in enumerate(described.usable)}
-        overflow = np.asarray(described.descriptors.overflow)
-        return [
-            self.name(
-                cloud.label,
-                described.parts[rows[index]],
-                {name: values[rows[index]] for name, values in found.items()},
-                int(overflow[rows[index]]),
-                cloud.kept_by_fallback,
-            )
-            if index in rows
-            else Recognition(label=cloud.label, reason=cloud.reason)
-            for index, cloud in enumerate(described.clouds)
-        ]
+        return self.answers(described.clouds, described.parts, found, described.descriptors.overflow)
 
-    def name(
+    def answers(
         self,
-        label: int,
-        part: Part,
+        instances: Sequence[Instance],
+        parts: Sequence[Part],
         probabilities: Mapping[Feature, NDArray[np.float32]],
-        overflow: int,
-        kept_by_fallback: bool,
-    ) -> Recognition:
-        """The answer for one instance that was described.
+        overflow: ArrayLike,
+    ) -> list[Recognition]:
+        """What is said of each instance of a frame.
 
         Args:
-            label: its number in the label image.
-            part: what was described of it.
-            probabilities: classifier -> [C] class probabilities.
-            overflow: the descriptor's.
-            kept_by_fallback: as in `InstanceCloud`.
+            instances: all of them; those without a reason are in the rows of the other arguments, in order.
+            parts: what was described of them.
+            probabilities: classifier -> [B, C] class probabilities.
+            overflow: [B] int, the descriptors'.
         """
-        joined = join({name: values[None] for name, values in probabilities.items()}, self.rule)
-        confidence = float(joined.confidence[0])
-        unknown = confidence < self.unknown_below
-        return Recognition(
-            label=label,
-            name=None if unknown else self.run.classes[joined.class_index[0]],
-            confidence=confidence,
-            classifier=str(joined.classifier[0]),
-            top={name: self._top(values) for name, values in probabilities.items()},
-            occluded=part.occluded,
-            overflow=overflow,
-            points_used=len(part.points),
-            kept_by_fallback=kept_by_fallback,
-            reason=f"unknown: a confidence of {confidence:.3f}, below {self.unknown_below:g}" if unknown else None,
-        )
+        joined = join(probabilities, self.rule)
+        points_past = np.asarray(overflow)
+        row_of = iter(range(len(parts)))
+        found = []
+        for one in instances:
+            if one.reason is not None:
+                found.append(Recognition(label=one.label, reason=one.reason))
+                continue
+            row = next(row_of)
+            confidence = float(joined.confidence[row])
+            unknown = confidence < self.unknown_below
+            found.append(
+                Recognition(
+                    label=one.label,
+                    name=None if unknown else self.run.classes[joined.class_index[row]],
+                    confidence=confidence,
+                    classifier=str(joined.classifier[row]),
+                    top={name: self._top(values[row]) for name, values in probabilities.items()},
+                    occluded=parts[row].occluded,
+                    overflow=int(points_past[row]),
+                    points_used=len(parts[row].points),
+                    kept_by_fallback=one.kept_by_fallback,
+                    reason=f"unknown: a confidence of {confidence:.3f}, below {self.unknown_below:g}"
+                    if unknown
+                    else None,
+                )
+            )
+        return found
 
     def _top(self, probabilities: NDArray[np.float32], count: int = 5) -> list[tuple[str, float]]:
         best = np.argsort(-probabilities, kind="stable")[:count]
         return [(self.run.classes[i], float(probabilities[i])) for i in best]
+
+
+def _rows(n: int) -> int:
+    """Rows that `n` instances are padded to: a batch bucket, after as many of the largest as they fill."""
+    whole = n // BATCH_BUCKETS[-1] * BATCH_BUCKETS[-1]
+    return n if n == whole > 0 else whole + batch_bucket(max(n - whole, 1))
+
+
+def pack_parts(parts: Sequence[Part], n_rows: int, capacity: int | None = None) -> PointClouds:
+    """Parts as clouds, and empty clouds up to `n_rows`; `capacity` as in `PointClouds.pack`."""
+    padded = [*parts, *[NO_PART] * (n_rows - len(parts))]
+    clouds = [(part.points, part.colors) for part in padded]
+    return PointClouds.pack(clouds, capacity, boundary=[part.boundary for part in padded])
+
+
+def _together(found: Sequence[Descriptors], n_rows: int) -> Descriptors:
+    """Batches one after the other, on the host; zeros up to `n_rows`."""
+
+    def join_rows(*batches: jax.Array) -> NDArray[Any]:
+        padding = np.zeros((n_rows - sum(map(len, batches)), *batches[0].shape[1:]), batches[0].dtype)
+        return np.concatenate([*batches, padding])
+
+    return jax.tree.map(join_rows, *found)
 
 
 def _compiled(name: Feature, model: MLP) -> Any:

@@ -50,6 +50,13 @@ def patches() -> np.ndarray:
     return labels
 
 
+def squares(count: int) -> np.ndarray:
+    labels = np.zeros((240, 320), np.uint8)
+    for number in range(count):
+        labels[20:80, 5 + 34 * number : 35 + 34 * number] = number + 1
+    return labels
+
+
 def test_every_instance_is_answered_in_the_order_of_labels(recognizer: Recognizer) -> None:
     answers = recognizer.recognize(tilted(patches()))
     assert [a.label for a in answers] == [3, 5, 7, 200]
@@ -142,13 +149,10 @@ def test_a_cloud_past_the_largest_bucket_is_made_coarser(recognizer: Recognizer)
     assert answer.overflow > 0
 
 
-def test_more_instances_than_a_batch_holds(recognizer: Recognizer, monkeypatch: pytest.MonkeyPatch) -> None:
-    labels = np.zeros((240, 320), np.uint8)
-    for number in range(9):  # two batches of four, then one
-        labels[20:80, 5 + 34 * number : 35 + 34 * number] = number + 1
+def test_more_instances_than_are_described_at_once(recognizer: Recognizer) -> None:
+    labels = squares(9)  # two batches of four, then one
     parts = [np.where((labels >= first) & (labels < first + 4), labels, 0) for first in (1, 5, 9)]
     expected = [answer for part in parts for answer in recognizer.recognize(tilted(part))]
-    monkeypatch.setattr("thor2_jax.recognizer.BATCH_BUCKETS", (1, 2, 4))
     found = recognizer.recognize(tilted(labels))
     assert [a.label for a in found] == list(range(1, 10)) and all(a.reason is None for a in found)
     assert [(a.name, a.points_used) for a in found] == [(a.name, a.points_used) for a in expected]
@@ -195,12 +199,11 @@ def test_nothing_compiles_after_warm_up(run: TrainedRun) -> None:
     fresh = Recognizer(run)
     jax.monitoring.register_event_duration_secs_listener(listen)
     try:
-        assert fresh.warm_up(max_points=1000, max_instances=3) == 2 * 3
+        assert fresh.warm_up(max_points=1000, max_instances=5) == 2 * 3 + 4
         assert compiled
         compiled.clear()
-        for count in (1, 2, 3):
-            chosen = np.isin(patches(), (3, 7, 200)[:count])
-            assert len(fresh.recognize(tilted(np.where(chosen, patches(), 0).astype(np.uint8)))) == count
+        for count in range(1, 6):
+            assert len(fresh.recognize(tilted(squares(count)))) == count
         assert compiled == []
     finally:
         jax.monitoring.unregister_event_duration_listener(listen)

@@ -12,11 +12,10 @@ from thor2_jax.capacity import BATCH_BUCKETS, POINT_BUCKETS, batch_bucket, point
 from thor2_jax.classifier import Feature
 from thor2_jax.descriptor import describe_strips, strips
 from thor2_jax.errors import InputError
-from thor2_jax.recognizer import NO_PART, THOR2, Part, Recognition, Recognizer
+from thor2_jax.recognizer import THOR2, Part, Recognition, Recognizer, pack_parts
 from thor2_jax.run_folder import load_run
 from thor2_jax.service.preparing import PreparedInstance
 from thor2_jax.service.settings import Settings
-from thor2_jax.types import PointClouds
 from thor2_jax.view_normalization import align
 
 __all__ = ["Engine", "Row"]
@@ -70,19 +69,16 @@ class Engine:
         """Compile for every size that `rows` can meet, one (points, clouds) at each step of the iterator."""
         for n_points in (n for n in POINT_BUCKETS if n >= LEAST_POINTS):
             for n_clouds in (b for b in BATCH_BUCKETS if LEAST_CLOUDS <= b <= _batch_size(self.max_batch)):
-                self._rows([NO_PART] * n_clouds, n_points)
+                self._rows([], n_clouds, n_points)
                 yield n_points, n_clouds
 
     def rows(self, parts: Sequence[Part]) -> list[Row]:
         """Describe and classify clouds, at most `max_batch` of them."""
-        padded = [*parts, *[NO_PART] * (_batch_size(len(parts)) - len(parts))]
         largest = max(len(part.points) for part in parts)
-        return self._rows(padded, max(point_bucket(largest), LEAST_POINTS))[: len(parts)]
+        return self._rows(parts, _batch_size(len(parts)), max(point_bucket(largest), LEAST_POINTS))
 
-    def _rows(self, parts: Sequence[Part], n_points: int) -> list[Row]:
-        clouds = [(part.points, part.colors) for part in parts]
-        packed = PointClouds.pack(clouds, n_points, boundary=[part.boundary for part in parts])
-        aligned = align(packed, self.run.config)
+    def _rows(self, parts: Sequence[Part], n_rows: int, n_points: int) -> list[Row]:
+        aligned = align(pack_parts(parts, n_rows, n_points), self.run.config)
         in_strips = strips(aligned, self.run.network, self.run.config)
         found = describe_strips(in_strips, self.run.network, self.run.config)
         probabilities = self._recognizer.probabilities(found, THOR2)
@@ -102,17 +98,10 @@ class Engine:
 
     def recognitions(self, instances: Sequence[PreparedInstance], rows: Sequence[Row]) -> list[Recognition]:
         """Answers for a frame's instances; `rows` are those of the usable ones, in order."""
-        following = iter(rows)
-        answers = []
-        for one in instances:
-            if one.reason is not None:
-                answers.append(Recognition(label=one.label, reason=one.reason))
-                continue
-            row = next(following)
-            answers.append(
-                self._recognizer.name(one.label, one.part, row.probabilities, row.overflow, one.kept_by_fallback)
-            )
-        return answers
+        usable = [one.part for one in instances if one.reason is None]
+        shape = len(rows), len(self.run.classes)
+        probabilities = {name: np.reshape([row.probabilities[name] for row in rows], shape) for name in THOR2}
+        return self._recognizer.answers(instances, usable, probabilities, [row.overflow for row in rows])
 
 
 def _keep_compiled(folder: Path) -> None:
