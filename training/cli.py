@@ -129,6 +129,9 @@ def train(
     folds: Annotated[int, typer.Option(min=1, help="More than 1: a model each, its own views held out.")] = 1,
     baselines: Annotated[str, typer.Option(help="Comma-separated: thor, forest, pointnet. To compare with.")] = "",
     leave_out: Annotated[str, typer.Option(help="Comma-separated: objects that are not trained.")] = "",
+    sequences: Annotated[
+        Path | None, typer.Option(help="YAML or JSON table: sequence -> its objects. A run for each, OUT/<sequence>.")
+    ] = None,
     workers: Annotated[int, typer.Option(min=1, help="Processes that render.")] = 2,
     coordinator: Annotated[str | None, typer.Option(help="HOST:PORT of process 0, if there are several.")] = None,
     processes: Annotated[int, typer.Option(min=1, help="Processes that train together.")] = 1,
@@ -140,12 +143,15 @@ def train(
     errors of a depth camera and of a mask. A --dataset has the copies that it was rendered with. --paper trains as the
     paper does: on plain views only, more of them, each in four mirrors, for longer; its defaults stand second.
 
-    With --baselines, a run that is finished gets those that it lacks.
+    With --baselines, a run that is finished gets those that it lacks. With --sequences, every sequence that lacks one
+    gets a run of its objects alone (see `thor2 evaluate ocid --per-sequence`).
     """
     import jax
 
     if (meshes is None) == (dataset is None):
         raise InputError("give exactly one of --meshes and --dataset")
+    if sequences is not None and (dataset is None or leave_out):
+        raise InputError(f"sequences is {sequences}; it goes with --dataset, and without --leave-out")
     if coordinator is not None:
         if meshes is not None:
             raise InputError("coordinator: several processes train from a --dataset that all of them can read")
@@ -158,13 +164,13 @@ def train(
     from training.meshes import find_meshes, read_names
     from training.protocol import DEFAULT, PAPER
     from training.render_job import render_dataset
+    from training.sequences import sequence_sources
     from training.train import VIEWS, check_out, is_finished, train_run
     from training.view_dataset import ViewDataset
     from training.view_source import ViewSource
 
     compared = check_baselines(_listed(baselines))
-    finished = bool(compared) and is_finished(out)
-    if not finished:
+    if sequences is None and not (compared and is_finished(out)):
         check_out(out)
     protocol = PAPER if paper else DEFAULT
     options = FitOptions(
@@ -189,20 +195,24 @@ def train(
         source = ViewDataset.open(dataset)
     if leave_out:
         source = WithoutClasses(source, _listed(leave_out))
-    with _bar() as bar:
-        runs = (
-            []
-            if finished
-            else train_run(source, out, features, options, _stages(bar), folds=folds, mirrors=protocol.mirrors)
-        )
-        if jax.process_index() == 0:
-            train_baselines(out, source, compared, _stages(bar))
-            if meshes is not None:
-                shutil.rmtree(out / VIEWS)
-    for run in runs:
-        for name, accuracy in run.record["held_out_accuracy"].items():
-            console.print(f"fold {run.record['fold']}: {name} names {accuracy:.3f} of the views held out rightly")
-    console.print(f"run written to {out}")
+    parts = {out: source}
+    if sequences is not None:
+        parts = {out / sequence: views for sequence, views in sequence_sources(source, sequences).items()}
+    runs = {}
+    for folder, views in parts.items():
+        with _bar() as bar:
+            show = _stages(bar)
+            if not is_finished(folder):
+                runs[folder] = train_run(views, folder, features, options, show, folds=folds, mirrors=protocol.mirrors)
+            if jax.process_index() == 0:
+                train_baselines(folder, views, compared, show)
+    if meshes is not None and jax.process_index() == 0:
+        shutil.rmtree(out / VIEWS)
+    for folder in parts:
+        for run in runs.get(folder, []):
+            for name, accuracy in run.record["held_out_accuracy"].items():
+                console.print(f"fold {run.record['fold']}: {name} names {accuracy:.3f} of the views held out rightly")
+        console.print(f"run written to {folder}")
 
 
 def _listed(names: str) -> list[str]:
@@ -263,15 +273,28 @@ def recognize(
         console.print(f"written to {out}")
 
 
-def _evaluate(kind: str, frames: Any, dataset: Path, models: Sequence[Path], out: Path | None, **files: Any) -> None:
+def _evaluate(
+    kind: str,
+    frames: Any,
+    dataset: Path,
+    models: Sequence[Path],
+    out: Path | None,
+    per_sequence: bool = False,
+    **files: Any,
+) -> None:
     from training.evaluation.job import evaluate_dataset
     from training.evaluation.page import accuracy_table
-    from training.evaluation.runs import load_runs
+    from training.evaluation.runs import load_runs, load_sequence_runs
+
+    if per_sequence and len(models) != 1:
+        raise InputError(
+            f"per_sequence: {len(models)} models are given; expected one folder with a run for each sequence"
+        )
 
     description = {"kind": kind, "path": str(dataset.resolve())}
     description |= {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in files.items() if path}
     with tempfile.TemporaryDirectory() as nowhere, _bar() as bar:
-        runs = load_runs(models)
+        runs = load_sequence_runs(models[0], frames.identifiers) if per_sequence else load_runs(models)
         found = evaluate_dataset(runs, frames, description, out or Path(nowhere) / "report", _stages(bar))
     counts, speed = found["instances"], found["speed"]
     if found["joinings"]:
@@ -327,12 +350,15 @@ def ocid(
     model: ModelsOption,
     names: Annotated[Path, typer.Option(help="YAML or JSON table: sequence -> object names in the order of placing.")],
     runs: MoreModels = None,
+    per_sequence: Annotated[
+        bool, typer.Option(help="RUN holds a run for each sequence, as `train --sequences` writes them.")
+    ] = False,
     out: ReportOption = None,
 ) -> None:
     """OCID, subset YCB10: {table,floor}/{bottom,top}/<type>/<sequence>/{rgb,depth,label,pcd}."""
     from training.readers.ocid import OCID
 
-    _evaluate("ocid", OCID(dataset, names), dataset, [*model, *(runs or [])], out, names=names)
+    _evaluate("ocid", OCID(dataset, names), dataset, [*model, *(runs or [])], out, per_sequence, names=names)
 
 
 @evaluate_app.command()

@@ -181,6 +181,40 @@ def test_train_by_folds(meshes: Path, tmp_path: Path, run: Run) -> None:
     assert code == 2 and "exists already" in one_line(err)
 
 
+def test_train_by_sequences(meshes: Path, tmp_path: Path, run: Run) -> None:
+    """Each on its own objects; called again, what is finished stays and what is missing is trained."""
+    soup, cereal, mug = NAMES
+    table, out = tmp_path / "table.yaml", tmp_path / "runs"
+    steps = ("--azimuth-step", 90, "--polar-step", 45, "--workers", 1)
+    assert call("render", "--meshes", meshes, "--out", tmp_path / "views", *steps) == 0
+    options = ("--sequences", table, "--epochs", 1, "--batch-size", 16, "--classifiers", "ce")
+    arguments = ("train", "--dataset", tmp_path / "views", "--out", out, *options)
+    table.write_text(json.dumps({"table/a": [soup, mug]}))
+    assert run(*arguments)[0] == 0
+    first = (out / "table/a/run.json").read_bytes()
+    assert sorted(json.loads(first)["classes"]) == sorted([soup, mug])
+    table.write_text(json.dumps({"table/a": [soup, mug], "b": [cereal, cereal, soup]}))
+    assert run(*arguments)[0] == 0
+    assert (out / "table/a/run.json").read_bytes() == first
+    assert sorted(json.loads((out / "b/run.json").read_text())["classes"]) == sorted([soup, cereal])
+    cases = {
+        "{}": "has no sequence",
+        '{"c": ["dragon"]}': "no class dragon",
+        '{"c": "mug"}': "c is 'mug'",
+        '{"c": []}': "c is []",
+        '{"../c": ["mug_white"]}': "'../c'",
+        '{"/c": ["mug_white"]}': "'/c'",
+        "[]": "list",
+    }
+    for content, said in cases.items():
+        table.write_text(content)
+        code, _, err = run(*arguments)
+        assert code == 2 and said in one_line(err), content
+    code, _, err = run("train", "--meshes", meshes, "--out", tmp_path / "other", *options)
+    assert code == 2 and "it goes with --dataset" in one_line(err)
+    assert sorted(p.name for p in out.iterdir()) == ["b", "table"]
+
+
 def test_one_bad_instance_among_many(model: Path, images: Path, scene: Scene, tmp_path: Path, run: Run) -> None:
     labels = scene.frame.labels.astype(np.uint8)
     labels[0, :5] = 9

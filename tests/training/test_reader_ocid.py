@@ -336,9 +336,11 @@ def test_the_camera_of_real_depth(shared: Path) -> None:
 
 
 class NamesInOrder:
-    """Stands in for a trained recognizer: calls the first instance of a frame a mug, every other a bowl."""
+    """Stands in for a trained recognizer: the first instance of a frame is of its first class, others of the second."""
 
-    run = SimpleNamespace(classes=("mug", "bowl"), classifiers={"tops": None})
+    def __init__(self, classes: tuple[str, ...] = ("mug", "bowl")) -> None:
+        network = SimpleNamespace(fingerprint="")
+        self.run = SimpleNamespace(classes=classes, classifiers={"tops": None}, config=None, network=network)
 
     def describe(self, frame: Any) -> Any:
         clouds = [SimpleNamespace(label=label, reason=None) for label in frame.instances]
@@ -386,3 +388,34 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     names.unlink()
     assert call(monkeypatch, "evaluate", "ocid", tmp_path, *options) == 2
     assert capsys.readouterr().err == f"error: {names}: No such file or directory\n"
+
+
+def test_every_sequence_by_its_own_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Each run has its own classes; one serves both cameras."""
+    sequences = {"seq36": ["mug", "bowl", "bowl"], "table/top/mixed/seq08": ["banana", "apple", "mug"]}
+    for place in ("table/bottom/curved/seq36", "table/top/curved/seq36", "table/top/mixed/seq08"):
+        write_frame(tmp_path / "YCB10", place)
+    names = write_names(tmp_path, sequences)
+    classes = {"seq36": ("mug", "bowl"), "seq08": ("banana", "apple")}
+
+    def load(paths: Sequence[Path]) -> list[EvaluatedRun]:
+        (path,) = paths
+        return [EvaluatedRun(path.name, f"digest of {path.name}", NamesInOrder(classes[path.name]))]  # type: ignore[arg-type]
+
+    monkeypatch.setattr("training.evaluation.runs.load_runs", load)
+    models = tmp_path / "runs"
+    (models / "seq36").mkdir(parents=True)
+    options = ("--model", models, "--names", names, "--per-sequence")
+    assert call(monkeypatch, "evaluate", "ocid", tmp_path, *options) == 2
+    assert f"error: model: {models} has no run for table/top/mixed/seq08\n" in capsys.readouterr().err
+    (models / "table/top/mixed/seq08").mkdir(parents=True)
+    assert call(monkeypatch, "evaluate", "ocid", tmp_path, *options, "--out", tmp_path / "report") == 0
+    report = json.loads((tmp_path / "report" / "report.json").read_text())
+    assert report["runs"] == ["runs/*"] and report["classes"] == ["apple", "banana", "bowl", "mug"]
+    by = {tuple(table["by"]): table["cells"] for table in report["accuracy"]["larger"]}
+    shares = {cell["where"]["sequence"]: cell["accuracy"]["TOPS"]["mean"] for cell in by["sequence",]}
+    assert [round(share, 3) for share in shares.values()] == [1.0, 1.0, 0.667]
+    assert call(monkeypatch, "evaluate", "ocid", tmp_path, *options, tmp_path) == 2
+    assert "2 models are given" in capsys.readouterr().err

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
 from thor2_jax.files import json_digest, write_text
-from thor2_jax.recognizer import DescribedFrame
-from training.baselines.baseline import Seen, seen_in
+from training.baselines.baseline import seen_in
 from training.evaluation.runs import Run
 from training.readers.labelled import LabelledFrame
 
@@ -70,7 +69,7 @@ def answer_frame(runs: Sequence[Run], item: LabelledFrame) -> list[InstanceAnswe
     described = runs[0].recognizer.describe(item.frame)
     compared = any(run.baselines for run in runs)
     seen = seen_in(described, runs[0].recognizer.run.config) if compared else None
-    found = [_said(run, described, seen) for run in runs]
+    found = [run.probabilities(item.identifier, described, seen) for run in runs]
     table = np.stack([found[r][name] for r, name in columns(runs)], axis=1)  # [B, M, C]
     rows = {described.clouds[index].label: row for row, index in enumerate(described.usable)}
     reasons = {cloud.label: cloud.reason for cloud in described.clouds}
@@ -83,13 +82,6 @@ def answer_frame(runs: Sequence[Run], item: LabelledFrame) -> list[InstanceAnswe
             reason = reasons.get(label) or "no pixels in the label image"
             answers.append(InstanceAnswer(label, truth, reason=reason))
     return answers
-
-
-def _said(run: Run, described: DescribedFrame, seen: Seen | None) -> dict[str, NDArray[np.float32]]:
-    said = {str(name): found for name, found in run.recognizer.probabilities(described.descriptors).items()}
-    if seen is not None:
-        said |= {name: baseline.probabilities(seen) for name, baseline in run.baselines.items()}
-    return said
 
 
 class AnswerFile:

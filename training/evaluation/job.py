@@ -18,7 +18,7 @@ from training.evaluation.gallery import Gallery
 from training.evaluation.page import WORST, write_report_page
 from training.evaluation.results import results
 from training.evaluation.runs import Run
-from training.locking import LOCK, locked
+from training.locking import locked
 from training.readers.labelled import LabelledFrames
 
 __all__ = ["evaluate_dataset"]
@@ -38,7 +38,7 @@ def evaluate_dataset(
     A frame is described once, whatever the number of runs; its answers are kept before the next one is begun.
 
     Args:
-        runs: as `load_runs` gives them.
+        runs: as `load_runs` or `load_sequence_runs` gives them.
         frames: the dataset.
         dataset: "kind" (uwis, ocid, bop, frames), "path", and whatever else the frames depend on.
         out: folder of the report: new, empty, or of the same evaluation.
@@ -53,7 +53,8 @@ def evaluate_dataset(
         OSError: something cannot be written.
     """
     if out.exists() and not (out / ANSWERS).is_file():
-        if not out.is_dir() or any(path.name != LOCK for path in out.iterdir()):
+        # The lock, and files that a process was writing when it was killed, begin with a point.
+        if not out.is_dir() or any(not path.name.startswith(".") for path in out.iterdir()):
             raise InputError(f"out: {out} exists already and is neither empty nor an evaluation")
     out.mkdir(parents=True, exist_ok=True)
     with locked(out):
@@ -67,7 +68,7 @@ def _evaluate(
     out: Path,
     progress: Callable[[str, int, int, str], object],
 ) -> dict[str, Any]:
-    classes, asked = runs[0].recognizer.run.classes, columns(runs)
+    classes, asked = runs[0].classes, columns(runs)
     description = {**dataset, "frames": len(frames)}
     file = AnswerFile(
         out / ANSWERS,
