@@ -5,10 +5,12 @@ peer runs in two processes.
 """
 
 import argparse
+import itertools
 import json
 import multiprocessing
 import os
 import platform
+import resource
 import time
 from pathlib import Path
 from typing import Any
@@ -18,6 +20,7 @@ import numpy as np
 from flax import nnx
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
 
 import colornet
 import thor2_jax as thor2
@@ -25,6 +28,7 @@ from benchmarks.clouds import sample_clouds
 from benchmarks.timing import time_calls
 from thor2_jax.classifier import FEATURES, MLP
 from thor2_jax.run_folder import TrainedRun, input_size
+from thor2_jax.streaming import describe_stream
 from training.builtin_objects import builtin_objects
 from training.scenes import compose_scene
 
@@ -110,6 +114,15 @@ def against_size(quick: bool) -> dict[str, list[list[float]]]:
     return {"points": by_points, "clouds": by_clouds}
 
 
+def stream(clouds: list[Any], count: int) -> dict[str, float]:
+    """Seconds for `count` clouds through `describe_stream`, and the process's peak memory afterwards in GiB."""
+    start = time.perf_counter()
+    endless = itertools.islice(itertools.cycle(clouds), count)
+    described = sum(len(found.overflow) for found in describe_stream(endless, NETWORK, CLOSED, N_POINTS))
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    return {"clouds": described, "seconds": time.perf_counter() - start, "peak_gib": peak}
+
+
 def frame_latency(calls: int) -> dict[str, float]:
     """Milliseconds from decoded arrays to names, a frame of 640 x 480 with six objects, three classifiers loaded."""
     classifiers = {name: MLP(input_size(name, CLOSED, NETWORK.n_regions), 17, rngs=nnx.Rngs(0)) for name in FEATURES}
@@ -133,13 +146,17 @@ def frame_latency(calls: int) -> dict[str, float]:
 
 
 def draw(sizes: dict[str, list[list[float]]], path: Path) -> None:
-    """Time against the number of points and of clouds, both logarithmic, with the line of a cost in proportion."""
+    """Time against the number of points and of clouds, both logarithmic, with the fixed and the linear part fitted."""
     figure = Figure(figsize=(9, 3.8), layout="constrained")
     FigureCanvasAgg(figure)
     for axes, (name, rows) in zip(figure.subplots(1, 2), sizes.items(), strict=True):
         x, seconds = np.array(rows).T
+        slope, fixed = np.polyfit(x, seconds, 1, w=1 / seconds)  # of relative errors
+        each = f"{slope * 1e6:.3g} µs a {'point' if name == 'points' else 'cloud'}"
         axes.loglog(x, seconds * 1e3, "o-", color="#0072b2", label="describe, closed form")
-        axes.loglog(x, seconds[-1] * 1e3 * x / x[-1], "--", color="#888888", label="in proportion")
+        axes.loglog(x, (fixed + slope * x) * 1e3, "--", color="#888888", label=f"{fixed * 1e3:.3g} ms + {each}")
+        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axes.yaxis.set_major_formatter("{x:g}")
         axes.set_xlabel("points a cloud (64 clouds)" if name == "points" else f"clouds ({N_POINTS} points each)")
         axes.set_xticks(x, [f"{int(size):,}" for size in x])
         axes.minorticks_off()
@@ -169,6 +186,12 @@ def main() -> None:
         "engine": rates,
         "align_share": share,
     }
+    result["stream"] = stream(clouds, 10_000 if options.quick else 100_000)
+    print(
+        "describe_stream: {clouds:,} clouds in {seconds:.1f} s, peak memory {peak_gib:.2f} GiB".format(
+            **result["stream"]
+        )
+    )
     try:
         agreement = peer_agrees(clouds[:8])
     except ImportError as error:
