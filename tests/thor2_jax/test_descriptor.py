@@ -226,12 +226,14 @@ def test_both_backends_give_the_same_floats() -> None:
 
 def test_what_is_no_batch_of_clouds_is_refused() -> None:
     packed = thor2.PointClouds.pack([aligned_cloud(0, 5)])
-    one = jax.tree.map(lambda a: a[0], packed)
+    one, batches = jax.tree.map(lambda a: a[0], packed), jax.tree.map(lambda a: a[None], packed)
     for function in (thor2.describe, thor2.describe_aligned, thor2.strips):
         with pytest.raises(thor2.InputError, match="clouds is ndarray"):
             function(np.zeros((1, 5, 3)), NETWORK, CLOSED)
         with pytest.raises(thor2.InputError, match=r"points \[512, 3\]"):
             function(one, NETWORK, CLOSED)
+        with pytest.raises(thor2.InputError, match=r"points \[1, 1, 512, 3\]"):
+            function(batches, NETWORK, CLOSED)
     with pytest.raises(thor2.InputError, match="clouds is list"):
         thor2.diagrams([], CLOSED)
 
