@@ -19,7 +19,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.files import write_text
 from thor2_jax.overlay import draw_overlay
 from thor2_jax.recognizer import Recognizer
-from thor2_jax.run_folder import RUN_FILE, TrainedRun, load_run
+from thor2_jax.run_folder import TrainedRun, load_run
 from training.builtin_objects import builtin_objects
 from training.evaluate import Instance, evaluate, summarize
 from training.meshes import TexturedMesh
@@ -29,7 +29,7 @@ from training.readers.labelled import LabelledFrame
 from training.render_job import render_dataset
 from training.report import Picture, write_page
 from training.scenes import Scene, compose_scene
-from training.train import VIEWS, Progress, train_run
+from training.train import VIEWS, Progress, is_finished, train_run
 from training.view_sphere import camera_pose
 from training.views import view_cloud
 
@@ -103,7 +103,7 @@ def _check_out(out: Path) -> None:
 
 
 def _trained(objects: Mapping[str, TexturedMesh], out: Path, seed: int, progress: Progress) -> TrainedRun:
-    if (out / RUN_FILE).is_file():
+    if is_finished(out):
         run = load_run(out)
         if run.record["seed"] != seed:
             raise InputError(f"seed is {seed}; {out} was trained with {run.record['seed']}")

@@ -23,6 +23,9 @@ LARGEST = 2.0
 SMALLEST = 0.001
 """Plausible longest side of an object, metres: a scan in millimetres falls outside, and the camera stays outside it."""
 
+FARTHEST = 2**23
+"""Of a texture coordinate: past it float32 has whole numbers alone, which tell no place in the image."""
+
 
 @dataclasses.dataclass(frozen=True)
 class TexturedMesh:
@@ -136,9 +139,11 @@ def _part(geometry: trimesh.Trimesh) -> TexturedMesh:
     """One geometry of a file.
 
     Raises:
-        InputError: it has no colour, or one that would fill memory.
+        InputError: it has no colour, or one that would fill memory; or faces that name other vertices than its own.
     """
     vertices, faces = np.asarray(geometry.vertices, np.float64), np.asarray(geometry.faces, np.int32)
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise InputError("faces that name vertices it does not have")
     visual: Any = geometry.visual
     if visual.kind == "vertex":
         return TexturedMesh(vertices, faces, corner_colors=np.asarray(visual.vertex_colors, np.uint8)[faces, :3])
@@ -168,6 +173,32 @@ def _part(geometry: trimesh.Trimesh) -> TexturedMesh:
     return TexturedMesh(vertices, faces, uv=uv, textures=(texture,), face_texture=np.zeros(len(faces), np.int32))
 
 
+def _check(mesh: TexturedMesh) -> None:
+    """Hold what a parser made of a file to what `TexturedMesh` says of itself, and to the size of an object.
+
+    Raises:
+        InputError: it is something else.
+    """
+    vertices, faces, n = mesh.vertices, mesh.faces, len(mesh.faces)
+    shapes: list[tuple[str, NDArray[Any] | None, tuple[int, ...]]] = [
+        ("vertices", vertices, (len(vertices), 3)),
+        ("faces", faces, (n, 3)),
+        ("texture coordinates", mesh.uv, (n, 3, 2)),
+        ("colours", mesh.corner_colors, (n, 3, 3)),
+        *(("a texture", texture, (*texture.shape[:2], 3)) for texture in mesh.textures),
+    ]
+    for name, array, shape in shapes:
+        if array is not None and array.shape != shape:
+            raise InputError(f"{name} of the shape {array.shape}; expected {shape}")
+    if not np.isfinite(vertices).all():
+        raise InputError(f"{(~np.isfinite(vertices)).any(axis=1).sum()} vertices are not finite")
+    if mesh.uv is not None and not (np.abs(mesh.uv) <= FARTHEST).all():
+        raise InputError(f"texture coordinates are not finite, or past {FARTHEST}")
+    longest = float(np.ptp(vertices[np.unique(faces)], axis=0).max())
+    if not SMALLEST <= longest <= LARGEST:
+        raise InputError(f"longest side {longest:g}; expected {SMALLEST:g} to {LARGEST:g} metres")
+
+
 def _check_obj_references(path: Path) -> None:
     """An OBJ file without its material or texture would load as grey: name the missing file instead.
 
@@ -181,11 +212,11 @@ def _check_obj_references(path: Path) -> None:
 
     for library in arguments(path, "mtllib"):
         if not (path.parent / library).is_file():
-            raise InputError(f"mesh {path}: its material file {library!r} is missing")
+            raise InputError(f"its material file {library!r} is missing")
         for entry in arguments(path.parent / library, "map_kd"):
             image = entry.split()[-1] if entry.startswith("-") else entry
             if not (path.parent / image).is_file():
-                raise InputError(f"mesh {path}: its texture {image!r} is missing")
+                raise InputError(f"its texture {image!r} is missing")
 
 
 def load_mesh(path: str | Path) -> TexturedMesh:
@@ -195,7 +226,7 @@ def load_mesh(path: str | Path) -> TexturedMesh:
 
     Raises:
         InputError: the file is missing, unreadable, of another kind, without faces or colour, with vertices or
-            texture coordinates that are not finite, or of no plausible size for an object in metres.
+            texture coordinates that are not finite or too far, or of no plausible size for an object in metres.
     """
     path = Path(path)
     if path.suffix.lower() not in MESH_SUFFIXES:
@@ -207,29 +238,17 @@ def load_mesh(path: str | Path) -> TexturedMesh:
             _check_obj_references(path)
         # Unprocessed: otherwise vertices that are not finite would be dropped in silence.
         loaded = trimesh.load_scene(path, process=False).dump(concatenate=False)
-    except InputError:
-        raise
-    except Exception as error:  # trimesh raises whatever its parsers do
-        raise InputError(f"mesh {path}: cannot be read ({' '.join(str(error).split())})") from error
-    geometries = [part for part in loaded if isinstance(part, trimesh.Trimesh) and len(part.faces)]
-    if not geometries:
-        raise InputError(f"mesh {path}: no faces")
-    if any(part.faces.min() < 0 or part.faces.max() >= len(part.vertices) for part in geometries):
-        raise InputError(f"mesh {path}: faces that name vertices it does not have")
-    try:
+        geometries = [part for part in loaded if isinstance(part, trimesh.Trimesh) and len(part.faces)]
+        if not geometries:
+            raise InputError("no faces")
         mesh = merge_meshes([_part(geometry) for geometry in geometries])
+        _check(mesh)
     except InputError as error:
         raise InputError(f"mesh {path}: {error}") from error
-    except Exception as error:  # textures are decoded now, and attributes may be of another number than vertices
-        raise InputError(f"mesh {path}: cannot be read ({' '.join(str(error).split())})") from error
-    if not np.isfinite(mesh.vertices).all():
-        raise InputError(f"mesh {path}: {(~np.isfinite(mesh.vertices)).any(axis=1).sum()} vertices are not finite")
-    if mesh.uv is not None and not np.isfinite(mesh.uv).all():
-        raise InputError(f"mesh {path}: texture coordinates are not finite")
-    used = mesh.vertices[np.unique(mesh.faces)]
-    longest = float(np.ptp(used, axis=0).max())
-    if not SMALLEST <= longest <= LARGEST:
-        raise InputError(f"mesh {path}: longest side {longest:g}; expected {SMALLEST:g} to {LARGEST:g} metres")
+    # On a damaged file trimesh and the decoders of textures raise anything, and its arrays need not fit one another.
+    except Exception as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise InputError(f"mesh {path}: cannot be read ({reason})") from error
     return mesh
 
 

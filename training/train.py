@@ -197,7 +197,8 @@ def train_run(
             runs.append(load_run(folder))
         _together("trained")
         if first:
-            shutil.rmtree(out / CHECKPOINTS)
+            # Renamed first: wherever a kill strikes, the run is in the making or finished, and nothing in between.
+            shutil.rmtree((out / CHECKPOINTS).rename(out / f".{CHECKPOINTS}"))
         return runs
 
 

@@ -1,9 +1,5 @@
-"""Two trainings of one run, and commands that are killed while they write."""
+"""Two trainings of one run at a time."""
 
-import shutil
-import signal
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -87,42 +83,3 @@ def test_a_training_that_began_while_another_described_its_views(tmp_path: Path)
                 train(other, progress=stopped)
 
     assert train(other, progress=dies).record == done[0].record  # goes on with what the other began
-
-
-KILLED = """
-import os, signal, sys
-import colornet
-colornet.build = colornet.load_default
-left = int(sys.argv.pop(1))
-
-def killing(function):
-    def called(*arguments):
-        global left
-        for step in (lambda: None, lambda: function(*arguments)):
-            step()
-            left -= 1
-            if left == 0:
-                os.kill(os.getpid(), signal.SIGKILL)
-    return called
-
-os.replace = killing(os.replace)
-from training.cli import main
-main()
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kill", [1, 2, 3, 6])
-def test_the_colour_network_s_command_is_killed(kill: int, tmp_path: Path) -> None:
-    """What has a name is whole; the folder is then refused, by name, and the same command makes another."""
-    names, out = ("network.npz", "network.png", "similarity.png"), tmp_path / "out"
-    command = [sys.executable, "-c", KILLED, str(kill), "colornet", "--out", str(out)]
-    assert subprocess.run(command, capture_output=True, timeout=200).returncode == -signal.SIGKILL
-    found = {path.name for path in out.iterdir() if not path.name.startswith(".")}
-    assert found == set(names[: kill // 2])
-    command[3] = "0"
-    again = subprocess.run(command, capture_output=True, text=True, timeout=200)
-    assert again.returncode == 2 and f"out: {out} exists already" in again.stderr and "Traceback" not in again.stderr
-    shutil.rmtree(out)
-    assert subprocess.run(command, capture_output=True, timeout=200).returncode == 0
-    assert {path.name for path in out.iterdir()} == set(names)

@@ -13,6 +13,8 @@ import pytest
 from thor2_jax.errors import InputError
 
 SECONDS = 5
+"""Of the processor: others may hold this process up."""
+
 MEMORY = 2**30
 """Bytes that a reader may take from the system beyond what the process has."""
 
@@ -28,15 +30,15 @@ def limits() -> Iterator[None]:
 
     pages = int(Path("/proc/self/statm").read_text().split()[0])
     before = resource.getrlimit(resource.RLIMIT_AS)
-    handler = signal.signal(signal.SIGALRM, stop)
-    signal.setitimer(signal.ITIMER_REAL, SECONDS)
+    handler = signal.signal(signal.SIGPROF, stop)
+    signal.setitimer(signal.ITIMER_PROF, SECONDS)
     resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + MEMORY, before[1]))
     try:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_AS, before)
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, handler)
+        signal.setitimer(signal.ITIMER_PROF, 0)
+        signal.signal(signal.SIGPROF, handler)
 
 
 @pytest.fixture(scope="session")

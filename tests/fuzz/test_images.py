@@ -123,7 +123,14 @@ def test_intrinsics(content: bytes, attempt: Any, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "content", [b"[" * 10**6, b"1" * 10**5, b'{"fx": ' * 10**5, INTRINSICS.replace(b"600.5", b"9" * 400)]
+    "content",
+    [
+        b"[" * 10**6,
+        b"1" * 10**5,
+        b'{"fx": ' * 10**5,
+        INTRINSICS.replace(b"600.5", b"9" * 400),
+        INTRINSICS.replace(b"1000.0", b"1" + b"9" * 30),
+    ],
 )
 def test_odd_json(content: bytes, attempt: Any, tmp_path: Path) -> None:
     path = tmp_path / "k.json"

@@ -42,11 +42,15 @@ def arrays(height: int = 5, width: int = 7) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("name", ["fx", "fy", "cx", "cy", "depth_scale"])
-@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, "500", None, True, [500], 1 + 0j])
+@pytest.mark.parametrize(
+    "value", [math.nan, math.inf, -math.inf, "500", None, True, [500], 1 + 0j, 1.1e9, -1.1e9, 2 * 10**30, 10**400]
+)
 def test_intrinsics_that_are_no_finite_numbers(name: str, value: Any) -> None:
     values = {"fx": 500, "fy": 500, "cx": 3, "cy": 2, name: value}
     for build in (lambda: Intrinsics(**values), lambda: Intrinsics.of(values)):
-        with pytest.raises(InputError, match=rf"^intrinsics\.{name} is .*must be a finite number$"):
+        with pytest.raises(
+            InputError, match=rf"^intrinsics\.{name} is .*must be a finite number, at most 1e\+09 in size$"
+        ):
             build()
 
 

@@ -274,6 +274,14 @@ def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
     assert [p.name for p in (tmp_path / "report").iterdir()] == ["thesis.tex"]
 
 
+def test_what_a_killed_evaluation_was_writing_is_passed_over(tmp_path: Path) -> None:
+    for name in ("whole", "killed"):
+        (tmp_path / name / "report").mkdir(parents=True)
+    (tmp_path / "killed" / "report" / ".answers.x.jsonl").write_text('{"data')
+    found = [without_times(evaluate_toys(tmp_path / name, 2)) for name in ("whole", "killed")]
+    assert found[0] == found[1]
+
+
 def test_of_two_evaluations_into_one_folder_the_second_is_refused(tmp_path: Path) -> None:
     (tmp_path / "report").mkdir()
     with locked(tmp_path / "report"), pytest.raises(InputError, match="another process is writing"):

@@ -195,6 +195,35 @@ def test_texture_coordinates_that_are_not_finite(tmp_path: Path) -> None:
     check_refused(tmp_path / "quad.glb", "texture coordinates are not finite")
 
 
+def test_texture_coordinates_that_are_too_far(tmp_path: Path) -> None:
+    material = PBRMaterial(baseColorTexture=Image.fromarray(CHECKERS))
+    for far, said in ((2.0**23, None), (1e30, "texture coordinates are not finite, or past 8388608")):
+        visual = trimesh.visual.TextureVisuals(uv=QUAD_UV * [1, far], material=material)
+        trimesh.Trimesh(QUAD, QUAD_FACES, visual=visual, process=False).export(tmp_path / "quad.glb")
+        if said is None:
+            assert load_mesh(tmp_path / "quad.glb").colors_at(np.arange(2), np.full((2, 2), 0.3)).shape == (2, 3)
+        else:
+            check_refused(tmp_path / "quad.glb", said)
+
+
+@pytest.mark.parametrize(
+    ("line", "other", "said"),
+    [
+        ("vt 1.0 1.0", "vt 1.0", r"texture coordinates of the shape \(1, 3, 1\); expected \(1, 3, 2\)"),
+        ("v 0.1 0.1 0.0", "v 0.1 0.1", r"vertices of the shape \(3, 2\); expected \(3, 3\)"),
+        ("v 0.1 0.1 0.0", "v", "cannot be read"),
+    ],
+)
+def test_lines_of_an_obj_that_are_cut_off(tmp_path: Path, line: str, other: str, said: str) -> None:
+    lines = "v 0.0 0.0 0.0\nv 0.1 0.0 0.0\nv 0.1 0.1 0.0\nvt 0.0 0.0\nvt 1.0 0.0\nvt 1.0 1.0\nf 1/1 2/2 3/3\n"
+    textured_quad(SimpleMaterial(image=Image.fromarray(CHECKERS))).export(tmp_path / "whole.obj")
+    content = "mtllib material.mtl\nusemtl material_0\n" + lines
+    (tmp_path / "quad.obj").write_text(content)
+    assert len(load_mesh(tmp_path / "quad.obj").faces) == 1
+    (tmp_path / "quad.obj").write_text(content.replace(line, other))
+    check_refused(tmp_path / "quad.obj", said)
+
+
 def put(folder: Path, *names: str) -> None:
     for name in names:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)

@@ -22,6 +22,7 @@ from thor2_jax.run_folder import TrainedRun, load_run
 from training import metrics
 from training import train as module
 from training.checkpoints import Checkpoints
+from training.evaluation.runs import run_folders
 from training.fit import FitOptions
 from training.train import train_run
 from training.view_source import MemoryViews
@@ -190,6 +191,22 @@ def test_a_stop_while_the_run_is_put_in_place(
     assert (out / "run.json").exists() == (moved == "run.json")
     same_weights(train(out, ("tops", "ce")), whole[1])
     assert names(out) == FINISHED
+
+
+def test_a_stop_while_checkpoints_are_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The run, or all its folds, is finished by then."""
+    rmdir = os.rmdir
+
+    def stopping(path: Any, **options: Any) -> None:
+        if Path(path).name.endswith("checkpoints"):
+            raise Stopped
+        rmdir(path, **options)
+
+    monkeypatch.setattr(os, "rmdir", stopping)
+    with pytest.raises(Stopped):
+        train_run(source(), tmp_path / "run", ["tops"], OPTIONS, config=CONFIG, folds=2)
+    assert module.is_finished(tmp_path / "run")
+    assert [load_run(folder).record["fold"] for folder in run_folders([tmp_path / "run"])] == [0, 1]
 
 
 def test_other_options_or_views_are_refused(tmp_path: Path) -> None:

@@ -28,7 +28,7 @@ FORMAT = 1
 
 
 def baseline_file(run: Path, name: str) -> Path:
-    """Where a run folder has its baseline of that name; `*` for any."""
+    """Where a run folder has its baseline of that name, or of that pattern of names."""
     return run / "baselines" / f"{name}.safetensors"
 
 

@@ -1,0 +1,248 @@
+"""Every command that writes, killed while it writes: what has a name is whole, and the same command goes on."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from flax import nnx
+from PIL import Image
+
+import colornet
+import thor2_jax as thor2
+from thor2_jax.classifier import MLP
+from thor2_jax.run_folder import TrainedRun, input_size, load_run, save_run
+from training import cli
+from training.baselines.files import baseline_file, read_baseline
+from training.metrics import read_figures
+from training.view_dataset import MANIFEST, Manifest
+
+pytestmark = pytest.mark.slow
+
+KILLED = """
+import os, signal, sys
+when, place = sys.argv.pop(1).split()
+out = sys.argv[sys.argv.index("--out") + 1]
+
+def killing(function):
+    def called(*arguments, **options):
+        here = os.path.relpath(arguments[-1], out) == place
+        if here and when == "before":
+            os.kill(os.getpid(), signal.SIGKILL)
+        function(*arguments, **options)
+        if here and when == "after":
+            os.kill(os.getpid(), signal.SIGKILL)
+    return called
+
+os.replace, os.rename = killing(os.replace), killing(os.rename)
+import colornet
+colornet.build = colornet.load_default
+from training.cli import main
+main()
+"""
+
+
+@pytest.fixture(scope="module")
+def environment(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """Programs that one process has compiled are there for the next."""
+    cache = {
+        "JAX_COMPILATION_CACHE_DIR": str(tmp_path_factory.mktemp("cache")),
+        "JAX_PERSISTENT_COMPILATION_CACHE_MIN_COMPILE_TIME_SECS": "0",
+        "TF_CPP_MIN_LOG_LEVEL": "3",
+    }
+    return os.environ | cache
+
+
+def kill(place: str, command: tuple[object, ...], environment: dict[str, str]) -> None:
+    """Run a command and kill it before or after a file or folder is put in its place in --out."""
+    arguments = [sys.executable, "-c", KILLED, place, *map(str, command)]
+    done = subprocess.run(arguments, capture_output=True, text=True, timeout=200, env=environment)
+    assert done.returncode == -signal.SIGKILL, done.stderr[-3000:]
+
+
+@pytest.fixture
+def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Any:
+    """Run a command undisturbed: exit status, and what it says on standard error."""
+
+    def run(*command: object) -> tuple[int, str]:
+        monkeypatch.setattr(sys, "argv", ["thor2", *map(str, command)])
+        with pytest.raises(SystemExit) as stop:
+            cli.main()
+        return int(stop.value.code or 0), capsys.readouterr().err
+
+    return run
+
+
+def check_refused(found: tuple[int, str], said: str) -> None:
+    status, err = found
+    lines = [line for line in err.splitlines() if line.startswith("error: ")]
+    assert status == 2 and len(lines) == 1 and said in lines[0], err
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    """Contents of the files that have their name; temporary ones begin with a point."""
+    paths = (path.relative_to(folder) for path in folder.rglob("*") if path.is_file())
+    return {str(path): (folder / path).read_bytes() for path in paths if not any(p[0] == "." for p in path.parts)}
+
+
+@pytest.fixture(scope="module")
+def meshes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two boxes with colours at their vertices."""
+    import trimesh
+
+    folder = tmp_path_factory.mktemp("meshes")
+    for name, sides, level in (("brick", (0.1, 0.05, 0.03), 40), ("stick", (0.2, 0.02, 0.02), 220)):
+        box = trimesh.creation.box(sides)
+        colors = np.full((len(box.vertices), 3), level, np.uint8)
+        trimesh.Trimesh(box.vertices, box.faces, vertex_colors=colors, process=False).export(folder / f"{name}.ply")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def frames(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two frames of a plane that falls off to the right, with two patches of it labelled."""
+    folder = tmp_path_factory.mktemp("frames")
+    rng = np.random.default_rng(0)
+    labels = np.zeros((240, 320), np.uint8)
+    labels[20:100, 20:90], labels[120:220, 100:150] = 1, 2
+    for name in ("one", "two"):
+        (folder / name).mkdir()
+        Image.fromarray(rng.integers(0, 256, (240, 320, 3), dtype=np.uint8)).save(folder / name / "color.png")
+        depth = np.broadcast_to(600 + np.arange(320) // 2, (240, 320)).astype(np.uint16)
+        Image.fromarray(depth).save(folder / name / "depth.png")
+        Image.fromarray(labels).save(folder / name / "mask.png")
+        (folder / name / "intrinsics.json").write_text('{"fx": 600, "fy": 600, "cx": 159.5, "cy": 119.5}')
+        (folder / name / "labels.json").write_text('{"labels": {"1": "brick", "2": "stick"}}')
+    return folder
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run with weights of chance."""
+    config = thor2.DescriptorConfig(homology="closed_form", n_slices=3, n_strips=8, image_size=8)
+    network, out = colornet.load_default(), tmp_path_factory.mktemp("model") / "run"
+    models = {name: MLP(input_size(name, config, 22), 2, rngs=nnx.Rngs(0)) for name in ("tops", "tops2")}
+    save_run(TrainedRun(config, network, ("brick", "stick"), models, {}), out)
+    return out
+
+
+# Colour network
+
+
+def test_colornet(environment: Any, call: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A folder that was begun is refused, by name."""
+    monkeypatch.setattr(colornet, "build", colornet.load_default)
+    command, whole = ("colornet", "--out"), tmp_path / "whole"
+    assert call(*command, whole)[0] == 0
+    assert files(whole).keys() == {"network.npz", "network.png", "similarity.png"}
+    for place, left in (("before network.npz", []), ("after network.png", ["network.npz", "network.png"])):
+        out = tmp_path / place
+        kill(place, (*command, out), environment)
+        assert files(out) == {name: files(whole)[name] for name in left}
+        check_refused(call(*command, out), f"out: {out} exists already")
+
+
+# Views and training
+
+STEPS = ("--azimuth-step", 90, "--polar-step", 90, "--workers", 1)
+
+
+def test_render(meshes: Path, environment: Any, call: Any, tmp_path: Path) -> None:
+    command, whole, out = ("render", "--meshes", meshes, *STEPS, "--out"), tmp_path / "whole", tmp_path / "views"
+    assert call(*command, whole)[0] == 0
+    expected = files(whole)
+    for place in (f"before {MANIFEST}", "before 0001-0000.safetensors"):
+        kill(place, (*command, out), environment)
+        found = files(out)
+        if MANIFEST in found:
+            manifest = Manifest.parse(found.pop(MANIFEST), out)
+            assert not manifest.finished and {shard.file for shard in manifest.shards} <= found.keys()
+        assert found.items() <= expected.items()
+        check_refused(call("train", "--dataset", out, "--out", tmp_path / "run"), str(out / MANIFEST))
+    check_refused(call(*command, out, "--seed", 1, "--sensor"), f"out: {out} was begun by another command")
+    assert call(*command, out)[0] == 0
+    assert files(out) == expected and files(out).keys() | {".lock"} == {path.name for path in out.iterdir()}
+
+
+def same_models(one: TrainedRun, other: TrainedRun) -> bool:
+    """The weights' files are named at random, so the folders' bytes differ."""
+    first, second = ([nnx.to_flat_state(nnx.state(m)) for m in run.classifiers.values()] for run in (one, other))
+    same = all(
+        path == other_path and np.array_equal(a[...], b[...])
+        for model, other_model in zip(first, second, strict=True)
+        for (path, a), (other_path, b) in zip(model, other_model, strict=True)
+    )
+    return same and (one.classes, one.config, one.record) == (other.classes, other.config, other.record)
+
+
+def test_train(meshes: Path, frames: Path, environment: Any, call: Any, tmp_path: Path) -> None:
+    options = (*STEPS, "--paper", "--batch-size", 16, "--classifiers", "ce", "--baselines", "forest", "--epochs", 2)
+    command, whole, out = ("train", "--meshes", meshes, *options, "--out"), tmp_path / "whole", tmp_path / "run"
+    assert call(*command, whole)[0] == 0
+    expected, run = files(whole), load_run(whole)
+    for place in ("after checkpoints/fold-0/ce/1", "before run.json", "before baselines/forest.safetensors"):
+        kill(place, (*command, out), environment)
+        found = files(out)
+        assert all(found[name] == expected[name] for name in {"curves.png", "network.npz"} & found.keys())
+        assert [row["epoch"] for row in read_figures(out / "metrics.jsonl")] in ([], [1], [1, 2])
+        if "run.json" in found:
+            assert same_models(load_run(out), run)
+        else:
+            check_refused(call("evaluate", "frames", frames, "--model", out), f"{out} is no run folder")
+        if "checkpoints/begun.json" in found:
+            check_refused(call(*command, out, "--epochs", 3), f"{out} holds a run in the making with epochs 2, not 3")
+    assert call(*command, out)[0] == 0
+    assert same_models(load_run(out), run)
+    found = files(out)
+    assert {name for name in found if "weights" not in name} == {name for name in expected if "weights" not in name}
+    assert found["curves.png"] == expected["curves.png"] and found["network.npz"] == expected["network.npz"]
+    first, second = (read_baseline(baseline_file(folder, "forest"), run.classes) for folder in (out, whole))
+    assert all(np.array_equal(second.arrays[name], array) for name, array in first.arrays.items())
+
+
+# Frames
+
+
+def without_times(found: dict[str, bytes]) -> dict[str, Any]:
+    """A report's files, but for the seconds in them and in the page."""
+    kept: dict[str, Any] = {name: content for name, content in found.items() if name.endswith((".jpg", ".png"))}
+    if "report.json" in found:
+        kept["report.json"] = {k: v for k, v in json.loads(found["report.json"]).items() if k != "speed"}
+    for line in found.get("answers.jsonl", b"").splitlines()[1:]:
+        answers = json.loads(line)
+        kept[f"answers.jsonl {answers['frame']}"] = answers["instances"]
+    return kept
+
+
+def test_evaluate(frames: Path, model: Path, environment: Any, call: Any, tmp_path: Path) -> None:
+    command, whole, out = (
+        ("evaluate", "frames", frames, "--model", model, "--out"),
+        tmp_path / "whole",
+        tmp_path / "out",
+    )
+    assert call(*command, whole)[0] == 0
+    expected = without_times(files(whole))
+    kill("before frames/1.jpg", (*command, out), environment)
+    found = without_times(files(out))
+    kept = {"frames/0.jpg", "answers.jsonl one"}  # besides confusions, of which a later frame may have a better one
+    assert {name for name in found if "confusions" not in name} == kept
+    assert all(found[name] == expected[name] for name in kept)
+    check_refused(call("evaluate", "frames", frames / "one", *command[3:], out), f"out: {out / 'answers.jsonl'} holds")
+    assert call(*command, out)[0] == 0
+    assert without_times(files(out)) == expected and files(out).keys() == files(whole).keys()
+
+
+def test_recognize(frames: Path, model: Path, environment: Any, call: Any, tmp_path: Path) -> None:
+    names = {"color": "color.png", "depth": "depth.png", "labels": "mask.png", "intrinsics": "intrinsics.json"}
+    images = [part for option, name in names.items() for part in (f"--{option}", frames / "one" / name)]
+    command, whole, out = ("recognize", "--model", model, *images, "--out"), tmp_path / "whole", tmp_path / "out"
+    assert call(*command, whole)[0] == 0
+    kill("before recognition.json", (*command, out), environment)
+    assert files(out) == {"overlay.png": files(whole)["overlay.png"]}
+    assert call(*command, out)[0] == 0
+    assert files(out) == files(whole)
