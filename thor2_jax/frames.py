@@ -191,6 +191,9 @@ def _read_image(path: str | Path, argument: str) -> tuple[NDArray[Any], str]:
             with Image.open(stream, formats=FORMATS) as image:
                 if image.width * image.height > MOST_PIXELS:
                     raise ValueError(f"{image.width} x {image.height} pixels; at most {MOST_PIXELS} are read")
+                image.verify()  # decoding passes over the checksums of a PNG's pixels
+            stream.seek(0)
+            with Image.open(stream, formats=FORMATS) as image:
                 return np.asarray(image), image.mode
         # Damaged files make the decoders raise a dozen kinds of exception; only bytes are at work here.
         except Exception as error:

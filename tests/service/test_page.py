@@ -286,6 +286,87 @@ def test_a_phones_width(open_page: Callable[..., Page], files: Files) -> None:
     fits()
 
 
+RECORD_TAGS = """() => {
+  const { drawImage, roundRect, fillText } = CanvasRenderingContext2D.prototype;
+  const recorded = (draw, note) => function (...given) {
+    if (this.canvas.id === "overlay") note(given);
+    return draw.apply(this, given);
+  };
+  let box;
+  Object.assign(CanvasRenderingContext2D.prototype, {
+    drawImage: recorded(drawImage, () => { window.tags = []; }),
+    roundRect: recorded(roundRect, ([x, y, width, height]) => { box = [x, y, x + width, y + height]; }),
+    fillText: recorded(fillText, ([text]) => window.tags.push([text, ...box])),
+  });
+}"""
+
+
+def tags_of(page: Page) -> list[tuple[str, np.ndarray]]:
+    """Texts and boxes (left, top, right, bottom) of the tags on the overlay; none leaves it or covers another."""
+    tags = page.evaluate("window.tags")
+    size = page.evaluate("[overlay.clientWidth, overlay.clientHeight]")
+    boxes = np.array([box for _, *box in tags])
+    assert (boxes[:, :2] >= 0).all() and (boxes[:, 2:] <= size).all()
+    for k, one in enumerate(boxes):
+        others = np.delete(boxes, k, axis=0)
+        covered = np.minimum(one[2:], others[:, 2:]) - np.maximum(one[:2], others[:, :2])
+        assert not (covered > 0).all(axis=1).any(), f"{tags[k][0]} covers another tag"
+    return [(text, box) for (text, *_), box in zip(tags, boxes, strict=True)]
+
+
+LONG = "extra_large_clamp"
+
+
+def with_long_names(route: Route) -> None:
+    if "explain" not in route.request.url:
+        route.continue_()
+        return
+    answer = route.fetch()
+    found = answer.json()
+    for one in found["instances"]:
+        one["name"] = one["name"] and LONG
+    route.fulfill(response=answer, json=found)
+
+
+def test_tags_of_a_narrow_picture_do_not_cover_each_other(
+    open_page: Callable[..., Page], files: Files, encode: Callable[..., bytes]
+) -> None:
+    page = open_page(with_long_names, viewport={"width": 360, "height": 740}, is_mobile=True, has_touch=True)
+    page.evaluate(RECORD_TAGS)
+    for k, sample in enumerate(json.loads((SAMPLES / "index.json").read_text())):
+        page.locator("#samples button").nth(k).tap()
+        expect(page.get_by_role("status")).to_contain_text(f"{sample['title']}: ")
+        tags = tags_of(page)
+        assert len(tags) == page.locator("#objects button").count()
+        assert sum(text == LONG for text, _ in tags) > len(tags) / 2
+
+    labels = np.zeros((240, 320), np.uint8)
+    for number in range(48):
+        y, x = divmod(number, 8)
+        labels[40 * y + 5 : 40 * y + 35, 40 * x + 5 : 40 * x + 35] = number + 1
+    upload(page, files | {"labels": encode(labels)})
+    expect(page.locator("#objects button")).to_have_count(48)
+    tags = tags_of(page)
+    numbers = [tag for tag in tags if tag[0].isdigit()]
+    assert len(tags) == 48 and len(numbers) > 24
+    for number, (left, top, right, bottom) in numbers[::10]:
+        page.locator("#overlay").tap(position={"x": (left + right) / 2, "y": (top + bottom) / 2})
+        chosen = page.locator('#objects button[aria-pressed="true"]')
+        expect(chosen).to_have_attribute("data-label", number)
+        expect(chosen.locator(".swatch")).to_have_text(number)
+
+
+def test_an_object_too_fine_for_the_overlay(
+    open_page: Callable[..., Page], files: Files, encode: Callable[..., bytes]
+) -> None:
+    """The overlay of a ragged label image leaves out every second column: here, all of the second object."""
+    page = open_page()
+    upload(page, files | {"labels": encode(np.tile(np.array([1, 2], np.uint8), (240, 160)))})
+    expect(page.locator("#objects button")).to_have_count(2)
+    page.locator('#objects button[data-label="2"]').click()
+    expect(page.locator("#details-facts")).to_contain_text("Label 2 ")
+
+
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_text_can_be_read_in_both_schemes(open_page: Callable[..., Page], scheme: str) -> None:
     page = open_page(color_scheme=scheme)

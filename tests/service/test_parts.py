@@ -3,6 +3,8 @@
 import asyncio
 import math
 import os
+import subprocess
+import sys
 import tempfile
 import threading
 import time
@@ -238,6 +240,7 @@ def test_a_defect_is_told_without_its_traceback(
         "field": None,
         "message": "This is a defect of the service.",
     }
+    assert 'thor2_requests_total{path="/v1/recognize",status="500"} 1.0' in app.state.service.metrics.text().decode()
 
 
 def test_large_files_stay_in_memory(app: FastAPI, files: dict[str, bytes], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -257,6 +260,20 @@ def test_large_files_stay_in_memory(app: FastAPI, files: dict[str, bytes], monke
     assert len(multipart(large)[1]) > MAX_BODY - 200_000
     assert calls(app, frame_request(large))[0].status_code == 200
     assert taken == [large]
+
+
+def test_a_worker_that_died_leaves_no_requests_waiting(tmp_path: Path) -> None:
+    """Its other counts stay."""
+    worker = "from thor2_jax.service.metrics import Metrics; import os; metrics = Metrics(); "
+    died = "metrics.waiting.inc(3); metrics.compilations.inc(2); os._exit(0)"
+    said = ""
+    for life in (died, "metrics.waiting.inc(1); print(metrics.text().decode())"):
+        environment = os.environ | {"PROMETHEUS_MULTIPROC_DIR": str(tmp_path)}
+        said = subprocess.run(
+            [sys.executable, "-c", worker + life],
+            cwd=Path(__file__).parents[2], env=environment, check=True, capture_output=True, text=True,
+        ).stdout  # fmt: skip
+    assert "thor2_requests_waiting 1.0" in said and "thor2_compilations_after_warm_up_total 2.0" in said
 
 
 def test_settings_out_of_range_are_refused() -> None:

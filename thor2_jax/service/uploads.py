@@ -3,6 +3,7 @@
 from collections.abc import AsyncGenerator
 
 from fastapi import Request
+from python_multipart.multipart import parse_options_header
 from starlette.datastructures import UploadFile
 from starlette.formparsers import MultiPartException, MultiPartParser
 
@@ -34,11 +35,15 @@ async def read_form(request: Request, names: tuple[str, ...]) -> dict[str, bytes
     """The parts of these names of a multipart form; others are passed over.
 
     Raises:
-        RequestError: 413 past `MAX_BODY` bytes, 415 for another type of body, 400 for one that cannot be taken apart,
-            422 for a part that is missing or given twice.
+        RequestError: 413 past `MAX_BODY` bytes, 415 for another type of body or charset, 400 for one that
+            cannot be taken apart, 422 for a part that is missing or given twice.
     """
-    if request.headers.get("content-type", "").partition(";")[0].strip().lower() != "multipart/form-data":
+    kind, options = parse_options_header(request.headers.get("content-type"))
+    if kind != b"multipart/form-data":
         raise RequestError(415, "body", "The body must be multipart/form-data.")
+    # Some of Python's charsets fail on what they cannot decode, and some take time as the square of its length.
+    if options.get(b"charset", b"utf-8").lower() not in (b"utf-8", b"iso-8859-1", b"us-ascii"):
+        raise RequestError(415, "body", "The charset must be utf-8, iso-8859-1 or us-ascii.")
     parser = MultiPartParser(request.headers, _chunks(request), max_files=8, max_fields=8, max_part_size=MAX_BODY)
     parser.spool_max_size = MAX_BODY + 1  # what is larger would go to a temporary file
     try:
@@ -51,9 +56,7 @@ async def read_form(request: Request, names: tuple[str, ...]) -> dict[str, bytes
             parts = form.getlist(name)
             if len(parts) != 1:
                 raise RequestError(422, name, f"{name} is {'given more than once' if parts else 'missing'}.")
-            found[name] = (
-                await parts[0].read() if isinstance(parts[0], UploadFile) else parts[0].encode(errors="replace")
-            )
+            found[name] = await parts[0].read() if isinstance(parts[0], UploadFile) else parts[0].encode()
         return found
     finally:
         await form.close()

@@ -2,7 +2,7 @@
 
 import { showDetails } from "./details.js";
 import { element, percent, rgb } from "./drawing.js";
-import { Overlay, paints } from "./overlay.js";
+import { ink, Overlay, paints } from "./overlay.js";
 import * as service from "./service.js";
 
 const FIELDS = ["color", "depth", "labels", "intrinsics"];
@@ -97,8 +97,9 @@ function show(what, answer, bitmap) {
 function objectButton(instance, color) {
   const { label, name, confidence, classifier, occluded, unrecognized } = instance;
   const facts = name === null ? unrecognized : `${classifier.toUpperCase()} is surer${occluded ? " · hidden in part" : ""}`;
-  const swatch = element("span", { className: "swatch" });
-  swatch.style.setProperty("--paint", rgb(color));
+  const swatch = element("span", { className: "swatch" }, label);
+  swatch.style.background = rgb(color);
+  swatch.style.color = ink(color);
   const button = element(
     "button",
     { type: "button", onclick: () => select(label) },

@@ -8,13 +8,18 @@ const UNRECOGNIZED = [213, 94, 0];
 
 const SMALL = 480; // CSS pixels: narrower pictures get smaller letters and thinner lines
 
+// How little a place is wanted: names stand beside their objects, labels on them.
+const NAME_COSTS = { above: 0, below: 0.3, on: 0.6 };
+const LABEL_COSTS = { above: 0.6, below: 0.6, on: 0 };
+
 /** A colour for each instance. */
 export function paints(instances) {
   let named = 0;
   return instances.map(({ name }) => (name === null ? UNRECOGNIZED : PAINTS[named++ % PAINTS.length]));
 }
 
-const ink = ([red, green, blue]) => (0.299 * red + 0.587 * green + 0.114 * blue > 100 ? "#000" : "#fff");
+/** The colour of letters on a colour. */
+export const ink = ([red, green, blue]) => (0.299 * red + 0.587 * green + 0.114 * blue > 100 ? "#000" : "#fff");
 
 export class Overlay {
   /** On `canvas`; `onSelect(label)` is called when an object is clicked. */
@@ -92,50 +97,60 @@ export class Overlay {
       context.lineWidth = line;
       context.stroke(outline);
     }
-    this.placeTags(context, width, height, across, down);
-    for (const k of order) this.paintTag(context, this.tags[k]);
+    this.placeTags(context, width, height);
+    for (const tag of this.tags) this.paintTag(context, tag);
   }
 
   isSelected(k) {
     return this.instances[k].label === this.selected;
   }
 
-  placeTags(context, width, height, across, down) {
+  /** Each object's label, as in the list, on the object; then in its stead the name, wherever that has room. */
+  placeTags(context, width, height) {
     const small = width < SMALL;
     const size = small ? 11 : 13;
     context.font = `600 ${size}px system-ui, sans-serif`;
     this.tags = [];
-    this.instances.forEach(({ label, name, confidence }, k) => {
-      const text = name === null ? "unrecognized" : small ? name : `${name} ${percent(confidence)}`;
-      const box = { width: Math.min(width, context.measureText(text).width + size), height: size + 8 };
-      const region = this.regions.of(label);
-      const around = {
-        x: region.left * across,
-        y: region.top * down,
-        width: (region.right - region.left) * across,
-        height: (region.bottom - region.top) * down,
-      };
-      Object.assign(box, this.bestPlace(label, box, around, width, height));
-      this.tags.push({ label, text, box, color: this.colors[k], font: context.font, isSelected: this.isSelected(k) });
+    const place = (k, text, costs) => {
+      const { label } = this.instances[k];
+      const others = this.tags.filter((tag) => tag.label !== label);
+      const room = { width: context.measureText(text).width + size, height: size + 8 };
+      const box = this.freePlace(label, room, others, costs, width, height);
+      if (!box) return;
+      this.tags = [...others, { label, text, box, color: this.colors[k], font: context.font, isSelected: this.isSelected(k) }];
+    };
+    this.instances.forEach(({ label }, k) => place(k, `${label}`, LABEL_COSTS));
+    this.instances.forEach(({ name, confidence }, k) => {
+      place(k, name === null ? "unrecognized" : small ? name : `${name} ${percent(confidence)}`, NAME_COSTS);
     });
   }
 
-  /** Above, below or on the object, wherever it hides least of the other names and objects. */
-  bestPlace(label, box, around, width, height) {
-    let best = null;
-    const middle = around.y + (around.height - box.height) / 2;
-    for (const [far, y] of [[0, around.y - box.height - 3], [0.3, around.y + around.height + 3], [0.6, middle]]) {
+  /** A box at an object, clear of other tags, where it hides least of other objects; undefined if there is none. */
+  freePlace(label, room, others, costs, width, height) {
+    const region = this.regions.of(label);
+    if (!region || room.width > width) return;
+    const across = width / this.regions.width;
+    const down = height / this.regions.height;
+    const ys = {
+      above: region.top * down - room.height - 3,
+      below: region.bottom * down + 3,
+      on: ((region.top + region.bottom) * down - room.height) / 2,
+    };
+    let best = { cost: Infinity };
+    for (const [where, y] of Object.entries(ys)) {
       for (const part of [0.5, 0.25, 0.75, 0, 1]) {
-        const place = {
-          x: Math.max(0, Math.min(width - box.width, around.x + around.width * part - box.width / 2)),
-          y: Math.max(0, Math.min(height - box.height, y)),
+        const middle = (region.left + (region.right - region.left) * part) * across;
+        const box = {
+          ...room,
+          x: Math.max(0, Math.min(width - room.width, middle - room.width / 2)),
+          y: Math.max(0, Math.min(height - room.height, y)),
         };
-        const covered = this.tags.reduce((sum, { box: other }) => sum + shared({ ...box, ...place }, other), 0);
-        const cost = 10 * covered + 3 * this.hidden(label, { ...box, ...place }) + far + Math.abs(part - 0.5);
-        if (!best || cost < best.cost) best = { cost, place };
+        if (others.some((other) => overlap(box, other.box))) continue;
+        const cost = 3 * this.hidden(label, box) + costs[where] + Math.abs(part - 0.5);
+        if (cost < best.cost) best = { cost, box };
       }
     }
-    return best.place;
+    return best.box;
   }
 
   /** How much of a box lies on other objects than `label`, from 0 to 1. */
@@ -160,15 +175,12 @@ export class Overlay {
     context.fillStyle = ink(color);
     context.textAlign = "center";
     context.textBaseline = "middle";
-    context.fillText(text, box.x + box.width / 2, box.y + box.height / 2 + 0.5, box.width - 4);
+    context.fillText(text, box.x + box.width / 2, box.y + box.height / 2 + 0.5);
   }
 }
 
-/** Pixels that two boxes share. */
-function shared(a, b) {
-  const across = Math.min(a.x + a.width, b.x + b.width) - Math.max(a.x, b.x);
-  const down = Math.min(a.y + a.height, b.y + b.height) - Math.max(a.y, b.y);
-  return Math.max(0, across) * Math.max(0, down);
+function overlap(a, b) {
+  return a.x < b.x + b.width && b.x < a.x + a.width && a.y < b.y + b.height && b.y < a.y + a.height;
 }
 
 /** The label map unpacked: each label's area, outline and box, in pixels of the map. */

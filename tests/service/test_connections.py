@@ -1,0 +1,109 @@
+"""Connections that hold on: over real sockets, with an application that takes its time and short limits."""
+
+import asyncio
+import contextlib
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+import uvicorn
+
+from thor2_jax.service import connections
+
+WORK = 1.0
+HEAD = b"%s /%s HTTP/1.1\r\nHost: x\r\n%s\r\n"
+SLOW, QUICK = HEAD % (b"GET", b"slow", b""), HEAD % (b"GET", b"", b"")
+CUT = QUICK[:-6]
+UPLOAD = HEAD % (b"POST", b"", b"Content-Length: 1000\r\n")
+
+
+async def application(scope: Any, receive: Any, send: Any) -> None:
+    """Answers without a look at the body."""
+    if scope["path"] == "/slow":
+        await asyncio.sleep(WORK)
+    await send({"type": "http.response.start", "status": 200, "headers": [(b"content-length", b"4")]})
+    await send({"type": "http.response.body", "body": b"done"})
+
+
+@pytest.fixture
+def address(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    monkeypatch.setattr(connections, "HEAD_SECONDS", WORK / 4)
+    monkeypatch.setattr(connections, "REST_SECONDS", WORK)
+    config = uvicorn.Config(application, http=connections.TimedConnection, lifespan="off", log_level="critical")
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        server = uvicorn.Server(config)
+        thread = threading.Thread(target=server.run, args=([listening],))
+        thread.start()
+        yield listening.getsockname()
+        server.should_exit = True
+        thread.join()
+
+
+def until_closed(address: Any, sent: bytes, then: bytes = b"") -> int:
+    """Answers on a connection until the server closes it; `then` is sent again and again."""
+    answers = b""
+    with socket.create_connection(address) as connection:
+        connection.sendall(sent)
+        connection.settimeout(WORK / 20)
+        for _ in range(200):
+            try:
+                received = connection.recv(4096)
+            except TimeoutError:
+                with contextlib.suppress(ConnectionError):
+                    connection.sendall(then)
+                continue
+            except ConnectionError:
+                received = b""
+            if not received:
+                return answers.count(b"done")
+            answers += received
+    raise AssertionError("the connection is held")
+
+
+@pytest.mark.parametrize(
+    ("sent", "answers"),
+    [(CUT, 0), (QUICK + CUT, 1), (SLOW + CUT, 1), (SLOW + SLOW + CUT, 2), (SLOW + SLOW + QUICK, 3)],
+)
+def test_every_whole_request_is_answered_and_a_cut_head_ends_the_connection(
+    address: Any, sent: bytes, answers: int
+) -> None:
+    assert until_closed(address, sent) == answers
+
+
+@pytest.mark.parametrize(("sent", "then"), [(b"", b"\r\n"), (QUICK, b""), (QUICK, b"\r\n"), (UPLOAD, b"x")])
+def test_bytes_now_and_then_do_not_hold_a_connection(address: Any, sent: bytes, then: bytes) -> None:
+    assert until_closed(address, sent, then) == bool(sent)
+
+
+def test_a_body_may_arrive_after_its_answer(address: Any) -> None:
+    with socket.create_connection(address, timeout=30) as connection:
+        connection.sendall(UPLOAD)
+        time.sleep(WORK / 2)
+        connection.sendall(bytes(1000) + QUICK)
+        answers = b""
+        while received := connection.recv(4096):
+            answers += received
+    assert answers.count(b"done") == 2
+
+
+@pytest.mark.parametrize("start", [b"GET /", CUT + b"\r\nX: "])
+def test_a_head_without_end(address: Any, start: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connections, "HEAD_SECONDS", 60)
+    with socket.create_connection(address, timeout=30) as connection, pytest.raises(ConnectionError):
+        connection.sendall(start)
+        for _ in range(64):
+            connection.sendall(b"x" * 2**20)
+
+
+def test_many_pipelined_requests(address: Any) -> None:
+    """More bytes than a head may have."""
+    count = connections.MAX_HEAD // len(QUICK) + 1000
+    with socket.create_connection(address, timeout=30) as connection:
+        threading.Thread(target=connection.sendall, args=(QUICK * count,)).start()
+        answers = b""
+        while received := connection.recv(2**16):
+            answers += received
+    assert answers.count(b"done") == count
