@@ -24,8 +24,8 @@ def voxel_downsample(
         size: side of a cube, in the points' unit.
 
     Returns:
-        points [m, 3] and colors [m, c] of the types given (uint8 means are rounded, halves up); cubes in lexicographic
-        order of y, x, z.
+        points [m, 3] and colors [m, c] of the types given (uint8 means are rounded, halves up), cubes in lexicographic
+        order.
 
     Raises:
         InputError: a size that is not positive, points that are not finite, or other shapes.
@@ -43,8 +43,8 @@ def voxel_downsample(
     extent = cubes.max(axis=1) + 1
     if float(extent[0]) * float(extent[1]) * float(extent[2]) >= 2**62:
         raise InputError(f"size is {size!r}; too small for a cloud that spans {np.ptp(exact, axis=1).tolist()}")
-    # Pixels come row by row, so that keys with y first are nearly in order, which a stable sort makes use of.
-    key = (cubes[1] * extent[0] + cubes[0]) * extent[2] + cubes[2]
+    key = (cubes[0] * extent[1] + cubes[1]) * extent[2] + cubes[2]
+    # In place of `np.unique`: pixels come in rows, and a stable sort makes use of what is in order already.
     order = np.argsort(key, kind="stable")
     cube = np.empty_like(order)
     cube[order] = np.cumsum(np.diff(key[order], prepend=-1) != 0) - 1

@@ -17,7 +17,7 @@ def by_dictionary(points: np.ndarray, values: np.ndarray, size: float) -> tuple[
     cubes: dict[tuple[int, ...], list[int]] = {}
     for i, point in enumerate(points):
         cubes.setdefault(tuple(math.floor((point[k] - low[k]) / size) for k in range(3)), []).append(i)
-    members = [cubes[key] for key in sorted(cubes, key=lambda key: (key[1], key[0], key[2]))]
+    members = [cubes[key] for key in sorted(cubes)]
     return np.array([points[m].mean(axis=0) for m in members]), np.array([values[m].mean(axis=0) for m in members])
 
 
