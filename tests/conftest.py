@@ -23,7 +23,7 @@ SHARED = Path(__file__).resolve().parents[1].parent / "shared"
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--thorough", action="store_true", help="laws and readers with many more examples; takes 20 minutes more")
+    parser.addoption("--thorough", action="store_true", help="many more examples of laws and damaged files")
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
