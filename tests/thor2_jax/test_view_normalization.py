@@ -118,6 +118,17 @@ def test_degenerate_clouds_move_rigidly_too(name: str) -> None:
     assert (np.diff(after.max(axis=0)) <= 2e-6).all()
 
 
+@pytest.mark.parametrize("height", [0.03, 0.045, 0.055, 0.07])
+@pytest.mark.parametrize("heavy", ["below", "above"])
+def test_the_camera_s_side_is_told_from_the_box_s_middle(height: float, heavy: str) -> None:
+    """A camera beside a slab whose mean lies near one of its large faces."""
+    rng = np.random.default_rng(0)
+    points = rng.random((450, 3)) * [0.4, 0.3, 0.1]
+    points[:400, 2] = 0 if heavy == "below" else 0.1
+    normal = thor2.view_normalize(pack(points, camera=np.array([1, 0.15, height])), CONFIG)
+    assert float(normal.camera[0, 2]) <= float(normal.points[0, : len(points), 2].max()) / 2
+
+
 def test_the_camera_is_brought_to_the_near_side() -> None:
     """The same cloud from two opposite sides: a half turn about x apart."""
     points = object_cloud(3)
