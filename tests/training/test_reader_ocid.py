@@ -383,6 +383,8 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     assert "2 instances scored" in capsys.readouterr().out
     report = json.loads((tmp_path / "report" / "report.json").read_text())
     assert report["instances"]["scored"] == 2 and sum(report["instances"]["no_class"].values()) == 1
+    page = (tmp_path / "report" / "report.html").read_text()
+    assert "<h2>Confusions</h2>\n<p>There are none.</p>" in page and "Runs: run." in page
     cell = report["accuracy"]["larger"][0]["cells"][0]
     assert cell["instances"] == 2 and cell["accuracy"]["TOPS"]["mean"] == 1.0
     names.unlink()

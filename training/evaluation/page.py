@@ -174,6 +174,8 @@ def _confusions(found: Mapping[str, Any], gallery: Gallery, out: Path) -> Sectio
         crop = gallery.confusion(truth, answer)
         if crop.is_file():
             pictures.append(Picture(_relative(crop, out), f"{truth} named {answer}", small=True))
+    if not rows:
+        return "Confusions", "There are none.", None, pictures
     text = "The most frequent confusions, each with the instance that the wrong answer was surest of."
     return "Confusions", text, (["", "answers", "of all to this object"], rows), pictures
 
@@ -185,7 +187,7 @@ def _measured(found: Mapping[str, Any]) -> Section:
     if speed["median_seconds"]:
         text += f"; median {speed['median_seconds']:.2f} s a frame"
     text += "." + "".join(f" {name}: {seconds} s a frame." for name, seconds in published_seconds().items())
-    rows = [[f"run {run}", ""] for run in found["runs"]]
-    rows += [[f"not described: {reason}", f"{n:,}"] for reason, n in counts["not_described"].items()]
+    text += f" Runs: {', '.join(found['runs'])}."
+    rows = [[f"not described: {reason}", f"{n:,}"] for reason, n in counts["not_described"].items()]
     rows += [[f"not scored, no class of the runs: {name}", f"{n:,}"] for name, n in counts["no_class"].items()]
-    return "How it was measured", text, (["", "instances"], rows), []
+    return "How it was measured", text, (["", "instances"], rows) if rows else None, []
