@@ -198,6 +198,7 @@ def test_train_by_sequences(meshes: Path, tmp_path: Path, run: Run) -> None:
     assert (out / "table/a/run.json").read_bytes() == first
     assert sorted(json.loads((out / "b/run.json").read_text())["classes"]) == sorted([soup, cereal])
     cases = {
+        json.dumps({"b": [cereal, mug]}): "b was trained on other views",
         "{}": "has no sequence",
         '{"c": ["dragon"]}': "no class dragon",
         '{"c": "mug"}': "c is 'mug'",

@@ -53,7 +53,7 @@ def train_baselines(
         OSError: a file cannot be written.
     """
     wanted = check_baselines(names)
-    for folder in run_folders([Path(path)]) if wanted else []:
+    for folder in run_folders([Path(path)]):
         lacking = [name for name in wanted if not baseline_file(folder, name).is_file()]
         run = load_run(folder)
         record = run.record

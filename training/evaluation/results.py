@@ -14,6 +14,7 @@ from training.evaluation.answers import FrameAnswers, InstanceAnswer
 from training.evaluation.confidence import accuracy_at_coverage, auroc, expected_calibration_error, reliability
 from training.evaluation.joining import RULES, Rule, join_by, joinings, main_joining
 from training.evaluation.published import published
+from training.readers.labelled import sequence_of
 
 __all__ = ["COVERAGE", "Answered", "answered", "results", "wrong_answers"]
 
@@ -75,7 +76,7 @@ def wrong_answers(
 
 def _attributes(kind: str, frame: FrameAnswers) -> dict[str, str]:
     # OCID's tables go by sequence: the folder of the frame.
-    sequence = {"sequence": frame.frame.rpartition("/")[0]} if kind == "ocid" else {}
+    sequence = {"sequence": sequence_of(frame.frame)} if kind == "ocid" else {}
     return {**frame.attributes, **sequence}
 
 

@@ -20,6 +20,7 @@ from training.baselines.baseline import Baseline, Seen
 from training.baselines.files import baseline_file
 from training.baselines.load import load_baselines
 from training.checkpoints import CHECKPOINTS
+from training.readers.labelled import path_ends, sequence_of
 
 __all__ = ["Run", "SequenceRun", "load_runs", "load_sequence_runs", "run_folders"]
 
@@ -144,7 +145,7 @@ class SequenceRun(Run):
 
     def probabilities(self, frame: str, described: DescribedFrame, seen: Seen | None) -> dict[str, NDArray[np.float32]]:
         """As of the sequence's own run, and 0 for objects that it does not know."""
-        run = self.of_sequence[frame.rpartition("/")[0]]
+        run = self.of_sequence[sequence_of(frame)]
         columns = [self.classes.index(name) for name in run.classes]
         found = {}
         for name, values in run.probabilities(frame, described, seen).items():
@@ -172,10 +173,8 @@ def load_sequence_runs(folder: Path, frames: Iterable[str]) -> list[SequenceRun]
     loaded: dict[Path, list[Run]] = {}
     of_sequence: dict[str, list[Run]] = {}
     lacking = []
-    for sequence in dict.fromkeys(frame.rpartition("/")[0] for frame in frames):
-        parts = sequence.split("/")
-        ends = (folder / "/".join(parts[start:]) for start in range(len(parts)))
-        own = next((end for end in ends if end.is_dir()), None)
+    for sequence in dict.fromkeys(map(sequence_of, frames)):
+        own = next((folder / end for end in path_ends(sequence) if (folder / end).is_dir()), None)
         if own is None:
             lacking.append(sequence)
         else:

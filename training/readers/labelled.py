@@ -6,7 +6,18 @@ from collections.abc import Iterator, Mapping, Sequence
 
 from thor2_jax.frames import RGBDFrame
 
-__all__ = ["LabelledFrame", "LabelledFrames"]
+__all__ = ["LabelledFrame", "LabelledFrames", "path_ends", "sequence_of"]
+
+
+def sequence_of(identifier: str) -> str:
+    """The sequence a/b/c of the frame a/b/c/d."""
+    return identifier.rpartition("/")[0]
+
+
+def path_ends(sequence: str) -> list[str]:
+    """What a sequence a/b/c may be called, the longest first: a/b/c, b/c, c."""
+    parts = sequence.split("/")
+    return ["/".join(parts[start:]) for start in range(len(parts))]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

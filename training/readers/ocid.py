@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from thor2_jax.errors import InputError
 from thor2_jax.frames import Intrinsics, RGBDFrame, read_color, read_depth, read_labels
 from training.readers.files import complaints_about, read_table
-from training.readers.labelled import LabelledFrame, LabelledFrames
+from training.readers.labelled import LabelledFrame, LabelledFrames, path_ends
 from training.readers.pcd import read_organized_points
 
 __all__ = ["OCID", "fit_intrinsics"]
@@ -84,8 +84,7 @@ def _names(path: Path, sequences: Iterable[_Sequence]) -> dict[_Sequence, list[s
     named: dict[_Sequence, list[str]] = {}
     lacking = []
     for sequence in sequences:
-        ends = ("/".join(sequence[start:]) for start in range(len(sequence)))
-        key = next((end for end in ends if end in table), None)
+        key = next((end for end in path_ends("/".join(sequence)) if end in table), None)
         if key is None:
             lacking.append("/".join(sequence))
             continue
