@@ -15,7 +15,7 @@ import numpy as np
 
 from thor2_jax.reductions import ROWS, argmax, fold, larger, largest, smaller, smallest
 
-__all__ = ["minimal_box_axes", "rotate", "support_points"]
+__all__ = ["minimal_box", "rotate", "support_points"]
 
 HIGHEST = jax.lax.Precision.HIGHEST
 """TF32 would lose three digits of a coordinate on recent GPUs."""
@@ -138,8 +138,8 @@ def _search(support: jax.Array, axes: jax.Array) -> tuple[jax.Array, jax.Array]:
     return axes, jnp.prod(turned.max(axis=1) - turned.min(axis=1))
 
 
-def minimal_box_axes(points: jax.Array) -> jax.Array:
-    """Axes of an approximately minimal-volume oriented box: rows of a rotation, longest side first, signs arbitrary.
+def minimal_box(points: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """An approximately minimal-volume oriented box: its axes, longest side first, and the cloud's ends along them.
 
     Two starts, the principal axes of all points and those of the support points (as of the hull's vertices, which is
     the released rule); the smaller box wins. No gradient flows through the axes: they jump where another face becomes
@@ -149,7 +149,7 @@ def minimal_box_axes(points: jax.Array) -> jax.Array:
         points: [3, N] float32, mean zero, padding at the origin; N is a multiple of 16.
 
     Returns:
-        [3, 3] float32, orthonormal.
+        [3, 3] float32, orthonormal rows, their signs arbitrary; [3] least and [3] greatest coordinate along each.
     """
     points = jax.lax.stop_gradient(points)
     frame = _eigenvectors(_moments(points))
@@ -162,5 +162,6 @@ def minimal_box_axes(points: jax.Array) -> jax.Array:
     found, volumes = jax.vmap(lambda start: _search(support, start))(starts)
     axes = found[jnp.argmin(volumes)]
     turned = rotate(axes, principal)
-    sides = largest(turned) - smallest(turned)
-    return jnp.matmul(axes[jnp.argsort(-sides)], frame, precision=HIGHEST)
+    low, high = smallest(turned), largest(turned)
+    order = jnp.argsort(low - high)
+    return jnp.matmul(axes[order], frame, precision=HIGHEST), low[order], high[order]

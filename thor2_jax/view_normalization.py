@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from thor2_jax.bounding_box import HIGHEST, minimal_box_axes, rotate
+from thor2_jax.bounding_box import HIGHEST, minimal_box, rotate
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
 from thor2_jax.parameters import Parameters
@@ -33,14 +33,16 @@ def _planes(cloud: PointClouds) -> tuple[jax.Array, jax.Array]:
     return jnp.pad(cloud.points, ((0, missing), (0, 0))).T, jnp.pad(cloud.mask, (0, missing))
 
 
-def _to_first_octant(points: jax.Array, mask: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Points [3, M] moved so that the least coordinate along each axis is 0, and the shift [3]. Padding is set to 0."""
+def _place(rotation: jax.Array, points: jax.Array, mask: jax.Array, camera: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Points [3, M] and camera [3], rotated and moved so that the least coordinate along each axis is 0; padding 0."""
+    points = rotate(rotation, points)
     low = smallest(jnp.where(mask, points, jnp.inf))
     low = jnp.where(jnp.isfinite(low), low, 0)
-    return jnp.where(mask, points - low[:, None], 0), low
+    return jnp.where(mask, points - low[:, None], 0), jnp.matmul(rotation, camera, precision=HIGHEST) - low
 
 
-def _normalize_one(cloud: PointClouds, sigma_s: jax.Array) -> PointClouds:
+def _frame(cloud: PointClouds, sigma_s: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    """The rotation [3, 3] of the view normalization, and what it turns: points [3, M] about their mean, mask, camera."""
     points, mask = _planes(cloud)
     scaled = points * sigma_s
     centre = total(jnp.where(mask, scaled, 0)) / jnp.maximum(mask.sum(), 1)
@@ -48,9 +50,7 @@ def _normalize_one(cloud: PointClouds, sigma_s: jax.Array) -> PointClouds:
     centred = jnp.where(mask, scaled - centre[:, None], 0)
     camera = cloud.camera * sigma_s - centre
 
-    axes = minimal_box_axes(centred)
-    turned = rotate(axes, centred)
-    low, high = smallest(turned), largest(turned)
+    axes, low, high = minimal_box(centred)
     middle = (low + high) / 2
 
     # The mean is the origin here: the heavier half lies below the middle where the middle is positive.
@@ -60,7 +60,7 @@ def _normalize_one(cloud: PointClouds, sigma_s: jax.Array) -> PointClouds:
     z_sign = jnp.where(camera_z > 0, -1.0, 1.0)
 
     x_low = jnp.minimum(low[0] * x_sign, high[0] * x_sign)
-    bins = jnp.floor(turned[0] * x_sign / OCCLUSION_BIN - x_low / OCCLUSION_BIN)
+    bins = jnp.floor(rotate(axes[:1], centred)[0] * x_sign / OCCLUSION_BIN - x_low / OCCLUSION_BIN)
     last = largest(jnp.where(mask, bins, -1))
     edge = jnp.pad(cloud.boundary, (0, len(mask) - len(cloud.boundary))) & mask
     at_start = (edge & (bins <= 1)).sum()
@@ -69,9 +69,11 @@ def _normalize_one(cloud: PointClouds, sigma_s: jax.Array) -> PointClouds:
     x_sign = jnp.where(at_start > at_end, -x_sign, x_sign)
 
     x, z = axes[0] * x_sign, axes[2] * z_sign
-    frame = jax.lax.stop_gradient(jnp.stack([x, jnp.cross(z, x), z]))
-    points, shift = _to_first_octant(rotate(frame, centred), mask)
-    camera = jnp.matmul(frame, camera, precision=HIGHEST) - shift
+    return jax.lax.stop_gradient(jnp.stack([x, jnp.cross(z, x), z])), centred, mask, camera
+
+
+def _normalize_one(cloud: PointClouds, sigma_s: jax.Array) -> PointClouds:
+    points, camera = _place(*_frame(cloud, sigma_s))
     return dataclasses.replace(cloud, points=points.T[: len(cloud.mask)], camera=camera)
 
 
@@ -103,12 +105,13 @@ def view_normalize(clouds: PointClouds, config: DescriptorConfig, parameters: Pa
     return _view_normalize(clouds, np.float32(config.sigma_s) if parameters is None else parameters.sigma_s)
 
 
-def _turn_one(cloud: PointClouds, alpha: jax.Array) -> PointClouds:
+def _about_y(alpha: jax.Array) -> jax.Array:
     c, s = jnp.cos(alpha), jnp.sin(alpha)
-    about_y = jnp.array([[c, 0, -s], [0, 1, 0], [s, 0, c]])
-    points, mask = _planes(cloud)
-    points, shift = _to_first_octant(rotate(about_y, points), mask)
-    camera = jnp.matmul(about_y, cloud.camera, precision=HIGHEST) - shift
+    return jnp.array([[c, 0, -s], [0, 1, 0], [s, 0, c]])
+
+
+def _turn_one(cloud: PointClouds, alpha: jax.Array) -> PointClouds:
+    points, camera = _place(_about_y(alpha), *_planes(cloud), cloud.camera)
     return dataclasses.replace(cloud, points=points.T[: len(cloud.mask)], camera=camera)
 
 
@@ -136,8 +139,10 @@ def turn(normal: PointClouds, config: DescriptorConfig, parameters: Parameters |
 @jax.jit
 def _align(clouds: PointClouds, sigma_s: jax.Array, alpha: jax.Array) -> tuple[jax.Array, jax.Array]:
     def points_and_camera(cloud: PointClouds) -> tuple[jax.Array, jax.Array]:
-        aligned = _turn_one(_normalize_one(cloud, sigma_s), alpha)
-        return aligned.points, aligned.camera  # the rest of the cloud would be copied
+        frame, *cloud_about_mean = _frame(cloud, sigma_s)
+        # One rotation: the shift between the two would cancel.
+        points, camera = _place(jnp.matmul(_about_y(alpha), frame, precision=HIGHEST), *cloud_about_mean)
+        return points.T[: len(cloud.mask)], camera  # the rest of the cloud would be copied
 
     return jax.vmap(points_and_camera)(clouds)
 
