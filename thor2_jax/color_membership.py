@@ -50,6 +50,6 @@ def color_sets(colors: jax.Array, sets: RegionSets) -> jax.Array:
     """
     eight_bit = jnp.floor(colors * 255 + 0.5)
     # In floats, and faster: the nearest level's quotient is at least 1 / 10 away from the next whole number.
-    level = jnp.floor((eight_bit + GRID_STEP / 2) * np.float32(1 / GRID_STEP)).astype(jnp.int32)
+    level = jnp.floor((eight_bit + GRID_STEP / 2) * np.float32(1 / GRID_STEP))
     color = (level[..., 0] * GRID_LEVELS + level[..., 1]) * GRID_LEVELS + level[..., 2]
-    return sets.of_color[color].astype(jnp.int32)
+    return sets.of_color.at[color.astype(jnp.int32)].get(mode="clip").astype(jnp.int32)

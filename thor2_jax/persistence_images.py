@@ -46,11 +46,16 @@ def persistence_images(
         diagram.
     """
     persistence = jnp.where(diagrams.mask, diagrams.deaths - diagrams.births, 0)
+    births = strip_births(config)
+    # Whole vector registers of pairs.
+    padding = -len(births) % 8
+    persistence = jnp.pad(persistence, [(0, 0)] * (persistence.ndim - 1) + [(0, padding)])
+    births = jnp.pad(births, (0, padding))
     variance = config.image_variance if variance is None else variance
     # No persistence, no weight: padding adds nothing.
     weight = _weight(persistence, config.persistence_weight if persistence_weight is None else persistence_weight)
     by_persistence = _at_edges(persistence, variance, config) * weight[..., None, :]
-    by_birth = jnp.diff(_at_edges(strip_births(config), variance, config), axis=-2)
+    by_birth = jnp.diff(_at_edges(births, variance, config), axis=-2)
     # Differences along persistence are taken of the product: before it, compilers make each edge's `erf` twice.
     images = jnp.diff(jnp.matmul(by_persistence, by_birth.T, precision=jax.lax.Precision.HIGHEST), axis=-2) / 4
     return jnp.swapaxes(images, -1, -2)
