@@ -24,7 +24,7 @@ from thor2_jax.persistence import diagrams_of_strips
 from thor2_jax.persistence_images import past_window, persistence_images
 from thor2_jax.slicing import strips_of_cloud
 from thor2_jax.types import Descriptors, Diagrams, PointClouds, Strips
-from thor2_jax.view_normalization import align
+from thor2_jax.view_normalization import align_planes
 
 __all__ = ["describe", "describe_aligned", "describe_strips", "diagrams", "strips", "strips_by_sets"]
 
@@ -49,9 +49,22 @@ def _check(clouds: PointClouds) -> None:
 _color_sets = jax.jit(color_sets)
 
 
+@partial(jax.jit, static_argnums=5)
+def _strips_of_planes(
+    points: jax.Array,
+    colors: jax.Array,
+    mask: jax.Array,
+    set_of_point: jax.Array,
+    sets: RegionSets,
+    config: DescriptorConfig,
+) -> Strips:
+    return jax.vmap(lambda *cloud: strips_of_cloud(*cloud, sets, config))(points, colors, mask, set_of_point)
+
+
 @partial(jax.jit, static_argnums=3)
 def _strips_of(aligned: PointClouds, set_of_point: jax.Array, sets: RegionSets, config: DescriptorConfig) -> Strips:
-    return jax.vmap(lambda cloud, of_point: strips_of_cloud(cloud, of_point, sets, config))(aligned, set_of_point)
+    planes = jnp.swapaxes(aligned.points, 1, 2)
+    return _strips_of_planes(planes, aligned.colors, aligned.mask, set_of_point, sets, config)
 
 
 def strips_by_sets(aligned: PointClouds, sets: RegionSets, config: DescriptorConfig) -> Strips:
@@ -140,7 +153,10 @@ def describe(
     # Tables of more clouds than that do not stay in a CPU's caches, and a cloud costs twice as much.
     if len(clouds.mask) > BATCH_BUCKETS[-1] and jax.default_backend() == "cpu":
         return _describe_in_parts(clouds, network, config, parameters)
-    return describe_aligned(align(clouds, config, parameters), network, config, parameters)
+    sets = _region_sets(network)
+    planes = align_planes(clouds, config, parameters)
+    found = _strips_of_planes(planes, clouds.colors, clouds.mask, _color_sets(clouds.colors, sets), sets, config)
+    return describe_strips(found, network, config, parameters)
 
 
 @partial(jax.jit, static_argnums=(1, 2))

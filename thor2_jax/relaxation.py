@@ -19,7 +19,7 @@ import numpy as np
 from colornet.grid import GRID_LEVELS, GRID_STEP, grid_colors
 from thor2_jax.color_membership import RegionSets
 from thor2_jax.config import DescriptorConfig, Relaxation
-from thor2_jax.types import PointClouds, Strips
+from thor2_jax.types import Strips
 
 __all__ = ["hyab", "interval_weights", "relaxed_strips", "soft_regions", "to_lab"]
 
@@ -74,7 +74,14 @@ def _rise(weight: jax.Array, above: jax.Array, temperature: float) -> jax.Array:
     return temperature * (top + jnp.log(jnp.maximum(terms, floor)))
 
 
-def relaxed_strips(cloud: PointClouds, sets: RegionSets, config: DescriptorConfig, overflow: jax.Array) -> Strips:
+def relaxed_strips(
+    points: jax.Array,
+    colors: jax.Array,
+    mask: jax.Array,
+    sets: RegionSets,
+    config: DescriptorConfig,
+    overflow: jax.Array,
+) -> Strips:
     """Soft extremes and colour vectors of every strip of one aligned cloud (no batch axis).
 
     With w the weight of a point in a strip and m the mean of y with the weights w^2, the extremes are
@@ -83,7 +90,9 @@ def relaxed_strips(cloud: PointClouds, sets: RegionSets, config: DescriptorConfi
     any weight has hardly any persistence, and so vanishes from the image; so does a strip of one point.
 
     Args:
-        cloud: points [N, 3], scaled units; those with a negative x or z count for nothing, as in hard slices.
+        points: [3, N], scaled units; those with a negative x or z count for nothing, as in hard slices.
+        colors: [N, 3] sRGB in [0, 1].
+        mask: [N] bool.
         sets: of the colour network's regions.
         config: its `relaxation` gives the temperatures. Static.
         overflow: [] int32, passed on.
@@ -92,11 +101,11 @@ def relaxed_strips(cloud: PointClouds, sets: RegionSets, config: DescriptorConfi
         Strips, "occupied" where any weight is.
     """
     relaxation = config.relaxation or Relaxation()
-    x, y, z = cloud.points.T
-    counted = (cloud.mask & (x >= 0) & (z >= 0))[:, None]
+    x, y, z = points
+    counted = (mask & (x >= 0) & (z >= 0))[:, None]
     log_slice = interval_weights(z, config.sigma_1, config.n_slices, relaxation.slice)
     log_strip = interval_weights(x, config.sigma_2, config.n_strips, relaxation.strip)
-    regions = soft_regions(cloud.colors, sets, relaxation.color)
+    regions = soft_regions(colors, sets, relaxation.color)
 
     # Checkpoint: the [N, J] arrays of a slice are computed again for its gradient rather than kept for all slices.
     @jax.checkpoint

@@ -13,7 +13,7 @@ import numpy as np
 from thor2_jax.color_membership import RegionSets
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.relaxation import relaxed_strips
-from thor2_jax.types import PointClouds, Strips
+from thor2_jax.types import Strips
 
 __all__ = ["slice_and_strip", "strip_births", "strips_of_cloud"]
 
@@ -27,20 +27,22 @@ def strip_births(config: DescriptorConfig) -> jax.Array:
     return jnp.asarray(np.arange(config.n_strips) * config.sigma_2, jnp.float32)
 
 
-def slice_and_strip(points: jax.Array, mask: jax.Array, config: DescriptorConfig) -> tuple[jax.Array, jax.Array]:
+def slice_and_strip(
+    x: jax.Array, z: jax.Array, mask: jax.Array, config: DescriptorConfig
+) -> tuple[jax.Array, jax.Array]:
     """Slice and strip number of each point of one aligned cloud.
 
     Slice i is {i s1 <= z < (i+1) s1}, strip j is {j s2 <= x < (j+1) s2}.
 
     Args:
-        points: [N, 3] float32, scaled units, first octant.
+        x: [N] float32, scaled units, as `z` of the first octant.
+        z: [N] float32.
         mask: [N] bool.
         config: static.
 
     Returns:
         Two [N] int32 arrays, not limited to the descriptor's size; what padding holds means nothing.
     """
-    x, z = points[:, 0], points[:, 2]
     if config.convention == "paper":
         return jnp.floor(z / config.sigma_1).astype(jnp.int32), jnp.floor(x / config.sigma_2).astype(jnp.int32)
     # Rounded to 0.01, x is k / 100; the first edge j / 40 that is not below it has j = ceil(2 k / 5), in whole numbers.
@@ -97,28 +99,38 @@ def _extremes_jvp(n_segments: int, primals: Any, tangents: Any) -> Any:
     return found, tuple(tangent(values) for values in found)
 
 
-def strips_of_cloud(cloud: PointClouds, set_of_point: jax.Array, sets: RegionSets, config: DescriptorConfig) -> Strips:
+def strips_of_cloud(
+    points: jax.Array,
+    colors: jax.Array,
+    mask: jax.Array,
+    set_of_point: jax.Array,
+    sets: RegionSets,
+    config: DescriptorConfig,
+) -> Strips:
     """Extreme points and colour vectors of every strip of one aligned cloud (no batch axis).
 
     A config with a relaxation gives the soft ones (`relaxation`).
 
     Args:
-        cloud: points [N, 3], scaled units, first octant.
+        points: [3, N], scaled units, first octant.
+        colors: [N, 3] sRGB, of which a relaxation needs more than their sets.
+        mask: [N] bool.
         set_of_point: [N] int32, the set of each point's colour, as of `color_sets`.
         sets: of the colour network's regions.
         config: static.
     """
     n_segments = config.n_slices * config.n_strips
-    i, j = slice_and_strip(cloud.points, cloud.mask, config)
+    x, y, z = points
+    i, j = slice_and_strip(x, z, mask, config)
     # What is no number would become slice and strip 0.
-    inside = cloud.mask & jnp.isfinite(cloud.points).all(axis=-1)
+    inside = mask & jnp.isfinite(x) & jnp.isfinite(y) & jnp.isfinite(z)
     inside &= (i >= 0) & (i < config.n_slices) & (j >= 0) & (j < config.n_strips)
-    overflow = (cloud.mask & ~inside).sum(dtype=jnp.int32)
+    overflow = (mask & ~inside).sum(dtype=jnp.int32)
     if config.relaxation is not None:
-        return relaxed_strips(cloud, sets, config, overflow)
+        return relaxed_strips(points, colors, mask, sets, config, overflow)
     segment = jnp.where(inside, i * config.n_strips + j, n_segments)  # past the end: dropped by the scatters
 
-    low, high = _extremes(cloud.points[:, 1], segment, n_segments)
+    low, high = _extremes(y, segment, n_segments)
     occupied = low <= high
     extremes = jnp.where(occupied[:, None], jnp.stack([low, high], axis=-1), 0)
 

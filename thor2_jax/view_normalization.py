@@ -13,6 +13,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 from thor2_jax.bounding_box import HIGHEST, minimal_box, rotate
 from thor2_jax.config import DescriptorConfig
@@ -21,10 +22,16 @@ from thor2_jax.parameters import Parameters
 from thor2_jax.reductions import ROWS, largest, smallest, total
 from thor2_jax.types import PointClouds
 
-__all__ = ["align", "mirror", "turn", "view_normalize"]
+__all__ = ["align", "align_planes", "mirror", "turn", "view_normalize"]
 
 OCCLUSION_BIN = 0.01
 """Width in scaled units of the x-bins in which boundary points are counted; two at either end decide."""
+
+
+def _sigma_s_and_alpha(config: DescriptorConfig, parameters: Parameters | None) -> tuple[ArrayLike, ArrayLike]:
+    if parameters is None:
+        return np.float32(config.sigma_s), np.float32(config.alpha)
+    return parameters.sigma_s, parameters.alpha
 
 
 def _planes(cloud: PointClouds) -> tuple[jax.Array, jax.Array]:
@@ -46,7 +53,7 @@ def _count(flags: jax.Array) -> jax.Array:
     return total(flags.astype(jnp.float32))
 
 
-def _frame(cloud: PointClouds, sigma_s: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+def _frame(cloud: PointClouds, sigma_s: ArrayLike) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
     """The rotation [3, 3] of the view normalization, and what it turns: points [3, M] about their mean, mask, camera."""
     points, mask = _planes(cloud)
     scaled = points * sigma_s
@@ -75,13 +82,13 @@ def _frame(cloud: PointClouds, sigma_s: jax.Array) -> tuple[jax.Array, jax.Array
     return jax.lax.stop_gradient(jnp.stack([x, jnp.cross(z, x), z])), centred, mask, camera
 
 
-def _normalize_one(cloud: PointClouds, sigma_s: jax.Array) -> PointClouds:
+def _normalize_one(cloud: PointClouds, sigma_s: ArrayLike) -> PointClouds:
     points, camera = _place(*_frame(cloud, sigma_s))
     return dataclasses.replace(cloud, points=points.T[: len(cloud.mask)], camera=camera)
 
 
 @jax.jit
-def _view_normalize(clouds: PointClouds, sigma_s: jax.Array) -> PointClouds:
+def _view_normalize(clouds: PointClouds, sigma_s: ArrayLike) -> PointClouds:
     return jax.vmap(lambda cloud: _normalize_one(cloud, sigma_s))(clouds)
 
 
@@ -105,21 +112,21 @@ def view_normalize(clouds: PointClouds, config: DescriptorConfig, parameters: Pa
     Returns:
         Clouds in scaled units; `camera` moved along; colours, mask and boundary as they were.
     """
-    return _view_normalize(clouds, np.float32(config.sigma_s) if parameters is None else parameters.sigma_s)
+    return _view_normalize(clouds, _sigma_s_and_alpha(config, parameters)[0])
 
 
-def _about_y(alpha: jax.Array) -> jax.Array:
+def _about_y(alpha: ArrayLike) -> jax.Array:
     c, s = jnp.cos(alpha), jnp.sin(alpha)
     return jnp.array([[c, 0, -s], [0, 1, 0], [s, 0, c]])
 
 
-def _turn_one(cloud: PointClouds, alpha: jax.Array) -> PointClouds:
+def _turn_one(cloud: PointClouds, alpha: ArrayLike) -> PointClouds:
     points, camera = _place(_about_y(alpha), *_planes(cloud), cloud.camera)
     return dataclasses.replace(cloud, points=points.T[: len(cloud.mask)], camera=camera)
 
 
 @jax.jit
-def _turn(normal: PointClouds, alpha: jax.Array) -> PointClouds:
+def _turn(normal: PointClouds, alpha: ArrayLike) -> PointClouds:
     return jax.vmap(lambda cloud: _turn_one(cloud, alpha))(normal)
 
 
@@ -136,26 +143,36 @@ def turn(normal: PointClouds, config: DescriptorConfig, parameters: Parameters |
     Returns:
         The aligned clouds, scaled units, in the first octant.
     """
-    return _turn(normal, np.float32(config.alpha) if parameters is None else parameters.alpha)
+    return _turn(normal, _sigma_s_and_alpha(config, parameters)[1])
 
 
 @jax.jit
-def _align(clouds: PointClouds, sigma_s: jax.Array, alpha: jax.Array) -> tuple[jax.Array, jax.Array]:
-    def points_and_camera(cloud: PointClouds) -> tuple[jax.Array, jax.Array]:
-        frame, *cloud_about_mean = _frame(cloud, sigma_s)
+def _align_planes(clouds: PointClouds, sigma_s: ArrayLike, alpha: ArrayLike) -> tuple[jax.Array, jax.Array]:
+    def one(cloud: PointClouds) -> tuple[jax.Array, jax.Array]:
+        frame, points, mask, camera = _frame(cloud, sigma_s)
         # One rotation: the shift between the two would cancel.
-        points, camera = _place(jnp.matmul(_about_y(alpha), frame, precision=HIGHEST), *cloud_about_mean)
-        return points.T[: len(cloud.mask)], camera  # the rest of the cloud would be copied
+        rotation = jnp.matmul(_about_y(alpha), frame, precision=HIGHEST)
+        points, camera = _place(rotation, points, mask, camera)
+        return points[:, : len(cloud.mask)], camera  # the rest of the cloud would be copied
 
-    return jax.vmap(points_and_camera)(clouds)
+    return jax.vmap(one)(clouds)
+
+
+@jax.jit
+def _align(clouds: PointClouds, sigma_s: ArrayLike, alpha: ArrayLike) -> tuple[jax.Array, jax.Array]:
+    planes, camera = _align_planes(clouds, sigma_s, alpha)
+    return jnp.swapaxes(planes, 1, 2), camera
 
 
 def align(clouds: PointClouds, config: DescriptorConfig, parameters: Parameters | None = None) -> PointClouds:
     """`turn` of `view_normalize`: clouds in metres to aligned clouds in scaled units, ready to be sliced."""
-    sigma_s = np.float32(config.sigma_s) if parameters is None else parameters.sigma_s
-    alpha = np.float32(config.alpha) if parameters is None else parameters.alpha
-    points, camera = _align(clouds, sigma_s, alpha)
+    points, camera = _align(clouds, *_sigma_s_and_alpha(config, parameters))
     return dataclasses.replace(clouds, points=points, camera=camera)
+
+
+def align_planes(clouds: PointClouds, config: DescriptorConfig, parameters: Parameters | None = None) -> jax.Array:
+    """The points of `align` as planes, [B, 3, N], which spares those who slice them next two transpositions."""
+    return _align_planes(clouds, *_sigma_s_and_alpha(config, parameters))[0]
 
 
 @partial(jax.jit, static_argnums=1)
