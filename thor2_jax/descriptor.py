@@ -58,7 +58,8 @@ def _strips_of_planes(
     sets: RegionSets,
     config: DescriptorConfig,
 ) -> Strips:
-    return jax.vmap(lambda *cloud: strips_of_cloud(*cloud, sets, config))(points, colors, mask, set_of_point)
+    one = partial(strips_of_cloud, sets=sets, config=config)
+    return jax.vmap(one)(points, colors, mask, set_of_point)
 
 
 @partial(jax.jit, static_argnums=3)

@@ -66,7 +66,7 @@ def instance_cloud(frame: RGBDFrame, label: int) -> InstanceCloud:
         trusted &= ~flying
     valid, depth = pixels[trusted], depth[trusted]
     points = (pixel_rays(valid, frame.labels.shape[1], frame.intrinsics) * depth[:, None]).astype(np.float32)
-    points, colors = voxel_downsample(points, frame.color.reshape(-1, 3)[valid], VOXEL)
+    points, colors = voxel_downsample(points, frame.color.reshape(-1, 3).take(valid, axis=0), VOXEL)
     if len(points) < MIN_POINTS:
         reason = (
             f"{len(points)} points ({len(pixels)} pixels, {len(valid)} of them with depth "
@@ -74,4 +74,4 @@ def instance_cloud(frame: RGBDFrame, label: int) -> InstanceCloud:
         )
         return InstanceCloud(label, points, colors, len(pixels), reason=reason)
     kept, relaxed = remove_outliers(points)
-    return InstanceCloud(label, points[kept], colors[kept], len(pixels), steep or relaxed)
+    return InstanceCloud(label, points.take(kept, axis=0), colors.take(kept, axis=0), len(pixels), steep or relaxed)

@@ -71,12 +71,15 @@ def _grid(points: NDArray[np.float64]) -> tuple[NDArray[np.int64], tuple[int, ..
     Two layers of cells on every side are empty, so that no cell touches the first.
     """
     place = np.floor(points / CELL)
-    place -= np.floor(np.median(place, axis=1, keepdims=True))
-    near = (np.abs(place) <= REACH).all(axis=0)
-    cells = np.where(near, place, 0).astype(np.int64)
-    cells -= cells.min(axis=1, keepdims=True) - 2
+    near = None
+    if np.ptp(place, axis=1).max() > REACH:
+        place -= np.floor(np.median(place, axis=1, keepdims=True))
+        near = (np.abs(place) <= REACH).all(axis=0)
+        place = np.where(near, place, 0)
+    cells = (place - place.min(axis=1, keepdims=True)).astype(np.int64) + 2
     shape = tuple((cells.max(axis=1) + 3).tolist())
-    return np.where(near, np.ravel_multi_index(tuple(cells), shape), 0), shape
+    flat = np.ravel_multi_index(tuple(cells), shape)
+    return flat if near is None else np.where(near, flat, 0), shape
 
 
 def _surrounded(points: NDArray[np.float64], cell: NDArray[np.int64], shape: tuple[int, ...]) -> NDArray[np.bool_]:

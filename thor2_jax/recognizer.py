@@ -308,10 +308,10 @@ def _rows(n: int) -> int:
 
 
 def pack_parts(parts: Sequence[Part], n_rows: int, capacity: int | None = None) -> PointClouds:
-    """Parts as clouds, and empty clouds up to `n_rows`; `capacity` as in `PointClouds.pack`."""
+    """Parts as clouds, and empty clouds up to `n_rows`, on the host; `capacity` as in `PointClouds.pack`."""
     padded = [*parts, *[NO_PART] * (n_rows - len(parts))]
     clouds = [(part.points, part.colors) for part in padded]
-    return PointClouds.pack(clouds, capacity, boundary=[part.boundary for part in padded])
+    return PointClouds.pack_on_host(clouds, capacity, boundary=[part.boundary for part in padded])
 
 
 def _together(found: Sequence[Descriptors], n_rows: int) -> Descriptors:

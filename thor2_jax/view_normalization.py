@@ -54,7 +54,7 @@ def _count(flags: jax.Array) -> jax.Array:
 
 
 def _frame(cloud: PointClouds, sigma_s: ArrayLike) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """The rotation [3, 3] of the view normalization, and what it turns: points [3, M] about their mean, mask, camera."""
+    """The view normalization's rotation [3, 3] and what it turns: points [3, M] about their mean, mask, camera."""
     points, mask = _planes(cloud)
     scaled = points * sigma_s
     centre = total(jnp.where(mask, scaled, 0)) / jnp.maximum(_count(mask), 1)

@@ -47,7 +47,8 @@ def voxel_downsample(
     # In place of `np.unique`: pixels come in rows, and a stable sort makes use of what is in order already.
     order = np.argsort(key, kind="stable")
     cube = np.empty_like(order)
-    cube[order] = np.cumsum(np.diff(key[order], prepend=-1) != 0) - 1
+    in_order = key.take(order)
+    cube[order[0]], cube[order[1:]] = 0, np.cumsum(in_order[1:] != in_order[:-1])
     counts = np.bincount(cube)
 
     def mean(planes: NDArray[Any]) -> NDArray[np.float64]:

@@ -109,13 +109,19 @@ def test_the_whole_way_against_finite_differences(name: str, monkeypatch: pytest
     """In a frame that stands still: no gradient goes through it."""
     config, clouds = CONFIGS[name], clouds_of(in_metres, 1)
     frame = jnp.asarray(np.linalg.qr(np.random.default_rng(2).normal(size=(3, 3)))[0])
-    monkeypatch.setattr(view_normalization, "minimal_box_axes", lambda points: frame)
+
+    def box(points: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        turned = frame @ points
+        return frame, turned.min(axis=1), turned.max(axis=1)
+
+    monkeypatch.setattr(view_normalization, "minimal_box", box)
 
     def describe(
         clouds: thor2.PointClouds, network: Any, config: thor2.DescriptorConfig, parameters: thor2.Parameters
     ) -> thor2.Descriptors:
-        normal = jax.vmap(lambda cloud: view_normalization._normalize_one(cloud, parameters.sigma_s))(clouds)
-        aligned = thor2.turn(normal, config, parameters)
+        # What is compiled already has another frame in it.
+        planes, _ = view_normalization._align_planes.__wrapped__(clouds, parameters.sigma_s, parameters.alpha)
+        aligned = dataclasses.replace(clouds, points=jnp.swapaxes(planes, 1, 2))
         return thor2.describe_aligned(aligned, network, config, parameters)
 
     loss = loss_of(describe, clouds, config)

@@ -185,7 +185,7 @@ def test_turn_is_the_rotation_matrix_about_y_by_minus_alpha(alpha: float) -> Non
         np.testing.assert_allclose(aligned.camera[i], np.asarray(normal.camera[i]) @ matrix.T - low, atol=1e-5)
     if config == CONFIG:
         both = thor2.align(clouds, config)
-        np.testing.assert_array_equal(both.points, aligned.points)
+        np.testing.assert_allclose(both.points, aligned.points, atol=1e-6)  # one rotation in place of two
 
 
 @pytest.mark.parametrize("axes", ["", "x", "y", "xy", "xyz"])
