@@ -7,9 +7,9 @@
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import jax
 import numpy as np
@@ -40,6 +40,8 @@ __all__ = ["NO_PART", "THOR2", "VOXEL", "DescribedFrame", "Part", "Recognition",
 
 THOR2: tuple[Feature, ...] = ("tops", "tops2")
 """The two classifiers whose joint answer is THOR2's."""
+
+T = TypeVar("T")
 
 VOXEL = 0.01
 """Voxel side in scaled units of every cloud that is described, in training too: colour counts depend on it."""
@@ -132,7 +134,7 @@ class Instance(Protocol):
 
 
 AT_ONCE = 4
-"""Instances described at a time: while the device works on them, the next ones are prepared."""
+"""Instances described and classified at a time: while the device works on them, the next ones are prepared."""
 
 NO_PART = Part(False, np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), np.zeros(0, bool))
 
@@ -207,21 +209,31 @@ class Recognizer:
 
     def describe(self, frame: RGBDFrame) -> DescribedFrame:
         """Clouds and descriptors of a frame's instances, those past the largest batch bucket included."""
+        clouds, parts, found = self._in_turns(frame, self._describe_parts)
+        usable = [i for i, cloud in enumerate(clouds) if cloud.reason is None]
+        return DescribedFrame(clouds, usable, parts, _together(found, _rows(len(parts))))
+
+    def _in_turns(
+        self, frame: RGBDFrame, start: Callable[[Sequence[Part]], T]
+    ) -> tuple[list[InstanceCloud], list[Part], list[T]]:
+        """Clouds and parts of a frame's instances, and what `start` returns for `AT_ONCE` parts at a time, or fewer.
+
+        The device works on what has been started while the next instances are prepared.
+        """
         clouds: list[InstanceCloud] = []
         parts: list[Part] = []
-        found: list[Descriptors] = []
+        started: list[T] = []
         for label in frame.instances:
             cloud, part = prepare(frame, label, self.run.config.sigma_s)
             clouds.append(cloud)
             if cloud.reason is None:
                 parts.append(part)
                 if len(parts) % AT_ONCE == 0:
-                    found.append(self._describe_parts(parts[-AT_ONCE:]))
+                    started.append(start(parts[-AT_ONCE:]))
         rest = len(parts) % AT_ONCE
         if rest or not parts:
-            found.append(self._describe_parts(parts[len(parts) - rest :]))
-        usable = [i for i, cloud in enumerate(clouds) if cloud.reason is None]
-        return DescribedFrame(clouds, usable, parts, _together(found, _rows(len(parts))))
+            started.append(start(parts[len(parts) - rest :]))
+        return clouds, parts, started
 
     def _describe_parts(self, parts: Sequence[Part]) -> Descriptors:
         return describe(pack_parts(parts, _rows(len(parts))), self.run.network, self.run.config)
@@ -248,9 +260,14 @@ class Recognizer:
         missing = [name for name in voting if name not in self._apply]
         if missing:
             raise InputError(f"classifiers: the run has no {', '.join(missing)}, only {', '.join(self._apply)}")
-        described = self.describe(frame)
-        found = self.probabilities(described.descriptors, voting)
-        return self.answers(described.clouds, described.parts, found, described.descriptors.overflow)
+
+        def start(parts: Sequence[Part]) -> tuple[Any, dict[Feature, Any]]:
+            found = self._describe_parts(parts)
+            return found.overflow, {name: self._apply[name](found) for name in voting}
+
+        clouds, parts, started = self._in_turns(frame, start)
+        overflow, probabilities = _together(started, _rows(len(parts)))
+        return self.answers(clouds, parts, probabilities, overflow)
 
     def answers(
         self,
@@ -314,14 +331,15 @@ def pack_parts(parts: Sequence[Part], n_rows: int, capacity: int | None = None) 
     return PointClouds.pack_on_host(clouds, capacity, boundary=[part.boundary for part in padded])
 
 
-def _together(found: Sequence[Descriptors], n_rows: int) -> Descriptors:
-    """Batches one after the other, on the host; zeros up to `n_rows`."""
+def _together(found: Sequence[T], n_rows: int) -> T:
+    """Batches one after the other along the first axis, on the host; zeros up to `n_rows`."""
 
     def join_rows(*batches: jax.Array) -> NDArray[Any]:
         padding = np.zeros((n_rows - sum(map(len, batches)), *batches[0].shape[1:]), batches[0].dtype)
         return np.concatenate([*batches, padding])
 
-    return jax.tree.map(join_rows, *found)
+    joined: T = jax.tree.map(join_rows, *found)
+    return joined
 
 
 def _compiled(name: Feature, model: MLP) -> Any:
