@@ -328,7 +328,7 @@ def pack_parts(parts: Sequence[Part], n_rows: int, capacity: int | None = None) 
     """Parts as clouds, and empty clouds up to `n_rows`, on the host; `capacity` as in `PointClouds.pack`."""
     padded = [*parts, *[NO_PART] * (n_rows - len(parts))]
     clouds = [(part.points, part.colors) for part in padded]
-    return PointClouds.pack_on_host(clouds, capacity, boundary=[part.boundary for part in padded])
+    return PointClouds.pack(clouds, capacity, boundary=[part.boundary for part in padded], on_host=True)
 
 
 def _together(found: Sequence[T], n_rows: int) -> T:

@@ -45,6 +45,8 @@ class PointClouds:
         capacity: int | None = None,
         camera: ArrayLike | None = None,
         boundary: Sequence[ArrayLike | None] | None = None,
+        *,
+        on_host: bool = False,
     ) -> "PointClouds":
         """Pad a list of clouds to one size.
 
@@ -54,23 +56,13 @@ class PointClouds:
             capacity: padded number of points; by default the bucket of the largest cloud.
             camera: [3] or [B, 3], the camera's position; by default the origin.
             boundary: one [n] bool array (or None) a cloud: the points on the occlusion boundary.
+            on_host: the fields are NumPy arrays; a compiled function takes them to the device sooner than this does.
 
         Raises:
             InputError: no clouds, wrong shapes or types, coordinates that are not finite in float32, colours out of
                 range, a cloud larger than `capacity` or the largest bucket, a capacity that is no positive integer,
                 a camera that is not finite or of another shape. The message gives the cloud's index.
         """
-        return jax.device_put(cls.pack_on_host(clouds, capacity, camera, boundary))
-
-    @classmethod
-    def pack_on_host(
-        cls,
-        clouds: Sequence[tuple[ArrayLike, ArrayLike]],
-        capacity: int | None = None,
-        camera: ArrayLike | None = None,
-        boundary: Sequence[ArrayLike | None] | None = None,
-    ) -> "PointClouds":
-        """`pack` without the way to the device, which compiled functions make faster: the fields are NumPy arrays."""
         if len(clouds) == 0:
             raise InputError("clouds is empty; at least one (xyz, rgb) pair is needed")
         parts = [_checked(pair, f"clouds[{i}]") for i, pair in enumerate(clouds)]
@@ -92,7 +84,7 @@ class PointClouds:
         mask = np.arange(n) < np.array(sizes)[:, None]
         position = np.broadcast_to(position, (len(parts), 3))
         fields: Any = points, colors, mask, position, edge
-        return cls(*fields)
+        return cls(*(fields if on_host else jax.device_put(fields)))
 
 
 def _padded_size(sizes: list[int], capacity: int | None) -> int:

@@ -37,6 +37,17 @@ def test_pack_pads_every_size() -> None:
     assert not np.asarray(packed.boundary).any()
 
 
+def test_packed_on_the_host_is_the_same_in_numpy_arrays() -> None:
+    parts, edge = [cloud(3), cloud(0)], [np.array([True, False, True]), None]
+    packed = thor2.PointClouds.pack(parts, 16, [1.0, 2.0, 3.0], edge)
+    on_host = thor2.PointClouds.pack(parts, 16, [1.0, 2.0, 3.0], edge, on_host=True)
+    for field in dataclasses.fields(packed):
+        expected, found = getattr(packed, field.name), getattr(on_host, field.name)
+        assert isinstance(expected, jax.Array) and isinstance(found, np.ndarray)
+        assert found.dtype == expected.dtype
+        np.testing.assert_array_equal(found, expected)
+
+
 def test_pack_takes_float_colours_capacity_camera_and_boundary() -> None:
     xyz, rgb = RNG.random((5, 3)), RNG.random((5, 3))
     edge = np.array([True, False, True, False, False])
