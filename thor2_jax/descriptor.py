@@ -8,6 +8,7 @@
 """
 
 import functools
+from collections.abc import Sequence
 from functools import partial
 
 import jax
@@ -15,7 +16,6 @@ import jax.numpy as jnp
 
 from colornet import ColorNetwork
 from colornet.grid import GRID_SIZE
-from thor2_jax.capacity import BATCH_BUCKETS
 from thor2_jax.color_membership import RegionSets, color_sets, region_sets
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
@@ -35,6 +35,9 @@ def _region_sets(network: ColorNetwork) -> RegionSets:
     with jax.ensure_compile_time_eval():
         return region_sets(network)
 
+
+PART, AT_ONCE = 64, 4
+"""Clouds that a CPU describes in one go, and how many such parts at the same time."""
 
 _default_parameters = functools.lru_cache(maxsize=8)(Parameters.of)
 
@@ -151,8 +154,7 @@ def describe(
         InputError: `clouds` is no batch of clouds.
     """
     _check(clouds)
-    # Tables of more clouds than that do not stay in a CPU's caches, and a cloud costs twice as much.
-    if len(clouds.mask) > BATCH_BUCKETS[-1] and jax.default_backend() == "cpu":
+    if len(clouds.mask) > PART and jax.default_backend() == "cpu":
         return _describe_in_parts(clouds, network, config, parameters)
     sets = _region_sets(network)
     planes = align_planes(clouds, config, parameters)
@@ -164,12 +166,25 @@ def describe(
 def _describe_in_parts(
     clouds: PointClouds, network: ColorNetwork, config: DescriptorConfig, parameters: Parameters | None
 ) -> Descriptors:
-    size = BATCH_BUCKETS[-1]
-    n_parts = len(clouds.mask) // size
-    whole = jax.tree.map(lambda a: a[: n_parts * size].reshape(n_parts, size, *a.shape[1:]), clouds)
-    found = jax.lax.map(lambda part: describe(part, network, config, parameters), whole)
-    found = jax.tree.map(lambda a: a.reshape(n_parts * size, *a.shape[2:]), found)
-    if n_parts * size == len(clouds.mask):
+    """`describe` for CPUs: `AT_ONCE` parts at a time, so that their tables stay in the caches."""
+    n_clouds, size = len(clouds.mask), PART * AT_ONCE
+
+    def part(first: int, last: int) -> PointClouds:
+        return jax.tree.map(lambda a: a[first:last], clouds)
+
+    if n_clouds <= size:
+        # Parts of one program, so that one goes on where another waits for a core.
+        parts = [part(k, min(k + PART, n_clouds)) for k in range(0, n_clouds, PART)]
+        return _joined([describe(one, network, config, parameters) for one in parts])
+    n_groups = n_clouds // size
+    groups = jax.tree.map(lambda a: a.reshape(n_groups, size, *a.shape[1:]), part(0, n_groups * size))
+    found = jax.lax.map(lambda group: describe(group, network, config, parameters), groups)
+    found = jax.tree.map(lambda a: a.reshape(n_groups * size, *a.shape[2:]), found)
+    if n_groups * size == n_clouds:
         return found
-    rest = describe(jax.tree.map(lambda a: a[n_parts * size :], clouds), network, config, parameters)
-    return jax.tree.map(lambda *arrays: jnp.concatenate(arrays), found, rest)
+    return _joined([found, describe(part(n_groups * size, n_clouds), network, config, parameters)])
+
+
+def _joined(found: Sequence[Descriptors]) -> Descriptors:
+    joined: Descriptors = jax.tree.map(lambda *arrays: jnp.concatenate(arrays), *found)
+    return joined
