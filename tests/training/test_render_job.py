@@ -153,7 +153,7 @@ render_job.render_dataset(objects, sys.argv[1], 60, 45, local(int(sys.argv[3])))
     [
         # Odd: with a file written under its temporary name; even: with a shard that is not listed, or is.
         [(4, 1)],
-        pytest.param([(1, 1), (5, 2), (3, 2), (2, 1)], marks=pytest.mark.slow),
+        pytest.param([(1, 1), (5, 2), (3, 2), (2, 1)], marks=pytest.mark.thorough),
     ],
 )
 def test_killed_again_and_again_it_goes_on(whole: Path, tmp_path: Path, kills: list[tuple[int, int]]) -> None:
