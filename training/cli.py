@@ -171,8 +171,6 @@ def train(
 
     compared = check_baselines(_listed(baselines))
     if sequences is None and not (compared and is_finished(out)):
-        if is_finished(out):
-            shutil.rmtree(out / VIEWS, ignore_errors=True)  # left where a kill struck after the run was written
         check_out(out)
     protocol = PAPER if paper else DEFAULT
     options = FitOptions(

@@ -177,12 +177,14 @@ def test_train_by_folds(meshes: Path, tmp_path: Path, run: Run) -> None:
     code, out, _ = run(*arguments)
     assert code == 0 and "fold 0: ce names" in out and "fold 1: ce names" in out
     assert sorted(p.name for p in (tmp_path / "run" / "fold-1").iterdir()) == ["network.npz", "run.json", "weights"]
-    before = {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()}
+    # What stands beside a finished run may be a dataset that somebody trains from: it stays.
     (tmp_path / "run" / "views").mkdir()
-    (tmp_path / "run" / "views" / "left by a kill").write_bytes(bytes(9))
-    code, _, err = run(*arguments)
-    assert code == 2 and "exists already" in one_line(err)
-    assert {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()} == before
+    (tmp_path / "run" / "views" / "manifest.json").write_bytes(bytes(9))
+    before = {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()}
+    for source in (arguments, ("train", "--dataset", tmp_path / "run" / "views", "--out", tmp_path / "run")):
+        code, _, err = run(*source)
+        assert code == 2 and "exists already" in one_line(err)
+        assert {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()} == before
 
 
 def test_train_by_sequences(meshes: Path, tmp_path: Path, run: Run) -> None:
