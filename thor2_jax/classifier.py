@@ -1,6 +1,7 @@
 """The classifiers (paper, section "Recognition"): one MLP a descriptor, and the rule that joins their answers."""
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -63,17 +64,18 @@ def feature_of(descriptors: Descriptors, name: Feature) -> jax.Array:
 def _product_of_sparse(x: jax.Array, kernel: jax.Array) -> jax.Array:
     """`x @ kernel`, [B, F] and [F, H] to [B, H], from the rows of `kernel` that an entry of `x` other than 0 needs.
 
-    Where there are more of those than a quarter, it is the plain product.
+    There is room for a tenth of the rows, or a quarter. Where more are needed, it is the plain product.
     """
     needed = (x != 0).any(axis=0)
-    most = -(-len(needed) // 4)
+    rooms = [-(-len(needed) // part) for part in (10, 4)]
 
-    def of_needed() -> jax.Array:
-        row = jnp.nonzero(needed, size=most, fill_value=len(needed))[0]
+    def of_needed(room: int) -> jax.Array:
+        row = jnp.nonzero(needed, size=room, fill_value=len(needed))[0]
         entries = x.at[:, row].get(mode="fill", fill_value=0)
         return jnp.matmul(entries, kernel.at[row].get(mode="clip"))
 
-    return jax.lax.cond(needed.sum() <= most, of_needed, lambda: jnp.matmul(x, kernel))
+    too_small = (needed.sum() > jnp.array(rooms)).sum()
+    return jax.lax.switch(too_small, [*[partial(of_needed, room) for room in rooms], lambda: jnp.matmul(x, kernel)])
 
 
 @_product_of_sparse.defjvp

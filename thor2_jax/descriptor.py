@@ -8,7 +8,6 @@
 """
 
 import functools
-from collections.abc import Sequence
 from functools import partial
 
 import jax
@@ -20,6 +19,7 @@ from thor2_jax.color_membership import RegionSets, color_sets, region_sets
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
 from thor2_jax.parameters import Parameters
+from thor2_jax.parts import in_parts, part_size
 from thor2_jax.persistence import diagrams_of_strips
 from thor2_jax.persistence_images import past_window, persistence_images
 from thor2_jax.slicing import strips_of_cloud
@@ -35,9 +35,6 @@ def _region_sets(network: ColorNetwork) -> RegionSets:
     with jax.ensure_compile_time_eval():
         return region_sets(network)
 
-
-PART, AT_ONCE = 64, 4
-"""Clouds that a CPU describes in one go, and how many such parts at the same time."""
 
 _default_parameters = functools.lru_cache(maxsize=8)(Parameters.of)
 
@@ -154,8 +151,14 @@ def describe(
         InputError: `clouds` is no batch of clouds.
     """
     _check(clouds)
-    if len(clouds.mask) > PART and jax.default_backend() == "cpu":
+    if len(clouds.mask) > part_size(clouds):
         return _describe_in_parts(clouds, network, config, parameters)
+    return _describe_part(clouds, network, config, parameters)
+
+
+def _describe_part(
+    clouds: PointClouds, network: ColorNetwork, config: DescriptorConfig, parameters: Parameters | None
+) -> Descriptors:
     sets = _region_sets(network)
     planes = align_planes(clouds, config, parameters)
     found = _strips_of_planes(planes, clouds.colors, clouds.mask, _color_sets(clouds.colors, sets), sets, config)
@@ -166,25 +169,4 @@ def describe(
 def _describe_in_parts(
     clouds: PointClouds, network: ColorNetwork, config: DescriptorConfig, parameters: Parameters | None
 ) -> Descriptors:
-    """`describe` for CPUs: `AT_ONCE` parts at a time, so that their tables stay in the caches."""
-    n_clouds, size = len(clouds.mask), PART * AT_ONCE
-
-    def part(first: int, last: int) -> PointClouds:
-        return jax.tree.map(lambda a: a[first:last], clouds)
-
-    if n_clouds <= size:
-        # Parts of one program, so that one goes on where another waits for a core.
-        parts = [part(k, min(k + PART, n_clouds)) for k in range(0, n_clouds, PART)]
-        return _joined([describe(one, network, config, parameters) for one in parts])
-    n_groups = n_clouds // size
-    groups = jax.tree.map(lambda a: a.reshape(n_groups, size, *a.shape[1:]), part(0, n_groups * size))
-    found = jax.lax.map(lambda group: describe(group, network, config, parameters), groups)
-    found = jax.tree.map(lambda a: a.reshape(n_groups * size, *a.shape[2:]), found)
-    if n_groups * size == n_clouds:
-        return found
-    return _joined([found, describe(part(n_groups * size, n_clouds), network, config, parameters)])
-
-
-def _joined(found: Sequence[Descriptors]) -> Descriptors:
-    joined: Descriptors = jax.tree.map(lambda *arrays: jnp.concatenate(arrays), *found)
-    return joined
+    return in_parts(lambda part: _describe_part(part, network, config, parameters), clouds)

@@ -144,7 +144,7 @@ class RGBDFrame:
     def depth_m(self) -> NDArray[np.float32]:
         """Depth [H, W] float32 in metres; 0 where there is none."""
         if self.depth.dtype.kind == "u":
-            return (self.depth.astype(np.float64) / self.intrinsics.depth_scale).astype(np.float32)
+            return np.divide(self.depth, self.intrinsics.depth_scale, dtype=np.float32)
         return np.where(np.isfinite(self.depth), self.depth, 0).astype(np.float32)
 
     @cached_property

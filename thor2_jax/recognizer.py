@@ -344,5 +344,11 @@ def _together(found: Sequence[T], n_rows: int) -> T:
 
 def _compiled(name: Feature, model: MLP) -> Any:
     graph, state = nnx.split(model)
-    forward = jax.jit(lambda state, found: class_probabilities(nnx.merge(graph, state), found, name))
-    return lambda found: forward(state, found)
+    # Leaves, since a state would be taken apart, in Python, at every call.
+    leaves, structure = jax.tree.flatten(state)
+
+    @jax.jit
+    def forward(leaves: list[jax.Array], found: Descriptors) -> jax.Array:
+        return class_probabilities(nnx.merge(graph, jax.tree.unflatten(structure, leaves)), found, name)
+
+    return lambda found: forward(leaves, found)

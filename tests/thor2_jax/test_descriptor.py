@@ -13,7 +13,7 @@ from scipy.special import ndtr
 
 import colornet
 import thor2_jax as thor2
-from thor2_jax import descriptor
+from thor2_jax import parts as cpu_parts
 
 NETWORK = colornet.load_default()
 CLOSED = thor2.DescriptorConfig(homology="closed_form")
@@ -113,12 +113,11 @@ def test_empty_clouds_in_a_batch_are_zero_and_disturb_nobody() -> None:
     np.testing.assert_array_equal(found.tops2[1], company.tops2[1])
 
 
-@pytest.mark.parametrize(("homology", "count"), [("gudhi", 32), ("closed_form", 27)])
-def test_batches_in_parts(homology: str, count: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each cloud as in a small batch, in value and in gradient; with and without a rest after whole groups."""
-    monkeypatch.setattr(descriptor, "PART", 8)
-    monkeypatch.setattr(descriptor, "AT_ONCE", 2)
-    config = thor2.DescriptorConfig(homology=homology)
+def test_batches_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each cloud as in a small batch, in value and in gradient, through callbacks too; whole groups and a rest."""
+    monkeypatch.setattr(cpu_parts, "LARGEST", 8)
+    monkeypatch.setattr(cpu_parts, "AT_ONCE", 2)
+    config, count = thor2.DescriptorConfig(homology="gudhi"), 27
     few = thor2.PointClouds.pack([camera_cloud(seed, 300) for seed in range(8)], 512)
     order = np.arange(count) % 8
     many = jax.tree.map(lambda a: a[order], few)
