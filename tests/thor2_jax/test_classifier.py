@@ -53,7 +53,7 @@ def test_logits_against_numpy(n: int, model: MLP) -> None:
 
 
 @pytest.mark.parametrize("n", [1, FEW, FEW + 1])
-@pytest.mark.parametrize("n_used", [0, 1, 9, 10, 33])  # a quarter of 33 inputs, rounded up, is 9
+@pytest.mark.parametrize("n_used", [0, 1, 4, 5, 9, 10, 33])  # of 33 inputs, rounded up, a tenth is 4, a quarter 9
 def test_logits_and_their_gradient_where_most_inputs_are_zero(n_used: int, n: int, model: MLP) -> None:
     x = np.zeros((n, 33), np.float32)
     x[:, RNG.permutation(33)[:n_used]] = RNG.normal(size=(n, n_used))
