@@ -17,6 +17,10 @@ MOST_VALUES = 10**6
 """Of a YAML file with its aliases written out: a few lines of them can stand for gigabytes."""
 
 
+MOST_NESTED = 100
+"""Levels of a YAML file: the time to read one grows with their square."""
+
+
 @contextlib.contextmanager
 def complaints_about(identifier: str) -> Iterator[None]:
     """Put `identifier` before what an InputError says, and make one of a file that is missing."""
@@ -40,14 +44,26 @@ def parse_json(content: bytes) -> Any:
         raise ValueError("it is nested too deeply") from None
 
 
+class _Loader(yaml.SafeLoader):
+    level = 0
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        if self.level == MOST_NESTED:
+            raise ValueError(f"it is nested more than {MOST_NESTED} levels deep")
+        self.level += 1
+        node = super().compose_node(parent, index)
+        self.level -= 1
+        return node
+
+
 def parse_yaml(content: bytes) -> Any:
     """What a YAML file holds, of plain types.
 
     Raises:
-        ValueError: it is damaged, or stands for more than `MOST_VALUES`.
+        ValueError: it is damaged, nested more than `MOST_NESTED` levels deep, or stands for more than `MOST_VALUES`.
     """
     try:
-        loader = yaml.SafeLoader(content)
+        loader = _Loader(content)
         try:
             root = loader.get_single_node()
             if root is None:
