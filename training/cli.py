@@ -144,7 +144,7 @@ def train(
     paper does: on plain views only, more of them, each in four mirrors, for longer; its defaults stand second.
 
     With --baselines, a run that is finished gets those that it lacks. With --sequences, every sequence that lacks one
-    gets a run of its objects alone (see `thor2 evaluate ocid --per-sequence`).
+    gets a run of its objects alone (see `thor2 evaluate ocid --per-sequence`); the others must be of the same options.
     """
     import jax
 
@@ -165,7 +165,7 @@ def train(
     from training.protocol import DEFAULT, PAPER
     from training.render_job import render_dataset
     from training.sequences import sequence_sources
-    from training.train import VIEWS, check_out, is_finished, train_run
+    from training.train import VIEWS, check_out, check_trained, is_finished, train_run
     from training.view_dataset import ViewDataset
     from training.view_source import ViewSource
 
@@ -198,6 +198,8 @@ def train(
     parts = {out: source}
     if sequences is not None:
         parts = {out / sequence: views for sequence, views in sequence_sources(source, sequences).items()}
+        for folder in filter(is_finished, parts):
+            check_trained(parts[folder], folder, features, options, folds, protocol.mirrors)
     runs = {}
     for folder, views in parts.items():
         with _bar() as bar:

@@ -39,7 +39,7 @@ from training.metrics import append_figures, forget_after, read_figures
 from training.pictures import draw_curves
 from training.view_source import ViewSource
 
-__all__ = ["VIEWS", "Progress", "check_out", "is_finished", "train_run"]
+__all__ = ["VIEWS", "Progress", "check_out", "check_trained", "is_finished", "train_run"]
 
 Progress = Callable[[str, int, int, str], object]
 """Called with (stage, done, total, note)."""
@@ -48,6 +48,9 @@ VIEWS = "views"
 BEGUN = "begun.json"
 METRICS = "metrics.jsonl"
 CURVES = "curves.png"
+
+CONFIG = DescriptorConfig(homology="closed_form")
+"""The descriptor, unless another one is asked for: the paper's."""
 
 CURVE = ("epoch", "loss", "accuracy", "held_out_accuracy")
 """What a record keeps of an epoch's figures: what another run gives again."""
@@ -79,12 +82,61 @@ def _check_same(out: Path, begun: Mapping[str, Any]) -> None:
         found = dict(json.loads(path.read_bytes()))
     except (OSError, ValueError, TypeError, RecursionError) as error:
         raise InputError(f"out: {path} cannot be read: {error}") from None
-    for name, value in begun.items():
+    _compare(f"out: {out} holds a run in the making", found, begun)
+
+
+def _compare(what: str, found: Mapping[str, Any], asked: Mapping[str, Any]) -> None:
+    for name, value in asked.items():
         if found.get(name) != value:
             raise InputError(
-                f"out: {out} holds a run in the making with {name} {found.get(name)!r}, not {value!r}; "
-                "go on with the same, or name another folder"
+                f"{what} with {name} {found.get(name)!r}, not {value!r}; go on with the same, or name another folder"
             )
+
+
+def check_trained(
+    source: ViewSource,
+    out: str | Path,
+    features: Sequence[str],
+    options: FitOptions,
+    folds: int = 1,
+    mirrors: Sequence[str] = MIRRORS,
+) -> None:
+    """Refuse a finished run that is not what `train_run` gives for the same arguments.
+
+    Raises:
+        InputError: naming what differs, or a run that cannot be read.
+    """
+    names, network = check_features(features, "classifiers"), colornet.load_default()
+    asked = _asked(source, names, options, CONFIG, network, folds, mirrors)
+    out = Path(out).absolute()
+    record = load_run(out if (out / RUN_FILE).is_file() else out / "fold-0").record
+    found = {**record, "dataset": record["dataset"]["digest"]}
+    _compare(f"out: {out} holds a run that was trained", found, asked)
+
+
+def _asked(
+    source: ViewSource,
+    names: Sequence[Feature],
+    options: FitOptions,
+    config: DescriptorConfig,
+    network: colornet.ColorNetwork,
+    folds: int,
+    mirrors: Sequence[str],
+) -> dict[str, Any]:
+    """All that a trained run follows from."""
+    return {
+        "descriptor_version": DESCRIPTOR_VERSION,
+        "descriptor_config": dataclasses.asdict(config),
+        "color_network": network.fingerprint,
+        "dataset": source.digest,
+        "classifiers": list(names),
+        "folds": folds,
+        "mirrors": list(mirrors),
+        "epochs": options.epochs,
+        "learning_rates": list(options.learning_rates),
+        "batch_size": options.batch_size,
+        "seed": options.seed,
+    }
 
 
 def _begin(out: Path, begun: Mapping[str, Any]) -> None:
@@ -134,22 +186,10 @@ def train_run(
         OSError: something cannot be written; the last complete checkpoints stay.
     """
     names = check_features(features, "classifiers")
-    config = config or DescriptorConfig(homology="closed_form")
+    config = config or CONFIG
     network = colornet.load_default()
     out = Path(out).absolute()
-    begun = {
-        "descriptor_version": DESCRIPTOR_VERSION,
-        "descriptor_config": dataclasses.asdict(config),
-        "color_network": network.fingerprint,
-        "dataset": source.digest,
-        "classifiers": list(names),
-        "folds": folds,
-        "mirrors": list(mirrors),
-        "epochs": options.epochs,
-        "learning_rates": list(options.learning_rates),
-        "batch_size": options.batch_size,
-        "seed": options.seed,
-    }
+    begun = _asked(source, names, options, config, network, folds, mirrors)
     check_out(out)
     _check_same(out, begun)
     check_batch_size(options.batch_size, batch_mesh())
