@@ -13,7 +13,8 @@ import colornet
 from colornet.mapper import MapperGraph
 
 _BUILD = """
-import json, resource, sys, time
+import json, re, sys, time
+from pathlib import Path
 import numpy as np
 import colornet, colornet.builder as builder
 
@@ -29,7 +30,9 @@ seconds = time.perf_counter() - start
 network.save(sys.argv[1])
 members = {f"members_{k}": m for k, m in enumerate(graph.members)}
 np.savez(sys.argv[2], names=graph.names, nerve=graph.nerve, cyclic=graph.cyclic, **members)
-print(json.dumps({"seconds": seconds, "kib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss}))
+# Not by getrusage, whose peak is at least that of the process which started this one.
+peak = re.search(r"VmHWM:\\s*(\\d+) kB", Path("/proc/self/status").read_text())
+print(json.dumps({"seconds": seconds, "kib": int(peak[1])}))
 """
 
 
