@@ -65,9 +65,8 @@ def main() -> None:
             "share_of_arithmetic": shares[1],
         }
     options.out.mkdir(parents=True, exist_ok=True)
-    result = {"device": device.device_kind, "jax": jax.__version__, "clouds": len(clouds), "points": N_POINTS}
-    result["rows"] = rows
-    (options.out / "gpu.json").write_text(json.dumps(result, indent=1) + "\n")
+    measured = {"device": device.device_kind, "jax": jax.__version__, "clouds": len(clouds), "points": N_POINTS}
+    (options.out / "gpu.json").write_text(json.dumps(measured | {"rows": rows}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -28,7 +28,7 @@ def part_size(clouds: PointClouds) -> int:
 
 
 def in_parts(function: Callable[[PointClouds], T], clouds: PointClouds) -> T:
-    """`function(clouds)`, where it is a part after the other that `function` sees. To be called under `jax.jit`.
+    """`function(clouds)`, computed `AT_ONCE` parts at a time. To be called under `jax.jit`.
 
     Args:
         function: clouds [B, N] to arrays [B, ...], each cloud by itself.
