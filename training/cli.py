@@ -206,8 +206,8 @@ def train(
             show = _stages(bar)
             if not is_finished(folder):
                 runs[folder] = train_run(views, folder, features, options, show, folds=folds, mirrors=protocol.mirrors)
-            if jax.process_index() == 0 and (compared or folder not in runs):
-                train_baselines(folder, views, compared, show)  # refuses a finished run of other views
+            if compared and jax.process_index() == 0:
+                train_baselines(folder, views, compared, show)
     if meshes is not None and jax.process_index() == 0:
         shutil.rmtree(out / VIEWS)
     for folder in parts:

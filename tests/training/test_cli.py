@@ -204,8 +204,8 @@ def test_train_by_sequences(meshes: Path, tmp_path: Path, run: Run) -> None:
     assert (out / "table/a/run.json").read_bytes() == first
     assert sorted(json.loads((out / "b/run.json").read_text())["classes"]) == sorted([soup, cereal])
     before = sorted(out.rglob("*"))
+    table.write_text(json.dumps({"b": [cereal, soup], "c": [soup, mug]}))
     for change in (("--epochs", 2), ("--batch-size", 8), ("--seed", 1), ("--folds", 2), ("--classifiers", "ce,tops")):
-        table.write_text(json.dumps({"b": [cereal, soup], "c": [soup, mug]}))
         code, _, err = run(*arguments, *change)
         assert code == 2 and "b holds a run that was trained with" in one_line(err)
     assert sorted(out.rglob("*")) == before

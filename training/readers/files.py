@@ -16,7 +16,6 @@ __all__ = ["complaints_about", "parse_json", "parse_yaml", "read_table"]
 MOST_VALUES = 10**6
 """Of a YAML file with its aliases written out: a few lines of them can stand for gigabytes."""
 
-
 MOST_NESTED = 100
 """Levels of a YAML file: the time to read one grows with their square."""
 
