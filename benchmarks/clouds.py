@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from thor2_jax.frames import backproject
-from training.builtin_objects import builtin_objects
-from training.meshes import TexturedMesh, find_meshes, load_mesh
-from training.rendering import RayCaster, render_view
-from training.view_sphere import camera_pose
+from thor2_jax.recognition.frames import backproject
+from training.objects.builtin_objects import builtin_objects
+from training.objects.meshes import TexturedMesh, find_meshes, load_mesh
+from training.rendering.ray_caster import RayCaster, render_view
+from training.rendering.view_sphere import camera_pose
 
 __all__ = ["SCANS", "sample_clouds"]
 

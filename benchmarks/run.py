@@ -27,12 +27,12 @@ import colornet
 import thor2_jax as thor2
 from benchmarks.clouds import sample_clouds
 from benchmarks.timing import time_calls
-from thor2_jax.classifier import FEATURES, MLP
-from thor2_jax.run_folder import TrainedRun, input_size
-from thor2_jax.streaming import describe_stream
-from thor2_jax.view_normalization import align_planes
-from training.builtin_objects import builtin_objects
-from training.scenes import compose_scene
+from thor2_jax.descriptor.streaming import describe_stream
+from thor2_jax.descriptor.view_normalization import align_planes
+from thor2_jax.recognition.classifier import FEATURES, MLP
+from thor2_jax.recognition.run_directory import TrainedRun, input_size
+from training.objects.builtin_objects import builtin_objects
+from training.rendering.scenes import compose_scene
 
 NETWORK = colornet.load_default()
 CLOSED = thor2.DescriptorConfig(homology="closed_form")

@@ -27,12 +27,12 @@ from PIL import Image
 
 import colornet
 import thor2_jax as thor2
-from thor2_jax.classifier import FEATURES, MLP
 from thor2_jax.client import multipart
-from thor2_jax.run_folder import TrainedRun, input_size, save_run
+from thor2_jax.recognition.classifier import FEATURES, MLP
+from thor2_jax.recognition.run_directory import TrainedRun, input_size, save_run
 from thor2_jax.service.decoding import frame_of
-from training.builtin_objects import builtin_objects
-from training.scenes import compose_scene
+from training.objects.builtin_objects import builtin_objects
+from training.rendering.scenes import compose_scene
 
 LIMIT_MS = 250.0
 RATES = (30, 35, 40, 45, 50)

@@ -19,9 +19,9 @@ from matplotlib.figure import Figure
 
 import colornet
 import thor2_jax as thor2
-from training.builtin_objects import builtin_objects
-from training.view_sphere import camera_pose
-from training.views import view_cloud
+from training.objects.builtin_objects import builtin_objects
+from training.rendering.view_sphere import camera_pose
+from training.views.mesh_views import view_cloud
 
 LAMP = np.array([0.80, 0.66, 0.55], np.float32)
 """What the lamp multiplies red, green and blue by: gain 0.67, warm."""

@@ -31,21 +31,21 @@ from matplotlib.figure import Figure
 
 import colornet
 import thor2_jax as thor2
-from thor2_jax.classifier import MLP, feature_of
-from thor2_jax.color_membership import region_sets
+from thor2_jax.descriptor.color_membership import region_sets
 from thor2_jax.files import check_new
-from thor2_jax.recognizer import THOR2
-from thor2_jax.run_folder import TrainedRun, input_size, save_run
-from training.builtin_objects import COLOR_PAIRS, SHAPE_PAIRS, builtin_objects
-from training.dataset import Batch, Samples, build_samples, expand
+from thor2_jax.recognition.classifier import MLP, feature_of
+from thor2_jax.recognition.recognizer import THOR2
+from thor2_jax.recognition.run_directory import TrainedRun, input_size, save_run
 from training.evaluate import evaluate, joinings, summarize
-from training.fit import FitOptions
-from training.meshes import find_meshes, read_names
+from training.fitting.fit import FitOptions
+from training.fitting.samples import Batch, Samples, build_samples, expand
+from training.fitting.steps import scale_inputs
+from training.objects.builtin_objects import COLOR_PAIRS, SHAPE_PAIRS, builtin_objects
+from training.objects.meshes import find_meshes, read_names
 from training.readers import FrameFolder, LabelledFrame, UWISOccluded
-from training.scenes import compose_scene
-from training.steps import scale_inputs
-from training.view_source import MemoryViews
-from training.views import render_views
+from training.rendering.scenes import compose_scene
+from training.views.mesh_views import render_views
+from training.views.source import MemoryViews
 
 NETWORK = colornet.load_default()
 CONFIG = thor2.DescriptorConfig(homology="closed_form")

@@ -24,9 +24,9 @@ from scipy.spatial.transform import Rotation
 
 import colornet
 import thor2_jax as thor2
-from training.builtin_objects import builtin_objects
-from training.view_sphere import camera_pose
-from training.views import view_cloud
+from training.objects.builtin_objects import builtin_objects
+from training.rendering.view_sphere import camera_pose
+from training.views.mesh_views import view_cloud
 
 HARD = thor2.DescriptorConfig(homology="closed_form")
 SOFT = dataclasses.replace(HARD, relaxation=thor2.Relaxation(slice=0.02, strip=0.01, extremum=0.01, color=10.0))

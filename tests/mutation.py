@@ -43,25 +43,37 @@ TESTS = {
     "colornet/mapper.py": ("colornet/test_color_math.py", "colornet/test_build.py"),
     "colornet/network.py": ("colornet/test_files.py", "colornet/test_membership.py"),
     "colornet/regions.py": ("colornet/test_regions.py", "colornet/test_build.py"),
-    "thor2_jax/bounding_box.py": ("thor2_jax/test_bounding_box.py", "thor2_jax/test_view_normalization.py"),
+    "thor2_jax/descriptor/bounding_box.py": (
+        "thor2_jax/descriptor/test_bounding_box.py",
+        "thor2_jax/descriptor/test_view_normalization.py",
+    ),
     "thor2_jax/capacity.py": ("thor2_jax/test_capacity.py",),
-    "thor2_jax/classifier.py": ("thor2_jax/test_classifier.py",),
-    "thor2_jax/color_membership.py": ("thor2_jax/test_color_membership.py", "thor2_jax/test_types.py"),
+    "thor2_jax/recognition/classifier.py": ("thor2_jax/recognition/test_classifier.py",),
+    "thor2_jax/descriptor/color_membership.py": (
+        "thor2_jax/descriptor/test_color_membership.py",
+        "thor2_jax/test_types.py",
+    ),
     "thor2_jax/config.py": ("thor2_jax/test_config.py",),
-    "thor2_jax/descriptor.py": ("thor2_jax/test_descriptor.py",),
-    "thor2_jax/frames.py": ("thor2_jax/test_frames.py", "thor2_jax/test_types.py"),
-    "thor2_jax/instance_clouds.py": ("thor2_jax/test_instance_clouds.py", "thor2_jax/test_types.py"),
-    "thor2_jax/occlusion.py": ("thor2_jax/test_occlusion.py", "thor2_jax/test_types.py"),
-    "thor2_jax/outlier_removal.py": ("thor2_jax/test_outlier_removal.py", "thor2_jax/test_instance_clouds.py"),
+    "thor2_jax/descriptor/describe.py": ("thor2_jax/descriptor/test_describe.py",),
+    "thor2_jax/recognition/frames.py": ("thor2_jax/recognition/test_frames.py", "thor2_jax/test_types.py"),
+    "thor2_jax/recognition/instance_clouds.py": (
+        "thor2_jax/recognition/test_instance_clouds.py",
+        "thor2_jax/test_types.py",
+    ),
+    "thor2_jax/recognition/occlusion.py": ("thor2_jax/recognition/test_occlusion.py", "thor2_jax/test_types.py"),
+    "thor2_jax/recognition/outlier_removal.py": (
+        "thor2_jax/recognition/test_outlier_removal.py",
+        "thor2_jax/recognition/test_instance_clouds.py",
+    ),
     "thor2_jax/parameters.py": ("thor2_jax/test_types.py", "properties/test_reproducibility.py"),
-    "thor2_jax/persistence.py": ("thor2_jax/test_persistence.py",),
-    "thor2_jax/persistence_images.py": ("thor2_jax/test_persistence_images.py",),
-    "thor2_jax/reductions.py": ("thor2_jax/test_reductions.py",),
-    "thor2_jax/relaxation.py": ("properties/test_relaxation.py",),
-    "thor2_jax/slicing.py": ("thor2_jax/test_slicing.py",),
-    "thor2_jax/types.py": ("thor2_jax/test_types.py", "thor2_jax/test_persistence.py"),
-    "thor2_jax/view_normalization.py": ("thor2_jax/test_view_normalization.py",),
-    "thor2_jax/voxel_grid.py": ("thor2_jax/test_voxel_grid.py",),
+    "thor2_jax/descriptor/persistence.py": ("thor2_jax/descriptor/test_persistence.py",),
+    "thor2_jax/descriptor/persistence_images.py": ("thor2_jax/descriptor/test_persistence_images.py",),
+    "thor2_jax/descriptor/reductions.py": ("thor2_jax/descriptor/test_reductions.py",),
+    "thor2_jax/descriptor/relaxation.py": ("properties/test_relaxation.py",),
+    "thor2_jax/descriptor/slicing.py": ("thor2_jax/descriptor/test_slicing.py",),
+    "thor2_jax/types.py": ("thor2_jax/test_types.py", "thor2_jax/descriptor/test_persistence.py"),
+    "thor2_jax/descriptor/view_normalization.py": ("thor2_jax/descriptor/test_view_normalization.py",),
+    "thor2_jax/recognition/voxel_grid.py": ("thor2_jax/recognition/test_voxel_grid.py",),
 }
 """The tests, below tests/, that hold a module to account: the quickest first."""
 
@@ -214,7 +226,9 @@ def print_report(results: dict[Mutant, dict[str, Any]]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="Mutation testing; see the head of this file.")
-    parser.add_argument("modules", nargs="*", metavar="MODULE", help="as thor2_jax/slicing.py; by default all")
+    parser.add_argument(
+        "modules", nargs="*", metavar="MODULE", help="as thor2_jax/descriptor/slicing.py; by default all"
+    )
     parser.add_argument(
         "--results", type=Path, required=True, help="one JSON line a mutant; what it has is not run again"
     )

@@ -2,13 +2,13 @@
 
 import thor2_jax.jax_version  # noqa: F401  first: it refuses versions of jax that give wrong numbers
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig, Relaxation
-from thor2_jax.descriptor import describe, describe_aligned, describe_strips, diagrams, strips
+from thor2_jax.descriptor.describe import describe, describe_aligned, describe_strips, diagrams, strips
+from thor2_jax.descriptor.view_normalization import align, mirror, turn, view_normalize
 from thor2_jax.errors import InputError
-from thor2_jax.frames import Intrinsics, RGBDFrame, read_frame
 from thor2_jax.parameters import Parameters
-from thor2_jax.recognizer import Recognition, Recognizer
+from thor2_jax.recognition.frames import Intrinsics, RGBDFrame, read_frame
+from thor2_jax.recognition.recognizer import Recognition, Recognizer
 from thor2_jax.types import Descriptors, Diagrams, PointClouds, Strips
-from thor2_jax.view_normalization import align, mirror, turn, view_normalize
 
 __all__ = [
     "DESCRIPTOR_VERSION",

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thor2_jax.recognizer import Recognition
+from thor2_jax.recognition.recognizer import Recognition
 
 __all__ = ["Client", "ServiceError", "multipart"]
 

@@ -17,10 +17,10 @@ import jax.export
 import jax.numpy as jnp
 
 from thor2_jax.capacity import BATCH_BUCKETS, POINT_BUCKETS
-from thor2_jax.classifier import class_probabilities
-from thor2_jax.descriptor import describe
+from thor2_jax.descriptor.describe import describe
 from thor2_jax.errors import InputError
-from thor2_jax.run_folder import TrainedRun
+from thor2_jax.recognition.classifier import class_probabilities
+from thor2_jax.recognition.run_directory import TrainedRun
 from thor2_jax.types import PointClouds
 
 __all__ = ["PLATFORMS", "export_recognizer"]

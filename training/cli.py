@@ -87,10 +87,10 @@ def render(
     seed: Annotated[int, typer.Option(help="Of the variations.")] = 0,
 ) -> None:
     """Render views of meshes to a dataset that `train --dataset` reads. Interrupted, it goes on when called again."""
-    from training.engines import local, on_ray
-    from training.meshes import find_meshes, read_names
-    from training.render_job import render_dataset
-    from training.variations import Illumination, Occlusion, Segmentation, Sensor, Variations
+    from training.augmentation import Illumination, Occlusion, Segmentation, Sensor, Variations
+    from training.objects.meshes import find_meshes, read_names
+    from training.storage.workers import local, on_ray
+    from training.views.render_job import render_dataset
 
     if address is not None and engine != "ray":
         raise InputError(f"address is {address}; it goes with --engine ray")
@@ -156,18 +156,18 @@ def train(
         if meshes is not None:
             raise InputError("coordinator: several processes train from a --dataset that all of them can read")
         jax.distributed.initialize(coordinator, processes, process)
-    from thor2_jax.classifier import check_features
+    from thor2_jax.recognition.classifier import check_features
     from training.baselines.job import check_baselines, train_baselines
-    from training.engines import local
-    from training.fit import FitOptions
-    from training.left_out import WithoutClasses
-    from training.meshes import find_meshes, read_names
-    from training.protocol import DEFAULT, PAPER
-    from training.render_job import render_dataset
-    from training.sequences import sequence_sources
-    from training.train import VIEWS, check_out, check_trained, is_finished, train_run
-    from training.view_dataset import ViewDataset
-    from training.view_source import ViewSource
+    from training.fitting.fit import FitOptions
+    from training.fitting.job import VIEWS, check_out, check_trained, is_finished, train_run
+    from training.fitting.protocol import DEFAULT, PAPER
+    from training.objects.meshes import find_meshes, read_names
+    from training.storage.workers import local
+    from training.views.dataset import ViewDataset
+    from training.views.left_out import WithoutClasses
+    from training.views.render_job import render_dataset
+    from training.views.sequences import sequence_sources
+    from training.views.source import ViewSource
 
     compared = check_baselines(_listed(baselines))
     if sequences is None and not (compared and is_finished(out)):
@@ -253,9 +253,9 @@ def recognize(
     import dataclasses
 
     from thor2_jax.files import write_text
-    from thor2_jax.frames import read_frame
-    from thor2_jax.overlay import draw_overlay
-    from thor2_jax.recognizer import Recognizer
+    from thor2_jax.recognition.frames import read_frame
+    from thor2_jax.recognition.overlay import draw_overlay
+    from thor2_jax.recognition.recognizer import Recognizer
 
     frame = read_frame(color=color, depth=depth, labels=labels, intrinsics=intrinsics)
     answers = Recognizer.load(model, unknown_below).recognize(frame)

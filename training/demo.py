@@ -17,21 +17,21 @@ import numpy as np
 
 from thor2_jax.errors import InputError
 from thor2_jax.files import write_text
-from thor2_jax.overlay import draw_overlay
-from thor2_jax.recognizer import Recognizer
-from thor2_jax.run_folder import TrainedRun, load_run
-from training.builtin_objects import builtin_objects
+from thor2_jax.recognition.overlay import draw_overlay
+from thor2_jax.recognition.recognizer import Recognizer
+from thor2_jax.recognition.run_directory import TrainedRun, load_run
 from training.evaluate import Instance, evaluate, summarize
-from training.meshes import TexturedMesh
-from training.pictures import draw_accuracy, draw_confusion, draw_curves, draw_descriptor, draw_objects
-from training.protocol import DEFAULT
+from training.fitting.job import VIEWS, Progress, is_finished, train_run
+from training.fitting.protocol import DEFAULT
+from training.objects.builtin_objects import builtin_objects
+from training.objects.meshes import TexturedMesh
 from training.readers.labelled import LabelledFrame
-from training.render_job import render_dataset
-from training.report import Picture, write_page
-from training.scenes import Scene, compose_scene
-from training.train import VIEWS, Progress, is_finished, train_run
-from training.view_sphere import camera_pose
-from training.views import view_cloud
+from training.rendering.scenes import Scene, compose_scene
+from training.rendering.view_sphere import camera_pose
+from training.reports.html import Picture, write_page
+from training.reports.plots import draw_accuracy, draw_confusion, draw_curves, draw_descriptor, draw_objects
+from training.views.mesh_views import view_cloud
+from training.views.render_job import render_dataset
 
 __all__ = ["DemoFigures", "run_demo"]
 

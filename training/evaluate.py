@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from thor2_jax.classifier import DEFAULT_RULE
-from thor2_jax.recognizer import Recognizer
+from thor2_jax.recognition.classifier import DEFAULT_RULE
+from thor2_jax.recognition.recognizer import Recognizer
 from training.evaluation.accuracy import parts
 from training.evaluation.answers import answer_frame
-from training.evaluation.joining import join_by, joinings
+from training.evaluation.fusion import join_by, joinings
 from training.evaluation.runs import Run
 from training.readers.labelled import LabelledFrame
 

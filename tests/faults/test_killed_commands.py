@@ -15,12 +15,12 @@ from PIL import Image
 
 import colornet
 import thor2_jax as thor2
-from thor2_jax.classifier import MLP
-from thor2_jax.run_folder import TrainedRun, input_size, load_run, save_run
+from thor2_jax.recognition.classifier import MLP
+from thor2_jax.recognition.run_directory import TrainedRun, input_size, load_run, save_run
 from training import cli
 from training.baselines.files import baseline_file, read_baseline
-from training.metrics import read_figures
-from training.view_dataset import MANIFEST, Manifest
+from training.fitting.metrics_log import read_figures
+from training.views.dataset import MANIFEST, Manifest
 
 pytestmark = pytest.mark.slow
 

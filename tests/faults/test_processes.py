@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 import thor2_jax as thor2
-from thor2_jax.run_folder import TrainedRun, load_run
-from training.fit import FitOptions
-from training.train import train_run
-from training.view_source import MemoryViews
+from thor2_jax.recognition.run_directory import TrainedRun, load_run
+from training.fitting.fit import FitOptions
+from training.fitting.job import train_run
+from training.views.source import MemoryViews
 
 CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=3, n_strips=8, image_size=8)
 OPTIONS = FitOptions(epochs=2, batch_size=4)

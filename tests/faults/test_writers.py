@@ -13,14 +13,14 @@ from flax import nnx
 import colornet
 import thor2_jax as thor2
 from colornet.draw import draw_similarity
-from thor2_jax.classifier import MLP
 from thor2_jax.files import write_text
-from thor2_jax.overlay import draw_overlay
-from thor2_jax.run_folder import TrainedRun, input_size, load_run, save_run
+from thor2_jax.recognition.classifier import MLP
+from thor2_jax.recognition.overlay import draw_overlay
+from thor2_jax.recognition.run_directory import TrainedRun, input_size, load_run, save_run
 from training.evaluation.answers import AnswerFile, FrameAnswers
-from training.fit import Figures
-from training.metrics import append_figures, forget_after, read_figures
-from training.view_dataset import MANIFEST, Manifest
+from training.fitting.fit import Figures
+from training.fitting.metrics_log import append_figures, forget_after, read_figures
+from training.views.dataset import MANIFEST, Manifest
 
 CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=2, n_strips=5, image_size=8)
 NETWORK = colornet.load_default()

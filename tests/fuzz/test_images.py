@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from thor2_jax.errors import InputError
-from thor2_jax.frames import read_color, read_depth, read_intrinsics, read_labels
+from thor2_jax.recognition.frames import read_color, read_depth, read_intrinsics, read_labels
 from thor2_jax.testing import damaged
 
 RNG = np.random.default_rng(0)

@@ -13,13 +13,13 @@ from hypothesis import strategies as st
 
 import colornet
 import thor2_jax as thor2
-from thor2_jax.classifier import MLP
 from thor2_jax.files import json_digest
-from thor2_jax.run_folder import TrainedRun, input_size, load_run, save_run
+from thor2_jax.recognition.classifier import MLP
+from thor2_jax.recognition.run_directory import TrainedRun, input_size, load_run, save_run
 from thor2_jax.testing import damaged
 from training.baselines.files import Stored, read_baseline, write_baseline
 from training.evaluation.answers import AnswerFile, FrameAnswers, InstanceAnswer
-from training.metrics import read_figures
+from training.fitting.metrics_log import read_figures
 
 CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=2, n_strips=5, image_size=8)
 
@@ -53,7 +53,7 @@ def test_descriptions(data: st.DataObject, run: Path, attempt: Any, monkeypatch:
         part = data.draw(damaged(json.dumps(table[key]).encode()))
         other = json.dumps(table | {key: "PART"}).encode().replace(b'"PART"', part)
     with monkeypatch.context() as patch:
-        patch.setattr("thor2_jax.run_folder._restore_weights", lambda path, n_inputs, n_classes: None)
+        patch.setattr("thor2_jax.recognition.run_directory._restore_weights", lambda path, n_inputs, n_classes: None)
         found = damaged_and_back(run / "run.json", other, lambda: load_run(run), attempt)
     assert found is None or (found.config, found.classes, found.record) == (CONFIG, ("mug", "bowl"), {"epochs": 3})
 

@@ -16,15 +16,15 @@ from PIL import Image
 
 import colornet
 from thor2_jax.testing import damaged, networks
-from training.meshes import read_names
-from training.normalized_views import NormalizedViews
+from training.objects.meshes import read_names
 from training.readers.bop import BOP
-from training.readers.files import read_table
 from training.readers.frames import FrameFolder
 from training.readers.ocid import OCID
 from training.readers.pcd import read_organized_points
 from training.readers.uwis import UWISOccluded
-from training.view_dataset import MANIFEST, Manifest, Shard, ViewDataset, encode
+from training.storage.tables import read_table
+from training.views.dataset import MANIFEST, Manifest, Shard, ViewDataset, encode
+from training.views.normalized_views import NormalizedViews
 
 HEIGHT, WIDTH = 6, 8
 LAUGHS = "\n".join(

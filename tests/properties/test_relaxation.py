@@ -12,8 +12,8 @@ import thor2_jax as thor2
 from colornet.lab import GRID_WHITE
 from colornet.lab import hyab as exact_hyab
 from colornet.lab import to_lab as exact_lab
-from thor2_jax.color_membership import region_sets
-from thor2_jax.relaxation import hyab, interval_weights, soft_regions, to_lab
+from thor2_jax.descriptor.color_membership import region_sets
+from thor2_jax.descriptor.relaxation import hyab, interval_weights, soft_regions, to_lab
 
 NETWORK = colornet.load_default()
 HARD = thor2.DescriptorConfig(homology="closed_form")

@@ -31,9 +31,9 @@ from pathlib import Path
 import numpy as np
 from flax import nnx
 import colornet, thor2_jax as thor2
-from training.fit import FitOptions
-from training.train import train_run
-from training.view_source import MemoryViews
+from training.fitting.fit import FitOptions
+from training.fitting.job import train_run
+from training.views.source import MemoryViews
 
 rng = np.random.default_rng(0)
 clouds = {"a": [], "b": []}

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 import colornet
 import thor2_jax as thor2
-from thor2_jax.classifier import MLP, class_probabilities
+from thor2_jax.recognition.classifier import MLP, class_probabilities
 
 NETWORK = colornet.load_default()
 N_CLOUDS = 64

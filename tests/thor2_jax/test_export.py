@@ -8,9 +8,9 @@ from flax import nnx
 
 import colornet
 import thor2_jax as thor2
-from thor2_jax.classifier import FEATURES, MLP
 from thor2_jax.export import export_recognizer
-from thor2_jax.run_folder import TrainedRun, input_size
+from thor2_jax.recognition.classifier import FEATURES, MLP
+from thor2_jax.recognition.run_directory import TrainedRun, input_size
 
 CONFIG = thor2.DescriptorConfig()
 

@@ -11,8 +11,8 @@ import pytest
 
 import colornet
 import thor2_jax as thor2
-from thor2_jax.instance_clouds import InstanceCloud
-from thor2_jax.occlusion import Occlusion
+from thor2_jax.recognition.instance_clouds import InstanceCloud
+from thor2_jax.recognition.occlusion import Occlusion
 
 RNG = np.random.default_rng(0)
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import colornet
-from thor2_jax.color_membership import region_sets
-from training.dataset import Samples
+from thor2_jax.descriptor.color_membership import region_sets
+from training.fitting.samples import Samples
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.config import DescriptorConfig
-from thor2_jax.recognizer import Part, Recognition
+from thor2_jax.recognition.recognizer import Part, Recognition
 from thor2_jax.service.engine import Row
 from thor2_jax.service.preparing import Prepared
 from thor2_jax.service.schemas import Candidate, Details, ExplainedFrame, ExplainedInstance, Instance, Slice, Strip

@@ -16,7 +16,7 @@ from pydantic import ValidationError
 
 from thor2_jax.capacity import POINT_BUCKETS
 from thor2_jax.errors import InputError
-from thor2_jax.frames import Intrinsics, RGBDFrame
+from thor2_jax.recognition.frames import Intrinsics, RGBDFrame
 from thor2_jax.service.problem import RequestError
 from thor2_jax.service.schemas import Clouds
 from thor2_jax.service.settings import FARTHEST, MAX_BODY, MAX_CLOUDS, MAX_INSTANCES, MAX_PIXELS, MAX_TEXT

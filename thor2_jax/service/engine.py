@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.capacity import BATCH_BUCKETS, POINT_BUCKETS, batch_bucket, point_bucket
-from thor2_jax.classifier import Feature
-from thor2_jax.descriptor import describe_strips, strips
+from thor2_jax.descriptor.describe import describe_strips, strips
+from thor2_jax.descriptor.view_normalization import align
 from thor2_jax.errors import InputError
-from thor2_jax.recognizer import THOR2, Part, Recognition, Recognizer, pack_parts
-from thor2_jax.run_folder import load_run
+from thor2_jax.recognition.classifier import Feature
+from thor2_jax.recognition.recognizer import THOR2, Part, Recognition, Recognizer, pack_parts
+from thor2_jax.recognition.run_directory import load_run
 from thor2_jax.service.preparing import PreparedInstance
 from thor2_jax.service.settings import Settings
-from thor2_jax.view_normalization import align
 
 __all__ = ["Engine", "Row"]
 

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
-from thor2_jax.recognizer import Part, prepare
+from thor2_jax.recognition.recognizer import Part, prepare
 from thor2_jax.service.decoding import clouds_of_json, clouds_of_npz, frame_of
 from thor2_jax.service.problem import RequestError, late
 from thor2_jax.service.schemas import LabelMap

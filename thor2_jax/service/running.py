@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import AsyncIterator, Iterator
 
-from thor2_jax.recognizer import Part, Recognition
+from thor2_jax.recognition.recognizer import Part, Recognition
 from thor2_jax.service.answers import explained_frame
 from thor2_jax.service.batching import Batcher
 from thor2_jax.service.engine import Engine, Row

@@ -19,11 +19,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from colornet import ColorNetwork
 from thor2_jax.config import DescriptorConfig
+from thor2_jax.descriptor.view_normalization import OCCLUSION_BIN
 from thor2_jax.testing.clouds import settled
 from thor2_jax.testing.comparing import assert_equal, assert_near, joined, taken, with_points
 from thor2_jax.testing.tolerances import UNIT
 from thor2_jax.types import Descriptors, PointClouds, Strips
-from thor2_jax.view_normalization import OCCLUSION_BIN
 
 __all__ = [
     "assert_backends_agree",

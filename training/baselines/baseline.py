@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from colornet import ColorNetwork
 from thor2_jax.config import DescriptorConfig
-from thor2_jax.recognizer import DescribedFrame
+from thor2_jax.descriptor.view_normalization import view_normalize
+from thor2_jax.recognition.recognizer import DescribedFrame
 from thor2_jax.types import PointClouds
-from thor2_jax.view_normalization import view_normalize
-from training.fit import FitOptions
-from training.folds import fold_of_views
-from training.view_source import ViewSource
+from training.fitting.fit import FitOptions
+from training.fitting.folds import fold_of_views
+from training.views.source import ViewSource
 
 __all__ = ["TITLES", "Baseline", "Fitted", "Seen", "Task", "seen_in"]
 

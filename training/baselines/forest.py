@@ -12,12 +12,12 @@ from sklearn.ensemble import RandomForestClassifier
 
 from colornet import ColorNetwork
 from thor2_jax.config import DescriptorConfig
-from thor2_jax.descriptor import strips
+from thor2_jax.descriptor.describe import strips
+from thor2_jax.descriptor.view_normalization import mirror, turn
 from thor2_jax.types import PointClouds, Strips
-from thor2_jax.view_normalization import mirror, turn
 from training.baselines.baseline import Fitted, Seen, Task
-from training.dataset import MIRRORS
-from training.normalized_views import padded_batches
+from training.fitting.samples import MIRRORS
+from training.views.normalized_views import padded_batches
 
 __all__ = ["Forest", "forest_features", "train_forest"]
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from thor2_jax.errors import InputError
-from thor2_jax.run_folder import load_run
+from thor2_jax.recognition.run_directory import load_run
 from training.baselines.baseline import Fitted, Task
 from training.baselines.files import Stored, baseline_file, write_baseline
 from training.baselines.forest import train_forest
@@ -14,8 +14,8 @@ from training.baselines.pointnet import train_pointnet
 from training.baselines.thor import train_thor
 from training.evaluation.confidence import fit_temperature
 from training.evaluation.runs import run_folders
-from training.fit import FitOptions
-from training.view_source import ViewSource
+from training.fitting.fit import FitOptions
+from training.views.source import ViewSource
 
 __all__ = ["BASELINES", "check_baselines", "train_baselines"]
 

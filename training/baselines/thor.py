@@ -22,18 +22,18 @@ import numpy as np
 from flax import nnx
 from numpy.typing import NDArray
 
-from thor2_jax.classifier import MLP
 from thor2_jax.config import DescriptorConfig
+from thor2_jax.descriptor.view_normalization import OCCLUSION_BIN, turn
 from thor2_jax.errors import InputError
+from thor2_jax.recognition.classifier import MLP
 from thor2_jax.types import PointClouds
-from thor2_jax.view_normalization import OCCLUSION_BIN, turn
 from training.baselines.baseline import Fitted, Seen, Task
 from training.baselines.files import arrays_of, model_with
-from training.calibration import sample_probabilities
-from training.checkpoints import Checkpoints
-from training.dataset import Samples, build_samples
-from training.fit import Figures, fit
-from training.view_sphere import view_angles
+from training.fitting.calibration import sample_probabilities
+from training.fitting.checkpoints import Checkpoints
+from training.fitting.fit import Figures, fit
+from training.fitting.samples import Samples, build_samples
+from training.rendering.view_sphere import view_angles
 
 __all__ = ["THOR", "TYPES", "ViewType", "camera_types", "train_thor", "view_types"]
 

@@ -14,12 +14,12 @@ from thor2_jax.config import DESCRIPTOR_VERSION
 from thor2_jax.errors import InputError
 from thor2_jax.files import write_text
 from training.evaluation.answers import AnswerFile, FrameAnswers, answer_frame, columns
-from training.evaluation.gallery import Gallery
+from training.evaluation.frame_pictures import Gallery
 from training.evaluation.page import WORST, write_report_page
 from training.evaluation.results import results
 from training.evaluation.runs import Run
-from training.locking import locked
 from training.readers.labelled import LabelledFrames
+from training.storage.locks import locked
 
 __all__ = ["evaluate_dataset"]
 

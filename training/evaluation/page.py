@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 
 from training.baselines.baseline import TITLES
-from training.evaluation.gallery import Gallery
-from training.evaluation.joining import RULES
-from training.evaluation.pictures import draw_reliability
+from training.evaluation.frame_pictures import Gallery
+from training.evaluation.fusion import RULES
 from training.evaluation.published import published, published_seconds
 from training.evaluation.results import COVERAGE
-from training.pictures import draw_accuracy, draw_confusion_counts
-from training.report import Picture, Section, Table, write_page
+from training.reports.html import Picture, Section, Table, write_page
+from training.reports.instance_pictures import draw_reliability
+from training.reports.plots import draw_accuracy, draw_confusion_counts
 
 __all__ = ["accuracy_table", "figure_text", "write_report_page"]
 

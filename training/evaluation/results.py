@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thor2_jax.classifier import DEFAULT_RULE
+from thor2_jax.recognition.classifier import DEFAULT_RULE
 from training.evaluation.accuracy import over_runs, parts, tables_of
 from training.evaluation.answers import FrameAnswers, InstanceAnswer
 from training.evaluation.confidence import accuracy_at_coverage, auroc, expected_calibration_error, reliability
-from training.evaluation.joining import RULES, Rule, join_by, joinings, main_joining
+from training.evaluation.fusion import RULES, Rule, join_by, joinings, main_joining
 from training.evaluation.published import published
 from training.readers.labelled import sequence_of
 

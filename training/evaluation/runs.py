@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
 from thor2_jax.files import json_digest
-from thor2_jax.recognizer import DescribedFrame, Recognizer
-from thor2_jax.run_folder import RUN_FILE
+from thor2_jax.recognition.recognizer import DescribedFrame, Recognizer
+from thor2_jax.recognition.run_directory import RUN_FILE
 from training.baselines.baseline import Baseline, Seen
 from training.baselines.files import baseline_file
 from training.baselines.load import load_baselines
-from training.checkpoints import CHECKPOINTS
+from training.fitting.checkpoints import CHECKPOINTS
 from training.readers.labelled import path_ends, sequence_of
 
 __all__ = ["Run", "SequenceRun", "load_runs", "load_sequence_runs", "run_folders"]

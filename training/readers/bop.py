@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
-from thor2_jax.frames import Intrinsics, RGBDFrame, read_color, read_depth, read_labels
-from training.readers.files import complaints_about, read_table
+from thor2_jax.recognition.frames import Intrinsics, RGBDFrame, read_color, read_depth, read_labels
 from training.readers.labelled import LabelledFrame, LabelledFrames
+from training.storage.tables import complaints_about, read_table
 
 __all__ = ["BOP", "SMALLEST_VISIBLE"]
 

@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 
 from thor2_jax.errors import InputError
-from thor2_jax.frames import read_frame
+from thor2_jax.recognition.frames import read_frame
 from training.readers.labelled import LabelledFrame, LabelledFrames
 
 __all__ = ["FrameFolder"]

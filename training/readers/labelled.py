@@ -4,7 +4,7 @@ import abc
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 
-from thor2_jax.frames import RGBDFrame
+from thor2_jax.recognition.frames import RGBDFrame
 
 __all__ = ["LabelledFrame", "LabelledFrames", "path_ends", "sequence_of"]
 

@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
-from thor2_jax.frames import Intrinsics, RGBDFrame, read_color, read_depth, read_labels
-from training.readers.files import complaints_about, read_table
+from thor2_jax.recognition.frames import Intrinsics, RGBDFrame, read_color, read_depth, read_labels
 from training.readers.labelled import LabelledFrame, LabelledFrames, path_ends
 from training.readers.pcd import read_organized_points
+from training.storage.tables import complaints_about, read_table
 
 __all__ = ["OCID", "fit_intrinsics"]
 

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from thor2_jax.errors import InputError
-from thor2_jax.frames import Intrinsics, RGBDFrame, read_color, read_depth, read_labels
-from training.readers.files import parse_yaml
+from thor2_jax.recognition.frames import Intrinsics, RGBDFrame, read_color, read_depth, read_labels
 from training.readers.labelled import LabelledFrame, LabelledFrames
+from training.storage.tables import parse_yaml
 
 __all__ = ["INTRINSICS", "NOT_SCORED", "UWISOccluded", "Video", "video_attributes"]
 

@@ -1,0 +1,140 @@
+"""Minimal boxes against exact rectangles (OpenCV), exact hulls (SciPy), an exhaustive search (trimesh), known boxes."""
+
+import itertools
+
+import cv2
+import jax
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
+
+from thor2_jax.descriptor.bounding_box import _minimum_area_angle, minimal_box, support_points
+
+compiled_box, compiled_support = jax.jit(minimal_box), jax.jit(support_points)
+
+
+def padded(points: np.ndarray, capacity: int = 512) -> np.ndarray:
+    """Centred points, [3, N], padded with zeros."""
+    out = np.zeros((3, capacity), np.float32)
+    out[:, : len(points)] = (points - (points.mean(axis=0) if len(points) else 0)).T
+    return out
+
+
+def box_of(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Axes, float64, and the side lengths along them, from the points themselves."""
+    axes, low, high = (np.asarray(part, np.float64) for part in compiled_box(padded(points)))
+    if len(points) == 0:
+        return axes, np.zeros(3)
+    turned = (points - points.mean(axis=0)) @ axes.T
+    np.testing.assert_allclose([low, high], [turned.min(axis=0), turned.max(axis=0)], atol=1e-6 * np.abs(points).max())
+    return axes, np.ptp(turned, axis=0)
+
+
+def shapes() -> list[np.ndarray]:
+    """Clouds like those of objects: flat, long, round, half seen; turned any way."""
+    rng = np.random.default_rng(0)
+    clouds = []
+    for k in range(24):
+        points = rng.normal(size=(500, 3))
+        if k % 3 == 0:
+            points = rng.uniform(-1, 1, (500, 3))
+        if k % 3 == 1:
+            points = points / np.linalg.norm(points, axis=1, keepdims=True)
+            points = points[points[:, 2] > rng.uniform(-0.5, 0.5)]
+        points = points * rng.uniform(0.1, 1, 3) + rng.normal(scale=0.01, size=points.shape)
+        clouds.append(points @ Rotation.random(random_state=k).as_matrix().T)
+    return clouds
+
+
+DEGENERATE = {
+    "empty": np.zeros((0, 3)),
+    "one point": np.array([[0.3, -0.2, 1.5]]),
+    "two points": np.array([[0.3, -0.2, 1.5], [0.4, 0.1, 1.2]]),
+    "three points": np.array([[0, 0, 0], [1.0, 0, 0], [0, 2.0, 0]]),
+    "all equal": np.full((101, 3), 0.7),
+    "line": np.linspace(0, 1, 101)[:, None] * [1.0, 2.0, -1.0],
+    "plane": np.random.default_rng(0).random((101, 2)) @ [[1.0, 0, 1.0], [0, 1.0, 0]],
+    "cube": np.array(list(itertools.product((-1.0, 1.0), repeat=3))),
+    "ball": trimesh.creation.icosphere(2).vertices,
+}
+
+
+@pytest.mark.parametrize("name", DEGENERATE)
+def test_axes_are_orthonormal_and_finite_whatever_the_cloud(name: str) -> None:
+    axes, sides = box_of(DEGENERATE[name])
+    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-5)
+    assert sides[0] >= sides[1] - 1e-5 and sides[1] >= sides[2] - 1e-5
+
+
+def test_the_boxes_of_a_line_a_plane_and_a_cube() -> None:
+    np.testing.assert_allclose(box_of(DEGENERATE["line"])[1], [np.sqrt(6), 0, 0], atol=1e-5)
+    assert box_of(DEGENERATE["plane"])[1][2] < 1e-5
+    turned = DEGENERATE["cube"] @ Rotation.from_euler("xyz", [0.3, 0.5, 0.7]).as_matrix().T
+    assert np.prod(box_of(turned)[1]) <= 8 * 1.05
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_finds_a_known_box(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    sides = np.sort(rng.uniform(0.1, 1, 3))[::-1]
+    corners = np.array(list(itertools.product((0, 1), repeat=3)))
+    points = np.concatenate([corners, rng.random((301, 3))]) * sides
+    found = box_of(points @ Rotation.random(random_state=seed).as_matrix().T)[1]
+    assert np.prod(found) <= 1.03 * np.prod(sides)
+    np.testing.assert_allclose(found, sides, rtol=0.03)
+
+
+def test_volumes_against_an_exhaustive_search_over_the_hulls_faces() -> None:
+    ratios = [np.prod(box_of(points)[1]) / np.prod(trimesh.bounds.oriented_bounds(points)[1]) for points in shapes()]
+    assert np.median(ratios) <= 1.02
+    assert max(ratios) <= 1.08
+
+
+def test_seen_along_each_axis_the_box_is_a_minimum_area_rectangle() -> None:
+    ratios = []
+    for points in shapes():
+        axes, sides = box_of(points)
+        turned = points @ axes.T
+        for a, b in ((0, 1), (1, 2), (0, 2)):
+            width, height = cv2.minAreaRect(turned[:, [a, b]].astype(np.float32))[1]
+            ratios.append(sides[a] * sides[b] / (width * height))
+    assert np.median(ratios) <= 1.005
+    assert max(ratios) <= 1.08
+
+
+def test_support_points_are_vertices_of_the_hull() -> None:
+    for points in shapes():
+        centred = padded(points).astype(np.float64)
+        frame = np.linalg.svd(centred.T, full_matrices=False)[2]
+        principal = (frame @ centred).astype(np.float32)
+        found = np.asarray(compiled_support(principal))
+        assert found.shape == (3, 66)
+        cloud = principal[:, : len(points)].T
+        corners = {tuple(row) for row in cloud[ConvexHull(cloud).vertices].tolist()}
+        chosen = {tuple(row) for row in found.T.tolist()}
+        assert chosen <= corners and len(chosen) >= 15
+        for axis in range(3):  # among them the extremes of each axis
+            assert {tuple(cloud[k].tolist()) for k in (cloud[:, axis].argmin(), cloud[:, axis].argmax())} <= chosen
+
+
+def test_support_points_of_an_empty_cloud() -> None:
+    np.testing.assert_array_equal(compiled_support(np.zeros((3, 16), np.float32)), np.zeros((3, 66)))
+
+
+@pytest.mark.parametrize("capacity", [528, 1024])
+def test_padding_does_not_change_the_box(capacity: int) -> None:
+    points = shapes()[1]
+    axes = np.asarray(compiled_box(padded(points, capacity))[0], np.float64)
+    np.testing.assert_allclose(np.abs(axes @ box_of(points)[0].T), np.eye(3), atol=1e-4)
+
+
+def test_a_mirrored_projection_turns_the_other_way() -> None:
+    """So the signs of the frame that the search starts from do not matter."""
+    angle = jax.jit(_minimum_area_angle)
+    for seed in range(5):
+        xy = np.random.default_rng(seed).normal(size=(2, 80)).astype(np.float32)
+        found = float(angle(xy))
+        assert 0 < abs(found) < np.pi / 4
+        assert float(angle(xy * np.array([[1], [-1]], np.float32))) == pytest.approx(-found, abs=1e-6)

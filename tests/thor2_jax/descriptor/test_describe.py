@@ -1,0 +1,266 @@
+"""The whole way from clouds to TOPS and TOPS2 against NumPy in float64, and what must not matter."""
+
+import dataclasses
+import logging
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from scipy.special import ndtr
+
+import colornet
+import thor2_jax as thor2
+from thor2_jax.descriptor.describe import chunking as cpu_parts
+
+NETWORK = colornet.load_default()
+CLOSED = thor2.DescriptorConfig(homology="closed_form")
+CONFIGS = {
+    f"{convention}-{homology}": thor2.DescriptorConfig(convention=convention, homology=homology)
+    for convention in ("paper", "released")
+    for homology in ("gudhi", "closed_form")
+}
+Cloud = tuple[np.ndarray, np.ndarray]
+
+
+def aligned_cloud(seed: int, n: int, size: tuple[float, float, float] = (0.76, 0.4, 0.68)) -> Cloud:
+    """Random points in the first octant, none within 1e-5 of a border of the paper's slices and strips."""
+    rng = np.random.default_rng(seed)
+    points = (rng.random((n, 3)) * size).astype(np.float32)
+    for axis, width in ((0, 0.025), (2, 0.1)):
+        border = np.round(points[:, axis] / width) * width
+        points[np.abs(points[:, axis] - border) < 1e-5, axis] += np.float32(1e-3)
+    return points, rng.integers(0, 256, (n, 3), dtype=np.uint8)
+
+
+def camera_cloud(seed: int, n: int = 900) -> Cloud:
+    """A lopsided box of a thing, in metres before the camera."""
+    rng = np.random.default_rng(seed)
+    points = rng.random((n, 3)) * [0.2, 0.11, 0.05]
+    points = points[points[:, 0] / 0.2 + points[:, 1] / 0.11 < 1.5]
+    points = points @ Rotation.random(random_state=seed).as_matrix().T + [0.02, -0.05, 0.5]
+    return points.astype(np.float32), rng.integers(0, 256, points.shape, dtype=np.uint8)
+
+
+def expected_descriptor(points: np.ndarray, rgb: np.ndarray, released: bool) -> tuple[np.ndarray, np.ndarray, int]:
+    """Images [7, 32, 32], embeddings [7, 22, 31] and overflow of one aligned cloud, from the equations."""
+    x, y, z = points.astype(np.float64).T
+    if released:
+        x, y, z = np.round(x, 2), np.round(y, 2), np.round(z, 1)
+        i = np.searchsorted(np.unique(z), z)
+        j = np.digitize(x, np.arange(0, 0.775, 0.025), right=True)
+    else:
+        i, j = np.floor(z / 0.1).astype(int), np.floor(x / 0.025).astype(int)
+    weights = NETWORK.membership(rgb).astype(np.float64)
+    images, embeddings = np.zeros((7, 32, 32)), np.zeros((7, 22, 31))
+    overflow = int(np.sum((i > 6) | (j > 30)))
+    edges = (np.arange(33) - 1) * 0.025
+    for a, b in {(a, b) for a, b in zip(i.tolist(), j.tolist(), strict=True) if a < 7 and b < 31}:
+        here = (i == a) & (j == b)
+        persistence = y[here].max() - y[here].min()
+        overflow += int(persistence > 0.775)
+        masses = [np.diff(ndtr((edges - centre) / np.sqrt(0.00025))) for centre in (b * 0.025, persistence)]
+        images[a] += persistence * np.outer(*masses)
+        color = weights[here].sum(axis=0) / (here.sum() if released else 1)
+        embeddings[a, :, b] = color @ NETWORK.similarity
+    return images, embeddings, overflow
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_aligned_clouds_against_numpy(name: str) -> None:
+    config = CONFIGS[name]
+    sizes = [(0.76, 0.4, 0.68), (0.4, 0.7, 0.3), (0.9, 1.2, 0.9)]  # the last one overflows in every way
+    clouds = [aligned_cloud(k, n, sizes[k % 3]) for k, n in enumerate((512, 333, 511, 1, 2, 0))]
+    found = thor2.describe_aligned(thor2.PointClouds.pack(clouds), NETWORK, config)
+    for b, (points, rgb) in enumerate(clouds):
+        images, embeddings, overflow = expected_descriptor(points, rgb, config.convention == "released")
+        np.testing.assert_allclose(found.images[b], images, atol=2e-6)
+        np.testing.assert_allclose(found.embeddings[b], embeddings, rtol=1e-5, atol=1e-5)
+        assert int(found.overflow[b]) == overflow
+    assert int(found.overflow[2]) > 0 and found.overflow.dtype == jnp.int32
+    assert (found.tops.shape, found.color.shape, found.tops2.shape) == ((6, 7168), (6, 4774), (6, 11942))
+    assert found.tops2.dtype == jnp.float32
+
+
+def test_persistence_past_the_window_is_counted_on_its_own() -> None:
+    points = np.array([[0.01, 0, 0.05], [0.01, 0.7, 0.05], [0.03, 0, 0.05], [0.03, 0.8, 0.05]], np.float32)
+    clouds = thor2.PointClouds.pack([(points, np.zeros((4, 3), np.uint8))])
+    assert thor2.describe_aligned(clouds, NETWORK, CLOSED).overflow.tolist() == [1]
+
+
+def test_describe_is_align_and_then_the_rest() -> None:
+    clouds = thor2.PointClouds.pack([camera_cloud(0), camera_cloud(1)])
+    whole = thor2.describe(clouds, NETWORK, CLOSED)
+    aligned = thor2.align(clouds, CLOSED)
+    for parts in (
+        thor2.describe_aligned(aligned, NETWORK, CLOSED),
+        thor2.describe_strips(thor2.strips(aligned, NETWORK, CLOSED), NETWORK, CLOSED),
+    ):
+        np.testing.assert_array_equal(whole.tops2, parts.tops2)
+
+
+def test_empty_clouds_in_a_batch_are_zero_and_disturb_nobody() -> None:
+    empty, cloud = (np.zeros((0, 3)), np.zeros((0, 3))), camera_cloud(0)
+    config = thor2.DescriptorConfig()
+    found = thor2.describe(thor2.PointClouds.pack([empty, cloud, empty]), NETWORK, config)
+    company = thor2.describe(thor2.PointClouds.pack([cloud, cloud, camera_cloud(1)]), NETWORK, config)
+    np.testing.assert_array_equal(found.tops2[0], 0)
+    np.testing.assert_array_equal(found.tops2[2], 0)
+    assert found.overflow.tolist()[::2] == [0, 0]
+    np.testing.assert_array_equal(found.tops2[1], company.tops2[0])
+    np.testing.assert_array_equal(found.tops2[1], company.tops2[1])
+
+
+def test_batches_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each cloud as in a small batch, in value and in gradient, through callbacks too; whole groups and a rest."""
+    monkeypatch.setattr(cpu_parts, "LARGEST", 8)
+    monkeypatch.setattr(cpu_parts, "AT_ONCE", 2)
+    config, count = thor2.DescriptorConfig(homology="gudhi"), 27
+    few = thor2.PointClouds.pack([camera_cloud(seed, 300) for seed in range(8)], 512)
+    order = np.arange(count) % 8
+    many = jax.tree.map(lambda a: a[order], few)
+    expected, found = thor2.describe(few, NETWORK, config), thor2.describe(many, NETWORK, config)
+    for name in ("images", "embeddings", "overflow"):
+        np.testing.assert_allclose(getattr(found, name), np.asarray(getattr(expected, name))[order], atol=1e-6)
+
+    def mass(points: jax.Array, clouds: thor2.PointClouds) -> jax.Array:
+        return thor2.describe(dataclasses.replace(clouds, points=points), NETWORK, config).images.sum()
+
+    gradient = jax.grad(mass)(many.points, many)
+    np.testing.assert_allclose(gradient, np.asarray(jax.grad(mass)(few.points, few))[order], atol=1e-5)
+
+
+@pytest.mark.parametrize("homology", ["gudhi", "closed_form"])
+def test_padding_and_company_do_not_matter(homology: str) -> None:
+    config = thor2.DescriptorConfig(homology=homology)
+    clouds = [aligned_cloud(k, n) for k, n in enumerate((512, 37, 300))]
+    together = thor2.describe_aligned(thor2.PointClouds.pack(clouds), NETWORK, config)
+    for b, cloud in enumerate(clouds):
+        for capacity in (512, 700):
+            alone = thor2.describe_aligned(thor2.PointClouds.pack([cloud], capacity), NETWORK, config)
+            np.testing.assert_allclose(alone.tops2[0], together.tops2[b], rtol=1e-6, atol=1e-6)
+
+
+def test_order_and_duplicates() -> None:
+    points, rgb = aligned_cloud(3, 400)
+    order = np.random.default_rng(0).permutation(400)
+    packed = thor2.PointClouds.pack(
+        [(points, rgb), (points[order], rgb[order]), (np.tile(points, (2, 1)), np.tile(rgb, (2, 1)))]
+    )
+    found = thor2.describe_aligned(packed, NETWORK, CLOSED)
+    np.testing.assert_array_equal(found.tops[1], found.tops[0])
+    np.testing.assert_array_equal(found.tops[2], found.tops[0])
+    np.testing.assert_allclose(found.color[1], found.color[0], rtol=1e-5)
+    np.testing.assert_allclose(found.color[2], 2 * found.color[0], rtol=1e-5)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_rigid_motion_of_cloud_and_camera(seed: int) -> None:
+    """A point on a border of strips may change sides; hardly a strip may differ."""
+    points, rgb = camera_cloud(seed)
+    motion, shift = Rotation.random(random_state=seed + 10).as_matrix(), np.array([0.1, 0.2, -0.4])
+    found = thor2.describe(
+        thor2.PointClouds.pack([(points, rgb), (points @ motion.T + shift, rgb)], camera=[[0, 0, 0], shift]),
+        NETWORK,
+        CLOSED,
+    )
+    differ = np.abs(np.asarray(found.embeddings[0] - found.embeddings[1])).max(axis=1) > 1e-3
+    assert differ.sum() <= 2 < 30 < np.asarray(found.embeddings[0]).any(axis=1).sum()
+    assert (np.abs(np.asarray(found.images[0] - found.images[1])) > 1e-4).mean() < 0.01
+
+
+DEGENERATE = {
+    "one point": np.array([[0.1, 0.2, 0.9]]),
+    "all equal": np.full((101, 3), 0.7),
+    "line": np.linspace(0, 0.2, 101)[:, None] * [1.0, 2.0, -1.0] + 0.5,
+    "plane": np.random.default_rng(0).random((101, 2)) @ [[0.1, 0, 0.1], [0, 0.1, 0]] + 0.5,
+    "cube": np.stack(np.meshgrid(*[[-0.1, 0.0, 0.1]] * 3), axis=-1).reshape(-1, 3),
+    "ball": np.stack(
+        [
+            0.1 * np.cos(np.arange(200)) * np.sin(np.arange(200) * 0.7),
+            0.1 * np.sin(np.arange(200)) * np.sin(np.arange(200) * 0.7),
+            0.1 * np.cos(np.arange(200) * 0.7),
+        ],
+        axis=1,
+    ),
+    "empty": np.zeros((0, 3)),
+}
+
+
+def degenerate() -> thor2.PointClouds:
+    return thor2.PointClouds.pack([(points, np.full(points.shape, 0.3)) for points in DEGENERATE.values()])
+
+
+def test_degenerate_clouds_give_finite_numbers() -> None:
+    found = thor2.describe(degenerate(), NETWORK, CLOSED)
+    assert np.isfinite(np.asarray(found.tops2)).all()
+    described = np.asarray(found.embeddings).any(axis=(1, 2, 3))
+    np.testing.assert_array_equal(described, [len(points) > 0 for points in DEGENERATE.values()])
+
+
+@pytest.mark.parametrize("homology", ["gudhi", "closed_form"])
+def test_inside_a_callers_jit_and_vmap(homology: str) -> None:
+    """With a network never seen before, so that nothing of the first trace may be kept for the calls after it."""
+    network = dataclasses.replace(NETWORK, n_raw_nodes={"gudhi": 24, "closed_form": 25}[homology])
+    config = thor2.DescriptorConfig(homology=homology)
+    packed = thor2.PointClouds.pack([aligned_cloud(k, n) for k, n in enumerate((512, 0, 33, 1))])
+    jitted = jax.jit(lambda clouds: thor2.describe_aligned(clouds, network, config))(packed)
+    plain = thor2.describe_aligned(packed, network, config)
+    pairs = jax.tree.map(lambda a: a.reshape(2, 2, *a.shape[1:]), packed)
+    mapped = jax.vmap(lambda clouds: thor2.describe_aligned(clouds, network, config))(pairs)
+    for found in (jitted, mapped):
+        np.testing.assert_allclose(found.tops2.reshape(4, -1), plain.tops2, rtol=1e-6, atol=1e-6)
+        np.testing.assert_array_equal(found.overflow.reshape(4), plain.overflow)
+
+
+def test_both_backends_give_the_same_floats() -> None:
+    rng = np.random.default_rng(0)
+    packed = thor2.PointClouds.pack([aligned_cloud(k, int(n)) for k, n in enumerate(rng.integers(0, 513, 128))])
+    first, second = (
+        thor2.describe_aligned(packed, NETWORK, thor2.DescriptorConfig(homology=homology))
+        for homology in ("gudhi", "closed_form")
+    )
+    np.testing.assert_array_equal(first.tops2, second.tops2)
+    np.testing.assert_array_equal(first.overflow, second.overflow)
+
+
+def test_what_is_no_batch_of_clouds_is_refused() -> None:
+    packed = thor2.PointClouds.pack([aligned_cloud(0, 5)])
+    one, batches = jax.tree.map(lambda a: a[0], packed), jax.tree.map(lambda a: a[None], packed)
+    for function in (thor2.describe, thor2.describe_aligned, thor2.strips):
+        with pytest.raises(thor2.InputError, match="clouds is ndarray"):
+            function(np.zeros((1, 5, 3)), NETWORK, CLOSED)
+        with pytest.raises(thor2.InputError, match=r"points \[512, 3\]"):
+            function(one, NETWORK, CLOSED)
+        with pytest.raises(thor2.InputError, match=r"points \[1, 1, 512, 3\]"):
+            function(batches, NETWORK, CLOSED)
+    with pytest.raises(thor2.InputError, match="clouds is list"):
+        thor2.diagrams([], CLOSED)
+
+
+def test_compiles_once_a_bucket(caplog: pytest.LogCaptureFixture) -> None:
+    """Every size of cloud that shares its bucket and its batch size shares one compilation."""
+    config = thor2.DescriptorConfig(homology="closed_form", alpha=0.7)  # of no other test
+
+    def compiled(sizes: tuple[int, ...], network: colornet.ColorNetwork = NETWORK) -> list[str]:
+        caplog.clear()
+        packed = thor2.PointClouds.pack([camera_like(n) for n in sizes])
+        with jax.log_compiles(), caplog.at_level(logging.WARNING):
+            jax.block_until_ready(thor2.describe(packed, network, config))
+        lines = [record.getMessage() for record in caplog.records]
+        return [line.split()[4] for line in lines if line.startswith("Finished XLA compilation of")]
+
+    def camera_like(n: int) -> Cloud:
+        return np.random.default_rng(n).random((n, 3)) * 0.1, np.zeros((n, 3), np.uint8)
+
+    first = compiled((5, 512))
+    assert first and len(first) == len(set(first)), first
+    assert {name for name in first if "normalize" in name or "strips" in name}
+    for sizes in ((0, 1), (512, 400), (37, 5)):
+        assert compiled(sizes) == []
+    assert compiled((512, 5), colornet.load(Path(colornet.__file__).with_name("data") / "network.npz")) == []
+    larger = compiled((513, 2))
+    assert larger and len(larger) == len(set(larger))
+    assert compiled((1024, 900)) == []

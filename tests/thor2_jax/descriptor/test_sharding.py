@@ -1,0 +1,95 @@
+"""One batch on eight devices and in two processes against one device, each in processes of their own."""
+
+import json
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+_CLOUDS = """
+import json, sys
+import numpy as np
+import colornet
+import thor2_jax as thor2
+from thor2_jax.descriptor.sharding import batch_mesh, describe_sharded, shard_clouds
+import jax
+
+def clouds(count):
+    rng = np.random.default_rng(0)
+    for k in range(count):
+        n = 100 + 20 * k
+        yield rng.random((n, 3)) * (0.2, 0.1, 0.05), rng.integers(0, 256, (n, 3), dtype=np.uint8)
+
+network = colornet.load_default()
+"""
+
+_DEVICES = """
+assert len(jax.devices()) == 8
+packed = thor2.PointClouds.pack(list(clouds(16)), 512)
+worst = {}
+for homology in ("closed_form", "gudhi"):
+    config = thor2.DescriptorConfig(homology=homology)
+    one = thor2.describe(packed, network, config)
+    many = describe_sharded(shard_clouds(packed, batch_mesh()), network, config)
+    assert len(many.images.sharding.device_set) == 8
+    worst[homology] = max(float(abs(np.asarray(a) - np.asarray(b)).max()) for a, b in
+                          zip(jax.tree.leaves(one), jax.tree.leaves(many), strict=True))
+refused = []
+for bad in (lambda: shard_clouds(thor2.PointClouds.pack(list(clouds(6)), 512), batch_mesh()),
+            lambda: describe_sharded(packed, network, config)):
+    try:
+        bad()
+    except thor2.InputError as error:
+        refused.append(str(error))
+print(json.dumps({"worst": worst, "refused": refused}))
+"""
+
+_PROCESS = """
+port, rank, folder = sys.argv[1], int(sys.argv[2]), sys.argv[3]
+jax.distributed.initialize(f"localhost:{port}", 2, rank)
+mine = list(clouds(8))[rank * 4 : rank * 4 + 4]
+config = thor2.DescriptorConfig(homology="gudhi")
+found = describe_sharded(shard_clouds(thor2.PointClouds.pack(mine, 512), batch_mesh()), network, config)
+assert found.images.shape[0] == 8
+tops2 = [np.asarray(s.data) for s in found.tops2.addressable_shards]
+np.save(f"{folder}/{rank}.npy", np.concatenate(tops2))
+"""
+
+_ALONE = """
+packed = thor2.PointClouds.pack(list(clouds(8)), 512)
+np.save(sys.argv[1], np.asarray(thor2.describe(packed, network, thor2.DescriptorConfig(homology="gudhi")).tops2))
+"""
+
+
+def start(code: str, *arguments: object, flags: str = "") -> subprocess.Popen[str]:
+    command = [sys.executable, "-c", _CLOUDS + code, *map(str, arguments)]
+    environment = {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu", "PATH": "/usr/bin:/bin"}
+    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def finish(process: subprocess.Popen[str]) -> str:
+    out, err = process.communicate(timeout=300)
+    assert process.returncode == 0, err[-3000:]
+    return out
+
+
+def test_eight_devices_give_the_numbers_of_one() -> None:
+    told = json.loads(finish(start(_DEVICES, flags="--xla_force_host_platform_device_count=8")).splitlines()[-1])
+    assert told["worst"]["closed_form"] <= 1e-6 and told["worst"]["gudhi"] <= 1e-6
+    assert len(told["refused"]) == 2
+    assert "multiple of the 8 devices" in told["refused"][0] and "shard_clouds" in told["refused"][1]
+
+
+@pytest.mark.slow
+def test_two_processes_give_the_numbers_of_one(tmp_path: Path) -> None:
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        port = free.getsockname()[1]
+    for process in [start(_PROCESS, port, rank, tmp_path) for rank in range(2)]:
+        finish(process)
+    finish(start(_ALONE, tmp_path / "alone.npy"))
+    parts = np.concatenate([np.load(tmp_path / f"{rank}.npy") for rank in range(2)])
+    np.testing.assert_allclose(parts, np.load(tmp_path / "alone.npy"), atol=1e-6)

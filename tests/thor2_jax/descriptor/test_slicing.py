@@ -1,0 +1,166 @@
+"""Slices, strips and colour vectors against a plain loop over the points in NumPy, float64."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import colornet
+import thor2_jax as thor2
+from thor2_jax.descriptor.slicing import slice_and_strip, strip_births
+
+NETWORK = colornet.load_default()
+PAPER, RELEASED = thor2.DescriptorConfig(), thor2.DescriptorConfig.released()
+Cloud = tuple[np.ndarray, np.ndarray]
+
+
+def paper_rule(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return np.floor(points[:, 2] / 0.1).astype(int), np.floor(points[:, 0] / 0.025).astype(int)
+
+
+def released_rule(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    levels = np.round(points[:, 2], 1)
+    slices = np.searchsorted(np.unique(levels), levels)
+    return slices, np.digitize(np.round(points[:, 0], 2), np.arange(0, 0.775, 0.025), right=True)
+
+
+def expected_strips(points: np.ndarray, rgb: np.ndarray, released: bool) -> dict[str, np.ndarray]:
+    i, j = (released_rule if released else paper_rule)(points)
+    y = np.round(points[:, 1], 2) if released else points[:, 1]
+    weights = NETWORK.membership(rgb).astype(np.float64)
+    out = {name: np.zeros((7, 31)) for name in ("low", "high")}
+    out["occupied"], out["color"] = np.zeros((7, 31), bool), np.zeros((7, 31, 22))
+    for a in range(7):
+        for b in range(31):
+            here = (i == a) & (j == b)
+            if here.any():
+                out["low"][a, b], out["high"][a, b] = y[here].min(), y[here].max()
+                out["occupied"][a, b] = True
+                out["color"][a, b] = weights[here].sum(axis=0) / (here.sum() if released else 1)
+    out["overflow"] = np.sum((i >= 7) | (j >= 31))
+    return out
+
+
+def aligned_cloud(seed: int, n: int, size: tuple[float, float, float] = (0.76, 0.4, 0.68)) -> Cloud:
+    """Random points in the first octant, none within 1e-5 of a border of the paper's slices and strips."""
+    rng = np.random.default_rng(seed)
+    points = (rng.random((n, 3)) * size).astype(np.float32)
+    for axis, width in ((0, 0.025), (2, 0.1)):
+        border = np.round(points[:, axis] / width) * width
+        points[np.abs(points[:, axis] - border) < 1e-5, axis] += np.float32(1e-3)
+    return points, rng.integers(0, 256, (n, 3), dtype=np.uint8)
+
+
+@pytest.mark.parametrize("config", [PAPER, RELEASED], ids=["paper", "released"])
+@pytest.mark.parametrize("sizes", [(0,), (1, 2), (333, 0, 512), (0, 0)])
+def test_strips_against_numpy(sizes: tuple[int, ...], config: thor2.DescriptorConfig) -> None:
+    clouds = [aligned_cloud(k, n) for k, n in enumerate(sizes)]
+    found = thor2.strips(thor2.PointClouds.pack(clouds), NETWORK, config)
+    for b, (points, rgb) in enumerate(clouds):
+        expected = expected_strips(points.astype(np.float64), rgb, config.convention == "released")
+        for field in dataclasses.fields(found):
+            actual = np.asarray(getattr(found, field.name)[b])
+            np.testing.assert_allclose(actual, expected[field.name], atol=1e-5, err_msg=f"{b} {field.name}")
+
+
+def test_the_released_rule_on_many_random_clouds() -> None:
+    """All coordinates at once, in the hundreds of thousands: single precision must not round another way."""
+    rng = np.random.default_rng(0)
+    points = (rng.random((300, 512, 3)) * [0.8, 0.4, 1.2]).astype(np.float32)
+    mask = np.ones((300, 512), bool)
+    i, j = jax.jit(jax.vmap(lambda p, m: slice_and_strip(p[:, 0], p[:, 2], m, RELEASED)))(points, mask)
+    for b in range(300):
+        slices, strips = released_rule(points[b].astype(np.float64))
+        np.testing.assert_array_equal(i[b], slices)
+        np.testing.assert_array_equal(np.minimum(j[b], 31), strips)  # digitize has no number past 31
+
+
+def test_the_released_rounding_at_every_half() -> None:
+    """Floats on and right beside each half of 0.01 and 0.1, where a product in single precision goes wrong."""
+    x = np.concatenate([(np.arange(79) + 0.5) / 100, np.arange(78) / 100]).astype(np.float32)
+    z = np.concatenate([(np.arange(12) + 0.5) / 10, np.arange(13) / 10]).astype(np.float32)
+    for column, values in ((0, x), (2, z)):
+        near = [values, np.nextafter(values, np.float32(9)), np.nextafter(values, np.float32(-9))]
+        points = np.zeros((3 * len(values), 3), np.float32)
+        points[:, column] = np.maximum(np.concatenate(near), 0)
+        found = jax.jit(lambda p: slice_and_strip(p[:, 0], p[:, 2], jnp.ones(len(p), bool), RELEASED))(points)
+        slices, strips = released_rule(points.astype(np.float64))
+        np.testing.assert_array_equal(found[0], slices)
+        np.testing.assert_array_equal(np.minimum(found[1], 31), strips)
+
+
+def test_padding_does_not_occupy_levels_in_the_released_rule() -> None:
+    points = np.array([[0.1, 0.1, 0.4], [0.2, 0.2, 0.6], [0, 0, 0]], np.float32)
+    i, _ = slice_and_strip(points[:, 0], points[:, 2], jnp.array([True, True, False]), RELEASED)
+    np.testing.assert_array_equal(i[:2], [0, 1])
+
+
+def test_levels_from_twice_the_slices_on_are_past_the_end_in_the_released_rule() -> None:
+    """Whatever their rank: 1.3 is the last level that counts, 1.4 the first that does not."""
+    for far, number in ((1.3, 1), (1.4, 14)):
+        points = jnp.array([[0.1, 0.1, 0], [0.1, 0.1, far]], jnp.float32)
+        i, _ = slice_and_strip(points[:, 0], points[:, 2], jnp.ones(2, bool), RELEASED)
+        np.testing.assert_array_equal(i, [0, number])
+
+
+@pytest.mark.parametrize("config", [PAPER, RELEASED], ids=["paper", "released"])
+@pytest.mark.parametrize("size", [(0.7, 0.4, 1.2), (1.3, 0.4, 0.6), (1.6, 0.4, 1.3)])
+def test_overflow_is_the_number_of_points_left_out(
+    size: tuple[float, float, float], config: thor2.DescriptorConfig
+) -> None:
+    clouds = [aligned_cloud(k, n, size) for k, n in enumerate((500, 77))]
+    found = thor2.strips(thor2.PointClouds.pack(clouds), NETWORK, config)
+    for b, (points, rgb) in enumerate(clouds):
+        expected = expected_strips(points.astype(np.float64), rgb, config.convention == "released")
+        assert int(found.overflow[b]) == expected["overflow"] > 0
+        np.testing.assert_array_equal(found.occupied[b], expected["occupied"])
+        np.testing.assert_allclose(found.color[b], expected["color"], atol=1e-5)
+
+
+def test_points_outside_on_every_side_are_counted_and_land_nowhere() -> None:
+    far = [[1e12, 0, 0], [0, 0, 1e12], [3e38, 3e38, 3e38], [-0.5, 0, 0], [0, 0, -0.5], [0.7751, 0, 0], [0, 0, 0.7001]]
+    points = np.array([[0.01, 0.2, 0.01], *far], np.float32)
+    found = thor2.strips(thor2.PointClouds.pack([(points, np.zeros(points.shape))]), NETWORK, PAPER)
+    assert int(found.overflow[0]) == len(far)
+    np.testing.assert_array_equal(np.argwhere(np.asarray(found.occupied)), [[0, 0, 0]])
+    assert float(found.color.sum()) == pytest.approx(1)
+
+
+def test_order_duplicates_and_padding() -> None:
+    points, rgb = aligned_cloud(7, 333)
+    order = np.random.default_rng(0).permutation(333)
+    plain = thor2.strips(thor2.PointClouds.pack([(points, rgb)]), NETWORK, PAPER)
+    others = {
+        "order": (thor2.PointClouds.pack([(points[order], rgb[order])]), 1),
+        "padding": (thor2.PointClouds.pack([(points, rgb)], capacity=1024), 1),
+        "duplicates": (thor2.PointClouds.pack([(np.tile(points, (3, 1)), np.tile(rgb, (3, 1)))]), 3),
+    }
+    for name, (clouds, times) in others.items():
+        found = thor2.strips(clouds, NETWORK, PAPER)
+        for field in ("low", "high", "occupied"):
+            np.testing.assert_array_equal(getattr(found, field), getattr(plain, field), err_msg=name)
+        np.testing.assert_allclose(found.color, times * plain.color, atol=1e-5, err_msg=name)
+
+
+def test_gradients_reach_one_point_an_extreme() -> None:
+    points, rgb = aligned_cloud(1, 333)
+    clouds = thor2.PointClouds.pack([(points, rgb)], capacity=400)
+
+    def span(x: jax.Array) -> jax.Array:
+        found = thor2.strips(dataclasses.replace(clouds, points=x), NETWORK, PAPER)
+        return (found.high - found.low).sum()
+
+    gradient = np.asarray(jax.grad(span)(clouds.points))[0]
+    expected = np.zeros((400, 3))
+    i, j = paper_rule(points.astype(np.float64))
+    for strip in set(zip(i.tolist(), j.tolist(), strict=True)):
+        here = np.flatnonzero((i == strip[0]) & (j == strip[1]))
+        expected[here[points[here, 1].argmax()], 1] += 1
+        expected[here[points[here, 1].argmin()], 1] -= 1
+    np.testing.assert_array_equal(gradient, expected)
+
+
+def test_strips_are_born_at_their_lower_edge() -> None:
+    np.testing.assert_array_equal(strip_births(PAPER), np.array([j * 0.025 for j in range(31)], np.float32))

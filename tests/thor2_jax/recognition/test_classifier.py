@@ -1,0 +1,155 @@
+"""The classifier against the same layers in NumPy, float64, and the rule that joins two answers."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+from scipy.stats import gmean
+
+import thor2_jax as thor2
+from thor2_jax.recognition.classifier import FEATURES, FEW, HIDDEN, MLP, Rule, check_features, feature_of, join
+
+RNG = np.random.default_rng(0)
+apply = nnx.jit(lambda model, x: model(x))
+train = nnx.jit(lambda model, x, rngs=None: model(x, train=True, rngs=rngs))
+
+
+def settled(n_inputs: int, n_classes: int) -> MLP:
+    """A classifier whose batch statistics and scales are not the ones it was born with."""
+    model = MLP(n_inputs, n_classes, rngs=nnx.Rngs(0))
+    model.input_scale[...] = jnp.asarray(RNG.uniform(0.5, 2, n_inputs), jnp.float32)
+    for norm in model.norms:
+        for values in (norm.mean, norm.bias):
+            values[...] = jnp.asarray(RNG.normal(size=values.shape), jnp.float32)
+        for values in (norm.var, norm.scale):
+            values[...] = jnp.asarray(RNG.uniform(0.5, 2, values.shape), jnp.float32)
+    return model
+
+
+@pytest.fixture(scope="module")
+def model() -> MLP:
+    return settled(33, 5)
+
+
+def numpy_logits(model: MLP, x: np.ndarray, own_statistics: bool) -> np.ndarray:
+    x = x.astype(np.float64) * np.asarray(model.input_scale[...])
+    for layer, norm in zip(model.layers, model.norms, strict=True):
+        x = x @ np.asarray(layer.kernel[...]) + np.asarray(layer.bias[...])
+        mean, var = (x.mean(0), x.var(0)) if own_statistics else (np.asarray(norm.mean[...]), np.asarray(norm.var[...]))
+        x = (x - mean) / np.sqrt(var + 1e-5) * np.asarray(norm.scale[...]) + np.asarray(norm.bias[...])
+        x = np.maximum(x, 0)
+    return x @ np.asarray(model.head.kernel[...]) + np.asarray(model.head.bias[...])
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, 7])
+def test_logits_against_numpy(n: int, model: MLP) -> None:
+    x = RNG.normal(size=(n, 33)).astype(np.float32)
+    found = apply(model, jnp.asarray(x))
+    assert found.shape == (n, 5)
+    np.testing.assert_allclose(found, numpy_logits(model, x, own_statistics=False), rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("n", [1, FEW, FEW + 1])
+@pytest.mark.parametrize("n_used", [0, 1, 4, 5, 9, 10, 33])  # of 33 inputs, rounded up, a tenth is 4, a quarter 9
+def test_logits_and_their_gradient_where_most_inputs_are_zero(n_used: int, n: int, model: MLP) -> None:
+    x = np.zeros((n, 33), np.float32)
+    x[:, RNG.permutation(33)[:n_used]] = RNG.normal(size=(n, n_used))
+    np.testing.assert_allclose(apply(model, x), numpy_logits(model, x, own_statistics=False), rtol=1e-4, atol=1e-4)
+
+    # The same network without a look at zeros: rows past FEW, of which nothing is taken.
+    def loss(x: jax.Array, past: int) -> jax.Array:
+        return jnp.sin(model(jnp.pad(x, ((0, past), (0, 0))))[:n]).sum()
+
+    found = jax.jit(jax.grad(loss), static_argnums=1)
+    expected = found(x, FEW + 1)
+    assert n_used == 33 or float(jnp.abs(expected[x == 0]).min()) > 0
+    np.testing.assert_allclose(found(x, 0), expected, rtol=1e-3, atol=1e-4)
+
+
+def test_the_papers_layers() -> None:
+    model = MLP(40, 6, rngs=nnx.Rngs(0))
+    assert HIDDEN == (512, 256, 128, 64)
+    shapes = [layer.kernel[...].shape for layer in [*model.layers, model.head]]
+    assert shapes == [(40, 512), (512, 256), (256, 128), (128, 64), (64, 6)]
+    assert model.dropout.rate == 0.2
+
+
+def test_training_uses_the_batchs_statistics_and_moves_the_running_ones() -> None:
+    model = MLP(33, 5, rngs=nnx.Rngs(0), dropout=0.0)
+    x = RNG.normal(size=(16, 33)).astype(np.float32)
+    expected = numpy_logits(model, x, own_statistics=True)
+    np.testing.assert_allclose(train(model, jnp.asarray(x)), expected, rtol=1e-3, atol=1e-3)
+    first = x @ np.asarray(model.layers[0].kernel[...]) + np.asarray(model.layers[0].bias[...])
+    np.testing.assert_allclose(model.norms[0].mean[...], 0.1 * first.mean(axis=0), atol=1e-5)
+    np.testing.assert_allclose(model.norms[0].var[...], 0.9 + 0.1 * first.var(axis=0), atol=1e-5)
+
+
+def test_dropout_is_for_training_alone() -> None:
+    model = MLP(33, 5, rngs=nnx.Rngs(0))
+    x = jnp.asarray(RNG.normal(size=(7, 33)), jnp.float32)
+    np.testing.assert_array_equal(apply(model, x), apply(model, x))
+    runs = [np.asarray(train(model, x, nnx.Rngs(dropout=key))) for key in (0, 1, 1)]
+    assert np.abs(runs[0] - runs[1]).max() > 1e-3
+    np.testing.assert_array_equal(runs[1], runs[2])
+
+
+@pytest.mark.parametrize("names", [*itertools.permutations(FEATURES), ("tops",), ["tops2", "ce"]])
+def test_features_come_in_one_order(names: object) -> None:
+    assert check_features(names, "x") == tuple(name for name in ("ce", "tops", "tops2") if name in names)  # type: ignore[operator]
+
+
+@pytest.mark.parametrize("names", [(), [], ["tops", "tops"], ["shape"], "tops", None, ["tops", None], 3])
+def test_bad_features_are_refused(names: object) -> None:
+    with pytest.raises(thor2.InputError) as caught:
+        check_features(names, "classifiers")
+    message = str(caught.value)
+    assert message.startswith(f"classifiers is {names!r}") and "ce, tops, tops2" in message
+
+
+def test_each_feature_is_its_descriptor() -> None:
+    found = thor2.Descriptors(
+        jnp.asarray(RNG.random((2, 7, 32, 32))), jnp.asarray(RNG.random((2, 7, 22, 31))), jnp.zeros(2, jnp.int32)
+    )
+    sizes = {name: feature_of(found, name).shape for name in FEATURES}
+    assert sizes == {"ce": (2, 4774), "tops": (2, 7168), "tops2": (2, 11942)}
+    np.testing.assert_array_equal(feature_of(found, "ce"), found.color)
+
+
+@pytest.mark.parametrize("n", [0, 1, 101])
+@pytest.mark.parametrize("rule", ["mean", "log-mean"])
+def test_join_by_means(n: int, rule: Rule) -> None:
+    tops, tops2 = (np.asarray(jax.nn.softmax(RNG.normal(size=(n, 4)))) for _ in range(2))
+    found = join({"tops": tops, "tops2": tops2}, rule)
+    for b in range(n):
+        pair = tops[b].astype(np.float64), tops2[b].astype(np.float64)
+        together = (pair[0] + pair[1]) / 2 if rule == "mean" else gmean(pair) / gmean(pair).sum()
+        best = found.class_index[b]
+        assert best == together.argmax() and found.confidence[b] == pytest.approx(together[best], rel=1e-12)
+        assert found.classifier[b] == ("tops" if tops[b, best] >= tops2[b, best] else "tops2")
+    assert len(found.class_index) == n
+
+
+def test_a_class_that_one_classifier_rules_out_is_not_named() -> None:
+    """Both say 0 of the third class: a probability of 0 has a logarithm all the same."""
+    found = join({"tops": np.array([[0.9, 0.1, 0.0]], np.float32), "tops2": np.array([[0.0, 1.0, 0.0]], np.float32)})
+    assert found.class_index[0] == 1 and found.confidence[0] == pytest.approx(1) and found.classifier[0] == "tops2"
+
+
+@pytest.mark.parametrize("n", [0, 1, 101])
+def test_join_takes_the_more_confident_classifier(n: int) -> None:
+    tops, tops2 = (np.asarray(jax.nn.softmax(RNG.normal(size=(n, 4)))) for _ in range(2))
+    found = join({"tops": tops, "tops2": tops2}, "larger")
+    for b in range(n):
+        name, row = max((("tops", tops[b]), ("tops2", tops2[b])), key=lambda pair: pair[1].max())
+        assert found.classifier[b] == name
+        assert found.class_index[b] == row.argmax() and found.confidence[b] == row.max()
+    assert len(found.class_index) == n
+
+
+def test_join_of_a_tie_and_of_one() -> None:
+    first, second = np.array([[0.3, 0.7]]), np.array([[0.7, 0.3]])
+    assert join({"tops": first, "tops2": second}, "larger") == (np.array([1]), np.array([0.7]), np.array(["tops"]))
+    assert join({"tops2": second}).classifier.tolist() == ["tops2"]

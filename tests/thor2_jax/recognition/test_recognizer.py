@@ -1,0 +1,209 @@
+"""From a frame to answers, with classifiers of random weights: what is checked is the way, not the names."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+from flax import nnx
+
+import colornet
+import thor2_jax as thor2
+from thor2_jax.recognition.classifier import FEATURES, MLP, feature_of
+from thor2_jax.recognition.recognizer import Recognizer
+from thor2_jax.recognition.run_directory import TrainedRun, input_size
+
+CLASSES = ("a", "b", "c", "d")
+INTRINSICS = thor2.Intrinsics(600.0, 600.0, 159.5, 119.5)
+CONFIG = thor2.DescriptorConfig(homology="closed_form")
+
+
+@pytest.fixture(scope="module")
+def run() -> TrainedRun:
+    network = colornet.load_default()
+    classifiers = {
+        name: MLP(input_size(name, CONFIG, network.n_regions), len(CLASSES), rngs=nnx.Rngs(k))
+        for k, name in enumerate(FEATURES)
+    }
+    return TrainedRun(CONFIG, network, CLASSES, classifiers, {})
+
+
+@pytest.fixture(scope="module")
+def recognizer(run: TrainedRun) -> Recognizer:
+    return Recognizer(run)
+
+
+def tilted(labels: np.ndarray, seed: int = 0, nearest: int = 600) -> thor2.RGBDFrame:
+    """A plane before the camera that falls off to the right, with coloured noise on it."""
+    rng = np.random.default_rng(seed)
+    depth = np.broadcast_to(nearest + np.arange(320) // 2, (240, 320)).astype(np.uint16)
+    color = rng.integers(0, 256, (240, 320, 3), dtype=np.uint8)
+    return thor2.RGBDFrame(color, depth, labels, INTRINSICS)
+
+
+def patches() -> np.ndarray:
+    labels = np.zeros((240, 320), np.uint8)
+    labels[20:100, 20:90] = 3
+    labels[20:60, 150:250] = 7
+    labels[200:203, 10:13] = 5  # nine pixels: too few
+    labels[120:220, 100:150] = 200
+    return labels
+
+
+def squares(count: int) -> np.ndarray:
+    labels = np.zeros((240, 320), np.uint8)
+    for number in range(count):
+        labels[20:80, 5 + 34 * number : 35 + 34 * number] = number + 1
+    return labels
+
+
+def test_every_instance_is_answered_in_the_order_of_labels(recognizer: Recognizer) -> None:
+    answers = recognizer.recognize(tilted(patches()))
+    assert [a.label for a in answers] == [3, 5, 7, 200]
+    assert answers[1].name is None and answers[1].confidence is None
+    assert answers[1].reason is not None and "at least 30" in answers[1].reason
+    for answer in (answers[0], answers[2], answers[3]):
+        assert answer.name in CLASSES and answer.reason is None and not answer.occluded
+        assert answer.points_used > 30 and answer.overflow >= 0
+
+
+def test_what_both_find_likely_wins(recognizer: Recognizer) -> None:
+    described = recognizer.describe(tilted(patches()))
+    found = recognizer.probabilities(described.descriptors, ("tops", "tops2"))
+    named = [answer for answer in recognizer.recognize(tilted(patches())) if answer.reason is None]
+    assert len(named) == 3
+    for row, answer in enumerate(named):
+        together = np.sqrt(found["tops"][row].astype(np.float64) * found["tops2"][row])
+        best = int(together.argmax())
+        assert answer.name == CLASSES[best]
+        assert answer.confidence == pytest.approx(together[best] / together.sum(), rel=1e-6)
+        assert answer.classifier == max(("tops", "tops2"), key=lambda name: found[name][row][best])
+
+
+def test_by_the_paper_s_rule_the_more_confident_classifier_wins(run: TrainedRun) -> None:
+    with pytest.raises(thor2.InputError, match="rule is 'least'; expected one of larger, mean, log-mean"):
+        Recognizer(run, rule="least")  # type: ignore[arg-type]
+    for answer in Recognizer(run, rule="larger").recognize(tilted(patches())):
+        if answer.reason is None:
+            first = {name: top[0] for name, top in answer.top.items()}
+            assert set(first) == {"tops", "tops2"}
+            winner = max(first, key=lambda name: first[name][1])
+            assert (answer.classifier, answer.name, answer.confidence) == (winner, *first[winner])
+            for top in answer.top.values():
+                shares = [share for _, share in top]
+                assert shares == sorted(shares, reverse=True) and sum(shares) == pytest.approx(1, abs=1e-5)
+
+
+def test_answers_below_a_confidence_have_no_name(recognizer: Recognizer, run: TrainedRun) -> None:
+    all_named = recognizer.recognize(tilted(patches()))
+    sure = sorted(answer.confidence for answer in all_named if answer.confidence is not None)
+    assert len(set(sure)) == 3
+    for answer, named in zip(Recognizer(run, sure[1]).recognize(tilted(patches())), all_named, strict=True):
+        if named.confidence is None or named.confidence >= sure[1]:
+            assert answer == named
+        else:
+            assert answer.name is None and answer.reason is not None and answer.reason.startswith("unknown: ")
+            assert dataclasses.replace(answer, name=named.name, reason=None) == named
+    for value in (-0.1, 1.5, float("nan")):
+        with pytest.raises(thor2.InputError, match=f"unknown_below is {value}"):
+            Recognizer(run, value)
+
+
+def test_probabilities_are_the_classifiers_on_the_descriptors(recognizer: Recognizer, run: TrainedRun) -> None:
+    """Against the same layers in NumPy, float64."""
+    described = recognizer.describe(tilted(patches()))
+    for name, found in recognizer.probabilities(described.descriptors).items():
+        model = run.classifiers[name]
+        x = np.asarray(feature_of(described.descriptors, name), np.float64) * np.asarray(model.input_scale[...])
+        for layer, norm in zip(model.layers, model.norms, strict=True):
+            x = x @ np.asarray(layer.kernel[...], np.float64) + np.asarray(layer.bias[...])
+            x = (x - np.asarray(norm.mean[...])) / np.sqrt(np.asarray(norm.var[...]) + 1e-5)
+            x = np.maximum(x * np.asarray(norm.scale[...]) + np.asarray(norm.bias[...]), 0)
+        logits = x @ np.asarray(model.head.kernel[...], np.float64) + np.asarray(model.head.bias[...])
+        expected = np.exp(logits - logits.max(axis=1, keepdims=True))
+        np.testing.assert_allclose(found, expected / expected.sum(axis=1, keepdims=True), atol=1e-5)
+
+
+def test_an_instance_does_not_depend_on_the_others(recognizer: Recognizer) -> None:
+    labels = patches()
+    together = {a.label: a for a in recognizer.recognize(tilted(labels))}
+    for label in (3, 7, 200):
+        (alone,) = recognizer.recognize(tilted(np.where(labels == label, labels, 0).astype(np.uint8)))
+        assert alone.name == together[label].name
+        assert alone.confidence == pytest.approx(together[label].confidence, abs=1e-5)
+
+
+def test_a_frame_without_instances_has_no_answers(recognizer: Recognizer) -> None:
+    assert recognizer.recognize(tilted(np.zeros((240, 320), np.uint8))) == []
+
+
+def test_a_cloud_past_the_largest_bucket_is_made_coarser(recognizer: Recognizer) -> None:
+    # 3 m x 2 m at 2.4 m: about 370,000 voxels of 4 mm would be 23 times the bucket if every one was hit.
+    n = 300
+    depth = np.full((n, n), 2400, np.uint16)
+    wide = thor2.Intrinsics(200.0, 200.0, n / 2, n / 2)
+    frame = thor2.RGBDFrame(np.full((n, n, 3), 90, np.uint8), depth, np.ones((n, n), np.uint8), wide)
+    (answer,) = recognizer.recognize(frame)
+    assert answer.reason is None
+    assert 1000 < answer.points_used <= 8192
+    assert answer.overflow > 0
+
+
+def test_more_instances_than_are_described_at_once(recognizer: Recognizer) -> None:
+    labels = squares(9)  # two batches of four, then one
+    parts = [np.where((labels >= first) & (labels < first + 4), labels, 0) for first in (1, 5, 9)]
+    expected = [answer for part in parts for answer in recognizer.recognize(tilted(part))]
+    found = recognizer.recognize(tilted(labels))
+    assert [a.label for a in found] == list(range(1, 10)) and all(a.reason is None for a in found)
+    assert [(a.name, a.points_used) for a in found] == [(a.name, a.points_used) for a in expected]
+    assert [a.confidence for a in found] == pytest.approx([a.confidence for a in expected], abs=1e-5)
+
+
+@pytest.mark.slow
+def test_more_instances_than_the_largest_batch(recognizer: Recognizer) -> None:
+    labels = np.zeros((240, 320), np.uint16)
+    side = 12
+    number = 0
+    for row in range(0, 240 - side, side):
+        for column in range(0, 320 - side, side):
+            number += 1
+            labels[row : row + side - 1, column : column + side - 1] = number
+    assert number > 256
+    # At 2 m a pixel is 3 mm wide, and such a patch 3 cm.
+    answers = recognizer.recognize(tilted(labels, nearest=2000))
+    assert [a.label for a in answers] == list(range(1, number + 1))
+    assert all(a.reason is None for a in answers)
+    only_last = np.where(labels == number, labels, 0).astype(np.uint16)
+    (alone,) = recognizer.recognize(tilted(only_last, nearest=2000))
+    assert alone.confidence == pytest.approx(answers[-1].confidence, abs=1e-5)
+
+
+def test_a_missing_classifier_is_named(run: TrainedRun) -> None:
+    shape_only = Recognizer(dataclasses.replace(run, classifiers={"tops": run.classifiers["tops"]}))
+    with pytest.raises(thor2.InputError, match="no tops2"):
+        shape_only.recognize(tilted(patches()))
+    answers = shape_only.recognize(tilted(patches()), classifiers=("tops",))
+    assert {a.classifier for a in answers if a.reason is None} == {"tops"}
+    with pytest.raises(thor2.InputError, match="shape"):
+        shape_only.recognize(tilted(patches()), classifiers=("shape",))  # type: ignore[arg-type]
+
+
+def test_nothing_compiles_after_warm_up(run: TrainedRun) -> None:
+    """Compilations counted by JAX's own monitoring, with a recognizer that no other test has used."""
+    compiled: list[str] = []
+
+    def listen(event: str, duration: float, **_: object) -> None:
+        if event == "/jax/core/compile/backend_compile_duration":
+            compiled.append(event)
+
+    fresh = Recognizer(run)
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        assert fresh.warm_up(max_points=1000, max_instances=5) == 2 * 3 + 4
+        assert compiled
+        compiled.clear()
+        for count in range(1, 6):
+            assert len(fresh.recognize(tilted(squares(count)))) == count
+        assert compiled == []
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)

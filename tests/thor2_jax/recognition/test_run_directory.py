@@ -1,0 +1,234 @@
+"""Run folders: what comes back is what was saved; anything else is refused in one line."""
+
+import dataclasses
+import gc
+import json
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import orbax.checkpoint as ocp
+import pytest
+from flax import nnx
+
+import colornet
+import thor2_jax as thor2
+from thor2_jax.files import json_digest
+from thor2_jax.recognition.classifier import FEATURES, MLP
+from thor2_jax.recognition.recognizer import Recognizer
+from thor2_jax.recognition.run_directory import TrainedRun, input_size, load_run, save_run
+
+CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=2, n_strips=5, image_size=8, alpha=0.5)
+CLASSES = ("a mug", "b", "ç")
+CONSTANTS = dataclasses.asdict(CONFIG)
+
+
+def make_run(features: tuple[str, ...] = ("tops", "ce")) -> TrainedRun:
+    rng, network = np.random.default_rng(0), colornet.load_default()
+    classifiers = {}
+    for name in features:
+        model = MLP(input_size(name, CONFIG, network.n_regions), len(CLASSES), rngs=nnx.Rngs(1))
+        for norm in model.norms:  # statistics unlike those of a fresh model
+            norm.mean[...] = jnp.asarray(rng.normal(size=norm.mean.shape), jnp.float32)
+        model.input_scale[...] = jnp.asarray(rng.uniform(1, 2, model.input_scale.shape), jnp.float32)
+        classifiers[name] = model
+    return TrainedRun(CONFIG, network, CLASSES, classifiers, {"epochs": 3, "figures": [0.5, 1]})
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("runs") / "deep" / "run"
+    save_run(make_run(), path)
+    return path
+
+
+@pytest.fixture
+def copied(saved: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(saved, tmp_path / "run"))
+
+
+def test_input_sizes() -> None:
+    sizes = {name: input_size(name, thor2.DescriptorConfig(), 22) for name in FEATURES}
+    assert sizes == {"ce": 4774, "tops": 7168, "tops2": 11942}
+
+
+def test_what_comes_back_is_what_was_saved(saved: Path) -> None:
+    run, found = make_run(), load_run(saved)
+    assert (found.config, found.classes, found.record) == (run.config, run.classes, run.record)
+    assert found.network.fingerprint == run.network.fingerprint
+    assert tuple(found.classifiers) == ("ce", "tops")
+    rng = np.random.default_rng(0)
+    images, color = rng.random((1, 2, 8, 8), np.float32), rng.random((1, 2, 22, 5), np.float32)
+    descriptors = thor2.Descriptors(jnp.asarray(images), jnp.asarray(color), jnp.zeros(1, jnp.int32))
+    before, after = Recognizer(run).probabilities(descriptors), Recognizer.load(saved).probabilities(descriptors)
+    for name in run.classifiers:
+        assert before[name].shape == (1, 3)
+        np.testing.assert_array_equal(before[name], after[name])
+
+
+def test_a_folder_holds_three_things_and_can_be_read_by_all(saved: Path) -> None:
+    assert sorted(p.name for p in saved.iterdir()) == ["network.npz", "run.json", "weights"]
+    assert sorted(p.name for p in saved.parent.iterdir()) == ["run"]
+    assert saved.stat().st_mode & 0o777 == 0o755
+    description = json.loads((saved / "run.json").read_text())
+    assert description["descriptor_version"] == thor2.DESCRIPTOR_VERSION
+    assert description["descriptor_config"] == dataclasses.asdict(CONFIG)
+
+
+def test_a_name_that_is_taken_is_refused(saved: Path, tmp_path: Path) -> None:
+    before = (saved / "run.json").read_bytes()
+    (tmp_path / "file").write_text("x")
+    for taken in (saved, tmp_path / "file"):
+        with pytest.raises(thor2.InputError, match=f"out: {taken} exists already"):
+            save_run(make_run(), taken)
+    assert (saved / "run.json").read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["file"]
+
+
+def test_an_empty_folder_may_be_filled(tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    save_run(make_run(("ce",)), tmp_path / "run")
+    assert [p.name for p in tmp_path.iterdir()] == ["run"]
+    assert tuple(load_run(tmp_path / "run").classifiers) == ("ce",)
+
+
+@pytest.mark.parametrize("broken", ["network", "weights", "json"])
+def test_nothing_is_left_behind_when_saving_fails(broken: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: Any, **__: Any) -> None:
+        raise OSError("no space left on device")
+
+    run = make_run()
+    if broken == "network":
+        monkeypatch.setattr(colornet, "save", fail)
+    elif broken == "weights":
+        monkeypatch.setattr(ocp.StandardCheckpointer, "save", fail)
+    else:
+        run = dataclasses.replace(run, record={"not JSON": object()})
+    with pytest.raises(TypeError if broken == "json" else OSError):
+        save_run(run, tmp_path / "run")
+    assert list(tmp_path.iterdir()) == []
+
+
+def edited(**changes: Any) -> Callable[[Path], None]:
+    """As another version might have written it: the digest fits."""
+
+    def edit(path: Path) -> None:
+        description = json.loads((path / "run.json").read_text())
+        for key, value in changes.items():
+            if value is None:
+                del description[key]
+            else:
+                description[key] = value
+        description["digest"] = json_digest(description)
+        (path / "run.json").write_text(json.dumps(description))
+
+    return edit
+
+
+def damage_weights(path: Path) -> None:
+    for file in (path / "weights" / "tops").rglob("*"):
+        if file.is_file():
+            file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+
+
+def damage_data(path: Path) -> None:
+    """Cut the arrays themselves, with all that describes them in place."""
+    for file in (path / "weights" / "ce").rglob("d/*"):
+        file.write_bytes(file.read_bytes()[:-1000])
+
+
+@pytest.mark.parametrize("relaxation", [None, thor2.Relaxation(color=2.0)], ids=["hard", "relaxed"])
+def test_every_constant_comes_back(relaxation: thor2.Relaxation | None, tmp_path: Path) -> None:
+    config = dataclasses.replace(CONFIG, relaxation=relaxation, persistence_weight=1.5)
+    save_run(dataclasses.replace(make_run(("ce",)), config=config), tmp_path / "run")
+    assert load_run(tmp_path / "run").config == config
+
+
+def replaced(old: str, new: str) -> Callable[[Path], None]:
+    def edit(path: Path) -> None:
+        content = (path / "run.json").read_text()
+        assert old in content
+        (path / "run.json").write_text(content.replace(old, new))
+
+    return edit
+
+
+def test_a_description_may_be_laid_out_anew(copied: Path) -> None:
+    description = json.loads((copied / "run.json").read_text())
+    (copied / "run.json").write_text(json.dumps(dict(reversed(description.items())), indent=None))
+    assert load_run(copied).config == CONFIG
+
+
+def flip_a_bit(path: Path) -> None:
+    file = max((path / "weights" / "ce").rglob("d/*"), key=lambda file: file.stat().st_size)
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 1
+    file.write_bytes(content)
+
+
+def other_network(path: Path) -> None:
+    network = colornet.load_default()
+    dataclasses.replace(network, mean_rgb=network.mean_rgb + 1).save(path / "network.npz")
+
+
+DAMAGES: dict[str, tuple[Callable[[Path], Any], str]] = {
+    "no folder": (shutil.rmtree, "run is no run folder"),
+    "no run.json": (lambda path: (path / "run.json").unlink(), "run is no run folder"),
+    "cut run.json": (lambda path: (path / "run.json").write_text('{"format": 1,'), "run.json cannot be read"),
+    "binary run.json": (lambda path: (path / "run.json").write_bytes(b"\xff\xfe\x00"), "run.json cannot be read"),
+    "a list": (lambda path: (path / "run.json").write_text("[1]"), "run.json has format 'list'"),
+    "other format": (edited(format=2), "run.json has format 2"),
+    "other version": (edited(descriptor_version=99), "descriptor version 99"),
+    "changed constant": (replaced('"alpha": 0.5', '"alpha": 0.25'), "run.json is damaged, or was changed"),
+    "changed record": (replaced('"epochs": 3', '"epochs": 4'), "run.json is damaged, or was changed"),
+    "no digest": (replaced('"digest"', '"other"'), "run.json is damaged, or was changed"),
+    "no classes": (edited(classes=None), "run.json: KeyError: 'classes'"),
+    "empty classes": (edited(classes=[]), "classes is []"),
+    "numbered classes": (edited(classes=[1, 2, 3]), "classes is [1, 2, 3]"),
+    "one string": (edited(classes="abc"), "classes is 'abc'"),
+    "more classes": (edited(classes=["a", "b", "c", "d"]), "weights/ce is damaged, or not of 220 inputs and 4 classes"),
+    "unknown classifier": (edited(classifiers=["shape"]), "classifiers is ['shape']"),
+    "missing classifier": (edited(classifiers=["ce", "tops", "tops2"]), "run.json: KeyError: 'tops2'"),
+    "unknown constant": (edited(descriptor_config={**CONSTANTS, "beta": 1}), "beta"),
+    "bad relaxation": (edited(descriptor_config={**CONSTANTS, "relaxation": {"slice": 0}}), "Relaxation.slice is 0"),
+    "no relaxation": (edited(descriptor_config={**CONSTANTS, "relaxation": 5}), "run.json: TypeError"),
+    "list of constants": (edited(descriptor_config=[1]), "run.json: TypeError"),
+    "bad constant": (edited(descriptor_config={**CONSTANTS, "sigma_s": -1}), "DescriptorConfig.sigma_s is -1"),
+    "other constant": (edited(descriptor_config={**CONSTANTS, "n_slices": 3}), "not of 330 inputs and 3 classes"),
+    "no network": (lambda path: (path / "network.npz").unlink(), "network.npz cannot be read"),
+    "cut network": (lambda path: (path / "network.npz").write_bytes(b"PK\x03\x04"), "network.npz cannot be read"),
+    "other network": (other_network, "network.npz is another colour network"),
+    "cut weights": (damage_weights, "weights/tops is damaged"),
+    "cut data": (damage_data, "weights/ce is damaged"),
+    "flipped bit": (flip_a_bit, "weights/ce is damaged"),
+    "no weights": (lambda path: shutil.rmtree(path / "weights" / "tops"), "weights/tops is missing"),
+    "empty weights": (
+        lambda path: (shutil.rmtree(path / "weights" / "tops"), (path / "weights" / "tops").mkdir()),
+        "weights/tops is damaged",
+    ),
+}
+
+
+@pytest.fixture(scope="module")
+def small_heap() -> Iterator[None]:
+    """What exists already is no garbage: collecting the rest is then a matter of milliseconds."""
+    gc.collect()
+    gc.freeze()
+    yield
+    gc.unfreeze()
+
+
+@pytest.mark.usefixtures("small_heap")
+@pytest.mark.parametrize("name", DAMAGES)
+def test_damaged_folders_are_refused_in_one_line(name: str, copied: Path) -> None:
+    """And nothing else is said: what is left of a failed read would be a warning, and so an error here."""
+    damage, words = DAMAGES[name]
+    damage(copied)
+    with pytest.raises(thor2.InputError) as caught:
+        load_run(copied)
+    gc.collect()
+    message = str(caught.value)
+    assert message.startswith("model: ") and words in message and "\n" not in message and len(message) < 700

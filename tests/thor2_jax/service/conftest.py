@@ -1,0 +1,129 @@
+"""A run with random weights, a frame, and one running service for most tests."""
+
+import io
+import json
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pytest
+from flax import nnx
+from PIL import Image
+
+import colornet
+import thor2_jax as thor2
+from thor2_jax.recognition.classifier import FEATURES, MLP
+from thor2_jax.recognition.run_directory import TrainedRun, input_size, save_run
+
+Files = dict[str, bytes]
+CAMERA = {"fx": 600.0, "fy": 600.0, "cx": 159.5, "cy": 119.5}
+
+
+def png(image: np.ndarray, **options: object) -> bytes:
+    stream = io.BytesIO()
+    Image.fromarray(image).save(stream, "PNG", **options)
+    return stream.getvalue()
+
+
+@pytest.fixture(scope="session")
+def encode() -> Callable[..., bytes]:
+    return png
+
+
+@pytest.fixture(scope="session")
+def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    config, network = thor2.DescriptorConfig(), colornet.load_default()
+    classifiers = {
+        name: MLP(input_size(name, config, network.n_regions), 7, rngs=nnx.Rngs(k)) for k, name in enumerate(FEATURES)
+    }
+    folder = tmp_path_factory.mktemp("service") / "run"
+    save_run(TrainedRun(config, network, tuple("abcdefg"), classifiers, {"meshes": "/a/path/of/this/machine"}), folder)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def frame() -> thor2.RGBDFrame:
+    """A coloured plane that falls off to the right; three instances to name and one that is too small."""
+    labels = np.zeros((240, 320), np.uint8)
+    labels[20:100, 20:90] = 3
+    labels[200:203, 10:13] = 5
+    labels[20:60, 150:250] = 7
+    labels[120:220, 100:150] = 200
+    depth = np.broadcast_to(600 + np.arange(320) // 2, (240, 320)).astype(np.uint16)
+    color = np.random.default_rng(0).integers(0, 256, (240, 320, 3), dtype=np.uint8)
+    return thor2.RGBDFrame(color, depth, labels, thor2.Intrinsics(**CAMERA))
+
+
+@pytest.fixture(scope="session")
+def files(frame: thor2.RGBDFrame) -> Files:
+    images = {name: png(getattr(frame, name)) for name in ("color", "depth", "labels")}
+    return {**images, "intrinsics": json.dumps(CAMERA).encode()}
+
+
+class Server:
+    """`thor2 serve` in a process of its own."""
+
+    def __init__(self, run: Path, log: Path, cache: Path, *options: str) -> None:
+        self.log = log
+        command = [sys.executable, "-m", "training.cli", "serve", "--model", str(run), "--port", "0"]
+        with log.open("wb") as stream:
+            self.process = subprocess.Popen(
+                [*command, "--max-batch", "8", "--cache", str(cache), *options],
+                cwd=Path(__file__).parents[3],
+                stdout=stream,
+                stderr=stream,
+            )
+        self.url = self._until(lambda: re.search(r"http://127\.0\.0\.1:\d+", log.read_text()))[0]
+        self._until(self._ready)
+
+    def _until(self, found: Callable[[], re.Match[str] | None]) -> re.Match[str]:
+        start = time.monotonic()
+        while time.monotonic() - start < 240:
+            answer = found()
+            if answer:
+                return answer
+            assert self.process.poll() is None, self.log.read_text()
+            time.sleep(0.05)
+        raise AssertionError(self.log.read_text())
+
+    def _ready(self) -> re.Match[str] | None:
+        try:
+            return re.match("200", str(httpx.get(f"{self.url}/readyz").status_code))
+        except httpx.TransportError:
+            return None
+
+    def terminate(self) -> int:
+        self.process.send_signal(signal.SIGTERM)
+        return self.process.wait(60)
+
+
+@pytest.fixture(scope="session")
+def start_server(run_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., Server]]:
+    folder, started = tmp_path_factory.mktemp("servers"), []
+
+    def start(*options: str) -> Server:
+        started.append(Server(run_folder, folder / f"{len(started)}.log", folder / "cache", *options))
+        return started[-1]
+
+    yield start
+    for server in started:
+        if server.process.poll() is None:
+            server.process.kill()
+            server.process.wait()
+
+
+@pytest.fixture(scope="session")
+def server(start_server: Callable[..., Server]) -> Server:
+    return start_server()
+
+
+@pytest.fixture
+def ask(server: Server) -> Iterator[httpx.Client]:
+    with httpx.Client(base_url=server.url, timeout=60) as client:
+        yield client

@@ -1,0 +1,194 @@
+"""Baselines of a run folder: trained, kept in files, calibrated on held-out views, asked beside the classifiers."""
+
+import dataclasses
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from flax import nnx
+from safetensors.numpy import load_file, save_file
+from typer.testing import CliRunner
+
+import colornet
+import thor2_jax as thor2
+from thor2_jax.descriptor.describe import describe
+from thor2_jax.errors import InputError
+from thor2_jax.recognition.classifier import MLP
+from thor2_jax.recognition.run_directory import TrainedRun, load_run, save_run
+from training.baselines import job
+from training.baselines.baseline import seen_in
+from training.baselines.job import BASELINES, check_baselines, train_baselines
+from training.baselines.load import load_baselines
+from training.cli import app
+from training.evaluation.runs import load_runs
+from training.fitting.folds import fold_of_views
+from training.fitting.job import is_finished
+from training.views.left_out import WithoutClasses
+from training.views.mesh_views import Cloud
+from training.views.normalized_views import normalize_views
+from training.views.source import MemoryViews
+
+CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=1, image_size=8)
+NAMES = ("plank", "cube")
+
+
+def clouds(seed: int = 0, views: int = 20) -> dict[str, list[Cloud]]:
+    rng = np.random.default_rng(seed)
+    sizes = {"plank": (0.2, 0.03, 0.02), "cube": (0.06, 0.06, 0.06)}
+    levels = {"plank": (200, 30, 30), "cube": (30, 30, 200)}
+    return {
+        name: [
+            (
+                (rng.random((120, 3)) * sizes[name] + [0, 0, 0.5]).astype(np.float32),
+                np.full((120, 3), levels[name], np.uint8),
+            )
+            for _ in range(views)
+        ]
+        for name in NAMES
+    }
+
+
+class Views(MemoryViews):
+    """Views in memory that tell their cameras' angles, as those on disk: 4 azimuths, 5 polar angles."""
+
+    @property
+    def record(self) -> Any:
+        return {**super().record, "job": {"azimuth_step": 90, "polar_step": 45}}
+
+
+SOURCE = Views(clouds(), CONFIG)
+
+
+def write_run(folder: Path, folds: int = 2, fold: int = 1) -> Path:
+    network = colornet.load_default()
+    record = {
+        "dataset": dict(SOURCE.record), "epochs": 4, "learning_rates": [1e-2, 1e-3], "batch_size": 8, "seed": 0,
+        "folds": folds, "fold": fold, "temperatures": {"tops": 1.5},
+    }  # fmt: skip
+    save_run(TrainedRun(CONFIG, network, NAMES, {"tops": MLP(64, 2, rngs=nnx.Rngs(0))}, record), folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = write_run(tmp_path_factory.mktemp("baselines") / "run")
+    train_baselines(folder, SOURCE)
+    return folder
+
+
+def described(seed: int) -> Any:
+    packed = thor2.PointClouds.pack([cloud for each in clouds(seed, 4).values() for cloud in each])
+    return SimpleNamespace(packed=packed, descriptors=describe(packed, colornet.load_default(), CONFIG))
+
+
+def test_all_baselines_learn_and_are_calibrated(trained: Path) -> None:
+    assert sorted(path.name for path in (trained / "baselines").iterdir()) == [
+        "forest.safetensors", "pointnet.safetensors", "thor.safetensors",
+    ]  # fmt: skip
+    (run,) = load_runs([trained])
+    assert run.asked == ("tops", "thor", "forest", "pointnet")
+    assert set(run.temperatures) == {"tops", *BASELINES} and run.temperatures["tops"] == 1.5
+    seen = seen_in(described(5), CONFIG)
+    for name, model in run.baselines.items():
+        found = model.probabilities(seen)
+        np.testing.assert_allclose(found.sum(axis=1), 1, atol=1e-5)
+        assert (found.argmax(axis=1) == np.repeat([0, 1], 4)).mean() == 1, name
+
+
+def test_what_is_there_is_not_trained_again(trained: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = {path: path.read_bytes() for path in (trained / "baselines").iterdir()}
+    monkeypatch.setattr(job, "_TRAIN", dict.fromkeys(BASELINES, lambda task: pytest.fail("trained again")))
+    train_baselines(trained, SOURCE)
+    assert before == {path: path.read_bytes() for path in (trained / "baselines").iterdir()}
+
+
+def test_views_held_out_are_those_of_the_runs_fold(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    label = np.repeat([0, 1], 20)
+    view = np.tile(np.arange(20), 2)
+    marks: list[Any] = []
+
+    def stopped(task: Any) -> Any:
+        marks.append(task.held_out(label, view))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(job, "_TRAIN", {"forest": stopped})
+    for folds, fold in ((5, 3), (1, 0)):
+        folder = write_run(tmp_path / f"{folds}", folds, fold)
+        with pytest.raises(KeyboardInterrupt):
+            train_baselines(folder, SOURCE, ["forest"])
+        assert not list((folder / "baselines").glob("*.safetensors"))
+    np.testing.assert_array_equal(marks[0], fold_of_views(label, view, NAMES, 5, 0) == 3)
+    assert marks[0].sum() == 8 and not marks[1].any()
+
+
+def test_a_run_without_held_out_views_has_no_temperatures(tmp_path: Path) -> None:
+    folder = write_run(tmp_path / "run", 1, 0)
+    train_baselines(folder, SOURCE, ["forest"])
+    models, temperatures = load_baselines(folder, load_run(folder))
+    assert list(models) == ["forest"] and temperatures == {}
+
+
+def test_refusals(trained: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="trained on other views"):
+        train_baselines(trained, Views(clouds(1), CONFIG))
+    with pytest.raises(InputError, match="baselines is forest, tree; expected"):
+        check_baselines(["forest", "tree"])
+    assert check_baselines(["pointnet", "thor"]) == ("thor", "pointnet") and check_baselines([]) == ()
+    original = load_run(write_run(tmp_path / "original"))
+    record = {**original.record, "dataset": dict(MEMORY.record)}
+    folder = tmp_path / "run"
+    save_run(dataclasses.replace(original, record=record), folder)
+    with pytest.raises(InputError, match="thor needs the cameras' angles"):
+        train_baselines(folder, MEMORY, ["thor"])
+
+
+MEMORY = MemoryViews(clouds(), CONFIG)
+
+
+@pytest.mark.parametrize("damage", ["cut", "changed", "classes", "lacking"])
+def test_damaged_files_are_refused(trained: Path, tmp_path: Path, damage: str) -> None:
+    folder = write_run(tmp_path / "run")
+    (folder / "baselines").mkdir()
+    file = folder / "baselines" / "forest.safetensors"
+    content = (trained / "baselines" / "forest.safetensors").read_bytes()
+    if damage == "cut":
+        file.write_bytes(content[:-9])
+    elif damage == "changed":
+        file.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+    else:
+        file.write_bytes(content)
+        about = {"format": 1, "classes": ["a", "b"], "temperature": None, "seconds": 1.0, "digest": ""}
+        save_file({} if damage == "lacking" else load_file(file), file, {"about": json.dumps(about)})
+    with pytest.raises(InputError, match="forest.safetensors") as caught:
+        load_baselines(folder, load_run(folder))
+    assert "\n" not in str(caught.value)
+
+
+def test_finished_runs(tmp_path: Path) -> None:
+    assert not is_finished(tmp_path / "none")
+    folder = write_run(tmp_path / "run" / "fold-0").parent
+    assert is_finished(folder) and is_finished(folder / "fold-0")
+    (folder / "checkpoints").mkdir()
+    assert not is_finished(folder)
+
+
+def test_classes_left_out() -> None:
+    source = MemoryViews({"a": clouds()["plank"][:2], "b": clouds()["cube"][:3], "c": clouds()["cube"][3:4]}, CONFIG)
+    found = WithoutClasses(source, ["b"])
+    assert found.classes == ("a", "c") and [(s.label, s.views) for s in found.shards] == [(0, 2), (1, 1)]
+    assert found.record["views"] == 3 and found.record["digest"] == found.digest != source.digest
+    views = found.read(1)
+    assert views.label == 1
+    np.testing.assert_array_equal(views.xyz, normalize_views(clouds()["cube"][3:4], 1, [0], [0], CONFIG).xyz)
+    with pytest.raises(InputError, match="no class d"):
+        WithoutClasses(source, ["a", "d"])
+
+
+def test_the_command_refuses_an_unknown_baseline_before_any_work(tmp_path: Path) -> None:
+    arguments = ["train", "--dataset", str(tmp_path), "--out", str(tmp_path / "run"), "--baselines", "forest, tree"]
+    result = CliRunner().invoke(app, arguments)
+    assert isinstance(result.exception, InputError) and "forest, tree" in str(result.exception)
+    assert not (tmp_path / "run").exists()

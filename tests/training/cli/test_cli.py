@@ -1,0 +1,382 @@
+"""The command line as a user meets it: one small model trained once, then every command and every kind of bad input."""
+
+import dataclasses
+import json
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from thor2_jax.recognition.run_directory import load_run, save_run
+from training import cli
+from training.objects.builtin_objects import builtin_objects
+from training.rendering.scenes import Scene, compose_scene
+
+Run = Callable[..., tuple[int, str, str]]
+NAMES = ("soup_can_red", "cereal_box_blue", "mug_white")
+
+
+@pytest.fixture(scope="module")
+def meshes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of three PLY files with vertex colours."""
+    import trimesh
+
+    folder = tmp_path_factory.mktemp("meshes")
+    objects = builtin_objects()
+    for name in NAMES:
+        mesh = objects[name]
+        colors = mesh.colors_at(np.arange(len(mesh.faces)), np.full((len(mesh.faces), 2), 1 / 3, np.float32))
+        corners = mesh.vertices[mesh.faces].reshape(-1, 3)
+        faces = np.arange(len(corners)).reshape(-1, 3)
+        plain = trimesh.Trimesh(corners, faces, vertex_colors=np.repeat(colors, 3, axis=0), process=False)
+        plain.export(folder / f"{name}.ply")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    objects = builtin_objects()
+    return compose_scene({name: objects[name] for name in NAMES}, np.random.default_rng(3), n_objects=3)
+
+
+@pytest.fixture(scope="module")
+def images(tmp_path_factory: pytest.TempPathFactory, scene: Scene) -> Path:
+    """The scene as the files of `thor2 recognize` and of `thor2 evaluate frames`."""
+    folder = tmp_path_factory.mktemp("frames") / "one"
+    folder.mkdir()
+    frame = scene.frame
+    Image.fromarray(frame.color).save(folder / "color.png")
+    Image.fromarray(frame.depth.astype(np.uint16)).save(folder / "depth.png")
+    Image.fromarray(frame.labels.astype(np.uint8)).save(folder / "mask.png")
+    k = frame.intrinsics
+    (folder / "intrinsics.json").write_text(json.dumps({"fx": k.fx, "fy": k.fy, "cx": k.cx, "cy": k.cy}))
+    (folder / "labels.json").write_text(json.dumps({"labels": {str(i): n for i, n in scene.truth.items()}}))
+    return folder
+
+
+def call(*arguments: object) -> int:
+    before = sys.argv
+    sys.argv = ["thor2", *map(str, arguments)]
+    try:
+        cli.main()
+    except SystemExit as stop:
+        return int(stop.code or 0)
+    finally:
+        sys.argv = before
+    return 0
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]) -> Run:
+    """Run a command; exit code, standard output, standard error."""
+
+    def run(*arguments: object) -> tuple[int, str, str]:
+        code = call(*arguments)
+        out, err = capsys.readouterr()
+        return code, out, err
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def model(meshes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A model of three objects, 24 views each, three epochs."""
+    out = tmp_path_factory.mktemp("model") / "run"
+    steps = ("--azimuth-step", 60, "--polar-step", 45, "--workers", 1)
+    options = ("--epochs", 6, "--batch-size", 16, "--classifiers", "tops,tops2,ce")
+    assert call("train", "--meshes", meshes, "--out", out, *steps, *options) == 0
+    return out
+
+
+def recognize(images: Path, **changes: Path) -> list[object]:
+    files = {
+        "color": images / "color.png",
+        "depth": images / "depth.png",
+        "labels": images / "mask.png",
+        "intrinsics": images / "intrinsics.json",
+    }
+    return [part for name, path in {**files, **changes}.items() for part in (f"--{name}", path)]
+
+
+def one_line(err: str) -> str:
+    lines = [line for line in err.splitlines() if line.startswith("error:")]
+    assert len(lines) == 1, err
+    assert "Traceback" not in err
+    return lines[0]
+
+
+def test_run_folder(model: Path) -> None:
+    found = ["curves.png", "metrics.jsonl", "network.npz", "run.json", "weights"]
+    assert sorted(p.name for p in model.iterdir()) == found
+    assert len((model / "metrics.jsonl").read_text().splitlines()) == 18
+    description = json.loads((model / "run.json").read_text())
+    assert sorted(description["classes"]) == sorted(NAMES)
+    assert description["descriptor_version"] == 1
+
+
+def test_recognize(model: Path, images: Path, scene: Scene, tmp_path: Path, run: Run) -> None:
+    code, out, _ = run("recognize", "--model", model, *recognize(images), "--out", tmp_path / "answer")
+    assert code == 0
+    answers = json.loads((tmp_path / "answer" / "recognition.json").read_text())
+    assert [a["label"] for a in answers] == list(scene.frame.instances)
+    assert all(a["name"] in NAMES and a["classifier"] in ("tops", "tops2") and a["name"] in out for a in answers)
+    with Image.open(tmp_path / "answer" / "overlay.png") as overlay:
+        assert overlay.size == scene.frame.color.shape[1::-1]
+
+
+def test_recognize_calls_what_it_is_not_sure_of_unknown(model: Path, images: Path, run: Run) -> None:
+    code, out, _ = run("recognize", "--model", model, *recognize(images), "--unknown-below", 1)
+    assert code == 0 and "unrecognized" in out and "unknown" in out
+    code, _, err = run("recognize", "--model", model, *recognize(images), "--unknown-below", 1.5)
+    assert code == 2 and one_line(err) == "error: unknown_below is 1.5; it must be from 0 to 1"
+
+
+def test_evaluate_frames(model: Path, images: Path, scene: Scene, tmp_path: Path, run: Run) -> None:
+    """Figures of the report against the answers of `recognize`; two runs; the same command again goes on."""
+    other = tmp_path / "other"
+    save_run(dataclasses.replace(load_run(model), record={"another": "run"}), other)
+    command = ("evaluate", "frames", images.parent, "--model", model, other, "--out", tmp_path / "report")
+    code, out, _ = run(*command)
+    assert code == 0 and "THOR2" in out and "a second" in out
+    report = json.loads((tmp_path / "report" / "report.json").read_text())
+    run("recognize", "--model", model, *recognize(images), "--out", tmp_path / "answer")
+    answers = json.loads((tmp_path / "answer" / "recognition.json").read_text())
+    right = np.mean([a["name"] == scene.truth[a["label"]] for a in answers])
+    whole = report["accuracy"][report["rule"]][0]["cells"][0]
+    assert report["instances"]["scored"] == whole["instances"] == len(scene.truth)
+    assert whole["accuracy"]["THOR2"] == {"mean": pytest.approx(right), "std": 0.0, "runs": 2}
+    before = (tmp_path / "report" / "answers.jsonl").read_bytes()
+    assert run(*command)[0] == 0
+    assert (tmp_path / "report" / "answers.jsonl").read_bytes() == before
+    code, _, err = run("evaluate", "frames", images.parent, "--model", model, "--out", tmp_path / "report")
+    assert code == 2 and "runs" in one_line(err)
+    code, _, err = run("evaluate", "frames", images.parent, "--model", model, "--out", tmp_path / "answer")
+    assert code == 2 and "exists already" in one_line(err)
+
+
+def test_render_then_train_is_train(meshes: Path, model: Path, tmp_path: Path) -> None:
+    """Views written by `render` and read back train the same model as views rendered by `train`."""
+    steps = ("--azimuth-step", 60, "--polar-step", 45, "--workers", 1)
+    options = ("--epochs", 6, "--batch-size", 16, "--classifiers", "tops,tops2,ce")
+    varied = ("--illumination", "--sensor", "--occlusion", "--segmentation")
+    assert call("render", "--meshes", meshes, "--out", tmp_path / "views", *steps, *varied) == 0
+    assert call("train", "--dataset", tmp_path / "views", "--out", tmp_path / "run", *options) == 0
+    assert not (model / "views").exists()
+    first, second = (json.loads((f / "run.json").read_text()) for f in (model, tmp_path / "run"))
+    assert first["record"]["curves"] == second["record"]["curves"]
+
+
+def test_train_by_folds(meshes: Path, tmp_path: Path, run: Run) -> None:
+    steps = ("--azimuth-step", 90, "--polar-step", 45, "--workers", 1)
+    options = ("--epochs", 1, "--batch-size", 16, "--classifiers", "ce", "--folds", 2)
+    arguments = ("train", "--meshes", meshes, "--out", tmp_path / "run", *steps, *options)
+    code, out, _ = run(*arguments)
+    assert code == 0 and "fold 0: ce names" in out and "fold 1: ce names" in out
+    assert sorted(p.name for p in (tmp_path / "run" / "fold-1").iterdir()) == ["network.npz", "run.json", "weights"]
+    # What stands beside a finished run may be a dataset that somebody trains from: it stays.
+    (tmp_path / "run" / "views").mkdir()
+    (tmp_path / "run" / "views" / "manifest.json").write_bytes(bytes(9))
+    before = {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()}
+    for source in (arguments, ("train", "--dataset", tmp_path / "run" / "views", "--out", tmp_path / "run")):
+        code, _, err = run(*source)
+        assert code == 2 and "exists already" in one_line(err)
+        assert {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()} == before
+
+
+def test_train_by_sequences(meshes: Path, tmp_path: Path, run: Run) -> None:
+    """Each on its own objects; called again, what is finished stays and what is missing is trained."""
+    soup, cereal, mug = NAMES
+    table, out = tmp_path / "table.yaml", tmp_path / "runs"
+    steps = ("--azimuth-step", 90, "--polar-step", 45, "--workers", 1)
+    assert call("render", "--meshes", meshes, "--out", tmp_path / "views", *steps) == 0
+    options = ("--sequences", table, "--epochs", 1, "--batch-size", 16, "--classifiers", "ce")
+    arguments = ("train", "--dataset", tmp_path / "views", "--out", out, *options)
+    table.write_text(json.dumps({"table/a": [soup, mug]}))
+    assert run(*arguments)[0] == 0
+    first = (out / "table/a/run.json").read_bytes()
+    assert sorted(json.loads(first)["classes"]) == sorted([soup, mug])
+    table.write_text(json.dumps({"table/a": [soup, mug], "b": [cereal, cereal, soup]}))
+    assert run(*arguments)[0] == 0
+    assert (out / "table/a/run.json").read_bytes() == first
+    assert sorted(json.loads((out / "b/run.json").read_text())["classes"]) == sorted([soup, cereal])
+    before = sorted(out.rglob("*"))
+    table.write_text(json.dumps({"b": [cereal, soup], "c": [soup, mug]}))
+    for change in (("--epochs", 2), ("--batch-size", 8), ("--seed", 1), ("--folds", 2), ("--classifiers", "ce,tops")):
+        code, _, err = run(*arguments, *change)
+        assert code == 2 and "b holds a run that was trained with" in one_line(err)
+    assert sorted(out.rglob("*")) == before
+    cases = {
+        json.dumps({"b": [cereal, mug]}): "b holds a run that was trained with dataset",
+        "{}": "has no sequence",
+        '{"c": ["dragon"]}': "no class dragon",
+        '{"c": "mug"}': "c is 'mug'",
+        '{"c": []}': "c is []",
+        '{"../c": ["mug_white"]}': "'../c'",
+        '{"/c": ["mug_white"]}': "'/c'",
+        "[]": "list",
+    }
+    for content, said in cases.items():
+        table.write_text(content)
+        code, _, err = run(*arguments)
+        assert code == 2 and said in one_line(err), content
+    code, _, err = run("train", "--meshes", meshes, "--out", tmp_path / "other", *options)
+    assert code == 2 and "it goes with --dataset" in one_line(err)
+    assert sorted(p.name for p in out.iterdir()) == ["b", "table"]
+
+
+def test_one_bad_instance_among_many(model: Path, images: Path, scene: Scene, tmp_path: Path, run: Run) -> None:
+    labels = scene.frame.labels.astype(np.uint8)
+    labels[0, :5] = 9
+    Image.fromarray(labels).save(tmp_path / "labels.png")
+    changed = recognize(images, labels=tmp_path / "labels.png")
+    code, out, _ = run("recognize", "--model", model, *changed, "--out", tmp_path / "answer")
+    assert code == 0 and "unrecognized" in out
+    answers = {a["label"]: a for a in json.loads((tmp_path / "answer" / "recognition.json").read_text())}
+    assert answers[9]["name"] is None and "at least 30" in answers[9]["reason"]
+    assert all(answers[label]["name"] is not None for label in scene.frame.instances)
+
+
+def spoil(folder: Path, source: Path) -> dict[str, tuple[str, Path, str]]:
+    """Case -> (argument, spoiled file, what the message must say)."""
+    truncated = folder / "truncated.png"
+    truncated.write_bytes((source / "depth.png").read_bytes()[:2000])
+    text = folder / "text.png"
+    text.write_text("no image")
+    half = folder / "half.png"
+    with Image.open(source / "mask.png") as mask:
+        mask.crop((0, 0, 100, 100)).save(half)
+    eight = folder / "eight.png"
+    Image.fromarray(np.zeros((480, 640), np.uint8)).save(eight)
+    cases = {
+        "no such file": ("color", folder / "absent.png", "absent.png"),
+        "no image": ("color", text, "text.png"),
+        "truncated": ("depth", truncated, "truncated.png"),
+        "other size": ("labels", half, "(100, 100)"),
+        "8-bit depth": ("depth", eight, "uint8"),
+        "colour is grey": ("color", eight, "RGB"),
+        "intrinsics are an image": ("intrinsics", eight, "JSON"),
+    }
+    good = json.loads((source / "intrinsics.json").read_text())
+    for name, values, said in (
+        ("without fx", {k: v for k, v in good.items() if k != "fx"}, "fx"),
+        ("negative fy", good | {"fy": -1.0}, "-1.0"),
+        ("zero scale", good | {"depth_scale": 0}, "depth_scale"),
+        ("not a number", good | {"cx": float("nan")}, "nan"),
+        ("a word", good | {"cx": "left"}, "'left'"),
+    ):
+        path = folder / f"{name}.json"
+        path.write_text(json.dumps(values))
+        cases[name] = ("intrinsics", path, said)
+    return cases
+
+
+def test_bad_images(model: Path, images: Path, tmp_path: Path, run: Run) -> None:
+    for case, (argument, path, said) in spoil(tmp_path, images).items():
+        changed = recognize(images, **{argument: path})
+        code, _, err = run("recognize", "--model", model, *changed, "--out", tmp_path / "answer")
+        assert code == 2, case
+        assert said in one_line(err), case
+        assert not (tmp_path / "answer").exists(), case
+
+
+def test_bad_models(model: Path, images: Path, tmp_path: Path, run: Run) -> None:
+    def spoiled(name: str, change: Callable[[Path], object]) -> Path:
+        folder = tmp_path / name
+        shutil.copytree(model, folder)
+        change(folder)
+        return folder
+
+    def other_version(folder: Path) -> None:
+        text = (folder / "run.json").read_text()
+        (folder / "run.json").write_text(text.replace('"descriptor_version": 1', '"descriptor_version": 99'))
+
+    cases = {
+        tmp_path / "absent": "absent",
+        tmp_path: "run.json",
+        spoiled("version", other_version): "99",
+        spoiled("json", lambda f: (f / "run.json").write_text("{")): "run.json",
+        spoiled("network", lambda f: (f / "network.npz").write_bytes(b"PK")): "network.npz",
+        spoiled("weights", lambda f: shutil.rmtree(f / "weights" / "tops")): "tops",
+    }
+    for path, said in cases.items():
+        code, _, err = run("recognize", "--model", path, *recognize(images))
+        assert code == 2, path
+        assert said in one_line(err), path
+
+
+def test_bad_training_input(meshes: Path, tmp_path: Path, run: Run) -> None:
+    unknown = tmp_path / "names.json"
+    unknown.write_text(json.dumps({"mug": "no_such_scan"}))
+    broken = tmp_path / "broken"
+    broken.mkdir()
+    (broken / "can.ply").write_bytes((meshes / "soup_can_red.ply").read_bytes()[:500])
+    bare = tmp_path / "bare"
+    bare.mkdir()
+    (bare / "can.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    full = tmp_path / "full"
+    full.mkdir()
+    (full / "file").touch()
+    out = tmp_path / "run"
+    coarse = ("--azimuth-step", 90, "--polar-step", 90)
+    cases = {
+        "no folder": (["--meshes", tmp_path / "absent", "--out", out], "absent"),
+        "unknown name": (["--meshes", meshes, "--names", unknown, "--out", out], "no_such_scan"),
+        "broken mesh": (["--meshes", broken, "--out", out, *coarse], "can.ply"),
+        "no colour": (["--meshes", bare, "--out", out, *coarse], "can.obj"),
+        "step zero": (["--meshes", meshes, "--out", out, "--azimuth-step", 0], "0"),
+        "no source": (["--out", out], "--meshes"),
+        "unknown classifier": (["--meshes", meshes, "--out", out, "--classifiers", "shape"], "shape"),
+        "no epochs": (["--meshes", meshes, "--out", out, "--epochs", 0], "epochs"),
+        "no dataset": (["--dataset", tmp_path / "absent", "--out", out], "absent"),
+        "folder in use": (["--meshes", meshes, "--out", full], "full"),
+    }
+    for case, (arguments, said) in cases.items():
+        code, _, err = run("train", *arguments)
+        assert code == 2, case
+        assert said in one_line(err), case
+        assert not out.exists(), case
+    # The views are good for another try.
+    code, _, err = run("train", "--meshes", meshes, "--out", out, *coarse, "--folds", 99)
+    assert code == 2 and "99" in one_line(err)
+    assert [p.name for p in out.iterdir()] == ["views"]
+    assert run("train", "--meshes", meshes, "--out", out, *coarse, "--epochs", 1, "--classifiers", "ce")[0] == 0
+
+
+def test_paper_protocol(meshes: Path, tmp_path: Path) -> None:
+    """Plain views, each in four mirrors; what is given takes the place of the protocol's numbers."""
+    options = ("--azimuth-step", 90, "--polar-step", 45, "--workers", 1, "--epochs", 1, "--classifiers", "ce")
+    for name, paper in (("paper", ["--paper"]), ("default", [])):
+        assert call("train", "--meshes", meshes, "--out", tmp_path / name, *options, *paper) == 0
+    of = {name: json.loads((tmp_path / name / "run.json").read_text())["record"] for name in ("paper", "default")}
+    assert of["paper"]["samples"] == 4 * of["paper"]["dataset"]["views"] == 4 * 3 * 4 * 5
+    assert of["paper"]["batch_size"] == 128 and of["default"]["batch_size"] > 100
+    # Of the varied copies, those with too few points are left out.
+    assert 2 * 3 * 4 * 5 < of["default"]["samples"] / 2 <= 3 * 3 * 4 * 5
+    assert of["default"]["samples"] == 2 * of["default"]["dataset"]["views"]
+
+
+def test_bad_datasets(model: Path, tmp_path: Path, run: Run) -> None:
+    for kind in ("uwis", "frames"):
+        for path in (tmp_path / "absent", tmp_path):
+            code, _, err = run("evaluate", kind, path, "--model", model)
+            assert code == 2
+            assert str(path) in one_line(err)
+
+
+def test_usage_errors_have_exit_code_2(run: Run) -> None:
+    assert run("recognize")[0] == 2
+    assert run("no-such-command")[0] == 2
+    assert run("--help")[0] == 0
+
+
+def test_colornet(tmp_path: Path, run: Run) -> None:
+    code, out, _ = run("colornet", "--out", tmp_path / "network")
+    assert code == 0
+    assert "23 raw nodes, 22 regions, 55 edges; equal to the packaged network" in " ".join(out.split())
+    assert sorted(p.name for p in (tmp_path / "network").iterdir()) == ["network.npz", "network.png", "similarity.png"]
+    code, _, err = run("colornet", "--out", tmp_path / "network")
+    assert code == 2 and "exists already" in one_line(err)

@@ -1,0 +1,289 @@
+"""A whole evaluation with recognizers that are made up: killed, resumed, refused; its page and pictures."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import thor2_jax as thor2
+from thor2_jax.errors import InputError
+from training.evaluation.answers import AnswerFile
+from training.evaluation.job import evaluate_dataset
+from training.evaluation.runs import Run
+from training.readers.labelled import LabelledFrame, LabelledFrames
+from training.storage.locks import LOCK, locked
+
+CLASSES = ("bowl", "can", "mug")
+
+
+class ToyDataset(LabelledFrames):
+    """Frame k has the labels 1 to 3, of which 3 is of no class; each fourth lacks 2. The first pixel is k."""
+
+    def __init__(self, n: int, prefix: str = "frame") -> None:
+        self.identifiers = [f"{prefix}{k}" for k in range(n)]
+        self.read: list[int] = []
+
+    def __getitem__(self, number: int) -> LabelledFrame:
+        self.read.append(number)
+        color = np.random.default_rng(number).integers(0, 255, (48, 64, 3), dtype=np.uint8)
+        color[0, 0] = number
+        labels = np.zeros((48, 64), np.uint8)
+        labels[5:20, 5:25] = 1
+        labels[25:40, 20:60] = 2 if number % 4 else 0
+        labels[2:9, 40:60] = 3
+        depth = np.full((48, 64), 800, np.uint16)
+        frame = thor2.RGBDFrame(color, depth, labels, thor2.Intrinsics(50.0, 50.0, 32.0, 24.0))
+        truth = {1: CLASSES[number % 3], 2: "mug", 3: "dragon"}
+        return LabelledFrame(self.identifiers[number], frame, truth, {"light": str(number % 2)})
+
+
+class OneFrame(LabelledFrames):
+    """A dataset of one frame."""
+
+    def __init__(self, item: LabelledFrame) -> None:
+        self.identifiers, self.item = [item.identifier], item
+
+    def __getitem__(self, number: int) -> LabelledFrame:
+        return self.item
+
+
+class ToyRecognizer:
+    """Probabilities of chance, the same for a run and frame; notes each frame that it describes in a file."""
+
+    def __init__(self, seed: int, log: Path, features: tuple[str, ...], kill_at: int | None = None) -> None:
+        self.seed, self.log, self.kill_at = seed, log, kill_at
+        self.run = SimpleNamespace(classes=CLASSES, classifiers=dict.fromkeys(features))
+
+    def describe(self, frame: Any) -> Any:
+        number = int(frame.color[0, 0, 0])
+        if number == self.kill_at:
+            os.kill(os.getpid(), signal.SIGKILL)
+        with self.log.open("a") as file:
+            file.write(f"{number}\n")
+        clouds = [SimpleNamespace(label=label, reason=None) for label in frame.instances]
+        n = len(clouds)
+        return SimpleNamespace(clouds=clouds, usable=list(range(n)), occluded=[False] * n, descriptors=number)
+
+    def probabilities(self, descriptors: int) -> dict[str, np.ndarray]:
+        rng = np.random.default_rng([self.seed, descriptors])
+        return {name: rng.dirichlet(np.ones(3), 4).astype(np.float32) for name in self.run.classifiers}
+
+
+def toys(log: Path, kill_at: int | None = None) -> list[Run]:
+    """Two runs, of which the second has no CE."""
+    features = (("ce", "tops", "tops2"), ("tops", "tops2"))
+    return [Run(f"run{k}", f"digest{k}", ToyRecognizer(k, log, f, kill_at)) for k, f in enumerate(features)]  # type: ignore[arg-type]
+
+
+def evaluate_toys(folder: Path, n: int, kill_at: int | None = None) -> dict[str, Any]:
+    description = {"kind": "frames", "path": "toys"}
+    return evaluate_dataset(toys(folder / "log", kill_at), ToyDataset(n), description, folder / "report")
+
+
+def without_times(found: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in found.items() if name != "speed"}
+
+
+def test_killed_and_resumed_is_the_same_and_computes_nothing_twice(tmp_path: Path) -> None:
+    for name in ("whole", "killed"):
+        (tmp_path / name).mkdir()
+    whole = evaluate_toys(tmp_path / "whole", 9)
+    program = f"import runpy; from pathlib import Path; m = runpy.run_path({__file__!r}); "
+    program += f"m['evaluate_toys'](Path({str(tmp_path / 'killed')!r}), 9, kill_at=5)"
+    killed = subprocess.run([sys.executable, "-c", program], capture_output=True, timeout=120)
+    assert killed.returncode == -signal.SIGKILL, killed.stderr.decode()[-500:]
+    report = tmp_path / "killed" / "report"
+    assert not (report / "report.json").exists()
+    assert len((report / "answers.jsonl").read_text().splitlines()) == 1 + 5
+    with (report / "answers.jsonl").open("a") as file:
+        file.write('{"frame": "frame5", "attrib')  # as a kill in the midst of a write would leave it
+    resumed = evaluate_toys(tmp_path / "killed", 9)
+    assert (tmp_path / "killed" / "log").read_text().split() == [str(k) for k in range(9)]
+    assert without_times(resumed) == without_times(whole)
+    pictures = {p.relative_to(report): p.read_bytes() for p in report.rglob("*.jpg")}
+    other = tmp_path / "whole" / "report"
+    assert pictures == {p.relative_to(other): p.read_bytes() for p in other.rglob("*.jpg")}
+
+    assert without_times(evaluate_toys(tmp_path / "killed", 9)) == without_times(whole)
+    assert len((tmp_path / "killed" / "log").read_text().split()) == 9
+    assert [p.name for p in report.rglob(".*")] == [LOCK]
+
+
+def test_what_is_answered_is_not_read_again(tmp_path: Path) -> None:
+    evaluate_toys(tmp_path, 6)
+    answers = tmp_path / "report" / "answers.jsonl"
+    answers.write_text("".join(answers.read_text().splitlines(keepends=True)[: 1 + 4]))
+    dataset = ToyDataset(6)
+    evaluate_dataset(toys(tmp_path / "log"), dataset, {"kind": "frames", "path": "toys"}, tmp_path / "report")
+    assert dataset.read == [4, 5]
+
+
+def test_report_of_runs_of_which_one_lacks_a_classifier(tmp_path: Path) -> None:
+    stages: list[tuple[str, int, int, str]] = []
+    found = evaluate_dataset(
+        toys(tmp_path / "log"),
+        ToyDataset(5),
+        {"kind": "frames", "path": "toys"},
+        tmp_path / "report",
+        lambda *stage: stages.append(stage),
+    )
+    assert [done for _, done, _, _ in stages] == list(range(6)) and "frames/s" in stages[-1][3]
+    assert found == json.loads((tmp_path / "report" / "report.json").read_text())
+    accuracy = found["accuracy"]["larger"][0]["cells"][0]["accuracy"]
+    assert {name: figure["runs"] for name, figure in accuracy.items()} == {
+        "CE": 1, "TOPS": 2, "TOPS2": 2, "CE+TOPS": 1, "CE+TOPS2": 1, "THOR2": 2, "CE+TOPS+TOPS2": 1,
+    }  # fmt: skip
+    assert found["instances"] == {
+        "labelled": 15,
+        "scored": 10,
+        "not_described": {"no pixels in the label image": 2},
+        "no_class": {"dragon": 5},
+    }
+    assert np.sum(found["confusion"]) == 20 and np.sum(found["confusion"], axis=0)[-1] == 4
+
+
+class Page(HTMLParser):
+    """Collects pictures, headings' text and tags that are open at the end."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.text: list[str] = []
+        self.pictures: list[dict[str, str | None]] = []
+        self.seen: set[str] = set()
+        self.open: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.seen.add(tag)
+        if tag == "img":
+            self.pictures.append(dict(attrs))
+        elif tag != "meta":
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text.append(data)
+
+
+@pytest.mark.parametrize("n", [1, 2, 15])
+def test_page_of_datasets_of_any_size(tmp_path: Path, n: int) -> None:
+    found = evaluate_toys(tmp_path, n)
+    report = tmp_path / "report"
+    page = Page((report / "report.html").read_text())
+    assert page.open == [] and not page.seen & {"script", "link"}
+    assert all(p["alt"] and (report / str(p["src"])).is_file() for p in page.pictures)
+    shown = [p for p in page.pictures if str(p["src"]).startswith("frames/")]
+    assert len(shown) == min(n, 12) and len(found["shown"]) == len(shown)
+    crops = {str(p["src"]) for p in page.pictures if str(p["src"]).startswith("confusions/")}
+    assert len(crops) == len(found["worst"])
+    whole = found["accuracy"][found["rule"]][0]["cells"][0]["accuracy"]["THOR2"]
+    assert f"{whole['mean']:.3f} ±\u00a0{whole['std']:.3f}" in page.text
+    for picture in page.pictures:
+        with Image.open(report / str(picture["src"])) as image:
+            image.load()
+            assert max(image.size) <= 2000
+
+
+def test_page_of_instances_none_of_which_is_described_or_known(tmp_path: Path) -> None:
+    for name, truth in (("undescribed", {1: "mug"}), ("unknown", {1: "dragon"})):
+        frame = thor2.RGBDFrame(
+            np.zeros((8, 8, 3), np.uint8),
+            np.zeros((8, 8), np.uint16),
+            np.zeros((8, 8), np.uint8),
+            thor2.Intrinsics(1.0, 1.0, 0.0, 0.0),
+        )
+        dataset = OneFrame(LabelledFrame("f", frame, truth, {}))
+        description = {"kind": "frames", "path": name}
+        evaluate_dataset(toys(tmp_path / "log"), dataset, description, tmp_path / name)
+        assert Page((tmp_path / name / "report.html").read_text()).open == []
+
+
+def test_gallery_is_green_where_right_and_red_where_wrong(tmp_path: Path) -> None:
+    from training.reports.instance_pictures import RIGHT, WRONG, draw_crop, draw_judged
+
+    color = np.full((60, 90, 3), 128, np.uint8)
+    labels = np.zeros((60, 90), np.uint8)
+    labels[20:50, 5:40] = 1
+    labels[20:50, 50:85] = 2
+    draw_judged(color, labels, {1: (True, "a"), 2: (False, "b (c)"), 7: (False, "gone")}, tmp_path / "f.jpg")
+    with Image.open(tmp_path / "f.jpg") as image:
+        pixels = np.asarray(image.convert("RGB")).astype(int)
+    for row, paint in (((49, 20), RIGHT), ((49, 70), WRONG)):
+        assert np.abs(pixels[row] - paint).max() < 40
+    assert np.abs(pixels[40, 20] - 128).max() < 20
+    mask = np.zeros((60, 90), bool)
+    mask[0, 89] = True
+    draw_crop(color, mask, tmp_path / "c.jpg")
+    with Image.open(tmp_path / "c.jpg") as image:
+        assert max(image.size) == 240
+
+
+def test_answers_of_something_else_are_refused(tmp_path: Path) -> None:
+    evaluate_toys(tmp_path, 3)
+    runs, report = toys(tmp_path / "log"), tmp_path / "report"
+    before = (report / "answers.jsonl").read_bytes()
+    same = {"kind": "frames", "path": "toys"}
+    other = [Run("run0", "another digest", runs[0].recognizer), runs[1]]
+    cases: dict[str, tuple[Any, Any, Any]] = {
+        "another digest": (other, ToyDataset(3), same),
+        "elsewhere": (runs, ToyDataset(3), same | {"path": "elsewhere"}),
+        '"frames": 4': (runs, ToyDataset(4), same),
+        "digest0": (runs[:1], ToyDataset(3), same),
+    }
+    for said, (given, dataset, description) in cases.items():
+        with pytest.raises(InputError, match="name another folder") as caught:
+            evaluate_dataset(given, dataset, description, report)
+        assert said in str(caught.value) and "\n" not in str(caught.value)
+    assert (report / "answers.jsonl").read_bytes() == before
+
+
+def test_a_dataset_whose_frames_changed_is_refused(tmp_path: Path) -> None:
+    evaluate_toys(tmp_path, 3)
+    path = tmp_path / "report" / "answers.jsonl"
+    path.write_text("".join(path.read_text().splitlines(keepends=True)[:3]))
+    with pytest.raises(InputError, match="'frame0', but the dataset has 'photo0'"):
+        evaluate_dataset(
+            toys(tmp_path / "log"), ToyDataset(3, "photo"), {"kind": "frames", "path": "toys"}, tmp_path / "report"
+        )
+
+
+@pytest.mark.parametrize("content", ["", "[1]\n", "[" * 100_000 + "\n", "{}\n{}\n", '{"a": 1}\nnonsense\n'])
+def test_a_damaged_file_of_answers_is_refused(tmp_path: Path, content: str) -> None:
+    (tmp_path / "answers.jsonl").write_text(content)
+    with pytest.raises(InputError, match="damaged"):
+        AnswerFile(tmp_path / "answers.jsonl", {"a": 1})
+    assert (tmp_path / "answers.jsonl").read_text() == content
+
+
+def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "report").mkdir()
+    (tmp_path / "report" / "thesis.tex").touch()
+    with pytest.raises(InputError, match="exists already"):
+        evaluate_toys(tmp_path, 1)
+    assert [p.name for p in (tmp_path / "report").iterdir()] == ["thesis.tex"]
+
+
+def test_what_a_killed_evaluation_was_writing_is_passed_over(tmp_path: Path) -> None:
+    for name in ("whole", "killed"):
+        (tmp_path / name / "report").mkdir(parents=True)
+    (tmp_path / "killed" / "report" / ".answers.x.jsonl").write_text('{"data')
+    found = [without_times(evaluate_toys(tmp_path / name, 2)) for name in ("whole", "killed")]
+    assert found[0] == found[1]
+
+
+def test_of_two_evaluations_into_one_folder_the_second_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "report").mkdir()
+    with locked(tmp_path / "report"), pytest.raises(InputError, match="another process is writing"):
+        evaluate_toys(tmp_path, 2)
+    evaluate_toys(tmp_path, 2)

@@ -1,0 +1,135 @@
+"""Which folders are runs, and which runs may be evaluated together."""
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from flax import nnx
+
+import colornet
+from thor2_jax.config import DescriptorConfig
+from thor2_jax.descriptor.describe import describe
+from thor2_jax.errors import InputError
+from thor2_jax.recognition.classifier import MLP
+from thor2_jax.recognition.run_directory import TrainedRun, input_size, save_run
+from thor2_jax.types import PointClouds
+from training.baselines.files import baseline_file
+from training.evaluation.runs import load_runs, load_sequence_runs, run_folders
+
+CONFIG = DescriptorConfig(homology="closed_form", n_slices=1, n_strips=3)
+
+Maker = Callable[..., Path]
+
+
+@pytest.fixture
+def make(tmp_path: Path) -> Maker:
+    """Write an untrained run of colour alone."""
+    network = colornet.load_default()
+
+    def make(
+        name: str, classes: tuple[str, ...] = ("a", "b"), seed: int = 0, config: DescriptorConfig = CONFIG
+    ) -> Path:
+        model = MLP(input_size("ce", config, network.n_regions), len(classes), rngs=nnx.Rngs(seed))
+        save_run(TrainedRun(config, network, classes, {"ce": model}, {}), tmp_path / name)
+        return tmp_path / name
+
+    return make
+
+
+def test_folds_are_found_in_their_order(tmp_path: Path) -> None:
+    for fold in (10, 2, 0):
+        (tmp_path / "five" / f"fold-{fold}").mkdir(parents=True)
+        (tmp_path / "five" / f"fold-{fold}" / "run.json").touch()
+    (tmp_path / "single").mkdir()
+    (tmp_path / "single" / "run.json").touch()
+    found = run_folders([tmp_path / "single", tmp_path / "five"])
+    assert [f.relative_to(tmp_path).as_posix() for f in found] == [
+        "single",
+        "five/fold-0",
+        "five/fold-2",
+        "five/fold-10",
+    ]
+    (tmp_path / "five" / "checkpoints").mkdir()
+    with pytest.raises(InputError, match="five is not finished"):
+        run_folders([tmp_path / "five"])
+    assert run_folders([tmp_path / "five" / "fold-2"]) == [tmp_path / "five" / "fold-2"]
+
+
+def test_folds_are_loaded_with_names_and_digests(make: Maker, tmp_path: Path) -> None:
+    for fold in range(2):
+        make(f"both/fold-{fold}", seed=fold)
+    runs = load_runs([tmp_path / "both"])
+    assert [run.name for run in runs] == ["both/fold-0", "both/fold-1"]
+    assert len({run.digest for run in runs}) == 2
+    assert [run.digest for run in load_runs([tmp_path / "both"])] == [run.digest for run in runs]
+
+
+def test_a_digest_is_of_files_that_have_their_name(make: Maker) -> None:
+    folder = make("run")
+    before = load_runs([folder])[0].digest
+    file = baseline_file(folder, "forest")
+    file.parent.mkdir()
+    file.with_name(f".{file.stem}.x{file.suffix}").touch()  # of a process that was killed while it wrote
+    assert load_runs([folder])[0].digest == before
+
+
+def test_runs_that_do_not_fit_together_are_refused(make: Maker, tmp_path: Path) -> None:
+    first = make("first")
+    cases = {
+        "different classes (c)": make("classes", ("a", "b", "c")),
+        "different classes (in another order)": make("order", ("b", "a")),
+        "different descriptors": make("config", config=dataclasses.replace(CONFIG, alpha=0.5)),
+        "the same run": first,
+        "no run folder": tmp_path,
+    }
+    for said, other in cases.items():
+        with pytest.raises(InputError, match="^model: ") as caught:
+            load_runs([first, other])
+        assert said in str(caught.value) and str(other) in str(caught.value)
+    with pytest.raises(InputError, match="no run folder is given"):
+        load_runs([])
+
+
+def test_runs_of_sequences(make: Maker, tmp_path: Path) -> None:
+    """Against the runs one by one."""
+    for fold in range(2):
+        make(f"runs/bottom/s1/fold-{fold}", ("b", "c"), seed=fold)
+        make(f"runs/s2/fold-{fold}", ("a", "b"), seed=2 + fold)
+    found = load_sequence_runs(tmp_path / "runs", ["x/bottom/s1/f1", "x/bottom/s1/f2", "x/top/s2/f1"])
+    assert [run.name for run in found] == ["runs/*/fold-0", "runs/*/fold-1"]
+    assert all(run.classes == ("a", "b", "c") and run.asked == ("ce",) for run in found)
+    assert found[0].digest != found[1].digest
+    assert [run.digest for run in load_sequence_runs(tmp_path / "runs", ["x/top/s2/f1"])] != [r.digest for r in found]
+
+    rng = np.random.default_rng(0)
+    clouds = PointClouds.pack([(rng.random((50, 3)), rng.random((50, 3))) for _ in range(3)])
+    described = SimpleNamespace(descriptors=describe(clouds, colornet.load_default(), CONFIG))
+    for fold, run in enumerate(found):
+        for frame, own, columns in (("x/bottom/s1/f2", "bottom/s1", [1, 2]), ("x/top/s2/f1", "s2", [0, 1])):
+            (alone,) = load_runs([tmp_path / "runs" / own / f"fold-{fold}"])
+            values = run.probabilities(frame, described, None)["ce"]  # type: ignore[arg-type]
+            expected = np.zeros((3, 3))
+            expected[:, columns] = alone.probabilities(frame, described, None)["ce"]  # type: ignore[arg-type]
+            np.testing.assert_array_equal(values, expected.astype(np.float32))
+
+
+def test_runs_of_sequences_that_do_not_fit_together_are_refused(make: Maker, tmp_path: Path) -> None:
+    make("runs/s1")
+    make("runs/s2/fold-0")
+    make("runs/s2/fold-1", seed=1)
+    make("runs/s3", config=dataclasses.replace(CONFIG, alpha=0.5))
+    (tmp_path / "runs" / "s4").mkdir()
+    cases = {
+        ("s1", "s2"): "different folds, classifiers or baselines",
+        ("s1", "s3"): "different descriptors or colour networks",
+        ("s1", "s4"): "s4",
+        ("s1", "s5"): "has no run for s5",
+        (): "has no run for any sequence",
+    }
+    for sequences, said in cases.items():
+        with pytest.raises(InputError, match="^model: ") as caught:
+            load_sequence_runs(tmp_path / "runs", [f"{sequence}/frame" for sequence in sequences])
+        assert said in str(caught.value)

@@ -1,0 +1,79 @@
+"""Temperatures of a fold's classifiers: what they are fitted on, and where they are kept."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from flax import nnx
+
+import colornet
+import thor2_jax as thor2
+from thor2_jax.recognition.classifier import MLP, Feature, class_probabilities
+from thor2_jax.recognition.run_directory import input_size
+from training.evaluation.confidence import fit_temperature
+from training.evaluation.runs import load_runs
+from training.fitting import calibration
+from training.fitting.calibration import sample_probabilities, temperatures
+from training.fitting.fit import FitOptions
+from training.fitting.job import train_run
+from training.fitting.samples import MIRRORS, build_samples
+from training.views.normalized_views import padded_batches
+from training.views.source import MemoryViews
+
+CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=2, n_strips=8, image_size=8)
+NETWORK = colornet.load_default()
+
+
+def source(views: int) -> MemoryViews:
+    rng = np.random.default_rng(0)
+    sizes = {"brick": (0.1, 0.05, 0.03), "stick": (0.2, 0.01, 0.01)}
+    return MemoryViews(
+        {
+            name: [
+                (
+                    (rng.random((90, 3)) * size + [0, 0, 0.5]).astype(np.float32),
+                    rng.integers(0, 256, (90, 3), dtype=np.uint8),
+                )
+                for _ in range(views)
+            ]
+            for name, size in sizes.items()
+        },
+        CONFIG,
+    )
+
+
+@pytest.mark.parametrize("feature", ["ce", "tops2"])
+def test_samples_are_answered_as_their_clouds_are(feature: Feature, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(calibration, "CHUNK", 3)
+    views = source(2)
+    samples = build_samples(views, NETWORK, CONFIG)
+    model = MLP(input_size(feature, CONFIG, NETWORK.n_regions), 2, rngs=nnx.Rngs(0))
+    rows = np.array([7, 0, 3, 5])
+    found = sample_probabilities(model, samples, rows, feature, NETWORK, CONFIG)
+    expected = []
+    for index in range(2):
+        ((_, normal),) = padded_batches(views.read(index).clouds(), 2)
+        for axes in MIRRORS:
+            aligned = thor2.turn(thor2.mirror(normal, axes), CONFIG)
+            described = thor2.describe_aligned(aligned, NETWORK, CONFIG)
+            expected.append(np.asarray(class_probabilities(model, described, feature)))
+    np.testing.assert_allclose(found, np.concatenate(expected)[rows], atol=1e-5)
+    assert sample_probabilities(model, samples, rows[:0], feature, NETWORK, CONFIG).shape == (0, 2)
+
+
+def test_temperatures_are_those_of_the_samples_held_out() -> None:
+    samples = build_samples(source(3), NETWORK, CONFIG)
+    model = MLP(input_size("tops", CONFIG, NETWORK.n_regions), 2, rngs=nnx.Rngs(0))
+    held_out = samples.view == 1
+    found = temperatures({"tops": model}, samples, held_out, NETWORK, CONFIG)
+    said = sample_probabilities(model, samples, np.flatnonzero(held_out), "tops", NETWORK, CONFIG)
+    assert found == {"tops": fit_temperature(said, samples.label[held_out])}
+    assert temperatures({"tops": model}, samples, None, NETWORK, CONFIG) == {}
+
+
+def test_runs_of_several_folds_keep_their_temperatures(tmp_path: Path) -> None:
+    options = FitOptions(epochs=2, batch_size=4)
+    train_run(source(4), tmp_path / "run", ("tops",), options, config=CONFIG, folds=2)
+    for run in load_runs([tmp_path / "run"]):
+        assert set(run.temperatures) == {"tops"} and 0.01 <= run.temperatures["tops"] <= 100
+        assert run.recognizer.run.record["temperatures"] == run.temperatures

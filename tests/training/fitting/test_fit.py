@@ -1,0 +1,213 @@
+"""Fitting: it learns what can be learnt, the same way every time, and says so when it cannot."""
+
+import dataclasses
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+
+import colornet
+import thor2_jax as thor2
+from thor2_jax.descriptor.color_membership import region_sets
+from thor2_jax.recognition.classifier import MLP, Feature, feature_of
+from training.fitting.checkpoints import Checkpoints
+from training.fitting.fit import Figures, FitOptions, fit
+from training.fitting.samples import Samples, expand
+
+NETWORK = colornet.load_default()
+CONFIG = thor2.DescriptorConfig(n_slices=2, n_strips=5, image_size=12)  # small, so that it is quick
+QUICK = FitOptions(epochs=8, batch_size=16, seed=3)
+LONGER = dataclasses.replace(QUICK, epochs=12)
+
+Fit = Callable[..., tuple[MLP, int]]
+
+
+@pytest.fixture
+def fitted(tmp_path: Path, separable: Samples) -> Fit:
+    """`fit` on the separable samples, in a folder of its own."""
+    folders = (tmp_path / str(number) for number in range(99))
+
+    def run(
+        feature: Feature = "tops2", options: FitOptions = QUICK, samples: Samples = separable, **arguments: object
+    ) -> tuple[MLP, int]:
+        with Checkpoints(next(folders)) as checkpoints:
+            return fit(samples, NETWORK, CONFIG, feature, options, checkpoints, **arguments)
+
+    return run
+
+
+def described(samples: Samples) -> thor2.Descriptors:
+    batch = jax.tree.map(jnp.asarray, samples.take(np.arange(len(samples))))
+    return thor2.describe_strips(expand(batch, region_sets(NETWORK).weights, CONFIG), NETWORK, CONFIG)
+
+
+def answers(model: MLP, samples: Samples, feature: Feature) -> np.ndarray:
+    return np.asarray(model(feature_of(described(samples), feature)).argmax(axis=1))
+
+
+def leaves(model: MLP) -> list[np.ndarray]:
+    return [np.asarray(a) for a in jax.tree.leaves(nnx.to_pure_dict(nnx.state(model)))]
+
+
+def same_bits(a: MLP, b: MLP) -> None:
+    assert len(leaves(a)) > 20
+    for one, other in zip(leaves(a), leaves(b), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_learns_to_tell_separable_classes_apart(separable: Samples, fitted: Fit) -> None:
+    curve: list[Figures] = []
+    steps: list[tuple[int, int, int]] = []
+    model, best = fitted(
+        epoch_done=curve.append, progress=lambda done, total, figures: steps.append((done, total, figures.epoch))
+    )
+    assert (answers(model, separable, "tops2") == separable.label).all()
+    assert [figures.epoch for figures in curve] == list(range(1, 9))
+    assert curve[-1].loss < curve[0].loss / 3 and curve[-1].accuracy > 0.8
+    assert best == min(curve, key=lambda figures: figures.loss).epoch
+    assert all(math.isfinite(figures.loss) and figures.held_out_accuracy is None for figures in curve)
+    assert steps == [(done, 24, (done + 2) // 3) for done in range(1, 25)]
+
+
+@pytest.mark.slow
+def test_a_feature_sees_no_more_than_its_descriptor(separable: Samples, fitted: Fit) -> None:
+    """Shape cannot tell class 1 from 2, colour cannot tell 0 from 1."""
+    tops, ce = (answers(fitted(name, LONGER)[0], separable, name) for name in ("tops", "ce"))
+    np.testing.assert_array_equal(tops == 0, separable.label == 0)
+    np.testing.assert_array_equal(ce == 2, separable.label == 2)
+
+
+def test_what_is_held_out_is_measured_and_not_learnt(separable: Samples, fitted: Fit) -> None:
+    """Held out with wrong labels, a third is never named rightly; the best epoch is one that names most rightly."""
+    held_out = np.arange(48) >= 38
+    wrong = dataclasses.replace(separable, label=np.where(held_out, 0, separable.label).astype(np.int32))
+    curve: list[Figures] = []
+    model, best = fitted(samples=wrong, held_out=held_out, epoch_done=curve.append)
+    right = answers(model, separable, "tops2")[held_out] == 0
+    assert max(figures.held_out_accuracy or 0 for figures in curve) == curve[best - 1].held_out_accuracy
+    assert curve[best - 1].held_out_accuracy == pytest.approx(right.mean())
+    final = curve[-1]
+    assert final.accuracy > 0.8 and final.held_out_accuracy == pytest.approx((separable.label[held_out] == 0).mean())
+
+
+def test_the_same_seed_gives_the_same_bits_and_another_does_not(fitted: Fit) -> None:
+    options = dataclasses.replace(QUICK, epochs=2)
+    first, second = fitted(options=options)[0], fitted(options=options)[0]
+    same_bits(first, second)
+    other = fitted(options=dataclasses.replace(options, seed=4))[0]
+    assert np.abs(other.head.kernel[...] - first.head.kernel[...]).max() > 1e-3
+
+
+class Stopped(Exception):
+    pass
+
+
+def test_going_on_gives_the_bits_of_never_having_stopped(separable: Samples, fitted: Fit, tmp_path: Path) -> None:
+    held_out = np.arange(48) % 4 == 0
+    expected: list[Figures] = []
+    model, best = fitted(held_out=held_out, epoch_done=expected.append)
+    found: list[Figures] = []
+
+    def stop_at(step: int) -> Callable[[int, int, Figures], None]:
+        def progress(done: int, total: int, figures: Figures) -> None:
+            if done == step:
+                raise Stopped
+
+        return progress
+
+    for step in (3, 4, 9, None):  # in the second and in the third epoch; the third call begins with the second
+        with Checkpoints(tmp_path / "stopped") as checkpoints:
+            progress = stop_at(step) if step else lambda *_: None
+            try:
+                again = fit(separable, NETWORK, CONFIG, "tops2", QUICK, checkpoints, held_out, progress, found.append)
+            except Stopped:
+                continue
+    same_bits(again[0], model)
+    assert again[1] == best
+    without_rate = [dataclasses.replace(figures, samples_per_second=0) for figures in expected]
+    assert [dataclasses.replace(figures, samples_per_second=0) for figures in found] == without_rate
+
+
+def test_a_fit_that_is_done_only_gives_its_classifier(separable: Samples, tmp_path: Path) -> None:
+    def refuse(*_: object) -> None:
+        raise AssertionError("a step was made")
+
+    options = dataclasses.replace(QUICK, epochs=2)
+    with Checkpoints(tmp_path) as checkpoints:
+        first = fit(separable, NETWORK, CONFIG, "ce", options, checkpoints)
+    with Checkpoints(tmp_path) as checkpoints:
+        second = fit(separable, NETWORK, CONFIG, "ce", options, checkpoints, None, refuse, refuse)
+    same_bits(first[0], second[0])
+    assert first[1] == second[1]
+
+
+def test_inputs_are_scaled_block_by_block_to_a_root_mean_square_of_one(separable: Samples, fitted: Fit) -> None:
+    model, _ = fitted(options=FitOptions(epochs=1))
+    blocks = np.asarray(model.input_scale[...]) * np.asarray(described(separable).tops2)
+    for block in np.split(blocks.reshape(48, 2, 144 + 110), [144], axis=2):
+        assert np.sqrt((block.astype(np.float64) ** 2).mean()) == pytest.approx(1, rel=1e-4)
+
+
+def test_the_samples_are_left_alone_and_a_few_are_one_batch(separable: Samples, fitted: Fit) -> None:
+    few = dataclasses.replace(
+        separable,
+        strip_start=separable.strip_start[:6],
+        color_start=separable.color_start[:6],
+        label=separable.label[:5],
+        view=separable.view[:5],
+    )
+    arrays = [getattr(few, field.name) for field in dataclasses.fields(few)]
+    before = [np.copy(a) for a in arrays]
+    steps: list[int] = []
+    fitted("tops", FitOptions(epochs=1), few, progress=lambda done, total, figures: steps.append(done))
+    assert steps == [1]
+    for a, b in zip(arrays, before, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_a_loss_that_is_not_finite_is_an_error_and_the_last_checkpoint_stays(
+    separable: Samples, fitted: Fit, tmp_path: Path
+) -> None:
+    broken = dataclasses.replace(separable, color_count=separable.color_count * np.nan)
+    with pytest.raises(thor2.InputError, match="loss of ce is nan in epoch 1"):
+        fitted("ce", samples=broken)
+    with Checkpoints(tmp_path / "c") as checkpoints:
+        fit(separable, NETWORK, CONFIG, "ce", dataclasses.replace(QUICK, epochs=2), checkpoints)
+    with Checkpoints(tmp_path / "c") as checkpoints:
+        with pytest.raises(thor2.InputError, match="loss of ce is nan in epoch 3"):
+            fit(broken, NETWORK, CONFIG, "ce", QUICK, checkpoints)
+    with Checkpoints(tmp_path / "c") as checkpoints:
+        assert checkpoints.last_epoch == 2
+        fit(separable, NETWORK, CONFIG, "ce", QUICK, checkpoints)
+
+
+def test_too_little_to_learn_from(separable: Samples, fitted: Fit) -> None:
+    with pytest.raises(thor2.InputError, match="there are 1 samples to train on; at least 2"):
+        fitted(held_out=np.arange(48) > 0)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *[("epochs", value) for value in (0, -1, 1.5, "3", True)],
+        *[("batch_size", value) for value in (1, 0, 2.0, None)],
+        *[("seed", value) for value in (-1, 0.5, 2**31)],
+        *[("learning_rates", value) for value in ((1e-2,), (0, 1e-3), (1e-2, -1), (math.nan, 1.0), (math.inf, 1.0))],
+    ],
+)
+def test_bad_options_are_refused_by_name(name: str, value: object) -> None:
+    with pytest.raises(thor2.InputError) as caught:
+        FitOptions(**{name: value})
+    assert str(caught.value).startswith(f"{name} is {value!r}; it must be")
+    assert "\n" not in str(caught.value)
+
+
+def test_the_papers_options() -> None:
+    options = FitOptions(seed=2**31 - 1)
+    assert options.epochs == 100 and options.learning_rates == (1e-2, 1e-3)
+    jax.random.key(options.seed)

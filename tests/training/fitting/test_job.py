@@ -1,0 +1,355 @@
+"""From views to a run folder, at once, in several goes, and by folds."""
+
+import errno
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from flax import nnx
+from PIL import Image
+
+import thor2_jax as thor2
+from thor2_jax.recognition.run_directory import TrainedRun, load_run
+from training.evaluation.runs import run_folders
+from training.fitting import job as module
+from training.fitting import metrics_log as metrics
+from training.fitting.checkpoints import Checkpoints
+from training.fitting.fit import FitOptions
+from training.fitting.job import train_run
+from training.views.mesh_views import Cloud
+from training.views.source import MemoryViews
+
+CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=3, n_strips=8, image_size=8)
+OPTIONS = FitOptions(epochs=3, batch_size=4)
+FINISHED = ["curves.png", "metrics.jsonl", "network.npz", "run.json", "weights"]
+
+
+def clouds(seed: int = 0, views: int = 6) -> dict[str, list[Cloud]]:
+    rng = np.random.default_rng(seed)
+    out: dict[str, list[Cloud]] = {}
+    for name, size, level in (("red brick", (0.1, 0.05, 0.03), 0), ("stick", (0.2, 0.01, 0.01), 255)):
+        out[name] = [
+            ((rng.random((200, 3)) * size + [0, 0, 0.5]).astype(np.float32), np.full((200, 3), level, np.uint8))
+            for _ in range(views)
+        ]
+    return out
+
+
+def source(seed: int = 0, views: int = 6) -> MemoryViews:
+    return MemoryViews(clouds(seed, views), CONFIG)
+
+
+def train(out: Path, features: tuple[str, ...] = ("tops",), options: FitOptions = OPTIONS, **more: Any) -> TrainedRun:
+    (run,) = train_run(source(), out, features, options, config=CONFIG, **more)
+    return run
+
+
+def weights(run: TrainedRun) -> dict[str, Any]:
+    return {name: nnx.to_flat_state(nnx.state(model)) for name, model in run.classifiers.items()}
+
+
+def same_weights(a: TrainedRun, b: TrainedRun) -> None:
+    first, second = weights(a), weights(b)
+    assert first.keys() == second.keys()
+    for name in first:
+        assert len(first[name]) > 20
+        for (path, one), (other_path, other) in zip(first[name], second[name], strict=True):
+            assert path == other_path
+            np.testing.assert_array_equal(one[...], other[...])
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def told_of(path: Path) -> list[tuple[Any, ...]]:
+    rows = metrics.read_figures(path / "metrics.jsonl")
+    return [(row["fold"], row["classifier"], row["epoch"], row["loss"], row["accuracy"]) for row in rows]
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, TrainedRun]:
+    """A run trained at one go."""
+    out = tmp_path_factory.mktemp("whole") / "run"
+    return out, train(out, ("tops", "ce"))
+
+
+def test_a_run_is_written_and_told_of(tmp_path: Path) -> None:
+    told: list[tuple[str, int, int]] = []
+
+    def progress(stage: str, done: int, total: int, note: str) -> None:
+        told.append((stage, done, total))
+        if stage != "describe":
+            assert "loss" in note and "accuracy" in note and "samples/s" in note
+
+    out = tmp_path / "run"
+    run = train(out, progress=progress)
+    assert run.classes == ("red brick", "stick") and tuple(run.classifiers) == ("tops",)
+    fit_steps = [("fit tops", done, 18) for done in range(1, 19)]
+    assert told == [("describe", 6, 12), ("describe", 12, 12), *fit_steps]
+    assert names(out) == FINISHED
+    found = load_run(out)
+    assert (found.classes, found.config, found.record) == (run.classes, CONFIG, run.record)
+    record = found.record
+    assert (record["samples"], record["batch_size"], record["folds"], record["held_out_accuracy"]) == (24, 4, 1, {})
+    assert record["dataset"] == source().record and record["dataset"]["views"] == 12
+    curve = record["curves"]["tops"]
+    assert [row["epoch"] for row in curve] == [1, 2, 3]
+    assert record["kept_epochs"] == {"tops": min(curve, key=lambda row: row["loss"])["epoch"]}
+    assert [(0, "tops", *row.values()) for row in curve] == told_of(out)
+    with Image.open(out / "curves.png") as picture:
+        assert picture.width > 300
+
+
+def test_bad_input_is_told_before_any_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def work(*_: Any, **__: Any) -> None:
+        raise AssertionError("work was begun")
+
+    monkeypatch.setattr(module, "build_samples", work)
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "kept").write_text("x")
+    with pytest.raises(thor2.InputError, match=f"out: {tmp_path / 'run'} exists already"):
+        train(tmp_path / "run")
+    with pytest.raises(thor2.InputError, match=r"classifiers is \('shape',\)"):
+        train(tmp_path / "new", ("shape",))
+    assert [p.name for p in tmp_path.rglob("*")] == ["run", "kept"]
+
+
+@pytest.mark.parametrize(
+    ("bad", "folds", "said"),
+    [
+        ({}, 1, "views of 0 classes"),
+        ({"mug": [], "box": clouds()["stick"]}, 1, "class 'mug' has no views"),
+        ({"mug": clouds()["stick"]}, 1, "views of 1 classes"),
+        (clouds(views=3), 4, "folds is 4, but class 'red brick' has only 3 views"),
+    ],
+)
+def test_nothing_is_written_for_bad_views(
+    bad: Mapping[str, list[Cloud]], folds: int, said: str, tmp_path: Path
+) -> None:
+    with pytest.raises(thor2.InputError, match=said):
+        train_run(MemoryViews(bad, CONFIG), tmp_path / "run", ["tops"], OPTIONS, config=CONFIG, folds=folds)
+    assert names(tmp_path) == []
+
+
+class Stopped(BaseException):
+    """As Ctrl+C."""
+
+
+def stop_when(stage: str, step: int) -> Any:
+    def progress(now: str, done: int, total: int, note: str) -> None:
+        if (now, done) == (stage, step):
+            raise Stopped
+
+    return progress
+
+
+def test_a_run_goes_on_and_ends_as_if_it_had_not_been_stopped(whole: tuple[Path, TrainedRun], tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    for stage, step in (("fit ce", 2), ("fit ce", 9), ("fit ce", 14), ("fit tops", 1), ("fit tops", 18)):
+        with pytest.raises(Stopped):
+            train(out, ("tops", "ce"), progress=stop_when(stage, step))
+        with pytest.raises(thor2.InputError, match=r"has no run\.json"):
+            load_run(out)
+    run = train(out, ("tops", "ce"))
+    same_weights(run, whole[1])
+    assert run.record == whole[1].record
+    assert told_of(out) == told_of(whole[0])
+    assert names(out) == FINISHED
+    with pytest.raises(thor2.InputError, match="exists already and is not an empty folder"):
+        train(out, ("tops", "ce"))
+
+
+@pytest.mark.parametrize("moved", ["nothing", "weights", "network.npz", "run.json"])
+def test_a_stop_while_the_run_is_put_in_place(
+    moved: str, whole: tuple[Path, TrainedRun], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "run"
+    rename = Path.rename
+
+    def stopping(self: Path, target: Path) -> Path:
+        if self.parent.name == "run" and moved == "nothing":
+            raise Stopped
+        found = rename(self, target)
+        if self.name == moved and target.parent == out:
+            raise Stopped
+        return found
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "rename", stopping)
+        with pytest.raises(Stopped):
+            train(out, ("tops", "ce"))
+    assert (out / "run.json").exists() == (moved == "run.json")
+    same_weights(train(out, ("tops", "ce")), whole[1])
+    assert names(out) == FINISHED
+
+
+def test_a_stop_while_checkpoints_are_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The run, or all its folds, is finished by then."""
+    rmdir = os.rmdir
+
+    def stopping(path: Any, **options: Any) -> None:
+        if Path(path).name.endswith("checkpoints"):
+            raise Stopped
+        rmdir(path, **options)
+
+    monkeypatch.setattr(os, "rmdir", stopping)
+    with pytest.raises(Stopped):
+        train_run(source(), tmp_path / "run", ["tops"], OPTIONS, config=CONFIG, folds=2)
+    assert module.is_finished(tmp_path / "run")
+    assert [load_run(folder).record["fold"] for folder in run_folders([tmp_path / "run"])] == [0, 1]
+
+
+def test_other_options_or_views_are_refused(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    with pytest.raises(Stopped):
+        train(out, progress=stop_when("fit tops", 8))
+    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    cases: list[tuple[str, dict[str, Any]]] = [
+        ("batch_size 4, not 6", {"options": FitOptions(epochs=3, batch_size=6)}),
+        ("epochs 3, not 4", {"options": FitOptions(epochs=4, batch_size=4)}),
+        ("seed 0, not 1", {"options": FitOptions(epochs=3, batch_size=4, seed=1)}),
+        (r"classifiers \['tops'\], not \['ce', 'tops'\]", {"features": ("tops", "ce")}),
+        ("folds 1, not 3", {"folds": 3}),
+    ]
+    for said, changes in cases:
+        with pytest.raises(thor2.InputError, match=f"out: {out} holds a run in the making with {said}"):
+            train(out, **changes)
+    with pytest.raises(thor2.InputError, match=f"in the making with dataset '{source().digest}', not "):
+        train_run(source(1), out, ["tops"], OPTIONS, config=CONFIG)
+    with pytest.raises(thor2.InputError, match="in the making with descriptor_config"):
+        train_run(source(), out, ["tops"], OPTIONS)
+    assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
+    (out / "checkpoints" / "begun.json").write_text("{")
+    with pytest.raises(thor2.InputError, match=r"begun\.json cannot be read"):
+        train(out)
+
+
+def test_a_damaged_checkpoint_is_named(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    with pytest.raises(Stopped):
+        train(out, progress=stop_when("fit tops", 8))
+    last = out / "checkpoints" / "fold-0" / "tops" / "1"
+    largest = max((path for path in last.rglob("*") if path.is_file()), key=lambda path: path.stat().st_size)
+    largest.write_bytes(largest.read_bytes()[:-1])
+    with pytest.raises(thor2.InputError, match=f"checkpoint: {last} cannot be read: it is damaged"):
+        train(out)
+    shutil.rmtree(last.parent)
+    train(out)
+
+
+def test_a_full_disk(whole: tuple[Path, TrainedRun], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever cannot be written, the run goes on from the last checkpoint once there is room."""
+    out = tmp_path / "run"
+
+    def full(*_: Any, **__: Any) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    save = Checkpoints.save
+    calls = 0
+
+    def second_fails(self: Checkpoints, *arguments: Any) -> None:
+        nonlocal calls
+        calls += 1
+        full() if calls == 2 else save(self, *arguments)
+
+    for where, name, replacement in (
+        (module, "write_text", full),
+        (Checkpoints, "save", second_fails),
+        (module, "append_figures", full),
+        (module, "draw_curves", full),
+        (module, "save_run", full),
+    ):
+        with monkeypatch.context() as patch:
+            patch.setattr(where, name, replacement)
+            with pytest.raises(OSError, match="No space left"):
+                train(out, ("tops", "ce"))
+        assert not (out / "run.json").exists()
+    same_weights(train(out, ("tops", "ce")), whole[1])
+    assert names(out) == FINISHED
+
+
+def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(OSError) as caught:
+        train(tmp_path / "file" / "run")
+    assert "file" in str(caught.value)
+
+
+def test_folds(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    told: list[str] = []
+
+    def progress(stage: str, done: int, total: int, note: str) -> None:
+        if stage == "fold 1: fit tops" and done == 9 and not told:
+            told.append(stage)
+            raise Stopped
+
+    def run() -> list[TrainedRun]:
+        return train_run(source(views=6), out, ["tops"], OPTIONS, progress, CONFIG, folds=3)
+
+    with pytest.raises(Stopped):
+        run()
+    first = load_run(out / "fold-0")
+    assert names(out) == ["checkpoints", "curves.png", "fold-0", "metrics.jsonl"]
+    runs = run()
+    assert names(out) == ["curves.png", "fold-0", "fold-1", "fold-2", "metrics.jsonl"]
+    assert names(out / "fold-2") == ["network.npz", "run.json", "weights"]
+    same_weights(runs[0], first)
+    assert [run.record["fold"] for run in runs] == [0, 1, 2]
+    assert told_of(out) == [
+        (fold, "tops", row["epoch"], row["loss"], row["accuracy"])
+        for fold, found in enumerate(runs)
+        for row in found.record["curves"]["tops"]
+    ]
+    for found in runs:
+        curve = found.record["curves"]["tops"]
+        best = max(row["held_out_accuracy"] for row in curve)
+        assert found.record["held_out_accuracy"] == {"tops": best}
+        assert curve[found.record["kept_epochs"]["tops"] - 1]["held_out_accuracy"] == best
+    with pytest.raises(AssertionError):
+        same_weights(runs[0], runs[1])
+    with pytest.raises(thor2.InputError, match="exists already"):
+        run()
+
+
+_PROGRAM = """
+import sys
+sys.path.insert(0, sys.argv[1])
+import test_train
+test_train.train(test_train.Path(sys.argv[2]), ("tops", "ce"))
+"""
+
+
+@pytest.mark.slow
+def test_a_killed_process_goes_on_to_the_same_bytes(whole: tuple[Path, TrainedRun], tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    command = [sys.executable, "-c", _PROGRAM, str(Path(__file__).parent), str(out)]
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
+    killed = 0
+    # At once after lines appear: while a checkpoint is being written, or the next epoch is under way.
+    for lines in (1, 5):
+        with subprocess.Popen(command, env=environment) as process:
+            while process.poll() is None:
+                if (out / "metrics.jsonl").exists() and len((out / "metrics.jsonl").read_text().splitlines()) >= lines:
+                    process.kill()
+                    break
+                time.sleep(0.001)
+        killed += process.returncode == -signal.SIGKILL
+    assert killed == 2
+    assert json.loads((out / "checkpoints" / "begun.json").read_text())["epochs"] == 3
+    subprocess.run(command, env=environment, check=True)
+    same_weights(load_run(out), whole[1])
+    assert (out / "weights").is_dir() and told_of(out) == told_of(whole[0])
+    first, second = (json.loads((folder / "run.json").read_text()) for folder in (out, whole[0]))
+    assert first["record"] == second["record"]
+    assert names(out) == FINISHED

@@ -1,0 +1,116 @@
+"""Training over eight devices and over two processes against one device, each in processes of their own."""
+
+import json
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+_PROGRAM = """
+import json, sys
+from pathlib import Path
+out, port, rank = Path(sys.argv[1]), sys.argv[2], int(sys.argv[3])
+import jax
+if port != "0":
+    jax.distributed.initialize(f"localhost:{port}", 2, rank)
+import numpy as np
+from flax import nnx
+import thor2_jax as thor2
+from training.fitting.fit import FitOptions
+from training.fitting.job import train_run
+from training.views.source import MemoryViews
+
+rng = np.random.default_rng(0)
+def clouds(size, low, high):
+    return [((rng.random((150, 3)) * size + (0, 0, 0.5)).astype(np.float32),
+             rng.integers(low, high, (150, 3), dtype=np.uint8)) for _ in range(16)]
+
+config = thor2.DescriptorConfig(homology="closed_form", n_slices=3, n_strips=8, image_size=8)
+views = {"brick": clouds((0.1, 0.05, 0.03), 0, 99), "stick": clouds((0.2, 0.02, 0.02), 99, 255)}
+told = []
+runs = train_run(MemoryViews(views, config), out, ["tops2"], FitOptions(epochs=4, batch_size=16),
+                 lambda *stage: told.append(stage), config, folds=2)
+assert len(jax.devices()) == int(sys.argv[4])
+for fold, run in enumerate(runs):
+    state = nnx.to_flat_state(nnx.state(run.classifiers["tops2"]))
+    arrays = {"/".join(map(str, path)): value[...] for path, value in state}
+    np.savez(out.parent / f"{out.name}-{rank}-{fold}.npz", **arrays)
+"""
+
+
+def start(out: Path, devices: int, port: int = 0, rank: int = 0, local_devices: int = 1) -> subprocess.Popen[str]:
+    arguments = [str(out), str(port), str(rank), str(devices)]
+    environment = {
+        **os.environ,
+        "PYTHONPATH": str(Path(__file__).parents[3]),
+        "XLA_FLAGS": f"--xla_force_host_platform_device_count={local_devices}",
+        "JAX_PLATFORMS": "cpu",
+    }
+    command = [sys.executable, "-c", _PROGRAM, *arguments]
+    return subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
+
+
+def finish(*processes: subprocess.Popen[str]) -> None:
+    try:
+        for process in processes:
+            _, err = process.communicate(timeout=120)
+            assert process.returncode == 0, err[-3000:]
+    finally:
+        for process in processes:
+            process.kill()
+            process.communicate()
+
+
+def curve(out: Path) -> list[tuple[Any, ...]]:
+    rows = [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
+    assert [(row["fold"], row["epoch"]) for row in rows] == [(fold, epoch) for fold in (0, 1) for epoch in range(1, 5)]
+    return [(row["loss"], row["accuracy"], row["held_out_accuracy"]) for row in rows]
+
+
+def saved(out: Path, rank: int, fold: int) -> dict[str, np.ndarray]:
+    with np.load(out.parent / f"{out.name}-{rank}-{fold}.npz") as file:
+        return dict(file)
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("alone") / "run"
+    finish(start(out, 1))
+    return out
+
+
+@pytest.mark.slow
+def test_eight_devices_learn_as_one_does(alone: Path, tmp_path: Path) -> None:
+    finish(start(tmp_path / "run", 8, local_devices=8))
+    np.testing.assert_allclose(curve(tmp_path / "run"), curve(alone), rtol=2e-3, atol=2e-3)
+
+
+@pytest.mark.slow
+def test_two_processes_reach_the_weights_of_one(alone: Path, tmp_path: Path) -> None:
+    """The bits of one process with two devices; the curve of one device."""
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        port = free.getsockname()[1]
+    pair = [start(tmp_path / "pair", 2, port, rank) for rank in (0, 1)]
+    finish(*pair)
+    finish(start(tmp_path / "one", 2, local_devices=2))
+    np.testing.assert_allclose(curve(tmp_path / "pair"), curve(alone), rtol=2e-3, atol=2e-3)
+    assert sorted(path.name for path in (tmp_path / "pair").iterdir()) == [
+        "curves.png",
+        "fold-0",
+        "fold-1",
+        "metrics.jsonl",
+    ]
+    for fold in (0, 1):
+        expected = saved(tmp_path / "one", 0, fold)
+        assert len(expected) > 20
+        for rank in (0, 1):
+            found = saved(tmp_path / "pair", rank, fold)
+            assert found.keys() == expected.keys()
+            for name, value in expected.items():
+                np.testing.assert_array_equal(found[name], value, err_msg=name)

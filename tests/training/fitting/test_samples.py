@@ -1,0 +1,171 @@
+"""Training samples against the same views described one at a time."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import colornet
+import thor2_jax as thor2
+from thor2_jax.descriptor.color_membership import region_sets
+from training.fitting import samples as module
+from training.fitting.samples import PAPER_MIRRORS, Samples, build_samples, expand
+from training.views.mesh_views import Cloud
+from training.views.normalized_views import NormalizedViews
+from training.views.source import MemoryViews
+
+NETWORK = colornet.load_default()
+CONFIG = thor2.DescriptorConfig(homology="closed_form")
+
+
+def views(seed: int, sizes: tuple[int, ...]) -> list[Cloud]:
+    rng = np.random.default_rng(seed)
+    return [
+        (
+            (rng.random((n, 3)) * [0.2, 0.1, 0.05] + [0, 0, 0.5]).astype(np.float32),
+            rng.integers(0, 256, (n, 3), np.uint8),
+        )
+        for n in sizes
+    ]
+
+
+def expanded(samples: Samples, rows: Any, config: thor2.DescriptorConfig = CONFIG) -> thor2.Strips:
+    return expand(samples.take(np.asarray(rows)), region_sets(NETWORK).weights, config)
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        CONFIG,
+        thor2.DescriptorConfig.released(homology="closed_form"),
+        thor2.DescriptorConfig(n_slices=2, n_strips=6, relaxation=thor2.Relaxation()),
+    ],
+    ids=["paper", "released", "relaxed"],
+)
+def test_every_view_is_used_mirrored_in_four_ways(
+    config: thor2.DescriptorConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "CHUNK", 2)
+    source = MemoryViews({"mug": views(0, (300, 299, 1)), "box": views(1, (40,))}, config)
+    told: list[int] = []
+    samples = build_samples(source, NETWORK, config, told.append, PAPER_MIRRORS)
+    assert samples.classes == ("mug", "box") and len(samples) == 16
+    assert told == [2, 1, 1]
+    assert sorted(zip(samples.label.tolist(), samples.view.tolist(), strict=True)) == sorted(
+        [(0, v) for v in range(3)] * 4 + [(1, 0)] * 4
+    )
+    found = thor2.describe_strips(expanded(samples, np.arange(16), config), NETWORK, config)
+    for label in range(2):
+        for number, cloud in enumerate(source.read(label).clouds()):
+            rows = np.flatnonzero((samples.label == label) & (samples.view == number))
+            normal = thor2.PointClouds.pack([cloud])
+            for row, axes in zip(rows, PAPER_MIRRORS, strict=True):
+                aligned = thor2.turn(thor2.mirror(normal, axes), config)
+                expected = thor2.describe_aligned(aligned, NETWORK, config)
+                # Relaxed strips add up many small numbers, in another order in another batch.
+                tolerance = 1e-6 if config.relaxation is None else 1e-4
+                np.testing.assert_allclose(found.images[row], expected.images[0], atol=tolerance)
+                np.testing.assert_allclose(found.embeddings[row], expected.embeddings[0], rtol=1e-5, atol=1e-3)
+
+
+def test_counts_are_whole_and_add_up_to_the_points() -> None:
+    sizes = (300, 40, 1)
+    samples = build_samples(MemoryViews({"a": views(0, sizes), "b": views(1, (5,))}, CONFIG), NETWORK, CONFIG)
+    assert samples.color_count.dtype == np.float32 and (samples.color_count % 1 == 0).all()
+    points = np.add.reduceat(samples.color_count, samples.color_start[:-1])
+    assert points.tolist() == [*sizes * 2, *[5] * 2]
+
+
+def test_any_rows_in_any_order_and_none() -> None:
+    samples = build_samples(MemoryViews({"a": views(0, (300, 20)), "b": views(1, (5,))}, CONFIG), NETWORK, CONFIG)
+    everything = expanded(samples, np.arange(6))
+    for rows in ([5, 0, 5, 2], []):
+        batch = samples.take(np.array(rows, int))
+        assert [a.shape[1:] for a in batch] == [a.shape[1:] for a in samples.take(np.array([0]))]
+        np.testing.assert_array_equal(batch.label, samples.label[rows])
+        some = jax.tree.leaves(expanded(samples, np.array(rows, int)))
+        for one, every in zip(some, jax.tree.leaves(everything), strict=True):
+            np.testing.assert_array_equal(one, np.asarray(every)[rows])
+
+
+def test_expansion_under_jit_is_the_same() -> None:
+    samples = build_samples(MemoryViews({"a": views(0, (300, 20)), "b": views(1, (5,))}, CONFIG), NETWORK, CONFIG)
+    weights = region_sets(NETWORK).weights
+    batch = jax.tree.map(jnp.asarray, samples.take(np.arange(6)))
+    under_jit = jax.jit(lambda b: expand(b, weights, CONFIG))(batch)
+    for a, b in zip(jax.tree.leaves(under_jit), jax.tree.leaves(expanded(samples, np.arange(6))), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_a_sample_is_small() -> None:
+    """A hundredth of its TOPS2 descriptor."""
+    samples = build_samples(MemoryViews({"a": views(0, (300,)), "b": views(1, (300,))}, CONFIG), NETWORK, CONFIG)
+    assert samples.nbytes / len(samples) < 4 * 11942 / 15
+    fields = [getattr(samples, f.name) for f in dataclasses.fields(samples) if f.name != "classes"]
+    assert samples.nbytes == sum(a.nbytes for a in fields)
+
+
+@dataclasses.dataclass
+class Shard:
+    label: int
+    views: int
+
+
+class Shards:
+    """A source of two shards of one class, the first with two copies of one view, and one of another."""
+
+    classes = ("mug", "box")
+    digest = "d"
+    record: dict[str, Any] = {}
+
+    def __init__(self, whole: MemoryViews) -> None:
+        mug, box = whole.read(0), whole.read(1)
+        cut = int(mug.counts[:2].sum())
+        numbers = {"view": np.array([7, 7], np.int32), "copy": np.array([0, 1], np.int32)}
+        first = dataclasses.replace(mug, xyz=mug.xyz[:cut], rgb=mug.rgb[:cut], counts=mug.counts[:2], **numbers)
+        numbers = {"view": np.array([9], np.int32), "copy": np.array([0], np.int32)}
+        second = dataclasses.replace(mug, xyz=mug.xyz[cut:], rgb=mug.rgb[cut:], counts=mug.counts[2:], **numbers)
+        self._parts = [first, second, box]
+        self.shards = [Shard(part.label, len(part)) for part in self._parts]
+
+    def read(self, index: int) -> NormalizedViews:
+        return self._parts[index]
+
+
+def test_shards_of_a_class_and_copies_of_a_view() -> None:
+    whole = MemoryViews({"mug": views(0, (30, 31, 32)), "box": views(1, (33,))}, CONFIG)
+    samples = build_samples(Shards(whole), NETWORK, CONFIG)
+    assert sorted(zip(samples.label.tolist(), samples.view.tolist(), strict=True)) == sorted(
+        [(0, 7)] * 4 + [(0, 9)] * 2 + [(1, 0)] * 2
+    )
+    expected = build_samples(whole, NETWORK, CONFIG)
+    np.testing.assert_array_equal(np.sort(samples.color_count), np.sort(expected.color_count))
+    np.testing.assert_allclose(np.sort(samples.length), np.sort(expected.length), atol=1e-6)
+
+
+def test_the_digest_is_that_of_the_views() -> None:
+    def digest(**given: list[Cloud]) -> str:
+        return MemoryViews(given, CONFIG).digest
+
+    one, two = views(0, (3, 4)), views(1, (5,))
+    other = [(one[0][0], one[0][1] ^ 1), one[1]]
+    digests = [digest(a=one, b=two), digest(b=one, a=two), digest(a=two, b=one), digest(a=other, b=two)]
+    assert len(set(digests)) == 4
+    assert digest(a=views(0, (3, 4)), b=two) == digests[0]
+
+
+def test_bad_views_are_refused() -> None:
+    def build(given: dict[str, list[Cloud]]) -> Samples:
+        return build_samples(MemoryViews(given, CONFIG), NETWORK, CONFIG)
+
+    with pytest.raises(thor2.InputError, match="views of 0 classes"):
+        build({})
+    with pytest.raises(thor2.InputError, match="views of 1 classes"):
+        build({"mug": views(0, (5,))})
+    with pytest.raises(thor2.InputError, match="class 'mug' has no views"):
+        build({"box": views(0, (5,)), "mug": []})
+    with pytest.raises(thor2.InputError, match="9000 points"):
+        build({"a": [(np.zeros((9000, 3), np.float32), np.zeros((9000, 3), np.uint8))], "b": views(0, (5,))})

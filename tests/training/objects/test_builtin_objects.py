@@ -1,0 +1,84 @@
+"""The built-in objects: sizes, closed surfaces, and pairs that only colour or only shape tells apart."""
+
+import numpy as np
+import pytest
+import trimesh
+
+import colornet
+from training.objects.builtin_objects import COLOR_PAIRS, SHAPE_PAIRS, builtin_objects
+from training.objects.meshes import TexturedMesh
+
+OBJECTS = builtin_objects()
+
+
+def color_shares(mesh: TexturedMesh, n: int = 40_000) -> dict[tuple[int, ...], float]:
+    """Colours and the share of the surface they cover, by points spread evenly over it."""
+    shape = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    points, face = trimesh.sample.sample_surface(shape, n, seed=0)
+    weights = trimesh.triangles.points_to_barycentric(shape.triangles[face], points)[:, 1:]
+    colors, counts = np.unique(mesh.colors_at(face, weights), axis=0, return_counts=True)
+    return {tuple(color): count / n for color, count in zip(colors.tolist(), counts, strict=True) if count > n / 1000}
+
+
+def test_names_and_pairs() -> None:
+    assert len(OBJECTS) >= 12
+    assert {name for pair in COLOR_PAIRS + SHAPE_PAIRS for name in pair} <= set(OBJECTS)
+    assert len(COLOR_PAIRS) >= 3 and len(SHAPE_PAIRS) >= 3
+
+
+@pytest.mark.parametrize("name", OBJECTS)
+def test_an_object_of_plausible_size_on_the_ground(name: str) -> None:
+    mesh = OBJECTS[name]
+    size = np.ptp(mesh.vertices, axis=0)
+    assert 0.05 < size.max() < 0.25 and size.min() > 0.015
+    assert mesh.vertices[:, 2].min() == pytest.approx(0, abs=1e-9)
+    assert 12 <= len(mesh.faces) <= 6000
+    assert len(color_shares(mesh)) >= 2
+
+
+@pytest.mark.parametrize("name", OBJECTS)
+def test_surfaces_are_closed_and_face_one_way(name: str) -> None:
+    shape = trimesh.Trimesh(OBJECTS[name].vertices, OBJECTS[name].faces, process=True)
+    shape.merge_vertices(merge_tex=True, digits_vertex=7)
+    shape.update_faces(shape.nondegenerate_faces())
+    assert shape.is_watertight and shape.is_winding_consistent and shape.volume > 0
+
+
+def test_always_the_same() -> None:
+    for name, mesh in builtin_objects().items():
+        assert np.array_equal(mesh.vertices, OBJECTS[name].vertices)
+        assert all(np.array_equal(a, b) for a, b in zip(mesh.textures, OBJECTS[name].textures, strict=True))
+
+
+@pytest.mark.parametrize("pair", COLOR_PAIRS)
+def test_only_colour_tells_apart(pair: tuple[str, str]) -> None:
+    one, other = (OBJECTS[name] for name in pair)
+    assert np.array_equal(one.vertices, other.vertices) and np.array_equal(one.faces, other.faces)
+    network = colornet.load_default()
+
+    def regions(mesh: TexturedMesh) -> np.ndarray:
+        return sum(share * network.membership(np.array(c, np.uint8)) for c, share in color_shares(mesh).items())
+
+    # Two distributions over the colour regions differ by 2 at most.
+    assert np.abs(regions(one) - regions(other)).sum() > 0.8
+
+
+@pytest.mark.parametrize("pair", SHAPE_PAIRS)
+def test_only_shape_tells_apart(pair: tuple[str, str]) -> None:
+    one, other = (OBJECTS[name] for name in pair)
+    shares, others = color_shares(one), color_shares(other)
+    assert set(shares) == set(others)
+    for color, share in shares.items():
+        assert share == pytest.approx(others[color], abs=0.02)
+    extents = [np.sort(np.ptp(mesh.vertices, axis=0)) for mesh in (one, other)]
+    assert np.abs(extents[0] - extents[1]).max() > 0.03
+
+
+def test_colours_keep_their_regions_under_other_light() -> None:
+    network, rng = colornet.load_default(), np.random.default_rng(0)
+    colors = {color for mesh in OBJECTS.values() for color in color_shares(mesh)}
+    assert len(colors) >= 10
+    for color in colors:
+        lit = np.array(color) * rng.uniform(0.9, 1.1, (200, 1)) + rng.normal(0, 3, (200, 3))
+        found = network.membership(np.rint(lit).clip(0, 255).astype(np.uint8)).mean(axis=0)
+        assert np.abs(found - network.membership(np.array(color, np.uint8))).sum() < 0.1, color

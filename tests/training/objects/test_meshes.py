@@ -1,0 +1,310 @@
+"""Mesh files written by trimesh and by hand, read back; colours against the paint; bad files and tables by name."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+from trimesh.visual.material import PBRMaterial, SimpleMaterial
+
+from thor2_jax.errors import InputError
+from training.objects.meshes import TexturedMesh, find_meshes, load_mesh, merge_meshes, read_names
+
+QUAD = np.array([[0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0], [0, 0.1, 0]])
+QUAD_FACES = np.array([[0, 1, 2], [0, 2, 3]])
+QUAD_UV = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float)
+# Rows from the top: red, green / blue, white.
+CHECKERS = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 255]]], np.uint8)
+
+
+def textured_quad(material: PBRMaterial | SimpleMaterial) -> trimesh.Trimesh:
+    visual = trimesh.visual.TextureVisuals(uv=QUAD_UV, material=material)
+    return trimesh.Trimesh(QUAD, QUAD_FACES, visual=visual, process=False)
+
+
+def quadrant_colors(mesh: TexturedMesh) -> list[list[int]]:
+    """Colours at the middles of the quad's quarters: (x, y) low-low, high-low, high-high, low-high."""
+    colors = []
+    for x, y in [(0.025, 0.025), (0.075, 0.025), (0.075, 0.075), (0.025, 0.075)]:
+        for face in range(2):
+            a, b, c = mesh.vertices[mesh.faces[face]][:, :2]
+            weights = np.linalg.solve(np.stack([b - a, c - a], axis=1), np.array([x, y]) - a)
+            if weights.min() >= -1e-9 and weights.sum() <= 1 + 1e-9:
+                colors.append(mesh.colors_at(np.array([face]), weights[None])[0].tolist())
+                break
+    return colors
+
+
+SEEN = [[0, 0, 255], [255, 255, 255], [0, 255, 0], [255, 0, 0]]
+
+
+@pytest.mark.parametrize("suffix", ["glb", "obj"])
+def test_texture_the_right_way_up(tmp_path: Path, suffix: str) -> None:
+    image = Image.fromarray(CHECKERS)
+    material = PBRMaterial(baseColorTexture=image) if suffix == "glb" else SimpleMaterial(image=image)
+    textured_quad(material).export(tmp_path / f"quad.{suffix}")
+    mesh = load_mesh(tmp_path / f"quad.{suffix}")
+    assert len(mesh.faces) == 2 and mesh.vertices.dtype == np.float64 and mesh.faces.dtype == np.int32
+    assert quadrant_colors(mesh) == SEEN
+    np.testing.assert_allclose(mesh.centre, [0.05, 0.05, 0])
+
+
+def test_base_colour_factor_multiplies_the_texture_or_stands_alone(tmp_path: Path) -> None:
+    factor = np.array([128, 255, 51, 255], np.uint8)
+    textured_quad(PBRMaterial(baseColorTexture=Image.fromarray(CHECKERS), baseColorFactor=factor)).export(
+        tmp_path / "both.glb"
+    )
+    expected = np.rint(np.array(SEEN) * factor[:3] / 255).astype(int).tolist()
+    assert quadrant_colors(load_mesh(tmp_path / "both.glb")) == expected
+    textured_quad(PBRMaterial(baseColorFactor=factor)).export(tmp_path / "plain.glb")
+    assert quadrant_colors(load_mesh(tmp_path / "plain.glb")) == [[128, 255, 51]] * 4
+
+
+@pytest.mark.parametrize("suffix", ["glb", "ply"])
+def test_vertex_colours_are_interpolated(tmp_path: Path, suffix: str) -> None:
+    colors = np.array([[0, 0, 0], [200, 0, 0], [200, 100, 0], [0, 100, 0]], np.uint8)
+    trimesh.Trimesh(QUAD, QUAD_FACES, vertex_colors=colors, process=False).export(tmp_path / f"quad.{suffix}")
+    mesh = load_mesh(tmp_path / f"quad.{suffix}")
+    assert quadrant_colors(mesh) == [[50, 25, 0], [150, 25, 0], [150, 75, 0], [50, 75, 0]]
+
+
+def test_face_colours(tmp_path: Path) -> None:
+    lines = ["ply", "format ascii 1.0", "element vertex 4", *(f"property float {a}" for a in "xyz"), "element face 2"]
+    lines += ["property list uchar int vertex_indices", *(f"property uchar {c}" for c in ("red", "green", "blue"))]
+    lines += ["end_header", *(" ".join(map(str, p)) for p in QUAD), "3 0 1 2 10 20 30", "3 0 2 3 40 50 60"]
+    (tmp_path / "quad.ply").write_text("\n".join(lines) + "\n")
+    assert quadrant_colors(load_mesh(tmp_path / "quad.ply"))[1::2] == [[10, 20, 30], [40, 50, 60]]
+
+
+def test_parts_of_a_scene_are_placed_and_merged(tmp_path: Path) -> None:
+    scene = trimesh.Scene()
+    for index, color in enumerate([(255, 0, 0), (0, 0, 255)]):
+        part = textured_quad(PBRMaterial(baseColorTexture=Image.new("RGB", (2, 2), color)))
+        scene.add_geometry(part, transform=trimesh.transformations.translation_matrix([0, 0, index * 0.2]))
+    scene.export(tmp_path / "two.glb")
+    mesh = load_mesh(tmp_path / "two.glb")
+    assert len(mesh.faces) == 4 and len(mesh.textures) == 2
+    height = mesh.vertices[mesh.faces[:, 0], 2]
+    colors = mesh.colors_at(np.arange(4), np.full((4, 2), 0.3))
+    assert colors[height < 0.1].tolist() == [[255, 0, 0]] * 2 and colors[height > 0.1].tolist() == [[0, 0, 255]] * 2
+
+
+def test_texture_repeats_outside_the_unit_square() -> None:
+    uv = np.array([[[-0.25, 1.75], [2.25, 0.25], [0.75, -0.75]]], np.float32)
+    mesh = TexturedMesh(QUAD, np.array([[0, 1, 2]], np.int32), uv, (CHECKERS,), np.zeros(1, np.int32))
+    corners = mesh.colors_at(np.zeros(3, int), np.array([[0, 0], [1, 0], [0, 1.0]]))
+    assert corners.tolist() == [[0, 255, 0], [0, 0, 255], [255, 255, 255]]
+    assert mesh.colors_at(np.zeros(0, int), np.zeros((0, 2))).shape == (0, 3)
+
+
+def test_merging_and_moving() -> None:
+    paint = np.full((2, 3, 3), 7, np.uint8)
+    painted = TexturedMesh(QUAD, QUAD_FACES.astype(np.int32), corner_colors=paint)
+    matrix = trimesh.transformations.rotation_matrix(0.5, [1, 2, 3])
+    matrix[:3, 3] = 1, 2, 3
+    moved = painted.transformed(matrix)
+    np.testing.assert_allclose(moved.vertices, trimesh.transform_points(QUAD, matrix), atol=1e-12)
+    both = merge_meshes([painted, moved])
+    np.testing.assert_array_equal(both.vertices[both.faces[2:]], moved.vertices[moved.faces])
+    assert merge_meshes([painted]) is painted
+    textured = TexturedMesh(
+        QUAD, QUAD_FACES.astype(np.int32), np.zeros((2, 3, 2), np.float32), (CHECKERS,), np.zeros(2, np.int32)
+    )
+    with pytest.raises(InputError, match="bake them into one kind"):
+        merge_meshes([painted, textured])
+
+
+def colored(vertices: np.ndarray) -> trimesh.Trimesh:
+    colors = np.full((len(vertices), 3), 99, np.uint8)
+    return trimesh.Trimesh(vertices, QUAD_FACES, vertex_colors=colors, process=False)
+
+
+def check_refused(path: Path, message: str) -> None:
+    with pytest.raises(InputError, match=message) as caught:
+        load_mesh(path)
+    assert path.name in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_meshes_that_do_not_fit(tmp_path: Path) -> None:
+    check_refused(tmp_path / "missing.glb", "no such file")
+    (tmp_path / "mesh.stl").touch()
+    check_refused(tmp_path / "mesh.stl", "extension must be one of .glb, .obj, .ply")
+    for suffix in ("glb", "obj", "ply"):
+        (tmp_path / f"empty.{suffix}").touch()
+        check_refused(tmp_path / f"empty.{suffix}", "cannot be read|no faces")
+        (tmp_path / f"noise.{suffix}").write_bytes(np.random.default_rng(0).bytes(2000))
+        check_refused(tmp_path / f"noise.{suffix}", "cannot be read|no faces")
+    trimesh.Trimesh(QUAD, QUAD_FACES, process=False).export(tmp_path / "grey.ply")
+    check_refused(tmp_path / "grey.ply", "no texture and no vertex colours")
+    trimesh.PointCloud(QUAD, np.full((4, 4), 9, np.uint8)).export(tmp_path / "points.ply")
+    check_refused(tmp_path / "points.ply", "no faces")
+    colored(QUAD * 1000).export(tmp_path / "millimetres.ply")
+    check_refused(tmp_path / "millimetres.ply", "longest side 100; expected 0.001 to 2 metres")
+    colored(QUAD * 0).export(tmp_path / "nothing.ply")
+    check_refused(tmp_path / "nothing.ply", "longest side 0")
+    for value in (np.nan, np.inf):
+        broken = QUAD.copy()
+        broken[1, 2] = value
+        colored(broken).export(tmp_path / "broken.ply")
+        check_refused(tmp_path / "broken.ply", "1 vertices are not finite")
+
+
+@pytest.mark.parametrize("suffix", ["glb", "ply"])
+@pytest.mark.parametrize("share", [0.1, 0.4, 0.7, 0.97])
+def test_cut_off_files(tmp_path: Path, suffix: str, share: float) -> None:
+    image = Image.fromarray(np.random.default_rng(0).integers(0, 256, (16, 16, 3), np.uint8))
+    mesh = textured_quad(PBRMaterial(baseColorTexture=image)) if suffix == "glb" else colored(QUAD)
+    mesh.export(tmp_path / f"whole.{suffix}")
+    content = (tmp_path / f"whole.{suffix}").read_bytes()
+    path = tmp_path / f"cut.{suffix}"
+    path.write_bytes(content[: int(len(content) * share)])
+    check_refused(path, f"mesh .*cut.{suffix}: ")
+
+
+def test_faces_that_point_nowhere(tmp_path: Path) -> None:
+    obj = "mtllib paint.mtl\nusemtl a\nv 0 0 0\nv 0.1 0 0\nv 0.1 0.1 0\nvt 0 0\nvt 1 0\nvt 1 1\nf 1/1 2/2 9/3\n"
+    (tmp_path / "paint.mtl").write_text("newmtl a\nKd 1 0 0\n")
+    (tmp_path / "far.obj").write_text(obj)
+    check_refused(tmp_path / "far.obj", "cannot be read|faces")
+    lines = ["ply", "format ascii 1.0", "element vertex 3", *(f"property float {a}" for a in "xyz")]
+    lines += [*(f"property uchar {c}" for c in ("red", "green", "blue")), "element face 1"]
+    lines += ["property list uchar int vertex_indices", "end_header"]
+    lines += ["0 0 0 1 2 3", "0.1 0 0 1 2 3", "0 0.1 0 1 2 3", "3 0 1 9"]
+    (tmp_path / "far.ply").write_text("\n".join(lines) + "\n")
+    check_refused(tmp_path / "far.ply", "cannot be read|faces")
+
+
+def test_obj_without_its_paint(tmp_path: Path) -> None:
+    textured_quad(SimpleMaterial(image=Image.fromarray(CHECKERS))).export(tmp_path / "quad.obj")
+    (picture,) = tmp_path.glob("*.png")
+    (material,) = tmp_path.glob("*.mtl")
+    picture.unlink()
+    check_refused(tmp_path / "quad.obj", f"its texture '{picture.name}' is missing")
+    material.unlink()
+    check_refused(tmp_path / "quad.obj", f"its material file '{material.name}' is missing")
+
+
+def test_texture_coordinates_that_are_not_finite(tmp_path: Path) -> None:
+    uv = QUAD_UV.copy()
+    uv[2, 0] = np.nan
+    material = PBRMaterial(baseColorTexture=Image.fromarray(CHECKERS))
+    visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
+    trimesh.Trimesh(QUAD, QUAD_FACES, visual=visual, process=False).export(tmp_path / "quad.glb")
+    check_refused(tmp_path / "quad.glb", "texture coordinates are not finite")
+
+
+def test_texture_coordinates_that_are_too_far(tmp_path: Path) -> None:
+    material = PBRMaterial(baseColorTexture=Image.fromarray(CHECKERS))
+    for far, said in ((2.0**23, None), (1e30, "texture coordinates are not finite, or past 8388608")):
+        visual = trimesh.visual.TextureVisuals(uv=QUAD_UV * [1, far], material=material)
+        trimesh.Trimesh(QUAD, QUAD_FACES, visual=visual, process=False).export(tmp_path / "quad.glb")
+        if said is None:
+            assert load_mesh(tmp_path / "quad.glb").colors_at(np.arange(2), np.full((2, 2), 0.3)).shape == (2, 3)
+        else:
+            check_refused(tmp_path / "quad.glb", said)
+
+
+@pytest.mark.parametrize(
+    ("line", "other", "said"),
+    [
+        ("vt 1.0 1.0", "vt 1.0", r"texture coordinates of the shape \(1, 3, 1\); expected \(1, 3, 2\)"),
+        ("v 0.1 0.1 0.0", "v 0.1 0.1", r"vertices of the shape \(3, 2\); expected \(3, 3\)"),
+        ("v 0.1 0.1 0.0", "v", "cannot be read"),
+    ],
+)
+def test_lines_of_an_obj_that_are_cut_off(tmp_path: Path, line: str, other: str, said: str) -> None:
+    lines = "v 0.0 0.0 0.0\nv 0.1 0.0 0.0\nv 0.1 0.1 0.0\nvt 0.0 0.0\nvt 1.0 0.0\nvt 1.0 1.0\nf 1/1 2/2 3/3\n"
+    textured_quad(SimpleMaterial(image=Image.fromarray(CHECKERS))).export(tmp_path / "whole.obj")
+    content = "mtllib material.mtl\nusemtl material_0\n" + lines
+    (tmp_path / "quad.obj").write_text(content)
+    assert len(load_mesh(tmp_path / "quad.obj").faces) == 1
+    (tmp_path / "quad.obj").write_text(content.replace(line, other))
+    check_refused(tmp_path / "quad.obj", said)
+
+
+def put(folder: Path, *names: str) -> None:
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).touch()
+
+
+def test_finding_meshes(tmp_path: Path) -> None:
+    put(
+        tmp_path,
+        "mug.glb",
+        "notes.txt",
+        "can/can.ply",
+        "can/can.png",
+        "box/textured.obj",
+        "box/other.glb",
+        "none/a.txt",
+    )
+    found = find_meshes(tmp_path)
+    assert {name: path.relative_to(tmp_path).as_posix() for name, path in found.items()} == {
+        "box": "box/textured.obj",
+        "can": "can/can.ply",
+        "mug": "mug.glb",
+    }
+    assert list(found) == sorted(found)
+    put(tmp_path, "two/a.ply", "two/b.ply")
+    with pytest.raises(InputError, match="2 mesh files .*keep one"):
+        find_meshes(tmp_path)
+    named = find_meshes(tmp_path, {"soup": "can", "cup": "mug", "again": "mug"})
+    assert [(name, path.stem) for name, path in named.items()] == [("again", "mug"), ("cup", "mug"), ("soup", "can")]
+
+
+def test_finding_meshes_that_are_not_there(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="nowhere: no such folder"):
+        find_meshes(tmp_path / "nowhere")
+    with pytest.raises(InputError, match="no .glb, .obj, .ply file"):
+        find_meshes(tmp_path)
+    put(tmp_path, "mug.glb")
+    with pytest.raises(InputError, match="no mesh for bowl, dish"):
+        find_meshes(tmp_path, {"a": "dish", "b": "bowl", "c": "mug"})
+    with pytest.raises(InputError, match="names is empty"):
+        find_meshes(tmp_path, {})
+    put(tmp_path, "mug.obj")
+    with pytest.raises(InputError, match="scan 'mug' is there twice"):
+        find_meshes(tmp_path)
+
+
+def test_reading_names(tmp_path: Path) -> None:
+    (tmp_path / "names.json").write_text(json.dumps({"mug": "025_mug"}))
+    (tmp_path / "names.yaml").write_text("mug: 025_mug\n")
+    assert read_names(tmp_path / "names.json") == read_names(tmp_path / "names.yaml") == {"mug": "025_mug"}
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "message"),
+    [
+        ("names.txt", "", "extension must be"),
+        ("names.json", "{", "names file .*names.json: "),
+        ("names.yaml", "a: [", "names file .*names.yaml: "),
+        ("names.json", "[]", "expected a table"),
+        ("names.yaml", "", "expected a table"),
+        ("names.json", '{"mug": 25}', "both strings, not 'mug': 25"),
+        ("names.yaml", "25: mug", "both strings, not 25: 'mug'"),
+        ("names.json", '{"mug": ""}', "both strings"),
+    ],
+)
+def test_names_that_do_not_fit(tmp_path: Path, file: str, content: str, message: str) -> None:
+    (tmp_path / file).write_text(content)
+    with pytest.raises(InputError, match=message) as caught:
+        read_names(tmp_path / file)
+    assert "\n" not in str(caught.value)
+    with pytest.raises(InputError, match="No such file"):
+        read_names(tmp_path / "absent.json")
+
+
+def test_scans_against_trimeshs_own_reading(shared: Path) -> None:
+    found = find_meshes(shared / "data" / "meshes")
+    for name in ("025_mug", "056_tennis_ball"):
+        mesh = load_mesh(found[name])
+        reference = trimesh.load_scene(found[name], process=False).to_mesh()
+        np.testing.assert_allclose(mesh.vertices[mesh.faces], reference.triangles, atol=1e-9)
+        # trimesh's own conversion reads the texture at the vertices.
+        vertex_colors = np.asarray(reference.visual.to_color().vertex_colors)[:, :3].astype(int)
+        at_corner = mesh.colors_at(np.arange(len(mesh.faces)), np.zeros((len(mesh.faces), 2))).astype(int)
+        assert np.median(np.abs(at_corner - vertex_colors[reference.faces[:, 0]])) <= 2

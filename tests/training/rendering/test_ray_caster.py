@@ -1,0 +1,118 @@
+"""Ray casting against analytic depths of a sphere and a box, and against another intersection in float64."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from thor2_jax.recognition.frames import Intrinsics, backproject
+from training.objects.meshes import TexturedMesh
+from training.rendering.ray_caster import Camera, RayCaster, pixel_rays, render_view
+from training.rendering.view_sphere import camera_pose
+
+CAMERA = Camera.from_field_of_view(161, 121, 30.0)
+
+
+def painted(shape: trimesh.Trimesh, color: tuple[int, int, int] = (200, 30, 40)) -> TexturedMesh:
+    colors = np.tile(np.array(color, np.uint8), (len(shape.faces), 3, 1))
+    return TexturedMesh(np.array(shape.vertices), np.array(shape.faces, np.int32), corner_colors=colors)
+
+
+def nearest_by_hand(shape: trimesh.Trimesh, origin: np.ndarray, rays: np.ndarray) -> np.ndarray:
+    """Moeller and Trumbore's intersection of every ray with every triangle in float64; 0 where there is none."""
+    nearest = np.full(len(rays), np.inf)
+    for a, b, c in shape.triangles:
+        p = np.cross(rays, c - a)
+        q = np.cross(origin - a, b - a)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            inverse = 1 / (p @ (b - a))
+            u, v, t = p @ (origin - a) * inverse, rays @ q * inverse, (c - a) @ q * inverse
+            hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0) & (t < nearest)
+        nearest[hit] = t[hit]
+    return np.where(np.isinf(nearest), 0, nearest)
+
+
+def test_field_of_view() -> None:
+    k = CAMERA.intrinsics
+    assert (k.cx, k.cy) == (80, 60) and k.fx == k.fy
+    # The image's outer borders, half a pixel beyond the outermost centres, are seen at half the angle.
+    assert np.degrees(np.arctan(80.5 / k.fx)) == pytest.approx(15)
+
+
+def test_depth_of_a_sphere() -> None:
+    radius, distance = 0.1, 0.8
+    mesh = painted(trimesh.creation.icosphere(subdivisions=5, radius=radius))
+    view = render_view(RayCaster([mesh]), camera_pose(0.7, 1.1, np.zeros(3), distance), CAMERA)
+    _, depth = view.full_image(CAMERA)
+    rays = pixel_rays(CAMERA.intrinsics, CAMERA.height, CAMERA.width)
+    # |t r - (0, 0, d)| = R, nearer root; z of r is 1, so t is the depth.
+    rr = (rays**2).sum(axis=1)
+    root = distance**2 - rr * (distance**2 - radius**2)
+    expected = np.where(root > 0, (distance - np.sqrt(root.clip(0))) / rr, 0).reshape(depth.shape) * 1000
+    both = (depth > 0) & (expected > 0)
+    assert (depth > 0).sum() == pytest.approx((expected > 0).sum(), rel=0.01)
+    inner = both & (root.reshape(depth.shape) > 0.002)
+    assert inner.sum() > 500
+    assert np.abs(depth[inner] - expected[inner]).max() < 0.5 + 0.3  # rounding, and facets inside the sphere
+
+
+def test_depth_of_a_box_from_above_is_exact() -> None:
+    mesh = painted(trimesh.creation.box([0.16, 0.1, 0.06]))
+    view = render_view(RayCaster([mesh]), camera_pose(0.0, 0.0, np.zeros(3), 0.5), CAMERA)
+    assert set(np.unique(view.depth)) <= {0, 470}
+    points = backproject(view.depth / 1000.0, view.intrinsics)[view.depth > 0]
+    pixel = 0.47 / CAMERA.intrinsics.fx
+    # From the pole the image's columns run along y, its rows along x.
+    assert np.ptp(points[:, 0]) == pytest.approx(0.1, abs=2 * pixel)
+    assert np.ptp(points[:, 1]) == pytest.approx(0.16, abs=2 * pixel)
+
+
+def test_against_another_intersection_and_the_cropped_part_misses_nothing() -> None:
+    shape = trimesh.creation.capsule(height=0.12, radius=0.03, count=[12, 12])
+    shape.apply_translation([0.02, -0.01, 0.03])
+    pose = camera_pose(2.0, 1.9, np.array([0.0, 0.01, 0.05]), 0.6)
+    view = render_view(RayCaster([painted(shape)]), pose, CAMERA)
+    assert view.depth.size < CAMERA.width * CAMERA.height / 2
+    _, depth = view.full_image(CAMERA)
+    rays = pixel_rays(CAMERA.intrinsics, CAMERA.height, CAMERA.width) @ pose[:3, :3].T
+    expected = nearest_by_hand(shape, pose[:3, 3], rays)
+    expected = expected.reshape(depth.shape)
+    assert np.array_equal(depth > 0, expected > 0)
+    assert np.abs(depth - expected * 1000).max() <= 0.501
+
+
+def test_nearest_mesh_is_hit_and_named() -> None:
+    near, far = painted(trimesh.creation.box([0.1] * 3), (1, 2, 3)), painted(trimesh.creation.box([0.3] * 3), (9, 8, 7))
+    near.vertices[:, 0] += 0.5
+    hits = RayCaster([far, near]).cast(np.array([2.0, 0, 0]), np.array([[-1.0, 0, 0], [-2, 0.1, 0], [1, 0, 0]]))
+    assert hits.mesh.tolist() == [1, 0, -1]
+    assert hits.color.tolist() == [[1, 2, 3], [9, 8, 7], [0, 0, 0]]
+    assert hits.distance.tolist() == pytest.approx([1.45, 0.925, np.inf])
+
+
+def test_no_rays_and_no_meshes() -> None:
+    hits = RayCaster([painted(trimesh.creation.box([0.1] * 3))]).cast(np.zeros(3), np.zeros((0, 3)))
+    assert hits.distance.shape == (0,) and hits.color.shape == (0, 3)
+    with pytest.raises(ValueError, match="meshes is empty"):
+        RayCaster([])
+
+
+def test_an_object_outside_the_image_leaves_it_empty() -> None:
+    mesh = painted(trimesh.creation.box([0.1] * 3))
+    for centre in ([0, 5.0, 0], [0, 0, -5.0], [0, 3.0, 9.0]):
+        view = render_view(RayCaster([mesh]), camera_pose(0.0, 1.5, np.array(centre)), CAMERA)
+        assert not view.depth.any() and not view.color.any()
+
+
+def test_camera_inside_the_bounding_box_sees_the_whole_image() -> None:
+    view = render_view(RayCaster([painted(trimesh.creation.box([1.0] * 3))]), np.eye(4), CAMERA)
+    assert view.depth.shape == (CAMERA.height, CAMERA.width) and set(np.unique(view.depth)) == {500}
+    assert view.corner == (0, 0) and view.intrinsics == CAMERA.intrinsics
+
+
+def test_off_centre_intrinsics() -> None:
+    camera = Camera(100, 80, Intrinsics(150.0, 140.0, 20.0, 60.0))
+    mesh = painted(trimesh.creation.icosphere(subdivisions=3, radius=0.01))
+    color, depth = render_view(RayCaster([mesh]), camera_pose(0.2, 1.3, np.zeros(3), 0.5), camera).full_image(camera)
+    rows, columns = np.nonzero(depth)
+    assert rows.mean() == pytest.approx(60, abs=0.3) and columns.mean() == pytest.approx(20, abs=0.3)
+    assert (color[rows, columns] == [200, 30, 40]).all()

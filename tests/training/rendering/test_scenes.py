@@ -1,0 +1,174 @@
+"""Composed scenes: what a frame shows against the labels, objects apart and on the table, noise as documented."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from thor2_jax.errors import InputError
+from thor2_jax.recognition.frames import Intrinsics, backproject
+from training.objects.builtin_objects import builtin_objects
+from training.objects.meshes import TexturedMesh
+from training.rendering.ray_caster import Camera
+from training.rendering.scenes import MIN_PIXELS, SCENE_CAMERA, Scene, _arrange, _put_down, _sensed_depth, compose_scene
+
+OBJECTS = builtin_objects()
+SMALL = Camera(320, 240, Intrinsics(307.5, 307.5, 159.5, 119.5))
+
+
+def scenes(n: int, **options: float) -> list[Scene]:
+    return [compose_scene(OBJECTS, np.random.default_rng(seed), camera=SMALL, **options) for seed in range(n)]
+
+
+def hull(mesh: TexturedMesh) -> trimesh.Trimesh:
+    return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).convex_hull
+
+
+def test_frame_and_truth_agree() -> None:
+    scene = compose_scene(OBJECTS, np.random.default_rng(1))
+    frame = scene.frame
+    assert frame.color.shape == (480, 640, 3) and frame.depth.dtype == np.uint16
+    assert frame.intrinsics == SCENE_CAMERA.intrinsics
+    assert set(frame.instances) == set(scene.truth) == set(scene.visible)
+    assert set(scene.truth) <= {1, 2, 3, 4, 5} and set(scene.truth.values()) <= set(OBJECTS)
+    assert len(set(scene.truth.values())) == len(scene.truth)
+    for label in scene.truth:
+        assert (frame.labels == label).sum() >= MIN_PIXELS
+        assert 0 < scene.visible[label] <= 1
+
+
+def test_seeded() -> None:
+    one, same, other = (compose_scene(OBJECTS, np.random.default_rng(seed), camera=SMALL) for seed in (3, 3, 4))
+    assert np.array_equal(one.frame.color, same.frame.color) and np.array_equal(one.frame.depth, same.frame.depth)
+    assert one.truth == same.truth and not np.array_equal(one.frame.color, other.frame.color)
+
+
+def test_instances_have_their_objects_colours_without_noise() -> None:
+    for scene in scenes(4, noise=0, light=0):
+        for label, name in scene.truth.items():
+            painted = {tuple(c) for texture in OBJECTS[name].textures for c in texture.reshape(-1, 3).tolist()}
+            seen = {tuple(c) for c in scene.frame.color[scene.frame.labels == label].tolist()}
+            assert seen <= painted
+
+
+def test_objects_lie_on_a_plane_in_front_of_the_camera() -> None:
+    for scene in scenes(3, noise=0):
+        depth = scene.frame.depth_m.astype(np.float64)
+        points = backproject(depth, scene.frame.intrinsics)
+        table = points[(scene.frame.labels == 0) & (depth > 0)]
+        middle = table.mean(axis=0)
+        normal = np.linalg.svd(table[::7] - middle, full_matrices=False)[2][2]
+        normal *= -np.sign(normal @ middle)
+        # A few pixels may be of an object too hidden to be labelled.
+        assert np.quantile(np.abs((table - middle) @ normal), 0.998) < 0.002
+        pitch = np.degrees(np.arcsin(-normal[2]))
+        assert 24.5 < pitch < 50.5
+        assert 0.5 < depth[scene.frame.labels > 0].min() < 1.3
+        for label in scene.truth:
+            height = (points[scene.frame.labels == label] - middle) @ normal
+            assert height.min() > -0.002 and 0.01 < height.max() < 0.25
+
+
+def test_visible_share_is_that_of_the_object_alone() -> None:
+    for seed in range(30):
+        scene = compose_scene(OBJECTS, np.random.default_rng(seed), n_objects=1, camera=SMALL)
+        assert scene.visible == {1: 1.0} and scene.occlusion(1) == "none"
+
+
+def test_degrees_of_occlusion() -> None:
+    scene = scenes(1)[0]
+    shares = {1: 1.0, 2: 0.96, 3: 0.95, 4: 0.71, 5: 0.7, 6: 0.01}
+    graded = Scene(scene.frame, scene.truth, shares)
+    assert [graded.occlusion(k) for k in shares] == ["none", "none", "low", "low", "high", "high"]
+
+
+def test_clutter_hides() -> None:
+    def hidden(clutter: float) -> float:
+        return float(
+            np.mean([share <= 0.95 for scene in scenes(20, clutter=clutter) for share in scene.visible.values()])
+        )
+
+    open_table, default, crowded = hidden(0.0), hidden(0.85), hidden(1.0)
+    assert open_table < 0.35 < crowded and open_table < default
+    degrees = [scene.occlusion(label) for scene in scenes(20) for label in scene.truth]
+    assert all(degrees.count(degree) > 0.1 * len(degrees) for degree in ("none", "low", "high"))
+
+
+def test_objects_stand_apart_on_the_table() -> None:
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        meshes = _arrange(list(OBJECTS.values())[seed::4], np.array([1.0, 0]), 0.8, rng)
+        hulls = [hull(mesh) for mesh in meshes]
+        for k, one in enumerate(hulls):
+            assert one.vertices[:, 2].min() == pytest.approx(0, abs=1e-9)
+            for other in hulls[k + 1 :]:
+                # No vertex of one in the other's footprint, by the other's shadow as a prism.
+                for a, b in ((one, other), (other, one)):
+                    shadow = trimesh.convex.convex_hull(
+                        np.concatenate([np.c_[b.vertices[:, :2], np.full(len(b.vertices), z)] for z in (-1, 1)])
+                    )
+                    inside = (a.vertices @ shadow.face_normals.T) - (shadow.triangles[:, 0] * shadow.face_normals).sum(
+                        1
+                    )
+                    assert (inside.max(axis=1) > 0.004).all()
+
+
+def test_poses() -> None:
+    """Every pose keeps the mesh's shape; tall things stand or lie, and nothing balances on a tip."""
+    rng = np.random.default_rng(0)
+    heights = {name: {round(_put_down(OBJECTS[name], rng).height, 3) for _ in range(60)} for name in OBJECTS}
+    assert heights["soup_can_red"] == {0.101, 0.066}
+    assert heights["cereal_box_blue"] == {0.235, 0.16, 0.055}
+    assert len(heights["screwdriver"]) == 1 and len(heights["white_plate"]) == 1 and len(heights["wooden_spoon"]) == 1
+    mesh = OBJECTS["mug_blue"]
+    moved = _put_down(mesh, rng).mesh
+    before, after = (np.linalg.norm(m.vertices[:-1] - m.vertices[1:], axis=1) for m in (mesh, moved))
+    np.testing.assert_allclose(after, before, atol=1e-12)
+    assert trimesh.Trimesh(moved.vertices, moved.faces).volume > 0
+
+
+def test_noise_of_depth() -> None:
+    rng = np.random.default_rng(0)
+    for z in (0.6, 1.5, 3.0):
+        found = _sensed_depth(np.full((200, 200), z), 1.0, rng)
+        assert found.mean() == pytest.approx(z * 1000, abs=0.3)
+        expected = np.hypot(1.2 + 1.9 * (z - 0.4) ** 2, 1 / np.sqrt(12))
+        assert found.std() == pytest.approx(expected, rel=0.03)
+    step = np.full((100, 100), 0.8)
+    step[:, 50:] = 1.0
+    found = _sensed_depth(step, 1.0, rng)
+    assert (found[:, :49] > 0).all() and (found[:, 51:] > 0).all()
+    assert 0.15 < (found[:, 49:51] == 0).mean() < 0.45
+    assert not _sensed_depth(np.array([[0.0, 5.0], [0.0, 4.5]]), 1.0, rng).any()
+    assert np.array_equal(_sensed_depth(step, 0.0, rng), np.rint(step * 1000))
+
+
+def test_light_changes_colours_by_a_gain() -> None:
+    plain, lit = (
+        compose_scene(OBJECTS, np.random.default_rng(5), camera=SMALL, noise=0, light=light) for light in (0.0, 0.3)
+    )
+    assert np.array_equal(plain.frame.labels, lit.frame.labels)
+    bright = (plain.frame.color > 60).all(axis=-1) & (lit.frame.color < 255).all(axis=-1)
+    gain = lit.frame.color[bright] / plain.frame.color[bright]
+    assert np.ptp(gain, axis=0).max() < 0.02 and 0.6 < gain.min() <= gain.max() < 1.45
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"n_objects": 0}, "n_objects is 0"),
+        ({"n_objects": 99}, "n_objects is 99; it must be 1 to 18"),
+        ({"clutter": 1.5}, "clutter is 1.5"),
+        ({"noise": -1.0}, "noise is -1.0"),
+        ({"light": float("nan")}, "light is nan"),
+    ],
+)
+def test_numbers_outside_their_range(options: dict[str, float], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        compose_scene(OBJECTS, np.random.default_rng(0), **options)
+    with pytest.raises(InputError, match="n_objects"):
+        compose_scene({}, np.random.default_rng(0))
+
+
+def test_all_objects_at_once() -> None:
+    scene = compose_scene(OBJECTS, np.random.default_rng(0), n_objects=len(OBJECTS), camera=SMALL)
+    assert len(scene.truth) > len(OBJECTS) / 2

@@ -1,0 +1,137 @@
+"""The page as a browser's parser reads it, and the pictures as files."""
+
+import dataclasses
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import colornet
+import thor2_jax as thor2
+from training import demo
+from training.evaluate import Instance
+from training.fitting.fit import FitOptions
+from training.objects.builtin_objects import builtin_objects
+from training.reports.html import Picture, write_page
+from training.reports.plots import draw_accuracy, draw_confusion, draw_curves, draw_descriptor, draw_objects
+
+
+class Page(HTMLParser):
+    """Collects text, sources of pictures and tags that are open at the end."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.text: list[str] = []
+        self.pictures: list[dict[str, str | None]] = []
+        self.open: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        if tag == "img":
+            self.pictures.append(dict(attrs))
+        elif tag != "meta":
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text.append(data)
+
+
+def test_page_holds_what_it_is_given_and_no_markup_from_it(tmp_path: Path) -> None:
+    section = ("A < B", "x & y", (["name", "value"], [["<b>", "1"]]), [Picture("p.png", 'the "first"')])
+    write_page(tmp_path / "page.html", title="T<script>", lead="l", sections=[section])
+    page = Page((tmp_path / "page.html").read_text())
+    assert page.open == []
+    assert {"T<script>", "A < B", "x & y", "<b>", 'the "first"'} <= set(page.text)
+    assert page.pictures == [{"src": "p.png", "alt": 'the "first"'}]
+    assert [p.name for p in tmp_path.iterdir()] == ["page.html"]
+
+
+def colors_in(path: Path) -> int:
+    with Image.open(path) as image:
+        return len(np.unique(np.asarray(image.convert("RGB")).reshape(-1, 3), axis=0))
+
+
+def test_every_picture_is_drawn(tmp_path: Path) -> None:
+    some = dict(list(builtin_objects().items())[:3])
+    draw_objects(some, tmp_path / "objects.png")
+    draw_accuracy(("A", "B"), {"all": [0.5, 1.0], "few": [0.0, 0.25]}, {"all": 4, "few": 1}, tmp_path / "accuracy.png")
+    draw_curves({"ce": [{"epoch": 1, "loss": 1.0, "accuracy": 0.5}]}, tmp_path / "curves.png")
+    answered = Instance("f", 1, "a", {}, {"THOR2": ("b", 0.9)})
+    silent = Instance("f", 2, "b", {}, {}, reason="too small")
+    draw_confusion([answered, silent], ("a", "b"), "THOR2", tmp_path / "confusion.png")
+    points = np.random.default_rng(0).random((200, 3)) * (0.2, 0.1, 0.05) + (0, 0, 1)
+    draw_descriptor(
+        points,
+        np.full((200, 3), 200, np.uint8),
+        colornet.load_default(),
+        thor2.DescriptorConfig(homology="closed_form"),
+        "box",
+        tmp_path / "descriptor.png",
+    )
+    found = sorted(p.name for p in tmp_path.iterdir())
+    assert found == ["accuracy.png", "confusion.png", "curves.png", "descriptor.png", "objects.png"]
+    assert all(colors_in(tmp_path / name) > 10 for name in found)
+
+
+def test_an_unwritable_folder_is_an_oserror_and_leaves_nothing(tmp_path: Path) -> None:
+    with pytest.raises(OSError):
+        draw_curves({"ce": []}, tmp_path / "absent" / "curves.png")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
+def test_demo_in_small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The whole demonstration with few views, epochs and scenes."""
+    names = ("mug_blue", "soup_can_red", "cereal_box_yellow", "sponge", "white_bowl")
+    everything = builtin_objects()
+    monkeypatch.setattr(demo, "builtin_objects", lambda: {name: everything[name] for name in names})
+    monkeypatch.setattr(demo, "N_SCENES", 6)
+    small = {"azimuth_step": 45.0, "polar_step": 30.0, "fit": FitOptions(epochs=4, batch_size=128)}
+    monkeypatch.setattr(demo, "PROTOCOL", dataclasses.replace(demo.PROTOCOL, **small))
+
+    class Stopped(BaseException):
+        pass
+
+    def stopped_at(last: str) -> list[str]:
+        """Stop there; the stages until then."""
+        stages = []
+
+        def told(stage: str, done: int, total: int, note: str) -> None:
+            stages.append(stage)
+            if stage == last:
+                raise Stopped
+
+        with pytest.raises(Stopped):
+            demo.run_demo(tmp_path, 1, told)
+        return list(dict.fromkeys(stages))
+
+    assert stopped_at("render views") == ["render views"]
+    assert stopped_at("fit tops")[-3:] == ["describe", "fit ce", "fit tops"]
+    assert "fit ce" not in stopped_at("recognize scenes")
+    assert not (tmp_path / "report.html").exists()
+    with pytest.raises(thor2.InputError, match="seed is 2; .* was trained with 1"):
+        demo.run_demo(tmp_path, 2)
+    stages: dict[str, tuple[int, int]] = {}
+    figures = demo.run_demo(tmp_path, 1, lambda stage, done, total, note: stages.update({stage: (done, total)}))
+    assert stages == {"compose scenes": (6, 6), "recognize scenes": (6, 6)}
+    assert sorted(path.name for path in (tmp_path / "run").iterdir()) == [
+        "curves.png", "metrics.jsonl", "network.npz", "run.json", "weights",
+    ]  # fmt: skip
+    with pytest.raises(thor2.InputError, match="exists already and is no demonstration that was stopped"):
+        demo.run_demo(tmp_path, 1)
+    assert figures.names == ("CE", "TOPS", "TOPS2", "THOR2")
+    parts = {part: count for part, count in figures.instances.items() if part != "all"}
+    assert figures.instances["all"] == sum(parts.values()) > 6
+    for k in range(4):  # the whole is the mean of its parts
+        mean = sum(figures.accuracy[part][k] * count for part, count in parts.items()) / figures.instances["all"]
+        assert figures.accuracy["all"][k] == pytest.approx(mean)
+    assert figures.accuracy["all"][3] > 0.4  # chance is 0.2
+    page = Page((tmp_path / "report.html").read_text())
+    assert page.open == [] and len(page.pictures) == 11
+    assert all((tmp_path / str(picture["src"])).is_file() for picture in page.pictures)
+    assert dataclasses.asdict(figures).keys() <= set((tmp_path / "demo.json").read_text().split('"'))

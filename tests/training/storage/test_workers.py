@@ -1,0 +1,94 @@
+"""The ordered maps: order, how far they run ahead, workers that die, parents that are killed."""
+
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from thor2_jax.errors import InputError
+from training.storage import workers as engines
+from training.storage.workers import IN_PROCESS, local, on_ray
+
+# Functions of a test file cannot be imported by a worker; `eval` can, and the items say what it does.
+SLOW_FIRST = ["__import__('time').sleep(0.3) or 0", *map(str, range(1, 9))]
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_results_keep_the_order_and_items_are_drawn_as_needed(workers: int) -> None:
+    drawn: list[str] = []
+
+    def items() -> Iterator[str]:
+        for item in SLOW_FIRST:
+            drawn.append(item)
+            yield item
+
+    found, ahead = [], []
+    with closing(local(workers)(eval, items())) as results:
+        for result in results:
+            found.append(result)
+            ahead.append(len(drawn) - len(found))
+    assert found == list(range(9))
+    assert max(ahead) == (0 if workers == 1 else workers)
+
+
+def test_no_items() -> None:
+    assert list(IN_PROCESS(eval, [])) == list(local(2)(eval, [])) == []
+
+
+@pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_an_exception_of_the_function_arrives(workers: int) -> None:
+    with pytest.raises(ZeroDivisionError), closing(local(workers)(eval, ["1", "1 / 0", "2"])) as results:
+        list(results)
+
+
+@pytest.mark.slow
+def test_a_worker_that_dies_is_told_of() -> None:
+    results = local(2)(eval, ["1", "__import__('os')._exit(3)", "2", "3"])
+    with pytest.raises(ChildProcessError, match="a worker process died"), closing(results):
+        list(results)
+
+
+def is_running(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")
+def test_workers_end_with_a_parent_that_is_killed() -> None:
+    program = """
+from training.storage.workers import local
+import time
+results = local(2)(eval, ["__import__('time').sleep(0.5) or __import__('os').getpid()"] * 9)
+print(next(results), next(results), flush=True)
+time.sleep(60)
+"""
+    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        workers = [int(pid) for pid in parent.stdout.readline().split()]
+        assert workers and all(is_running(pid) for pid in workers)
+        parent.send_signal(signal.SIGKILL)
+    end = time.monotonic() + 20
+    while any(map(is_running, workers)) and time.monotonic() < end:
+        time.sleep(0.05)
+    assert not any(map(is_running, workers))
+
+
+def test_bad_requests(monkeypatch: pytest.MonkeyPatch) -> None:
+    for make in (local, on_ray):
+        with pytest.raises(InputError, match="workers must be at least 1, not 0"):
+            make(0)
+
+    def absent(name: str) -> None:
+        raise ModuleNotFoundError(name)
+
+    monkeypatch.setattr(engines.importlib, "import_module", absent)
+    with pytest.raises(InputError, match=r"ray is not installed; it comes with the extra thor2-jax\[cluster\]"):
+        on_ray(2)

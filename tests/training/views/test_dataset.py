@@ -1,0 +1,163 @@
+"""Reading datasets of views: what was written comes back, and what is damaged is refused by name."""
+
+import dataclasses
+import hashlib
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import thor2_jax
+from thor2_jax.errors import InputError
+from training.objects.builtin_objects import builtin_objects
+from training.views.dataset import Manifest, ViewDataset, encode
+from training.views.mesh_views import Cloud, render_views
+from training.views.normalized_views import LARGEST, STEP, NormalizedViews, normalize_views, padded_batches
+from training.views.render_job import render_dataset
+
+OBJECTS = {name: builtin_objects()[name] for name in ("tennis_ball", "screwdriver")}
+CONFIG = thor2_jax.DescriptorConfig(homology="closed_form")
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("rendered") / "views"
+    render_dataset(OBJECTS, out, 60, 45)
+    return out
+
+
+@pytest.fixture
+def copied(written: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(written, tmp_path / "views")
+
+
+def views_of(clouds: list[Cloud]) -> NormalizedViews:
+    return normalize_views(clouds, 3, range(len(clouds)), [0] * len(clouds), CONFIG)
+
+
+def test_what_was_rendered_comes_back_normalized(written: Path) -> None:
+    """Against `view_normalize` of the same clouds one by one: no coordinate is off by more than half a step."""
+    dataset = ViewDataset.open(written)
+    assert dataset.classes == ("tennis_ball", "screwdriver")
+    assert len(dataset) == 60 and [(shard.label, shard.views) for shard in dataset.shards] == [(0, 30), (1, 30)]
+    for index, (name, clouds) in enumerate(render_views(OBJECTS, 60, 45).items()):
+        views = dataset.read(index)
+        assert dataset.classes[views.label] == name
+        assert views.xyz.dtype == np.float32 and views.rgb.dtype == np.uint8 and views.counts.dtype == np.int64
+        assert views.view.dtype == views.copy.dtype == np.int32
+        assert views.view.tolist() == list(range(30)) and not views.copy.any()
+        assert views.counts.tolist() == [len(xyz) for xyz, _ in clouds] and len(views) == 30
+        for (xyz, rgb), cloud in list(zip(views.clouds(), clouds, strict=True))[::10]:
+            normal = thor2_jax.view_normalize(thor2_jax.PointClouds.pack([cloud]), CONFIG)
+            assert np.abs(xyz - np.asarray(normal.points)[0, : len(xyz)]).max() <= STEP / 2 * 1.02
+            assert np.array_equal(rgb, cloud[1])
+
+
+def test_files_hold_exactly_what_normalization_gives(written: Path) -> None:
+    clouds = render_views(OBJECTS, 60, 45)["tennis_ball"]
+    views, read = views_of(clouds), ViewDataset.open(written).read(0)
+    assert np.array_equal(views.xyz, read.xyz)
+    assert np.array_equal(np.rint(read.xyz / STEP), read.xyz / STEP)
+    assert (written / "0000-0000.safetensors").read_bytes() == encode(views)
+
+
+def test_digest_and_record(written: Path) -> None:
+    dataset = ViewDataset.open(written)
+    assert dataset.digest == hashlib.sha256((written / "manifest.json").read_bytes()).hexdigest()
+    record = json.loads(json.dumps(dataset.record))
+    assert record["digest"] == dataset.digest and record["views"] == 60 and record["left_out"] == 0
+    assert record["job"]["azimuth_step"] == 60 and record["job"]["variations"] is None
+    assert [entry["name"] for entry in record["job"]["objects"]] == list(OBJECTS)
+
+
+def test_few_bytes_a_view(written: Path) -> None:
+    dataset = ViewDataset.open(written)
+    size = sum(path.stat().st_size for path in written.iterdir())
+    assert size < 9 * sum(shard.points for shard in dataset.shards) + 60 * 100
+
+
+def test_no_views_and_views_past_the_range() -> None:
+    nothing = views_of([])
+    assert len(nothing) == 0 and nothing.xyz.shape == (0, 3) and nothing.clouds() == []
+    assert len(encode(nothing)) > 0
+    line = np.linspace(0, 1, 50, dtype=np.float32)[:, None] * np.array([0, 0, 1], np.float32)
+    rgb = np.zeros((50, 3), np.uint8)
+    assert views_of([(line * np.float32(LARGEST / 2.5), rgb)]).xyz.max() == LARGEST
+    with pytest.raises(InputError, match="a view is 4.05 scaled units long, more than 4"):
+        views_of([(line, rgb), (line * np.float32(1.62), rgb)])
+
+
+def test_padded_batches() -> None:
+    clouds = [(np.full((n, 3), n, np.float32), np.zeros((n, 3), np.uint8)) for n in (3, 600, 5)]
+    batches = list(padded_batches(clouds, 2))
+    assert [count for count, _ in batches] == [2, 1]
+    assert [batch.mask.shape for _, batch in batches] == [(2, 1024), (2, 512)]
+    assert [batch.mask.sum(axis=1).tolist() for _, batch in batches] == [[3, 600], [5, 0]]
+    assert list(padded_batches([], 2)) == []
+
+
+def check_refused(folder: Path, message: str) -> None:
+    with pytest.raises(InputError, match=message) as caught:
+        ViewDataset.open(folder).read(1)
+    assert "\n" not in str(caught.value) and str(folder) in str(caught.value)
+
+
+def test_damaged_shards(copied: Path) -> None:
+    path = copied / "0001-0000.safetensors"
+    whole = path.read_bytes()
+    flipped = bytearray(whole)
+    flipped[len(whole) // 2] ^= 1
+    for content in (b"", b"noise", whole[: len(whole) // 2], whole[:-1], bytes(flipped), whole + b"0"):
+        path.write_bytes(content)
+        check_refused(copied, "0001-0000.safetensors is damaged")
+    shutil.copy(copied / "0000-0000.safetensors", path)
+    check_refused(copied, "0001-0000.safetensors is damaged")
+    path.unlink()
+    check_refused(copied, "0001-0000.safetensors is missing or damaged")
+    path.mkdir()
+    check_refused(copied, "0001-0000.safetensors is missing or damaged")
+    assert len(ViewDataset.open(copied).read(0)) == 30
+
+
+def test_a_changed_manifest_is_refused(copied: Path) -> None:
+    path = copied / "manifest.json"
+    text = path.read_text()
+    for old, new in [('"label": 1', '"label": 0'), ('"screwdriver"', '"screwdrivel"'), ('"views": 30', '"views": 31')]:
+        assert old in text
+        path.write_text(text.replace(old, new))
+        check_refused(copied, "manifest.json is damaged")
+    for length in (0, 10, len(text) // 2, len(text) - 3):
+        path.write_text(text[:length])
+        check_refused(copied, "manifest.json is damaged")
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("[]", "manifest.json is damaged"),
+        ("null", "manifest.json is damaged"),
+        ("{}", "manifest.json is damaged"),
+        ("[" * 100_000, "manifest.json is damaged"),
+        ('{"format": 2}', "manifest.json is damaged"),
+        ('{"format": 1, "sigma_s": 2.5, "voxel": 0.01, "objects": {"a": {}}}', "format 1; this version reads 2"),
+        ('{"format": 3, "sha256": ""}', "format 3; this version reads 2"),
+    ],
+)
+def test_manifests_that_do_not_fit(tmp_path: Path, content: str, message: str) -> None:
+    (tmp_path / "manifest.json").write_text(content)
+    check_refused(tmp_path, message)
+
+
+def test_folders_that_are_none(tmp_path: Path) -> None:
+    check_refused(tmp_path / "absent", "absent is no folder")
+    check_refused(tmp_path, "manifest.json cannot be read")
+
+
+def test_other_versions_and_unfinished_ones(copied: Path) -> None:
+    manifest = ViewDataset.open(copied).manifest
+    Manifest({**manifest.job, "descriptor_version": 99}, manifest.shards).write(copied)
+    check_refused(copied, "version 99 of the descriptor")
+    dataclasses.replace(manifest, shards=manifest.shards[:1]).write(copied)
+    check_refused(copied, "1 of 2 shards; rendering did not finish")

@@ -1,0 +1,156 @@
+"""Training clouds against analytic surfaces and against clouds of real scans from the released pipeline."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial import cKDTree
+
+from thor2_jax.errors import InputError
+from training.augmentation import Illumination, Variations
+from training.objects.meshes import TexturedMesh, find_meshes, load_mesh
+from training.rendering.view_sphere import DISTANCE, camera_pose, view_angles
+from training.views.mesh_views import MIN_POINTS, SIGMA_S, VOXEL, Cloud, ViewTask, render_task, render_views, view_cloud
+from training.views.mesh_views import mesh_views as views
+
+GOLDEN = ["004_sugar_box", "006_mustard_bottle", "025_mug", "048_hammer", "055_baseball", "061_foam_brick"]
+
+
+def ball(radius: float = 0.05) -> TexturedMesh:
+    shape = trimesh.creation.icosphere(subdivisions=4, radius=radius)
+    colors = np.where(shape.vertices[:, 2:] > 0, [220, 40, 30], [20, 60, 200]).astype(np.uint8)
+    return TexturedMesh(np.array(shape.vertices), np.array(shape.faces, np.int32), corner_colors=colors[shape.faces])
+
+
+def test_points_lie_on_the_sphere_with_its_colours() -> None:
+    pose = camera_pose(0.4, 1.2, np.zeros(3))
+    xyz, rgb = view_cloud(ball(), pose)
+    assert xyz.dtype == np.float32 and rgb.dtype == np.uint8 and xyz.shape == rgb.shape
+    assert len(xyz) > 300
+    # A voxel's mean lies inside the curved surface by a fraction of the voxel.
+    radius = np.linalg.norm(xyz - [0, 0, DISTANCE], axis=1)
+    assert np.abs(radius - 0.05).max() < 0.003
+    world = xyz @ pose[:3, :3].T + pose[:3, 3]
+    assert (rgb[world[:, 2] > 0.006] == [220, 40, 30]).all()
+    assert (rgb[world[:, 2] < -0.006] == [20, 60, 200]).all()
+
+
+def test_one_point_a_voxel() -> None:
+    xyz, _ = view_cloud(ball(), camera_pose(0.4, 1.2, np.zeros(3)))
+    voxel = VOXEL / SIGMA_S
+    # The grid starts half a voxel below the least coordinate of the points, which the means only come near.
+    cells = np.floor((xyz - xyz.min(axis=0)) / voxel).astype(int)
+    assert len(np.unique(cells, axis=0)) > 0.6 * len(xyz)
+    surface = 2 * np.pi * 0.05**2 / voxel**2
+    assert 0.4 * surface < len(xyz) < 1.2 * surface
+
+
+def test_nothing_seen() -> None:
+    with pytest.raises(InputError, match="sees nothing"):
+        view_cloud(ball(), camera_pose(0.0, 1.0, np.array([0, 0, 9.0])))
+
+
+def check_same(one: dict[str, list[Cloud]], other: dict[str, list[Cloud]]) -> None:
+    assert list(one) == list(other)
+    for name in one:
+        assert len(one[name]) == len(other[name])
+        for (xyz, rgb), (other_xyz, other_rgb) in zip(one[name], other[name], strict=True):
+            assert xyz.dtype == other_xyz.dtype == np.float32 and rgb.dtype == other_rgb.dtype == np.uint8
+            assert np.array_equal(xyz, other_xyz) and np.array_equal(rgb, other_rgb)
+
+
+def test_all_views_of_all_objects_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(views, "CHUNK", 4)
+    seen: list[tuple[int, int]] = []
+    meshes = {"ball": ball(), "marble": ball(0.02)}
+    found = render_views(meshes, 120, 90, 1, lambda done, total: seen.append((done, total)))
+    assert seen == [(done, 18) for done in (4, 8, 9, 13, 17, 18)]
+    expected = {
+        name: [view_cloud(mesh, camera_pose(*angles, np.zeros(3))) for angles in view_angles(120, 90)]
+        for name, mesh in meshes.items()
+    }
+    check_same(found, expected)
+
+
+@pytest.mark.slow
+def test_workers_give_the_same_views(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(views, "CHUNK", 50)
+    check_same(*(render_views({"a": ball(), "b": ball(0.03)}, 20, 15, workers) for workers in (1, 2)))
+
+
+def test_files_of_meshes_and_meshes_give_the_same(tmp_path: Path) -> None:
+    colors = np.full((4, 3), 99, np.uint8)
+    corners = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]])
+    faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+    trimesh.Trimesh(corners, faces, vertex_colors=colors, process=False).export(tmp_path / "corner.ply")
+    mesh = TexturedMesh(
+        corners.astype(np.float32).astype(np.float64), faces.astype(np.int32), corner_colors=colors[faces]
+    )
+    check_same(render_views({"a": tmp_path / "corner.ply"}, 180, 90), render_views({"a": mesh}, 180, 90))
+
+
+def test_views_of_few_points_are_left_out() -> None:
+    sheet = ball(0.03)
+    sheet.vertices[:, 2] *= 0.005  # seen edge on from the side
+    clouds = render_views({"sheet": sheet}, 180, 90)["sheet"]
+    assert len(clouds) == 4 and min(len(xyz) for xyz, _ in clouds) >= MIN_POINTS
+
+
+def test_bad_requests(tmp_path: Path) -> None:
+    (tmp_path / "bad.ply").write_text("not a mesh")
+    for found, steps, workers, message in [
+        ({}, (60, 45), 1, "found is empty"),
+        ({"ball": ball()}, (0, 45), 1, "azimuth_step"),
+        ({"ball": ball()}, (60, -45), 1, "polar_step"),
+        ({"ball": ball()}, (60, 45), 0, "workers must be at least 1, not 0"),
+        ({"ball": ball(), "z": tmp_path / "bad.ply"}, (60, 45), 1, "bad.ply"),
+        ({"z": tmp_path / "absent.ply"}, (60, 45), 1, "absent.ply: no such file"),
+        ({"speck": ball(0.003)}, (180, 90), 1, "object 'speck': none of its 6 views has 30 points"),
+    ]:
+        with pytest.raises(InputError, match=message):
+            render_views(found, *steps, workers)
+
+
+def test_varied_copies_follow_the_view_and_the_name_alone() -> None:
+    """Whatever part of the angles a task has: a seed of their own makes copies, and the view itself stays."""
+    angles, variations = view_angles(90, 90), Variations(illumination=Illumination(), copies=2)
+    whole = render_task(ViewTask("ball", ball(), angles, 0, variations, 7))
+    assert [(cloud.view, cloud.copy) for cloud in whole] == [(view, copy) for view in range(12) for copy in range(3)]
+    part = render_task(ViewTask("ball", ball(), angles[5:7], 5, variations, 7))
+    for cloud, other in zip(part, whole[15:21], strict=True):
+        assert (cloud.view, cloud.copy) == (other.view, other.copy)
+        assert np.array_equal(cloud.xyz, other.xyz) and np.array_equal(cloud.rgb, other.rgb)
+    plain = render_task(ViewTask("ball", ball(), angles))
+    for cloud, other in zip(plain, whole[::3], strict=True):
+        assert np.array_equal(cloud.xyz, other.xyz) and np.array_equal(cloud.rgb, other.rgb)
+    others = [
+        render_task(ViewTask("bowl", ball(), angles[:1], 0, variations, 7)),
+        render_task(ViewTask("ball", ball(), angles[:1], 0, variations, 8)),
+        render_task(ViewTask("ball", ball(), angles[:1], 1, variations, 7)),
+    ]
+    copies = [clouds[copy].rgb.tobytes() for clouds in (whole, *others) for copy in (1, 2)]
+    assert len(set(copies)) == len(copies)
+
+
+@pytest.mark.parametrize("name", GOLDEN)
+def test_golden_clouds(shared: Path, name: str) -> None:
+    """Other ray tracers round a few depths to the other millimetre, which moves a point, or adds or takes one away.
+
+    So the clouds agree to 1e-4 in all but a hundredth of their points or so, and everywhere to a voxel.
+    """
+    mesh = load_mesh(find_meshes(shared / "data" / "meshes", {name: name})[name])
+    equal, total = 0, 0
+    for path in sorted((shared / "golden").glob(f"{name}_?.npz")):
+        with np.load(path) as golden:
+            points, colors, (azimuth, polar) = golden["points"], golden["colors"] * 255, golden["view"]
+        xyz, rgb = view_cloud(mesh, camera_pose(azimuth, polar, mesh.centre))
+        assert abs(len(xyz) - len(points)) <= 3
+        distance, nearest = cKDTree(points).query(xyz * SIGMA_S)
+        same = distance < 1e-4
+        equal, total = equal + int(same.sum()), total + len(xyz)
+        assert distance.max() < VOXEL
+        assert np.mean(same) > 0.92
+        difference = np.abs(rgb - colors[nearest])
+        assert difference[same].mean() < 0.5 and np.mean(difference > 2) < 0.03
+    assert total > 1000 and equal / total > 0.97

@@ -1,0 +1,394 @@
+"""The rendering job: the same bytes whatever interrupts it and wherever it runs; other jobs and folders are refused."""
+
+import contextlib
+import dataclasses
+import json
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from thor2_jax.errors import InputError
+from training import cli, render_job
+from training.augmentation import Illumination, Variations
+from training.objects.builtin_objects import builtin_objects
+from training.objects.meshes import TexturedMesh
+from training.storage.locks import locked
+from training.storage.workers import local, on_ray
+from training.views.dataset import MANIFEST, ViewDataset
+from training.views.render_job import render_dataset
+
+NAMES = ("screwdriver", "tennis_ball")
+OBJECTS = {name: builtin_objects()[name] for name in NAMES}
+STEPS = (60, 45)
+"""30 views an object: of 16 and 14 with the shards of these tests."""
+
+
+@pytest.fixture(autouse=True)
+def small_shards(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(render_job, "SHARD", 16)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The dataset of a job that nothing interrupted."""
+    out = tmp_path_factory.mktemp("whole") / "deep" / "views"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(render_job, "SHARD", 16)
+        render_dataset(OBJECTS, out, *STEPS)
+    return out
+
+
+@pytest.fixture
+def copied(whole: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(whole, tmp_path / "views")
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def sphere(radius: float) -> TexturedMesh:
+    shape = trimesh.creation.icosphere(subdivisions=2, radius=radius)
+    colors = np.full((len(shape.faces), 3, 3), 9, np.uint8)
+    return TexturedMesh(np.array(shape.vertices), np.array(shape.faces, np.int32), corner_colors=colors)
+
+
+def test_folder(whole: Path) -> None:
+    assert sorted(contents(whole)) == [
+        ".lock",
+        "0000-0000.safetensors",
+        "0000-0001.safetensors",
+        "0001-0000.safetensors",
+        "0001-0001.safetensors",
+        "manifest.json",
+    ]
+    dataset = ViewDataset.open(whole)
+    assert [(shard.file[:9], shard.label, shard.views, shard.left_out) for shard in dataset.shards] == [
+        ("0000-0000", 0, 16, 0),
+        ("0000-0001", 0, 14, 0),
+        ("0001-0000", 1, 16, 0),
+        ("0001-0001", 1, 14, 0),
+    ]
+    assert np.array_equal(np.concatenate([dataset.read(k).view for k in (0, 1)]), np.arange(30))
+    assert "time" not in (whole / MANIFEST).read_text()
+
+
+@pytest.mark.slow
+def test_workers_change_nothing(whole: Path, tmp_path: Path) -> None:
+    render_dataset(OBJECTS, tmp_path / "views", *STEPS, local(2))
+    assert contents(tmp_path / "views") == contents(whole)
+
+
+class Stop(BaseException):
+    """As KeyboardInterrupt, at a place of our choice."""
+
+
+def test_stopped_at_any_write_it_goes_on(whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before and after each of the nine files that a job puts in place: manifest, shard, manifest, ..."""
+    replace, left = os.replace, 0
+
+    def stopping(source: Path, target: Path) -> None:
+        nonlocal left
+        left -= 1
+        if left == 0:
+            raise Stop
+        replace(source, target)
+        left -= 1
+        if left == 0:
+            raise Stop
+
+    monkeypatch.setattr(os, "replace", stopping)
+    for stop in range(1, 19):
+        out, left = tmp_path / str(stop), stop
+        with pytest.raises(Stop):
+            render_dataset(OBJECTS, out, *STEPS)
+        with pytest.raises(InputError, match=MANIFEST) if stop < 18 else contextlib.nullcontext():
+            ViewDataset.open(out)
+        left, before = 0, contents(out)
+        seen: list[tuple[int, int]] = []
+        render_dataset(OBJECTS, out, *STEPS, progress=lambda done, total: seen.append((done, total)))  # noqa: B023
+        assert contents(out) == contents(whole)
+        # Shards that were listed are not made again.
+        listed = json.loads(before[MANIFEST])["views"] if MANIFEST in before else 0
+        assert seen == [(done, 60) for done in (0, 16, 30, 46, 60) if done >= listed]
+        assert left == -2 * (2 * (len(seen) - 1) + (MANIFEST not in before))
+
+
+KILLED = """
+import os, signal, sys
+from training.views.mesh_views import render_job
+from training.objects.builtin_objects import builtin_objects
+from training.storage.workers import local
+
+render_job.SHARD = 16
+replace, left = os.replace, int(sys.argv[2])
+
+def killing(source, target):
+    global left
+    for step in (lambda: None, lambda: replace(source, target)):
+        step()
+        left -= 1
+        if left == 0:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+os.replace = killing
+objects = {name: builtin_objects()[name] for name in ("screwdriver", "tennis_ball")}
+render_job.render_dataset(objects, sys.argv[1], 60, 45, local(int(sys.argv[3])))
+"""
+
+
+@pytest.mark.parametrize(
+    "kills",
+    [
+        # Odd: with a file written under its temporary name; even: with a shard that is not listed, or is.
+        [(4, 1)],
+        pytest.param([(1, 1), (5, 2), (3, 2), (2, 1)], marks=pytest.mark.thorough),
+    ],
+)
+def test_killed_again_and_again_it_goes_on(whole: Path, tmp_path: Path, kills: list[tuple[int, int]]) -> None:
+    out = tmp_path / "views"
+    for step, workers in kills:
+        command = [sys.executable, "-c", KILLED, str(out), str(step), str(workers)]
+        assert subprocess.run(command, capture_output=True, timeout=120).returncode == -signal.SIGKILL
+    assert set(contents(out)) != set(contents(whole))
+    render_dataset(OBJECTS, out, *STEPS)
+    assert contents(out) == contents(whole)
+
+
+def test_interrupted_by_the_keyboard(whole: Path, tmp_path: Path) -> None:
+    def interrupt(done: int, total: int) -> None:
+        if done > total / 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        render_dataset(OBJECTS, tmp_path / "views", *STEPS, progress=interrupt)
+    with pytest.raises(InputError, match="3 of 4 shards; rendering did not finish"):
+        ViewDataset.open(tmp_path / "views")
+    render_dataset(OBJECTS, tmp_path / "views", *STEPS)
+    assert contents(tmp_path / "views") == contents(whole)
+
+
+def changed(folder: Path) -> dict[str, int]:
+    return {path.name: path.stat().st_mtime_ns for path in folder.iterdir()}
+
+
+def test_a_finished_dataset_is_left_as_it_is(copied: Path) -> None:
+    before = changed(copied)
+    assert len(render_dataset(OBJECTS, copied, *STEPS)) == 60
+    assert changed(copied) == before | {".lock": changed(copied)[".lock"]}
+
+
+def test_damaged_and_missing_shards_are_made_again_and_no_others(whole: Path, copied: Path) -> None:
+    bad, missing = copied / "0000-0001.safetensors", copied / "0001-0000.safetensors"
+    content = bytearray(bad.read_bytes())
+    content[1000] ^= 1
+    bad.write_bytes(content)
+    missing.unlink()
+    before = changed(copied)
+    render_dataset(OBJECTS, copied, *STEPS)
+    assert contents(copied) == contents(whole)
+    same = {name for name, time in changed(copied).items() if before.get(name) == time}
+    assert same - {".lock"} == {"0000-0000.safetensors", "0001-0001.safetensors"}
+
+
+def test_another_job_is_refused(copied: Path) -> None:
+    before = contents(copied)
+    moved = dataclasses.replace(OBJECTS["tennis_ball"], vertices=OBJECTS["tennis_ball"].vertices + 1e-3)
+    screwdriver = OBJECTS["screwdriver"]
+    painted = dataclasses.replace(screwdriver, textures=tuple(texture ^ 1 for texture in screwdriver.textures))
+    light = Variations(illumination=Illumination())
+    for found, steps, options, message in [
+        (OBJECTS, (90, 45), {}, "azimuth_step is 60.0 there and 90.0 here"),
+        (OBJECTS, (60, 90), {}, "polar_step is 45.0 there and 90.0 here"),
+        (OBJECTS, STEPS, {"variations": light}, "variations is null there and {"),
+        (OBJECTS | {"tennis_ball": moved}, STEPS, {}, "the mesh of 'tennis_ball' is another"),
+        (OBJECTS | {"screwdriver": painted}, STEPS, {}, "the mesh of 'screwdriver' is another"),
+        ({"tennis_ball": moved}, STEPS, {}, "it has the object 'screwdriver', which is missing here"),
+        (OBJECTS | {"apple": moved}, STEPS, {}, "it has no object 'apple'"),
+        (dict(reversed(OBJECTS.items())), STEPS, {}, "its objects are in another order"),
+    ]:
+        with pytest.raises(InputError, match=message) as caught:
+            render_dataset(found, copied, *steps, **options)
+        assert str(copied) in str(caught.value) and "\n" not in str(caught.value)
+        assert contents(copied) == before
+
+
+def test_variations_are_part_of_the_job(tmp_path: Path) -> None:
+    out, light = tmp_path / "views", Variations(illumination=Illumination(), copies=2)
+    dataset = render_dataset({"ball": sphere(0.03)}, out, 90, 90, variations=light, seed=1)
+    assert len(dataset) == 36 and dataset.record["job"]["variations"]["seed"] == 1
+    assert [shard.views for shard in dataset.shards] == [15, 15, 6]
+    views = dataset.read(1)
+    assert views.view.tolist() == list(np.repeat(range(5, 10), 3)) and views.copy.tolist() == [0, 1, 2] * 5
+    for options in ({}, {"variations": light, "seed": 2}, {"variations": dataclasses.replace(light, copies=3)}):
+        with pytest.raises(InputError, match="variations is"):
+            render_dataset({"ball": sphere(0.03)}, out, 90, 90, **options)
+    off = render_dataset({"ball": sphere(0.03)}, tmp_path / "off", 90, 90, variations=Variations(), seed=2)
+    assert len(off) == 12 and off.record["job"]["variations"] is None
+
+
+def test_views_of_few_points_are_left_out_and_counted(tmp_path: Path) -> None:
+    sheet = sphere(0.03)
+    sheet.vertices[:, 2] *= 0.005  # seen edge on from the side
+    dataset = render_dataset({"sheet": sheet}, tmp_path / "views", 180, 90)
+    assert len(dataset) == 4 and dataset.record["left_out"] == 2
+    assert dataset.read(0).view.tolist() == [0, 1, 4, 5]
+
+
+def test_a_shard_without_views(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(render_job, "SHARD", 2)
+    sheet = sphere(0.03)
+    sheet.vertices[:, 2] *= 0.005
+    dataset = render_dataset({"sheet": sheet}, tmp_path / "views", 180, 90)
+    assert [(shard.views, shard.left_out) for shard in dataset.shards] == [(2, 0), (0, 2), (2, 0)]
+    assert len(dataset.read(1)) == 0 and dataset.read(1).xyz.shape == (0, 3)
+
+
+def test_odd_names(tmp_path: Path) -> None:
+    name = "../a b/ü"
+    dataset = render_dataset({name: sphere(0.03)}, tmp_path / "views", 180, 90)
+    assert dataset.classes == (name,) and [path.name for path in tmp_path.iterdir()] == ["views"]
+
+
+def test_bad_requests_write_nothing(tmp_path: Path) -> None:
+    out = tmp_path / "views"
+    (tmp_path / "bad.ply").write_text("not a mesh")
+    for found, steps, options, message in [
+        ({}, STEPS, {}, "found is empty"),
+        (OBJECTS, (0, 45), {}, "azimuth_step"),
+        (OBJECTS, STEPS, {"seed": -1}, "seed is -1"),
+        ({**OBJECTS, "z": tmp_path / "bad.ply"}, STEPS, {}, "bad.ply"),
+        ({"speck": sphere(0.003)}, (180, 90), {}, "object 'speck': none of its 6 views has 30 points"),
+        ({"door": sphere(0.6)}, (180, 90), {}, "object 'door' is 2.08 m across; views of at most 1.60 m"),
+    ]:
+        with pytest.raises(InputError, match=message):
+            render_dataset(found, out, *steps, **options)
+        assert not out.exists()
+
+
+def test_folders_in_use_are_kept(tmp_path: Path) -> None:
+    out = tmp_path / "views"
+    out.mkdir()
+    (out / "mine.txt").write_text("mine")
+    with pytest.raises(InputError, match=f"{out} exists already and holds files, but no manifest.json"):
+        render_dataset(OBJECTS, out, 180, 90)
+    with pytest.raises(InputError, match="mine.txt exists already and is no folder"):
+        render_dataset(OBJECTS, out / "mine.txt", 180, 90)
+    (out / MANIFEST).write_text('{"format": 1}')
+    with pytest.raises(InputError, match="manifest.json has format 1; this version reads 2"):
+        render_dataset(OBJECTS, out, 180, 90)
+    assert (out / MANIFEST).read_text() == '{"format": 1}' and (out / "mine.txt").read_text() == "mine"
+
+
+def test_two_processes_in_one_folder(whole: Path, copied: Path) -> None:
+    with locked(copied), pytest.raises(InputError, match=f"another process is writing to {copied}"):
+        render_dataset(OBJECTS, copied, *STEPS)
+    render_dataset(OBJECTS, copied, *STEPS)
+    assert contents(copied) == contents(whole)
+
+
+@contextlib.contextmanager
+def full_disk() -> Iterator[None]:
+    """Files of this process cannot grow past 20 kB: a manifest fits, a shard does not."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def test_a_full_disk_leaves_a_folder_to_go_on_with(whole: Path, copied: Path) -> None:
+    (copied / "0001-0000.safetensors").unlink()
+    with full_disk(), pytest.raises(OSError, match="File too large"):
+        render_dataset(OBJECTS, copied, *STEPS)
+    assert set(contents(whole)) - set(contents(copied)) == {"0001-0000.safetensors"}
+    with pytest.raises(InputError, match="3 of 4 shards"):
+        ViewDataset.open(copied)
+    render_dataset(OBJECTS, copied, *STEPS)
+    assert contents(copied) == contents(whole)
+
+
+def test_a_folder_that_cannot_be_made(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(OSError, match="file"):
+        render_dataset(OBJECTS, tmp_path / "file" / "views", *STEPS)
+
+
+def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Twice the same, then with other steps, then on a cluster that cannot be had."""
+    mesh = sphere(0.03)
+    (tmp_path / "meshes").mkdir()
+    colors = np.full((len(mesh.faces), 4), 99, np.uint8)
+    trimesh.Trimesh(mesh.vertices, mesh.faces, face_colors=colors).export(tmp_path / "meshes" / "ball.ply")
+
+    def run(*options: str) -> tuple[int, str, str]:
+        folders = ["--meshes", str(tmp_path / "meshes"), "--out", str(tmp_path / "views")]
+        monkeypatch.setattr(
+            sys, "argv", ["thor2", "render", *folders, "--workers", "1", "--polar-step", "90", *options]
+        )
+        with pytest.raises(SystemExit) as stop:
+            cli.main()
+        return int(stop.value.code or 0), *capsys.readouterr()
+
+    for _ in range(2):
+        code, out, _ = run("--azimuth-step", "180")
+        assert code == 0 and "6 views of 1 objects (0 left out)" in out
+    before = contents(tmp_path / "views")
+    code, _, err = run("--azimuth-step", "90")
+    assert code == 2 and "azimuth_step is 180.0 there and 90.0 here" in err and "Traceback" not in err
+    assert contents(tmp_path / "views") == before
+    monkeypatch.setitem(sys.modules, "ray", None)
+    code, _, err = run("--azimuth-step", "180", "--engine", "ray")
+    assert code == 2 and "thor2-jax[cluster]" in err
+    assert run("--engine", "cloud")[0] == 2
+    assert run("--address", "head:6379")[0] == 2
+
+
+def children() -> set[int]:
+    """Processes of this one, and theirs."""
+    parents = {}
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError):
+            state, parent = path.read_text().rpartition(")")[2].split()[:2]
+            if state != "Z":
+                parents[int(path.parent.name)] = int(parent)
+    found, new = set(), {os.getpid()}
+    while new := {pid for pid, parent in parents.items() if parent in new}:
+        found |= new
+    return found
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")
+def test_on_a_ray_cluster_that_loses_a_worker(whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("ray", reason="the extra [cluster] is not installed")
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    before, killed = children(), []
+
+    def kill_one() -> None:
+        while not killed:
+            time.sleep(0.02)
+            for pid in children() - before:
+                with contextlib.suppress(OSError):
+                    if Path(f"/proc/{pid}/cmdline").read_bytes().startswith(b"ray::render_task"):
+                        os.kill(pid, signal.SIGKILL)
+                        killed.append(pid)
+                        return
+
+    threading.Thread(target=kill_one, daemon=True).start()
+    render_dataset(OBJECTS, tmp_path / "views", *STEPS, on_ray(2))
+    assert len(killed) == 1
+    assert contents(tmp_path / "views") == contents(whole)
+    assert children() == before

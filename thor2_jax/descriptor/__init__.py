@@ -1,0 +1,1 @@
+"""From point clouds to descriptors: view normalization, slicing, colour, persistence, images."""

@@ -1,0 +1,185 @@
+"""The soft descriptor: slices, strips, extremes and colour regions whose gradients do not vanish.
+
+Hard slices, strips and colour regions are piecewise constant in points and colours. With
+`DescriptorConfig(relaxation=Relaxation(...))` a point belongs to all of them a little. Towards zero temperature, all
+four together, everything here becomes what `slicing` computes, for any cloud in the first octant with no point on a
+border between two slices or strips and no colour halfway between two of the grid.
+
+>>> config = DescriptorConfig(relaxation=Relaxation(color=2.0))               # doctest: +SKIP
+>>> found = describe(clouds, network, config)                                 # doctest: +SKIP
+"""
+
+import functools
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from colornet.grid import GRID_LEVELS, GRID_STEP, grid_colors
+from thor2_jax.config import DescriptorConfig, Relaxation
+from thor2_jax.descriptor.color_membership import RegionSets
+from thor2_jax.types import Strips
+
+__all__ = ["hyab", "interval_weights", "relaxed_strips", "soft_regions", "to_lab"]
+
+HIGHEST = jax.lax.Precision.HIGHEST
+
+_TO_XYZ = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+"""Linear sRGB to XYZ, as rounded in IEC 61966-2-1."""
+
+_WHITE = np.array([0.3127 / 0.3290, 1, (1 - 0.3127 - 0.3290) / 0.3290])
+"""XYZ of D65, the white of the colour network's grid."""
+
+_OFFSETS = np.array(list(itertools.product((-1, 0, 1), repeat=3)))
+"""[27, 3] levels from the nearest grid colour to its neighbours and itself."""
+
+_LEAST_WEIGHT = 1e-3
+"""Of a point in a strip: below it, a strip's middle goes to zero, so that no quotient gets out of hand."""
+
+
+def interval_weights(at: jax.Array, width: float, count: int, temperature: float) -> jax.Array:
+    """Logarithm of the weight of coordinates in consecutive intervals of a width, the first one from 0 up.
+
+    sigmoid((x - lower) / T) - sigmoid((x - upper) / T). The first interval is open below: aligned clouds touch 0, and
+    a point on that border has nowhere else to go.
+
+    Args:
+        at: [N] coordinates.
+        width: of an interval, the unit of `at`.
+        count: C, number of intervals.
+        temperature: T, the unit of `at`.
+
+    Returns:
+        [N, C], at most 0; the weights themselves sum to 1 for points well before the last border.
+    """
+    edges = (np.arange(count + 1) * width).astype(np.float32)
+    above = jax.nn.log_sigmoid((at[:, None] - edges[1:-1]) / temperature)
+    below = jax.nn.log_sigmoid((edges[1:] - at[:, None]) / temperature)
+    # As a product the difference keeps its digits where both sigmoids are nearly equal.
+    both = above + below[:, 1:] + np.log1p(-np.exp(-width / temperature))
+    return jnp.concatenate([below[:, :1], both], axis=1)
+
+
+def _rise(weight: jax.Array, above: jax.Array, temperature: float) -> jax.Array:
+    """T log(1 + sum over points of w (exp(above / T) - 1)): [N, J] and [N, J] to [J].
+
+    A log-sum-exp in which a point of weight 0 has no part, and which is 0 where all of `above` is 0. It is never
+    negative if the weighted sum of `above` is 0.
+    """
+    scaled = above / temperature
+    top = jax.lax.stop_gradient(jnp.maximum(scaled.max(axis=0), 0))
+    floor = jnp.exp(-jnp.minimum(top, 80.0))
+    terms = (weight * jnp.exp(scaled - top)).sum(axis=0) + (1 - weight.sum(axis=0)) * jnp.exp(-top)
+    return temperature * (top + jnp.log(jnp.maximum(terms, floor)))
+
+
+def relaxed_strips(
+    points: jax.Array,
+    colors: jax.Array,
+    mask: jax.Array,
+    sets: RegionSets,
+    config: DescriptorConfig,
+    overflow: jax.Array,
+) -> Strips:
+    """Soft extremes and colour vectors of every strip of one aligned cloud (no batch axis).
+
+    With w the weight of a point in a strip and m the mean of y with the weights w^2, the extremes are
+    m + T log(1 + sum w (exp(w (y - m) / T) - 1)) and the same downwards. Deviations count by w as well: else a point
+    far up in the next strip would outweigh, at any temperature, its small part in this one. A strip that holds hardly
+    any weight has hardly any persistence, and so vanishes from the image; so does a strip of one point.
+
+    Args:
+        points: [3, N], scaled units; those with a negative x or z count for nothing, as in hard slices.
+        colors: [N, 3] sRGB in [0, 1].
+        mask: [N] bool.
+        sets: of the colour network's regions.
+        config: its `relaxation` gives the temperatures. Static.
+        overflow: [] int32, passed on.
+
+    Returns:
+        Strips, "occupied" where any weight is.
+    """
+    relaxation = config.relaxation or Relaxation()
+    x, y, z = points
+    counted = (mask & (x >= 0) & (z >= 0))[:, None]
+    log_slice = interval_weights(z, config.sigma_1, config.n_slices, relaxation.slice)
+    log_strip = interval_weights(x, config.sigma_2, config.n_strips, relaxation.strip)
+    regions = soft_regions(colors, sets, relaxation.color)
+
+    # Checkpoint: the [N, J] arrays of a slice are computed again for its gradient rather than kept for all slices.
+    @jax.checkpoint
+    def one_slice(log_weight: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+        weight = jnp.where(counted, jnp.exp(log_weight[:, None] + log_strip), 0)
+        square = weight**2
+        middle = (square * y[:, None]).sum(axis=0) / (square.sum(axis=0) + _LEAST_WEIGHT**2)
+        above = weight * (y[:, None] - middle)
+        low = middle - _rise(weight, -above, relaxation.extremum)
+        high = middle + _rise(weight, above, relaxation.extremum)
+        return low, high, (weight > 0).any(axis=0), jnp.matmul(weight.T, regions, precision=HIGHEST)
+
+    low, high, occupied, color = jax.lax.map(one_slice, log_slice.T)
+    return Strips(low, high, occupied, color, overflow)
+
+
+def to_lab(colors: jax.Array) -> jax.Array:
+    """CIELAB (D65) of sRGB colours in [0, 1]: [..., 3] to [..., 3], L* in 0..100."""
+    dark = colors <= 0.04045
+    linear = jnp.where(dark, colors / 12.92, ((jnp.where(dark, 1, colors) + 0.055) / 1.055) ** 2.4)
+    xyz = jnp.matmul(linear, jnp.asarray((_TO_XYZ / _WHITE[:, None]).T, linear.dtype), precision=HIGHEST)
+    small = xyz <= (6 / 29) ** 3
+    root = jnp.where(small, xyz * (29 / 6) ** 2 / 3 + 4 / 29, jnp.cbrt(jnp.where(small, 1, xyz)))
+    fx, fy, fz = root[..., 0], root[..., 1], root[..., 2]
+    return jnp.stack([116 * fy - 16, 500 * (fx - fy), 200 * (fy - fz)], axis=-1)
+
+
+def hyab(first: jax.Array, second: jax.Array) -> jax.Array:
+    """HyAB colour difference |dL*| + sqrt(da*^2 + db*^2): [..., 3] and [..., 3] to [...]. Gradient 0 where equal."""
+    difference = first - second
+    squared = (difference[..., 1:] ** 2).sum(axis=-1)
+    chroma = jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1)), 0)
+    return jnp.abs(difference[..., 0]) + chroma
+
+
+@functools.cache
+def _grid_lab() -> jax.Array:
+    with jax.ensure_compile_time_eval():
+        return to_lab(jnp.asarray(grid_colors() / 255, jnp.float32))
+
+
+def soft_regions(colors: jax.Array, sets: RegionSets, temperature: float) -> jax.Array:
+    """Region weights of colours: those of the grid colours around, by a softmax over HyAB distances.
+
+    The 27 grid colours within one level of the nearest share the weight by exp(-HyAB / T), times a factor that fades to
+    0 where a channel is 1/2 + T / (1 + T) levels away. So nothing jumps where the nearest grid colour changes, and
+    towards zero temperature what is left is the colour nearest in every channel, which is the hard rule; the one
+    nearest by HyAB can be another.
+
+    Args:
+        colors: [N, 3] sRGB, limited to [0, 1] first.
+        sets: of the colour network.
+        temperature: T, HyAB units in CIELAB.
+
+    Returns:
+        [N, R], rows sum to 1.
+    """
+    colors = jnp.clip(colors, 0, 1)
+    scaled = colors * (255 / GRID_STEP)
+    nearest = jnp.floor(scaled + 0.5).astype(jnp.int32)
+    levels = nearest[:, None] + _OFFSETS.astype(np.int32)
+    exists = ((levels >= 0) & (levels < GRID_LEVELS)).all(axis=-1)
+    levels = jnp.clip(levels, 0, GRID_LEVELS - 1)
+    row = (levels[..., 0] * GRID_LEVELS + levels[..., 1]) * GRID_LEVELS + levels[..., 2]
+
+    reach = 0.5 + temperature / (1 + temperature)
+    left = 1 - ((scaled[:, None] - levels) / reach) ** 2
+    # The nearest one always stays: at a tiny temperature rounding may take its last bit.
+    chosen = exists & ((left > 0).all(axis=-1) | ~_OFFSETS.any(axis=-1))
+    fade = 2 * jnp.log(jnp.where(left > 0, left, 1e-7)).sum(axis=-1)
+    distance = hyab(to_lab(colors)[:, None], _grid_lab()[row])
+    share = jax.nn.softmax(jnp.where(chosen, fade - distance / temperature, -jnp.inf), axis=-1)
+
+    # Added up by set of regions first: [N, 62] in place of [N, 27, 22].
+    by_set = jnp.zeros((len(colors), sets.weights.shape[0]), share.dtype)
+    by_set = by_set.at[jnp.arange(len(colors))[:, None], sets.of_color[row]].add(share)
+    return jnp.matmul(by_set, sets.weights, precision=HIGHEST)

@@ -1,0 +1,77 @@
+"""One coloured point cloud for each instance of a frame (paper, section "Recognition").
+
+Valid depth, a voxel grid of 3 mm, outlier removal. What cannot be used is told, not dropped.
+"""
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thor2_jax.recognition.frames import RGBDFrame, pixel_rays
+from thor2_jax.recognition.outlier_removal import flying_pixels, remove_outliers
+from thor2_jax.recognition.voxel_grid import voxel_downsample
+
+__all__ = ["MAX_DEPTH", "MIN_DEPTH", "MIN_POINTS", "InstanceCloud", "instance_cloud", "instance_clouds"]
+
+MIN_DEPTH, MAX_DEPTH = 0.26, 2.5
+"""Metres between which depth is trusted."""
+
+VOXEL = 0.003
+"""Metres: side of a cube of the grid on which outliers are removed."""
+
+MIN_POINTS = 30
+"""Points on that grid that an instance needs."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class InstanceCloud:
+    """The cloud of one instance.
+
+    Attributes:
+        label: its number in the label image.
+        points: [n, 3] float32, metres, OpenCV camera frame.
+        colors: [n, 3] uint8, sRGB.
+        n_pixels: pixels of its mask.
+        kept_by_fallback: a rule of outlier removal would have dropped most of it and was left out.
+        reason: why the cloud cannot be used; None if it can.
+    """
+
+    label: int
+    points: NDArray[np.float32]
+    colors: NDArray[np.uint8]
+    n_pixels: int
+    kept_by_fallback: bool = False
+    reason: str | None = None
+
+
+def instance_clouds(frame: RGBDFrame) -> list[InstanceCloud]:
+    """The clouds of all instances, in the order of `frame.instances`, those that cannot be used included."""
+    return [instance_cloud(frame, label) for label in frame.instances]
+
+
+def instance_cloud(frame: RGBDFrame, label: int) -> InstanceCloud:
+    """The cloud of one instance, which may be one that cannot be used.
+
+    Args:
+        frame: the frame.
+        label: one of `frame.instances`.
+    """
+    pixels = frame.instance_pixels[label]
+    depth = frame.depth_m.ravel()[pixels]
+    trusted = (depth >= MIN_DEPTH) & (depth <= MAX_DEPTH)
+    flying = flying_pixels(frame, pixels)
+    steep = 2 * int((trusted & ~flying).sum()) < int(trusted.sum())
+    if not steep:
+        trusted &= ~flying
+    valid, depth = pixels[trusted], depth[trusted]
+    points = (pixel_rays(valid, frame.labels.shape[1], frame.intrinsics) * depth[:, None]).astype(np.float32)
+    points, colors = voxel_downsample(points, frame.color.reshape(-1, 3).take(valid, axis=0), VOXEL)
+    if len(points) < MIN_POINTS:
+        reason = (
+            f"{len(points)} points ({len(pixels)} pixels, {len(valid)} of them with depth "
+            f"from {MIN_DEPTH} to {MAX_DEPTH} m); at least {MIN_POINTS} are needed"
+        )
+        return InstanceCloud(label, points, colors, len(pixels), reason=reason)
+    kept, relaxed = remove_outliers(points)
+    return InstanceCloud(label, points.take(kept, axis=0), colors.take(kept, axis=0), len(pixels), steep or relaxed)

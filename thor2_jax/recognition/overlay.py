@@ -1,0 +1,233 @@
+"""A picture of what was recognized: the photo, and on it every instance's outline and a label with the answer.
+
+draw_overlay(frame.color, frame.labels, recognizer.recognize(frame), "overlay.png")
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+from thor2_jax.errors import InputError
+from thor2_jax.files import replacing
+
+if TYPE_CHECKING:
+    from thor2_jax.recognition.recognizer import Recognition
+
+__all__ = ["COLORS", "UNRECOGNIZED", "draw_overlay"]
+
+COLORS = ((86, 180, 233), (240, 228, 66), (0, 158, 115), (204, 121, 167), (0, 114, 178))
+"""Of recognized instances, in turn: Okabe and Ito's sky blue, yellow, bluish green, reddish purple and blue, which all
+eyes tell apart."""
+
+UNRECOGNIZED = (213, 94, 0)
+"""Of the others: vermilion of the same palette; its orange is not in the turn because it would be too near."""
+
+_SMALLEST = 8
+"""Size of the smallest letters that can be read, pixels."""
+
+
+class _Box(NamedTuple):
+    """Columns left to right and rows top to bottom, ends not included."""
+
+    left: int
+    top: int
+    right: int
+    bottom: int
+
+
+class _Mask(NamedTuple):
+    """An instance's mask, cut out with a margin of one pixel: `pixels[1, 1]` is the corner (left, top) of `box`."""
+
+    box: _Box
+    pixels: NDArray[np.bool_]
+
+
+class _Lettering(NamedTuple):
+    """A text of one or two lines as it is drawn: from `start` on, relative to the corner of a box of width x height."""
+
+    text: str
+    font: ImageFont.FreeTypeFont | ImageFont.ImageFont
+    size: int
+    spacing: int
+    start: tuple[float, float]
+    width: int
+    height: int
+
+
+def draw_overlay(
+    color: NDArray[np.uint8], labels: NDArray[Any], answers: Sequence[Recognition], path: str | Path
+) -> None:
+    """Draw answers on the photo they are about; the PNG appears under its name whole or not at all.
+
+    A label tells name, confidence, the surest classifier, and "occluded" where it is; or "unrecognized". Letters and
+    outlines grow with the picture. Labels lie inside it, clear of each other while there is room. Letters shrink
+    where a label is wider than the picture; one that does not fit in the smallest legible letters is left out.
+
+    Args:
+        color: [H, W, 3] uint8, sRGB.
+        labels: [H, W] integers; 0 is background, every other number an instance.
+        answers: of instances in `labels`; instances without an answer are not drawn.
+        path: of the picture.
+
+    Raises:
+        InputError: shapes or types that do not fit, or an answer about a label that does not occur in `labels`.
+        OSError: the file cannot be written.
+    """
+    color, labels = np.asarray(color), np.asarray(labels)
+    if color.ndim != 3 or color.shape[2] != 3 or 0 in color.shape:
+        raise InputError(f"color has shape {color.shape}; expected [H, W, 3]")
+    if color.dtype != np.uint8:
+        raise InputError(f"color has type {color.dtype}; expected uint8")
+    if labels.shape != color.shape[:2]:
+        raise InputError(f"labels has shape {labels.shape}; color has {color.shape[:2]} (rows, columns)")
+    if labels.dtype.kind not in "ui":
+        raise InputError(f"labels has type {labels.dtype}; expected integers")
+    masks = [_cut_out(labels, answer.label) for answer in answers]
+    paints = _paints(answers)
+    diagonal = math.hypot(*labels.shape)
+    thickness = max(1, round(diagonal / 350))
+    size = max(11, round(14 * (diagonal / 800) ** 0.75))  # less than in proportion: large pictures have room to zoom in
+
+    pixels = color.copy()
+    for mask, paint in zip(masks, paints, strict=True):
+        _outline(pixels, mask, paint, thickness)
+    picture = Image.fromarray(pixels)
+    _write_labels(picture, labels != 0, masks, paints, [_text(a) for a in answers], size)
+    with replacing(path) as temporary:
+        picture.save(temporary, format="PNG")
+
+
+def _paints(answers: Sequence[Recognition]) -> list[tuple[int, int, int]]:
+    recognized = np.cumsum([answer.name is not None for answer in answers])
+    return [
+        UNRECOGNIZED if answer.name is None else COLORS[(int(count) - 1) % len(COLORS)]
+        for answer, count in zip(answers, recognized, strict=True)
+    ]
+
+
+def _text(answer: Recognition) -> str:
+    occluded = ["occluded"] if answer.occluded else []
+    if answer.name is None:
+        return "\n".join(["unrecognized", *occluded])
+    sure = "" if answer.confidence is None else f" {answer.confidence:.2f}"
+    surest = [] if answer.classifier is None else [answer.classifier.upper()]
+    return f"{answer.name}{sure}\n{', '.join(surest + occluded)}".rstrip()
+
+
+def _cut_out(labels: NDArray[Any], label: int) -> _Mask:
+    mask = labels == label
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    if label == 0 or not len(rows):
+        raise InputError(f"answers: label {label} is no instance of labels")
+    box = _Box(int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1)
+    return _Mask(box, np.pad(mask[box.top : box.bottom, box.left : box.right], 1))
+
+
+def _eroded(mask: NDArray[np.bool_], steps: int) -> NDArray[np.bool_]:
+    """The mask without its outermost `steps` layers of 4-neighbours; its margin must be empty."""
+    for _ in range(steps):
+        inner = np.zeros_like(mask)
+        inner[1:-1, 1:-1] = mask[1:-1, 1:-1] & mask[:-2, 1:-1] & mask[2:, 1:-1] & mask[1:-1, :-2] & mask[1:-1, 2:]
+        mask = inner
+    return mask
+
+
+def _outline(pixels: NDArray[np.uint8], mask: _Mask, paint: tuple[int, int, int], thickness: int) -> None:
+    """Draw a coloured line along the mask's edge, inside; along that a thin black or white one."""
+    left, top, right, bottom = mask.box
+    within = _eroded(mask.pixels, thickness)
+    core = _eroded(within, max(1, thickness // 3))
+    target = pixels[top:bottom, left:right]
+    target[(mask.pixels & ~within)[1:-1, 1:-1]] = paint
+    target[(within & ~core)[1:-1, 1:-1]] = _ink(paint)
+
+
+def _ink(paint: tuple[int, int, int]) -> tuple[int, int, int]:
+    """Black or white, whichever stands out better against a colour."""
+    red, green, blue = paint
+    return (0, 0, 0) if 0.299 * red + 0.587 * green + 0.114 * blue > 100 else (255, 255, 255)
+
+
+def _write_labels(
+    picture: Image.Image,
+    instances: NDArray[np.bool_],
+    masks: Sequence[_Mask],
+    paints: Sequence[tuple[int, int, int]],
+    texts: Sequence[str],
+    size: int,
+) -> None:
+    draw = ImageDraw.Draw(picture)
+    covered = np.pad(instances, ((1, 0), (1, 0))).cumsum(axis=0, dtype=np.int32).cumsum(axis=1, dtype=np.int32)
+    placed: list[tuple[_Box, _Lettering, tuple[int, int, int]]] = []
+    for mask, paint, text in zip(masks, paints, texts, strict=True):
+        lettering = _fitting(draw, text, size, picture.size)
+        if lettering is not None:
+            box = _place(lettering, mask.box, [other for other, _, _ in placed], covered)
+            placed.append((box, lettering, paint))
+            _leader(draw, box, mask, paint, max(1, size // 7))
+    for box, lettering, paint in placed:  # after all leaders, which may cross the place of a label
+        draw.rectangle((box.left, box.top, box.right - 1, box.bottom - 1), fill=paint)
+        start = box.left + lettering.start[0], box.top + lettering.start[1]
+        draw.multiline_text(start, lettering.text, _ink(paint), lettering.font, spacing=lettering.spacing)
+
+
+def _fitting(draw: ImageDraw.ImageDraw, text: str, size: int, room: tuple[int, int]) -> _Lettering | None:
+    """The text in letters of `size`, or in the largest smaller ones that `room` (width, height) holds; None if none."""
+    for letters in range(size, _SMALLEST - 1, -1):
+        font, padding = _font(letters), letters // 4
+        left, top, right, bottom = draw.multiline_textbbox((0, 0), text, font, spacing=padding)
+        width, height = math.ceil(right - left) + 2 * padding, math.ceil(bottom - top) + 2 * padding
+        if width <= room[0] and height <= room[1]:
+            return _Lettering(text, font, letters, padding, (padding - left, padding - top), width, height)
+    return None
+
+
+@functools.lru_cache(maxsize=32)
+def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    return ImageFont.load_default(size)
+
+
+def _place(lettering: _Lettering, target: _Box, placed: Sequence[_Box], covered: NDArray[np.int32]) -> _Box:
+    """The best place of a grid over the picture: clear of other labels, near its instance, hiding little of any."""
+    rows, columns = covered.shape[0] - 1, covered.shape[1] - 1
+    letters, width, height = lettering.size, lettering.width, lettering.height
+    top, left = (
+        np.unique(np.append(np.arange(0, room + 1, max(1, letters // 2)), room))
+        for room in (rows - height, columns - width)
+    )
+    top = top[:, None]
+    right, bottom = left + width, top + height
+    gap_x = np.maximum(0, np.maximum(left - target.right, target.left - right))
+    gap_y = np.maximum(0, np.maximum(top - target.bottom, target.top - bottom))
+    off_centre = np.hypot(left + right - target.left - target.right, top + bottom - target.top - target.bottom)
+    hidden = covered[bottom, right] - covered[top, right] - covered[bottom, left] + covered[top, left]
+    # In heights of a letter: to hide an instance under a tenth of the label is as bad as to lie four away from it.
+    cost = np.hypot(gap_x, gap_y) / letters + off_centre / (10 * letters) + 40 * hidden / (width * height)
+    for other in placed:
+        shared_x = np.minimum(right, other.right + 2) - np.maximum(left, other.left - 2)
+        shared_y = np.minimum(bottom, other.bottom + 2) - np.maximum(top, other.top - 2)
+        # Far more than the rest can add up to: labels overlap only where every place does.
+        cost += 1000 * np.maximum(0, shared_x) * np.maximum(0, shared_y)
+    i, j = np.unravel_index(np.argmin(cost), cost.shape)
+    x, y = int(left[j]), int(top[i, 0])
+    return _Box(x, y, x + width, y + height)
+
+
+def _leader(draw: ImageDraw.ImageDraw, box: _Box, mask: _Mask, paint: tuple[int, int, int], thickness: int) -> None:
+    """A line from a label that lies beside its instance to the nearest pixel of it."""
+    row, column = np.nonzero(mask.pixels)
+    row, column = row + mask.box.top - 1, column + mask.box.left - 1
+    from_row, from_column = np.clip(row, box.top, box.bottom - 1), np.clip(column, box.left, box.right - 1)
+    nearest = np.argmin((row - from_row) ** 2 + (column - from_column) ** 2)
+    start = int(from_column[nearest]), int(from_row[nearest])
+    end = int(column[nearest]), int(row[nearest])
+    if start != end:
+        draw.line((start, end), fill=paint, width=thickness)

@@ -1,0 +1,110 @@
+"""Masks a few pixels too small or too large: the outermost points are missing, or some of the background's are there.
+
+The background is a plane: the table, or a wall behind. Past the outline only what is near the object in depth is added.
+The rest, a strip a few millimetres wide, is what outlier removal in recognition drops, as strays or as a small piece.
+"""
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation, binary_erosion, maximum_filter
+
+from thor2_jax.recognition.frames import Intrinsics
+from thor2_jax.recognition.outlier_removal import CELL
+from training.augmentation.pixels import FRAME_PIXEL, pixel_width, without
+from training.augmentation.settings import Range, check_fields
+from training.rendering.ray_caster import TRAINING_CAMERA, RenderedView
+
+__all__ = ["Segmentation", "resegmented"]
+
+NEAR = 2 * CELL
+"""Metres behind the object within which background remains: cells that touch are one piece for outlier removal."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Segmentation:
+    """A mask's error, drawn once a view.
+
+    Attributes:
+        pixels: of a frame that the mask reaches past the outline; below 0 it stays inside.
+        tilt: degrees between the background's normal and the camera's axis.
+        touching: share of backgrounds that touch what is seen of the object, as the table does; others are farther.
+        gap: metres between object and background where they do not touch.
+
+    Raises:
+        InputError: a value outside its limits.
+    """
+
+    pixels: Range = (-3.0, 3.0)
+    tilt: Range = (0.0, 70.0)
+    touching: float = 0.7
+    gap: Range = (0.0, 0.5)
+
+    def __post_init__(self) -> None:
+        check_fields(self, pixels=(-50, 50), tilt=(0, 75), touching=(0, 1), gap=(0, 10))
+
+
+def resegmented(view: RenderedView, segmentation: Segmentation, rng: np.random.Generator) -> RenderedView:
+    """The view in a mask with an error drawn from `segmentation`. An eroded mask keeps half of the pixels at least."""
+    seen = view.depth > 0
+    if not seen.any():
+        return view
+    steps = round(rng.uniform(*segmentation.pixels) * FRAME_PIXEL / pixel_width(view))
+    return _dilated(view, steps, segmentation, rng) if steps > 0 else _eroded(view, seen, -steps)
+
+
+def _eroded(view: RenderedView, seen: NDArray[np.bool_], steps: int) -> RenderedView:
+    mask, count = seen, int(seen.sum())
+    for _ in range(steps):
+        smaller = binary_erosion(mask)
+        if 2 * int(smaller.sum()) < count:
+            break
+        mask = smaller
+    return without(view, np.flatnonzero(seen & ~mask))
+
+
+def _dilated(view: RenderedView, steps: int, segmentation: Segmentation, rng: np.random.Generator) -> RenderedView:
+    view = _widened(view, steps)
+    seen = view.depth > 0
+    plane = _background(view, seen, segmentation, rng)
+    added = binary_dilation(seen, iterations=steps) & ~seen & (plane > 0)
+    added &= plane <= maximum_filter(view.depth, 2 * steps + 1) + 1000 * NEAR
+    color, depth = view.color.copy(), view.depth.copy()
+    color[added] = rng.integers(0, 256, 3)
+    depth[added] = plane[added]
+    return dataclasses.replace(view, color=color, depth=depth)
+
+
+def _widened(view: RenderedView, margin: int) -> RenderedView:
+    """The view with a margin on all sides, as far as the training camera's image goes."""
+    camera, k = TRAINING_CAMERA, view.intrinsics
+    sides = []
+    for first, length, size in zip(view.corner, view.depth.shape, (camera.height, camera.width), strict=True):
+        sides.append((min(margin, first), max(0, min(margin, size - first - length))))
+    (top, _), (left, _) = sides
+    return RenderedView(
+        np.pad(view.color, (*sides, (0, 0))),
+        np.pad(view.depth, sides),
+        Intrinsics(k.fx, k.fy, k.cx + left, k.cy + top, k.depth_scale),
+        view.pose,
+        (view.corner[0] - top, view.corner[1] - left),
+    )
+
+
+def _background(
+    view: RenderedView, seen: NDArray[np.bool_], segmentation: Segmentation, rng: np.random.Generator
+) -> NDArray[np.uint16]:
+    """Depth [h, w] of a plane behind the object, millimetres; 0 where the plane is not seen."""
+    tilt, azimuth = np.radians(rng.uniform(*segmentation.tilt)), rng.uniform(0, 2 * np.pi)
+    gap = 0.0 if rng.random() < segmentation.touching else rng.uniform(*segmentation.gap)
+    k, (height, width) = view.intrinsics, view.depth.shape
+    # n . ray: negative where the plane faces the camera; n . point is this times the depth.
+    facing = (
+        np.sin(tilt) * np.cos(azimuth) * (np.arange(width) - k.cx) / k.fx
+        + (np.sin(tilt) * np.sin(azimuth) * (np.arange(height) - k.cy) / k.fy)[:, None]
+        - np.cos(tilt)
+    )
+    offset = (facing[seen] * view.depth[seen]).min() - 1000 * gap
+    depth = offset / np.minimum(facing, -1e-3)
+    return np.where(depth < 65535, np.rint(depth), 0).astype(np.uint16)

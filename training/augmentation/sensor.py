@@ -1,0 +1,100 @@
+"""Depth as a consumer camera gives it: axial and lateral noise, missing and flying pixels, in steps of 1 mm.
+
+The standard deviation along the axis is at most 1.2 mm + 1.9 mm (z / m - 0.4)^2, across it 0.8 pixels (Nguyen, Izadi
+and Lovell, "Modeling Kinect sensor noise for improved 3D reconstruction and tracking", 3DIMPVT 2012).
+"""
+
+import dataclasses
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from training.augmentation.pixels import FRAME_PIXEL, pixel_width, without
+from training.augmentation.settings import Range, check_fields
+from training.rendering.ray_caster import RenderedView
+
+__all__ = ["Sensor", "axial_deviation", "sensed"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Sensor:
+    """A depth camera at a distance drawn once a view.
+
+    Attributes:
+        distance: metres for which noise is drawn: where frames show objects, not where the training camera stands.
+        axial: factor of `axial_deviation`, drawn once a view. Within a centimetre real frames have 0.4 to 0.55 of it.
+        lateral: standard deviation in pixels of a frame, along rows and along columns, of where depth is sampled.
+        grazing: degrees from facing the camera from which on a surface counts as an edge.
+        missing: share of pixels without depth on edges: outlines, steps in depth and surfaces that steep.
+        flying: share of the others on edges whose depth lies between the surface's and the background's.
+        background: metres behind the object, drawn once a view.
+
+    Raises:
+        InputError: a value outside its limits.
+    """
+
+    distance: Range = (0.6, 1.2)
+    axial: Range = (0.3, 1.0)
+    lateral: float = 0.8
+    grazing: float = 78.0
+    missing: float = 0.3
+    flying: float = 0.3
+    background: Range = (0.1, 1.0)
+
+    def __post_init__(self) -> None:
+        check_fields(
+            self,
+            distance=(0.2, 5),
+            axial=(0, 10),
+            lateral=(0, 10),
+            grazing=(45, 89),
+            missing=(0, 1),
+            flying=(0, 1),
+            background=(0, 10),
+        )
+
+
+def axial_deviation(z: float) -> float:
+    """Standard deviation of depth at a distance z, both in metres (Nguyen, Izadi and Lovell 2012)."""
+    return 0.0012 + 0.0019 * (z - 0.4) ** 2
+
+
+def sensed(view: RenderedView, sensor: Sensor, rng: np.random.Generator) -> RenderedView:
+    """The view as a camera drawn from `sensor` measures it."""
+    pixels = np.flatnonzero(view.depth)
+    n = len(pixels)
+    if n == 0:
+        return view
+    deviation = rng.uniform(*sensor.axial) * axial_deviation(rng.uniform(*sensor.distance))
+    behind = rng.uniform(*sensor.background)
+    width = pixel_width(view)
+    lateral = sensor.lateral * FRAME_PIXEL / width
+    # Nothing is seen around the view, so that its border is an edge and samples fall there.
+    margin = 1 + math.ceil(4 * lateral)
+    depth = np.pad(view.depth, margin).astype(np.float32)
+    edge = _edges(depth, 1000 * width * math.tan(math.radians(sensor.grazing)))
+    shift = np.rint(np.float32(lateral) * rng.standard_normal((2, n), np.float32)).clip(-margin, margin)
+    row, column = np.divmod(pixels, view.depth.shape[1])
+    at = (row + margin) * depth.shape[1] + column + margin
+    at += (shift[0] * depth.shape[1] + shift[1]).astype(np.intp)
+    found, on_edge = depth.take(at), np.flatnonzero(edge.take(at))
+    lost = found == 0
+    chance = rng.random((2, len(on_edge)), np.float32)
+    lost[on_edge[chance[0] < sensor.missing]] = True
+    mixed = on_edge[chance[1] < sensor.flying]
+    found[mixed] += np.float32(1000 * behind) * rng.random(len(mixed), np.float32)
+    found += np.float32(1000 * deviation) * rng.standard_normal(n, np.float32)
+    measured = view.depth.copy()
+    measured.reshape(-1)[pixels] = np.rint(found).clip(1, 65535).astype(np.uint16)
+    return without(dataclasses.replace(view, depth=measured), pixels[lost])
+
+
+def _edges(depth: NDArray[np.float32], step: float) -> NDArray[np.bool_]:
+    """Pixels from which the depth beside differs by more than `step`; beside nothing it does."""
+    edge = np.zeros(depth.shape, bool)
+    for here, beside in ((edge, depth), (edge.T, depth.T)):
+        far = np.abs(np.diff(beside, axis=0)) > step
+        here[1:] |= far
+        here[:-1] |= far
+    return edge

@@ -1,0 +1,43 @@
+"""What a training consists of, from views to step sizes: the paper's, and the one that names more objects."""
+
+import dataclasses
+
+from training.augmentation import Illumination, Occlusion, Segmentation, Sensor, Variations
+from training.fitting.fit import FitOptions
+from training.fitting.samples import MIRRORS, PAPER_MIRRORS
+
+__all__ = ["DEFAULT", "PAPER", "Protocol"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Protocol:
+    """A training protocol.
+
+    Attributes:
+        azimuth_step: degrees between cameras around the object.
+        polar_step: degrees between cameras from pole to pole.
+        variations: varied copies of each view; None makes none.
+        mirrors: in which each view is used.
+        fit: how a classifier is fitted.
+    """
+
+    azimuth_step: float
+    polar_step: float
+    variations: Variations | None
+    mirrors: tuple[str, ...]
+    fit: FitOptions
+
+
+DEFAULT = Protocol(
+    azimuth_step=20.0,
+    polar_step=15.0,
+    variations=Variations(Illumination(), Sensor(), Occlusion(), Segmentation()),
+    mirrors=MIRRORS,
+    fit=FitOptions(epochs=24, batch_size=256),
+)
+"""Fewer views than the paper's, each also twice under another light, partly hidden and as a depth camera sees it."""
+
+PAPER = Protocol(
+    azimuth_step=5.0, polar_step=5.0, variations=None, mirrors=PAPER_MIRRORS, fit=FitOptions(epochs=100, batch_size=128)
+)
+"""Paper, section "Training": 72 x 37 views of an object, four mirrors, 100 epochs."""

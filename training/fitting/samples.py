@@ -1,0 +1,220 @@
+"""Training samples: normalized views, mirrored and cut into strips (paper, section "Training").
+
+    samples = build_samples(ViewDataset.open("views"), network, config)
+    batch = samples.take(np.arange(256))                                  # padded, to be handed to a device
+    strips = expand(batch, region_sets(network).weights, config)          # there, under jit
+
+A sample is kept as what its descriptor is made of: the length of each strip that has points, and how many of the
+strip's points have each set of colour regions; some hundred bytes in place of the 48 kB of TOPS2.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from colornet import ColorNetwork
+from thor2_jax.config import DescriptorConfig
+from thor2_jax.descriptor.color_membership import RegionSets, region_sets
+from thor2_jax.descriptor.describe import strips_by_sets
+from thor2_jax.descriptor.view_normalization import mirror, turn
+from thor2_jax.errors import InputError
+from thor2_jax.types import Strips
+from training.views.normalized_views import padded_batches
+from training.views.source import ViewSource
+
+__all__ = ["MIRRORS", "PAPER_MIRRORS", "Batch", "Samples", "build_samples", "expand"]
+
+MIRRORS = ("", "x")
+"""Mirrors of a normalized view with different descriptors: a mirror in y changes no strip's length and no count."""
+
+PAPER_MIRRORS = ("", "x", "y", "xy")
+"""The paper uses each view four times."""
+
+CHUNK = 64
+"""Views computed together."""
+
+PADDING = np.iinfo(np.uint16).max
+"""Stands for no strip."""
+
+
+class Batch(NamedTuple):
+    """B samples, padded to the same numbers E of strips and C of colour counts; `expand` makes strips of them.
+
+    Attributes:
+        strip: [B, E] uint16, slice x n_strips + strip; PADDING past the sample's last.
+        length: [B, E] float32, greatest less least y of the strip, scaled units.
+        color_strip: [B, C] uint16, strip of a count; PADDING past the sample's last.
+        color_set: [B, C] uint16, the set of regions that is counted.
+        color_count: [B, C] float32, points of the strip with that set (weights, if the config relaxes the descriptor).
+        label: [B] int32.
+    """
+
+    strip: Any
+    length: Any
+    color_strip: Any
+    color_set: Any
+    color_count: Any
+    label: Any
+
+
+@dataclasses.dataclass(frozen=True)
+class Samples:
+    """Training samples in compact form, host arrays. The fields are those of `Batch`, all samples' one after another.
+
+    Attributes:
+        strip_start: [M + 1] int64, where each sample's part of `strip` and `length` begins; the last is their end.
+        color_start: [M + 1] int64, the same for the colour counts.
+        strip: [T] uint16.
+        length: [T] float32.
+        color_strip: [U] uint16.
+        color_set: [U] uint16.
+        color_count: [U] float32.
+        label: [M] int32, index into `classes`.
+        view: [M] int32, the view of its object that a sample is of; its mirrored and varied copies share the number.
+        classes: class names.
+    """
+
+    strip_start: NDArray[np.int64]
+    color_start: NDArray[np.int64]
+    strip: NDArray[np.uint16]
+    length: NDArray[np.float32]
+    color_strip: NDArray[np.uint16]
+    color_set: NDArray[np.uint16]
+    color_count: NDArray[np.float32]
+    label: NDArray[np.int32]
+    view: NDArray[np.int32]
+    classes: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.label)
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of all arrays."""
+        return sum(a.nbytes for a in vars(self).values() if isinstance(a, np.ndarray))
+
+    @functools.cached_property
+    def _most(self) -> tuple[int, int]:
+        return int(np.diff(self.strip_start).max()), int(np.diff(self.color_start).max())
+
+    def take(self, rows: NDArray[np.integer[Any]]) -> Batch:
+        """The samples of these numbers. The padded sizes are the largest of all samples, whatever the rows."""
+        strips, in_strips = _entries(self.strip_start, rows, self._most[0])
+        colors, in_colors = _entries(self.color_start, rows, self._most[1])
+        return Batch(
+            strip=np.where(in_strips, self.strip[strips], PADDING),
+            length=self.length[strips],
+            color_strip=np.where(in_colors, self.color_strip[colors], PADDING),
+            color_set=self.color_set[colors],
+            color_count=self.color_count[colors],
+            label=self.label[rows],
+        )
+
+
+def _entries(
+    start: NDArray[np.int64], rows: NDArray[np.integer[Any]], most: int
+) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Places [B, most] of the rows' entries, and which are no padding."""
+    place = start[rows, None] + np.arange(most)
+    inside = place < start[rows + 1, None]
+    return np.where(inside, place, 0), inside
+
+
+def build_samples(
+    source: ViewSource,
+    network: ColorNetwork,
+    config: DescriptorConfig,
+    progress: Callable[[int], object] = lambda n: None,
+    mirrors: Sequence[str] = MIRRORS,
+) -> Samples:
+    """Mirror every view and keep its strips; one shard of views is in memory at a time.
+
+    Args:
+        source: of normalized views.
+        network: gives the colour regions.
+        config: static.
+        progress: called with the number of views done since the last call.
+        mirrors: each in the letters of its axes; a sample each.
+
+    Raises:
+        InputError: fewer than two classes, a class without views, or a file of the source that cannot be read.
+    """
+    if len(source.classes) < 2:
+        raise InputError(f"there are views of {len(source.classes)} classes; a classifier needs at least two")
+    for label, name in enumerate(source.classes):
+        if not any(shard.label == label and shard.views for shard in source.shards):
+            raise InputError(f"class {name!r} has no views")
+    sets = region_sets(network)
+    # With one "region" a set, a colour vector counts sets: few entries of it are not zero, and they are whole numbers.
+    counting = RegionSets(sets.of_color, jnp.eye(len(sets.weights)))
+    parts: list[dict[str, NDArray[Any]]] = []
+    for index, shard in enumerate(source.shards):
+        views = source.read(index)
+        done = 0
+        for count, normal in padded_batches(views.clouds(), CHUNK):
+            for axes in mirrors:
+                found = strips_by_sets(turn(mirror(normal, axes), config), counting, config)
+                part = _compact(jax.tree.map(lambda a: np.asarray(a)[:count], found))  # noqa: B023
+                part["label"] = np.full(count, shard.label, np.int32)
+                parts.append(part | {"view": views.view[done : done + count]})
+            done += count
+            progress(count)
+    fields = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    for name in ("strip", "color"):
+        fields[f"{name}_start"] = np.concatenate([[0], np.cumsum(fields.pop(f"{name}_entries"), dtype=np.int64)])
+    return Samples(classes=tuple(source.classes), **fields)
+
+
+def _compact(strips: Strips) -> dict[str, NDArray[Any]]:
+    n_samples = len(strips.low)
+    occupied = np.asarray(strips.occupied).reshape(n_samples, -1)
+    counts = np.asarray(strips.color).reshape(*occupied.shape, -1)
+    sample, strip = np.nonzero(occupied)
+    # Looked for in occupied strips alone, a tenth of all.
+    entry, color_set = np.nonzero(counts[sample, strip])
+    return {
+        "strip": strip.astype(np.uint16),
+        "length": (strips.high - strips.low).reshape(n_samples, -1)[sample, strip],
+        "strip_entries": occupied.sum(axis=1),
+        "color_strip": strip[entry].astype(np.uint16),
+        "color_set": color_set.astype(np.uint16),
+        "color_count": counts[sample[entry], strip[entry], color_set],
+        "color_entries": np.bincount(sample[entry], minlength=n_samples),
+    }
+
+
+def expand(batch: Batch, set_weights: jax.Array, config: DescriptorConfig) -> Strips:
+    """Strips of a batch's samples, fields [B, S, J] and [B, S, J, R], for `describe_strips`; to be called under jit.
+
+    Args:
+        batch: from `Samples.take`.
+        set_weights: [K, R], region weights of each set (`RegionSets.weights`).
+        config: static.
+
+    Returns:
+        `low` is 0 and `high` the length of a strip: descriptors depend on no more. `overflow` is not kept, and 0.
+    """
+    shape = config.n_slices, config.n_strips
+    n_strips, n_regions = shape[0] * shape[1], set_weights.shape[1]
+
+    def one(sample: Batch) -> Strips:
+        # What is past the end, as padding is, is dropped.
+        high = jnp.zeros(n_strips, jnp.float32).at[sample.strip].set(sample.length, mode="drop")
+        occupied = jnp.zeros(n_strips, bool).at[sample.strip].set(True, mode="drop")
+        weights = sample.color_count[:, None] * set_weights[sample.color_set]
+        color = jnp.zeros((n_strips, n_regions), jnp.float32).at[sample.color_strip].add(weights, mode="drop")
+        return Strips(
+            low=jnp.zeros(shape, jnp.float32),
+            high=high.reshape(shape),
+            occupied=occupied.reshape(shape),
+            color=color.reshape(*shape, n_regions),
+            overflow=jnp.zeros((), jnp.int32),
+        )
+
+    return jax.vmap(one)(batch)

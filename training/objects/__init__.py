@@ -1,0 +1,1 @@
+"""Objects to train on: meshes from files, and the built-in objects."""

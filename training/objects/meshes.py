@@ -1,0 +1,336 @@
+"""Scanned meshes: reading GLB, OBJ and PLY files, the colour at a point of the surface, finding them in a folder."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from PIL import Image
+from trimesh.visual.material import PBRMaterial, SimpleMaterial, empty_material
+
+from thor2_jax.errors import InputError
+from thor2_jax.recognition.frames import MOST_PIXELS
+from training.storage.tables import parse_json, parse_yaml
+
+__all__ = ["MESH_SUFFIXES", "TexturedMesh", "find_meshes", "load_mesh", "merge_meshes", "read_names"]
+
+MESH_SUFFIXES = (".glb", ".obj", ".ply")
+
+LARGEST = 2.0
+SMALLEST = 0.001
+"""Plausible longest side of an object, metres: a scan in millimetres falls outside, and the camera stays outside it."""
+
+FARTHEST = 2**23
+"""Of a texture coordinate: past it float32 has whole numbers alone, which tell no place in the image."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TexturedMesh:
+    """A coloured triangle mesh. Colours are sRGB as stored in the file, unlit.
+
+    Painted either with textures (`uv`, `textures`, `face_texture`) or with colours at the faces' corners
+    (`corner_colors`); the other kind is None or empty.
+
+    Attributes:
+        vertices: [V, 3] float64, metres.
+        faces: [F, 3] int32.
+        uv: [F, 3, 2] float32, per corner, origin at the image's lower left, repeating outside [0, 1]; or None.
+        textures: images [h, w, 3] uint8.
+        face_texture: [F] int32, index into `textures`; or None.
+        corner_colors: [F, 3, 3] uint8; or None.
+    """
+
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.int32]
+    uv: NDArray[np.float32] | None = None
+    textures: tuple[NDArray[np.uint8], ...] = ()
+    face_texture: NDArray[np.int32] | None = None
+    corner_colors: NDArray[np.uint8] | None = None
+
+    @property
+    def centre(self) -> NDArray[np.float64]:
+        """Centre of the axis-aligned bounding box [3], metres: what a training camera looks at."""
+        return (self.vertices.min(axis=0) + self.vertices.max(axis=0)) / 2
+
+    def transformed(self, matrix: NDArray[np.float64]) -> "TexturedMesh":
+        """The mesh moved by a homogeneous matrix [4, 4]; the paint is shared."""
+        return dataclasses.replace(self, vertices=self.vertices @ matrix[:3, :3].T + matrix[:3, 3])
+
+    def colors_at(self, face: NDArray[np.integer], barycentric: NDArray[np.floating]) -> NDArray[np.uint8]:
+        """SRGB colours of points on the surface.
+
+        Textures are read at the nearest texel: in a training view a pixel spans several texels, so that bilinear
+        weights change nothing that the voxel mean keeps, and a mix across the border of a chart would bring in colours
+        the object does not have.
+
+        Args:
+            face: [n] integer, index into `faces`.
+            barycentric: [n, 2], weights of the face's second and third corner.
+
+        Returns:
+            [n, 3] uint8.
+        """
+        second, third = barycentric[:, :1], barycentric[:, 1:]
+        if self.corner_colors is not None:
+            a, b, c = np.moveaxis(self.corner_colors[face].astype(np.float32), 1, 0)
+            return np.rint(a + second * (b - a) + third * (c - a)).clip(0, 255).astype(np.uint8)
+        assert self.uv is not None and self.face_texture is not None
+        a, b, c = np.moveaxis(self.uv[face], 1, 0)
+        uv = a + second * (b - a) + third * (c - a)
+        if len(self.textures) == 1:
+            return _nearest_texel(self.textures[0], uv)
+        colors = np.zeros((len(face), 3), np.uint8)
+        texture = self.face_texture[face]
+        for index in np.unique(texture):
+            here = texture == index
+            colors[here] = _nearest_texel(self.textures[index], uv[here])
+        return colors
+
+
+def _nearest_texel(image: NDArray[np.uint8], uv: NDArray[np.floating]) -> NDArray[np.uint8]:
+    height, width = image.shape[:2]
+    column = np.floor(uv[:, 0] * width).astype(np.int64) % width
+    row = np.floor((1 - uv[:, 1]) * height).astype(np.int64) % height
+    return image[row, column]
+
+
+def merge_meshes(parts: Sequence[TexturedMesh]) -> TexturedMesh:
+    """One mesh of several, in the same frame.
+
+    Raises:
+        InputError: some parts have textures and others corner colours.
+    """
+    if len(parts) == 1:
+        return parts[0]
+    offsets = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
+    vertices = np.concatenate([part.vertices for part in parts])
+    faces = np.concatenate([part.faces + offset for part, offset in zip(parts, offsets, strict=True)]).astype(np.int32)
+    colors = [part.corner_colors for part in parts if part.corner_colors is not None]
+    if len(colors) == len(parts):
+        return TexturedMesh(vertices, faces, corner_colors=np.concatenate(colors))
+    if colors:
+        raise InputError("some parts of the mesh have textures and others colours at vertices; bake them into one kind")
+    first = np.cumsum([0, *(len(part.textures) for part in parts[:-1])])
+    return TexturedMesh(
+        vertices,
+        faces,
+        uv=np.concatenate([part.uv for part in parts if part.uv is not None]),
+        textures=tuple(texture for part in parts for texture in part.textures),
+        face_texture=np.concatenate(
+            [part.face_texture + k for part, k in zip(parts, first, strict=True) if part.face_texture is not None]
+        ).astype(np.int32),
+    )
+
+
+def _solid(vertices: NDArray[np.float64], faces: NDArray[np.int32], color: NDArray[np.uint8]) -> TexturedMesh:
+    return TexturedMesh(
+        vertices,
+        faces,
+        uv=np.zeros((len(faces), 3, 2), np.float32),
+        textures=(color.reshape(1, 1, 3),),
+        face_texture=np.zeros(len(faces), np.int32),
+    )
+
+
+def _part(geometry: trimesh.Trimesh) -> TexturedMesh:
+    """One geometry of a file.
+
+    Raises:
+        InputError: it has no colour, or one that would fill memory; or faces that name other vertices than its own.
+    """
+    vertices, faces = np.asarray(geometry.vertices, np.float64), np.asarray(geometry.faces, np.int32)
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise InputError("faces that name vertices it does not have")
+    visual: Any = geometry.visual
+    if visual.kind == "vertex":
+        return TexturedMesh(vertices, faces, corner_colors=np.asarray(visual.vertex_colors, np.uint8)[faces, :3])
+    if visual.kind == "face":
+        colors = np.asarray(visual.face_colors, np.uint8)[:, None, :3]
+        return TexturedMesh(vertices, faces, corner_colors=np.repeat(colors, 3, axis=1))
+    if visual.kind != "texture":
+        raise InputError("no texture and no vertex colours")
+    material = visual.material
+    if isinstance(material, PBRMaterial):
+        image, factor = material.baseColorTexture, material.baseColorFactor
+    elif isinstance(material, SimpleMaterial):
+        image, factor = material.image, None if material.image is not None else material.diffuse
+        if not material.kwargs and image is not None and np.array_equal(image, empty_material().image):
+            raise InputError("texture coordinates, but no material with a texture or a colour")
+    else:
+        raise InputError(f"unsupported material {type(material).__name__}")
+    factor = np.full(3, 255, np.uint8) if factor is None else np.asarray(factor, np.uint8)[:3]
+    if image is None or visual.uv is None:
+        return _solid(vertices, faces, factor)
+    if isinstance(image, Image.Image) and image.width * image.height > MOST_PIXELS:
+        raise InputError(f"a texture of {image.width} x {image.height} pixels; at most {MOST_PIXELS} are read")
+    texture = np.asarray(image.convert("RGB") if isinstance(image, Image.Image) else image, np.uint8)
+    if (factor < 255).any():
+        texture = np.rint(texture * (factor / 255.0)).astype(np.uint8)
+    uv = np.asarray(visual.uv, np.float32)[faces]
+    return TexturedMesh(vertices, faces, uv=uv, textures=(texture,), face_texture=np.zeros(len(faces), np.int32))
+
+
+def _check(mesh: TexturedMesh) -> None:
+    """Hold what a parser made of a file to what `TexturedMesh` says of itself, and to the size of an object.
+
+    Raises:
+        InputError: it is something else.
+    """
+    vertices, faces, n = mesh.vertices, mesh.faces, len(mesh.faces)
+    shapes: list[tuple[str, NDArray[Any] | None, tuple[int, ...]]] = [
+        ("vertices", vertices, (len(vertices), 3)),
+        ("faces", faces, (n, 3)),
+        ("texture coordinates", mesh.uv, (n, 3, 2)),
+        ("colours", mesh.corner_colors, (n, 3, 3)),
+        *(("a texture", texture, (*texture.shape[:2], 3)) for texture in mesh.textures),
+    ]
+    for name, array, shape in shapes:
+        if array is not None and array.shape != shape:
+            raise InputError(f"{name} of the shape {array.shape}; expected {shape}")
+    if not np.isfinite(vertices).all():
+        raise InputError(f"{(~np.isfinite(vertices)).any(axis=1).sum()} vertices are not finite")
+    if mesh.uv is not None and not (np.abs(mesh.uv) <= FARTHEST).all():
+        raise InputError(f"texture coordinates are not finite, or past {FARTHEST}")
+    longest = float(np.ptp(vertices[np.unique(faces)], axis=0).max())
+    if not SMALLEST <= longest <= LARGEST:
+        raise InputError(f"longest side {longest:g}; expected {SMALLEST:g} to {LARGEST:g} metres")
+
+
+def _check_obj_references(path: Path) -> None:
+    """An OBJ file without its material or texture would load as grey: name the missing file instead.
+
+    Raises:
+        InputError: a file that `path` refers to is missing.
+    """
+
+    def arguments(file: Path, keyword: str) -> list[str]:
+        lines = file.read_text(encoding="utf-8", errors="replace").splitlines()
+        return [line.split(None, 1)[1].strip() for line in lines if line.lower().startswith(keyword + " ")]
+
+    for library in arguments(path, "mtllib"):
+        if not (path.parent / library).is_file():
+            raise InputError(f"its material file {library!r} is missing")
+        for entry in arguments(path.parent / library, "map_kd"):
+            image = entry.split()[-1] if entry.startswith("-") else entry
+            if not (path.parent / image).is_file():
+                raise InputError(f"its texture {image!r} is missing")
+
+
+def load_mesh(path: str | Path) -> TexturedMesh:
+    """Read a GLB, OBJ or PLY file with a texture, vertex colours, face colours or plain material colours.
+
+    Colours are taken as stored, as sRGB; a base colour factor multiplies its texture, or stands alone without one.
+
+    Raises:
+        InputError: the file is missing, unreadable, of another kind, without faces or colour, with vertices or
+            texture coordinates that are not finite or too far, or of no plausible size for an object in metres.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in MESH_SUFFIXES:
+        raise InputError(f"mesh {path}: the extension must be one of {', '.join(MESH_SUFFIXES)}")
+    if not path.is_file():
+        raise InputError(f"mesh {path}: no such file")
+    try:
+        if path.suffix.lower() == ".obj":
+            _check_obj_references(path)
+        # Unprocessed: otherwise vertices that are not finite would be dropped in silence.
+        loaded = trimesh.load_scene(path, process=False).dump(concatenate=False)
+        geometries = [part for part in loaded if isinstance(part, trimesh.Trimesh) and len(part.faces)]
+        if not geometries:
+            raise InputError("no faces")
+        mesh = merge_meshes([_part(geometry) for geometry in geometries])
+        _check(mesh)
+    except InputError as error:
+        raise InputError(f"mesh {path}: {error}") from error
+    # On a damaged file trimesh and the decoders of textures raise anything, and its arrays need not fit one another.
+    except Exception as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise InputError(f"mesh {path}: cannot be read ({reason})") from error
+    return mesh
+
+
+def _mesh_in(folder: Path) -> Path | None:
+    """The one mesh file in a folder: `textured.*` first, then the only GLB, then the only file; None if there is none.
+
+    Raises:
+        InputError: several, and no rule to choose by.
+    """
+    files = sorted(file for file in folder.iterdir() if file.is_file() and file.suffix.lower() in MESH_SUFFIXES)
+    named = [file for file in files if file.stem.lower() == "textured"]
+    binary = [file for file in named or files if file.suffix.lower() == ".glb"]
+    for choice in (files, named, binary):
+        if len(choice) == 1:
+            return choice[0]
+    if files:
+        raise InputError(
+            f"mesh folder {folder}: {len(files)} mesh files ({', '.join(f.name for f in files)}); keep one"
+        )
+    return None
+
+
+def find_meshes(folder: str | Path, names: Mapping[str, str] | None = None) -> dict[str, Path]:
+    """Object names to mesh files, sorted by name.
+
+    Args:
+        folder: holds `<scan>.glb` (or .obj, .ply) files, `<scan>/` folders with one mesh file each, or both.
+        names: object name -> scan (a folder's name or a file's stem). Without it every scan is an object under its own
+            name.
+
+    Raises:
+        InputError: the folder is missing or holds no mesh, a scan is there twice or is ambiguous, or `names` names
+            unknown scans.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(f"mesh folder {folder}: no such folder")
+    wanted = None if names is None else set(names.values())
+    scans: dict[str, Path] = {}
+    for entry in sorted(folder.iterdir()):
+        if entry.is_dir():
+            # A folder that nobody asked for may be in any state.
+            name, path = entry.name, _mesh_in(entry) if wanted is None or entry.name in wanted else None
+        else:
+            name, path = entry.stem, entry if entry.suffix.lower() in MESH_SUFFIXES else None
+        if path is None or (wanted is not None and name not in wanted):
+            continue
+        if name in scans:
+            raise InputError(f"mesh folder {folder}: scan {name!r} is there twice ({scans[name].name}, {path.name})")
+        scans[name] = path
+    if names is None:
+        if not scans:
+            raise InputError(f"mesh folder {folder}: no {', '.join(MESH_SUFFIXES)} file in it or in its folders")
+        return scans
+    if not names:
+        raise InputError("names is empty; at least one object is needed")
+    unknown = sorted(set(names.values()) - set(scans))
+    if unknown:
+        raise InputError(f"mesh folder {folder}: no mesh for {', '.join(unknown)}")
+    return {name: scans[names[name]] for name in sorted(names)}
+
+
+def read_names(path: str | Path) -> dict[str, str]:
+    """Read a table of object name -> scan from a JSON or YAML file.
+
+    Raises:
+        InputError: the file is missing, not JSON or YAML, empty, or not a flat table of strings.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in (".json", ".yaml", ".yml"):
+        raise InputError(f"names file {path}: the extension must be .json, .yaml or .yml")
+    try:
+        content = path.read_bytes()
+        table = parse_json(content) if suffix == ".json" else parse_yaml(content)
+    except OSError as error:
+        raise InputError(f"names file {path}: {error.strerror}") from error
+    except ValueError as error:
+        raise InputError(f"names file {path}: {error}") from error
+    if not isinstance(table, dict) or not table:
+        raise InputError(f"names file {path}: expected a table of object name: scan")
+    for name, scan in table.items():
+        if not (isinstance(name, str) and name and isinstance(scan, str) and scan):
+            raise InputError(f"names file {path}: expected a name and a scan, both strings, not {name!r}: {scan!r}")
+    return dict(table)

@@ -1,0 +1,1 @@
+"""Rendering: ray caster, view sphere, cluttered scenes."""

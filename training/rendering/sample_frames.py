@@ -1,0 +1,70 @@
+"""The sample frames of the service's page: scenes of the built-in objects, cut to the objects, as files.
+
+python -c "from training.rendering.sample_frames import write_sample_frames as w; w('thor2_jax/service/page/samples')"
+"""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from thor2_jax.recognition.frames import RGBDFrame
+from training.objects.builtin_objects import builtin_objects
+from training.rendering.scenes import compose_scene
+
+__all__ = ["write_sample_frames"]
+
+SAMPLES = (
+    ("crockery", "A laid table", 1, 6),
+    ("breakfast", "Mugs and a can in line", 3, 5),
+    ("tools", "Tools and a sponge", 4, 5),
+    ("clutter", "Seven close together", 6, 7),
+)
+"""Folder, title, seed and number of objects of each; picked by eye."""
+
+LIGHT = 0.2
+NOISE = 0.5
+"""Noise is most of a depth image's bytes; four samples stay within 400 kB."""
+
+MARGIN = 24
+"""Pixels around the objects."""
+
+LEAST_WIDTH = 400
+"""Pixels of a sample that is 3/4 as high."""
+
+
+def write_sample_frames(folder: str | Path) -> None:
+    """Write the frames and `index.json`, which lists them, over what is in `folder`.
+
+    Raises:
+        OSError: a file cannot be written.
+    """
+    folder, objects = Path(folder), builtin_objects()
+    for name, _, seed, n_objects in SAMPLES:
+        scene = compose_scene(objects, np.random.default_rng(seed), n_objects=n_objects, noise=NOISE, light=LIGHT)
+        _write(_cut(scene.frame), folder / name)
+    index = [{"folder": name, "title": title} for name, title, _, _ in SAMPLES]
+    (folder / "index.json").write_text(json.dumps(index, indent=1) + "\n")
+
+
+def _cut(frame: RGBDFrame) -> RGBDFrame:
+    rows, columns = (np.flatnonzero((frame.labels > 0).any(axis=axis)) for axis in (1, 0))
+    needed = max(np.ptp(columns) + 1, (np.ptp(rows) + 1) * 4 / 3) + 2 * MARGIN
+    height, width = frame.labels.shape
+    across = min(width, max(LEAST_WIDTH, 4 * round(needed / 4)))
+    down = across * 3 // 4
+    left = int(np.clip((columns[0] + columns[-1] - across) // 2, 0, width - across))
+    top = int(np.clip((rows[0] + rows[-1] - down) // 2, 0, height - down))
+    camera = dataclasses.replace(frame.intrinsics, cx=frame.intrinsics.cx - left, cy=frame.intrinsics.cy - top)
+    color, depth, labels = (a[top : top + down, left : left + across] for a in (frame.color, frame.depth, frame.labels))
+    return RGBDFrame(color, depth, labels, camera)
+
+
+def _write(frame: RGBDFrame, folder: Path) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(frame.color).save(folder / "color.jpg", quality=85, subsampling=0)
+    Image.fromarray(frame.depth).save(folder / "depth.png", optimize=True)
+    Image.fromarray(frame.labels).save(folder / "labels.png", optimize=True)
+    (folder / "intrinsics.json").write_text(json.dumps(dataclasses.asdict(frame.intrinsics)) + "\n")

@@ -1,0 +1,265 @@
+"""Cluttered table scenes of known objects, rendered with labels: what a recognizer trained on single views is tried on.
+
+    scene = compose_scene(builtin_objects(), np.random.default_rng(0))
+    scene.frame, scene.truth[1], scene.visible[1], scene.occlusion(1)
+
+The table is the plane z = 0; objects rest on it, apart from one another, and hide one another from a camera that looks
+down.
+"""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
+
+from thor2_jax.errors import InputError
+from thor2_jax.recognition.frames import Intrinsics, RGBDFrame
+from training.objects.meshes import TexturedMesh
+from training.rendering.ray_caster import Camera, RayCaster, pixel_rays, render_view
+from training.rendering.view_sphere import camera_pose
+
+__all__ = ["SCENE_CAMERA", "Scene", "compose_scene"]
+
+SCENE_CAMERA = Camera(640, 480, Intrinsics(615.0, 615.0, 319.5, 239.5))
+"""Like a small active-stereo camera at VGA size: 55 degrees across."""
+
+MIN_PIXELS = 50
+"""Instances of which fewer are seen are not labelled."""
+
+GAP = 0.006
+"""Least distance between two objects' footprints, metres."""
+
+REACH = 0.18
+"""Objects lie within this distance of the middle of the table, metres, unless there is no room."""
+
+FARTHEST = 4.0
+"""Metres; beyond it the sensor sees no depth."""
+
+EDGE = 0.02
+"""A step in depth between neighbouring pixels, metres, from which on depth may be missing."""
+
+Array = NDArray[np.float64]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Scene:
+    """A frame and what is in it.
+
+    Attributes:
+        frame: colour, depth in millimetres, labels from 1 in no order; table and background are 0.
+        truth: label -> object name.
+        visible: label -> share of the pixels the object would fill alone that show it, in (0, 1].
+    """
+
+    frame: RGBDFrame
+    truth: Mapping[int, str]
+    visible: Mapping[int, float]
+
+    def occlusion(self, label: int) -> str:
+        """How much of an instance is hidden: "none" (up to 5 %), "low" (up to 30 %) or "high"."""
+        share = self.visible[label]
+        return "none" if share > 0.95 else "low" if share > 0.7 else "high"
+
+
+@dataclasses.dataclass(frozen=True)
+class _Placed:
+    """A mesh on the table and the corners [k, 2] and outward normals [k, 2] of its convex footprint."""
+
+    mesh: TexturedMesh
+    corners: Array
+    normals: Array
+
+    @property
+    def height(self) -> float:
+        return float(self.mesh.vertices[:, 2].max())
+
+    def moved(self, x: float, y: float) -> "_Placed":
+        matrix = np.eye(4)
+        matrix[:2, 3] = x, y
+        return _Placed(self.mesh.transformed(matrix), self.corners + [x, y], self.normals)
+
+    def apart(self, other: "_Placed", x: float, y: float) -> bool:
+        """Whether this, moved by x and y, keeps `GAP` from the other: true if a side of either footprint parts them."""
+        mine, theirs = self.corners + [x, y], other.corners
+        ahead = (self.normals @ theirs.T).min(axis=1) - (self.normals @ mine.T).max(axis=1)
+        behind = (other.normals @ mine.T).min(axis=1) - (other.normals @ theirs.T).max(axis=1)
+        return bool(max(ahead.max(), behind.max()) >= GAP)
+
+
+SIDES = tuple(
+    np.array(turn, np.float64)
+    for turn in (
+        [[1, 0, 0], [0, 0, -1], [0, 1, 0]],
+        [[1, 0, 0], [0, 0, 1], [0, -1, 0]],
+        [[0, 0, -1], [0, 1, 0], [1, 0, 0]],
+        [[0, 0, 1], [0, 1, 0], [-1, 0, 0]],
+    )
+)
+"""Turns [3, 3] that put each of the four sides down."""
+
+
+def _rests(hull: Array) -> bool:
+    """Whether a body with these hull vertices [n, 3] stays as it is put down: middle above what touches the table.
+
+    What is within 3 mm of the table counts as touching it, so a can rests on its side; the middle must be inside by 5
+    mm and by a tenth of the height, so a screwdriver does not stand on its handle.
+    """
+    feet = hull[hull[:, 2] < hull[:, 2].min() + 0.003, :2]
+    low, high = hull.min(axis=0), hull.max(axis=0)
+    middle = (low + high)[:2] / 2
+    if len(feet) < 3 or np.linalg.svd(feet - feet.mean(axis=0), compute_uv=False)[1] < 0.005:
+        return False
+    sides = ConvexHull(feet).equations
+    return bool((sides[:, :2] @ middle + sides[:, 2] <= -max(0.005, (high - low)[2] / 10)).all())
+
+
+def _put_down(mesh: TexturedMesh, rng: np.random.Generator) -> _Placed:
+    """As stored two times in three, else on a side it can rest on; any yaw; middle over the origin, lowest z = 0."""
+    used = mesh.vertices[np.unique(mesh.faces)]
+    hull = used[ConvexHull(used, qhull_options="QJ").vertices]
+    sides = [turn for turn in SIDES if _rests(hull @ turn.T)]
+    turn = sides[rng.integers(len(sides))] if sides and rng.random() < 1 / 3 else np.eye(3)
+    angle = rng.uniform(0, 2 * np.pi)
+    c, s = np.cos(angle), np.sin(angle)
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ turn
+    hull = hull @ matrix[:3, :3].T
+    low, high = hull.min(axis=0), hull.max(axis=0)
+    matrix[:3, 3] = -(low[0] + high[0]) / 2, -(low[1] + high[1]) / 2, -low[2]
+    footprint = hull[:, :2] + matrix[:2, 3]
+    outline = ConvexHull(footprint, qhull_options="QJ")
+    return _Placed(mesh.transformed(matrix), footprint[outline.vertices], outline.equations[:, :2])
+
+
+def _in_line(new: _Placed, placed: Sequence[_Placed], towards: Array, rng: np.random.Generator) -> Array | None:
+    """A free place [2] in line with one already there and the camera, the taller in front; None if there is none."""
+    anchor = placed[int(rng.integers(len(placed)))]
+    middle = (anchor.corners.min(axis=0) + anchor.corners.max(axis=0)) / 2
+    sideways = np.array([-towards[1], towards[0]])
+    # To one side, so that seldom all of it is hidden.
+    middle = middle + sideways * rng.choice([-1, 1]) * rng.uniform(0.15, 0.45) * np.ptp(anchor.corners @ sideways)
+    forth = towards if new.height > anchor.height else -towards
+    for distance in np.arange(0.0, 0.3, 0.006) + rng.uniform(0, 0.006):
+        place = middle + distance * forth
+        if np.linalg.norm(place) > 1.3 * REACH:
+            return None
+        if all(new.apart(other, *place) for other in placed):
+            return place
+    return None
+
+
+def _anywhere(new: _Placed, placed: Sequence[_Placed], rng: np.random.Generator) -> Array:
+    """A free place [2] on the table, farther out only if there is no room."""
+    reach = REACH
+    while True:
+        angle, radius = rng.uniform(0, 2 * np.pi), reach * np.sqrt(rng.random())
+        place = radius * np.array([np.cos(angle), np.sin(angle)])
+        if all(new.apart(other, *place) for other in placed):
+            return place
+        reach *= 1.005
+
+
+def _arrange(
+    meshes: Sequence[TexturedMesh], towards: Array, clutter: float, rng: np.random.Generator
+) -> list[TexturedMesh]:
+    placed: list[_Placed] = []
+    for mesh in meshes:
+        new = _put_down(mesh, rng)
+        place = _in_line(new, placed, towards, rng) if placed and rng.random() < clutter else None
+        placed.append(new.moved(*(_anywhere(new, placed, rng) if place is None else place)))
+    return [item.mesh for item in placed]
+
+
+def _table() -> TexturedMesh:
+    """A square of 1.6 m at z = 0 in planks of slightly different greyish brown."""
+    planks = np.random.default_rng(0).integers(-9, 10, (16, 1, 1))
+    texture = (np.array([150, 138, 122]) + np.repeat(np.repeat(planks, 32, axis=0), 512, axis=1)).astype(np.uint8)
+    texture[::32] = 96, 88, 78
+    corner = np.array([[-0.8, -0.8, 0], [0.8, -0.8, 0], [0.8, 0.8, 0], [-0.8, 0.8, 0]])
+    uv = np.array([[[0, 0], [1, 0], [1, 1]], [[0, 0], [1, 1], [0, 1]]], np.float32).clip(1e-4, 1 - 1e-4)
+    faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+    return TexturedMesh(corner, faces, uv=uv, textures=(texture,), face_texture=np.zeros(2, np.int32))
+
+
+def _sensed_depth(depth_m: Array, noise: float, rng: np.random.Generator) -> NDArray[np.uint16]:
+    """Depth [H, W] as a sensor gives it, millimetres.
+
+    Axial noise with the standard deviation 1.2 mm + 1.9 mm (z / m - 0.4)^2 (Nguyen, Izadi and Lovell 2012) times
+    `noise`; at a step of more than `EDGE` three pixels in ten have no depth; nor has anything beyond `FARTHEST`.
+    """
+    sigma = 0.0012 + 0.0019 * (depth_m - 0.4) ** 2
+    near_edge = np.zeros(depth_m.shape, bool)
+    for axis in (0, 1):
+        step = np.abs(np.diff(depth_m, axis=axis)) > EDGE
+        rows, columns = (slice(None), slice(1, None)) if axis else (slice(1, None), slice(None))
+        near_edge[rows, columns] |= step
+        rows, columns = (slice(None), slice(None, -1)) if axis else (slice(None, -1), slice(None))
+        near_edge[rows, columns] |= step
+    found = depth_m + noise * sigma * rng.standard_normal(depth_m.shape)
+    lost = near_edge & (rng.random(depth_m.shape) < 0.3 * min(noise, 1.0))
+    seen = (depth_m > 0) & (depth_m < FARTHEST) & ~lost
+    return np.where(seen, np.rint(found.clip(0.001) * 1000), 0).astype(np.uint16)
+
+
+def compose_scene(
+    objects: Mapping[str, TexturedMesh],
+    rng: np.random.Generator,
+    n_objects: int = 5,
+    camera: Camera = SCENE_CAMERA,
+    clutter: float = 0.85,
+    noise: float = 1.0,
+    light: float = 0.08,
+) -> Scene:
+    """Put different objects on a table at random and render them from 0.7 to 1.1 m, looking down at 25 to 50 degrees.
+
+    Args:
+        objects: name -> mesh; metres, z up.
+        rng: of everything random.
+        n_objects: how many of the objects.
+        camera: of the frame.
+        clutter: probability, in [0, 1], that an object is put in line with another and the camera, so that one hides
+            the other.
+        noise: of the sensor; 1 is a consumer depth camera's and a standard deviation of 2 in colour, 0 none.
+        light: colours are multiplied by a common gain within 1 +- light, and each channel by one within 1 +- light / 4.
+
+    Returns:
+        The scene. An instance of which fewer than `MIN_PIXELS` pixels are seen is not in it (its pixels are labelled
+        0), so that it may have fewer than `n_objects` labels.
+
+    Raises:
+        InputError: a number outside its range, or more objects than there are.
+    """
+    if not 1 <= n_objects <= len(objects):
+        raise InputError(f"n_objects is {n_objects!r}; it must be 1 to {len(objects)}, the number of objects")
+    for argument, value, most in (("clutter", clutter, 1.0), ("noise", noise, 10.0), ("light", light, 0.5)):
+        if not 0 <= value <= most:
+            raise InputError(f"{argument} is {value!r}; it must be 0 to {most:g}")
+    names = [list(objects)[k] for k in rng.choice(len(objects), n_objects, replace=False)]
+    azimuth, pitch = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(25, 50))
+    pose = camera_pose(azimuth, np.pi / 2 - pitch, np.array([0, 0, 0.04]), rng.uniform(0.7, 1.1))
+    towards = np.array([np.cos(azimuth), np.sin(azimuth)])
+    meshes = _arrange([objects[name] for name in names], towards, clutter, rng)
+
+    rays = pixel_rays(camera.intrinsics, camera.height, camera.width) @ pose[:3, :3].T
+    hits = RayCaster([_table(), *meshes]).cast(pose[:3, 3], rays)
+    shape = (camera.height, camera.width)
+    labels = hits.mesh.clip(0).astype(np.uint8 if n_objects < 256 else np.uint16).reshape(shape)
+    truth, visible = {}, {}
+    for label, (name, mesh) in enumerate(zip(names, meshes, strict=True), 1):
+        seen = int((labels == label).sum())
+        if seen < MIN_PIXELS:
+            labels[labels == label] = 0
+            continue
+        truth[label] = name
+        visible[label] = seen / int((render_view(RayCaster([mesh]), pose, camera).depth > 0).sum())
+
+    depth = np.where(hits.mesh >= 0, hits.distance, 0).astype(np.float64).reshape(shape)
+    color = np.where(hits.mesh[:, None] >= 0, hits.color, np.array([92, 96, 104])).reshape(*shape, 3)
+    gain = rng.uniform(1 - light, 1 + light) * rng.uniform(1 - light / 4, 1 + light / 4, 3)
+    lit = color * gain + noise * 2 * rng.standard_normal(color.shape, np.float32)
+    frame = RGBDFrame(
+        np.rint(lit).clip(0, 255).astype(np.uint8), _sensed_depth(depth, noise, rng), labels, camera.intrinsics
+    )
+    return Scene(frame, truth, visible)

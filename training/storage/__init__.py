@@ -1,0 +1,1 @@
+"""Files and processes: locks, tables, worker pools."""

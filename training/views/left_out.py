@@ -1,0 +1,57 @@
+"""Training without some of the objects, to see what is made of objects that were not trained."""
+
+import dataclasses
+import functools
+import hashlib
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+from thor2_jax.errors import InputError
+from training.views.normalized_views import NormalizedViews
+from training.views.source import ViewSource
+
+__all__ = ["WithoutClasses"]
+
+
+class _Shard(NamedTuple):
+    label: int
+    views: int
+    place: int
+
+
+class WithoutClasses:
+    """A source of views without those of some classes."""
+
+    def __init__(self, source: ViewSource, names: Sequence[str]) -> None:
+        """`names` are the classes to leave out.
+
+        Raises:
+            InputError: one is no class of the source.
+        """
+        missing = sorted(set(names) - set(source.classes))
+        if missing:
+            raise InputError(f"leave_out is {', '.join(names)}; the views have no class {', '.join(missing)}")
+        self.classes = tuple(name for name in source.classes if name not in names)
+        new = {source.classes.index(name): label for label, name in enumerate(self.classes)}
+        self.shards = tuple(
+            _Shard(new[shard.label], shard.views, index)
+            for index, shard in enumerate(source.shards)
+            if shard.label in new
+        )
+        self._source, self._names = source, sorted(set(names))
+
+    @functools.cached_property
+    def digest(self) -> str:
+        """SHA-256 of the source's and the names."""
+        return hashlib.sha256(repr((self._source.digest, self._names)).encode()).hexdigest()
+
+    @property
+    def record(self) -> Mapping[str, Any]:
+        """The source's, with what was left out."""
+        views = sum(shard.views for shard in self.shards)
+        return {**self._source.record, "digest": self.digest, "views": views, "classes_left_out": self._names}
+
+    def read(self, index: int) -> NormalizedViews:
+        """The views of a shard; raises as the source's."""
+        shard = self.shards[index]
+        return dataclasses.replace(self._source.read(shard.place), label=shard.label)

@@ -1,0 +1,246 @@
+"""The rendering job: meshes to a folder of normalized views that `ViewDataset` reads.
+
+    dataset = render_dataset(find_meshes("meshes"), "views", engine=local(workers=2))
+
+Workers render; this process normalizes and writes, a shard at a time, in the order of the job. So the bytes depend
+neither on the number of workers nor on where they are, and a job that was interrupted goes on where it was.
+"""
+
+import contextlib
+import dataclasses
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
+from thor2_jax.errors import InputError
+from thor2_jax.files import replacing
+from thor2_jax.recognition.recognizer import VOXEL
+from training.augmentation import Variations
+from training.objects.meshes import TexturedMesh
+from training.rendering.ray_caster import TRAINING_CAMERA
+from training.rendering.view_sphere import DISTANCE, view_angles
+from training.storage.locks import LOCK, locked
+from training.storage.workers import IN_PROCESS, Engine
+from training.views.dataset import MANIFEST, Manifest, Shard, ViewDataset, encode
+from training.views.mesh_views import (
+    MIN_POINTS,
+    SIGMA_S,
+    Progress,
+    ViewCloud,
+    checked_meshes,
+    clouds_per_view,
+    render_task,
+    view_tasks,
+)
+from training.views.normalized_views import LARGEST, STEP, normalize_views
+
+__all__ = ["render_dataset"]
+
+SHARD = 256
+"""Clouds of a shard, some less where copies do not come out even: a few megabytes, a second of rendering."""
+
+SUFFIX = ".safetensors"
+
+
+def _digest(mesh: TexturedMesh) -> str:
+    """SHA-256 of all that is rendered: files can name others, and objects need not come from files."""
+    hasher = hashlib.sha256()
+    for array in (mesh.vertices, mesh.faces, mesh.uv, mesh.face_texture, mesh.corner_colors, *mesh.textures):
+        hasher.update(repr(array is not None and (array.dtype.str, array.shape)).encode())
+        if array is not None:
+            hasher.update(array.tobytes())
+    return hasher.hexdigest()
+
+
+def _objects(found: Mapping[str, Path | TexturedMesh], angles: NDArray[np.float64]) -> list[dict[str, str]]:
+    objects = []
+    for name, mesh in checked_meshes(found, angles):
+        across = SIGMA_S * float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
+        if across > LARGEST:
+            raise InputError(
+                f"object {name!r} is {across / SIGMA_S:.2f} m across; views of at most {LARGEST / SIGMA_S:.2f} m can "
+                "be stored"
+            )
+        objects.append({"name": name, "mesh": _digest(mesh)})
+    return objects
+
+
+def _difference(old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
+    """What differs between two jobs, in words; empty if nothing does."""
+    for key in {**new, **old}:
+        was, now = old.get(key), new.get(key)
+        if was == now:
+            continue
+        if key != "objects":
+            return f"{key} is {json.dumps(was)} there and {json.dumps(now)} here"
+        before, after = ({entry["name"]: entry["mesh"] for entry in table["objects"]} for table in (old, new))
+        for name in before | after:
+            if name not in after:
+                return f"it has the object {name!r}, which is missing here"
+            if name not in before:
+                return f"it has no object {name!r}"
+            if before[name] != after[name]:
+                return f"the mesh of {name!r} is another"
+        return "its objects are in another order"
+    return ""
+
+
+def _leftovers(folder: Path) -> set[Path]:
+    """Files that a process was writing when it was killed."""
+    return {path for pattern in (f".{Path(MANIFEST).stem}.*", f".*{SUFFIX}") for path in folder.glob(pattern)}
+
+
+def _make_folder(folder: Path) -> None:
+    """Make the folder if it is missing.
+
+    Raises:
+        InputError: it holds something else than a dataset, finished or not.
+        OSError: it cannot be made.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"out: {folder} exists already and is no folder")
+    folder.mkdir(parents=True, exist_ok=True)
+    others = set(folder.iterdir()) - _leftovers(folder) - {folder / LOCK}
+    if others and folder / MANIFEST not in others:
+        raise InputError(f"out: {folder} exists already and holds files, but no {MANIFEST}")
+
+
+def _is_whole(shard: Shard, folder: Path) -> bool:
+    try:
+        shard.content(folder)
+    except InputError:
+        return False
+    return True
+
+
+def _begin(folder: Path, job: Mapping[str, Any]) -> Manifest:
+    """The folder's manifest, made if there is none, with those shards only whose files are whole.
+
+    Raises:
+        InputError: the folder holds another job.
+        OSError: it cannot be written.
+    """
+    path = folder / MANIFEST
+    found = Manifest.parse(path.read_bytes(), path) if path.exists() else None
+    if found and (difference := _difference(found.job, job)):
+        raise InputError(f"out: {folder} was begun by another command: {difference}")
+    for leftover in _leftovers(folder):
+        leftover.unlink()
+    manifest = Manifest(job, tuple(shard for shard in found.shards if _is_whole(shard, folder)) if found else ())
+    if manifest != found:
+        manifest.write(folder)
+    return manifest
+
+
+def _store(path: Path, label: int, planned: int, rendered: Sequence[ViewCloud]) -> Shard:
+    """Normalize the views of a shard and write its file; `planned` is their number with those left out.
+
+    Raises:
+        InputError: a view that cannot be normalized or stored.
+        OSError: the file cannot be written.
+    """
+    views = normalize_views(
+        [(cloud.xyz, cloud.rgb) for cloud in rendered],
+        label,
+        [cloud.view for cloud in rendered],
+        [cloud.copy for cloud in rendered],
+        DescriptorConfig(),
+    )
+    content = encode(views)
+    with replacing(path) as temporary:
+        temporary.write_bytes(content)
+    return Shard(
+        file=path.name,
+        sha256=hashlib.sha256(content).hexdigest(),
+        label=label,
+        views=len(views),
+        left_out=planned - len(views),
+        points=len(views.xyz),
+    )
+
+
+def render_dataset(
+    found: Mapping[str, Path | TexturedMesh],
+    out: str | Path,
+    azimuth_step: float = 5.0,
+    polar_step: float = 5.0,
+    engine: Engine = IN_PROCESS,
+    progress: Progress = lambda done, total: None,
+    variations: Variations | None = None,
+    seed: int = 0,
+) -> ViewDataset:
+    """Render views of every object, normalize them and write them to a folder, or finish what the folder holds of that.
+
+    Called again with the same arguments after any interruption, it makes what is missing or damaged, and the folder
+    ends up with the bytes that it would have had without. Memory holds a shard a worker, and one.
+
+    Args:
+        found: object name -> mesh file, as from `find_meshes`, or mesh.
+        out: folder; new, empty, or with a dataset of the same arguments. Made with its parents.
+        azimuth_step: degrees; divides 360.
+        polar_step: degrees; divides 180.
+        engine: where views are rendered; of no influence on the result.
+        progress: called with (views done, views in all) at the start and after each shard; copies count as views.
+        variations: adds varied copies of each view; None adds none.
+        seed: of the variations. What an object's copies look like does not depend on the other objects.
+
+    Raises:
+        InputError: no meshes, a mesh that cannot be read, is too large or never seen, steps or a seed that do not fit,
+            `out` holds something else or views of other arguments (says what differs), or another process is writing to
+            it. Nothing is written then.
+        OSError: `out` cannot be written. It can be finished later.
+    """
+    out = Path(out)
+    if seed < 0:
+        raise InputError(f"seed is {seed}; it must not be negative")
+    angles = view_angles(azimuth_step, polar_step)
+    objects = _objects(found, angles)
+    copies = clouds_per_view(variations)
+    size = max(1, SHARD // copies)
+    # Shard's file -> object's index and index of the first of the shard's angles.
+    plan = {
+        f"{label:04d}-{number:04d}{SUFFIX}": (label, first)
+        for label in range(len(objects))
+        for number, first in enumerate(range(0, len(angles), size))
+    }
+    job = {
+        "descriptor_version": DESCRIPTOR_VERSION,
+        "sigma_s": SIGMA_S,
+        "voxel": VOXEL,
+        "step": STEP,
+        "min_points": MIN_POINTS,
+        "camera": {**dataclasses.asdict(TRAINING_CAMERA), "distance": DISTANCE},
+        "azimuth_step": float(azimuth_step),
+        "polar_step": float(polar_step),
+        "variations": {"seed": seed, **variations.record()} if variations else None,
+        "objects": objects,
+        "shards": len(plan),
+    }
+    done: dict[str, Shard] = {}
+
+    def show_progress() -> None:
+        progress(sum(shard.views + shard.left_out for shard in done.values()), copies * len(angles) * len(objects))
+
+    _make_folder(out)
+    with locked(out):
+        done.update((shard.file, shard) for shard in _begin(out, job).shards)
+        show_progress()
+        missing = [file for file in plan if file not in done]
+        parts = [(objects[label]["name"], first) for label, first in (plan[file] for file in missing)]
+        tasks = view_tasks(found, angles, parts, size, variations, seed)
+        with contextlib.closing(engine(render_task, tasks)) as results:
+            for file, rendered in zip(missing, results, strict=True):
+                label, first = plan[file]
+                try:
+                    done[file] = _store(out / file, label, copies * len(angles[first : first + size]), rendered)
+                except InputError as error:
+                    raise InputError(f"object {objects[label]['name']!r}: {error}") from None
+                Manifest(job, tuple(done[name] for name in plan if name in done)).write(out)
+                show_progress()
+    return ViewDataset.open(out)

@@ -1,0 +1,83 @@
+"""Where training takes its normalized views from: a `ViewDataset` on disk, or clouds in memory.
+
+source = ViewDataset.open("views")
+source = MemoryViews(render_views(find_meshes("meshes")), config)
+"""
+
+import functools
+import hashlib
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple, Protocol
+
+from thor2_jax.config import DescriptorConfig
+from training.views.mesh_views import Cloud
+from training.views.normalized_views import NormalizedViews, normalize_views
+
+__all__ = ["MemoryViews", "ViewSource"]
+
+
+class ViewSource(Protocol):
+    """Normalized views, a shard at a time, each of one object: a `ViewDataset` on disk, or `MemoryViews`."""
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Class names."""
+
+    @property
+    def digest(self) -> str:
+        """Another one if any of the views is another."""
+
+    @property
+    def record(self) -> Mapping[str, Any]:
+        """What a run keeps of them, as JSON holds it."""
+
+    @property
+    def shards(self) -> Sequence[Any]:
+        """One entry for each `read`, with `label`, and `views`, their number."""
+
+    def read(self, index: int) -> NormalizedViews:
+        """The views of a shard."""
+
+
+class _Shard(NamedTuple):
+    label: int
+    views: int
+
+
+class MemoryViews:
+    """Clouds in memory as a source of views, a class a shard; `read` normalizes them."""
+
+    def __init__(self, views: Mapping[str, Sequence[Cloud]], config: DescriptorConfig) -> None:
+        """Nothing is computed yet.
+
+        Args:
+            views: class name -> clouds (xyz [n, 3] float32 metres in the camera frame, rgb [n, 3] uint8).
+            config: of the normalization.
+        """
+        self.classes = tuple(views)
+        self.shards = tuple(_Shard(label, len(clouds)) for label, clouds in enumerate(views.values()))
+        self._clouds = tuple(views.values())
+        self._config = config
+
+    @functools.cached_property
+    def digest(self) -> str:
+        """SHA-256 of names and clouds."""
+        digest = hashlib.sha256(repr((self.classes, self.shards)).encode())
+        for xyz, rgb in (cloud for clouds in self._clouds for cloud in clouds):
+            digest.update(xyz.tobytes())
+            digest.update(rgb.tobytes())
+        return digest.hexdigest()
+
+    @property
+    def record(self) -> Mapping[str, Any]:
+        """Digest and number of views."""
+        return {"digest": self.digest, "views": sum(shard.views for shard in self.shards)}
+
+    def read(self, index: int) -> NormalizedViews:
+        """The normalized views of a class.
+
+        Raises:
+            InputError: a cloud with more points than the largest bucket, or too long.
+        """
+        clouds = self._clouds[index]
+        return normalize_views(clouds, index, range(len(clouds)), [0] * len(clouds), self._config)
