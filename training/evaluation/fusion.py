@@ -16,8 +16,7 @@ __all__ = ["RULES", "Rule", "join_by", "joinings", "main_joining"]
 
 Rule = classifier.Rule | Literal["calibrated"]
 RULES: tuple[Rule, ...] = (*classifier.RULES, "calibrated")
-"""The rules of `thor2_jax.recognition.classifier.join`, the paper's first; and the paper's after each classifier's temperature,
-fitted on held-out views."""
+"""The rules of `classifier.join`, the paper's first, and the paper's after temperatures fitted on held-out views."""
 
 
 def joinings(available: Iterable[str]) -> dict[str, tuple[str, ...]]:
