@@ -12,7 +12,7 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import FuncFormatter, LogLocator
 from numpy.typing import NDArray
 
-from colornet.files import whole_file
+from colornet.files import atomic_write
 from colornet.lab import MEAN_WHITE, to_lab
 from colornet.network import ColorNetwork
 
@@ -130,5 +130,5 @@ def _readable(rgb: NDArray[np.float64]) -> str:
 
 def _save(figure: Figure, path: str | Path) -> None:
     FigureCanvasAgg(figure)
-    with whole_file(path) as temporary:
+    with atomic_write(path) as temporary:
         figure.savefig(temporary, format="png", dpi=_DPI)

@@ -1,8 +1,9 @@
-"""Files: written whole or not at all, and read with damage told in one line."""
+"""Atomic writes, and files of named arrays."""
 
 import contextlib
 import io
-import uuid
+import os
+import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -10,25 +11,28 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["read_arrays", "whole_file", "write_arrays"]
+__all__ = ["atomic_write", "read_arrays", "write_arrays"]
 
 MOST_BYTES = 2**26
 """Of arrays that are read: zeros take up a thousandth in the file."""
 
 
 @contextlib.contextmanager
-def whole_file(path: str | Path) -> Iterator[Path]:
-    """Context that yields a temporary name beside `path`, and on success gives what was written there the name `path`.
+def atomic_write(path: str | Path) -> Iterator[Path]:
+    """Yield a temporary file beside `path` to write to; on success it replaces `path`, readable by everyone.
 
-    On an error nothing is left behind, and a file that `path` had before stays as it was.
+    On any error or interrupt the temporary file is removed, and an older file at `path` stays as it was.
 
     Raises:
-        OSError: the file cannot be written.
+        OSError: the folder does not exist or cannot be written.
     """
     path = Path(path)
-    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
+    descriptor, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=path.suffix, dir=path.parent)
+    os.close(descriptor)
+    temporary = Path(name)
     try:
         yield temporary
+        temporary.chmod(0o644)
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
@@ -40,7 +44,7 @@ def write_arrays(path: str | Path, arrays: Mapping[str, NDArray[Any]]) -> None:
     Raises:
         OSError: the file cannot be written.
     """
-    with whole_file(path) as temporary, open(temporary, "xb") as stream:
+    with atomic_write(path) as temporary, open(temporary, "wb") as stream:
         np.savez_compressed(stream, **dict[str, Any](arrays))
 
 

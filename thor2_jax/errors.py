@@ -1,11 +1,29 @@
-"""The one exception that means: what you gave us is wrong, and here is what and where."""
+"""The exception for invalid input, and a prefix for its message."""
 
-__all__ = ["InputError"]
+import contextlib
+from collections.abc import Iterator
+
+__all__ = ["InputError", "with_context"]
 
 
 class InputError(ValueError):
-    """Bad input from outside: names the argument (or file) and the offending value, in one line.
+    """Invalid input from the user; its message names the argument or the file and the offending value, in one line.
 
-    The command line turns it into one line on standard error and exit code 2. Every other exception is a defect
-    of this software and keeps its traceback.
+    The command line prints it on standard error and exits with code 2. Every other exception is a defect of this
+    software and keeps its traceback.
     """
+
+
+@contextlib.contextmanager
+def with_context(identifier: str) -> Iterator[None]:
+    """Prefix the message of an InputError raised inside with `identifier`; a missing file becomes an InputError too.
+
+    Raises:
+        InputError: with the prefix.
+    """
+    try:
+        yield
+    except FileNotFoundError as error:
+        raise InputError(f"{identifier}: {error.filename} is missing") from None
+    except InputError as error:
+        raise InputError(f"{identifier}: {error}") from None

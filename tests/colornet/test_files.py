@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import colornet
-from colornet.files import MOST_BYTES, read_arrays, whole_file, write_arrays
+from colornet.files import MOST_BYTES, read_arrays, write_arrays
 
 # Changes with the contents of the network, and with nothing else.
 FINGERPRINT = "96981396ff3bc1ce0b440c5b781da4d2a5784b271f72967140e5b4b1bb6c593c"
@@ -176,16 +176,6 @@ def test_no_flipped_byte_passes_for_another_network(network: colornet.ColorNetwo
             assert str(path) in str(error) and "\n" not in str(error)
             refused += 1
     assert refused > 150
-
-
-def test_a_failed_write_leaves_the_old_file(tmp_path: Path) -> None:
-    path = tmp_path / "file"
-    path.write_text("old")
-    with pytest.raises(RuntimeError), whole_file(path) as temporary:
-        temporary.write_text("new, half")
-        raise RuntimeError
-    assert path.read_text() == "old"
-    assert os.listdir(tmp_path) == ["file"]
 
 
 def test_a_network_cannot_be_saved_where_there_is_no_folder(network: colornet.ColorNetwork, tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ import pytest
 
 import colornet
 import thor2_jax as thor2
-from thor2_jax.descriptor.describe import view_normalization
+from thor2_jax.descriptor import view_normalization
 
 NETWORK = colornet.load_default()
 SMALL = {"n_slices": 3, "n_strips": 8, "image_size": 12}

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from thor2_jax.files import replacing, write_text
+from thor2_jax.files import atomic_write, write_text
 
 
 def test_text_is_utf_8_and_readable_by_all(tmp_path: Path) -> None:
@@ -19,7 +19,7 @@ def test_text_is_utf_8_and_readable_by_all(tmp_path: Path) -> None:
 def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
     path = tmp_path / "a.txt"
     path.write_text("old")
-    with pytest.raises(RuntimeError), replacing(path) as temporary:
+    with pytest.raises(RuntimeError), atomic_write(path) as temporary:
         assert temporary.parent == tmp_path and temporary.suffix == ".txt"
         temporary.write_text("half")
         assert path.read_text() == "old"
@@ -29,7 +29,7 @@ def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
 
 
 def test_an_interrupt_leaves_nothing(tmp_path: Path) -> None:
-    with pytest.raises(KeyboardInterrupt), replacing(tmp_path / "a.txt") as temporary:
+    with pytest.raises(KeyboardInterrupt), atomic_write(tmp_path / "a.txt") as temporary:
         temporary.write_text("half")
         raise KeyboardInterrupt
     assert list(tmp_path.iterdir()) == []

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from thor2_jax.errors import InputError
+from thor2_jax.errors import InputError, with_context
 
 __all__ = [
     "MOST_PIXELS",
@@ -243,10 +243,8 @@ def read_intrinsics(path: str | Path) -> Intrinsics:
         values = json.loads(Path(path).read_bytes())
     except (ValueError, RecursionError) as error:
         raise InputError(f"intrinsics: {path} is no JSON ({error})") from None
-    try:
+    with with_context(str(path)):
         return Intrinsics.of(values)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
 
 
 def read_frame(*, color: str | Path, depth: str | Path, labels: str | Path, intrinsics: str | Path) -> RGBDFrame:

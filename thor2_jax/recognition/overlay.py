@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from thor2_jax.errors import InputError
-from thor2_jax.files import replacing
+from thor2_jax.files import atomic_write
 
 if TYPE_CHECKING:
     from thor2_jax.recognition.recognizer import Recognition
@@ -101,7 +101,7 @@ def draw_overlay(
         _outline(pixels, mask, paint, thickness)
     picture = Image.fromarray(pixels)
     _write_labels(picture, labels != 0, masks, paints, [_text(a) for a in answers], size)
-    with replacing(path) as temporary:
+    with atomic_write(path) as temporary:
         picture.save(temporary, format="PNG")
 
 

@@ -20,7 +20,7 @@ from flax import nnx
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
-from thor2_jax.files import json_digest, replacing
+from thor2_jax.files import atomic_write, json_digest
 
 __all__ = ["Stored", "arrays_of", "baseline_file", "model_with", "read_baseline", "write_baseline"]
 
@@ -70,7 +70,7 @@ def write_baseline(path: Path, stored: Stored, classes: Sequence[str]) -> None:
     about["digest"] = _digest(stored.arrays, about)
     arrays = {name: np.ascontiguousarray(array) for name, array in stored.arrays.items()}
     path.parent.mkdir(exist_ok=True)
-    with replacing(path) as temporary:
+    with atomic_write(path) as temporary:
         safetensors.numpy.save_file(arrays, temporary, {"about": json.dumps(about)})
 
 

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thor2_jax.errors import InputError
+from thor2_jax.errors import InputError, with_context
 from thor2_jax.recognition.frames import Intrinsics, RGBDFrame, read_color, read_depth, read_labels
 from training.readers.labelled import LabelledFrame, LabelledFrames
-from training.storage.tables import complaints_about, read_table
+from training.storage.tables import read_table
 
 __all__ = ["BOP", "SMALLEST_VISIBLE"]
 
@@ -63,9 +63,9 @@ class BOP(LabelledFrames):
     def __getitem__(self, number: int) -> LabelledFrame:
         """Read a frame; also refuses an image or object that a table lacks."""
         folder, image = self._images[number]
-        with complaints_about(folder.name):
+        with with_context(folder.name):
             scene = self._scene(folder)
-        with complaints_about(self.identifiers[number]):
+        with with_context(self.identifiers[number]):
             frame, objects = scene.read(image)
             truth = {label: self._name(obj_id) for label, obj_id in objects.items()}
         return LabelledFrame(self.identifiers[number], frame, truth, {"scene": folder.name})
@@ -91,13 +91,13 @@ class _Scene:
     def read(self, image: Path) -> tuple[RGBDFrame, dict[int, int]]:
         """The frame of a colour image, and label -> obj_id of the instances that are scored."""
         number = str(int(image.stem))
-        with complaints_about(str(self._folder / "scene_camera.json")):
+        with with_context(str(self._folder / "scene_camera.json")):
             intrinsics = _intrinsics(_entry(self._cameras, number))
-        with complaints_about(str(self._folder / "scene_gt.json")):
+        with with_context(str(self._folder / "scene_gt.json")):
             objects = _values(_entry(self._objects, number), "obj_id", int)
         visible: list[float] = [1.0] * len(objects)
         if self._visible is not None:
-            with complaints_about(str(self._folder / "scene_gt_info.json")):
+            with with_context(str(self._folder / "scene_gt_info.json")):
                 visible = _values(_entry(self._visible, number), "visib_fract", (int, float))
                 if len(visible) != len(objects):
                     raise InputError(f"it has {len(visible)} instances in image {number}, scene_gt.json {len(objects)}")

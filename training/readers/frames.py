@@ -3,7 +3,7 @@
 import json
 from pathlib import Path
 
-from thor2_jax.errors import InputError
+from thor2_jax.errors import InputError, with_context
 from thor2_jax.recognition.frames import read_frame
 from training.readers.labelled import LabelledFrame, LabelledFrames
 
@@ -33,7 +33,7 @@ class FrameFolder(LabelledFrames):
     def __getitem__(self, number: int) -> LabelledFrame:
         """Read a frame."""
         folder = self._folders[number]
-        try:
+        with with_context(folder.name):
             frame = read_frame(
                 color=folder / "color.png",
                 depth=folder / "depth.png",
@@ -41,10 +41,6 @@ class FrameFolder(LabelledFrames):
                 intrinsics=folder / "intrinsics.json",
             )
             truth = _truth(folder / "labels.json")
-        except FileNotFoundError as error:
-            raise InputError(f"{folder.name}: {error.filename} is missing") from None
-        except InputError as error:
-            raise InputError(f"{folder.name}: {error}") from None
         return LabelledFrame(folder.name, frame, truth, {})
 
 

@@ -18,11 +18,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from thor2_jax.errors import InputError
+from thor2_jax.errors import InputError, with_context
 from thor2_jax.recognition.frames import Intrinsics, RGBDFrame, read_color, read_depth, read_labels
 from training.readers.labelled import LabelledFrame, LabelledFrames, path_ends
 from training.readers.pcd import read_organized_points
-from training.storage.tables import complaints_about, read_table
+from training.storage.tables import read_table
 
 __all__ = ["OCID", "fit_intrinsics"]
 
@@ -72,7 +72,7 @@ class OCID(LabelledFrames):
         """Read a frame; also refuses a cloud that gives no intrinsics, and a label without a name."""
         sequence, image = self._images[number]
         place, camera, kind, _ = sequence
-        with complaints_about(self.identifiers[number]):
+        with with_context(self.identifiers[number]):
             frame, truth = _read(image, _FIRST_OBJECT[place], self._names[sequence])
         attributes = {"place": place, "camera": _CAMERAS[camera], "type": kind}
         return LabelledFrame(self.identifiers[number], frame, truth, attributes)
@@ -105,7 +105,7 @@ def _read(image: Path, first_object: int, names: list[str]) -> tuple[RGBDFrame, 
     labels = read_labels(label_file)
     cloud_file = folder / "pcd" / f"{image.stem}.pcd"
     points = read_organized_points(cloud_file)
-    with complaints_about(str(cloud_file)):
+    with with_context(str(cloud_file)):
         if points.shape[:2] != color.shape[:2]:
             raise InputError(f"the cloud has {points.shape[:2]} points; color has {color.shape[:2]} (rows, columns)")
         intrinsics = fit_intrinsics(points)

@@ -6,7 +6,7 @@
 from pathlib import Path
 from typing import NamedTuple
 
-from thor2_jax.errors import InputError
+from thor2_jax.errors import InputError, with_context
 from thor2_jax.recognition.frames import Intrinsics, RGBDFrame, read_color, read_depth, read_labels
 from training.readers.labelled import LabelledFrame, LabelledFrames
 from training.storage.tables import parse_yaml
@@ -84,7 +84,7 @@ class UWISOccluded(LabelledFrames):
         """Read a frame."""
         video, color = self._frames[number]
         stem, identifier = _stem(color), self.identifiers[number]
-        try:
+        with with_context(identifier):
             frame = RGBDFrame(
                 read_color(color),
                 read_depth(color.with_name(f"{stem}_depth.png")),
@@ -92,10 +92,6 @@ class UWISOccluded(LabelledFrames):
                 INTRINSICS,
             )
             truth = _truth(color.with_name(f"{stem}_poses.yaml"))
-        except FileNotFoundError as error:
-            raise InputError(f"{identifier}: {error.filename} is missing") from None
-        except InputError as error:
-            raise InputError(f"{identifier}: {error}") from None
         return LabelledFrame(identifier, frame, truth, video_attributes(int(video.name)))
 
 

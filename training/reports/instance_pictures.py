@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 from scipy.ndimage import binary_erosion
 
-from thor2_jax.files import replacing
+from thor2_jax.files import atomic_write
 from thor2_jax.recognition.overlay import COLORS, UNRECOGNIZED
 from training.reports.plots import save_figure
 
@@ -28,7 +28,7 @@ _CROP = 240
 
 
 def _save(picture: Image.Image, path: Path) -> None:
-    with replacing(path) as temporary:
+    with atomic_write(path) as temporary:
         picture.save(temporary, format="JPEG", quality=85)
 
 

@@ -14,7 +14,7 @@ from colornet import ColorNetwork
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.describe import describe_strips, strips
 from thor2_jax.descriptor.view_normalization import align
-from thor2_jax.files import replacing
+from thor2_jax.files import atomic_write
 from thor2_jax.types import PointClouds
 from training.evaluate import Instance
 from training.objects.meshes import TexturedMesh
@@ -43,7 +43,7 @@ def save_figure(figure: Figure, path: str | Path) -> None:
         OSError: it cannot be written.
     """
     FigureCanvasAgg(figure)
-    with replacing(path) as temporary:
+    with atomic_write(path) as temporary:
         figure.savefig(temporary, dpi=_DPI, format="png")
 
 

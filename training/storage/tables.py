@@ -1,9 +1,7 @@
-"""What readers share about files: tables in JSON and YAML, and complaints that name the frame."""
+"""Tables in JSON and YAML files."""
 
-import contextlib
 import json
 import math
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,24 +9,13 @@ import yaml
 
 from thor2_jax.errors import InputError
 
-__all__ = ["complaints_about", "parse_json", "parse_yaml", "read_table"]
+__all__ = ["parse_json", "parse_yaml", "read_table"]
 
 MOST_VALUES = 10**6
 """Of a YAML file with its aliases written out: a few lines of them can stand for gigabytes."""
 
 MOST_NESTED = 100
 """Levels of a YAML file: the time to read one grows with their square."""
-
-
-@contextlib.contextmanager
-def complaints_about(identifier: str) -> Iterator[None]:
-    """Put `identifier` before what an InputError says, and make one of a file that is missing."""
-    try:
-        yield
-    except FileNotFoundError as error:
-        raise InputError(f"{identifier}: {error.filename} is missing") from None
-    except InputError as error:
-        raise InputError(f"{identifier}: {error}") from None
 
 
 def parse_json(content: bytes) -> Any:

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
-from thor2_jax.errors import InputError
-from thor2_jax.files import replacing
+from thor2_jax.errors import InputError, with_context
+from thor2_jax.files import atomic_write
 from thor2_jax.recognition.recognizer import VOXEL
 from training.augmentation import Variations
 from training.objects.meshes import TexturedMesh
@@ -153,7 +153,7 @@ def _store(path: Path, label: int, planned: int, rendered: Sequence[ViewCloud]) 
         DescriptorConfig(),
     )
     content = encode(views)
-    with replacing(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_bytes(content)
     return Shard(
         file=path.name,
@@ -237,10 +237,8 @@ def render_dataset(
         with contextlib.closing(engine(render_task, tasks)) as results:
             for file, rendered in zip(missing, results, strict=True):
                 label, first = plan[file]
-                try:
+                with with_context(f"object {objects[label]['name']!r}"):
                     done[file] = _store(out / file, label, copies * len(angles[first : first + size]), rendered)
-                except InputError as error:
-                    raise InputError(f"object {objects[label]['name']!r}: {error}") from None
                 Manifest(job, tuple(done[name] for name in plan if name in done)).write(out)
                 show_progress()
     return ViewDataset.open(out)

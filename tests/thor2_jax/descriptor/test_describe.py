@@ -13,7 +13,7 @@ from scipy.special import ndtr
 
 import colornet
 import thor2_jax as thor2
-from thor2_jax.descriptor.describe import chunking as cpu_parts
+from thor2_jax.descriptor import chunking
 
 NETWORK = colornet.load_default()
 CLOSED = thor2.DescriptorConfig(homology="closed_form")
@@ -115,8 +115,8 @@ def test_empty_clouds_in_a_batch_are_zero_and_disturb_nobody() -> None:
 
 def test_batches_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each cloud as in a small batch, in value and in gradient, through callbacks too; whole groups and a rest."""
-    monkeypatch.setattr(cpu_parts, "LARGEST", 8)
-    monkeypatch.setattr(cpu_parts, "AT_ONCE", 2)
+    monkeypatch.setattr(chunking, "LARGEST", 8)
+    monkeypatch.setattr(chunking, "AT_ONCE", 2)
     config, count = thor2.DescriptorConfig(homology="gudhi"), 27
     few = thor2.PointClouds.pack([camera_cloud(seed, 300) for seed in range(8)], 512)
     order = np.arange(count) % 8

@@ -11,8 +11,8 @@ from thor2_jax.errors import InputError
 from training.augmentation import Illumination, Variations
 from training.objects.meshes import TexturedMesh, find_meshes, load_mesh
 from training.rendering.view_sphere import DISTANCE, camera_pose, view_angles
+from training.views import mesh_views as views
 from training.views.mesh_views import MIN_POINTS, SIGMA_S, VOXEL, Cloud, ViewTask, render_task, render_views, view_cloud
-from training.views.mesh_views import mesh_views as views
 
 GOLDEN = ["004_sugar_box", "006_mustard_bottle", "025_mug", "048_hammer", "055_baseball", "061_foam_brick"]
 

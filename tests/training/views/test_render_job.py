@@ -19,12 +19,13 @@ import pytest
 import trimesh
 
 from thor2_jax.errors import InputError
-from training import cli, render_job
+from training import cli
 from training.augmentation import Illumination, Variations
 from training.objects.builtin_objects import builtin_objects
 from training.objects.meshes import TexturedMesh
 from training.storage.locks import locked
 from training.storage.workers import local, on_ray
+from training.views import render_job
 from training.views.dataset import MANIFEST, ViewDataset
 from training.views.render_job import render_dataset
 
@@ -127,7 +128,7 @@ def test_stopped_at_any_write_it_goes_on(whole: Path, tmp_path: Path, monkeypatc
 
 KILLED = """
 import os, signal, sys
-from training.views.mesh_views import render_job
+from training.views import render_job
 from training.objects.builtin_objects import builtin_objects
 from training.storage.workers import local
 
