@@ -12,9 +12,9 @@ from training.baselines.files import Stored, baseline_file, write_baseline
 from training.baselines.forest import train_forest
 from training.baselines.pointnet import train_pointnet
 from training.baselines.thor import train_thor
-from training.evaluation.confidence import fit_temperature
-from training.evaluation.runs import run_folders
 from training.fitting.fit import FitOptions
+from training.fitting.run_directories import find_run_directories
+from training.fitting.temperature import fit_temperature
 from training.views.source import ViewSource
 
 __all__ = ["BASELINES", "check_baselines", "train_baselines"]
@@ -53,7 +53,7 @@ def train_baselines(
         OSError: a file cannot be written.
     """
     wanted = check_baselines(names)
-    for folder in run_folders([Path(path)]):
+    for folder in find_run_directories([Path(path)]):
         lacking = [name for name in wanted if not baseline_file(folder, name).is_file()]
         run = load_run(folder)
         record = run.record

@@ -4,12 +4,10 @@ Guo et al., "On Calibration of Modern Neural Networks" (ICML 2017), for temperat
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import minimize_scalar
-from scipy.special import log_softmax
 from sklearn.metrics import roc_auc_score
 
 from thor2_jax.errors import InputError
@@ -21,16 +19,11 @@ __all__ = [
     "accuracy_at_coverage",
     "auroc",
     "expected_calibration_error",
-    "fit_temperature",
-    "negative_log_likelihood",
     "reliability",
-    "with_temperature",
 ]
 
 BINS = 15
 """Of equal width over [0, 1], as is usual."""
-
-Floats = NDArray[np.floating[Any]]
 
 
 class Reliability(NamedTuple):
@@ -83,51 +76,6 @@ def expected_calibration_error(confidence: ArrayLike, right: ArrayLike, bins: in
     if not used.any():
         return math.nan
     return float(np.average(np.abs(found.accuracy - found.confidence)[used], weights=found.answers[used]))
-
-
-def with_temperature(probabilities: Floats, temperature: float) -> NDArray[np.float64]:
-    """softmax(log p / temperature) of [N, C] probabilities: above 1 less sure, below 1 surer; the winner stays.
-
-    Logarithms of probabilities are logits up to a constant, which softmax does not see.
-    """
-    return np.exp(_log_softmax(probabilities, temperature))
-
-
-def _log_softmax(probabilities: Floats, temperature: float) -> NDArray[np.float64]:
-    logits = np.log(np.maximum(np.asarray(probabilities, np.float64), np.finfo(np.float32).tiny))
-    return np.asarray(log_softmax(logits / temperature, axis=1))
-
-
-def negative_log_likelihood(probabilities: Floats, truth: NDArray[np.integer[Any]], temperature: float = 1.0) -> float:
-    """Mean over N of -log of the true class's probability; `probabilities` [N, C], `truth` [N] class indices."""
-    return float(-_log_softmax(probabilities, temperature)[np.arange(len(truth)), truth].mean())
-
-
-def fit_temperature(probabilities: Floats, truth: NDArray[np.integer[Any]]) -> float:
-    """The temperature, from 0.01 to 100, at which held-out answers are most likely.
-
-    Args:
-        probabilities: [N, C] of views that the classifier was not trained on.
-        truth: [N] class indices.
-
-    Raises:
-        InputError: shapes that do not fit, no views, or an index that is no class.
-    """
-    probabilities, truth = np.asarray(probabilities), np.asarray(truth)
-    if probabilities.ndim != 2 or truth.shape != probabilities.shape[:1] or len(truth) == 0:
-        raise InputError(
-            f"probabilities and truth have shapes {probabilities.shape} and {truth.shape}; "
-            "expected [N, C] and [N] with N above 0"
-        )
-    if truth.min() < 0 or truth.max() >= probabilities.shape[1]:
-        raise InputError(f"truth has the index {truth.max()}; there are {probabilities.shape[1]} classes")
-    found = minimize_scalar(
-        lambda exponent: negative_log_likelihood(probabilities, truth, math.exp(exponent)),
-        bounds=(math.log(0.01), math.log(100)),
-        method="bounded",
-        options={"xatol": 1e-6},
-    )
-    return math.exp(found.x)
 
 
 def auroc(confidence: ArrayLike, positive: ArrayLike) -> float:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from thor2_jax.recognition import classifier
 from thor2_jax.recognition.classifier import FEATURES
 from training.baselines.baseline import TITLES
-from training.evaluation.confidence import with_temperature
+from training.fitting.temperature import with_temperature
 
 __all__ = ["RULES", "Rule", "join_by", "joinings", "main_joining"]
 

@@ -19,10 +19,10 @@ from thor2_jax.recognition.run_directory import RUN_FILE
 from training.baselines.baseline import Baseline, Seen
 from training.baselines.files import baseline_file
 from training.baselines.load import load_baselines
-from training.fitting.checkpoints import CHECKPOINTS
+from training.fitting.run_directories import find_run_directories
 from training.readers.labelled import path_ends, sequence_of
 
-__all__ = ["Run", "SequenceRun", "load_runs", "load_sequence_runs", "run_folders"]
+__all__ = ["Run", "SequenceRun", "load_runs", "load_sequence_runs"]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -67,24 +67,6 @@ class Run:
         return said
 
 
-def run_folders(paths: Iterable[Path]) -> list[Path]:
-    """The run folders among `paths`; of one that holds fold-0, fold-1, ..., those in their order.
-
-    Raises:
-        InputError: a folder that is neither, or a training that is not finished.
-    """
-    folders: list[Path] = []
-    for path in map(Path, paths):
-        folds = [f.parent for f in path.glob(f"fold-*/{RUN_FILE}") if f.parent.name[5:].isdecimal()]
-        if (path / RUN_FILE).is_file() or not folds:
-            folders.append(path)  # what is no run folder is refused when it is read
-        elif (path / CHECKPOINTS).exists():
-            raise InputError(f"model: the training of {path} is not finished; finish it, or name single folds of it")
-        else:
-            folders += sorted(folds, key=lambda fold: int(fold.name[5:]))
-    return folders
-
-
 def _digest(path: Path) -> str:
     digest = hashlib.sha256()
     baselines = baseline_file(path, "[!.]*")  # without one that a process was writing when it was killed
@@ -102,7 +84,7 @@ def load_runs(paths: Sequence[Path]) -> list[Run]:
     Raises:
         InputError: no run, one that cannot be read, one given twice, or runs that differ in what they share.
     """
-    folders = run_folders(paths)
+    folders = find_run_directories(paths)
     if not folders:
         raise InputError("model: no run folder is given")
     runs = [_load(folder) for folder in folders]

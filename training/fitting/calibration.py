@@ -1,4 +1,4 @@
-"""Temperatures of a fold's classifiers, from the views that it holds out; `evaluation.confidence` fits them."""
+"""Temperatures of a fold's classifiers, from the views that it holds out."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from colornet import ColorNetwork
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.recognition.classifier import MLP, Feature, class_probabilities
-from training.evaluation.confidence import fit_temperature
 from training.fitting.samples import Batch, Samples
 from training.fitting.steps import describe_batch
+from training.fitting.temperature import fit_temperature
 
 __all__ = ["sample_probabilities", "temperatures"]
 

@@ -17,7 +17,7 @@ from thor2_jax.recognition.classifier import MLP
 from thor2_jax.recognition.run_directory import TrainedRun, input_size, save_run
 from thor2_jax.types import PointClouds
 from training.baselines.files import baseline_file
-from training.evaluation.runs import load_runs, load_sequence_runs, run_folders
+from training.evaluation.runs import load_runs, load_sequence_runs
 
 CONFIG = DescriptorConfig(homology="closed_form", n_slices=1, n_strips=3)
 
@@ -37,25 +37,6 @@ def make(tmp_path: Path) -> Maker:
         return tmp_path / name
 
     return make
-
-
-def test_folds_are_found_in_their_order(tmp_path: Path) -> None:
-    for fold in (10, 2, 0):
-        (tmp_path / "five" / f"fold-{fold}").mkdir(parents=True)
-        (tmp_path / "five" / f"fold-{fold}" / "run.json").touch()
-    (tmp_path / "single").mkdir()
-    (tmp_path / "single" / "run.json").touch()
-    found = run_folders([tmp_path / "single", tmp_path / "five"])
-    assert [f.relative_to(tmp_path).as_posix() for f in found] == [
-        "single",
-        "five/fold-0",
-        "five/fold-2",
-        "five/fold-10",
-    ]
-    (tmp_path / "five" / "checkpoints").mkdir()
-    with pytest.raises(InputError, match="five is not finished"):
-        run_folders([tmp_path / "five"])
-    assert run_folders([tmp_path / "five" / "fold-2"]) == [tmp_path / "five" / "fold-2"]
 
 
 def test_folds_are_loaded_with_names_and_digests(make: Maker, tmp_path: Path) -> None:

@@ -10,13 +10,13 @@ import colornet
 import thor2_jax as thor2
 from thor2_jax.recognition.classifier import MLP, Feature, class_probabilities
 from thor2_jax.recognition.run_directory import input_size
-from training.evaluation.confidence import fit_temperature
 from training.evaluation.runs import load_runs
 from training.fitting import calibration
 from training.fitting.calibration import sample_probabilities, temperatures
 from training.fitting.fit import FitOptions
 from training.fitting.job import train_run
 from training.fitting.samples import MIRRORS, build_samples
+from training.fitting.temperature import fit_temperature
 from training.views.normalized_views import padded_batches
 from training.views.source import MemoryViews
 

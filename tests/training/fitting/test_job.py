@@ -19,12 +19,12 @@ from PIL import Image
 
 import thor2_jax as thor2
 from thor2_jax.recognition.run_directory import TrainedRun, load_run
-from training.evaluation.runs import run_folders
 from training.fitting import job as module
 from training.fitting import metrics_log as metrics
 from training.fitting.checkpoints import Checkpoints
 from training.fitting.fit import FitOptions
 from training.fitting.job import train_run
+from training.fitting.run_directories import find_run_directories
 from training.views.mesh_views import Cloud
 from training.views.source import MemoryViews
 
@@ -206,7 +206,7 @@ def test_a_stop_while_checkpoints_are_removed(tmp_path: Path, monkeypatch: pytes
     with pytest.raises(Stopped):
         train_run(source(), tmp_path / "run", ["tops"], OPTIONS, config=CONFIG, folds=2)
     assert module.is_finished(tmp_path / "run")
-    assert [load_run(folder).record["fold"] for folder in run_folders([tmp_path / "run"])] == [0, 1]
+    assert [load_run(folder).record["fold"] for folder in find_run_directories([tmp_path / "run"])] == [0, 1]
 
 
 def test_other_options_or_views_are_refused(tmp_path: Path) -> None:

@@ -1,0 +1,30 @@
+"""Run directories on disk: a single run, or the folds of one training."""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from thor2_jax.errors import InputError
+from thor2_jax.recognition.run_directory import RUN_FILE
+from training.fitting.checkpoints import CHECKPOINTS
+
+__all__ = ["find_run_directories"]
+
+
+def find_run_directories(paths: Iterable[Path]) -> list[Path]:
+    """Return the run directories among `paths`; a directory with fold-0, fold-1, ... is replaced by its folds.
+
+    Raises:
+        InputError: a training is not finished. A path that is no run directory is refused when it is loaded.
+    """
+    directories: list[Path] = []
+    for path in map(Path, paths):
+        folds = [f.parent for f in path.glob(f"fold-*/{RUN_FILE}") if f.parent.name[5:].isdecimal()]
+        if (path / RUN_FILE).is_file() or not folds:
+            directories.append(path)
+        elif (path / CHECKPOINTS).exists():
+            raise InputError(
+                f"model: {path} holds an unfinished training; finish it with `thor2 train`, or give single folds of it"
+            )
+        else:
+            directories += sorted(folds, key=lambda fold: int(fold.name[5:]))
+    return directories
