@@ -89,13 +89,13 @@ def render(
     """Render views of meshes to a dataset that `train --dataset` reads. Interrupted, it goes on when called again."""
     from training.augmentation import Illumination, Occlusion, Segmentation, Sensor, Variations
     from training.objects.meshes import find_meshes, read_names
-    from training.storage.workers import local, on_ray
+    from training.storage.workers import local_workers, ray_workers
     from training.views.render_job import render_dataset
 
     if address is not None and engine != "ray":
         raise InputError(f"address is {address}; it goes with --engine ray")
     found = find_meshes(meshes, read_names(names) if names else None)
-    place = local(workers) if engine == "local" else on_ray(workers, address)
+    pool = local_workers(workers) if engine == "local" else ray_workers(workers, address)
     variations = Variations(
         illumination=Illumination() if illumination else None,
         sensor=Sensor() if sensor else None,
@@ -105,7 +105,7 @@ def render(
     )
     with _bar() as bar:
         progress = _stage(bar, "render")
-        dataset = render_dataset(found, out, azimuth_step, polar_step, place, progress, variations or None, seed)
+        dataset = render_dataset(found, out, azimuth_step, polar_step, pool, progress, variations or None, seed)
     console.print(
         f"{len(dataset)} views of {len(dataset.classes)} objects ({dataset.manifest.left_out} left out) in {out}"
     )
@@ -162,7 +162,7 @@ def train(
     from training.fitting.job import VIEWS, check_out, check_trained, is_finished, train_run
     from training.fitting.protocol import DEFAULT, PAPER
     from training.objects.meshes import find_meshes, read_names
-    from training.storage.workers import local
+    from training.storage.workers import local_workers
     from training.views.dataset import ViewDataset
     from training.views.left_out import WithoutClasses
     from training.views.render_job import render_dataset
@@ -188,7 +188,7 @@ def train(
         with _bar() as bar:
             progress = _stage(bar, "render")
             source: ViewSource = render_dataset(
-                found, out / VIEWS, *steps, local(workers), progress, protocol.variations, seed
+                found, out / VIEWS, *steps, local_workers(workers), progress, protocol.variations, seed
             )
     else:
         assert dataset is not None

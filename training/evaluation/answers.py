@@ -1,7 +1,7 @@
 """What every classifier of every run says of every labelled instance, kept frame by frame as it comes.
 
-`answers.jsonl`: the first line tells what was asked, each further line holds a frame and a digest of what it says. A
-file that a crash cut off is good up to its last whole line.
+`answers.jsonl`: the first line tells what was asked, each further line holds a frame. A file that a crash cut off is good
+up to its last whole line. Files of version 0.1.0 also have a digest in each line, which is not read.
 """
 
 import dataclasses
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
-from thor2_jax.files import json_digest, write_text
+from thor2_jax.files import write_text
 from training.baselines.baseline import seen_in
 from training.evaluation.runs import Run
 from training.readers.labelled import LabelledFrame
@@ -145,22 +145,22 @@ def _encoded(answers: FrameAnswers) -> str:
         }
         for i in answers.instances
     ]
-    said = {
+    frame = {
         "frame": answers.frame,
         "attributes": dict(answers.attributes),
         "seconds": round(answers.seconds, 4),
         "instances": instances,
     }
-    return json.dumps({**said, "digest": json_digest(said)})
+    return json.dumps(frame)
 
 
 def _decoded(line: str | bytes) -> FrameAnswers:
     values = json.loads(line)
-    if values["digest"] != json_digest(values):
-        raise ValueError(f"the digest of frame {values.get('frame')!r} is not that of what it says")
     instances = []
     for instance in values["instances"]:
-        rows = instance["probabilities"]
-        instance["probabilities"] = None if rows is None else np.array(rows, np.float32)
+        if instance["probabilities"] is not None:
+            instance["probabilities"] = np.array(instance["probabilities"], np.float32)
+            if instance["probabilities"].ndim != 2:
+                raise ValueError(f"the probabilities of frame {values['frame']!r} are not a table")
         instances.append(InstanceAnswer(**instance))
     return FrameAnswers(values["frame"], values["attributes"], values["seconds"], instances)

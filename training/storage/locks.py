@@ -1,9 +1,10 @@
-"""One process at a time in a folder that is in the making."""
+"""Exclusive locks on output directories."""
 
 import contextlib
-import fcntl
 from collections.abc import Iterator
 from pathlib import Path
+
+import filelock
 
 from thor2_jax.errors import InputError
 
@@ -13,16 +14,24 @@ LOCK = ".lock"
 
 
 @contextlib.contextmanager
-def locked(folder: Path) -> Iterator[None]:
-    """Keep other processes from writing to the folder. The lock ends with this process, however that ends.
+def locked(directory: Path) -> Iterator[None]:
+    """Hold an exclusive lock on an output directory, which is created if it is missing.
+
+    The operating system releases the lock when the process ends, even if it is killed. The lock file stays.
 
     Raises:
-        InputError: another process has it.
-        OSError: the folder does not exist or cannot be written.
+        InputError: if another process holds the lock.
+        OSError: if the directory cannot be written, or its file system has no locks.
     """
-    with (folder / LOCK).open("w") as stream:
-        try:
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise InputError(f"out: another process is writing to {folder}") from None
+    # A soft lock, filelock's fallback on file systems without locks, would outlive a killed process.
+    lock = filelock.FileLock(directory / LOCK, blocking=False, fallback_to_soft=False)
+    try:
+        lock.acquire()
+    except filelock.Timeout:
+        raise InputError(
+            f"out: another process is writing to {directory}; wait until it ends, or choose another directory"
+        ) from None
+    try:
         yield
+    finally:
+        lock.release()

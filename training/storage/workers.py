@@ -1,10 +1,10 @@
-"""Where tasks run: in processes of this machine, or on a Ray cluster. Either is a map that keeps the order.
+"""Worker pools: ordered parallel maps over processes of this machine or tasks of a Ray cluster.
 
-    with closing(local(workers=2)(function, items)) as results:      # or on_ray(workers=64, address="auto")
+    with closing(local_workers(2)(function, items)) as results:  # or ray_workers(64, address="auto")
         for result in results:
             ...
 
-Results wait in the order of their items, `workers` of them at most, so memory does not grow with the number of items.
+At most `workers` results wait to be read, so memory does not grow with the number of items.
 """
 
 import collections
@@ -21,21 +21,21 @@ from typing import Any, Protocol, TypeVar
 
 from thor2_jax.errors import InputError
 
-__all__ = ["IN_PROCESS", "Engine", "local", "on_ray"]
+__all__ = ["IN_PROCESS", "WorkerPool", "local_workers", "ray_workers"]
 
 A = TypeVar("A")
 B = TypeVar("B")
 Handle = TypeVar("Handle")
 
 
-class Engine(Protocol):
-    """Applies a function to items, several at a time; yields the results in the order of the items."""
+class WorkerPool(Protocol):
+    """Map a function over items, several at a time, and yield the results in the order of the items."""
 
     def __call__(self, function: Callable[[A], B], items: Iterable[A]) -> Generator[B, None, None]:
-        """`function` and items are pickled: a function of a module. Closing the generator ends what still runs."""
+        """Pickle `function` (of a module) and the items. Closing the generator ends the tasks that still run."""
 
 
-def _in_order(
+def _map_ordered(
     submit: Callable[[A], Handle], fetch: Callable[[Handle], B], items: Iterable[A], ahead: int
 ) -> Generator[B, None, None]:
     pending: collections.deque[Handle] = collections.deque()
@@ -47,78 +47,83 @@ def _in_order(
         yield fetch(pending.popleft())
 
 
-def _begin_worker() -> None:
-    """Leave Ctrl-C to the parent, and end with it even if it is killed: an idle worker would wait for ever."""
+def _initialize_worker() -> None:
+    """Leave Ctrl-C to the parent, and exit when the parent ends: an idle worker would otherwise wait forever."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     assert parent is not None
 
-    def follow() -> None:
+    def exit_with_parent() -> None:
         parent.join()
         os._exit(1)
 
-    threading.Thread(target=follow, daemon=True).start()
+    threading.Thread(target=exit_with_parent, daemon=True).start()
 
 
-def _check(workers: int) -> None:
+def _check_workers(workers: int) -> None:
     if workers < 1:
-        raise InputError(f"workers must be at least 1, not {workers}")
+        raise InputError(f"workers is {workers}; expected at least 1")
 
 
-def local(workers: int = 1) -> Engine:
-    """Processes of this machine; 1 works in this one. With more, the calling script needs a `__main__` guard.
+def local_workers(workers: int = 1) -> WorkerPool:
+    """Return a pool of processes on this machine; one worker runs in the calling process.
 
-    A process that dies, out of memory for one, ends the map with ChildProcessError.
+    With several workers, the calling script needs an `if __name__ == "__main__"` guard. The map raises
+    ChildProcessError if a worker dies, for example because memory ran out.
 
     Raises:
-        InputError: `workers` is not positive.
+        InputError: if `workers` is not positive.
     """
-    _check(workers)
+    _check_workers(workers)
 
     def run(function: Callable[[A], B], items: Iterable[A]) -> Generator[B, None, None]:
         if workers == 1:
             yield from map(function, items)
             return
-        # Not forked: JAX has threads, and a copy of them in a child can hang.
+        # JAX starts threads, and a forked child can deadlock on their locks.
         context = multiprocessing.get_context("spawn")
-        pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_begin_worker)
+        executor = ProcessPoolExecutor(workers, mp_context=context, initializer=_initialize_worker)
         try:
-            yield from _in_order(
-                lambda item: pool.submit(function, item), lambda future: future.result(), items, workers
+            yield from _map_ordered(
+                lambda item: executor.submit(function, item), lambda future: future.result(), items, workers
             )
         except BrokenProcessPool as error:
-            raise ChildProcessError(f"a worker process died, perhaps for want of memory ({error})") from error
+            raise ChildProcessError(f"a worker process died, possibly because memory ran out ({error})") from error
         finally:
-            pool.shutdown(cancel_futures=True)
+            executor.shutdown(cancel_futures=True)
 
     return run
 
 
-IN_PROCESS = local()
+IN_PROCESS = local_workers()
+"""The pool that runs every task in the calling process."""
 
 
-def on_ray(workers: int, address: str | None = None) -> Engine:
-    """Tasks on a Ray cluster. What a worker that dies had at hand is done again by another.
+def ray_workers(workers: int, address: str | None = None) -> WorkerPool:
+    """Return a pool of tasks on a Ray cluster, which repeats the tasks of a worker that dies.
 
     Args:
-        workers: tasks at a time.
-        address: as of `ray.init`; None is the cluster of this machine, or one started for the duration of the map.
+        workers: number of tasks that run at a time.
+        address: address of the cluster, as for `ray.init`; None uses the cluster of this machine, or starts one for the
+            duration of the map.
 
     Raises:
-        InputError: `workers` is not positive, or Ray is not installed.
+        InputError: if `workers` is not positive, or Ray is not installed.
     """
-    _check(workers)
+    _check_workers(workers)
     try:
         ray: Any = importlib.import_module("ray")
     except ModuleNotFoundError:
-        raise InputError("engine: ray is not installed; it comes with the extra thor2-jax[cluster]") from None
+        raise InputError(
+            "engine is ray, but the package ray is not installed; run pip install 'thor2-jax[cluster]'"
+        ) from None
 
     def run(function: Callable[[A], B], items: Iterable[A]) -> Generator[B, None, None]:
         with warnings.catch_warnings():
-            # JAX warns of forks; Ray's are followed by the start of another program.
+            # JAX warns about forks; Ray's forks execute another program at once, which is safe.
             warnings.filterwarnings("ignore", r"os\.fork\(\) was called", RuntimeWarning)
             cluster = ray.init(address, log_to_driver=False, logging_level="error")
         with cluster:
-            yield from _in_order(ray.remote(function).remote, ray.get, items, workers)
+            yield from _map_ordered(ray.remote(function).remote, ray.get, items, workers)
 
     return run

@@ -25,7 +25,7 @@ from training.augmentation import Variations, vary
 from training.objects.meshes import TexturedMesh, load_mesh
 from training.rendering.ray_caster import TRAINING_CAMERA, Camera, RayCaster, RenderedView, render_view
 from training.rendering.view_sphere import camera_pose, view_angles
-from training.storage.workers import local
+from training.storage.workers import local_workers
 
 __all__ = [
     "MIN_POINTS",
@@ -220,11 +220,11 @@ def render_views(
     Raises:
         InputError: no meshes, a mesh that cannot be read or is never seen, or steps or workers that do not fit.
     """
-    angles, engine = view_angles(azimuth_step, polar_step), local(workers)
+    angles, pool = view_angles(azimuth_step, polar_step), local_workers(workers)
     views: dict[str, list[Cloud]] = {name: [] for name, _ in checked_meshes(found, angles)}
     parts = [(name, first) for name in found for first in range(0, len(angles), CHUNK)]
     done, total = 0, len(angles) * len(found)
-    with closing(engine(render_task, view_tasks(found, angles, parts, CHUNK))) as results:
+    with closing(pool(render_task, view_tasks(found, angles, parts, CHUNK))) as results:
         for (name, first), clouds in zip(parts, results, strict=True):
             views[name] += [(cloud.xyz, cloud.rgb) for cloud in clouds]
             done += len(angles[first : first + CHUNK])

@@ -1,6 +1,6 @@
 """The rendering job: meshes to a folder of normalized views that `ViewDataset` reads.
 
-    dataset = render_dataset(find_meshes("meshes"), "views", engine=local(workers=2))
+    dataset = render_dataset(find_meshes("meshes"), "views", pool=local_workers(2))
 
 Workers render; this process normalizes and writes, a shard at a time, in the order of the job. So the bytes depend
 neither on the number of workers nor on where they are, and a job that was interrupted goes on where it was.
@@ -26,7 +26,7 @@ from training.objects.meshes import TexturedMesh
 from training.rendering.ray_caster import TRAINING_CAMERA
 from training.rendering.view_sphere import DISTANCE, view_angles
 from training.storage.locks import LOCK, locked
-from training.storage.workers import IN_PROCESS, Engine
+from training.storage.workers import IN_PROCESS, WorkerPool
 from training.views.dataset import MANIFEST, Manifest, Shard, ViewDataset, encode
 from training.views.mesh_views import (
     MIN_POINTS,
@@ -170,7 +170,7 @@ def render_dataset(
     out: str | Path,
     azimuth_step: float = 5.0,
     polar_step: float = 5.0,
-    engine: Engine = IN_PROCESS,
+    pool: WorkerPool = IN_PROCESS,
     progress: Progress = lambda done, total: None,
     variations: Variations | None = None,
     seed: int = 0,
@@ -185,7 +185,7 @@ def render_dataset(
         out: folder; new, empty, or with a dataset of the same arguments. Made with its parents.
         azimuth_step: degrees; divides 360.
         polar_step: degrees; divides 180.
-        engine: where views are rendered; of no influence on the result.
+        pool: where views are rendered; has no influence on the result.
         progress: called with (views done, views in all) at the start and after each shard; copies count as views.
         variations: adds varied copies of each view; None adds none.
         seed: of the variations. What an object's copies look like does not depend on the other objects.
@@ -234,7 +234,7 @@ def render_dataset(
         missing = [file for file in plan if file not in done]
         parts = [(objects[label]["name"], first) for label, first in (plan[file] for file in missing)]
         tasks = view_tasks(found, angles, parts, size, variations, seed)
-        with contextlib.closing(engine(render_task, tasks)) as results:
+        with contextlib.closing(pool(render_task, tasks)) as results:
             for file, rendered in zip(missing, results, strict=True):
                 label, first = plan[file]
                 with with_context(f"object {objects[label]['name']!r}"):

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from thor2_jax.errors import InputError
-from training.storage import workers as engines
-from training.storage.workers import IN_PROCESS, local, on_ray
+from training.storage import workers as worker_pools
+from training.storage.workers import IN_PROCESS, local_workers, ray_workers
 
 # Functions of a test file cannot be imported by a worker; `eval` can, and the items say what it does.
 SLOW_FIRST = ["__import__('time').sleep(0.3) or 0", *map(str, range(1, 9))]
@@ -28,7 +28,7 @@ def test_results_keep_the_order_and_items_are_drawn_as_needed(workers: int) -> N
             yield item
 
     found, ahead = [], []
-    with closing(local(workers)(eval, items())) as results:
+    with closing(local_workers(workers)(eval, items())) as results:
         for result in results:
             found.append(result)
             ahead.append(len(drawn) - len(found))
@@ -37,18 +37,18 @@ def test_results_keep_the_order_and_items_are_drawn_as_needed(workers: int) -> N
 
 
 def test_no_items() -> None:
-    assert list(IN_PROCESS(eval, [])) == list(local(2)(eval, [])) == []
+    assert list(IN_PROCESS(eval, [])) == list(local_workers(2)(eval, [])) == []
 
 
 @pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_an_exception_of_the_function_arrives(workers: int) -> None:
-    with pytest.raises(ZeroDivisionError), closing(local(workers)(eval, ["1", "1 / 0", "2"])) as results:
+    with pytest.raises(ZeroDivisionError), closing(local_workers(workers)(eval, ["1", "1 / 0", "2"])) as results:
         list(results)
 
 
 @pytest.mark.slow
 def test_a_worker_that_dies_is_told_of() -> None:
-    results = local(2)(eval, ["1", "__import__('os')._exit(3)", "2", "3"])
+    results = local_workers(2)(eval, ["1", "__import__('os')._exit(3)", "2", "3"])
     with pytest.raises(ChildProcessError, match="a worker process died"), closing(results):
         list(results)
 
@@ -64,9 +64,9 @@ def is_running(pid: int) -> bool:
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")
 def test_workers_end_with_a_parent_that_is_killed() -> None:
     program = """
-from training.storage.workers import local
+from training.storage.workers import local_workers
 import time
-results = local(2)(eval, ["__import__('time').sleep(0.5) or __import__('os').getpid()"] * 9)
+results = local_workers(2)(eval, ["__import__('time').sleep(0.5) or __import__('os').getpid()"] * 9)
 print(next(results), next(results), flush=True)
 time.sleep(60)
 """
@@ -82,13 +82,13 @@ time.sleep(60)
 
 
 def test_bad_requests(monkeypatch: pytest.MonkeyPatch) -> None:
-    for make in (local, on_ray):
-        with pytest.raises(InputError, match="workers must be at least 1, not 0"):
+    for make in (local_workers, ray_workers):
+        with pytest.raises(InputError, match="workers is 0"):
             make(0)
 
     def absent(name: str) -> None:
         raise ModuleNotFoundError(name)
 
-    monkeypatch.setattr(engines.importlib, "import_module", absent)
-    with pytest.raises(InputError, match=r"ray is not installed; it comes with the extra thor2-jax\[cluster\]"):
-        on_ray(2)
+    monkeypatch.setattr(worker_pools.importlib, "import_module", absent)
+    with pytest.raises(InputError, match=r"engine is ray"):
+        ray_workers(2)

@@ -103,7 +103,7 @@ def test_bad_requests(tmp_path: Path) -> None:
         ({}, (60, 45), 1, "found is empty"),
         ({"ball": ball()}, (0, 45), 1, "azimuth_step"),
         ({"ball": ball()}, (60, -45), 1, "polar_step"),
-        ({"ball": ball()}, (60, 45), 0, "workers must be at least 1, not 0"),
+        ({"ball": ball()}, (60, 45), 0, "workers is 0"),
         ({"ball": ball(), "z": tmp_path / "bad.ply"}, (60, 45), 1, "bad.ply"),
         ({"z": tmp_path / "absent.ply"}, (60, 45), 1, "absent.ply: no such file"),
         ({"speck": ball(0.003)}, (180, 90), 1, "object 'speck': none of its 6 views has 30 points"),

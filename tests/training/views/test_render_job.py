@@ -24,7 +24,7 @@ from training.augmentation import Illumination, Variations
 from training.objects.builtin_objects import builtin_objects
 from training.objects.meshes import TexturedMesh
 from training.storage.locks import locked
-from training.storage.workers import local, on_ray
+from training.storage.workers import local_workers, ray_workers
 from training.views import render_job
 from training.views.dataset import MANIFEST, ViewDataset
 from training.views.render_job import render_dataset
@@ -87,7 +87,7 @@ def test_folder(whole: Path) -> None:
 
 @pytest.mark.slow
 def test_workers_change_nothing(whole: Path, tmp_path: Path) -> None:
-    render_dataset(OBJECTS, tmp_path / "views", *STEPS, local(2))
+    render_dataset(OBJECTS, tmp_path / "views", *STEPS, local_workers(2))
     assert contents(tmp_path / "views") == contents(whole)
 
 
@@ -130,7 +130,7 @@ KILLED = """
 import os, signal, sys
 from training.views import render_job
 from training.objects.builtin_objects import builtin_objects
-from training.storage.workers import local
+from training.storage.workers import local_workers
 
 render_job.SHARD = 16
 replace, left = os.replace, int(sys.argv[2])
@@ -145,7 +145,7 @@ def killing(source, target):
 
 os.replace = killing
 objects = {name: builtin_objects()[name] for name in ("screwdriver", "tennis_ball")}
-render_job.render_dataset(objects, sys.argv[1], 60, 45, local(int(sys.argv[3])))
+render_job.render_dataset(objects, sys.argv[1], 60, 45, local_workers(int(sys.argv[3])))
 """
 
 
@@ -389,7 +389,7 @@ def test_on_a_ray_cluster_that_loses_a_worker(whole: Path, tmp_path: Path, monke
                         return
 
     threading.Thread(target=kill_one, daemon=True).start()
-    render_dataset(OBJECTS, tmp_path / "views", *STEPS, on_ray(2))
+    render_dataset(OBJECTS, tmp_path / "views", *STEPS, ray_workers(2))
     assert len(killed) == 1
     assert contents(tmp_path / "views") == contents(whole)
     assert children() == before
