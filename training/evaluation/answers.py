@@ -1,7 +1,7 @@
 """What every classifier of every run says of every labelled instance, kept frame by frame as it comes.
 
-`answers.jsonl`: the first line tells what was asked, each further line holds a frame. A file that a crash cut off is good
-up to its last whole line. Files of version 0.1.0 also have a digest in each line, which is not read.
+`answers.jsonl`: the first line tells what was asked, each further line holds a frame. A file that a crash cut off is
+good up to its last whole line. The digests in the lines of version 0.1.0 are not read.
 """
 
 import dataclasses
