@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from thor2_jax.recognition.classifier import DEFAULT_RULE
+from thor2_jax.recognition.fusion import DEFAULT_RULE
 from thor2_jax.recognition.recognizer import Recognizer
 from training.evaluation.accuracy import parts
 from training.evaluation.answers import answer_frame

@@ -1,31 +1,23 @@
-"""The classifiers (paper, section "Recognition"): one MLP a descriptor, and the rule that joins their answers."""
+"""The classifiers (paper, section "Recognition"): one MLP for each kind of descriptor."""
 
-from collections.abc import Mapping
 from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from flax import nnx
-from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
 from thor2_jax.types import Descriptors
 
 __all__ = [
-    "DEFAULT_RULE",
     "FEATURES",
     "HIDDEN",
-    "RULES",
     "Feature",
-    "Joined",
     "MLP",
-    "Rule",
     "check_features",
     "class_probabilities",
     "feature_of",
-    "join",
 ]
 
 Feature = Literal["ce", "tops", "tops2"]
@@ -45,14 +37,6 @@ def check_features(names: object, argument: str) -> tuple[Feature, ...]:
     if not values or len(set(values)) != len(values) or not set(values) <= set(FEATURES):
         raise InputError(f"{argument} is {names!r}; expected one or more different ones of {', '.join(FEATURES)}")
     return tuple(name for name in FEATURES if name in values)
-
-
-Rule = Literal["larger", "mean", "log-mean"]
-RULES: tuple[Rule, ...] = ("larger", "mean", "log-mean")
-"""Ways to make one answer of several classifiers; see `join`."""
-
-DEFAULT_RULE: Rule = "log-mean"
-"""Names more synthetic views that were held out than the paper's rule, "larger"."""
 
 
 def feature_of(descriptors: Descriptors, name: Feature) -> jax.Array:
@@ -120,39 +104,3 @@ class MLP(nnx.Module):
 def class_probabilities(model: MLP, descriptors: Descriptors, name: Feature) -> jax.Array:
     """Softmax [B, n_classes] of a trained classifier of that name."""
     return jax.nn.softmax(model(feature_of(descriptors, name)))
-
-
-class Joined(NamedTuple):
-    """The answer of several classifiers together, one a cloud.
-
-    Attributes:
-        class_index: [B] int, the winning class.
-        confidence: [B] float, its joint probability.
-        classifier: [B] str, the feature whose classifier is surest of it.
-    """
-
-    class_index: NDArray[np.intp]
-    confidence: NDArray[np.floating[Any]]
-    classifier: NDArray[np.str_]
-
-
-def join(probabilities: Mapping[Feature, NDArray[np.floating[Any]]], rule: Rule = DEFAULT_RULE) -> Joined:
-    """One answer of several classifiers (paper, "Recognition", for the rule "larger").
-
-    Args:
-        probabilities: feature -> [B, C] class probabilities of its classifier.
-        rule: "larger", the classifier with the larger top-1 probability answers, the first one if they are equal;
-            "mean" of the probabilities; "log-mean", their geometric mean, so that both have to find a class likely.
-    """
-    names = np.array(list(probabilities))
-    stacked = np.stack([probabilities[name] for name in probabilities])  # [M, B, C]
-    clouds = np.arange(stacked.shape[1])
-    if rule == "larger":
-        together = stacked[stacked.max(axis=2).argmax(axis=0), clouds]
-    elif rule == "mean":
-        together = stacked.astype(np.float64).mean(axis=0)
-    else:
-        together = np.exp(np.log(np.maximum(stacked, np.finfo(np.float32).tiny, dtype=np.float64)).mean(axis=0))
-        together /= together.sum(axis=1, keepdims=True)
-    index = together.argmax(axis=1)
-    return Joined(index, together.max(axis=1), names[stacked[:, clouds, index].argmax(axis=0)])

@@ -17,7 +17,7 @@ __all__ = ["MAX_DEPTH", "MIN_DEPTH", "MIN_POINTS", "InstanceCloud", "instance_cl
 MIN_DEPTH, MAX_DEPTH = 0.26, 2.5
 """Metres between which depth is trusted."""
 
-VOXEL = 0.003
+CLOUD_VOXEL = 0.003
 """Metres: side of a cube of the grid on which outliers are removed."""
 
 MIN_POINTS = 30
@@ -66,7 +66,7 @@ def instance_cloud(frame: RGBDFrame, label: int) -> InstanceCloud:
         trusted &= ~flying
     valid, depth = pixels[trusted], depth[trusted]
     points = (pixel_rays(valid, frame.labels.shape[1], frame.intrinsics) * depth[:, None]).astype(np.float32)
-    points, colors = voxel_downsample(points, frame.color.reshape(-1, 3).take(valid, axis=0), VOXEL)
+    points, colors = voxel_downsample(points, frame.color.reshape(-1, 3).take(valid, axis=0), CLOUD_VOXEL)
     if len(points) < MIN_POINTS:
         reason = (
             f"{len(points)} points ({len(pixels)} pixels, {len(valid)} of them with depth "

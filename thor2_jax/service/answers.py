@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.config import DescriptorConfig
-from thor2_jax.recognition.recognizer import Part, Recognition
+from thor2_jax.recognition.prepared_instance import PreparedInstance
+from thor2_jax.recognition.recognizer import Recognition
 from thor2_jax.service.engine import Row
 from thor2_jax.service.preparing import Prepared
 from thor2_jax.service.schemas import Candidate, Details, ExplainedFrame, ExplainedInstance, Instance, Slice, Strip
@@ -61,19 +62,19 @@ def explained_frame(
         if one.reason is None:
             row = next(following)
             if len(instances) < MAX_DETAILED:
-                details = _details(one.part, row, config)
+                details = _details(one, row, config)
         instances.append(ExplainedInstance(**dict(instance(recognition)), details=details))
     return ExplainedFrame(instances=instances, label_map=prepared.label_map, timings=timings)
 
 
-def _details(part: Part, row: Row, config: DescriptorConfig) -> Details:
-    aligned = row.aligned[: len(part.points)]
+def _details(prepared: PreparedInstance, row: Row, config: DescriptorConfig) -> Details:
+    aligned = row.aligned[: len(prepared.points)]
     shown = np.random.default_rng(0).permutation(len(aligned))[:MAX_POINTS]
     peak = float(row.images.max())
     images = np.rint(row.images * (255 / peak if peak > 0 else 0)).astype(int)
     return Details(
         points=aligned[shown].astype(float).round(4).tolist(),
-        colors=part.colors[shown].tolist(),
+        colors=prepared.colors[shown].tolist(),
         slice_borders=_slice_borders(aligned[:, 2], config),
         image_peak=peak,
         slices=[

@@ -13,9 +13,9 @@ from thor2_jax.descriptor.describe import describe_strips, strips
 from thor2_jax.descriptor.view_normalization import align
 from thor2_jax.errors import InputError
 from thor2_jax.recognition.classifier import Feature
-from thor2_jax.recognition.recognizer import THOR2, Part, Recognition, Recognizer, pack_parts
+from thor2_jax.recognition.prepared_instance import PreparedInstance, pack_instances
+from thor2_jax.recognition.recognizer import THOR2, Recognition, Recognizer
 from thor2_jax.recognition.run_directory import load_run
-from thor2_jax.service.preparing import PreparedInstance
 from thor2_jax.service.settings import Settings
 
 __all__ = ["Engine", "Row"]
@@ -72,13 +72,13 @@ class Engine:
                 self._rows([], n_clouds, n_points)
                 yield n_points, n_clouds
 
-    def rows(self, parts: Sequence[Part]) -> list[Row]:
+    def rows(self, instances: Sequence[PreparedInstance]) -> list[Row]:
         """Describe and classify clouds, at most `max_batch` of them."""
-        largest = max(len(part.points) for part in parts)
-        return self._rows(parts, _batch_size(len(parts)), max(point_bucket(largest), LEAST_POINTS))
+        largest = max(len(instance.points) for instance in instances)
+        return self._rows(instances, _batch_size(len(instances)), max(point_bucket(largest), LEAST_POINTS))
 
-    def _rows(self, parts: Sequence[Part], n_rows: int, n_points: int) -> list[Row]:
-        aligned = align(pack_parts(parts, n_rows, n_points), self.run.config)
+    def _rows(self, instances: Sequence[PreparedInstance], n_rows: int, n_points: int) -> list[Row]:
+        aligned = align(pack_instances(instances, n_rows, n_points), self.run.config)
         in_strips = strips(aligned, self.run.network, self.run.config)
         found = describe_strips(in_strips, self.run.network, self.run.config)
         probabilities = self._recognizer.probabilities(found, THOR2)
@@ -93,15 +93,14 @@ class Engine:
                 points[k],
                 colors[k],
             )
-            for k in range(len(parts))
+            for k in range(len(instances))
         ]
 
     def recognitions(self, instances: Sequence[PreparedInstance], rows: Sequence[Row]) -> list[Recognition]:
         """Answers for a frame's instances; `rows` are those of the usable ones, in order."""
-        usable = [one.part for one in instances if one.reason is None]
         shape = len(rows), len(self.run.classes)
         probabilities = {name: np.reshape([row.probabilities[name] for row in rows], shape) for name in THOR2}
-        return self._recognizer.answers(instances, usable, probabilities, [row.overflow for row in rows])
+        return self._recognizer.recognitions(instances, probabilities, [row.overflow for row in rows])
 
 
 def _keep_compiled(folder: Path) -> None:

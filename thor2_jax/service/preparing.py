@@ -20,26 +20,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.recognizer import Part, prepare
+from thor2_jax.recognition.prepared_instance import PreparedInstance, prepare_instance
 from thor2_jax.service.decoding import clouds_of_json, clouds_of_npz, frame_of
 from thor2_jax.service.problem import RequestError, late
 from thor2_jax.service.schemas import LabelMap
 from thor2_jax.service.settings import MAX_RUNS
 
-__all__ = ["Prepared", "PreparedInstance", "Preparers", "prepare_clouds", "prepare_frame"]
+__all__ = ["Prepared", "Preparers", "prepare_clouds", "prepare_frame"]
 
 LEAST_TIME = 1.0
 """Seconds that a request has at least once a process has begun with it. Only what is far from usual is cut off."""
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class PreparedInstance:
-    """An instance of a frame: its number, why it cannot be used (or None), and what will be described of it."""
-
-    label: int
-    reason: str | None
-    kept_by_fallback: bool
-    part: Part
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -56,11 +46,8 @@ def prepare_frame(files: dict[str, bytes], sigma_s: float, with_map: bool) -> Pr
     start = time.perf_counter()
     frame = frame_of(**files)
     decoded = time.perf_counter()
-    instances = []
     try:
-        for label in frame.instances:
-            cloud, part = prepare(frame, label, sigma_s)
-            instances.append(PreparedInstance(label, cloud.reason, cloud.kept_by_fallback, part))
+        instances = [prepare_instance(frame, label, sigma_s) for label in frame.instances]
     except InputError:  # images and numbers are right one by one: the camera puts the points out of all bounds
         raise RequestError(422, "intrinsics", "intrinsics put the points of an instance too far apart.") from None
     label_map = _label_map(frame.labels) if with_map else None
@@ -85,8 +72,7 @@ def prepare_clouds(content: bytes, as_npz: bool) -> Prepared:
     start = time.perf_counter()
     clouds = (clouds_of_npz if as_npz else clouds_of_json)(content)
     instances = [
-        PreparedInstance(k, None, False, Part(False, points, colors, np.zeros(len(points), bool)))
-        for k, (points, colors) in enumerate(clouds)
+        PreparedInstance(k, points, colors, np.zeros(len(points), bool)) for k, (points, colors) in enumerate(clouds)
     ]
     return Prepared(instances, {"decode": time.perf_counter() - start})
 

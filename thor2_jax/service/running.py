@@ -7,7 +7,8 @@ import threading
 import time
 from collections.abc import AsyncIterator, Iterator
 
-from thor2_jax.recognition.recognizer import Part, Recognition
+from thor2_jax.recognition.prepared_instance import PreparedInstance
+from thor2_jax.recognition.recognizer import Recognition
 from thor2_jax.service.answers import explained_frame
 from thor2_jax.service.batching import Batcher
 from thor2_jax.service.engine import Engine, Row
@@ -146,10 +147,10 @@ class Service:
 
     async def _rows(self, prepared: Prepared, ticket: Ticket) -> list[Row]:
         ticket.seconds.update(prepared.seconds)
-        parts = [instance.part for instance in prepared.instances if instance.reason is None]
+        usable = [instance for instance in prepared.instances if instance.reason is None]
         with ticket.stage("device"):
-            return await asyncio.wrap_future(self._batcher.submit(parts, ticket.deadline))
+            return await asyncio.wrap_future(self._batcher.submit(usable, ticket.deadline))
 
-    def _on_device(self, parts: list[Part]) -> list[Row]:
-        self.metrics.batches.observe(len(parts))
-        return self.engine.rows(parts)
+    def _on_device(self, instances: list[PreparedInstance]) -> list[Row]:
+        self.metrics.batches.observe(len(instances))
+        return self.engine.rows(instances)

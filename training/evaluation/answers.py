@@ -71,13 +71,13 @@ def answer_frame(runs: Sequence[Run], item: LabelledFrame) -> list[InstanceAnswe
     seen = seen_in(described, runs[0].recognizer.run.config) if compared else None
     found = [run.probabilities(item.identifier, described, seen) for run in runs]
     table = np.stack([found[r][name] for r, name in columns(runs)], axis=1)  # [B, M, C]
-    rows = {described.clouds[index].label: row for row, index in enumerate(described.usable)}
-    reasons = {cloud.label: cloud.reason for cloud in described.clouds}
+    rows = {instance.label: row for row, instance in enumerate(described.usable)}
+    reasons = {instance.label: instance.reason for instance in described.instances}
     answers = []
     for label, truth in sorted(item.truth.items()):
         if label in rows:
             row = rows[label]
-            answers.append(InstanceAnswer(label, truth, bool(described.occluded[row]), None, table[row]))
+            answers.append(InstanceAnswer(label, truth, described.usable[row].occluded, None, table[row]))
         else:
             reason = reasons.get(label) or "no pixels in the label image"
             answers.append(InstanceAnswer(label, truth, reason=reason))

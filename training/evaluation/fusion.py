@@ -7,16 +7,16 @@ from typing import Any, Literal, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from thor2_jax.recognition import classifier
-from thor2_jax.recognition.classifier import FEATURES
+from thor2_jax.recognition.classifier import FEATURES, Feature
+from thor2_jax.recognition.fusion import FUSION_RULES, FusionRule, fuse
 from training.baselines.baseline import TITLES
 from training.fitting.temperature import with_temperature
 
 __all__ = ["RULES", "Rule", "join_by", "joinings", "main_joining"]
 
-Rule = classifier.Rule | Literal["calibrated"]
-RULES: tuple[Rule, ...] = (*classifier.RULES, "calibrated")
-"""The rules of `classifier.join`, the paper's first, and the paper's after temperatures fitted on held-out views."""
+Rule = FusionRule | Literal["calibrated"]
+RULES: tuple[Rule, ...] = (*FUSION_RULES, "calibrated")
+"""The rules of `fuse`, the paper's first, and the paper's after temperatures fitted on held-out views."""
 
 
 def joinings(available: Iterable[str]) -> dict[str, tuple[str, ...]]:
@@ -50,6 +50,6 @@ def join_by(
     if rule == "calibrated":
         assert temperatures is not None
         probabilities = {name: with_temperature(found, temperatures[name]) for name, found in probabilities.items()}
-        rule = "larger"
-    joined = classifier.join(cast(Mapping[classifier.Feature, NDArray[np.floating[Any]]], probabilities), rule)
-    return joined.class_index, joined.confidence
+        rule = "max"
+    fused = fuse(cast(Mapping[Feature, NDArray[np.floating[Any]]], probabilities), rule)
+    return fused.class_index, fused.confidence

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thor2_jax.recognition.classifier import DEFAULT_RULE
+from thor2_jax.recognition.fusion import DEFAULT_RULE
 from training.evaluation.accuracy import over_runs, parts, tables_of
 from training.evaluation.answers import FrameAnswers, InstanceAnswer
 from training.evaluation.confidence import accuracy_at_coverage, auroc, expected_calibration_error, reliability

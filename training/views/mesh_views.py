@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
 from thor2_jax.recognition.frames import backproject
-from thor2_jax.recognition.recognizer import VOXEL
+from thor2_jax.recognition.prepared_instance import DESCRIPTOR_VOXEL
 from thor2_jax.recognition.voxel_grid import downsample_to_fit
 from training.augmentation import Variations, vary
 from training.objects.meshes import TexturedMesh, load_mesh
@@ -67,7 +67,7 @@ def cloud_of(view: RenderedView) -> Cloud:
     depth = view.depth.astype(np.float32) / np.float32(1000)
     seen = view.depth > 0
     points = backproject(depth, view.intrinsics)[seen].astype(np.float64) * SIGMA_S
-    points, colors = downsample_to_fit(points, view.color[seen].astype(np.float64), VOXEL)
+    points, colors = downsample_to_fit(points, view.color[seen].astype(np.float64), DESCRIPTOR_VOXEL)
     return (points / SIGMA_S).astype(np.float32), np.rint(colors).astype(np.uint8)
 
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
 from thor2_jax.errors import InputError, with_context
 from thor2_jax.files import atomic_write
-from thor2_jax.recognition.recognizer import VOXEL
+from thor2_jax.recognition.prepared_instance import DESCRIPTOR_VOXEL
 from training.augmentation import Variations
 from training.objects.meshes import TexturedMesh
 from training.rendering.ray_caster import TRAINING_CAMERA
@@ -212,7 +212,7 @@ def render_dataset(
     job = {
         "descriptor_version": DESCRIPTOR_VERSION,
         "sigma_s": SIGMA_S,
-        "voxel": VOXEL,
+        "voxel": DESCRIPTOR_VOXEL,
         "step": STEP,
         "min_points": MIN_POINTS,
         "camera": {**dataclasses.asdict(TRAINING_CAMERA), "distance": DISTANCE},

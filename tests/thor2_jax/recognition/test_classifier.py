@@ -1,4 +1,4 @@
-"""The classifier against the same layers in NumPy, float64, and the rule that joins two answers."""
+"""The classifier against the same layers in NumPy, float64."""
 
 import itertools
 
@@ -7,10 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import nnx
-from scipy.stats import gmean
 
 import thor2_jax as thor2
-from thor2_jax.recognition.classifier import FEATURES, FEW, HIDDEN, MLP, Rule, check_features, feature_of, join
+from thor2_jax.recognition.classifier import FEATURES, FEW, HIDDEN, MLP, check_features, feature_of
 
 RNG = np.random.default_rng(0)
 apply = nnx.jit(lambda model, x: model(x))
@@ -116,40 +115,3 @@ def test_each_feature_is_its_descriptor() -> None:
     sizes = {name: feature_of(found, name).shape for name in FEATURES}
     assert sizes == {"ce": (2, 4774), "tops": (2, 7168), "tops2": (2, 11942)}
     np.testing.assert_array_equal(feature_of(found, "ce"), found.color)
-
-
-@pytest.mark.parametrize("n", [0, 1, 101])
-@pytest.mark.parametrize("rule", ["mean", "log-mean"])
-def test_join_by_means(n: int, rule: Rule) -> None:
-    tops, tops2 = (np.asarray(jax.nn.softmax(RNG.normal(size=(n, 4)))) for _ in range(2))
-    found = join({"tops": tops, "tops2": tops2}, rule)
-    for b in range(n):
-        pair = tops[b].astype(np.float64), tops2[b].astype(np.float64)
-        together = (pair[0] + pair[1]) / 2 if rule == "mean" else gmean(pair) / gmean(pair).sum()
-        best = found.class_index[b]
-        assert best == together.argmax() and found.confidence[b] == pytest.approx(together[best], rel=1e-12)
-        assert found.classifier[b] == ("tops" if tops[b, best] >= tops2[b, best] else "tops2")
-    assert len(found.class_index) == n
-
-
-def test_a_class_that_one_classifier_rules_out_is_not_named() -> None:
-    """Both say 0 of the third class: a probability of 0 has a logarithm all the same."""
-    found = join({"tops": np.array([[0.9, 0.1, 0.0]], np.float32), "tops2": np.array([[0.0, 1.0, 0.0]], np.float32)})
-    assert found.class_index[0] == 1 and found.confidence[0] == pytest.approx(1) and found.classifier[0] == "tops2"
-
-
-@pytest.mark.parametrize("n", [0, 1, 101])
-def test_join_takes_the_more_confident_classifier(n: int) -> None:
-    tops, tops2 = (np.asarray(jax.nn.softmax(RNG.normal(size=(n, 4)))) for _ in range(2))
-    found = join({"tops": tops, "tops2": tops2}, "larger")
-    for b in range(n):
-        name, row = max((("tops", tops[b]), ("tops2", tops2[b])), key=lambda pair: pair[1].max())
-        assert found.classifier[b] == name
-        assert found.class_index[b] == row.argmax() and found.confidence[b] == row.max()
-    assert len(found.class_index) == n
-
-
-def test_join_of_a_tie_and_of_one() -> None:
-    first, second = np.array([[0.3, 0.7]]), np.array([[0.7, 0.3]])
-    assert join({"tops": first, "tops2": second}, "larger") == (np.array([1]), np.array([0.7]), np.array(["tops"]))
-    assert join({"tops2": second}).classifier.tolist() == ["tops2"]

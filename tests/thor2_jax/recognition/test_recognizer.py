@@ -81,9 +81,9 @@ def test_what_both_find_likely_wins(recognizer: Recognizer) -> None:
 
 
 def test_by_the_paper_s_rule_the_more_confident_classifier_wins(run: TrainedRun) -> None:
-    with pytest.raises(thor2.InputError, match="rule is 'least'; expected one of larger, mean, log-mean"):
+    with pytest.raises(thor2.InputError, match="rule is 'least'; expected one of max, mean, log-mean"):
         Recognizer(run, rule="least")  # type: ignore[arg-type]
-    for answer in Recognizer(run, rule="larger").recognize(tilted(patches())):
+    for answer in Recognizer(run, rule="max").recognize(tilted(patches())):
         if answer.reason is None:
             first = {name: top[0] for name, top in answer.top.items()}
             assert set(first) == {"tops", "tops2"}

@@ -1,5 +1,6 @@
 """What /v1/explain adds to the names, against the library on the same run."""
 
+import dataclasses
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -15,7 +16,7 @@ from thor2_jax.descriptor.describe import strips
 from thor2_jax.recognition.recognizer import DescribedFrame
 from thor2_jax.service.answers import explained_frame
 from thor2_jax.service.engine import Row
-from thor2_jax.service.preparing import Prepared, PreparedInstance, prepare_frame
+from thor2_jax.service.preparing import Prepared, prepare_frame
 from thor2_jax.service.schemas import LabelMap
 from thor2_jax.service.settings import MAX_DETAILED, MAX_RUNS
 
@@ -58,7 +59,7 @@ def test_the_details_are_those_of_the_library(answer: Any, described: DescribedF
     named = [one for one in answer["instances"] if one["details"] is not None]
     assert len(named) == len(described.usable) == 3
     for row, one in enumerate(named):
-        details, part = one["details"], described.parts[row]
+        details, part = one["details"], described.usable[row]
         images = np.asarray(described.descriptors.images[row])
         assert details["image_peak"] == pytest.approx(images.max(), rel=1e-4)
         shown = np.array([piece["image"] for piece in details["slices"]])
@@ -111,13 +112,13 @@ def explained(part: Any, count: int, config: thor2.DescriptorConfig, z: np.ndarr
         np.zeros((7, 31, 22), np.float32),
     )
     empty = LabelMap(width=1, height=1, labels=[0], lengths=[1])
-    instances = [PreparedInstance(k, None, False, part) for k in range(count)]
+    instances = [dataclasses.replace(part, label=k) for k in range(count)]
     found = [thor2.Recognition(label=k, name="a") for k in range(count)]
     return explained_frame(Prepared(instances, {}, empty), found, [row] * count, config, {})
 
 
 def test_past_the_first_instances_there_are_no_details(described: DescribedFrame) -> None:
-    part = described.parts[0]
+    part = described.usable[0]
     many = explained(part, MAX_DETAILED + 2, thor2.DescriptorConfig(), np.zeros(len(part.points)))
     assert [one.details is None for one in many.instances] == [False] * MAX_DETAILED + [True] * 2
     details = many.instances[0].details
@@ -127,7 +128,7 @@ def test_past_the_first_instances_there_are_no_details(described: DescribedFrame
 
 
 def test_slices_of_the_released_convention_are_the_levels_that_occur(described: DescribedFrame) -> None:
-    part = described.parts[0]
+    part = described.usable[0]
     z = np.resize([0.02, 0.11, 0.32], len(part.points))  # levels 0, 1, 3
     (one,) = explained(part, 1, thor2.DescriptorConfig.released(), z).instances
     np.testing.assert_allclose(one.details.slice_borders, [(-0.05, 0.05), (0.05, 0.15), (0.25, 0.35)], atol=1e-9)

@@ -19,13 +19,14 @@ class ToyRecognizer:
     def __init__(
         self, labels: list[int], unusable: dict[int, str], probabilities: dict[str, list[list[float]]]
     ) -> None:
-        self.clouds = [SimpleNamespace(label=label, reason=unusable.get(label)) for label in labels]
+        self.instances = [
+            SimpleNamespace(label=label, reason=unusable.get(label), occluded=label == 4) for label in labels
+        ]
         self.table = {name: np.array(rows) for name, rows in probabilities.items()}
 
     def describe(self, frame: Any) -> Any:
-        usable = [i for i, cloud in enumerate(self.clouds) if cloud.reason is None]
-        occluded = [self.clouds[i].label == 4 for i in usable]
-        return SimpleNamespace(clouds=self.clouds, usable=usable, occluded=occluded, descriptors=None)
+        usable = [instance for instance in self.instances if instance.reason is None]
+        return SimpleNamespace(instances=self.instances, usable=usable, descriptors=None)
 
     def probabilities(self, descriptors: Any) -> dict[str, np.ndarray]:
         return self.table

@@ -69,9 +69,8 @@ class ToyRecognizer:
             os.kill(os.getpid(), signal.SIGKILL)
         with self.log.open("a") as file:
             file.write(f"{number}\n")
-        clouds = [SimpleNamespace(label=label, reason=None) for label in frame.instances]
-        n = len(clouds)
-        return SimpleNamespace(clouds=clouds, usable=list(range(n)), occluded=[False] * n, descriptors=number)
+        instances = [SimpleNamespace(label=label, reason=None, occluded=False) for label in frame.instances]
+        return SimpleNamespace(instances=instances, usable=instances, descriptors=number)
 
     def probabilities(self, descriptors: int) -> dict[str, np.ndarray]:
         rng = np.random.default_rng([self.seed, descriptors])
@@ -138,7 +137,7 @@ def test_report_of_runs_of_which_one_lacks_a_classifier(tmp_path: Path) -> None:
     )
     assert [done for _, done, _, _ in stages] == list(range(6)) and "frames/s" in stages[-1][3]
     assert found == json.loads((tmp_path / "report" / "report.json").read_text())
-    accuracy = found["accuracy"]["larger"][0]["cells"][0]["accuracy"]
+    accuracy = found["accuracy"]["max"][0]["cells"][0]["accuracy"]
     assert {name: figure["runs"] for name, figure in accuracy.items()} == {
         "CE": 1, "TOPS": 2, "TOPS2": 2, "CE+TOPS": 1, "CE+TOPS2": 1, "THOR2": 2, "CE+TOPS+TOPS2": 1,
     }  # fmt: skip

@@ -60,7 +60,7 @@ def test_joinings_carry_the_papers_names() -> None:
 def test_rules_of_joining_by_hand() -> None:
     """The larger top-1 is 0.7; the means are 0.31, 0.34, 0.35; only the second class is above 0 in both."""
     both = {"tops": np.array([[0.0, 0.3, 0.7]]), "tops2": np.array([[0.62, 0.38, 0.0]])}
-    index, confidence = join_by("larger", both)
+    index, confidence = join_by("max", both)
     assert (index[0], confidence[0]) == (2, 0.7)
     index, confidence = join_by("mean", both)
     assert (index[0], confidence[0]) == (2, pytest.approx(0.35))
@@ -74,7 +74,7 @@ def test_rules_of_joining_by_hand() -> None:
 def test_temperatures_decide_whom_to_believe() -> None:
     """At a temperature of 4, 0.9 against 0.1 becomes 9 ** 0.25 to 1, or 0.634: less than 0.8."""
     both = {"tops": np.array([[0.9, 0.1]]), "tops2": np.array([[0.2, 0.8]])}
-    assert join_by("larger", both)[0][0] == 0
+    assert join_by("max", both)[0][0] == 0
     index, confidence = join_by("calibrated", both, {"tops": 4.0, "tops2": 1.0})
     assert (index[0], confidence[0]) == (1, pytest.approx(0.8))
     index, confidence = join_by("calibrated", {"tops": both["tops"]}, {"tops": 4.0})
@@ -129,7 +129,7 @@ def test_figures_against_numpy_and_sklearn() -> None:
         "THOR2": [[0, 1], [3, 4]],
         "CE+TOPS+TOPS2": [[2, 3, 4]],
     }.items():
-        for table in found["accuracy"]["larger"]:
+        for table in found["accuracy"]["max"]:
             for cell in table["cells"]:
                 here = [i for i, f in scored if cell["where"].items() <= f.attributes.items()]
                 accuracies = [np.mean([right(i, rows) for i in here]) for rows in per_run]
@@ -138,7 +138,7 @@ def test_figures_against_numpy_and_sklearn() -> None:
                 std = pytest.approx(np.std(accuracies, ddof=1)) if len(accuracies) > 1 else None
                 assert cell["accuracy"][name]["std"] == std
                 assert cell["accuracy"][name]["runs"] == len(accuracies)
-    assert [table["by"] for table in found["accuracy"]["larger"]] == [
+    assert [table["by"] for table in found["accuracy"]["max"]] == [
         [], ["environment"], ["environment", "occlusion"],
     ]  # fmt: skip
     assert [cell["where"]["occlusion"] for cell in found["accuracy"]["mean"][2]["cells"]] == ["none", "low", "high"] * 2
@@ -174,7 +174,7 @@ def test_nothing_or_one_instance(kept: int) -> None:
     assert found["instances"]["scored"] == kept and found["speed"]["frames_per_second"] is None
     assert found["joinings"] == (["TOPS", "TOPS2", "THOR2"] if kept else [])
     if kept:
-        assert found["accuracy"]["larger"][0]["cells"][0]["accuracy"]["THOR2"]["mean"] == 0.0
+        assert found["accuracy"]["max"][0]["cells"][0]["accuracy"]["THOR2"]["mean"] == 0.0
         assert found["confidence"]["THOR2"]["auroc_right"] == {"mean": None, "std": None, "runs": 0}
 
 
@@ -202,7 +202,7 @@ def test_sequences_of_ocid() -> None:
     answer = InstanceAnswer(1, "mug", probabilities=np.eye(3, dtype=np.float32)[:2])
     names = ["table/bottom/mixed/seq1", "table/bottom/mixed/seq2"]
     frames = [FrameAnswers(f"{name}/{k}", {"camera": "lower"}, 1.0, [answer]) for name in names for k in range(2)]
-    tables = results("ocid", frames, COLUMNS[:2], ["a"], CLASSES, NONE)["accuracy"]["larger"]
+    tables = results("ocid", frames, COLUMNS[:2], ["a"], CLASSES, NONE)["accuracy"]["max"]
     assert tables[-1]["by"] == ["sequence"]
     assert [cell["where"]["sequence"] for cell in tables[-1]["cells"]] == names
     assert tables[1]["cells"][0]["published"]["SimpleView"] == pytest.approx(0.6254)

@@ -385,7 +385,7 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     assert report["instances"]["scored"] == 2 and sum(report["instances"]["no_class"].values()) == 1
     page = (tmp_path / "report" / "report.html").read_text()
     assert "<h2>Confusions</h2>\n<p>There are none.</p>" in page and "Runs: run." in page
-    cell = report["accuracy"]["larger"][0]["cells"][0]
+    cell = report["accuracy"]["max"][0]["cells"][0]
     assert cell["instances"] == 2 and cell["accuracy"]["TOPS"]["mean"] == 1.0
     names.unlink()
     assert call(monkeypatch, "evaluate", "ocid", tmp_path, *options) == 2
@@ -416,7 +416,7 @@ def test_every_sequence_by_its_own_run(
     assert call(monkeypatch, "evaluate", "ocid", tmp_path, *options, "--out", tmp_path / "report") == 0
     report = json.loads((tmp_path / "report" / "report.json").read_text())
     assert report["runs"] == ["runs/*"] and report["classes"] == ["apple", "banana", "bowl", "mug"]
-    by = {tuple(table["by"]): table["cells"] for table in report["accuracy"]["larger"]}
+    by = {tuple(table["by"]): table["cells"] for table in report["accuracy"]["max"]}
     shares = {cell["where"]["sequence"]: cell["accuracy"]["TOPS"]["mean"] for cell in by["sequence",]}
     assert [round(share, 3) for share in shares.values()] == [1.0, 1.0, 0.667]
     assert call(monkeypatch, "evaluate", "ocid", tmp_path, *options, tmp_path) == 2

@@ -1,0 +1,47 @@
+"""Fusion of the classifiers: the three rules against SciPy and by hand."""
+
+import jax
+import numpy as np
+import pytest
+from scipy.stats import gmean
+
+from thor2_jax.recognition.fusion import FusionRule, fuse
+
+RNG = np.random.default_rng(0)
+
+
+@pytest.mark.parametrize("n", [0, 1, 101])
+@pytest.mark.parametrize("rule", ["mean", "log-mean"])
+def test_the_means_against_scipy(n: int, rule: FusionRule) -> None:
+    tops, tops2 = (np.asarray(jax.nn.softmax(RNG.normal(size=(n, 4)))) for _ in range(2))
+    result = fuse({"tops": tops, "tops2": tops2}, rule)
+    for b in range(n):
+        pair = tops[b].astype(np.float64), tops2[b].astype(np.float64)
+        fused = (pair[0] + pair[1]) / 2 if rule == "mean" else gmean(pair) / gmean(pair).sum()
+        best = result.class_index[b]
+        assert best == fused.argmax() and result.confidence[b] == pytest.approx(fused[best], rel=1e-12)
+        assert result.classifier[b] == ("tops" if tops[b, best] >= tops2[b, best] else "tops2")
+    assert len(result.class_index) == n
+
+
+def test_a_class_that_one_classifier_rules_out_loses() -> None:
+    """A probability of 0 has no logarithm: both give it to the third class."""
+    result = fuse({"tops": np.array([[0.9, 0.1, 0.0]], np.float32), "tops2": np.array([[0.0, 1.0, 0.0]], np.float32)})
+    assert result.class_index[0] == 1 and result.confidence[0] == pytest.approx(1) and result.classifier[0] == "tops2"
+
+
+@pytest.mark.parametrize("n", [0, 1, 101])
+def test_max_takes_the_most_confident_classifier(n: int) -> None:
+    tops, tops2 = (np.asarray(jax.nn.softmax(RNG.normal(size=(n, 4)))) for _ in range(2))
+    result = fuse({"tops": tops, "tops2": tops2}, "max")
+    for b in range(n):
+        name, row = max((("tops", tops[b]), ("tops2", tops2[b])), key=lambda pair: pair[1].max())
+        assert result.classifier[b] == name
+        assert result.class_index[b] == row.argmax() and result.confidence[b] == row.max()
+    assert len(result.class_index) == n
+
+
+def test_the_first_classifier_wins_a_tie_and_one_is_enough() -> None:
+    first, second = np.array([[0.3, 0.7]]), np.array([[0.7, 0.3]])
+    assert fuse({"tops": first, "tops2": second}, "max") == (np.array([1]), np.array([0.7]), np.array(["tops"]))
+    assert fuse({"tops2": second}).classifier.tolist() == ["tops2"]
