@@ -12,7 +12,16 @@ from training.augmentation import Illumination, Variations
 from training.objects.meshes import TexturedMesh, find_meshes, load_mesh
 from training.rendering.view_sphere import DISTANCE, camera_pose, view_angles
 from training.views import mesh_views as views
-from training.views.mesh_views import MIN_POINTS, SIGMA_S, VOXEL, Cloud, ViewTask, render_task, render_views, view_cloud
+from training.views.mesh_views import (
+    MIN_POINTS,
+    SIGMA_S,
+    DESCRIPTOR_VOXEL,
+    Cloud,
+    ViewTask,
+    render_task,
+    render_views,
+    view_cloud,
+)
 
 GOLDEN = ["004_sugar_box", "006_mustard_bottle", "025_mug", "048_hammer", "055_baseball", "061_foam_brick"]
 
@@ -38,7 +47,7 @@ def test_points_lie_on_the_sphere_with_its_colours() -> None:
 
 def test_one_point_a_voxel() -> None:
     xyz, _ = view_cloud(ball(), camera_pose(0.4, 1.2, np.zeros(3)))
-    voxel = VOXEL / SIGMA_S
+    voxel = DESCRIPTOR_VOXEL / SIGMA_S
     # The grid starts half a voxel below the least coordinate of the points, which the means only come near.
     cells = np.floor((xyz - xyz.min(axis=0)) / voxel).astype(int)
     assert len(np.unique(cells, axis=0)) > 0.6 * len(xyz)
@@ -149,7 +158,7 @@ def test_golden_clouds(shared: Path, name: str) -> None:
         distance, nearest = cKDTree(points).query(xyz * SIGMA_S)
         same = distance < 1e-4
         equal, total = equal + int(same.sum()), total + len(xyz)
-        assert distance.max() < VOXEL
+        assert distance.max() < DESCRIPTOR_VOXEL
         assert np.mean(same) > 0.92
         difference = np.abs(rgb - colors[nearest])
         assert difference[same].mean() < 0.5 and np.mean(difference > 2) < 0.03
