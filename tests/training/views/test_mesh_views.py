@@ -13,9 +13,9 @@ from training.objects.meshes import TexturedMesh, find_meshes, load_mesh
 from training.rendering.view_sphere import DISTANCE, camera_pose, view_angles
 from training.views import mesh_views as views
 from training.views.mesh_views import (
+    DESCRIPTOR_VOXEL,
     MIN_POINTS,
     SIGMA_S,
-    DESCRIPTOR_VOXEL,
     Cloud,
     ViewTask,
     render_task,
