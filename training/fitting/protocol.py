@@ -1,6 +1,7 @@
 """What a training consists of, from views to step sizes: the paper's, and the one that names more objects."""
 
 import dataclasses
+from typing import Any
 
 from training.augmentation import Illumination, Occlusion, Segmentation, Sensor, Variations
 from training.fitting.fit import FitOptions
@@ -26,6 +27,25 @@ class Protocol:
     variations: Variations | None
     mirrors: tuple[str, ...]
     fit: FitOptions
+
+    def replace(
+        self,
+        azimuth_step: float | None = None,
+        polar_step: float | None = None,
+        epochs: int | None = None,
+        batch_size: int | None = None,
+        seed: int | None = None,
+    ) -> "Protocol":
+        """Return the protocol with the given values; None keeps the protocol's own.
+
+        Raises:
+            InputError: A value of the fit is invalid.
+        """
+        steps = {"azimuth_step": azimuth_step, "polar_step": polar_step}
+        fit: dict[str, Any] = {"epochs": epochs, "batch_size": batch_size, "seed": seed}
+        given: dict[str, Any] = {name: value for name, value in steps.items() if value is not None}
+        given["fit"] = dataclasses.replace(self.fit, **{n: v for n, v in fit.items() if v is not None})
+        return dataclasses.replace(self, **given)
 
 
 DEFAULT = Protocol(

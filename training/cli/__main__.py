@@ -1,0 +1,5 @@
+"""Run the command line with `python -m training.cli`."""
+
+from training.cli import main
+
+main()

@@ -1,0 +1,127 @@
+"""`thor2 evaluate`: measure the accuracy of trained runs, one command per dataset format."""
+
+import hashlib
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.table import Table
+
+from thor2_jax.errors import InputError
+from training.cli.app import app, console, progress_bars
+
+evaluate_app = typer.Typer(no_args_is_help=True, help="Measure the accuracy of trained runs on a labelled dataset.")
+app.add_typer(evaluate_app, name="evaluate")
+
+DatasetArgument = Annotated[Path, typer.Argument(help="Directory of the dataset.")]
+ModelsOption = Annotated[
+    list[Path], typer.Option("--model", help="Run directory, or the directory of a training with several folds.")
+]
+MoreModels = Annotated[list[Path] | None, typer.Argument(metavar="[RUN]...", help="Further run directories.")]
+ReportOption = Annotated[
+    Path | None,
+    typer.Option("--out", help="Directory for report.html and report.json; an interrupted evaluation resumes."),
+]
+
+
+@evaluate_app.command()
+def uwis(dataset: DatasetArgument, model: ModelsOption, runs: MoreModels = None, out: ReportOption = None) -> None:
+    """UW-IS Occluded: <video>/images/<id>_{rgb,depth,labels}.png and <id>_poses.yaml."""
+    from training.readers.uwis import UWISOccluded
+
+    _evaluate("uwis", UWISOccluded(dataset), dataset, [*model, *(runs or [])], out)
+
+
+@evaluate_app.command()
+def frames(dataset: DatasetArgument, model: ModelsOption, runs: MoreModels = None, out: ReportOption = None) -> None:
+    """Single frames: <frame>/{color,depth,mask}.png, intrinsics.json, labels.json."""
+    from training.readers.frames import FrameFolder
+
+    _evaluate("frames", FrameFolder(dataset), dataset, [*model, *(runs or [])], out)
+
+
+@evaluate_app.command()
+def ocid(
+    dataset: DatasetArgument,
+    model: ModelsOption,
+    names: Annotated[
+        Path, typer.Option(help="YAML or JSON table: sequence -> object names in the order of their placement.")
+    ],
+    runs: MoreModels = None,
+    per_sequence: Annotated[
+        bool, typer.Option(help="RUN holds one run per sequence, as written by `train --sequences`.")
+    ] = False,
+    out: ReportOption = None,
+) -> None:
+    """OCID, subset YCB10: {table,floor}/{bottom,top}/<type>/<sequence>/{rgb,depth,label,pcd}."""
+    from training.readers.ocid import OCID
+
+    _evaluate("ocid", OCID(dataset, names), dataset, [*model, *(runs or [])], out, per_sequence, names)
+
+
+@evaluate_app.command()
+def bop(
+    dataset: DatasetArgument,
+    model: ModelsOption,
+    names: Annotated[Path | None, typer.Option(help="YAML or JSON table: obj_id -> name. Default: obj_000001.")] = None,
+    runs: MoreModels = None,
+    out: ReportOption = None,
+) -> None:
+    """BOP format (YCB-Video and others): <scene>/{rgb,depth,mask_visib}, scene_camera.json and scene_gt.json."""
+    from training.readers.bop import BOP
+
+    _evaluate("bop", BOP(dataset, names), dataset, [*model, *(runs or [])], out, names=names)
+
+
+def _evaluate(
+    kind: str,
+    frames: Any,
+    dataset: Path,
+    models: list[Path],
+    out: Path | None,
+    per_sequence: bool = False,
+    names: Path | None = None,
+) -> None:
+    from training.evaluation.job import evaluate_dataset
+    from training.evaluation.runs import load_runs, load_sequence_runs
+
+    if per_sequence and len(models) != 1:
+        raise InputError(
+            f"per_sequence: {len(models)} models are given; expected one directory with a run per sequence"
+        )
+    description = {"kind": kind, "path": str(dataset.resolve())}
+    if names:
+        description["names"] = hashlib.sha256(names.read_bytes()).hexdigest()
+    with tempfile.TemporaryDirectory() as temporary, progress_bars() as progress:
+        runs = load_sequence_runs(models[0], frames.identifiers) if per_sequence else load_runs(models)
+        report = evaluate_dataset(runs, frames, description, out or Path(temporary) / "report", progress)
+    _print_report(report)
+    if out is not None:
+        console.print(f"report: {out / 'report.html'}")
+
+
+def _print_report(report: Mapping[str, Any]) -> None:
+    from training.evaluation.page import accuracy_table
+
+    counts, speed = report["instances"], report["speed"]
+    if report["joinings"]:
+        shown = Table("", "instances", *report["joinings"])
+        for table in report["accuracy"][report["rule"]]:
+            header, rows = accuracy_table(table, report["joinings"])
+            shown.add_section()
+            if header[0]:
+                shown.add_row(f"by {header[0]}", style="bold")
+            for row in rows:
+                shown.add_row(*row)
+        console.print(shown)
+    console.print(
+        f"{counts['scored']} instances scored, {sum(counts['not_described'].values())} of them could not be described "
+        f"(counted as incorrect); {sum(counts['no_class'].values())} are of no class of the runs"
+    )
+    if speed["frames_per_second"]:
+        console.print(
+            f"{speed['frames']} frames, {speed['frames_per_second']:.2f} a second with compilation; "
+            f"median {speed['median_seconds']:.2f} s a frame"
+        )

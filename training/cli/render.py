@@ -1,0 +1,65 @@
+"""`thor2 render`: render a dataset of training views."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from thor2_jax.errors import InputError
+from training.cli.app import app, console, progress_bars
+
+
+@app.command()
+def render(
+    meshes: Annotated[Path, typer.Option(help="Directory of meshes (GLB, OBJ, PLY), one per file or subdirectory.")],
+    out: Annotated[Path, typer.Option(help="Directory for the views: new, or begun by this command.")],
+    names: Annotated[
+        Path | None, typer.Option(help="JSON or YAML table: object name -> mesh. Default: all meshes.")
+    ] = None,
+    azimuth_step: Annotated[float, typer.Option(help="Degrees between cameras around the object.")] = 5.0,
+    polar_step: Annotated[float, typer.Option(help="Degrees between cameras from pole to pole.")] = 5.0,
+    workers: Annotated[int, typer.Option(min=1, help="Rendering processes; with Ray, concurrent tasks.")] = 2,
+    engine: Annotated[
+        Literal["local", "ray"], typer.Option(help="Render on this machine or on a Ray cluster (extra `cluster`).")
+    ] = "local",
+    address: Annotated[
+        str | None, typer.Option(help="Address of the Ray cluster. Default: the one on this machine.")
+    ] = None,
+    illumination: Annotated[bool, typer.Option("--illumination", help="Augment: light and camera response.")] = False,
+    sensor: Annotated[bool, typer.Option("--sensor", help="Augment: noise and faults of the depth sensor.")] = False,
+    occlusion: Annotated[bool, typer.Option("--occlusion", help="Augment: another object in front.")] = False,
+    segmentation: Annotated[bool, typer.Option("--segmentation", help="Augment: inexact masks.")] = False,
+    copies: Annotated[int, typer.Option(help="Augmented copies of each view, if there are augmentations.")] = 2,
+    seed: Annotated[int, typer.Option(help="Seed for the augmentations.")] = 0,
+) -> None:
+    """Render views of meshes to a dataset for `train --dataset`. An interrupted rendering resumes."""
+    from training.augmentation import Illumination, Occlusion, Segmentation, Sensor, Variations
+    from training.objects.meshes import find_meshes, read_names
+    from training.storage.workers import local_workers, ray_workers
+    from training.views.render_job import render_dataset
+
+    if address is not None and engine != "ray":
+        raise InputError(f"address is {address}; it is only used with --engine ray")
+    variations = Variations(
+        illumination=Illumination() if illumination else None,
+        sensor=Sensor() if sensor else None,
+        occlusion=Occlusion() if occlusion else None,
+        segmentation=Segmentation() if segmentation else None,
+        copies=copies,
+    )
+    found = find_meshes(meshes, read_names(names) if names else None)
+    pool = local_workers(workers) if engine == "local" else ray_workers(workers, address)
+    with progress_bars() as progress:
+        dataset = render_dataset(
+            found,
+            out,
+            azimuth_step,
+            polar_step,
+            pool,
+            lambda done, total: progress("render", done, total, ""),
+            variations or None,
+            seed,
+        )
+    console.print(
+        f"{len(dataset)} views of {len(dataset.classes)} objects ({dataset.manifest.left_out} left out) in {out}"
+    )

@@ -1,0 +1,42 @@
+"""`thor2 serve`: the HTTP service."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from thor2_jax.errors import InputError
+from training.cli.app import ModelOption, UnknownOption, app
+
+
+@app.command()
+def serve(
+    model: ModelOption,
+    host: Annotated[str, typer.Option(help="Address to listen on; 0.0.0.0 for other machines.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port; 0 selects a free one, named in the log.")] = 8080,
+    workers: Annotated[int, typer.Option(min=1, help="Server processes, each with its own model and queue.")] = 1,
+    processes: Annotated[int, typer.Option(min=1, help="Processes per worker that decode and prepare frames.")] = 2,
+    queue: Annotated[int, typer.Option(min=1, help="Requests per worker at a time; others get status 429.")] = 32,
+    deadline: Annotated[float, typer.Option(help="Seconds per request before it gets status 504.")] = 5.0,
+    max_batch: Annotated[int, typer.Option(help="Largest number of clouds in a device batch.")] = 32,
+    unknown_below: UnknownOption = 0.0,
+    cache: Annotated[
+        Path | None, typer.Option(help="Directory for compiled programs, so that the next start is faster.")
+    ] = None,
+    token: Annotated[
+        str | None, typer.Option(envvar="THOR2_TOKEN", help="Bearer token that clients must send.")
+    ] = None,
+) -> None:
+    """Serve recognition over HTTP (extra `serve`); see /openapi.json."""
+    try:
+        from thor2_jax.service.server import serve as serve_forever
+    except ModuleNotFoundError as error:
+        if (error.name or "").startswith("thor2_jax"):
+            raise
+        raise InputError(f"{error.name} is not installed; serve requires: pip install 'thor2-jax[serve]'") from None
+    from thor2_jax.service.settings import Settings
+
+    settings = Settings(
+        model, token, queue, deadline, max_batch, processes=processes, unknown_below=unknown_below, cache=cache
+    )
+    serve_forever(settings, host, port, workers)

@@ -1,0 +1,92 @@
+"""`thor2 train`: train a recognizer."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from thor2_jax.errors import InputError
+from training.cli.app import app, console, progress_bars, split_names
+
+
+@app.command()
+def train(
+    out: Annotated[Path, typer.Option(help="Run directory: new, or begun by this command.")],
+    meshes: Annotated[Path | None, typer.Option(help="Directory of meshes (GLB, OBJ, PLY) to render.")] = None,
+    dataset: Annotated[
+        Path | None, typer.Option(help="Directory written by `thor2 render`, instead of --meshes.")
+    ] = None,
+    names: Annotated[
+        Path | None, typer.Option(help="JSON or YAML table: object name -> mesh. Default: all meshes.")
+    ] = None,
+    paper: Annotated[bool, typer.Option(help="Use the paper's protocol.")] = False,
+    azimuth_step: Annotated[
+        float | None, typer.Option(help="Degrees between cameras around the object. (20; paper: 5)")
+    ] = None,
+    polar_step: Annotated[
+        float | None, typer.Option(help="Degrees between cameras from pole to pole. (15; paper: 5)")
+    ] = None,
+    classifiers: Annotated[str, typer.Option(help="Comma-separated: tops, tops2, ce.")] = "tops,tops2,ce",
+    epochs: Annotated[
+        int | None, typer.Option(help="Half at a learning rate of 1e-2, half at 1e-3. (24; paper: 100)")
+    ] = None,
+    batch_size: Annotated[int | None, typer.Option(help="Samples per step. (256; paper: 128)")] = None,
+    seed: Annotated[int, typer.Option(help="Seed for augmentations, weights, sample order and dropout.")] = 0,
+    folds: Annotated[int, typer.Option(min=1, help="More than 1: one model per fold, which is its held-out set.")] = 1,
+    baselines: Annotated[
+        str, typer.Option(help="Comma-separated baselines to train too: thor, forest, pointnet.")
+    ] = "",
+    leave_out: Annotated[str, typer.Option(help="Comma-separated objects to train without.")] = "",
+    sequences: Annotated[
+        Path | None,
+        typer.Option(help="YAML or JSON table: sequence -> its objects. One run per sequence, in OUT/<sequence>."),
+    ] = None,
+    workers: Annotated[int, typer.Option(min=1, help="Rendering processes.")] = 2,
+    coordinator: Annotated[
+        str | None, typer.Option(help="HOST:PORT of process 0, for training with several processes.")
+    ] = None,
+    processes: Annotated[int, typer.Option(min=1, help="Number of processes that train together.")] = 1,
+    process: Annotated[int, typer.Option(min=0, help="Index of this process.")] = 0,
+) -> None:
+    """Train a recognizer on synthetic views of meshes. An interrupted training resumes.
+
+    With --meshes, each view is used as rendered and in two augmented copies, with other light, partial occlusion, depth
+    sensor errors and inexact masks. A --dataset has the copies that it was rendered with. --paper trains as the paper
+    does: more views, no augmented copies, four mirrors of each view and more epochs.
+
+    With --baselines, a finished run gets the baselines that it lacks. With --sequences, one run is trained for each
+    sequence, on its objects only (see `thor2 evaluate ocid --per-sequence`); finished runs must have the same options.
+    """
+    import jax
+
+    if (meshes is None) == (dataset is None):
+        raise InputError("give exactly one of --meshes and --dataset")
+    if sequences is not None and (dataset is None or leave_out):
+        raise InputError(f"sequences is {sequences}; it requires --dataset and excludes --leave-out")
+    if coordinator is not None:
+        if meshes is not None:
+            raise InputError("coordinator: several processes need a --dataset that all of them can read, not --meshes")
+        jax.distributed.initialize(coordinator, processes, process)
+    from training.fitting.protocol import DEFAULT, PAPER
+    from training.train_job import TrainJob, run_train_job
+
+    job = TrainJob(
+        out=out,
+        protocol=(PAPER if paper else DEFAULT).replace(
+            azimuth_step=azimuth_step, polar_step=polar_step, epochs=epochs, batch_size=batch_size, seed=seed
+        ),
+        meshes=meshes,
+        dataset=dataset,
+        names=names,
+        classifiers=split_names(classifiers),
+        folds=folds,
+        baselines=split_names(baselines),
+        leave_out=split_names(leave_out),
+        sequences=sequences,
+        workers=workers,
+    )
+    for directory, runs in run_train_job(job, progress_bars).items():
+        for run in runs:
+            for name, accuracy in run.record["held_out_accuracy"].items():
+                console.print(f"fold {run.record['fold']}: {name} has a held-out accuracy of {accuracy:.3f}")
+        console.print(f"run written to {directory}")
