@@ -60,3 +60,11 @@ def shared() -> Path:
     if not SHARED.is_dir():
         pytest.skip("no shared/ folder with real scans beside the checkout")
     return SHARED
+
+
+@pytest.fixture(scope="session", params=["objects", "scans"])
+def golden_files(request: pytest.FixtureRequest) -> tuple[Path, ...]:
+    """Golden files of the built-in objects (tests/golden/make_golden.py), and those of real scans."""
+    if request.param == "objects":
+        return tuple(sorted((Path(__file__).parent / "golden" / "objects").glob("*.npz")))
+    return tuple(sorted((request.getfixturevalue("shared") / "golden").glob("*.npz")))

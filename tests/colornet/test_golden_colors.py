@@ -1,4 +1,4 @@
-"""Regions and similarity against colour matrices computed outside this project, on views of real scans."""
+"""Regions and similarity against colour matrices computed outside the product."""
 
 from pathlib import Path
 
@@ -12,15 +12,8 @@ def as_8_bit(colors: np.ndarray) -> np.ndarray:
     return np.floor(colors * np.float32(255) + np.float32(0.5)).astype(np.uint8)
 
 
-def golden_files(shared: Path) -> list[Path]:
-    paths = sorted((shared / "golden").glob("*.npz"))
-    assert len(paths) == 24
-    return paths
-
-
-def test_region_weights_strip_by_strip(shared: Path, network: colornet.ColorNetwork) -> None:
-    strips = 0
-    for path in golden_files(shared):
+def test_region_weights_strip_by_strip(golden_files: tuple[Path, ...], network: colornet.ColorNetwork) -> None:
+    for path in golden_files:
         with np.load(path) as golden:
             aligned, expected = golden["aligned"].astype(np.float64), golden["paper_color"]
             weights = network.membership(as_8_bit(golden["colors"]))
@@ -28,13 +21,12 @@ def test_region_weights_strip_by_strip(shared: Path, network: colornet.ColorNetw
         found = np.zeros((7, 31, 22))
         np.add.at(found, (i, j), weights)
         np.testing.assert_allclose(found, expected, atol=1e-4, err_msg=path.name)
-        strips += int((expected.sum(axis=-1) > 0).sum())
-    assert strips == 644
+        assert expected.sum(axis=-1).any()
 
 
-def test_similarity(shared: Path, network: colornet.ColorNetwork) -> None:
+def test_similarity(golden_files: tuple[Path, ...], network: colornet.ColorNetwork) -> None:
     """The embeddings are colour matrix times Delta; float32 in the files."""
-    for path in golden_files(shared):
+    for path in golden_files:
         with np.load(path) as golden:
             color, embedding = golden["paper_color"].astype(np.float64), golden["paper_embedding"]
         np.testing.assert_allclose(color @ network.similarity, embedding, rtol=2e-7, err_msg=path.name)

@@ -1,0 +1,234 @@
+"""Compute the golden files of the built-in objects with an independent float64 reference.
+
+    python tests/golden/make_golden.py        # rewrites tests/golden/objects/*.npz; a test compares
+
+The reference is NumPy, SciPy, gudhi, persim and colour-science. It uses nothing of `thor2_jax`, and of the other
+packages only data: the meshes of the built-in objects, and the mean colours, edges and members of the packaged colour
+regions. Each file is one view of one object:
+
+| array | shape | meaning |
+|---|---|---|
+| points, colors | [n, 3] | input cloud, scaled units (metres x 2.5), camera frame, camera at the origin; sRGB |
+| box_extent | [3] | side lengths of the reference's bounding box, longest first, scaled units |
+| aligned | [n, 3] | view-normalized cloud, turned by alpha, in the first octant; same order as points |
+| released_diagrams | [k, 3] | slice, birth, death |
+| released_images | [7, 32, 32] | persistence images; axis 1 is birth, axis 2 is persistence |
+| released_color | [7, 31, 22] | colour vectors of the strips, divided by their number of points |
+| paper_images | [7, 32, 32] | the same by the paper's equations |
+| paper_color, paper_embedding | [7, 31, 22] | sums of region weights, and these times Delta |
+| view | [2] | azimuth and polar angle of the camera, radians |
+"""
+
+import math
+from pathlib import Path
+
+import colour
+import gudhi
+import numpy as np
+from persim import PersistenceImager
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import shortest_path
+from scipy.spatial import ConvexHull
+
+import colornet
+from training.objects.builtin_objects import builtin_objects
+from training.objects.meshes import TexturedMesh
+
+FOLDER = Path(__file__).parent / "objects"
+
+VIEWS = {
+    "mug_blue": (0.7, 1.1),
+    "banana": (2.1, 0.6),
+    "hammer": (1.0, 0.8),
+    "white_bowl": (3.3, 0.9),
+    "yellow_bottle": (4.0, 1.3),
+    "soup_can_red": (5.2, 1.2),
+    "sponge": (0.3, 0.7),
+}
+"""Azimuth and polar angle, in radians, at which each object is seen."""
+
+SCALE, SLICE, STRIP, ALPHA, N_SLICES, N_STRIPS = 2.5, 0.1, 0.025, math.pi / 4, 7, 31
+VARIANCE = 0.00025
+VOXEL = 0.01
+DISTANCE = 1.5
+WIDTH, HEIGHT, FIELD_OF_VIEW = 800, 600, math.radians(40)
+
+Array = np.ndarray
+
+
+def render(mesh: TexturedMesh, azimuth: float, polar: float) -> tuple[Array, Array]:
+    """Return the depth [H, W] in whole millimetres (0: background) and the colour [H, W, 3] seen from 1.5 m."""
+    outward = np.array([math.sin(polar) * math.cos(azimuth), math.sin(polar) * math.sin(azimuth), math.cos(polar)])
+    right = np.array([-math.sin(azimuth), math.cos(azimuth), 0])
+    down = np.cross(-outward, right)
+    used = mesh.vertices[np.unique(mesh.faces)]
+    position = (used.min(axis=0) + used.max(axis=0)) / 2 + DISTANCE * outward
+    vertices = (mesh.vertices - position) @ np.stack([right, down, -outward]).T
+    focal, centre = WIDTH / 2 / math.tan(FIELD_OF_VIEW / 2), (np.array([WIDTH, HEIGHT]) - 1) / 2
+    depth, color = np.full((HEIGHT, WIDTH), np.inf), np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    for number, face in enumerate(mesh.faces):
+        corners = vertices[face]
+        pixels = corners[:, :2] / corners[:, 2:] * focal + centre
+        (left, top), (past, below) = np.ceil(pixels.min(axis=0)).astype(int), np.floor(pixels.max(axis=0)).astype(int)
+        columns, rows = (grid.ravel() for grid in np.meshgrid(np.arange(left, past + 1), np.arange(top, below + 1)))
+        if len(rows) == 0 or abs(np.linalg.det(corners)) < 1e-15:
+            continue
+        rays = np.stack([(columns - centre[0]) / focal, (rows - centre[1]) / focal, np.ones(len(rows))])
+        # depth * ray = corners' combination by barycentric weights, so the solution is the weights over the depth.
+        weights = np.linalg.solve(corners.T, rays)
+        z = 1 / np.where((weights >= -1e-12).all(axis=0), weights.sum(axis=0), 1e-9)
+        nearer = z < np.minimum(depth[rows, columns], 10)
+        rows, columns, z, weights = rows[nearer], columns[nearer], z[nearer], weights[:, nearer]
+        depth[rows, columns] = z
+        uv = (weights * z).T @ mesh.uv[number]
+        texture = mesh.textures[mesh.face_texture[number]]
+        sizes = np.array([texture.shape[1], texture.shape[0]])
+        u, v = (np.floor(np.stack([uv[:, 0], 1 - uv[:, 1]], axis=1) * sizes).astype(int) % sizes).T
+        color[rows, columns] = texture[v, u]
+    return np.where(np.isfinite(depth), np.rint(depth * 1000), 0), color
+
+
+def cloud(depth: Array, color: Array) -> tuple[Array, Array]:
+    """Return the points in scaled units and the 8-bit colours of the voxels of 0.01 that the view fills."""
+    rows, columns = np.nonzero(depth)
+    # Metres in float32, as in the released pipeline: every fourth millimetre lies on a border between voxels.
+    z = (depth[rows, columns].astype(np.float32) / np.float32(1000)).astype(np.float64)
+    focal = WIDTH / 2 / math.tan(FIELD_OF_VIEW / 2)
+    points = np.stack([(columns - (WIDTH - 1) / 2) * z / focal, (rows - (HEIGHT - 1) / 2) * z / focal, z], 1) * SCALE
+    voxel = np.floor((points - (points.min(axis=0) - VOXEL / 2)) / VOXEL)
+    _, member, count = np.unique(voxel, axis=0, return_inverse=True, return_counts=True)
+    means = np.zeros((len(count), 6))
+    np.add.at(means, member.ravel(), np.concatenate([points, color[rows, columns]], axis=1))
+    means /= count[:, None]
+    return means[:, :3], np.rint(means[:, 3:]).astype(np.uint8)
+
+
+def refined(axes: Array, points: Array, first: int, second: int) -> Array:
+    """Rotate two axes so that the minimum-area rectangle of the projection onto them is axis-aligned."""
+    plane = points @ axes[[first, second]].T
+    hull = plane[ConvexHull(plane).vertices]
+    candidates = []
+    for x, y in np.roll(hull, -1, axis=0) - hull:
+        direction = np.array([x, y]) / np.hypot(x, y)
+        turn = np.array([direction, [-direction[1], direction[0]]])
+        candidates.append((np.prod(np.ptp(hull @ turn.T, axis=0)), turn))
+    new = axes.copy()
+    new[[first, second]] = min(candidates, key=lambda candidate: candidate[0])[1] @ axes[[first, second]]
+    return new
+
+
+def longest_first(axes: Array, points: Array) -> Array:
+    axes = axes[np.argsort(-np.ptp(points @ axes.T, axis=0))]
+    return np.stack([axes[0], axes[1], np.cross(axes[0], axes[1])])
+
+
+def normalized(points: Array) -> Array:
+    """Return the view-normalized cloud in the first octant; the camera is at the origin."""
+    hull = points[ConvexHull(points).vertices]
+    axes = longest_first(np.linalg.eigh(np.cov(hull.T))[1].T, points)
+    axes = longest_first(refined(refined(axes, points, 0, 1), points, 1, 2), points)
+    rotated = points @ axes.T
+    middle = (rotated.min(axis=0) + rotated.max(axis=0)) / 2
+    if middle[2] < 0:  # the camera is on the +z side of the box
+        rotated[:, 1:] *= -1
+    if rotated[:, 0].mean() > (rotated[:, 0].min() + rotated[:, 0].max()) / 2:  # the heavier half comes first
+        rotated[:, :2] *= -1
+    return rotated - rotated.min(axis=0)
+
+
+def turned(points: Array) -> Array:
+    """Return the cloud rotated by -alpha about y, in the first octant."""
+    c, s = math.cos(ALPHA), math.sin(ALPHA)
+    rotated = points @ np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]]).T
+    return rotated - rotated.min(axis=0)
+
+
+def members(colors: Array) -> Array:
+    """Return the region weights [n, 22] of 8-bit colours: 1/m in each of the m regions of the nearest grid colour."""
+    network = colornet.load_default()
+    level = np.floor(colors / 5 + 0.5).astype(int)
+    bits = network.region_bits[(level[:, 0] * 52 + level[:, 1]) * 52 + level[:, 2]]
+    flags = (bits[:, None] >> np.arange(network.n_regions)) & 1
+    return flags / flags.sum(axis=1, keepdims=True)
+
+
+def similarity() -> Array:
+    """Return Delta [22, 22] from the regions' mean colours and edges."""
+    network = colornet.load_default()
+    white = np.array([0.31271, 0.32902])  # D65, 2 degree observer
+    lab = colour.XYZ_to_Lab(colour.sRGB_to_XYZ(network.mean_rgb / 255), white)
+    difference = np.diff(lab[network.edges], axis=1)[:, 0]
+    weight = np.abs(difference[:, 0]) + np.hypot(difference[:, 1], difference[:, 2])
+    graph = coo_array((weight, tuple(network.edges.T)), shape=(network.n_regions,) * 2)
+    return 1 / (1 + shortest_path(graph, directed=False))
+
+
+def diagram(births: Array, lengths: Array) -> Array:
+    """Return the finite H0 pairs [k, 2] of the strips of a slice, from gudhi."""
+    tree = gudhi.SimplexTree()
+    for strip, (birth, length) in enumerate(zip(births, lengths, strict=True)):
+        tree.insert([2 * strip], birth)
+        tree.insert([2 * strip + 1], birth)
+        tree.insert([2 * strip, 2 * strip + 1], birth + length)
+    tree.compute_persistence(min_persistence=-1)
+    pairs = tree.persistence_intervals_in_dimension(0)
+    pairs = pairs[np.isfinite(pairs[:, 1])]
+    return pairs[np.argsort(pairs[:, 0])]
+
+
+def descriptor(slices: Array, strips: Array, y: Array, weights: Array) -> tuple[Array, Array, Array, Array]:
+    """Return diagrams [k, 3], images [7, 32, 32], colour sums [7, 31, 22] and counts [7, 31] of numbered strips."""
+    imager = PersistenceImager(
+        birth_range=(-STRIP, 0.775),
+        pers_range=(-STRIP, 0.775),
+        pixel_size=STRIP,
+        weight="persistence",
+        weight_params={"n": 1.0},
+        kernel_params={"sigma": [[VARIANCE, 0.0], [0.0, VARIANCE]]},
+    )
+    diagrams, images = [], np.zeros((N_SLICES, 32, 32))
+    color, count = np.zeros((N_SLICES, N_STRIPS, weights.shape[1])), np.zeros((N_SLICES, N_STRIPS))
+    np.add.at(color, (slices, strips), weights)
+    np.add.at(count, (slices, strips), 1)
+    for number in np.unique(slices):
+        here = slices == number
+        occupied = np.unique(strips[here])
+        lengths = np.array([np.ptp(y[here & (strips == strip)]) for strip in occupied])
+        pairs = diagram(occupied * STRIP, lengths)
+        images[number] = imager.transform(pairs, skew=True)
+        diagrams.append(np.column_stack([np.full(len(pairs), number), pairs]))
+    return np.concatenate(diagrams), images, color, count
+
+
+def golden(mesh: TexturedMesh, azimuth: float, polar: float) -> dict[str, Array]:
+    """Return the arrays of one file."""
+    points, colors = cloud(*render(mesh, azimuth, polar))
+    points = points.astype(np.float32)
+    normal = normalized(points.astype(np.float64))
+    aligned = turned(normal).astype(np.float32)
+    x, y, z = aligned.astype(np.float64).T
+    weights = members(colors)
+
+    paper = descriptor(np.floor(z / SLICE).astype(int), np.floor(x / STRIP).astype(int), y, weights)
+    x, y, z = np.round(x, 2), np.round(y, 2), np.round(z, 1)
+    levels = np.searchsorted(np.unique(z), z)
+    released = descriptor(levels, np.digitize(x, np.arange(0, 0.775, STRIP), right=True), y, weights)
+    return {
+        "points": points,
+        "colors": (colors / 255).astype(np.float32),
+        "box_extent": normal.max(axis=0),
+        "aligned": aligned,
+        "released_diagrams": released[0],
+        "released_images": released[1].astype(np.float32),
+        "released_color": (released[2] / np.maximum(released[3], 1)[..., None]).astype(np.float32),
+        "paper_images": paper[1].astype(np.float32),
+        "paper_color": paper[2].astype(np.float32),
+        "paper_embedding": (paper[2] @ similarity()).astype(np.float32),
+        "view": np.array([azimuth, polar]),
+    }
+
+
+if __name__ == "__main__":
+    objects = builtin_objects()
+    for name, angles in VIEWS.items():
+        np.savez_compressed(FOLDER / f"{name}.npz", **golden(objects[name], *angles))
