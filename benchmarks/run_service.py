@@ -30,7 +30,7 @@ import thor2_jax as thor2
 from thor2_jax.client import multipart
 from thor2_jax.recognition.classifier import FEATURES, MLP
 from thor2_jax.recognition.run_directory import TrainedRun, input_size, save_run
-from thor2_jax.service.decoding import frame_of
+from thor2_jax.service.decoding import decode_frame
 from training.objects.builtin_objects import builtin_objects
 from training.rendering.scenes import compose_scene
 
@@ -76,10 +76,10 @@ def plain_loop(run: Path, frames: list[Files], calls: int) -> dict[str, float]:
     """Decode and recognize one frame after another in this process."""
     recognizer, times = thor2.Recognizer.load(run), []
     for files in frames:
-        recognizer.recognize(frame_of(**files))
+        recognizer.recognize(decode_frame(**files))
     for k in range(calls):
         start = time.perf_counter()
-        recognizer.recognize(frame_of(**frames[k % len(frames)]))
+        recognizer.recognize(decode_frame(**frames[k % len(frames)]))
         times.append((time.perf_counter() - start) * 1e3)
     return {"frames_per_s": round(1e3 * calls / sum(times), 1), **spread(times)}
 

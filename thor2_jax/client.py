@@ -1,4 +1,4 @@
-"""A client of the inference service.
+"""Client of the inference service.
 
 >>> client = Client("http://127.0.0.1:8080")                                        # doctest: +SKIP
 >>> client.recognize(color="c.png", depth="d.png", labels="l.png", intrinsics="k.json")     # doctest: +SKIP
@@ -23,13 +23,13 @@ __all__ = ["Client", "ServiceError", "multipart"]
 
 
 class ServiceError(Exception):
-    """The service refused a request, or could not do it.
+    """Error response of the service.
 
     Attributes:
-        status: the HTTP status.
-        field: the part of the request that is at fault; None if it is none.
-        message: what is wrong.
-        retry_after: seconds to wait before the next try; None if a try is of no use.
+        status: HTTP status.
+        field: field of the request that caused the error; None if there is none.
+        message: description of the error.
+        retry_after: seconds after which the request can be repeated; None if repeating it does not help.
     """
 
     def __init__(self, status: int, field: str | None, message: str, retry_after: float | None) -> None:
@@ -37,55 +37,55 @@ class ServiceError(Exception):
         self.status, self.field, self.message, self.retry_after = status, field, message, retry_after
 
 
-def multipart(parts: Mapping[str, bytes]) -> tuple[str, bytes]:
-    """Content type and body of a multipart form with these parts, each a file."""
+def multipart(files: Mapping[str, bytes]) -> tuple[str, bytes]:
+    """Return the content type and the body of a multipart form with these files."""
     boundary = secrets.token_hex(16)
-    pieces = [
+    sections = [
         f'--{boundary}\r\nContent-Disposition: form-data; name="{name}"; filename="{name}"\r\n\r\n'.encode()
         + content
         + b"\r\n"
-        for name, content in parts.items()
+        for name, content in files.items()
     ]
-    return f"multipart/form-data; boundary={boundary}", b"".join([*pieces, f"--{boundary}--\r\n".encode()])
+    return f"multipart/form-data; boundary={boundary}", b"".join([*sections, f"--{boundary}--\r\n".encode()])
 
 
 class Client:
-    """Calls one service. It holds no connection and may be used from several threads."""
+    """Client of one service. It keeps no connection open and is thread-safe."""
 
     def __init__(self, url: str, token: str | None = None, timeout: float = 30.0) -> None:
-        """A client of the service at `url`; `timeout` in seconds for each call."""
+        """Create a client of the service at `url` with a bearer token and a timeout per request in seconds."""
         self._url, self._token, self._timeout = url.rstrip("/"), token, timeout
 
     def recognize(
         self, *, color: str | Path | bytes, depth: str | Path | bytes, labels: str | Path | bytes, intrinsics: Any
     ) -> list[Recognition]:
-        """Name every instance of a frame, in the order of its label numbers.
+        """Recognize every instance of a frame, in the order of the labels.
 
         Args:
-            color: PNG or JPEG; a path, or the file's content.
+            color: 8-bit PNG or JPEG, as a path or the content of the file.
             depth: 16-bit PNG.
             labels: PNG of instance numbers.
-            intrinsics: a JSON file, or a mapping with fx, fy, cx, cy and, if wanted, depth_scale.
+            intrinsics: JSON file, or a mapping with fx, fy, cx, cy and optionally depth_scale.
 
         Raises:
-            ServiceError: the service refused it or could not do it.
-            OSError: a file cannot be read, or the service not be reached.
+            ServiceError: the service returned an error.
+            OSError: a file cannot be read, or the service cannot be reached.
         """
-        files = {name: _content(given) for name, given in (("color", color), ("depth", depth), ("labels", labels))}
+        files = {name: _read(file) for name, file in (("color", color), ("depth", depth), ("labels", labels))}
         files["intrinsics"] = (
-            json.dumps(dict(intrinsics)).encode() if isinstance(intrinsics, Mapping) else _content(intrinsics)
+            json.dumps(dict(intrinsics)).encode() if isinstance(intrinsics, Mapping) else _read(intrinsics)
         )
-        answer = json.loads(self._call("/v1/recognize", *multipart(files)))
-        return [_recognition(one) for one in answer["instances"]]
+        answer = json.loads(self._request("/v1/recognize", *multipart(files)))
+        return [_recognition(instance) for instance in answer["instances"]]
 
     def describe(self, clouds: Sequence[tuple[Any, Any]]) -> dict[str, NDArray[Any]]:
-        """Descriptors of clouds, pairs (xyz [n, 3] metres, rgb [n, 3] uint8).
+        """Compute the descriptors of clouds, pairs (xyz [n, 3] in metres, rgb [n, 3] uint8).
 
         Returns:
             images [B, S, P, P], embeddings [B, S, R, J] and overflow [B].
 
         Raises:
-            ServiceError: the service refused it or could not do it.
+            ServiceError: the service returned an error.
             OSError: the service cannot be reached.
         """
         body = io.BytesIO()
@@ -95,43 +95,43 @@ class Client:
             colors=np.concatenate([np.asarray(rgb, np.uint8).reshape(-1, 3) for _, rgb in clouds]),
             sizes=np.array([len(xyz) for xyz, _ in clouds]),
         )
-        answer = self._call("/v1/describe", "application/octet-stream", body.getvalue())
-        with np.load(io.BytesIO(answer), allow_pickle=False) as found:
-            return dict(found)
+        answer = self._request("/v1/describe", "application/octet-stream", body.getvalue())
+        with np.load(io.BytesIO(answer), allow_pickle=False) as arrays:
+            return dict(arrays)
 
     def model(self) -> dict[str, Any]:
-        """What answers: classes, classifiers, the descriptor's version and constants. Raises as `describe`."""
-        return json.loads(self._call("/v1/model"))
+        """Return the classes, classifiers, descriptor version and configuration of the model. Raises as `describe`."""
+        return json.loads(self._request("/v1/model"))
 
-    def _call(self, path: str, content_type: str | None = None, body: bytes | None = None) -> bytes:
+    def _request(self, path: str, content_type: str | None = None, body: bytes | None = None) -> bytes:
         request = urllib.request.Request(self._url + path, data=body)
         if content_type is not None:
             request.add_header("Content-Type", content_type)
         if self._token is not None:
             request.add_header("Authorization", f"Bearer {self._token}")
         try:
-            with urllib.request.urlopen(request, timeout=self._timeout) as answer:
-                return answer.read()
+            with urllib.request.urlopen(request, timeout=self._timeout) as response:
+                return response.read()
         except urllib.error.HTTPError as error:
             with error:
-                raise _refusal(error) from None
+                raise _service_error(error) from None
 
 
-def _content(given: str | Path | bytes) -> bytes:
-    return given if isinstance(given, bytes) else Path(given).read_bytes()
+def _read(file: str | Path | bytes) -> bytes:
+    return file if isinstance(file, bytes) else Path(file).read_bytes()
 
 
-def _refusal(error: urllib.error.HTTPError) -> ServiceError:
-    after = error.headers.get("Retry-After")
+def _service_error(error: urllib.error.HTTPError) -> ServiceError:
+    retry_after = error.headers.get("Retry-After")
     try:
         problem = json.loads(error.read())
         field, message = problem["field"], str(problem["message"])
-    except (ValueError, KeyError, TypeError):  # something between here and the service answered
+    except (ValueError, KeyError, TypeError):  # The response comes from a proxy, not from the service.
         field, message = None, error.reason
-    return ServiceError(error.code, field, message, None if after is None else float(after))
+    return ServiceError(error.code, field, message, None if retry_after is None else float(retry_after))
 
 
-def _recognition(one: Mapping[str, Any]) -> Recognition:
-    fields = {name: value for name, value in one.items() if name not in ("top", "unrecognized")}
-    top = {name: [(c["name"], c["probability"]) for c in best] for name, best in one["top"].items()}
-    return Recognition(**fields, top=top, reason=one["unrecognized"])
+def _recognition(instance: Mapping[str, Any]) -> Recognition:
+    fields = {name: value for name, value in instance.items() if name not in ("top", "unrecognized")}
+    top = {classifier: [(c["name"], c["probability"]) for c in best] for classifier, best in instance["top"].items()}
+    return Recognition(**fields, top=top, reason=instance["unrecognized"])

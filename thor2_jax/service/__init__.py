@@ -1,8 +1,8 @@
-"""The inference service: frames and clouds over HTTP to names and descriptors (extra `serve`).
+"""Inference service: object names and descriptors of RGB-D frames and point clouds over HTTP (extra `serve`).
 
     thor2 serve --model run
 
-A request's way: `app` takes it in (`uploads`: limits, multipart), `running` leads it on. `preparing` decodes it
-(`decoding`) and makes clouds, in processes of its own; `batching` puts the clouds of all waiting requests into batches,
-which `engine` gives to the device; `answers` makes the records that go back. `page/` is the web page at /.
+Modules in the order of a request: `app` (routes), `uploads` (size limits, multipart forms), `pipeline` (admission and
+stages), `preparation` (worker processes that decode images and compute instance clouds, with `decoding`), `batching`
+(batches across requests), `engine` (the compiled model), `answers` (JSON records). `page/` is the web page served at /.
 """

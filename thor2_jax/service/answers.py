@@ -1,4 +1,4 @@
-"""From what was found to the records that are answered."""
+"""Conversion of recognition results into the JSON records of the API."""
 
 from collections.abc import Sequence
 
@@ -8,78 +8,87 @@ from numpy.typing import NDArray
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.recognition.prepared_instance import PreparedInstance
 from thor2_jax.recognition.recognizer import Recognition
-from thor2_jax.service.engine import Row
-from thor2_jax.service.preparing import Prepared
-from thor2_jax.service.schemas import Candidate, Details, ExplainedFrame, ExplainedInstance, Instance, Slice, Strip
-from thor2_jax.service.settings import MAX_DETAILED
+from thor2_jax.service.engine import CloudResult
+from thor2_jax.service.preparation import PreparedRequest
+from thor2_jax.service.schemas import (
+    Candidate,
+    Details,
+    ExplainedFrame,
+    ExplainedInstance,
+    InstanceAnswer,
+    SliceDetails,
+    StripColors,
+)
+from thor2_jax.service.settings import MAX_EXPLAINED
 
-__all__ = ["explained_frame", "instance"]
+__all__ = ["explained_frame", "instance_answer"]
 
-MAX_POINTS = 1000
-"""Points of a cloud that are shown."""
+MAX_SHOWN_POINTS = 1000
+"""Number of points of a cloud in an explanation."""
 
 
-def instance(found: Recognition) -> Instance:
-    """What is said of one instance."""
+def instance_answer(recognition: Recognition) -> InstanceAnswer:
+    """Return the JSON record of one recognized instance."""
     top = {
-        name: [Candidate(name=candidate, probability=p) for candidate, p in best] for name, best in found.top.items()
+        classifier: [Candidate(name=name, probability=p) for name, p in candidates]
+        for classifier, candidates in recognition.top.items()
     }
-    return Instance(
-        label=found.label,
-        name=found.name,
-        confidence=found.confidence,
-        classifier=found.classifier,
+    return InstanceAnswer(
+        label=recognition.label,
+        name=recognition.name,
+        confidence=recognition.confidence,
+        classifier=recognition.classifier,
         top=top,
-        occluded=found.occluded,
-        overflow=found.overflow,
-        points_used=found.points_used,
-        kept_by_fallback=found.kept_by_fallback,
-        unrecognized=found.reason,
+        occluded=recognition.occluded,
+        overflow=recognition.overflow,
+        points_used=recognition.points_used,
+        kept_by_fallback=recognition.kept_by_fallback,
+        unrecognized=recognition.reason,
     )
 
 
 def explained_frame(
-    prepared: Prepared,
-    found: Sequence[Recognition],
-    rows: Sequence[Row],
+    prepared: PreparedRequest,
+    recognitions: Sequence[Recognition],
+    results: Sequence[CloudResult],
     config: DescriptorConfig,
     timings: dict[str, float],
 ) -> ExplainedFrame:
-    """What is said of a frame's instances, and what it rests on.
+    """Return the instances of a frame together with the clouds and descriptors behind their names.
 
     Args:
-        prepared: the frame, with its label map.
-        found: one an instance.
-        rows: one an instance that could be used, in order.
-        config: of the descriptors.
-        timings: milliseconds a stage.
+        prepared: the decoded frame, with its label map.
+        recognitions: one per instance.
+        results: one per usable instance, in the order of the instances.
+        config: configuration of the descriptors.
+        timings: stage -> milliseconds.
     """
     assert prepared.label_map is not None
-    following = iter(rows)
+    remaining = iter(results)
     instances: list[ExplainedInstance] = []
-    for one, recognition in zip(prepared.instances, found, strict=True):
+    for instance, recognition in zip(prepared.instances, recognitions, strict=True):
         details = None
-        if one.reason is None:
-            row = next(following)
-            if len(instances) < MAX_DETAILED:
-                details = _details(one, row, config)
-        instances.append(ExplainedInstance(**dict(instance(recognition)), details=details))
+        if instance.reason is None:
+            result = next(remaining)
+            if len(instances) < MAX_EXPLAINED:
+                details = _details(instance, result, config)
+        instances.append(ExplainedInstance(**dict(instance_answer(recognition)), details=details))
     return ExplainedFrame(instances=instances, label_map=prepared.label_map, timings=timings)
 
 
-def _details(prepared: PreparedInstance, row: Row, config: DescriptorConfig) -> Details:
-    aligned = row.aligned[: len(prepared.points)]
-    shown = np.random.default_rng(0).permutation(len(aligned))[:MAX_POINTS]
-    peak = float(row.images.max())
-    images = np.rint(row.images * (255 / peak if peak > 0 else 0)).astype(int)
+def _details(instance: PreparedInstance, result: CloudResult, config: DescriptorConfig) -> Details:
+    aligned = result.aligned[: len(instance.points)]
+    shown = np.random.default_rng(0).permutation(len(aligned))[:MAX_SHOWN_POINTS]
+    peak = float(result.images.max())
+    images = np.rint(result.images * (255 / peak if peak > 0 else 0)).astype(int)
     return Details(
         points=aligned[shown].astype(float).round(4).tolist(),
-        colors=prepared.colors[shown].tolist(),
+        colors=instance.colors[shown].tolist(),
         slice_borders=_slice_borders(aligned[:, 2], config),
         image_peak=peak,
         slices=[
-            Slice(image=image.tolist(), strips=_strips(color))
-            for image, color in zip(images, row.strip_colors, strict=True)
+            SliceDetails(image=image.tolist(), strips=_strip_colors(colors))
+            for image, colors in zip(images, result.strip_colors, strict=True)
         ],
     )
 
@@ -87,15 +96,15 @@ def _details(prepared: PreparedInstance, row: Row, config: DescriptorConfig) -> 
 def _slice_borders(z: NDArray[np.float32], config: DescriptorConfig) -> list[tuple[float, float]]:
     if config.convention == "paper":
         low = np.arange(config.n_slices) * config.sigma_1
-    else:  # z is rounded, and the levels that occur are the slices
+    else:  # The released code rounds z and numbers only the levels that occur.
         low = (np.unique(np.rint(z / config.sigma_1))[: config.n_slices] - 0.5) * config.sigma_1
     return [(round(float(border), 4), round(float(border + config.sigma_1), 4)) for border in low]
 
 
-def _strips(color: NDArray[np.float32]) -> list[Strip]:
+def _strip_colors(colors: NDArray[np.float32]) -> list[StripColors]:
     strips = []
-    for number in np.flatnonzero(color.any(axis=1)):
-        regions = np.flatnonzero(color[number])
-        weights = color[number, regions].astype(float).round(3).tolist()
-        strips.append(Strip(strip=int(number), regions=regions.tolist(), weights=weights))
+    for strip in np.flatnonzero(colors.any(axis=1)):
+        regions = np.flatnonzero(colors[strip])
+        weights = colors[strip, regions].astype(float).round(3).tolist()
+        strips.append(StripColors(strip=int(strip), regions=regions.tolist(), weights=weights))
     return strips

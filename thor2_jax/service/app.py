@@ -1,4 +1,4 @@
-"""The HTTP side: routes, who may call them, and errors as JSON."""
+"""HTTP routes, authentication and error responses."""
 
 import contextlib
 import io
@@ -19,24 +19,24 @@ from starlette.requests import ClientDisconnect
 
 from thor2_jax.config import DESCRIPTOR_VERSION
 from thor2_jax.service import schemas
-from thor2_jax.service.answers import instance
-from thor2_jax.service.engine import Row
-from thor2_jax.service.metrics import RequestCounting
+from thor2_jax.service.answers import instance_answer
+from thor2_jax.service.engine import CloudResult
+from thor2_jax.service.metrics import RequestCounter
 from thor2_jax.service.page_files import PageFiles
-from thor2_jax.service.problem import Problem, RequestError, documented
-from thor2_jax.service.running import Service
+from thor2_jax.service.pipeline import Service
+from thor2_jax.service.problem import Problem, RequestError, error_responses
 from thor2_jax.service.schemas import NPZ
 from thor2_jax.service.settings import Settings
 from thor2_jax.service.uploads import read_body, read_form
 
 __all__ = ["create_app"]
 
-FRAME = ("color", "depth", "labels", "intrinsics")
-"""Parts of a form that is a frame."""
+FRAME_FIELDS = ("color", "depth", "labels", "intrinsics")
+FRAME_ERRORS = error_responses(400, 408, 413, 415, 422, 429, 503, 504)
 
 
 def create_app(settings: Settings) -> FastAPI:
-    """The ASGI application. It owns its processes and threads from its lifespan's start to its end.
+    """Create the ASGI application. Its processes and threads run for the duration of its lifespan.
 
     Raises:
         InputError: the run cannot be read, or lacks a classifier.
@@ -46,64 +46,70 @@ def create_app(settings: Settings) -> FastAPI:
     @contextlib.asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
         await run_in_threadpool(service.start)
-        with _told_of_signals(service):
+        with _stop_accepting_on_signal(service):
             yield
         await run_in_threadpool(service.close)
 
     app = FastAPI(
         title="THOR2",
         version="1",
-        description="Names the objects of an RGB-D frame with an instance segmentation.",
+        description="Recognition of the objects in an RGB-D frame with an instance segmentation.",
         lifespan=lifespan,
-        docs_url=None,  # its page loads scripts from elsewhere
+        docs_url=None,  # The interactive documentation loads scripts from another server.
         redoc_url=None,
     )
     app.state.service = service
-    app.add_middleware(RequestCounting, metrics=service.metrics)
-    app.include_router(_open_routes(service))
-    app.include_router(_guarded_routes(service))
+    app.add_middleware(RequestCounter, metrics=service.metrics)
+    app.include_router(_health_routes(service))
+    token = settings.token
+    authenticated = (
+        APIRouter(dependencies=[Depends(_token_check(token))], responses=error_responses(401)) if token else APIRouter()
+    )
+    _add_inference_routes(authenticated, service)
+    _add_model_routes(authenticated, service)
+    app.include_router(authenticated)
     app.router.default = PageFiles()
     app.add_exception_handler(RequestError, _on_request_error)
-    app.add_exception_handler(HTTPException, _on_http_error)
+    app.add_exception_handler(HTTPException, _on_http_exception)
     app.add_exception_handler(ClientDisconnect, _on_disconnect)
-    app.add_exception_handler(Exception, _on_defect)
+    app.add_exception_handler(Exception, _on_internal_error)
     return app
 
 
 @contextlib.contextmanager
-def _told_of_signals(service: Service) -> Iterator[None]:
-    """While the server finishes its connections after a signal, the service already takes nothing more."""
+def _stop_accepting_on_signal(service: Service) -> Iterator[None]:
+    """Refuse new requests from the moment of the signal; the server only closes its connections later."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
+    previous = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
 
     def stop(number: int, frame: Any) -> None:
-        service.stop_taking()
-        handler = before[signal.Signals(number)]
+        service.stop_accepting()
+        handler = previous[signal.Signals(number)]
         if callable(handler):
             handler(number, frame)
 
-    for number in before:
+    for number in previous:
         signal.signal(number, stop)
     try:
         yield
     finally:
-        for number, handler in before.items():
+        for number, handler in previous.items():
             signal.signal(number, handler)
 
 
-def _open_routes(service: Service) -> APIRouter:
+def _health_routes(service: Service) -> APIRouter:
     routes = APIRouter()
 
     @routes.get("/healthz")
     async def healthz() -> schemas.Health:
-        """The process lives."""
+        """Report that the process is alive."""
         return schemas.Health(status="alive")
 
-    @routes.get("/readyz", responses=documented(503))
+    @routes.get("/readyz", responses=error_responses(503))
     async def readyz() -> schemas.Health:
-        """Everything is compiled, and requests are taken."""
+        """Report whether all programs are compiled and requests are accepted."""
         if service.state != "ready":
             raise RequestError(503, None, f"The service is {service.state}.")
         return schemas.Health(status="ready")
@@ -111,67 +117,65 @@ def _open_routes(service: Service) -> APIRouter:
     return routes
 
 
-def _guarded_routes(service: Service) -> APIRouter:
-    token = service.settings.token
-    guarded = APIRouter(dependencies=[Depends(_check(token))], responses=documented(401)) if token else APIRouter()
-
-    @guarded.post(
-        "/v1/recognize",
-        responses=documented(400, 408, 413, 415, 422, 429, 503, 504),
-        openapi_extra={"requestBody": schemas.FRAME_FORM},
-    )
+def _add_inference_routes(routes: APIRouter, service: Service) -> None:
+    @routes.post("/v1/recognize", responses=FRAME_ERRORS, openapi_extra={"requestBody": schemas.FRAME_FORM})
     async def recognize(request: Request) -> schemas.FrameAnswer:
-        """Name every instance of a frame."""
-        async with service.request() as ticket:
-            with ticket.stage("upload"):
-                files = await read_form(request, FRAME)
-            found = await service.recognize(files, ticket)
-        return schemas.FrameAnswer(instances=[instance(one) for one in found], timings=ticket.milliseconds())
+        """Recognize every instance of a frame."""
+        async with service.admit() as admitted:
+            with admitted.stage("upload"):
+                files = await read_form(request, FRAME_FIELDS)
+            recognitions = await service.recognize(files, admitted)
+        return schemas.FrameAnswer(
+            instances=[instance_answer(recognition) for recognition in recognitions], timings=admitted.milliseconds()
+        )
 
-    @guarded.post(
+    @routes.post(
         "/v1/explain",
         response_model=schemas.ExplainedFrame,
-        responses=documented(400, 408, 413, 415, 422, 429, 503, 504),
+        responses=FRAME_ERRORS,
         openapi_extra={"requestBody": schemas.FRAME_FORM},
     )
     async def explain(request: Request) -> Response:
-        """Name every instance of a frame, and show what the names rest on: clouds, persistence images, colours."""
-        async with service.request() as ticket:
-            with ticket.stage("upload"):
-                files = await read_form(request, FRAME)
-            answer = await service.explain(files, ticket)
+        """Recognize every instance of a frame and return the evidence: clouds, persistence images and colours."""
+        async with service.admit() as admitted:
+            with admitted.stage("upload"):
+                files = await read_form(request, FRAME_FIELDS)
+            answer = await service.explain(files, admitted)
             content = await run_in_threadpool(answer.model_dump_json)
         return Response(content, media_type="application/json")
 
-    @guarded.post(
+    @routes.post(
         "/v1/describe",
         response_model=schemas.DescribeAnswer,
         responses={
             200: {"content": {NPZ: {"schema": {"type": "string", "format": "binary"}}}},
-            **documented(408, 413, 415, 422, 429, 503, 504),
+            **error_responses(408, 413, 415, 422, 429, 503, 504),
         },
         openapi_extra={"requestBody": schemas.CLOUDS_BODY},
     )
     async def describe(request: Request) -> Response:
-        """Descriptors of clouds. The answer has the type of the body: JSON, or npz.
+        """Compute the descriptors of clouds. The answer has the content type of the body: JSON or npz.
 
-        npz: points [M, 3] floats in metres, colors [M, 3] uint8 and sizes [B], points of each cloud; answered by images
-        [B, S, P, P], embeddings [B, S, R, J] and overflow [B].
+        An npz body has the arrays points [M, 3] float (metres), colors [M, 3] uint8 and sizes [B] (points per cloud);
+        the answer has images [B, S, P, P], embeddings [B, S, R, J] and overflow [B].
         """
-        kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
-        if kind not in (NPZ, "application/json"):
+        content_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+        if content_type not in (NPZ, "application/json"):
             raise RequestError(415, "body", f"The body must be application/json or {NPZ} (npz).")
-        async with service.request() as ticket:
-            with ticket.stage("upload"):
+        async with service.admit() as admitted:
+            with admitted.stage("upload"):
                 content = await read_body(request)
-            rows = await service.describe(content, kind == NPZ, ticket)
-            if kind == NPZ:
-                return Response(await run_in_threadpool(_npz, rows), media_type=NPZ)
-            return Response(await run_in_threadpool(_json, rows, ticket.milliseconds()), media_type="application/json")
+            results = await service.describe(content, content_type == NPZ, admitted)
+            if content_type == NPZ:
+                return Response(await run_in_threadpool(_encode_npz, results), media_type=NPZ)
+            body = await run_in_threadpool(_encode_json, results, admitted.milliseconds())
+            return Response(body, media_type="application/json")
 
-    @guarded.get("/v1/model")
+
+def _add_model_routes(routes: APIRouter, service: Service) -> None:
+    @routes.get("/v1/model")
     async def model() -> schemas.ModelAnswer:
-        """What answers here."""
+        """Return the classes and the configuration of the model."""
         run = service.engine.run
         return schemas.ModelAnswer(
             classes=list(run.classes),
@@ -181,69 +185,67 @@ def _guarded_routes(service: Service) -> APIRouter:
             color_network=run.network.fingerprint,
         )
 
-    @guarded.get("/v1/colornet")
+    @routes.get("/v1/colornet")
     async def colornet() -> schemas.ColorNetworkAnswer:
-        """The colour network of the descriptors."""
+        """Return the colour network of the descriptors."""
         network = service.engine.run.network
         arrays = ("mean_rgb", "member_counts", "edges", "edge_weights", "similarity")
         return schemas.ColorNetworkAnswer(
             fingerprint=network.fingerprint, **{name: getattr(network, name).tolist() for name in arrays}
         )
 
-    @guarded.get("/metrics", response_class=Response, responses={200: {"content": {"text/plain": {}}}})
+    @routes.get("/metrics", response_class=Response, responses={200: {"content": {"text/plain": {}}}})
     async def metrics() -> Response:
-        """Counters for Prometheus."""
+        """Return the metrics in the Prometheus text format."""
         return Response(service.metrics.text(), media_type="text/plain; version=0.0.4; charset=utf-8")
 
-    return guarded
 
-
-def _check(token: str) -> Callable[..., Any]:
+def _token_check(token: str) -> Callable[..., Any]:
     async def check(
-        given: Annotated[HTTPAuthorizationCredentials | None, Depends(HTTPBearer(auto_error=False))],
+        credentials: Annotated[HTTPAuthorizationCredentials | None, Depends(HTTPBearer(auto_error=False))],
     ) -> None:
-        if given is None or not secrets.compare_digest(given.credentials.encode(), token.encode()):
-            raise RequestError(401, "Authorization", "The bearer token is missing or wrong.")
+        if credentials is None or not secrets.compare_digest(credentials.credentials.encode(), token.encode()):
+            raise RequestError(401, "Authorization", "The bearer token is missing or invalid.")
 
     return check
 
 
-def _json(rows: Sequence[Row], timings: dict[str, float]) -> bytes:
+def _encode_json(results: Sequence[CloudResult], timings: dict[str, float]) -> bytes:
     descriptors = [
-        {"images": row.images.tolist(), "embeddings": row.embeddings.tolist(), "overflow": row.overflow} for row in rows
+        {"images": r.images.tolist(), "embeddings": r.embeddings.tolist(), "overflow": r.overflow} for r in results
     ]
     return pydantic_core.to_json({"descriptors": descriptors, "timings": timings})
 
 
-def _npz(rows: Sequence[Row]) -> bytes:
+def _encode_npz(results: Sequence[CloudResult]) -> bytes:
     stream = io.BytesIO()
     np.savez(
         stream,
-        images=np.stack([row.images for row in rows]),
-        embeddings=np.stack([row.embeddings for row in rows]),
-        overflow=np.array([row.overflow for row in rows], np.int32),
+        images=np.stack([r.images for r in results]),
+        embeddings=np.stack([r.embeddings for r in results]),
+        overflow=np.array([r.overflow for r in results], np.int32),
     )
     return stream.getvalue()
 
 
-def _problem(status: int, problem: Problem, headers: dict[str, str] | None = None) -> JSONResponse:
+def _problem_response(status: int, problem: Problem, headers: dict[str, str] | None = None) -> JSONResponse:
     return JSONResponse(problem.model_dump(), status, headers)
 
 
 async def _on_request_error(_: Request, error: Exception) -> Response:
     assert isinstance(error, RequestError)
     headers = {401: {"WWW-Authenticate": "Bearer"}, 429: {"Retry-After": "1"}, 503: {"Retry-After": "1"}}
-    return _problem(error.status, Problem(field=error.field, message=error.message), headers.get(error.status))
+    return _problem_response(error.status, Problem(field=error.field, message=error.message), headers.get(error.status))
 
 
-async def _on_http_error(_: Request, error: Exception) -> Response:
+async def _on_http_exception(_: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
-    return _problem(error.status_code, Problem(field=None, message=error.detail), dict(error.headers or {}))
+    return _problem_response(error.status_code, Problem(field=None, message=error.detail), dict(error.headers or {}))
 
 
 async def _on_disconnect(_: Request, error: Exception) -> Response:
-    return _problem(400, Problem(field="body", message="The body ended early."))
+    return _problem_response(400, Problem(field="body", message="The body is incomplete."))
 
 
-async def _on_defect(_: Request, error: Exception) -> Response:
-    return _problem(500, Problem(field=None, message="This is a defect of the service."))
+async def _on_internal_error(_: Request, error: Exception) -> Response:
+    return _problem_response(500, Problem(field=None, message="Internal error of the service; see its log."))

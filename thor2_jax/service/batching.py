@@ -1,4 +1,4 @@
-"""One thread that owns the device: clouds of all waiting requests share its batches."""
+"""A single thread that runs the model, with batches shared between waiting requests."""
 
 import dataclasses
 import queue
@@ -8,93 +8,98 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from typing import Generic, TypeVar
 
-from thor2_jax.service.problem import late
+from thor2_jax.service.problem import deadline_exceeded
 
 __all__ = ["Batcher"]
 
-Cloud = TypeVar("Cloud")
-Row = TypeVar("Row")
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class _Job(Generic[Cloud, Row]):
-    clouds: Sequence[Cloud]
+class _Job(Generic[Item, Result]):
+    items: Sequence[Item]
     deadline: float
-    future: Future[list[Row]]
+    future: Future[list[Result]]
 
 
-class Batcher(Generic[Cloud, Row]):
-    """Calls `compute` with the clouds of several jobs at once, in a thread of its own."""
+class Batcher(Generic[Item, Result]):
+    """Combine the items of several jobs into batches and process them in one thread."""
 
     def __init__(
-        self, compute: Callable[[list[Cloud]], list[Row]], expected: Callable[[], int], max_batch: int, window: float
+        self,
+        process_batch: Callable[[list[Item]], list[Result]],
+        count_expected: Callable[[], int],
+        max_batch: int,
+        window: float,
     ) -> None:
         """Start the thread.
 
         Args:
-            compute: a row for each of at most `max_batch` clouds.
-            expected: how many jobs there are now, with those that are not submitted yet.
-            max_batch: most clouds in a call.
-            window: seconds that a batch with room left waits for jobs that are expected.
+            process_batch: returns one result per item, for at most `max_batch` items.
+            count_expected: returns the number of current jobs, including jobs that are not submitted yet.
+            max_batch: maximum number of items in a batch.
+            window: seconds for which an incomplete batch waits for expected jobs.
         """
-        self._compute, self._expected = compute, expected
+        self._process_batch, self._count_expected = process_batch, count_expected
         self._max_batch, self._window = max_batch, window
-        self._waiting: queue.SimpleQueue[_Job[Cloud, Row] | None] = queue.SimpleQueue()
+        self._waiting: queue.SimpleQueue[_Job[Item, Result] | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._run, name="device")
         self._thread.start()
 
-    def submit(self, clouds: Sequence[Cloud], deadline: float) -> Future[list[Row]]:
-        """Rows of `clouds`, in order. The future raises RequestError (504) if they wait past `deadline`.
+    def submit(self, items: Sequence[Item], deadline: float) -> Future[list[Result]]:
+        """Queue `items` and return a future of their results, in order.
 
-        The deadline is one of `time.monotonic`. A future that is cancelled in time is not worked on.
+        The future raises RequestError (504) if the job still waits at `deadline` (a time of `time.monotonic`). A
+        future that is cancelled while it waits is skipped.
         """
-        job = _Job(clouds, deadline, Future[list[Row]]())
-        if clouds:
+        job = _Job(items, deadline, Future[list[Result]]())
+        if items:
             self._waiting.put(job)
         else:
             job.future.set_result([])
         return job.future
 
     def close(self) -> None:
-        """Do what was submitted, then end the thread."""
+        """Finish all submitted jobs and stop the thread."""
         self._waiting.put(None)
         self._thread.join()
 
     def _run(self) -> None:
-        going_on = True
-        while going_on:
-            jobs: list[_Job[Cloud, Row]] = []
-            room, until = self._max_batch, 0.0
-            while room > 0:
+        is_open = True
+        while is_open:
+            jobs: list[_Job[Item, Result]] = []
+            free, window_end = self._max_batch, 0.0
+            while free > 0:
                 try:
-                    patience = until - time.monotonic() if len(jobs) < self._expected() else 0.0
-                    job = self._waiting.get(timeout=max(0.0, patience) if jobs else None)
+                    timeout = window_end - time.monotonic() if len(jobs) < self._count_expected() else 0.0
+                    job = self._waiting.get(timeout=max(0.0, timeout) if jobs else None)
                 except queue.Empty:
                     break
                 if job is None:
-                    going_on = False
+                    is_open = False
                     break
                 if not jobs:
-                    until = time.monotonic() + self._window
+                    window_end = time.monotonic() + self._window
                 jobs.append(job)
-                room -= len(job.clouds)
-            self._work([job for job in jobs if job.future.set_running_or_notify_cancel()])
+                free -= len(job.items)
+            self._process([job for job in jobs if job.future.set_running_or_notify_cancel()])
 
-    def _work(self, jobs: list[_Job[Cloud, Row]]) -> None:
+    def _process(self, jobs: list[_Job[Item, Result]]) -> None:
         now = time.monotonic()
         for job in jobs:
             if job.deadline < now:
-                job.future.set_exception(late())
+                job.future.set_exception(deadline_exceeded())
         jobs = [job for job in jobs if job.deadline >= now]
-        clouds = [cloud for job in jobs for cloud in job.clouds]
-        rows: list[Row] = []
+        items = [item for job in jobs for item in job.items]
+        results: list[Result] = []
         try:
-            for first in range(0, len(clouds), self._max_batch):
-                rows += self._compute(clouds[first : first + self._max_batch])
-        except Exception as error:  # whoever waits must hear of it; the thread serves the next
+            for first in range(0, len(items), self._max_batch):
+                results += self._process_batch(items[first : first + self._max_batch])
+        except Exception as error:  # The callers receive the error; the thread continues with the next batch.
             for job in jobs:
                 job.future.set_exception(error)
             return
         for job in jobs:
-            job.future.set_result(rows[: len(job.clouds)])
-            del rows[: len(job.clouds)]
+            job.future.set_result(results[: len(job.items)])
+            del results[: len(job.items)]

@@ -1,4 +1,4 @@
-"""HTTP connections with limits on a request's head; uvicorn would wait for ever, and take whatever comes."""
+"""HTTP connections with limits on the request head; uvicorn itself has neither a timeout nor a size limit there."""
 
 import asyncio
 from typing import Any
@@ -8,19 +8,19 @@ from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 __all__ = ["TimedConnection"]
 
 HEAD_SECONDS = 5.0
-"""For a request's head to be complete: from the opening of a connection, the last answer, and its own first byte."""
+"""Time limit for a complete request head, counted from the connection, the previous answer and its own first byte."""
 
-REST_SECONDS = 30.0
-"""Likewise from an answer that was given before all of its request had arrived: many clients read only then."""
+EARLY_ANSWER_SECONDS = 30.0
+"""The same limit after an answer that preceded the end of its request: many clients send everything before reading."""
 
 MAX_HEAD = 2**20
-"""Bytes that may arrive from the first one of a head before its end does."""
+"""Maximum number of bytes received between the first byte of a request head and its end."""
 
 
 class TimedConnection(HttpToolsProtocol):
-    """uvicorn's connection, closed where a head takes too long or is too large; a body has its request's limits.
+    """uvicorn connection that is closed if a request head arrives too slowly or is too large.
 
-    Requests whose heads are complete are answered before the connection is closed.
+    Requests with complete heads are answered before the connection is closed. Bodies are limited by `uploads`.
     """
 
     _timer: asyncio.TimerHandle | None = None
@@ -28,12 +28,12 @@ class TimedConnection(HttpToolsProtocol):
     _head_bytes = 0
 
     def connection_made(self, transport: Any) -> None:
-        """Begin to wait for the first head."""
+        """Start the timer of the first request head."""
         super().connection_made(transport)
         self._expect_head(HEAD_SECONDS)
 
     def data_received(self, data: bytes) -> None:
-        """Take bytes, and no more of a head that is too large."""
+        """Process received bytes, and close the connection if a request head is too large."""
         super().data_received(data)
         self._head_bytes += len(data)
         if self._in_head and self._head_bytes > MAX_HEAD:
@@ -41,25 +41,25 @@ class TimedConnection(HttpToolsProtocol):
             self.shutdown()
 
     def on_message_begin(self) -> None:
-        """Begin to wait for the rest of a head."""
+        """Start the timer of a request head that has begun."""
         super().on_message_begin()
         self._in_head, self._head_bytes = True, 0
         self._expect_head(HEAD_SECONDS)
 
     def on_headers_complete(self) -> None:
-        """The head is there."""
+        """Stop the timer: the request head is complete."""
         self._in_head = False
         self._stop_timer()
         super().on_headers_complete()
 
     def on_response_complete(self) -> None:
-        """Begin to wait for the next head: uvicorn's own patience begins again with whatever byte arrives."""
+        """Start the timer of the next request head; uvicorn restarts its own keep-alive timer with every byte."""
         super().on_response_complete()
-        if self.cycle.response_complete:  # else the next head is there already
-            self._expect_head(REST_SECONDS if self.cycle.more_body else HEAD_SECONDS)
+        if self.cycle.response_complete:  # Otherwise the next request is already complete.
+            self._expect_head(EARLY_ANSWER_SECONDS if self.cycle.more_body else HEAD_SECONDS)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Nothing is waited for any more."""
+        """Stop the timer."""
         self._stop_timer()
         super().connection_lost(exc)
 

@@ -1,6 +1,6 @@
-"""Bytes of a request to a frame or to clouds.
+"""Decoding of request bodies into frames and clouds.
 
-Sizes are checked before anything is unpacked, and every error names the field.
+Sizes are checked before anything is decompressed, and every error names the field.
 """
 
 import io
@@ -19,150 +19,164 @@ from thor2_jax.errors import InputError
 from thor2_jax.recognition.frames import Intrinsics, RGBDFrame
 from thor2_jax.service.problem import RequestError
 from thor2_jax.service.schemas import Clouds
-from thor2_jax.service.settings import FARTHEST, MAX_BODY, MAX_CLOUDS, MAX_INSTANCES, MAX_PIXELS, MAX_TEXT
+from thor2_jax.service.settings import (
+    MAX_BODY,
+    MAX_CLOUDS,
+    MAX_COORDINATE,
+    MAX_IMAGE_PIXELS,
+    MAX_INSTANCES,
+    MAX_INTRINSICS_BYTES,
+)
 
-__all__ = ["CloudArrays", "clouds_of_json", "clouds_of_npz", "frame_of"]
+__all__ = ["CloudArrays", "decode_frame", "decode_json_clouds", "decode_npz_clouds"]
 
 CloudArrays = list[tuple[NDArray[np.float32], NDArray[np.uint8]]]
-"""Points [n, 3] in metres and colours [n, 3] of each cloud."""
+"""Points [n, 3] in metres and sRGB colours [n, 3] of each cloud."""
 
 
-def frame_of(color: bytes, depth: bytes, labels: bytes, intrinsics: bytes) -> RGBDFrame:
-    """A frame of the files' contents (formats as in `frames.read_frame`, depth and labels PNG only).
+def decode_frame(color: bytes, depth: bytes, labels: bytes, intrinsics: bytes) -> RGBDFrame:
+    """Decode a frame from the contents of its files (formats of `frames.read_frame`; depth and labels only as PNG).
 
     Raises:
         RequestError: 413 or 422.
     """
-    camera = _intrinsics(intrinsics)
+    camera = _decode_intrinsics(intrinsics)
     images = {
-        "color": _image("color", color, ("PNG", "JPEG"), ("RGB", "RGBA")),
-        "depth": _image("depth", depth, ("PNG",), ("I;16",)),
-        "labels": _image("labels", labels, ("PNG",), ("L", "P", "I;16", "I")),
+        "color": _decode_image("color", color, ("PNG", "JPEG"), ("RGB", "RGBA")),
+        "depth": _decode_image("depth", depth, ("PNG",), ("I;16",)),
+        "labels": _decode_image("labels", labels, ("PNG",), ("L", "P", "I;16", "I")),
     }
     try:
         frame = RGBDFrame(np.ascontiguousarray(images["color"][..., :3]), images["depth"], images["labels"], camera)
     except InputError as error:
         raise RequestError(422, str(error).split(maxsplit=1)[0], f"{error}.") from None
     if len(frame.instances) > MAX_INSTANCES:
-        raise RequestError(422, "labels", f"labels has {len(frame.instances)} instances; at most {MAX_INSTANCES}.")
+        raise RequestError(
+            422, "labels", f"labels has {len(frame.instances)} instances; expected at most {MAX_INSTANCES}."
+        )
     return frame
 
 
-def _intrinsics(content: bytes) -> Intrinsics:
-    if len(content) > MAX_TEXT:
-        raise RequestError(413, "intrinsics", f"intrinsics has {len(content)} bytes; at most {MAX_TEXT} are taken.")
+def _decode_intrinsics(content: bytes) -> Intrinsics:
+    if len(content) > MAX_INTRINSICS_BYTES:
+        raise RequestError(
+            413, "intrinsics", f"intrinsics has {len(content)} bytes; expected at most {MAX_INTRINSICS_BYTES}."
+        )
     try:
         return Intrinsics.of(json.loads(content))
     except InputError as error:
         raise RequestError(422, "intrinsics", f"{error}.") from None
     except (ValueError, RecursionError):
-        raise RequestError(422, "intrinsics", "intrinsics is no JSON, or nested too deeply.") from None
+        raise RequestError(422, "intrinsics", "intrinsics is not valid JSON, or is nested too deeply.") from None
 
 
-def _image(field: str, content: bytes, formats: tuple[str, ...], modes: tuple[str, ...]) -> NDArray[Any]:
-    def bad(status: int, what: str) -> RequestError:
-        return RequestError(status, field, f"{field} {what}.")
+def _decode_image(field: str, content: bytes, formats: tuple[str, ...], modes: tuple[str, ...]) -> NDArray[Any]:
+    def image_error(status: int, description: str) -> RequestError:
+        return RequestError(status, field, f"{field} {description}.")
 
     try:
         image = Image.open(io.BytesIO(content), formats=formats)
-    except Exception:  # damaged files make the decoders raise anything; only bytes are at work here
-        raise bad(422, f"is no {' or '.join(formats)}, or its header is damaged") from None
+    except Exception:  # Damaged files make the decoders raise many types of exception.
+        raise image_error(422, f"is not a {' or '.join(formats)} image, or its header is damaged") from None
     width, height = image.size
-    if width * height > MAX_PIXELS:
-        raise bad(413, f"has {width} x {height} pixels; at most {MAX_PIXELS} are taken")
+    if width * height > MAX_IMAGE_PIXELS:
+        raise image_error(413, f"has {width} x {height} pixels; expected at most {MAX_IMAGE_PIXELS}")
     if image.mode not in modes:
-        raise bad(422, f"is {_kind(image.mode)}; expected {' or '.join(map(_kind, modes))}")
+        raise image_error(422, f"is {_mode_name(image.mode)}; expected {' or '.join(map(_mode_name, modes))}")
     try:
-        image.verify()  # decoding passes over the checksums of a PNG's pixels
+        image.verify()  # Decoding alone ignores the checksums of a PNG's pixels.
         return np.asarray(Image.open(io.BytesIO(content), formats=formats))
-    except Exception:  # as above
-        raise bad(422, "is damaged or cut short") from None
+    except Exception:  # As above.
+        raise image_error(422, "is damaged or truncated") from None
 
 
-def _kind(mode: str) -> str:
-    kinds = {"1": "black and white", "L": "8-bit grey", "I;16": "16-bit grey", "I": "32-bit grey", "P": "indexed"}
-    return kinds.get(mode, mode)
+def _mode_name(mode: str) -> str:
+    names = {"1": "black and white", "L": "8-bit grey", "I;16": "16-bit grey", "I": "32-bit grey", "P": "indexed"}
+    return names.get(mode, mode)
 
 
-def clouds_of_json(content: bytes) -> CloudArrays:
-    """Clouds of the JSON form, `schemas.Clouds`. Raises RequestError (422)."""
+def decode_json_clouds(content: bytes) -> CloudArrays:
+    """Decode clouds from JSON (`schemas.Clouds`). Raises RequestError (422)."""
     try:
-        found = Clouds.model_validate_json(content)
+        body = Clouds.model_validate_json(content)
     except ValidationError as error:
         first = error.errors(include_url=False, include_context=False, include_input=False)[0]
-        where = ".".join(map(str, first["loc"])) or "body"
-        raise RequestError(422, where[:200], f"{where[:200]}: {first['msg'][:200]}.") from None
+        field = ".".join(map(str, first["loc"]))[:200] or "body"
+        raise RequestError(422, field, f"{field}: {first['msg'][:200]}.") from None
     clouds = []
-    for k, cloud in enumerate(found.clouds):
+    for k, cloud in enumerate(body.clouds):
         points, colors = (np.array(rows).reshape(-1, 3) for rows in (cloud.points, cloud.colors))
-        clouds.append(_cloud(f"clouds.{k}", points, colors.astype(np.uint8)))
+        clouds.append(_check_cloud(f"clouds.{k}", points, colors.astype(np.uint8)))
     return clouds
 
 
-def clouds_of_npz(content: bytes) -> CloudArrays:
-    """Clouds of the npz form: `points` [M, 3] floats, `colors` [M, 3] uint8, `sizes` [B] points of each cloud.
+def decode_npz_clouds(content: bytes) -> CloudArrays:
+    """Decode clouds from an npz file: `points` [M, 3] float, `colors` [M, 3] uint8, `sizes` [B] points per cloud.
 
-    Nothing is unpickled, and no array is made before its size is known.
+    Nothing is unpickled, and no array is allocated before its size is known.
 
     Raises:
         RequestError: 413 or 422.
     """
-    arrays = _unpacked(content)
+    arrays = _decode_npz(content)
     points, colors, sizes = arrays["points"], arrays["colors"], arrays["sizes"]
-    for name, ok, expected in (
-        ("points", points.dtype.kind == "f" and points.ndim == 2 and points.shape[1:] == (3,), "floats [M, 3]"),
-        ("colors", colors.dtype == np.uint8 and colors.shape == points.shape, "uint8 [M, 3], as many as points"),
-        ("sizes", sizes.dtype.kind in "ui" and sizes.ndim == 1, "integers [B]"),
+    for name, is_valid, expected in (
+        ("points", points.dtype.kind == "f" and points.ndim == 2 and points.shape[1:] == (3,), "float [M, 3]"),
+        ("colors", colors.dtype == np.uint8 and colors.shape == points.shape, "uint8 [M, 3], one row per point"),
+        ("sizes", sizes.dtype.kind in "ui" and sizes.ndim == 1, "integer [B]"),
     ):
-        if not ok:
-            found = arrays[name]
-            raise RequestError(422, name, f"{name} is {found.dtype} {list(found.shape)}; expected {expected}.")
+        if not is_valid:
+            array = arrays[name]
+            raise RequestError(422, name, f"{name} is {array.dtype} {list(array.shape)}; expected {expected}.")
     counts = [int(n) for n in sizes[: MAX_CLOUDS + 1]]
     if not 1 <= len(counts) <= MAX_CLOUDS:
         raise RequestError(422, "sizes", f"sizes has {len(sizes)} entries; expected 1 to {MAX_CLOUDS}.")
     if min(counts) < 0 or max(counts) > POINT_BUCKETS[-1] or sum(counts) != len(points):
         raise RequestError(
-            422, "sizes", f"sizes must lie between 0 and {POINT_BUCKETS[-1]} and add up to the {len(points)} points."
+            422, "sizes", f"sizes must lie between 0 and {POINT_BUCKETS[-1]} and sum to the {len(points)} points."
         )
     ends = np.cumsum(counts)
-    return [_cloud("points", points[end - n : end], colors[end - n : end]) for n, end in zip(counts, ends, strict=True)]
+    return [
+        _check_cloud("points", points[end - n : end], colors[end - n : end])
+        for n, end in zip(counts, ends, strict=True)
+    ]
 
 
-def _unpacked(content: bytes) -> dict[str, NDArray[Any]]:
+def _decode_npz(content: bytes) -> dict[str, NDArray[Any]]:
     names = ("points", "colors", "sizes")
     try:
         archive = zipfile.ZipFile(io.BytesIO(content))
         entries = {name: archive.getinfo(f"{name}.npy") for name in names if f"{name}.npy" in archive.namelist()}
-    except Exception:  # damaged archives raise anything; only bytes are at work here
-        raise RequestError(422, "body", "The body is no npz file, or is damaged.") from None
+    except Exception:  # Damaged archives raise many types of exception.
+        raise RequestError(422, "body", "The body is not an npz file, or is damaged.") from None
     for name in names:
         if name not in entries:
-            raise RequestError(422, name, f"{name} is missing.")
+            raise RequestError(422, name, f"{name} is missing from the npz file.")
     if any(entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) for entry in entries.values()):
-        raise RequestError(422, "body", "The npz file must be stored or deflated.")
+        raise RequestError(422, "body", "The npz file must be uncompressed or deflated.")
     total = sum(entry.file_size for entry in entries.values())
     if total > MAX_BODY:
-        raise RequestError(413, "body", f"The arrays have {total} bytes; at most {MAX_BODY} are taken.")
-    return {name: _npy(name, archive, entry) for name, entry in entries.items()}
+        raise RequestError(413, "body", f"The arrays have {total} bytes; expected at most {MAX_BODY}.")
+    return {name: _decode_npy(name, archive, entry) for name, entry in entries.items()}
 
 
-def _npy(name: str, archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> NDArray[Any]:
+def _decode_npy(name: str, archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> NDArray[Any]:
     try:
-        stream = io.BytesIO(archive.read(entry))  # never more than entry.file_size
+        stream = io.BytesIO(archive.read(entry))  # At most entry.file_size bytes.
         version = np.lib.format.read_magic(stream)
         read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-        shape, by_columns, dtype = read_header[version](stream)
+        shape, is_fortran_order, dtype = read_header[version](stream)
         data = stream.read()
         if dtype.hasobject or math.prod(shape) * dtype.itemsize != len(data):
             raise ValueError
-        return np.frombuffer(data, dtype).reshape(shape, order="F" if by_columns else "C")
-    except Exception:  # as above
-        raise RequestError(422, name, f"{name} is no array of numbers, or is damaged.") from None
+        return np.frombuffer(data, dtype).reshape(shape, order="F" if is_fortran_order else "C")
+    except Exception:  # As above.
+        raise RequestError(422, name, f"{name} is not a numeric array, or is damaged.") from None
 
 
-def _cloud(field: str, points: NDArray[Any], colors: NDArray[np.uint8]) -> tuple[Any, NDArray[np.uint8]]:
+def _check_cloud(field: str, points: NDArray[Any], colors: NDArray[np.uint8]) -> tuple[Any, NDArray[np.uint8]]:
     if colors.shape != points.shape:
         raise RequestError(422, f"{field}.colors", f"{field} has {len(points)} points and {len(colors)} colors.")
-    if not (np.abs(points) <= FARTHEST).all():
-        raise RequestError(422, field, f"{field} has coordinates that are not within {FARTHEST} m.")
+    if not (np.abs(points) <= MAX_COORDINATE).all():
+        raise RequestError(422, field, f"{field} has coordinates that are not within {MAX_COORDINATE} m.")
     return points.astype(np.float32), colors

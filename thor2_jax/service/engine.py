@@ -1,4 +1,4 @@
-"""The recognizer's part on the device, in batches of few sizes that are all compiled before the first request."""
+"""The compiled model: descriptors and class probabilities for batches of a few sizes, all compiled before serving."""
 
 import dataclasses
 from collections.abc import Iterator, Sequence
@@ -18,22 +18,22 @@ from thor2_jax.recognition.recognizer import THOR2, Recognition, Recognizer
 from thor2_jax.recognition.run_directory import load_run
 from thor2_jax.service.settings import Settings
 
-__all__ = ["Engine", "Row"]
+__all__ = ["CloudResult", "InferenceEngine"]
 
-LEAST_POINTS, LEAST_CLOUDS = 2048, 8
-"""Smaller batches are padded to this: they take the device hardly less time, and each size takes seconds to compile."""
+MIN_POINTS_BUCKET, MIN_BATCH_BUCKET = 2048, 8
+"""Smallest shape of a batch. Smaller shapes run hardly faster, and each shape takes seconds to compile."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Row:
-    """What the device says of one cloud.
+class CloudResult:
+    """Descriptor and class probabilities of one cloud.
 
     Attributes:
         images: [S, P, P] float32, persistence images.
         embeddings: [S, R, J] float32, colour embeddings.
-        overflow: points and pairs that the descriptor has no room for.
+        overflow: number of points and persistence pairs outside the descriptor's grid.
         probabilities: classifier -> [C] float32.
-        aligned: [N, 3] float32, the aligned cloud and padding, scaled units.
+        aligned: [N, 3] float32, the aligned cloud in scaled units, with padding.
         strip_colors: [S, J, R] float32, strip colour vectors.
     """
 
@@ -45,47 +45,56 @@ class Row:
     strip_colors: NDArray[np.float32]
 
 
-class Engine:
-    """A trained run on the device. Not to be called from several threads at once."""
+class InferenceEngine:
+    """A trained run on the device. Not thread-safe."""
 
     def __init__(self, settings: Settings) -> None:
-        """Read the run.
+        """Load the run.
 
         Raises:
-            InputError: it cannot be read, or lacks a classifier that THOR2 needs; or as `Recognizer`.
+            InputError: the run cannot be read or lacks a classifier of THOR2, or an error of `Recognizer`.
         """
         if settings.cache is not None:
-            _keep_compiled(settings.cache)
+            _enable_compilation_cache(settings.cache)
         run = load_run(settings.model)
         missing = [name for name in THOR2 if name not in run.classifiers]
         if missing:
-            raise InputError(f"model: {settings.model} has no classifier {', '.join(missing)}")
-        # The same pairs as gudhi's, without a call back from the device.
+            raise InputError(
+                f"model: {settings.model} has no classifier {', '.join(missing)}; "
+                f"serving needs {' and '.join(THOR2)}: train the run with them"
+            )
+        # The closed form computes the same pairs as gudhi without a host callback.
         self.run = dataclasses.replace(run, config=dataclasses.replace(run.config, homology="closed_form"))
         self.max_batch = settings.max_batch
         self._recognizer = Recognizer(self.run, settings.unknown_below)
 
     def warm_up(self) -> Iterator[tuple[int, int]]:
-        """Compile for every size that `rows` can meet, one (points, clouds) at each step of the iterator."""
-        for n_points in (n for n in POINT_BUCKETS if n >= LEAST_POINTS):
-            for n_clouds in (b for b in BATCH_BUCKETS if LEAST_CLOUDS <= b <= _batch_size(self.max_batch)):
-                self._rows([], n_clouds, n_points)
+        """Compile every batch shape that `infer` can use, and yield each one as (points, clouds)."""
+        for n_points in (n for n in POINT_BUCKETS if n >= MIN_POINTS_BUCKET):
+            for n_clouds in (b for b in BATCH_BUCKETS if MIN_BATCH_BUCKET <= b <= _padded_batch(self.max_batch)):
+                self._infer([], n_clouds, n_points)
                 yield n_points, n_clouds
 
-    def rows(self, instances: Sequence[PreparedInstance]) -> list[Row]:
-        """Describe and classify clouds, at most `max_batch` of them."""
+    def infer(self, instances: Sequence[PreparedInstance]) -> list[CloudResult]:
+        """Describe and classify at most `max_batch` clouds."""
         largest = max(len(instance.points) for instance in instances)
-        return self._rows(instances, _batch_size(len(instances)), max(point_bucket(largest), LEAST_POINTS))
+        return self._infer(instances, _padded_batch(len(instances)), max(point_bucket(largest), MIN_POINTS_BUCKET))
 
-    def _rows(self, instances: Sequence[PreparedInstance], n_rows: int, n_points: int) -> list[Row]:
-        aligned = align(pack_instances(instances, n_rows, n_points), self.run.config)
-        in_strips = strips(aligned, self.run.network, self.run.config)
-        found = describe_strips(in_strips, self.run.network, self.run.config)
-        probabilities = self._recognizer.probabilities(found, THOR2)
-        arrays = (found.images, found.embeddings, found.overflow, aligned.points, in_strips.color)
+    def _infer(self, instances: Sequence[PreparedInstance], n_clouds: int, n_points: int) -> list[CloudResult]:
+        aligned = align(pack_instances(instances, n_clouds, n_points), self.run.config)
+        cloud_strips = strips(aligned, self.run.network, self.run.config)
+        descriptors = describe_strips(cloud_strips, self.run.network, self.run.config)
+        probabilities = self._recognizer.probabilities(descriptors, THOR2)
+        arrays = (
+            descriptors.images,
+            descriptors.embeddings,
+            descriptors.overflow,
+            aligned.points,
+            cloud_strips.color,
+        )
         images, embeddings, overflow, points, colors = (np.asarray(a) for a in arrays)
         return [
-            Row(
+            CloudResult(
                 images[k],
                 embeddings[k],
                 int(overflow[k]),
@@ -96,19 +105,19 @@ class Engine:
             for k in range(len(instances))
         ]
 
-    def recognitions(self, instances: Sequence[PreparedInstance], rows: Sequence[Row]) -> list[Recognition]:
-        """Answers for a frame's instances; `rows` are those of the usable ones, in order."""
-        shape = len(rows), len(self.run.classes)
-        probabilities = {name: np.reshape([row.probabilities[name] for row in rows], shape) for name in THOR2}
-        return self._recognizer.recognitions(instances, probabilities, [row.overflow for row in rows])
+    def recognize(self, instances: Sequence[PreparedInstance], results: Sequence[CloudResult]) -> list[Recognition]:
+        """Return a recognition per instance of a frame; `results` are those of the usable instances, in order."""
+        shape = len(results), len(self.run.classes)
+        probabilities = {name: np.reshape([r.probabilities[name] for r in results], shape) for name in THOR2}
+        return self._recognizer.recognitions(instances, probabilities, [r.overflow for r in results])
 
 
-def _keep_compiled(folder: Path) -> None:
-    jax.config.update("jax_compilation_cache_dir", str(folder))
-    # By default only what takes a second to compile, and is large, is kept.
+def _enable_compilation_cache(directory: Path) -> None:
+    jax.config.update("jax_compilation_cache_dir", str(directory))
+    # By default JAX caches only large programs that take more than a second to compile.
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
 
 
-def _batch_size(n_clouds: int) -> int:
-    return max(batch_bucket(n_clouds), LEAST_CLOUDS)
+def _padded_batch(n_clouds: int) -> int:
+    return max(batch_bucket(n_clouds), MIN_BATCH_BUCKET)

@@ -1,4 +1,4 @@
-"""What the service counts, for Prometheus, and the proof that no request compiles anything."""
+"""Prometheus metrics of the service, including the number of compilations after warm-up (expected to be zero)."""
 
 import os
 from pathlib import Path
@@ -8,49 +8,51 @@ from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, gene
 from prometheus_client.multiprocess import MultiProcessCollector, mark_process_dead
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-__all__ = ["CompilationWatch", "Metrics", "RequestCounting"]
+__all__ = ["CompilationCounter", "Metrics", "RequestCounter"]
 
-SECONDS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0)
-COMPILED = "/jax/core/compile/backend_compile_duration"
-WORKERS = "PROMETHEUS_MULTIPROC_DIR"
+STAGE_BUCKETS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0)
+BATCH_SIZE_BUCKETS = (1, 2, 4, 8, 16, 32, 64)
+COMPILATION_EVENT = "/jax/core/compile/backend_compile_duration"
+SHARED_DIRECTORY = "PROMETHEUS_MULTIPROC_DIR"
 
 
 class Metrics:
-    """Counters of one process; of all workers where `PROMETHEUS_MULTIPROC_DIR` names their common folder."""
+    """Metrics of one process, or of all workers if `PROMETHEUS_MULTIPROC_DIR` names their shared directory."""
 
     def __init__(self) -> None:
-        if WORKERS in os.environ:
-            _forget_dead_workers(Path(os.environ[WORKERS]))
+        if SHARED_DIRECTORY in os.environ:
+            _remove_dead_workers(Path(os.environ[SHARED_DIRECTORY]))
         registry = self._registry = CollectorRegistry()
-        self.requests = Counter("thor2_requests", "Requests.", ["path", "status"], registry=registry)
+        self.requests = Counter("thor2_requests", "Answered requests.", ["path", "status"], registry=registry)
         self.stages = Histogram(
-            "thor2_stage_seconds", "Seconds of a request by stage.", ["stage"], registry=registry, buckets=SECONDS
+            "thor2_stage_seconds",
+            "Duration of the stages of a request.",
+            ["stage"],
+            registry=registry,
+            buckets=STAGE_BUCKETS,
         )
         self.batches = Histogram(
-            "thor2_batch_clouds",
-            "Clouds in a batch of the device.",
-            registry=registry,
-            buckets=(1, 2, 4, 8, 16, 32, 64),
+            "thor2_batch_clouds", "Number of clouds in a batch.", registry=registry, buckets=BATCH_SIZE_BUCKETS
         )
-        self.waiting = Gauge(
-            "thor2_requests_waiting", "Requests in work.", registry=registry, multiprocess_mode="livesum"
+        self.in_progress = Gauge(
+            "thor2_requests_waiting", "Requests in progress.", registry=registry, multiprocess_mode="livesum"
         )
         self.compilations = Counter(
-            "thor2_compilations_after_warm_up", "Programs compiled since the service was ready.", registry=registry
+            "thor2_compilations_after_warm_up", "Programs compiled after warm-up.", registry=registry
         )
 
     def text(self) -> bytes:
-        """In the format that Prometheus reads."""
-        if WORKERS not in os.environ:
+        """Return the metrics in the Prometheus text format."""
+        if SHARED_DIRECTORY not in os.environ:
             return generate_latest(self._registry)
-        together = CollectorRegistry()
-        MultiProcessCollector(together)
-        return generate_latest(together)
+        all_workers = CollectorRegistry()
+        MultiProcessCollector(all_workers)
+        return generate_latest(all_workers)
 
 
-def _forget_dead_workers(folder: Path) -> None:
-    """A worker that is started in place of one that died: the requests of that one wait no more."""
-    for path in folder.glob("gauge_live*.db"):
+def _remove_dead_workers(directory: Path) -> None:
+    """Remove the gauges of workers that have died, so that their requests no longer count as in progress."""
+    for path in directory.glob("gauge_live*.db"):
         pid = int(path.stem.rpartition("_")[2])
         try:
             os.kill(pid, 0)
@@ -58,51 +60,51 @@ def _forget_dead_workers(folder: Path) -> None:
             mark_process_dead(pid)
 
 
-class CompilationWatch:
-    """Counts what JAX compiles in this process, from `start` to `stop`."""
+class CompilationCounter:
+    """Count the programs that JAX compiles in this process between `start` and `stop`."""
 
     def __init__(self, counter: Counter) -> None:
-        self._counter, self._listening = counter, False
+        self._counter, self._is_active = counter, False
 
-    def _listen(self, event: str, duration_secs: float, **_: str | int) -> None:
-        if event == COMPILED:
+    def _on_event(self, event: str, duration_secs: float, **_: str | int) -> None:
+        if event == COMPILATION_EVENT:
             self._counter.inc()
 
     def start(self) -> None:
-        """Count from now on."""
-        self._listening = True
-        jax.monitoring.register_event_duration_secs_listener(self._listen)
+        """Start counting."""
+        self._is_active = True
+        jax.monitoring.register_event_duration_secs_listener(self._on_event)
 
     def stop(self) -> None:
-        """Count no more; harmless if `start` was never called."""
-        if self._listening:
-            jax.monitoring.unregister_event_duration_listener(self._listen)
+        """Stop counting; does nothing before `start`."""
+        if self._is_active:
+            jax.monitoring.unregister_event_duration_listener(self._on_event)
 
 
-class RequestCounting:
-    """ASGI middleware: counts answers by route and status."""
+class RequestCounter:
+    """ASGI middleware that counts responses by route and status."""
 
     def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
         self._app, self._metrics = app, metrics
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass on, and look at the status that goes out."""
+        """Call the application and count the status of its response."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
 
         def count(status: int) -> None:
-            # Only names of routes: paths are the caller's, and without end.
+            # Routes, not paths: callers could create an unlimited number of labels.
             path = getattr(scope.get("route"), "path", "other")
             self._metrics.requests.labels(path or "other", str(status)).inc()
 
-        async def counted(message: Message) -> None:
+        async def send_counted(message: Message) -> None:
             if message["type"] == "http.response.start":
                 count(message["status"])
             await send(message)
 
         try:
-            await self._app(scope, receive, counted)
-        except Exception:  # it is answered further out
+            await self._app(scope, receive, send_counted)
+        except Exception:  # An outer middleware answers with status 500.
             count(500)
             raise

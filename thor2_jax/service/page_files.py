@@ -1,4 +1,4 @@
-"""The static files of the page (`page/`, plain HTML, CSS and JavaScript modules), served at /."""
+"""Static files of the web page (`page/`: HTML, CSS and JavaScript modules without a build step), served at /."""
 
 import os
 from pathlib import Path
@@ -10,23 +10,23 @@ from starlette.staticfiles import StaticFiles
 __all__ = ["PageFiles"]
 
 HEADERS = {
-    # Scripts, styles, pictures and requests: this server and no other; nothing inline; in no frame.
+    # The page loads from and connects to its own server only, has no inline code and cannot be framed.
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; "
     "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
-    "Cache-Control": "no-cache",  # asked for again each time, sent only if it changed
+    "Cache-Control": "no-cache",  # Browsers revalidate each file and transfer it only if it changed.
 }
 
 
 class PageFiles(StaticFiles):
-    """The files of the page, with headers that keep it to this server."""
+    """Static files of the page with security headers."""
 
     def __init__(self) -> None:
         super().__init__(directory=Path(__file__).parent / "page", html=True)
 
     def file_response(self, full_path: str | os.PathLike[str], *args: Any, **kwargs: Any) -> Response:
-        """A file's response, with `HEADERS`."""
+        """Return the response for a file, with `HEADERS`."""
         response = super().file_response(full_path, *args, **kwargs)
         response.headers.update(HEADERS)
         return response

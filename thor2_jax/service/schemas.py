@@ -1,11 +1,11 @@
-"""What the service takes and answers, as pydantic models; the OpenAPI document is made from them."""
+"""Request and response bodies as pydantic models, from which the OpenAPI document is generated."""
 
 from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from thor2_jax.capacity import POINT_BUCKETS
-from thor2_jax.service.settings import FARTHEST, MAX_CLOUDS, MAX_DETAILED
+from thor2_jax.service.settings import MAX_CLOUDS, MAX_COORDINATE, MAX_EXPLAINED
 
 __all__ = [
     "CLOUDS_BODY",
@@ -15,24 +15,24 @@ __all__ = [
     "Clouds",
     "ColorNetworkAnswer",
     "DescribeAnswer",
-    "Descriptor",
+    "DescriptorAnswer",
     "Details",
     "ExplainedFrame",
     "ExplainedInstance",
     "FrameAnswer",
     "Health",
-    "Instance",
+    "InstanceAnswer",
     "LabelMap",
     "ModelAnswer",
-    "Slice",
-    "Strip",
+    "SliceDetails",
+    "StripColors",
 ]
 
 NPZ = "application/octet-stream"
-"""Type of a body that is an npz file."""
+"""Content type of npz files."""
 
 Milliseconds = dict[str, float]
-Coordinate = Annotated[float, Field(ge=-FARTHEST, le=FARTHEST, allow_inf_nan=False)]
+Coordinate = Annotated[float, Field(ge=-MAX_COORDINATE, le=MAX_COORDINATE, allow_inf_nan=False)]
 Channel = Annotated[int, Field(ge=0, le=255)]
 
 
@@ -43,89 +43,93 @@ class Candidate(BaseModel):
     probability: float
 
 
-class Instance(BaseModel):
-    """What is said of one instance of the label image."""
+class InstanceAnswer(BaseModel):
+    """Recognition of one instance of the label image."""
 
-    label: int = Field(description="Its number in the label image.")
-    name: str | None = Field(description="The object's name; null if it was not recognized.")
-    confidence: float | None = Field(description="The name's probability by both classifiers together.")
-    classifier: str | None = Field(description="The classifier that is surer of the name: tops or tops2.")
-    top: dict[str, list[Candidate]] = Field(description="Each classifier's five most probable classes.")
-    occluded: bool = Field(description="Hidden in part by another instance, or cut by the image's border.")
-    overflow: int = Field(description="Points and pairs that the descriptor has no room for.")
-    points_used: int = Field(description="Points of the described cloud.")
-    kept_by_fallback: bool = Field(description="Outlier removal was relaxed, as it would have dropped most of it.")
-    unrecognized: str | None = Field(description="Why it has no name; null if it has one.")
+    label: int = Field(description="Number of the instance in the label image.")
+    name: str | None = Field(description="Name of the object; null if it is unknown or cannot be recognized.")
+    confidence: float | None = Field(
+        description="Probability of the most probable class after fusion of the classifiers."
+    )
+    classifier: str | None = Field(
+        description="Classifier that gives this class the higher probability: tops or tops2."
+    )
+    top: dict[str, list[Candidate]] = Field(description="Five most probable classes of each classifier.")
+    occluded: bool = Field(description="Partly hidden by another instance or cut off by the image border.")
+    overflow: int = Field(description="Number of points and persistence pairs outside the descriptor's grid.")
+    points_used: int = Field(description="Number of points of the described cloud.")
+    kept_by_fallback: bool = Field(description="Outlier removal was relaxed because it would have removed most points.")
+    unrecognized: str | None = Field(description="Reason why the name is null; null if there is a name.")
 
 
 class FrameAnswer(BaseModel):
     """All instances of a frame, in the order of their labels."""
 
-    instances: list[Instance]
-    timings: Milliseconds = Field(description="Milliseconds a stage: upload, decode, clouds, device, total.")
+    instances: list[InstanceAnswer]
+    timings: Milliseconds = Field(description="Milliseconds per stage: upload, decode, clouds, device, total.")
 
 
-class Strip(BaseModel):
-    """The points of one strip of a slice by colour region."""
+class StripColors(BaseModel):
+    """Points of one strip of a slice, by colour region."""
 
     strip: int
     regions: list[int]
-    weights: list[float] = Field(description="Points in each of these regions; one of m regions counts 1/m in each.")
+    weights: list[float] = Field(description="Points in each region; a point with m regions counts 1/m in each.")
 
 
-class Slice(BaseModel):
-    """One slice of a cloud, as the descriptor sees it."""
+class SliceDetails(BaseModel):
+    """Persistence image and strip colours of one slice."""
 
     image: list[list[int]] = Field(description="[P, P] persistence image, 255 at image_peak; axes birth, persistence.")
-    strips: list[Strip] = Field(description="Those with points.")
+    strips: list[StripColors] = Field(description="Strips that contain points.")
 
 
 class Details(BaseModel):
-    """What a name rests on. Lengths are scaled units."""
+    """Evidence for a name. Lengths are in scaled units."""
 
     points: list[tuple[float, float, float]] = Field(
-        description="The aligned cloud: slices lie along z, strips along x. A random part of a large one."
+        description="Aligned cloud, or a random sample of a large one; slices lie along z, strips along x."
     )
-    colors: list[tuple[int, int, int]] = Field(description="sRGB of these points.")
-    slice_borders: list[tuple[float, float]] = Field(description="Where along z each slice begins and ends.")
-    image_peak: float = Field(description="Largest value of the persistence images.")
-    slices: list[Slice]
+    colors: list[tuple[int, int, int]] = Field(description="sRGB colours of these points.")
+    slice_borders: list[tuple[float, float]] = Field(description="Start and end of each slice along z.")
+    image_peak: float = Field(description="Maximum of the persistence images.")
+    slices: list[SliceDetails]
 
 
-class ExplainedInstance(Instance):
-    """An instance with what its name rests on."""
+class ExplainedInstance(InstanceAnswer):
+    """Recognition of an instance, with the evidence for its name."""
 
     details: Details | None = Field(
-        description=f"null if it was not recognized, and past the first {MAX_DETAILED} instances."
+        description=f"null if the cloud cannot be used, and after the first {MAX_EXPLAINED} instances."
     )
 
 
 class LabelMap(BaseModel):
-    """The label image in runs, row after row. A ragged one is made coarser: rows and columns are left out evenly."""
+    """The label image, run-length encoded row by row; an image with too many runs is subsampled."""
 
     width: int
     height: int
     labels: list[int]
-    lengths: list[int] = Field(description="Pixels that each of `labels` holds on for.")
+    lengths: list[int] = Field(description="Length in pixels of the run of each entry of `labels`.")
 
 
 class ExplainedFrame(BaseModel):
-    """All instances of a frame, in the order of their labels, with what their names rest on."""
+    """All instances of a frame with the evidence for their names, in the order of their labels."""
 
     instances: list[ExplainedInstance]
     label_map: LabelMap
-    timings: Milliseconds = Field(description="Milliseconds a stage: upload, decode, clouds, device, total.")
+    timings: Milliseconds = Field(description="Milliseconds per stage: upload, decode, clouds, device, total.")
 
 
 class Cloud(BaseModel):
-    """A coloured point cloud in the camera's frame (x right, y down, z forward)."""
+    """A coloured point cloud in the camera frame (x right, y down, z forward)."""
 
     model_config = ConfigDict(extra="forbid")
     points: Annotated[list[tuple[Coordinate, Coordinate, Coordinate]], Field(max_length=POINT_BUCKETS[-1])] = Field(
         description="Metres."
     )
     colors: Annotated[list[tuple[Channel, Channel, Channel]], Field(max_length=POINT_BUCKETS[-1])] = Field(
-        description="sRGB, 0 to 255, one a point."
+        description="sRGB, 0 to 255, one per point."
     )
 
 
@@ -136,44 +140,44 @@ class Clouds(BaseModel):
     clouds: Annotated[list[Cloud], Field(min_length=1, max_length=MAX_CLOUDS)]
 
 
-class Descriptor(BaseModel):
-    """TOPS2 of one cloud, part by part. TOPS are the images, CE the embeddings."""
+class DescriptorAnswer(BaseModel):
+    """Descriptor of one cloud: TOPS consists of the images, CE of the embeddings, TOPS2 of both."""
 
     images: list[list[list[float]]] = Field(description="[S, P, P] persistence images; axes birth, persistence.")
     embeddings: list[list[list[float]]] = Field(description="[S, R, J] colour embeddings, regions by strips.")
-    overflow: int = Field(description="Points and pairs that the descriptor has no room for.")
+    overflow: int = Field(description="Number of points and persistence pairs outside the descriptor's grid.")
 
 
 class DescribeAnswer(BaseModel):
-    """One descriptor a cloud, in the order given."""
+    """One descriptor per cloud, in the order of the request."""
 
-    descriptors: list[Descriptor]
-    timings: Milliseconds = Field(description="Milliseconds a stage: upload, decode, device, total.")
+    descriptors: list[DescriptorAnswer]
+    timings: Milliseconds = Field(description="Milliseconds per stage: upload, decode, device, total.")
 
 
 class ModelAnswer(BaseModel):
-    """The trained run that answers."""
+    """The model of the service."""
 
     classes: list[str]
     classifiers: list[str]
     descriptor_version: int
-    descriptor: dict[str, Any] = Field(description="The descriptor's constants.")
-    color_network: str = Field(description="The colour network's fingerprint.")
+    descriptor: dict[str, Any] = Field(description="Configuration of the descriptor.")
+    color_network: str = Field(description="Fingerprint of the colour network.")
 
 
 class ColorNetworkAnswer(BaseModel):
-    """The colour network: R regions and how they touch."""
+    """The colour network: R colour regions, the edges between them and their similarity."""
 
-    mean_rgb: list[list[float]] = Field(description="[R, 3] mean colour of each region, 0 to 255.")
-    member_counts: list[int] = Field(description="[R] colours of the grid in each region.")
+    mean_rgb: list[list[float]] = Field(description="[R, 3] mean sRGB colour of each region, 0 to 255.")
+    member_counts: list[int] = Field(description="[R] number of grid colours in each region.")
     edges: list[list[int]] = Field(description="[E, 2] pairs of regions.")
-    edge_weights: list[float] = Field(description="[E] distance of the two mean colours.")
-    similarity: list[list[float]] = Field(description="[R, R].")
+    edge_weights: list[float] = Field(description="[E] HyAB distance between the two mean colours.")
+    similarity: list[list[float]] = Field(description="[R, R] similarity matrix Delta.")
     fingerprint: str
 
 
 class Health(BaseModel):
-    """Whether the service lives, or is ready."""
+    """Health of the service."""
 
     status: str
 
@@ -190,7 +194,7 @@ FRAME_FORM: dict[str, Any] = {
                     "depth": {
                         "type": "string",
                         "format": "binary",
-                        "description": "16-bit PNG, millimetres (or what the intrinsics' depth_scale says); 0 is none.",
+                        "description": "16-bit PNG in units of 1 / depth_scale metres (by default mm); 0: no depth.",
                     },
                     "labels": {
                         "type": "string",
@@ -199,23 +203,22 @@ FRAME_FORM: dict[str, Any] = {
                     },
                     "intrinsics": {
                         "type": "string",
-                        "description": "JSON with fx, fy, cx, cy in pixels and, if wanted, depth_scale, units a metre.",
+                        "description": "JSON: fx, fy, cx, cy in pixels and optionally depth_scale (units per metre).",
                     },
                 },
             }
         }
     },
 }
-"""The body of /v1/recognize in words of the OpenAPI. It is taken apart by hand (`uploads`): FastAPI's own way would put
-large files on the disk."""
+"""OpenAPI schema of the body of /v1/recognize. `uploads` parses the form, since FastAPI writes large files to disk."""
 
 
 def _clouds_body() -> dict[str, Any]:
     schema = Clouds.model_json_schema()
-    schema["properties"]["clouds"]["items"] = schema.pop("$defs")["Cloud"]  # references would lead out of the document
+    schema["properties"]["clouds"]["items"] = schema.pop("$defs")["Cloud"]  # References cannot be resolved.
     binary = {"type": "string", "format": "binary"}
     return {"required": True, "content": {"application/json": {"schema": schema}, NPZ: {"schema": binary}}}
 
 
 CLOUDS_BODY = _clouds_body()
-"""The body of /v1/describe, likewise."""
+"""OpenAPI schema of the body of /v1/describe."""

@@ -1,4 +1,4 @@
-"""The service under uvicorn: one process, or several workers behind one socket."""
+"""Serving with uvicorn: one process, or several workers that share a socket."""
 
 import contextlib
 import copy
@@ -16,7 +16,7 @@ from uvicorn.supervisors import Multiprocess
 
 from thor2_jax.service.app import create_app
 from thor2_jax.service.connections import TimedConnection
-from thor2_jax.service.engine import Engine
+from thor2_jax.service.engine import InferenceEngine
 from thor2_jax.service.settings import Settings
 
 __all__ = ["serve"]
@@ -25,17 +25,17 @@ log = logging.getLogger(__name__)
 
 
 def serve(settings: Settings, host: str = "127.0.0.1", port: int = 8080, workers: int = 1) -> None:
-    """Answer until SIGTERM or SIGINT; then finish what was taken and return.
+    """Serve until SIGTERM or SIGINT, then finish the accepted requests and return.
 
     Args:
-        settings: of each worker.
-        host: address to listen at.
-        port: to listen at; 0 takes a free one, and the log tells which.
-        workers: processes with a model, a queue and preparing processes each.
+        settings: settings of each worker.
+        host: address to listen on.
+        port: port to listen on; 0 chooses a free port, which the log names.
+        workers: number of processes, each with its own model, queue and preparation processes.
 
     Raises:
         InputError: the run cannot be read.
-        OSError: the address is taken.
+        OSError: the address is in use.
     """
     log_config = copy.deepcopy(LOGGING_CONFIG)
     log_config["loggers"]["thor2_jax.service"] = {"handlers": ["default"], "level": "INFO", "propagate": False}
@@ -49,21 +49,21 @@ def serve(settings: Settings, host: str = "127.0.0.1", port: int = 8080, workers
         server_header=False,
         log_config=log_config,
         timeout_graceful_shutdown=int(settings.deadline) + 5,
-        timeout_worker_healthcheck=60,  # a worker imports and compiles at its start
+        timeout_worker_healthcheck=60,  # A worker does not answer while it imports modules.
     )
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    with socket.create_server((host, port), family=family, backlog=config.backlog) as listening:
-        shown = f"[{host}]" if ":" in host else host
-        log.info("listening at http://%s:%d", shown, listening.getsockname()[1])
+    with socket.create_server((host, port), family=family, backlog=config.backlog) as listener:
+        url_host = f"[{host}]" if ":" in host else host
+        log.info("listening at http://%s:%d", url_host, listener.getsockname()[1])
         if workers == 1:
-            # uvicorn raises the signal again when all is finished: then that is the end, and no failure.
+            # uvicorn raises the signal again after the shutdown, which then is a normal exit.
             signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
             config.load()
             with contextlib.suppress(KeyboardInterrupt):
-                uvicorn.Server(config).run([listening])
+                uvicorn.Server(config).run([listener])
         else:
-            Engine(settings)  # what is wrong with the run is said once, here
-            listening.set_inheritable(True)
-            with tempfile.TemporaryDirectory() as folder:
-                os.environ["PROMETHEUS_MULTIPROC_DIR"] = folder
-                Multiprocess(config, [listening]).run()
+            InferenceEngine(settings)  # Report an unreadable run once, not once per worker.
+            listener.set_inheritable(True)
+            with tempfile.TemporaryDirectory() as directory:
+                os.environ["PROMETHEUS_MULTIPROC_DIR"] = directory
+                Multiprocess(config, [listener]).run()

@@ -1,4 +1,4 @@
-"""What can be set when the service starts, and the limits that hold for every request."""
+"""Settings of the service, and the limits of a request."""
 
 import dataclasses
 from pathlib import Path
@@ -7,59 +7,59 @@ from thor2_jax.capacity import BATCH_BUCKETS
 from thor2_jax.errors import InputError
 
 __all__ = [
-    "FARTHEST",
     "MAX_BODY",
     "MAX_CLOUDS",
-    "MAX_DETAILED",
+    "MAX_COORDINATE",
+    "MAX_EXPLAINED",
+    "MAX_IMAGE_PIXELS",
     "MAX_INSTANCES",
-    "MAX_PIXELS",
-    "MAX_RUNS",
-    "MAX_TEXT",
+    "MAX_INTRINSICS_BYTES",
+    "MAX_LABEL_RUNS",
     "Settings",
 ]
 
-FARTHEST = 100.0
-"""Metres: largest coordinate of a cloud."""
+MAX_COORDINATE = 100.0
+"""Largest absolute value of a coordinate of a cloud, in metres."""
 
 MAX_BODY = 16 * 2**20
-"""Bytes of a request's body, and of the arrays that it unpacks to."""
+"""Maximum size of a request body, and of the arrays it decompresses to, in bytes."""
 
-MAX_PIXELS = 1920 * 1080
-"""Pixels of an image."""
+MAX_IMAGE_PIXELS = 1920 * 1080
+"""Maximum number of pixels of an image."""
 
 MAX_INSTANCES = 256
-"""Instances in a frame."""
+"""Maximum number of instances in a frame."""
 
-MAX_DETAILED = 32
-"""Instances of a frame that are explained."""
+MAX_EXPLAINED = 32
+"""Maximum number of instances of a frame that are explained."""
 
-MAX_RUNS = 50_000
-"""Runs in the label map of an explained frame."""
+MAX_LABEL_RUNS = 50_000
+"""Maximum number of runs in the label map of an explained frame."""
 
 MAX_CLOUDS = 32
-"""Clouds in a request."""
+"""Maximum number of clouds in a request."""
 
-MAX_TEXT = 4096
-"""Bytes of the intrinsics."""
+MAX_INTRINSICS_BYTES = 4096
+"""Maximum size of the intrinsics file."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """How a process of the service works.
+    """Settings of one process of the service.
 
     Attributes:
-        model: run folder.
-        token: callers must send `Authorization: Bearer TOKEN`; None lets everybody in.
-        queue: requests that are worked on or wait at one time; more get a 429.
-        deadline: seconds from a request's arrival to its answer; later it gets a 504.
-        max_batch: largest batch on the device, one of `capacity.BATCH_BUCKETS`.
-        window: seconds that a batch waits for the instances of requests that are being prepared.
-        processes: that decode images and make clouds.
-        unknown_below: confidence that an answer needs to have a name, as in `Recognizer`.
-        cache: folder for compiled programs, so that the next start need not compile; None keeps none.
+        model: run directory.
+        token: callers must send `Authorization: Bearer TOKEN`; None turns authentication off.
+        queue: maximum number of requests in progress; further requests receive status 429.
+        deadline: seconds from the arrival of a request to its answer; a later answer becomes status 504.
+        max_batch: maximum batch size, one of `capacity.BATCH_BUCKETS`.
+        window: seconds for which a batch waits for the instances of requests in progress.
+        processes: number of processes that decode images and compute clouds.
+        unknown_below: confidence below which an object is unknown, as in `Recognizer`.
+        cache: directory of compiled programs, which a later start reuses; None disables the cache.
 
     Raises:
-        InputError: a value out of its range.
+        InputError: a value is out of range.
     """
 
     model: Path
@@ -75,8 +75,8 @@ class Settings:
     def __post_init__(self) -> None:
         for name in ("queue", "deadline", "processes"):
             if not getattr(self, name) > 0:
-                raise InputError(f"{name} is {getattr(self, name)}; it must be positive")
+                raise InputError(f"{name} is {getattr(self, name)}; expected a positive number")
         if self.max_batch not in BATCH_BUCKETS:
             raise InputError(f"max_batch is {self.max_batch}; expected one of {', '.join(map(str, BATCH_BUCKETS))}")
         if self.token is not None and not (self.token and self.token.isascii() and self.token.isprintable()):
-            raise InputError("token must be printable ASCII characters, at least one")
+            raise InputError("token is empty or has other characters; expected printable ASCII characters")

@@ -1,4 +1,4 @@
-"""A run with random weights, a frame, and one running service for most tests."""
+"""A run with random weights, a frame, and a running service that most tests share."""
 
 import io
 import json
@@ -37,19 +37,19 @@ def encode() -> Callable[..., bytes]:
 
 
 @pytest.fixture(scope="session")
-def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     config, network = thor2.DescriptorConfig(), colornet.load_default()
     classifiers = {
         name: MLP(input_size(name, config, network.n_regions), 7, rngs=nnx.Rngs(k)) for k, name in enumerate(FEATURES)
     }
     folder = tmp_path_factory.mktemp("service") / "run"
-    save_run(TrainedRun(config, network, tuple("abcdefg"), classifiers, {"meshes": "/a/path/of/this/machine"}), folder)
+    save_run(TrainedRun(config, network, tuple("abcdefg"), classifiers, {"meshes": "/a/local/path"}), folder)
     return folder
 
 
 @pytest.fixture(scope="session")
 def frame() -> thor2.RGBDFrame:
-    """A coloured plane that falls off to the right; three instances to name and one that is too small."""
+    """A coloured plane with three usable instances and one that is too small."""
     labels = np.zeros((240, 320), np.uint8)
     labels[20:100, 20:90] = 3
     labels[200:203, 10:13] = 5
@@ -67,7 +67,7 @@ def files(frame: thor2.RGBDFrame) -> Files:
 
 
 class Server:
-    """`thor2 serve` in a process of its own."""
+    """`thor2 serve` in a subprocess."""
 
     def __init__(self, run: Path, log: Path, cache: Path, *options: str) -> None:
         self.log = log
@@ -79,15 +79,15 @@ class Server:
                 stdout=stream,
                 stderr=stream,
             )
-        self.url = self._until(lambda: re.search(r"http://127\.0\.0\.1:\d+", log.read_text()))[0]
-        self._until(self._ready)
+        self.url = self._wait_for(lambda: re.search(r"http://127\.0\.0\.1:\d+", log.read_text()))[0]
+        self._wait_for(self._ready)
 
-    def _until(self, found: Callable[[], re.Match[str] | None]) -> re.Match[str]:
+    def _wait_for(self, condition: Callable[[], re.Match[str] | None]) -> re.Match[str]:
         start = time.monotonic()
         while time.monotonic() - start < 240:
-            answer = found()
-            if answer:
-                return answer
+            match = condition()
+            if match:
+                return match
             assert self.process.poll() is None, self.log.read_text()
             time.sleep(0.05)
         raise AssertionError(self.log.read_text())
@@ -104,11 +104,11 @@ class Server:
 
 
 @pytest.fixture(scope="session")
-def start_server(run_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., Server]]:
+def start_server(run_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., Server]]:
     folder, started = tmp_path_factory.mktemp("servers"), []
 
     def start(*options: str) -> Server:
-        started.append(Server(run_folder, folder / f"{len(started)}.log", folder / "cache", *options))
+        started.append(Server(run_dir, folder / f"{len(started)}.log", folder / "cache", *options))
         return started[-1]
 
     yield start
@@ -124,6 +124,6 @@ def server(start_server: Callable[..., Server]) -> Server:
 
 
 @pytest.fixture
-def ask(server: Server) -> Iterator[httpx.Client]:
+def http(server: Server) -> Iterator[httpx.Client]:
     with httpx.Client(base_url=server.url, timeout=60) as client:
         yield client

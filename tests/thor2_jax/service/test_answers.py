@@ -1,4 +1,4 @@
-"""What a running service says of good requests, against the library on the same run."""
+"""Answers of a running service to valid requests, compared with the library on the same run."""
 
 import io
 from collections.abc import Callable
@@ -16,16 +16,16 @@ from thor2_jax.client import Client, ServiceError
 
 
 @pytest.fixture(scope="module")
-def expected(run_folder: Path, frame: thor2.RGBDFrame) -> list[thor2.Recognition]:
-    return thor2.Recognizer.load(run_folder).recognize(frame)
+def expected(run_dir: Path, frame: thor2.RGBDFrame) -> list[thor2.Recognition]:
+    return thor2.Recognizer.load(run_dir).recognize(frame)
 
 
-def test_a_frame_is_answered_as_by_the_library(
+def test_recognize_matches_the_library(
     server: Any, frame: thor2.RGBDFrame, files: dict[str, bytes], expected: list[thor2.Recognition]
 ) -> None:
-    found = Client(server.url).recognize(**files)
-    assert [one.label for one in found] == [3, 5, 7, 200]
-    for one, other in zip(found, expected, strict=True):
+    recognitions = Client(server.url).recognize(**files)
+    assert [r.label for r in recognitions] == [3, 5, 7, 200]
+    for one, other in zip(recognitions, expected, strict=True):
         assert (one.name, one.classifier, one.reason) == (other.name, other.classifier, other.reason)
         assert (one.occluded, one.overflow, one.points_used) == (other.occluded, other.overflow, other.points_used)
         assert one.kept_by_fallback == other.kept_by_fallback
@@ -37,29 +37,31 @@ def test_a_frame_is_answered_as_by_the_library(
             assert [p for _, p in best] == pytest.approx([p for _, p in other.top[name]], abs=1e-5)
 
 
-def test_the_json_has_reasons_and_timings(ask: httpx.Client, files: dict[str, bytes]) -> None:
-    answer = ask.post("/v1/recognize", files=files).json()
+def test_recognize_returns_reasons_and_timings(http: httpx.Client, files: dict[str, bytes]) -> None:
+    answer = http.post("/v1/recognize", files=files).json()
     small = answer["instances"][1]
-    assert small["label"] == 5 and small["name"] is None and "at least 30" in small["unrecognized"]
+    assert small["label"] == 5 and small["name"] is None and "30" in small["unrecognized"]
     assert set(answer["timings"]) == {"upload", "decode", "clouds", "device", "total"}
     assert answer["timings"]["total"] >= answer["timings"]["decode"] + answer["timings"]["clouds"] > 0
 
 
-def test_color_as_jpeg_and_intrinsics_as_a_plain_field(
-    ask: httpx.Client, frame: thor2.RGBDFrame, files: dict[str, bytes]
+def test_jpeg_color_and_plain_intrinsics_field(
+    http: httpx.Client, frame: thor2.RGBDFrame, files: dict[str, bytes]
 ) -> None:
     stream = io.BytesIO()
     Image.fromarray(frame.color).save(stream, "JPEG")
     images = {"color": stream.getvalue(), "depth": files["depth"], "labels": files["labels"]}
-    answer = ask.post("/v1/recognize", files=images, data={"intrinsics": files["intrinsics"].decode()})
+    answer = http.post("/v1/recognize", files=images, data={"intrinsics": files["intrinsics"].decode()})
     assert answer.status_code == 200 and len(answer.json()["instances"]) == 4
 
 
-def test_no_instances_and_no_depth(ask: httpx.Client, files: dict[str, bytes], encode: Callable[..., bytes]) -> None:
+def test_frames_without_instances_or_depth(
+    http: httpx.Client, files: dict[str, bytes], encode: Callable[..., bytes]
+) -> None:
     empty = encode(np.zeros((240, 320), np.uint8))
-    assert ask.post("/v1/recognize", files=files | {"labels": empty}).json()["instances"] == []
+    assert http.post("/v1/recognize", files=files | {"labels": empty}).json()["instances"] == []
     blind = encode(np.zeros((240, 320), np.uint16))
-    instances = ask.post("/v1/recognize", files=files | {"depth": blind}).json()["instances"]
+    instances = http.post("/v1/recognize", files=files | {"depth": blind}).json()["instances"]
     assert len(instances) == 4 and all(one["unrecognized"] for one in instances)
 
 
@@ -71,16 +73,16 @@ def clouds(count: int) -> list[tuple[np.ndarray, np.ndarray]]:
     ]
 
 
-def test_descriptors_are_those_of_the_library(server: Any, ask: httpx.Client) -> None:
-    given = clouds(11)  # more than a batch, up to 7,100 points
+def test_describe_matches_the_library(server: Any, http: httpx.Client) -> None:
+    inputs = clouds(11)  # More than a batch, with up to 7,100 points.
     config = thor2.DescriptorConfig(homology="closed_form")
-    expected = thor2.describe(thor2.PointClouds.pack(given), colornet.load_default(), config)
-    found = Client(server.url).describe(given)
-    np.testing.assert_allclose(found["images"], expected.images, atol=1e-5)
-    np.testing.assert_allclose(found["embeddings"], expected.embeddings, rtol=1e-5, atol=1e-4)
-    np.testing.assert_array_equal(found["overflow"], expected.overflow)
-    body = {"clouds": [{"points": xyz.tolist(), "colors": rgb.tolist()} for xyz, rgb in given[:2]]}
-    answer = ask.post("/v1/describe", json=body).json()
+    expected = thor2.describe(thor2.PointClouds.pack(inputs), colornet.load_default(), config)
+    answer = Client(server.url).describe(inputs)
+    np.testing.assert_allclose(answer["images"], expected.images, atol=1e-5)
+    np.testing.assert_allclose(answer["embeddings"], expected.embeddings, rtol=1e-5, atol=1e-4)
+    np.testing.assert_array_equal(answer["overflow"], expected.overflow)
+    body = {"clouds": [{"points": xyz.tolist(), "colors": rgb.tolist()} for xyz, rgb in inputs[:2]]}
+    answer = http.post("/v1/describe", json=body).json()
     assert set(answer["timings"]) == {"upload", "decode", "device", "total"}
     for k, one in enumerate(answer["descriptors"]):
         np.testing.assert_allclose(one["images"], expected.images[k], atol=1e-5)
@@ -88,60 +90,60 @@ def test_descriptors_are_those_of_the_library(server: Any, ask: httpx.Client) ->
         assert one["overflow"] == expected.overflow[k]
 
 
-def test_empty_and_degenerate_clouds_are_described(server: Any, ask: httpx.Client) -> None:
-    nothing = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
+def test_empty_and_degenerate_clouds(server: Any, http: httpx.Client) -> None:
+    empty = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
     one_point = np.ones((1, 3), np.float32), np.zeros((1, 3), np.uint8)
     far_apart = np.array([[-100, 0, 0], [100, 0, 0], [0, 100, 1e-30]], np.float32), np.zeros((3, 3), np.uint8)
-    found = Client(server.url).describe([nothing, one_point, far_apart])
-    assert not found["images"][0].any() and not found["embeddings"][0].any()
-    assert all(np.isfinite(values).all() for values in found.values())
-    assert ask.post("/v1/describe", json={"clouds": [{"points": [], "colors": []}]}).status_code == 200
+    answer = Client(server.url).describe([empty, one_point, far_apart])
+    assert not answer["images"][0].any() and not answer["embeddings"][0].any()
+    assert all(np.isfinite(values).all() for values in answer.values())
+    assert http.post("/v1/describe", json={"clouds": [{"points": [], "colors": []}]}).status_code == 200
 
 
-def test_the_model_and_the_color_network(server: Any, ask: httpx.Client) -> None:
+def test_model_and_color_network(server: Any, http: httpx.Client) -> None:
     network = colornet.load_default()
     model = Client(server.url).model()
     assert model["classes"] == list("abcdefg") and set(model["classifiers"]) == {"ce", "tops", "tops2"}
     assert model["descriptor"]["n_slices"] == 7 and model["color_network"] == network.fingerprint
-    assert "path" not in str(model)
-    found = ask.get("/v1/colornet").json()
-    np.testing.assert_allclose(found["mean_rgb"], network.mean_rgb)
-    np.testing.assert_allclose(found["similarity"], network.similarity)
-    assert len(found["edges"]) == len(found["edge_weights"]) == len(network.edges)
+    assert "local/path" not in str(model)
+    answer = http.get("/v1/colornet").json()
+    np.testing.assert_allclose(answer["mean_rgb"], network.mean_rgb)
+    np.testing.assert_allclose(answer["similarity"], network.similarity)
+    assert len(answer["edges"]) == len(answer["edge_weights"]) == len(network.edges)
 
 
-def test_health_page_and_unknown_paths(ask: httpx.Client) -> None:
-    assert ask.get("/healthz").json() == {"status": "alive"} and ask.get("/readyz").json() == {"status": "ready"}
-    assert ask.get("/").headers["content-type"].startswith("text/html")
+def test_health_page_and_unknown_paths(http: httpx.Client) -> None:
+    assert http.get("/healthz").json() == {"status": "alive"} and http.get("/readyz").json() == {"status": "ready"}
+    assert http.get("/").headers["content-type"].startswith("text/html")
     for path in ("/nothing", "/../app.py", "/%2e%2e/app.py"):
-        missing = ask.get(path)
+        missing = http.get(path)
         assert missing.status_code == 404 and set(missing.json()) == {"field", "message"}
-    wrong = ask.get("/v1/recognize")
+    wrong = http.get("/v1/recognize")
     assert wrong.status_code == 405 and wrong.headers["allow"] == "POST"
 
 
-def test_the_client_tells_what_was_refused(server: Any, files: dict[str, bytes]) -> None:
-    with pytest.raises(ServiceError, match="depth") as refused:
-        Client(server.url).recognize(**files | {"depth": b"nothing"})
-    assert (refused.value.status, refused.value.field, refused.value.retry_after) == (422, "depth", None)
+def test_client_raises_service_error(server: Any, files: dict[str, bytes]) -> None:
+    with pytest.raises(ServiceError, match="depth") as error:
+        Client(server.url).recognize(**files | {"depth": b"not an image"})
+    assert (error.value.status, error.value.field, error.value.retry_after) == (422, "depth", None)
 
 
-def test_the_client_reads_files(server: Any, files: dict[str, bytes], tmp_path: Path) -> None:
+def test_client_reads_files(server: Any, files: dict[str, bytes], tmp_path: Path) -> None:
     for name, content in files.items():
         (tmp_path / name).write_bytes(content)
-    found = Client(server.url).recognize(**{name: tmp_path / name for name in files})
-    assert len(found) == 4
+    recognitions = Client(server.url).recognize(**{name: tmp_path / name for name in files})
+    assert len(recognitions) == 4
     camera = {"fx": 600, "fy": 600, "cx": 159.5, "cy": 119.5}
     again = Client(server.url).recognize(
         **{name: files[name] for name in ("color", "depth", "labels")}, intrinsics=camera
     )
-    assert [one.confidence for one in again] == [one.confidence for one in found]
+    assert [one.confidence for one in again] == [one.confidence for one in recognitions]
 
 
-def test_nothing_was_compiled_for_a_request(ask: httpx.Client, files: dict[str, bytes]) -> None:
-    """Last in this file: all sizes above have been asked for."""
-    assert ask.post("/v1/recognize", files=files).status_code == 200
-    lines = ask.get("/metrics").text.splitlines()
+def test_no_compilation_after_warm_up(http: httpx.Client, files: dict[str, bytes]) -> None:
+    """This test comes last in the module: the requests above use all batch shapes."""
+    assert http.post("/v1/recognize", files=files).status_code == 200
+    lines = http.get("/metrics").text.splitlines()
     values = dict(line.rsplit(" ", 1) for line in lines if not line.startswith("#"))
     assert float(values["thor2_compilations_after_warm_up_total"]) == 0
     assert float(values['thor2_requests_total{path="/v1/recognize",status="200"}']) >= 1

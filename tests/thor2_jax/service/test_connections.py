@@ -1,4 +1,4 @@
-"""Connections that hold on: over real sockets, with an application that takes its time and short limits."""
+"""Time and size limits of request heads, over real sockets with a slow application and short limits."""
 
 import asyncio
 import contextlib
@@ -21,7 +21,7 @@ UPLOAD = HEAD % (b"POST", b"", b"Content-Length: 1000\r\n")
 
 
 async def application(scope: Any, receive: Any, send: Any) -> None:
-    """Answers without a look at the body."""
+    """Answer without reading the body."""
     if scope["path"] == "/slow":
         await asyncio.sleep(WORK)
     await send({"type": "http.response.start", "status": 200, "headers": [(b"content-length", b"4")]})
@@ -31,7 +31,7 @@ async def application(scope: Any, receive: Any, send: Any) -> None:
 @pytest.fixture
 def address(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     monkeypatch.setattr(connections, "HEAD_SECONDS", WORK / 4)
-    monkeypatch.setattr(connections, "REST_SECONDS", WORK)
+    monkeypatch.setattr(connections, "EARLY_ANSWER_SECONDS", WORK)
     config = uvicorn.Config(application, http=connections.TimedConnection, lifespan="off", log_level="critical")
     with socket.create_server(("127.0.0.1", 0)) as listening:
         server = uvicorn.Server(config)
@@ -43,7 +43,7 @@ def address(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
 
 
 def until_closed(address: Any, sent: bytes, then: bytes = b"") -> int:
-    """Answers on a connection until the server closes it; `then` is sent again and again."""
+    """Count the answers on a connection until the server closes it; `then` is sent repeatedly."""
     answers = b""
     with socket.create_connection(address) as connection:
         connection.sendall(sent)
@@ -60,25 +60,23 @@ def until_closed(address: Any, sent: bytes, then: bytes = b"") -> int:
             if not received:
                 return answers.count(b"done")
             answers += received
-    raise AssertionError("the connection is held")
+    raise AssertionError("the connection is still open")
 
 
 @pytest.mark.parametrize(
     ("sent", "answers"),
     [(CUT, 0), (QUICK + CUT, 1), (SLOW + CUT, 1), (SLOW + SLOW + CUT, 2), (SLOW + SLOW + QUICK, 3)],
 )
-def test_every_whole_request_is_answered_and_a_cut_head_ends_the_connection(
-    address: Any, sent: bytes, answers: int
-) -> None:
+def test_truncated_head_closes_the_connection(address: Any, sent: bytes, answers: int) -> None:
     assert until_closed(address, sent) == answers
 
 
 @pytest.mark.parametrize(("sent", "then"), [(b"", b"\r\n"), (QUICK, b""), (QUICK, b"\r\n"), (UPLOAD, b"x")])
-def test_bytes_now_and_then_do_not_hold_a_connection(address: Any, sent: bytes, then: bytes) -> None:
+def test_slow_bytes_do_not_keep_a_connection_open(address: Any, sent: bytes, then: bytes) -> None:
     assert until_closed(address, sent, then) == bool(sent)
 
 
-def test_a_body_may_arrive_after_its_answer(address: Any) -> None:
+def test_body_may_arrive_after_its_answer(address: Any) -> None:
     with socket.create_connection(address, timeout=30) as connection:
         connection.sendall(UPLOAD)
         time.sleep(WORK / 2)
@@ -90,7 +88,7 @@ def test_a_body_may_arrive_after_its_answer(address: Any) -> None:
 
 
 @pytest.mark.parametrize("start", [b"GET /", CUT + b"\r\nX: "])
-def test_a_head_without_end(address: Any, start: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_endless_head_closes_the_connection(address: Any, start: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(connections, "HEAD_SECONDS", 60)
     with socket.create_connection(address, timeout=30) as connection, pytest.raises(ConnectionError):
         connection.sendall(start)
@@ -99,7 +97,7 @@ def test_a_head_without_end(address: Any, start: bytes, monkeypatch: pytest.Monk
 
 
 def test_many_pipelined_requests(address: Any) -> None:
-    """More bytes than a head may have."""
+    """Together the requests are larger than the limit for one head."""
     count = connections.MAX_HEAD // len(QUICK) + 1000
     with socket.create_connection(address, timeout=30) as connection:
         threading.Thread(target=connection.sendall, args=(QUICK * count,)).start()

@@ -1,4 +1,4 @@
-"""Whatever is sent: a 4xx whose JSON names the field, and the next good request is answered."""
+"""Invalid requests receive a 4xx status whose JSON names the field, and the next valid request is answered."""
 
 import io
 import json
@@ -21,22 +21,22 @@ Files = dict[str, bytes]
 
 
 @pytest.fixture(autouse=True)
-def still_answering(ask: httpx.Client, files: Files) -> Iterator[None]:
+def check_still_serving(http: httpx.Client, files: Files) -> Iterator[None]:
     yield
-    assert ask.post("/v1/recognize", files=files).status_code == 200
+    assert http.post("/v1/recognize", files=files).status_code == 200
 
 
-def refused(answer: httpx.Response, status: int, field: str | None, *words: str) -> None:
+def check_refused(answer: httpx.Response, status: int, field: str | None, *words: str) -> None:
     assert answer.status_code == status, answer.text
     problem = answer.json()
     assert set(problem) == {"field", "message"} and problem["field"] == field, problem
     for word in words:
         assert word in problem["message"]
-    for secret in ("Traceback", "/", "0x", ".py", "Error"):
-        assert secret not in problem["message"].replace("application/json", "").replace("multipart/form-data", "")
+    for internal in ("Traceback", "/", "0x", ".py", "Error"):
+        assert internal not in problem["message"].replace("application/json", "").replace("multipart/form-data", "")
 
 
-def test_a_head_that_does_not_end(server: Any) -> None:
+def test_incomplete_heads_time_out(server: Any) -> None:
     host, port = server.url.removeprefix("http://").split(":")
     whole = b"GET /healthz HTTP/1.1\r\nHost: x\r\n\r\n"
     for sent in (b"", b"GET /healthz HTTP/1.1\r\nHost:", whole + b"GET /healthz HTTP/1.1\r\n"):
@@ -49,7 +49,7 @@ def test_a_head_that_does_not_end(server: Any) -> None:
 
 
 def png_bomb(width: int, height: int, kind: int = 2, bits: int = 8) -> bytes:
-    """Header of a large image, and little else: a deflated run of zeros."""
+    """PNG whose header declares a large image, with a deflated run of zeros."""
 
     def chunk(name: bytes, content: bytes) -> bytes:
         return struct.pack(">I", len(content)) + name + content + struct.pack(">I", zlib.crc32(name + content))
@@ -60,20 +60,22 @@ def png_bomb(width: int, height: int, kind: int = 2, bits: int = 8) -> bytes:
 
 
 @pytest.mark.parametrize("field", ["color", "depth", "labels"])
-def test_images_that_are_damaged_cut_short_too_large_or_none(ask: httpx.Client, files: Files, field: str) -> None:
+def test_damaged_truncated_or_large_images(http: httpx.Client, files: Files, field: str) -> None:
     good = files[field]
-    for bad in (b"", b"nothing", good[:20], good[: len(good) // 2], good[:-40]):
-        refused(ask.post("/v1/recognize", files=files | {field: bad}), 422, field)
-    for place in range(8, len(good), len(good) // 20):  # what can still be read as an image is one
+    for bad in (b"", b"damaged", good[:20], good[: len(good) // 2], good[:-40]):
+        check_refused(http.post("/v1/recognize", files=files | {field: bad}), 422, field)
+    for place in range(8, len(good), len(good) // 20):  # Some of these can still be decoded.
         flipped = good[:place] + bytes([good[place] ^ 0xFF]) + good[place + 1 :]
-        answer = ask.post("/v1/recognize", files=files | {field: flipped})
+        answer = http.post("/v1/recognize", files=files | {field: flipped})
         assert answer.status_code in (200, 413, 422), answer.text
     for width, height in ((50_000, 50_000), (2**31 - 1, 1), (8000, 8000)):
-        answer = ask.post("/v1/recognize", files=files | {field: png_bomb(width, height)})
+        answer = http.post("/v1/recognize", files=files | {field: png_bomb(width, height)})
         assert answer.status_code in (413, 422) and answer.json()["field"] == field
 
 
-def test_images_of_other_kinds(ask: httpx.Client, files: Files, frame: Any, encode: Callable[..., bytes]) -> None:
+def test_images_of_other_modes_and_formats(
+    http: httpx.Client, files: Files, frame: Any, encode: Callable[..., bytes]
+) -> None:
     gif = io.BytesIO()
     Image.fromarray(frame.labels).save(gif, "GIF")
     for field, content in (
@@ -84,65 +86,65 @@ def test_images_of_other_kinds(ask: httpx.Client, files: Files, frame: Any, enco
         ("labels", files["color"]),
         ("labels", gif.getvalue()),
     ):
-        refused(ask.post("/v1/recognize", files=files | {field: content}), 422, field)
+        check_refused(http.post("/v1/recognize", files=files | {field: content}), 422, field)
 
 
-def test_images_of_other_sizes(ask: httpx.Client, files: Files, encode: Callable[..., bytes]) -> None:
+def test_images_of_different_sizes(http: httpx.Client, files: Files, encode: Callable[..., bytes]) -> None:
     for field, kind in (("depth", np.uint16), ("labels", np.uint8)):
         small = encode(np.ones((120, 160), kind))
-        refused(ask.post("/v1/recognize", files=files | {field: small}), 422, field, "(120, 160)", "(240, 320)")
+        check_refused(http.post("/v1/recognize", files=files | {field: small}), 422, field, "(120, 160)", "(240, 320)")
 
 
-def test_too_many_labels(ask: httpx.Client, files: Files, encode: Callable[..., bytes]) -> None:
-    many = np.arange(240 * 320).astype(np.uint16).reshape(240, 320)  # 65,535 and zeros
-    refused(ask.post("/v1/recognize", files=files | {"labels": encode(many)}), 422, "labels", "65535 instances")
+def test_too_many_instances(http: httpx.Client, files: Files, encode: Callable[..., bytes]) -> None:
+    many = np.arange(240 * 320).astype(np.uint16).reshape(240, 320)  # 65,535 labels and background.
+    check_refused(http.post("/v1/recognize", files=files | {"labels": encode(many)}), 422, "labels", "65535 instances")
 
 
-def test_intrinsics(ask: httpx.Client, files: Files) -> None:
+def test_invalid_intrinsics(http: httpx.Client, files: Files) -> None:
     good = json.loads(files["intrinsics"])
     texts = [json.dumps(good | {"fx": value}) for value in (float("nan"), float("inf"), 0, -1, "600", None, [1], True)]
     texts += ["", "{", "[]", "null", "{}", '{"fx": 1e999, "fy": 1, "cx": 0, "cy": 0}', "[" * 2000, '{"fx":' * 500]
     texts += [json.dumps(good | {"fx": 10**400}), '{"fx": ' + "1" * 3000 + ', "fy": 1, "cx": 0, "cy": 0}']
     for text in texts:
-        refused(ask.post("/v1/recognize", files=files | {"intrinsics": text.encode()}), 422, "intrinsics")
-    refused(ask.post("/v1/recognize", files=files | {"intrinsics": b"\xff\xfe\x00"}), 422, "intrinsics")
-    refused(ask.post("/v1/recognize", files=files | {"intrinsics": b" " * 5000}), 413, "intrinsics", "5000")
+        check_refused(http.post("/v1/recognize", files=files | {"intrinsics": text.encode()}), 422, "intrinsics")
+    check_refused(http.post("/v1/recognize", files=files | {"intrinsics": b"\xff\xfe\x00"}), 422, "intrinsics")
+    check_refused(http.post("/v1/recognize", files=files | {"intrinsics": b" " * 5000}), 413, "intrinsics", "5000")
     for extreme in ({"fx": 1e-300}, {"cx": 1e300}, {"fx": 1e300, "fy": 1e300}, {"depth_scale": 1e-300}):
-        answer = ask.post("/v1/recognize", files=files | {"intrinsics": json.dumps(good | extreme).encode()})
+        answer = http.post("/v1/recognize", files=files | {"intrinsics": json.dumps(good | extreme).encode()})
         assert answer.status_code == 200 or answer.json()["field"] == "intrinsics"
 
 
-def test_forms(ask: httpx.Client, files: Files) -> None:
+def test_invalid_forms(http: httpx.Client, files: Files) -> None:
     for name in files:
-        left = {other: content for other, content in files.items() if other != name}
-        refused(ask.post("/v1/recognize", files=left), 422, name, "missing")
+        incomplete = {other: content for other, content in files.items() if other != name}
+        check_refused(http.post("/v1/recognize", files=incomplete), 422, name, "missing")
     twice = [*files.items(), ("depth", files["depth"])]
-    refused(ask.post("/v1/recognize", files=twice), 422, "depth", "more than once")
-    refused(ask.post("/v1/recognize", json={"color": "x"}), 415, "body")
-    refused(ask.post("/v1/recognize", content=b"x"), 415, "body")
+    check_refused(http.post("/v1/recognize", files=twice), 422, "depth", "more than once")
+    check_refused(http.post("/v1/recognize", json={"color": "x"}), 415, "body")
+    check_refused(http.post("/v1/recognize", content=b"x"), 415, "body")
     for kind in ("multipart/form-data", "multipart/form-data; boundary=", "multipart/form-data; boundary=" + "x" * 500):
-        answer = ask.post("/v1/recognize", content=b"--x\r\n\r\n", headers={"content-type": kind})
+        answer = http.post("/v1/recognize", content=b"--x\r\n\r\n", headers={"content-type": kind})
         assert answer.status_code in (400, 422) and answer.json()["field"] in ("body", "color")
     for charset in ("punycode", "idna", "undefined", "raw_unicode_escape", "utf-16", "none"):
         headers = {"content-type": f"multipart/form-data; boundary=x; charset={charset}"}
-        refused(ask.post("/v1/recognize", content=b"--x--\r\n", headers=headers), 415, "body", "utf-8")
+        check_refused(http.post("/v1/recognize", content=b"--x--\r\n", headers=headers), 415, "body", "utf-8")
     many = [(f"part{k}", b"") for k in range(1000)]
-    refused(ask.post("/v1/recognize", files=many), 400, "body")
+    check_refused(http.post("/v1/recognize", files=many), 400, "body")
 
 
-def test_bodies_past_the_limit(ask: httpx.Client, files: Files) -> None:
-    refused(ask.post("/v1/recognize", files=files | {"color": bytes(MAX_BODY)}), 413, "body")
-    refused(ask.post("/v1/describe", content=bytes(MAX_BODY + 1), headers=NPZ), 413, "body")
+def test_bodies_over_the_size_limit(http: httpx.Client, files: Files) -> None:
+    check_refused(http.post("/v1/recognize", files=files | {"color": bytes(MAX_BODY)}), 413, "body")
+    check_refused(http.post("/v1/describe", content=bytes(MAX_BODY + 1), headers=NPZ), 413, "body")
 
-    def endless() -> Iterator[bytes]:  # in chunks: no length is declared
+    def endless() -> Iterator[bytes]:  # Sent in chunks without a declared length.
         for _ in range(MAX_BODY // 2**16 + 1):
             yield bytes(2**16)
 
-    refused(ask.post("/v1/describe", content=endless(), headers=NPZ), 413, "body")
+    check_refused(http.post("/v1/describe", content=endless(), headers=NPZ), 413, "body")
 
 
-def test_a_body_that_never_comes(server: Any) -> None:
-    """Only the connection waits, and it ends."""
+def test_body_that_never_arrives(server: Any) -> None:
+    """The connection times out without affecting others."""
     host, port = server.url.removeprefix("http://").split(":")
     with socket.create_connection((host, int(port)), timeout=30) as slow:
         slow.sendall(
@@ -185,21 +187,23 @@ POINTS, COLORS = np.zeros((4, 3), np.float32), np.zeros((4, 3), np.uint8)
         ({"sizes": np.array(4)}, "sizes"),
     ],
 )
-def test_npz_of_other_arrays(ask: httpx.Client, change: dict[str, Any], field: str) -> None:
+def test_npz_with_invalid_arrays(http: httpx.Client, change: dict[str, Any], field: str) -> None:
     arrays = {"points": POINTS, "colors": COLORS, "sizes": np.array([4])} | change
-    refused(ask.post("/v1/describe", content=npz(**arrays), headers=NPZ), 422, field)
+    check_refused(http.post("/v1/describe", content=npz(**arrays), headers=NPZ), 422, field)
 
 
-def test_npz_that_are_damaged_or_bombs(ask: httpx.Client) -> None:
+def test_damaged_npz_and_decompression_bombs(http: httpx.Client) -> None:
     good = npz(points=POINTS, colors=COLORS, sizes=np.array([4]))
-    for bad in (b"", b"nothing", good[:100], good[:-30], good[:40] + b"\xff" * 40 + good[80:]):
-        answer = ask.post("/v1/describe", content=bad, headers=NPZ)
+    for bad in (b"", b"damaged", good[:100], good[:-30], good[:40] + b"\xff" * 40 + good[80:]):
+        answer = http.post("/v1/describe", content=bad, headers=NPZ)
         assert answer.status_code == 422 and answer.json()["field"] in ("body", "points"), answer.text
-    refused(ask.post("/v1/describe", content=npz(points=POINTS, colors=COLORS), headers=NPZ), 422, "sizes", "missing")
+    check_refused(
+        http.post("/v1/describe", content=npz(points=POINTS, colors=COLORS), headers=NPZ), 422, "sizes", "missing"
+    )
 
     bomb = npz(points=np.zeros((20_000_000, 3), np.float32), colors=COLORS, sizes=np.array([4]))
     assert len(bomb) < 10**6
-    refused(ask.post("/v1/describe", content=bomb, headers=NPZ), 413, "body")
+    check_refused(http.post("/v1/describe", content=bomb, headers=NPZ), 413, "body")
 
     def archive(points: bytes, method: int = zipfile.ZIP_DEFLATED) -> bytes:
         stream = io.BytesIO()
@@ -210,19 +214,19 @@ def test_npz_that_are_damaged_or_bombs(ask: httpx.Client) -> None:
                     np.lib.format.write_array(entry, array)
         return stream.getvalue()
 
-    # A header that tells of an array that is not there: nothing of that size may be made.
+    # The header declares an array that is not there: nothing of that size may be allocated.
     header = io.BytesIO()
     np.lib.format.write_array_header_1_0(header, {"descr": "<f4", "fortran_order": False, "shape": (10**12, 3)})
-    refused(ask.post("/v1/describe", content=archive(header.getvalue()), headers=NPZ), 422, "points")
+    check_refused(http.post("/v1/describe", content=archive(header.getvalue()), headers=NPZ), 422, "points")
     deep = b"\x93NUMPY\x01\x00" + struct.pack("<H", 9000) + b"(" * 9000
-    refused(ask.post("/v1/describe", content=archive(deep), headers=NPZ), 422, "points")
-    refused(ask.post("/v1/describe", content=archive(b"", zipfile.ZIP_LZMA), headers=NPZ), 422, "body")
+    check_refused(http.post("/v1/describe", content=archive(deep), headers=NPZ), 422, "points")
+    check_refused(http.post("/v1/describe", content=archive(b"", zipfile.ZIP_LZMA), headers=NPZ), 422, "body")
 
-    # A directory that tells of fewer bytes than come out.
+    # The directory declares fewer bytes than the entry decompresses to.
     lying = bytearray(archive(bytes(50_000_000)))
     place = lying.rindex(b"PK\x01\x02", 0, lying.rindex(b"points.npy"))
     lying[place + 24 : place + 28] = struct.pack("<I", 1000)
-    refused(ask.post("/v1/describe", content=bytes(lying), headers=NPZ), 422, "points")
+    check_refused(http.post("/v1/describe", content=bytes(lying), headers=NPZ), 422, "points")
 
 
 @pytest.mark.parametrize(
@@ -248,18 +252,18 @@ def test_npz_that_are_damaged_or_bombs(ask: httpx.Client) -> None:
         (b"\xff\xfe", "body"),
     ],
 )
-def test_json_of_other_shapes(ask: httpx.Client, body: bytes, field: str) -> None:
-    answer = ask.post("/v1/describe", content=body, headers={"content-type": "application/json"})
-    refused(answer, 422, field)
+def test_invalid_json_clouds(http: httpx.Client, body: bytes, field: str) -> None:
+    answer = http.post("/v1/describe", content=body, headers={"content-type": "application/json"})
+    check_refused(answer, 422, field)
 
 
-def test_other_types_of_bodies(ask: httpx.Client) -> None:
+def test_unsupported_content_types(http: httpx.Client) -> None:
     for kind in ("text/plain", "application/x-www-form-urlencoded", ""):
-        assert ask.post("/v1/describe", content=b"{}", headers={"content-type": kind}).status_code == 415
+        assert http.post("/v1/describe", content=b"{}", headers={"content-type": kind}).status_code == 415
 
 
-def test_a_frame_that_takes_too_long(ask: httpx.Client, files: Files, encode: Callable[..., bytes]) -> None:
-    """Noise over the largest image: every point is a voxel. It is answered or cut off in bounds, and hurts nobody."""
+def test_slow_frame_is_answered_or_cut_off(http: httpx.Client, files: Files, encode: Callable[..., bytes]) -> None:
+    """Noise over the largest image, where every point is a voxel, is answered or cut off in bounded time."""
     rng = np.random.default_rng(0)
     shape = (1080, 1920)
     images = {
@@ -267,6 +271,6 @@ def test_a_frame_that_takes_too_long(ask: httpx.Client, files: Files, encode: Ca
         "depth": encode(rng.integers(260, 2500, shape).astype(np.uint16)),
         "labels": encode(np.ones(shape, np.uint8)),
     }
-    answer = ask.post("/v1/recognize", files=files | images)
+    answer = http.post("/v1/recognize", files=files | images)
     assert answer.status_code in (200, 504)
-    assert answer.elapsed.total_seconds() < 20  # the deadline is 5
+    assert answer.elapsed.total_seconds() < 20  # The deadline is 5 s.

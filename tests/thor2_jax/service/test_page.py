@@ -1,4 +1,4 @@
-"""The page as people use it, in headless Chromium."""
+"""The web page in headless Chromium."""
 
 import io
 import json
@@ -24,24 +24,24 @@ FIELDS = {"color": "image/png", "depth": "image/png", "labels": "image/png", "in
 def browser() -> Iterator[Browser]:
     chromium = shutil.which("chromium")
     if chromium is None:
-        pytest.skip("no chromium to drive the page with: apt-get install chromium")
+        pytest.skip("chromium is not installed (apt-get install chromium)")
     with sync_playwright() as playwright:
         yield playwright.chromium.launch(executable_path=chromium)
 
 
 @pytest.fixture
 def open_page(browser: Browser, server: Any) -> Iterator[Callable[..., Page]]:
-    """Open the page in a fresh profile. At the end: nothing was asked of another address, and no script failed."""
-    contexts, asked, wrong = [], [], []
+    """Open the page in a new profile; afterwards, check that no other server was contacted and no script failed."""
+    contexts, urls, errors = [], [], []
 
     def open_one(route: Callable[[Route], None] | None = None, **options: Any) -> Page:
         contexts.append(browser.new_context(**options))
         page = contexts[-1].new_page()
         page.set_default_timeout(15_000)
-        page.on("request", lambda request: asked.append(request.url))
-        page.on("pageerror", lambda error: wrong.append(str(error)))
-        # A refused request is a line in the console too; the page must say it, and tests look there.
-        page.on("console", lambda line: wrong.append(line.text) if "status of" not in line.text else None)
+        page.on("request", lambda request: urls.append(request.url))
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        # Error statuses also appear in the console; tests check how the page shows them.
+        page.on("console", lambda line: errors.append(line.text) if "status of" not in line.text else None)
         if route is not None:
             page.route("**/v1/**", route)
         page.goto(server.url)
@@ -51,12 +51,12 @@ def open_page(browser: Browser, server: Any) -> Iterator[Callable[..., Page]]:
     yield open_one
     for context in contexts:
         context.close()
-    assert asked and all(url.startswith(f"{server.url}/") for url in asked)
-    assert wrong == []
+    assert urls and all(url.startswith(f"{server.url}/") for url in urls)
+    assert errors == []
 
 
 def choose_sample(page: Page) -> np.ndarray:
-    """Have the first sample recognized; its labels."""
+    """Recognize the first sample and return its labels."""
     page.locator("#samples button").first.click()
     expect(page.locator("#objects button").first).to_be_visible()
     folder = json.loads((SAMPLES / "index.json").read_text())[0]["folder"]
@@ -65,7 +65,7 @@ def choose_sample(page: Page) -> np.ndarray:
 
 def upload(page: Page, files: Files, color_name: str = "color.png") -> None:
     if not page.locator("#upload-form").is_visible():
-        page.get_by_text("Upload a frame of your own").click()
+        page.get_by_text("Upload your own frame").click()
     for field, kind in FIELDS.items():
         name = color_name if field == "color" else field
         page.locator(f"#{field}").set_input_files({"name": name, "mimeType": kind, "buffer": files[field]})
@@ -73,12 +73,12 @@ def upload(page: Page, files: Files, color_name: str = "color.png") -> None:
 
 
 def pixels(canvas: Locator) -> np.ndarray:
-    """What is drawn on a canvas, [H, W, 3]."""
+    """Return the pixels of a canvas, [H, W, 3]."""
     canvas.scroll_into_view_if_needed()
     return np.asarray(Image.open(io.BytesIO(canvas.screenshot())).convert("RGB")).astype(int)
 
 
-def test_a_sample_is_outlined_and_named(open_page: Callable[..., Page]) -> None:
+def test_sample_is_outlined_and_named(open_page: Callable[..., Page]) -> None:
     page = open_page(viewport={"width": 1280, "height": 900})
     expect(page.locator("#ready")).to_have_text("Ready")
     labels = choose_sample(page)
@@ -102,7 +102,7 @@ def test_a_sample_is_outlined_and_named(open_page: Callable[..., Page]) -> None:
         assert around > 2 * (high - low).max(), f"object {k} has no outline"
 
 
-def test_a_click_shows_what_a_name_rests_on(open_page: Callable[..., Page]) -> None:
+def test_click_shows_the_details_of_an_object(open_page: Callable[..., Page]) -> None:
     page = open_page(viewport={"width": 1280, "height": 900})
     labels = choose_sample(page)
     overlay = page.locator("#overlay")
@@ -136,7 +136,7 @@ def test_a_click_shows_what_a_name_rests_on(open_page: Callable[..., Page]) -> N
     expect(page.locator(".badge")).to_have_count(1)
 
 
-def test_by_keyboard_alone(open_page: Callable[..., Page]) -> None:
+def test_keyboard_navigation(open_page: Callable[..., Page]) -> None:
     page = open_page()
 
     def tab_to(selector: str) -> None:
@@ -145,9 +145,9 @@ def test_by_keyboard_alone(open_page: Callable[..., Page]) -> None:
             if page.evaluate("selector => document.activeElement.matches(selector)", selector):
                 ring = page.evaluate("parseFloat(getComputedStyle(document.activeElement).outlineWidth)")
                 style = page.evaluate("getComputedStyle(document.activeElement).outlineStyle")
-                assert ring >= 2 and style == "solid", "the focus cannot be seen"
+                assert ring >= 2 and style == "solid", "the focus is not visible"
                 return
-        raise AssertionError(f"{selector} is not reached")
+        raise AssertionError(f"{selector} cannot be reached by keyboard")
 
     tab_to("#samples button:nth-child(2)")
     page.keyboard.press("Enter")
@@ -161,32 +161,32 @@ def test_by_keyboard_alone(open_page: Callable[..., Page]) -> None:
     expect(page.locator("#classes li")).to_have_count(7)
 
 
-def test_an_uploaded_frame(open_page: Callable[..., Page], files: Files) -> None:
+def test_uploaded_frame(open_page: Callable[..., Page], files: Files) -> None:
     page = open_page()
     upload(page, files, color_name="<b>x</b>.png")
     status = page.get_by_role("status")
-    expect(status).to_contain_text("<b>x</b>.png: 4 objects, 1 of them not recognized.")
+    expect(status).to_contain_text("<b>x</b>.png: 4 objects, 1 of them unknown.")
     expect(page.locator('#samples button[aria-pressed="true"]')).to_have_count(0)
     small = page.locator('#objects button[data-label="5"]')
-    expect(small).to_contain_text("unrecognized")
-    expect(small).to_contain_text("at least 30")
+    expect(small).to_contain_text("unknown object")
+    expect(small).to_contain_text("30")
     small.click()
-    expect(page.locator("#details-reason")).to_contain_text("at least 30")
+    expect(page.locator("#details-reason")).to_contain_text("30")
     expect(page.locator("#evidence")).to_be_hidden()
     page.locator('#objects button[data-label="7"]').click()
     expect(page.locator("#evidence")).to_be_visible()
 
 
-def test_no_objects(open_page: Callable[..., Page], files: Files, encode: Callable[..., bytes]) -> None:
+def test_frame_without_objects(open_page: Callable[..., Page], files: Files, encode: Callable[..., bytes]) -> None:
     page = open_page()
     upload(page, files | {"labels": encode(np.zeros((240, 320), np.uint8))})
     expect(page.get_by_role("status")).to_contain_text("no objects")
     expect(page.locator("#details")).to_be_hidden()
 
 
-def test_what_is_wrong_stands_beside_its_field(open_page: Callable[..., Page], ask: httpx.Client, files: Files) -> None:
+def test_errors_appear_beside_their_fields(open_page: Callable[..., Page], http: httpx.Client, files: Files) -> None:
     page = open_page()
-    page.get_by_text("Upload a frame of your own").click()
+    page.get_by_text("Upload your own frame").click()
     page.get_by_role("button", name="Recognize", exact=True).click()
     for field in FIELDS:
         expect(page.locator(f"#{field}-error")).to_have_text("Choose a file.")
@@ -195,9 +195,9 @@ def test_what_is_wrong_stands_beside_its_field(open_page: Callable[..., Page], a
     for field in FIELDS:
         bad = files | {field: files["depth" if field == "color" else "color"]}
         upload(page, bad)
-        said = ask.post("/v1/explain", files=bad).json()
-        assert said["field"] == field
-        expect(page.locator(f"#{field}-error")).to_have_text(said["message"])
+        problem = http.post("/v1/explain", files=bad).json()
+        assert problem["field"] == field
+        expect(page.locator(f"#{field}-error")).to_have_text(problem["message"])
         expect(page.locator(f"#{field}")).to_have_attribute("aria-invalid", "true")
         expect(page.locator(f"#{field}")).to_be_focused()
         assert f"{field}-error" in (page.locator(f"#{field}").get_attribute("aria-describedby") or "")
@@ -208,7 +208,7 @@ def test_what_is_wrong_stands_beside_its_field(open_page: Callable[..., Page], a
     expect(page.locator(".error:not(:empty), [aria-invalid]")).to_have_count(0)
 
 
-def test_a_token_is_asked_for(open_page: Callable[..., Page]) -> None:
+def test_page_asks_for_the_token(open_page: Callable[..., Page]) -> None:
     def guard(route: Route) -> None:
         if route.request.headers.get("authorization") == "Bearer secret":
             route.continue_()
@@ -230,7 +230,7 @@ def test_a_token_is_asked_for(open_page: Callable[..., Page]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("answer", "said"),
+    ("response", "message"),
     [
         (
             {"status": 429, "headers": {"Retry-After": "1"}, "json": {"field": None, "message": "Too many wait."}},
@@ -240,17 +240,17 @@ def test_a_token_is_asked_for(open_page: Callable[..., Page]) -> None:
         ({"status": 413, "json": {"field": "body", "message": "The body is too large."}}, "The body is too large."),
     ],
 )
-def test_a_service_that_refuses(open_page: Callable[..., Page], answer: Any, said: str) -> None:
-    page = open_page(lambda route: route.fulfill(**answer) if "explain" in route.request.url else route.continue_())
+def test_error_responses_are_shown(open_page: Callable[..., Page], response: Any, message: str) -> None:
+    page = open_page(lambda route: route.fulfill(**response) if "explain" in route.request.url else route.continue_())
     page.locator("#samples button").first.click()
-    expect(page.get_by_role("alert")).to_have_text(said)
+    expect(page.get_by_role("alert")).to_have_text(message)
     expect(page.locator("#result")).to_be_hidden()
     page.unroute("**/v1/**")
     choose_sample(page)
     expect(page.get_by_role("alert")).to_be_hidden()
 
 
-def test_files_that_are_too_large(open_page: Callable[..., Page], files: Files, tmp_path: Path) -> None:
+def test_files_over_the_size_limit(open_page: Callable[..., Page], files: Files, tmp_path: Path) -> None:
     page = open_page()
     upload(page, files)
     expect(page.locator("#objects button")).to_have_count(4)
@@ -260,7 +260,7 @@ def test_files_that_are_too_large(open_page: Callable[..., Page], files: Files, 
     expect(page.get_by_role("alert")).to_contain_text("bytes")
 
 
-def test_a_phones_width(open_page: Callable[..., Page], files: Files) -> None:
+def test_phone_width(open_page: Callable[..., Page], files: Files) -> None:
     page = open_page(viewport={"width": 360, "height": 740}, is_mobile=True, has_touch=True)
 
     def fits() -> None:
@@ -275,7 +275,7 @@ def test_a_phones_width(open_page: Callable[..., Page], files: Files) -> None:
         assert min(heights) >= 24
 
     fits()
-    page.get_by_text("Upload a frame of your own").tap()
+    page.get_by_text("Upload your own frame").tap()
     page.get_by_role("button", name="Recognize", exact=True).tap()
     fits()
     upload(page, files)
@@ -288,9 +288,9 @@ def test_a_phones_width(open_page: Callable[..., Page], files: Files) -> None:
 
 RECORD_TAGS = """() => {
   const { drawImage, roundRect, fillText } = CanvasRenderingContext2D.prototype;
-  const recorded = (draw, note) => function (...given) {
-    if (this.canvas.id === "overlay") note(given);
-    return draw.apply(this, given);
+  const recorded = (draw, note) => function (...args) {
+    if (this.canvas.id === "overlay") note(args);
+    return draw.apply(this, args);
   };
   let box;
   Object.assign(CanvasRenderingContext2D.prototype, {
@@ -302,7 +302,7 @@ RECORD_TAGS = """() => {
 
 
 def tags_of(page: Page) -> list[tuple[str, np.ndarray]]:
-    """Texts and boxes (left, top, right, bottom) of the tags on the overlay; none leaves it or covers another."""
+    """Return texts and boxes (left, top, right, bottom) of the overlay's tags, and check that none overlap."""
     tags = page.evaluate("window.tags")
     size = page.evaluate("[overlay.clientWidth, overlay.clientHeight]")
     boxes = np.array([box for _, *box in tags])
@@ -310,7 +310,7 @@ def tags_of(page: Page) -> list[tuple[str, np.ndarray]]:
     for k, one in enumerate(boxes):
         others = np.delete(boxes, k, axis=0)
         covered = np.minimum(one[2:], others[:, 2:]) - np.maximum(one[:2], others[:, :2])
-        assert not (covered > 0).all(axis=1).any(), f"{tags[k][0]} covers another tag"
+        assert not (covered > 0).all(axis=1).any(), f"{tags[k][0]} overlaps another tag"
     return [(text, box) for (text, *_), box in zip(tags, boxes, strict=True)]
 
 
@@ -322,13 +322,13 @@ def with_long_names(route: Route) -> None:
         route.continue_()
         return
     answer = route.fetch()
-    found = answer.json()
-    for one in found["instances"]:
+    body = answer.json()
+    for one in body["instances"]:
         one["name"] = one["name"] and LONG
-    route.fulfill(response=answer, json=found)
+    route.fulfill(response=answer, json=body)
 
 
-def test_tags_of_a_narrow_picture_do_not_cover_each_other(
+def test_tags_of_a_narrow_image_do_not_overlap(
     open_page: Callable[..., Page], files: Files, encode: Callable[..., bytes]
 ) -> None:
     page = open_page(with_long_names, viewport={"width": 360, "height": 740}, is_mobile=True, has_touch=True)
@@ -356,10 +356,10 @@ def test_tags_of_a_narrow_picture_do_not_cover_each_other(
         expect(chosen.locator(".swatch")).to_have_text(number)
 
 
-def test_an_object_too_fine_for_the_overlay(
+def test_object_lost_in_the_subsampled_label_map(
     open_page: Callable[..., Page], files: Files, encode: Callable[..., bytes]
 ) -> None:
-    """The overlay of a ragged label image leaves out every second column: here, all of the second object."""
+    """The label map of this image is subsampled so that the second object disappears."""
     page = open_page()
     upload(page, files | {"labels": encode(np.tile(np.array([1, 2], np.uint8), (240, 160)))})
     expect(page.locator("#objects button")).to_have_count(2)
@@ -368,7 +368,7 @@ def test_an_object_too_fine_for_the_overlay(
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_text_can_be_read_in_both_schemes(open_page: Callable[..., Page], scheme: str) -> None:
+def test_text_contrast_in_both_color_schemes(open_page: Callable[..., Page], scheme: str) -> None:
     page = open_page(color_scheme=scheme)
     values = page.evaluate(
         "(() => { const style = getComputedStyle(document.documentElement);"
@@ -394,8 +394,8 @@ def test_text_can_be_read_in_both_schemes(open_page: Callable[..., Page], scheme
         assert (high + 0.05) / (low + 0.05) >= 4.5, (ink, ground)
 
 
-def test_headers_keep_the_page_to_its_server(ask: httpx.Client) -> None:
+def test_security_headers_of_the_page(http: httpx.Client) -> None:
     for path in ("/", "/app.js", "/style.css", "/samples/index.json"):
-        policy = ask.get(path).headers["content-security-policy"]
+        policy = http.get(path).headers["content-security-policy"]
         assert "default-src 'none'" in policy and "unsafe" not in policy and "http" not in policy
-        assert ask.get(path).headers["x-content-type-options"] == "nosniff"
+        assert http.get(path).headers["x-content-type-options"] == "nosniff"

@@ -1,4 +1,4 @@
-"""A PNG with a wrong checksum is damaged, for the service and for the library, even where its pixels can be read."""
+"""The service and the library refuse a PNG with an invalid checksum, even if its pixels can be decoded."""
 
 import io
 import json
@@ -12,7 +12,7 @@ from PIL import Image
 
 from thor2_jax.errors import InputError
 from thor2_jax.recognition.frames import read_frame
-from thor2_jax.service.decoding import frame_of
+from thor2_jax.service.decoding import decode_frame
 from thor2_jax.service.problem import RequestError
 
 Chunk = tuple[bytes, bytes, int]
@@ -32,7 +32,7 @@ def png(chunks: list[Chunk]) -> bytes:
 
 @pytest.fixture
 def labels() -> list[Chunk]:
-    """An indexed image of zeros and ones, 12 x 16: its pixels in three chunks, text before them and a date behind."""
+    """An indexed image of zeros and ones, 12 x 16, with its pixels in three chunks, and a text and a date chunk."""
     rows = np.pad(np.indices((12, 16)).sum(axis=0, dtype=np.uint8) % 2, ((0, 0), (1, 0)))
     data = zlib.compress(rows.tobytes(), 0)
     parts = (data[:50], data[50:90], data[90:])
@@ -66,23 +66,23 @@ def read(files: dict[str, bytes], folder: Path) -> np.ndarray:
     return read_frame(**{name: folder / name for name in files}).labels
 
 
-def test_right_checksums(labels: list[Chunk], others: dict[str, bytes], tmp_path: Path) -> None:
+def test_valid_checksums(labels: list[Chunk], others: dict[str, bytes], tmp_path: Path) -> None:
     files = {**others, "labels": png(labels)}
     expected = np.indices((12, 16)).sum(axis=0) % 2
-    np.testing.assert_array_equal(frame_of(**files).labels, expected)
+    np.testing.assert_array_equal(decode_frame(**files).labels, expected)
     np.testing.assert_array_equal(read(files, tmp_path), expected)
 
 
 @pytest.mark.parametrize("damage", ["checksum", "content"])
 @pytest.mark.parametrize("k", range(len(KINDS)), ids=[f"{kind.decode()} {k}" for k, kind in enumerate(KINDS)])
-def test_a_wrong_checksum(labels: list[Chunk], others: dict[str, bytes], tmp_path: Path, k: int, damage: str) -> None:
+def test_invalid_checksum(labels: list[Chunk], others: dict[str, bytes], tmp_path: Path, k: int, damage: str) -> None:
     kind, content, crc = labels[k]
     assert kind == KINDS[k]
     changed = bytes([*content[:-1], content[-1] ^ 1])
     labels[k] = (kind, content, crc ^ 1) if damage == "checksum" else (kind, changed, crc)
     files = {**others, "labels": png(labels)}
-    with pytest.raises(RequestError) as refused:
-        frame_of(**files)
-    assert (refused.value.status, refused.value.field) == (422, "labels")
+    with pytest.raises(RequestError) as error:
+        decode_frame(**files)
+    assert (error.value.status, error.value.field) == (422, "labels")
     with pytest.raises(InputError, match="^labels: .* is damaged"):
         read(files, tmp_path)

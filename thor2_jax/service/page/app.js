@@ -1,4 +1,4 @@
-// The page: choose a frame, have it recognized, look at its objects.
+// Main module of the page: choose a frame, recognize it, show its objects.
 
 import { showDetails } from "./details.js";
 import { element, percent, rgb } from "./drawing.js";
@@ -6,56 +6,56 @@ import { ink, Overlay, paints } from "./overlay.js";
 import * as service from "./service.js";
 
 const FIELDS = ["color", "depth", "labels", "intrinsics"];
-const at = (id) => document.getElementById(id);
+const byId = (id) => document.getElementById(id);
 
-const overlay = new Overlay(at("overlay"), select);
-let about = null; // the model and the mean colours of its regions
-let frame = null; // the answer on show
-let running = new AbortController();
+const overlay = new Overlay(byId("overlay"), select);
+let loaded = null; // The model and the mean colours of its colour regions.
+let frame = null; // The answer that is shown.
+let currentRequest = new AbortController();
 
-function say(text, busy = false) {
-  at("status").textContent = text;
-  at("status").toggleAttribute("data-busy", busy);
-  at("status").removeAttribute("data-empty");
+function setStatus(text, busy = false) {
+  byId("status").textContent = text;
+  byId("status").toggleAttribute("data-busy", busy);
+  byId("status").removeAttribute("data-empty");
 }
 
 function markField(id, message) {
-  at(`${id}-error`).textContent = message;
-  if (message) at(id).setAttribute("aria-invalid", "true");
-  else at(id).removeAttribute("aria-invalid");
+  byId(`${id}-error`).textContent = message;
+  if (message) byId(id).setAttribute("aria-invalid", "true");
+  else byId(id).removeAttribute("aria-invalid");
 }
 
 function clearProblems() {
   [...FIELDS, "token"].forEach((id) => markField(id, ""));
-  at("problem").hidden = true;
+  byId("problem").hidden = true;
 }
 
-/** Say what went wrong: beside the field concerned if it is on the page, else above the result. */
-function tell(problem, fields = []) {
-  say("");
+/** Show an error beside the field concerned if it is on the page, otherwise above the result. */
+function showProblem(problem, fields = []) {
+  setStatus("");
   if (problem.status === 401) {
-    at("token-section").hidden = false;
-    // Nobody has done anything wrong before a token was asked for.
-    if (at("token").value) markField("token", problem.message);
-    at("token").focus();
+    byId("token-section").hidden = false;
+    // The first request is sent without a token: that is not an error of the user.
+    if (byId("token").value) markField("token", problem.message);
+    byId("token").focus();
   } else if (fields.includes(problem.field)) {
     markField(problem.field, problem.message);
-    at(problem.field).focus();
+    byId(problem.field).focus();
   } else {
-    at("problem").textContent = problem.message;
-    at("problem").hidden = false;
+    byId("problem").textContent = problem.message;
+    byId("problem").hidden = false;
   }
   if (!(problem instanceof service.Problem)) throw problem;
 }
 
 async function recognize(what, fileSource, fields) {
-  running.abort();
-  const { signal } = (running = new AbortController());
+  currentRequest.abort();
+  const { signal } = (currentRequest = new AbortController());
   clearProblems();
-  say(`Recognizing ${what}`, true);
-  at("result").setAttribute("aria-busy", "true");
+  setStatus(`Recognizing ${what}`, true);
+  byId("result").setAttribute("aria-busy", "true");
   try {
-    about ??= await load();
+    loaded ??= await load();
     const files = await fileSource();
     const answer = await service.explain(files, signal);
     const bitmap = await createImageBitmap(files.color, { imageOrientation: "none" });
@@ -63,15 +63,15 @@ async function recognize(what, fileSource, fields) {
   } catch (problem) {
     if (signal.aborted) return;
     hideResult();
-    tell(problem, fields);
+    showProblem(problem, fields);
   } finally {
-    if (!signal.aborted) at("result").removeAttribute("aria-busy");
+    if (!signal.aborted) byId("result").removeAttribute("aria-busy");
   }
 }
 
 function hideResult() {
   frame = null;
-  at("result").hidden = at("details").hidden = true;
+  byId("result").hidden = byId("details").hidden = true;
 }
 
 function show(what, answer, bitmap) {
@@ -80,23 +80,23 @@ function show(what, answer, bitmap) {
   const named = instances.filter(({ name }) => name !== null);
   const count = `${instances.length} ${instances.length === 1 ? "object" : "objects"}`;
   const unnamed = instances.length - named.length;
-  if (!instances.length) say(`${what}: no objects; the label image is 0 everywhere.`);
-  else say(`${what}: ${count}${unnamed ? `, ${unnamed} of them not recognized` : ""}.`);
-  at("result").hidden = false;
-  at("details").hidden = true;
+  if (!instances.length) setStatus(`${what}: no objects: the label image is 0 everywhere.`);
+  else setStatus(`${what}: ${count}${unnamed ? `, ${unnamed} of them unknown` : ""}.`);
+  byId("result").hidden = false;
+  byId("details").hidden = true;
   const colors = paints(instances);
-  at("objects").replaceChildren(...instances.map((instance, k) => element("li", {}, objectButton(instance, colors[k]))));
+  byId("objects").replaceChildren(...instances.map((instance, k) => element("li", {}, objectButton(instance, colors[k]))));
   const stages = Object.entries(timings).map(([stage, ms]) => `${stage}\u00a0${ms.toFixed(ms < 10 ? 1 : 0)}\u00a0ms`);
-  at("timings").textContent = stages.join(" · ");
+  byId("timings").textContent = stages.join(" · ");
   const first = named[0] ?? instances[0];
   overlay.show(bitmap, instances, answer.label_map, first?.label);
   if (first) select(first.label);
-  if (at("status").getBoundingClientRect().top > innerHeight / 2) at("status").scrollIntoView();
+  if (byId("status").getBoundingClientRect().top > innerHeight / 2) byId("status").scrollIntoView();
 }
 
 function objectButton(instance, color) {
   const { label, name, confidence, classifier, occluded, unrecognized } = instance;
-  const facts = name === null ? unrecognized : `${classifier.toUpperCase()} is surer${occluded ? " · hidden in part" : ""}`;
+  const facts = name === null ? unrecognized : `${classifier.toUpperCase()} is surer${occluded ? " · partly occluded" : ""}`;
   const swatch = element("span", { className: "swatch" }, label);
   swatch.style.background = rgb(color);
   swatch.style.color = ink(color);
@@ -104,7 +104,7 @@ function objectButton(instance, color) {
     "button",
     { type: "button", onclick: () => select(label) },
     swatch,
-    element("span", { className: "name" }, name ?? "unrecognized"),
+    element("span", { className: "name" }, name ?? "unknown object"),
     element("span", { className: "sure" }, name === null ? "" : percent(confidence)),
     element("span", { className: "facts hint" }, facts),
   );
@@ -113,19 +113,19 @@ function objectButton(instance, color) {
 }
 
 function select(label) {
-  for (const button of at("objects").querySelectorAll("button")) {
+  for (const button of byId("objects").querySelectorAll("button")) {
     button.setAttribute("aria-pressed", button.dataset.label === String(label));
   }
   overlay.select(label);
-  showDetails(frame.instances.find((one) => one.label === label), about.model, about.regions);
+  showDetails(frame.instances.find((one) => one.label === label), loaded.model, loaded.regions);
 }
 
 async function load() {
   const [model, network] = await Promise.all([service.model(), service.colornet()]);
-  at("token-section").hidden = true;
-  at("model-title").textContent = `The model knows ${model.classes.length} objects`;
-  at("classes").replaceChildren(...model.classes.map((name) => element("li", {}, name)));
-  at("model").hidden = false;
+  byId("token-section").hidden = true;
+  byId("model-title").textContent = `Objects known to the model: ${model.classes.length}`;
+  byId("classes").replaceChildren(...model.classes.map((name) => element("li", {}, name)));
+  byId("model").hidden = false;
   return { model, regions: network.mean_rgb };
 }
 
@@ -140,54 +140,54 @@ async function showSamples() {
     });
     return button;
   });
-  at("samples").replaceChildren(...buttons);
+  byId("samples").replaceChildren(...buttons);
 }
 
 function press(chosen) {
-  for (const button of at("samples").children) button.setAttribute("aria-pressed", button === chosen);
+  for (const button of byId("samples").children) button.setAttribute("aria-pressed", button === chosen);
 }
 
-at("upload-form").addEventListener("submit", (event) => {
+byId("upload-form").addEventListener("submit", (event) => {
   event.preventDefault();
   clearProblems();
-  const files = Object.fromEntries(FIELDS.map((name) => [name, at(name).files[0]]));
+  const files = Object.fromEntries(FIELDS.map((name) => [name, byId(name).files[0]]));
   const missing = FIELDS.filter((name) => !files[name]);
   if (missing.length) {
     missing.forEach((name) => markField(name, "Choose a file."));
-    at(missing[0]).focus();
+    byId(missing[0]).focus();
     return;
   }
   press(null);
   recognize(files.color.name, async () => files, FIELDS);
 });
 
-at("token-form").addEventListener("submit", async (event) => {
+byId("token-form").addEventListener("submit", async (event) => {
   event.preventDefault();
   clearProblems();
-  service.useToken(at("token").value.trim());
+  service.useToken(byId("token").value.trim());
   try {
-    about = await load();
-    say("The token is accepted. Choose a frame.");
+    loaded = await load();
+    setStatus("The token was accepted. Choose a frame.");
   } catch (problem) {
-    tell(problem);
+    showProblem(problem);
   }
 });
 
 async function watchReady() {
   const state = (name, text) => {
-    at("ready").dataset.state = name;
-    at("ready").textContent = text;
+    byId("ready").dataset.state = name;
+    byId("ready").textContent = text;
   };
   try {
     await service.ready();
     state("ready", "Ready");
   } catch (problem) {
     if (problem.status === 503) state("waiting", "Starting");
-    else state("failed", "No answer");
+    else state("failed", "Not reachable");
     setTimeout(watchReady, 2000);
   }
 }
 
 watchReady();
-showSamples().catch(tell);
-load().then((found) => (about = found), tell);
+showSamples().catch(showProblem);
+load().then((value) => (loaded = value), showProblem);

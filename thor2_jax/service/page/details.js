@@ -1,24 +1,24 @@
-// What the name of one object rests on: its cloud, its slices, and what both classifiers say.
+// Details of one object: its cloud, its slices, and the probabilities of both classifiers.
 
 import { element, keepDrawn, percent, rgb, themed } from "./drawing.js";
 
-const at = (id) => document.getElementById(id);
+const byId = (id) => document.getElementById(id);
 const TITLES = { tops: "TOPS: shape", tops2: "TOPS2: shape, colour" };
 
-/** Fill the section. `model` and `regions` (mean colours) are the service's. */
+/** Fill the section. `regions` are the mean colours of the colour regions. */
 export function showDetails(instance, model, regions) {
   const { name, label, details } = instance;
-  at("details-title").textContent = name ?? `Object ${label}, not recognized`;
-  at("details-facts").textContent = facts(instance);
-  at("details-reason").textContent = reason(instance);
-  at("evidence").hidden = details === null;
-  at("details").hidden = false;
+  byId("details-title").textContent = name ?? `Object ${label}: unknown`;
+  byId("details-facts").textContent = facts(instance);
+  byId("details-reason").textContent = reason(instance);
+  byId("evidence").hidden = details === null;
+  byId("details").hidden = false;
   if (details === null) return;
-  keepDrawn(at("cloud"), (context, width, height) => drawCloud(context, width, height, instance));
-  at("cloud").setAttribute("aria-label", `Cloud of ${name} from the side, cut into slices from bottom to top.`);
+  keepDrawn(byId("cloud"), (context, width, height) => drawCloud(context, width, height, instance));
+  byId("cloud").setAttribute("aria-label", `Point cloud of ${name}, side view, with slices from bottom to top.`);
   const { sigma_1: thickness, sigma_s: perMetre } = model.descriptor;
-  at("cloud-hint").textContent = `Turned and cut into slices of ${+((100 * thickness) / perMetre).toFixed(1)} cm.`;
-  at("classifiers").replaceChildren(...Object.keys(instance.top).map((which) => topFive(instance, which)));
+  byId("cloud-hint").textContent = `Aligned and cut into slices of ${+((100 * thickness) / perMetre).toFixed(1)} cm.`;
+  byId("classifiers").replaceChildren(...Object.keys(instance.top).map((which) => topFive(instance, which)));
   showSlices(details, model, regions);
 }
 
@@ -26,17 +26,17 @@ function facts({ name, label, confidence, occluded, points_used, overflow, kept_
   if (name === null) return `Label ${label}`;
   return [
     `Label ${label}`,
-    `${percent(confidence)} sure`,
-    occluded ? "hidden in part" : "wholly seen",
+    `confidence ${percent(confidence)}`,
+    occluded ? "partly occluded" : "not occluded",
     `${points_used} points`,
-    ...(overflow ? [`${overflow} points or pairs do not fit the descriptor`] : []),
+    ...(overflow ? [`overflow: ${overflow} points or pairs outside the descriptor`] : []),
     ...(kept_by_fallback ? ["outlier removal was relaxed"] : []),
   ].join(" · ");
 }
 
 function reason({ unrecognized, details }) {
   if (unrecognized !== null) return unrecognized.charAt(0).toUpperCase() + unrecognized.slice(1) + ".";
-  return details === null ? "This frame has more objects than are explained at a time." : "";
+  return details === null ? "Details are limited to the first objects of a frame." : "";
 }
 
 function topFive(instance, which) {
@@ -76,7 +76,7 @@ function drawCloud(context, width, height, { details, points_used }) {
     context.fillStyle = themed("--muted");
     context.fillText(k, 6, toY((low + high) / 2));
   });
-  // A cloud of which a part is shown gets larger dots, so that surfaces stay closed.
+  // A sample of a large cloud is drawn with larger dots, so that surfaces look closed.
   const radius = Math.max(1.2, 0.007 * scale * Math.sqrt(points_used / points.length));
   const backToFront = points.map((_, k) => k).sort((a, b) => points[b][1] - points[a][1]);
   for (const k of backToFront) {
@@ -109,10 +109,10 @@ function showSlices({ slices }, model, regions) {
     const item = element("li", {}, title, shape, colors);
     return { item, colors, strips };
   });
-  at("slices").replaceChildren(...drawings.map(({ item }) => item));
+  byId("slices").replaceChildren(...drawings.map(({ item }) => item));
   for (const { colors, strips } of drawings) {
     keepDrawn(colors, (context, width, height) => {
-      // An image begins a pixel before its first strip: drawn so, strips lie below their births.
+      // An image starts one pixel before the first strip; with this offset, strips lie below their births.
       const step = width / Math.max(model.descriptor.image_size, model.descriptor.n_strips + 1);
       for (const { strip, regions: present, weights } of strips) {
         let y = height;
@@ -136,7 +136,7 @@ function mainColor(strips, regions) {
   return `colour ${regions[region].map(Math.round).join(", ")}`;
 }
 
-// Nine colours of matplotlib's magma.
+// Nine colours of matplotlib's magma colour map.
 const MAGMA = [
   [0, 0, 4], [28, 16, 68], [79, 18, 123], [129, 37, 129], [181, 54, 122], [229, 80, 100], [251, 135, 97],
   [254, 194, 135], [252, 253, 191],

@@ -1,4 +1,4 @@
-// What all drawings share: canvases as sharp as the screen, drawn again when their size or the colour scheme changes.
+// Drawing helpers: canvases at the resolution of the screen, redrawn when their size or the colour scheme changes.
 
 const drawn = new WeakMap();
 const watch = new ResizeObserver((entries) => {
@@ -22,21 +22,21 @@ function draw(canvas) {
   drawn.get(canvas)(context, width, height);
 }
 
-/** Draw with `paint(context, width, height)`, in CSS pixels, now and whenever it is needed. */
+/** Draw with `paint(context, width, height)` in CSS pixels, now and after every change of size or colour scheme. */
 export function keepDrawn(canvas, paint) {
   drawn.set(canvas, paint);
   watch.observe(canvas);
   draw(canvas);
 }
 
-/** A colour of the style sheet, for example `--muted`. */
+/** Return a colour of the style sheet, for example `--muted`. */
 export const themed = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 
 export const rgb = ([red, green, blue]) => `rgb(${red} ${green} ${blue})`;
 
 export const percent = (share) => `${(100 * share).toFixed(share < 0.0995 ? 1 : 0)}\u00a0%`;
 
-/** An element with properties and children. */
+/** Create an element with properties and children. */
 export function element(tag, properties = {}, ...children) {
   const made = Object.assign(document.createElement(tag), properties);
   made.append(...children);

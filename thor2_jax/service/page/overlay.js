@@ -1,28 +1,28 @@
-// The colour image with the outlines and names of its objects, and which object lies where.
+// The colour image with the outlines and names of its objects, and the object at a position.
 
 import { keepDrawn, percent, rgb } from "./drawing.js";
 
-// Okabe and Ito's palette, as in the pictures of the command line.
+// Okabe and Ito's palette, as in the images of the command line.
 const PAINTS = [[86, 180, 233], [240, 228, 66], [0, 158, 115], [204, 121, 167], [0, 114, 178]];
 const UNRECOGNIZED = [213, 94, 0];
 
-const SMALL = 480; // CSS pixels: narrower pictures get smaller letters and thinner lines
+const SMALL = 480; // Images narrower than this (CSS pixels) get smaller letters and thinner lines.
 
-// How little a place is wanted: names stand beside their objects, labels on them.
+// Penalties of tag positions: names preferably lie beside their objects, labels on them.
 const NAME_COSTS = { above: 0, below: 0.3, on: 0.6 };
 const LABEL_COSTS = { above: 0.6, below: 0.6, on: 0 };
 
-/** A colour for each instance. */
+/** Return a colour for each instance. */
 export function paints(instances) {
   let named = 0;
   return instances.map(({ name }) => (name === null ? UNRECOGNIZED : PAINTS[named++ % PAINTS.length]));
 }
 
-/** The colour of letters on a colour. */
+/** Return the text colour for a background colour. */
 export const ink = ([red, green, blue]) => (0.299 * red + 0.587 * green + 0.114 * blue > 100 ? "#000" : "#fff");
 
 export class Overlay {
-  /** On `canvas`; `onSelect(label)` is called when an object is clicked. */
+  /** Draw on `canvas`; `onSelect(label)` is called when an object is clicked. */
   constructor(canvas, onSelect) {
     this.canvas = canvas;
     this.regions = null;
@@ -39,7 +39,7 @@ export class Overlay {
   show(bitmap, instances, labelMap, selected) {
     Object.assign(this, { bitmap, instances, selected, colors: paints(instances), regions: new Regions(labelMap) });
     this.canvas.style.aspectRatio = `${bitmap.width} / ${bitmap.height}`;
-    const names = instances.map(({ name }) => name ?? "unrecognized").join(", ");
+    const names = instances.map(({ name }) => name ?? "unknown object").join(", ");
     this.canvas.setAttribute("aria-label", `Colour image with the outlines of its objects: ${names || "none"}.`);
     this.redraw();
   }
@@ -53,7 +53,7 @@ export class Overlay {
     keepDrawn(this.canvas, (context, width, height) => this.paint(context, width, height));
   }
 
-  /** The label of the object at a place in CSS pixels, 0 if there is none. Names lie on top. */
+  /** Return the label of the object or tag at a position in CSS pixels, 0 if there is none. */
   labelAt(x, y) {
     if (!this.regions) return 0;
     const tag = this.tags.find(({ box }) => x >= box.x && x < box.x + box.width && y >= box.y && y < box.y + box.height);
@@ -105,7 +105,7 @@ export class Overlay {
     return this.instances[k].label === this.selected;
   }
 
-  /** Each object's label, as in the list, on the object; then in its stead the name, wherever that has room. */
+  /** Place the label of each object on it, then replace labels by names where there is enough space. */
   placeTags(context, width, height) {
     const small = width < SMALL;
     const size = small ? 11 : 13;
@@ -121,11 +121,11 @@ export class Overlay {
     };
     this.instances.forEach(({ label }, k) => place(k, `${label}`, LABEL_COSTS));
     this.instances.forEach(({ name, confidence }, k) => {
-      place(k, name === null ? "unrecognized" : small ? name : `${name} ${percent(confidence)}`, NAME_COSTS);
+      place(k, name === null ? "unknown" : small ? name : `${name} ${percent(confidence)}`, NAME_COSTS);
     });
   }
 
-  /** A box at an object, clear of other tags, where it hides least of other objects; undefined if there is none. */
+  /** Return the box near an object that overlaps no tag and hides least of other objects, or undefined. */
   freePlace(label, room, others, costs, width, height) {
     const region = this.regions.of(label);
     if (!region || room.width > width) return;
@@ -153,7 +153,7 @@ export class Overlay {
     return best.box;
   }
 
-  /** How much of a box lies on other objects than `label`, from 0 to 1. */
+  /** Return the fraction of a box that lies on objects other than `label`. */
   hidden(label, box) {
     let hits = 0;
     for (let k = 0; k < 27; k++) {
@@ -183,12 +183,12 @@ function overlap(a, b) {
   return a.x < b.x + b.width && b.x < a.x + a.width && a.y < b.y + b.height && b.y < a.y + a.height;
 }
 
-/** The label map unpacked: each label's area, outline and box, in pixels of the map. */
+/** Decoded label map: area, outline and bounding box of each label, in pixels of the map. */
 class Regions {
   constructor({ width, height, labels, lengths }) {
     Object.assign(this, { width, height });
     this.map = new Int32Array(width * height);
-    this.found = new Map();
+    this.byLabel = new Map();
     let start = 0;
     labels.forEach((label, k) => {
       const end = start + lengths[k];
@@ -204,15 +204,15 @@ class Regions {
   }
 
   of(label) {
-    return this.found.get(label);
+    return this.byLabel.get(label);
   }
 
   addRun(label, start, end) {
-    if (!this.found.has(label)) {
+    if (!this.byLabel.has(label)) {
       const box = { left: this.width, top: this.height, right: 0, bottom: 0 };
-      this.found.set(label, { area: new Path2D(), outline: new Path2D(), ...box });
+      this.byLabel.set(label, { area: new Path2D(), outline: new Path2D(), ...box });
     }
-    const region = this.found.get(label);
+    const region = this.byLabel.get(label);
     while (start < end) {
       const y = Math.floor(start / this.width);
       const x = start - y * this.width;
@@ -226,7 +226,7 @@ class Regions {
     }
   }
 
-  /** Marching squares: between each four neighbouring pixels, a line where one label ends. */
+  /** Marching squares: add outline segments between each four neighbouring pixels. */
   trace() {
     for (let y = -1; y < this.height; y++) {
       for (let x = -1; x < this.width; x++) {
@@ -237,8 +237,8 @@ class Regions {
           if (label === 0) continue;
           const crossed = middles.filter((_, k) => (corners[k] === label) !== (corners[(k + 1) % 4] === label));
           for (let k = 0; k < crossed.length; k += 2) {
-            this.found.get(label).outline.moveTo(...crossed[k]);
-            this.found.get(label).outline.lineTo(...crossed[k + 1]);
+            this.byLabel.get(label).outline.moveTo(...crossed[k]);
+            this.byLabel.get(label).outline.lineTo(...crossed[k + 1]);
           }
         }
       }

@@ -1,4 +1,4 @@
-// Calls of the service. Whatever goes wrong is a Problem, whose message can be shown as it is.
+// Requests to the service. Every error is a Problem, whose message can be shown to the user.
 
 let token = "";
 
@@ -21,7 +21,7 @@ async function call(path, options = {}) {
     answer = await fetch(path, { ...options, headers });
   } catch (error) {
     if (error.name === "AbortError") throw error;
-    throw new Problem(0, null, "The service does not answer. It may be down, or the files may be too large for it.");
+    throw new Problem(0, null, "The service cannot be reached. It may be down, or the files may be too large.");
   }
   if (answer.ok) return answer;
   const { field = null, message = `The service answered with status ${answer.status}.` } = await answer

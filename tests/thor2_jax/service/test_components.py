@@ -1,4 +1,4 @@
-"""Batches, processes, limits on requests, and the counter of compilations, each alone."""
+"""Unit tests of batching, preparation processes, request limits and the compilation counter."""
 
 import asyncio
 import math
@@ -23,66 +23,66 @@ from thor2_jax.client import multipart
 from thor2_jax.errors import InputError
 from thor2_jax.service.app import create_app
 from thor2_jax.service.batching import Batcher
-from thor2_jax.service.metrics import CompilationWatch
-from thor2_jax.service.preparing import Preparers, prepare_clouds
+from thor2_jax.service.metrics import CompilationCounter
+from thor2_jax.service.preparation import PreparationPool, prepare_clouds
 from thor2_jax.service.problem import RequestError
 from thor2_jax.service.settings import MAX_BODY, Settings
 
 
 class Device:
-    """Doubles numbers; waits for leave before each batch."""
+    """Double numbers; wait for permission before each batch."""
 
     def __init__(self) -> None:
         self.batches: list[list[int]] = []
-        self.leave = threading.Semaphore(0)
+        self.permits = threading.Semaphore(0)
 
     def __call__(self, numbers: list[int]) -> list[int]:
-        self.leave.acquire()
+        self.permits.acquire()
         self.batches.append(numbers)
         if 13 in numbers:
             raise ArithmeticError("thirteen")
         return [2 * n for n in numbers]
 
 
-def in_a_while(seconds: float = 60.0) -> float:
+def deadline_in(seconds: float = 60.0) -> float:
     return time.monotonic() + seconds
 
 
-def test_waiting_jobs_share_batches_and_get_their_own_rows() -> None:
+def test_waiting_jobs_share_batches() -> None:
     device = Device()
     batcher = Batcher(device, lambda: 0, max_batch=4, window=0.0)
-    first = batcher.submit([1], in_a_while())
-    time.sleep(0.1)  # the device has begun with it
-    others = [batcher.submit(numbers, in_a_while()) for numbers in ([2, 3], [], [4], [5, 6, 7, 8, 9, 10])]
-    device.leave.release(10)
+    first = batcher.submit([1], deadline_in())
+    time.sleep(0.1)  # The device is now processing it.
+    others = [batcher.submit(numbers, deadline_in()) for numbers in ([2, 3], [], [4], [5, 6, 7, 8, 9, 10])]
+    device.permits.release(10)
     assert first.result(10) == [2]
     assert [other.result(10) for other in others] == [[4, 6], [], [8], [10, 12, 14, 16, 18, 20]]
     assert device.batches == [[1], [2, 3, 4, 5], [6, 7, 8, 9], [10]]
     batcher.close()
 
 
-def test_a_batch_waits_for_jobs_that_are_expected_but_not_for_long() -> None:
+def test_batch_waits_briefly_for_expected_jobs() -> None:
     device = Device()
-    device.leave.release(10)
+    device.permits.release(10)
     batcher = Batcher(device, lambda: 2, max_batch=4, window=0.3)
-    first = batcher.submit([1], in_a_while())
-    second = batcher.submit([2], in_a_while())
+    first = batcher.submit([1], deadline_in())
+    second = batcher.submit([2], deadline_in())
     assert (first.result(10), second.result(10)) == ([2], [4]) and device.batches == [[1, 2]]
     start = time.monotonic()
-    assert batcher.submit([3], in_a_while()).result(10) == [6]
+    assert batcher.submit([3], deadline_in()).result(10) == [6]
     assert 0.25 < time.monotonic() - start < 5
     batcher.close()
 
 
-def test_late_cancelled_and_failing_jobs_harm_no_others() -> None:
+def test_late_cancelled_and_failing_jobs_are_isolated() -> None:
     device = Device()
     batcher = Batcher(device, lambda: 0, max_batch=1, window=0.0)
-    first = batcher.submit([1], in_a_while())
+    first = batcher.submit([1], deadline_in())
     time.sleep(0.1)
-    late, cancelled = batcher.submit([2], time.monotonic()), batcher.submit([3], in_a_while())
-    failing, last = batcher.submit([13], in_a_while()), batcher.submit([5], in_a_while())
+    late, cancelled = batcher.submit([2], time.monotonic()), batcher.submit([3], deadline_in())
+    failing, last = batcher.submit([13], deadline_in()), batcher.submit([5], deadline_in())
     assert cancelled.cancel()
-    device.leave.release(10)
+    device.permits.release(10)
     assert first.result(10) == [2] and last.result(10) == [10]
     with pytest.raises(RequestError) as error:
         late.result(10)
@@ -93,56 +93,56 @@ def test_late_cancelled_and_failing_jobs_harm_no_others() -> None:
     batcher.close()
 
 
-def test_closing_finishes_what_was_submitted() -> None:
+def test_close_finishes_submitted_jobs() -> None:
     device = Device()
     batcher = Batcher(device, lambda: 0, max_batch=2, window=0.0)
-    jobs = [batcher.submit([n], in_a_while()) for n in range(7)]
-    device.leave.release(10)
+    jobs = [batcher.submit([n], deadline_in()) for n in range(7)]
+    device.permits.release(10)
     batcher.close()
     assert [job.result(0) for job in jobs] == [[2 * n] for n in range(7)]
 
 
 @pytest.fixture(scope="module")
-def preparers() -> Iterator[Preparers]:
-    found = Preparers(1)
-    yield found
-    found.close()
+def pool() -> Iterator[PreparationPool]:
+    pool = PreparationPool(1)
+    yield pool
+    pool.close()
 
 
-def test_a_process_gives_back_results_and_errors(preparers: Preparers) -> None:
-    assert preparers.submit(in_a_while(), math.sqrt, 4.0).result(30) == 2.0
-    with pytest.raises(RequestError) as refused:
-        preparers.submit(in_a_while(), prepare_clouds, b"nothing", True).result(30)
-    assert (refused.value.status, refused.value.field) == (422, "body")
+def test_process_returns_results_and_errors(pool: PreparationPool) -> None:
+    assert pool.submit(deadline_in(), math.sqrt, 4.0).result(30) == 2.0
+    with pytest.raises(RequestError) as error:
+        pool.submit(deadline_in(), prepare_clouds, b"damaged", True).result(30)
+    assert (error.value.status, error.value.field) == (422, "body")
     with pytest.raises(RuntimeError, match="math domain error"):
-        preparers.submit(in_a_while(), math.sqrt, -1.0).result(30)
+        pool.submit(deadline_in(), math.sqrt, -1.0).result(30)
 
 
-def test_a_process_that_takes_too_long_is_replaced(preparers: Preparers) -> None:
-    before = preparers.submit(in_a_while(), os.getpid).result(30)
+def test_slow_process_is_replaced(pool: PreparationPool) -> None:
+    before = pool.submit(deadline_in(), os.getpid).result(30)
     start = time.monotonic()
     with pytest.raises(RequestError) as late:
-        preparers.submit(in_a_while(0.5), time.sleep, 60).result(30)
+        pool.submit(deadline_in(0.5), time.sleep, 60).result(30)
     assert late.value.status == 504 and time.monotonic() - start < 20
-    after = preparers.submit(in_a_while(), os.getpid).result(30)
+    after = pool.submit(deadline_in(), os.getpid).result(30)
     assert after != before
     with pytest.raises(ProcessLookupError):
         os.kill(before, 0)
 
 
-def test_a_process_that_dies_is_replaced(preparers: Preparers) -> None:
+def test_crashed_process_is_replaced(pool: PreparationPool) -> None:
     with pytest.raises(RequestError) as died:
-        preparers.submit(in_a_while(), os._exit, 3).result(30)
+        pool.submit(deadline_in(), os._exit, 3).result(30)
     assert died.value.status == 422
-    pid = preparers.submit(in_a_while(), os.getpid).result(30)
+    pid = pool.submit(deadline_in(), os.getpid).result(30)
     os.kill(pid, 9)
-    time.sleep(0.2)  # while it had nothing to do: nobody notices
-    assert preparers.submit(in_a_while(), math.sqrt, 9.0).result(30) == 3.0
+    time.sleep(0.2)  # The pool does not notice the death of an idle process.
+    assert pool.submit(deadline_in(), math.sqrt, 9.0).result(30) == 3.0
 
 
-def test_compilations_are_counted_between_start_and_stop() -> None:
+def test_compilations_are_counted_until_stop() -> None:
     counter = Counter("compilations", "Test.", registry=CollectorRegistry())
-    watch = CompilationWatch(counter)
+    watch = CompilationCounter(counter)
     watch.stop()
     watch.start()
     jax.jit(lambda x: x * 3 + 1)(jnp.ones(17)).block_until_ready()
@@ -155,27 +155,27 @@ def test_compilations_are_counted_between_start_and_stop() -> None:
 
 
 @pytest.fixture(scope="module")
-def app(run_folder: Path) -> FastAPI:
-    return create_app(Settings(run_folder, token="secret", queue=2, deadline=0.5))
+def app(run_dir: Path) -> FastAPI:
+    return create_app(Settings(run_dir, token="secret", queue=2, deadline=0.5))
 
 
 def calls(app: FastAPI, *requests: Callable[[httpx.AsyncClient], Any]) -> list[httpx.Response]:
-    """Answers to requests that are made all at once."""
+    """Send requests concurrently and return their responses."""
 
-    async def together() -> list[httpx.Response]:
+    async def send_all() -> list[httpx.Response]:
         transport = httpx.ASGITransport(app)
         async with httpx.AsyncClient(transport=transport, base_url="http://x") as client:
             client.headers["Authorization"] = "Bearer secret"
             return await asyncio.gather(*(request(client) for request in requests))
 
-    return asyncio.run(together())
+    return asyncio.run(send_all())
 
 
 def frame_request(files: dict[str, bytes]) -> Callable[[httpx.AsyncClient], Any]:
     return lambda client: client.post("/v1/recognize", files=files)
 
 
-def test_the_token_is_needed_for_all_but_health(app: FastAPI) -> None:
+def test_token_is_required_except_for_health(app: FastAPI) -> None:
     guarded = [("POST", f"/v1/{name}") for name in ("recognize", "explain", "describe")]
     guarded += [("GET", "/v1/model"), ("GET", "/v1/colornet")]
     for method, path in [*guarded, ("GET", "/metrics")]:
@@ -188,7 +188,7 @@ def test_the_token_is_needed_for_all_but_health(app: FastAPI) -> None:
     assert model.status_code == 200 and health.status_code == 200
 
 
-def test_nothing_is_taken_before_it_is_ready_and_while_it_stops(
+def test_requests_are_refused_unless_ready(
     app: FastAPI, files: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for state in ("starting", "stopping", "failed"):
@@ -198,7 +198,7 @@ def test_nothing_is_taken_before_it_is_ready_and_while_it_stops(
         assert state in answer.json()["message"]
 
 
-def test_past_the_queue_it_is_429_and_past_the_deadline_504(
+def test_full_queue_is_429_and_deadline_504(
     app: FastAPI, files: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async def slow(*_: Any) -> list[Any]:
@@ -210,7 +210,7 @@ def test_past_the_queue_it_is_429_and_past_the_deadline_504(
     answers = calls(app, *[frame_request(files)] * 5)
     assert sorted(answer.status_code for answer in answers) == [200, 200, 429, 429, 429]
     assert all(answer.headers["retry-after"] == "1" for answer in answers if answer.status_code == 429)
-    assert calls(app, frame_request(files))[0].status_code == 200  # places are given back
+    assert calls(app, frame_request(files))[0].status_code == 200  # Finished requests leave the queue.
 
     async def stuck(*_: Any) -> list[Any]:
         await asyncio.sleep(60)
@@ -221,7 +221,7 @@ def test_past_the_queue_it_is_429_and_past_the_deadline_504(
     assert calls(app, frame_request(files), frame_request(files))[1].status_code == 504
 
 
-def test_a_defect_is_told_without_its_traceback(
+def test_internal_error_hides_its_traceback(
     app: FastAPI, files: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async def broken(*_: Any) -> list[Any]:
@@ -236,21 +236,18 @@ def test_a_defect_is_told_without_its_traceback(
             return await client.post("/v1/recognize", files=files, headers={"Authorization": "Bearer secret"})
 
     answer = asyncio.run(ask())
-    assert answer.status_code == 500 and answer.json() == {
-        "field": None,
-        "message": "This is a defect of the service.",
-    }
+    assert answer.status_code == 500 and answer.json()["field"] is None and "/some/path" not in answer.text
     assert 'thor2_requests_total{path="/v1/recognize",status="500"} 1.0' in app.state.service.metrics.text().decode()
 
 
 def test_large_files_stay_in_memory(app: FastAPI, files: dict[str, bytes], monkeypatch: pytest.MonkeyPatch) -> None:
     def roll(*_: Any) -> None:
-        raise AssertionError("a part of the request went to the disk")
+        raise AssertionError("a part of the request was written to disk")
 
-    taken: list[dict[str, bytes]] = []
+    received: list[dict[str, bytes]] = []
 
-    async def recognize(given: dict[str, bytes], _: Any) -> list[Any]:
-        taken.append(given)
+    async def recognize(files: dict[str, bytes], _: Any) -> list[Any]:
+        received.append(files)
         return []
 
     monkeypatch.setattr(tempfile.SpooledTemporaryFile, "rollover", roll)
@@ -259,24 +256,24 @@ def test_large_files_stay_in_memory(app: FastAPI, files: dict[str, bytes], monke
     large = files | {"color": os.urandom(MAX_BODY - 200_000)}
     assert len(multipart(large)[1]) > MAX_BODY - 200_000
     assert calls(app, frame_request(large))[0].status_code == 200
-    assert taken == [large]
+    assert received == [large]
 
 
-def test_a_worker_that_died_leaves_no_requests_waiting(tmp_path: Path) -> None:
-    """Its other counts stay."""
+def test_dead_worker_has_no_requests_in_progress(tmp_path: Path) -> None:
+    """Its other counts are kept."""
     worker = "from thor2_jax.service.metrics import Metrics; import os; metrics = Metrics(); "
-    died = "metrics.waiting.inc(3); metrics.compilations.inc(2); os._exit(0)"
-    said = ""
-    for life in (died, "metrics.waiting.inc(1); print(metrics.text().decode())"):
+    died = "metrics.in_progress.inc(3); metrics.compilations.inc(2); os._exit(0)"
+    text = ""
+    for code in (died, "metrics.in_progress.inc(1); print(metrics.text().decode())"):
         environment = os.environ | {"PROMETHEUS_MULTIPROC_DIR": str(tmp_path)}
-        said = subprocess.run(
-            [sys.executable, "-c", worker + life],
+        text = subprocess.run(
+            [sys.executable, "-c", worker + code],
             cwd=Path(__file__).parents[3], env=environment, check=True, capture_output=True, text=True,
         ).stdout  # fmt: skip
-    assert "thor2_requests_waiting 1.0" in said and "thor2_compilations_after_warm_up_total 2.0" in said
+    assert "thor2_requests_waiting 1.0" in text and "thor2_compilations_after_warm_up_total 2.0" in text
 
 
-def test_settings_out_of_range_are_refused() -> None:
+def test_settings_out_of_range() -> None:
     for wrong in ({"queue": 0}, {"deadline": 0.0}, {"processes": 0}, {"max_batch": 3}, {"token": ""}, {"token": "é"}):
         with pytest.raises(InputError, match=next(iter(wrong))):
             Settings(Path("run"), **wrong)

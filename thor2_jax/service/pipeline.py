@@ -1,0 +1,165 @@
+"""The service without HTTP: admission of requests, the stages of a request, start and shutdown."""
+
+import asyncio
+import contextlib
+import logging
+import threading
+import time
+from collections.abc import AsyncIterator, Iterator
+
+from thor2_jax.recognition.prepared_instance import PreparedInstance
+from thor2_jax.recognition.recognizer import Recognition
+from thor2_jax.service.answers import explained_frame
+from thor2_jax.service.batching import Batcher
+from thor2_jax.service.engine import CloudResult, InferenceEngine
+from thor2_jax.service.metrics import CompilationCounter, Metrics
+from thor2_jax.service.preparation import PreparationPool, PreparedRequest, prepare_clouds, prepare_frame
+from thor2_jax.service.problem import RequestError, deadline_exceeded
+from thor2_jax.service.schemas import ExplainedFrame
+from thor2_jax.service.settings import Settings
+
+__all__ = ["AdmittedRequest", "Service"]
+
+log = logging.getLogger(__name__)
+
+
+class AdmittedRequest:
+    """A request in progress.
+
+    Attributes:
+        deadline: time of `time.monotonic` by which it must be answered.
+        seconds: stage -> duration.
+    """
+
+    def __init__(self, time_limit: float) -> None:
+        self._start = time.monotonic()
+        self.deadline = self._start + time_limit
+        self.seconds: dict[str, float] = {}
+
+    @contextlib.contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Measure the duration of the context, unless it raises."""
+        start = time.monotonic()
+        yield
+        self.seconds[name] = time.monotonic() - start
+
+    def milliseconds(self) -> dict[str, float]:
+        """Return the durations of all finished stages and the total so far."""
+        total = time.monotonic() - self._start
+        return {name: round(seconds * 1e3, 3) for name, seconds in {**self.seconds, "total": total}.items()}
+
+
+class Service:
+    """One process of the service."""
+
+    def __init__(self, settings: Settings) -> None:
+        """Load the run. Raises InputError if it cannot be read."""
+        self.settings = settings
+        self.metrics = Metrics()
+        self.engine = InferenceEngine(settings)
+        self.state = "starting"
+        self._compilations = CompilationCounter(self.metrics.compilations)
+        self._in_progress = self._accepted = self._finished = 0
+
+    def start(self) -> None:
+        """Start processes and threads. `state` becomes "ready" when all batch shapes are compiled."""
+        self._pool = PreparationPool(self.settings.processes)
+        self._batcher = Batcher(
+            self._process_batch, lambda: self._in_progress, self.settings.max_batch, self.settings.window
+        )
+        self._warm_up_thread = threading.Thread(target=self._warm_up, name="warm-up")
+        self._warm_up_thread.start()
+
+    def _warm_up(self) -> None:
+        start, compiled = time.monotonic(), 0
+        try:
+            for _ in self.engine.warm_up():
+                if self.state != "starting":
+                    return
+                compiled += 1
+        except Exception:
+            log.exception("warm-up failed")
+            self.state = "failed"
+            return
+        self._compilations.start()
+        if self.state == "starting":
+            self.state = "ready"
+        log.info("ready: %d batch shapes compiled in %.1f s", compiled, time.monotonic() - start)
+
+    def stop_accepting(self) -> None:
+        """Refuse new requests; requests in progress are still answered."""
+        self.state = "stopping"
+
+    def close(self) -> None:
+        """Finish requests in progress, then stop processes and threads."""
+        self.stop_accepting()
+        self._warm_up_thread.join()
+        self._pool.close()
+        self._batcher.close()
+        self._compilations.stop()
+        log.info("stopped: %d requests accepted, %d finished", self._accepted, self._finished)
+
+    @contextlib.asynccontextmanager
+    async def admit(self) -> AsyncIterator[AdmittedRequest]:
+        """Admit a request for the duration of the context.
+
+        Raises:
+            RequestError: 503 if the service is not ready, 429 if the queue is full; at the deadline, 408 if the body
+                has not arrived and 504 otherwise.
+        """
+        if self.state != "ready":
+            raise RequestError(503, None, f"The service is {self.state}.")
+        if self._in_progress >= self.settings.queue:
+            raise RequestError(429, None, f"The queue is full: {self.settings.queue} requests are in progress.")
+        request = AdmittedRequest(self.settings.deadline)
+        self._in_progress += 1
+        self._accepted += 1
+        self.metrics.in_progress.inc()
+        try:
+            async with asyncio.timeout(self.settings.deadline):
+                yield request
+        except TimeoutError:
+            if "upload" in request.seconds:
+                raise deadline_exceeded() from None
+            raise RequestError(408, "body", "The body did not arrive before the deadline.") from None
+        finally:
+            self._in_progress -= 1
+            self._finished += 1
+            self.metrics.in_progress.dec()
+            for name, seconds in request.seconds.items():
+                self.metrics.stages.labels(name).observe(seconds)
+
+    async def recognize(self, files: dict[str, bytes], request: AdmittedRequest) -> list[Recognition]:
+        """Recognize the frame in `files` (the arguments of `decoding.decode_frame`). Raises RequestError."""
+        prepared, results = await self._infer_frame(files, False, request)
+        return self.engine.recognize(prepared.instances, results)
+
+    async def explain(self, files: dict[str, bytes], request: AdmittedRequest) -> ExplainedFrame:
+        """Recognize a frame and return the evidence as well. Raises RequestError."""
+        prepared, results = await self._infer_frame(files, True, request)
+        recognitions = self.engine.recognize(prepared.instances, results)
+        config = self.engine.run.config
+        return await asyncio.to_thread(explained_frame, prepared, recognitions, results, config, request.milliseconds())
+
+    async def describe(self, content: bytes, is_npz: bool, request: AdmittedRequest) -> list[CloudResult]:
+        """Describe the clouds of an npz or JSON body. Raises RequestError."""
+        future = self._pool.submit(request.deadline, prepare_clouds, content, is_npz)
+        return await self._infer(await asyncio.wrap_future(future), request)
+
+    async def _infer_frame(
+        self, files: dict[str, bytes], with_label_map: bool, request: AdmittedRequest
+    ) -> tuple[PreparedRequest, list[CloudResult]]:
+        sigma_s = self.engine.run.config.sigma_s
+        future = self._pool.submit(request.deadline, prepare_frame, files, sigma_s, with_label_map)
+        prepared = await asyncio.wrap_future(future)
+        return prepared, await self._infer(prepared, request)
+
+    async def _infer(self, prepared: PreparedRequest, request: AdmittedRequest) -> list[CloudResult]:
+        request.seconds.update(prepared.seconds)
+        usable = [instance for instance in prepared.instances if instance.reason is None]
+        with request.stage("device"):
+            return await asyncio.wrap_future(self._batcher.submit(usable, request.deadline))
+
+    def _process_batch(self, instances: list[PreparedInstance]) -> list[CloudResult]:
+        self.metrics.batches.observe(len(instances))
+        return self.engine.infer(instances)

@@ -1,0 +1,176 @@
+"""Worker processes that decode images and compute instance clouds.
+
+This is most of the work of a frame and holds the interpreter lock, so threads would not run in parallel. A process that
+exceeds its deadline or crashes is replaced.
+"""
+
+import dataclasses
+import multiprocessing
+import queue
+import signal
+import time
+import traceback
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from multiprocessing.connection import Connection
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thor2_jax.errors import InputError
+from thor2_jax.recognition.prepared_instance import PreparedInstance, prepare_instance
+from thor2_jax.service.decoding import decode_frame, decode_json_clouds, decode_npz_clouds
+from thor2_jax.service.problem import RequestError, deadline_exceeded
+from thor2_jax.service.schemas import LabelMap
+from thor2_jax.service.settings import MAX_LABEL_RUNS
+
+__all__ = ["PreparationPool", "PreparedRequest", "prepare_clouds", "prepare_frame"]
+
+MIN_SECONDS = 1.0
+"""Minimum time that a process has for a request, so that only exceptionally slow requests are interrupted."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class PreparedRequest:
+    """A decoded request.
+
+    Attributes:
+        instances: its instances, in the order of their labels.
+        seconds: stage -> duration.
+        label_map: the label image of the frame, if requested.
+    """
+
+    instances: list[PreparedInstance]
+    seconds: dict[str, float]
+    label_map: LabelMap | None = None
+
+
+def prepare_frame(files: dict[str, bytes], sigma_s: float, with_label_map: bool) -> PreparedRequest:
+    """Decode a frame and compute the clouds of its instances. Raises RequestError."""
+    start = time.perf_counter()
+    frame = decode_frame(**files)
+    decoded = time.perf_counter()
+    try:
+        instances = [prepare_instance(frame, label, sigma_s) for label in frame.instances]
+    except InputError:  # The images and the intrinsics are valid, but their combination exceeds the voxel grid.
+        raise RequestError(
+            422, "intrinsics", "intrinsics place the points of an instance too far apart; check fx, fy and depth_scale."
+        ) from None
+    label_map = _encode_label_map(frame.labels) if with_label_map else None
+    return PreparedRequest(instances, {"decode": decoded - start, "clouds": time.perf_counter() - decoded}, label_map)
+
+
+def _encode_label_map(labels: NDArray[Any]) -> LabelMap:
+    step = 1
+    while True:
+        coarse = labels[::step, ::step]
+        flat = coarse.ravel()
+        starts = np.flatnonzero(np.diff(flat, prepend=~flat[0]))
+        if len(starts) <= MAX_LABEL_RUNS:
+            height, width = coarse.shape
+            lengths = np.diff(starts, append=flat.size)
+            return LabelMap(width=width, height=height, labels=flat[starts].tolist(), lengths=lengths.tolist())
+        step *= 2
+
+
+def prepare_clouds(content: bytes, is_npz: bool) -> PreparedRequest:
+    """Decode the clouds of a request body. Raises RequestError."""
+    start = time.perf_counter()
+    clouds = (decode_npz_clouds if is_npz else decode_json_clouds)(content)
+    instances = [
+        PreparedInstance(k, points, colors, np.zeros(len(points), bool)) for k, (points, colors) in enumerate(clouds)
+    ]
+    return PreparedRequest(instances, {"decode": time.perf_counter() - start})
+
+
+def _run_process(pipe: Connection) -> None:
+    """Receive functions with their arguments, and send back (result, None) or (None, error)."""
+    for number in (signal.SIGINT, signal.SIGTERM):  # A terminal signals all processes; the service stops this one.
+        signal.signal(number, signal.SIG_IGN)
+    pipe.send("ready")
+    while True:
+        try:
+            function, arguments = pipe.recv()
+        except EOFError:
+            return
+        outcome: tuple[Any, Exception | None]
+        try:
+            outcome = function(*arguments), None
+        except RequestError as error:
+            outcome = None, error
+        except Exception:
+            outcome = None, RuntimeError(traceback.format_exc())
+        pipe.send(outcome)
+
+
+class _PreparationProcess:
+    def __init__(self, context: Any) -> None:
+        self.pipe, child_pipe = context.Pipe()
+        self.process = context.Process(target=_run_process, args=(child_pipe,), daemon=True)
+        self.process.start()
+        child_pipe.close()
+        self.pipe.recv()
+
+    def stop(self) -> None:
+        self.process.kill()
+        self.process.join()
+        self.pipe.close()
+
+
+class PreparationPool:
+    """A fixed number of processes, each with a thread that waits for it."""
+
+    def __init__(self, count: int) -> None:
+        """Start `count` processes."""
+        # The fork server has imported this module and has no threads: a replacement process starts at once.
+        self._context = multiprocessing.get_context("forkserver")
+        self._context.set_forkserver_preload([__name__])
+        self._threads = ThreadPoolExecutor(count, thread_name_prefix="prepare")
+        self._idle: queue.SimpleQueue[_PreparationProcess] = queue.SimpleQueue()
+        for _ in range(count):
+            self._idle.put(_PreparationProcess(self._context))
+
+    def submit(
+        self, deadline: float, function: Callable[..., PreparedRequest], *arguments: Any
+    ) -> Future[PreparedRequest]:
+        """Call `function` in a process; the function and its arguments are pickled.
+
+        The future raises RequestError: the error of the function, 504 if the call has not returned at `deadline` (a
+        time of `time.monotonic`), 422 if the process crashed.
+        """
+        return self._threads.submit(self._call, deadline, function, arguments)
+
+    def _call(
+        self, deadline: float, function: Callable[..., PreparedRequest], arguments: Sequence[Any]
+    ) -> PreparedRequest:
+        remaining = deadline - time.monotonic()
+        if remaining <= 0:
+            raise deadline_exceeded()
+        process = self._idle.get()
+        try:
+            if not process.process.is_alive():
+                process = self._replace(process)
+            process.pipe.send((function, arguments))
+            if not process.pipe.poll(max(remaining, MIN_SECONDS)):
+                process = self._replace(process)
+                raise deadline_exceeded()
+            result, error = process.pipe.recv()
+        except (EOFError, OSError):
+            process = self._replace(process)
+            raise RequestError(422, "body", "The body made the process that decoded it crash.") from None
+        finally:
+            self._idle.put(process)
+        if error is not None:
+            raise error
+        return result
+
+    def _replace(self, process: _PreparationProcess) -> _PreparationProcess:
+        process.stop()
+        return _PreparationProcess(self._context)
+
+    def close(self) -> None:
+        """Wait for submitted calls, then stop the processes."""
+        self._threads.shutdown()
+        while not self._idle.empty():
+            self._idle.get().stop()
