@@ -32,7 +32,7 @@ from matplotlib.figure import Figure
 import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.color_membership import region_sets
-from thor2_jax.files import check_new
+from thor2_jax.files import check_output_directory
 from thor2_jax.recognition.classifier import MLP, feature_of
 from thor2_jax.recognition.recognizer import THOR2
 from thor2_jax.recognition.run_directory import TrainedRun, input_size, save_run
@@ -213,7 +213,7 @@ def main() -> None:
     parser, options = arguments()
     try:
         fits = [FitOptions(epochs=options.epochs, seed=seed) for seed in range(options.seeds)]
-        check_new(options.out / "thor2-l")
+        check_output_directory(options.out / "thor2-l")
         compare(options, fits)
     except (thor2.InputError, OSError) as error:
         parser.error(str(error))

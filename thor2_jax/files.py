@@ -1,38 +1,88 @@
-"""Writing files so that they appear under their name whole or not at all."""
+"""Atomic writes, digests, and the check of output directories."""
 
 import hashlib
 import json
-from collections.abc import Mapping
+import tempfile
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from colornet.files import atomic_write
 from thor2_jax.errors import InputError
 
-__all__ = ["atomic_write", "check_new", "json_digest", "write_text"]
+__all__ = [
+    "atomic_write",
+    "check_output_directory",
+    "content_digest",
+    "directory_digest",
+    "json_digest",
+    "write_text",
+]
 
 
-def check_new(path: str | Path) -> None:
-    """Refuse a folder to write to whose name is taken, by anything but an empty folder: nothing is overwritten.
+def check_output_directory(directory: str | Path, marker: str | None = None, resumable: Collection[str] = ()) -> None:
+    """Raise unless a command may write to a directory, so that nothing foreign is overwritten and no work is lost.
+
+    The directory may be missing or empty. A command that resumes also accepts what an interrupted run of it leaves: any
+    directory with the file `marker`, and one that holds nothing but `resumable` names and names that begin with a dot
+    (locks and temporary files).
+
+    Args:
+        directory: output directory of the command.
+        marker: relative path of a file that only this command writes.
+        resumable: names that this command writes before the marker.
 
     Raises:
-        InputError: naming the path.
+        InputError: if the directory holds anything else, or cannot be written.
     """
-    path = Path(path)
-    if path.is_symlink() or (path.exists() and not (path.is_dir() and not any(path.iterdir()))):
-        raise InputError(f"out: {path} exists already and is not an empty folder")
+    directory = Path(directory)
+    try:
+        names = (
+            sorted(path.name for path in directory.iterdir()) if directory.exists() or directory.is_symlink() else []
+        )
+        if marker or resumable:
+            names = [name for name in names if name not in resumable and not name.startswith(".")]
+        if names and not (marker and (directory / marker).is_file()):
+            raise InputError(
+                f"out: {directory} already contains {', '.join(names[:3])}; expected a new or empty directory"
+                f"{' or an interrupted run of this command' if marker or resumable else ''}; choose another directory"
+            )
+        existing = next(path for path in (directory, *directory.absolute().parents) if path.exists())
+        with tempfile.TemporaryFile(dir=existing):
+            pass
+    except OSError as error:
+        raise InputError(
+            f"out: {directory} is not a directory that can be written ({error.strerror}); choose another directory"
+        ) from None
+
+
+def content_digest(parts: Iterable[str | bytes]) -> str:
+    """Return the SHA-256 of texts and bytes in their order, in hexadecimal."""
+    digest = hashlib.sha256()
+    for part in parts:
+        digest.update(part.encode() if isinstance(part, str) else part)
+    return digest.hexdigest()
+
+
+def directory_digest(directory: Path, prefix: str = "") -> str:
+    """Return the SHA-256 of `prefix` and of the names, sizes and contents of all files in a directory."""
+
+    def parts() -> Iterator[str | bytes]:
+        yield prefix
+        for path in sorted(path for path in directory.rglob("*") if path.is_file()):
+            content = path.read_bytes()
+            yield f"{path.relative_to(directory).as_posix()} {len(content)}"
+            yield content
+
+    return content_digest(parts())
 
 
 def json_digest(table: Mapping[str, Any]) -> str:
-    """SHA-256, in hexadecimal, of what a JSON table says but for its own "digest", however it is laid out.
-
-    A changed number reads as well as the right one; its digest tells.
-    """
-    said = {key: value for key, value in table.items() if key != "digest"}
-    return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
+    """Return the SHA-256 of a JSON table, whatever its layout, without its own entry "digest"."""
+    return content_digest([json.dumps({k: v for k, v in table.items() if k != "digest"}, sort_keys=True)])
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write `text` in UTF-8."""
+    """Write `text` to `path` in UTF-8, atomically."""
     with atomic_write(path) as temporary:
         temporary.write_text(text, encoding="utf-8")

@@ -15,8 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from thor2_jax.errors import InputError
-from thor2_jax.files import write_text
+from thor2_jax.files import check_output_directory, write_text
 from thor2_jax.recognition.overlay import draw_overlay
 from thor2_jax.recognition.recognizer import Recognizer
 from thor2_jax.recognition.run_directory import TrainedRun, load_run
@@ -30,6 +29,7 @@ from training.rendering.scenes import Scene, compose_scene
 from training.rendering.view_sphere import camera_pose
 from training.reports.html import Picture, write_page
 from training.reports.plots import draw_accuracy, draw_confusion, draw_curves, draw_descriptor, draw_objects
+from training.storage.jobs import check_same_job
 from training.views.mesh_views import view_cloud
 from training.views.render_job import render_dataset
 
@@ -93,20 +93,10 @@ def _parts(summary: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]
             yield f"occlusion {degree}", summary["accuracy"]["occlusion"][degree]
 
 
-def _check_out(out: Path) -> None:
-    """Refuse a folder with anything that a demonstration does not leave when it is stopped."""
-    begun = ("run", "pictures", "demo.json")
-    if out.exists() and not (
-        out.is_dir() and all(path.name in begun or path.name.startswith(".") for path in out.iterdir())
-    ):
-        raise InputError(f"out: {out} exists already and is no demonstration that was stopped")
-
-
 def _trained(objects: Mapping[str, TexturedMesh], out: Path, seed: int, progress: Progress) -> TrainedRun:
     if is_finished(out):
         run = load_run(out)
-        if run.record["seed"] != seed:
-            raise InputError(f"seed is {seed}; {out} was trained with {run.record['seed']}")
+        check_same_job(out, {"seed": run.record["seed"]}, {"seed": seed})
     else:
         dataset = render_dataset(
             objects,
@@ -139,7 +129,7 @@ def run_demo(out: str | Path, seed: int = 0, progress: Progress = lambda stage, 
     """
     start = time.perf_counter()
     out = Path(out)
-    _check_out(out)
+    check_output_directory(out, resumable=("run", "pictures", "demo.json"))
     pictures = out / "pictures"
     pictures.mkdir(parents=True, exist_ok=True)
     objects = builtin_objects()

@@ -144,7 +144,7 @@ def test_colornet(environment: Any, call: Any, tmp_path: Path, monkeypatch: pyte
         out = tmp_path / place
         kill(place, (*command, out), environment)
         assert files(out) == {name: files(whole)[name] for name in left}
-        check_refused(call(*command, out), f"out: {out} exists already")
+        check_refused(call(*command, out), f"out: {out} already contains")
 
 
 # Views and training
@@ -164,7 +164,7 @@ def test_render(meshes: Path, environment: Any, call: Any, tmp_path: Path) -> No
             assert not manifest.finished and {shard.file for shard in manifest.shards} <= found.keys()
         assert found.items() <= expected.items()
         check_refused(call("train", "--dataset", out, "--out", tmp_path / "run"), str(out / MANIFEST))
-    check_refused(call(*command, out, "--seed", 1, "--sensor"), f"out: {out} was begun by another command")
+    check_refused(call(*command, out, "--seed", 1, "--sensor"), f"out: {out} was written with variations null")
     assert call(*command, out)[0] == 0
     assert files(out) == expected and files(out).keys() | {".lock"} == {path.name for path in out.iterdir()}
 
@@ -195,7 +195,7 @@ def test_train(meshes: Path, frames: Path, environment: Any, call: Any, tmp_path
         else:
             check_refused(call("evaluate", "frames", frames, "--model", out), f"{out} is no run folder")
         if "checkpoints/begun.json" in found:
-            check_refused(call(*command, out, "--epochs", 3), f"{out} holds a run in the making with epochs 2, not 3")
+            check_refused(call(*command, out, "--epochs", 3), f"{out} was written with epochs 2, not 3")
     assert call(*command, out)[0] == 0
     assert same_models(load_run(out), run)
     found = files(out)

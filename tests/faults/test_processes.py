@@ -63,7 +63,7 @@ def test_a_training_that_began_while_another_described_its_views(tmp_path: Path)
         if stage == "describe" and not done:
             done.append(train(out))
 
-    with pytest.raises(thor2.InputError, match="exists already and is not an empty folder"):
+    with pytest.raises(thor2.InputError, match="already contains"):
         train(out, progress=quicker)
     assert load_run(out).record == done[0].record
 

@@ -10,7 +10,9 @@ from thor2_jax.recognition.frames import RGBDFrame
 from thor2_jax.recognition.overlay import draw_overlay
 from thor2_jax.recognition.recognizer import Recognition
 
-__all__ = ["write_recognitions"]
+__all__ = ["RESULT_FILES", "write_recognitions"]
+
+RESULT_FILES = ("overlay.png", "recognition.json")
 
 
 def write_recognitions(out: Path, frame: RGBDFrame, recognitions: Sequence[Recognition]) -> None:
@@ -20,6 +22,6 @@ def write_recognitions(out: Path, frame: RGBDFrame, recognitions: Sequence[Recog
         OSError: A file cannot be written.
     """
     out.mkdir(parents=True, exist_ok=True)
-    draw_overlay(frame.color, frame.labels, recognitions, out / "overlay.png")
+    draw_overlay(frame.color, frame.labels, recognitions, out / RESULT_FILES[0])
     rows = [dataclasses.asdict(recognition) for recognition in recognitions]
-    write_text(out / "recognition.json", json.dumps(rows, indent=1) + "\n")
+    write_text(out / RESULT_FILES[1], json.dumps(rows, indent=1) + "\n")

@@ -7,7 +7,6 @@ RUN/weights/NAME/  one classifier's parameters and batch statistics (orbax)
 """
 
 import dataclasses
-import hashlib
 import json
 import shutil
 import tempfile
@@ -24,7 +23,7 @@ from flax import nnx
 import colornet
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig, Relaxation
 from thor2_jax.errors import InputError
-from thor2_jax.files import check_new, json_digest
+from thor2_jax.files import check_output_directory, directory_digest, json_digest
 from thor2_jax.recognition.classifier import MLP, Feature, check_features
 
 __all__ = ["RUN_FILE", "TrainedRun", "input_size", "load_run", "save_run"]
@@ -72,13 +71,7 @@ def _digest(path: Path, n_inputs: int, n_classes: int) -> str:
     Checked before orbax reads anything: it does not notice every damage, and where it does, its unfinished reads go on
     to print tracebacks from their threads.
     """
-    digest = hashlib.sha256(f"{n_inputs} {n_classes}".encode())
-    for file in sorted(path.rglob("*")):
-        if file.is_file():
-            content = file.read_bytes()
-            digest.update(f"{file.relative_to(path).as_posix()} {len(content)}".encode())
-            digest.update(content)
-    return digest.hexdigest()
+    return directory_digest(path, f"{n_inputs} {n_classes}")
 
 
 def save_run(run: TrainedRun, path: str | Path) -> None:
@@ -88,8 +81,8 @@ def save_run(run: TrainedRun, path: str | Path) -> None:
         InputError: something of that name exists already and is not an empty folder.
         OSError: it cannot be written; nothing is left behind.
     """
-    path = Path(path).absolute()
-    check_new(path)
+    path = Path(path).resolve()
+    check_output_directory(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
     try:

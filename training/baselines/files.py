@@ -5,7 +5,6 @@ seconds that training took, and the digest of all that and the arrays.
 """
 
 import dataclasses
-import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -20,7 +19,7 @@ from flax import nnx
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
-from thor2_jax.files import atomic_write, json_digest
+from thor2_jax.files import atomic_write, content_digest, json_digest
 
 __all__ = ["Stored", "arrays_of", "baseline_file", "model_with", "read_baseline", "write_baseline"]
 
@@ -48,11 +47,10 @@ class Stored:
 
 
 def _digest(arrays: Mapping[str, NDArray[Any]], about: Mapping[str, Any]) -> str:
-    digest = hashlib.sha256(json_digest(about).encode())
+    parts: list[str | bytes] = [json_digest(about)]
     for name in sorted(arrays):
-        digest.update(f"{name} {arrays[name].dtype} {arrays[name].shape}\0".encode())
-        digest.update(np.ascontiguousarray(arrays[name]).tobytes())
-    return digest.hexdigest()
+        parts += [f"{name} {arrays[name].dtype} {arrays[name].shape}\0", np.ascontiguousarray(arrays[name]).tobytes()]
+    return content_digest(parts)
 
 
 def write_baseline(path: Path, stored: Stored, classes: Sequence[str]) -> None:

@@ -15,9 +15,9 @@ def colornet(
     """Build the colour network from scratch and draw it."""
     import colornet as colornet_package
     from colornet.draw import draw_network, draw_similarity
-    from thor2_jax.files import check_new
+    from thor2_jax.files import check_output_directory
 
-    check_new(out)
+    check_output_directory(out)
     network = colornet_package.build()
     out.mkdir(parents=True, exist_ok=True)
     network.save(out / "network.npz")

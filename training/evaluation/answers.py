@@ -18,6 +18,7 @@ from thor2_jax.files import write_text
 from training.baselines.baseline import seen_in
 from training.evaluation.runs import Run
 from training.readers.labelled import LabelledFrame
+from training.storage.jobs import check_same_job
 
 __all__ = ["AnswerFile", "FrameAnswers", "InstanceAnswer", "answer_frame", "columns"]
 
@@ -117,12 +118,7 @@ class AnswerFile:
             self.frames = [_decoded(line) for line in lines]
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise InputError(f"out: {path} is damaged ({error}); remove it to begin again") from None
-        for name, value in asked.items():
-            if found.get(name) != value:
-                raise InputError(
-                    f"out: {path} holds answers for {name} {json.dumps(found.get(name))}, not {json.dumps(value)}; "
-                    "name another folder"
-                )
+        check_same_job(path.parent, found, asked)
         if whole < len(content):
             with path.open("r+b") as file:
                 file.truncate(whole)

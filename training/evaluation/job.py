@@ -12,7 +12,7 @@ from typing import Any
 
 from thor2_jax.config import DESCRIPTOR_VERSION
 from thor2_jax.errors import InputError
-from thor2_jax.files import write_text
+from thor2_jax.files import check_output_directory, write_text
 from training.evaluation.answers import AnswerFile, FrameAnswers, answer_frame, columns
 from training.evaluation.frame_pictures import Gallery
 from training.evaluation.page import WORST, write_report_page
@@ -52,11 +52,7 @@ def evaluate_dataset(
             process evaluates into it; or a frame cannot be read. Answers so far stay.
         OSError: something cannot be written.
     """
-    if out.exists() and not (out / ANSWERS).is_file():
-        # The lock, and files that a process was writing when it was killed, begin with a point.
-        if not out.is_dir() or any(not path.name.startswith(".") for path in out.iterdir()):
-            raise InputError(f"out: {out} exists already and is neither empty nor an evaluation")
-    out.mkdir(parents=True, exist_ok=True)
+    check_output_directory(out, ANSWERS)
     with locked(out):
         return _evaluate(runs, frames, dataset, out, progress)
 

@@ -5,7 +5,6 @@ Folds of one training, several trainings of the same classes, or a training for 
 
 import dataclasses
 import functools
-import hashlib
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
@@ -13,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
-from thor2_jax.files import json_digest
+from thor2_jax.files import content_digest, json_digest
 from thor2_jax.recognition.recognizer import DescribedFrame, Recognizer
 from thor2_jax.recognition.run_directory import RUN_FILE
 from training.baselines.baseline import Baseline, Seen
@@ -68,14 +67,14 @@ class Run:
 
 
 def _digest(path: Path) -> str:
-    digest = hashlib.sha256()
-    baselines = baseline_file(path, "[!.]*")  # without one that a process was writing when it was killed
+    baselines = baseline_file(path, "[!.]*")  # without temporary files
     weights = [*sorted((path / "weights").rglob("*")), *sorted(baselines.parent.glob(baselines.name))]
-    for file in [path / RUN_FILE, path / "network.npz", *weights]:
-        if file.is_file():
-            digest.update(f"{file.relative_to(path).as_posix()}\0{file.stat().st_size}\0".encode())
-            digest.update(file.read_bytes())
-    return digest.hexdigest()
+    files = [file for file in (path / RUN_FILE, path / "network.npz", *weights) if file.is_file()]
+    return content_digest(
+        part
+        for file in files
+        for part in (f"{file.relative_to(path).as_posix()}\0{file.stat().st_size}\0", file.read_bytes())
+    )
 
 
 def load_runs(paths: Sequence[Path]) -> list[Run]:

@@ -12,7 +12,6 @@ before it goes only then: whatever happens, the last good one stays.
 """
 
 import contextlib
-import hashlib
 import logging
 import os
 import re
@@ -27,7 +26,7 @@ import orbax.checkpoint as ocp  # type: ignore[import-untyped]
 from orbax.checkpoint import checkpoint_managers
 
 from thor2_jax.errors import InputError
-from thor2_jax.files import write_text
+from thor2_jax.files import directory_digest, write_text
 
 __all__ = ["CHECKPOINTS", "Checkpoints"]
 
@@ -90,7 +89,7 @@ class Checkpoints:
             with _no_tracebacks():
                 self._manager.save(epoch, args=ocp.args.StandardSave(host), metrics={"score": score})
             if jax.process_index() == 0:
-                write_text(self._path(epoch) / DIGEST, _digest(self._path(epoch) / "default"))
+                write_text(self._path(epoch) / DIGEST, directory_digest(self._path(epoch) / "default"))
         except Exception as error:  # orbax raises whatever its storage layers raise
             number, why = _cause(error)
             raise OSError(
@@ -120,7 +119,7 @@ class Checkpoints:
         target = jax.tree.map(lambda a: np.zeros(a.shape, a.dtype), like)
         try:
             # A process that was killed after the one and before the other has left no digest.
-            if (path / DIGEST).is_file() and (path / DIGEST).read_text() != _digest(path / "default"):
+            if (path / DIGEST).is_file() and (path / DIGEST).read_text() != directory_digest(path / "default"):
                 raise ValueError("it is damaged")
             with _no_tracebacks():
                 state = self._manager.restore(epoch, args=ocp.args.StandardRestore(target))
@@ -158,13 +157,3 @@ def _no_tracebacks() -> Iterator[None]:
         yield
     finally:
         logger.disabled = before
-
-
-def _digest(path: Path) -> str:
-    """SHA-256 of all files. Checked before orbax reads: of a damaged file it can make other numbers without a word."""
-    digest = hashlib.sha256()
-    for file in sorted(file for file in path.rglob("*") if file.is_file()):
-        content = file.read_bytes()
-        digest.update(f"{file.relative_to(path).as_posix()} {len(content)}".encode())
-        digest.update(content)
-    return digest.hexdigest()

@@ -26,7 +26,7 @@ import colornet
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
 from thor2_jax.descriptor.sharding import batch_mesh
 from thor2_jax.errors import InputError
-from thor2_jax.files import check_new, write_text
+from thor2_jax.files import check_output_directory, write_text
 from thor2_jax.recognition.classifier import MLP, Feature, check_features
 from thor2_jax.recognition.run_directory import RUN_FILE, TrainedRun, load_run, save_run
 from training.fitting.calibration import temperatures
@@ -36,6 +36,7 @@ from training.fitting.folds import fold_of_samples
 from training.fitting.metrics_log import append_figures, forget_after, read_figures
 from training.fitting.samples import MIRRORS, Samples, build_samples
 from training.reports.plots import draw_curves
+from training.storage.jobs import check_same_job
 from training.storage.locks import locked
 from training.views.source import ViewSource
 
@@ -57,15 +58,8 @@ CURVE = ("epoch", "loss", "accuracy", "held_out_accuracy")
 
 
 def check_out(out: str | Path) -> None:
-    """Refuse a name that is taken, by anything but an empty folder or a run in the making.
-
-    Raises:
-        InputError: naming the path.
-    """
-    out = Path(out)
-    if not out.is_dir() or any(path.name not in (VIEWS, CHECKPOINTS) for path in out.iterdir()):
-        if not (out / CHECKPOINTS / BEGUN).is_file():
-            check_new(out)
+    """Raise InputError unless `out` is new, empty, or the directory of an interrupted training."""
+    check_output_directory(out, f"{CHECKPOINTS}/{BEGUN}", (VIEWS, CHECKPOINTS))
 
 
 def is_finished(out: Path) -> bool:
@@ -82,15 +76,7 @@ def _check_same(out: Path, begun: Mapping[str, Any]) -> None:
         found = dict(json.loads(path.read_bytes()))
     except (OSError, ValueError, TypeError, RecursionError) as error:
         raise InputError(f"out: {path} cannot be read: {error}") from None
-    _compare(f"out: {out} holds a run in the making", found, begun)
-
-
-def _compare(what: str, found: Mapping[str, Any], asked: Mapping[str, Any]) -> None:
-    for name, value in asked.items():
-        if found.get(name) != value:
-            raise InputError(
-                f"{what} with {name} {found.get(name)!r}, not {value!r}; go on with the same, or name another folder"
-            )
+    check_same_job(out, found, begun)
 
 
 def check_trained(
@@ -111,7 +97,7 @@ def check_trained(
     out = Path(out).absolute()
     record = load_run(out if (out / RUN_FILE).is_file() else out / "fold-0").record
     found = {**record, "dataset": record["dataset"]["digest"]}
-    _compare(f"out: {out} holds a run that was trained", found, asked)
+    check_same_job(out, {name: found.get(name) for name in asked}, asked)
 
 
 def _asked(

@@ -11,18 +11,16 @@ from thor2_jax.errors import InputError
 
 __all__ = ["parse_json", "parse_yaml", "read_table"]
 
-MOST_VALUES = 10**6
-"""Of a YAML file with its aliases written out: a few lines of them can stand for gigabytes."""
-
-MOST_NESTED = 100
-"""Levels of a YAML file: the time to read one grows with their square."""
+MAX_YAML_BYTES = 2**24
+MAX_YAML_VALUES = 10**6
+"""Values of a YAML file after its aliases are expanded: a few lines of them can stand for gigabytes."""
 
 
 def parse_json(content: bytes) -> Any:
-    """What a JSON file holds.
+    """Return the value in a JSON file.
 
     Raises:
-        ValueError: it is damaged.
+        ValueError: if the file is damaged.
     """
     try:
         return json.loads(content)
@@ -30,55 +28,42 @@ def parse_json(content: bytes) -> Any:
         raise ValueError("it is nested too deeply") from None
 
 
-class _Loader(yaml.SafeLoader):
-    level = 0
-
-    def compose_node(self, parent: Any, index: Any) -> Any:
-        if self.level == MOST_NESTED:
-            raise ValueError(f"it is nested more than {MOST_NESTED} levels deep")
-        self.level += 1
-        node = super().compose_node(parent, index)
-        self.level -= 1
-        return node
-
-
 def parse_yaml(content: bytes) -> Any:
-    """What a YAML file holds, of plain types.
+    """Return the value in a YAML file, built from plain types.
 
     Raises:
-        ValueError: it is damaged, nested more than `MOST_NESTED` levels deep, or stands for more than `MOST_VALUES`.
+        ValueError: if the file is damaged, larger than `MAX_YAML_BYTES` or expands to more than `MAX_YAML_VALUES`.
     """
+    if len(content) > MAX_YAML_BYTES:
+        raise ValueError(f"it has {len(content)} bytes; expected at most {MAX_YAML_BYTES}")
     try:
-        loader = _Loader(content)
-        try:
-            root = loader.get_single_node()
-            if root is None:
-                return None
-            if _values_of(root, {}) > MOST_VALUES:
-                raise ValueError(f"with its aliases it holds more than {MOST_VALUES} values")
-            return loader.construct_document(root)
-        finally:
-            loader.dispose()
-    # The constructors of YAML's tags raise several kinds of exception; only the content is at work here.
+        value = yaml.safe_load(content)
+        size = _expanded_size(value, {})
+    # The constructors of YAML's tags raise several kinds of exception, all of them caused by the content.
     except Exception as error:
         raise ValueError(" ".join(str(error).split()) or type(error).__name__) from None
+    if size > MAX_YAML_VALUES:
+        raise ValueError(f"its aliases expand to more than {MAX_YAML_VALUES} values")
+    return value
 
 
-def _values_of(node: Any, known: dict[int, float]) -> float:
-    if id(node) not in known:
-        known[id(node)] = math.inf  # while it is counted: a node within itself has no end
-        inner = [] if isinstance(node, yaml.ScalarNode) else node.value
-        pairs = [part for entry in inner for part in (entry if isinstance(entry, tuple) else (entry,))]
-        known[id(node)] = 1 + sum(_values_of(part, known) for part in pairs)
-    return known[id(node)]
+def _expanded_size(value: Any, sizes: dict[int, float]) -> float:
+    """Return the number of values in `value`, counting shared ones each time they occur."""
+    if not isinstance(value, (dict, list, set, tuple)):
+        return 1
+    if id(value) not in sizes:
+        sizes[id(value)] = math.inf  # a value that contains itself is infinite
+        parts = [*value, *value.values()] if isinstance(value, dict) else value
+        sizes[id(value)] = 1 + sum(_expanded_size(part, sizes) for part in parts)
+    return sizes[id(value)]
 
 
 def read_table(path: Path) -> dict[Any, Any]:
     """Read a file that holds one table: JSON if its name ends in .json, YAML otherwise.
 
     Raises:
-        InputError: damaged, or something else than a table; names the file.
-        OSError: it cannot be opened.
+        InputError: if the file is damaged or holds something else; the message names the file.
+        OSError: if the file cannot be opened.
     """
     content = path.read_bytes()
     try:

@@ -9,7 +9,6 @@ neither on the number of workers nor on where they are, and a job that was inter
 import contextlib
 import dataclasses
 import hashlib
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,13 +18,14 @@ from numpy.typing import NDArray
 
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
 from thor2_jax.errors import InputError, with_context
-from thor2_jax.files import atomic_write
+from thor2_jax.files import atomic_write, check_output_directory, content_digest
 from thor2_jax.recognition.prepared_instance import DESCRIPTOR_VOXEL
 from training.augmentation import Variations
 from training.objects.meshes import TexturedMesh
 from training.rendering.ray_caster import TRAINING_CAMERA
 from training.rendering.view_sphere import DISTANCE, view_angles
-from training.storage.locks import LOCK, locked
+from training.storage.jobs import check_same_job
+from training.storage.locks import locked
 from training.storage.workers import IN_PROCESS, WorkerPool
 from training.views.dataset import MANIFEST, Manifest, Shard, ViewDataset, encode
 from training.views.mesh_views import (
@@ -50,12 +50,10 @@ SUFFIX = ".safetensors"
 
 def _digest(mesh: TexturedMesh) -> str:
     """SHA-256 of all that is rendered: files can name others, and objects need not come from files."""
-    hasher = hashlib.sha256()
+    parts: list[str | bytes] = []
     for array in (mesh.vertices, mesh.faces, mesh.uv, mesh.face_texture, mesh.corner_colors, *mesh.textures):
-        hasher.update(repr(array is not None and (array.dtype.str, array.shape)).encode())
-        if array is not None:
-            hasher.update(array.tobytes())
-    return hasher.hexdigest()
+        parts += ["False"] if array is None else [repr((array.dtype.str, array.shape)), array.tobytes()]
+    return content_digest(parts)
 
 
 def _objects(found: Mapping[str, Path | TexturedMesh], angles: NDArray[np.float64]) -> list[dict[str, str]]:
@@ -71,44 +69,9 @@ def _objects(found: Mapping[str, Path | TexturedMesh], angles: NDArray[np.float6
     return objects
 
 
-def _difference(old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
-    """What differs between two jobs, in words; empty if nothing does."""
-    for key in {**new, **old}:
-        was, now = old.get(key), new.get(key)
-        if was == now:
-            continue
-        if key != "objects":
-            return f"{key} is {json.dumps(was)} there and {json.dumps(now)} here"
-        before, after = ({entry["name"]: entry["mesh"] for entry in table["objects"]} for table in (old, new))
-        for name in before | after:
-            if name not in after:
-                return f"it has the object {name!r}, which is missing here"
-            if name not in before:
-                return f"it has no object {name!r}"
-            if before[name] != after[name]:
-                return f"the mesh of {name!r} is another"
-        return "its objects are in another order"
-    return ""
-
-
 def _leftovers(folder: Path) -> set[Path]:
     """Files that a process was writing when it was killed."""
     return {path for pattern in (f".{Path(MANIFEST).stem}.*", f".*{SUFFIX}") for path in folder.glob(pattern)}
-
-
-def _make_folder(folder: Path) -> None:
-    """Make the folder if it is missing.
-
-    Raises:
-        InputError: it holds something else than a dataset, finished or not.
-        OSError: it cannot be made.
-    """
-    if folder.exists() and not folder.is_dir():
-        raise InputError(f"out: {folder} exists already and is no folder")
-    folder.mkdir(parents=True, exist_ok=True)
-    others = set(folder.iterdir()) - _leftovers(folder) - {folder / LOCK}
-    if others and folder / MANIFEST not in others:
-        raise InputError(f"out: {folder} exists already and holds files, but no {MANIFEST}")
 
 
 def _is_whole(shard: Shard, folder: Path) -> bool:
@@ -128,8 +91,8 @@ def _begin(folder: Path, job: Mapping[str, Any]) -> Manifest:
     """
     path = folder / MANIFEST
     found = Manifest.parse(path.read_bytes(), path) if path.exists() else None
-    if found and (difference := _difference(found.job, job)):
-        raise InputError(f"out: {folder} was begun by another command: {difference}")
+    if found:
+        check_same_job(folder, found.job, job)
     for leftover in _leftovers(folder):
         leftover.unlink()
     manifest = Manifest(job, tuple(shard for shard in found.shards if _is_whole(shard, folder)) if found else ())
@@ -197,6 +160,7 @@ def render_dataset(
         OSError: `out` cannot be written. It can be finished later.
     """
     out = Path(out)
+    check_output_directory(out, MANIFEST)
     if seed < 0:
         raise InputError(f"seed is {seed}; it must not be negative")
     angles = view_angles(azimuth_step, polar_step)
@@ -227,7 +191,6 @@ def render_dataset(
     def show_progress() -> None:
         progress(sum(shard.views + shard.left_out for shard in done.values()), copies * len(angles) * len(objects))
 
-    _make_folder(out)
     with locked(out):
         done.update((shard.file, shard) for shard in _begin(out, job).shards)
         show_progress()

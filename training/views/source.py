@@ -5,11 +5,12 @@ source = MemoryViews(render_views(find_meshes("meshes")), config)
 """
 
 import functools
-import hashlib
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
 from thor2_jax.config import DescriptorConfig
+from thor2_jax.files import content_digest
 from training.views.mesh_views import Cloud
 from training.views.normalized_views import NormalizedViews, normalize_views
 
@@ -62,11 +63,8 @@ class MemoryViews:
     @functools.cached_property
     def digest(self) -> str:
         """SHA-256 of names and clouds."""
-        digest = hashlib.sha256(repr((self.classes, self.shards)).encode())
-        for xyz, rgb in (cloud for clouds in self._clouds for cloud in clouds):
-            digest.update(xyz.tobytes())
-            digest.update(rgb.tobytes())
-        return digest.hexdigest()
+        arrays = (array for clouds in self._clouds for cloud in clouds for array in cloud)
+        return content_digest(itertools.chain([repr((self.classes, self.shards))], (a.tobytes() for a in arrays)))
 
     @property
     def record(self) -> Mapping[str, Any]:

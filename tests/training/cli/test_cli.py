@@ -155,7 +155,7 @@ def test_evaluate_frames(model: Path, images: Path, scene: Scene, tmp_path: Path
     code, _, err = run("evaluate", "frames", images.parent, "--model", model, "--out", tmp_path / "report")
     assert code == 2 and "runs" in one_line(err)
     code, _, err = run("evaluate", "frames", images.parent, "--model", model, "--out", tmp_path / "answer")
-    assert code == 2 and "exists already" in one_line(err)
+    assert code == 2 and "already contains" in one_line(err)
 
 
 def test_render_then_train_is_train(meshes: Path, model: Path, tmp_path: Path) -> None:
@@ -183,7 +183,7 @@ def test_train_by_folds(meshes: Path, tmp_path: Path, run: Run) -> None:
     before = {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()}
     for source in (arguments, ("train", "--dataset", tmp_path / "run" / "views", "--out", tmp_path / "run")):
         code, _, err = run(*source)
-        assert code == 2 and "exists already" in one_line(err)
+        assert code == 2 and "already contains" in one_line(err)
         assert {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()} == before
 
 
@@ -379,4 +379,4 @@ def test_colornet(tmp_path: Path, run: Run) -> None:
     assert "23 raw nodes, 22 regions, 55 edges; equal to the packaged network" in " ".join(out.split())
     assert sorted(p.name for p in (tmp_path / "network").iterdir()) == ["network.npz", "network.png", "similarity.png"]
     code, _, err = run("colornet", "--out", tmp_path / "network")
-    assert code == 2 and "exists already" in one_line(err)
+    assert code == 2 and "already contains" in one_line(err)

@@ -237,11 +237,11 @@ def test_answers_of_something_else_are_refused(tmp_path: Path) -> None:
     cases: dict[str, tuple[Any, Any, Any]] = {
         "another digest": (other, ToyDataset(3), same),
         "elsewhere": (runs, ToyDataset(3), same | {"path": "elsewhere"}),
-        '"frames": 4': (runs, ToyDataset(4), same),
-        "digest0": (runs[:1], ToyDataset(3), same),
+        "frames 3, not 4": (runs, ToyDataset(4), same),
+        "digest1": (runs[:1], ToyDataset(3), same),
     }
     for said, (given, dataset, description) in cases.items():
-        with pytest.raises(InputError, match="name another folder") as caught:
+        with pytest.raises(InputError, match="out: .* was written with ") as caught:
             evaluate_dataset(given, dataset, description, report)
         assert said in str(caught.value) and "\n" not in str(caught.value)
     assert (report / "answers.jsonl").read_bytes() == before
@@ -268,7 +268,7 @@ def test_a_damaged_file_of_answers_is_refused(tmp_path: Path, content: str) -> N
 def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
     (tmp_path / "report").mkdir()
     (tmp_path / "report" / "thesis.tex").touch()
-    with pytest.raises(InputError, match="exists already"):
+    with pytest.raises(InputError, match="already contains thesis.tex"):
         evaluate_toys(tmp_path, 1)
     assert [p.name for p in (tmp_path / "report").iterdir()] == ["thesis.tex"]
 

@@ -117,7 +117,7 @@ def test_bad_input_is_told_before_any_work(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setattr(module, "build_samples", work)
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "kept").write_text("x")
-    with pytest.raises(thor2.InputError, match=f"out: {tmp_path / 'run'} exists already"):
+    with pytest.raises(thor2.InputError, match=f"out: {tmp_path / 'run'} already contains kept"):
         train(tmp_path / "run")
     with pytest.raises(thor2.InputError, match=r"classifiers is \('shape',\)"):
         train(tmp_path / "new", ("shape",))
@@ -165,7 +165,7 @@ def test_a_run_goes_on_and_ends_as_if_it_had_not_been_stopped(whole: tuple[Path,
     assert run.record == whole[1].record
     assert told_of(out) == told_of(whole[0])
     assert names(out) == FINISHED
-    with pytest.raises(thor2.InputError, match="exists already and is not an empty folder"):
+    with pytest.raises(thor2.InputError, match="out: .* already contains"):
         train(out, ("tops", "ce"))
 
 
@@ -218,15 +218,15 @@ def test_other_options_or_views_are_refused(tmp_path: Path) -> None:
         ("batch_size 4, not 6", {"options": FitOptions(epochs=3, batch_size=6)}),
         ("epochs 3, not 4", {"options": FitOptions(epochs=4, batch_size=4)}),
         ("seed 0, not 1", {"options": FitOptions(epochs=3, batch_size=4, seed=1)}),
-        (r"classifiers \['tops'\], not \['ce', 'tops'\]", {"features": ("tops", "ce")}),
+        (r"classifiers\[0\] \"tops\", not \"ce\"", {"features": ("tops", "ce")}),
         ("folds 1, not 3", {"folds": 3}),
     ]
     for said, changes in cases:
-        with pytest.raises(thor2.InputError, match=f"out: {out} holds a run in the making with {said}"):
+        with pytest.raises(thor2.InputError, match=f"out: {out} was written with {said}"):
             train(out, **changes)
-    with pytest.raises(thor2.InputError, match=f"in the making with dataset '{source().digest}', not "):
+    with pytest.raises(thor2.InputError, match=f'was written with dataset "{source().digest}", not '):
         train_run(source(1), out, ["tops"], OPTIONS, config=CONFIG)
-    with pytest.raises(thor2.InputError, match="in the making with descriptor_config"):
+    with pytest.raises(thor2.InputError, match=r"was written with descriptor_config\.\w+ "):
         train_run(source(), out, ["tops"], OPTIONS)
     assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
     (out / "checkpoints" / "begun.json").write_text("{")
@@ -318,7 +318,7 @@ def test_folds(tmp_path: Path) -> None:
         assert curve[found.record["kept_epochs"]["tops"] - 1]["held_out_accuracy"] == best
     with pytest.raises(AssertionError):
         same_weights(runs[0], runs[1])
-    with pytest.raises(thor2.InputError, match="exists already"):
+    with pytest.raises(thor2.InputError, match="out: .* already contains"):
         run()
 
 

@@ -13,7 +13,6 @@ from PIL import Image
 from thor2_jax.errors import InputError
 from training.readers import FrameFolder, UWISOccluded
 from training.readers.uwis import INTRINSICS, video_attributes
-from training.storage.tables import parse_yaml
 
 # The dataset's table: (category, occlusion, light) -> video numbers.
 VIDEOS = {
@@ -193,14 +192,6 @@ def test_uwis_poses_that_do_not_fit(tmp_path: Path, text: str, complaint: str) -
     message = str(caught.value)
     assert message.startswith("41/000000: ") and "000000_poses.yaml" in message and complaint in message
     assert "\n" not in message
-
-
-@pytest.mark.parametrize(("opened", "closed"), [("[", "]"), ("{a: ", "}"), ("- ", "")])
-def test_yaml_is_nested_up_to_a_hundred_levels(opened: str, closed: str) -> None:
-    inner = "1" if closed != "]" else ""
-    assert parse_yaml((opened * 99 + inner + closed * 99).encode()) is not None
-    with pytest.raises(ValueError, match="nested more than 100 levels deep"):
-        parse_yaml((opened * 101 + inner + closed * 101).encode())
 
 
 def test_uwis_labels_that_two_objects_share(tmp_path: Path) -> None:

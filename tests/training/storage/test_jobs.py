@@ -1,0 +1,38 @@
+"""Comparison of job records."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from thor2_jax.errors import InputError
+from training.storage.jobs import check_same_job
+
+JOB: dict[str, Any] = {"seed": 0, "steps": [5.0, 15.0], "camera": {"width": 800}, "variations": None}
+
+
+def test_equal_jobs_are_accepted_as_json() -> None:
+    check_same_job(Path("out"), JOB, JOB | {"steps": (5, 15)})
+
+
+@pytest.mark.parametrize(
+    ("changes", "difference"),
+    [
+        ({"seed": 1}, "seed 0, not 1"),
+        ({"steps": [5, 20]}, r"steps\[1\] 15.0, not 20"),
+        ({"steps": [5]}, r"steps\[1\] 15.0, not null"),
+        ({"camera": {"width": 640}}, "camera.width 800, not 640"),
+        ({"variations": {"seed": 0}}, r'variations null, not \{"seed": 0\}'),
+        ({"folds": 5}, "folds null, not 5"),
+        ({"seed": "x" * 1000}, r'seed 0, not "x{99}\.\.\.;'),
+    ],
+)
+def test_the_first_difference_is_named(changes: dict[str, Any], difference: str) -> None:
+    with pytest.raises(InputError, match=f"out: run was written with {difference}") as caught:
+        check_same_job(Path("run"), JOB, JOB | changes)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_field_is_a_difference() -> None:
+    with pytest.raises(InputError, match="folds 5, not null"):
+        check_same_job(Path("run"), JOB | {"folds": 5}, JOB)

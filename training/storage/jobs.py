@@ -1,0 +1,53 @@
+"""Comparison of job records: whether an output directory belongs to the job that is requested."""
+
+import itertools
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from thor2_jax.errors import InputError
+
+__all__ = ["check_same_job"]
+
+MAX_SHOWN = 100
+"""Characters of a value that an error message shows."""
+
+
+def check_same_job(directory: Path, stored: Mapping[str, Any], requested: Mapping[str, Any]) -> None:
+    """Raise if an output directory was written by another job than the requested one.
+
+    Args:
+        directory: output directory.
+        stored: record of the job that wrote it, as read from JSON.
+        requested: record of the job to run, as JSON can hold it.
+
+    Raises:
+        InputError: naming the first field that differs, with both values.
+    """
+    difference = _first_difference("", stored, json.loads(json.dumps(requested)))
+    if difference:
+        field, old, new = difference
+        raise InputError(
+            f"out: {directory} was written with {field} {_shown(old)}, not {_shown(new)}; "
+            "repeat the command with the same options, or choose another directory"
+        )
+
+
+def _first_difference(field: str, stored: Any, requested: Any) -> tuple[str, Any, Any] | None:
+    """Return the path of the first field that differs and both values; a missing value is None."""
+    inner: list[tuple[str, Any, Any]] = []
+    if isinstance(stored, Mapping) and isinstance(requested, Mapping):
+        keys = dict.fromkeys([*requested, *stored])
+        inner = [(f"{field}.{key}" if field else key, stored.get(key), requested.get(key)) for key in keys]
+    elif isinstance(stored, list) and isinstance(requested, list):
+        pairs = itertools.zip_longest(stored, requested)
+        inner = [(f"{field}[{index}]", *pair) for index, pair in enumerate(pairs)]
+    elif stored != requested:
+        return field, stored, requested
+    return next((found for entry in inner if (found := _first_difference(*entry))), None)
+
+
+def _shown(value: Any) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= MAX_SHOWN else f"{text[:MAX_SHOWN]}..."
