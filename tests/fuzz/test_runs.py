@@ -1,4 +1,4 @@
-"""Damaged run folders, and the lines that a training and an evaluation keep."""
+"""Damaged run directories, and damaged files of a training and an evaluation."""
 
 import json
 import shutil
@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 
 import colornet
 import thor2_jax as thor2
-from thor2_jax.files import json_digest
 from thor2_jax.recognition.classifier import MLP
 from thor2_jax.recognition.run_directory import TrainedRun, input_size, load_run, save_run
 from thor2_jax.testing import damaged
@@ -43,7 +42,7 @@ def damaged_and_back(path: Path, content: bytes, read: Any, attempt: Any) -> Any
 
 @given(data=st.data())
 def test_descriptions(data: st.DataObject, run: Path, attempt: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Weights are not read: the description's digest is checked before."""
+    """A damaged run.json is refused or is read as a run of the right types. Weights are not restored."""
     content = (run / "run.json").read_bytes()
     if data.draw(st.booleans()):
         other = data.draw(damaged(content))
@@ -54,8 +53,10 @@ def test_descriptions(data: st.DataObject, run: Path, attempt: Any, monkeypatch:
         other = json.dumps(table | {key: "PART"}).encode().replace(b'"PART"', part)
     with monkeypatch.context() as patch:
         patch.setattr("thor2_jax.recognition.run_directory._restore_weights", lambda path, n_inputs, n_classes: None)
-        found = damaged_and_back(run / "run.json", other, lambda: load_run(run), attempt)
-    assert found is None or (found.config, found.classes, found.record) == (CONFIG, ("mug", "bowl"), {"epochs": 3})
+        loaded = damaged_and_back(run / "run.json", other, lambda: load_run(run), attempt)
+    if loaded is not None:
+        assert isinstance(loaded.config, thor2.DescriptorConfig) and isinstance(loaded.record, dict)
+        assert loaded.classes and all(isinstance(name, str) for name in loaded.classes)
 
 
 @settings(max_examples=30)
@@ -79,12 +80,11 @@ def test_odd_numbers(value: str, run: Path, attempt: Any) -> None:
 
 
 def test_sizes_that_would_fill_memory(run: Path, attempt: Any, tmp_path: Path) -> None:
-    """Of a description whose digest fits: the weights' own is compared before anything of theirs is made."""
+    """The digest of the weights is compared before any array is made."""
     path = Path(shutil.copytree(run, tmp_path / "run"))
     for key in ("n_slices", "n_strips"):
         table = json.loads((run / "run.json").read_bytes())
         table["descriptor_config"][key] = 10**7
-        table["digest"] = json_digest(table)
         (path / "run.json").write_text(json.dumps(table))
         assert attempt(lambda: load_run(path)) is None
 

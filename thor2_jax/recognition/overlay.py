@@ -1,4 +1,4 @@
-"""A picture of what was recognized: the photo, and on it every instance's outline and a label with the answer.
+"""Pictures of recognized frames: the photo with the outline of each instance and a label with its answer.
 
 draw_overlay(frame.color, frame.labels, recognizer.recognize(frame), "overlay.png")
 """
@@ -21,21 +21,38 @@ from thor2_jax.files import atomic_write
 if TYPE_CHECKING:
     from thor2_jax.recognition.recognizer import Recognition
 
-__all__ = ["COLORS", "UNRECOGNIZED", "draw_overlay"]
+__all__ = ["COLORS", "UNRECOGNIZED", "Annotation", "Paint", "draw_instances", "draw_overlay"]
 
-COLORS = ((86, 180, 233), (240, 228, 66), (0, 158, 115), (204, 121, 167), (0, 114, 178))
-"""Of recognized instances, in turn: Okabe and Ito's sky blue, yellow, bluish green, reddish purple and blue, which all
-eyes tell apart."""
+Paint = tuple[int, int, int]
+"""An sRGB colour, 0 to 255."""
 
-UNRECOGNIZED = (213, 94, 0)
-"""Of the others: vermilion of the same palette; its orange is not in the turn because it would be too near."""
+COLORS: tuple[Paint, ...] = ((86, 180, 233), (240, 228, 66), (0, 158, 115), (204, 121, 167), (0, 114, 178))
+"""Colours of recognized instances, in turn: sky blue, yellow, bluish green, reddish purple and blue of the palette of
+Okabe and Ito, which people with colour blindness can tell apart."""
 
-_SMALLEST = 8
-"""Size of the smallest letters that can be read, pixels."""
+UNRECOGNIZED: Paint = (213, 94, 0)
+"""Colour of instances without a name: vermilion of the same palette. Its orange is too close and not used."""
+
+_SMALLEST_LETTERS = 8
+"""Size of the smallest legible letters, pixels."""
+
+
+class Annotation(NamedTuple):
+    """What is drawn on an instance.
+
+    Attributes:
+        label: its number in the label image.
+        paint: colour of the outline and of the label's background.
+        text: the label, of one or more lines; empty for none.
+    """
+
+    label: int
+    paint: Paint
+    text: str
 
 
 class _Box(NamedTuple):
-    """Columns left to right and rows top to bottom, ends not included."""
+    """A rectangle of pixels; `right` and `bottom` are not included."""
 
     left: int
     top: int
@@ -44,14 +61,14 @@ class _Box(NamedTuple):
 
 
 class _Mask(NamedTuple):
-    """An instance's mask, cut out with a margin of one pixel: `pixels[1, 1]` is the corner (left, top) of `box`."""
+    """An instance's mask, cropped with a margin of one pixel: `pixels[1, 1]` is the corner (left, top) of `box`."""
 
     box: _Box
     pixels: NDArray[np.bool_]
 
 
 class _Lettering(NamedTuple):
-    """A text of one or two lines as it is drawn: from `start` on, relative to the corner of a box of width x height."""
+    """A label's text, font and size; `start` is its position relative to the corner of a box of width x height."""
 
     text: str
     font: ImageFont.FreeTypeFont | ImageFont.ImageFont
@@ -65,20 +82,18 @@ class _Lettering(NamedTuple):
 def draw_overlay(
     color: NDArray[np.uint8], labels: NDArray[Any], answers: Sequence[Recognition], path: str | Path
 ) -> None:
-    """Draw answers on the photo they are about; the PNG appears under its name whole or not at all.
+    """Draw the answers for a frame on its photo and write a PNG, which appears only when it is complete.
 
-    A label tells name, confidence, the surest classifier, and "occluded" where it is; or "unrecognized". Letters and
-    outlines grow with the picture. Labels lie inside it, clear of each other while there is room. Letters shrink
-    where a label is wider than the picture; one that does not fit in the smallest legible letters is left out.
+    A label shows the name, the confidence, the classifier and whether the instance is occluded, or "unrecognized".
 
     Args:
         color: [H, W, 3] uint8, sRGB.
         labels: [H, W] integers; 0 is background, every other number an instance.
-        answers: of instances in `labels`; instances without an answer are not drawn.
-        path: of the picture.
+        answers: for instances in `labels`; instances without an answer are not drawn.
+        path: path of the picture.
 
     Raises:
-        InputError: shapes or types that do not fit, or an answer about a label that does not occur in `labels`.
+        InputError: shapes or types that do not fit, or an answer for a label that does not occur in `labels`.
         OSError: the file cannot be written.
     """
     color, labels = np.asarray(color), np.asarray(labels)
@@ -87,25 +102,46 @@ def draw_overlay(
     if color.dtype != np.uint8:
         raise InputError(f"color has type {color.dtype}; expected uint8")
     if labels.shape != color.shape[:2]:
-        raise InputError(f"labels has shape {labels.shape}; color has {color.shape[:2]} (rows, columns)")
+        raise InputError(f"labels has shape {labels.shape}; expected {color.shape[:2]} (rows, columns), as color")
     if labels.dtype.kind not in "ui":
         raise InputError(f"labels has type {labels.dtype}; expected integers")
-    masks = [_cut_out(labels, answer.label) for answer in answers]
-    paints = _paints(answers)
-    diagonal = math.hypot(*labels.shape)
-    thickness = max(1, round(diagonal / 350))
-    size = max(11, round(14 * (diagonal / 800) ** 0.75))  # less than in proportion: large pictures have room to zoom in
-
-    pixels = color.copy()
-    for mask, paint in zip(masks, paints, strict=True):
-        _outline(pixels, mask, paint, thickness)
-    picture = Image.fromarray(pixels)
-    _write_labels(picture, labels != 0, masks, paints, [_text(a) for a in answers], size)
+    for answer in answers:
+        if answer.label == 0 or not (labels == answer.label).any():
+            raise InputError(f"answers: label {answer.label} is no instance of labels")
+    annotations = [
+        Annotation(answer.label, paint, _text(answer)) for answer, paint in zip(answers, _paints(answers), strict=True)
+    ]
+    picture = draw_instances(color, labels, annotations)
     with atomic_write(path) as temporary:
         picture.save(temporary, format="PNG")
 
 
-def _paints(answers: Sequence[Recognition]) -> list[tuple[int, int, int]]:
+def draw_instances(color: NDArray[np.uint8], labels: NDArray[Any], annotations: Sequence[Annotation]) -> Image.Image:
+    """Return a photo with the outlines and labels of instances.
+
+    Letters and outlines grow with the picture. Labels lie inside it, clear of each other while there is space; the
+    first annotations choose first. Letters shrink if a label is wider than the picture; a label that does not fit in the
+    smallest legible letters is left out.
+
+    Args:
+        color: [H, W, 3] uint8, sRGB.
+        labels: [H, W] integers; 0 is background, every other number an instance.
+        annotations: of labels that occur in `labels`.
+    """
+    masks = [_crop(labels, annotation.label) for annotation in annotations]
+    diagonal = math.hypot(*labels.shape)
+    thickness = max(1, round(diagonal / 350))
+    # Letters grow less than in proportion: a large picture is looked at enlarged.
+    size = max(11, round(14 * (diagonal / 800) ** 0.75))
+    pixels = color.copy()
+    for mask, annotation in zip(masks, annotations, strict=True):
+        _draw_outline(pixels, mask, annotation.paint, thickness)
+    picture = Image.fromarray(pixels)
+    _draw_labels(picture, labels != 0, masks, annotations, size)
+    return picture
+
+
+def _paints(answers: Sequence[Recognition]) -> list[Paint]:
     recognized = np.cumsum([answer.name is not None for answer in answers])
     return [
         UNRECOGNIZED if answer.name is None else COLORS[(int(count) - 1) % len(COLORS)]
@@ -122,17 +158,15 @@ def _text(answer: Recognition) -> str:
     return f"{answer.name}{sure}\n{', '.join(surest + occluded)}".rstrip()
 
 
-def _cut_out(labels: NDArray[Any], label: int) -> _Mask:
+def _crop(labels: NDArray[Any], label: int) -> _Mask:
     mask = labels == label
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    if label == 0 or not len(rows):
-        raise InputError(f"answers: label {label} is no instance of labels")
     box = _Box(int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1)
     return _Mask(box, np.pad(mask[box.top : box.bottom, box.left : box.right], 1))
 
 
 def _eroded(mask: NDArray[np.bool_], steps: int) -> NDArray[np.bool_]:
-    """The mask without its outermost `steps` layers of 4-neighbours; its margin must be empty."""
+    """Return the mask without its outermost `steps` layers of 4-neighbours; its margin must be empty."""
     for _ in range(steps):
         inner = np.zeros_like(mask)
         inner[1:-1, 1:-1] = mask[1:-1, 1:-1] & mask[:-2, 1:-1] & mask[2:, 1:-1] & mask[1:-1, :-2] & mask[1:-1, 2:]
@@ -140,8 +174,8 @@ def _eroded(mask: NDArray[np.bool_], steps: int) -> NDArray[np.bool_]:
     return mask
 
 
-def _outline(pixels: NDArray[np.uint8], mask: _Mask, paint: tuple[int, int, int], thickness: int) -> None:
-    """Draw a coloured line along the mask's edge, inside; along that a thin black or white one."""
+def _draw_outline(pixels: NDArray[np.uint8], mask: _Mask, paint: Paint, thickness: int) -> None:
+    """Draw a coloured line along the inner edge of the mask and a thin black or white one beside it."""
     left, top, right, bottom = mask.box
     within = _eroded(mask.pixels, thickness)
     core = _eroded(within, max(1, thickness // 3))
@@ -150,42 +184,41 @@ def _outline(pixels: NDArray[np.uint8], mask: _Mask, paint: tuple[int, int, int]
     target[(within & ~core)[1:-1, 1:-1]] = _ink(paint)
 
 
-def _ink(paint: tuple[int, int, int]) -> tuple[int, int, int]:
-    """Black or white, whichever stands out better against a colour."""
+def _ink(paint: Paint) -> Paint:
+    """Return black or white, whichever has more contrast with a colour."""
     red, green, blue = paint
     return (0, 0, 0) if 0.299 * red + 0.587 * green + 0.114 * blue > 100 else (255, 255, 255)
 
 
-def _write_labels(
+def _draw_labels(
     picture: Image.Image,
     instances: NDArray[np.bool_],
     masks: Sequence[_Mask],
-    paints: Sequence[tuple[int, int, int]],
-    texts: Sequence[str],
+    annotations: Sequence[Annotation],
     size: int,
 ) -> None:
     draw = ImageDraw.Draw(picture)
     covered = np.pad(instances, ((1, 0), (1, 0))).cumsum(axis=0, dtype=np.int32).cumsum(axis=1, dtype=np.int32)
-    placed: list[tuple[_Box, _Lettering, tuple[int, int, int]]] = []
-    for mask, paint, text in zip(masks, paints, texts, strict=True):
-        lettering = _fitting(draw, text, size, picture.size)
+    placed: list[tuple[_Box, _Lettering, Paint]] = []
+    for mask, annotation in zip(masks, annotations, strict=True):
+        lettering = _fit(draw, annotation.text, size, picture.size) if annotation.text else None
         if lettering is not None:
             box = _place(lettering, mask.box, [other for other, _, _ in placed], covered)
-            placed.append((box, lettering, paint))
-            _leader(draw, box, mask, paint, max(1, size // 7))
-    for box, lettering, paint in placed:  # after all leaders, which may cross the place of a label
+            placed.append((box, lettering, annotation.paint))
+            _draw_leader(draw, box, mask, annotation.paint, max(1, size // 7))
+    for box, lettering, paint in placed:  # after all leaders, which may cross a label
         draw.rectangle((box.left, box.top, box.right - 1, box.bottom - 1), fill=paint)
         start = box.left + lettering.start[0], box.top + lettering.start[1]
         draw.multiline_text(start, lettering.text, _ink(paint), lettering.font, spacing=lettering.spacing)
 
 
-def _fitting(draw: ImageDraw.ImageDraw, text: str, size: int, room: tuple[int, int]) -> _Lettering | None:
-    """The text in letters of `size`, or in the largest smaller ones that `room` (width, height) holds; None if none."""
-    for letters in range(size, _SMALLEST - 1, -1):
+def _fit(draw: ImageDraw.ImageDraw, text: str, size: int, space: tuple[int, int]) -> _Lettering | None:
+    """Return the text in the largest letters, up to `size`, that fit into `space` (width, height); None if none do."""
+    for letters in range(size, _SMALLEST_LETTERS - 1, -1):
         font, padding = _font(letters), letters // 4
         left, top, right, bottom = draw.multiline_textbbox((0, 0), text, font, spacing=padding)
         width, height = math.ceil(right - left) + 2 * padding, math.ceil(bottom - top) + 2 * padding
-        if width <= room[0] and height <= room[1]:
+        if width <= space[0] and height <= space[1]:
             return _Lettering(text, font, letters, padding, (padding - left, padding - top), width, height)
     return None
 
@@ -196,12 +229,12 @@ def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
 
 
 def _place(lettering: _Lettering, target: _Box, placed: Sequence[_Box], covered: NDArray[np.int32]) -> _Box:
-    """The best place of a grid over the picture: clear of other labels, near its instance, hiding little of any."""
+    """Return the best box on a grid over the picture: clear of other labels, near its instance, hiding few others."""
     rows, columns = covered.shape[0] - 1, covered.shape[1] - 1
     letters, width, height = lettering.size, lettering.width, lettering.height
     top, left = (
-        np.unique(np.append(np.arange(0, room + 1, max(1, letters // 2)), room))
-        for room in (rows - height, columns - width)
+        np.unique(np.append(np.arange(0, last + 1, max(1, letters // 2)), last))
+        for last in (rows - height, columns - width)
     )
     top = top[:, None]
     right, bottom = left + width, top + height
@@ -209,20 +242,20 @@ def _place(lettering: _Lettering, target: _Box, placed: Sequence[_Box], covered:
     gap_y = np.maximum(0, np.maximum(top - target.bottom, target.top - bottom))
     off_centre = np.hypot(left + right - target.left - target.right, top + bottom - target.top - target.bottom)
     hidden = covered[bottom, right] - covered[top, right] - covered[bottom, left] + covered[top, left]
-    # In heights of a letter: to hide an instance under a tenth of the label is as bad as to lie four away from it.
+    # In letter heights: hiding an instance under a tenth of the label costs as much as a distance of four letters.
     cost = np.hypot(gap_x, gap_y) / letters + off_centre / (10 * letters) + 40 * hidden / (width * height)
     for other in placed:
         shared_x = np.minimum(right, other.right + 2) - np.maximum(left, other.left - 2)
         shared_y = np.minimum(bottom, other.bottom + 2) - np.maximum(top, other.top - 2)
-        # Far more than the rest can add up to: labels overlap only where every place does.
+        # The factor exceeds all other costs together: labels overlap only if every place does.
         cost += 1000 * np.maximum(0, shared_x) * np.maximum(0, shared_y)
     i, j = np.unravel_index(np.argmin(cost), cost.shape)
     x, y = int(left[j]), int(top[i, 0])
     return _Box(x, y, x + width, y + height)
 
 
-def _leader(draw: ImageDraw.ImageDraw, box: _Box, mask: _Mask, paint: tuple[int, int, int], thickness: int) -> None:
-    """A line from a label that lies beside its instance to the nearest pixel of it."""
+def _draw_leader(draw: ImageDraw.ImageDraw, box: _Box, mask: _Mask, paint: Paint, thickness: int) -> None:
+    """Draw a line from a label that lies beside its instance to the nearest pixel of the instance."""
     row, column = np.nonzero(mask.pixels)
     row, column = row + mask.box.top - 1, column + mask.box.left - 1
     from_row, from_column = np.clip(row, box.top, box.bottom - 1), np.clip(column, box.left, box.right - 1)

@@ -1,4 +1,4 @@
-"""Run folders: what comes back is what was saved; anything else is refused in one line."""
+"""Run directories: what is loaded is what was saved; anything else is refused in one line."""
 
 import dataclasses
 import gc
@@ -16,7 +16,6 @@ from flax import nnx
 
 import colornet
 import thor2_jax as thor2
-from thor2_jax.files import json_digest
 from thor2_jax.recognition.classifier import FEATURES, MLP
 from thor2_jax.recognition.recognizer import Recognizer
 from thor2_jax.recognition.run_directory import TrainedRun, input_size, load_run, save_run
@@ -55,7 +54,7 @@ def test_input_sizes() -> None:
     assert sizes == {"ce": 4774, "tops": 7168, "tops2": 11942}
 
 
-def test_what_comes_back_is_what_was_saved(saved: Path) -> None:
+def test_what_is_loaded_is_what_was_saved(saved: Path) -> None:
     run, found = make_run(), load_run(saved)
     assert (found.config, found.classes, found.record) == (run.config, run.classes, run.record)
     assert found.network.fingerprint == run.network.fingerprint
@@ -69,7 +68,7 @@ def test_what_comes_back_is_what_was_saved(saved: Path) -> None:
         np.testing.assert_array_equal(before[name], after[name])
 
 
-def test_a_folder_holds_three_things_and_can_be_read_by_all(saved: Path) -> None:
+def test_a_run_directory_has_three_entries_and_is_readable(saved: Path) -> None:
     assert sorted(p.name for p in saved.iterdir()) == ["network.npz", "run.json", "weights"]
     assert sorted(p.name for p in saved.parent.iterdir()) == ["run"]
     assert saved.stat().st_mode & 0o777 == 0o755
@@ -78,7 +77,7 @@ def test_a_folder_holds_three_things_and_can_be_read_by_all(saved: Path) -> None
     assert description["descriptor_config"] == dataclasses.asdict(CONFIG)
 
 
-def test_a_name_that_is_taken_is_refused(saved: Path, tmp_path: Path) -> None:
+def test_an_existing_path_is_refused(saved: Path, tmp_path: Path) -> None:
     before = (saved / "run.json").read_bytes()
     (tmp_path / "file").write_text("x")
     for taken in (saved, tmp_path / "file"):
@@ -88,7 +87,7 @@ def test_a_name_that_is_taken_is_refused(saved: Path, tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
 
 
-def test_an_empty_folder_may_be_filled(tmp_path: Path) -> None:
+def test_an_empty_directory_may_be_filled(tmp_path: Path) -> None:
     (tmp_path / "run").mkdir()
     save_run(make_run(("ce",)), tmp_path / "run")
     assert [p.name for p in tmp_path.iterdir()] == ["run"]
@@ -113,8 +112,6 @@ def test_nothing_is_left_behind_when_saving_fails(broken: str, tmp_path: Path, m
 
 
 def edited(**changes: Any) -> Callable[[Path], None]:
-    """As another version might have written it: the digest fits."""
-
     def edit(path: Path) -> None:
         description = json.loads((path / "run.json").read_text())
         for key, value in changes.items():
@@ -122,7 +119,6 @@ def edited(**changes: Any) -> Callable[[Path], None]:
                 del description[key]
             else:
                 description[key] = value
-        description["digest"] = json_digest(description)
         (path / "run.json").write_text(json.dumps(description))
 
     return edit
@@ -141,24 +137,14 @@ def damage_data(path: Path) -> None:
 
 
 @pytest.mark.parametrize("relaxation", [None, thor2.Relaxation(color=2.0)], ids=["hard", "relaxed"])
-def test_every_constant_comes_back(relaxation: thor2.Relaxation | None, tmp_path: Path) -> None:
+def test_every_constant_is_restored(relaxation: thor2.Relaxation | None, tmp_path: Path) -> None:
     config = dataclasses.replace(CONFIG, relaxation=relaxation, persistence_weight=1.5)
     save_run(dataclasses.replace(make_run(("ce",)), config=config), tmp_path / "run")
     assert load_run(tmp_path / "run").config == config
 
 
-def replaced(old: str, new: str) -> Callable[[Path], None]:
-    def edit(path: Path) -> None:
-        content = (path / "run.json").read_text()
-        assert old in content
-        (path / "run.json").write_text(content.replace(old, new))
-
-    return edit
-
-
-def test_a_description_may_be_laid_out_anew(copied: Path) -> None:
-    description = json.loads((copied / "run.json").read_text())
-    (copied / "run.json").write_text(json.dumps(dict(reversed(description.items())), indent=None))
+def test_the_digest_of_earlier_versions_is_ignored(copied: Path) -> None:
+    edited(digest="0" * 64)(copied)
     assert load_run(copied).config == CONFIG
 
 
@@ -175,16 +161,14 @@ def other_network(path: Path) -> None:
 
 
 DAMAGES: dict[str, tuple[Callable[[Path], Any], str]] = {
-    "no folder": (shutil.rmtree, "run is no run folder"),
-    "no run.json": (lambda path: (path / "run.json").unlink(), "run is no run folder"),
+    "no folder": (shutil.rmtree, "run is no run directory"),
+    "no run.json": (lambda path: (path / "run.json").unlink(), "run is no run directory"),
     "cut run.json": (lambda path: (path / "run.json").write_text('{"format": 1,'), "run.json cannot be read"),
     "binary run.json": (lambda path: (path / "run.json").write_bytes(b"\xff\xfe\x00"), "run.json cannot be read"),
     "a list": (lambda path: (path / "run.json").write_text("[1]"), "run.json has format 'list'"),
     "other format": (edited(format=2), "run.json has format 2"),
     "other version": (edited(descriptor_version=99), "descriptor version 99"),
-    "changed constant": (replaced('"alpha": 0.5', '"alpha": 0.25'), "run.json is damaged, or was changed"),
-    "changed record": (replaced('"epochs": 3', '"epochs": 4'), "run.json is damaged, or was changed"),
-    "no digest": (replaced('"digest"', '"other"'), "run.json is damaged, or was changed"),
+    "no record": (edited(record=[1]), "run.json: TypeError"),
     "no classes": (edited(classes=None), "run.json: KeyError: 'classes'"),
     "empty classes": (edited(classes=[]), "classes is []"),
     "numbered classes": (edited(classes=[1, 2, 3]), "classes is [1, 2, 3]"),
@@ -200,7 +184,7 @@ DAMAGES: dict[str, tuple[Callable[[Path], Any], str]] = {
     "other constant": (edited(descriptor_config={**CONSTANTS, "n_slices": 3}), "not of 330 inputs and 3 classes"),
     "no network": (lambda path: (path / "network.npz").unlink(), "network.npz cannot be read"),
     "cut network": (lambda path: (path / "network.npz").write_bytes(b"PK\x03\x04"), "network.npz cannot be read"),
-    "other network": (other_network, "network.npz is another colour network"),
+    "other network": (other_network, "network.npz is not the colour network"),
     "cut weights": (damage_weights, "weights/tops is damaged"),
     "cut data": (damage_data, "weights/ce is damaged"),
     "flipped bit": (flip_a_bit, "weights/ce is damaged"),
@@ -214,7 +198,7 @@ DAMAGES: dict[str, tuple[Callable[[Path], Any], str]] = {
 
 @pytest.fixture(scope="module")
 def small_heap() -> Iterator[None]:
-    """What exists already is no garbage: collecting the rest is then a matter of milliseconds."""
+    """Freeze the objects that exist, so that a garbage collection takes milliseconds."""
     gc.collect()
     gc.freeze()
     yield
@@ -223,8 +207,8 @@ def small_heap() -> Iterator[None]:
 
 @pytest.mark.usefixtures("small_heap")
 @pytest.mark.parametrize("name", DAMAGES)
-def test_damaged_folders_are_refused_in_one_line(name: str, copied: Path) -> None:
-    """And nothing else is said: what is left of a failed read would be a warning, and so an error here."""
+def test_a_damaged_run_directory_is_refused_in_one_line(name: str, copied: Path) -> None:
+    """A failed read leaves nothing behind: that would warn when it is collected, and a warning is an error here."""
     damage, words = DAMAGES[name]
     damage(copied)
     with pytest.raises(thor2.InputError) as caught:

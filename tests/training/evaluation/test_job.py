@@ -208,8 +208,8 @@ def test_page_of_instances_none_of_which_is_described_or_known(tmp_path: Path) -
         assert Page((tmp_path / name / "report.html").read_text()).open == []
 
 
-def test_gallery_is_green_where_right_and_red_where_wrong(tmp_path: Path) -> None:
-    from training.reports.instance_pictures import RIGHT, WRONG, draw_crop, draw_judged
+def test_correct_instances_are_green_and_incorrect_ones_red(tmp_path: Path) -> None:
+    from training.reports.instance_pictures import CORRECT, INCORRECT, draw_crop, draw_judged
 
     color = np.full((60, 90, 3), 128, np.uint8)
     labels = np.zeros((60, 90), np.uint8)
@@ -218,7 +218,7 @@ def test_gallery_is_green_where_right_and_red_where_wrong(tmp_path: Path) -> Non
     draw_judged(color, labels, {1: (True, "a"), 2: (False, "b (c)"), 7: (False, "gone")}, tmp_path / "f.jpg")
     with Image.open(tmp_path / "f.jpg") as image:
         pixels = np.asarray(image.convert("RGB")).astype(int)
-    for row, paint in (((49, 20), RIGHT), ((49, 70), WRONG)):
+    for row, paint in (((49, 20), CORRECT), ((49, 70), INCORRECT)):
         assert np.abs(pixels[row] - paint).max() < 40
     assert np.abs(pixels[40, 20] - 128).max() < 20
     mask = np.zeros((60, 90), bool)
