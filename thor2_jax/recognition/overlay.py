@@ -120,8 +120,8 @@ def draw_instances(color: NDArray[np.uint8], labels: NDArray[Any], annotations: 
     """Return a photo with the outlines and labels of instances.
 
     Letters and outlines grow with the picture. Labels lie inside it, clear of each other while there is space; the
-    first annotations choose first. Letters shrink if a label is wider than the picture; a label that does not fit in the
-    smallest legible letters is left out.
+    first annotations choose first. Letters shrink if a label is wider than the picture; a label that does not fit in
+    the smallest legible letters is left out.
 
     Args:
         color: [H, W, 3] uint8, sRGB.
