@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 
 from thor2_jax.recognition.frames import backproject
 from training.objects.builtin_objects import builtin_objects
-from training.objects.meshes import TexturedMesh, find_meshes, load_mesh
+from training.objects.mesh import TexturedMesh
+from training.objects.meshes import find_meshes, load_mesh
 from training.rendering.ray_caster import RayCaster, render_view
 from training.rendering.view_sphere import camera_pose
 

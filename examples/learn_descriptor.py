@@ -37,15 +37,15 @@ from thor2_jax.recognition.classifier import MLP, feature_of
 from thor2_jax.recognition.recognizer import THOR2
 from thor2_jax.recognition.run_directory import TrainedRun, input_size, save_run
 from training.evaluate import evaluate, joinings, summarize
-from training.fitting.fit import FitOptions
+from training.fitting.options import FitOptions
 from training.fitting.samples import Batch, Samples, build_samples, expand
 from training.fitting.steps import scale_inputs
 from training.objects.builtin_objects import COLOR_PAIRS, SHAPE_PAIRS, builtin_objects
 from training.objects.meshes import find_meshes, read_names
 from training.readers import FrameFolder, LabelledFrame, UWISOccluded
 from training.rendering.scenes import compose_scene
+from training.views.memory_views import MemoryViews
 from training.views.mesh_views import render_views
-from training.views.source import MemoryViews
 
 NETWORK = colornet.load_default()
 CONFIG = thor2.DescriptorConfig(homology="closed_form")

@@ -16,7 +16,10 @@ from numpy.typing import ArrayLike, NDArray
 from thor2_jax.capacity import POINT_BUCKETS, point_bucket
 from thor2_jax.errors import InputError
 
-__all__ = ["Descriptors", "Diagrams", "PointClouds", "Strips"]
+__all__ = ["Cloud", "Descriptors", "Diagrams", "PointClouds", "Strips"]
+
+Cloud = tuple[NDArray[np.float32], NDArray[np.uint8]]
+"""One point cloud of any size: xyz [n, 3] and sRGB [n, 3]."""
 
 
 @jax.tree_util.register_dataclass

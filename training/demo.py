@@ -20,10 +20,11 @@ from thor2_jax.recognition.overlay import draw_overlay
 from thor2_jax.recognition.recognizer import Recognizer
 from thor2_jax.recognition.run_directory import TrainedRun, load_run
 from training.evaluate import Instance, evaluate, summarize
-from training.fitting.job import VIEWS, Progress, is_finished, train_run
+from training.fitting.job import VIEWS, is_finished, train_run
+from training.fitting.options import Progress
 from training.fitting.protocol import DEFAULT
 from training.objects.builtin_objects import builtin_objects
-from training.objects.meshes import TexturedMesh
+from training.objects.mesh import TexturedMesh
 from training.readers.labelled import LabelledFrame
 from training.rendering.scenes import Scene, compose_scene
 from training.rendering.view_sphere import camera_pose
@@ -104,7 +105,7 @@ def _trained(objects: Mapping[str, TexturedMesh], out: Path, seed: int, progress
             PROTOCOL.azimuth_step,
             PROTOCOL.polar_step,
             progress=lambda done, total: progress("render views", done, total, ""),
-            variations=PROTOCOL.variations,
+            augmentations=PROTOCOL.augmentations,
             seed=seed,
         )
         options = dataclasses.replace(PROTOCOL.fit, seed=seed)

@@ -11,15 +11,16 @@ import jax
 from thor2_jax.recognition.classifier import check_features
 from thor2_jax.recognition.run_directory import TrainedRun
 from training.baselines.job import check_baselines, train_baselines
-from training.fitting.job import VIEWS, Progress, check_out, check_trained, is_finished, train_run
+from training.fitting.job import VIEWS, check_out, check_trained, is_finished, train_run
+from training.fitting.options import Progress
 from training.fitting.protocol import Protocol
 from training.objects.meshes import find_meshes, read_names
 from training.storage.workers import local_workers
 from training.views.dataset import ViewDataset
 from training.views.left_out import WithoutClasses
+from training.views.normalized_views import ViewSource
 from training.views.render_job import render_dataset
 from training.views.sequences import sequence_sources
-from training.views.source import ViewSource
 
 __all__ = ["TrainJob", "run_train_job"]
 
@@ -111,6 +112,6 @@ def _open_views(job: TrainJob, display: Display) -> ViewSource:
             protocol.polar_step,
             local_workers(job.workers),
             lambda done, total: progress("render", done, total, ""),
-            protocol.variations,
+            protocol.augmentations,
             protocol.fit.seed,
         )

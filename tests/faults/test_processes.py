@@ -8,9 +8,9 @@ import pytest
 
 import thor2_jax as thor2
 from thor2_jax.recognition.run_directory import TrainedRun, load_run
-from training.fitting.fit import FitOptions
 from training.fitting.job import train_run
-from training.views.source import MemoryViews
+from training.fitting.options import FitOptions
+from training.views.memory_views import MemoryViews
 
 CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=3, n_strips=8, image_size=8)
 OPTIONS = FitOptions(epochs=2, batch_size=4)

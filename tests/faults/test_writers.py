@@ -18,8 +18,8 @@ from thor2_jax.recognition.classifier import MLP
 from thor2_jax.recognition.overlay import draw_overlay
 from thor2_jax.recognition.run_directory import TrainedRun, input_size, load_run, save_run
 from training.evaluation.answers import AnswerFile, FrameAnswers
-from training.fitting.fit import Figures
 from training.fitting.metrics_log import append_figures, forget_after, read_figures
+from training.fitting.options import EpochMetrics
 from training.views.dataset import MANIFEST, Manifest
 
 CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=2, n_strips=5, image_size=8)
@@ -114,6 +114,6 @@ def test_figures_go_on_after_a_full_disk(tmp_path: Path, disk: Any) -> None:
     assert [row["epoch"] for row in read_figures(path)] == [1, 2]
 
 
-def _figures(epoch: int) -> Figures:
-    values: dict[str, Any] = {field.name: 0.5 for field in dataclasses.fields(Figures)}
-    return Figures(**(values | {"epoch": epoch}))
+def _figures(epoch: int) -> EpochMetrics:
+    values: dict[str, Any] = {field.name: 0.5 for field in dataclasses.fields(EpochMetrics)}
+    return EpochMetrics(**(values | {"epoch": epoch}))

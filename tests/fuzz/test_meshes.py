@@ -15,7 +15,8 @@ from PIL import Image
 from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
 from thor2_jax.testing import damaged
-from training.objects.meshes import TexturedMesh, load_mesh, read_names
+from training.objects.mesh import TexturedMesh
+from training.objects.meshes import load_mesh, read_names
 
 QUAD = np.array([[0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0], [0, 0.1, 0.05]])
 FACES = np.array([[0, 1, 2], [0, 2, 3]])

@@ -32,7 +32,7 @@ from scipy.spatial import ConvexHull
 
 import colornet
 from training.objects.builtin_objects import builtin_objects
-from training.objects.meshes import TexturedMesh
+from training.objects.mesh import TexturedMesh
 
 FOLDER = Path(__file__).parent / "objects"
 

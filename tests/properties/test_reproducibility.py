@@ -31,9 +31,9 @@ from pathlib import Path
 import numpy as np
 from flax import nnx
 import colornet, thor2_jax as thor2
-from training.fitting.fit import FitOptions
+from training.fitting.options import FitOptions
 from training.fitting.job import train_run
-from training.views.source import MemoryViews
+from training.views.memory_views import MemoryViews
 
 rng = np.random.default_rng(0)
 clouds = {"a": [], "b": []}

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 
 from training.augmentation.settings import Range, check_fields
-from training.rendering.ray_caster import RenderedView
+from training.rendering.camera import RenderedView
 
 __all__ = ["Illumination", "relit"]
 

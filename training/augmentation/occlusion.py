@@ -9,12 +9,13 @@ from numpy.typing import NDArray
 from training.augmentation.pixels import pixel_width, without
 from training.augmentation.settings import Range, check_fields
 from training.objects.builtin_objects import builtin_objects
-from training.rendering.ray_caster import Camera, RayCaster, RenderedView, render_view
+from training.rendering.camera import Camera, RenderedView
+from training.rendering.ray_caster import RayCaster, render_view
 from training.rendering.view_sphere import DISTANCE, camera_pose
 
 __all__ = ["Occlusion", "occluded"]
 
-PIXEL = 0.002
+SILHOUETTE_PIXEL = 0.002
 """Metres: side of a silhouette's pixel."""
 
 POSES = tuple((azimuth, polar) for azimuth in (0.4, 2.0) for polar in (0.8, 1.3))
@@ -23,13 +24,13 @@ POSES = tuple((azimuth, polar) for azimuth in (0.4, 2.0) for polar in (0.8, 1.3)
 PLACES = 32
 """Places of the silhouette that are tried, on a line from outside the view to its middle."""
 
-SAMPLE = 400
+SAMPLE_PIXELS = 400
 """Pixels of the view, about, that tell how much is hidden at each place."""
 
-TRIES = 4
+MAX_TRIES = 4
 """Silhouettes that are tried before a straight edge."""
 
-CLOSE = 0.05
+SHARE_TOLERANCE = 0.05
 """How far from the share drawn a silhouette's may be."""
 
 
@@ -68,10 +69,10 @@ def occluded(view: RenderedView, occlusion: Occlusion, rng: np.random.Generator)
     row, column = (place - place.mean() for place in np.divmod(pixels, view.depth.shape[1]))
     # The other object comes along x.
     x, y = c * column + s * row, c * row - s * column
-    for _ in range(0 if rng.random() < occlusion.straight else TRIES):
+    for _ in range(0 if rng.random() < occlusion.straight else MAX_TRIES):
         hidden = _behind_silhouette(x, y, share, rng.uniform(*occlusion.nearer), rng)
         found = hidden.mean()
-        if abs(found - share) <= CLOSE and occlusion.share[0] <= found <= occlusion.share[1]:
+        if abs(found - share) <= SHARE_TOLERANCE and occlusion.share[0] <= found <= occlusion.share[1]:
             break
     else:
         hidden = np.zeros(n, bool)
@@ -82,7 +83,7 @@ def occluded(view: RenderedView, occlusion: Occlusion, rng: np.random.Generator)
 @functools.cache
 def _silhouettes() -> tuple[NDArray[np.bool_], ...]:
     """Outlines [h, w] of the built-in objects, with nothing on the border; 0.2 s, once a process."""
-    f = DISTANCE / PIXEL
+    f = DISTANCE / SILHOUETTE_PIXEL
     camera = Camera.from_field_of_view(400, 400, float(np.degrees(2 * np.arctan(200 / f))))
     found = []
     for mesh in builtin_objects().values():
@@ -97,7 +98,7 @@ def _behind_silhouette(
     """Which points (x [n] and y [n], metres) a silhouette hides that comes along x until it hides about `share`."""
     bank = _silhouettes()
     silhouette = bank[rng.integers(len(bank))]
-    pixel = PIXEL * scale
+    pixel = SILHOUETTE_PIXEL * scale
     height, width = silhouette.shape
     sideways = rng.uniform(y.min(), y.max()) / 2
     places = np.linspace(x.min() - width / 2 * pixel, 0, PLACES)
@@ -108,6 +109,6 @@ def _behind_silhouette(
         row = (y / pixel + height / 2).astype(np.intp).clip(0, height - 1)
         return silhouette[row, column]
 
-    sample = slice(None, None, -(-len(x) // SAMPLE))
+    sample = slice(None, None, -(-len(x) // SAMPLE_PIXELS))
     shares = hides(x[sample] - places[:, None], y[sample] - sideways).mean(axis=1)
     return hides(x - places[np.argmin(np.abs(shares - share))], y - sideways)

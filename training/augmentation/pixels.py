@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from training.rendering.ray_caster import RenderedView
+from training.rendering.camera import RenderedView
 
 __all__ = ["FRAME_PIXEL", "pixel_width", "without"]
 

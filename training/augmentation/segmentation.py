@@ -14,11 +14,11 @@ from thor2_jax.recognition.frames import Intrinsics
 from thor2_jax.recognition.outlier_removal import CELL
 from training.augmentation.pixels import FRAME_PIXEL, pixel_width, without
 from training.augmentation.settings import Range, check_fields
-from training.rendering.ray_caster import TRAINING_CAMERA, RenderedView
+from training.rendering.camera import TRAINING_CAMERA, RenderedView
 
 __all__ = ["Segmentation", "resegmented"]
 
-NEAR = 2 * CELL
+MAX_BACKGROUND_GAP = 2 * CELL
 """Metres behind the object within which background remains: cells that touch are one piece for outlier removal."""
 
 
@@ -69,7 +69,7 @@ def _dilated(view: RenderedView, steps: int, segmentation: Segmentation, rng: np
     seen = view.depth > 0
     plane = _background(view, seen, segmentation, rng)
     added = binary_dilation(seen, iterations=steps) & ~seen & (plane > 0)
-    added &= plane <= maximum_filter(view.depth, 2 * steps + 1) + 1000 * NEAR
+    added &= plane <= maximum_filter(view.depth, 2 * steps + 1) + 1000 * MAX_BACKGROUND_GAP
     color, depth = view.color.copy(), view.depth.copy()
     color[added] = rng.integers(0, 256, 3)
     depth[added] = plane[added]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from training.augmentation.pixels import FRAME_PIXEL, pixel_width, without
 from training.augmentation.settings import Range, check_fields
-from training.rendering.ray_caster import RenderedView
+from training.rendering.camera import RenderedView
 
 __all__ = ["Sensor", "axial_deviation", "sensed"]
 

@@ -1,4 +1,4 @@
-"""What the variations' settings share: ranges and the check of their values."""
+"""What the augmentations' settings share: ranges and the check of their values."""
 
 import dataclasses
 import math

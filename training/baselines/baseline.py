@@ -13,9 +13,9 @@ from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.view_normalization import view_normalize
 from thor2_jax.recognition.recognizer import DescribedFrame
 from thor2_jax.types import PointClouds
-from training.fitting.fit import FitOptions
 from training.fitting.folds import fold_of_views
-from training.views.source import ViewSource
+from training.fitting.options import FitOptions
+from training.views.normalized_views import ViewSource
 
 __all__ = ["TITLES", "Baseline", "Fitted", "Seen", "Task", "seen_in"]
 

@@ -12,10 +12,10 @@ from training.baselines.files import Stored, baseline_file, write_baseline
 from training.baselines.forest import train_forest
 from training.baselines.pointnet import train_pointnet
 from training.baselines.thor import train_thor
-from training.fitting.fit import FitOptions
+from training.fitting.options import FitOptions
 from training.fitting.run_directories import find_run_directories
 from training.fitting.temperature import fit_temperature
-from training.views.source import ViewSource
+from training.views.normalized_views import ViewSource
 
 __all__ = ["BASELINES", "check_baselines", "train_baselines"]
 

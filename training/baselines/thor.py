@@ -31,7 +31,8 @@ from training.baselines.baseline import Fitted, Seen, Task
 from training.baselines.files import arrays_of, model_with
 from training.fitting.calibration import sample_probabilities
 from training.fitting.checkpoints import Checkpoints
-from training.fitting.fit import Figures, fit
+from training.fitting.fit import fit
+from training.fitting.options import EpochMetrics
 from training.fitting.samples import Samples, build_samples
 from training.rendering.view_sphere import view_angles
 
@@ -204,7 +205,9 @@ def train_thor(task: Task) -> Fitted:
         rows = np.flatnonzero([name in types[view] for view in samples.view])
         part = _part(samples, rows)
 
-        def told(done: int, total: int, figures: Figures, number: int = number, name: str = name, k: int = k) -> None:
+        def told(
+            done: int, total: int, figures: EpochMetrics, number: int = number, name: str = name, k: int = k
+        ) -> None:
             epoch = number * task.options.epochs + figures.epoch
             note = f"{name}, {k} slices, accuracy {figures.accuracy:.3f}"
             task.progress("fit thor", epoch, len(keys) * task.options.epochs, note)

@@ -33,14 +33,18 @@ def render(
     seed: Annotated[int, typer.Option(help="Seed for the augmentations.")] = 0,
 ) -> None:
     """Render views of meshes to a dataset for `train --dataset`. An interrupted rendering resumes."""
-    from training.augmentation import Illumination, Occlusion, Segmentation, Sensor, Variations
+    from training.augmentation.augmentations import Augmentations
+    from training.augmentation.illumination import Illumination
+    from training.augmentation.occlusion import Occlusion
+    from training.augmentation.segmentation import Segmentation
+    from training.augmentation.sensor import Sensor
     from training.objects.meshes import find_meshes, read_names
     from training.storage.workers import local_workers, ray_workers
     from training.views.render_job import render_dataset
 
     if address is not None and engine != "ray":
         raise InputError(f"address is {address}; it is only used with --engine ray")
-    variations = Variations(
+    augmentations = Augmentations(
         illumination=Illumination() if illumination else None,
         sensor=Sensor() if sensor else None,
         occlusion=Occlusion() if occlusion else None,
@@ -57,7 +61,7 @@ def render(
             polar_step,
             pool,
             lambda done, total: progress("render", done, total, ""),
-            variations or None,
+            augmentations or None,
             seed,
         )
     console.print(

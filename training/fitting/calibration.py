@@ -19,7 +19,7 @@ from training.fitting.temperature import fit_temperature
 
 __all__ = ["sample_probabilities", "temperatures"]
 
-CHUNK = 256
+SAMPLES_PER_BATCH = 256
 """Samples computed together."""
 
 
@@ -42,9 +42,9 @@ def sample_probabilities(
     config = dataclasses.replace(config, homology="closed_form")
     graph, state = nnx.split(model)
     parts = [np.zeros((0, len(samples.classes)), np.float32)]
-    for first in range(0, len(rows), CHUNK):
-        part = rows[first : first + CHUNK]
-        batch = samples.take(np.resize(part, CHUNK))
+    for first in range(0, len(rows), SAMPLES_PER_BATCH):
+        part = rows[first : first + SAMPLES_PER_BATCH]
+        batch = samples.take(np.resize(part, SAMPLES_PER_BATCH))
         parts.append(np.asarray(_probabilities(graph, state, batch, feature, network, config))[: len(part)])
     return np.concatenate(parts)
 

@@ -21,80 +21,37 @@ from thor2_jax.errors import InputError
 from thor2_jax.recognition.classifier import MLP, Feature
 from thor2_jax.recognition.run_directory import input_size
 from training.fitting.checkpoints import Checkpoints
+from training.fitting.options import EpochMetrics, FitOptions
 from training.fitting.samples import Batch, Samples
-from training.fitting.steps import Setting, count_right, initial_state, scale_inputs, spread, train_step
+from training.fitting.steps import (
+    FitContext,
+    count_correct,
+    initial_state,
+    replicate,
+    scale_inputs,
+    shard_batch,
+    train_step,
+)
 
-__all__ = ["Figures", "FitOptions", "check_batch_size", "fit"]
+__all__ = ["check_batch_size", "fit"]
 
 
-MAX_SEED = 2**31 - 1
-"""JAX takes a seed of 32 bits."""
-
-AHEAD = 2
+STEPS_IN_FLIGHT = 2
 """Steps handed to the devices before the first of them has to be done: the host gathers batches meanwhile."""
 
-SCALED = 1024
+SCALE_SAMPLES = 1024
 """About so many training samples tell the scale of the inputs."""
-
-
-@dataclasses.dataclass(frozen=True)
-class FitOptions:
-    """How a classifier is fitted.
-
-    Attributes:
-        epochs: first half at `learning_rates[0]`, the rest at `learning_rates[1]`.
-        learning_rates: Adam's two step sizes.
-        batch_size: samples a step; what is left of an epoch after whole batches is left out (another draw each epoch).
-        seed: of initial weights, order and dropout.
-
-    Raises:
-        InputError: a value out of its range, naming the field and the value.
-    """
-
-    epochs: int = 100
-    learning_rates: tuple[float, float] = (1e-2, 1e-3)
-    batch_size: int = 128
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        for name, least in (("epochs", 1), ("batch_size", 2), ("seed", 0)):
-            if type(getattr(self, name)) is not int or getattr(self, name) < least:
-                raise InputError(f"{name} is {getattr(self, name)!r}; it must be a whole number of at least {least}")
-        if self.seed > MAX_SEED:
-            raise InputError(f"seed is {self.seed}; it must be at most {MAX_SEED}")
-        rates = self.learning_rates
-        if len(rates) != 2 or not all(isinstance(rate, int | float) and 0 < rate < math.inf for rate in rates):
-            raise InputError(f"learning_rates is {rates!r}; it must be two positive numbers")
-
-
-@dataclasses.dataclass(frozen=True)
-class Figures:
-    """How an epoch goes.
-
-    Attributes:
-        epoch: counted from 1.
-        loss: mean over the epoch's training samples so far.
-        accuracy: of the same, with dropout.
-        samples_per_second: of the epoch so far, from the end of its first step (which may compile).
-        held_out_accuracy: of the samples held out, at the end of the epoch; None before, or if there are none.
-    """
-
-    epoch: int
-    loss: float
-    accuracy: float
-    samples_per_second: float
-    held_out_accuracy: float | None = None
 
 
 T = TypeVar("T")
 
 
 def _delayed(items: Iterable[T]) -> Iterator[T]:
-    """The items, each after AHEAD more have been begun."""
+    """The items, each after STEPS_IN_FLIGHT more have been begun."""
     waiting: deque[T] = deque()
     for item in items:
         waiting.append(item)
-        if len(waiting) > AHEAD:
+        if len(waiting) > STEPS_IN_FLIGHT:
             yield waiting.popleft()
     yield from waiting
 
@@ -113,8 +70,8 @@ def fit(
     options: FitOptions,
     checkpoints: Checkpoints,
     held_out: NDArray[np.bool_] | None = None,
-    progress: Callable[[int, int, Figures], object] = lambda done, total, figures: None,
-    epoch_done: Callable[[Figures], object] = lambda figures: None,
+    progress: Callable[[int, int, EpochMetrics], object] = lambda done, total, figures: None,
+    epoch_done: Callable[[EpochMetrics], object] = lambda figures: None,
     mesh: Mesh | None = None,
 ) -> tuple[MLP, int]:
     """Train the MLP of one feature, on from the last checkpoint if there is one.
@@ -156,18 +113,18 @@ def fit(
     config = dataclasses.replace(config, homology="closed_form")
     n_inputs = input_size(feature, config, network.n_regions)
     model = MLP(n_inputs, len(samples.classes), rngs=nnx.Rngs(options.seed))
-    sample = samples.take(train_rows[:: max(1, len(train_rows) // SCALED)][:SCALED])
+    sample = samples.take(train_rows[:: max(1, len(train_rows) // SCALE_SAMPLES)][:SCALE_SAMPLES])
     model.input_scale[...] = scale_inputs(sample, feature, network, config)
     graph, state = initial_state(model)
-    setting = Setting(graph, feature, network, config, mesh)
+    context = FitContext(graph, feature, network, config, mesh)
     if checkpoints.last_epoch:
         state = checkpoints.last(state)
-    state = spread(state, mesh, split=False)
+    state = replicate(state, mesh)
 
     def batches(rows: NDArray[np.intp]) -> Iterator[Batch]:
         part = batch_size // jax.process_count()
         for first in range(jax.process_index() * part, len(rows), batch_size):
-            yield spread(samples.take(rows[first : first + part]), mesh, split=True)
+            yield shard_batch(samples.take(rows[first : first + part]), mesh)
 
     def train(epoch: int) -> Iterator[tuple[jax.Array, jax.Array]]:
         nonlocal state
@@ -175,7 +132,7 @@ def fit(
         order = np.random.default_rng((options.seed, epoch)).permutation(train_rows)[: n_steps * batch_size]
         rate = np.float32(options.learning_rates[epoch > (options.epochs + 1) // 2])
         for step, batch in enumerate(batches(order), (epoch - 1) * n_steps):
-            state, figures = train_step(setting, state, batch, rate, np.uint32(options.seed), np.uint32(step))
+            state, figures = train_step(context, state, batch, rate, np.uint32(options.seed), np.uint32(step))
             yield figures
 
     def held_out_accuracy() -> float | None:
@@ -183,7 +140,9 @@ def fit(
             return None
         full = np.resize(test_rows, len(test_rows) + -len(test_rows) % batch_size)
         left = range(len(test_rows), 0, -batch_size)
-        right = [count_right(setting, state, batch, np.int32(n)) for n, batch in zip(left, batches(full), strict=True)]
+        right = [
+            count_correct(context, state, batch, np.int32(n)) for n, batch in zip(left, batches(full), strict=True)
+        ]
         return float(np.sum(jax.device_get(right)) / len(test_rows))
 
     for epoch in range(checkpoints.last_epoch + 1, options.epochs + 1):
@@ -198,7 +157,7 @@ def fit(
             if done == 1:
                 start = time.perf_counter()
             rate = (done - 1) * batch_size / max(time.perf_counter() - start, 1e-9)
-            found = Figures(epoch, loss, accuracy, rate)
+            found = EpochMetrics(epoch, loss, accuracy, rate)
             progress((epoch - 1) * n_steps + done, n_steps * options.epochs, found)
         found = dataclasses.replace(found, held_out_accuracy=held_out_accuracy())
         epoch_done(found)

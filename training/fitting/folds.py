@@ -7,14 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
-from training.fitting.samples import Samples
 
-__all__ = ["fold_of_samples", "fold_of_views"]
-
-
-def fold_of_samples(samples: Samples, folds: int, seed: int) -> NDArray[np.intp]:
-    """Fold of each sample, [M]; see `fold_of_views`. All samples of one view, mirrored and varied, are in one fold."""
-    return fold_of_views(samples.label, samples.view, samples.classes, folds, seed)
+__all__ = ["fold_of_views"]
 
 
 def fold_of_views(

@@ -13,7 +13,7 @@ import contextlib
 import dataclasses
 import json
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,19 +31,17 @@ from thor2_jax.recognition.classifier import MLP, Feature, check_features
 from thor2_jax.recognition.run_directory import RUN_FILE, TrainedRun, load_run, save_run
 from training.fitting.calibration import temperatures
 from training.fitting.checkpoints import CHECKPOINTS, Checkpoints
-from training.fitting.fit import Figures, FitOptions, check_batch_size, fit
-from training.fitting.folds import fold_of_samples
+from training.fitting.fit import check_batch_size, fit
+from training.fitting.folds import fold_of_views
 from training.fitting.metrics_log import append_figures, forget_after, read_figures
+from training.fitting.options import EpochMetrics, FitOptions, Progress
 from training.fitting.samples import MIRRORS, Samples, build_samples
 from training.reports.plots import draw_curves
 from training.storage.jobs import check_same_job
 from training.storage.locks import locked
-from training.views.source import ViewSource
+from training.views.normalized_views import ViewSource
 
-__all__ = ["VIEWS", "Progress", "check_out", "check_trained", "is_finished", "train_run"]
-
-Progress = Callable[[str, int, int, str], object]
-"""Called with (stage, done, total, note)."""
+__all__ = ["VIEWS", "check_out", "check_trained", "is_finished", "train_run"]
 
 VIEWS = "views"
 BEGUN = "begun.json"
@@ -130,7 +128,7 @@ def _begin(out: Path, begun: Mapping[str, Any]) -> None:
         write_text(out / CHECKPOINTS / BEGUN, json.dumps(begun, indent=1) + "\n")
 
 
-def _together(point: str) -> None:
+def _wait_for_all(point: str) -> None:
     """Wait until all processes are here, so that none reads what the first has not written."""
     if jax.process_count() > 1:
         multihost_utils.sync_global_devices(point)
@@ -191,8 +189,8 @@ def train_run(
         if first and before:
             held.enter_context(locked(out / CHECKPOINTS))
         samples = build_samples(source, network, config, described, mirrors)
-        fold_of = fold_of_samples(samples, folds, options.seed)
-        _together("checked")
+        fold_of = fold_of_views(samples.label, samples.view, samples.classes, folds, options.seed)
+        _wait_for_all("checked")
         if first:
             if not before:
                 check_out(out)  # another process may have been quicker
@@ -200,7 +198,7 @@ def train_run(
                 held.enter_context(locked(out / CHECKPOINTS))
                 _check_same(out, begun)
             _begin(out, begun)
-        _together("begun")
+        _wait_for_all("begun")
 
         runs = []
         for fold in range(folds):
@@ -219,9 +217,9 @@ def train_run(
                     record["temperatures"] = calibrated
                     run = TrainedRun(config, network, samples.classes, classifiers, record)
                     _publish(run, out / CHECKPOINTS / f"fold-{fold}" / "run", folder)
-                _together("published")
+                _wait_for_all("published")
             runs.append(load_run(folder))
-        _together("trained")
+        _wait_for_all("trained")
         if first:
             # Renamed first: wherever a kill strikes, the run is in the making or finished, and nothing in between.
             shutil.rmtree((out / CHECKPOINTS).rename(out / f".{CHECKPOINTS}"))
@@ -246,14 +244,14 @@ def _fit_fold(
     for name in names:
         stage = f"fit {name}" if held_out is None else f"fold {fold}: fit {name}"
 
-        def told(done: int, total: int, figures: Figures, stage: str = stage) -> None:
+        def told(done: int, total: int, figures: EpochMetrics, stage: str = stage) -> None:
             note = (
                 f"epoch {figures.epoch}/{options.epochs}, loss {figures.loss:.3f}, accuracy {figures.accuracy:.3f}, "
                 f"{figures.samples_per_second:,.0f} samples/s"
             )
             progress(stage, done, total, note)
 
-        def epoch_done(figures: Figures, name: Feature = name) -> None:
+        def epoch_done(figures: EpochMetrics, name: Feature = name) -> None:
             if first:
                 append_figures(out / METRICS, fold, name, figures)
 

@@ -7,14 +7,14 @@ from typing import Any
 
 from thor2_jax.errors import InputError
 from thor2_jax.files import write_text
-from training.fitting.fit import Figures
+from training.fitting.options import EpochMetrics
 
 __all__ = ["append_figures", "forget_after", "read_figures"]
 
 _WHOSE = {"fold", "classifier"}
 
 
-def append_figures(path: Path, fold: int, classifier: str, figures: Figures) -> None:
+def append_figures(path: Path, fold: int, classifier: str, figures: EpochMetrics) -> None:
     """Add one line."""
     row = {"fold": fold, "classifier": classifier, **dataclasses.asdict(figures)}
     with path.open("a", encoding="utf-8") as file:

@@ -3,8 +3,12 @@
 import dataclasses
 from typing import Any
 
-from training.augmentation import Illumination, Occlusion, Segmentation, Sensor, Variations
-from training.fitting.fit import FitOptions
+from training.augmentation.augmentations import Augmentations
+from training.augmentation.illumination import Illumination
+from training.augmentation.occlusion import Occlusion
+from training.augmentation.segmentation import Segmentation
+from training.augmentation.sensor import Sensor
+from training.fitting.options import FitOptions
 from training.fitting.samples import MIRRORS, PAPER_MIRRORS
 
 __all__ = ["DEFAULT", "PAPER", "Protocol"]
@@ -17,14 +21,14 @@ class Protocol:
     Attributes:
         azimuth_step: degrees between cameras around the object.
         polar_step: degrees between cameras from pole to pole.
-        variations: varied copies of each view; None makes none.
+        augmentations: varied copies of each view; None makes none.
         mirrors: in which each view is used.
         fit: how a classifier is fitted.
     """
 
     azimuth_step: float
     polar_step: float
-    variations: Variations | None
+    augmentations: Augmentations | None
     mirrors: tuple[str, ...]
     fit: FitOptions
 
@@ -51,13 +55,17 @@ class Protocol:
 DEFAULT = Protocol(
     azimuth_step=20.0,
     polar_step=15.0,
-    variations=Variations(Illumination(), Sensor(), Occlusion(), Segmentation()),
+    augmentations=Augmentations(Illumination(), Sensor(), Occlusion(), Segmentation()),
     mirrors=MIRRORS,
     fit=FitOptions(epochs=24, batch_size=256),
 )
 """Fewer views than the paper's, each also twice under another light, partly hidden and as a depth camera sees it."""
 
 PAPER = Protocol(
-    azimuth_step=5.0, polar_step=5.0, variations=None, mirrors=PAPER_MIRRORS, fit=FitOptions(epochs=100, batch_size=128)
+    azimuth_step=5.0,
+    polar_step=5.0,
+    augmentations=None,
+    mirrors=PAPER_MIRRORS,
+    fit=FitOptions(epochs=100, batch_size=128),
 )
 """Paper, section "Training": 72 x 37 views of an object, four mirrors, 100 epochs."""

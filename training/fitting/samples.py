@@ -25,8 +25,7 @@ from thor2_jax.descriptor.describe import strips_by_sets
 from thor2_jax.descriptor.view_normalization import mirror, turn
 from thor2_jax.errors import InputError
 from thor2_jax.types import Strips
-from training.views.normalized_views import padded_batches
-from training.views.source import ViewSource
+from training.views.normalized_views import ViewSource, padded_batches
 
 __all__ = ["MIRRORS", "PAPER_MIRRORS", "Batch", "Samples", "build_samples", "expand"]
 
@@ -36,7 +35,7 @@ MIRRORS = ("", "x")
 PAPER_MIRRORS = ("", "x", "y", "xy")
 """The paper uses each view four times."""
 
-CHUNK = 64
+VIEWS_PER_BATCH = 64
 """Views computed together."""
 
 PADDING = np.iinfo(np.uint16).max
@@ -157,7 +156,7 @@ def build_samples(
     for index, shard in enumerate(source.shards):
         views = source.read(index)
         done = 0
-        for count, normal in padded_batches(views.clouds(), CHUNK):
+        for count, normal in padded_batches(views.clouds(), VIEWS_PER_BATCH):
             for axes in mirrors:
                 found = strips_by_sets(turn(mirror(normal, axes), config), counting, config)
                 part = _compact(jax.tree.map(lambda a: np.asarray(a)[:count], found))  # noqa: B023

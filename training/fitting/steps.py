@@ -27,12 +27,13 @@ from training.fitting.samples import Batch, expand
 
 __all__ = [
     "FitState",
-    "Setting",
-    "count_right",
+    "FitContext",
+    "count_correct",
     "describe_batch",
     "initial_state",
+    "replicate",
     "scale_inputs",
-    "spread",
+    "shard_batch",
     "train_step",
 ]
 
@@ -51,7 +52,7 @@ class FitState(NamedTuple):
     optimizer: Any
 
 
-class Setting(NamedTuple):
+class FitContext(NamedTuple):
     """What is fixed in a fit; static under jit.
 
     Attributes:
@@ -76,15 +77,17 @@ def initial_state(model: MLP) -> tuple[Any, FitState]:
     return graph, FitState(params, rest, optax.adam(0.0).init(params))
 
 
-def spread(tree: Any, mesh: Mesh, split: bool) -> Any:
-    """Host arrays onto the devices of a mesh.
+def shard_batch(batch: Batch, mesh: Mesh) -> Batch:
+    """Move a batch to the devices of a mesh, split along the samples; each process gives its own chunk of the batch."""
+    return _to_devices(batch, NamedSharding(mesh, PartitionSpec(AXIS)))
 
-    Args:
-        tree: pytree of arrays.
-        mesh: from `batch_mesh`.
-        split: along their first axis, of which each process gives its own part; or else the same everywhere.
-    """
-    sharding = NamedSharding(mesh, PartitionSpec(AXIS) if split else PartitionSpec())
+
+def replicate(tree: Any, mesh: Mesh) -> Any:
+    """Move a pytree of host arrays to the devices of a mesh, the same on all of them."""
+    return _to_devices(tree, NamedSharding(mesh, PartitionSpec()))
+
+
+def _to_devices(tree: Any, sharding: NamedSharding) -> Any:
     return jax.tree.map(lambda a: jax.make_array_from_process_local_data(sharding, np.asarray(a)), tree)
 
 
@@ -99,12 +102,12 @@ def _everywhere(tree: Any, mesh: Mesh) -> Any:
 
 @partial(jax.jit, static_argnums=0, donate_argnums=1)
 def train_step(
-    setting: Setting, state: FitState, batch: Batch, rate: ArrayLike, seed: ArrayLike, step: ArrayLike
+    context: FitContext, state: FitState, batch: Batch, rate: ArrayLike, seed: ArrayLike, step: ArrayLike
 ) -> tuple[FitState, tuple[jax.Array, jax.Array]]:
     """One step of Adam.
 
     Args:
-        setting: static.
+        context: static.
         state: used up.
         batch: spread over the devices.
         rate: step size.
@@ -114,11 +117,11 @@ def train_step(
     Returns:
         The state after it, and the batch's loss and accuracy before it.
     """
-    x = feature_of(describe_batch(batch, setting.network, setting.config), setting.feature)
+    x = feature_of(describe_batch(batch, context.network, context.config), context.feature)
     key = jax.random.fold_in(jax.random.key(seed), step)
 
     def loss_of(params: Any) -> Any:
-        model = nnx.merge(setting.graph, params, state.rest, copy=True)
+        model = nnx.merge(context.graph, params, state.rest, copy=True)
         logits = model(x, train=True, rngs=nnx.Rngs(dropout=key))
         loss = optax.softmax_cross_entropy_with_integer_labels(logits, batch.label).mean()
         return loss, ((logits.argmax(axis=-1) == batch.label).mean(), nnx.state(model, nnx.Not(nnx.Param)))
@@ -126,16 +129,16 @@ def train_step(
     (loss, (accuracy, rest)), gradients = jax.value_and_grad(loss_of, has_aux=True)(state.params)
     updates, optimizer = optax.adam(rate).update(gradients, state.optimizer, state.params)
     after = FitState(optax.apply_updates(state.params, updates), rest, optimizer)
-    return _everywhere((after, (loss, accuracy)), setting.mesh)
+    return _everywhere((after, (loss, accuracy)), context.mesh)
 
 
 @partial(jax.jit, static_argnums=0)
-def count_right(setting: Setting, state: FitState, batch: Batch, count: ArrayLike) -> jax.Array:
+def count_correct(context: FitContext, state: FitState, batch: Batch, count: ArrayLike) -> jax.Array:
     """How many of the first `count` samples of a batch are named rightly."""
-    model = nnx.merge(setting.graph, state.params, state.rest, copy=True)
-    logits = model(feature_of(describe_batch(batch, setting.network, setting.config), setting.feature))
+    model = nnx.merge(context.graph, state.params, state.rest, copy=True)
+    logits = model(feature_of(describe_batch(batch, context.network, context.config), context.feature))
     right = (logits.argmax(axis=-1) == batch.label) & (jnp.arange(len(logits)) < count)
-    return _everywhere(right.sum(), setting.mesh)
+    return _everywhere(right.sum(), context.mesh)
 
 
 @partial(jax.jit, static_argnums=(1, 2, 3))

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from training.objects.meshes import TexturedMesh, merge_meshes
+from training.objects.mesh import TexturedMesh, merge_meshes
 
 __all__ = ["COLOR_PAIRS", "SHAPE_PAIRS", "builtin_objects"]
 

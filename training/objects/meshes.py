@@ -1,7 +1,6 @@
-"""Scanned meshes: reading GLB, OBJ and PLY files, the colour at a point of the surface, finding them in a folder."""
+"""Mesh files: find them in a directory and read GLB, OBJ and PLY."""
 
-import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,116 +12,19 @@ from trimesh.visual.material import PBRMaterial, SimpleMaterial, empty_material
 
 from thor2_jax.errors import InputError
 from thor2_jax.recognition.frames import MOST_PIXELS
+from training.objects.mesh import TexturedMesh, merge_meshes
 from training.storage.tables import parse_json, parse_yaml
 
-__all__ = ["MESH_SUFFIXES", "TexturedMesh", "find_meshes", "load_mesh", "merge_meshes", "read_names"]
+__all__ = ["MESH_SUFFIXES", "find_meshes", "load_mesh", "read_names"]
 
 MESH_SUFFIXES = (".glb", ".obj", ".ply")
 
-LARGEST = 2.0
-SMALLEST = 0.001
+MAX_SIDE = 2.0
+MIN_SIDE = 0.001
 """Plausible longest side of an object, metres: a scan in millimetres falls outside, and the camera stays outside it."""
 
-FARTHEST = 2**23
+MAX_TEXTURE_COORDINATE = 2**23
 """Of a texture coordinate: past it float32 has whole numbers alone, which tell no place in the image."""
-
-
-@dataclasses.dataclass(frozen=True)
-class TexturedMesh:
-    """A coloured triangle mesh. Colours are sRGB as stored in the file, unlit.
-
-    Painted either with textures (`uv`, `textures`, `face_texture`) or with colours at the faces' corners
-    (`corner_colors`); the other kind is None or empty.
-
-    Attributes:
-        vertices: [V, 3] float64, metres.
-        faces: [F, 3] int32.
-        uv: [F, 3, 2] float32, per corner, origin at the image's lower left, repeating outside [0, 1]; or None.
-        textures: images [h, w, 3] uint8.
-        face_texture: [F] int32, index into `textures`; or None.
-        corner_colors: [F, 3, 3] uint8; or None.
-    """
-
-    vertices: NDArray[np.float64]
-    faces: NDArray[np.int32]
-    uv: NDArray[np.float32] | None = None
-    textures: tuple[NDArray[np.uint8], ...] = ()
-    face_texture: NDArray[np.int32] | None = None
-    corner_colors: NDArray[np.uint8] | None = None
-
-    @property
-    def centre(self) -> NDArray[np.float64]:
-        """Centre of the axis-aligned bounding box [3], metres: what a training camera looks at."""
-        return (self.vertices.min(axis=0) + self.vertices.max(axis=0)) / 2
-
-    def transformed(self, matrix: NDArray[np.float64]) -> "TexturedMesh":
-        """The mesh moved by a homogeneous matrix [4, 4]; the paint is shared."""
-        return dataclasses.replace(self, vertices=self.vertices @ matrix[:3, :3].T + matrix[:3, 3])
-
-    def colors_at(self, face: NDArray[np.integer], barycentric: NDArray[np.floating]) -> NDArray[np.uint8]:
-        """SRGB colours of points on the surface.
-
-        Textures are read at the nearest texel: in a training view a pixel spans several texels, so that bilinear
-        weights change nothing that the voxel mean keeps, and a mix across the border of a chart would bring in colours
-        the object does not have.
-
-        Args:
-            face: [n] integer, index into `faces`.
-            barycentric: [n, 2], weights of the face's second and third corner.
-
-        Returns:
-            [n, 3] uint8.
-        """
-        second, third = barycentric[:, :1], barycentric[:, 1:]
-        if self.corner_colors is not None:
-            a, b, c = np.moveaxis(self.corner_colors[face].astype(np.float32), 1, 0)
-            return np.rint(a + second * (b - a) + third * (c - a)).clip(0, 255).astype(np.uint8)
-        assert self.uv is not None and self.face_texture is not None
-        a, b, c = np.moveaxis(self.uv[face], 1, 0)
-        uv = a + second * (b - a) + third * (c - a)
-        if len(self.textures) == 1:
-            return _nearest_texel(self.textures[0], uv)
-        colors = np.zeros((len(face), 3), np.uint8)
-        texture = self.face_texture[face]
-        for index in np.unique(texture):
-            here = texture == index
-            colors[here] = _nearest_texel(self.textures[index], uv[here])
-        return colors
-
-
-def _nearest_texel(image: NDArray[np.uint8], uv: NDArray[np.floating]) -> NDArray[np.uint8]:
-    height, width = image.shape[:2]
-    column = np.floor(uv[:, 0] * width).astype(np.int64) % width
-    row = np.floor((1 - uv[:, 1]) * height).astype(np.int64) % height
-    return image[row, column]
-
-
-def merge_meshes(parts: Sequence[TexturedMesh]) -> TexturedMesh:
-    """One mesh of several, in the same frame.
-
-    Raises:
-        InputError: some parts have textures and others corner colours.
-    """
-    if len(parts) == 1:
-        return parts[0]
-    offsets = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
-    vertices = np.concatenate([part.vertices for part in parts])
-    faces = np.concatenate([part.faces + offset for part, offset in zip(parts, offsets, strict=True)]).astype(np.int32)
-    colors = [part.corner_colors for part in parts if part.corner_colors is not None]
-    if len(colors) == len(parts):
-        return TexturedMesh(vertices, faces, corner_colors=np.concatenate(colors))
-    if colors:
-        raise InputError("some parts of the mesh have textures and others colours at vertices; bake them into one kind")
-    first = np.cumsum([0, *(len(part.textures) for part in parts[:-1])])
-    return TexturedMesh(
-        vertices,
-        faces,
-        uv=np.concatenate([part.uv for part in parts if part.uv is not None]),
-        textures=tuple(texture for part in parts for texture in part.textures),
-        face_texture=np.concatenate(
-            [part.face_texture + k for part, k in zip(parts, first, strict=True) if part.face_texture is not None]
-        ).astype(np.int32),
-    )
 
 
 def _solid(vertices: NDArray[np.float64], faces: NDArray[np.int32], color: NDArray[np.uint8]) -> TexturedMesh:
@@ -192,11 +94,11 @@ def _check(mesh: TexturedMesh) -> None:
             raise InputError(f"{name} of the shape {array.shape}; expected {shape}")
     if not np.isfinite(vertices).all():
         raise InputError(f"{(~np.isfinite(vertices)).any(axis=1).sum()} vertices are not finite")
-    if mesh.uv is not None and not (np.abs(mesh.uv) <= FARTHEST).all():
-        raise InputError(f"texture coordinates are not finite, or past {FARTHEST}")
+    if mesh.uv is not None and not (np.abs(mesh.uv) <= MAX_TEXTURE_COORDINATE).all():
+        raise InputError(f"texture coordinates are not finite, or past {MAX_TEXTURE_COORDINATE}")
     longest = float(np.ptp(vertices[np.unique(faces)], axis=0).max())
-    if not SMALLEST <= longest <= LARGEST:
-        raise InputError(f"longest side {longest:g}; expected {SMALLEST:g} to {LARGEST:g} metres")
+    if not MIN_SIDE <= longest <= MAX_SIDE:
+        raise InputError(f"longest side {longest:g}; expected {MIN_SIDE:g} to {MAX_SIDE:g} metres")
 
 
 def _check_obj_references(path: Path) -> None:

@@ -24,7 +24,7 @@ SAMPLES = (
 )
 """Folder, title, seed and number of objects of each; picked by eye."""
 
-LIGHT = 0.2
+LIGHT_CHANGE = 0.2
 NOISE = 0.5
 """Noise is most of a depth image's bytes; four samples stay within 400 kB."""
 
@@ -43,7 +43,9 @@ def write_sample_frames(folder: str | Path) -> None:
     """
     folder, objects = Path(folder), builtin_objects()
     for name, _, seed, n_objects in SAMPLES:
-        scene = compose_scene(objects, np.random.default_rng(seed), n_objects=n_objects, noise=NOISE, light=LIGHT)
+        scene = compose_scene(
+            objects, np.random.default_rng(seed), n_objects=n_objects, noise=NOISE, light=LIGHT_CHANGE
+        )
         _write(_cut(scene.frame), folder / name)
     index = [{"folder": name, "title": title} for name, title, _, _ in SAMPLES]
     (folder / "index.json").write_text(json.dumps(index, indent=1) + "\n")

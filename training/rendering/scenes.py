@@ -16,8 +16,9 @@ from scipy.spatial import ConvexHull
 
 from thor2_jax.errors import InputError
 from thor2_jax.recognition.frames import Intrinsics, RGBDFrame
-from training.objects.meshes import TexturedMesh
-from training.rendering.ray_caster import Camera, RayCaster, pixel_rays, render_view
+from training.objects.mesh import TexturedMesh
+from training.rendering.camera import Camera
+from training.rendering.ray_caster import RayCaster, pixel_rays, render_view
 from training.rendering.view_sphere import camera_pose
 
 __all__ = ["SCENE_CAMERA", "Scene", "compose_scene"]
@@ -28,16 +29,16 @@ SCENE_CAMERA = Camera(640, 480, Intrinsics(615.0, 615.0, 319.5, 239.5))
 MIN_PIXELS = 50
 """Instances of which fewer are seen are not labelled."""
 
-GAP = 0.006
+MIN_GAP = 0.006
 """Least distance between two objects' footprints, metres."""
 
-REACH = 0.18
+TABLE_RADIUS = 0.18
 """Objects lie within this distance of the middle of the table, metres, unless there is no room."""
 
-FARTHEST = 4.0
+MAX_SENSOR_DEPTH = 4.0
 """Metres; beyond it the sensor sees no depth."""
 
-EDGE = 0.02
+EDGE_STEP = 0.02
 """A step in depth between neighbouring pixels, metres, from which on depth may be missing."""
 
 Array = NDArray[np.float64]
@@ -81,11 +82,11 @@ class _Placed:
         return _Placed(self.mesh.transformed(matrix), self.corners + [x, y], self.normals)
 
     def apart(self, other: "_Placed", x: float, y: float) -> bool:
-        """Whether this, moved by x and y, keeps `GAP` from the other: true if a side of either footprint parts them."""
+        """Return whether this object, moved by x and y, is at least `MIN_GAP` from the other (separating axis test)."""
         mine, theirs = self.corners + [x, y], other.corners
         ahead = (self.normals @ theirs.T).min(axis=1) - (self.normals @ mine.T).max(axis=1)
         behind = (other.normals @ mine.T).min(axis=1) - (other.normals @ theirs.T).max(axis=1)
-        return bool(max(ahead.max(), behind.max()) >= GAP)
+        return bool(max(ahead.max(), behind.max()) >= MIN_GAP)
 
 
 SIDES = tuple(
@@ -143,7 +144,7 @@ def _in_line(new: _Placed, placed: Sequence[_Placed], towards: Array, rng: np.ra
     forth = towards if new.height > anchor.height else -towards
     for distance in np.arange(0.0, 0.3, 0.006) + rng.uniform(0, 0.006):
         place = middle + distance * forth
-        if np.linalg.norm(place) > 1.3 * REACH:
+        if np.linalg.norm(place) > 1.3 * TABLE_RADIUS:
             return None
         if all(new.apart(other, *place) for other in placed):
             return place
@@ -152,7 +153,7 @@ def _in_line(new: _Placed, placed: Sequence[_Placed], towards: Array, rng: np.ra
 
 def _anywhere(new: _Placed, placed: Sequence[_Placed], rng: np.random.Generator) -> Array:
     """A free place [2] on the table, farther out only if there is no room."""
-    reach = REACH
+    reach = TABLE_RADIUS
     while True:
         angle, radius = rng.uniform(0, 2 * np.pi), reach * np.sqrt(rng.random())
         place = radius * np.array([np.cos(angle), np.sin(angle)])
@@ -186,20 +187,20 @@ def _table() -> TexturedMesh:
 def _sensed_depth(depth_m: Array, noise: float, rng: np.random.Generator) -> NDArray[np.uint16]:
     """Depth [H, W] as a sensor gives it, millimetres.
 
-    Axial noise with the standard deviation 1.2 mm + 1.9 mm (z / m - 0.4)^2 (Nguyen, Izadi and Lovell 2012) times
-    `noise`; at a step of more than `EDGE` three pixels in ten have no depth; nor has anything beyond `FARTHEST`.
+    The standard deviation of the axial noise is `noise` times 1.2 mm + 1.9 mm (z / m - 0.4)^2 (Nguyen, Izadi and Lovell
+    2012). Three in ten pixels at depth steps of more than `EDGE_STEP`, and all beyond `MAX_SENSOR_DEPTH`, are missing.
     """
     sigma = 0.0012 + 0.0019 * (depth_m - 0.4) ** 2
     near_edge = np.zeros(depth_m.shape, bool)
     for axis in (0, 1):
-        step = np.abs(np.diff(depth_m, axis=axis)) > EDGE
+        step = np.abs(np.diff(depth_m, axis=axis)) > EDGE_STEP
         rows, columns = (slice(None), slice(1, None)) if axis else (slice(1, None), slice(None))
         near_edge[rows, columns] |= step
         rows, columns = (slice(None), slice(None, -1)) if axis else (slice(None, -1), slice(None))
         near_edge[rows, columns] |= step
     found = depth_m + noise * sigma * rng.standard_normal(depth_m.shape)
     lost = near_edge & (rng.random(depth_m.shape) < 0.3 * min(noise, 1.0))
-    seen = (depth_m > 0) & (depth_m < FARTHEST) & ~lost
+    seen = (depth_m > 0) & (depth_m < MAX_SENSOR_DEPTH) & ~lost
     return np.where(seen, np.rint(found.clip(0.001) * 1000), 0).astype(np.uint16)
 
 

@@ -17,7 +17,7 @@ from thor2_jax.descriptor.view_normalization import align
 from thor2_jax.files import atomic_write
 from thor2_jax.types import PointClouds
 from training.evaluate import Instance
-from training.objects.meshes import TexturedMesh
+from training.objects.mesh import TexturedMesh
 from training.rendering.ray_caster import RayCaster, render_view
 from training.rendering.view_sphere import camera_pose
 

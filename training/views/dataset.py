@@ -7,7 +7,7 @@
 
 A folder holds `manifest.json` and shards, each with views of one object. A shard is a safetensors file:
 
-    xyz     [n, 3] uint16   points of all its views, one view after the other, in steps of `STEP` scaled units
+    xyz     [n, 3] uint16   points of all views, one view after the other, in `COORDINATE_STEP` scaled units
     rgb     [n, 3] uint8    sRGB
     counts  [V] int64       points of each view
     view    [V] int32       index of the view's angles among those of its object
@@ -30,17 +30,17 @@ import safetensors.numpy
 from thor2_jax.config import DESCRIPTOR_VERSION
 from thor2_jax.errors import InputError
 from thor2_jax.files import write_text
-from training.views.normalized_views import STEP, NormalizedViews
+from training.views.normalized_views import COORDINATE_STEP, NormalizedViews
 
 __all__ = ["MANIFEST", "Manifest", "NormalizedViews", "Shard", "ViewDataset", "encode"]
 
-FORMAT = 2
+MANIFEST_FORMAT = 2
 MANIFEST = "manifest.json"
 
 
 def encode(views: NormalizedViews) -> bytes:
     """The file of a shard with these views."""
-    steps = (views.xyz / np.float32(STEP)).astype(np.uint16)
+    steps = (views.xyz / np.float32(COORDINATE_STEP)).astype(np.uint16)
     return safetensors.numpy.save(
         {"xyz": steps, "rgb": views.rgb, "counts": views.counts, "view": views.view, "copy": views.copy}
     )
@@ -48,7 +48,7 @@ def encode(views: NormalizedViews) -> bytes:
 
 def _decode(content: bytes, label: int) -> NormalizedViews:
     arrays = safetensors.numpy.load(content)
-    xyz = arrays["xyz"].astype(np.float32) * np.float32(STEP)
+    xyz = arrays["xyz"].astype(np.float32) * np.float32(COORDINATE_STEP)
     return NormalizedViews(xyz, arrays["rgb"], arrays["counts"], label, arrays["view"], arrays["copy"])
 
 
@@ -134,7 +134,7 @@ class Manifest:
             OSError: the folder cannot be written.
         """
         table = {
-            "format": FORMAT,
+            "format": MANIFEST_FORMAT,
             "views": self.views,
             "left_out": self.left_out,
             "job": self.job,
@@ -152,7 +152,7 @@ class Manifest:
         """
         try:
             table = json.loads(content)
-            if table["format"] == FORMAT:
+            if table["format"] == MANIFEST_FORMAT:
                 checksum = table.pop("sha256")
                 if checksum != hashlib.sha256(_dump(table).encode()).hexdigest():
                     raise ValueError("its checksum is not its own")
@@ -167,7 +167,7 @@ class Manifest:
                 return found
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise InputError(f"dataset: {path} is damaged ({type(error).__name__}: {error})") from None
-        raise InputError(f"dataset: {path} has format {table['format']!r}; this version reads {FORMAT}")
+        raise InputError(f"dataset: {path} has format {table['format']!r}; this version reads {MANIFEST_FORMAT}")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -7,8 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from thor2_jax.errors import InputError
-from training.views.normalized_views import NormalizedViews
-from training.views.source import ViewSource
+from training.views.normalized_views import NormalizedViews, ViewSource
 
 __all__ = ["WithoutClasses"]
 

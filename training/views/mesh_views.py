@@ -21,15 +21,17 @@ from thor2_jax.errors import InputError
 from thor2_jax.recognition.frames import backproject
 from thor2_jax.recognition.prepared_instance import DESCRIPTOR_VOXEL
 from thor2_jax.recognition.voxel_grid import downsample_to_fit
-from training.augmentation import Variations, vary
-from training.objects.meshes import TexturedMesh, load_mesh
-from training.rendering.ray_caster import TRAINING_CAMERA, Camera, RayCaster, RenderedView, render_view
+from thor2_jax.types import Cloud
+from training.augmentation.augmentations import Augmentations, augment
+from training.objects.mesh import TexturedMesh
+from training.objects.meshes import load_mesh
+from training.rendering.camera import TRAINING_CAMERA, Camera, RenderedView
+from training.rendering.ray_caster import RayCaster, render_view
 from training.rendering.view_sphere import camera_pose, view_angles
 from training.storage.workers import local_workers
 
 __all__ = [
     "MIN_POINTS",
-    "Cloud",
     "Progress",
     "ViewCloud",
     "ViewTask",
@@ -47,10 +49,8 @@ SIGMA_S = DescriptorConfig().sigma_s
 MIN_POINTS = 30
 """Views with fewer points are left out: too little of the object is seen to describe it."""
 
-CHUNK = 256
+VIEWS_PER_TASK = 256
 """Views a task: long against sending a mesh and indexing it (0.03 s), short against its 2,664 views."""
-
-Cloud = tuple[NDArray[np.float32], NDArray[np.uint8]]
 
 Progress = Callable[[int, int], object]
 """Called with (views done, views in all)."""
@@ -102,15 +102,15 @@ class ViewTask:
         mesh: metres, z up.
         angles: [n, 2] azimuth and polar angle in radians.
         first: index of the first among all angles of its object.
-        variations: makes varied copies of each view; None makes none.
-        seed: of the variations.
+        augmentations: makes varied copies of each view; None makes none.
+        seed: of the augmentations.
     """
 
     name: str
     mesh: TexturedMesh
     angles: NDArray[np.float64]
     first: int = 0
-    variations: Variations | None = None
+    augmentations: Augmentations | None = None
     seed: int = 0
 
 
@@ -131,9 +131,9 @@ class ViewCloud:
     rgb: NDArray[np.uint8]
 
 
-def clouds_per_view(variations: Variations | None) -> int:
+def clouds_per_view(augmentations: Augmentations | None) -> int:
     """The view as rendered, and its varied copies."""
-    return 1 + variations.copies if variations else 1
+    return 1 + augmentations.copies if augmentations else 1
 
 
 def _seed_of(name: str) -> int:
@@ -146,10 +146,10 @@ def _all_clouds(task: ViewTask) -> Iterator[ViewCloud]:
     for number, (azimuth, polar) in enumerate(task.angles.tolist(), task.first):
         view = render_view(caster, camera_pose(azimuth, polar, centre))
         yield ViewCloud(number, 0, *cloud_of(view))
-        for copy in range(1, clouds_per_view(task.variations)):
-            assert task.variations is not None
+        for copy in range(1, clouds_per_view(task.augmentations)):
+            assert task.augmentations is not None
             rng = np.random.default_rng([task.seed, name, number, copy])
-            yield ViewCloud(number, copy, *cloud_of(vary(view, task.variations, rng)))
+            yield ViewCloud(number, copy, *cloud_of(augment(view, task.augmentations, rng)))
 
 
 def render_task(task: ViewTask) -> list[ViewCloud]:
@@ -183,7 +183,7 @@ def view_tasks(
     angles: NDArray[np.float64],
     parts: Iterable[tuple[str, int]],
     size: int,
-    variations: Variations | None = None,
+    augmentations: Augmentations | None = None,
     seed: int = 0,
 ) -> Iterator[ViewTask]:
     """A task for each part, which is an object's name and the index of the first of its `size` angles.
@@ -193,7 +193,7 @@ def view_tasks(
     for name, group in itertools.groupby(parts, key=operator.itemgetter(0)):
         mesh = _mesh(found[name])
         for _, first in group:
-            yield ViewTask(name, mesh, angles[first : first + size], first, variations, seed)
+            yield ViewTask(name, mesh, angles[first : first + size], first, augmentations, seed)
 
 
 def render_views(
@@ -222,11 +222,11 @@ def render_views(
     """
     angles, pool = view_angles(azimuth_step, polar_step), local_workers(workers)
     views: dict[str, list[Cloud]] = {name: [] for name, _ in checked_meshes(found, angles)}
-    parts = [(name, first) for name in found for first in range(0, len(angles), CHUNK)]
+    parts = [(name, first) for name in found for first in range(0, len(angles), VIEWS_PER_TASK)]
     done, total = 0, len(angles) * len(found)
-    with closing(pool(render_task, view_tasks(found, angles, parts, CHUNK))) as results:
+    with closing(pool(render_task, view_tasks(found, angles, parts, VIEWS_PER_TASK))) as results:
         for (name, first), clouds in zip(parts, results, strict=True):
             views[name] += [(cloud.xyz, cloud.rgb) for cloud in clouds]
-            done += len(angles[first : first + CHUNK])
+            done += len(angles[first : first + VIEWS_PER_TASK])
             progress(done, total)
     return views

@@ -1,7 +1,8 @@
 """Normalized views: what the files of a dataset hold and what training sees."""
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Protocol
 
 import jax
 import numpy as np
@@ -10,18 +11,17 @@ from numpy.typing import NDArray
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.view_normalization import view_normalize
 from thor2_jax.errors import InputError
-from thor2_jax.types import PointClouds
-from training.views.mesh_views import Cloud
+from thor2_jax.types import Cloud, PointClouds
 
-__all__ = ["LARGEST", "STEP", "NormalizedViews", "normalize_views", "padded_batches"]
+__all__ = ["MAX_COORDINATE", "COORDINATE_STEP", "NormalizedViews", "ViewSource", "normalize_views", "padded_batches"]
 
-STEP = 2.0**-14
+COORDINATE_STEP = 2.0**-14
 """Coordinates are rounded to multiples of this many scaled units (0.024 mm)."""
 
-LARGEST = STEP * np.iinfo(np.uint16).max
-"""Largest coordinate, scaled units (1.6 m): multiples of `STEP` fit into 16 bits."""
+MAX_COORDINATE = COORDINATE_STEP * np.iinfo(np.uint16).max
+"""Largest coordinate, scaled units (1.6 m): multiples of `COORDINATE_STEP` fit into 16 bits."""
 
-BATCH = 64
+CLOUDS_PER_BATCH = 64
 """Clouds normalized together."""
 
 
@@ -46,7 +46,7 @@ class NormalizedViews:
 
     Attributes:
         xyz: [n, 3] float32, points of all views, one view after the other; scaled units, first octant, before the turn
-            by alpha; multiples of `STEP`.
+            by alpha; multiples of `COORDINATE_STEP`.
         rgb: [n, 3] uint8.
         counts: [V] int64, points of each view.
         label: index of the object among the classes.
@@ -70,6 +70,29 @@ class NormalizedViews:
         return [(self.xyz[end - n : end], self.rgb[end - n : end]) for n, end in zip(self.counts, ends, strict=True)]
 
 
+class ViewSource(Protocol):
+    """Normalized views, a shard at a time, each of one object: a `ViewDataset` on disk, or `MemoryViews`."""
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Class names."""
+
+    @property
+    def digest(self) -> str:
+        """Another one if any of the views is another."""
+
+    @property
+    def record(self) -> Mapping[str, Any]:
+        """What a run keeps of them, as JSON holds it."""
+
+    @property
+    def shards(self) -> Sequence[Any]:
+        """One entry for each `read`, with `label`, and `views`, their number."""
+
+    def read(self, index: int) -> NormalizedViews:
+        """The views of a shard."""
+
+
 def normalize_views(
     clouds: Sequence[Cloud], label: int, view: Sequence[int], copy: Sequence[int], config: DescriptorConfig
 ) -> NormalizedViews:
@@ -83,18 +106,18 @@ def normalize_views(
         config: only `sigma_s` is used.
 
     Raises:
-        InputError: a cloud with more points than the largest bucket, or longer than `LARGEST`.
+        InputError: a cloud with more points than the largest bucket, or longer than `MAX_COORDINATE`.
     """
     xyz = [np.zeros((0, 3), np.float32)]
     # On the CPU of whatever machine: an accelerator rounds otherwise, and a job that renders need not hold its memory.
     with jax.default_device(jax.local_devices(backend="cpu")[0]):
-        for count, batch in padded_batches(clouds, BATCH):
+        for count, batch in padded_batches(clouds, CLOUDS_PER_BATCH):
             normal = view_normalize(batch, config)
             points, mask = np.asarray(normal.points)[:count], np.asarray(normal.mask)[:count]
-            xyz.append(np.rint(points[mask] / np.float32(STEP)) * np.float32(STEP))
+            xyz.append(np.rint(points[mask] / np.float32(COORDINATE_STEP)) * np.float32(COORDINATE_STEP))
     joined = np.concatenate(xyz)
-    if not (joined <= LARGEST).all():
-        raise InputError(f"a view is {joined.max():.3g} scaled units long, more than {LARGEST:.3g}")
+    if not (joined <= MAX_COORDINATE).all():
+        raise InputError(f"a view is {joined.max():.3g} scaled units long, more than {MAX_COORDINATE:.3g}")
     return NormalizedViews(
         xyz=joined,
         rgb=np.concatenate([np.zeros((0, 3), np.uint8), *(rgb for _, rgb in clouds)]),

@@ -20,9 +20,9 @@ from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
 from thor2_jax.errors import InputError, with_context
 from thor2_jax.files import atomic_write, check_output_directory, content_digest
 from thor2_jax.recognition.prepared_instance import DESCRIPTOR_VOXEL
-from training.augmentation import Variations
-from training.objects.meshes import TexturedMesh
-from training.rendering.ray_caster import TRAINING_CAMERA
+from training.augmentation.augmentations import Augmentations
+from training.objects.mesh import TexturedMesh
+from training.rendering.camera import TRAINING_CAMERA
 from training.rendering.view_sphere import DISTANCE, view_angles
 from training.storage.jobs import check_same_job
 from training.storage.locks import locked
@@ -38,11 +38,11 @@ from training.views.mesh_views import (
     render_task,
     view_tasks,
 )
-from training.views.normalized_views import LARGEST, STEP, normalize_views
+from training.views.normalized_views import COORDINATE_STEP, MAX_COORDINATE, normalize_views
 
 __all__ = ["render_dataset"]
 
-SHARD = 256
+CLOUDS_PER_SHARD = 256
 """Clouds of a shard, some less where copies do not come out even: a few megabytes, a second of rendering."""
 
 SUFFIX = ".safetensors"
@@ -60,10 +60,10 @@ def _objects(found: Mapping[str, Path | TexturedMesh], angles: NDArray[np.float6
     objects = []
     for name, mesh in checked_meshes(found, angles):
         across = SIGMA_S * float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
-        if across > LARGEST:
+        if across > MAX_COORDINATE:
             raise InputError(
-                f"object {name!r} is {across / SIGMA_S:.2f} m across; views of at most {LARGEST / SIGMA_S:.2f} m can "
-                "be stored"
+                f"object {name!r} has a diameter of {across / SIGMA_S:.2f} m; at most {MAX_COORDINATE / SIGMA_S:.2f} m "
+                "can be stored; scale the mesh to metres"
             )
         objects.append({"name": name, "mesh": _digest(mesh)})
     return objects
@@ -135,7 +135,7 @@ def render_dataset(
     polar_step: float = 5.0,
     pool: WorkerPool = IN_PROCESS,
     progress: Progress = lambda done, total: None,
-    variations: Variations | None = None,
+    augmentations: Augmentations | None = None,
     seed: int = 0,
 ) -> ViewDataset:
     """Render views of every object, normalize them and write them to a folder, or finish what the folder holds of that.
@@ -150,8 +150,8 @@ def render_dataset(
         polar_step: degrees; divides 180.
         pool: where views are rendered; has no influence on the result.
         progress: called with (views done, views in all) at the start and after each shard; copies count as views.
-        variations: adds varied copies of each view; None adds none.
-        seed: of the variations. What an object's copies look like does not depend on the other objects.
+        augmentations: adds varied copies of each view; None adds none.
+        seed: of the augmentations. What an object's copies look like does not depend on the other objects.
 
     Raises:
         InputError: no meshes, a mesh that cannot be read, is too large or never seen, steps or a seed that do not fit,
@@ -165,8 +165,8 @@ def render_dataset(
         raise InputError(f"seed is {seed}; it must not be negative")
     angles = view_angles(azimuth_step, polar_step)
     objects = _objects(found, angles)
-    copies = clouds_per_view(variations)
-    size = max(1, SHARD // copies)
+    copies = clouds_per_view(augmentations)
+    size = max(1, CLOUDS_PER_SHARD // copies)
     # Shard's file -> object's index and index of the first of the shard's angles.
     plan = {
         f"{label:04d}-{number:04d}{SUFFIX}": (label, first)
@@ -177,12 +177,12 @@ def render_dataset(
         "descriptor_version": DESCRIPTOR_VERSION,
         "sigma_s": SIGMA_S,
         "voxel": DESCRIPTOR_VOXEL,
-        "step": STEP,
+        "step": COORDINATE_STEP,
         "min_points": MIN_POINTS,
         "camera": {**dataclasses.asdict(TRAINING_CAMERA), "distance": DISTANCE},
         "azimuth_step": float(azimuth_step),
         "polar_step": float(polar_step),
-        "variations": {"seed": seed, **variations.record()} if variations else None,
+        "variations": {"seed": seed, **augmentations.record()} if augmentations else None,
         "objects": objects,
         "shards": len(plan),
     }
@@ -196,7 +196,7 @@ def render_dataset(
         show_progress()
         missing = [file for file in plan if file not in done]
         parts = [(objects[label]["name"], first) for label, first in (plan[file] for file in missing)]
-        tasks = view_tasks(found, angles, parts, size, variations, seed)
+        tasks = view_tasks(found, angles, parts, size, augmentations, seed)
         with contextlib.closing(pool(render_task, tasks)) as results:
             for file, rendered in zip(missing, results, strict=True):
                 label, first = plan[file]

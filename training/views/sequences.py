@@ -5,7 +5,7 @@ from pathlib import Path
 from thor2_jax.errors import InputError
 from training.storage.tables import read_table
 from training.views.left_out import WithoutClasses
-from training.views.source import ViewSource
+from training.views.normalized_views import ViewSource
 
 __all__ = ["sequence_sources"]
 

@@ -13,18 +13,19 @@ from scipy.ndimage import binary_dilation, binary_erosion, distance_transform_cd
 from thor2_jax.errors import InputError
 from thor2_jax.recognition.frames import Intrinsics, RGBDFrame, backproject
 from thor2_jax.recognition.instance_clouds import instance_clouds
-from training.augmentation import Illumination, Occlusion, Segmentation, Sensor, Variations, vary
-from training.augmentation.augmentation import _without_flying
-from training.augmentation.occlusion import _silhouettes
-from training.augmentation.segmentation import _background, _widened
-from training.augmentation.sensor import sensed
+from training.augmentation.augmentations import Augmentations, _without_flying, augment
+from training.augmentation.illumination import Illumination
+from training.augmentation.occlusion import Occlusion, _silhouettes
+from training.augmentation.segmentation import Segmentation, _background, _widened
+from training.augmentation.sensor import Sensor, sensed
 from training.objects.builtin_objects import builtin_objects
-from training.rendering.ray_caster import TRAINING_CAMERA, RayCaster, RenderedView, render_view
+from training.rendering.camera import TRAINING_CAMERA, RenderedView
+from training.rendering.ray_caster import RayCaster, render_view
 from training.rendering.view_sphere import camera_pose
 from training.views.mesh_views import cloud_of
 
 OBJECTS = builtin_objects()
-ALL = Variations(Illumination(), Sensor(), Occlusion(), Segmentation())
+ALL = Augmentations(Illumination(), Sensor(), Occlusion(), Segmentation())
 SWITCHES: dict[str, Any] = {
     "illumination": Illumination(),
     "sensor": Sensor(),
@@ -57,7 +58,7 @@ def wall(z: int = 1500, size: int = 60, margin: int = 0) -> NDArray[np.uint16]:
 
 
 def varied(view: RenderedView, seed: int, **settings: Any) -> RenderedView:
-    return vary(view, Variations(**settings), np.random.default_rng(seed))
+    return augment(view, Augmentations(**settings), np.random.default_rng(seed))
 
 
 def same(one: RenderedView, other: RenderedView) -> bool:
@@ -73,18 +74,18 @@ def same(one: RenderedView, other: RenderedView) -> bool:
 
 
 def test_off() -> None:
-    off = Variations()
-    assert not off and off.copies == 2 and all(Variations(**{name: on}) for name, on in SWITCHES.items())
-    assert same(vary(MUG, off, np.random.default_rng(0)), MUG)
+    off = Augmentations()
+    assert not off and off.copies == 2 and all(Augmentations(**{name: on}) for name, on in SWITCHES.items())
+    assert same(augment(MUG, off, np.random.default_rng(0)), MUG)
 
 
 def test_record() -> None:
-    record = Variations(illumination=Illumination(), copies=3).record()
+    record = Augmentations(illumination=Illumination(), copies=3).record()
     assert record == json.loads(json.dumps(record))
     assert list(record) == ["illumination", "sensor", "occlusion", "segmentation", "copies"]
     assert record["sensor"] is None and record["copies"] == 3 and record["illumination"]["gain"] == [0.4, 1.6]
-    assert Variations(**SWITCHES).record() == ALL.record() != record
-    assert hash(Variations(**SWITCHES)) == hash(ALL)
+    assert Augmentations(**SWITCHES).record() == ALL.record() != record
+    assert hash(Augmentations(**SWITCHES)) == hash(ALL)
 
 
 @pytest.mark.parametrize(
@@ -102,9 +103,9 @@ def test_record() -> None:
         (lambda: Occlusion(none=float("inf")), r"occlusion\.none is inf"),
         (lambda: Segmentation(tilt=(0.0, 90.0)), r"segmentation\.tilt is \(0\.0, 90\.0\)"),
         (lambda: Segmentation(pixels=[-3, 3]), r"segmentation\.pixels is \[-3, 3\]"),  # type: ignore[arg-type]
-        (lambda: Variations(copies=0), r"variations\.copies is 0"),
-        (lambda: Variations(copies=True), r"variations\.copies is True"),
-        (lambda: Variations(sensor=Occlusion()), r"variations\.sensor is Occlusion\("),  # type: ignore[arg-type]
+        (lambda: Augmentations(copies=0), r"augmentations\.copies is 0"),
+        (lambda: Augmentations(copies=True), r"augmentations\.copies is True"),
+        (lambda: Augmentations(sensor=Occlusion()), r"augmentations\.sensor is Occlusion\("),  # type: ignore[arg-type]
     ],
 )
 def test_values_outside_their_limits(make: Callable[[], Any], message: str) -> None:
@@ -153,7 +154,7 @@ def test_all_objects_from_all_sides() -> None:
         caster = RayCaster([mesh])
         for polar in (0.0, np.pi / 2, 2.5):
             view = render_view(caster, camera_pose(0.0, polar, mesh.centre))
-            seen = [(vary(view, ALL, rng).depth > 0).sum() / (view.depth > 0).sum() for _ in range(5)]
+            seen = [(augment(view, ALL, rng).depth > 0).sum() / (view.depth > 0).sum() for _ in range(5)]
             assert 0.1 < min(seen) <= max(seen) < 1.7
 
 
@@ -319,8 +320,8 @@ def test_hidden_share(straight: float) -> None:
 
 
 def test_share_of_views_that_nothing_hides() -> None:
-    rng, variations = np.random.default_rng(0), Variations(occlusion=Occlusion(none=0.4))
-    hidden = [not same(vary(MUG, variations, rng), MUG) for _ in range(600)]
+    rng, augmentations = np.random.default_rng(0), Augmentations(occlusion=Occlusion(none=0.4))
+    hidden = [not same(augment(MUG, augmentations, rng), MUG) for _ in range(600)]
     assert np.mean(hidden) == pytest.approx(0.6, abs=0.06)
 
 

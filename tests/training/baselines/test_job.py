@@ -18,6 +18,7 @@ from thor2_jax.descriptor.describe import describe
 from thor2_jax.errors import InputError
 from thor2_jax.recognition.classifier import MLP
 from thor2_jax.recognition.run_directory import TrainedRun, load_run, save_run
+from thor2_jax.types import Cloud
 from training.baselines import job
 from training.baselines.baseline import seen_in
 from training.baselines.job import BASELINES, check_baselines, train_baselines
@@ -27,9 +28,8 @@ from training.evaluation.runs import load_runs
 from training.fitting.folds import fold_of_views
 from training.fitting.job import is_finished
 from training.views.left_out import WithoutClasses
-from training.views.mesh_views import Cloud
+from training.views.memory_views import MemoryViews
 from training.views.normalized_views import normalize_views
-from training.views.source import MemoryViews
 
 CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=1, image_size=8)
 NAMES = ("plank", "cube")

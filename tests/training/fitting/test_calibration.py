@@ -13,12 +13,12 @@ from thor2_jax.recognition.run_directory import input_size
 from training.evaluation.runs import load_runs
 from training.fitting import calibration
 from training.fitting.calibration import sample_probabilities, temperatures
-from training.fitting.fit import FitOptions
 from training.fitting.job import train_run
+from training.fitting.options import FitOptions
 from training.fitting.samples import MIRRORS, build_samples
 from training.fitting.temperature import fit_temperature
+from training.views.memory_views import MemoryViews
 from training.views.normalized_views import padded_batches
-from training.views.source import MemoryViews
 
 CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=2, n_strips=8, image_size=8)
 NETWORK = colornet.load_default()
@@ -44,7 +44,7 @@ def source(views: int) -> MemoryViews:
 
 @pytest.mark.parametrize("feature", ["ce", "tops2"])
 def test_samples_are_answered_as_their_clouds_are(feature: Feature, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(calibration, "CHUNK", 3)
+    monkeypatch.setattr(calibration, "SAMPLES_PER_BATCH", 3)
     views = source(2)
     samples = build_samples(views, NETWORK, CONFIG)
     model = MLP(input_size(feature, CONFIG, NETWORK.n_regions), 2, rngs=nnx.Rngs(0))

@@ -16,7 +16,8 @@ import thor2_jax as thor2
 from thor2_jax.descriptor.color_membership import region_sets
 from thor2_jax.recognition.classifier import MLP, Feature, feature_of
 from training.fitting.checkpoints import Checkpoints
-from training.fitting.fit import Figures, FitOptions, fit
+from training.fitting.fit import fit
+from training.fitting.options import EpochMetrics, FitOptions
 from training.fitting.samples import Samples, expand
 
 NETWORK = colornet.load_default()
@@ -61,7 +62,7 @@ def same_bits(a: MLP, b: MLP) -> None:
 
 
 def test_learns_to_tell_separable_classes_apart(separable: Samples, fitted: Fit) -> None:
-    curve: list[Figures] = []
+    curve: list[EpochMetrics] = []
     steps: list[tuple[int, int, int]] = []
     model, best = fitted(
         epoch_done=curve.append, progress=lambda done, total, figures: steps.append((done, total, figures.epoch))
@@ -86,7 +87,7 @@ def test_what_is_held_out_is_measured_and_not_learnt(separable: Samples, fitted:
     """Held out with wrong labels, a third is never named rightly; the best epoch is one that names most rightly."""
     held_out = np.arange(48) >= 38
     wrong = dataclasses.replace(separable, label=np.where(held_out, 0, separable.label).astype(np.int32))
-    curve: list[Figures] = []
+    curve: list[EpochMetrics] = []
     model, best = fitted(samples=wrong, held_out=held_out, epoch_done=curve.append)
     right = answers(model, separable, "tops2")[held_out] == 0
     assert max(figures.held_out_accuracy or 0 for figures in curve) == curve[best - 1].held_out_accuracy
@@ -109,12 +110,12 @@ class Stopped(Exception):
 
 def test_going_on_gives_the_bits_of_never_having_stopped(separable: Samples, fitted: Fit, tmp_path: Path) -> None:
     held_out = np.arange(48) % 4 == 0
-    expected: list[Figures] = []
+    expected: list[EpochMetrics] = []
     model, best = fitted(held_out=held_out, epoch_done=expected.append)
-    found: list[Figures] = []
+    found: list[EpochMetrics] = []
 
-    def stop_at(step: int) -> Callable[[int, int, Figures], None]:
-        def progress(done: int, total: int, figures: Figures) -> None:
+    def stop_at(step: int) -> Callable[[int, int, EpochMetrics], None]:
+        def progress(done: int, total: int, figures: EpochMetrics) -> None:
             if done == step:
                 raise Stopped
 

@@ -19,14 +19,14 @@ from PIL import Image
 
 import thor2_jax as thor2
 from thor2_jax.recognition.run_directory import TrainedRun, load_run
+from thor2_jax.types import Cloud
 from training.fitting import job as module
 from training.fitting import metrics_log as metrics
 from training.fitting.checkpoints import Checkpoints
-from training.fitting.fit import FitOptions
 from training.fitting.job import train_run
+from training.fitting.options import FitOptions
 from training.fitting.run_directories import find_run_directories
-from training.views.mesh_views import Cloud
-from training.views.source import MemoryViews
+from training.views.memory_views import MemoryViews
 
 CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=3, n_strips=8, image_size=8)
 OPTIONS = FitOptions(epochs=3, batch_size=4)

@@ -6,12 +6,12 @@ from pathlib import Path
 import pytest
 
 import thor2_jax as thor2
-from training.fitting.fit import Figures
 from training.fitting.metrics_log import append_figures, forget_after, read_figures
+from training.fitting.options import EpochMetrics
 
 
-def figures(epoch: int) -> Figures:
-    return Figures(epoch, 1 / epoch, 0.5, 1000.0)
+def figures(epoch: int) -> EpochMetrics:
+    return EpochMetrics(epoch, 1 / epoch, 0.5, 1000.0)
 
 
 def test_lines_are_added_and_forgotten(tmp_path: Path) -> None:

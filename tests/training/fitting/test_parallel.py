@@ -21,9 +21,9 @@ if port != "0":
 import numpy as np
 from flax import nnx
 import thor2_jax as thor2
-from training.fitting.fit import FitOptions
+from training.fitting.options import FitOptions
 from training.fitting.job import train_run
-from training.views.source import MemoryViews
+from training.views.memory_views import MemoryViews
 
 rng = np.random.default_rng(0)
 def clouds(size, low, high):

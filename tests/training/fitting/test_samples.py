@@ -11,11 +11,11 @@ import pytest
 import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.color_membership import region_sets
+from thor2_jax.types import Cloud
 from training.fitting import samples as module
 from training.fitting.samples import PAPER_MIRRORS, Samples, build_samples, expand
-from training.views.mesh_views import Cloud
+from training.views.memory_views import MemoryViews
 from training.views.normalized_views import NormalizedViews
-from training.views.source import MemoryViews
 
 NETWORK = colornet.load_default()
 CONFIG = thor2.DescriptorConfig(homology="closed_form")
@@ -48,7 +48,7 @@ def expanded(samples: Samples, rows: Any, config: thor2.DescriptorConfig = CONFI
 def test_every_view_is_used_mirrored_in_four_ways(
     config: thor2.DescriptorConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "CHUNK", 2)
+    monkeypatch.setattr(module, "VIEWS_PER_BATCH", 2)
     source = MemoryViews({"mug": views(0, (300, 299, 1)), "box": views(1, (40,))}, config)
     told: list[int] = []
     samples = build_samples(source, NETWORK, config, told.append, PAPER_MIRRORS)

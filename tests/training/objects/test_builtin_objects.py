@@ -6,7 +6,7 @@ import trimesh
 
 import colornet
 from training.objects.builtin_objects import COLOR_PAIRS, SHAPE_PAIRS, builtin_objects
-from training.objects.meshes import TexturedMesh
+from training.objects.mesh import TexturedMesh
 
 OBJECTS = builtin_objects()
 

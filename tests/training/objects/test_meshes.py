@@ -10,7 +10,8 @@ from PIL import Image
 from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
 from thor2_jax.errors import InputError
-from training.objects.meshes import TexturedMesh, find_meshes, load_mesh, merge_meshes, read_names
+from training.objects.mesh import TexturedMesh, merge_meshes
+from training.objects.meshes import find_meshes, load_mesh, read_names
 
 QUAD = np.array([[0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0], [0, 0.1, 0]])
 QUAD_FACES = np.array([[0, 1, 2], [0, 2, 3]])

@@ -5,8 +5,9 @@ import pytest
 import trimesh
 
 from thor2_jax.recognition.frames import Intrinsics, backproject
-from training.objects.meshes import TexturedMesh
-from training.rendering.ray_caster import Camera, RayCaster, pixel_rays, render_view
+from training.objects.mesh import TexturedMesh
+from training.rendering.camera import Camera
+from training.rendering.ray_caster import RayCaster, pixel_rays, render_view
 from training.rendering.view_sphere import camera_pose
 
 CAMERA = Camera.from_field_of_view(161, 121, 30.0)

@@ -7,8 +7,8 @@ import trimesh
 from thor2_jax.errors import InputError
 from thor2_jax.recognition.frames import Intrinsics, backproject
 from training.objects.builtin_objects import builtin_objects
-from training.objects.meshes import TexturedMesh
-from training.rendering.ray_caster import Camera
+from training.objects.mesh import TexturedMesh
+from training.rendering.camera import Camera
 from training.rendering.scenes import MIN_PIXELS, SCENE_CAMERA, Scene, _arrange, _put_down, _sensed_depth, compose_scene
 
 OBJECTS = builtin_objects()

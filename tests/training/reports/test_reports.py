@@ -12,7 +12,7 @@ import colornet
 import thor2_jax as thor2
 from training import demo
 from training.evaluate import Instance
-from training.fitting.fit import FitOptions
+from training.fitting.options import FitOptions
 from training.objects.builtin_objects import builtin_objects
 from training.reports.html import Picture, write_page
 from training.reports.plots import draw_accuracy, draw_confusion, draw_curves, draw_descriptor, draw_objects

@@ -11,10 +11,17 @@ import pytest
 
 import thor2_jax
 from thor2_jax.errors import InputError
+from thor2_jax.types import Cloud
 from training.objects.builtin_objects import builtin_objects
 from training.views.dataset import Manifest, ViewDataset, encode
-from training.views.mesh_views import Cloud, render_views
-from training.views.normalized_views import LARGEST, STEP, NormalizedViews, normalize_views, padded_batches
+from training.views.mesh_views import render_views
+from training.views.normalized_views import (
+    COORDINATE_STEP,
+    MAX_COORDINATE,
+    NormalizedViews,
+    normalize_views,
+    padded_batches,
+)
 from training.views.render_job import render_dataset
 
 OBJECTS = {name: builtin_objects()[name] for name in ("tennis_ball", "screwdriver")}
@@ -51,7 +58,7 @@ def test_what_was_rendered_comes_back_normalized(written: Path) -> None:
         assert views.counts.tolist() == [len(xyz) for xyz, _ in clouds] and len(views) == 30
         for (xyz, rgb), cloud in list(zip(views.clouds(), clouds, strict=True))[::10]:
             normal = thor2_jax.view_normalize(thor2_jax.PointClouds.pack([cloud]), CONFIG)
-            assert np.abs(xyz - np.asarray(normal.points)[0, : len(xyz)]).max() <= STEP / 2 * 1.02
+            assert np.abs(xyz - np.asarray(normal.points)[0, : len(xyz)]).max() <= COORDINATE_STEP / 2 * 1.02
             assert np.array_equal(rgb, cloud[1])
 
 
@@ -59,7 +66,7 @@ def test_files_hold_exactly_what_normalization_gives(written: Path) -> None:
     clouds = render_views(OBJECTS, 60, 45)["tennis_ball"]
     views, read = views_of(clouds), ViewDataset.open(written).read(0)
     assert np.array_equal(views.xyz, read.xyz)
-    assert np.array_equal(np.rint(read.xyz / STEP), read.xyz / STEP)
+    assert np.array_equal(np.rint(read.xyz / COORDINATE_STEP), read.xyz / COORDINATE_STEP)
     assert (written / "0000-0000.safetensors").read_bytes() == encode(views)
 
 
@@ -84,7 +91,7 @@ def test_no_views_and_views_past_the_range() -> None:
     assert len(encode(nothing)) > 0
     line = np.linspace(0, 1, 50, dtype=np.float32)[:, None] * np.array([0, 0, 1], np.float32)
     rgb = np.zeros((50, 3), np.uint8)
-    assert views_of([(line * np.float32(LARGEST / 2.5), rgb)]).xyz.max() == LARGEST
+    assert views_of([(line * np.float32(MAX_COORDINATE / 2.5), rgb)]).xyz.max() == MAX_COORDINATE
     with pytest.raises(InputError, match="a view is 4.05 scaled units long, more than 4"):
         views_of([(line, rgb), (line * np.float32(1.62), rgb)])
 

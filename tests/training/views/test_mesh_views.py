@@ -8,16 +8,18 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from thor2_jax.errors import InputError
-from training.augmentation import Illumination, Variations
+from thor2_jax.types import Cloud
+from training.augmentation.augmentations import Augmentations
+from training.augmentation.illumination import Illumination
 from training.objects.builtin_objects import builtin_objects
-from training.objects.meshes import TexturedMesh, find_meshes, load_mesh
+from training.objects.mesh import TexturedMesh
+from training.objects.meshes import find_meshes, load_mesh
 from training.rendering.view_sphere import DISTANCE, camera_pose, view_angles
 from training.views import mesh_views as views
 from training.views.mesh_views import (
     DESCRIPTOR_VOXEL,
     MIN_POINTS,
     SIGMA_S,
-    Cloud,
     ViewTask,
     render_task,
     render_views,
@@ -69,7 +71,7 @@ def check_same(one: dict[str, list[Cloud]], other: dict[str, list[Cloud]]) -> No
 
 
 def test_all_views_of_all_objects_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(views, "CHUNK", 4)
+    monkeypatch.setattr(views, "VIEWS_PER_TASK", 4)
     seen: list[tuple[int, int]] = []
     meshes = {"ball": ball(), "marble": ball(0.02)}
     found = render_views(meshes, 120, 90, 1, lambda done, total: seen.append((done, total)))
@@ -83,7 +85,7 @@ def test_all_views_of_all_objects_in_order(monkeypatch: pytest.MonkeyPatch) -> N
 
 @pytest.mark.slow
 def test_workers_give_the_same_views(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(views, "CHUNK", 50)
+    monkeypatch.setattr(views, "VIEWS_PER_TASK", 50)
     check_same(*(render_views({"a": ball(), "b": ball(0.03)}, 20, 15, workers) for workers in (1, 2)))
 
 
@@ -122,10 +124,10 @@ def test_bad_requests(tmp_path: Path) -> None:
 
 def test_varied_copies_follow_the_view_and_the_name_alone() -> None:
     """Whatever part of the angles a task has: a seed of their own makes copies, and the view itself stays."""
-    angles, variations = view_angles(90, 90), Variations(illumination=Illumination(), copies=2)
-    whole = render_task(ViewTask("ball", ball(), angles, 0, variations, 7))
+    angles, augmentations = view_angles(90, 90), Augmentations(illumination=Illumination(), copies=2)
+    whole = render_task(ViewTask("ball", ball(), angles, 0, augmentations, 7))
     assert [(cloud.view, cloud.copy) for cloud in whole] == [(view, copy) for view in range(12) for copy in range(3)]
-    part = render_task(ViewTask("ball", ball(), angles[5:7], 5, variations, 7))
+    part = render_task(ViewTask("ball", ball(), angles[5:7], 5, augmentations, 7))
     for cloud, other in zip(part, whole[15:21], strict=True):
         assert (cloud.view, cloud.copy) == (other.view, other.copy)
         assert np.array_equal(cloud.xyz, other.xyz) and np.array_equal(cloud.rgb, other.rgb)
@@ -133,9 +135,9 @@ def test_varied_copies_follow_the_view_and_the_name_alone() -> None:
     for cloud, other in zip(plain, whole[::3], strict=True):
         assert np.array_equal(cloud.xyz, other.xyz) and np.array_equal(cloud.rgb, other.rgb)
     others = [
-        render_task(ViewTask("bowl", ball(), angles[:1], 0, variations, 7)),
-        render_task(ViewTask("ball", ball(), angles[:1], 0, variations, 8)),
-        render_task(ViewTask("ball", ball(), angles[:1], 1, variations, 7)),
+        render_task(ViewTask("bowl", ball(), angles[:1], 0, augmentations, 7)),
+        render_task(ViewTask("ball", ball(), angles[:1], 0, augmentations, 8)),
+        render_task(ViewTask("ball", ball(), angles[:1], 1, augmentations, 7)),
     ]
     copies = [clouds[copy].rgb.tobytes() for clouds in (whole, *others) for copy in (1, 2)]
     assert len(set(copies)) == len(copies)

@@ -20,9 +20,10 @@ import trimesh
 
 from thor2_jax.errors import InputError
 from training import cli
-from training.augmentation import Illumination, Variations
+from training.augmentation.augmentations import Augmentations
+from training.augmentation.illumination import Illumination
 from training.objects.builtin_objects import builtin_objects
-from training.objects.meshes import TexturedMesh
+from training.objects.mesh import TexturedMesh
 from training.storage.locks import locked
 from training.storage.workers import local_workers, ray_workers
 from training.views import render_job
@@ -37,7 +38,7 @@ STEPS = (60, 45)
 
 @pytest.fixture(autouse=True)
 def small_shards(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(render_job, "SHARD", 16)
+    monkeypatch.setattr(render_job, "CLOUDS_PER_SHARD", 16)
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +46,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The dataset of a job that nothing interrupted."""
     out = tmp_path_factory.mktemp("whole") / "deep" / "views"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(render_job, "SHARD", 16)
+        patch.setattr(render_job, "CLOUDS_PER_SHARD", 16)
         render_dataset(OBJECTS, out, *STEPS)
     return out
 
@@ -132,7 +133,7 @@ from training.views import render_job
 from training.objects.builtin_objects import builtin_objects
 from training.storage.workers import local_workers
 
-render_job.SHARD = 16
+render_job.CLOUDS_PER_SHARD = 16
 replace, left = os.replace, int(sys.argv[2])
 
 def killing(source, target):
@@ -208,11 +209,11 @@ def test_another_job_is_refused(copied: Path) -> None:
     moved = dataclasses.replace(OBJECTS["tennis_ball"], vertices=OBJECTS["tennis_ball"].vertices + 1e-3)
     screwdriver = OBJECTS["screwdriver"]
     painted = dataclasses.replace(screwdriver, textures=tuple(texture ^ 1 for texture in screwdriver.textures))
-    light = Variations(illumination=Illumination())
+    light = Augmentations(illumination=Illumination())
     for found, steps, options, message in [
         (OBJECTS, (90, 45), {}, "azimuth_step 60.0, not 90.0"),
         (OBJECTS, (60, 90), {}, "polar_step 45.0, not 90.0"),
-        (OBJECTS, STEPS, {"variations": light}, "variations null, not {"),
+        (OBJECTS, STEPS, {"augmentations": light}, "variations null, not {"),
         (OBJECTS | {"tennis_ball": moved}, STEPS, {}, r"objects\[\d\].mesh "),
         (OBJECTS | {"screwdriver": painted}, STEPS, {}, r"objects\[\d\].mesh "),
         ({"tennis_ball": moved}, STEPS, {}, r"objects\[\d\]"),
@@ -225,17 +226,17 @@ def test_another_job_is_refused(copied: Path) -> None:
         assert contents(copied) == before
 
 
-def test_variations_are_part_of_the_job(tmp_path: Path) -> None:
-    out, light = tmp_path / "views", Variations(illumination=Illumination(), copies=2)
-    dataset = render_dataset({"ball": sphere(0.03)}, out, 90, 90, variations=light, seed=1)
+def test_augmentations_are_part_of_the_job(tmp_path: Path) -> None:
+    out, light = tmp_path / "views", Augmentations(illumination=Illumination(), copies=2)
+    dataset = render_dataset({"ball": sphere(0.03)}, out, 90, 90, augmentations=light, seed=1)
     assert len(dataset) == 36 and dataset.record["job"]["variations"]["seed"] == 1
     assert [shard.views for shard in dataset.shards] == [15, 15, 6]
     views = dataset.read(1)
     assert views.view.tolist() == list(np.repeat(range(5, 10), 3)) and views.copy.tolist() == [0, 1, 2] * 5
-    for options in ({}, {"variations": light, "seed": 2}, {"variations": dataclasses.replace(light, copies=3)}):
+    for options in ({}, {"augmentations": light, "seed": 2}, {"augmentations": dataclasses.replace(light, copies=3)}):
         with pytest.raises(InputError, match="variations is"):
             render_dataset({"ball": sphere(0.03)}, out, 90, 90, **options)
-    off = render_dataset({"ball": sphere(0.03)}, tmp_path / "off", 90, 90, variations=Variations(), seed=2)
+    off = render_dataset({"ball": sphere(0.03)}, tmp_path / "off", 90, 90, augmentations=Augmentations(), seed=2)
     assert len(off) == 12 and off.record["job"]["variations"] is None
 
 
@@ -248,7 +249,7 @@ def test_views_of_few_points_are_left_out_and_counted(tmp_path: Path) -> None:
 
 
 def test_a_shard_without_views(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(render_job, "SHARD", 2)
+    monkeypatch.setattr(render_job, "CLOUDS_PER_SHARD", 2)
     sheet = sphere(0.03)
     sheet.vertices[:, 2] *= 0.005
     dataset = render_dataset({"sheet": sheet}, tmp_path / "views", 180, 90)
@@ -271,7 +272,7 @@ def test_bad_requests_write_nothing(tmp_path: Path) -> None:
         (OBJECTS, STEPS, {"seed": -1}, "seed is -1"),
         ({**OBJECTS, "z": tmp_path / "bad.ply"}, STEPS, {}, "bad.ply"),
         ({"speck": sphere(0.003)}, (180, 90), {}, "object 'speck': none of its 6 views has 30 points"),
-        ({"door": sphere(0.6)}, (180, 90), {}, "object 'door' is 2.08 m across; views of at most 1.60 m"),
+        ({"door": sphere(0.6)}, (180, 90), {}, "object 'door' has a diameter of 2.08 m"),
     ]:
         with pytest.raises(InputError, match=message):
             render_dataset(found, out, *steps, **options)

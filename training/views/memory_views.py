@@ -7,37 +7,14 @@ source = MemoryViews(render_views(find_meshes("meshes")), config)
 import functools
 import itertools
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.files import content_digest
-from training.views.mesh_views import Cloud
+from thor2_jax.types import Cloud
 from training.views.normalized_views import NormalizedViews, normalize_views
 
-__all__ = ["MemoryViews", "ViewSource"]
-
-
-class ViewSource(Protocol):
-    """Normalized views, a shard at a time, each of one object: a `ViewDataset` on disk, or `MemoryViews`."""
-
-    @property
-    def classes(self) -> tuple[str, ...]:
-        """Class names."""
-
-    @property
-    def digest(self) -> str:
-        """Another one if any of the views is another."""
-
-    @property
-    def record(self) -> Mapping[str, Any]:
-        """What a run keeps of them, as JSON holds it."""
-
-    @property
-    def shards(self) -> Sequence[Any]:
-        """One entry for each `read`, with `label`, and `views`, their number."""
-
-    def read(self, index: int) -> NormalizedViews:
-        """The views of a shard."""
+__all__ = ["MemoryViews"]
 
 
 class _Shard(NamedTuple):

@@ -1,4 +1,4 @@
-"""Which variations are on, and a view with all of them."""
+"""Which augmentations are on, and a view with all of them."""
 
 import dataclasses
 from typing import Any
@@ -13,13 +13,13 @@ from training.augmentation.occlusion import Occlusion, occluded
 from training.augmentation.pixels import without
 from training.augmentation.segmentation import Segmentation, resegmented
 from training.augmentation.sensor import Sensor, sensed
-from training.rendering.ray_caster import RenderedView
+from training.rendering.camera import RenderedView
 
-__all__ = ["Variations", "vary"]
+__all__ = ["Augmentations", "augment"]
 
 
 @dataclasses.dataclass(frozen=True)
-class Variations:
+class Augmentations:
     """Variations of training views; None is off. False if all are off.
 
     Attributes:
@@ -49,9 +49,9 @@ class Variations:
         for name, kind in kinds.items():
             value = getattr(self, name)
             if value is not None and not isinstance(value, kind):
-                raise InputError(f"variations.{name} is {value!r}; it must be None or {kind.__name__}")
+                raise InputError(f"augmentations.{name} is {value!r}; it must be None or {kind.__name__}")
         if not isinstance(self.copies, int) or isinstance(self.copies, bool) or self.copies < 1:
-            raise InputError(f"variations.copies is {self.copies!r}; it must be a whole number of at least 1")
+            raise InputError(f"augmentations.copies is {self.copies!r}; it must be a whole number of at least 1")
 
     def __bool__(self) -> bool:
         return any((self.illumination, self.sensor, self.occlusion, self.segmentation))
@@ -65,7 +65,7 @@ class Variations:
         return dataclasses.asdict(self, dict_factory=plain)
 
 
-def vary(view: RenderedView, variations: Variations, rng: np.random.Generator) -> RenderedView:
+def augment(view: RenderedView, augmentations: Augmentations, rng: np.random.Generator) -> RenderedView:
     """A varied copy of a view: the same for the same arguments and state of `rng`.
 
     In the order of what happens to a frame: light, the mask's error, another object in front, the depth camera. As
@@ -73,22 +73,22 @@ def vary(view: RenderedView, variations: Variations, rng: np.random.Generator) -
 
     Args:
         view: unchanged.
-        variations: what to vary.
+        augmentations: what to vary.
         rng: of everything random.
 
     Returns:
         A view with the same pose. A mask that reaches past the outline needs room: there the part of the image, its
         corner and its intrinsics may be larger by some pixels.
     """
-    if variations.illumination:
-        view = relit(view, variations.illumination, rng)
-    if variations.segmentation:
-        view = resegmented(view, variations.segmentation, rng)
-    if variations.occlusion:
-        view = occluded(view, variations.occlusion, rng)
-    if variations.sensor:
-        view = sensed(view, variations.sensor, rng)
-    return _without_flying(view) if variations.segmentation or variations.sensor else view
+    if augmentations.illumination:
+        view = relit(view, augmentations.illumination, rng)
+    if augmentations.segmentation:
+        view = resegmented(view, augmentations.segmentation, rng)
+    if augmentations.occlusion:
+        view = occluded(view, augmentations.occlusion, rng)
+    if augmentations.sensor:
+        view = sensed(view, augmentations.sensor, rng)
+    return _without_flying(view) if augmentations.segmentation or augmentations.sensor else view
 
 
 def _without_flying(view: RenderedView) -> RenderedView:
