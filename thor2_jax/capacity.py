@@ -1,7 +1,8 @@
-"""Which padded size a cloud or a batch gets: the one rule shared by training, warm-up and service.
+"""Buckets: the padded sizes of clouds and batches, shared by training, warm-up and service.
 
-A compiled function is tied to the shapes of its arguments. With sizes drawn from a short list, whatever is warmed up is
-all that will ever be compiled.
+JAX compiles a function once for each shape of its arguments. A cloud is therefore padded to a point bucket, the
+smallest of a few fixed numbers of points that holds it, and a batch to a batch bucket. Once every bucket in use has
+been warmed up, no call compiles any more.
 """
 
 from thor2_jax.errors import InputError
@@ -9,29 +10,32 @@ from thor2_jax.errors import InputError
 __all__ = ["BATCH_BUCKETS", "POINT_BUCKETS", "batch_bucket", "point_bucket"]
 
 POINT_BUCKETS = (512, 1024, 2048, 4096, 8192)
+"""Padded numbers of points of a cloud."""
+
 BATCH_BUCKETS = (1, 2, 4, 8, 16, 32, 64, 128, 256)
+"""Padded numbers of clouds of a batch."""
 
 
-def _smallest(buckets: tuple[int, ...], n: int, what: str) -> int:
+def _smallest_bucket(buckets: tuple[int, ...], n: int, name: str, advice: str) -> int:
     for bucket in buckets:
         if n <= bucket:
             return bucket
-    raise InputError(f"{n} {what}: more than the largest bucket, {buckets[-1]}")
+    raise InputError(f"{name} is {n}; expected at most {buckets[-1]}, the largest bucket; {advice}")
 
 
 def point_bucket(n_points: int) -> int:
-    """Smallest padded number of points that holds `n_points`.
+    """Return the smallest padded number of points that holds `n_points`.
 
     Raises:
-        InputError: more points than the largest bucket; voxel the cloud more coarsely.
+        InputError: `n_points` exceeds the largest bucket.
     """
-    return _smallest(POINT_BUCKETS, n_points, "points in a cloud")
+    return _smallest_bucket(POINT_BUCKETS, n_points, "n_points", "downsample the cloud with a coarser voxel grid")
 
 
 def batch_bucket(n_clouds: int) -> int:
-    """Smallest padded number of clouds that holds `n_clouds`.
+    """Return the smallest padded number of clouds that holds `n_clouds`.
 
     Raises:
-        InputError: more clouds than the largest bucket; split the batch.
+        InputError: `n_clouds` exceeds the largest bucket.
     """
-    return _smallest(BATCH_BUCKETS, n_clouds, "clouds in a batch")
+    return _smallest_bucket(BATCH_BUCKETS, n_clouds, "n_clouds", "split the batch")

@@ -1,4 +1,4 @@
-"""Constants of the descriptor (paper, section "Descriptor computation"), in one frozen, hashable record.
+"""The constants of the descriptor (paper, section "Descriptor computation") in one frozen, hashable record.
 
 >>> DescriptorConfig().n_slices
 7
@@ -15,7 +15,7 @@ from thor2_jax.errors import InputError
 __all__ = ["DESCRIPTOR_VERSION", "DescriptorConfig", "Relaxation"]
 
 DESCRIPTOR_VERSION = 1
-"""Raised by one with every change that alters a descriptor's values; stored in run folders, which refuse to mix."""
+"""Version of the descriptor's values, stored in every run directory; a run of another version is rejected."""
 
 _CHOICES = {"homology": ("gudhi", "closed_form"), "convention": ("paper", "released")}
 
@@ -23,22 +23,22 @@ _CHOICES = {"homology": ("gudhi", "closed_form"), "convention": ("paper", "relea
 def _is_finite(value: object) -> bool:
     try:
         return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-    except OverflowError:  # an integer past the largest float
+    except OverflowError:  # an integer beyond the largest float
         return False
 
 
 @dataclasses.dataclass(frozen=True)
 class Relaxation:
-    """Temperatures of the soft descriptor (`relaxation`). Towards zero, all together, it becomes the hard one.
+    """Temperatures of the relaxed descriptor, which approaches the hard one as all four approach zero.
 
     Attributes:
-        slice: width of the sigmoid at a slice's borders, scaled units along z.
-        strip: width of the sigmoid at a strip's borders, scaled units along x.
-        extremum: of the log-sum-exp over a strip's points, scaled units along y.
-        color: of the softmax over colours, units of the HyAB distance in CIELAB.
+        slice: width of the sigmoid at the borders of slices, scaled units along z.
+        strip: width of the sigmoid at the borders of strips, scaled units along x.
+        extremum: temperature of the log-sum-exp over the points of a strip, scaled units along y.
+        color: temperature of the softmax over colours, units of the HyAB distance in CIELAB.
 
     Raises:
-        InputError: a temperature that is no positive number, naming the field and the value.
+        InputError: a temperature is not a positive number; the message names the field and the value.
     """
 
     slice: float = 0.01
@@ -50,32 +50,32 @@ class Relaxation:
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
             if not (_is_finite(value) and value > 0):
-                raise InputError(f"Relaxation.{field.name} is {value!r}; it must be a positive number")
+                raise InputError(f"Relaxation.{field.name} is {value!r}; expected a positive number")
 
 
 @dataclasses.dataclass(frozen=True)
 class DescriptorConfig:
-    """What turns a coloured cloud into TOPS and TOPS2. Static under jit: another config is another compilation.
+    """Settings of the descriptors TOPS and TOPS2. Static under `jax.jit`: each config compiles once.
 
-    Lengths are scaled units (metres x `sigma_s`) unless said otherwise.
+    Lengths are in scaled units (metres times `sigma_s`) unless stated otherwise.
 
     Attributes:
-        homology: where persistence diagrams come from: gudhi through one host callback a batch, or the same pairs in
-            JAX.
-        convention: the paper's equations, or those of the authors' released code (see `released`).
+        homology: source of the persistence diagrams, "gudhi" (one host callback for a batch) or "closed_form" (the same
+            pairs, computed by JAX).
+        convention: "paper" for the paper's equations, "released" for the authors' released code (see `released`).
         sigma_s: scaled units per metre.
-        sigma_1: thickness of a slice (along z of the aligned cloud).
-        sigma_2: width of a strip (along x of the aligned cloud); also the side of an image's pixel.
-        alpha: angle in radians between the normalized cloud's long axis and the x-y plane.
-        n_slices: slices kept in a descriptor; points beyond count as overflow.
-        n_strips: strips kept in a slice, n_s^max of the paper (31 for UW-IS Occluded, 29 for OCID).
-        image_size: pixels along either side of a persistence image; the window starts at -`sigma_2`.
+        sigma_1: thickness of a slice, along z of the aligned cloud.
+        sigma_2: width of a strip, along x of the aligned cloud; also the side of a pixel of an image.
+        alpha: angle between the long axis of the normalized cloud and the x-y plane, radians.
+        n_slices: number of slices; points beyond them are counted in `overflow`.
+        n_strips: number of strips in a slice, n_s^max of the paper (31 for UW-IS Occluded, 29 for OCID).
+        image_size: pixels along each side of a persistence image; its window starts at -`sigma_2`.
         image_variance: variance of the Gaussian at each point of a diagram.
-        persistence_weight: exponent n of a point's weight in an image, persistence**n; the paper's is 1.
-        relaxation: temperatures of soft slices, strips, extremes and colours; None is the paper's hard descriptor.
+        persistence_weight: exponent n of the weight persistence**n of a point in an image; 1 in the paper.
+        relaxation: temperatures of soft slices, strips, extremes and colours; None for the paper's hard descriptor.
 
     Raises:
-        InputError: a value out of its range, naming the field and the value.
+        InputError: a value is out of range; the message names the field and the value.
     """
 
     homology: Literal["gudhi", "closed_form"] = "gudhi"
@@ -94,38 +94,41 @@ class DescriptorConfig:
     def __post_init__(self) -> None:
         for name, allowed in _CHOICES.items():
             if getattr(self, name) not in allowed:
-                raise InputError(f"DescriptorConfig.{name} is {getattr(self, name)!r}; it must be one of {allowed}")
+                raise InputError(f"DescriptorConfig.{name} is {getattr(self, name)!r}; expected one of {allowed}")
         for name in ("sigma_s", "sigma_1", "sigma_2", "image_variance", "persistence_weight"):
             if not (_is_finite(getattr(self, name)) and getattr(self, name) > 0):
-                raise InputError(f"DescriptorConfig.{name} is {getattr(self, name)!r}; it must be a positive number")
+                raise InputError(f"DescriptorConfig.{name} is {getattr(self, name)!r}; expected a positive number")
         for name in ("n_slices", "n_strips", "image_size"):
             if type(getattr(self, name)) is not int or getattr(self, name) < 1:
-                raise InputError(f"DescriptorConfig.{name} is {getattr(self, name)!r}; it must be a positive integer")
+                raise InputError(f"DescriptorConfig.{name} is {getattr(self, name)!r}; expected a positive integer")
         if not _is_finite(self.alpha):
-            raise InputError(f"DescriptorConfig.alpha is {self.alpha!r}; it must be a finite angle in radians")
+            raise InputError(f"DescriptorConfig.alpha is {self.alpha!r}; expected a finite angle in radians")
         if not (self.relaxation is None or isinstance(self.relaxation, Relaxation)):
-            raise InputError(f"DescriptorConfig.relaxation is {self.relaxation!r}; it must be a Relaxation or None")
+            raise InputError(f"DescriptorConfig.relaxation is {self.relaxation!r}; expected a Relaxation or None")
         if self.convention == "released" and self.relaxation is not None:
             raise InputError(
-                f"DescriptorConfig.relaxation is {self.relaxation}; the released convention rounds and has no soft form"
+                f"DescriptorConfig.relaxation is {self.relaxation}; expected None in the released convention"
             )
         if self.convention == "released" and (self.sigma_1, self.sigma_2) != (0.1, 0.025):
             raise InputError(
-                f"DescriptorConfig.sigma_1, sigma_2 are {self.sigma_1}, {self.sigma_2}; the released convention rounds "
-                "to 0.1 and 0.01 and holds for 0.1 and 0.025 only"
+                f"DescriptorConfig.sigma_1, sigma_2 are {self.sigma_1}, {self.sigma_2}; expected 0.1, 0.025, the only "
+                "values of the released convention"
             )
 
     @classmethod
     def released(cls, **changes: Any) -> "DescriptorConfig":
-        """The conventions of the authors' released code, on the same aligned cloud.
+        """Return a config with the convention of the authors' released code, for the same aligned clouds.
 
-        x and y rounded to 0.01 and z to 0.1 (half to even); slices are the occurring z levels, renumbered from 0; a
-        strip is numbered, and born, at its upper bin edge; colour vectors are divided by their strip's number of
-        points.
+        Coordinates x and y are rounded to 0.01 and z to 0.1, half to even. Slices are the levels of z that occur,
+        renumbered from 0. A strip is numbered by, and born at, its upper edge. Colour vectors are divided by the number
+        of points of their strip.
+
+        Args:
+            changes: other fields of the config.
         """
         return cls(convention="released", **changes)
 
     @property
     def window(self) -> float:
-        """Upper end of an image's axes: largest persistence that an image shows, in scaled units (0.775)."""
+        """Upper end of the axes of an image, the largest persistence that it covers, in scaled units (0.775)."""
         return (self.image_size - 1) * self.sigma_2

@@ -1,32 +1,32 @@
-"""Which versions of jax this package runs on; others are refused when this module is imported, before anything else."""
+"""The versions of jax that this package supports; importing this module rejects all others."""
 
 import re
 from importlib.metadata import version
 
 __all__ = ["check_jax_version"]
 
-WRONG_NUMBERS = {
+REJECTED_VERSIONS = {
     "0.10.2": "it computes rotations of more than 32,768 points wrongly on CPU (https://github.com/jax-ml/jax/issues/39103)"
 }
-"""Version -> what is wrong with it."""
+"""Rejected version -> reason."""
 
-NEWEST_SERIES = (0, 10)
-"""Major and minor version of the newest series that the tests have run on."""
+NEWEST_TESTED_SERIES = (0, 10)
+"""Major and minor version of the newest release series that the tests have run on."""
 
 
-def check_jax_version(package: str, found: str) -> None:
-    """Refuse a version of jax or jaxlib; the same rule stands in pyproject.toml, for installers.
+def check_jax_version(package: str, installed: str) -> None:
+    """Reject unsupported versions of jax or jaxlib. Installers read the same rule from pyproject.toml.
 
     Raises:
-        ImportError: with the package, the version, the reason and what to install.
+        ImportError: the version is not supported; the message has the reason and what to install.
     """
-    advice = "install the set of packages in constraints.txt, or another 0.10"
-    if found in WRONG_NUMBERS:
-        raise ImportError(f"{package} {found} is refused: {WRONG_NUMBERS[found]}; {advice}")
-    series = tuple(int(part) for part in re.findall(r"\d+", found)[:2])
-    if series > NEWEST_SERIES:
-        newest = ".".join(map(str, NEWEST_SERIES))
-        raise ImportError(f"{package} {found} is refused: it is newer than {newest}, the last one tested; {advice}")
+    advice = "install the versions in constraints.txt, or another 0.10"
+    if installed in REJECTED_VERSIONS:
+        raise ImportError(f"{package} {installed} is not supported: {REJECTED_VERSIONS[installed]}; {advice}")
+    series = tuple(int(part) for part in re.findall(r"\d+", installed)[:2])
+    if series > NEWEST_TESTED_SERIES:
+        newest = ".".join(map(str, NEWEST_TESTED_SERIES))
+        raise ImportError(f"{package} {installed} is not supported: the newest tested series is {newest}; {advice}")
 
 
 for package in ("jax", "jaxlib"):

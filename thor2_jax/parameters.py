@@ -1,6 +1,6 @@
-"""The descriptor's numbers that gradients can reach, as one record of arrays.
+"""The parameters of the descriptor that can be learned, as one record of arrays.
 
-They enter compiled functions as arguments: other values need no other compilation.
+Compiled functions take them as arguments, so that other values need no compilation.
 
 >>> parameters = Parameters.of(network, config)                               # doctest: +SKIP
 >>> loss = lambda p: (describe(clouds, network, config, p).tops2**2).sum()    # doctest: +SKIP
@@ -21,14 +21,14 @@ __all__ = ["Parameters"]
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Parameters:
-    """What may be learned of a descriptor. Where given, it takes the place of the same numbers of network and config.
+    """Learnable parameters of a descriptor, which replace the same numbers of the network and the config.
 
     Attributes:
-        similarity: [R, R] float32, Delta of the paper.
-        alpha: [] float32, angle in radians of the turn about y. The hard descriptor depends on it through slices and
-            strips alone, so its gradient is zero there; the relaxed one's is not.
+        similarity: [R, R] float32, the similarity matrix Delta.
+        alpha: [] float32, angle of the turn about y, radians. The hard descriptor depends on it only through the choice
+            of slices and strips, so that its gradient is zero; the gradient of a relaxed descriptor is not.
         sigma_s: [] float32, scaled units per metre.
-        image_variance: [] float32, positive: variance of the Gaussian at each point of a diagram.
+        image_variance: [] float32, positive; variance of the Gaussian at each point of a diagram.
         persistence_weight: [] float32, exponent n of the weight persistence**n.
     """
 
@@ -40,8 +40,8 @@ class Parameters:
 
     @classmethod
     def of(cls, network: ColorNetwork, config: DescriptorConfig) -> "Parameters":
-        """The values of a network and a config."""
-        # Arrays also where a caller's function is being traced, so that they may be kept.
+        """Return the values of a network and a config."""
+        # Concrete arrays even while a caller's function is traced, so that they can be cached.
         with jax.ensure_compile_time_eval():
             return cls(
                 similarity=jnp.asarray(network.similarity, jnp.float32),

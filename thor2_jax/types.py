@@ -1,7 +1,7 @@
-"""The records that flow between the stages. Each is frozen, a pytree of arrays, and names its fields' shapes.
+"""The records that are passed between the stages of the pipeline: frozen pytrees of arrays.
 
-B is the number of clouds, N the padded number of points, S slices, J strips, R colour regions, P pixels of an image's
-side.
+Shapes use these letters: B clouds, N points of a cloud after padding, S slices, J strips of a slice, R colour regions,
+P pixels along the side of an image.
 """
 
 import dataclasses
@@ -25,14 +25,14 @@ Cloud = tuple[NDArray[np.float32], NDArray[np.uint8]]
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class PointClouds:
-    """A batch of coloured clouds, padded to one size.
+    """A batch of coloured point clouds, padded to the same number of points.
 
     Attributes:
-        points: [B, N, 3] float32. Metres in the camera frame for input; scaled units after view normalization.
+        points: [B, N, 3] float32; metres in the camera frame as input, scaled units after view normalization.
         colors: [B, N, 3] float32, sRGB in [0, 1].
         mask: [B, N] bool, False on padding.
         camera: [B, 3] float32, the camera's position in the frame of `points`.
-        boundary: [B, N] bool, points on the object's occlusion boundary; all False for unoccluded or training views.
+        boundary: [B, N] bool, points on the occlusion boundary of the object; all False for unoccluded views.
     """
 
     points: jax.Array
@@ -51,42 +51,43 @@ class PointClouds:
         *,
         on_host: bool = False,
     ) -> "PointClouds":
-        """Pad a list of clouds to one size.
+        """Pad clouds of different sizes to the same number of points, and stack them.
 
         Args:
-            clouds: pairs (xyz [n, 3] metres, rgb [n, 3] sRGB: uint8, or floating in [0, 1]). A cloud may be empty
-                (n = 0): it is all padding, and its descriptor is zero.
-            capacity: padded number of points; by default the bucket of the largest cloud.
-            camera: [3] or [B, 3], the camera's position; by default the origin.
-            boundary: one [n] bool array (or None) a cloud: the points on the occlusion boundary.
-            on_host: the fields are NumPy arrays; a compiled function takes them to the device sooner than this does.
+            clouds: pairs of xyz [n, 3], floating, metres, and rgb [n, 3], sRGB, uint8 or floating in [0, 1]. An empty
+                cloud (n = 0) becomes padding only; its descriptor is zero.
+            capacity: padded number of points N; by default the point bucket of the largest cloud, the smallest of
+                `thor2_jax.capacity.POINT_BUCKETS` that holds it. Compiled functions are reused for equal N.
+            camera: [3] or [B, 3], position of the camera; by default the origin.
+            boundary: for each cloud an [n] bool array or None, the points on the occlusion boundary.
+            on_host: keep the fields as NumPy arrays. A compiled function transfers them faster than `device_put`.
 
         Raises:
-            InputError: no clouds, wrong shapes or types, coordinates that are not finite in float32, colours out of
-                range, a cloud larger than `capacity` or the largest bucket, a capacity that is no positive integer,
-                a camera that is not finite or of another shape. The message gives the cloud's index.
+            InputError: `clouds` is empty, or has wrong shapes or types, coordinates that are not finite in float32, or
+                colours out of range; a cloud exceeds `capacity` or the largest bucket; `capacity` is not a positive
+                integer; `camera` is not finite or has another shape. The message gives the index of the cloud.
         """
         if len(clouds) == 0:
-            raise InputError("clouds is empty; at least one (xyz, rgb) pair is needed")
-        parts = [_checked(pair, f"clouds[{i}]") for i, pair in enumerate(clouds)]
-        sizes = [len(xyz) for xyz, _ in parts]
+            raise InputError("clouds is empty; expected at least one pair (xyz, rgb)")
+        arrays = [_check_cloud(pair, f"clouds[{i}]") for i, pair in enumerate(clouds)]
+        sizes = [len(xyz) for xyz, _ in arrays]
         n = _padded_size(sizes, capacity)
-        points = np.zeros((len(parts), n, 3), np.float32)
-        colors = np.zeros((len(parts), n, 3), np.float32)
-        edge = np.zeros((len(parts), n), bool)
-        if boundary is not None and len(boundary) != len(parts):
-            raise InputError(f"boundary has {len(boundary)} entries for {len(parts)} clouds")
-        for i, (xyz, rgb) in enumerate(parts):
+        points = np.zeros((len(arrays), n, 3), np.float32)
+        colors = np.zeros((len(arrays), n, 3), np.float32)
+        on_boundary = np.zeros((len(arrays), n), bool)
+        if boundary is not None and len(boundary) != len(arrays):
+            raise InputError(f"boundary has {len(boundary)} entries for {len(arrays)} clouds; give one for each cloud")
+        for i, (xyz, rgb) in enumerate(arrays):
             points[i, : sizes[i]], colors[i, : sizes[i]] = xyz, rgb
             if boundary is not None and boundary[i] is not None:
                 flags = np.asarray(boundary[i])
                 if flags.shape != (sizes[i],) or flags.dtype != bool:
                     raise InputError(f"boundary[{i}] is {flags.dtype} {list(flags.shape)}; expected bool [{sizes[i]}]")
-                edge[i, : sizes[i]] = flags
-        position = np.zeros(3, np.float32) if camera is None else _position(camera, len(parts))
+                on_boundary[i, : sizes[i]] = flags
+        position = np.zeros(3, np.float32) if camera is None else _camera_positions(camera, len(arrays))
         mask = np.arange(n) < np.array(sizes)[:, None]
-        position = np.broadcast_to(position, (len(parts), 3))
-        fields: Any = points, colors, mask, position, edge
+        position = np.broadcast_to(position, (len(arrays), 3))
+        fields: Any = points, colors, mask, position, on_boundary
         return cls(*(fields if on_host else jax.device_put(fields)))
 
 
@@ -95,20 +96,20 @@ def _padded_size(sizes: list[int], capacity: int | None) -> int:
     if capacity is None:
         if largest > POINT_BUCKETS[-1]:
             raise InputError(
-                f"clouds[{sizes.index(largest)}] has {largest} points, more than the largest bucket, "
-                f"{POINT_BUCKETS[-1]}; voxel it more coarsely or give a capacity"
+                f"clouds[{sizes.index(largest)}] has {largest} points; expected at most {POINT_BUCKETS[-1]}, the "
+                "largest bucket; downsample it or give a capacity"
             )
         return point_bucket(largest)
     if not isinstance(capacity, int) or isinstance(capacity, bool) or capacity < 1:
-        raise InputError(f"capacity is {capacity!r}; it must be a positive integer")
+        raise InputError(f"capacity is {capacity!r}; expected a positive integer")
     if largest > capacity:
-        raise InputError(f"capacity is {capacity}, but clouds[{sizes.index(largest)}] has {largest} points")
+        raise InputError(f"capacity is {capacity}; clouds[{sizes.index(largest)}] needs at least {largest}")
     return capacity
 
 
-def _position(camera: ArrayLike, n_clouds: int) -> NDArray[np.float32]:
+def _camera_positions(camera: ArrayLike, n_clouds: int) -> NDArray[np.float32]:
     try:
-        position = _single(np.asarray(camera, np.float64))
+        position = _as_float32(np.asarray(camera, np.float64))
     except (TypeError, ValueError):
         raise InputError(f"camera is {camera!r}; expected numbers, [3] or [{n_clouds}, 3]") from None
     if position.shape not in ((3,), (n_clouds, 3)) or not np.isfinite(position).all():
@@ -116,46 +117,46 @@ def _position(camera: ArrayLike, n_clouds: int) -> NDArray[np.float32]:
     return position
 
 
-def _single(values: NDArray[Any]) -> NDArray[np.float32]:
-    """To float32, without a warning where a value is too large: that becomes infinity, which the caller refuses."""
+def _as_float32(values: NDArray[Any]) -> NDArray[np.float32]:
+    """Convert to float32. Values that are too large become infinite without a warning; the caller rejects them."""
     with np.errstate(over="ignore"):
         return values.astype(np.float32)
 
 
-def _checked(pair: tuple[ArrayLike, ArrayLike], name: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _check_cloud(pair: tuple[ArrayLike, ArrayLike], name: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     if not isinstance(pair, tuple | list) or len(pair) != 2:
         raise InputError(f"{name} is a {type(pair).__name__}; expected a pair (xyz, rgb)")
     points, colors = np.asarray(pair[0]), np.asarray(pair[1])
     if points.ndim != 2 or points.shape[1] != 3 or not np.issubdtype(points.dtype, np.floating):
-        raise InputError(f"{name}: xyz is {points.dtype} {list(points.shape)}; expected floating [n, 3], metres")
+        raise InputError(f"{name}: xyz is {points.dtype} {list(points.shape)}; expected floating [n, 3], in metres")
     if colors.shape != points.shape:
-        raise InputError(f"{name}: rgb is {list(colors.shape)}; expected {list(points.shape)}, as xyz")
-    finite = np.isfinite(_single(points))
+        raise InputError(f"{name}: rgb is {list(colors.shape)}; expected {list(points.shape)}, the shape of xyz")
+    finite = np.isfinite(_as_float32(points))
     if not finite.all():
         bad = int(np.flatnonzero(~finite.all(axis=1))[0])
-        raise InputError(f"{name}: xyz[{bad}] is {points[bad].tolist()}; every coordinate must be finite in float32")
+        raise InputError(f"{name}: xyz[{bad}] is {points[bad].tolist()}; expected numbers that are finite in float32")
     if colors.dtype == np.uint8:
-        return _single(points), colors.astype(np.float32) / np.float32(255)
+        return _as_float32(points), colors.astype(np.float32) / np.float32(255)
     if not np.issubdtype(colors.dtype, np.floating):
         raise InputError(f"{name}: rgb is {colors.dtype}; expected uint8, or floating in [0, 1]")
     inside = (colors >= 0) & (colors <= 1)
     if not inside.all():
         bad = int(np.flatnonzero(~inside.all(axis=1))[0])
-        raise InputError(f"{name}: rgb[{bad}] is {colors[bad].tolist()}; floating colours must lie in [0, 1]")
-    return _single(points), _single(colors)
+        raise InputError(f"{name}: rgb[{bad}] is {colors[bad].tolist()}; expected floating colours in [0, 1]")
+    return _as_float32(points), _as_float32(colors)
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Strips:
-    """What a descriptor needs of an aligned cloud, strip by strip (fields [..., S, J] and [..., S, J, R]).
+    """The extremes and the colour vector of every strip of aligned clouds, from which descriptors are computed.
 
     Attributes:
-        low: [..., S, J] float32, least y of the strip's points; 0 where the strip is empty.
-        high: [..., S, J] float32, greatest y of the strip's points; 0 where the strip is empty.
-        occupied: [..., S, J] bool, the strip has a point.
-        color: [..., S, J, R] float32, strip colour vectors Phi^j (rows of the colour matrix C^i).
-        overflow: [...] int32, points outside the slices and strips.
+        low: [..., S, J] float32, least y of the points of the strip; 0 if it is empty.
+        high: [..., S, J] float32, greatest y of the points of the strip; 0 if it is empty.
+        occupied: [..., S, J] bool, True if the strip has a point.
+        color: [..., S, J, R] float32, colour vectors Phi^j of the strips, the rows of the colour matrix C^i.
+        overflow: [...] int32, number of points outside the grid of slices and strips.
     """
 
     low: jax.Array
@@ -168,12 +169,12 @@ class Strips:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Diagrams:
-    """Finite H0 persistence pairs, a slice a row, padded to the number of strips.
+    """Finite H0 persistence pairs of every slice, padded to the number of strips.
 
     Attributes:
         births: [..., S, J] float32, scaled units; 0 on padding.
         deaths: [..., S, J] float32, scaled units; 0 on padding.
-        mask: [..., S, J] bool, True where there is a pair.
+        mask: [..., S, J] bool, False on padding.
     """
 
     births: jax.Array
@@ -182,8 +183,8 @@ class Diagrams:
 
 
 @jax.jit
-def _side_by_side(images: jax.Array, embeddings: jax.Array) -> jax.Array:
-    """[..., S, P, P] and [..., S, R, J] to [..., S * (P * P + R * J)], slice by slice."""
+def _interleave(images: jax.Array, embeddings: jax.Array) -> jax.Array:
+    """Concatenate [..., S, P, P] and [..., S, R, J] slice by slice, to [..., S * (P * P + R * J)]."""
     blocks = [a.reshape(*a.shape[:-2], -1) for a in (images, embeddings)]
     return jnp.concatenate(blocks, axis=-1).reshape(*images.shape[:-3], -1)
 
@@ -194,10 +195,10 @@ class Descriptors:
     """TOPS, TOPS2 and the colour embeddings (CE) of a batch of clouds.
 
     Attributes:
-        images: [B, S, P, P] float32, persistence images; axes birth, persistence; zeros for an absent slice.
-        embeddings: [B, S, R, J] float32, colour embeddings E^i = (C^i Delta)^T.
-        overflow: [B] int32, points outside the slices and strips plus strips whose persistence is past the window.
-            Nothing is dropped in silence: where this is not zero, the descriptor misses that much of the cloud.
+        images: [B, S, P, P] float32, persistence images, axes birth and persistence; zeros for an absent slice.
+        embeddings: [B, S, R, J] float32, colour embeddings E^i = (C^i Delta)^T, axes region and strip.
+        overflow: [B] int32, number of points outside the grid of slices and strips, plus number of strips whose
+            persistence exceeds the image window. The descriptor leaves these out; 0 means that it covers the cloud.
     """
 
     images: jax.Array
@@ -206,18 +207,18 @@ class Descriptors:
 
     @property
     def tops(self) -> jax.Array:
-        """Shape descriptor TOPS [B, S * P * P] (7,168 floats)."""
+        """The shape descriptor TOPS, [B, S * P * P] (7,168 floats): the images of the slices one after the other."""
         return self.images.reshape(*self.overflow.shape, -1)
 
     @property
     def color(self) -> jax.Array:
-        """Colour embeddings alone, CE [B, S * R * J] (4,774 floats)."""
+        """The colour descriptor CE, [B, S * R * J] (4,774 floats): the embeddings one after the other."""
         return self.embeddings.reshape(*self.overflow.shape, -1)
 
     @property
     def tops2(self) -> jax.Array:
-        """Shape and colour descriptor TOPS2 [B, S * (P * P + R * J)] (11,942 floats).
+        """The shape and colour descriptor TOPS2, [B, S * (P * P + R * J)] (11,942 floats).
 
-        One block [image | embedding] a slice.
+        It has one block [image | embedding] for each slice.
         """
-        return _side_by_side(self.images, self.embeddings)
+        return _interleave(self.images, self.embeddings)

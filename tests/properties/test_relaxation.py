@@ -13,7 +13,7 @@ from colornet.lab import GRID_WHITE
 from colornet.lab import hyab as exact_hyab
 from colornet.lab import to_lab as exact_lab
 from thor2_jax.descriptor.color_membership import region_sets
-from thor2_jax.descriptor.relaxation import hyab, interval_weights, soft_regions, to_lab
+from thor2_jax.descriptor.relaxation import hyab, interval_log_weights, soft_regions, to_lab
 
 NETWORK = colornet.load_default()
 HARD = thor2.DescriptorConfig(homology="closed_form")
@@ -57,7 +57,7 @@ def test_weights_of_intervals_are_differences_of_sigmoids() -> None:
             return 1 / (1 + np.exp(-(at[:, None] - edge) / temperature))
 
         expected = np.where(lower > 0, below(lower), 1) - below(upper)
-        found = np.exp(interval_weights(jnp.asarray(at, jnp.float32), 0.1, 7, temperature))
+        found = np.exp(interval_log_weights(jnp.asarray(at, jnp.float32), 0.1, 7, temperature))
         np.testing.assert_allclose(found, expected, atol=2e-5)
         np.testing.assert_allclose(found.sum(axis=1), 1 - below(upper[-1:])[:, 0], atol=2e-5)
 

@@ -1,4 +1,4 @@
-"""Buckets: the smallest that holds, at every border."""
+"""The smallest bucket is chosen, at every border."""
 
 from collections.abc import Callable
 
@@ -19,7 +19,7 @@ def test_buckets_double() -> None:
     assert BATCH_BUCKETS == tuple(2**k for k in range(9))
 
 
-@pytest.mark.parametrize(("pick", "n", "words"), [(point_bucket, 8193, "points"), (batch_bucket, 257, "clouds")])
-def test_past_the_largest_bucket(pick: Callable[[int], int], n: int, words: str) -> None:
-    with pytest.raises(InputError, match=rf"{n} {words}.*largest bucket, {n - 1}$"):
+@pytest.mark.parametrize(("pick", "name", "n"), [(point_bucket, "n_points", 8193), (batch_bucket, "n_clouds", 257)])
+def test_past_the_largest_bucket(pick: Callable[[int], int], name: str, n: int) -> None:
+    with pytest.raises(InputError, match=rf"^{name} is {n}\b.*\b{n - 1}\b"):
         pick(n)

@@ -1,4 +1,8 @@
-"""Large batches on CPUs: a few parts at a time, so that the tables of a part stay in the caches."""
+"""Large batches on CPUs, computed a chunk of clouds at a time so that intermediate tables stay in the caches.
+
+`map_chunks(function, clouds)` equals `function(clouds)`, the plain version, for any function that treats each cloud by
+itself. On accelerators it is the plain version.
+"""
 
 from collections.abc import Callable, Sequence
 from typing import TypeVar
@@ -8,51 +12,57 @@ import jax.numpy as jnp
 
 from thor2_jax.types import PointClouds
 
-__all__ = ["in_parts", "part_size"]
+__all__ = ["chunk_size", "map_chunks"]
 
 T = TypeVar("T")
 
-LARGEST, MOST_POINTS = 64, 2**17
-"""Clouds that a part has at most, and points, padding included."""
+MAX_CHUNK_CLOUDS = 64
+"""Largest number of clouds in a chunk."""
 
-AT_ONCE = 4
-"""Parts of one program, so that one goes on where another waits for a core."""
+MAX_CHUNK_POINTS = 2**17
+"""Largest number of points in a chunk, padding included."""
+
+CHUNKS_PER_STEP = 4
+"""Chunks in one step of the loop; XLA can run them concurrently."""
 
 
-def part_size(clouds: PointClouds) -> int:
-    """Clouds of a part; `clouds` themselves are one where that many or fewer, or on another device than a CPU."""
+def chunk_size(clouds: PointClouds) -> int:
+    """Return the number of clouds in a chunk. On an accelerator the whole batch is one chunk."""
     n_clouds, capacity = clouds.mask.shape
     if jax.default_backend() != "cpu":
         return n_clouds
-    return max(1, min(LARGEST, MOST_POINTS // max(capacity, 1)))
+    return max(1, min(MAX_CHUNK_CLOUDS, MAX_CHUNK_POINTS // max(capacity, 1)))
 
 
-def in_parts(function: Callable[[PointClouds], T], clouds: PointClouds) -> T:
-    """`function(clouds)`, computed `AT_ONCE` parts at a time. To be called under `jax.jit`.
+def map_chunks(function: Callable[[PointClouds], T], clouds: PointClouds) -> T:
+    """Return `function(clouds)`, computed `CHUNKS_PER_STEP` chunks at a time. Call it under `jax.jit`.
 
     Args:
-        function: clouds [B, N] to arrays [B, ...], each cloud by itself.
+        function: maps clouds [B, N] to arrays [B, ...] and treats each cloud by itself.
         clouds: [B, N].
     """
-    n_clouds, size = len(clouds.mask), part_size(clouds)
+    n_clouds, size = len(clouds.mask), chunk_size(clouds)
     if n_clouds <= size:
         return function(clouds)
 
-    def part(first: int, last: int) -> PointClouds:
-        return jax.tree.map(lambda a: a[first:last], clouds)
+    def step(clouds: PointClouds) -> T:
+        starts = range(0, len(clouds.mask), size)
+        return _concatenate([function(jax.tree.map(lambda a, k=k: a[k : k + size], clouds)) for k in starts])
 
-    group = size * AT_ONCE
-    if n_clouds <= group:
-        return _joined([function(part(k, min(k + size, n_clouds))) for k in range(0, n_clouds, size)])
-    n_groups = n_clouds // group
-    groups = jax.tree.map(lambda a: a.reshape(n_groups, group, *a.shape[1:]), part(0, n_groups * group))
-    found = jax.lax.map(lambda one: in_parts(function, one), groups)
-    found = jax.tree.map(lambda a: a.reshape(n_groups * group, *a.shape[2:]), found)
-    if n_groups * group == n_clouds:
-        return found
-    return _joined([found, in_parts(function, part(n_groups * group, n_clouds))])
+    clouds_per_step = size * CHUNKS_PER_STEP
+    if n_clouds <= clouds_per_step:
+        return step(clouds)
+    n_steps, rest = divmod(n_clouds, clouds_per_step)
+    head = jax.tree.map(
+        lambda a: a[: n_clouds - rest].reshape(n_steps, clouds_per_step, *a.shape[1:]),
+        clouds,
+    )
+    results = jax.tree.map(lambda a: a.reshape(n_clouds - rest, *a.shape[2:]), jax.lax.map(step, head))
+    if rest == 0:
+        return results
+    return _concatenate([results, step(jax.tree.map(lambda a: a[n_clouds - rest :], clouds))])
 
 
-def _joined(found: Sequence[T]) -> T:
-    joined: T = jax.tree.map(lambda *arrays: jnp.concatenate(arrays), *found)
-    return joined
+def _concatenate(results: Sequence[T]) -> T:
+    concatenated: T = jax.tree.map(lambda *arrays: jnp.concatenate(arrays), *results)
+    return concatenated

@@ -1,4 +1,4 @@
-"""The whole way from clouds to TOPS and TOPS2 (paper, sections "TOPS" and "TOPS2").
+"""The complete pipeline from point clouds to TOPS and TOPS2 (paper, sections "TOPS" and "TOPS2").
 
 >>> import colornet, thor2_jax as thor2
 >>> network, config = colornet.load_default(), thor2.DescriptorConfig(homology="closed_form")
@@ -16,10 +16,10 @@ import jax.numpy as jnp
 from colornet import ColorNetwork
 from colornet.grid import GRID_SIZE
 from thor2_jax.config import DescriptorConfig
-from thor2_jax.descriptor.chunking import in_parts, part_size
+from thor2_jax.descriptor.chunking import chunk_size, map_chunks
 from thor2_jax.descriptor.color_membership import RegionSets, color_sets, region_sets
 from thor2_jax.descriptor.persistence import diagrams_of_strips
-from thor2_jax.descriptor.persistence_images import past_window, persistence_images
+from thor2_jax.descriptor.persistence_images import count_past_window, persistence_images
 from thor2_jax.descriptor.slicing import strips_of_cloud
 from thor2_jax.descriptor.view_normalization import align_planes
 from thor2_jax.errors import InputError
@@ -31,7 +31,7 @@ __all__ = ["describe", "describe_aligned", "describe_strips", "diagrams", "strip
 
 @functools.lru_cache(maxsize=8)
 def _region_sets(network: ColorNetwork) -> RegionSets:
-    # Kept for later calls, so they must be arrays also when the first call happens while a caller's function is traced.
+    # The result outlives the call, so it must be concrete even if the first call happens while a function is traced.
     with jax.ensure_compile_time_eval():
         return region_sets(network)
 
@@ -39,13 +39,13 @@ def _region_sets(network: ColorNetwork) -> RegionSets:
 _default_parameters = functools.lru_cache(maxsize=8)(Parameters.of)
 
 
-def _check(clouds: PointClouds) -> None:
+def _check_batch(clouds: PointClouds) -> None:
     if not isinstance(clouds, PointClouds) or clouds.points.ndim != 3:
-        found = f"points {list(clouds.points.shape)}" if isinstance(clouds, PointClouds) else type(clouds).__name__
-        raise InputError(f"clouds is {found}; expected PointClouds with points [B, N, 3] (see PointClouds.pack)")
+        given = f"points {list(clouds.points.shape)}" if isinstance(clouds, PointClouds) else type(clouds).__name__
+        raise InputError(f"clouds is {given}; expected PointClouds with points [B, N, 3]; use PointClouds.pack")
 
 
-# Apart from `_strips_of`: fused into its scatter, the look-up would be made again and again, one number at a time.
+# Compiled apart from `_strips_of`: fused into its scatter, the look-up would be repeated, one number at a time.
 _color_sets = jax.jit(color_sets)
 
 
@@ -54,22 +54,22 @@ def _strips_of_planes(
     points: jax.Array,
     colors: jax.Array,
     mask: jax.Array,
-    set_of_point: jax.Array,
+    region_set: jax.Array,
     sets: RegionSets,
     config: DescriptorConfig,
 ) -> Strips:
     one = partial(strips_of_cloud, sets=sets, config=config)
-    return jax.vmap(one)(points, colors, mask, set_of_point)
+    return jax.vmap(one)(points, colors, mask, region_set)
 
 
 @partial(jax.jit, static_argnums=3)
-def _strips_of(aligned: PointClouds, set_of_point: jax.Array, sets: RegionSets, config: DescriptorConfig) -> Strips:
+def _strips_of(aligned: PointClouds, region_set: jax.Array, sets: RegionSets, config: DescriptorConfig) -> Strips:
     planes = jnp.swapaxes(aligned.points, 1, 2)
-    return _strips_of_planes(planes, aligned.colors, aligned.mask, set_of_point, sets, config)
+    return _strips_of_planes(planes, aligned.colors, aligned.mask, region_set, sets, config)
 
 
 def strips_by_sets(aligned: PointClouds, sets: RegionSets, config: DescriptorConfig) -> Strips:
-    """`strips` with any weights of the sets that colours belong to, in place of a network's."""
+    """Return `strips` with the given region sets instead of those of a network."""
     return _strips_of(aligned, _color_sets(aligned.colors, sets), sets, config)
 
 
@@ -80,38 +80,38 @@ def _diagrams(strips: Strips, config: DescriptorConfig) -> Diagrams:
 
 @partial(jax.jit, static_argnums=2)
 def _describe_strips(strips: Strips, parameters: Parameters, config: DescriptorConfig) -> Descriptors:
-    found = diagrams_of_strips(strips, config)
+    diagrams = diagrams_of_strips(strips, config)
     # E^i = (C^i Delta)^T
     embeddings = jnp.matmul(strips.color, parameters.similarity, precision=jax.lax.Precision.HIGHEST)
     return Descriptors(
-        images=persistence_images(found, config, parameters.image_variance, parameters.persistence_weight),
+        images=persistence_images(diagrams, config, parameters.image_variance, parameters.persistence_weight),
         embeddings=jnp.swapaxes(embeddings, -1, -2),
-        overflow=strips.overflow + past_window(found, config),
+        overflow=strips.overflow + count_past_window(diagrams, config),
     )
 
 
 def strips(aligned: PointClouds, network: ColorNetwork, config: DescriptorConfig) -> Strips:
-    """Extremes and colour vectors of every strip: all that the descriptors need, and a fraction of their size.
+    """Return the extremes and the colour vector of every strip: all that descriptors need, at a fraction of their size.
 
     Args:
-        aligned: scaled units, as `align` returns them.
-        network: gives the colour regions.
-        config: static; another one compiles again, as does another shape of `aligned`.
+        aligned: clouds in scaled units, as `align` returns them.
+        network: the colour network, of which only the regions are used.
+        config: static.
     """
-    _check(aligned)
+    _check_batch(aligned)
     return strips_by_sets(aligned, _region_sets(network), config)
 
 
 def describe_strips(
     strips: Strips, network: ColorNetwork, config: DescriptorConfig, parameters: Parameters | None = None
 ) -> Descriptors:
-    """Persistence images and colour embeddings of `strips` (fields [B, S, J]); the rest as in `describe`."""
+    """Return the descriptors of `strips` (fields [B, S, J]); the other arguments are those of `describe`."""
     return _describe_strips(strips, _default_parameters(network, config) if parameters is None else parameters, config)
 
 
 def diagrams(aligned: PointClouds, config: DescriptorConfig) -> Diagrams:
-    """Persistence diagrams of aligned clouds, fields [B, S, J]. Colours play no part."""
-    _check(aligned)
+    """Return the persistence diagrams of aligned clouds, fields [B, S, J]. Colours are not used."""
+    _check_batch(aligned)
     one_set = RegionSets(jnp.zeros(GRID_SIZE, jnp.int32), jnp.ones((1, 1), jnp.float32))
     return _diagrams(strips_by_sets(aligned, one_set, config), config)
 
@@ -119,12 +119,9 @@ def diagrams(aligned: PointClouds, config: DescriptorConfig) -> Diagrams:
 def describe_aligned(
     aligned: PointClouds, network: ColorNetwork, config: DescriptorConfig, parameters: Parameters | None = None
 ) -> Descriptors:
-    """TOPS, CE and TOPS2 of clouds that are aligned already (scaled units, first octant, turned by alpha).
+    """Return the descriptors of clouds that are already aligned, as `align` returns them.
 
-    The arguments are those of `describe`.
-
-    Raises:
-        InputError: `aligned` is no batch of clouds.
+    The other arguments, the result and the errors are those of `describe`.
     """
     return describe_strips(strips(aligned, network, config), network, config, parameters)
 
@@ -132,41 +129,54 @@ def describe_aligned(
 def describe(
     clouds: PointClouds, network: ColorNetwork, config: DescriptorConfig, parameters: Parameters | None = None
 ) -> Descriptors:
-    """TOPS, CE and TOPS2 of clouds as the camera saw them.
+    """Return the descriptors TOPS, CE and TOPS2 of a batch of point clouds.
 
-    View normalization, turn, slices, diagrams, images, embeddings. Gradients reach points, colours and parameters; the
-    frame of the view normalization counts as fixed. What points and parameters change through the choice of slices,
-    strips and colour regions alone has a gradient of exactly zero (colours, alpha) unless the config relaxes it.
+    The stages are, in order: view normalization, the turn by alpha, slices and strips, persistence diagrams,
+    persistence images and colour embeddings.
+
+    The first call with a new shape [B, N], `config` or `network` compiles; later calls reuse the compiled program. N is
+    the padded number of points: `PointClouds.pack` rounds the number of points of the largest cloud up to a point
+    bucket (512, 1024, ..., 8192; see `thor2_jax.capacity`), so that few values of N ever occur. Other values of the
+    clouds or of `parameters` never cause a compilation.
+
+    Gradients reach the points, the colours and `parameters`; the frame of the view normalization is held constant.
+    The choice of slices, strips and colour regions is piecewise constant, so that the gradient with respect to the
+    colours and to alpha is exactly zero unless `config.relaxation` is set.
 
     Args:
         clouds: [B, N] clouds in metres.
-        network: the colour network; its regions and similarity fix the colour part.
-        config: static; another one compiles again, as does another B or N.
-        parameters: take the place of the network's and the config's where given. Other values compile nothing.
+        network: the colour network; it gives the colour regions and their similarity.
+        config: static.
+        parameters: replace the corresponding numbers of `network` and `config`.
 
     Returns:
-        Descriptors of the B clouds. An empty cloud's are zero.
+        Descriptors of the B clouds, in the order of the batch. `images` [B, S, P, P] and `embeddings` [B, S, R, J] hold
+        one entry for each slice, the lowest first. `tops` [B, S * P * P] are the images, `color` [B, S * R * J] the
+        embeddings, and `tops2` has both, as one block [image | embedding] for each slice; each of them is flattened in
+        C order. `overflow` [B] counts the points outside the grid of slices and strips plus the strips whose
+        persistence exceeds the image window; it is 0 if the descriptor covers the whole cloud. An empty cloud has a
+        descriptor of zeros.
 
     Raises:
-        InputError: `clouds` is no batch of clouds.
+        InputError: `clouds` is not a batch of clouds.
     """
-    _check(clouds)
-    if len(clouds.mask) > part_size(clouds):
-        return _describe_in_parts(clouds, network, config, parameters)
-    return _describe_part(clouds, network, config, parameters)
+    _check_batch(clouds)
+    if len(clouds.mask) > chunk_size(clouds):
+        return _describe_in_chunks(clouds, network, config, parameters)
+    return _describe_chunk(clouds, network, config, parameters)
 
 
-def _describe_part(
+def _describe_chunk(
     clouds: PointClouds, network: ColorNetwork, config: DescriptorConfig, parameters: Parameters | None
 ) -> Descriptors:
     sets = _region_sets(network)
     planes = align_planes(clouds, config, parameters)
-    found = _strips_of_planes(planes, clouds.colors, clouds.mask, _color_sets(clouds.colors, sets), sets, config)
-    return describe_strips(found, network, config, parameters)
+    strips = _strips_of_planes(planes, clouds.colors, clouds.mask, _color_sets(clouds.colors, sets), sets, config)
+    return describe_strips(strips, network, config, parameters)
 
 
 @partial(jax.jit, static_argnums=(1, 2))
-def _describe_in_parts(
+def _describe_in_chunks(
     clouds: PointClouds, network: ColorNetwork, config: DescriptorConfig, parameters: Parameters | None
 ) -> Descriptors:
-    return in_parts(lambda part: _describe_part(part, network, config, parameters), clouds)
+    return map_chunks(lambda chunk: _describe_chunk(chunk, network, config, parameters), clouds)

@@ -1,11 +1,11 @@
 """Persistence diagrams of slices (paper, section "Filtration").
 
-They come from gudhi, through one host callback a batch, or in closed form.
+They come from gudhi, through one host callback for a batch, or from a closed form.
 
-The filtration of a slice: strip j puts in two vertices, its points of least and greatest y, at j s2, and the edge
-between them at j s2 + (y_max - y_min). Each strip is a component of its own: its second vertex dies when the edge
-comes, the first lives for ever. So the finite H0 pairs are (j s2, j s2 + y_max - y_min), one a strip; this is the
-closed form.
+In the filtration of a slice, strip j adds two vertices, its points of least and greatest y, at j s2, and the edge
+between them at j s2 + (y_max - y_min). Each strip is a connected component of its own: one vertex dies when the edge
+is added, the other one never dies. The finite H0 pairs are therefore (j s2, j s2 + y_max - y_min), one for each strip;
+this is the closed form.
 """
 
 from typing import Any
@@ -23,11 +23,11 @@ __all__ = ["diagrams_of_strips"]
 
 
 def diagrams_of_strips(strips: Strips, config: DescriptorConfig) -> Diagrams:
-    """Finite H0 pairs of every slice, zero-length ones included.
+    """Return the finite H0 pairs of every slice, including those of zero persistence.
 
     Args:
-        strips: fields [..., S, J]; every leading axis goes through the one callback together.
-        config: `homology` chooses the backend. Static.
+        strips: fields [..., S, J]; one callback handles all leading axes together.
+        config: its `homology` selects the backend. Static.
 
     Returns:
         Diagrams with fields [..., S, J]; pair j of a slice is that of strip j.
@@ -35,35 +35,35 @@ def diagrams_of_strips(strips: Strips, config: DescriptorConfig) -> Diagrams:
     births = jnp.broadcast_to(strip_births(config), strips.low.shape)
     edges = births + (strips.high - strips.low)
     if config.homology == "closed_form":
-        vertex, edge, found = births, edges, strips.occupied
+        birth, death, mask = births, edges, strips.occupied
     else:
         out = jax.ShapeDtypeStruct(strips.low.shape, jnp.int32)
         values = jax.lax.stop_gradient((births, edges))
         birth_index, death_index = jax.pure_callback(
             _gudhi_pairs, (out, out), *values, strips.occupied, vmap_method="expand_dims"
         )
-        # gudhi tells which vertex and which edge make a pair; the values, and so the gradient, are gathered here.
-        found = death_index >= 0
-        vertex = jnp.take_along_axis(births, jnp.maximum(birth_index, 0), axis=-1)
-        edge = jnp.take_along_axis(edges, jnp.maximum(death_index, 0), axis=-1)
-    return Diagrams(births=jnp.where(found, vertex, 0), deaths=jnp.where(found, edge, 0), mask=found)
+        # gudhi returns which vertex and edge form a pair. JAX gathers the values, so that gradients reach them.
+        mask = death_index >= 0
+        birth = jnp.take_along_axis(births, jnp.maximum(birth_index, 0), axis=-1)
+        death = jnp.take_along_axis(edges, jnp.maximum(death_index, 0), axis=-1)
+    return Diagrams(births=jnp.where(mask, birth, 0), deaths=jnp.where(mask, death, 0), mask=mask)
 
 
 def _gudhi_pairs(births: Any, edges: Any, occupied: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Strips, within their slice, of each pair's birth vertex and death edge; -1 where there is no pair.
+    """Return the strip of each pair's birth vertex and of its death edge, int32 [..., S, J]; -1 where there is no pair.
 
-    Counted within the slice, the numbers hold whatever leading axes `vmap` has added.
+    Strips are numbered within their slice, so that the numbers hold for any leading axes that `vmap` adds.
     """
     births, edges, occupied = (np.asarray(a) for a in (births, edges, occupied))
     shape = np.broadcast_shapes(births.shape, edges.shape, occupied.shape)
     strip = np.flatnonzero(np.broadcast_to(occupied, shape)).astype(np.int32)
     birth_index, death_index = np.full((2, int(np.prod(shape))), -1, np.int32)
     if len(strip):
-        at = np.broadcast_to(births, shape).reshape(-1)[strip].astype(np.float64)
+        vertex_at = np.broadcast_to(births, shape).reshape(-1)[strip].astype(np.float64)
         edge_at = np.broadcast_to(edges, shape).reshape(-1)[strip].astype(np.float64)
         low = np.arange(len(strip), dtype=np.int32) * 2
         tree = gudhi.SimplexTree()
-        tree.insert_batch(np.concatenate([low, low + 1])[None], np.concatenate([at, at]))
+        tree.insert_batch(np.concatenate([low, low + 1])[None], np.concatenate([vertex_at, vertex_at]))
         tree.insert_batch(np.stack([low, low + 1]), edge_at)
         tree.compute_persistence(min_persistence=-1)
         pairs = tree.flag_persistence_generators()[0]  # rows: birth vertex, the death edge's two vertices

@@ -1,12 +1,12 @@
-"""The soft descriptor: slices, strips, extremes and colour regions whose gradients do not vanish.
+"""The relaxed descriptor: slices, strips, extremes and colour regions whose gradients do not vanish.
 
 Hard slices, strips and colour regions are piecewise constant in points and colours. With
-`DescriptorConfig(relaxation=Relaxation(...))` a point belongs to all of them a little. Towards zero temperature, all
-four together, everything here becomes what `slicing` computes, for any cloud in the first octant with no point on a
-border between two slices or strips and no colour halfway between two of the grid.
+`DescriptorConfig(relaxation=Relaxation(...))` a point has a weight in each of them. As all four temperatures approach
+zero, the results approach those of `slicing`, for any cloud in the first octant that has no point on a border between
+two slices or strips and no colour halfway between two grid colours.
 
 >>> config = DescriptorConfig(relaxation=Relaxation(color=2.0))               # doctest: +SKIP
->>> found = describe(clouds, network, config)                                 # doctest: +SKIP
+>>> descriptors = describe(clouds, network, config)                                 # doctest: +SKIP
 """
 
 import functools
@@ -21,51 +21,51 @@ from thor2_jax.config import DescriptorConfig, Relaxation
 from thor2_jax.descriptor.color_membership import RegionSets
 from thor2_jax.types import Strips
 
-__all__ = ["hyab", "interval_weights", "relaxed_strips", "soft_regions", "to_lab"]
+__all__ = ["hyab", "interval_log_weights", "relaxed_strips", "soft_regions", "to_lab"]
 
 HIGHEST = jax.lax.Precision.HIGHEST
 
 _TO_XYZ = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
-"""Linear sRGB to XYZ, as rounded in IEC 61966-2-1."""
+"""Matrix from linear sRGB to XYZ, as rounded in IEC 61966-2-1."""
 
 _WHITE = np.array([0.3127 / 0.3290, 1, (1 - 0.3127 - 0.3290) / 0.3290])
-"""XYZ of D65, the white of the colour network's grid."""
+"""XYZ of D65, the white point of the colour grid (`colornet.lab.GRID_WHITE`)."""
 
 _OFFSETS = np.array(list(itertools.product((-1, 0, 1), repeat=3)))
-"""[27, 3] levels from the nearest grid colour to its neighbours and itself."""
+"""[27, 3] offsets, in levels, from the nearest grid colour to itself and its neighbours."""
 
-_LEAST_WEIGHT = 1e-3
-"""Of a point in a strip: below it, a strip's middle goes to zero, so that no quotient gets out of hand."""
+_WEIGHT_FLOOR = 1e-3
+"""Where the weights in a strip are smaller than this, its mean is pulled to 0, which keeps the quotient bounded."""
 
 
-def interval_weights(at: jax.Array, width: float, count: int, temperature: float) -> jax.Array:
-    """Logarithm of the weight of coordinates in consecutive intervals of a width, the first one from 0 up.
+def interval_log_weights(coordinates: jax.Array, width: float, count: int, temperature: float) -> jax.Array:
+    """Return the logarithms of the weights of coordinates in consecutive intervals that start at 0.
 
-    sigmoid((x - lower) / T) - sigmoid((x - upper) / T). The first interval is open below: aligned clouds touch 0, and
-    a point on that border has nowhere else to go.
+    A weight is sigmoid((x - lower) / T) - sigmoid((x - upper) / T). The first interval is unbounded below: aligned
+    clouds touch 0, and a point on that border belongs to no other interval.
 
     Args:
-        at: [N] coordinates.
-        width: of an interval, the unit of `at`.
-        count: C, number of intervals.
-        temperature: T, the unit of `at`.
+        coordinates: [N].
+        width: width of an interval, in the unit of `coordinates`.
+        count: number C of intervals.
+        temperature: T, in the unit of `coordinates`.
 
     Returns:
-        [N, C], at most 0; the weights themselves sum to 1 for points well before the last border.
+        [N, C], at most 0. The weights sum to 1 for coordinates well below the last border.
     """
     edges = (np.arange(count + 1) * width).astype(np.float32)
-    above = jax.nn.log_sigmoid((at[:, None] - edges[1:-1]) / temperature)
-    below = jax.nn.log_sigmoid((edges[1:] - at[:, None]) / temperature)
-    # As a product the difference keeps its digits where both sigmoids are nearly equal.
-    both = above + below[:, 1:] + np.log1p(-np.exp(-width / temperature))
-    return jnp.concatenate([below[:, :1], both], axis=1)
+    above = jax.nn.log_sigmoid((coordinates[:, None] - edges[1:-1]) / temperature)
+    below = jax.nn.log_sigmoid((edges[1:] - coordinates[:, None]) / temperature)
+    # Written as a product, the difference loses no digits where both sigmoids are nearly equal.
+    between = above + below[:, 1:] + np.log1p(-np.exp(-width / temperature))
+    return jnp.concatenate([below[:, :1], between], axis=1)
 
 
 def _rise(weight: jax.Array, above: jax.Array, temperature: float) -> jax.Array:
-    """T log(1 + sum over points of w (exp(above / T) - 1)): [N, J] and [N, J] to [J].
+    """Return T log(1 + sum over points of w (exp(above / T) - 1)): [N, J] and [N, J] to [J].
 
-    A log-sum-exp in which a point of weight 0 has no part, and which is 0 where all of `above` is 0. It is never
-    negative if the weighted sum of `above` is 0.
+    This log-sum-exp ignores points of weight 0 and is 0 if `above` is 0 everywhere. It is not negative if the weighted
+    sum of `above` is 0.
     """
     scaled = above / temperature
     top = jax.lax.stop_gradient(jnp.maximum(scaled.max(axis=0), 0))
@@ -82,40 +82,40 @@ def relaxed_strips(
     config: DescriptorConfig,
     overflow: jax.Array,
 ) -> Strips:
-    """Soft extremes and colour vectors of every strip of one aligned cloud (no batch axis).
+    """Return the soft extremes and the colour vector of every strip of one aligned cloud (no batch axis).
 
-    With w the weight of a point in a strip and m the mean of y with the weights w^2, the extremes are
-    m + T log(1 + sum w (exp(w (y - m) / T) - 1)) and the same downwards. Deviations count by w as well: else a point
-    far up in the next strip would outweigh, at any temperature, its small part in this one. A strip that holds hardly
-    any weight has hardly any persistence, and so vanishes from the image; so does a strip of one point.
+    Let w be the weight of a point in a strip and m the mean of y with the weights w^2. The upper extreme is
+    m + T log(1 + sum w (exp(w (y - m) / T) - 1)), and the lower one likewise. Deviations are multiplied by w too;
+    otherwise a point high up in the next strip would dominate at any temperature in spite of its small weight. A strip
+    that holds little weight or only one point has little persistence and vanishes from the image.
 
     Args:
-        points: [3, N], scaled units; those with a negative x or z count for nothing, as in hard slices.
+        points: [3, N], scaled units; points with a negative x or z are ignored, as in hard slices.
         colors: [N, 3] sRGB in [0, 1].
         mask: [N] bool.
-        sets: of the colour network's regions.
+        sets: region sets of the colour network.
         config: its `relaxation` gives the temperatures. Static.
-        overflow: [] int32, passed on.
+        overflow: [] int32, returned unchanged.
 
     Returns:
-        Strips, "occupied" where any weight is.
+        Strips; a strip is occupied if any point has a positive weight in it.
     """
     relaxation = config.relaxation or Relaxation()
     x, y, z = points
     counted = (mask & (x >= 0) & (z >= 0))[:, None]
-    log_slice = interval_weights(z, config.sigma_1, config.n_slices, relaxation.slice)
-    log_strip = interval_weights(x, config.sigma_2, config.n_strips, relaxation.strip)
+    log_slice = interval_log_weights(z, config.sigma_1, config.n_slices, relaxation.slice)
+    log_strip = interval_log_weights(x, config.sigma_2, config.n_strips, relaxation.strip)
     regions = soft_regions(colors, sets, relaxation.color)
 
-    # Checkpoint: the [N, J] arrays of a slice are computed again for its gradient rather than kept for all slices.
+    # With a checkpoint, the gradient recomputes the [N, J] arrays of a slice instead of keeping those of all slices.
     @jax.checkpoint
     def one_slice(log_weight: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
         weight = jnp.where(counted, jnp.exp(log_weight[:, None] + log_strip), 0)
         square = weight**2
-        middle = (square * y[:, None]).sum(axis=0) / (square.sum(axis=0) + _LEAST_WEIGHT**2)
-        above = weight * (y[:, None] - middle)
-        low = middle - _rise(weight, -above, relaxation.extremum)
-        high = middle + _rise(weight, above, relaxation.extremum)
+        mean = (square * y[:, None]).sum(axis=0) / (square.sum(axis=0) + _WEIGHT_FLOOR**2)
+        above = weight * (y[:, None] - mean)
+        low = mean - _rise(weight, -above, relaxation.extremum)
+        high = mean + _rise(weight, above, relaxation.extremum)
         return low, high, (weight > 0).any(axis=0), jnp.matmul(weight.T, regions, precision=HIGHEST)
 
     low, high, occupied, color = jax.lax.map(one_slice, log_slice.T)
@@ -123,7 +123,7 @@ def relaxed_strips(
 
 
 def to_lab(colors: jax.Array) -> jax.Array:
-    """CIELAB (D65) of sRGB colours in [0, 1]: [..., 3] to [..., 3], L* in 0..100."""
+    """Convert sRGB colours in [0, 1] to CIELAB (D65): [..., 3] to [..., 3], L* in 0..100."""
     dark = colors <= 0.04045
     linear = jnp.where(dark, colors / 12.92, ((jnp.where(dark, 1, colors) + 0.055) / 1.055) ** 2.4)
     xyz = jnp.matmul(linear, jnp.asarray((_TO_XYZ / _WHITE[:, None]).T, linear.dtype), precision=HIGHEST)
@@ -134,7 +134,7 @@ def to_lab(colors: jax.Array) -> jax.Array:
 
 
 def hyab(first: jax.Array, second: jax.Array) -> jax.Array:
-    """HyAB colour difference |dL*| + sqrt(da*^2 + db*^2): [..., 3] and [..., 3] to [...]. Gradient 0 where equal."""
+    """Return the HyAB difference |dL*| + sqrt(da*^2 + db*^2), [..., 3] to [...]; its gradient is 0 at equal colours."""
     difference = first - second
     squared = (difference[..., 1:] ** 2).sum(axis=-1)
     chroma = jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1)), 0)
@@ -148,20 +148,20 @@ def _grid_lab() -> jax.Array:
 
 
 def soft_regions(colors: jax.Array, sets: RegionSets, temperature: float) -> jax.Array:
-    """Region weights of colours: those of the grid colours around, by a softmax over HyAB distances.
+    """Return region weights of colours, averaged over nearby grid colours by a softmax over HyAB distances.
 
-    The 27 grid colours within one level of the nearest share the weight by exp(-HyAB / T), times a factor that fades to
-    0 where a channel is 1/2 + T / (1 + T) levels away. So nothing jumps where the nearest grid colour changes, and
-    towards zero temperature what is left is the colour nearest in every channel, which is the hard rule; the one
-    nearest by HyAB can be another.
+    The 27 grid colours within one level of the nearest one share the weight in proportion to exp(-HyAB / T), times a
+    factor that fades to 0 where a channel is 1/2 + T / (1 + T) levels away. The weights are therefore continuous where
+    the nearest grid colour changes. Towards zero temperature only the colour nearest in every channel remains, as in
+    the hard rule; the colour nearest by HyAB may be another one.
 
     Args:
-        colors: [N, 3] sRGB, limited to [0, 1] first.
-        sets: of the colour network.
-        temperature: T, HyAB units in CIELAB.
+        colors: [N, 3] sRGB, clipped to [0, 1] first.
+        sets: region sets of the colour network.
+        temperature: T, units of HyAB in CIELAB.
 
     Returns:
-        [N, R], rows sum to 1.
+        [N, R]; rows sum to 1.
     """
     colors = jnp.clip(colors, 0, 1)
     scaled = colors * (255 / GRID_STEP)
@@ -172,14 +172,14 @@ def soft_regions(colors: jax.Array, sets: RegionSets, temperature: float) -> jax
     row = (levels[..., 0] * GRID_LEVELS + levels[..., 1]) * GRID_LEVELS + levels[..., 2]
 
     reach = 0.5 + temperature / (1 + temperature)
-    left = 1 - ((scaled[:, None] - levels) / reach) ** 2
-    # The nearest one always stays: at a tiny temperature rounding may take its last bit.
-    chosen = exists & ((left > 0).all(axis=-1) | ~_OFFSETS.any(axis=-1))
-    fade = 2 * jnp.log(jnp.where(left > 0, left, 1e-7)).sum(axis=-1)
+    closeness = 1 - ((scaled[:, None] - levels) / reach) ** 2
+    # The nearest colour always stays; at a tiny temperature rounding could exclude it.
+    chosen = exists & ((closeness > 0).all(axis=-1) | ~_OFFSETS.any(axis=-1))
+    fade = 2 * jnp.log(jnp.where(closeness > 0, closeness, 1e-7)).sum(axis=-1)
     distance = hyab(to_lab(colors)[:, None], _grid_lab()[row])
     share = jax.nn.softmax(jnp.where(chosen, fade - distance / temperature, -jnp.inf), axis=-1)
 
-    # Added up by set of regions first: [N, 62] in place of [N, 27, 22].
+    # Summed by region set first: [N, 62] instead of [N, 27, 22].
     by_set = jnp.zeros((len(colors), sets.weights.shape[0]), share.dtype)
     by_set = by_set.at[jnp.arange(len(colors))[:, None], sets.of_color[row]].add(share)
     return jnp.matmul(by_set, sets.weights, precision=HIGHEST)

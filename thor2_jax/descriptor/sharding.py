@@ -1,8 +1,8 @@
-"""One batch over several devices, of one process or of many (jax.distributed): every device describes its own clouds.
+"""Describe one batch on several devices, of one process or of several (jax.distributed).
 
->>> mesh = batch_mesh()                                             # doctest: +SKIP   all devices of all processes
->>> clouds = shard_clouds(PointClouds.pack(mine), mesh)             # doctest: +SKIP   this process's part of the batch
->>> found = describe_sharded(clouds, network, config)               # doctest: +SKIP   sharded like the clouds
+>>> mesh = batch_mesh()                                             # doctest: +SKIP   # all devices of all processes
+>>> clouds = shard_clouds(PointClouds.pack(local), mesh)            # doctest: +SKIP   # the clouds of this process
+>>> descriptors = describe_sharded(clouds, network, config)         # doctest: +SKIP   # sharded like the clouds
 """
 
 import functools
@@ -21,37 +21,40 @@ from thor2_jax.types import Descriptors, PointClouds
 
 __all__ = ["batch_mesh", "describe_sharded", "shard_clouds"]
 
-AXIS = "batch"
+BATCH_AXIS = "batch"
+"""Name of the only axis of the device mesh."""
 
 
 def batch_mesh(devices: Sequence[Any] | None = None) -> Mesh:
-    """A mesh of devices (by default all of all processes) along the one axis "batch"."""
-    return Mesh(np.asarray(jax.devices() if devices is None else devices), (AXIS,))
+    """Return a mesh of devices, by default all devices of all processes, along the axis "batch"."""
+    return Mesh(np.asarray(jax.devices() if devices is None else devices), (BATCH_AXIS,))
 
 
 def shard_clouds(clouds: PointClouds, mesh: Mesh) -> PointClouds:
     """Distribute a batch over the devices of `mesh`.
 
     Args:
-        clouds: [B, N]; with several processes, this process's part of the batch: B and N must be the same in all.
-        mesh: from `batch_mesh`.
+        clouds: [B, N]. With several processes, the clouds of this process; B and N must be equal in all of them.
+        mesh: as `batch_mesh` returns it.
 
     Returns:
         The whole batch [B * processes, N], sharded along B.
 
     Raises:
-        InputError: B is no multiple of the number of this process's devices.
+        InputError: B is not a multiple of the number of devices of this process.
     """
     local = len(mesh.local_devices)
     if clouds.mask.shape[0] % local:
-        raise InputError(f"clouds has {clouds.mask.shape[0]} clouds; expected a multiple of the {local} devices")
-    sharding = NamedSharding(mesh, PartitionSpec(AXIS))
+        raise InputError(
+            f"clouds has {clouds.mask.shape[0]} clouds; expected a multiple of {local}, the number of local devices"
+        )
+    sharding = NamedSharding(mesh, PartitionSpec(BATCH_AXIS))
     return jax.tree.map(lambda a: jax.make_array_from_process_local_data(sharding, np.asarray(a)), clouds)
 
 
 @functools.lru_cache(maxsize=8)
 def _sharded(network: ColorNetwork, config: DescriptorConfig, mesh: Mesh) -> Any:
-    spec = PartitionSpec(AXIS)
+    spec = PartitionSpec(BATCH_AXIS)
 
     def local(clouds: PointClouds) -> Descriptors:
         return describe(clouds, network, config)
@@ -60,20 +63,20 @@ def _sharded(network: ColorNetwork, config: DescriptorConfig, mesh: Mesh) -> Any
 
 
 def describe_sharded(clouds: PointClouds, network: ColorNetwork, config: DescriptorConfig) -> Descriptors:
-    """`describe` with every device at work on its own clouds; nothing travels between devices.
+    """Describe a sharded batch: each device describes its own clouds, without communication between devices.
 
     Args:
         clouds: as `shard_clouds` returns them.
         network: the colour network.
-        config: the descriptor. Static.
+        config: static.
 
     Returns:
-        Descriptors sharded like the clouds; a process reads its own part by `addressable_shards`.
+        Descriptors sharded like the clouds; a process reads its own ones through `addressable_shards`.
 
     Raises:
-        InputError: `clouds` is not sharded by `shard_clouds`.
+        InputError: `clouds` does not come from `shard_clouds`.
     """
     sharding = getattr(clouds.points, "sharding", None)
-    if not isinstance(sharding, NamedSharding) or sharding.mesh.axis_names != (AXIS,):
+    if not isinstance(sharding, NamedSharding) or sharding.mesh.axis_names != (BATCH_AXIS,):
         raise InputError(f"clouds has the sharding {sharding}; expected clouds from shard_clouds")
     return _sharded(network, config, sharding.mesh)(clouds)

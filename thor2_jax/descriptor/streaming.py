@@ -1,4 +1,4 @@
-"""Descriptors of more clouds than fit into memory, a batch at a time."""
+"""Describe more clouds than fit into memory, batch by batch."""
 
 import itertools
 from collections import deque
@@ -25,42 +25,42 @@ def describe_stream(
     capacity: int | None = None,
     batch: int = BATCH_BUCKETS[-1],
 ) -> Iterator[Descriptors]:
-    """Describe clouds batch by batch, in order; memory does not grow with their number.
+    """Describe clouds batch by batch, in order; memory use does not grow with their number.
 
-    The next batch is packed while the last one is computed.
+    The next batch is packed while the previous one is computed.
 
     Args:
-        clouds: pairs (xyz, rgb) as `PointClouds.pack` takes them; read lazily.
+        clouds: pairs (xyz, rgb) as `PointClouds.pack` takes them, read lazily.
         network: the colour network.
-        config: the descriptor. Static.
-        capacity: padded number of points; by default each batch's own bucket.
-        batch: clouds described together. One more compilation for another number.
+        config: static.
+        capacity: padded number of points; by default the bucket of each batch's largest cloud.
+        batch: number of clouds described together. Each number compiles once.
 
     Yields:
-        Descriptors of up to `batch` clouds, host arrays.
+        Descriptors of up to `batch` clouds, as NumPy arrays.
 
     Raises:
-        InputError: a batch that is not positive, or a cloud that `PointClouds.pack` refuses; the message gives its
-            index in its batch.
+        InputError: `batch` is not positive, or `PointClouds.pack` rejects a cloud; the message gives the index of the
+            cloud in its batch.
     """
     if batch < 1:
-        raise InputError(f"batch is {batch}; it must be at least 1")
+        raise InputError(f"batch is {batch}; expected at least 1")
     return _stream(iter(clouds), network, config, capacity, batch)
 
 
 def _stream(
     clouds: Iterator[tuple[Any, Any]], network: ColorNetwork, config: DescriptorConfig, capacity: int | None, batch: int
 ) -> Iterator[Descriptors]:
+    empty_cloud = (np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
     running: deque[tuple[int, Descriptors]] = deque()
-    while part := list(itertools.islice(clouds, batch)):
-        nothing = (np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
-        packed = PointClouds.pack(part + [nothing] * (batch - len(part)), capacity)
-        running.append((len(part), describe(packed, network, config)))
+    while chunk := list(itertools.islice(clouds, batch)):
+        packed = PointClouds.pack(chunk + [empty_cloud] * (batch - len(chunk)), capacity)
+        running.append((len(chunk), describe(packed, network, config)))
         if len(running) > 1:
-            yield _fetched(*running.popleft())
+            yield _fetch(*running.popleft())
     while running:
-        yield _fetched(*running.popleft())
+        yield _fetch(*running.popleft())
 
 
-def _fetched(count: int, descriptors: Descriptors) -> Descriptors:
+def _fetch(count: int, descriptors: Descriptors) -> Descriptors:
     return jax.tree.map(lambda a: np.asarray(a)[:count], descriptors)

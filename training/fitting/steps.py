@@ -20,7 +20,7 @@ from colornet import ColorNetwork
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.color_membership import region_sets
 from thor2_jax.descriptor.describe import describe_strips
-from thor2_jax.descriptor.sharding import AXIS
+from thor2_jax.descriptor.sharding import BATCH_AXIS
 from thor2_jax.recognition.classifier import MLP, Feature, feature_of
 from thor2_jax.types import Descriptors
 from training.fitting.samples import Batch, expand
@@ -79,7 +79,7 @@ def initial_state(model: MLP) -> tuple[Any, FitState]:
 
 def shard_batch(batch: Batch, mesh: Mesh) -> Batch:
     """Move a batch to the devices of a mesh, split along the samples; each process gives its own chunk of the batch."""
-    return _to_devices(batch, NamedSharding(mesh, PartitionSpec(AXIS)))
+    return _to_devices(batch, NamedSharding(mesh, PartitionSpec(BATCH_AXIS)))
 
 
 def replicate(tree: Any, mesh: Mesh) -> Any:

@@ -1,11 +1,11 @@
-"""Large batches in parts: what a part sees, and that the results come back in order."""
+"""Large batches in chunks: their sizes, and results in the order of the clouds."""
 
 import jax
 import numpy as np
 import pytest
 
 import thor2_jax as thor2
-from thor2_jax.descriptor.chunking import AT_ONCE, in_parts, part_size
+from thor2_jax.descriptor.chunking import CHUNKS_PER_STEP, chunk_size, map_chunks
 
 
 def clouds_of(count: int, capacity: int) -> thor2.PointClouds:
@@ -16,25 +16,25 @@ def clouds_of(count: int, capacity: int) -> thor2.PointClouds:
 
 
 @pytest.mark.parametrize(("capacity", "size"), [(1, 64), (512, 64), (2048, 64), (4096, 32), (8192, 16), (2**18, 1)])
-def test_parts_have_few_points(capacity: int, size: int) -> None:
-    assert part_size(clouds_of(2, capacity)) == size
+def test_chunks_have_few_points(capacity: int, size: int) -> None:
+    assert chunk_size(clouds_of(2, capacity)) == size
 
 
-def test_other_devices_see_all_clouds_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_accelerators_use_a_single_chunk(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert part_size(clouds_of(300, 1)) == 300
+    assert chunk_size(clouds_of(300, 1)) == 300
 
 
 @pytest.mark.parametrize("count", [1, 16, 17, 63, 64, 65, 127, 128, 150])
-def test_results_are_in_the_order_of_the_clouds(count: int) -> None:
-    seen: list[int] = []
+def test_results_equal_those_of_the_whole_batch(count: int) -> None:
+    sizes: list[int] = []
 
-    def mean_x(part: thor2.PointClouds) -> dict[str, jax.Array]:
-        seen.append(len(part.mask))
-        return {"x": part.points[:, :, 0].mean(axis=1), "points": part.points}
+    def mean_x(chunk: thor2.PointClouds) -> dict[str, jax.Array]:
+        sizes.append(len(chunk.mask))
+        return {"x": chunk.points[:, :, 0].mean(axis=1), "points": chunk.points}
 
-    clouds = clouds_of(count, 8192)  # parts of 16
-    found = jax.jit(lambda clouds: in_parts(mean_x, clouds))(clouds)
-    np.testing.assert_array_equal(found["x"], np.arange(count))
-    np.testing.assert_array_equal(found["points"], clouds.points)
-    assert max(seen) <= 16 and len(seen) <= 2 * AT_ONCE
+    clouds = clouds_of(count, 8192)  # chunks of 16
+    results = jax.jit(lambda clouds: map_chunks(mean_x, clouds))(clouds)
+    assert max(sizes) <= 16 and len(sizes) <= 2 * CHUNKS_PER_STEP
+    for name, expected in mean_x(clouds).items():
+        np.testing.assert_array_equal(results[name], expected)

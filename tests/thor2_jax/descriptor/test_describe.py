@@ -113,10 +113,10 @@ def test_empty_clouds_in_a_batch_are_zero_and_disturb_nobody() -> None:
     np.testing.assert_array_equal(found.tops2[1], company.tops2[1])
 
 
-def test_batches_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_batches_in_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each cloud as in a small batch, in value and in gradient, through callbacks too; whole groups and a rest."""
-    monkeypatch.setattr(chunking, "LARGEST", 8)
-    monkeypatch.setattr(chunking, "AT_ONCE", 2)
+    monkeypatch.setattr(chunking, "MAX_CHUNK_CLOUDS", 8)
+    monkeypatch.setattr(chunking, "CHUNKS_PER_STEP", 2)
     config, count = thor2.DescriptorConfig(homology="gudhi"), 27
     few = thor2.PointClouds.pack([camera_cloud(seed, 300) for seed in range(8)], 512)
     order = np.arange(count) % 8

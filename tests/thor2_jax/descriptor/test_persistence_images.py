@@ -10,7 +10,7 @@ import pytest
 from scipy.special import ndtr
 
 import thor2_jax as thor2
-from thor2_jax.descriptor.persistence_images import past_window, persistence_images
+from thor2_jax.descriptor.persistence_images import count_past_window, persistence_images
 
 CONFIG = thor2.DescriptorConfig()
 TOLERANCE = 1e-6
@@ -98,7 +98,7 @@ def test_pairs_past_the_window_are_counted() -> None:
     persistence = np.where(np.abs(persistence - 0.775) < 1e-4, 0, persistence)
     mask = rng.random(births.shape) < 0.6
     pairs = thor2.Diagrams(jnp.asarray(births), jnp.asarray(births + persistence), jnp.asarray(mask))
-    found = past_window(pairs, CONFIG)
+    found = count_past_window(pairs, CONFIG)
     np.testing.assert_array_equal(found, (mask & (persistence > 0.775)).sum(axis=(1, 2)))
     assert found.dtype == jnp.int32
 

@@ -9,7 +9,7 @@ import pytest
 
 import colornet
 import thor2_jax as thor2
-from thor2_jax.descriptor.slicing import slice_and_strip, strip_births
+from thor2_jax.descriptor.slicing import slices_and_strips, strip_births
 
 NETWORK = colornet.load_default()
 PAPER, RELEASED = thor2.DescriptorConfig(), thor2.DescriptorConfig.released()
@@ -70,7 +70,7 @@ def test_the_released_rule_on_many_random_clouds() -> None:
     rng = np.random.default_rng(0)
     points = (rng.random((300, 512, 3)) * [0.8, 0.4, 1.2]).astype(np.float32)
     mask = np.ones((300, 512), bool)
-    i, j = jax.jit(jax.vmap(lambda p, m: slice_and_strip(p[:, 0], p[:, 2], m, RELEASED)))(points, mask)
+    i, j = jax.jit(jax.vmap(lambda p, m: slices_and_strips(p[:, 0], p[:, 2], m, RELEASED)))(points, mask)
     for b in range(300):
         slices, strips = released_rule(points[b].astype(np.float64))
         np.testing.assert_array_equal(i[b], slices)
@@ -85,7 +85,7 @@ def test_the_released_rounding_at_every_half() -> None:
         near = [values, np.nextafter(values, np.float32(9)), np.nextafter(values, np.float32(-9))]
         points = np.zeros((3 * len(values), 3), np.float32)
         points[:, column] = np.maximum(np.concatenate(near), 0)
-        found = jax.jit(lambda p: slice_and_strip(p[:, 0], p[:, 2], jnp.ones(len(p), bool), RELEASED))(points)
+        found = jax.jit(lambda p: slices_and_strips(p[:, 0], p[:, 2], jnp.ones(len(p), bool), RELEASED))(points)
         slices, strips = released_rule(points.astype(np.float64))
         np.testing.assert_array_equal(found[0], slices)
         np.testing.assert_array_equal(np.minimum(found[1], 31), strips)
@@ -93,7 +93,7 @@ def test_the_released_rounding_at_every_half() -> None:
 
 def test_padding_does_not_occupy_levels_in_the_released_rule() -> None:
     points = np.array([[0.1, 0.1, 0.4], [0.2, 0.2, 0.6], [0, 0, 0]], np.float32)
-    i, _ = slice_and_strip(points[:, 0], points[:, 2], jnp.array([True, True, False]), RELEASED)
+    i, _ = slices_and_strips(points[:, 0], points[:, 2], jnp.array([True, True, False]), RELEASED)
     np.testing.assert_array_equal(i[:2], [0, 1])
 
 
@@ -101,7 +101,7 @@ def test_levels_from_twice_the_slices_on_are_past_the_end_in_the_released_rule()
     """Whatever their rank: 1.3 is the last level that counts, 1.4 the first that does not."""
     for far, number in ((1.3, 1), (1.4, 14)):
         points = jnp.array([[0.1, 0.1, 0], [0.1, 0.1, far]], jnp.float32)
-        i, _ = slice_and_strip(points[:, 0], points[:, 2], jnp.ones(2, bool), RELEASED)
+        i, _ = slices_and_strips(points[:, 0], points[:, 2], jnp.ones(2, bool), RELEASED)
         np.testing.assert_array_equal(i, [0, number])
 
 
