@@ -3,7 +3,7 @@
 import hashlib
 import json
 import tempfile
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -77,9 +77,9 @@ def directory_digest(directory: Path, prefix: str = "") -> str:
     return content_digest(parts())
 
 
-def json_digest(table: Mapping[str, Any]) -> str:
-    """Return the SHA-256 of a JSON table, whatever its layout, without its own entry "digest"."""
-    return content_digest([json.dumps({k: v for k, v in table.items() if k != "digest"}, sort_keys=True)])
+def json_digest(value: Any) -> str:
+    """Return the SHA-256 of a JSON value, whatever the order of its keys."""
+    return content_digest([json.dumps(value, sort_keys=True)])
 
 
 def write_text(path: str | Path, text: str) -> None:

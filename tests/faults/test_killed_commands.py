@@ -19,7 +19,7 @@ from thor2_jax.recognition.classifier import MLP
 from thor2_jax.recognition.run_directory import TrainedRun, input_size, load_run, save_run
 from training import cli
 from training.baselines.files import baseline_file, read_baseline
-from training.fitting.metrics_log import read_figures
+from training.fitting.metrics_log import read_metrics
 from training.views.dataset import MANIFEST, Manifest
 
 pytestmark = pytest.mark.slow
@@ -189,7 +189,7 @@ def test_train(meshes: Path, frames: Path, environment: Any, call: Any, tmp_path
         kill(place, (*command, out), environment)
         found = files(out)
         assert all(found[name] == expected[name] for name in {"curves.png", "network.npz"} & found.keys())
-        assert [row["epoch"] for row in read_figures(out / "metrics.jsonl")] in ([], [1], [1, 2])
+        assert [row["epoch"] for row in read_metrics(out / "metrics.jsonl")] in ([], [1], [1, 2])
         if "run.json" in found:
             assert same_models(load_run(out), run)
         else:

@@ -18,7 +18,7 @@ from thor2_jax.recognition.classifier import MLP
 from thor2_jax.recognition.overlay import draw_overlay
 from thor2_jax.recognition.run_directory import TrainedRun, input_size, load_run, save_run
 from training.evaluation.answers import AnswerFile, FrameAnswers
-from training.fitting.metrics_log import append_figures, forget_after, read_figures
+from training.fitting.metrics_log import append_metrics, discard_later_epochs, read_metrics
 from training.fitting.options import EpochMetrics
 from training.views.dataset import MANIFEST, Manifest
 
@@ -102,16 +102,16 @@ def test_answers_go_on_after_a_full_disk(tmp_path: Path, disk: Any) -> None:
 
 def test_figures_go_on_after_a_full_disk(tmp_path: Path, disk: Any) -> None:
     path = tmp_path / "metrics.jsonl"
-    append_figures(path, 0, "ce", _figures(1))
+    append_metrics(path, 0, "ce", _figures(1))
     for step in (1, 2):
         disk.again(step, errno.ENOSPC)
         with pytest.raises(OSError):
-            append_figures(path, 0, "ce", _figures(2))
+            append_metrics(path, 0, "ce", _figures(2))
         disk.again(0, 0)
-        assert [row["epoch"] for row in read_figures(path)] == [1]
-        forget_after(path, 0, "ce", 1)  # as a training that goes on does
-    append_figures(path, 0, "ce", _figures(2))
-    assert [row["epoch"] for row in read_figures(path)] == [1, 2]
+        assert [row["epoch"] for row in read_metrics(path)] == [1]
+        discard_later_epochs(path, 0, "ce", 1)  # as a training that goes on does
+    append_metrics(path, 0, "ce", _figures(2))
+    assert [row["epoch"] for row in read_metrics(path)] == [1, 2]
 
 
 def _figures(epoch: int) -> EpochMetrics:

@@ -16,9 +16,9 @@ import thor2_jax as thor2
 from thor2_jax.recognition.classifier import MLP
 from thor2_jax.recognition.run_directory import TrainedRun, input_size, load_run, save_run
 from thor2_jax.testing import damaged
-from training.baselines.files import Stored, read_baseline, write_baseline
+from training.baselines.files import StoredBaseline, read_baseline, write_baseline
 from training.evaluation.answers import AnswerFile, FrameAnswers, InstanceAnswer
-from training.fitting.metrics_log import read_figures
+from training.fitting.metrics_log import read_metrics
 
 CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=2, n_strips=5, image_size=8)
 
@@ -117,7 +117,7 @@ def test_answers(data: st.DataObject, answers: bytes, attempt: Any, tmp_path_fac
 @given(data=st.data())
 def test_baselines(data: st.DataObject, attempt: Any, tmp_path_factory: Any) -> None:
     path = tmp_path_factory.getbasetemp() / "baselines" / "forest.safetensors"
-    stored = Stored({"a": np.arange(6.0).reshape(2, 3), "b": np.array([1], np.int32)}, 1.5, 2.0)
+    stored = StoredBaseline({"a": np.arange(6.0).reshape(2, 3), "b": np.array([1], np.int32)}, 1.5, 2.0)
     write_baseline(path, stored, ["mug"])
     path.write_bytes(data.draw(damaged(path.read_bytes())))
     found = attempt(lambda: read_baseline(path, ["mug"]))
@@ -136,7 +136,7 @@ ROWS = b"".join(
 def test_figures(content: bytes, attempt: Any, tmp_path_factory: Any) -> None:
     path = tmp_path_factory.getbasetemp() / "metrics.jsonl"
     path.write_bytes(content)
-    found = attempt(lambda: read_figures(path))
+    found = attempt(lambda: read_metrics(path))
     assert found is None or all((row["fold"], row["classifier"], row["epoch"]) for row in found)
 
 

@@ -100,9 +100,9 @@ def test_a_directory_digest_depends_on_names_and_contents(tmp_path: Path) -> Non
     assert directory_digest(tmp_path) in digests
 
 
-def test_a_json_digest_ignores_layout_and_its_own_entry() -> None:
+def test_a_json_digest_ignores_the_order_of_keys() -> None:
     digest = json_digest({"a": 1, "b": [2, 3]})
-    assert digest == json_digest({"b": (2, 3), "a": 1, "digest": "x"}) != json_digest({"a": 1, "b": [2]})
+    assert digest == json_digest({"b": (2, 3), "a": 1}) != json_digest({"a": 1, "b": [2]})
 
 
 def test_digests_are_those_of_earlier_versions(tmp_path: Path) -> None:

@@ -1,7 +1,7 @@
-"""A trained baseline as one file, RUN/baselines/NAME.safetensors: arrays and a few words about them, no code.
+"""Files of trained baselines, RUN/baselines/NAME.safetensors.
 
-What it says of itself: the format, the classes, the temperature (`calibration`; none if no views were held out), the
-seconds that training took, and the digest of all that and the arrays.
+The metadata entry "about" is JSON: the format, the classes, the temperature (null without a held-out set), the training
+time in seconds, and a digest of these entries and the arrays.
 """
 
 import dataclasses
@@ -21,24 +21,24 @@ from numpy.typing import NDArray
 from thor2_jax.errors import InputError
 from thor2_jax.files import atomic_write, content_digest, json_digest
 
-__all__ = ["Stored", "arrays_of", "baseline_file", "model_with", "read_baseline", "write_baseline"]
+__all__ = ["StoredBaseline", "baseline_file", "load_arrays", "model_arrays", "read_baseline", "write_baseline"]
 
 FORMAT = 1
 
 
 def baseline_file(run: Path, name: str) -> Path:
-    """Where a run folder has its baseline of that name, or of that pattern of names."""
+    """Return the path of a baseline in a run directory; `name` may be a glob pattern."""
     return run / "baselines" / f"{name}.safetensors"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Stored:
-    """What a file holds.
+class StoredBaseline:
+    """Contents of a baseline file.
 
     Attributes:
-        arrays: by name.
-        temperature: fitted on views held out; None if there were none.
-        seconds: of training.
+        arrays: learned arrays by name.
+        temperature: temperature fitted on the held-out set; None without one.
+        seconds: training time.
     """
 
     arrays: Mapping[str, NDArray[Any]]
@@ -53,11 +53,11 @@ def _digest(arrays: Mapping[str, NDArray[Any]], about: Mapping[str, Any]) -> str
     return content_digest(parts)
 
 
-def write_baseline(path: Path, stored: Stored, classes: Sequence[str]) -> None:
-    """Write a file; it appears whole or not at all.
+def write_baseline(path: Path, stored: StoredBaseline, classes: Sequence[str]) -> None:
+    """Write a baseline file atomically, and create its directory if it is missing.
 
     Raises:
-        OSError: it cannot be written.
+        OSError: if the file cannot be written.
     """
     about = {
         "format": FORMAT,
@@ -72,56 +72,58 @@ def write_baseline(path: Path, stored: Stored, classes: Sequence[str]) -> None:
         safetensors.numpy.save_file(arrays, temporary, {"about": json.dumps(about)})
 
 
-def read_baseline(path: Path, classes: Sequence[str]) -> Stored:
-    """Read a file.
+def read_baseline(path: Path, classes: Sequence[str]) -> StoredBaseline:
+    """Read a baseline file.
 
     Args:
-        path: of the file.
-        classes: those of its run.
+        path: path of the file.
+        classes: class names of its run.
 
     Raises:
-        InputError: it is damaged, of another format, or of other classes; names the file.
+        InputError: if the file is damaged or has another format or other classes; the message names the file.
     """
     try:
         with safetensors.safe_open(path, "numpy") as file:
             about = json.loads(file.metadata()["about"])
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         if about["format"] != FORMAT:
-            raise InputError(f"model: {path} has format {about['format']!r}; this version reads {FORMAT}")
-        if about["digest"] != _digest(arrays, about):
-            raise ValueError("its digest is not that of what it holds")
+            raise InputError(
+                f"model: {path} has format {about['format']!r}; expected {FORMAT}; train the baseline again"
+            )
+        if about.pop("digest") != _digest(arrays, about):
+            raise ValueError("its digest does not match")
         if about["classes"] != list(classes):
-            raise InputError(f"model: {path} is not of its run's classes")
-        return Stored(arrays, about["temperature"], about["seconds"])
+            raise InputError(f"model: {path} has other classes than its run; train the baseline again")
+        return StoredBaseline(arrays, about["temperature"], about["seconds"])
     except InputError:
         raise
     except (OSError, ValueError, KeyError, TypeError, safetensors.SafetensorError) as error:
-        raise InputError(f"model: {path} cannot be read: {error}; without it, it is trained again") from None
+        raise InputError(f"model: {path} cannot be read ({error}); remove it and train the baseline again") from None
 
 
 def _flat(state: Any) -> dict[str, Any]:
     return dict(flax.traverse_util.flatten_dict(nnx.to_pure_dict(state)))
 
 
-def arrays_of(model: nnx.Module) -> dict[str, NDArray[Any]]:
-    """Parameters and batch statistics of a model, by their paths."""
+def model_arrays(model: nnx.Module) -> dict[str, NDArray[Any]]:
+    """Return the parameters and batch statistics of a model by their paths."""
     state = nnx.state(model, (nnx.Param, nnx.BatchStat))
     return {"/".join(map(str, path)): np.asarray(array) for path, array in _flat(state).items()}
 
 
-def model_with(model: nnx.Module, arrays: Mapping[str, NDArray[Any]]) -> Any:
-    """`model` with these parameters and batch statistics in place of its own.
+def load_arrays(model: nnx.Module, arrays: Mapping[str, NDArray[Any]]) -> Any:
+    """Set the parameters and batch statistics of `model`, and return it.
 
     Raises:
-        ValueError: one is missing or has another shape.
+        ValueError: if an array is missing or has another shape.
     """
     state = nnx.state(model, (nnx.Param, nnx.BatchStat))
-    found = {}
+    loaded = {}
     for path, own in _flat(state).items():
         name = "/".join(map(str, path))
         if name not in arrays or arrays[name].shape != own.shape:
-            raise ValueError(f"{name} is missing or has not the shape {own.shape}")
-        found[path] = jnp.asarray(arrays[name])
-    nnx.replace_by_pure_dict(state, flax.traverse_util.unflatten_dict(found))
+            raise ValueError(f"{name} is missing or does not have the shape {own.shape}")
+        loaded[path] = jnp.asarray(arrays[name])
+    nnx.replace_by_pure_dict(state, flax.traverse_util.unflatten_dict(loaded))
     nnx.update(model, state)
     return model

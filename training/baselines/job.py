@@ -8,7 +8,7 @@ from pathlib import Path
 from thor2_jax.errors import InputError
 from thor2_jax.recognition.run_directory import load_run
 from training.baselines.baseline import Fitted, Task
-from training.baselines.files import Stored, baseline_file, write_baseline
+from training.baselines.files import StoredBaseline, baseline_file, write_baseline
 from training.baselines.forest import train_forest
 from training.baselines.pointnet import train_pointnet
 from training.baselines.thor import train_thor
@@ -71,5 +71,5 @@ def train_baselines(
             fitted = _TRAIN[name](task)
             seconds = time.perf_counter() - start
             temperature = fit_temperature(fitted.probabilities, fitted.truth) if len(fitted.truth) else None
-            write_baseline(file, Stored(fitted.model.arrays(), temperature, seconds), run.classes)
+            write_baseline(file, StoredBaseline(fitted.model.arrays(), temperature, seconds), run.classes)
             shutil.rmtree(scratch)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
 from training.baselines.baseline import Fitted, Seen, Task
-from training.baselines.files import arrays_of, model_with
+from training.baselines.files import load_arrays, model_arrays
 
 __all__ = ["POINTS", "ColoredPointNet", "PointNet", "train_pointnet"]
 
@@ -119,12 +119,12 @@ class ColoredPointNet:
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Weights by their paths."""
-        return arrays_of(self._model)
+        return model_arrays(self._model)
 
     @classmethod
     def with_arrays(cls, arrays: Mapping[str, NDArray[Any]], n_classes: int) -> "ColoredPointNet":
         """The inverse of `arrays`; raises ValueError if some are missing."""
-        return cls(model_with(PointNet(n_classes, rngs=nnx.Rngs(0)), arrays))
+        return cls(load_arrays(PointNet(n_classes, rngs=nnx.Rngs(0)), arrays))
 
     def probabilities(self, seen: Seen) -> NDArray[np.float32]:
         """[B, C]; the points drawn depend on their number alone."""

@@ -28,7 +28,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.recognition.classifier import MLP
 from thor2_jax.types import PointClouds
 from training.baselines.baseline import Fitted, Seen, Task
-from training.baselines.files import arrays_of, model_with
+from training.baselines.files import load_arrays, model_arrays
 from training.fitting.calibration import sample_probabilities
 from training.fitting.checkpoints import Checkpoints
 from training.fitting.fit import fit
@@ -135,7 +135,7 @@ class THOR:
         return {
             f"{name}-{k}/{path}": array
             for (name, k), model in self._library.items()
-            for path, array in arrays_of(model).items()
+            for path, array in model_arrays(model).items()
         }
 
     @classmethod
@@ -147,7 +147,7 @@ class THOR:
                 prefix = f"{name}-{k}/"
                 mine = {key.removeprefix(prefix): a for key, a in arrays.items() if key.startswith(prefix)}
                 model = MLP(k * config.image_size**2, n_classes, rngs=nnx.Rngs(0))
-                library[name, k] = model_with(model, mine)
+                library[name, k] = load_arrays(model, mine)
         return cls(library, config)
 
 

@@ -1,14 +1,14 @@
-"""Checkpoints of one fit, so that it can go on where it was stopped (orbax stands behind this module).
+"""Checkpoints of one fit, from which an interrupted fit resumes; the only module that uses orbax's managers.
 
-    with Checkpoints(folder) as checkpoints:
+    with Checkpoints(directory) as checkpoints:
         state = checkpoints.last(state) if checkpoints.last_epoch else state
         for epoch in range(checkpoints.last_epoch + 1, epochs + 1):
             ...
             checkpoints.save(epoch, state, score)
         state = checkpoints.best(state)
 
-Two epochs are kept, the last one and the one with the best score. A checkpoint appears whole or not at all, and the one
-before it goes only then: whatever happens, the last good one stays.
+Two epochs are kept: the last one and the one with the best score. A checkpoint is written atomically, and an older one
+is removed only afterwards, so the last complete checkpoint survives any crash.
 """
 
 import contextlib
@@ -31,29 +31,29 @@ from thor2_jax.files import directory_digest, write_text
 __all__ = ["CHECKPOINTS", "Checkpoints"]
 
 CHECKPOINTS = "checkpoints"
-"""Folder of a run in the making."""
+"""Directory inside the run directory of an unfinished training."""
 
-DIGEST = "sha256"
+DIGEST_FILE = "sha256"
 
 
 class Checkpoints:
-    """A folder of checkpoints; with several processes, one that all of them see."""
+    """Checkpoints in one directory, which all processes of a training share."""
 
-    def __init__(self, folder: str | Path) -> None:
-        """Open, or make, the folder, and clear away what a crash left unfinished.
+    def __init__(self, directory: str | Path) -> None:
+        """Open or create the directory, and remove incomplete checkpoints from it.
 
         Raises:
-            OSError: it cannot be made.
+            OSError: if the directory cannot be created.
         """
-        self.folder = Path(folder).absolute()
-        self.folder.mkdir(parents=True, exist_ok=True)
+        self.directory = Path(directory).absolute()
+        self.directory.mkdir(parents=True, exist_ok=True)
         keep = checkpoint_managers.AnyPreservationPolicy(
             [checkpoint_managers.LatestN(1), checkpoint_managers.BestN(get_metric_fn=_score, n=1)]
         )
         options = ocp.CheckpointManagerOptions(
             preservation_policy=keep, best_fn=_score, cleanup_tmp_directories=True, enable_async_checkpointing=False
         )
-        self._manager = ocp.CheckpointManager(self.folder, options=options)
+        self._manager = ocp.CheckpointManager(self.directory, options=options)
 
     def __enter__(self) -> "Checkpoints":
         return self
@@ -65,70 +65,71 @@ class Checkpoints:
 
     @property
     def last_epoch(self) -> int:
-        """Of the last checkpoint; 0 if there is none."""
+        """Epoch of the last checkpoint; 0 if there is none."""
         return int(self._manager.latest_step() or 0)
 
     @property
     def best_epoch(self) -> int:
-        """Of the checkpoint with the greatest score, the later one of equals; 0 if there is none."""
+        """Epoch of the checkpoint with the highest score, the latest of equal ones; 0 if there is none."""
         return int(self._manager.best_step() or 0)
 
     def save(self, epoch: int, state: Any, score: float) -> None:
         """Write a checkpoint.
 
         Args:
-            epoch: its number, greater than the last one's.
-            state: pytree of arrays, the same in all processes.
-            score: the greater, the better.
+            epoch: number of the epoch, greater than that of the last checkpoint.
+            state: pytree of arrays, equal in all processes.
+            score: quality of the state; higher is better.
 
         Raises:
-            OSError: it cannot be written, as when the disk is full.
+            OSError: if the checkpoint cannot be written, for example because the disk is full.
         """
         host = jax.tree.map(np.asarray, state)
         try:
-            with _no_tracebacks():
+            with _quiet_orbax():
                 self._manager.save(epoch, args=ocp.args.StandardSave(host), metrics={"score": score})
             if jax.process_index() == 0:
-                write_text(self._path(epoch) / DIGEST, directory_digest(self._path(epoch) / "default"))
+                write_text(self._path(epoch) / DIGEST_FILE, directory_digest(self._path(epoch) / "default"))
         except Exception as error:  # orbax raises whatever its storage layers raise
-            number, why = _cause(error)
-            raise OSError(
-                number, f"the checkpoint of epoch {epoch} cannot be written: {why}", str(self.folder)
-            ) from None
+            number, reason = _system_error(error)
+            message = f"the checkpoint of epoch {epoch} cannot be written: {reason}"
+            raise OSError(number, message, str(self.directory)) from None
 
     def last(self, like: Any) -> Any:
-        """The state of the last checkpoint, as host arrays.
+        """Return the state of the last checkpoint, as NumPy arrays.
 
         Args:
-            like: a state of the same structure, shapes and types.
+            like: state of the same structure, shapes and dtypes.
 
         Raises:
-            InputError: it is damaged, or of another structure.
+            InputError: if the checkpoint is damaged or has another structure.
         """
         return self._restore(self.last_epoch, like)
 
     def best(self, like: Any) -> Any:
-        """The state of the checkpoint with the greatest score; as `last`."""
+        """Return the state of the checkpoint with the highest score, like `last`."""
         return self._restore(self.best_epoch, like)
 
     def _path(self, epoch: int) -> Path:
-        return self.folder / str(epoch)
+        return self.directory / str(epoch)
 
     def _restore(self, epoch: int, like: Any) -> Any:
         path = self._path(epoch)
         target = jax.tree.map(lambda a: np.zeros(a.shape, a.dtype), like)
         try:
-            # A process that was killed after the one and before the other has left no digest.
-            if (path / DIGEST).is_file() and (path / DIGEST).read_text() != directory_digest(path / "default"):
+            # A process that is killed between checkpoint and digest leaves no digest.
+            if (path / DIGEST_FILE).is_file() and (path / DIGEST_FILE).read_text() != directory_digest(
+                path / "default"
+            ):
                 raise ValueError("it is damaged")
-            with _no_tracebacks():
+            with _quiet_orbax():
                 state = self._manager.restore(epoch, args=ocp.args.StandardRestore(target))
-            for found, expected in zip(jax.tree.leaves(state), jax.tree.leaves(target), strict=True):
-                if (found.shape, found.dtype) != (expected.shape, expected.dtype):
-                    raise ValueError(f"it has {found.dtype} {found.shape} for {expected.dtype} {expected.shape}")
+            for leaf, expected in zip(jax.tree.leaves(state), jax.tree.leaves(target), strict=True):
+                if (leaf.shape, leaf.dtype) != (expected.shape, expected.dtype):
+                    raise ValueError(f"it has {leaf.dtype} {leaf.shape}; expected {expected.dtype} {expected.shape}")
         except Exception as error:  # orbax raises whatever its storage layers raise
             raise InputError(
-                f"checkpoint: {path} cannot be read: {_first_line(error)}; without {self.folder}, training begins anew"
+                f"checkpoint: {path} cannot be read ({_first_line(error)}); remove {self.directory} to restart this fit"
             ) from None
         return state
 
@@ -141,16 +142,16 @@ def _first_line(error: Exception) -> str:
     return (str(error).strip().splitlines() or [type(error).__name__])[0][:300]
 
 
-def _cause(error: Exception) -> tuple[int | None, str]:
-    """Number and words of what the system said: an OSError's, or those in the text of tensorstore's error."""
-    found = re.search(r"os_error_code='(\d+)'", str(error))
-    number = error.errno if isinstance(error, OSError) else int(found[1]) if found else None
+def _system_error(error: Exception) -> tuple[int | None, str]:
+    """Return the system's error number and message, from an OSError or from the text of tensorstore's error."""
+    match = re.search(r"os_error_code='(\d+)'", str(error))
+    number = error.errno if isinstance(error, OSError) else int(match[1]) if match else None
     return number, os.strerror(number) if number else _first_line(error)
 
 
 @contextlib.contextmanager
-def _no_tracebacks() -> Iterator[None]:
-    """What orbax raises it also logs, thread by thread."""
+def _quiet_orbax() -> Iterator[None]:
+    """Suppress orbax's log, in which its threads print tracebacks of the errors that are raised anyway."""
     logger = logging.getLogger("absl")
     before, logger.disabled = logger.disabled, True
     try:

@@ -33,7 +33,7 @@ from training.fitting.calibration import temperatures
 from training.fitting.checkpoints import CHECKPOINTS, Checkpoints
 from training.fitting.fit import check_batch_size, fit
 from training.fitting.folds import fold_of_views
-from training.fitting.metrics_log import append_figures, forget_after, read_figures
+from training.fitting.metrics_log import append_metrics, discard_later_epochs, read_metrics
 from training.fitting.options import EpochMetrics, FitOptions, Progress
 from training.fitting.samples import MIRRORS, Samples, build_samples
 from training.reports.plots import draw_curves
@@ -208,7 +208,7 @@ def train_run(
                 classifiers, kept = _fit_fold(samples, held_out, out, fold, network, config, names, options, progress)
                 calibrated = temperatures(classifiers, samples, held_out, network, config)
                 if first:
-                    rows = read_figures(out / METRICS)
+                    rows = read_metrics(out / METRICS)
                     draw_curves(
                         {name: [row for row in rows if row["classifier"] == name] for name in names}, out / CURVES
                     )
@@ -253,11 +253,11 @@ def _fit_fold(
 
         def epoch_done(figures: EpochMetrics, name: Feature = name) -> None:
             if first:
-                append_figures(out / METRICS, fold, name, figures)
+                append_metrics(out / METRICS, fold, name, figures)
 
         with Checkpoints(out / CHECKPOINTS / f"fold-{fold}" / name) as checkpoints:
             if first:
-                forget_after(out / METRICS, fold, name, checkpoints.last_epoch)
+                discard_later_epochs(out / METRICS, fold, name, checkpoints.last_epoch)
             classifiers[name], kept[name] = fit(
                 samples, network, config, name, options, checkpoints, held_out, told, epoch_done
             )

@@ -72,7 +72,7 @@ def names(folder: Path) -> list[str]:
 
 
 def told_of(path: Path) -> list[tuple[Any, ...]]:
-    rows = metrics.read_figures(path / "metrics.jsonl")
+    rows = metrics.read_metrics(path / "metrics.jsonl")
     return [(row["fold"], row["classifier"], row["epoch"], row["loss"], row["accuracy"]) for row in rows]
 
 
@@ -265,7 +265,7 @@ def test_a_full_disk(whole: tuple[Path, TrainedRun], tmp_path: Path, monkeypatch
     for where, name, replacement in (
         (module, "write_text", full),
         (Checkpoints, "save", second_fails),
-        (module, "append_figures", full),
+        (module, "append_metrics", full),
         (module, "draw_curves", full),
         (module, "save_run", full),
     ):
