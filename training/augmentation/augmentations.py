@@ -1,4 +1,12 @@
-"""Which augmentations are on, and a view with all of them."""
+"""Augmentations of training views: beyond the paper, each with its own switch.
+
+    augmentations = Augmentations(illumination=Illumination(), occlusion=Occlusion())
+    copy = augment(render_view(caster, pose), augmentations, np.random.default_rng(0))
+
+An augmented copy has the pose of its view. Illumination changes its colours only; segmentation adds or removes pixels
+along the outline; occlusion removes pixels behind another object; the sensor perturbs or removes depth. Where pixels
+are added or removed, colour and depth change together. The view as rendered is always kept as copy 0.
+"""
 
 import dataclasses
 from typing import Any
@@ -20,17 +28,17 @@ __all__ = ["Augmentations", "augment"]
 
 @dataclasses.dataclass(frozen=True)
 class Augmentations:
-    """Variations of training views; None is off. False if all are off.
+    """Augmentations to apply; None disables one. False if all are disabled.
 
     Attributes:
         illumination: light and camera response.
-        sensor: noise and faults of depth.
+        sensor: noise and faults of the depth sensor.
         occlusion: another object in front.
-        segmentation: masks too small or too large.
-        copies: varied copies of each view.
+        segmentation: masks that are too small or too large.
+        copies: number of augmented copies of each view.
 
     Raises:
-        InputError: `copies` is no whole number of at least 1, or a variation is of another type.
+        InputError: `copies` is not an integer of at least 1, or an augmentation has another type.
     """
 
     illumination: Illumination | None = None
@@ -51,13 +59,13 @@ class Augmentations:
             if value is not None and not isinstance(value, kind):
                 raise InputError(f"augmentations.{name} is {value!r}; it must be None or {kind.__name__}")
         if not isinstance(self.copies, int) or isinstance(self.copies, bool) or self.copies < 1:
-            raise InputError(f"augmentations.copies is {self.copies!r}; it must be a whole number of at least 1")
+            raise InputError(f"augmentations.copies is {self.copies!r}; it must be an integer of at least 1")
 
     def __bool__(self) -> bool:
         return any((self.illumination, self.sensor, self.occlusion, self.segmentation))
 
     def record(self) -> dict[str, Any]:
-        """All settings as JSON holds them: field -> value, None for a variation that is off, ranges as lists."""
+        """Return all settings as JSON holds them: None for a disabled augmentation, ranges as lists."""
 
         def plain(items: list[tuple[str, Any]]) -> dict[str, Any]:
             return {name: list(value) if isinstance(value, tuple) else value for name, value in items}
@@ -66,19 +74,19 @@ class Augmentations:
 
 
 def augment(view: RenderedView, augmentations: Augmentations, rng: np.random.Generator) -> RenderedView:
-    """A varied copy of a view: the same for the same arguments and state of `rng`.
+    """Return an augmented copy of a view; it is determined by the arguments and the state of `rng`.
 
-    In the order of what happens to a frame: light, the mask's error, another object in front, the depth camera. As
-    recognition does, pixels that fly are dropped where mask or camera can have made some.
+    The order is illumination, segmentation, occlusion, sensor. Flying pixels are removed after segmentation and sensor,
+    as recognition does.
 
     Args:
-        view: unchanged.
-        augmentations: what to vary.
-        rng: of everything random.
+        view: view as rendered; not modified.
+        augmentations: which augmentations to apply, with their settings.
+        rng: random number generator.
 
     Returns:
-        A view with the same pose. A mask that reaches past the outline needs room: there the part of the image, its
-        corner and its intrinsics may be larger by some pixels.
+        A view with the same pose. If the mask is dilated, the image may be larger by some pixels on each side; corner
+        and intrinsics are adapted.
     """
     if augmentations.illumination:
         view = relit(view, augmentations.illumination, rng)
@@ -92,7 +100,7 @@ def augment(view: RenderedView, augmentations: Augmentations, rng: np.random.Gen
 
 
 def _without_flying(view: RenderedView) -> RenderedView:
-    """As in `instance_clouds`: not if it were more than half of the pixels."""
+    """Remove flying pixels as recognition does: unless they are more than half of all pixels."""
     frame = RGBDFrame(view.color, view.depth, (view.depth > 0).astype(np.uint8), view.intrinsics)
     pixels = np.flatnonzero(view.depth)
     flying = flying_pixels(frame, pixels)

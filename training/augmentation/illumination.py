@@ -1,8 +1,8 @@
-"""Views under another light and through another camera: colours only, depth stays.
+"""Augmentation of light and camera response: changes colours only.
 
-A camera's picture of a scan differs from the scan's texture by the light's strength, colour and direction and by the
-camera's response. In this order, on sRGB values in [0, 1]: c ** gamma, times gain, cast and shading; then saturation
-(distance from the grey of the same luma), a veil of stray light, noise.
+A camera image of an object differs from the scanned texture by the strength, colour and direction of the light and by
+the camera's response. Applied in this order to sRGB values in [0, 1]: c ** gamma; gain, colour cast and shading;
+saturation (distance from the grey of the same luma); a veil of stray light; noise.
 """
 
 import dataclasses
@@ -17,35 +17,35 @@ from training.rendering.camera import RenderedView
 __all__ = ["Illumination", "relit"]
 
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)
-"""Shares of red, green and blue in an sRGB value's brightness (ITU-R BT.601)."""
+"""Luma coefficients of red, green and blue (ITU-R BT.601)."""
 
 STRIDE = 2
-"""Every so many pixels the shading is computed: still finer than the clouds' voxels."""
+"""Pixels between computed shading values: still finer than the voxels of the clouds."""
 
 SMOOTH = 5
-"""Side of the square over which slopes are averaged, in these steps: depth is in steps of 1 mm, a pixel 1.4 mm wide."""
+"""Side of the smoothing window for slopes, in strides: depth is rounded to 1 mm, a pixel is 1.4 mm wide."""
 
 STEEPEST = 3.0
-"""Slopes beyond this (72 degrees) are steps between surfaces or noise of the rounded depth."""
+"""Steeper slopes (72 degrees) are depth discontinuities or rounding noise."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Illumination:
-    """Light and camera response, drawn once a view.
+    """Ranges of light and camera response; values are drawn once per view.
 
     Attributes:
         gamma: exponent of all channels.
         gain: factor of all channels.
-        cast: largest deviation from 1 of each channel's own factor. 0.1 is what is left of light of 3,000 K after a
-            white balance that takes away four fifths of it.
-        shading: weight of the Lambert term of one distant light from a random direction on the camera's side; its mean
-            over the view is taken off, so that the gain alone tells the mean brightness.
+        cast: largest deviation from 1 of the factor of each channel. 0.1 remains of light of 3,000 K after a white
+            balance that corrects four fifths of it.
+        shading: weight of the Lambert term of one distant light from a random direction on the camera's side, less its
+            mean over the view, so that only the gain changes the mean brightness.
         saturation: factor of a colour's distance from grey.
-        veil: share of white in the mixture.
-        noise: standard deviation of a pixel, per channel.
+        veil: weight of white that is mixed in.
+        noise: standard deviation per pixel and channel.
 
     Raises:
-        InputError: a value outside its limits.
+        InputError: A value is outside its limits.
     """
 
     gamma: Range = (0.7, 1.4)
@@ -70,7 +70,7 @@ class Illumination:
 
 
 def relit(view: RenderedView, light: Illumination, rng: np.random.Generator) -> RenderedView:
-    """The view under a light drawn from `light`."""
+    """Return the view under a light drawn from `light`."""
     pixels = np.flatnonzero(view.depth)
     if len(pixels) == 0:
         return view
@@ -80,7 +80,7 @@ def relit(view: RenderedView, light: Illumination, rng: np.random.Generator) -> 
     )
     cast = rng.uniform(1 - light.cast, 1 + light.cast, 3)
     response = ((np.arange(256) / 255) ** gamma).astype(np.float32)
-    # Gain, cast, saturation and veil in one matrix: a pixel's grey is the same in all columns.
+    # Gain, cast, saturation and veil are one matrix: the grey of a pixel is the same in all columns.
     mixing = saturation * np.eye(3) + (1 - saturation) * LUMA[:, None]
     matrix = 255 * (1 - veil) * gain * cast[:, None] * mixing
     color = view.color.copy()
@@ -97,7 +97,7 @@ def relit(view: RenderedView, light: Illumination, rng: np.random.Generator) -> 
 
 
 def _lambert(view: RenderedView, pixels: NDArray[np.intp], rng: np.random.Generator) -> NDArray[np.float32]:
-    """Cosine between the normal and the direction to a distant light, 0 where it turns away, at pixels [n]."""
+    """Return the Lambert term of a random distant light at pixels [n]; 0 where the surface faces away."""
     light = rng.standard_normal(3)
     light[2] = -abs(light[2])
     light /= np.linalg.norm(light)
@@ -110,10 +110,10 @@ def _lambert(view: RenderedView, pixels: NDArray[np.intp], rng: np.random.Genera
 
 
 def _slopes(depth: NDArray[np.float32], focal: float) -> NDArray[np.float32]:
-    """Smoothed slope of the surface along rows [h, w]: depth a length across."""
+    """Return the smoothed slope of the surface along rows [h, w]: change of depth per length."""
     slope, counted = np.zeros((2, *depth.shape), np.float32)
     slope[:, 1:] = focal * np.diff(depth, axis=1) / np.maximum(depth[:, 1:], 1)
-    # Beside nothing the slope is as steep as on a step.
+    # Next to missing depth the slope is treated like a discontinuity.
     counted[:, 1:] = (depth[:, 1:] > 0) & (np.abs(slope[:, 1:]) < STEEPEST)
     total, weight = (uniform_filter(array, SMOOTH, mode="constant") for array in (slope * counted, counted))
     return total / np.maximum(weight, np.float32(1e-6))

@@ -1,4 +1,4 @@
-"""Another object in front: part of a view is hidden, along the outline of one of the built-in objects or an edge."""
+"""Augmentation of occlusion: removes the part of a view behind the outline of a built-in object or a straight edge."""
 
 import dataclasses
 import functools
@@ -16,36 +16,36 @@ from training.rendering.view_sphere import DISTANCE, camera_pose
 __all__ = ["Occlusion", "occluded"]
 
 SILHOUETTE_PIXEL = 0.002
-"""Metres: side of a silhouette's pixel."""
+"""Side of a pixel of the silhouettes, metres."""
 
 POSES = tuple((azimuth, polar) for azimuth in (0.4, 2.0) for polar in (0.8, 1.3))
-"""Azimuth and polar angle, radians, from which silhouettes are taken: as a camera looks down on a table."""
+"""Azimuth and polar angles of the silhouettes, radians: cameras that look down on a table."""
 
 PLACES = 32
-"""Places of the silhouette that are tried, on a line from outside the view to its middle."""
+"""Candidate positions of a silhouette, on a line from outside the view to its centre."""
 
 SAMPLE_PIXELS = 400
-"""Pixels of the view, about, that tell how much is hidden at each place."""
+"""Approximate number of pixels that estimate the occluded share at each position."""
 
 MAX_TRIES = 4
-"""Silhouettes that are tried before a straight edge."""
+"""Silhouettes to try before a straight edge is used."""
 
 SHARE_TOLERANCE = 0.05
-"""How far from the share drawn a silhouette's may be."""
+"""Largest accepted difference between the drawn share and that of a silhouette."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Occlusion:
-    """What hides a view, drawn once a view.
+    """Ranges of the occlusion; values are drawn once per view.
 
     Attributes:
-        share: of the view's pixels that are hidden.
-        none: share of views that nothing hides.
-        straight: share of the others that a straight edge hides, as of something large.
-        nearer: factor of the silhouette's size: the other object is that much nearer to the camera.
+        share: occluded share of the view's pixels.
+        none: probability that a view is not occluded.
+        straight: probability, for the others, that a straight edge (a large object) occludes it.
+        nearer: scale of the silhouette; the occluding object is nearer to the camera by this factor.
 
     Raises:
-        InputError: a value outside its limits.
+        InputError: A value is outside its limits.
     """
 
     share: Range = (0.05, 0.6)
@@ -58,7 +58,7 @@ class Occlusion:
 
 
 def occluded(view: RenderedView, occlusion: Occlusion, rng: np.random.Generator) -> RenderedView:
-    """The view without what is hidden. Where silhouettes are too small for the share drawn, a straight edge does."""
+    """Return the view without its occluded pixels; a straight edge replaces silhouettes that are too small."""
     pixels = np.flatnonzero(view.depth)
     n = len(pixels)
     if n == 0 or rng.random() < occlusion.none:
@@ -67,12 +67,12 @@ def occluded(view: RenderedView, occlusion: Occlusion, rng: np.random.Generator)
     angle, width = rng.uniform(0, 2 * np.pi), pixel_width(view)
     c, s = width * np.cos(angle), width * np.sin(angle)
     row, column = (place - place.mean() for place in np.divmod(pixels, view.depth.shape[1]))
-    # The other object comes along x.
+    # The occluding object moves along x.
     x, y = c * column + s * row, c * row - s * column
     for _ in range(0 if rng.random() < occlusion.straight else MAX_TRIES):
         hidden = _behind_silhouette(x, y, share, rng.uniform(*occlusion.nearer), rng)
-        found = hidden.mean()
-        if abs(found - share) <= SHARE_TOLERANCE and occlusion.share[0] <= found <= occlusion.share[1]:
+        actual = hidden.mean()
+        if abs(actual - share) <= SHARE_TOLERANCE and occlusion.share[0] <= actual <= occlusion.share[1]:
             break
     else:
         hidden = np.zeros(n, bool)
@@ -82,20 +82,22 @@ def occluded(view: RenderedView, occlusion: Occlusion, rng: np.random.Generator)
 
 @functools.cache
 def _silhouettes() -> tuple[NDArray[np.bool_], ...]:
-    """Outlines [h, w] of the built-in objects, with nothing on the border; 0.2 s, once a process."""
+    """Return silhouettes [h, w] of the built-in objects with an empty border; takes 0.2 s, once per process."""
     f = DISTANCE / SILHOUETTE_PIXEL
     camera = Camera.from_field_of_view(400, 400, float(np.degrees(2 * np.arctan(200 / f))))
-    found = []
+    silhouettes = []
     for mesh in builtin_objects().values():
         caster = RayCaster([mesh])
-        found += [np.pad(render_view(caster, camera_pose(*pose, mesh.centre), camera).depth > 0, 1) for pose in POSES]
-    return tuple(found)
+        silhouettes += [
+            np.pad(render_view(caster, camera_pose(*pose, mesh.centre), camera).depth > 0, 1) for pose in POSES
+        ]
+    return tuple(silhouettes)
 
 
 def _behind_silhouette(
     x: NDArray[np.float64], y: NDArray[np.float64], share: float, scale: float, rng: np.random.Generator
 ) -> NDArray[np.bool_]:
-    """Which points (x [n] and y [n], metres) a silhouette hides that comes along x until it hides about `share`."""
+    """Return which points (x [n], y [n], metres) a silhouette occludes that moves along x until it covers `share`."""
     bank = _silhouettes()
     silhouette = bank[rng.integers(len(bank))]
     pixel = SILHOUETTE_PIXEL * scale
@@ -104,7 +106,7 @@ def _behind_silhouette(
     places = np.linspace(x.min() - width / 2 * pixel, 0, PLACES)
 
     def hides(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """For points relative to the silhouette's middle."""
+        """Return which points, relative to the silhouette's centre, it covers."""
         column = (x / pixel + width / 2).astype(np.intp).clip(0, width - 1)
         row = (y / pixel + height / 2).astype(np.intp).clip(0, height - 1)
         return silhouette[row, column]

@@ -1,7 +1,7 @@
-"""Masks a few pixels too small or too large: the outermost points are missing, or some of the background's are there.
+"""Augmentation of the mask: a few pixels too small or too large, so that points are missing or of the background.
 
-The background is a plane: the table, or a wall behind. Past the outline only what is near the object in depth is added.
-The rest, a strip a few millimetres wide, is what outlier removal in recognition drops, as strays or as a small piece.
+The background is a plane: the table, or a wall behind. Beyond the outline only background near the object in depth is
+added: outlier removal in recognition drops the rest, a strip a few millimetres wide, as strays or as a small component.
 """
 
 import dataclasses
@@ -19,21 +19,21 @@ from training.rendering.camera import TRAINING_CAMERA, RenderedView
 __all__ = ["Segmentation", "resegmented"]
 
 MAX_BACKGROUND_GAP = 2 * CELL
-"""Metres behind the object within which background remains: cells that touch are one piece for outlier removal."""
+"""Largest distance of remaining background, metres: outlier removal treats adjacent cells as one component."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Segmentation:
-    """A mask's error, drawn once a view.
+    """Ranges of the mask's error; values are drawn once per view.
 
     Attributes:
-        pixels: of a frame that the mask reaches past the outline; below 0 it stays inside.
-        tilt: degrees between the background's normal and the camera's axis.
-        touching: share of backgrounds that touch what is seen of the object, as the table does; others are farther.
-        gap: metres between object and background where they do not touch.
+        pixels: by how many pixels of a real frame the mask is dilated; eroded if negative.
+        tilt: angle between the background's normal and the optical axis, degrees.
+        touching: probability that the background touches the visible object, as a table does.
+        gap: distance between object and background otherwise, metres.
 
     Raises:
-        InputError: a value outside its limits.
+        InputError: A value is outside its limits.
     """
 
     pixels: Range = (-3.0, 3.0)
@@ -46,7 +46,7 @@ class Segmentation:
 
 
 def resegmented(view: RenderedView, segmentation: Segmentation, rng: np.random.Generator) -> RenderedView:
-    """The view in a mask with an error drawn from `segmentation`. An eroded mask keeps half of the pixels at least."""
+    """Return the view in a mask with a drawn error; an eroded mask keeps at least half of the pixels."""
     seen = view.depth > 0
     if not seen.any():
         return view
@@ -77,7 +77,7 @@ def _dilated(view: RenderedView, steps: int, segmentation: Segmentation, rng: np
 
 
 def _widened(view: RenderedView, margin: int) -> RenderedView:
-    """The view with a margin on all sides, as far as the training camera's image goes."""
+    """Return the view with a margin on all sides, within the image of the training camera."""
     camera, k = TRAINING_CAMERA, view.intrinsics
     sides = []
     for first, length, size in zip(view.corner, view.depth.shape, (camera.height, camera.width), strict=True):
@@ -95,7 +95,7 @@ def _widened(view: RenderedView, margin: int) -> RenderedView:
 def _background(
     view: RenderedView, seen: NDArray[np.bool_], segmentation: Segmentation, rng: np.random.Generator
 ) -> NDArray[np.uint16]:
-    """Depth [h, w] of a plane behind the object, millimetres; 0 where the plane is not seen."""
+    """Return the depth [h, w] of a plane behind the object, millimetres; 0 where it is not visible."""
     tilt, azimuth = np.radians(rng.uniform(*segmentation.tilt)), rng.uniform(0, 2 * np.pi)
     gap = 0.0 if rng.random() < segmentation.touching else rng.uniform(*segmentation.gap)
     k, (height, width) = view.intrinsics, view.depth.shape

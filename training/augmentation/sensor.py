@@ -1,7 +1,7 @@
-"""Depth as a consumer camera gives it: axial and lateral noise, missing and flying pixels, in steps of 1 mm.
+"""Augmentation of the depth sensor: axial and lateral noise, missing and flying pixels, depth rounded to 1 mm.
 
-The standard deviation along the axis is at most 1.2 mm + 1.9 mm (z / m - 0.4)^2, across it 0.8 pixels (Nguyen, Izadi
-and Lovell, "Modeling Kinect sensor noise for improved 3D reconstruction and tracking", 3DIMPVT 2012).
+The axial standard deviation is at most 1.2 mm + 1.9 mm (z / m - 0.4)^2, the lateral one 0.8 pixels (Nguyen, Izadi and
+Lovell, "Modeling Kinect sensor noise for improved 3D reconstruction and tracking", 3DIMPVT 2012).
 """
 
 import dataclasses
@@ -19,19 +19,19 @@ __all__ = ["Sensor", "axial_deviation", "sensed"]
 
 @dataclasses.dataclass(frozen=True)
 class Sensor:
-    """A depth camera at a distance drawn once a view.
+    """Ranges of the depth sensor's errors; values are drawn once per view.
 
     Attributes:
-        distance: metres for which noise is drawn: where frames show objects, not where the training camera stands.
-        axial: factor of `axial_deviation`, drawn once a view. Within a centimetre real frames have 0.4 to 0.55 of it.
-        lateral: standard deviation in pixels of a frame, along rows and along columns, of where depth is sampled.
-        grazing: degrees from facing the camera from which on a surface counts as an edge.
-        missing: share of pixels without depth on edges: outlines, steps in depth and surfaces that steep.
-        flying: share of the others on edges whose depth lies between the surface's and the background's.
-        background: metres behind the object, drawn once a view.
+        distance: distance of objects in real frames, metres, which determines the noise.
+        axial: factor of `axial_deviation`; real frames have 0.4 to 0.55 of it within a centimetre.
+        lateral: standard deviation of the sampling position along rows and columns, in pixels of a real frame.
+        grazing: angle between surface normal and view direction from which a surface counts as an edge, degrees.
+        missing: share of edge pixels without depth; edges are outlines, depth discontinuities and grazing surfaces.
+        flying: share of the other edge pixels whose depth lies between the surface's and the background's.
+        background: distance of the background behind the object, metres.
 
     Raises:
-        InputError: a value outside its limits.
+        InputError: A value is outside its limits.
     """
 
     distance: Range = (0.6, 1.2)
@@ -56,12 +56,12 @@ class Sensor:
 
 
 def axial_deviation(z: float) -> float:
-    """Standard deviation of depth at a distance z, both in metres (Nguyen, Izadi and Lovell 2012)."""
+    """Return the axial standard deviation of depth at a distance z, both in metres (Nguyen, Izadi and Lovell 2012)."""
     return 0.0012 + 0.0019 * (z - 0.4) ** 2
 
 
 def sensed(view: RenderedView, sensor: Sensor, rng: np.random.Generator) -> RenderedView:
-    """The view as a camera drawn from `sensor` measures it."""
+    """Return the view as a depth camera drawn from `sensor` measures it."""
     pixels = np.flatnonzero(view.depth)
     n = len(pixels)
     if n == 0:
@@ -70,7 +70,7 @@ def sensed(view: RenderedView, sensor: Sensor, rng: np.random.Generator) -> Rend
     behind = rng.uniform(*sensor.background)
     width = pixel_width(view)
     lateral = sensor.lateral * FRAME_PIXEL / width
-    # Nothing is seen around the view, so that its border is an edge and samples fall there.
+    # The margin has no depth, so that the border of the view is an edge and lateral samples can fall there.
     margin = 1 + math.ceil(4 * lateral)
     depth = np.pad(view.depth, margin).astype(np.float32)
     edge = _edges(depth, 1000 * width * math.tan(math.radians(sensor.grazing)))
@@ -78,20 +78,20 @@ def sensed(view: RenderedView, sensor: Sensor, rng: np.random.Generator) -> Rend
     row, column = np.divmod(pixels, view.depth.shape[1])
     at = (row + margin) * depth.shape[1] + column + margin
     at += (shift[0] * depth.shape[1] + shift[1]).astype(np.intp)
-    found, on_edge = depth.take(at), np.flatnonzero(edge.take(at))
-    lost = found == 0
+    sampled, on_edge = depth.take(at), np.flatnonzero(edge.take(at))
+    lost = sampled == 0
     chance = rng.random((2, len(on_edge)), np.float32)
     lost[on_edge[chance[0] < sensor.missing]] = True
     mixed = on_edge[chance[1] < sensor.flying]
-    found[mixed] += np.float32(1000 * behind) * rng.random(len(mixed), np.float32)
-    found += np.float32(1000 * deviation) * rng.standard_normal(n, np.float32)
+    sampled[mixed] += np.float32(1000 * behind) * rng.random(len(mixed), np.float32)
+    sampled += np.float32(1000 * deviation) * rng.standard_normal(n, np.float32)
     measured = view.depth.copy()
-    measured.reshape(-1)[pixels] = np.rint(found).clip(1, 65535).astype(np.uint16)
+    measured.reshape(-1)[pixels] = np.rint(sampled).clip(1, 65535).astype(np.uint16)
     return without(dataclasses.replace(view, depth=measured), pixels[lost])
 
 
 def _edges(depth: NDArray[np.float32], step: float) -> NDArray[np.bool_]:
-    """Pixels from which the depth beside differs by more than `step`; beside nothing it does."""
+    """Return the pixels whose depth differs from a neighbour's by more than `step`; missing depth counts as 0."""
     edge = np.zeros(depth.shape, bool)
     for here, beside in ((edge, depth), (edge.T, depth.T)):
         far = np.abs(np.diff(beside, axis=0)) > step

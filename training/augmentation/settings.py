@@ -1,4 +1,4 @@
-"""What the augmentations' settings share: ranges and the check of their values."""
+"""Ranges of the augmentations' settings and the check of their values."""
 
 import dataclasses
 import math
@@ -9,18 +9,18 @@ from thor2_jax.errors import InputError
 __all__ = ["Range", "check_fields"]
 
 Range = tuple[float, float]
-"""Least and largest of values that are drawn uniformly."""
+"""Smallest and largest value of a uniform distribution."""
 
 
 def check_fields(record: Any, **limits: Range) -> None:
     """Check a dataclass of numbers and ranges; a field is a range if its default is.
 
     Args:
-        record: the dataclass, named in lower case in the message.
-        limits: of every field, both allowed.
+        record: the dataclass; messages name it in lower case.
+        limits: smallest and largest allowed value of every field.
 
     Raises:
-        InputError: a number outside its limits, or a range that is not two such numbers in order.
+        InputError: A number is outside its limits, or a range is not two such numbers in ascending order.
     """
     for field in dataclasses.fields(record):
         value = getattr(record, field.name)
@@ -34,5 +34,5 @@ def check_fields(record: Any, **limits: Range) -> None:
             or numbers[0] > numbers[-1]
         ):
             name = f"{type(record).__name__.lower()}.{field.name}"
-            wanted = "a pair of numbers in order" if is_range else "a number"
+            wanted = "a pair of ascending numbers" if is_range else "a number"
             raise InputError(f"{name} is {value!r}; it must be {wanted} from {low:g} to {high:g}")

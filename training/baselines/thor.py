@@ -34,6 +34,7 @@ from training.fitting.checkpoints import Checkpoints
 from training.fitting.fit import fit
 from training.fitting.options import EpochMetrics
 from training.fitting.samples import Samples, build_samples
+from training.fitting.steps import FitContext
 from training.rendering.view_sphere import view_angles
 
 __all__ = ["THOR", "TYPES", "ViewType", "camera_types", "train_thor", "view_types"]
@@ -215,13 +216,12 @@ def train_thor(task: Task) -> Fitted:
         first = dataclasses.replace(config, n_slices=k)
         with Checkpoints(task.scratch / f"{name}-{k}") as checkpoints:
             marked = held_out[rows]
-            model, _ = fit(
-                part, task.network, first, "tops", task.options, checkpoints, marked if marked.any() else None, told
-            )
+            context = FitContext("tops", task.network, first)
+            model, _ = fit(part, context, task.options, checkpoints, marked if marked.any() else None, told)
         library[name, k] = model
         if k == config.n_slices:
             asked = rows[marked]
-            said = sample_probabilities(model, part, np.flatnonzero(marked), "tops", task.network, first)
+            said = sample_probabilities(model, part, np.flatnonzero(marked), context)
             surer = said.max(axis=1) > best[asked].max(axis=1)
             best[asked[surer]] = said[surer]
     return Fitted(THOR(library, task.config), best[held_out], samples.label[held_out])

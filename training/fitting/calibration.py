@@ -1,4 +1,4 @@
-"""Temperatures of a fold's classifiers, from the views that it holds out."""
+"""Temperatures of a fold's classifiers, fitted on its held-out set."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -14,39 +14,33 @@ from colornet import ColorNetwork
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.recognition.classifier import MLP, Feature, class_probabilities
 from training.fitting.samples import Batch, Samples
-from training.fitting.steps import describe_batch
+from training.fitting.steps import FitContext, describe_batch
 from training.fitting.temperature import fit_temperature
 
 __all__ = ["sample_probabilities", "temperatures"]
 
 SAMPLES_PER_BATCH = 256
-"""Samples computed together."""
+"""Batch size of the predictions."""
 
 
-@partial(jax.jit, static_argnums=(0, 3, 4, 5))
-def _probabilities(
-    graph: Any, state: Any, batch: Batch, feature: Feature, network: ColorNetwork, config: DescriptorConfig
-) -> jax.Array:
-    return class_probabilities(nnx.merge(graph, state), describe_batch(batch, network, config), feature)
+@partial(jax.jit, static_argnums=(0, 1))
+def _probabilities(context: FitContext, graph: Any, state: Any, batch: Batch) -> jax.Array:
+    descriptors = describe_batch(batch, context.network, context.config)
+    return class_probabilities(nnx.merge(graph, state), descriptors, context.feature)
 
 
 def sample_probabilities(
-    model: MLP,
-    samples: Samples,
-    rows: NDArray[np.intp],
-    feature: Feature,
-    network: ColorNetwork,
-    config: DescriptorConfig,
+    model: MLP, samples: Samples, rows: NDArray[np.intp], context: FitContext
 ) -> NDArray[np.float32]:
-    """[len(rows), C] class probabilities of samples; the other arguments are those of `fit`."""
-    config = dataclasses.replace(config, homology="closed_form")
+    """Return the class probabilities [len(rows), C] of samples; `context` is that of the fit."""
+    context = dataclasses.replace(context, config=dataclasses.replace(context.config, homology="closed_form"))
     graph, state = nnx.split(model)
-    parts = [np.zeros((0, len(samples.classes)), np.float32)]
+    chunks = [np.zeros((0, len(samples.classes)), np.float32)]
     for first in range(0, len(rows), SAMPLES_PER_BATCH):
-        part = rows[first : first + SAMPLES_PER_BATCH]
-        batch = samples.take(np.resize(part, SAMPLES_PER_BATCH))
-        parts.append(np.asarray(_probabilities(graph, state, batch, feature, network, config))[: len(part)])
-    return np.concatenate(parts)
+        chunk = rows[first : first + SAMPLES_PER_BATCH]
+        batch = samples.take(np.resize(chunk, SAMPLES_PER_BATCH))
+        chunks.append(np.asarray(_probabilities(context, graph, state, batch))[: len(chunk)])
+    return np.concatenate(chunks)
 
 
 def temperatures(
@@ -56,12 +50,12 @@ def temperatures(
     network: ColorNetwork,
     config: DescriptorConfig,
 ) -> dict[str, float]:
-    """Each classifier's temperature; none if no samples were held out.
+    """Fit each classifier's temperature on the held-out set; return an empty dict if there is none.
 
     Args:
         classifiers: trained on the other samples.
-        samples: all of them.
-        held_out: [M], which were held out.
+        samples: all samples.
+        held_out: [M], True for samples of the held-out set.
         network: as in the fit.
         config: as in the fit.
     """
@@ -70,6 +64,6 @@ def temperatures(
     rows = np.flatnonzero(held_out)
     truth = samples.label[rows]
     return {
-        name: fit_temperature(sample_probabilities(model, samples, rows, name, network, config), truth)
+        name: fit_temperature(sample_probabilities(model, samples, rows, FitContext(name, network, config)), truth)
         for name, model in classifiers.items()
     }

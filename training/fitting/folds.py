@@ -1,4 +1,4 @@
-"""Which views are held out: five folds in the paper (section "Training")."""
+"""Cross-validation folds: five in the paper (section "Training")."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -14,29 +14,29 @@ __all__ = ["fold_of_views"]
 def fold_of_views(
     label: NDArray[np.integer[Any]], view: NDArray[np.integer[Any]], classes: Sequence[str], folds: int, seed: int
 ) -> NDArray[np.intp]:
-    """Fold of each cloud, [M], counted from 0: every class's views are dealt to the folds at random, evenly.
+    """Return the fold of each cloud [M], from 0: the views of every class are assigned at random and evenly.
 
-    All clouds of one view are in one fold: they are nearly the same, and a fold that is held out shall not be known
-    from training. How many clouds a view has does not matter.
+    All clouds of a view (mirrored and augmented copies) are in the same fold: they are nearly equal, and the held-out
+    set must not be known from training.
 
     Args:
         label: [M], index into `classes`.
-        view: [M], number of the view of its object.
-        classes: names.
-        folds: how many; 1 puts everything in fold 0.
-        seed: of the draw.
+        view: [M], index of the view among the views of its object.
+        classes: class names.
+        folds: number of folds; with 1, everything is in fold 0.
+        seed: seed for the assignment.
 
     Raises:
-        InputError: `folds` is not positive, or a class has fewer views than there are folds.
+        InputError: `folds` is not positive, or a class has fewer views than folds.
     """
     if folds < 1:
         raise InputError(f"folds is {folds}; it must be at least 1")
     rng = np.random.default_rng(seed)
     fold: NDArray[Any] = np.zeros(len(label), np.intp)
     for index, name in enumerate(classes):
-        mine = label == index
-        views, number = np.unique(view[mine], return_inverse=True)
+        members = label == index
+        views, number = np.unique(view[members], return_inverse=True)
         if len(views) < folds:
-            raise InputError(f"folds is {folds}, but class {name!r} has only {len(views)} views")
-        fold[mine] = (rng.permutation(len(views)) % folds)[number]
+            raise InputError(f"folds is {folds}; class {name!r} has {len(views)} views; use at most that many folds")
+        fold[members] = (rng.permutation(len(views)) % folds)[number]
     return fold

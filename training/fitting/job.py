@@ -1,12 +1,12 @@
-"""From labelled views to a run folder: samples, one classifier a feature and fold, figures, curves, record.
+"""Train a run directory: samples, one classifier per feature and fold, metrics, curves and the record.
 
-RUN/run.json, network.npz, weights/   the trained model (`run_folder`); of several folds, RUN/fold-0/run.json and so on
-RUN/metrics.jsonl                     a line an epoch, classifier and fold
-RUN/curves.png                        the same, drawn
-RUN/checkpoints/                      while it is in the making: what it was begun with, and how far it is
-RUN/views/                            the same: its views, where they were rendered for this run alone
+RUN/run.json, network.npz, weights/   the trained model (`run_directory`); with several folds, RUN/fold-0/run.json, ...
+RUN/metrics.jsonl                     one line per epoch, classifier and fold
+RUN/curves.png                        plots of the metrics
+RUN/checkpoints/                      until the training is finished: its job record and checkpoints
+RUN/views/                            until the training is finished: views rendered for this run only
 
-A run that was stopped goes on when it is asked for again. It is a run folder once run.json is there, which comes last.
+An interrupted training resumes when it is called again. run.json is written last and makes RUN a run directory.
 """
 
 import contextlib
@@ -36,6 +36,7 @@ from training.fitting.folds import fold_of_views
 from training.fitting.metrics_log import append_metrics, discard_later_epochs, read_metrics
 from training.fitting.options import EpochMetrics, FitOptions, Progress
 from training.fitting.samples import MIRRORS, Samples, build_samples
+from training.fitting.steps import FitContext
 from training.reports.plots import draw_curves
 from training.storage.jobs import check_same_job
 from training.storage.locks import locked
@@ -49,10 +50,68 @@ METRICS = "metrics.jsonl"
 CURVES = "curves.png"
 
 CONFIG = DescriptorConfig(homology="closed_form")
-"""The descriptor, unless another one is asked for: the paper's."""
+"""Default descriptor: the paper's."""
 
 CURVE = ("epoch", "loss", "accuracy", "held_out_accuracy")
-"""What a record keeps of an epoch's figures: what another run gives again."""
+"""Metrics of an epoch that the record keeps: those that a repeated training reproduces."""
+
+
+@dataclasses.dataclass(frozen=True)
+class _Training:
+    """The job of one run directory; see `train_run` for the fields.
+
+    Attributes:
+        source: labelled views.
+        out: absolute path of the run directory.
+        features: what the classifiers read.
+        options: of every fit.
+        config: descriptor.
+        network: colour network.
+        folds: number of folds.
+        mirrors: in which each view is used.
+    """
+
+    source: ViewSource
+    out: Path
+    features: tuple[Feature, ...]
+    options: FitOptions
+    config: DescriptorConfig
+    network: colornet.ColorNetwork
+    folds: int
+    mirrors: tuple[str, ...]
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """Everything that determines the trained run, as JSON holds it."""
+        return {
+            "descriptor_version": DESCRIPTOR_VERSION,
+            "descriptor_config": dataclasses.asdict(self.config),
+            "color_network": self.network.fingerprint,
+            "dataset": self.source.digest,
+            "classifiers": list(self.features),
+            "folds": self.folds,
+            "mirrors": list(self.mirrors),
+            "epochs": self.options.epochs,
+            "learning_rates": list(self.options.learning_rates),
+            "batch_size": self.options.batch_size,
+            "seed": self.options.seed,
+        }
+
+    def check_begun(self) -> None:
+        """Raise InputError if `out` holds an interrupted training of another job."""
+        path = self.out / CHECKPOINTS / BEGUN
+        if path.is_file():
+            try:
+                begun = dict(json.loads(path.read_bytes()))
+            except (OSError, ValueError, TypeError, RecursionError) as error:
+                raise InputError(f"out: {path} cannot be read ({error}); delete {path.parent} to start anew") from None
+            check_same_job(self.out, begun, self.record)
+
+    def begin(self) -> None:
+        """Write the job record unless the training is resumed."""
+        path = self.out / CHECKPOINTS / BEGUN
+        if not path.is_file():
+            write_text(path, json.dumps(self.record, indent=1) + "\n")
 
 
 def check_out(out: str | Path) -> None:
@@ -61,20 +120,9 @@ def check_out(out: str | Path) -> None:
 
 
 def is_finished(out: Path) -> bool:
-    """Whether a folder holds a trained run, or all folds of one."""
-    found = any((folder / RUN_FILE).is_file() for folder in (out, *out.glob("fold-*")))
-    return found and not (out / CHECKPOINTS).exists()
-
-
-def _check_same(out: Path, begun: Mapping[str, Any]) -> None:
-    path = out / CHECKPOINTS / BEGUN
-    if not path.is_file():
-        return
-    try:
-        found = dict(json.loads(path.read_bytes()))
-    except (OSError, ValueError, TypeError, RecursionError) as error:
-        raise InputError(f"out: {path} cannot be read: {error}") from None
-    check_same_job(out, found, begun)
+    """Return whether a directory holds a trained run, or all folds of one."""
+    trained = any((directory / RUN_FILE).is_file() for directory in (out, *out.glob("fold-*")))
+    return trained and not (out / CHECKPOINTS).exists()
 
 
 def check_trained(
@@ -85,51 +133,21 @@ def check_trained(
     folds: int = 1,
     mirrors: Sequence[str] = MIRRORS,
 ) -> None:
-    """Refuse a finished run that is not what `train_run` gives for the same arguments.
+    """Raise if a finished run differs from what `train_run` trains for the same arguments.
 
     Raises:
-        InputError: naming what differs, or a run that cannot be read.
+        InputError: The run was trained with another value, which is named, or cannot be read.
     """
-    names, network = check_features(features, "classifiers"), colornet.load_default()
-    asked = _asked(source, names, options, CONFIG, network, folds, mirrors)
     out = Path(out).absolute()
+    names = check_features(features, "classifiers")
+    training = _Training(source, out, names, options, CONFIG, colornet.load_default(), folds, tuple(mirrors))
     record = load_run(out if (out / RUN_FILE).is_file() else out / "fold-0").record
-    found = {**record, "dataset": record["dataset"]["digest"]}
-    check_same_job(out, {name: found.get(name) for name in asked}, asked)
-
-
-def _asked(
-    source: ViewSource,
-    names: Sequence[Feature],
-    options: FitOptions,
-    config: DescriptorConfig,
-    network: colornet.ColorNetwork,
-    folds: int,
-    mirrors: Sequence[str],
-) -> dict[str, Any]:
-    """All that a trained run follows from."""
-    return {
-        "descriptor_version": DESCRIPTOR_VERSION,
-        "descriptor_config": dataclasses.asdict(config),
-        "color_network": network.fingerprint,
-        "dataset": source.digest,
-        "classifiers": list(names),
-        "folds": folds,
-        "mirrors": list(mirrors),
-        "epochs": options.epochs,
-        "learning_rates": list(options.learning_rates),
-        "batch_size": options.batch_size,
-        "seed": options.seed,
-    }
-
-
-def _begin(out: Path, begun: Mapping[str, Any]) -> None:
-    if not (out / CHECKPOINTS / BEGUN).is_file():
-        write_text(out / CHECKPOINTS / BEGUN, json.dumps(begun, indent=1) + "\n")
+    stored = {**record, "dataset": record["dataset"]["digest"]}
+    check_same_job(out, {name: stored.get(name) for name in training.record}, training.record)
 
 
 def _wait_for_all(point: str) -> None:
-    """Wait until all processes are here, so that none reads what the first has not written."""
+    """Wait until all processes are here, so that none reads what the first one has not written."""
     if jax.process_count() > 1:
         multihost_utils.sync_global_devices(point)
 
@@ -144,142 +162,145 @@ def train_run(
     folds: int = 1,
     mirrors: Sequence[str] = MIRRORS,
 ) -> list[TrainedRun]:
-    """Train one classifier a feature and fold, and write the run folder or folders; or go on where that was stopped.
+    """Train one classifier per feature and fold and write the run directory or directories; resume if interrupted.
 
     Trains on all devices of all processes; each process is called with the same arguments and sees the same files.
+    `training.fitting.fit` describes what is equal between two trainings with the same seed.
 
     Args:
-        source: of labelled views.
-        out: the run folder; must not exist, be empty, or hold the same run in the making.
+        source: labelled views.
+        out: run directory: new, empty, or with the same training interrupted.
         features: any of "ce", "tops", "tops2".
-        options: of the fit; the same for every classifier.
-        progress: told of each step.
-        config: the descriptor; by default the paper's, with diagrams in closed form.
-        folds: with more than one, a model each (`out`/fold-0, ...), trained on the views of the others and measured on
-            its own.
-        mirrors: in which each view is used.
+        options: fit options of every classifier.
+        progress: called after each step.
+        config: descriptor; by default the paper's, with diagrams in closed form.
+        folds: with more than one, one model per fold (`out`/fold-0, ...), with the fold as its held-out set.
+        mirrors: mirrors in which each view is used.
 
     Returns:
         The run of each fold, as read back.
 
     Raises:
-        InputError: unknown features, `out` holds something else, a run in the making with other options or views
-            (told before any work) or one that another process trains; classes without views, or with fewer than folds;
-            a batch that does not divide among the devices: nothing is written then. A loss that is not finite: the
-            checkpoints so far stay.
-        OSError: something cannot be written; the last complete checkpoints stay.
+        InputError: Nothing is written if a feature is unknown, `out` holds something else, another process trains in it
+            or it was begun with other options or views, a class has no views or fewer than folds, or the batch does not
+            divide among the devices. If a loss is not finite, the checkpoints so far stay.
+        OSError: A file cannot be written; the last complete checkpoints stay.
     """
     names = check_features(features, "classifiers")
-    config = config or CONFIG
     network = colornet.load_default()
     out = Path(out).absolute()
-    begun = _asked(source, names, options, config, network, folds, mirrors)
+    training = _Training(source, out, names, options, config or CONFIG, network, folds, tuple(mirrors))
     check_out(out)
-    _check_same(out, begun)
+    training.check_begun()
     check_batch_size(options.batch_size, batch_mesh())
-    done, total = 0, sum(shard.views for shard in source.shards)
-
-    def described(count: int) -> None:
-        nonlocal done
-        done += count
-        progress("describe", done, total, "views")
-
-    with contextlib.ExitStack() as held:
-        first, before = jax.process_index() == 0, (out / CHECKPOINTS).is_dir()
-        if first and before:
-            held.enter_context(locked(out / CHECKPOINTS))
-        samples = build_samples(source, network, config, described, mirrors)
+    with contextlib.ExitStack() as locks:
+        first, resumed = jax.process_index() == 0, (out / CHECKPOINTS).is_dir()
+        if first and resumed:
+            locks.enter_context(locked(out / CHECKPOINTS))
+        samples = _describe_views(training, progress)
         fold_of = fold_of_views(samples.label, samples.view, samples.classes, folds, options.seed)
         _wait_for_all("checked")
         if first:
-            if not before:
+            if not resumed:
                 check_out(out)  # another process may have been quicker
                 (out / CHECKPOINTS).mkdir(parents=True, exist_ok=True)
-                held.enter_context(locked(out / CHECKPOINTS))
-                _check_same(out, begun)
-            _begin(out, begun)
+                locks.enter_context(locked(out / CHECKPOINTS))
+                training.check_begun()
+            training.begin()
         _wait_for_all("begun")
-
-        runs = []
-        for fold in range(folds):
-            folder = out if folds == 1 else out / f"fold-{fold}"
-            if not (folder / RUN_FILE).is_file():
-                held_out = fold_of == fold if folds > 1 else None
-                classifiers, kept = _fit_fold(samples, held_out, out, fold, network, config, names, options, progress)
-                calibrated = temperatures(classifiers, samples, held_out, network, config)
-                if first:
-                    rows = read_metrics(out / METRICS)
-                    draw_curves(
-                        {name: [row for row in rows if row["classifier"] == name] for name in names}, out / CURVES
-                    )
-                    record = begun | {"dataset": source.record, "samples": len(samples), "fold": fold}
-                    record |= _outcome([row for row in rows if row["fold"] == fold], kept)
-                    record["temperatures"] = calibrated
-                    run = TrainedRun(config, network, samples.classes, classifiers, record)
-                    _publish(run, out / CHECKPOINTS / f"fold-{fold}" / "run", folder)
-                _wait_for_all("published")
-            runs.append(load_run(folder))
+        runs = [
+            _train_fold(training, samples, fold, fold_of == fold if folds > 1 else None, progress)
+            for fold in range(folds)
+        ]
         _wait_for_all("trained")
         if first:
-            # Renamed first: wherever a kill strikes, the run is in the making or finished, and nothing in between.
+            # Renamed first: whenever the process is killed, the run is either interrupted or finished.
             shutil.rmtree((out / CHECKPOINTS).rename(out / f".{CHECKPOINTS}"))
         return runs
 
 
-def _fit_fold(
-    samples: Samples,
-    held_out: NDArray[np.bool_] | None,
-    out: Path,
-    fold: int,
-    network: colornet.ColorNetwork,
-    config: DescriptorConfig,
-    names: Sequence[Feature],
-    options: FitOptions,
-    progress: Progress,
+def _describe_views(training: _Training, progress: Progress) -> Samples:
+    done, total = 0, sum(shard.views for shard in training.source.shards)
+
+    def advance(count: int) -> None:
+        nonlocal done
+        done += count
+        progress("describe", done, total, "views")
+
+    return build_samples(training.source, training.network, training.config, advance, training.mirrors)
+
+
+def _train_fold(
+    training: _Training, samples: Samples, fold: int, held_out: NDArray[np.bool_] | None, progress: Progress
+) -> TrainedRun:
+    """Train and publish the run of a fold, unless it is finished, and read it back."""
+    out, config, network = training.out, training.config, training.network
+    directory = out if training.folds == 1 else out / f"fold-{fold}"
+    if not (directory / RUN_FILE).is_file():
+        classifiers, best_epochs = _fit_classifiers(training, samples, fold, held_out, progress)
+        calibrated = temperatures(classifiers, samples, held_out, network, config)
+        if jax.process_index() == 0:
+            rows = read_metrics(out / METRICS)
+            draw_curves(
+                {name: [row for row in rows if row["classifier"] == name] for name in training.features}, out / CURVES
+            )
+            record = training.record | {"dataset": training.source.record, "samples": len(samples), "fold": fold}
+            record |= _outcome([row for row in rows if row["fold"] == fold], best_epochs)
+            record["temperatures"] = calibrated
+            run = TrainedRun(config, network, samples.classes, classifiers, record)
+            _publish(run, out / CHECKPOINTS / f"fold-{fold}" / "run", directory)
+        _wait_for_all("published")
+    return load_run(directory)
+
+
+def _fit_classifiers(
+    training: _Training, samples: Samples, fold: int, held_out: NDArray[np.bool_] | None, progress: Progress
 ) -> tuple[dict[Feature, MLP], dict[Feature, int]]:
-    """The classifiers of a fold, and which epochs they are of."""
-    first = jax.process_index() == 0
+    """Fit the classifiers of a fold; return them and the epochs that they are from."""
+    first, metrics_file = jax.process_index() == 0, training.out / METRICS
     classifiers: dict[Feature, MLP] = {}
-    kept: dict[Feature, int] = {}
-    for name in names:
+    best_epochs: dict[Feature, int] = {}
+    for name in training.features:
         stage = f"fit {name}" if held_out is None else f"fold {fold}: fit {name}"
 
-        def told(done: int, total: int, figures: EpochMetrics, stage: str = stage) -> None:
+        def show(done: int, total: int, metrics: EpochMetrics, stage: str = stage) -> None:
             note = (
-                f"epoch {figures.epoch}/{options.epochs}, loss {figures.loss:.3f}, accuracy {figures.accuracy:.3f}, "
-                f"{figures.samples_per_second:,.0f} samples/s"
+                f"epoch {metrics.epoch}/{training.options.epochs}, loss {metrics.loss:.3f}, "
+                f"accuracy {metrics.accuracy:.3f}, {metrics.samples_per_second:,.0f} samples/s"
             )
             progress(stage, done, total, note)
 
-        def epoch_done(figures: EpochMetrics, name: Feature = name) -> None:
+        def epoch_done(metrics: EpochMetrics, name: Feature = name) -> None:
             if first:
-                append_metrics(out / METRICS, fold, name, figures)
+                append_metrics(metrics_file, fold, name, metrics)
 
-        with Checkpoints(out / CHECKPOINTS / f"fold-{fold}" / name) as checkpoints:
+        context = FitContext(name, training.network, training.config)
+        with Checkpoints(training.out / CHECKPOINTS / f"fold-{fold}" / name) as checkpoints:
             if first:
-                discard_later_epochs(out / METRICS, fold, name, checkpoints.last_epoch)
-            classifiers[name], kept[name] = fit(
-                samples, network, config, name, options, checkpoints, held_out, told, epoch_done
+                discard_later_epochs(metrics_file, fold, name, checkpoints.last_epoch)
+            classifiers[name], best_epochs[name] = fit(
+                samples, context, training.options, checkpoints, held_out, show, epoch_done
             )
-    return classifiers, kept
+    return classifiers, best_epochs
 
 
-def _outcome(rows: Sequence[Mapping[str, Any]], kept: Mapping[Feature, int]) -> dict[str, Any]:
-    """What a fold's record tells of its classifiers: curves, the epoch kept, and its accuracy on the views held out."""
-    curves: dict[str, list[dict[str, Any]]] = {name: [] for name in kept}
+def _outcome(rows: Sequence[Mapping[str, Any]], best_epochs: Mapping[Feature, int]) -> dict[str, Any]:
+    """Return the results of a fold for its record: curves, the epochs kept and the held-out accuracy."""
+    curves: dict[str, list[dict[str, Any]]] = {name: [] for name in best_epochs}
     held_out: dict[str, float] = {}
     for row in rows:
-        curves[row["classifier"]].append({key: row[key] for key in CURVE if row[key] is not None})
-        if row["epoch"] == kept[row["classifier"]] and row["held_out_accuracy"] is not None:
-            held_out[row["classifier"]] = row["held_out_accuracy"]
-    return {"kept_epochs": dict(kept), "held_out_accuracy": held_out, "curves": curves}
+        name = row["classifier"]
+        curves[name].append({key: row[key] for key in CURVE if row[key] is not None})
+        if row["epoch"] == best_epochs[name] and row["held_out_accuracy"] is not None:
+            held_out[name] = row["held_out_accuracy"]
+    return {"kept_epochs": dict(best_epochs), "held_out_accuracy": held_out, "curves": curves}
 
 
-def _publish(run: TrainedRun, whole: Path, folder: Path) -> None:
-    """Write a run folder to `whole` and move its parts into `folder`; run.json, the last, makes that a run folder."""
-    shutil.rmtree(whole, ignore_errors=True)  # of a process that was stopped just here
-    save_run(run, whole)
-    folder.mkdir(exist_ok=True)
-    shutil.rmtree(folder / "weights", ignore_errors=True)
+def _publish(run: TrainedRun, complete: Path, directory: Path) -> None:
+    """Write a run to `complete` and move its files into `directory`; run.json is moved last."""
+    shutil.rmtree(complete, ignore_errors=True)  # left by a process that was killed just here
+    save_run(run, complete)
+    directory.mkdir(exist_ok=True)
+    shutil.rmtree(directory / "weights", ignore_errors=True)
     for name in ("weights", "network.npz", RUN_FILE):
-        (whole / name).rename(folder / name)
+        (complete / name).rename(directory / name)

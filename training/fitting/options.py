@@ -1,4 +1,4 @@
-"""What a fit is given and what it reports: options, metrics of an epoch, progress."""
+"""Options of a fit, metrics of an epoch and the progress callback."""
 
 import dataclasses
 import math
@@ -12,7 +12,7 @@ Progress = Callable[[str, int, int, str], object]
 """Called with (stage, done, total, note)."""
 
 MAX_SEED = 2**31 - 1
-"""JAX takes a seed of 32 bits."""
+"""Largest seed that fits into 32 signed bits, as JAX requires."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,13 +20,13 @@ class FitOptions:
     """How a classifier is fitted.
 
     Attributes:
-        epochs: first half at `learning_rates[0]`, the rest at `learning_rates[1]`.
-        learning_rates: Adam's two step sizes.
-        batch_size: samples a step; what is left of an epoch after whole batches is left out (another draw each epoch).
-        seed: of initial weights, order and dropout.
+        epochs: number of epochs; the first half uses `learning_rates[0]`, the rest `learning_rates[1]`.
+        learning_rates: Adam's two learning rates.
+        batch_size: samples per step; an incomplete last batch is dropped (other samples in each epoch).
+        seed: seed for initial weights, sample order and dropout.
 
     Raises:
-        InputError: a value out of its range, naming the field and the value.
+        InputError: A value is out of range; the message names the field and the value.
     """
 
     epochs: int = 100
@@ -37,7 +37,7 @@ class FitOptions:
     def __post_init__(self) -> None:
         for name, least in (("epochs", 1), ("batch_size", 2), ("seed", 0)):
             if type(getattr(self, name)) is not int or getattr(self, name) < least:
-                raise InputError(f"{name} is {getattr(self, name)!r}; it must be a whole number of at least {least}")
+                raise InputError(f"{name} is {getattr(self, name)!r}; it must be an integer of at least {least}")
         if self.seed > MAX_SEED:
             raise InputError(f"seed is {self.seed}; it must be at most {MAX_SEED}")
         rates = self.learning_rates
@@ -47,14 +47,14 @@ class FitOptions:
 
 @dataclasses.dataclass(frozen=True)
 class EpochMetrics:
-    """How an epoch goes.
+    """Metrics of an epoch.
 
     Attributes:
-        epoch: counted from 1.
-        loss: mean over the epoch's training samples so far.
-        accuracy: of the same, with dropout.
-        samples_per_second: of the epoch so far, from the end of its first step (which may compile).
-        held_out_accuracy: of the samples held out, at the end of the epoch; None before, or if there are none.
+        epoch: number of the epoch, from 1.
+        loss: mean training loss of the epoch so far.
+        accuracy: training accuracy of the epoch so far, with dropout.
+        samples_per_second: training rate of the epoch so far, without its first step, which may compile.
+        held_out_accuracy: accuracy on the held-out set after the epoch; None before, or without a held-out set.
     """
 
     epoch: int

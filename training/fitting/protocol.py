@@ -1,4 +1,4 @@
-"""What a training consists of, from views to step sizes: the paper's, and the one that names more objects."""
+"""Training protocols, from camera steps to learning rates: the paper's, and the more accurate default."""
 
 import dataclasses
 from typing import Any
@@ -21,9 +21,9 @@ class Protocol:
     Attributes:
         azimuth_step: degrees between cameras around the object.
         polar_step: degrees between cameras from pole to pole.
-        augmentations: varied copies of each view; None makes none.
-        mirrors: in which each view is used.
-        fit: how a classifier is fitted.
+        augmentations: augmented copies of each view; None adds none.
+        mirrors: mirrors in which each view is used.
+        fit: fit options of every classifier.
     """
 
     azimuth_step: float
@@ -59,7 +59,7 @@ DEFAULT = Protocol(
     mirrors=MIRRORS,
     fit=FitOptions(epochs=24, batch_size=256),
 )
-"""Fewer views than the paper's, each also twice under another light, partly hidden and as a depth camera sees it."""
+"""Fewer views than the paper's, each with two augmented copies (light, sensor, occlusion and segmentation)."""
 
 PAPER = Protocol(
     azimuth_step=5.0,
@@ -68,4 +68,4 @@ PAPER = Protocol(
     mirrors=PAPER_MIRRORS,
     fit=FitOptions(epochs=100, batch_size=128),
 )
-"""Paper, section "Training": 72 x 37 views of an object, four mirrors, 100 epochs."""
+"""The paper's protocol (section "Training"): 72 x 37 views per object, four mirrors, 100 epochs."""

@@ -1,11 +1,11 @@
 """Training samples: normalized views, mirrored and cut into strips (paper, section "Training").
 
     samples = build_samples(ViewDataset.open("views"), network, config)
-    batch = samples.take(np.arange(256))                                  # padded, to be handed to a device
-    strips = expand(batch, region_sets(network).weights, config)          # there, under jit
+    batch = samples.take(np.arange(256))                                  # padded host arrays
+    strips = expand(batch, region_sets(network).weights, config)          # on the device, under jit
 
-A sample is kept as what its descriptor is made of: the length of each strip that has points, and how many of the
-strip's points have each set of colour regions; some hundred bytes in place of the 48 kB of TOPS2.
+A sample stores what its descriptor is computed from: the length of each occupied strip, and how many of its points have
+each set of colour regions. This takes some hundred bytes instead of the 48 kB of TOPS2.
 """
 
 import dataclasses
@@ -30,27 +30,27 @@ from training.views.normalized_views import ViewSource, padded_batches
 __all__ = ["MIRRORS", "PAPER_MIRRORS", "Batch", "Samples", "build_samples", "expand"]
 
 MIRRORS = ("", "x")
-"""Mirrors of a normalized view with different descriptors: a mirror in y changes no strip's length and no count."""
+"""Mirrors of a normalized view that change its descriptor: a mirror in y changes no strip length and no count."""
 
 PAPER_MIRRORS = ("", "x", "y", "xy")
-"""The paper uses each view four times."""
+"""The four mirrors of the paper."""
 
 VIEWS_PER_BATCH = 64
-"""Views computed together."""
+"""Batch size of the description of views."""
 
 PADDING = np.iinfo(np.uint16).max
-"""Stands for no strip."""
+"""Strip index of padding."""
 
 
 class Batch(NamedTuple):
-    """B samples, padded to the same numbers E of strips and C of colour counts; `expand` makes strips of them.
+    """B samples, padded to E strips and C colour counts; `expand` turns them into strips.
 
     Attributes:
-        strip: [B, E] uint16, slice x n_strips + strip; PADDING past the sample's last.
-        length: [B, E] float32, greatest less least y of the strip, scaled units.
-        color_strip: [B, C] uint16, strip of a count; PADDING past the sample's last.
-        color_set: [B, C] uint16, the set of regions that is counted.
-        color_count: [B, C] float32, points of the strip with that set (weights, if the config relaxes the descriptor).
+        strip: [B, E] uint16, slice x n_strips + strip; PADDING after the sample's last strip.
+        length: [B, E] float32, largest less smallest y of the strip, scaled units.
+        color_strip: [B, C] uint16, strip of a colour count; PADDING after the sample's last count.
+        color_set: [B, C] uint16, set of colour regions that is counted.
+        color_count: [B, C] float32, points of the strip with that set (weights for a relaxed descriptor).
         label: [B] int32.
     """
 
@@ -64,10 +64,10 @@ class Batch(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Samples:
-    """Training samples in compact form, host arrays. The fields are those of `Batch`, all samples' one after another.
+    """Training samples in compact form, as host arrays: the fields of `Batch` for one sample after the other.
 
     Attributes:
-        strip_start: [M + 1] int64, where each sample's part of `strip` and `length` begins; the last is their end.
+        strip_start: [M + 1] int64, index of each sample's first entry in `strip` and `length`, and their length.
         color_start: [M + 1] int64, the same for the colour counts.
         strip: [T] uint16.
         length: [T] float32.
@@ -75,7 +75,7 @@ class Samples:
         color_set: [U] uint16.
         color_count: [U] float32.
         label: [M] int32, index into `classes`.
-        view: [M] int32, the view of its object that a sample is of; its mirrored and varied copies share the number.
+        view: [M] int32, index of the view among the views of its object; mirrored and augmented copies share it.
         classes: class names.
     """
 
@@ -95,7 +95,7 @@ class Samples:
 
     @property
     def nbytes(self) -> int:
-        """Memory of all arrays."""
+        """Memory of all arrays, bytes."""
         return sum(a.nbytes for a in vars(self).values() if isinstance(a, np.ndarray))
 
     @functools.cached_property
@@ -103,7 +103,7 @@ class Samples:
         return int(np.diff(self.strip_start).max()), int(np.diff(self.color_start).max())
 
     def take(self, rows: NDArray[np.integer[Any]]) -> Batch:
-        """The samples of these numbers. The padded sizes are the largest of all samples, whatever the rows."""
+        """Return the samples with the given indices, padded to the largest size of all samples."""
         strips, in_strips = _entries(self.strip_start, rows, self._most[0])
         colors, in_colors = _entries(self.color_start, rows, self._most[1])
         return Batch(
@@ -119,10 +119,10 @@ class Samples:
 def _entries(
     start: NDArray[np.int64], rows: NDArray[np.integer[Any]], most: int
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Places [B, most] of the rows' entries, and which are no padding."""
-    place = start[rows, None] + np.arange(most)
-    inside = place < start[rows + 1, None]
-    return np.where(inside, place, 0), inside
+    """Return the indices [B, most] of the rows' entries, and which of them are not padding."""
+    index = start[rows, None] + np.arange(most)
+    inside = index < start[rows + 1, None]
+    return np.where(inside, index, 0), inside
 
 
 def build_samples(
@@ -132,39 +132,39 @@ def build_samples(
     progress: Callable[[int], object] = lambda n: None,
     mirrors: Sequence[str] = MIRRORS,
 ) -> Samples:
-    """Mirror every view and keep its strips; one shard of views is in memory at a time.
+    """Mirror every view and keep its strips; reads one shard of views at a time.
 
     Args:
-        source: of normalized views.
-        network: gives the colour regions.
-        config: static.
+        source: normalized views.
+        network: colour network that gives the regions.
+        config: descriptor. Static.
         progress: called with the number of views done since the last call.
-        mirrors: each in the letters of its axes; a sample each.
+        mirrors: axes of each mirror, such as "xy"; one sample each.
 
     Raises:
-        InputError: fewer than two classes, a class without views, or a file of the source that cannot be read.
+        InputError: There are fewer than two classes, a class has no views, or the source is unreadable.
     """
     if len(source.classes) < 2:
-        raise InputError(f"there are views of {len(source.classes)} classes; a classifier needs at least two")
+        raise InputError(f"there are views of {len(source.classes)} classes; expected at least two; add meshes")
     for label, name in enumerate(source.classes):
         if not any(shard.label == label and shard.views for shard in source.shards):
-            raise InputError(f"class {name!r} has no views")
+            raise InputError(f"class {name!r} has no views; render more views or leave it out")
     sets = region_sets(network)
-    # With one "region" a set, a colour vector counts sets: few entries of it are not zero, and they are whole numbers.
+    # With one "region" per set, colour vectors count the sets: sparse, with integer values.
     counting = RegionSets(sets.of_color, jnp.eye(len(sets.weights)))
-    parts: list[dict[str, NDArray[Any]]] = []
+    chunks: list[dict[str, NDArray[Any]]] = []
     for index, shard in enumerate(source.shards):
         views = source.read(index)
         done = 0
         for count, normal in padded_batches(views.clouds(), VIEWS_PER_BATCH):
             for axes in mirrors:
-                found = strips_by_sets(turn(mirror(normal, axes), config), counting, config)
-                part = _compact(jax.tree.map(lambda a: np.asarray(a)[:count], found))  # noqa: B023
-                part["label"] = np.full(count, shard.label, np.int32)
-                parts.append(part | {"view": views.view[done : done + count]})
+                strips = strips_by_sets(turn(mirror(normal, axes), config), counting, config)
+                compact = _compact(jax.tree.map(lambda a: np.asarray(a)[:count], strips))  # noqa: B023
+                compact["label"] = np.full(count, shard.label, np.int32)
+                chunks.append(compact | {"view": views.view[done : done + count]})
             done += count
             progress(count)
-    fields = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    fields = {name: np.concatenate([chunk[name] for chunk in chunks]) for name in chunks[0]}
     for name in ("strip", "color"):
         fields[f"{name}_start"] = np.concatenate([[0], np.cumsum(fields.pop(f"{name}_entries"), dtype=np.int64)])
     return Samples(classes=tuple(source.classes), **fields)
@@ -175,7 +175,7 @@ def _compact(strips: Strips) -> dict[str, NDArray[Any]]:
     occupied = np.asarray(strips.occupied).reshape(n_samples, -1)
     counts = np.asarray(strips.color).reshape(*occupied.shape, -1)
     sample, strip = np.nonzero(occupied)
-    # Looked for in occupied strips alone, a tenth of all.
+    # Only a tenth of the strips is occupied.
     entry, color_set = np.nonzero(counts[sample, strip])
     return {
         "strip": strip.astype(np.uint16),
@@ -189,21 +189,21 @@ def _compact(strips: Strips) -> dict[str, NDArray[Any]]:
 
 
 def expand(batch: Batch, set_weights: jax.Array, config: DescriptorConfig) -> Strips:
-    """Strips of a batch's samples, fields [B, S, J] and [B, S, J, R], for `describe_strips`; to be called under jit.
+    """Return the strips of a batch, fields [B, S, J] and [B, S, J, R], for `describe_strips`; call it under jit.
 
     Args:
         batch: from `Samples.take`.
-        set_weights: [K, R], region weights of each set (`RegionSets.weights`).
+        set_weights: [K, R], region weights of each set of regions (`RegionSets.weights`).
         config: static.
 
     Returns:
-        `low` is 0 and `high` the length of a strip: descriptors depend on no more. `overflow` is not kept, and 0.
+        `low` is 0 and `high` is the length of a strip: descriptors depend on nothing else. `overflow` is 0.
     """
     shape = config.n_slices, config.n_strips
     n_strips, n_regions = shape[0] * shape[1], set_weights.shape[1]
 
     def one(sample: Batch) -> Strips:
-        # What is past the end, as padding is, is dropped.
+        # Indices out of range, such as padding, are dropped.
         high = jnp.zeros(n_strips, jnp.float32).at[sample.strip].set(sample.length, mode="drop")
         occupied = jnp.zeros(n_strips, bool).at[sample.strip].set(True, mode="drop")
         weights = sample.color_count[:, None] * set_weights[sample.color_set]

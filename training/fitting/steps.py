@@ -1,7 +1,7 @@
-"""One step of training and one of measuring, over all devices of a mesh.
+"""The compiled training and evaluation steps, data-parallel over the devices of a mesh.
 
-Samples are spread over the devices, weights are the same on all, and means over the batch (loss, gradients, batch
-normalization) are means over the whole of it.
+Batches are sharded over the devices and weights are replicated; loss, gradients and batch normalization are means over
+the whole batch.
 """
 
 import dataclasses
@@ -20,7 +20,7 @@ from colornet import ColorNetwork
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.color_membership import region_sets
 from thor2_jax.descriptor.describe import describe_strips
-from thor2_jax.descriptor.sharding import BATCH_AXIS
+from thor2_jax.descriptor.sharding import BATCH_AXIS, batch_mesh
 from thor2_jax.recognition.classifier import MLP, Feature, feature_of
 from thor2_jax.types import Descriptors
 from training.fitting.samples import Batch, expand
@@ -43,7 +43,7 @@ class FitState(NamedTuple):
 
     Attributes:
         params: weights.
-        rest: batch statistics, and the fixed input scale.
+        rest: batch statistics and the constant input scaling.
         optimizer: state of Adam.
     """
 
@@ -52,26 +52,25 @@ class FitState(NamedTuple):
     optimizer: Any
 
 
-class FitContext(NamedTuple):
-    """What is fixed in a fit; static under jit.
+@dataclasses.dataclass(frozen=True)
+class FitContext:
+    """What is constant during a fit; static under jit.
 
     Attributes:
-        graph: the classifier without its arrays, as `nnx.split` gives it.
-        feature: what it reads.
-        network: gives the colour regions and their similarity.
-        config: of the samples; diagrams are to be made in closed form.
-        mesh: from `batch_mesh`.
+        feature: which part of the descriptor the classifier reads.
+        network: colour network; gives the colour regions and their similarity.
+        config: descriptor, as the samples were built with.
+        mesh: devices to train on, from `batch_mesh`; by default all devices of all processes.
     """
 
-    graph: Any
     feature: Feature
     network: ColorNetwork
     config: DescriptorConfig
-    mesh: Mesh
+    mesh: Mesh = dataclasses.field(default_factory=batch_mesh)
 
 
 def initial_state(model: MLP) -> tuple[Any, FitState]:
-    """The classifier's graph, and the state before the first step."""
+    """Return the classifier's graph (the model without its arrays) and the state before the first step."""
     split: Any = nnx.split(model, nnx.Param, ...)
     graph, params, rest = split
     return graph, FitState(params, rest, optax.adam(0.0).init(params))
@@ -92,36 +91,44 @@ def _to_devices(tree: Any, sharding: NamedSharding) -> Any:
 
 
 def describe_batch(batch: Batch, network: ColorNetwork, config: DescriptorConfig) -> Descriptors:
-    """Descriptors of the samples of a batch."""
+    """Return the descriptors of the samples of a batch."""
     return describe_strips(expand(batch, region_sets(network).weights, config), network, config)
 
 
-def _everywhere(tree: Any, mesh: Mesh) -> Any:
+def _replicated(tree: Any, mesh: Mesh) -> Any:
+    """Constrain the arrays to be replicated on all devices."""
     return jax.lax.with_sharding_constraint(tree, NamedSharding(mesh, PartitionSpec()))
 
 
-@partial(jax.jit, static_argnums=0, donate_argnums=1)
+@partial(jax.jit, static_argnums=(0, 1), donate_argnums=2)
 def train_step(
-    context: FitContext, state: FitState, batch: Batch, rate: ArrayLike, seed: ArrayLike, step: ArrayLike
+    context: FitContext,
+    graph: Any,
+    state: FitState,
+    batch: Batch,
+    rate: ArrayLike,
+    seed: ArrayLike,
+    step: ArrayLike,
 ) -> tuple[FitState, tuple[jax.Array, jax.Array]]:
-    """One step of Adam.
+    """Make one step of Adam.
 
     Args:
         context: static.
-        state: used up.
-        batch: spread over the devices.
-        rate: step size.
-        seed: of dropout.
+        graph: the classifier without its arrays, from `initial_state`. Static.
+        state: donated; not usable afterwards.
+        batch: on the devices, from `shard_batch`.
+        rate: learning rate.
+        seed: seed for the dropout.
         step: number of the step; dropout is drawn from it and the seed.
 
     Returns:
-        The state after it, and the batch's loss and accuracy before it.
+        The next state, and the batch's loss and accuracy before the step.
     """
     x = feature_of(describe_batch(batch, context.network, context.config), context.feature)
     key = jax.random.fold_in(jax.random.key(seed), step)
 
     def loss_of(params: Any) -> Any:
-        model = nnx.merge(context.graph, params, state.rest, copy=True)
+        model = nnx.merge(graph, params, state.rest, copy=True)
         logits = model(x, train=True, rngs=nnx.Rngs(dropout=key))
         loss = optax.softmax_cross_entropy_with_integer_labels(logits, batch.label).mean()
         return loss, ((logits.argmax(axis=-1) == batch.label).mean(), nnx.state(model, nnx.Not(nnx.Param)))
@@ -129,27 +136,28 @@ def train_step(
     (loss, (accuracy, rest)), gradients = jax.value_and_grad(loss_of, has_aux=True)(state.params)
     updates, optimizer = optax.adam(rate).update(gradients, state.optimizer, state.params)
     after = FitState(optax.apply_updates(state.params, updates), rest, optimizer)
-    return _everywhere((after, (loss, accuracy)), context.mesh)
+    return _replicated((after, (loss, accuracy)), context.mesh)
 
 
-@partial(jax.jit, static_argnums=0)
-def count_correct(context: FitContext, state: FitState, batch: Batch, count: ArrayLike) -> jax.Array:
-    """How many of the first `count` samples of a batch are named rightly."""
-    model = nnx.merge(context.graph, state.params, state.rest, copy=True)
+@partial(jax.jit, static_argnums=(0, 1))
+def count_correct(context: FitContext, graph: Any, state: FitState, batch: Batch, count: ArrayLike) -> jax.Array:
+    """Return how many of the first `count` samples of a batch are classified correctly."""
+    model = nnx.merge(graph, state.params, state.rest, copy=True)
     logits = model(feature_of(describe_batch(batch, context.network, context.config), context.feature))
-    right = (logits.argmax(axis=-1) == batch.label) & (jnp.arange(len(logits)) < count)
-    return _everywhere(right.sum(), context.mesh)
+    correct = (logits.argmax(axis=-1) == batch.label) & (jnp.arange(len(logits)) < count)
+    return _replicated(correct.sum(), context.mesh)
 
 
 @partial(jax.jit, static_argnums=(1, 2, 3))
 def scale_inputs(sample: Batch, feature: Feature, network: ColorNetwork, config: DescriptorConfig) -> jax.Array:
-    """1 / root mean square of each block of the descriptor (image, embedding) over a sample, for its entries: [F]."""
-    found = describe_batch(sample, network, config)
+    """Return the input scaling [F]: 1 / root mean square over a batch, one value for images, one for embeddings."""
+    descriptors = describe_batch(sample, network, config)
+    images, embeddings = descriptors.images, descriptors.embeddings
     block = dataclasses.replace(
-        found,
-        images=jnp.full(found.images.shape[1:], jnp.sqrt((found.images**2).mean()))[None],
-        embeddings=jnp.full(found.embeddings.shape[1:], jnp.sqrt((found.embeddings**2).mean()))[None],
-        overflow=found.overflow[:1],
+        descriptors,
+        images=jnp.full(images.shape[1:], jnp.sqrt((images**2).mean()))[None],
+        embeddings=jnp.full(embeddings.shape[1:], jnp.sqrt((embeddings**2).mean()))[None],
+        overflow=descriptors.overflow[:1],
     )
     size = feature_of(block, feature)[0]
     return jnp.where(size > 0, 1 / jnp.where(size > 0, size, 1), 1)

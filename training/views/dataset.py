@@ -1,20 +1,22 @@
-"""Datasets of normalized views on disk: what `render_dataset` writes and training reads.
+"""Datasets of normalized views on disk, written by `render_dataset` and read by training.
 
     dataset = ViewDataset.open("views")
     dataset.classes, len(dataset)
     for index in range(len(dataset.shards)):
         views = dataset.read(index)                # views.xyz, views.rgb, views.counts, views.label
 
-A folder holds `manifest.json` and shards, each with views of one object. A shard is a safetensors file:
+A dataset contains normalized point clouds, not images: for each object, one cloud per camera angle as rendered (`copy`
+0) and, if the job has augmentations, further clouds of augmented copies of the same view (`copy` 1, 2, ...). Views with
+too few points are left out. Its directory has `manifest.json` and shards, safetensors files with views of one object:
 
     xyz     [n, 3] uint16   points of all views, one view after the other, in `COORDINATE_STEP` scaled units
     rgb     [n, 3] uint8    sRGB
-    counts  [V] int64       points of each view
-    view    [V] int32       index of the view's angles among those of its object
-    copy    [V] int32       0 is the view as rendered, others are varied
+    counts  [V] int64       number of points of each view
+    view    [V] int32       index of the view among all views of the object
+    copy    [V] int32       0 is the view as rendered, others are augmented copies
 
-The manifest holds the job, which is all that the views depend on, and the shards that are done, with their checksums.
-There are no times in it: the same job gives the same bytes.
+The manifest has the job, everything that determines the views, and the finished shards with their checksums. It has no
+time stamps: the same job gives the same bytes.
 """
 
 import dataclasses
@@ -39,7 +41,7 @@ MANIFEST = "manifest.json"
 
 
 def encode(views: NormalizedViews) -> bytes:
-    """The file of a shard with these views."""
+    """Return the bytes of a shard's file."""
     steps = (views.xyz / np.float32(COORDINATE_STEP)).astype(np.uint16)
     return safetensors.numpy.save(
         {"xyz": steps, "rgb": views.rgb, "counts": views.counts, "view": views.view, "copy": views.copy}
@@ -54,15 +56,15 @@ def _decode(content: bytes, label: int) -> NormalizedViews:
 
 @dataclasses.dataclass(frozen=True)
 class Shard:
-    """A file of a dataset.
+    """A shard of a dataset.
 
     Attributes:
-        file: name in the dataset's folder.
-        sha256: of its bytes.
+        file: file name in the dataset's directory.
+        sha256: checksum of the file.
         label: index of its object among the dataset's classes.
-        views: number stored.
-        left_out: number of views that would be in it, had they shown enough points of the object.
-        points: of all its views.
+        views: number of clouds stored.
+        left_out: number of clouds left out because they have too few points.
+        points: number of points of all clouds.
     """
 
     file: str
@@ -75,23 +77,25 @@ class Shard:
     def __post_init__(self) -> None:
         numbers = (self.label, self.views, self.left_out, self.points)
         if not all(type(number) is int and number >= 0 for number in numbers):
-            raise ValueError(f"label, views, left_out, points are {numbers!r}; expected whole numbers")
+            raise ValueError(f"label, views, left_out, points are {numbers!r}; expected non-negative integers")
         if not isinstance(self.file, str) or Path(self.file).name != self.file:
-            raise ValueError(f"file is {self.file!r}; expected a name in the folder")
+            raise ValueError(f"file is {self.file!r}; expected a plain file name")
 
-    def content(self, folder: Path) -> bytes:
-        """The bytes of the file.
+    def content(self, directory: Path) -> bytes:
+        """Return the bytes of the file.
 
         Raises:
-            InputError: it is missing, cannot be read, or has another checksum; names the file.
+            InputError: The file is missing, unreadable or has another checksum.
         """
-        path = folder / self.file
+        path = directory / self.file
         try:
             content = path.read_bytes()
         except OSError as error:
-            raise InputError(f"dataset: {path} is missing or damaged ({error.strerror})") from None
+            raise InputError(
+                f"dataset: {path} cannot be read ({error.strerror}); repeat `thor2 render` to restore it"
+            ) from None
         if hashlib.sha256(content).hexdigest() != self.sha256:
-            raise InputError(f"dataset: {path} is damaged (its checksum is not the one in {MANIFEST})")
+            raise InputError(f"dataset: {path} is damaged (its checksum differs); repeat `thor2 render` to restore it")
         return content
 
 
@@ -101,12 +105,12 @@ def _dump(table: Mapping[str, Any]) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class Manifest:
-    """What a dataset's folder says of itself.
+    """The contents of a dataset.
 
     Attributes:
-        job: all that the views depend on, as JSON holds it. `objects` is a list of tables with `name` and `mesh` (the
-            mesh's checksum), `shards` the number of shards.
-        shards: those that are done, in the order of the job.
+        job: everything that determines the views, as JSON holds it. `objects` is a list of tables with `name` and
+            `mesh` (the mesh's checksum), `shards` the number of shards.
+        shards: finished shards, in the order of the job.
     """
 
     job: Mapping[str, Any]
@@ -114,24 +118,24 @@ class Manifest:
 
     @property
     def finished(self) -> bool:
-        """All shards are done."""
+        """Whether all shards are finished."""
         return len(self.shards) == self.job["shards"]
 
     @property
     def views(self) -> int:
-        """Views in all shards."""
+        """Number of clouds in all shards."""
         return sum(shard.views for shard in self.shards)
 
     @property
     def left_out(self) -> int:
-        """Views left out of all shards."""
+        """Number of clouds left out of all shards."""
         return sum(shard.left_out for shard in self.shards)
 
-    def write(self, folder: Path) -> None:
-        """Put this manifest in the place of the folder's.
+    def write(self, directory: Path) -> None:
+        """Write the manifest to the dataset's directory, replacing the one there.
 
         Raises:
-            OSError: the folder cannot be written.
+            OSError: The directory cannot be written.
         """
         table = {
             "format": MANIFEST_FORMAT,
@@ -141,94 +145,96 @@ class Manifest:
             "shards": [dataclasses.asdict(shard) for shard in self.shards],
         }
         checksum = hashlib.sha256(_dump(table).encode()).hexdigest()
-        write_text(folder / MANIFEST, _dump({**table, "sha256": checksum}))
+        write_text(directory / MANIFEST, _dump({**table, "sha256": checksum}))
 
     @classmethod
     def parse(cls, content: bytes, path: Path) -> "Manifest":
-        """The manifest in the bytes of a file.
+        """Return the manifest in the bytes of a file.
 
         Raises:
-            InputError: it is damaged or has another format; names `path`.
+            InputError: The manifest is damaged or has another format; the message names `path`.
         """
         try:
             table = json.loads(content)
             if table["format"] == MANIFEST_FORMAT:
                 checksum = table.pop("sha256")
                 if checksum != hashlib.sha256(_dump(table).encode()).hexdigest():
-                    raise ValueError("its checksum is not its own")
-                found = cls(table["job"], tuple(Shard(**shard) for shard in table["shards"]))
-                names = [entry["name"] for entry in found.job["objects"]]
+                    raise ValueError("its checksum differs")
+                manifest = cls(table["job"], tuple(Shard(**shard) for shard in table["shards"]))
+                names = [entry["name"] for entry in manifest.job["objects"]]
                 if not all(isinstance(name, str) for name in names):
                     raise ValueError(f"its objects are named {names!r}")
-                if any(shard.label >= len(names) for shard in found.shards):
-                    raise ValueError(f"it has shards of other objects than its {len(names)}")
-                if type(found.job["shards"]) is not int or "descriptor_version" not in found.job:
-                    raise ValueError("its job lacks the number of shards or the descriptor's version")
-                return found
+                if any(shard.label >= len(names) for shard in manifest.shards):
+                    raise ValueError("a shard has a label without an object")
+                if type(manifest.job["shards"]) is not int or "descriptor_version" not in manifest.job:
+                    raise ValueError("its job lacks the number of shards or the descriptor version")
+                return manifest
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise InputError(f"dataset: {path} is damaged ({type(error).__name__}: {error})") from None
-        raise InputError(f"dataset: {path} has format {table['format']!r}; this version reads {MANIFEST_FORMAT}")
+        raise InputError(f"dataset: {path} has format {table['format']!r}; expected {MANIFEST_FORMAT}; render it again")
 
 
 @dataclasses.dataclass(frozen=True)
 class ViewDataset:
-    """A finished dataset; `len` is the number of its views.
+    """A finished dataset; `len` is its number of clouds.
 
     Attributes:
-        folder: that holds it.
-        manifest: its contents.
-        digest: SHA-256 of the manifest's file, which holds the checksums of all the others.
+        directory: path of the dataset.
+        manifest: contents of the dataset.
+        digest: SHA-256 of the manifest, which has the checksums of all shards.
     """
 
-    folder: Path
+    directory: Path
     manifest: Manifest
     digest: str
 
     @classmethod
     def open(cls, path: str | Path) -> "ViewDataset":
-        """Read the manifest of a folder that `render_dataset` wrote. Shards are read, and checked, by `read`.
+        """Open a dataset that `render_dataset` wrote; shards are read and checked by `read`.
 
         Raises:
-            InputError: no such folder; no manifest in it, a damaged one, or one of another format or version of the
-                descriptor; or rendering did not finish. Names the file.
+            InputError: The directory or its manifest is missing, the manifest is damaged or of another format or
+                descriptor version, or the rendering is not finished.
         """
-        folder = Path(path)
-        if not folder.is_dir():
-            raise InputError(f"dataset: {folder} is no folder")
+        directory = Path(path)
+        if not directory.is_dir():
+            raise InputError(f"dataset: {directory} is not a directory; expected the output of `thor2 render`")
         try:
-            content = (folder / MANIFEST).read_bytes()
+            content = (directory / MANIFEST).read_bytes()
         except OSError as error:
-            raise InputError(f"dataset: {folder / MANIFEST} cannot be read ({error.strerror})") from None
-        manifest = Manifest.parse(content, folder / MANIFEST)
+            raise InputError(
+                f"dataset: {directory / MANIFEST} cannot be read ({error.strerror}); expected output of `thor2 render`"
+            ) from None
+        manifest = Manifest.parse(content, directory / MANIFEST)
         version = manifest.job["descriptor_version"]
         if version != DESCRIPTOR_VERSION:
             raise InputError(
-                f"dataset: {folder / MANIFEST} has views for version {version} of the descriptor; this is version "
-                f"{DESCRIPTOR_VERSION}"
+                f"dataset: {directory / MANIFEST} has views for descriptor version {version}; expected version "
+                f"{DESCRIPTOR_VERSION}; render the views again"
             )
         if not manifest.finished:
             raise InputError(
-                f"dataset: {folder / MANIFEST} lists {len(manifest.shards)} of {manifest.job['shards']} shards; "
-                "rendering did not finish and goes on with the same command"
+                f"dataset: {directory / MANIFEST} lists {len(manifest.shards)} of {manifest.job['shards']} shards; "
+                "repeat the `thor2 render` command to finish it"
             )
-        return cls(folder, manifest, hashlib.sha256(content).hexdigest())
+        return cls(directory, manifest, hashlib.sha256(content).hexdigest())
 
     def __len__(self) -> int:
         return self.manifest.views
 
     @property
     def classes(self) -> tuple[str, ...]:
-        """Names of the objects; labels are indices into it."""
+        """Names of the objects; labels are indices into this tuple."""
         return tuple(entry["name"] for entry in self.manifest.job["objects"])
 
     @property
     def shards(self) -> tuple[Shard, ...]:
-        """The files, in the order of the classes and of their views' angles."""
+        """The shards, ordered by class and view."""
         return self.manifest.shards
 
     @property
     def record(self) -> Mapping[str, Any]:
-        """What a run trained on these views keeps of them, as JSON holds it."""
+        """Description of the dataset for the record of a run, as JSON holds it."""
         return {
             "digest": self.digest,
             "views": self.manifest.views,
@@ -237,10 +243,10 @@ class ViewDataset:
         }
 
     def read(self, index: int) -> NormalizedViews:
-        """The views of a shard.
+        """Read the views of a shard.
 
         Raises:
-            InputError: its file is missing or damaged; names it.
+            InputError: The shard's file is missing or damaged.
         """
         shard = self.shards[index]
-        return _decode(shard.content(self.folder), shard.label)
+        return _decode(shard.content(self.directory), shard.label)

@@ -1,4 +1,4 @@
-"""Training without some of the objects, to see what is made of objects that were not trained."""
+"""Views without some of the classes, to evaluate the recognition of unknown objects."""
 
 import dataclasses
 import functools
@@ -15,21 +15,23 @@ __all__ = ["WithoutClasses"]
 class _Shard(NamedTuple):
     label: int
     views: int
-    place: int
+    source_index: int
 
 
 class WithoutClasses:
-    """A source of views without those of some classes."""
+    """A source of views that omits some classes."""
 
     def __init__(self, source: ViewSource, names: Sequence[str]) -> None:
-        """`names` are the classes to leave out.
+        """Omit the classes `names`.
 
         Raises:
-            InputError: one is no class of the source.
+            InputError: A name is not a class of the source.
         """
         missing = sorted(set(names) - set(source.classes))
         if missing:
-            raise InputError(f"leave_out is {', '.join(names)}; the views have no class {', '.join(missing)}")
+            raise InputError(
+                f"leave_out is {', '.join(names)}; expected classes of the views, which lack {', '.join(missing)}"
+            )
         self.classes = tuple(name for name in source.classes if name not in names)
         new = {source.classes.index(name): label for label, name in enumerate(self.classes)}
         self.shards = tuple(
@@ -41,16 +43,16 @@ class WithoutClasses:
 
     @functools.cached_property
     def digest(self) -> str:
-        """SHA-256 of the source's and the names."""
+        """SHA-256 of the source's digest and the omitted names."""
         return hashlib.sha256(repr((self._source.digest, self._names)).encode()).hexdigest()
 
     @property
     def record(self) -> Mapping[str, Any]:
-        """The source's, with what was left out."""
+        """Record of the source and the omitted classes."""
         views = sum(shard.views for shard in self.shards)
         return {**self._source.record, "digest": self.digest, "views": views, "classes_left_out": self._names}
 
     def read(self, index: int) -> NormalizedViews:
-        """The views of a shard; raises as the source's."""
+        """Read the views of a shard; raises what the source raises."""
         shard = self.shards[index]
-        return dataclasses.replace(self._source.read(shard.place), label=shard.label)
+        return dataclasses.replace(self._source.read(shard.source_index), label=shard.label)

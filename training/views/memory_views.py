@@ -1,6 +1,5 @@
-"""Where training takes its normalized views from: a `ViewDataset` on disk, or clouds in memory.
+"""Clouds in memory as a source of views for training.
 
-source = ViewDataset.open("views")
 source = MemoryViews(render_views(find_meshes("meshes")), config)
 """
 
@@ -23,14 +22,14 @@ class _Shard(NamedTuple):
 
 
 class MemoryViews:
-    """Clouds in memory as a source of views, a class a shard; `read` normalizes them."""
+    """Clouds in memory as a source of views, one shard per class; `read` normalizes them."""
 
     def __init__(self, views: Mapping[str, Sequence[Cloud]], config: DescriptorConfig) -> None:
-        """Nothing is computed yet.
+        """Keep the clouds; nothing is computed yet.
 
         Args:
             views: class name -> clouds (xyz [n, 3] float32 metres in the camera frame, rgb [n, 3] uint8).
-            config: of the normalization.
+            config: descriptor; only `sigma_s` is used.
         """
         self.classes = tuple(views)
         self.shards = tuple(_Shard(label, len(clouds)) for label, clouds in enumerate(views.values()))
@@ -39,20 +38,20 @@ class MemoryViews:
 
     @functools.cached_property
     def digest(self) -> str:
-        """SHA-256 of names and clouds."""
+        """SHA-256 of the class names and clouds."""
         arrays = (array for clouds in self._clouds for cloud in clouds for array in cloud)
         return content_digest(itertools.chain([repr((self.classes, self.shards))], (a.tobytes() for a in arrays)))
 
     @property
     def record(self) -> Mapping[str, Any]:
-        """Digest and number of views."""
+        """Digest and number of views, for the record of a run."""
         return {"digest": self.digest, "views": sum(shard.views for shard in self.shards)}
 
     def read(self, index: int) -> NormalizedViews:
-        """The normalized views of a class.
+        """Normalize the views of a class.
 
         Raises:
-            InputError: a cloud with more points than the largest bucket, or too long.
+            InputError: A cloud has more points than the largest bucket, or is too long.
         """
         clouds = self._clouds[index]
         return normalize_views(clouds, index, range(len(clouds)), [0] * len(clouds), self._config)

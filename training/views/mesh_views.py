@@ -1,8 +1,8 @@
-"""Training clouds: one coloured point cloud a view of a mesh (paper, section "Training").
+"""Render training clouds: one coloured point cloud per view of a mesh (paper, section "Training").
 
     views = render_views(find_meshes("meshes"), azimuth_step=5, polar_step=5, workers=2)     # name -> clouds
 
-For more views than memory holds: `render_dataset`.
+`render_dataset` writes more views than memory holds to disk.
 """
 
 import dataclasses
@@ -32,7 +32,7 @@ from training.storage.workers import local_workers
 
 __all__ = [
     "MIN_POINTS",
-    "Progress",
+    "RenderProgress",
     "ViewCloud",
     "ViewTask",
     "checked_meshes",
@@ -47,63 +47,63 @@ __all__ = [
 SIGMA_S = DescriptorConfig().sigma_s
 
 MIN_POINTS = 30
-"""Views with fewer points are left out: too little of the object is seen to describe it."""
+"""Views with fewer points are left out: too little of the object is visible to describe it."""
 
 VIEWS_PER_TASK = 256
-"""Views a task: long against sending a mesh and indexing it (0.03 s), short against its 2,664 views."""
+"""Views per task: rendering them takes long compared with sending and indexing a mesh (0.03 s)."""
 
-Progress = Callable[[int, int], object]
-"""Called with (views done, views in all)."""
+RenderProgress = Callable[[int, int], object]
+"""Called with (clouds done, total clouds)."""
 
 
 def cloud_of(view: RenderedView) -> Cloud:
-    """Back-project a rendered view and voxel it at 0.01 scaled units; coarser, as in recognition, to fit a bucket.
+    """Back-project a rendered view and downsample it to voxels of 0.01 scaled units, or coarser ones to fit a bucket.
 
     Returns:
         xyz [n, 3] float32, metres, camera frame; rgb [n, 3] uint8. n may be 0.
     """
-    # Metres in float32, all else in float64: every fourth millimetre lies on a border between voxels, and this is how
-    # the clouds of the released pipeline fall on either side.
+    # Metres in float32 and the rest in float64, as in the released pipeline: every fourth millimetre lies on a voxel
+    # border, and rounding decides on which side.
     depth = view.depth.astype(np.float32) / np.float32(1000)
-    seen = view.depth > 0
-    points = backproject(depth, view.intrinsics)[seen].astype(np.float64) * SIGMA_S
-    points, colors = downsample_to_fit(points, view.color[seen].astype(np.float64), DESCRIPTOR_VOXEL)
+    valid = view.depth > 0
+    points = backproject(depth, view.intrinsics)[valid].astype(np.float64) * SIGMA_S
+    points, colors = downsample_to_fit(points, view.color[valid].astype(np.float64), DESCRIPTOR_VOXEL)
     return (points / SIGMA_S).astype(np.float32), np.rint(colors).astype(np.uint8)
 
 
 def view_cloud(mesh: TexturedMesh, pose: NDArray[np.float64], camera: Camera = TRAINING_CAMERA) -> Cloud:
-    """The training cloud of one view: rendered, depth in steps of 1 mm, back-projected, voxelled at 0.01 scaled units.
+    """Return the training cloud of one view: depth in steps of 1 mm, back-projected, voxels of 0.01 scaled units.
 
-    Indexes the mesh anew at every call; for many views use `render_views`.
+    Each call indexes the mesh; use `render_views` for many views.
 
     Args:
         mesh: metres, z up.
-        pose: [4, 4] camera to object frame, as from `camera_pose`.
-        camera: 800 x 600 pixels, 40 degrees by default.
+        pose: [4, 4], camera to object frame, as from `camera_pose`.
+        camera: by default 800 x 600 pixels with a horizontal field of view of 40 degrees.
 
     Returns:
         xyz [n, 3] float32, metres, camera frame; rgb [n, 3] uint8.
 
     Raises:
-        InputError: nothing of the mesh is seen.
+        InputError: The mesh is not visible.
     """
     xyz, rgb = cloud_of(render_view(RayCaster([mesh]), pose, camera))
     if len(xyz) == 0:
-        raise InputError("the camera at this pose sees nothing of the mesh")
+        raise InputError("pose: the mesh is not visible; expected a camera that looks at it, as from camera_pose")
     return xyz, rgb
 
 
 @dataclasses.dataclass(frozen=True)
 class ViewTask:
-    """Views of one object to be rendered by one process.
+    """Views of one object, to be rendered by one process.
 
     Attributes:
-        name: of the object.
+        name: name of the object.
         mesh: metres, z up.
         angles: [n, 2] azimuth and polar angle in radians.
-        first: index of the first among all angles of its object.
-        augmentations: makes varied copies of each view; None makes none.
-        seed: of the augmentations.
+        first: index of the first view among all views of the object.
+        augmentations: adds augmented copies of each view; None adds none.
+        seed: seed for the augmentations.
     """
 
     name: str
@@ -119,8 +119,8 @@ class ViewCloud:
     """The cloud of one view.
 
     Attributes:
-        view: index of the angles among all of its object.
-        copy: 0 is as rendered, others are varied.
+        view: index of the view among all views of the object.
+        copy: 0 is the view as rendered, others are augmented copies.
         xyz: [n, 3] float32, metres, camera frame.
         rgb: [n, 3] uint8.
     """
@@ -132,12 +132,12 @@ class ViewCloud:
 
 
 def clouds_per_view(augmentations: Augmentations | None) -> int:
-    """The view as rendered, and its varied copies."""
+    """Return the number of clouds per view: the view as rendered and its augmented copies."""
     return 1 + augmentations.copies if augmentations else 1
 
 
 def _seed_of(name: str) -> int:
-    """A number that stays with the name, whatever other objects there are."""
+    """Return a seed that depends on the object's name only."""
     return int.from_bytes(hashlib.sha256(name.encode(errors="surrogatepass")).digest()[:8], "little")
 
 
@@ -153,7 +153,7 @@ def _all_clouds(task: ViewTask) -> Iterator[ViewCloud]:
 
 
 def render_task(task: ViewTask) -> list[ViewCloud]:
-    """The clouds of a task with `MIN_POINTS` points or more, view by view, the copies of a view one after the other."""
+    """Return the clouds of a task that have at least `MIN_POINTS` points, ordered by view and copy."""
     return [cloud for cloud in _all_clouds(task) if len(cloud.xyz) >= MIN_POINTS]
 
 
@@ -162,70 +162,73 @@ def _mesh(source: Path | TexturedMesh) -> TexturedMesh:
 
 
 def checked_meshes(
-    found: Mapping[str, Path | TexturedMesh], angles: NDArray[np.float64]
+    meshes: Mapping[str, Path | TexturedMesh], angles: NDArray[np.float64]
 ) -> Iterator[tuple[str, TexturedMesh]]:
-    """Each object's name and mesh, one in memory at a time, to be told of a useless one before an hour of rendering.
+    """Yield each object's name and mesh, one in memory at a time; finds unusable meshes before the long rendering.
 
     Raises:
-        InputError: no meshes, or one that cannot be read or has no view of `MIN_POINTS` points or more.
+        InputError: There are no meshes, or a mesh is unreadable or has no view of at least `MIN_POINTS` points.
     """
-    if not found:
-        raise InputError("found is empty; at least one mesh is needed")
-    for name, source in found.items():
+    if not meshes:
+        raise InputError("meshes is empty; expected at least one mesh")
+    for name, source in meshes.items():
         mesh = _mesh(source)
         if not any(len(cloud.xyz) >= MIN_POINTS for cloud in _all_clouds(ViewTask(name, mesh, angles))):
-            raise InputError(f"object {name!r}: none of its {len(angles)} views has {MIN_POINTS} points or more")
+            raise InputError(
+                f"object {name!r}: none of its {len(angles)} views has at least {MIN_POINTS} points; check the "
+                "mesh or leave it out"
+            )
         yield name, mesh
 
 
 def view_tasks(
-    found: Mapping[str, Path | TexturedMesh],
+    meshes: Mapping[str, Path | TexturedMesh],
     angles: NDArray[np.float64],
-    parts: Iterable[tuple[str, int]],
+    starts: Iterable[tuple[str, int]],
     size: int,
     augmentations: Augmentations | None = None,
     seed: int = 0,
 ) -> Iterator[ViewTask]:
-    """A task for each part, which is an object's name and the index of the first of its `size` angles.
+    """Yield one task of `size` views for each start, an object's name and the index of its first view.
 
-    A mesh is read when the first of the consecutive parts of its object is asked for.
+    A mesh is read once for consecutive starts of its object.
     """
-    for name, group in itertools.groupby(parts, key=operator.itemgetter(0)):
-        mesh = _mesh(found[name])
+    for name, group in itertools.groupby(starts, key=operator.itemgetter(0)):
+        mesh = _mesh(meshes[name])
         for _, first in group:
             yield ViewTask(name, mesh, angles[first : first + size], first, augmentations, seed)
 
 
 def render_views(
-    found: Mapping[str, Path | TexturedMesh],
+    meshes: Mapping[str, Path | TexturedMesh],
     azimuth_step: float = 5.0,
     polar_step: float = 5.0,
     workers: int = 1,
-    progress: Progress = lambda done, total: None,
+    progress: RenderProgress = lambda done, total: None,
 ) -> dict[str, list[Cloud]]:
-    """Training clouds of every object, in memory (a view of a scan takes about 15 kB).
+    """Render the training clouds of every object to memory (about 15 kB per view of a scan).
 
     Args:
-        found: object name -> mesh file, as from `find_meshes`, or mesh.
+        meshes: object name -> mesh file, as from `find_meshes`, or mesh.
         azimuth_step: degrees; divides 360.
         polar_step: degrees; divides 180.
-        workers: processes that render; the result does not depend on their number. With more than 1, the calling script
+        workers: rendering processes; the result does not depend on their number. With more than 1, the calling script
             needs the `if __name__ == "__main__"` guard of `multiprocessing`.
-        progress: called from time to time.
+        progress: called after each task.
 
     Returns:
-        name -> clouds (xyz [n, 3] float32 metres in the camera frame, rgb [n, 3] uint8), in the order of `found` and of
-        `view_angles`; views of fewer than `MIN_POINTS` points are left out.
+        name -> clouds (xyz [n, 3] float32 metres in the camera frame, rgb [n, 3] uint8), in the order of `meshes` and
+        `view_angles`; views with fewer than `MIN_POINTS` points are left out.
 
     Raises:
-        InputError: no meshes, a mesh that cannot be read or is never seen, or steps or workers that do not fit.
+        InputError: There are no meshes, a mesh is unreadable or never visible, or a step or `workers` is invalid.
     """
     angles, pool = view_angles(azimuth_step, polar_step), local_workers(workers)
-    views: dict[str, list[Cloud]] = {name: [] for name, _ in checked_meshes(found, angles)}
-    parts = [(name, first) for name in found for first in range(0, len(angles), VIEWS_PER_TASK)]
-    done, total = 0, len(angles) * len(found)
-    with closing(pool(render_task, view_tasks(found, angles, parts, VIEWS_PER_TASK))) as results:
-        for (name, first), clouds in zip(parts, results, strict=True):
+    views: dict[str, list[Cloud]] = {name: [] for name, _ in checked_meshes(meshes, angles)}
+    starts = [(name, first) for name in meshes for first in range(0, len(angles), VIEWS_PER_TASK)]
+    done, total = 0, len(angles) * len(meshes)
+    with closing(pool(render_task, view_tasks(meshes, angles, starts, VIEWS_PER_TASK))) as results:
+        for (name, first), clouds in zip(starts, results, strict=True):
             views[name] += [(cloud.xyz, cloud.rgb) for cloud in clouds]
             done += len(angles[first : first + VIEWS_PER_TASK])
             progress(done, total)

@@ -1,13 +1,14 @@
-"""The rendering job: meshes to a folder of normalized views that `ViewDataset` reads.
+"""Render meshes to a dataset of normalized views on disk, which `ViewDataset` reads.
 
     dataset = render_dataset(find_meshes("meshes"), "views", pool=local_workers(2))
 
-Workers render; this process normalizes and writes, a shard at a time, in the order of the job. So the bytes depend
-neither on the number of workers nor on where they are, and a job that was interrupted goes on where it was.
+Worker processes render; this process normalizes and writes the shards one by one, in a fixed order. The bytes therefore
+do not depend on the workers, and an interrupted rendering resumes at the first missing shard.
 """
 
 import contextlib
 import dataclasses
+import functools
 import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -31,7 +32,7 @@ from training.views.dataset import MANIFEST, Manifest, Shard, ViewDataset, encod
 from training.views.mesh_views import (
     MIN_POINTS,
     SIGMA_S,
-    Progress,
+    RenderProgress,
     ViewCloud,
     checked_meshes,
     clouds_per_view,
@@ -43,70 +44,72 @@ from training.views.normalized_views import COORDINATE_STEP, MAX_COORDINATE, nor
 __all__ = ["render_dataset"]
 
 CLOUDS_PER_SHARD = 256
-"""Clouds of a shard, some less where copies do not come out even: a few megabytes, a second of rendering."""
+"""Clouds per shard, rounded down to whole views: a few megabytes, about a second of rendering."""
 
 SUFFIX = ".safetensors"
 
 
 def _digest(mesh: TexturedMesh) -> str:
-    """SHA-256 of all that is rendered: files can name others, and objects need not come from files."""
+    """Return the SHA-256 of a mesh's arrays: mesh files refer to others, and meshes need not come from files."""
     parts: list[str | bytes] = []
     for array in (mesh.vertices, mesh.faces, mesh.uv, mesh.face_texture, mesh.corner_colors, *mesh.textures):
         parts += ["False"] if array is None else [repr((array.dtype.str, array.shape)), array.tobytes()]
     return content_digest(parts)
 
 
-def _objects(found: Mapping[str, Path | TexturedMesh], angles: NDArray[np.float64]) -> list[dict[str, str]]:
+def _objects(meshes: Mapping[str, Path | TexturedMesh], angles: NDArray[np.float64]) -> list[dict[str, str]]:
+    """Check every mesh and return the names and digests of the objects."""
     objects = []
-    for name, mesh in checked_meshes(found, angles):
-        across = SIGMA_S * float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
-        if across > MAX_COORDINATE:
+    for name, mesh in checked_meshes(meshes, angles):
+        diameter = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
+        if SIGMA_S * diameter > MAX_COORDINATE:
             raise InputError(
-                f"object {name!r} has a diameter of {across / SIGMA_S:.2f} m; at most {MAX_COORDINATE / SIGMA_S:.2f} m "
-                "can be stored; scale the mesh to metres"
+                f"object {name!r} has a diameter of {diameter:.2f} m; at most {MAX_COORDINATE / SIGMA_S:.2f} m can be "
+                "stored; scale the mesh to metres"
             )
         objects.append({"name": name, "mesh": _digest(mesh)})
     return objects
 
 
-def _leftovers(folder: Path) -> set[Path]:
-    """Files that a process was writing when it was killed."""
-    return {path for pattern in (f".{Path(MANIFEST).stem}.*", f".*{SUFFIX}") for path in folder.glob(pattern)}
+def _leftovers(directory: Path) -> set[Path]:
+    """Return the temporary files of a process that was killed."""
+    return {path for pattern in (f".{Path(MANIFEST).stem}.*", f".*{SUFFIX}") for path in directory.glob(pattern)}
 
 
-def _is_whole(shard: Shard, folder: Path) -> bool:
+def _is_intact(shard: Shard, directory: Path) -> bool:
     try:
-        shard.content(folder)
+        shard.content(directory)
     except InputError:
         return False
     return True
 
 
-def _begin(folder: Path, job: Mapping[str, Any]) -> Manifest:
-    """The folder's manifest, made if there is none, with those shards only whose files are whole.
+def _begin(directory: Path, job: Mapping[str, Any]) -> Manifest:
+    """Return the manifest with the intact shards; write it if it is missing or lists damaged shards.
 
     Raises:
-        InputError: the folder holds another job.
-        OSError: it cannot be written.
+        InputError: The directory holds another job.
+        OSError: The directory cannot be written.
     """
-    path = folder / MANIFEST
-    found = Manifest.parse(path.read_bytes(), path) if path.exists() else None
-    if found:
-        check_same_job(folder, found.job, job)
-    for leftover in _leftovers(folder):
+    path = directory / MANIFEST
+    stored = Manifest.parse(path.read_bytes(), path) if path.exists() else None
+    if stored:
+        check_same_job(directory, stored.job, job)
+    for leftover in _leftovers(directory):
         leftover.unlink()
-    manifest = Manifest(job, tuple(shard for shard in found.shards if _is_whole(shard, folder)) if found else ())
-    if manifest != found:
-        manifest.write(folder)
+    shards = stored.shards if stored else ()
+    manifest = Manifest(job, tuple(shard for shard in shards if _is_intact(shard, directory)))
+    if manifest != stored:
+        manifest.write(directory)
     return manifest
 
 
 def _store(path: Path, label: int, planned: int, rendered: Sequence[ViewCloud]) -> Shard:
-    """Normalize the views of a shard and write its file; `planned` is their number with those left out.
+    """Normalize the clouds of a shard and write its file; `planned` counts those left out, too.
 
     Raises:
-        InputError: a view that cannot be normalized or stored.
-        OSError: the file cannot be written.
+        InputError: A cloud cannot be normalized or stored.
+        OSError: The file cannot be written.
     """
     views = normalize_views(
         [(cloud.xyz, cloud.rgb) for cloud in rendered],
@@ -128,51 +131,78 @@ def _store(path: Path, label: int, planned: int, rendered: Sequence[ViewCloud]) 
     )
 
 
+@dataclasses.dataclass(frozen=True)
+class _Plan:
+    """Which views each shard of a dataset holds.
+
+    Attributes:
+        angles: [n, 2] azimuth and polar angle of every view of an object.
+        copies: clouds per view.
+        names: of the objects.
+    """
+
+    angles: NDArray[np.float64]
+    copies: int
+    names: tuple[str, ...]
+
+    @property
+    def size(self) -> int:
+        """Views per shard."""
+        return max(1, CLOUDS_PER_SHARD // self.copies)
+
+    @property
+    def clouds(self) -> int:
+        """Clouds in all shards, with those that will be left out."""
+        return self.copies * len(self.angles) * len(self.names)
+
+    @functools.cached_property
+    def shards(self) -> dict[str, tuple[int, int]]:
+        """File name -> label and index of the first view."""
+        return {
+            f"{label:04d}-{number:04d}{SUFFIX}": (label, first)
+            for label in range(len(self.names))
+            for number, first in enumerate(range(0, len(self.angles), self.size))
+        }
+
+
 def render_dataset(
-    found: Mapping[str, Path | TexturedMesh],
+    meshes: Mapping[str, Path | TexturedMesh],
     out: str | Path,
     azimuth_step: float = 5.0,
     polar_step: float = 5.0,
     pool: WorkerPool = IN_PROCESS,
-    progress: Progress = lambda done, total: None,
+    progress: RenderProgress = lambda done, total: None,
     augmentations: Augmentations | None = None,
     seed: int = 0,
 ) -> ViewDataset:
-    """Render views of every object, normalize them and write them to a folder, or finish what the folder holds of that.
+    """Render views of every object, normalize them and write them to a dataset; resume an interrupted rendering.
 
-    Called again with the same arguments after any interruption, it makes what is missing or damaged, and the folder
-    ends up with the bytes that it would have had without. Memory holds a shard a worker, and one.
+    A resumed rendering renders what is missing or damaged; the dataset ends up with the same bytes as without the
+    interruption. Memory holds one shard per worker, and one.
 
     Args:
-        found: object name -> mesh file, as from `find_meshes`, or mesh.
-        out: folder; new, empty, or with a dataset of the same arguments. Made with its parents.
+        meshes: object name -> mesh file, as from `find_meshes`, or mesh.
+        out: directory: new, empty, or with a dataset of the same arguments; created with its parents.
         azimuth_step: degrees; divides 360.
         polar_step: degrees; divides 180.
-        pool: where views are rendered; has no influence on the result.
-        progress: called with (views done, views in all) at the start and after each shard; copies count as views.
-        augmentations: adds varied copies of each view; None adds none.
-        seed: of the augmentations. What an object's copies look like does not depend on the other objects.
+        pool: worker processes that render; does not affect the result.
+        progress: called with (clouds done, total clouds) at the start and after each shard.
+        augmentations: adds augmented copies of each view; None adds none.
+        seed: seed for the augmentations. The copies of an object do not depend on the other objects.
 
     Raises:
-        InputError: no meshes, a mesh that cannot be read, is too large or never seen, steps or a seed that do not fit,
-            `out` holds something else or views of other arguments (says what differs), or another process is writing to
-            it. Nothing is written then.
-        OSError: `out` cannot be written. It can be finished later.
+        InputError: Nothing is written if there are no meshes, a mesh is unreadable, too large or never visible, a step
+            or the seed is invalid, or `out` holds something else, views of other arguments (names what differs) or is
+            written by another process.
+        OSError: `out` cannot be written; the rendering can be resumed.
     """
     out = Path(out)
     check_output_directory(out, MANIFEST)
     if seed < 0:
-        raise InputError(f"seed is {seed}; it must not be negative")
+        raise InputError(f"seed is {seed}; it must be at least 0")
     angles = view_angles(azimuth_step, polar_step)
-    objects = _objects(found, angles)
-    copies = clouds_per_view(augmentations)
-    size = max(1, CLOUDS_PER_SHARD // copies)
-    # Shard's file -> object's index and index of the first of the shard's angles.
-    plan = {
-        f"{label:04d}-{number:04d}{SUFFIX}": (label, first)
-        for label in range(len(objects))
-        for number, first in enumerate(range(0, len(angles), size))
-    }
+    objects = _objects(meshes, angles)
+    plan = _Plan(angles, clouds_per_view(augmentations), tuple(entry["name"] for entry in objects))
     job = {
         "descriptor_version": DESCRIPTOR_VERSION,
         "sigma_s": SIGMA_S,
@@ -184,24 +214,24 @@ def render_dataset(
         "polar_step": float(polar_step),
         "variations": {"seed": seed, **augmentations.record()} if augmentations else None,
         "objects": objects,
-        "shards": len(plan),
+        "shards": len(plan.shards),
     }
-    done: dict[str, Shard] = {}
-
-    def show_progress() -> None:
-        progress(sum(shard.views + shard.left_out for shard in done.values()), copies * len(angles) * len(objects))
-
     with locked(out):
-        done.update((shard.file, shard) for shard in _begin(out, job).shards)
-        show_progress()
-        missing = [file for file in plan if file not in done]
-        parts = [(objects[label]["name"], first) for label, first in (plan[file] for file in missing)]
-        tasks = view_tasks(found, angles, parts, size, augmentations, seed)
+        done = {shard.file: shard for shard in _begin(out, job).shards}
+        progress(_clouds(done), plan.clouds)
+        missing = [file for file in plan.shards if file not in done]
+        starts = [(plan.names[label], first) for label, first in (plan.shards[file] for file in missing)]
+        tasks = view_tasks(meshes, angles, starts, plan.size, augmentations, seed)
         with contextlib.closing(pool(render_task, tasks)) as results:
             for file, rendered in zip(missing, results, strict=True):
-                label, first = plan[file]
-                with with_context(f"object {objects[label]['name']!r}"):
-                    done[file] = _store(out / file, label, copies * len(angles[first : first + size]), rendered)
-                Manifest(job, tuple(done[name] for name in plan if name in done)).write(out)
-                show_progress()
+                label, first = plan.shards[file]
+                planned = plan.copies * len(angles[first : first + plan.size])
+                with with_context(f"object {plan.names[label]!r}"):
+                    done[file] = _store(out / file, label, planned, rendered)
+                Manifest(job, tuple(done[name] for name in plan.shards if name in done)).write(out)
+                progress(_clouds(done), plan.clouds)
     return ViewDataset.open(out)
+
+
+def _clouds(shards: Mapping[str, Shard]) -> int:
+    return sum(shard.views + shard.left_out for shard in shards.values())

@@ -1,4 +1,4 @@
-"""Training for each sequence of a dataset apart, on the objects that are in it alone (as in the papers, for OCID)."""
+"""Views for training one run per sequence of a dataset, on the sequence's objects only (the papers' OCID protocol)."""
 
 from pathlib import Path
 
@@ -11,20 +11,20 @@ __all__ = ["sequence_sources"]
 
 
 def sequence_sources(source: ViewSource, table: Path) -> dict[str, ViewSource]:
-    """The views that each sequence's training needs.
+    """Return the views for the training of each sequence.
 
     Args:
         source: views of the objects of all sequences.
-        table: JSON or YAML file, sequence -> names of its objects, as the reader of OCID takes it.
+        table: JSON or YAML file, sequence -> names of its objects, as for the OCID reader.
 
     Returns:
         Sequence -> views of its objects.
 
     Raises:
-        InputError: the table cannot be read, is empty, has a sequence that is no relative path, or names an object of
-            which there are no views.
+        InputError: The table is unreadable or empty, a sequence is not a relative path, or the source has no views of
+            an object.
     """
-    found: dict[str, ViewSource] = {}
+    sources: dict[str, ViewSource] = {}
     for sequence, names in read_table(table).items():
         if not isinstance(sequence, str) or Path(sequence).is_absolute() or {"", ".", ".."} & set(sequence.split("/")):
             raise InputError(f"sequences: {table} has the sequence {sequence!r}; expected a relative path")
@@ -33,7 +33,7 @@ def sequence_sources(source: ViewSource, table: Path) -> dict[str, ViewSource]:
         missing = sorted(set(names) - set(source.classes))
         if missing:
             raise InputError(f"sequences: {table}: the views have no class {', '.join(missing)}, named by {sequence}")
-        found[sequence] = WithoutClasses(source, [name for name in source.classes if name not in names])
-    if not found:
-        raise InputError(f"sequences: {table} has no sequence")
-    return found
+        sources[sequence] = WithoutClasses(source, [name for name in source.classes if name not in names])
+    if not sources:
+        raise InputError(f"sequences: {table} has no sequence; expected a table of sequence -> object names")
+    return sources

@@ -16,6 +16,7 @@ from training.fitting.calibration import sample_probabilities, temperatures
 from training.fitting.job import train_run
 from training.fitting.options import FitOptions
 from training.fitting.samples import MIRRORS, build_samples
+from training.fitting.steps import FitContext
 from training.fitting.temperature import fit_temperature
 from training.views.memory_views import MemoryViews
 from training.views.normalized_views import padded_batches
@@ -49,7 +50,8 @@ def test_samples_are_answered_as_their_clouds_are(feature: Feature, monkeypatch:
     samples = build_samples(views, NETWORK, CONFIG)
     model = MLP(input_size(feature, CONFIG, NETWORK.n_regions), 2, rngs=nnx.Rngs(0))
     rows = np.array([7, 0, 3, 5])
-    found = sample_probabilities(model, samples, rows, feature, NETWORK, CONFIG)
+    context = FitContext(feature, NETWORK, CONFIG)
+    found = sample_probabilities(model, samples, rows, context)
     expected = []
     for index in range(2):
         ((_, normal),) = padded_batches(views.read(index).clouds(), 2)
@@ -58,7 +60,7 @@ def test_samples_are_answered_as_their_clouds_are(feature: Feature, monkeypatch:
             described = thor2.describe_aligned(aligned, NETWORK, CONFIG)
             expected.append(np.asarray(class_probabilities(model, described, feature)))
     np.testing.assert_allclose(found, np.concatenate(expected)[rows], atol=1e-5)
-    assert sample_probabilities(model, samples, rows[:0], feature, NETWORK, CONFIG).shape == (0, 2)
+    assert sample_probabilities(model, samples, rows[:0], context).shape == (0, 2)
 
 
 def test_temperatures_are_those_of_the_samples_held_out() -> None:
@@ -66,7 +68,7 @@ def test_temperatures_are_those_of_the_samples_held_out() -> None:
     model = MLP(input_size("tops", CONFIG, NETWORK.n_regions), 2, rngs=nnx.Rngs(0))
     held_out = samples.view == 1
     found = temperatures({"tops": model}, samples, held_out, NETWORK, CONFIG)
-    said = sample_probabilities(model, samples, np.flatnonzero(held_out), "tops", NETWORK, CONFIG)
+    said = sample_probabilities(model, samples, np.flatnonzero(held_out), FitContext("tops", NETWORK, CONFIG))
     assert found == {"tops": fit_temperature(said, samples.label[held_out])}
     assert temperatures({"tops": model}, samples, None, NETWORK, CONFIG) == {}
 

@@ -19,6 +19,7 @@ from training.fitting.checkpoints import Checkpoints
 from training.fitting.fit import fit
 from training.fitting.options import EpochMetrics, FitOptions
 from training.fitting.samples import Samples, expand
+from training.fitting.steps import FitContext
 
 NETWORK = colornet.load_default()
 CONFIG = thor2.DescriptorConfig(n_slices=2, n_strips=5, image_size=12)  # small, so that it is quick
@@ -37,7 +38,7 @@ def fitted(tmp_path: Path, separable: Samples) -> Fit:
         feature: Feature = "tops2", options: FitOptions = QUICK, samples: Samples = separable, **arguments: object
     ) -> tuple[MLP, int]:
         with Checkpoints(next(folders)) as checkpoints:
-            return fit(samples, NETWORK, CONFIG, feature, options, checkpoints, **arguments)
+            return fit(samples, FitContext(feature, NETWORK, CONFIG), options, checkpoints, **arguments)
 
     return run
 
@@ -125,7 +126,15 @@ def test_going_on_gives_the_bits_of_never_having_stopped(separable: Samples, fit
         with Checkpoints(tmp_path / "stopped") as checkpoints:
             progress = stop_at(step) if step else lambda *_: None
             try:
-                again = fit(separable, NETWORK, CONFIG, "tops2", QUICK, checkpoints, held_out, progress, found.append)
+                again = fit(
+                    separable,
+                    FitContext("tops2", NETWORK, CONFIG),
+                    QUICK,
+                    checkpoints,
+                    held_out,
+                    progress,
+                    found.append,
+                )
             except Stopped:
                 continue
     same_bits(again[0], model)
@@ -140,9 +149,9 @@ def test_a_fit_that_is_done_only_gives_its_classifier(separable: Samples, tmp_pa
 
     options = dataclasses.replace(QUICK, epochs=2)
     with Checkpoints(tmp_path) as checkpoints:
-        first = fit(separable, NETWORK, CONFIG, "ce", options, checkpoints)
+        first = fit(separable, FitContext("ce", NETWORK, CONFIG), options, checkpoints)
     with Checkpoints(tmp_path) as checkpoints:
-        second = fit(separable, NETWORK, CONFIG, "ce", options, checkpoints, None, refuse, refuse)
+        second = fit(separable, FitContext("ce", NETWORK, CONFIG), options, checkpoints, None, refuse, refuse)
     same_bits(first[0], second[0])
     assert first[1] == second[1]
 
@@ -178,13 +187,13 @@ def test_a_loss_that_is_not_finite_is_an_error_and_the_last_checkpoint_stays(
     with pytest.raises(thor2.InputError, match="loss of ce is nan in epoch 1"):
         fitted("ce", samples=broken)
     with Checkpoints(tmp_path / "c") as checkpoints:
-        fit(separable, NETWORK, CONFIG, "ce", dataclasses.replace(QUICK, epochs=2), checkpoints)
+        fit(separable, FitContext("ce", NETWORK, CONFIG), dataclasses.replace(QUICK, epochs=2), checkpoints)
     with Checkpoints(tmp_path / "c") as checkpoints:
         with pytest.raises(thor2.InputError, match="loss of ce is nan in epoch 3"):
-            fit(broken, NETWORK, CONFIG, "ce", QUICK, checkpoints)
+            fit(broken, FitContext("ce", NETWORK, CONFIG), QUICK, checkpoints)
     with Checkpoints(tmp_path / "c") as checkpoints:
         assert checkpoints.last_epoch == 2
-        fit(separable, NETWORK, CONFIG, "ce", QUICK, checkpoints)
+        fit(separable, FitContext("ce", NETWORK, CONFIG), QUICK, checkpoints)
 
 
 def test_too_little_to_learn_from(separable: Samples, fitted: Fit) -> None:

@@ -175,7 +175,7 @@ def test_interrupted_by_the_keyboard(whole: Path, tmp_path: Path) -> None:
 
     with pytest.raises(KeyboardInterrupt):
         render_dataset(OBJECTS, tmp_path / "views", *STEPS, progress=interrupt)
-    with pytest.raises(InputError, match="3 of 4 shards; rendering did not finish"):
+    with pytest.raises(InputError, match="3 of 4 shards"):
         ViewDataset.open(tmp_path / "views")
     render_dataset(OBJECTS, tmp_path / "views", *STEPS)
     assert contents(tmp_path / "views") == contents(whole)
@@ -234,7 +234,7 @@ def test_augmentations_are_part_of_the_job(tmp_path: Path) -> None:
     views = dataset.read(1)
     assert views.view.tolist() == list(np.repeat(range(5, 10), 3)) and views.copy.tolist() == [0, 1, 2] * 5
     for options in ({}, {"augmentations": light, "seed": 2}, {"augmentations": dataclasses.replace(light, copies=3)}):
-        with pytest.raises(InputError, match="variations is"):
+        with pytest.raises(InputError, match="variations"):
             render_dataset({"ball": sphere(0.03)}, out, 90, 90, **options)
     off = render_dataset({"ball": sphere(0.03)}, tmp_path / "off", 90, 90, augmentations=Augmentations(), seed=2)
     assert len(off) == 12 and off.record["job"]["variations"] is None
@@ -267,11 +267,11 @@ def test_bad_requests_write_nothing(tmp_path: Path) -> None:
     out = tmp_path / "views"
     (tmp_path / "bad.ply").write_text("not a mesh")
     for found, steps, options, message in [
-        ({}, STEPS, {}, "found is empty"),
+        ({}, STEPS, {}, "meshes is empty"),
         (OBJECTS, (0, 45), {}, "azimuth_step"),
         (OBJECTS, STEPS, {"seed": -1}, "seed is -1"),
         ({**OBJECTS, "z": tmp_path / "bad.ply"}, STEPS, {}, "bad.ply"),
-        ({"speck": sphere(0.003)}, (180, 90), {}, "object 'speck': none of its 6 views has 30 points"),
+        ({"speck": sphere(0.003)}, (180, 90), {}, "object 'speck': none of its 6 views"),
         ({"door": sphere(0.6)}, (180, 90), {}, "object 'door' has a diameter of 2.08 m"),
     ]:
         with pytest.raises(InputError, match=message):
@@ -288,7 +288,7 @@ def test_folders_in_use_are_kept(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="out: .*mine.txt is not a directory"):
         render_dataset(OBJECTS, out / "mine.txt", 180, 90)
     (out / MANIFEST).write_text('{"format": 1}')
-    with pytest.raises(InputError, match="manifest.json has format 1; this version reads 2"):
+    with pytest.raises(InputError, match="manifest.json has format 1; expected 2"):
         render_dataset(OBJECTS, out, 180, 90)
     assert (out / MANIFEST).read_text() == '{"format": 1}' and (out / "mine.txt").read_text() == "mine"
 
