@@ -1,4 +1,4 @@
-"""A disk that fails when it is told to."""
+"""A simulated disk that fails at a chosen step."""
 
 import builtins
 import errno
@@ -12,9 +12,9 @@ import pytest
 
 
 class Disk:
-    """Counts what is written under a folder, and fails from the n-th time on, as a full or read-only disk does.
+    """Count the write operations under a directory, and fail from the n-th on, like a full or read-only disk.
 
-    Opening for writing, writing, making and renaming each count once. Removing never fails.
+    Opening for writing, writing, creating a directory and renaming each count once. Removing never fails.
     """
 
     def __init__(self, folder: Path, patch: pytest.MonkeyPatch) -> None:
@@ -37,14 +37,14 @@ class Disk:
                 raise OSError(self.number, os.strerror(self.number), os.fspath(path))
 
     def _failing(self, function: Callable[..., Any]) -> Callable[..., Any]:
-        def called(path: Any, *rest: Any, **more: Any) -> Any:
+        def wrapper(path: Any, *rest: Any, **more: Any) -> Any:
             self.step(path)
             return function(path, *rest, **more)
 
-        return called
+        return wrapper
 
     def _opening(self, function: Callable[..., Any]) -> Callable[..., Any]:
-        def opened(path: Any, mode: str = "r", *rest: Any, **more: Any) -> Any:
+        def wrapper(path: Any, mode: str = "r", *rest: Any, **more: Any) -> Any:
             if set(mode) & set("wxa+"):
                 self.step(path)
             stream = function(path, mode, *rest, **more)
@@ -52,23 +52,23 @@ class Disk:
                 self._failing_writes(stream, path)
             return stream
 
-        return opened
+        return wrapper
 
     def _failing_writes(self, stream: Any, path: Any) -> None:
         write = stream.write
 
-        def half(content: Any) -> Any:
+        def failing_write(content: Any) -> Any:
             try:
                 self.step(path)
             except OSError:
-                write(content[: len(content) // 2])  # what still fitted
+                write(content[: len(content) // 2])  # the part that still fits
                 raise
             return write(content)
 
-        stream.write = half
+        stream.write = failing_write
 
-    def again(self, fail_at: int, number: int) -> None:
-        """From now on, fail at that step with that number of the system's."""
+    def reset(self, fail_at: int, number: int) -> None:
+        """Restart the count; fail from step `fail_at` on with the error `number`, or never if `fail_at` is 0."""
         self.count, self.fail_at, self.number = 0, fail_at, number
 
 

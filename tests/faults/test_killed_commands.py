@@ -1,4 +1,4 @@
-"""Every command that writes, killed while it writes: what has a name is whole, and the same command goes on."""
+"""Every command that writes, killed while it writes: named files are complete, and the same command resumes."""
 
 import json
 import os
@@ -49,7 +49,7 @@ main()
 
 @pytest.fixture(scope="module")
 def environment(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """Programs that one process has compiled are there for the next."""
+    """Environment in which the processes share compiled programs."""
     cache = {
         "JAX_COMPILATION_CACHE_DIR": str(tmp_path_factory.mktemp("cache")),
         "JAX_PERSISTENT_COMPILATION_CACHE_MIN_COMPILE_TIME_SECS": "0",
@@ -59,7 +59,7 @@ def environment(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
 
 
 def kill(place: str, command: tuple[object, ...], environment: dict[str, str]) -> None:
-    """Run a command and kill it before or after a file or folder is put in its place in --out."""
+    """Run a command and kill it before or after it renames a file or directory to its place in --out."""
     arguments = [sys.executable, "-c", KILLED, place, *map(str, command)]
     done = subprocess.run(arguments, capture_output=True, text=True, timeout=200, env=environment)
     assert done.returncode == -signal.SIGKILL, done.stderr[-3000:]
@@ -67,7 +67,7 @@ def kill(place: str, command: tuple[object, ...], environment: dict[str, str]) -
 
 @pytest.fixture
 def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Any:
-    """Run a command undisturbed: exit status, and what it says on standard error."""
+    """Run a command without a kill; return its exit status and standard error."""
 
     def run(*command: object) -> tuple[int, str]:
         monkeypatch.setattr(sys, "argv", ["thor2", *map(str, command)])
@@ -78,21 +78,21 @@ def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) ->
     return run
 
 
-def check_refused(found: tuple[int, str], said: str) -> None:
-    status, err = found
+def check_refused(result: tuple[int, str], message: str) -> None:
+    status, err = result
     lines = [line for line in err.splitlines() if line.startswith("error: ")]
-    assert status == 2 and len(lines) == 1 and said in lines[0], err
+    assert status == 2 and len(lines) == 1 and message in lines[0], err
 
 
 def files(folder: Path) -> dict[str, bytes]:
-    """Contents of the files that have their name; temporary ones begin with a point."""
+    """Return the contents of all files but temporary ones, whose names begin with a dot."""
     paths = (path.relative_to(folder) for path in folder.rglob("*") if path.is_file())
     return {str(path): (folder / path).read_bytes() for path in paths if not any(p[0] == "." for p in path.parts)}
 
 
 @pytest.fixture(scope="module")
 def meshes(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two boxes with colours at their vertices."""
+    """Directory of two boxes with vertex colors."""
     import trimesh
 
     folder = tmp_path_factory.mktemp("meshes")
@@ -105,7 +105,7 @@ def meshes(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def frames(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two frames of a plane that falls off to the right, with two patches of it labelled."""
+    """Directory of two frames of a slanted plane with two labelled patches."""
     folder = tmp_path_factory.mktemp("frames")
     rng = np.random.default_rng(0)
     labels = np.zeros((240, 320), np.uint8)
@@ -123,7 +123,7 @@ def frames(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run with weights of chance."""
+    """Run directory with random weights."""
     config = thor2.DescriptorConfig(homology="closed_form", n_slices=3, n_strips=8, image_size=8)
     network, out = colornet.load_default(), tmp_path_factory.mktemp("model") / "run"
     models = {name: MLP(input_size(name, config, 22), 2, rngs=nnx.Rngs(0)) for name in ("tops", "tops2")}
@@ -135,7 +135,7 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_colornet(environment: Any, call: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A folder that was begun is refused, by name."""
+    """The command does not resume: a partial output is refused."""
     monkeypatch.setattr(colornet, "build", colornet.load_default)
     command, whole = ("colornet", "--out"), tmp_path / "whole"
     assert call(*command, whole)[0] == 0
@@ -169,8 +169,8 @@ def test_render(meshes: Path, environment: Any, call: Any, tmp_path: Path) -> No
     assert files(out) == expected and files(out).keys() | {".lock"} == {path.name for path in out.iterdir()}
 
 
-def same_models(one: TrainedRun, other: TrainedRun) -> bool:
-    """The weights' files are named at random, so the folders' bytes differ."""
+def equal_models(one: TrainedRun, other: TrainedRun) -> bool:
+    """Return whether two runs are equal; their files differ, because orbax names files at random."""
     first, second = ([nnx.to_flat_state(nnx.state(m)) for m in run.classifiers.values()] for run in (one, other))
     same = all(
         path == other_path and np.array_equal(a[...], b[...])
@@ -191,13 +191,13 @@ def test_train(meshes: Path, frames: Path, environment: Any, call: Any, tmp_path
         assert all(found[name] == expected[name] for name in {"curves.png", "network.npz"} & found.keys())
         assert [row["epoch"] for row in read_metrics(out / "metrics.jsonl")] in ([], [1], [1, 2])
         if "run.json" in found:
-            assert same_models(load_run(out), run)
+            assert equal_models(load_run(out), run)
         else:
             check_refused(call("evaluate", "frames", frames, "--model", out), f"{out} is no run directory")
         if "checkpoints/begun.json" in found:
             check_refused(call(*command, out, "--epochs", 3), f"{out} was written with epochs 2, not 3")
     assert call(*command, out)[0] == 0
-    assert same_models(load_run(out), run)
+    assert equal_models(load_run(out), run)
     found = files(out)
     assert {name for name in found if "weights" not in name} == {name for name in expected if "weights" not in name}
     assert found["curves.png"] == expected["curves.png"] and found["network.npz"] == expected["network.npz"]
@@ -209,7 +209,7 @@ def test_train(meshes: Path, frames: Path, environment: Any, call: Any, tmp_path
 
 
 def without_times(found: dict[str, bytes]) -> dict[str, Any]:
-    """A report's files, but for the seconds in them and in the page."""
+    """Return the contents of a report without its timings and its HTML page."""
     kept: dict[str, Any] = {name: content for name, content in found.items() if name.endswith((".jpg", ".png"))}
     if "report.json" in found:
         kept["report.json"] = {k: v for k, v in json.loads(found["report.json"]).items() if k != "speed"}
@@ -229,7 +229,7 @@ def test_evaluate(frames: Path, model: Path, environment: Any, call: Any, tmp_pa
     expected = without_times(files(whole))
     kill("before frames/1.jpg", (*command, out), environment)
     found = without_times(files(out))
-    kept = {"frames/0.jpg", "answers.jsonl one"}  # besides confusions, of which a later frame may have a better one
+    kept = {"frames/0.jpg", "answers.jsonl one"}  # confusions may change with later frames
     assert {name for name in found if "confusions" not in name} == kept
     assert all(found[name] == expected[name] for name in kept)
     check_refused(call("evaluate", "frames", frames / "one", *command[3:], out), f"out: {out / 'answers.jsonl'} holds")

@@ -1,4 +1,4 @@
-"""Two trainings of one run at a time."""
+"""Two trainings that write to the same run directory."""
 
 from pathlib import Path
 from typing import Any
@@ -37,9 +37,9 @@ def contents(folder: Path) -> dict[Path, bytes]:
     return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def test_two_trainings_of_one_run(tmp_path: Path) -> None:
-    """The second is refused at once, at whatever stage the first is, and changes nothing."""
-    out, refused = tmp_path / "run", []
+def test_a_second_training_is_refused(tmp_path: Path) -> None:
+    """At every stage of the first training, the second one is refused at once and changes nothing."""
+    out, refusals = tmp_path / "run", []
 
     def meanwhile(stage: str, done: int, total: int, note: str) -> None:
         if stage == "describe" or done not in (1, total):
@@ -47,16 +47,16 @@ def test_two_trainings_of_one_run(tmp_path: Path) -> None:
         before = contents(out)
         with pytest.raises(thor2.InputError, match=f"another process is writing to {out}") as caught:
             train(out)
-        refused.append(str(caught.value))
+        refusals.append(str(caught.value))
         assert contents(out) == before
 
     train(out, progress=meanwhile)
-    assert refused and load_run(out).classes == ("brick", "stick")
+    assert refusals and load_run(out).classes == ("brick", "stick")
     assert not list(out.rglob(".lock"))
 
 
-def test_a_training_that_began_while_another_described_its_views(tmp_path: Path) -> None:
-    """Neither had begun the folder when it looked: the slower one is refused, or goes on with what the other left."""
+def test_a_training_that_another_one_overtakes(tmp_path: Path) -> None:
+    """Both start with a new directory: the slower one is refused, or resumes what the other one left."""
     out, done = tmp_path / "run", []
 
     def quicker(stage: str, count: int, total: int, note: str) -> None:
@@ -82,4 +82,4 @@ def test_a_training_that_began_while_another_described_its_views(tmp_path: Path)
             with pytest.raises(Stopped):
                 train(other, progress=stopped)
 
-    assert train(other, progress=dies).record == done[0].record  # goes on with what the other began
+    assert train(other, progress=dies).record == done[0].record  # resumes the other training

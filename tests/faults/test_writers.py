@@ -1,4 +1,4 @@
-"""Every writer, with a disk that is full or read-only at every step of it: nothing half-written, nothing lost."""
+"""Every writer on a disk that becomes full or read-only at each of its steps: no partial files, no lost ones."""
 
 import dataclasses
 import errno
@@ -45,11 +45,11 @@ WRITERS: dict[str, Callable[[Path], Any]] = {
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS], ids=["full", "read-only"])
 @pytest.mark.parametrize("name", WRITERS)
-def test_files_appear_whole_or_not_at_all(name: str, number: int, tmp_path: Path, disk: Any) -> None:
+def test_files_are_written_atomically(name: str, number: int, tmp_path: Path, disk: Any) -> None:
     path = tmp_path / name
     path.write_bytes(b"old")
     for step in range(1, 100) if number == errno.ENOSPC else (1, 2, 99):
-        disk.again(step, number)
+        disk.reset(step, number)
         try:
             WRITERS[name](path)
         except OSError as error:
@@ -61,17 +61,17 @@ def test_files_appear_whole_or_not_at_all(name: str, number: int, tmp_path: Path
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS], ids=["full", "read-only"])
-def test_a_run_folder_appears_whole_or_not_at_all(number: int, tmp_path: Path, disk: Any) -> None:
+def test_a_run_directory_is_written_atomically(number: int, tmp_path: Path, disk: Any) -> None:
     run = make_run()
-    disk.again(0, 0)
+    disk.reset(0, 0)
     save_run(run, tmp_path / "whole")
     steps = disk.count
     for step in sorted({1, 2, 3, 5, 8, 13, steps // 2, steps - 2, steps - 1, steps} - {0}):
-        disk.again(step, number)
-        with pytest.raises(OSError):
+        disk.reset(step, number)
+        with pytest.raises((OSError, thor2.InputError)):
             save_run(run, tmp_path / "run")
         assert [path.name for path in tmp_path.iterdir()] == ["whole"]
-    disk.again(0, 0)
+    disk.reset(0, 0)
     save_run(run, tmp_path / "run")
     assert load_run(tmp_path / "run").classes == ("a", "b")
 
@@ -80,40 +80,40 @@ def answers(k: int) -> FrameAnswers:
     return FrameAnswers(f"frame{k}", {"light": "1"}, 0.5, [])
 
 
-def test_answers_go_on_after_a_full_disk(tmp_path: Path, disk: Any) -> None:
-    path, asked = tmp_path / "report" / "answers.jsonl", {"runs": ["digest"]}
-    AnswerFile(path, asked).append(answers(0))
+def test_answers_resume_after_a_full_disk(tmp_path: Path, disk: Any) -> None:
+    path, job = tmp_path / "report" / "answers.jsonl", {"runs": ["digest"]}
+    AnswerFile(path, job).append(answers(0))
     kept = 1
     for step in range(1, 4):
-        file = AnswerFile(path, asked)
-        assert [found.frame for found in file.frames] == [f"frame{k}" for k in range(kept)]
-        disk.again(step, errno.ENOSPC)
+        file = AnswerFile(path, job)
+        assert [answer.frame for answer in file.frames] == [f"frame{k}" for k in range(kept)]
+        disk.reset(step, errno.ENOSPC)
         try:
             file.append(answers(kept))
         except OSError:
             pass
         else:
             kept += 1
-        disk.again(0, 0)
+        disk.reset(0, 0)
     assert kept == 2
-    AnswerFile(path, asked).append(answers(kept))
-    assert len(AnswerFile(path, asked).frames) == 3
+    AnswerFile(path, job).append(answers(kept))
+    assert len(AnswerFile(path, job).frames) == 3
 
 
-def test_figures_go_on_after_a_full_disk(tmp_path: Path, disk: Any) -> None:
+def test_metrics_resume_after_a_full_disk(tmp_path: Path, disk: Any) -> None:
     path = tmp_path / "metrics.jsonl"
-    append_metrics(path, 0, "ce", _figures(1))
+    append_metrics(path, 0, "ce", _metrics(1))
     for step in (1, 2):
-        disk.again(step, errno.ENOSPC)
+        disk.reset(step, errno.ENOSPC)
         with pytest.raises(OSError):
-            append_metrics(path, 0, "ce", _figures(2))
-        disk.again(0, 0)
+            append_metrics(path, 0, "ce", _metrics(2))
+        disk.reset(0, 0)
         assert [row["epoch"] for row in read_metrics(path)] == [1]
-        discard_later_epochs(path, 0, "ce", 1)  # as a training that goes on does
-    append_metrics(path, 0, "ce", _figures(2))
+        discard_later_epochs(path, 0, "ce", 1)  # as a resumed training does
+    append_metrics(path, 0, "ce", _metrics(2))
     assert [row["epoch"] for row in read_metrics(path)] == [1, 2]
 
 
-def _figures(epoch: int) -> EpochMetrics:
+def _metrics(epoch: int) -> EpochMetrics:
     values: dict[str, Any] = {field.name: 0.5 for field in dataclasses.fields(EpochMetrics)}
     return EpochMetrics(**(values | {"epoch": epoch}))

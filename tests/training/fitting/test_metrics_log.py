@@ -1,4 +1,4 @@
-"""The file of figures."""
+"""The metrics log: one JSON line for each epoch, classifier and fold."""
 
 import json
 from pathlib import Path
@@ -10,17 +10,17 @@ from training.fitting.metrics_log import append_metrics, discard_later_epochs, r
 from training.fitting.options import EpochMetrics
 
 
-def figures(epoch: int) -> EpochMetrics:
+def metrics(epoch: int) -> EpochMetrics:
     return EpochMetrics(epoch, 1 / epoch, 0.5, 1000.0)
 
 
-def test_lines_are_added_and_forgotten(tmp_path: Path) -> None:
+def test_metrics_are_appended_and_discarded(tmp_path: Path) -> None:
     path = tmp_path / "metrics.jsonl"
     assert read_metrics(path) == []
     for fold in (0, 1):
         for name in ("ce", "tops"):
             for epoch in (1, 2, 3):
-                append_metrics(path, fold, name, figures(epoch))
+                append_metrics(path, fold, name, metrics(epoch))
     rows = [json.loads(line) for line in path.read_text().splitlines()]
     assert rows == read_metrics(path) and len(rows) == 12
     assert rows[4] == {
@@ -39,20 +39,20 @@ def test_lines_are_added_and_forgotten(tmp_path: Path) -> None:
     ]
 
 
-def test_a_line_that_was_cut_off_is_left_out_and_the_next_is_whole(tmp_path: Path) -> None:
+def test_an_incomplete_last_line_is_ignored(tmp_path: Path) -> None:
     path = tmp_path / "metrics.jsonl"
-    append_metrics(path, 0, "ce", figures(1))
+    append_metrics(path, 0, "ce", metrics(1))
     with path.open("a") as file:
         file.write('{"fold": 0, "cl')
     assert [row["epoch"] for row in read_metrics(path)] == [1]
     discard_later_epochs(path, 0, "ce", 1)
-    append_metrics(path, 0, "ce", figures(2))
+    append_metrics(path, 0, "ce", metrics(2))
     assert [row["epoch"] for row in read_metrics(path)] == [1, 2]
 
 
-def test_damage_and_no_folder(tmp_path: Path) -> None:
+def test_damage_and_a_missing_directory_are_errors(tmp_path: Path) -> None:
     (tmp_path / "metrics.jsonl").write_text("no json\n{}\n")
-    with pytest.raises(thor2.InputError, match="metrics.jsonl is damaged"):
+    with pytest.raises(thor2.InputError, match=r"out: .*metrics\.jsonl"):
         read_metrics(tmp_path / "metrics.jsonl")
     with pytest.raises(OSError):
-        append_metrics(tmp_path / "absent" / "metrics.jsonl", 0, "ce", figures(1))
+        append_metrics(tmp_path / "absent" / "metrics.jsonl", 0, "ce", metrics(1))
