@@ -77,9 +77,7 @@ def full_file_system(*_: Any, **__: Any) -> None:
 
 
 @pytest.mark.parametrize("fail", [full_disk, full_file_system])
-def test_the_last_checkpoint_survives_a_full_disk(
-    fail: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_last_checkpoint_survives_a_full_disk(fail: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with Checkpoints(tmp_path) as checkpoints:
         checkpoints.save(1, state(1), 0.0)
         with monkeypatch.context() as patch:
@@ -98,9 +96,7 @@ def test_a_directory_that_cannot_be_created_is_an_error(tmp_path: Path) -> None:
         Checkpoints(tmp_path / "file" / "c")
 
 
-def test_a_damaged_checkpoint_is_refused(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_damaged_checkpoint_is_refused(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     with Checkpoints(tmp_path) as checkpoints:
         checkpoints.save(1, state(1), 0.0)
     for file in sorted(path for path in (tmp_path / "1" / "default").rglob("*") if path.is_file()):
