@@ -1,4 +1,4 @@
-"""The colour network of THOR2: 22 regions of similar colours and how alike they are.
+"""The colour network of THOR2: 22 regions of similar colours and the similarity of every two regions.
 
 >>> import colornet
 >>> network = colornet.load_default()
@@ -20,8 +20,8 @@ __all__ = ["ColorNetwork", "build", "grid_index", "load", "load_default", "save"
 
 
 def build() -> ColorNetwork:
-    """Build the colour network from scratch, with kmapper; the packaged one is the result of this function."""
-    # kmapper, scikit-learn and colour-science take seconds to import; whoever only loads a network does not need them.
+    """Build the colour network from scratch, with kmapper; the packaged network is the result of this function."""
+    # kmapper, scikit-learn and colour-science take seconds to import and are not needed to load a network.
     from colornet.builder import build_network
 
     return build_network()
@@ -29,22 +29,22 @@ def build() -> ColorNetwork:
 
 @functools.cache
 def load_default() -> ColorNetwork:
-    """The packaged colour network."""
+    """Return the packaged colour network."""
     return load(Path(__file__).with_name("data") / "network.npz")
 
 
 def load(path: str | Path) -> ColorNetwork:
-    """Read a colour network that `save` wrote.
+    """Load a colour network that was written by `save`.
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: the file is damaged or holds something else; one line that names the file.
+        ValueError: the file is damaged or is not a colour network; the message names the file.
     """
     return ColorNetwork.load(path)
 
 
 def save(network: ColorNetwork, path: str | Path) -> None:
-    """Write a colour network to a file (npz); the file appears whole or not at all.
+    """Write a colour network to a file (npz), atomically.
 
     Raises:
         OSError: the file cannot be written.

@@ -1,4 +1,4 @@
-"""The way from the colour grid to the colour network (paper, section "Color network")."""
+"""Construction of the colour network from the colour grid (paper, section "Color network")."""
 
 import numpy as np
 
@@ -6,21 +6,21 @@ from colornet.grid import grid_colors
 from colornet.lab import GRID_WHITE, MEAN_WHITE, hyab, to_lab
 from colornet.mapper import EPS, map_colors
 from colornet.network import ColorNetwork
-from colornet.regions import join_redundant, mean_color, relabel, similarity
+from colornet.regions import mean_color, merge_redundant, relabel, similarity
 
 __all__ = ["build_network"]
 
 
 def build_network() -> ColorNetwork:
-    """Build the colour network from nothing but the colour grid; the same on every call."""
+    """Build the colour network from the colour grid; the result is the same on every call."""
     colors = grid_colors()
     graph = map_colors(to_lab(colors, GRID_WHITE))
-    members, region = join_redundant(colors, graph.members, EPS)
+    members, region = merge_redundant(colors, graph.members, EPS)
 
     nerve = relabel(graph.nerve, region)
     cyclic = relabel(graph.cyclic, region)
     edges = np.unique(np.concatenate([nerve, cyclic]), axis=0)
-    touching = (edges[:, None] == nerve).all(axis=-1).any(axis=1)
+    in_nerve = (edges[:, None] == nerve).all(axis=-1).any(axis=1)
 
     means = np.array([mean_color(colors, m) for m in members])
     lab = to_lab(means, MEAN_WHITE)
@@ -34,7 +34,7 @@ def build_network() -> ColorNetwork:
         member_counts=np.array([len(m) for m in members], np.int64),
         edges=edges,
         edge_weights=weights,
-        cyclic=~touching,
+        cyclic=~in_nerve,
         similarity=similarity(len(members), edges, weights),
         region_bits=bits,
         n_raw_nodes=len(graph.members),

@@ -1,4 +1,4 @@
-"""Pictures of the colour network: the regions on the a*-b* plane, and the similarity matrix."""
+"""Figures of the colour network: the regions on the a*-b* plane, and the similarity matrix."""
 
 from pathlib import Path
 from typing import Any
@@ -19,16 +19,16 @@ from colornet.network import ColorNetwork
 __all__ = ["draw_network", "draw_similarity"]
 
 _DPI = 150
-_INK = "#222222"
-_EDGE = "#8a8a8a"
-_BESIDE: dict[str, Any] = {"loc": "upper left", "frameon": False, "alignment": "left", "title_fontsize": 11}
+_TEXT_COLOR = "#222222"
+_EDGE_COLOR = "#8a8a8a"
+_LEGEND_STYLE: dict[str, Any] = {"loc": "upper left", "frameon": False, "alignment": "left", "title_fontsize": 11}
 
 
 def draw_network(network: ColorNetwork, path: str | Path) -> None:
     """Draw the network on the a*-b* plane of CIELAB (PNG).
 
-    A region stands at its mean colour and is filled with it; its area grows with its number of colours. An edge is the
-    thicker the closer its two mean colours are (HyAB); edges that close the hue circle are dashed.
+    Each region is a disc at its mean colour and in that colour; its area grows with the number of its colours. Edges
+    are thicker if the two mean colours are closer (HyAB); edges that close the hue circle are dashed.
 
     Raises:
         OSError: the file cannot be written.
@@ -38,13 +38,14 @@ def draw_network(network: ColorNetwork, path: str | Path) -> None:
     a, b = to_lab(network.mean_rgb, MEAN_WHITE)[:, 1:].T
     for (i, j), weight, cyclic in zip(network.edges, network.edge_weights, network.cyclic, strict=True):
         style = "--" if cyclic else "-"
-        axes.plot(a[[i, j]], b[[i, j]], style, color=_EDGE, linewidth=_width(weight), zorder=1, solid_capstyle="butt")
+        line: dict[str, Any] = {"linestyle": style, "linewidth": _width(weight), "solid_capstyle": "butt"}
+        axes.plot(a[[i, j]], b[[i, j]], color=_EDGE_COLOR, zorder=1, **line)
     axes.scatter(
-        a, b, s=_area(network.member_counts), c=network.mean_rgb / 255, edgecolors=_INK, linewidths=0.8, zorder=2
+        a, b, s=_area(network.member_counts), c=network.mean_rgb / 255, edgecolors=_TEXT_COLOR, linewidths=0.8, zorder=2
     )
     for r, (x, y) in enumerate(zip(a, b, strict=True)):
-        ink = _readable(network.mean_rgb[r])
-        axes.text(x, y, str(r), color=ink, ha="center", va="center", fontsize=9, fontweight="bold", zorder=3)
+        text_color = _contrasting(network.mean_rgb[r])
+        axes.text(x, y, str(r), color=text_color, ha="center", va="center", fontsize=9, fontweight="bold", zorder=3)
 
     axes.set_aspect("equal")
     axes.margins(0.08)
@@ -53,23 +54,23 @@ def draw_network(network: ColorNetwork, path: str | Path) -> None:
     axes.set_xlabel("a*  (green to red)")
     axes.set_ylabel("b*  (blue to yellow)")
     axes.set_title(f"Colour network: {network.n_regions} regions, {len(network.edges)} edges")
-    sizes = [_round_key(count) for count in (100, 5_000, 20_000)]
+    sizes = [_legend_disc(count) for count in (100, 5_000, 20_000)]
     figure.legend(
         handles=sizes,
         title="grid colours",
         labelspacing=1.6,
         handletextpad=1.2,
-        **_BESIDE,
+        **_LEGEND_STYLE,
         bbox_to_anchor=(0.815, 0.93),
     )
-    lines = [Line2D([], [], color=_EDGE, linewidth=_width(w), label=str(w)) for w in (25, 50, 100)]
-    lines.append(Line2D([], [], color=_EDGE, linewidth=_width(50), linestyle="--", label="across the\nhue seam"))
-    figure.legend(handles=lines, title="edge: HyAB", labelspacing=1.0, **_BESIDE, bbox_to_anchor=(0.815, 0.66))
+    lines = [Line2D([], [], color=_EDGE_COLOR, linewidth=_width(w), label=str(w)) for w in (25, 50, 100)]
+    lines.append(Line2D([], [], color=_EDGE_COLOR, linewidth=_width(50), linestyle="--", label="across the\nhue seam"))
+    figure.legend(handles=lines, title="edge: HyAB", labelspacing=1.0, **_LEGEND_STYLE, bbox_to_anchor=(0.815, 0.66))
     _save(figure, path)
 
 
 def draw_similarity(network: ColorNetwork, path: str | Path) -> None:
-    """Draw the similarity matrix Delta as a heat map, with the regions' mean colours along its axes (PNG).
+    """Draw the similarity matrix Delta as a heat map, with the mean colours of the regions along the axes (PNG).
 
     Raises:
         OSError: the file cannot be written.
@@ -77,17 +78,17 @@ def draw_similarity(network: ColorNetwork, path: str | Path) -> None:
     n = network.n_regions
     figure = Figure(figsize=(9.6, 8.8))
     axes = figure.add_axes((0.09, 0.09, 0.77, 0.84))
-    # The diagonal is 1, ten times the next: left out, so that the colours are spent on what differs.
-    others = np.ma.masked_array(network.similarity, np.eye(n, dtype=bool) | (network.similarity == 0))
+    # The diagonal is ten times as large as all other entries: masked, so that the colour scale covers the others.
+    off_diagonal = np.ma.masked_array(network.similarity, np.eye(n, dtype=bool) | (network.similarity == 0))
     axes.set_facecolor("#e4e4e4")
-    image = axes.imshow(others, cmap="viridis", norm=LogNorm())
+    image = axes.imshow(off_diagonal, cmap="viridis", norm=LogNorm())
     axes.set_title(f"Similarity of the {n} colour regions (diagonal, grey: 1)")
     axes.set_xticks([])
     axes.set_yticks([])
     along, down = axes.get_xaxis_transform(), axes.get_yaxis_transform()
     for r, rgb in enumerate(network.mean_rgb):
         label: dict[str, Any] = {
-            "color": _readable(rgb),
+            "color": _contrasting(rgb),
             "ha": "center",
             "va": "center",
             "fontsize": 9,
@@ -109,22 +110,22 @@ def draw_similarity(network: ColorNetwork, path: str | Path) -> None:
 
 
 def _area(counts: NDArray[np.int64] | int) -> NDArray[np.float64]:
-    """Marker area in points squared; it starts where a two-digit number still fits."""
+    """Return the marker area in points squared; the smallest marker still holds a two-digit number."""
     return np.asarray(190 + 0.03 * np.asarray(counts, np.float64))
 
 
-def _round_key(count: int) -> Line2D:
-    style: dict[str, Any] = {"marker": "o", "markerfacecolor": "white", "markeredgecolor": _INK}
+def _legend_disc(count: int) -> Line2D:
+    style: dict[str, Any] = {"marker": "o", "markerfacecolor": "white", "markeredgecolor": _TEXT_COLOR}
     return Line2D([], [], linestyle="", markersize=float(np.sqrt(_area(count))), label=f"{count:,}", **style)
 
 
 def _width(weight: float) -> float:
-    """Line width in points: the inverse of the distance, as the similarity of two neighbours is."""
+    """Return the line width in points, inversely proportional to the distance."""
     return 90 / float(weight)
 
 
-def _readable(rgb: NDArray[np.float64]) -> str:
-    """Black or white, whichever stands out from a colour."""
+def _contrasting(rgb: NDArray[np.float64]) -> str:
+    """Return black or white, whichever has more contrast to a colour."""
     return "black" if rgb @ [0.299, 0.587, 0.114] > 128 else "white"
 
 

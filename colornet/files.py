@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 __all__ = ["atomic_write", "read_arrays", "write_arrays"]
 
-MOST_BYTES = 2**26
-"""Of arrays that are read: zeros take up a thousandth in the file."""
+MAX_ARRAY_BYTES = 2**26
+"""Largest total size of the arrays in a file; compressed zeros need only a thousandth of it on disk."""
 
 
 @contextlib.contextmanager
@@ -39,7 +39,7 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
 
 
 def write_arrays(path: str | Path, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write named arrays to `path` (npz), compressed; equal arrays give equal bytes.
+    """Write named arrays to `path` (npz), compressed and atomically; equal arrays give equal bytes.
 
     Raises:
         OSError: the file cannot be written.
@@ -49,21 +49,21 @@ def write_arrays(path: str | Path, arrays: Mapping[str, NDArray[Any]]) -> None:
 
 
 def read_arrays(path: str | Path) -> dict[str, NDArray[Any]]:
-    """Read what `write_arrays` wrote.
+    """Read the arrays that `write_arrays` wrote.
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: the file is no such file, or is damaged.
+        ValueError: the file is damaged or is not a file of arrays.
     """
     data = Path(path).read_bytes()
     try:
         with np.load(io.BytesIO(data), allow_pickle=False) as archive:
-            if sum(member.file_size for member in archive.zip.infolist()) > MOST_BYTES:
-                raise ValueError("its arrays would fill memory")
+            if sum(member.file_size for member in archive.zip.infolist()) > MAX_ARRAY_BYTES:
+                raise ValueError("its arrays are too large")
             arrays = {name: archive[name] for name in archive.files}
         if not all(isinstance(array, np.ndarray) for array in arrays.values()):
-            raise ValueError("a member is no array")
+            raise ValueError("a member is not an array")
         return arrays
-    # Damaged bytes make zipfile, zlib and NumPy raise a dozen kinds of exception; nothing but bytes is at work here.
+    # For damaged bytes zipfile, zlib and NumPy raise a dozen kinds of exceptions; nothing else can fail here.
     except Exception as error:
         raise ValueError(f"{path} is damaged or not a file of arrays (npz)") from error

@@ -1,4 +1,4 @@
-"""The grid of sRGB colours that the network is built on (paper, section "Color network").
+"""The grid of sRGB colours from which the colour network is built (paper, section "Color network").
 
 >>> import numpy as np
 >>> grid_colors().shape
@@ -13,27 +13,27 @@ from numpy.typing import ArrayLike, NDArray
 __all__ = ["GRID_LEVELS", "GRID_SIZE", "GRID_STEP", "grid_colors", "grid_index"]
 
 GRID_STEP = 5
-"""Distance of neighbouring levels of a channel."""
+"""Difference of neighbouring levels of a channel."""
 
 GRID_LEVELS = 52
-"""Levels of a channel: 0, 5, ..., 255."""
+"""Number of levels of a channel: 0, 5, ..., 255."""
 
 GRID_SIZE = GRID_LEVELS**3
-"""Colours in the grid (140,608)."""
+"""Number of colours in the grid (140,608)."""
 
 
 def grid_colors() -> NDArray[np.uint8]:
-    """All sRGB colours whose channels are multiples of 5, the set X_rgb of the paper.
+    """Return all sRGB colours whose channels are multiples of 5, the set X_rgb of the paper.
 
     Returns:
-        [140608, 3] uint8, blue running fastest: row k is the colour whose `grid_index` is k.
+        [140608, 3] uint8; row k is the colour whose `grid_index` is k, so that blue varies fastest.
     """
     level = np.arange(GRID_LEVELS, dtype=np.uint8) * np.uint8(GRID_STEP)
     return np.stack(np.meshgrid(level, level, level, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 def grid_index(rgb: ArrayLike) -> NDArray[np.int32]:
-    """Row of the nearest grid colour: (ri * 52 + gi) * 52 + bi with ri = round(R / 5), never a tie.
+    """Return the row of the nearest grid colour, (ri * 52 + gi) * 52 + bi with ri = round(R / 5); ties cannot occur.
 
     Args:
         rgb: [..., 3] uint8, sRGB.
@@ -42,7 +42,7 @@ def grid_index(rgb: ArrayLike) -> NDArray[np.int32]:
         [...] int32 in 0..140607.
 
     Raises:
-        ValueError: another type, or a last axis that is not 3.
+        ValueError: `rgb` has another type, or its last axis is not 3.
     """
     rgb = np.asarray(rgb)
     if rgb.dtype != np.uint8 or rgb.ndim == 0 or rgb.shape[-1] != 3:

@@ -1,9 +1,9 @@
-"""CIELAB, through colour-science, and the HyAB colour difference.
+"""Conversion to CIELAB, by colour-science, and the HyAB colour difference.
 
-There are two D65 white points, and the reference values (golden files) come out exactly with both only: that of
-colour-science for the colours of the grid, and one with a fifth digit for the mean colours of regions. It matters for
-greys: sRGB's matrix is rounded, so greys have a chroma of up to 0.01 and with it one hue, and the fifth digit turns
-that hue from one interval of the cover into the next.
+Reproducing the reference values (golden files) exactly requires two D65 white points: that of colour-science for the
+colours of the grid, and one with a fifth digit for the mean colours of regions. The difference matters for greys: the
+matrix of sRGB is rounded, so that greys have a chroma of up to 0.01 and all the same hue, and the fifth digit moves
+that hue from one interval of the cover to the next.
 """
 
 import colour
@@ -20,10 +20,10 @@ MEAN_WHITE = (0.31271, 0.32902)
 
 
 def to_lab(rgb: NDArray[np.generic], white: tuple[float, float]) -> NDArray[np.float64]:
-    """CIELAB coordinates of sRGB colours.
+    """Convert sRGB colours to CIELAB.
 
     Args:
-        rgb: [..., 3] sRGB in 0..255, of any real type (mean colours are not whole numbers).
+        rgb: [..., 3] sRGB in 0..255, of any real type (mean colours are not integers).
         white: chromaticity (x, y) of the reference white.
 
     Returns:
@@ -34,6 +34,6 @@ def to_lab(rgb: NDArray[np.generic], white: tuple[float, float]) -> NDArray[np.f
 
 
 def hyab(lab_1: NDArray[np.float64], lab_2: NDArray[np.float64]) -> NDArray[np.float64]:
-    """HyAB colour difference |dL*| + sqrt(da*^2 + db*^2): [..., 3] and [..., 3] (broadcast) to [...] float64."""
+    """Return the HyAB difference |dL*| + sqrt(da*^2 + db*^2) of [..., 3] and [..., 3], broadcast: [...] float64."""
     difference = lab_1 - lab_2
     return np.asarray(np.abs(difference[..., 0]) + np.hypot(difference[..., 1], difference[..., 2]))

@@ -1,4 +1,4 @@
-"""The colour network as a record: regions of similar colours, how they touch, and which regions a colour belongs to.
+"""The record of the colour network: regions of similar colours, their neighbours, and the regions of each colour.
 
 >>> import colornet, numpy as np
 >>> network = colornet.load_default()
@@ -25,25 +25,23 @@ __all__ = ["ColorNetwork"]
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ColorNetwork:
-    """The colour network. Its arrays are read-only copies. R is the number of regions, E of edges.
+    """The colour network, with R regions and E edges. Its arrays are read-only copies.
 
-    Networks of the same contents are equal: what is compiled for one serves another that was read from the same file.
-
-    Regions are numbered in the order of kmapper's nodes, a joined node taking the place of its first.
+    Networks with the same contents are equal, so that compiled functions are shared between them. Regions are numbered
+    in the order of kmapper's nodes; a merged node has the place of its first one.
 
     Attributes:
-        mean_rgb: [R, 3] float64, arithmetic mean of the sRGB values of each region's colours, 0..255.
-        member_counts: [R] int64, colours of the grid in each region.
+        mean_rgb: [R, 3] float64, arithmetic mean of the sRGB colours of each region, 0..255.
+        member_counts: [R] int64, number of grid colours in each region.
         edges: [E, 2] int64, pairs of regions i < j, sorted.
-        edge_weights: [E] float64, HyAB distance of the two mean colours.
-        cyclic: [E] bool, edges that close the hue circle where the lens cuts it; the others join regions that share a
-            colour.
-        similarity: [R, R] float64, Delta: 1 / (1 + length of the cheapest path), diagonal 1.
+        edge_weights: [E] float64, HyAB distance between the two mean colours.
+        cyclic: [E] bool, edges across the cut of the hue circle; the other edges connect regions that share a colour.
+        similarity: [R, R] float64, Delta = 1 / (1 + length of the shortest path), diagonal 1.
         region_bits: [140608] uint32, regions of each grid colour (`colornet.grid_index`): bit r is set for region r.
-        n_raw_nodes: Mapper's nodes before redundant ones were joined.
+        n_raw_nodes: number of Mapper's nodes before redundant ones were merged.
 
     Raises:
-        ValueError: on construction, an array of another type or shape, or contents that contradict one another.
+        ValueError: an array has another type or shape, or the contents are inconsistent.
     """
 
     mean_rgb: NDArray[np.float64]
@@ -78,22 +76,22 @@ class ColorNetwork:
 
     def _check_contents(self) -> None:
         if not 1 <= self.n_regions <= 32:
-            raise ValueError(f"mean_rgb has {self.n_regions} regions; region_bits can hold 1 to 32")
+            raise ValueError(f"mean_rgb has {self.n_regions} regions; expected 1 to 32")
         if not self.region_bits.all():
-            raise ValueError(f"region_bits[{int(np.argmin(self.region_bits))}] is 0; every colour needs a region")
+            raise ValueError(f"region_bits[{int(np.argmin(self.region_bits))}] is 0; expected a region for each colour")
         if int(self.region_bits.max()) >> self.n_regions:
-            raise ValueError(f"region_bits has {int(self.region_bits.max()):#x}; there are {self.n_regions} regions")
+            raise ValueError(f"region_bits has {int(self.region_bits.max()):#x}; expected {self.n_regions} bits")
         counts = [int(np.count_nonzero(self.region_bits >> np.uint32(r) & 1)) for r in range(self.n_regions)]
         if counts != self.member_counts.tolist():
-            raise ValueError(f"member_counts is {self.member_counts.tolist()}; region_bits gives {counts}")
+            raise ValueError(f"member_counts is {self.member_counts.tolist()}; expected {counts}, as in region_bits")
         if self.edges.size and not 0 <= self.edges.min() <= self.edges.max() < self.n_regions:
             ends = f"{int(self.edges.min())} to {int(self.edges.max())}"
-            raise ValueError(f"edges names regions {ends}; there are {self.n_regions} regions")
+            raise ValueError(f"edges has regions {ends}; expected 0 to {self.n_regions - 1}")
         for name in ("mean_rgb", "edge_weights", "similarity"):
             if not np.isfinite(getattr(self, name)).all():
-                raise ValueError(f"{name} has a value that is not finite")
+                raise ValueError(f"{name} has a value that is not finite; expected finite numbers")
         if not (isinstance(self.n_raw_nodes, int) and self.n_raw_nodes >= self.n_regions):
-            raise ValueError(f"n_raw_nodes is {self.n_raw_nodes!r}; there are {self.n_regions} regions")
+            raise ValueError(f"n_raw_nodes is {self.n_raw_nodes!r}; expected an integer from {self.n_regions} on")
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, ColorNetwork) and self.fingerprint == other.fingerprint
@@ -107,16 +105,16 @@ class ColorNetwork:
         return len(self.mean_rgb)
 
     def membership(self, rgb: ArrayLike) -> NDArray[np.float32]:
-        """Region weights of 8-bit colours: weight 1/m in each of the m regions of the nearest grid colour.
+        """Return the region weights of 8-bit colours: 1/m in each of the m regions of the nearest grid colour.
 
         Args:
             rgb: [..., 3] uint8, sRGB.
 
         Returns:
-            [..., R] float32, each row summing to 1.
+            [..., R] float32; rows sum to 1.
 
         Raises:
-            ValueError: another type, or a last axis that is not 3.
+            ValueError: `rgb` has another type, or its last axis is not 3.
         """
         bits = self.region_bits[grid_index(rgb)]
         member = (bits[..., None] >> np.arange(self.n_regions, dtype=np.uint32)) & np.uint32(1)
@@ -124,10 +122,9 @@ class ColorNetwork:
 
     @functools.cached_property
     def fingerprint(self) -> str:
-        """SHA-256 of the contents, in hexadecimal: the same for two networks exactly if they are the same network.
+        """SHA-256 of the contents in hexadecimal, equal for equal networks.
 
-        Real numbers enter rounded to 1e-9, so that the last bit of a cube root on another processor does not tell apart
-        networks that are equal.
+        Real numbers are rounded to 1e-9, because their last bits may differ between processors.
         """
         digest = hashlib.sha256(f"colornet 1 {self.n_raw_nodes}".encode())
         for field in dataclasses.fields(self)[:-1]:
@@ -139,7 +136,7 @@ class ColorNetwork:
         return digest.hexdigest()
 
     def save(self, path: str | Path) -> None:
-        """Write the network to a file (npz) that `load` reads; the file appears whole or not at all.
+        """Write the network to a file (npz) that `load` reads, atomically.
 
         Raises:
             OSError: the file cannot be written.
@@ -148,19 +145,19 @@ class ColorNetwork:
 
     @classmethod
     def load(cls, path: str | Path) -> "ColorNetwork":
-        """Read a network that `save` wrote.
+        """Load a network that was written by `save`.
 
         Raises:
             OSError: the file cannot be read.
-            ValueError: the file is damaged or holds something else; one line that names the file.
+            ValueError: the file is damaged or is not a colour network; the message names the file.
         """
         arrays = read_arrays(path)
         if arrays.keys() != _FIELDS:
-            raise ValueError(f"{path} holds {sorted(arrays)}; a colour network is {sorted(_FIELDS)}")
+            raise ValueError(f"{path} has {sorted(arrays)}; expected a colour network, {sorted(_FIELDS)}")
         try:
             return cls(**{**arrays, "n_raw_nodes": arrays["n_raw_nodes"].item()})
         except ValueError as error:
-            raise ValueError(f"{path} is no colour network: {error}") from error
+            raise ValueError(f"{path} is not a colour network: {error}") from error
 
 
 _FIELDS = {field.name for field in dataclasses.fields(ColorNetwork)}

@@ -1,4 +1,4 @@
-"""From Mapper's nodes to colour regions and their similarity (paper, section "Color network")."""
+"""Colour regions from the nodes of Mapper, and their similarity (paper, section "Color network")."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -7,13 +7,14 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 
 from colornet.lab import MEAN_WHITE, hyab, to_lab
 
-__all__ = ["join_redundant", "mean_color", "relabel", "similarity"]
+__all__ = ["merge_redundant", "mean_color", "relabel", "similarity"]
 
-_COMMON = 0.95
+_MIN_SHARED = 0.95
+"""Share of the smaller node's colours above which two nodes can be redundant."""
 
 
 def mean_color(colors: NDArray[np.uint8], members: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Arithmetic mean of sRGB values.
+    """Return the arithmetic mean of sRGB colours.
 
     Args:
         colors: [n, 3] uint8, sRGB.
@@ -25,13 +26,13 @@ def mean_color(colors: NDArray[np.uint8], members: NDArray[np.int64]) -> NDArray
     return np.asarray(colors[members].mean(axis=0, dtype=np.float64))
 
 
-def join_redundant(
+def merge_redundant(
     colors: NDArray[np.uint8], members: list[NDArray[np.int64]], eps: float
 ) -> tuple[list[NDArray[np.int64]], NDArray[np.int64]]:
-    """Join nodes that stand for the same colours.
+    """Merge redundant nodes.
 
-    Two nodes are redundant when more than 95 % of the smaller one's members are common and their mean colours are at
-    most `eps` apart (HyAB).
+    Two nodes are redundant if they share more than 95 % of the members of the smaller one and the HyAB distance of
+    their mean colours is at most `eps`.
 
     Args:
         colors: [n, 3] uint8, sRGB.
@@ -47,20 +48,20 @@ def join_redundant(
     redundant = np.zeros((n, n), bool)
     for i in range(n):
         for j in range(i + 1, n):
-            common = np.intersect1d(members[i], members[j], assume_unique=True).size
-            mostly = common > _COMMON * min(members[i].size, members[j].size)
-            redundant[i, j] = mostly and hyab(means[i], means[j]) <= eps
+            shared = np.intersect1d(members[i], members[j], assume_unique=True).size
+            overlaps = shared > _MIN_SHARED * min(members[i].size, members[j].size)
+            redundant[i, j] = overlaps and hyab(means[i], means[j]) <= eps
     n_regions, component = connected_components(csr_array(redundant), directed=False)
     _, first = np.unique(component, return_index=True)
     region = np.argsort(np.argsort(first))[component].astype(np.int64)
-    joined = [
+    merged = [
         np.unique(np.concatenate([m for m, r in zip(members, region, strict=True) if r == k])) for k in range(n_regions)
     ]
-    return joined, region
+    return merged, region
 
 
 def relabel(edges: NDArray[np.int64], region: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Edges between nodes as edges between regions: pairs i < j, sorted, each once, none within a region.
+    """Convert edges between nodes to edges between regions: distinct sorted pairs i < j.
 
     Args:
         edges: [e, 2] int64, pairs of nodes.
@@ -71,7 +72,7 @@ def relabel(edges: NDArray[np.int64], region: NDArray[np.int64]) -> NDArray[np.i
 
 
 def similarity(n_regions: int, edges: NDArray[np.integer], weights: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Similarity matrix Delta: 1 / (1 + length of the cheapest path); 0 between regions that no path joins.
+    """Return the similarity Delta, 1 / (1 + length of the shortest path); 0 between regions without a path.
 
     Args:
         n_regions: number of regions n.
@@ -83,6 +84,6 @@ def similarity(n_regions: int, edges: NDArray[np.integer], weights: NDArray[np.f
     """
     graph = csr_array((weights, (edges[:, 0], edges[:, 1])), shape=(n_regions, n_regions))
     lengths = dijkstra(graph, directed=False)
-    # A path's length is summed in the order of travel: take one direction, so that the matrix is symmetric to the bit.
+    # Lengths are summed along the path: the minimum of both directions makes the matrix exactly symmetric.
     lengths = np.minimum(lengths, lengths.T)
     return np.asarray(1.0 / (1.0 + lengths))

@@ -1,4 +1,4 @@
-"""One build of the colour network from scratch, in a process of its own so that its time and memory can be told."""
+"""One build of the colour network from scratch, in a separate process so that its time and memory can be measured."""
 
 import dataclasses
 import json
@@ -30,7 +30,7 @@ seconds = time.perf_counter() - start
 network.save(sys.argv[1])
 members = {f"members_{k}": m for k, m in enumerate(graph.members)}
 np.savez(sys.argv[2], names=graph.names, nerve=graph.nerve, cyclic=graph.cyclic, **members)
-# Not by getrusage, whose peak is at least that of the process which started this one.
+# The peak of getrusage is at least that of the parent process.
 peak = re.search(r"VmHWM:\\s*(\\d+) kB", Path("/proc/self/status").read_text())
 print(json.dumps({"seconds": seconds, "kib": int(peak[1])}))
 """
@@ -38,7 +38,7 @@ print(json.dumps({"seconds": seconds, "kib": int(peak[1])}))
 
 @dataclasses.dataclass(frozen=True)
 class Rebuilt:
-    """The network made from scratch, Mapper's graph on the way there, and what it took."""
+    """The network built from scratch, the graph of Mapper, and the cost."""
 
     network: colornet.ColorNetwork
     graph: MapperGraph
@@ -57,8 +57,8 @@ def rebuilt(tmp_path_factory: pytest.TempPathFactory) -> Rebuilt:
     with np.load(folder / "graph.npz") as file:
         members = [file[f"members_{k}"] for k in range(len(file["names"]))]
         graph = MapperGraph(file["names"].tolist(), members, file["nerve"], file["cyclic"])
-    told = json.loads(done.stdout)
-    return Rebuilt(colornet.load(folder / "network.npz"), graph, told["seconds"], told["kib"] / 1024)
+    cost = json.loads(done.stdout)
+    return Rebuilt(colornet.load(folder / "network.npz"), graph, cost["seconds"], cost["kib"] / 1024)
 
 
 @pytest.fixture(scope="session")

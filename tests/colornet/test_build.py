@@ -1,4 +1,4 @@
-"""The network made from scratch: the packaged one to the bit, with the counts that the paper's recipe gives."""
+"""The network built from scratch equals the packaged one and has the counts of the paper."""
 
 import dataclasses
 
@@ -8,12 +8,12 @@ import colornet
 from colornet.grid import grid_colors
 from colornet.lab import GRID_WHITE, MEAN_WHITE, hyab, to_lab
 from colornet.mapper import EPS
-from colornet.regions import join_redundant, relabel
+from colornet.regions import merge_redundant, relabel
 
 from .conftest import Rebuilt
 
 
-def test_packaged_network_is_what_build_gives(rebuilt: Rebuilt, network: colornet.ColorNetwork) -> None:
+def test_packaged_network_is_the_result_of_build(rebuilt: Rebuilt, network: colornet.ColorNetwork) -> None:
     for field in dataclasses.fields(network):
         made, packaged = getattr(rebuilt.network, field.name), getattr(network, field.name)
         if np.asarray(packaged).dtype == np.float64:  # another processor may round a cube root the other way
@@ -23,7 +23,7 @@ def test_packaged_network_is_what_build_gives(rebuilt: Rebuilt, network: colorne
     assert rebuilt.network.fingerprint == network.fingerprint
 
 
-def test_build_is_quick_and_small(rebuilt: Rebuilt) -> None:
+def test_build_takes_little_time_and_memory(rebuilt: Rebuilt) -> None:
     assert rebuilt.seconds < 60
     assert rebuilt.mebibytes < 3 * 1024
 
@@ -50,9 +50,9 @@ def test_exactly_one_pair_of_nodes_is_redundant(rebuilt: Rebuilt) -> None:
     assert found == [("cube19_cluster0", "cube18_cluster0", 841, 853, 1279, 4.4)]
 
 
-def test_regions_are_numbered_as_kmapper_numbers_nodes(rebuilt: Rebuilt) -> None:
+def test_regions_are_numbered_like_kmapper_nodes(rebuilt: Rebuilt) -> None:
     colors, graph = grid_colors(), rebuilt.graph
-    members, region = join_redundant(colors, graph.members, EPS)
+    members, region = merge_redundant(colors, graph.members, EPS)
     kept = [name for name in graph.names if name != "cube19_cluster0"]
     named = dict(zip(graph.names, region.tolist(), strict=True))
     assert [named[name] for name in kept] == list(range(22))
@@ -61,7 +61,7 @@ def test_regions_are_numbered_as_kmapper_numbers_nodes(rebuilt: Rebuilt) -> None
         np.testing.assert_array_equal(np.flatnonzero(rebuilt.network.region_bits >> np.uint32(r) & 1), rows)
 
 
-def test_edges_are_shared_colours_and_the_seam(rebuilt: Rebuilt) -> None:
+def test_edges_are_shared_colors_and_the_hue_cut(rebuilt: Rebuilt) -> None:
     bits, network = rebuilt.network.region_bits, rebuilt.network
     sharing = [
         [i, j]
@@ -70,7 +70,7 @@ def test_edges_are_shared_colours_and_the_seam(rebuilt: Rebuilt) -> None:
         if np.any((bits >> np.uint32(i)) & (bits >> np.uint32(j)) & np.uint32(1))
     ]
     assert network.edges[~network.cyclic].tolist() == sharing
-    _, region = join_redundant(grid_colors(), rebuilt.graph.members, EPS)
+    _, region = merge_redundant(grid_colors(), rebuilt.graph.members, EPS)
     assert relabel(rebuilt.graph.cyclic, region).tolist() == network.edges[network.cyclic].tolist()
 
 

@@ -1,4 +1,4 @@
-"""The pictures: drawn whole, in the regions' own colours, and without a trace in the folder but themselves."""
+"""Figures of the network: complete, in the colours of the regions, and without leftover files."""
 
 import os
 from collections.abc import Callable

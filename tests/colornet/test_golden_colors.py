@@ -1,4 +1,4 @@
-"""Regions and similarity against colour matrices computed outside the product."""
+"""Regions and similarity against colour matrices of the golden files."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ import colornet
 
 
 def as_8_bit(colors: np.ndarray) -> np.ndarray:
-    """Colours in [0, 1], float32, to the nearest of 256 levels, halves up."""
+    """Round colours in [0, 1] to 8 bits, halves up."""
     return np.floor(colors * np.float32(255) + np.float32(0.5)).astype(np.uint8)
 
 
@@ -25,7 +25,7 @@ def test_region_weights_strip_by_strip(golden_files: tuple[Path, ...], network: 
 
 
 def test_similarity(golden_files: tuple[Path, ...], network: colornet.ColorNetwork) -> None:
-    """The embeddings are colour matrix times Delta; float32 in the files."""
+    """Embeddings are the product of colour matrix and Delta, float32 in the files."""
     for path in golden_files:
         with np.load(path) as golden:
             color, embedding = golden["paper_color"].astype(np.float64), golden["paper_embedding"]

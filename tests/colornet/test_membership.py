@@ -70,6 +70,6 @@ def test_one_color(network: colornet.ColorNetwork) -> None:
         [[1, 2, 3]],
     ],
 )
-def test_other_input_is_refused(network: colornet.ColorNetwork, rgb: object) -> None:
+def test_invalid_input_is_rejected(network: colornet.ColorNetwork, rgb: object) -> None:
     with pytest.raises(ValueError, match=r"^rgb is .*; expected uint8 \[\.\.\., 3\]$"):
         network.membership(rgb)

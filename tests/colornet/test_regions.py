@@ -1,4 +1,4 @@
-"""Joining nodes, moving edges, and the similarity matrix on small cases and against Floyd and Warshall."""
+"""Merging nodes, relabelling edges, and the similarity matrix, on small cases and against Floyd and Warshall."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 import colornet
 from colornet.grid import grid_colors
 from colornet.lab import MEAN_WHITE, hyab, to_lab
-from colornet.regions import join_redundant, mean_color, relabel, similarity
+from colornet.regions import mean_color, merge_redundant, relabel, similarity
 
 from .test_color_math import hyab_by_hand, lab_by_hand
 
@@ -24,7 +24,7 @@ def floyd_warshall(n: int, edges: NDArray[np.int64], weights: NDArray[np.float64
 
 
 def test_similarity_of_the_packaged_network(network: colornet.ColorNetwork) -> None:
-    """From the colours up: means, their CIELAB, edge weights, paths, similarity."""
+    """Recompute means, their CIELAB, edge weights, paths and similarity from the colours."""
     colors = grid_colors().astype(np.float64)
     member = (network.region_bits[:, None] >> np.arange(22, dtype=np.uint32) & 1).astype(np.float64)
     means = (member.T @ colors) / member.sum(axis=0)[:, None]
@@ -57,8 +57,8 @@ def test_mean_color() -> None:
     np.testing.assert_array_equal(mean_color(colors, np.array([1, 2])), [254.5, 0.5, 5.0])
 
 
-def test_join_only_nodes_that_share_members_and_color() -> None:
-    """40 greys, node sizes around the threshold of 95 % of the smaller one."""
+def test_only_nodes_with_shared_members_and_color_merge() -> None:
+    """Use 40 greys and node sizes around the threshold of 95 % of the smaller node."""
     colors = np.repeat(np.arange(100, 140, dtype=np.uint8)[:, None], 3, axis=1)
     whole = np.arange(40)
     cases = {
@@ -69,25 +69,25 @@ def test_join_only_nodes_that_share_members_and_color() -> None:
         "alone": ([whole], [0]),
     }
     for name, (members, expected) in cases.items():
-        joined, region = join_redundant(colors, members, eps=7.0)
+        joined, region = merge_redundant(colors, members, eps=7.0)
         assert region.tolist() == expected, name
         for k, rows in enumerate(joined):
             union = set().union(*(m.tolist() for m, r in zip(members, expected, strict=True) if r == k))
             assert rows.tolist() == sorted(union), name
 
 
-def test_do_not_join_nodes_of_another_mean_color() -> None:
+def test_nodes_with_another_mean_color_do_not_merge() -> None:
     colors = np.repeat(np.array([0, 250, 251], np.uint8)[:, None], 3, axis=1)
-    _, region = join_redundant(colors, [np.array([0]), np.array([0, 1, 2])], eps=7.0)
+    _, region = merge_redundant(colors, [np.array([0]), np.array([0, 1, 2])], eps=7.0)
     assert region.tolist() == [0, 1]
 
 
-def test_mean_colors_at_the_limit_join() -> None:
+def test_nodes_with_mean_colors_at_the_limit_merge() -> None:
     colors = np.repeat(np.array([100, 110, 120], np.uint8)[:, None], 3, axis=1)
     members = [np.array([0]), np.array([0, 1, 2])]
     limit = float(hyab(*to_lab(np.array([[100.0] * 3, [110.0] * 3]), MEAN_WHITE)))
     for eps, regions in ((limit, [0, 0]), (np.nextafter(limit, 0), [0, 1])):
-        assert join_redundant(colors, members, eps)[1].tolist() == regions
+        assert merge_redundant(colors, members, eps)[1].tolist() == regions
 
 
 def test_relabel() -> None:

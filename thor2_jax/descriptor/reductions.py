@@ -1,7 +1,8 @@
-"""Sums and extremes over the points of a cloud, in the form that CPUs compute in vector registers.
+"""Sums and extremes over the points of a cloud, vectorized for CPUs.
 
-A reduction of floats along the fastest axis has a fixed order, so compilers take one number after the other. Folded,
-the axis is cut into rows that are added or compared elementwise: eight numbers at a time, several times as fast.
+XLA keeps the order of a reduction of floats along the last axis and so computes it one number at a time. Folding the
+axis into rows that are combined elementwise uses vector registers and is several times as fast. Each docstring names
+the plain expression that gives the same result, up to rounding of sums.
 """
 
 import functools
@@ -13,47 +14,47 @@ import jax.numpy as jnp
 __all__ = ["ROWS", "argmax", "fold", "larger", "largest", "smaller", "smallest", "total"]
 
 ROWS = 16
-"""The last axis is cut into so many rows; its length must be a multiple."""
+"""Number of rows that the last axis is folded into; its length must be a multiple."""
 
-_SHORT = 8
-"""Length from which on a plain reduction is as fast."""
+_PLAIN_LENGTH = 8
+"""Largest length at which a plain argmax is as fast as halving."""
 
 
 def larger(a: jax.Array, b: jax.Array) -> jax.Array:
-    """The larger of two numbers, elementwise; one instruction, where `jnp.maximum` takes more to hand on NaN."""
+    """Return `jnp.maximum(a, b)` of numbers other than NaN, in one instruction; passing on NaN takes more."""
     return jnp.where(a > b, a, b)
 
 
 def smaller(a: jax.Array, b: jax.Array) -> jax.Array:
-    """The smaller of two numbers, elementwise."""
+    """Return `jnp.minimum(a, b)` of numbers other than NaN, in one instruction."""
     return jnp.where(a < b, a, b)
 
 
 def fold(values: jax.Array, op: Callable[[jax.Array, jax.Array], jax.Array], rows: int = ROWS) -> jax.Array:
-    """[..., N] to [..., N / rows]: entry k is `op` over the entries k, k + N / rows, k + 2 N / rows, ..."""
+    """Combine the entries k, k + N / rows, k + 2 N / rows, ... by `op` into entry k: [..., N] to [..., N / rows]."""
     folded = values.reshape(*values.shape[:-1], rows, values.shape[-1] // rows)
     return functools.reduce(op, (folded[..., k, :] for k in range(rows)))
 
 
 def total(values: jax.Array) -> jax.Array:
-    """Sum over the last axis, [..., N] to [...]."""
+    """Return `values.sum(axis=-1)`, [..., N] to [...]."""
     return fold(values, jnp.add).sum(axis=-1)
 
 
 def largest(values: jax.Array) -> jax.Array:
-    """Maximum over the last axis, [..., N] to [...]."""
+    """Return `values.max(axis=-1)`, [..., N] to [...]."""
     return fold(values, larger).max(axis=-1)
 
 
 def smallest(values: jax.Array) -> jax.Array:
-    """Minimum over the last axis, [..., N] to [...]."""
+    """Return `values.min(axis=-1)`, [..., N] to [...]."""
     return fold(values, smaller).min(axis=-1)
 
 
 def argmax(values: jax.Array) -> jax.Array:
-    """Index of a largest entry along the last axis, of any length > 0: [..., M] to [...] int32."""
+    """Return `values.argmax(axis=-1)` as int32, for any length > 0; any of several equal entries may be returned."""
     index = jnp.broadcast_to(jnp.arange(values.shape[-1], dtype=jnp.int32), values.shape)
-    while values.shape[-1] > _SHORT and values.shape[-1] % 2 == 0:
+    while values.shape[-1] > _PLAIN_LENGTH and values.shape[-1] % 2 == 0:
         half = values.shape[-1] // 2
         first, second = values[..., :half], values[..., half:]
         index = jnp.where(first >= second, index[..., :half], index[..., half:])

@@ -1,6 +1,6 @@
 """View normalization and the turn by alpha (paper, sections "View normalization" and "Slicing").
 
-From a cloud as the camera saw it to one that stands the same way whatever the camera's pose; turned, it can be sliced.
+View normalization rotates a cloud to a pose that does not depend on the pose of the camera; the turn prepares slicing.
 
 >>> clouds = PointClouds.pack([(xyz, rgb)])                      # doctest: +SKIP
 >>> normal = view_normalize(clouds, DescriptorConfig())          # doctest: +SKIP
@@ -25,7 +25,7 @@ from thor2_jax.types import PointClouds
 __all__ = ["align", "align_planes", "mirror", "turn", "view_normalize"]
 
 OCCLUSION_BIN = 0.01
-"""Width in scaled units of the x-bins in which boundary points are counted; two at either end decide."""
+"""Width of the bins along x in which boundary points are counted, scaled units."""
 
 
 def _sigma_s_and_alpha(config: DescriptorConfig, parameters: Parameters | None) -> tuple[ArrayLike, ArrayLike]:
@@ -35,13 +35,13 @@ def _sigma_s_and_alpha(config: DescriptorConfig, parameters: Parameters | None) 
 
 
 def _planes(cloud: PointClouds) -> tuple[jax.Array, jax.Array]:
-    """Coordinates [3, M] and mask [M] of a cloud; M is N, rounded up to what reductions need."""
-    missing = -cloud.mask.shape[0] % ROWS
-    return jnp.pad(cloud.points, ((0, missing), (0, 0))).T, jnp.pad(cloud.mask, (0, missing))
+    """Return points [3, M] and mask [M] of a cloud; M is N rounded up to a multiple of `ROWS`."""
+    padding = -cloud.mask.shape[0] % ROWS
+    return jnp.pad(cloud.points, ((0, padding), (0, 0))).T, jnp.pad(cloud.mask, (0, padding))
 
 
 def _place(rotation: jax.Array, points: jax.Array, mask: jax.Array, camera: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Points [3, M] and camera [3], rotated and moved so that the least coordinate along each axis is 0; padding 0."""
+    """Rotate points [3, M] and camera [3] and translate them to the first octant; padding is 0."""
     points = rotate(rotation, points)
     low = smallest(jnp.where(mask, points, jnp.inf))
     low = jnp.where(jnp.isfinite(low), low, 0)
@@ -49,34 +49,34 @@ def _place(rotation: jax.Array, points: jax.Array, mask: jax.Array, camera: jax.
 
 
 def _count(flags: jax.Array) -> jax.Array:
-    """Number of true flags [M], as a float: sums of floats are quicker here, and exact for any cloud in memory."""
+    """Count true flags [M], as a float: sums of floats are faster here, and exact below 2**24."""
     return total(flags.astype(jnp.float32))
 
 
 def _frame(cloud: PointClouds, sigma_s: ArrayLike) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """The view normalization's rotation [3, 3] and what it turns: points [3, M] about their mean, mask, camera."""
+    """Return the rotation [3, 3] of the view normalization, and the centred points [3, M], mask and camera for it."""
     points, mask = _planes(cloud)
     scaled = points * sigma_s
     centre = total(jnp.where(mask, scaled, 0)) / jnp.maximum(_count(mask), 1)
-    # Padding moves to the mean: within the hull of the cloud, it never is an extreme.
+    # Padding moves to the mean, inside the convex hull, where it is never an extreme point.
     centred = jnp.where(mask, scaled - centre[:, None], 0)
     camera = cloud.camera * sigma_s - centre
 
     axes, low, high = minimal_box(centred)
     middle = (low + high) / 2
 
-    # The mean is the origin here: the heavier half lies below the middle where the middle is positive.
+    # The mean is the origin: if the middle is positive, the mean lies below the middle.
     x_sign = jnp.where(middle[0] < 0, -1.0, 1.0)
-    # A half turn about x brings a camera on +z to -z.
+    # A half turn about x moves a camera from +z to -z.
     camera_z = jnp.matmul(axes[2], camera, precision=HIGHEST) - middle[2]
     z_sign = jnp.where(camera_z > 0, -1.0, 1.0)
 
     x_low = jnp.minimum(low[0] * x_sign, high[0] * x_sign)
     bins = jnp.floor(rotate(axes[:1], centred)[0] * x_sign / OCCLUSION_BIN - x_low / OCCLUSION_BIN)
     last = largest(jnp.where(mask, bins, -1))
-    edge = jnp.pad(cloud.boundary, (0, len(mask) - len(cloud.boundary))) & mask
-    # A half turn about z takes the occluded end away from the first slice.
-    x_sign = jnp.where(_count(edge & (bins <= 1)) > _count(edge & (bins >= last - 1)), -x_sign, x_sign)
+    boundary = jnp.pad(cloud.boundary, (0, len(mask) - len(cloud.boundary))) & mask
+    # A half turn about z moves the occluded end away from the first slice.
+    x_sign = jnp.where(_count(boundary & (bins <= 1)) > _count(boundary & (bins >= last - 1)), -x_sign, x_sign)
 
     x, z = axes[0] * x_sign, axes[2] * z_sign
     return jax.lax.stop_gradient(jnp.stack([x, jnp.cross(z, x), z])), centred, mask, camera
@@ -93,24 +93,29 @@ def _view_normalize(clouds: PointClouds, sigma_s: ArrayLike) -> PointClouds:
 
 
 def view_normalize(clouds: PointClouds, config: DescriptorConfig, parameters: Parameters | None = None) -> PointClouds:
-    """Rotate each cloud onto its minimal box, longest side along x, seen from -z, in the first octant.
+    """Rotate each cloud to the axes of its minimal box, and translate it to the first octant.
 
-    The steps of the paper's section "View normalization": (1, 2) axes of an approximately minimal-volume box, longest
-    first (`bounding_box`); (3) a camera on the +z side of the box's middle means a half turn about x; (5) what is then
-    free, a half turn about z, puts the mean of the points at or below the middle of the box along x, so that the end
-    with more of the cloud comes first; (4) if the first two x-bins of 0.01 hold more occlusion-boundary points than the
-    last two, a half turn about z keeps the occluded end out of the first slice; (6) translation to the first octant.
-    Every step follows the cloud and the camera: a rigid motion of both changes nothing. Cubes and balls have no unique
-    box; their frame is one of the equal ones. A gradient sees the frame as fixed: it jumps where another face of the
-    box becomes flush, and equal eigenvalues have no derivative.
+    The steps follow the section "View normalization" of the paper:
+
+    1. Rotate the cloud to the axes of an approximately minimal-volume box, longest side along x (`bounding_box`).
+    2. If the camera is on the +z side of the middle of the box, apply a half turn about x.
+    3. If the mean of the points is above the middle of the box along x, apply a half turn about z, so that the end with
+       more points comes first.
+    4. If the first two bins of 0.01 along x then hold more points of the occlusion boundary than the last two, apply a
+       half turn about z, so that the occluded end is not in the first slice.
+    5. Translate the cloud to the first octant.
+
+    A rigid motion of cloud and camera together does not change the result. Cubes and balls have no unique box; any of
+    the equal ones may be chosen. Gradients treat the rotation as a constant, because it is discontinuous where another
+    face becomes flush with the box and has no derivative where eigenvalues are equal.
 
     Args:
-        clouds: metres, any frame, camera given in the same one.
-        config: only `sigma_s` is used.
-        parameters: take the place of the config's where given. Other values compile nothing.
+        clouds: metres, in any frame; the camera is in the same frame.
+        config: only `sigma_s` is used. Static.
+        parameters: if given, replace the values of `config`. Other values do not compile again.
 
     Returns:
-        Clouds in scaled units; `camera` moved along; colours, mask and boundary as they were.
+        Clouds in scaled units, with the camera in the same frame; colours, mask and boundary are unchanged.
     """
     return _view_normalize(clouds, _sigma_s_and_alpha(config, parameters)[0])
 
@@ -131,17 +136,15 @@ def _turn(normal: PointClouds, alpha: ArrayLike) -> PointClouds:
 
 
 def turn(normal: PointClouds, config: DescriptorConfig, parameters: Parameters | None = None) -> PointClouds:
-    """Turn normalized clouds by -alpha about y (paper, "Slicing").
-
-    The long axis then stands at alpha to the x-y plane.
+    """Turn normalized clouds by -alpha about y, so that the long axis is at alpha to the x-y plane (paper, "Slicing").
 
     Args:
-        normal: clouds as `view_normalize` returns them, or mirrored ones.
-        config: only `alpha` is used.
-        parameters: take the place of the config's where given. Other values compile nothing.
+        normal: clouds as `view_normalize` or `mirror` return them.
+        config: only `alpha` is used. Static.
+        parameters: if given, replace the values of `config`. Other values do not compile again.
 
     Returns:
-        The aligned clouds, scaled units, in the first octant.
+        Aligned clouds in scaled units, in the first octant.
     """
     return _turn(normal, _sigma_s_and_alpha(config, parameters)[1])
 
@@ -150,10 +153,10 @@ def turn(normal: PointClouds, config: DescriptorConfig, parameters: Parameters |
 def _align_planes(clouds: PointClouds, sigma_s: ArrayLike, alpha: ArrayLike) -> tuple[jax.Array, jax.Array]:
     def one(cloud: PointClouds) -> tuple[jax.Array, jax.Array]:
         frame, points, mask, camera = _frame(cloud, sigma_s)
-        # One rotation: the shift between the two would cancel.
+        # One rotation suffices: the translation between the two would cancel.
         rotation = jnp.matmul(_about_y(alpha), frame, precision=HIGHEST)
         points, camera = _place(rotation, points, mask, camera)
-        return points[:, : len(cloud.mask)], camera  # the rest of the cloud would be copied
+        return points[:, : len(cloud.mask)], camera  # replacing the other fields would copy them
 
     return jax.vmap(one)(clouds)
 
@@ -165,23 +168,23 @@ def _align(clouds: PointClouds, sigma_s: ArrayLike, alpha: ArrayLike) -> tuple[j
 
 
 def align(clouds: PointClouds, config: DescriptorConfig, parameters: Parameters | None = None) -> PointClouds:
-    """`turn` of `view_normalize`: clouds in metres to aligned clouds in scaled units, ready to be sliced."""
+    """Normalize and turn clouds: `turn(view_normalize(clouds, config), config)`, in scaled units, ready for slicing."""
     points, camera = _align(clouds, *_sigma_s_and_alpha(config, parameters))
     return dataclasses.replace(clouds, points=points, camera=camera)
 
 
 def align_planes(clouds: PointClouds, config: DescriptorConfig, parameters: Parameters | None = None) -> jax.Array:
-    """The points of `align` as planes, [B, 3, N], which spares those who slice them next two transpositions."""
+    """Return the points of `align` as [B, 3, N], which saves two transpositions before slicing."""
     return _align_planes(clouds, *_sigma_s_and_alpha(config, parameters))[0]
 
 
 @partial(jax.jit, static_argnums=1)
 def mirror(normal: PointClouds, axes: str) -> PointClouds:
-    """Mirror normalized clouds within their boxes (paper, "Training": each view also mirrored in x, y and xy).
+    """Mirror normalized clouds within their boxes (paper, "Training": each view is also mirrored in x, y and xy).
 
     Args:
         normal: clouds in the first octant.
-        axes: letters of "xyz" to mirror in; "" returns the clouds as they are. Static.
+        axes: axes to mirror, letters of "xyz"; "" returns equal clouds. Static.
 
     Raises:
         InputError: `axes` has another letter.

@@ -1,4 +1,4 @@
-"""Laws that descriptors obey, and what to try them on: hold your own pipeline to them with Hypothesis.
+"""Properties of descriptors and Hypothesis strategies for clouds, to test your own pipeline with.
 
     from hypothesis import given
     import colornet, thor2_jax as thor2
@@ -11,8 +11,8 @@
         describe = lambda clouds: thor2.describe_aligned(clouds, network, config)
         assert_permutation_invariant(describe, clouds, seed, config)
 
-Needs the extra `testing`: pip install 'thor2-jax[testing]'. Batches have one shape, so that a law compiles once. Laws
-are asserted with tolerances that are derived (`tolerances`), or bit by bit.
+Requires the extra `testing`: pip install 'thor2-jax[testing]'. All batches of a strategy have the same shape, so that a
+property compiles once. Assertions compare bit by bit or with derived tolerances (`tolerances`).
 """
 
 from thor2_jax.testing.clouds import (

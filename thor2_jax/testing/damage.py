@@ -1,4 +1,4 @@
-"""A Hypothesis strategy for damaged files, to hold readers to: an error of theirs or a right answer, nothing else.
+"""A Hypothesis strategy for damaged files, to test that readers raise their own errors or return correct results.
 
 @given(damaged(path.read_bytes()))
 def test_reader(content):
@@ -15,14 +15,14 @@ from thor2_jax.testing.clouds import seeds
 __all__ = ["damaged"]
 
 _NUMBERS = [b"-1", b"0", b"1e400", b"nan", b"4294967296", b"9" * 30, b"null", b"[]", b'""', b"{}", b"true", b"1" * 5000]
-"""In the place of a number in a text."""
+"""Replacements of numbers in a text."""
 
 _EXTREMES = [0, 1, 2**7, 2**8 - 1, 2**15, 2**16 - 1, 2**31 - 1, 2**31, 2**32 - 1]
-"""In the place of a number in a binary header."""
+"""Replacements of numbers in a binary header."""
 
 
 def _place(content: bytearray, rng: np.random.Generator) -> int:
-    """Anywhere, half of the time among the first bytes, where headers are."""
+    """Draw a position, half of the time among the first bytes, where headers are."""
     return int(rng.integers(min(len(content), 128) if rng.random() < 0.5 else len(content)))
 
 
@@ -37,7 +37,7 @@ def _cut(content: bytearray, rng: np.random.Generator) -> bytearray:
 
 
 def _splice(content: bytearray, rng: np.random.Generator) -> bytearray:
-    """A piece of the file in the place of another, or in between, or gone."""
+    """Replace a piece of the file by another one, insert one, or delete one."""
     source, target = _place(content, rng), _place(content, rng)
     length = int(rng.integers(1, 65))
     piece = content[source : source + length] if rng.random() < 0.7 else bytearray()
@@ -52,7 +52,7 @@ def _extreme(content: bytearray, rng: np.random.Generator) -> bytearray:
 
 
 def _number(content: bytearray, rng: np.random.Generator) -> bytearray:
-    """Another number, or something else, where a text has one."""
+    """Replace a number in a text."""
     digits = np.flatnonzero((np.frombuffer(bytes(content), np.uint8) - 48) < 10)
     if len(digits) == 0:
         return _flip(content, rng)
@@ -63,38 +63,45 @@ def _number(content: bytearray, rng: np.random.Generator) -> bytearray:
 
 
 def _lines(content: bytearray, rng: np.random.Generator) -> bytearray:
-    """A line left out, doubled, or exchanged with another."""
+    """Delete, duplicate or exchange lines."""
     lines = content.split(b"\n")
     a, b = rng.integers(len(lines), size=2)
-    way = int(rng.integers(3))
-    if way == 0:
+    choice = int(rng.integers(3))
+    if choice == 0:
         del lines[a]
-    elif way == 1:
+    elif choice == 1:
         lines.insert(b, lines[a])
     else:
         lines[a], lines[b] = lines[b], lines[a]
     return bytearray(b"\n").join(lines)
 
 
-_WAYS: list[Callable[[bytearray, np.random.Generator], bytearray]] = [_flip, _cut, _splice, _extreme, _number, _lines]
+_KINDS: list[Callable[[bytearray, np.random.Generator], bytearray]] = [
+    _flip,
+    _cut,
+    _splice,
+    _extreme,
+    _number,
+    _lines,
+]
 
 
 def _damage(content: bytes, seed: int, times: int) -> bytes:
-    rng, found = np.random.default_rng(seed), bytearray(content)
+    rng, damaged_content = np.random.default_rng(seed), bytearray(content)
     for _ in range(times):
-        if found:
-            found = _WAYS[int(rng.integers(len(_WAYS)))](found, rng)
-    return bytes(found)
+        if damaged_content:
+            damaged_content = _KINDS[int(rng.integers(len(_KINDS)))](damaged_content, rng)
+    return bytes(damaged_content)
 
 
 def damaged(content: bytes, times: int = 3) -> st.SearchStrategy[bytes]:
-    """The bytes of a file after one or more damages.
+    """Generate the bytes of a file after one or more damages.
 
-    Bits flipped, the end cut off, pieces moved, left out or doubled, extreme numbers in binary headers and in texts,
-    lines left out, doubled or exchanged.
+    Damages flip bits, cut the end, move, delete or duplicate pieces and lines, and put extreme numbers into binary
+    headers and texts.
 
     Args:
-        content: of a valid file.
-        times: the most damages.
+        content: bytes of a valid file.
+        times: largest number of damages.
     """
     return st.builds(_damage, st.just(content), seeds(), st.integers(1, times))

@@ -1,4 +1,4 @@
-"""Hypothesis strategies for RGB-D frames, and the laws that frames obey."""
+"""Hypothesis strategies for RGB-D frames, and properties of instance clouds."""
 
 from collections.abc import Callable, Sequence
 
@@ -34,20 +34,20 @@ def _frame(seed: int, height: int, width: int, n_objects: int) -> RGBDFrame:
 
 
 def frames(max_side: int = 120, max_objects: int = 5) -> st.SearchStrategy[RGBDFrame]:
-    """Frames of ellipsoids before a slanting plane, some hidden by others or cut by the border, with holes in depth.
+    """Generate frames of ellipsoids in front of a slanted plane; some are occluded or cut by the border.
 
-    Depth in millimetres, uint16; labels uint8, not in a row.
+    Depth is in millimetres, uint16, with missing values; labels are uint8 and not consecutive.
 
     Args:
-        max_side: largest height and width, pixels, at least 8.
-        max_objects: the most instances; later ones hide earlier ones.
+        max_side: largest height and width in pixels, at least 8.
+        max_objects: largest number of instances; later ones occlude earlier ones.
     """
     side = st.integers(8, max_side)
     return st.builds(_frame, seeds(), side, side, st.integers(0, max_objects))
 
 
 def assert_labels_are_names(instance_clouds: Clouds, frame: RGBDFrame, seed: int) -> None:
-    """Label numbers are names: with other numbers, the instances have the same clouds. Bit by bit."""
+    """Assert that other label numbers give the same clouds, bit by bit."""
     numbers = np.random.default_rng(seed).permutation(np.arange(1, 256))
     other = np.concatenate([[0], numbers]).astype(np.uint16)
     found = {
@@ -66,7 +66,7 @@ def assert_labels_are_names(instance_clouds: Clouds, frame: RGBDFrame, seed: int
 
 
 def assert_depth_units_agree(instance_clouds: Clouds, frame: RGBDFrame) -> None:
-    """Depth in whole units and in metres are the same depth. Bit by bit: both become the same float32 metres."""
+    """Assert that depth in integer units and in metres gives the same clouds, bit by bit."""
     other = RGBDFrame(frame.color, frame.depth_m, frame.labels, frame.intrinsics)
     for first, second in zip(instance_clouds(frame), instance_clouds(other), strict=True):
         assert first.reason == second.reason

@@ -1,4 +1,4 @@
-"""Hypothesis strategies for colour networks other than the packaged one."""
+"""Hypothesis strategies for random colour networks."""
 
 import hypothesis.strategies as st
 import numpy as np
@@ -13,7 +13,7 @@ __all__ = ["networks"]
 def _network(seed: int, n_regions: int) -> ColorNetwork:
     rng = np.random.default_rng(seed)
     colors = grid_colors().astype(np.float64)
-    # Slabs along a random direction; every tenth part of one is shared with the next.
+    # Slabs along a random direction; a tenth of each is shared with the next.
     along = colors @ rng.normal(size=3)
     place = np.argsort(np.argsort(along)) / GRID_SIZE * n_regions
     region = place.astype(np.uint32)
@@ -36,9 +36,9 @@ def _network(seed: int, n_regions: int) -> ColorNetwork:
 
 
 def networks(n_regions: int = 5) -> st.SearchStrategy[ColorNetwork]:
-    """Networks whose regions are overlapping slabs of the colour cube, in a chain.
+    """Generate networks whose regions are overlapping slabs of the colour cube, connected in a chain.
 
-    All networks of a size have as many sets of regions, 2 R - 1: what is compiled for one serves the others.
+    All networks with R regions have 2 R - 1 region sets, so that they share compiled functions.
 
     Args:
         n_regions: R, 1 to 32.

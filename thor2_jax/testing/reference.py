@@ -1,4 +1,4 @@
-"""The descriptor of one aligned cloud in NumPy and float64, straight from the equations: the oracle of the laws."""
+"""Reference implementation of the descriptor of one aligned cloud, in NumPy and float64."""
 
 from typing import NamedTuple
 
@@ -13,14 +13,14 @@ __all__ = ["Reference", "cells", "pixel_masses", "reference_descriptor"]
 
 
 class Reference(NamedTuple):
-    """What the equations give for one cloud.
+    """The reference descriptor of one cloud.
 
     Attributes:
         images: [S, P, P].
         embeddings: [S, R, J].
-        persistence: [S, J], 0 where a strip is empty.
-        counts: [S, J] int, points of each strip.
-        overflow: points outside, and strips whose persistence is past the window.
+        persistence: [S, J], 0 for empty strips.
+        counts: [S, J] int, number of points of each strip.
+        overflow: number of points outside plus number of strips whose persistence exceeds the window.
     """
 
     images: NDArray[np.float64]
@@ -31,7 +31,7 @@ class Reference(NamedTuple):
 
 
 def cells(points: NDArray[np.floating], config: DescriptorConfig) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Slice and strip of each point [n, 3] of an aligned cloud, by the config's convention; not limited to its size."""
+    """Return the slice and strip of each point [n, 3] of an aligned cloud; numbers may lie outside the descriptor."""
     x, _, z = points.astype(np.float64).T
     if config.convention == "released":
         level, edges = np.round(z, 1), np.arange(config.n_strips) * config.sigma_2
@@ -41,7 +41,7 @@ def cells(points: NDArray[np.floating], config: DescriptorConfig) -> tuple[NDArr
 
 
 def pixel_masses(centres: NDArray[np.floating], config: DescriptorConfig) -> NDArray[np.float64]:
-    """Share of the Gaussian at each of `centres` [...] in each pixel of an axis: [..., P]."""
+    """Return the mass in each pixel of an axis of a Gaussian at each of `centres` [...]: [..., P]."""
     edges = (np.arange(config.image_size + 1) - 1) * config.sigma_2
     return np.diff(ndtr((edges - np.asarray(centres)[..., None]) / np.sqrt(config.image_variance)), axis=-1)
 
@@ -49,13 +49,13 @@ def pixel_masses(centres: NDArray[np.floating], config: DescriptorConfig) -> NDA
 def reference_descriptor(
     points: NDArray[np.floating], rgb: NDArray[np.uint8], network: ColorNetwork, config: DescriptorConfig
 ) -> Reference:
-    """The hard descriptor of one aligned cloud.
+    """Compute the hard descriptor of one aligned cloud.
 
     Args:
         points: [n, 3], scaled units, first octant.
         rgb: [n, 3].
-        network: gives regions and similarity.
-        config: both conventions; no relaxation.
+        network: the colour network.
+        config: of either convention, without relaxation.
     """
     i, j = cells(points, config)
     y = points[:, 1].astype(np.float64)

@@ -1,4 +1,4 @@
-"""How far float32 may lead two computations of the same thing apart: every tolerance of the laws is derived here.
+"""Derived tolerances: bounds on the difference of two float32 computations of the same quantity.
 
 u = 2^-24 is the unit roundoff of float32. A sum of n terms has a relative error of at most n u in any order, to first
 order in u (Higham, Accuracy and Stability of Numerical Algorithms, chapter 4).
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.config import DescriptorConfig
+from thor2_jax.descriptor.reductions import ROWS
 from thor2_jax.types import PointClouds
 
 __all__ = ["UNIT", "alignment_drift", "embedding_rounding", "image_lipschitz", "image_rounding"]
@@ -18,22 +19,19 @@ UNIT = 2.0**-24
 """Unit roundoff of float32."""
 
 _TABLE_ERROR = 8 * UNIT
-"""Of an entry of an image's tables, half a difference of two error functions: float32's erf is good to 5 units, and the
-rounding of its argument, 3 units relative, moves it by 3 max z erf'(z) < 1.5 more."""
-
-_FOLD = 16
-"""Rows that reductions over points add elementwise before the rest (`reductions`)."""
+"""Error of an entry of the tables of an image, half a difference of two error functions: erf in float32 is accurate to
+5 units, and the rounding of its argument, 3 units relative, adds 3 max z erf'(z) < 1.5."""
 
 
 def image_rounding(persistence: NDArray[np.float64], config: DescriptorConfig) -> NDArray[np.float64]:
-    """Bound on the rounding error of an image, summed over its pixels.
+    """Return a bound on the rounding error of an image, summed over its pixels.
 
     A pixel is the sum over J pairs of weight x entry x entry. Over a row of P pixels the entries sum to at most 1, and
     so do their errors to at most P table errors: 2 P of these a pair for both axes, and J + 2 units for the sum and the
     products. Two computations differ by twice as much.
 
     Args:
-        persistence: [...], sum of the pairs' weights.
+        persistence: [...], sum of the weights of the pairs.
         config: gives P and J.
 
     Returns:
@@ -43,21 +41,21 @@ def image_rounding(persistence: NDArray[np.float64], config: DescriptorConfig) -
 
 
 def image_lipschitz(persistence: NDArray[np.float64], config: DescriptorConfig) -> NDArray[np.float64]:
-    """By how much at most an image changes, summed over its pixels, where a pair's persistence moves by 1.
+    """Return the largest change of an image, summed over its pixels, per change of the persistence of a pair.
 
     The weight p changes by 1 and the Gaussian by the total variation of its shift, sqrt(2 / pi) / sigma, of which there
     is p. The theorem for Gaussians of Adams et al. (JMLR 2017, "Stability of persistence surfaces and images") allows
     births to move as well and bounds the change by sqrt(5) times as much for a move of 1 in the 1-Wasserstein distance.
 
     Args:
-        persistence: [...] of the pairs, the larger of before and after.
+        persistence: [...], the larger persistence of each pair before and after the change.
         config: gives the variance.
     """
     return 1 + math.sqrt(2 / math.pi / config.image_variance) * persistence
 
 
 def embedding_rounding(n_regions: int) -> float:
-    """Relative rounding error of an embedding of non-negative counts and similarities.
+    """Return the relative rounding error of an embedding of non-negative counts and similarities.
 
     A product with the weights of at most 2^7 sets of regions, and one with the similarity; weights are rounded once.
     """
@@ -65,7 +63,7 @@ def embedding_rounding(n_regions: int) -> float:
 
 
 def alignment_drift(clouds: PointClouds, config: DescriptorConfig) -> float:
-    """Scaled units by which rounding may move an aligned point between two placements or orders of the same clouds.
+    """Return the distance by which rounding may move an aligned point, between two poses or orders of the same clouds.
 
     For `decided_clouds`, whose box has the principal axes. Rounded and scaled, a coordinate of size D is off by 2 u D:
     a point by d = 2 sqrt(3) u D. So second moments, of largest eigenvalue l, are off by at most 2 d sqrt(l), and by the
@@ -75,7 +73,7 @@ def alignment_drift(clouds: PointClouds, config: DescriptorConfig) -> float:
     is that of some point, hence twice as much, and both computations may err: four times.
 
     Args:
-        clouds: metres, the placement farther from the origin.
+        clouds: metres, in the pose farther from the origin.
         config: gives sigma_s.
     """
     worst = 0.0
@@ -84,7 +82,7 @@ def alignment_drift(clouds: PointClouds, config: DescriptorConfig) -> float:
         centred = scaled - scaled.mean(axis=0)
         values = np.linalg.eigvalsh(centred.T @ centred / len(centred))
         off = 2 * math.sqrt(3) * UNIT * float(np.abs(scaled).max())
-        sums = (len(mask) / _FOLD + _FOLD + 10) * UNIT * float(values.sum())
+        sums = (len(mask) / ROWS + ROWS + 10) * UNIT * float(values.sum())
         angle = math.sqrt(2) * (2 * off * math.sqrt(values[2]) + sums) / float(np.diff(values).min())
         reach = float(np.linalg.norm(centred, axis=1).max())
         worst = max(worst, 4 * (reach * (angle + 16 * UNIT) + off))

@@ -1,4 +1,4 @@
-"""Folded reductions against NumPy, float64."""
+"""Folded reductions against plain ones of NumPy in float64."""
 
 from collections.abc import Callable
 
@@ -23,7 +23,7 @@ def numbers(*shape: int, seed: int = 0) -> np.ndarray:
 
 @jax.jit
 def both_ways(values: jax.Array) -> dict[str, tuple[jax.Array, jax.Array]]:
-    """Each reduction, plain and under vmap; compiled together."""
+    """Compute each reduction directly and under vmap, in one compiled function."""
     return {name: (function(values), jax.vmap(function)(values)) for name, (function, _) in REDUCTIONS.items()}
 
 
@@ -48,7 +48,7 @@ def test_any_leading_axes_without_jit(name: str, shape: tuple[int, ...]) -> None
 
 
 def test_infinities_and_ties() -> None:
-    """Each place in turn is the one that counts; all others are masked."""
+    """Each entry in turn determines the result; all others are masked."""
     for fill, name in ((-np.inf, "largest"), (np.inf, "smallest"), (0.0, "total")):
         values = np.full((48, 48), fill, np.float32)
         np.fill_diagonal(values, np.arange(48) - 20)
@@ -68,19 +68,19 @@ def test_fold_combines_entries_a_row_apart(length: int) -> None:
 
 
 @pytest.mark.parametrize("length", [1, 15, 17, 47])
-def test_lengths_that_are_no_multiple_are_refused(length: int) -> None:
+def test_lengths_that_are_not_multiples_are_rejected(length: int) -> None:
     for function in (total, largest, smallest):
         with pytest.raises(TypeError):
             function(jnp.zeros((2, length)))
 
 
 FEW = (*range(1, 21), 24, 32, 33, 40, 48, 64, 66, 80, 96, 112, 127, 128, 130)
-"""Every way that lengths halve: 0 to 4 times, to odd and to even ones."""
+"""Lengths that can be halved 0 to 4 times, to odd and to even ones."""
 
 
 @pytest.fixture(scope="module", params=[FEW, pytest.param(range(1, 131), marks=pytest.mark.slow)], ids=["few", "all"])
 def argmaxes(request: pytest.FixtureRequest) -> Callable[[np.ndarray], dict[int, np.ndarray]]:
-    """Length -> `argmax` of the first so many entries of each row of an [8, 130] array; compiled together."""
+    """Map a length to `argmax` over that many first entries of each row of an [8, 130] array, compiled together."""
     together = jax.jit(lambda values: {length: argmax(values[:, :length]) for length in request.param})
     return lambda values: {length: np.asarray(found) for length, found in together(values).items()}
 
@@ -121,7 +121,7 @@ def test_argmax_under_vmap_and_without_other_axes() -> None:
 
 @pytest.mark.parametrize("name", REDUCTIONS)
 def test_gradients_against_finite_differences(name: str) -> None:
-    """Of the NumPy function, in float64, away from ties."""
+    """Compare with differences of the NumPy function in float64, away from ties."""
     plain, oracle = REDUCTIONS[name]
     values = np.random.default_rng(0).permuted(np.tile(np.linspace(-1, 1, 48), (2, 1)), axis=1)
     weights = np.array([2.0, -0.5])
@@ -135,7 +135,7 @@ def test_gradients_against_finite_differences(name: str) -> None:
     np.testing.assert_allclose(gradient(values.astype(np.float32)), expected, atol=1e-6)
 
 
-def test_gradient_of_all_but_the_largest_is_zero_and_that_of_ties_adds_up_to_one() -> None:
+def test_gradients_of_ties_sum_to_one() -> None:
     values = numbers(48)
     values[5], values[[7, 20, 21, 40]] = -np.inf, 9.0
     gradient = np.asarray(jax.jit(jax.grad(largest))(values))
