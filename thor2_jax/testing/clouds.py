@@ -1,8 +1,8 @@
-"""Hypothesis strategies for coloured clouds: what laws are tried on.
+"""Hypothesis strategies for coloured point clouds.
 
-A cloud is a pair (xyz [n, 3] float32, rgb [n, 3] uint8), as `PointClouds.pack` takes it. Points are made by NumPy from
-a seed that Hypothesis draws, which is a thousand times as fast as drawing each coordinate; what shrinks is the number
-of points and the kind of cloud.
+A cloud is a pair (xyz [n, 3] float32, rgb [n, 3] uint8), as `PointClouds.pack` takes it. NumPy generates the points
+from a seed that Hypothesis draws, which is a thousand times as fast as drawing each coordinate. Hypothesis shrinks the
+number of points and the kind of the cloud.
 
 >>> from thor2_jax.testing import camera_clouds, packed
 >>> batches = packed(camera_clouds(kinds=("balls", "thin")), size=4, capacity=512)
@@ -36,19 +36,19 @@ Cloud = tuple[NDArray[np.float32], NDArray[np.uint8]]
 Points = NDArray[np.float64]
 
 LATTICE = 1 / 2048
-"""Metres: step of the coordinates of `lattice_clouds`."""
+"""Step of the coordinates of `lattice_clouds`, metres."""
 
-BODY = 8
-"""Copies of each point of the body of a decided cloud."""
+BODY_COPIES = 8
+"""Number of symmetric copies of each body point of a decided cloud."""
 
 
 def seeds() -> st.SearchStrategy[int]:
-    """Seeds for NumPy's generators."""
+    """Generate seeds for the generators of NumPy."""
     return st.integers(0, 2**32 - 1)
 
 
 def rotations() -> st.SearchStrategy[NDArray[np.float64]]:
-    """Rotation matrices [3, 3], spread evenly over all."""
+    """Generate uniformly distributed rotation matrices [3, 3]."""
     return st.builds(lambda seed: Rotation.random(random_state=seed).as_matrix(), seeds())
 
 
@@ -79,21 +79,21 @@ def _flat(rng: np.random.Generator, n: int) -> Points:
 
 
 def _noisy(rng: np.random.Generator, n: int) -> Points:
-    """A surface with a camera's noise and a few strays."""
+    """A surface with noise and a few outliers."""
     points = _revolutions(rng, n) + rng.normal(scale=0.03, size=(n, 3))
-    stray = rng.random(n) < 0.03
-    return np.where(stray[:, None], rng.uniform(-2, 2, (n, 3)), points)
+    outlier = rng.random(n) < 0.03
+    return np.where(outlier[:, None], rng.uniform(-2, 2, (n, 3)), points)
 
 
 def _partial(rng: np.random.Generator, n: int) -> Points:
-    """What a plane leaves of a body: seen from one side, or hidden in part."""
+    """A body cut by a plane, as if seen from one side or partly occluded."""
     body = (_boxes, _balls, _revolutions)[rng.integers(3)](rng, 4 * n + 4)
     along = body @ _balls(rng, 1)[0]
     return body[np.argsort(along)[: len(along) // 2]][:n]
 
 
 def _degenerate(rng: np.random.Generator, n: int) -> Points:
-    """Points that are equal, two places, a line, a line along an axis, or the corners of a cube."""
+    """Equal points, two distinct points, a line, a line along an axis, or the corners of a cube."""
     t = rng.uniform(-1, 1, (n, 1))
     return [
         np.zeros((n, 3)),
@@ -116,11 +116,11 @@ _MAKERS: dict[str, Callable[[np.random.Generator, int], Points]] = {
 }
 
 KINDS = tuple(_MAKERS)
-"""Kinds of clouds. Of each there are empty ones and ones of a single point."""
+"""Kinds of clouds; each includes empty clouds and clouds of a single point."""
 
 
 def _colors(rng: np.random.Generator, n: int) -> NDArray[np.uint8]:
-    """Patches of a few colours, or noise."""
+    """Draw from a few colours, or draw each colour at random."""
     palette = rng.integers(0, 256, (int(rng.integers(1, 6)), 3), dtype=np.uint8)
     return palette[rng.integers(len(palette), size=n)] if rng.random() < 0.7 else rng.integers(0, 256, (n, 3), np.uint8)
 
@@ -134,11 +134,11 @@ def _camera_cloud(seed: int, kind: str, n: int) -> Cloud:
 
 
 def camera_clouds(kinds: Sequence[str] = KINDS, max_points: int = 512) -> st.SearchStrategy[Cloud]:
-    """Clouds of things 4 to 24 cm across as a camera at the origin sees them: metres, OpenCV frame.
+    """Generate clouds of objects 4 to 24 cm across in the frame of a camera at the origin (metres, OpenCV convention).
 
     Args:
-        kinds: of `KINDS`.
-        max_points: largest number of points; there may be none.
+        kinds: a selection of `KINDS`.
+        max_points: largest number of points; clouds may be empty.
     """
     return st.builds(_camera_cloud, seeds(), st.sampled_from(kinds), st.integers(0, max_points))
 
@@ -149,30 +149,29 @@ def _lattice_cloud(seed: int, kind: str, exponent: int) -> Cloud:
 
 
 def lattice_clouds(kinds: Sequence[str] = KINDS) -> st.SearchStrategy[Cloud]:
-    """Camera clouds on which sums and means are exact in float32: no law that sums alone could break needs a tolerance.
+    """Generate camera clouds on which sums and means are exact in float32, so that properties hold without tolerance.
 
-    Coordinates are whole multiples of `LATTICE` below 1 m, and the number of points is a power of two up to 512: times
-    sigma_s = 5/2 they are whole multiples of 2^-12, 512 of them sum to less than 2^24 of these also when shifted by up
-    to 1 m, and a mean of 2^k of them needs no more bits than the sum.
+    Coordinates are integer multiples of `LATTICE` below 1 m, and the number of points is a power of two up to 512.
+    Multiplied by sigma_s = 5/2 they are integer multiples of 2^-12. A sum of 512 of them, even if shifted by up to 1 m,
+    is less than 2^24 such units, and a mean of 2^k of them needs no more bits than the sum.
     """
     return st.builds(_lattice_cloud, seeds(), st.sampled_from(kinds), st.integers(0, 9))
 
 
 def settled(points: Points, config: DescriptorConfig, margin: float = 0.1) -> Points:
-    """Aligned points [n, 3] moved within their strip and slice away from the borders of both.
+    """Move aligned points [n, 3] within their strip and slice, away from the borders of both.
 
-    Afterwards x and z are at least `margin` widths from a border, so that no rounding takes a point across one: hard
-    slices and strips are decided by construction, and no example need be thrown away. Coordinates of exactly 0 stay:
-    aligned clouds touch 0, and nothing is below.
+    Afterwards x and z are at least `margin` widths away from a border, so that rounding moves no point across one.
+    Coordinates of exactly 0 are kept: aligned clouds touch 0, and there is no strip below.
 
     Args:
         points: scaled units, first octant.
-        config: gives the widths.
+        config: gives the widths of strips and slices.
         margin: share of a width, below 1/2.
     """
     moved = points.copy()
     for axis, width in ((0, config.sigma_2), (2, config.sigma_1)):
-        inside = _inner(points[:, axis] / width, margin) * width
+        inside = _move_inside(points[:, axis] / width, margin) * width
         moved[:, axis] = np.where(points[:, axis] == 0, 0, inside)
     return moved
 
@@ -181,7 +180,7 @@ def _aligned_cloud(seed: int, kind: str, n: int, config: DescriptorConfig, margi
     rng = np.random.default_rng(seed)
     points = _MAKERS[kind](rng, n) @ Rotation.random(random_state=seed).as_matrix().T
     points = points - points.min(axis=0, initial=np.inf)
-    # The largest side becomes a share of the descriptor's window along each axis.
+    # Scale the longest side to a share of the extent of the descriptor along each axis.
     window = np.array([config.n_strips * config.sigma_2, config.window, config.n_slices * config.sigma_1])
     points *= window * rng.uniform(0.2, reach, 3) / max(points.max(initial=0), 1e-9)
     return settled(points, config, margin).astype(np.float32), _colors(rng, len(points))
@@ -194,14 +193,14 @@ def aligned_clouds(
     margin: float = 0.1,
     reach: float = 1.0,
 ) -> st.SearchStrategy[Cloud]:
-    """Clouds as `align` gives them: scaled units, first octant, and `settled`.
+    """Generate clouds as `align` returns them, in scaled units and the first octant, and `settled`.
 
     Args:
         config: gives widths and numbers of slices and strips.
-        kinds: of `KINDS`.
-        max_points: largest number of points; there may be none.
-        margin: of `settled`.
-        reach: largest side as a share of what the descriptor holds; above 1, some clouds overflow.
+        kinds: a selection of `KINDS`.
+        max_points: largest number of points; clouds may be empty.
+        margin: the margin of `settled`.
+        reach: longest side as a share of the extent of the descriptor; above 1, some clouds overflow.
     """
     return st.builds(
         lambda seed, kind, n: _aligned_cloud(seed, kind, n, config, margin, reach),
@@ -220,19 +219,19 @@ def _decided_cloud(seed: int, n_body: int, config: DescriptorConfig) -> Cloud:
     q = int(rng.integers(math.ceil(1.6 * side_y * s / cell), most + 1))
     side_x = (q + 0.3) * cell / s
 
-    # Squares of evenly spread numbers: the mean lies at a third of the side, whatever the seed.
+    # Squares of evenly spaced numbers put the mean at a third of the side for any seed.
     along = ((np.arange(n_body) + rng.random(n_body)) / n_body) ** 2 * 0.8 + 0.05
     radius = np.interp(along, np.linspace(0, 1, 5), rng.uniform(0.2, 0.8, 5))
     angle = rng.uniform(0, 2 * math.pi, n_body)
     a, b = radius * np.cos(angle), radius * np.sin(angle)
     body = [(along, y * first, z * second) for first, second in ((a, b), (b, a)) for y in (1, -1) for z in (1, -1)]
     corners = np.array([(x, y, z) for x in (0, 1) for y in (-1, 1) for z in (-1, 1)], float)
-    points = np.concatenate([corners, *(np.stack(part, axis=1) for part in body)])
+    points = np.concatenate([corners, *(np.stack(copy, axis=1) for copy in body)])
     points = (points * [1, 0.5, 0.5] + [0, 0.5, 0.5]) * [side_x, side_y, side_z]
 
-    # Settled in the aligned frame: at pi/4 mirroring in z exchanges the two coordinates, so both stay settled.
+    # Settled in the aligned frame: at pi/4, mirroring in z exchanges the two coordinates, so both stay settled.
     across = s * (points[:, 0] - points[:, 2] + side_z), s * (points[:, 0] + points[:, 2])
-    low, high = (np.where(np.arange(len(points)) < len(corners), c, _inner(c / cell) * cell) for c in across)
+    low, high = (np.where(np.arange(len(points)) < len(corners), c, _move_inside(c / cell) * cell) for c in across)
     points[:, 0], points[:, 2] = (low + high) * s - side_z / 2, (high - low) * s + side_z / 2
 
     camera = rng.uniform([0, 0, -2.5], [side_x, side_y, -1.25])
@@ -242,35 +241,40 @@ def _decided_cloud(seed: int, n_body: int, config: DescriptorConfig) -> Cloud:
     return seen[order].astype(np.float32), rgb[order]
 
 
-def _inner(places: Points, margin: float = 0.15) -> Points:
-    """Places in cells of width 1, moved within their cell to at least `margin` from its borders."""
+def _move_inside(places: Points, margin: float = 0.15) -> Points:
+    """Move coordinates within their cells of width 1 to at least `margin` from the borders."""
     cell, place = np.divmod(places, 1)
     return cell + margin + (1 - 2 * margin) * place
 
 
 def decided_clouds(config: DescriptorConfig, max_points: int = 488) -> st.SearchStrategy[Cloud]:
-    """Camera clouds whose every hard choice on the way to the descriptor has a margin: rounding cannot change any.
+    """Generate camera clouds for which rounding cannot change any discrete choice of the pipeline.
 
-    A body with a random profile between the eight corners of a box of three different sides, the camera at the origin.
-    Body and corners are symmetric in the box's two shorter axes: its axes are the principal ones, and every turn of the
-    search for the box makes it larger. The sides and so the eigenvalues are well apart; the mean lies at about a third
-    of the long side; the camera is well outside; aligned points are at least 0.15 strips from the borders of strips and
-    slices. Laws of the whole way hold on these without exception; on other clouds they hold but for ties.
+    A body with a random profile fills a box with three different sides, whose corners belong to the cloud; the camera
+    is at the origin. Body and corners are symmetric in the two shorter axes of the box, so that its axes are the
+    principal ones and any rotation enlarges the box. The sides, and therefore the eigenvalues, differ clearly; the mean
+    lies at about a third of the long side; the camera is well outside; and aligned points are at least 0.15 strips away
+    from the borders of strips and slices. Properties of the complete pipeline hold on these clouds without exception,
+    on other clouds except for ties.
 
     Args:
         config: with alpha = pi/4.
-        max_points: at least 136.
+        max_points: largest number of points, at least 136.
 
     Raises:
-        ValueError: another alpha, or fewer points.
+        ValueError: `config` has another alpha, or `max_points` is too small.
     """
-    if config.alpha != math.pi / 4 or max_points < 17 * BODY:
-        raise ValueError(f"alpha is {config.alpha}, max_points {max_points}; expected pi/4 and at least {17 * BODY}")
+    if config.alpha != math.pi / 4 or max_points < 17 * BODY_COPIES:
+        raise ValueError(
+            f"alpha is {config.alpha}, max_points {max_points}; expected pi/4 and at least {17 * BODY_COPIES}"
+        )
     return st.builds(
-        lambda seed, n_body: _decided_cloud(seed, n_body, config), seeds(), st.integers(16, max_points // BODY - 1)
+        lambda seed, n_body: _decided_cloud(seed, n_body, config),
+        seeds(),
+        st.integers(16, max_points // BODY_COPIES - 1),
     )
 
 
 def packed(clouds: st.SearchStrategy[Cloud], size: int, capacity: int) -> st.SearchStrategy[PointClouds]:
-    """Batches of `size` clouds padded to `capacity` points, cameras at the origin: one shape, one compilation."""
-    return st.lists(clouds, min_size=size, max_size=size).map(lambda parts: PointClouds.pack(parts, capacity))
+    """Generate batches of `size` clouds padded to `capacity` points, with cameras at the origin, all of one shape."""
+    return st.lists(clouds, min_size=size, max_size=size).map(lambda batch: PointClouds.pack(batch, capacity))

@@ -1,12 +1,12 @@
-"""What must not change a descriptor, one assertion a law, for any function from clouds to descriptors.
+"""Invariances of descriptors: one assertion for each, for any function from clouds to descriptors.
 
     @given(packed(aligned_clouds(config), size=4, capacity=512), seeds())
     def test_order(clouds, seed):
         assert_permutation_invariant(my_descriptor, clouds, seed)
 
-Each law says whether it holds bit by bit. If not, it takes a `drift`: how far rounding may move an aligned point
-(`alignment_drift`); the bounds on images and embeddings follow from that (`assert_near`). `drift=None`, the default, is
-for what begins at aligned clouds, and asks for the same bits.
+Each docstring states whether the property holds bit by bit. Otherwise the assertion takes a `drift`, the distance by
+which rounding may move an aligned point (`alignment_drift`), from which the bounds on images and embeddings follow
+(`assert_near`). The default `drift=None`, for functions of aligned clouds, requires equal bits.
 """
 
 import dataclasses
@@ -54,11 +54,10 @@ def _compare(found: Descriptors, expected: Descriptors, config: DescriptorConfig
 def assert_permutation_invariant(
     describe: Describe, clouds: PointClouds, seed: int, config: DescriptorConfig, drift: float | None = None
 ) -> None:
-    """A cloud is a set: the order of its points, padding among them included, means nothing.
+    """Assert that the order of the points, including padding, does not matter.
 
-    Bit by bit from aligned clouds on: extremes are some points' own coordinates, and counts are whole numbers below
-    2^24, exact in any order. View normalization sums coordinates and products, in an order that does matter to the last
-    bits.
+    Holds bit by bit for functions of aligned clouds: extremes are coordinates of points, and counts are integers below
+    2^24, exact in any order. In view normalization the order of sums changes the last bits.
     """
     size = clouds.mask.shape
     order = np.argsort(np.random.default_rng(seed).random(size), axis=1)
@@ -68,20 +67,20 @@ def assert_permutation_invariant(
 def assert_padding_invariant(
     describe: Describe, clouds: PointClouds, capacity: int, config: DescriptorConfig, drift: float = 0.0
 ) -> None:
-    """The bucket that a cloud is padded to means nothing.
+    """Assert that the padded number of points does not matter, up to rounding.
 
-    Another bucket is another program: products may be summed in another order, so this holds up to rounding.
+    Another capacity is another compiled program, which may sum products in another order.
 
     Args:
-        describe: compiles for the other capacity.
-        clouds: any.
-        capacity: more than that of `clouds`.
-        config: of the descriptor.
-        drift: 0 from aligned clouds on.
+        describe: function that also accepts the other capacity.
+        clouds: any clouds.
+        capacity: a capacity above that of `clouds`.
+        config: config of the descriptor.
+        drift: 0 for functions of aligned clouds.
     """
-    missing = capacity - clouds.mask.shape[1]
+    padding = capacity - clouds.mask.shape[1]
     padded = {
-        name: jnp.pad(getattr(clouds, name), [(0, 0), (0, missing)] + [(0, 0)] * (getattr(clouds, name).ndim - 2))
+        name: jnp.pad(getattr(clouds, name), [(0, 0), (0, padding)] + [(0, 0)] * (getattr(clouds, name).ndim - 2))
         for name in ("points", "colors", "mask", "boundary")
     }
     assert_near(describe(dataclasses.replace(clouds, **padded)), describe(clouds), config, drift)
@@ -90,42 +89,41 @@ def assert_padding_invariant(
 def assert_batch_size_invariant(
     describe: Describe, clouds: PointClouds, config: DescriptorConfig, drift: float = 0.0
 ) -> None:
-    """The size of the batch means nothing: each cloud is described as if it were alone.
+    """Assert that the batch size does not matter, up to rounding: each cloud is described as if it were alone.
 
-    A batch of another size is another program: this holds up to rounding, as `assert_padding_invariant` does.
+    Another batch size is another compiled program, which may sum products in another order.
 
     Args:
-        describe: compiles for batches of one.
-        clouds: any.
-        config: of the descriptor.
-        drift: 0 from aligned clouds on.
+        describe: function that also accepts batches of one cloud.
+        clouds: any clouds.
+        config: config of the descriptor.
+        drift: 0 for functions of aligned clouds.
     """
     alone = [describe(jax.tree.map(lambda a, b=b: a[b : b + 1], clouds)) for b in range(len(clouds.mask))]
-    assert_near(jax.tree.map(lambda *parts: jnp.concatenate(parts), *alone), describe(clouds), config, drift)
+    assert_near(jax.tree.map(lambda *fields: jnp.concatenate(fields), *alone), describe(clouds), config, drift)
 
 
 def assert_company_invariant(describe: Describe, clouds: PointClouds, others: PointClouds) -> None:
-    """A cloud's descriptor does not depend on the clouds beside it in the batch, whatever these are.
+    """Assert that a descriptor does not depend on the other clouds of the batch, bit by bit.
 
-    Bit by bit: the shapes are the same, so the program is, and nothing in it crosses the batch axis.
+    Equal shapes mean the same program, in which nothing crosses the batch axis.
     """
     expected = describe(clouds)
     for b in range(clouds.mask.shape[0]):
-        mixed = jax.tree.map(lambda mine, other, b=b: other.at[b].set(mine[b]), clouds, others)
-        found = describe(mixed)
-        assert_equal(*(jax.tree.map(lambda a, b=b: a[b], d) for d in (found, expected)))
+        mixed = jax.tree.map(lambda one, other, b=b: other.at[b].set(one[b]), clouds, others)
+        assert_equal(*(jax.tree.map(lambda a, b=b: a[b], d) for d in (describe(mixed), expected)))
 
 
 def assert_translation_invariant(describe: Describe, clouds: PointClouds, shift: ArrayLike) -> None:
-    """Cloud and camera moved together by a shift: nothing changes.
+    """Assert that a translation of cloud and camera together changes nothing.
 
-    Bit by bit on `lattice_clouds` shifted by whole steps of theirs, up to 1 m: their mean is exact, and so is what is
-    left when it is taken away. So this is a law for every kind of cloud, balls and cubes too.
+    Holds bit by bit on `lattice_clouds` shifted by multiples of their step, up to 1 m, whose mean and centred
+    coordinates are exact. It therefore holds for every kind of cloud, including balls and cubes.
 
     Args:
-        describe: from camera clouds.
-        clouds: on the lattice.
-        shift: [3] metres, a multiple of the lattice's step.
+        describe: function of camera clouds.
+        clouds: `lattice_clouds`.
+        shift: [3] metres, a multiple of `LATTICE`.
     """
     moved = with_points(clouds, np.asarray(clouds.points) + np.asarray(shift, np.float32))
     moved = dataclasses.replace(moved, camera=clouds.camera + jnp.asarray(shift, jnp.float32))
@@ -140,18 +138,18 @@ def assert_rigid_motion_invariant(
     config: DescriptorConfig,
     drift: float,
 ) -> None:
-    """Cloud and camera turned and moved together: nothing changes, wherever the object stands.
+    """Assert that a rigid motion of cloud and camera together changes nothing, up to the drift by rounding.
 
-    On `decided_clouds`, up to the drift by rounding. Where a choice is a tie - which of two boxes as small, which end
-    has more of the cloud - rounding makes it, and the frame is another of the equal ones.
+    Holds on `decided_clouds`. Where a choice is a tie, as between two boxes of equal volume, rounding decides it, and
+    the frame may be another of the equal ones.
 
     Args:
-        describe: from camera clouds.
-        clouds: decided ones.
+        describe: function of camera clouds.
+        clouds: `decided_clouds`.
         rotation: [3, 3].
         shift: [3] metres.
-        config: of the descriptor.
-        drift: `alignment_drift` of the placement farther away.
+        config: config of the descriptor.
+        drift: `alignment_drift` of the pose farther from the origin.
     """
     points = np.asarray(clouds.points, np.float64) @ rotation.T + np.asarray(shift)
     camera = np.asarray(clouds.camera, np.float64) @ rotation.T + np.asarray(shift)
@@ -162,15 +160,15 @@ def assert_rigid_motion_invariant(
 def assert_scale_invariant(
     describe_at: Callable[[PointClouds, float], Descriptors], clouds: PointClouds, sigma_s: float, exponent: int
 ) -> None:
-    """Lengths come in scaled units: an object k times as large at sigma_s / k is the same object.
+    """Assert that an object k times as large, described with sigma_s / k, has the same descriptor.
 
-    Bit by bit for k a power of two, which is exact, on every kind of cloud.
+    Holds bit by bit on every kind of cloud if k is a power of two.
 
     Args:
-        describe_at: from camera clouds and sigma_s.
-        clouds: any.
-        sigma_s: scaled units a metre.
-        exponent: k is two to the power of it.
+        describe_at: function of camera clouds and sigma_s.
+        clouds: any clouds.
+        sigma_s: scaled units per metre.
+        exponent: binary logarithm of k.
     """
     k = 2.0**exponent
     larger = dataclasses.replace(clouds, points=clouds.points * k, camera=clouds.camera * k)
@@ -180,20 +178,22 @@ def assert_scale_invariant(
 def assert_duplicates_count_twice(
     describe: Describe, clouds: PointClouds, config: DescriptorConfig, drift: float | None = None
 ) -> None:
-    """Every point twice: the shape is the same, and there is twice as much of each colour.
+    """Assert that duplicating every point keeps the images and doubles the embeddings.
 
-    Bit by bit from aligned clouds on: extremes stay, and doubled counts double every sum and product exactly. Overflow
-    counts points and, apart from them, pairs past the window, so it is compared by `assert_overflow_told` alone.
+    Holds bit by bit for functions of aligned clouds: extremes stay, and doubled counts double every sum and product
+    exactly. Overflow counts points as well as pairs, and is left to `assert_overflow_told`.
 
     Args:
-        describe: any; by the paper's convention (the released one divides counts by themselves).
+        describe: any function with the paper's convention; the released one divides by the number of points.
         clouds: at most half full.
-        config: of the descriptor.
-        drift: of the alignment, if `describe` aligns.
+        config: config of the descriptor.
+        drift: drift of the alignment, if `describe` aligns.
     """
     half = clouds.mask.shape[1] // 2
     if np.asarray(clouds.mask[:, half:]).any():
-        raise ValueError(f"clouds have points past half of the capacity, {half}")
+        raise ValueError(
+            f"clouds has points beyond half of the capacity, {half}; expected clouds that are at most half full"
+        )
     first = taken(clouds, np.arange(half))
     once, twice = describe(clouds), describe(joined(first, first))
     halved = dataclasses.replace(twice, embeddings=twice.embeddings / 2, overflow=once.overflow)
@@ -201,67 +201,67 @@ def assert_duplicates_count_twice(
 
 
 def assert_backends_agree(first: Describe, second: Describe, clouds: PointClouds) -> None:
-    """The pairs in closed form are those of gudhi, on every input.
+    """Assert that the closed form and gudhi give equal descriptors on every input, bit by bit.
 
-    Bit by bit: gudhi gives indices, and both take the same values from there. (Inside one larger program, compilers
-    may fuse differently around the callback; compare the stages, not the whole, there.)
+    gudhi returns indices, from which both take the same values. Within one larger program, XLA may fuse differently
+    around the callback; compare the stages separately in this case.
     """
     assert_equal(second(clouds), first(clouds))
 
 
 def assert_same_regions_alike(describe: Describe, clouds: PointClouds, network: ColorNetwork, seed: int) -> None:
-    """Colours of the same regions are indistinguishable: only regions enter a descriptor.
+    """Assert that colours of the same regions give equal descriptors, bit by bit.
 
-    Every point gets another 8-bit colour that belongs to the same set of regions. Bit by bit.
+    Every point gets another 8-bit colour that belongs to the same set of regions.
     """
     rng = np.random.default_rng(seed)
     _, of_color, counts = np.unique(network.region_bits, return_inverse=True, return_counts=True)
     by_set, first = np.argsort(of_color, kind="stable"), np.cumsum(counts) - counts
     levels = (np.floor(np.asarray(clouds.colors) * 255 + 0.5).astype(np.int64) + 2) // 5
-    found = of_color[(levels[..., 0] * 52 + levels[..., 1]) * 52 + levels[..., 2]]
-    other = by_set[first[found] + (rng.random(found.shape) * counts[found]).astype(np.int64)]
+    region_set = of_color[(levels[..., 0] * 52 + levels[..., 1]) * 52 + levels[..., 2]]
+    other = by_set[first[region_set] + (rng.random(region_set.shape) * counts[region_set]).astype(np.int64)]
     rgb = np.stack([other // 52**2, other // 52 % 52, other % 52], axis=-1) * 5
-    # Any 8-bit colour within two steps of the grid's has the grid's regions.
+    # Every 8-bit colour within two steps of a grid colour has its regions.
     rgb = np.clip(rgb + rng.integers(-2, 3, rgb.shape), 0, 255)
     recolored = dataclasses.replace(clouds, colors=jnp.asarray(rgb, jnp.float32) / np.float32(255))
     assert_equal(describe(recolored), describe(clouds))
 
 
 def assert_object_unity(describe: Describe, aligned: PointClouds, config: DescriptorConfig, m: int) -> None:
-    """Cutting away everything from slice m on leaves the blocks of the slices before m as they were.
+    """Assert that removing all points from slice m on does not change the blocks of the slices before, bit by bit.
 
-    The paper's reason for slices: what is still to be seen of an object is described as if all of it were. Bit by bit.
+    This is the paper's reason for slices: the visible part of an object is described as if all of it were visible.
 
     Args:
-        describe: from aligned clouds, by the paper's convention.
+        describe: function of aligned clouds, with the paper's convention.
         aligned: `settled` clouds.
-        config: of the descriptor.
-        m: first slice that is cut away.
+        config: config of the descriptor.
+        m: first slice that is removed.
     """
     keep = aligned.mask & (np.asarray(aligned.points[..., 2]) < m * config.sigma_1)
     found, expected = describe(dataclasses.replace(aligned, mask=keep)), describe(aligned)
     for name in ("images", "embeddings"):
         whole, cut = (np.asarray(getattr(d, name)) for d in (expected, found))
         np.testing.assert_array_equal(cut[:, :m], whole[:, :m], err_msg=name)
-        assert not cut[:, m:].any(), f"{name} of slices that are cut away"
+        assert not cut[:, m:].any(), f"{name} of removed slices"
 
 
 def assert_flip_follows_rule(
     normalize: Callable[[PointClouds], PointClouds], clouds: PointClouds, seed: int
 ) -> NDArray[np.int64]:
-    """A hidden end turns the cloud by pi about z exactly when the first two x-bins hold more of the boundary.
+    """Assert that a cloud is turned by pi about z exactly if its first two x-bins hold more boundary points.
 
-    The rule is counted in NumPy on the cloud normalized without a boundary. Turned, it is that cloud mirrored in x and
-    y, up to rounding: 8 u of the box's sides. Points are marked on both ends, none within 1e-4 of a bin's border;
-    clouds whose last bin is in doubt by as little are left out.
+    The points are counted in NumPy on the cloud normalized without a boundary. The turned cloud equals that cloud
+    mirrored in x and y, up to rounding by 8 units of the sides of the box. Boundary points are drawn on both ends, none
+    within 1e-4 of the border of a bin; clouds whose last bin is ambiguous by as little are skipped.
 
     Args:
         normalize: `view_normalize` with a config.
-        clouds: without boundary, any kind.
-        seed: of the marks.
+        clouds: any clouds without a boundary.
+        seed: seed for the boundary points.
 
     Returns:
-        [B]: 1 flipped, 0 not flipped, -1 left out.
+        [B]: 1 flipped, 0 not flipped, -1 skipped.
     """
     rng = np.random.default_rng(seed)
     normal = normalize(clouds)
@@ -270,38 +270,38 @@ def assert_flip_follows_rule(
     last = np.floor(x.max(axis=1, initial=0))
     clear = np.abs(x - np.round(x)) > 1e-4 / OCCLUSION_BIN
     end = np.where(rng.random((len(mask), 1)) < 0.5, x <= 2, x >= last[:, None] - 1)
-    marks = mask & clear & (end | (rng.random(mask.shape) < 0.1)) & (rng.random(mask.shape) < 0.7)
+    boundary = mask & clear & (end | (rng.random(mask.shape) < 0.1)) & (rng.random(mask.shape) < 0.7)
     bins = np.floor(x)
-    flips = (marks & (bins <= 1)).sum(axis=1) > (marks & (bins >= last[:, None] - 1)).sum(axis=1)
-    found = normalize(dataclasses.replace(clouds, boundary=jnp.asarray(marks)))
+    flips = (boundary & (bins <= 1)).sum(axis=1) > (boundary & (bins >= last[:, None] - 1)).sum(axis=1)
+    found = normalize(dataclasses.replace(clouds, boundary=jnp.asarray(boundary)))
     sides = points.max(axis=1, keepdims=True)
     turned = np.where(mask[..., None], sides * [1, 1, 0] - points * [1, 1, -1], 0)
     longest = x.max(axis=1)
-    doubtful = (longest > 0.5) & (np.abs(longest - np.round(longest)) <= 1e-4 / OCCLUSION_BIN)
-    for b in np.flatnonzero(~doubtful):
+    ambiguous = (longest > 0.5) & (np.abs(longest - np.round(longest)) <= 1e-4 / OCCLUSION_BIN)
+    for b in np.flatnonzero(~ambiguous):
         expected = turned[b] if flips[b] else points[b]
         np.testing.assert_allclose(found.points[b], expected, rtol=0, atol=8 * UNIT * float(sides[b].max()))
-    return np.where(doubtful, -1, flips)
+    return np.where(ambiguous, -1, flips)
 
 
 def assert_mirrored_strips(
     strips: Callable[[PointClouds], Strips], aligned: PointClouds, config: DescriptorConfig, axis: str
 ) -> None:
-    """A mirrored cloud has mirrored strips: in x their order, in z that of the slices, in y low and high change places.
+    """Assert that mirroring reverses the strips (x) or the slices (z), or exchanges low and high (y).
 
-    Mirrored in x and z about the middle of the strips and slices that there are. Bit by bit but for y, whose extremes
-    are rounded once on the way and once back: 2 u of the cloud's height.
+    Clouds are mirrored in x and z about the middle of the grid of slices and strips. Holds bit by bit except for y,
+    whose extremes are rounded twice, 2 units of the height of the cloud.
 
     Args:
-        strips: from aligned clouds.
-        aligned: clouds within the slices and strips.
-        config: of the descriptor, the paper's convention.
+        strips: function of aligned clouds.
+        aligned: clouds within the grid of slices and strips.
+        config: config of the descriptor, with the paper's convention.
         axis: "x", "y" or "z".
     """
     k = "xyz".index(axis)
     points = np.asarray(aligned.points, np.float64)
     mask = np.asarray(aligned.mask)[..., None]
-    # What touches the border at 0 would fall on the one past the last: settled, like the rest.
+    # Mirrored, points on the border at 0 would leave the grid; they are settled like the others.
     spread = np.stack([settled(p + [1e-9, 0, 1e-9], config) for p in points])
     height = float(np.where(mask, points, 0).max(initial=0))
     size = (config.n_strips * config.sigma_2, height, config.n_slices * config.sigma_1)[k]

@@ -1,4 +1,4 @@
-"""Laws on what a descriptor's numbers are: masses, linearity, stability, the equations themselves, and their limits."""
+"""Properties of the values of descriptors: masses, linearity, stability, the equations themselves, and their limits."""
 
 import dataclasses
 import math
@@ -30,10 +30,10 @@ Describe = Callable[[PointClouds], Descriptors]
 
 
 def assert_image_mass(images: NDArray[np.floating], diagrams: Diagrams, config: DescriptorConfig) -> None:
-    """An image's pixels sum to the persistences, each times the share of its Gaussian within the window.
+    """Assert that the pixels of an image sum to the persistences, each times the mass of its Gaussian in the window.
 
-    Never more than their sum, and all of it but for pairs about 3 sigma from the window's border. The shares are
-    computed in float64; the tolerance is the image's rounding.
+    The sum is at most that of the persistences, and close to it unless pairs lie within about 3 sigma of the border.
+    Masses are computed in float64; the tolerance is the rounding error of an image.
 
     Args:
         images: [..., S, P, P].
@@ -45,16 +45,16 @@ def assert_image_mass(images: NDArray[np.floating], diagrams: Diagrams, config: 
     inside = [pixel_masses(centres, config).sum(axis=-1) for centres in (births, persistence)]
     expected = (persistence * inside[0] * inside[1]).sum(axis=-1)
     total, most = np.asarray(images, np.float64).sum(axis=(-2, -1)), persistence.sum(axis=-1)
-    # Births and deaths have been rounded: their difference is off by 2 u of the death.
+    # Births and deaths are rounded: their difference is off by 2 units of the death.
     off = image_rounding(most, config) + 2 * UNIT * (deaths * image_lipschitz(persistence, config)).sum(axis=-1)
     assert (np.abs(total - expected) <= off).all(), f"mass is off by {np.abs(total - expected).max():.3g}"
     assert (total <= most + off).all()
 
 
 def assert_color_mass(strips: Strips, clouds: PointClouds) -> None:
-    """Every point counts once: colour vectors sum to the number of points, but for those that overflow.
+    """Assert that colour vectors sum to the number of points without those that overflow.
 
-    Weights 1/m are rounded, relative u, and so are sums of at most 32 of them a strip and of all strips.
+    Weights 1/m are rounded, and so are sums over at most 32 regions and over all strips.
     """
     points = np.asarray(clouds.mask).sum(axis=1)
     total = np.asarray(strips.color, np.float64).sum(axis=(-3, -2, -1)) + np.asarray(strips.overflow)
@@ -67,15 +67,15 @@ def assert_embedding_linear(
     similarities: tuple[NDArray[np.float32], NDArray[np.float32]],
     factors: tuple[float, float],
 ) -> None:
-    """E = (C Delta)^T is linear in Delta, and images do not depend on it.
+    """Assert that E = (C Delta)^T is linear in Delta and that images do not depend on Delta.
 
-    The tolerance is the rounding of products with entries of either sign: the counts times the sizes of the entries.
+    The tolerance is the rounding of products with entries of either sign, the counts times the absolute entries.
 
     Args:
-        describe_with: from clouds and a similarity [R, R].
-        clouds: any.
-        similarities: two, of any sign.
-        factors: a and b of the combination.
+        describe_with: function of clouds and a similarity [R, R].
+        clouds: any clouds.
+        similarities: two matrices with entries of any sign.
+        factors: coefficients of the linear combination.
     """
     combined = factors[0] * similarities[0] + factors[1] * similarities[1]
     first, second, found = (describe_with(clouds, np.asarray(s, np.float32)) for s in (*similarities, combined))
@@ -89,28 +89,28 @@ def assert_embedding_linear(
 
 
 def assert_embedding_additive(describe: Describe, first: PointClouds, second: PointClouds) -> None:
-    """Counts add up: the embedding of two aligned clouds in one is the sum of theirs (the paper's convention).
+    """Assert that the embedding of the union of two aligned clouds is the sum of theirs (paper's convention).
 
     Args:
-        describe: from aligned clouds.
-        first: clouds, and
-        second: as many, of the same capacity; at most half full, both.
+        describe: function of aligned clouds.
+        first: clouds that are at most half full.
+        second: as many clouds of the same capacity, at most half full.
     """
     half = first.mask.shape[1] // 2
-    parts = [
+    halves = [
         dataclasses.replace(c, **{n: getattr(c, n)[:, :half] for n in ("points", "colors", "mask", "boundary")})
         for c in (first, second)
     ]
-    a, b, both = (np.asarray(describe(c).embeddings, np.float64) for c in (first, second, joined(*parts)))
+    a, b, both = (np.asarray(describe(c).embeddings, np.float64) for c in (first, second, joined(*halves)))
     off = np.abs(a + b - both)
     assert (off <= 2 * embedding_rounding(both.shape[-2]) * both).all(), f"off by {off.max():.3g}"
 
 
 def moved_within_strips(aligned: PointClouds, config: DescriptorConfig, seed: int, eps: float) -> PointClouds:
-    """Every point moved by at most `eps` along each axis, x and z not out of their cell (of which `eps` is a tenth)."""
+    """Move every point by at most `eps` along each axis without leaving its strip and slice."""
     rng = np.random.default_rng(seed)
     points = np.asarray(aligned.points, np.float64)
-    # Ends of strips all outwards now and then: the worst case.
+    # The worst case, drawn half of the time, moves all points outwards.
     step = (
         rng.uniform(-eps, eps, points.shape)
         if rng.random() < 0.5
@@ -131,23 +131,24 @@ def assert_stable(
     eps: float,
     config: DescriptorConfig,
 ) -> float:
-    """Points that move by at most eps within their strips move each image by at most a constant times 2 eps a pair.
+    """Assert that moving points by at most eps within their strips changes each image by at most the proven bound.
 
-    Births stay and each extreme moves by at most eps, so the 1-Wasserstein distance of the diagrams is at most 2 eps a
-    pair. By the theorem for Gaussians of Adams et al. (JMLR 2017) images then differ, summed over pixels, by at most
-    (sqrt(5) |f'| + sqrt(10 / pi) |f| / sigma) W1, with the weight f = p: |f'| = 1, |f| the largest persistence. The law
-    checks both steps, and that the tighter constant for births that stay, sqrt(5) times smaller, holds pair by pair.
+    Births stay and each extreme moves by at most eps, so that the 1-Wasserstein distance W1 of the diagrams is at most
+    2 eps for each pair. By the theorem for Gaussians of Adams et al. (JMLR 2017), the images then differ, summed over
+    pixels, by at most (sqrt(5) |f'| + sqrt(10 / pi) |f| / sigma) W1 for the weight f = p, with |f'| = 1 and |f| the
+    largest persistence. Both steps are checked, and also the tighter constant for fixed births, smaller by sqrt(5),
+    pair by pair.
 
     Args:
-        describe: from aligned clouds.
-        diagrams: of aligned clouds.
+        describe: function of aligned clouds.
+        diagrams: function of aligned clouds.
         before: `settled` clouds.
-        after: the same, moved (`moved_within_strips`).
+        after: the same clouds, moved by `moved_within_strips`.
         eps: scaled units.
         config: with a persistence weight of 1.
 
     Returns:
-        The largest quotient of a move of an image and the theorem's bound: at most 1 / sqrt(5) but for rounding.
+        The largest quotient of the change of an image and its bound, at most 1 / sqrt(5) up to rounding.
     """
     found = [diagrams(clouds) for clouds in (before, after)]
     np.testing.assert_array_equal(found[0].mask, found[1].mask)
@@ -175,15 +176,15 @@ def _references(aligned: PointClouds, network: ColorNetwork, config: DescriptorC
 def assert_follows_equations(
     describe: Describe, aligned: PointClouds, network: ColorNetwork, config: DescriptorConfig
 ) -> None:
-    """The descriptor is that of NumPy in float64: the paper's equations, or the released code's rounding and numbering.
+    """Assert that descriptors equal those of `reference_descriptor` up to rounding.
 
-    By the released convention for every cloud, the paper's for `settled` ones: on a border of a strip, a quotient
-    rounded to float32 can fall on the other side. Coordinates below 2 are off by 2 u on the way to a persistence.
+    Holds for every cloud in the released convention and for `settled` clouds in the paper's convention: a quotient
+    rounded to float32 can cross the border of a strip. Coordinates below 2 add 2 units to the error of a persistence.
 
     Args:
-        describe: from aligned clouds.
-        aligned: clouds.
-        network: gives regions and similarity.
+        describe: function of aligned clouds.
+        aligned: aligned clouds.
+        network: the colour network.
         config: without relaxation.
     """
     found = describe(aligned)
@@ -203,9 +204,9 @@ def assert_follows_equations(
 def assert_overflow_told(
     describe: Describe, aligned: PointClouds, network: ColorNetwork, config: DescriptorConfig
 ) -> None:
-    """Nothing is dropped in silence: `overflow` counts the points and pairs that the descriptor misses, and no others.
+    """Assert that `overflow` counts exactly the points and pairs that the descriptor leaves out.
 
-    The same count in NumPy. Where it is 0, every point is in the embedding and every pair in the window.
+    The same count is computed in NumPy. If it is 0, every point is in the embedding and every pair in the window.
     """
     counted = [reference.overflow for reference in _references(aligned, network, config)]
     found = describe(aligned)
@@ -221,19 +222,19 @@ def assert_relaxation_converges(
     config: DescriptorConfig,
     factor: float,
 ) -> None:
-    """Towards zero temperature the relaxed descriptor is the hard one, at a rate: its bias is of the size of T log n.
+    """Assert that the relaxed descriptor converges to the hard one, with a bias of at most T log(2 n).
 
-    On `settled` clouds, whose points have weights of 1 within exp(-margin / T): with the default temperatures times a
-    `factor` of at most 0.02 that is exp(-25) or less. Each extreme of a strip of n points is then within T log(2 n) of
-    the hard one, T the extremum's temperature: the log-sum-exp lies between the greatest term, less T log 2 or itself,
-    and T log n more. 8-bit colours are at least 0.1 levels from a tie and get the hard regions.
+    On `settled` clouds the weights are 1 up to exp(-margin / T), at most exp(-25) if the default temperatures are
+    multiplied by a `factor` of at most 0.02. Each extreme of a strip of n points is then within T log(2 n) of the hard
+    one, for the temperature T of extrema: a log-sum-exp exceeds the greatest term by at most T log n and falls below it
+    by at most T log 2. 8-bit colours are at least 0.1 levels away from a tie and get the hard regions.
 
     Args:
-        describe_at: from aligned clouds and a config.
-        aligned: settled with a margin of 0.2 or more.
-        network: gives the regions.
-        config: hard.
-        factor: of the default temperatures, at most 0.02.
+        describe_at: function of aligned clouds and a config.
+        aligned: clouds settled with a margin of 0.2 or more.
+        network: the colour network.
+        config: a config without relaxation.
+        factor: multiplies the default temperatures, at most 0.02.
     """
     soft = Relaxation(**{name: factor * value for name, value in dataclasses.asdict(Relaxation()).items()})
     found = describe_at(aligned, dataclasses.replace(config, relaxation=soft))
