@@ -1,7 +1,7 @@
-"""RGB-D frames with an instance segmentation: checked on construction, read from image files.
+"""RGB-D frames with an instance segmentation: validated when they are made, read from image files.
 
 frame = read_frame(color="c.png", depth="d.png", labels="l.png", intrinsics="k.json")
-frame.instances                        # label numbers, 0 is background
+frame.instances                        # label numbers; 0 is background
 points = backproject(frame.depth_m, frame.intrinsics)      # [H, W, 3] metres, OpenCV camera frame
 """
 
@@ -20,10 +20,11 @@ from PIL import Image
 from thor2_jax.errors import InputError, with_context
 
 __all__ = [
-    "MOST_PIXELS",
+    "MAX_IMAGE_PIXELS",
     "Intrinsics",
     "RGBDFrame",
     "backproject",
+    "parse_intrinsics",
     "pixel_rays",
     "read_color",
     "read_depth",
@@ -33,20 +34,19 @@ __all__ = [
 ]
 
 
-FORMATS = ("PNG", "JPEG", "TIFF")
-"""Of images that are read. Some of the others that Pillow knows run programs."""
+IMAGE_FORMATS = ("PNG", "JPEG", "TIFF")
+"""Image formats that are read. For some of its other formats, Pillow runs external programs."""
 
-MOST_PIXELS = 2**26
-"""Of an image that is read: a small file can tell of a large one, and fill memory."""
+MAX_IMAGE_PIXELS = 2**26
+"""Largest number of pixels of an image that is read: a small file can decompress to gigabytes."""
 
-
-LARGEST = 10**9
-"""Of a number of the intrinsics, in size: past it, it is none of a camera, and integers soon fit no array."""
+LARGEST_INTRINSIC = 10**9
+"""Largest absolute value accepted for an intrinsic parameter."""
 
 
 def _is_number(value: Any) -> bool:
     try:
-        return isinstance(value, Real) and not isinstance(value, bool) and abs(float(value)) <= LARGEST
+        return isinstance(value, Real) and not isinstance(value, bool) and abs(float(value)) <= LARGEST_INTRINSIC
     except OverflowError:  # an integer past the largest float
         return False
 
@@ -56,15 +56,15 @@ class Intrinsics:
     """A pinhole camera without distortion; pixel centres have integer coordinates.
 
     Attributes:
-        fx: focal length in pixels along a row.
-        fy: focal length in pixels along a column.
-        cx: principal point, column.
-        cy: principal point, row.
-        depth_scale: depth units a metre (1000: millimetres).
+        fx: focal length along a row, pixels.
+        fy: focal length along a column, pixels.
+        cx: column of the principal point.
+        cy: row of the principal point.
+        depth_scale: depth units per metre; 1000 if depth is in millimetres.
 
     Raises:
-        InputError: a value that is no finite number or past `LARGEST`, or a focal length or depth scale that is not
-            positive.
+        InputError: a value is not a finite number or exceeds `LARGEST_INTRINSIC`, or a focal length or the depth scale
+            is not positive.
     """
 
     fx: float
@@ -78,39 +78,54 @@ class Intrinsics:
             value = getattr(self, field.name)
             if not _is_number(value):
                 raise InputError(
-                    f"intrinsics.{field.name} is {value!r}; it must be a finite number, at most {LARGEST:.0e} in size"
+                    f"intrinsics.{field.name} is {value!r}; expected a finite number of at most {LARGEST_INTRINSIC:.0e}"
                 )
             if value <= 0 and field.name not in ("cx", "cy"):
-                raise InputError(f"intrinsics.{field.name} is {value!r}; it must be positive")
+                raise InputError(f"intrinsics.{field.name} is {value!r}; expected a positive number")
 
     @classmethod
     def of(cls, values: Any) -> "Intrinsics":
-        """From a mapping with fx, fy, cx, cy and, if it is there, depth_scale; other entries are passed over.
+        """Make intrinsics from a mapping with fx, fy, cx, cy and optionally depth_scale; other entries are ignored.
 
         Raises:
-            InputError: no mapping, a missing entry, or a value that `Intrinsics` refuses.
+            InputError: `values` is no mapping, lacks an entry or has an invalid one.
         """
         if not isinstance(values, Mapping):
-            raise InputError(f"intrinsics is a {type(values).__name__}; expected a table with fx, fy, cx, cy")
+            raise InputError(f"intrinsics is a {type(values).__name__}; expected a mapping with fx, fy, cx, cy")
         missing = [name for name in ("fx", "fy", "cx", "cy") if name not in values]
         if missing:
-            raise InputError(f"intrinsics lacks {', '.join(missing)}")
+            raise InputError(f"intrinsics lacks {', '.join(missing)}; expected fx, fy, cx, cy")
         return cls(**{f.name: values[f.name] for f in dataclasses.fields(cls) if f.name in values})
+
+    @classmethod
+    def of_matrix(cls, matrix: Any, depth_scale: float = 1000.0) -> "Intrinsics":
+        """Make intrinsics from the nine numbers of a camera matrix, row by row.
+
+        Raises:
+            InputError: `matrix` is not of the form fx, 0, cx, 0, fy, cy, 0, 0, 1, or a value is invalid.
+        """
+        try:
+            fx, skew, cx, a, fy, cy, b, c, one = matrix
+        except (TypeError, ValueError):
+            skew = None
+        if skew is None or [skew, a, b, c, one] != [0, 0, 0, 0, 1]:
+            raise InputError(f"intrinsics is {matrix!r}; expected fx, 0, cx, 0, fy, cy, 0, 0, 1")
+        return cls.of({"fx": fx, "fy": fy, "cx": cx, "cy": cy, "depth_scale": depth_scale})
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class RGBDFrame:
-    """One registered RGB-D image and the instances in it.
+    """A registered RGB-D image and the instances in it.
 
     Attributes:
         color: [H, W, 3] uint8, sRGB.
-        depth: [H, W] unsigned integers in 1 / `intrinsics.depth_scale` metres, or floats in metres; 0 (or not finite)
-            where there is none.
-        labels: [H, W] integers, at least 0; 0 is background, every other number an instance.
-        intrinsics: of the common pixel grid; a mapping (see `Intrinsics.of`) is taken as well.
+        depth: [H, W] distance along the optical axis: unsigned integers in 1 / `intrinsics.depth_scale` metres
+            (millimetres by default) or floats in metres; 0, and in floats also NaN or infinity, where there is none.
+        labels: [H, W] integers; 0 is background, every other number an instance.
+        intrinsics: the camera of all three images; a mapping is converted by `Intrinsics.of`.
 
     Raises:
-        InputError: shapes or types that do not fit, naming the argument and what it is.
+        InputError: a shape or type that does not fit; names the argument.
     """
 
     color: NDArray[np.uint8]
@@ -126,7 +141,9 @@ class RGBDFrame:
             raise InputError(f"color has type {color.dtype}; expected uint8")
         for name, image in (("depth", depth), ("labels", labels)):
             if image.shape != color.shape[:2]:
-                raise InputError(f"{name} has shape {image.shape}; color has {color.shape[:2]} (rows, columns)")
+                raise InputError(
+                    f"{name} has shape {image.shape}; expected {color.shape[:2]} (rows, columns), as color"
+                )
         if depth.dtype.kind not in "uf" or depth.dtype == np.uint8:
             raise InputError(
                 f"depth has type {depth.dtype}; expected uint16 or uint32 (1 / depth_scale metres) or floats (metres)"
@@ -134,37 +151,40 @@ class RGBDFrame:
         if labels.dtype.kind not in "ui":
             raise InputError(f"labels has type {labels.dtype}; expected integers")
         if labels.min() < 0:
-            raise InputError(f"labels has the value {labels.min()}; labels must be at least 0")
-        given = self.intrinsics
-        intrinsics = given if isinstance(given, Intrinsics) else Intrinsics.of(given)
+            raise InputError(f"labels has the value {labels.min()}; expected 0 or more")
+        camera = self.intrinsics
+        intrinsics = camera if isinstance(camera, Intrinsics) else Intrinsics.of(camera)
         for name, value in (("color", color), ("depth", depth), ("labels", labels), ("intrinsics", intrinsics)):
             object.__setattr__(self, name, value)
 
     @cached_property
     def depth_m(self) -> NDArray[np.float32]:
-        """Depth [H, W] float32 in metres; 0 where there is none."""
+        """Depth in metres [H, W] float32; 0 where there is none."""
         if self.depth.dtype.kind == "u":
             return np.divide(self.depth, self.intrinsics.depth_scale, dtype=np.float32)
         return np.where(np.isfinite(self.depth), self.depth, 0).astype(np.float32)
 
     @cached_property
     def instance_pixels(self) -> dict[int, NDArray[np.intp]]:
-        """Label number -> its pixels, sorted flat indices (row * W + column); labels in increasing order, without 0."""
+        """Label number -> sorted flat indices (row * W + column) of its pixels, in the order of `instances`."""
         flat = self.labels.ravel()
-        pixels = np.flatnonzero(flat != 0)  # of booleans: several times as fast
+        pixels = np.flatnonzero(flat != 0)  # several times as fast on booleans as on integers
         order = np.argsort(flat[pixels], kind="stable")
         pixels = pixels[order]
-        found, first = np.unique(flat[pixels], return_index=True)
-        return dict(zip(found.tolist(), np.split(pixels, first[1:]), strict=False))
+        labels, first = np.unique(flat[pixels], return_index=True)
+        return dict(zip(labels.tolist(), np.split(pixels, first[1:]), strict=False))
 
     @cached_property
     def instances(self) -> tuple[int, ...]:
-        """Label numbers that occur, in increasing order, without 0."""
+        """Label numbers of the frame in increasing order, without 0."""
         return tuple(self.instance_pixels)
 
 
 def pixel_rays(pixels: NDArray[np.intp], width: int, intrinsics: Intrinsics) -> NDArray[np.float64]:
-    """Rays [n, 3] through pixels (flat indices [n]) in the OpenCV camera frame, z = 1: times a depth, a point."""
+    """Return the rays [n, 3] with z = 1 through pixels (flat indices [n]), in the OpenCV camera frame.
+
+    A ray times the pixel's depth is its point.
+    """
     row, column = np.divmod(pixels, width)
     rays = np.ones((len(pixels), 3))
     rays[:, 0] = (column - intrinsics.cx) / intrinsics.fx
@@ -173,92 +193,108 @@ def pixel_rays(pixels: NDArray[np.intp], width: int, intrinsics: Intrinsics) -> 
 
 
 def backproject(depth_m: NDArray[Any], intrinsics: Intrinsics) -> NDArray[Any]:
-    """Points [H, W, 3] of a depth image [H, W], metres, in the OpenCV camera frame (x right, y down, z forward)."""
+    """Return the points [H, W, 3] of a depth image [H, W] in metres.
+
+    The frame is OpenCV's camera frame (x right, y down, z forward).
+    """
     height, width = depth_m.shape
     rays = pixel_rays(np.arange(height * width), width, intrinsics)
     return (rays * depth_m.reshape(-1, 1)).astype(depth_m.dtype).reshape(height, width, 3)
 
 
 def _read_image(path: str | Path, argument: str) -> tuple[NDArray[Any], str]:
-    """An image file as an array, and its mode, Pillow's word for what the numbers mean.
+    """Read an image file; return its pixels and its Pillow mode.
 
     Raises:
-        InputError: none of `FORMATS`, damaged, or of more than `MOST_PIXELS`; names `argument` and the file.
-        OSError: it cannot be opened.
+        InputError: the file is damaged, not of `IMAGE_FORMATS` or larger than `MAX_IMAGE_PIXELS`; names `argument` and
+            the file.
+        OSError: the file cannot be opened.
     """
     with open(path, "rb") as stream:
         try:
-            with Image.open(stream, formats=FORMATS) as image:
-                if image.width * image.height > MOST_PIXELS:
-                    raise ValueError(f"{image.width} x {image.height} pixels; at most {MOST_PIXELS} are read")
-                image.verify()  # decoding passes over the checksums of a PNG's pixels
+            with Image.open(stream, formats=IMAGE_FORMATS) as image:
+                if image.width * image.height > MAX_IMAGE_PIXELS:
+                    raise ValueError(f"{image.width} x {image.height} pixels; expected at most {MAX_IMAGE_PIXELS}")
+                image.verify()  # decoding does not check the checksums of a PNG
             stream.seek(0)
-            with Image.open(stream, formats=FORMATS) as image:
+            with Image.open(stream, formats=IMAGE_FORMATS) as image:
                 return np.asarray(image), image.mode
-        # Damaged files make the decoders raise a dozen kinds of exception; only bytes are at work here.
+        # On damaged files, the decoders raise many kinds of exception; nothing but the content can cause them here.
         except Exception as error:
             reason = " ".join(str(error).split()) or type(error).__name__
-            raise InputError(f"{argument}: {path} is damaged or no image ({reason})") from None
+            raise InputError(
+                f"{argument}: {path} is damaged or no image ({reason}); expected {', '.join(IMAGE_FORMATS)}"
+            ) from None
 
 
 def read_color(path: str | Path) -> NDArray[np.uint8]:
     """Read an 8-bit RGB image [H, W, 3]; an alpha channel is dropped. Raises InputError and OSError as `read_frame`."""
-    found, mode = _read_image(path, "color")
+    pixels, mode = _read_image(path, "color")
     if mode not in ("RGB", "RGBA"):
         raise InputError(f"color: {path} has the mode {mode}; expected 8-bit RGB")
-    return np.ascontiguousarray(found[..., :3])
+    return np.ascontiguousarray(pixels[..., :3])
 
 
 def read_depth(path: str | Path) -> NDArray[np.uint16]:
     """Read a one-channel 16-bit image [H, W]. Raises InputError and OSError as `read_frame`."""
-    found, _ = _read_image(path, "depth")
-    if found.ndim != 2 or found.dtype not in (np.uint16, np.int32):
+    pixels, _ = _read_image(path, "depth")
+    if pixels.ndim != 2 or pixels.dtype not in (np.uint16, np.int32):
         raise InputError(
-            f"depth: {path} has shape {found.shape} and type {found.dtype}; expected one channel of 16 bits"
+            f"depth: {path} has shape {pixels.shape} and type {pixels.dtype}; expected one channel of 16 bits"
         )
     # Pillow reads some 16-bit files as 32-bit integers.
-    if found.dtype == np.int32 and (found.min() < 0 or found.max() > 65535):
-        raise InputError(f"depth: {path} has values from {found.min()} to {found.max()}; expected 0 to 65535")
-    return found.astype(np.uint16)
+    if pixels.dtype == np.int32 and (pixels.min() < 0 or pixels.max() > 65535):
+        raise InputError(f"depth: {path} has values from {pixels.min()} to {pixels.max()}; expected 0 to 65535")
+    return pixels.astype(np.uint16)
 
 
 def read_labels(path: str | Path) -> NDArray[Any]:
-    """Read a one-channel or indexed image [H, W] of whole numbers. Raises InputError and OSError as `read_frame`."""
-    found, _ = _read_image(path, "labels")
-    if found.ndim != 2 or found.dtype.kind not in "ui":
+    """Read a one-channel or indexed image [H, W] of integers. Raises InputError and OSError as `read_frame`."""
+    pixels, _ = _read_image(path, "labels")
+    if pixels.ndim != 2 or pixels.dtype.kind not in "ui":
         raise InputError(
-            f"labels: {path} has shape {found.shape} and type {found.dtype}; expected one channel of whole numbers"
+            f"labels: {path} has shape {pixels.shape} and type {pixels.dtype}; expected one channel of integers"
         )
-    return found
+    return pixels
+
+
+def parse_intrinsics(content: bytes) -> Intrinsics:
+    """Make intrinsics from JSON text: an object with fx, fy, cx, cy and optionally depth_scale (depth units per metre).
+
+    Raises:
+        InputError: `content` is no valid JSON, or as `Intrinsics.of`.
+    """
+    try:
+        values = json.loads(content)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"intrinsics is no valid JSON ({error}); expected an object with fx, fy, cx, cy") from None
+    return Intrinsics.of(values)
 
 
 def read_intrinsics(path: str | Path) -> Intrinsics:
-    """Read intrinsics from a JSON file: fx, fy, cx, cy and, if it is there, depth_scale (units a metre).
+    """Read intrinsics from a JSON file, see `parse_intrinsics`.
 
     Raises:
-        InputError: no JSON, or not these numbers; names the file.
-        OSError: it cannot be opened.
+        InputError: as `parse_intrinsics`; names the file.
+        OSError: the file cannot be opened.
     """
-    try:
-        values = json.loads(Path(path).read_bytes())
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"intrinsics: {path} is no JSON ({error})") from None
+    content = Path(path).read_bytes()
     with with_context(str(path)):
-        return Intrinsics.of(values)
+        return parse_intrinsics(content)
 
 
 def read_frame(*, color: str | Path, depth: str | Path, labels: str | Path, intrinsics: str | Path) -> RGBDFrame:
     """Read a frame from files.
 
     Args:
-        color: 8-bit RGB image (PNG or JPEG; an alpha channel is dropped).
-        depth: 16-bit one-channel PNG in 1 / depth_scale metres.
-        labels: one-channel or indexed PNG of instance numbers, 8 or 16 bits.
-        intrinsics: JSON, see `read_intrinsics`.
+        color: 8-bit RGB image (PNG, JPEG or TIFF; an alpha channel is dropped).
+        depth: 16-bit one-channel image in 1 / depth_scale metres, by default millimetres.
+        labels: one-channel or indexed image of instance numbers, 8 or 16 bits; 0 is background.
+        intrinsics: JSON file, see `parse_intrinsics`.
 
     Raises:
-        InputError: a file that is damaged or of another kind, or images of different sizes; names the file or the
-            argument.
+        InputError: a file is damaged or of the wrong kind, or the images differ in size; names the file or
+            the argument.
         OSError: a file cannot be opened.
     """
     return RGBDFrame(read_color(color), read_depth(depth), read_labels(labels), read_intrinsics(intrinsics))

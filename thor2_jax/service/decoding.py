@@ -4,7 +4,6 @@ Sizes are checked before anything is decompressed, and every error names the fie
 """
 
 import io
-import json
 import math
 import zipfile
 from typing import Any
@@ -16,7 +15,7 @@ from pydantic import ValidationError
 
 from thor2_jax.capacity import POINT_BUCKETS
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.frames import Intrinsics, RGBDFrame
+from thor2_jax.recognition.frames import Intrinsics, RGBDFrame, parse_intrinsics
 from thor2_jax.service.problem import RequestError
 from thor2_jax.service.schemas import Clouds
 from thor2_jax.service.settings import (
@@ -63,11 +62,9 @@ def _decode_intrinsics(content: bytes) -> Intrinsics:
             413, "intrinsics", f"intrinsics has {len(content)} bytes; expected at most {MAX_INTRINSICS_BYTES}."
         )
     try:
-        return Intrinsics.of(json.loads(content))
+        return parse_intrinsics(content)
     except InputError as error:
         raise RequestError(422, "intrinsics", f"{error}.") from None
-    except (ValueError, RecursionError):
-        raise RequestError(422, "intrinsics", "intrinsics is not valid JSON, or is nested too deeply.") from None
 
 
 def _decode_image(field: str, content: bytes, formats: tuple[str, ...], modes: tuple[str, ...]) -> NDArray[Any]:

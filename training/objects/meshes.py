@@ -11,7 +11,7 @@ from PIL import Image
 from trimesh.visual.material import PBRMaterial, SimpleMaterial, empty_material
 
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.frames import MOST_PIXELS
+from thor2_jax.recognition.frames import MAX_IMAGE_PIXELS
 from training.objects.mesh import TexturedMesh, merge_meshes
 from training.storage.tables import parse_json, parse_yaml
 
@@ -66,8 +66,8 @@ def _part(geometry: trimesh.Trimesh) -> TexturedMesh:
     factor = np.full(3, 255, np.uint8) if factor is None else np.asarray(factor, np.uint8)[:3]
     if image is None or visual.uv is None:
         return _solid(vertices, faces, factor)
-    if isinstance(image, Image.Image) and image.width * image.height > MOST_PIXELS:
-        raise InputError(f"a texture of {image.width} x {image.height} pixels; at most {MOST_PIXELS} are read")
+    if isinstance(image, Image.Image) and image.width * image.height > MAX_IMAGE_PIXELS:
+        raise InputError(f"a texture of {image.width} x {image.height} pixels; at most {MAX_IMAGE_PIXELS} are read")
     texture = np.asarray(image.convert("RGB") if isinstance(image, Image.Image) else image, np.uint8)
     if (factor < 255).any():
         texture = np.rint(texture * (factor / 255.0)).astype(np.uint8)

@@ -5,8 +5,8 @@ and, if it is there, `scene_gt_info.json`; see docs/bop_datasets_format.md of gi
 numbers its objects; a YAML or JSON file names them, obj_id -> name.
 """
 
+import dataclasses
 import functools
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -154,12 +154,8 @@ def _values(instances: Any, key: str, kind: type | tuple[type, ...]) -> list[Any
 def _intrinsics(entry: Any) -> Intrinsics:
     try:
         matrix, scale = entry["cam_K"], entry["depth_scale"]
-        fx, skew, cx, a, fy, cy, b, c, one = matrix
-    except (TypeError, KeyError, ValueError):
+    except (TypeError, KeyError):
         raise InputError("an image's entry is not {cam_K: <9 numbers>, depth_scale: <number>, ...}") from None
-    if [skew, a, b, c, one] != [0, 0, 0, 0, 1]:
-        raise InputError(f"cam_K is {matrix!r}; expected fx, 0, cx, 0, fy, cy, 0, 0, 1")
-    if not isinstance(scale, (int, float)) or not 0 < scale < math.inf:
-        raise InputError(f"depth_scale is {scale!r}; it must be a positive number")
-    # The format gives millimetres a unit of depth, Intrinsics take units a metre.
-    return Intrinsics(fx, fy, cx, cy, 1000 / scale)
+    intrinsics = Intrinsics.of_matrix(matrix, scale)
+    # The format has millimetres per depth unit, Intrinsics have depth units per metre.
+    return dataclasses.replace(intrinsics, depth_scale=1000 / scale)

@@ -48,16 +48,14 @@ def arrays(height: int = 5, width: int = 7) -> dict[str, Any]:
 def test_intrinsics_that_are_no_finite_numbers(name: str, value: Any) -> None:
     values = {"fx": 500, "fy": 500, "cx": 3, "cy": 2, name: value}
     for build in (lambda: Intrinsics(**values), lambda: Intrinsics.of(values)):
-        with pytest.raises(
-            InputError, match=rf"^intrinsics\.{name} is .*must be a finite number, at most 1e\+09 in size$"
-        ):
+        with pytest.raises(InputError, match=rf"^intrinsics\.{name} is "):
             build()
 
 
 @pytest.mark.parametrize("name", ["fx", "fy", "depth_scale"])
 @pytest.mark.parametrize("value", [0, -1.5])
 def test_intrinsics_that_are_not_positive(name: str, value: float) -> None:
-    with pytest.raises(InputError, match=rf"^intrinsics\.{name} is {value}; it must be positive$"):
+    with pytest.raises(InputError, match=rf"^intrinsics\.{name} is {value};"):
         Intrinsics.of({"fx": 500, "fy": 500, "cx": 3, "cy": 2, name: value})
 
 
@@ -73,13 +71,13 @@ def test_a_principal_point_may_lie_outside_the_image() -> None:
 @pytest.mark.parametrize("missing", ["fx", "fy", "cx", "cy"])
 def test_intrinsics_that_are_incomplete(missing: str) -> None:
     values = {name: 500 for name in ("fx", "fy", "cx", "cy") if name != missing}
-    with pytest.raises(InputError, match=rf"^intrinsics lacks {missing}$"):
+    with pytest.raises(InputError, match=rf"^intrinsics lacks {missing};"):
         Intrinsics.of(values)
 
 
 @pytest.mark.parametrize("values", [None, 3, [500, 500, 3, 2], "fx"])
 def test_intrinsics_that_are_no_table(values: Any) -> None:
-    with pytest.raises(InputError, match=rf"^intrinsics is a {type(values).__name__}; expected a table"):
+    with pytest.raises(InputError, match=rf"^intrinsics is a {type(values).__name__};"):
         Intrinsics.of(values)
 
 
@@ -96,7 +94,7 @@ def test_a_frame_takes_a_mapping_as_intrinsics() -> None:
 
 
 def test_a_frame_refuses_bad_intrinsics() -> None:
-    with pytest.raises(InputError, match=r"^intrinsics lacks cx, cy$"):
+    with pytest.raises(InputError, match=r"^intrinsics lacks cx, cy;"):
         RGBDFrame(**{**arrays(), "intrinsics": {"fx": 1, "fy": 2}})
 
 
@@ -116,7 +114,7 @@ def test_color_of_another_type(kind: Any) -> None:
 @pytest.mark.parametrize("shape", [(7, 5), (5, 6), (5, 7, 1), (35,), ()])
 def test_images_of_another_size(name: str, shape: tuple[int, ...]) -> None:
     given = arrays()
-    with pytest.raises(InputError, match=rf"^{name} has shape .*color has \(5, 7\)"):
+    with pytest.raises(InputError, match=rf"^{name} has shape .*\(5, 7\)"):
         RGBDFrame(**{**given, name: np.zeros(shape, given[name].dtype)})
 
 
@@ -272,7 +270,7 @@ def test_an_image_that_unpacks_to_gigabytes(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["depth", "labels"])
 def test_images_that_are_not_of_one_size(files: dict[str, Path], name: str) -> None:
     Image.fromarray(np.zeros((5, 6), np.uint16)).save(files[name])
-    with pytest.raises(InputError, match=rf"^{name} has shape \(5, 6\); color has \(5, 7\)"):
+    with pytest.raises(InputError, match=rf"^{name} has shape \(5, 6\).*\(5, 7\)"):
         read_frame(**files)
 
 
@@ -348,18 +346,18 @@ def test_indexed_label_files_hold_indices_not_colors(tmp_path: Path) -> None:
 @pytest.mark.parametrize("mode", ["RGB", "RGBA", "LA", "1"])
 def test_label_files_that_hold_no_numbers(tmp_path: Path, mode: str) -> None:
     Image.new(mode, (7, 5)).save(tmp_path / "l.png")
-    with pytest.raises(InputError, match=r"^labels: .*expected one channel of whole numbers$"):
+    with pytest.raises(InputError, match=r"^labels: .*expected one channel of integers$"):
         read_labels(tmp_path / "l.png")
 
 
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
-        ("", "is no JSON"),
-        ("{", "is no JSON"),
-        ("fx: 500", "is no JSON"),
-        ("[" * 100_000, "is no JSON"),
-        ("\xff", "is no JSON"),
+        ("", "is no valid JSON"),
+        ("{", "is no valid JSON"),
+        ("fx: 500", "is no valid JSON"),
+        ("[" * 100_000, "is no valid JSON"),
+        ("\xff", "is no valid JSON"),
         ("[500, 500, 3, 2]", "intrinsics is a list"),
         ("null", "intrinsics is a NoneType"),
         ('{"fx": 500, "fy": 500}', "intrinsics lacks cx, cy"),

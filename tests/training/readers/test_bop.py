@@ -272,10 +272,10 @@ def test_tables_that_are_no_json(tmp_path: Path, text: str) -> None:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"cam_K": K[:8]}, "is not {cam_K"),
-        ({"cam_K": None}, "is not {cam_K"),
-        ({"cam_K": [K[:3], K[3:6], K[6:]]}, "is not {cam_K"),
-        ({"cam_K": [1066.8, 0.5, *K[2:]]}, "cam_K is [1066.8, 0.5,"),
+        ({"cam_K": K[:8]}, "intrinsics is ["),
+        ({"cam_K": None}, "intrinsics is None"),
+        ({"cam_K": [K[:3], K[3:6], K[6:]]}, "intrinsics is [["),
+        ({"cam_K": [1066.8, 0.5, *K[2:]]}, "intrinsics is [1066.8, 0.5,"),
         ({"cam_K": [*K[:8], 2.0]}, "expected fx, 0, cx, 0, fy, cy, 0, 0, 1"),
         ({"cam_K": [-1.0, *K[1:]]}, "intrinsics.fx is -1.0"),
         ({"cam_K": [float("nan"), *K[1:]]}, "intrinsics.fx is nan"),
@@ -285,7 +285,7 @@ def test_tables_that_are_no_json(tmp_path: Path, text: str) -> None:
         ({"depth_scale": float("inf")}, "depth_scale is inf"),
         ({"depth_scale": float("nan")}, "depth_scale is nan"),
         ({"depth_scale": "0.1"}, "depth_scale is '0.1'"),
-        ({"depth_scale": 10**400}, "depth_scale is 0.0"),
+        ({"depth_scale": 10**400}, "depth_scale is 1000"),
     ],
 )
 def test_cameras_that_do_not_fit(tmp_path: Path, change: dict[str, Any], said: str) -> None:
