@@ -343,10 +343,8 @@ class NamesInOrder:
         self.run = SimpleNamespace(classes=classes, classifiers={"tops": None}, config=None, network=network)
 
     def describe(self, frame: Any) -> Any:
-        clouds = [SimpleNamespace(label=label, reason=None) for label in frame.instances]
-        return SimpleNamespace(
-            clouds=clouds, usable=range(len(clouds)), occluded=[False] * len(clouds), descriptors=clouds
-        )
+        instances = [SimpleNamespace(label=label, reason=None, occluded=False) for label in frame.instances]
+        return SimpleNamespace(instances=instances, usable=instances, descriptors=instances)
 
     def probabilities(self, clouds: Sequence[Any]) -> dict[str, np.ndarray]:
         return {"tops": np.array([[0.9, 0.1] if k == 0 else [0.2, 0.8] for k in range(len(clouds))]).reshape(-1, 2)}
