@@ -36,8 +36,11 @@ from thor2_jax.files import check_output_directory
 from thor2_jax.recognition.classifier import MLP, feature_of
 from thor2_jax.recognition.recognizer import THOR2
 from thor2_jax.recognition.run_directory import TrainedRun, input_size, save_run
-from training.evaluate import evaluate, joinings, summarize
-from training.fitting.options import FitOptions
+from training.evaluation.answering import answer_frames
+from training.evaluation.fusion import fusions
+from training.evaluation.results import compute_results
+from training.evaluation.runs import Run
+from training.fitting.fit import FitOptions
 from training.fitting.samples import Batch, Samples, build_samples, expand
 from training.fitting.steps import scale_inputs
 from training.objects.builtin_objects import COLOR_PAIRS, SHAPE_PAIRS, builtin_objects
@@ -231,15 +234,20 @@ def compare(options: argparse.Namespace, fits: Sequence[FitOptions]) -> None:
     print(f"{len(samples)} samples of {len(objects)} objects, {time.perf_counter() - start:.0f} s", flush=True)
 
     runs: dict[str, list[TrainedRun]] = {"THOR2": [], "THOR2-L": []}
-    names = list(joinings(THOR2))
+    names = list(fusions(THOR2))
     accuracy: dict[str, dict[str, list[list[float]]]] = {title: {name: [] for name in runs} for title in sets}
     for fit in fits:
         for name, found in runs.items():
             found.append(train(samples, fit, learn=name == "THOR2-L"))
             for title, frames in sets.items():
-                row = summarize(evaluate(thor2.Recognizer(found[-1]), frames), names)["accuracy"]["all"]["all"]
-                accuracy[title][name].append([row[joining] for joining in names])
-                print(f"seed {fit.seed}, {title} ({row['instances']}): {name} {row['THOR2']:.3f}", flush=True)
+                run = Run(name, "", thor2.Recognizer(found[-1]))
+                results = compute_results("frames", [run], [answers for _, answers in answer_frames([run], frames)])
+                cell = results["accuracy"][results["rule"]][0]["cells"][0]
+                accuracy[title][name].append([cell["accuracy"][fusion]["mean"] for fusion in names])
+                print(
+                    f"seed {fit.seed}, {title} ({cell['instances']}): {name} {accuracy[title][name][-1][-1]:.3f}",
+                    flush=True,
+                )
     options.out.mkdir(parents=True, exist_ok=True)
     save_run(runs["THOR2-L"][0], options.out / "thor2-l")
 

@@ -10,7 +10,8 @@ import jax
 
 from thor2_jax.recognition.classifier import check_features
 from thor2_jax.recognition.run_directory import TrainedRun
-from training.baselines.job import check_baselines, train_baselines
+from training.baselines.job import train_baselines
+from training.baselines.names import check_baselines
 from training.fitting.job import VIEWS, check_out, check_trained, is_finished, train_run
 from training.fitting.options import Progress
 from training.fitting.protocol import Protocol

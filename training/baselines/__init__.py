@@ -1,1 +1,1 @@
-"""Other recognizers, to compare with: trained on a run's views, asked about the same described frames."""
+"""Baselines that are trained on the same views as a run and evaluated on the same instances."""

@@ -1,4 +1,4 @@
-"""Training the baselines of finished runs, one file each, beside what the run folders hold already."""
+"""Training the baselines of finished runs; each becomes a file in the run directory."""
 
 import shutil
 import time
@@ -6,70 +6,75 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.run_directory import load_run
-from training.baselines.baseline import Fitted, Task
-from training.baselines.files import StoredBaseline, baseline_file, write_baseline
-from training.baselines.forest import train_forest
-from training.baselines.pointnet import train_pointnet
-from training.baselines.thor import train_thor
-from training.fitting.options import FitOptions
+from thor2_jax.recognition.run_directory import TrainedRun, load_run
+from training.baselines.files import Stored, baseline_file, write_baseline
+from training.baselines.fit_forest import fit_forest
+from training.baselines.fit_pointnet import fit_pointnet
+from training.baselines.fit_thor import fit_thor
+from training.baselines.names import BASELINES, check_baselines
+from training.baselines.task import FitTask, FittedBaseline
+from training.fitting.options import FitOptions, Progress
 from training.fitting.run_directories import find_run_directories
 from training.fitting.temperature import fit_temperature
 from training.views.normalized_views import ViewSource
 
-__all__ = ["BASELINES", "check_baselines", "train_baselines"]
+__all__ = ["train_baselines"]
 
-_TRAIN: dict[str, Callable[[Task], Fitted]] = {"thor": train_thor, "forest": train_forest, "pointnet": train_pointnet}
-
-BASELINES = tuple(_TRAIN)
-
-
-def check_baselines(names: Sequence[str]) -> tuple[str, ...]:
-    """`names` in the order of BASELINES, or an InputError that names the option."""
-    if not set(names) <= set(BASELINES) or len(set(names)) != len(names):
-        raise InputError(f"baselines is {', '.join(names)}; expected different ones of {', '.join(BASELINES)}")
-    return tuple(name for name in BASELINES if name in names)
+_FIT: dict[str, Callable[[FitTask], FittedBaseline]] = {
+    "thor": fit_thor,
+    "forest": fit_forest,
+    "pointnet": fit_pointnet,
+}
 
 
 def train_baselines(
     path: str | Path,
     source: ViewSource,
     names: Sequence[str] = BASELINES,
-    progress: Callable[[str, int, int, str], object] = lambda stage, done, total, note: None,
+    progress: Progress = lambda stage, done, total, note: None,
     options: FitOptions | None = None,
 ) -> None:
-    """Train those baselines that a run lacks; one that was stopped begins again, or, THOR, goes on.
+    """Train the baselines that a run lacks. An interrupted training of THOR resumes, the others start again.
 
     Args:
-        path: run folder, or one that holds the folds of a training: then for each of them.
-        source: the views that the run was trained on. Those that its fold holds out are held out here too.
+        path: run directory, or a directory with the folds of a training: then for each fold.
+        source: the views that the run was trained on; those that its fold holds out are held out here too.
         names: any of BASELINES.
-        progress: told (stage, done, total, note).
-        options: of the fits; by default those of the run's classifiers.
+        progress: called with (stage, done, total, note).
+        options: options of the fits; by default those of the run.
 
     Raises:
-        InputError: an unknown baseline, no run, other views than the run's, or views that a baseline cannot be trained
-            on.
+        InputError: a baseline is unknown, `path` is no run directory, the views are not those of the run, or a baseline
+            cannot be trained on them.
         OSError: a file cannot be written.
     """
-    wanted = check_baselines(names)
-    for folder in find_run_directories([Path(path)]):
-        lacking = [name for name in wanted if not baseline_file(folder, name).is_file()]
-        run = load_run(folder)
-        record = run.record
-        if record["dataset"]["digest"] != source.digest:
-            raise InputError(f"dataset: {folder} was trained on other views")
-        given = options or FitOptions(
-            record["epochs"], tuple(record["learning_rates"]), record["batch_size"], record["seed"]
-        )
-        for name in lacking:
-            file = baseline_file(folder, name)
-            scratch = file.with_name(f".{name}")
-            scratch.mkdir(parents=True, exist_ok=True)
-            start = time.perf_counter()
-            task = Task(source, run.network, run.config, given, record["folds"], record["fold"], scratch, progress)
-            fitted = _TRAIN[name](task)
-            seconds = time.perf_counter() - start
-            temperature = fit_temperature(fitted.probabilities, fitted.truth) if len(fitted.truth) else None
-            write_baseline(file, StoredBaseline(fitted.model.arrays(), temperature, seconds), run.classes)
-            shutil.rmtree(scratch)
+    names = check_baselines(names)
+    for directory in find_run_directories([Path(path)]):
+        run = load_run(directory)
+        if run.record["dataset"]["digest"] != source.digest:
+            raise InputError(
+                f"dataset: the views with digest {source.digest[:12]} are not those that {directory} was trained on; "
+                "give the dataset of that run"
+            )
+        for name in names:
+            if not baseline_file(directory, name).is_file():
+                _train(directory, run, source, name, progress, options)
+
+
+def _train(
+    directory: Path, run: TrainedRun, source: ViewSource, name: str, progress: Progress, options: FitOptions | None
+) -> None:
+    record = run.record
+    options = options or FitOptions(
+        record["epochs"], tuple(record["learning_rates"]), record["batch_size"], record["seed"]
+    )
+    file = baseline_file(directory, name)
+    scratch = file.with_name(f".{name}")
+    scratch.mkdir(parents=True, exist_ok=True)
+    start = time.perf_counter()
+    task = FitTask(source, run.network, run.config, options, record["folds"], record["fold"], scratch, progress)
+    fitted = _FIT[name](task)
+    seconds = time.perf_counter() - start
+    temperature = fit_temperature(fitted.probabilities, fitted.truth) if len(fitted.truth) else None
+    write_baseline(file, Stored(fitted.model.arrays(), temperature, seconds), run.classes)
+    shutil.rmtree(scratch)

@@ -1,4 +1,4 @@
-"""Reading the baselines of a run folder: RUN/baselines/{thor,forest,pointnet}.safetensors."""
+"""Loading the baselines of a run directory: RUN/baselines/{thor,forest,pointnet}.safetensors."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -14,7 +14,7 @@ from training.baselines.thor import THOR
 
 __all__ = ["load_baselines"]
 
-_MADE: dict[str, Callable[[Mapping[str, Any], TrainedRun], Baseline]] = {
+_BUILD: dict[str, Callable[[Mapping[str, Any], TrainedRun], Baseline]] = {
     "thor": lambda arrays, run: THOR.with_arrays(arrays, run.config, len(run.classes)),
     "forest": lambda arrays, run: Forest(arrays, run.network, run.config),
     "pointnet": lambda arrays, run: ColoredPointNet.with_arrays(arrays, len(run.classes)),
@@ -22,22 +22,24 @@ _MADE: dict[str, Callable[[Mapping[str, Any], TrainedRun], Baseline]] = {
 
 
 def load_baselines(path: Path, run: TrainedRun) -> tuple[dict[str, Baseline], dict[str, float]]:
-    """The baselines that a run folder has, and the temperatures of those that have one.
+    """Return the baselines of a run directory, and the temperatures of those that were calibrated.
 
     Raises:
-        InputError: a damaged file; names it.
+        InputError: a file is damaged or does not match the run.
     """
     models: dict[str, Baseline] = {}
     temperatures: dict[str, float] = {}
-    for name, made in _MADE.items():
+    for name, build in _BUILD.items():
         file = baseline_file(path, name)
         if not file.is_file():
             continue
         stored = read_baseline(file, run.classes)
         try:
-            models[name] = made(stored.arrays, run)
+            models[name] = build(stored.arrays, run)
         except ValueError as error:
-            raise InputError(f"model: {file} does not fit its run: {error}") from None
+            raise InputError(
+                f"model: {file} does not match its run ({error}); delete it and train the baseline again"
+            ) from None
         if stored.temperature is not None:
             temperatures[name] = stored.temperature
     return models, temperatures

@@ -106,10 +106,10 @@ def _print_report(report: Mapping[str, Any]) -> None:
     from training.evaluation.page import accuracy_table
 
     counts, speed = report["instances"], report["speed"]
-    if report["joinings"]:
-        shown = Table("", "instances", *report["joinings"])
+    if report["fusions"]:
+        shown = Table("", "instances", *report["fusions"])
         for table in report["accuracy"][report["rule"]]:
-            header, rows = accuracy_table(table, report["joinings"])
+            header, rows = accuracy_table(table, report["fusions"])
             shown.add_section()
             if header[0]:
                 shown.add_row(f"by {header[0]}", style="bold")

@@ -1,1 +1,1 @@
-"""Evaluation as in the paper (section "Results"): answers of trained runs on a dataset, tables, pictures, a page."""
+"""Evaluation on labelled datasets: answers, accuracy, confidence, fusion of classifiers and the report."""

@@ -1,4 +1,4 @@
-"""Accuracy by parts of a dataset, over several runs (paper, section "Results": mean and standard deviation)."""
+"""Breakdown of a dataset by attributes, and statistics over runs (paper, section "Results")."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Figure", "over_runs", "parts", "tables_of"]
+__all__ = ["RunStatistics", "attribute_tables", "group_by_attributes", "summarize_runs"]
 
 _ORDER = {"none": 0, "low": 1, "high": 2}
 
@@ -20,34 +20,36 @@ _TABLES: dict[str, tuple[tuple[str, ...], ...]] = {
     ),
     "ocid": (("camera",), ("camera", "place"), ("camera", "type"), ("camera", "place", "type"), ("sequence",)),
 }
-"""The paper's tables of its two datasets, each by values of these attributes."""
+"""Attributes of the paper's tables for its two datasets."""
 
 
-def tables_of(kind: str, attributes: Sequence[Mapping[str, str]]) -> list[tuple[str, ...]]:
-    """By which attributes accuracy is told: none first, then those of the paper's tables, or each by itself."""
+def attribute_tables(kind: str, attributes: Sequence[Mapping[str, str]]) -> list[tuple[str, ...]]:
+    """Return the attributes of each table: none for the first, then the paper's tables or each attribute by itself."""
     known = sorted({name for each in attributes for name in each})
     tables = _TABLES.get(kind, tuple((name,) for name in known))
     return [(), *(table for table in tables if set(table) <= set(known))]
 
 
-def parts(attributes: Sequence[Mapping[str, str]], names: Sequence[str]) -> dict[tuple[str, ...], NDArray[np.intp]]:
-    """Values of the attributes named -> indices of those that have them; what lacks one of them is in no part."""
-    found: dict[tuple[str, ...], list[int]] = {}
+def group_by_attributes(
+    attributes: Sequence[Mapping[str, str]], names: Sequence[str]
+) -> dict[tuple[str, ...], NDArray[np.intp]]:
+    """Return the indices for each combination of the named attributes' values; entries that lack one are left out."""
+    groups: dict[tuple[str, ...], list[int]] = {}
     for index, each in enumerate(attributes):
         if all(name in each for name in names):
-            found.setdefault(tuple(each[name] for name in names), []).append(index)
-    ordered = sorted(found, key=lambda values: [(_ORDER.get(value, -1), value) for value in values])
-    return {values: np.array(found[values], np.intp) for values in ordered}
+            groups.setdefault(tuple(each[name] for name in names), []).append(index)
+    ordered = sorted(groups, key=lambda values: [(_ORDER.get(value, -1), value) for value in values])
+    return {values: np.array(groups[values], np.intp) for values in ordered}
 
 
 @dataclasses.dataclass(frozen=True)
-class Figure:
-    """A figure of several runs.
+class RunStatistics:
+    """Statistics of a value over several runs.
 
     Attributes:
-        mean: over the runs; None if none of them has it.
-        std: sample standard deviation (n - 1) over the runs; None of a single one.
-        runs: how many have it.
+        mean: mean over the runs; None if no run has the value.
+        std: sample standard deviation (n - 1); None for fewer than two runs.
+        runs: number of runs that have the value.
     """
 
     mean: float | None
@@ -55,11 +57,12 @@ class Figure:
     runs: int
 
 
-def over_runs(values: Sequence[float]) -> Figure:
-    """Mean and standard deviation; values that are not finite (of nothing) are left out."""
+def summarize_runs(values: Sequence[float]) -> dict[str, Any]:
+    """Return `RunStatistics` of the finite values as a JSON table."""
     finite: NDArray[Any] = np.array([value for value in values if np.isfinite(value)])
-    return Figure(
+    statistics = RunStatistics(
         float(finite.mean()) if len(finite) else None,
         float(finite.std(ddof=1)) if len(finite) > 1 else None,
         len(finite),
     )
+    return dataclasses.asdict(statistics)

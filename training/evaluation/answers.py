@@ -1,39 +1,61 @@
-"""What every classifier of every run says of every labelled instance, kept frame by frame as it comes.
+"""Class probabilities of every classifier for every labelled instance, and the file that keeps them.
 
-`answers.jsonl`: the first line tells what was asked, each further line holds a frame. A file that a crash cut off is
-good up to its last whole line. The digests in the lines of version 0.1.0 are not read.
+The first line of `answers.jsonl` describes the evaluation; each further line holds the answers for one frame. A line
+that an interrupted evaluation left incomplete is removed when the evaluation resumes. The digests of version 0.1.0 are
+ignored.
 """
 
 import dataclasses
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
 from thor2_jax.files import write_text
-from training.baselines.baseline import seen_in
-from training.evaluation.runs import Run
-from training.readers.labelled import LabelledFrame
 from training.storage.jobs import check_same_job
 
-__all__ = ["AnswerFile", "FrameAnswers", "InstanceAnswer", "answer_frame", "columns"]
+__all__ = ["AnswerFile", "EvaluatedRun", "FrameAnswers", "InstanceAnswer", "all_predictors"]
+
+
+class EvaluatedRun(Protocol):
+    """What the results of an evaluation need to know of a run."""
+
+    @property
+    def name(self) -> str:
+        """Name in reports."""
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Class names, in the order of the probabilities."""
+
+    @property
+    def predictors(self) -> tuple[str, ...]:
+        """Names of the classifiers and baselines."""
+
+    @property
+    def temperatures(self) -> Mapping[str, float]:
+        """Temperatures of the calibrated classifiers and baselines."""
+
+
+def all_predictors(runs: Sequence[EvaluatedRun]) -> tuple[tuple[int, str], ...]:
+    """Return (index of the run, name) of every classifier and baseline of all runs."""
+    return tuple((index, name) for index, run in enumerate(runs) for name in run.predictors)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class InstanceAnswer:
-    """What is said of one labelled instance.
+    """Class probabilities for one labelled instance.
 
     Attributes:
-        label: its number in the label image.
-        truth: its name; may be no class of the runs.
-        occluded: by the recognizer's rule.
-        reason: why it could not be described; None if it was.
-        probabilities: [M, C] float32, a row a classifier or baseline in the order of `columns`; None if it was not
-            described.
+        label: label number in the label image.
+        truth: name of the object, which may be none of the classes.
+        occluded: the recognizer found the instance to be occluded.
+        reason: why the instance could not be described; None if it was.
+        probabilities: [M, C] float32, one row for each of `all_predictors`; None if the instance was not described.
     """
 
     label: int
@@ -45,13 +67,13 @@ class InstanceAnswer:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class FrameAnswers:
-    """What is said of a frame.
+    """Answers for one frame.
 
     Attributes:
-        frame: its identifier.
-        attributes: those of the reader.
-        seconds: to read, describe and classify it.
-        instances: the labelled ones, by label number.
+        frame: identifier of the frame.
+        attributes: attributes given by the reader.
+        seconds: time to read, describe and classify the frame.
+        instances: labelled instances, ordered by label number.
     """
 
     frame: str
@@ -60,78 +82,57 @@ class FrameAnswers:
     instances: Sequence[InstanceAnswer]
 
 
-def columns(runs: Sequence[Run]) -> tuple[tuple[int, str], ...]:
-    """(Number of the run, name) of every classifier and baseline at hand."""
-    return tuple((r, name) for r, run in enumerate(runs) for name in run.asked)
-
-
-def answer_frame(runs: Sequence[Run], item: LabelledFrame) -> list[InstanceAnswer]:
-    """Describe a frame once, with the first recognizer, and classify it with all classifiers and baselines."""
-    described = runs[0].recognizer.describe(item.frame)
-    compared = any(run.baselines for run in runs)
-    seen = seen_in(described, runs[0].recognizer.run.config) if compared else None
-    found = [run.probabilities(item.identifier, described, seen) for run in runs]
-    table = np.stack([found[r][name] for r, name in columns(runs)], axis=1)  # [B, M, C]
-    rows = {instance.label: row for row, instance in enumerate(described.usable)}
-    reasons = {instance.label: instance.reason for instance in described.instances}
-    answers = []
-    for label, truth in sorted(item.truth.items()):
-        if label in rows:
-            row = rows[label]
-            answers.append(InstanceAnswer(label, truth, described.usable[row].occluded, None, table[row]))
-        else:
-            reason = reasons.get(label) or "no pixels in the label image"
-            answers.append(InstanceAnswer(label, truth, reason=reason))
-    return answers
-
-
 class AnswerFile:
-    """Answers on disk: those so far, and one more frame at a time.
+    """The file with the answers of an evaluation; frames are appended one at a time.
 
     Attributes:
-        frames: the answers so far. Probabilities have six digits, also those of a frame just added, so that an
-            evaluation that was stopped and one that was not give the same.
+        frames: answers so far. Probabilities are rounded to six digits, also those of a frame just appended, so that a
+            resumed evaluation gives the same results as an uninterrupted one.
     """
 
-    def __init__(self, path: Path, asked: Mapping[str, Any]) -> None:
-        """Begin the file, or go on with it.
+    def __init__(self, path: Path, header: Mapping[str, Any]) -> None:
+        """Create the file, or read it to resume an evaluation.
 
         Args:
-            path: of the file; its folder is made if it is missing.
-            asked: what the answers depend on, as JSON holds it.
+            path: path of the file; its directory is created if it is missing.
+            header: JSON values that determine the answers.
 
         Raises:
-            InputError: a file of something else than `asked`, or a damaged one.
-            OSError: it cannot be read or written.
+            InputError: the file is damaged, or its header differs.
+            OSError: the file cannot be read or written.
         """
         self._path = path
         self.frames: list[FrameAnswers] = []
         if not path.exists():
             path.parent.mkdir(parents=True, exist_ok=True)
-            write_text(path, json.dumps(asked) + "\n")
+            write_text(path, json.dumps(header) + "\n")
             return
         content = path.read_bytes()
-        whole = content.rfind(b"\n") + 1
+        complete = content.rfind(b"\n") + 1
         try:
-            first, *lines = content[:whole].splitlines() or [b""]
-            found = dict(json.loads(first))
-            self.frames = [_decoded(line) for line in lines]
+            first, *lines = content[:complete].splitlines() or [b""]
+            stored = dict(json.loads(first))
+            self.frames = [_decode(line) for line in lines]
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-            raise InputError(f"out: {path} is damaged ({error}); remove it to begin again") from None
-        check_same_job(path.parent, found, asked)
-        if whole < len(content):
+            raise InputError(f"out: {path} is damaged ({error}); delete it to start again") from None
+        check_same_job(path.parent, stored, header)
+        if complete < len(content):
             with path.open("r+b") as file:
-                file.truncate(whole)
+                file.truncate(complete)
 
     def append(self, answers: FrameAnswers) -> None:
-        """Add a frame."""
-        line = _encoded(answers)
+        """Append the answers for a frame.
+
+        Raises:
+            OSError: the file cannot be written.
+        """
+        line = _encode(answers)
         with self._path.open("a", encoding="utf-8") as file:
             file.write(line + "\n")
-        self.frames.append(_decoded(line))
+        self.frames.append(_decode(line))
 
 
-def _encoded(answers: FrameAnswers) -> str:
+def _encode(answers: FrameAnswers) -> str:
     instances = [
         {
             **{f.name: getattr(i, f.name) for f in dataclasses.fields(i)},
@@ -141,16 +142,16 @@ def _encoded(answers: FrameAnswers) -> str:
         }
         for i in answers.instances
     ]
-    frame = {
+    values = {
         "frame": answers.frame,
         "attributes": dict(answers.attributes),
         "seconds": round(answers.seconds, 4),
         "instances": instances,
     }
-    return json.dumps(frame)
+    return json.dumps(values)
 
 
-def _decoded(line: str | bytes) -> FrameAnswers:
+def _decode(line: str | bytes) -> FrameAnswers:
     values = json.loads(line)
     instances = []
     for instance in values["instances"]:

@@ -1,7 +1,4 @@
-"""How far a confidence can be trusted: calibration, and refusing to answer below a threshold.
-
-Guo et al., "On Calibration of Modern Neural Networks" (ICML 2017), for temperature and expected calibration error.
-"""
+"""Confidence metrics: calibration error, AUROC, and accuracy at a given coverage."""
 
 import math
 from typing import NamedTuple
@@ -23,16 +20,16 @@ __all__ = [
 ]
 
 BINS = 15
-"""Of equal width over [0, 1], as is usual."""
+"""Number of confidence bins of equal width, the usual value in the literature."""
 
 
 class Reliability(NamedTuple):
-    """Answers by confidence.
+    """Accuracy by confidence.
 
     Attributes:
-        answers: [bins] int, how many in each bin.
-        accuracy: [bins], share of them that is right; NaN where there is none.
-        confidence: [bins], mean of theirs; NaN where there is none.
+        answers: [bins] int, number of answers in each bin.
+        accuracy: [bins], fraction of them that is correct; NaN in empty bins.
+        confidence: [bins], their mean confidence; NaN in empty bins.
     """
 
     answers: NDArray[np.intp]
@@ -40,7 +37,7 @@ class Reliability(NamedTuple):
     confidence: NDArray[np.float64]
 
 
-def _checked(confidence: ArrayLike, flags: ArrayLike, name: str) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def _check(confidence: ArrayLike, flags: ArrayLike, name: str) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     values, marks = np.asarray(confidence, np.float64), np.asarray(flags)
     if values.ndim != 1 or values.shape != marks.shape:
         raise InputError(f"confidence and {name} have shapes {values.shape} and {marks.shape}; expected [N] and [N]")
@@ -49,18 +46,18 @@ def _checked(confidence: ArrayLike, flags: ArrayLike, name: str) -> tuple[NDArra
     return values, marks.astype(bool)
 
 
-def reliability(confidence: ArrayLike, right: ArrayLike, bins: int = BINS) -> Reliability:
-    """Accuracy and mean confidence of each bin; bin k holds k/bins < confidence <= (k+1)/bins, the first also 0.
+def reliability(confidence: ArrayLike, correct: ArrayLike, bins: int = BINS) -> Reliability:
+    """Return accuracy and mean confidence of each bin; bin k holds k/bins < confidence <= (k+1)/bins, the first also 0.
 
     Args:
         confidence: [N], from 0 to 1.
-        right: [N], whether the answer was right.
-        bins: how many.
+        correct: [N], whether the answer is correct.
+        bins: number of bins.
 
     Raises:
-        InputError: shapes that do not fit, or values outside 0 to 1.
+        InputError: the shapes do not match, or a confidence is outside 0 to 1.
     """
-    values, marks = _checked(confidence, right, "right")
+    values, marks = _check(confidence, correct, "correct")
     number = np.clip(np.ceil(values * bins).astype(np.intp) - 1, 0, bins - 1)
     count = np.bincount(number, minlength=bins)
     with np.errstate(invalid="ignore"):
@@ -69,34 +66,42 @@ def reliability(confidence: ArrayLike, right: ArrayLike, bins: int = BINS) -> Re
     return Reliability(count, accuracy, mean)
 
 
-def expected_calibration_error(confidence: ArrayLike, right: ArrayLike, bins: int = BINS) -> float:
-    """Mean over the answers of |accuracy - confidence| of their bin; NaN without answers. Raises as `reliability`."""
-    found = reliability(confidence, right, bins)
-    used = found.answers > 0
+def expected_calibration_error(confidence: ArrayLike, correct: ArrayLike, bins: int = BINS) -> float:
+    """Return the mean over the answers of |accuracy - confidence| of their bin; NaN without answers.
+
+    Guo et al., "On Calibration of Modern Neural Networks" (ICML 2017). Arguments and errors are those of `reliability`.
+    """
+    values = reliability(confidence, correct, bins)
+    used = values.answers > 0
     if not used.any():
         return math.nan
-    return float(np.average(np.abs(found.accuracy - found.confidence)[used], weights=found.answers[used]))
+    return float(np.average(np.abs(values.accuracy - values.confidence)[used], weights=values.answers[used]))
 
 
 def auroc(confidence: ArrayLike, positive: ArrayLike) -> float:
-    """Area under the ROC curve of "positive if confident"; NaN if all are of one kind.
+    """Return the area under the ROC curve, the probability that a positive has a higher confidence than a negative.
 
-    The chance that a positive has a larger confidence than a negative. Positive may be "right" or "a known object".
+    Args:
+        confidence: [N], from 0 to 1.
+        positive: [N], for instance whether the answer is correct, or whether the object is known.
+
+    Returns:
+        The area; NaN if all are positive or all are negative.
 
     Raises:
-        InputError: shapes that do not fit, or values outside 0 to 1.
+        InputError: the shapes do not match, or a confidence is outside 0 to 1.
     """
-    values, marks = _checked(confidence, positive, "positive")
+    values, marks = _check(confidence, positive, "positive")
     return float(roc_auc_score(marks, values)) if 0 < marks.sum() < len(marks) else math.nan
 
 
 class Coverage(NamedTuple):
-    """Answers kept, the least confident ones being called unknown.
+    """The most confident answers; the others are rejected as unknown objects.
 
     Attributes:
-        threshold: below it an answer is "unknown".
-        kept: share of the answers at or above it; more than was asked for where confidences are equal.
-        accuracy: of those kept.
+        threshold: smallest confidence that is accepted.
+        kept: fraction of the answers that is accepted; more than the requested coverage where confidences are equal.
+        accuracy: accuracy of the accepted answers.
     """
 
     threshold: float
@@ -104,18 +109,18 @@ class Coverage(NamedTuple):
     accuracy: float
 
 
-def accuracy_at_coverage(confidence: ArrayLike, right: ArrayLike, coverage: float = 0.95) -> Coverage:
-    """Accuracy of the most confident answers, at least `coverage` of all; NaN without answers.
+def accuracy_at_coverage(confidence: ArrayLike, correct: ArrayLike, coverage: float = 0.95) -> Coverage:
+    """Return the accuracy if at least a fraction `coverage` of the answers is accepted; NaN without answers.
 
     Raises:
-        InputError: shapes that do not fit, values outside 0 to 1, or a coverage not in (0, 1].
+        InputError: the shapes do not match, a confidence is outside 0 to 1, or `coverage` is not in (0, 1].
     """
-    values, marks = _checked(confidence, right, "right")
+    values, marks = _check(confidence, correct, "correct")
     if not 0 < coverage <= 1:
-        raise InputError(f"coverage is {coverage}; it must be above 0 and at most 1")
+        raise InputError(f"coverage is {coverage}; expected a number above 0 and at most 1")
     if not len(values):
         return Coverage(math.nan, math.nan, math.nan)
-    needed = math.ceil(round(coverage * len(values), 9))  # 0.95 * 20 is a little more than 19
-    threshold = np.sort(values)[len(values) - needed]
+    accepted = math.ceil(round(coverage * len(values), 9))  # 0.95 * 20 is slightly more than 19 in floating point
+    threshold = np.sort(values)[len(values) - accepted]
     kept = values >= threshold
     return Coverage(float(threshold), float(kept.mean()), float(marks[kept].mean()))

@@ -1,72 +1,85 @@
-"""Pictures that are taken while a dataset is gone through, so that no frame is read twice."""
+"""Pictures of an evaluation, drawn while the frames are in memory."""
 
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from training.evaluation.answers import FrameAnswers
-from training.evaluation.fusion import main_joining
-from training.evaluation.results import answered, wrong_answers
+from training.evaluation.answers import EvaluatedRun, FrameAnswers
+from training.evaluation.fusion import main_fusion
+from training.evaluation.results import fuse_answers, incorrect_answers
 from training.readers.labelled import LabelledFrame
 from training.reports.instance_pictures import draw_crop, draw_judged
 
-__all__ = ["Gallery"]
+__all__ = ["FramePictures"]
 
-SHOWN = 12
-"""Frames in the gallery, spread over the dataset."""
+FRAMES = 12
+"""Number of frames drawn, evenly spread over the dataset."""
 
 
-class Gallery:
-    """Some frames with the first run's answers, and for every confusion its most confident instance.
+class FramePictures:
+    """Pictures of some frames with the answers of the first run, and of the most confident instance of each confusion.
 
-    `frames/<number>.jpg`, counted from 0; `confusions/<truth>-<answer>.jpg`, numbers of the classes.
+    They are `frames/<number>.jpg`, counted from 0, and `confusions/<truth>-<prediction>.jpg` with class indices.
+
+    Attributes:
+        shown: numbers of the frames that are drawn.
     """
 
-    def __init__(self, out: Path, columns: Sequence[tuple[int, str]], classes: Sequence[str], frames: int) -> None:
-        """Pictures in `out` of a dataset of so many frames; answers are in the order of `columns`."""
-        self._out, self._columns, self._classes = out, columns, classes
-        self.shown = sorted({int(n) for n in np.linspace(0, frames - 1, SHOWN)})
-        self._most: dict[tuple[str, str], float] = {}
-        for folder in ("frames", "confusions"):
-            (out / folder).mkdir(parents=True, exist_ok=True)
+    def __init__(self, out: Path, runs: Sequence[EvaluatedRun], n_frames: int) -> None:
+        """Create the directories in `out`.
 
-    def frame(self, number: int) -> Path:
-        """The picture of a frame."""
+        Args:
+            out: directory of the report.
+            runs: evaluated runs.
+            n_frames: number of frames of the dataset.
+
+        Raises:
+            OSError: a directory cannot be created.
+        """
+        self._out, self._runs, self._classes = out, runs, runs[0].classes
+        self.shown = sorted({int(n) for n in np.linspace(0, n_frames - 1, FRAMES)})
+        self._highest: dict[tuple[str, str], float] = {}
+        for name in ("frames", "confusions"):
+            (out / name).mkdir(parents=True, exist_ok=True)
+
+    def frame_path(self, number: int) -> Path:
+        """Return the path of the picture of a frame."""
         return self._out / "frames" / f"{number}.jpg"
 
-    def confusion(self, truth: str, answer: str) -> Path:
-        """The picture of a confusion."""
-        return self._out / "confusions" / f"{self._classes.index(truth)}-{self._classes.index(answer)}.jpg"
+    def confusion_path(self, truth: str, prediction: str) -> Path:
+        """Return the path of the picture of a confusion."""
+        return self._out / "confusions" / f"{self._classes.index(truth)}-{self._classes.index(prediction)}.jpg"
 
-    def recall(self, frame: FrameAnswers) -> None:
-        """Take note of a frame whose pictures are there already."""
-        for instance, answer, confidence in wrong_answers(frame, self._columns, self._classes):
-            pair = instance.truth, answer
-            self._most[pair] = max(confidence, self._most.get(pair, -1.0))
+    def restore(self, answers: FrameAnswers) -> None:
+        """Take into account a frame that was drawn before the evaluation was interrupted."""
+        for instance, prediction, confidence in incorrect_answers(answers, self._runs):
+            pair = instance.truth, prediction
+            self._highest[pair] = max(confidence, self._highest.get(pair, -1.0))
 
-    def add(self, number: int, item: LabelledFrame, frame: FrameAnswers) -> None:
-        """Draw what is worth it of a frame.
+    def draw(self, number: int, item: LabelledFrame, answers: FrameAnswers) -> None:
+        """Draw the frame if it is shown, and those of its incorrect answers that are the most confident so far.
 
         Raises:
             OSError: a file cannot be written.
         """
-        for instance, answer, confidence in wrong_answers(frame, self._columns, self._classes):
-            if confidence > self._most.get((instance.truth, answer), -1.0):
-                self._most[instance.truth, answer] = confidence
+        for instance, prediction, confidence in incorrect_answers(answers, self._runs):
+            if confidence > self._highest.get((instance.truth, prediction), -1.0):
+                self._highest[instance.truth, prediction] = confidence
                 mask = item.frame.labels == instance.label
-                draw_crop(item.frame.color, mask, self.confusion(instance.truth, answer))
+                draw_crop(item.frame.color, mask, self.confusion_path(instance.truth, prediction))
         if number in self.shown:
-            draw_judged(item.frame.color, item.frame.labels, self._judged(frame), self.frame(number))
+            draw_judged(item.frame.color, item.frame.labels, self._judge(answers), self.frame_path(number))
 
-    def _judged(self, frame: FrameAnswers) -> dict[int, tuple[bool, str]]:
-        known = [i for i in frame.instances if i.truth in self._classes]
+    def _judge(self, answers: FrameAnswers) -> dict[int, tuple[bool, str]]:
+        """Return label -> (correct, text) for the instances of known objects."""
+        known = [i for i in answers.instances if i.truth in self._classes]
         judged = {i.label: (False, f"none ({i.truth})") for i in known}
         described = [i for i in known if i.probabilities is not None]
-        found = answered(described, self._columns)
-        first = next(iter(found[main_joining(found)].values()))
-        for instance, index in zip(described, first.answer, strict=True):
-            answer = self._classes[index]
-            right = answer == instance.truth
-            judged[instance.label] = right, answer if right else f"{answer} ({instance.truth})"
+        predictions = fuse_answers(described, self._runs)
+        first = next(iter(predictions[main_fusion(predictions)].values()))
+        for instance, index in zip(described, first.class_index, strict=True):
+            name = self._classes[index]
+            correct = name == instance.truth
+            judged[instance.label] = correct, name if correct else f"{name} ({instance.truth})"
         return judged

@@ -1,4 +1,4 @@
-"""Ways to make one answer of several classifiers' probabilities."""
+"""Fusion of several classifiers: combinations, their names in tables, and the rules."""
 
 import itertools
 from collections.abc import Iterable, Mapping
@@ -9,47 +9,47 @@ from numpy.typing import NDArray
 
 from thor2_jax.recognition.classifier import FEATURES, Feature
 from thor2_jax.recognition.fusion import FUSION_RULES, FusionRule, fuse
-from training.baselines.baseline import TITLES
+from training.baselines.names import TITLES
 from training.fitting.temperature import with_temperature
 
-__all__ = ["RULES", "Rule", "join_by", "joinings", "main_joining"]
+__all__ = ["RULES", "Rule", "fuse_by", "fusions", "main_fusion"]
 
 Rule = FusionRule | Literal["calibrated"]
 RULES: tuple[Rule, ...] = (*FUSION_RULES, "calibrated")
-"""The rules of `fuse`, the paper's first, and the paper's after temperatures fitted on held-out views."""
+"""The rules of `fuse`, and "calibrated": the rule "max" on temperature-scaled probabilities."""
 
 
-def joinings(available: Iterable[str]) -> dict[str, tuple[str, ...]]:
-    """The baselines at hand, each by itself, and every combination of classifiers.
+def fusions(available: Iterable[str]) -> dict[str, tuple[str, ...]]:
+    """Return title -> names for each available baseline alone and for every combination of the available classifiers.
 
-    These have the paper's names: CE, TOPS, ..., THOR2 (= TOPS + TOPS2).
+    Titles are those of the paper: CE, TOPS, ..., THOR2 (TOPS and TOPS2).
     """
-    given = set(available)
-    names = [name for name in FEATURES if name in given]
-    groups = [group for size in range(1, len(names) + 1) for group in itertools.combinations(names, size)]
-    alone: dict[str, tuple[str, ...]] = {title: (name,) for name, title in TITLES.items() if name in given}
-    return alone | {"THOR2" if group == ("tops", "tops2") else "+".join(group).upper(): group for group in groups}
+    names = set(available)
+    features = [name for name in FEATURES if name in names]
+    groups = [group for size in range(1, len(features) + 1) for group in itertools.combinations(features, size)]
+    baselines: dict[str, tuple[str, ...]] = {title: (name,) for name, title in TITLES.items() if name in names}
+    return baselines | {"THOR2" if group == ("tops", "tops2") else "+".join(group).upper(): group for group in groups}
 
 
-def main_joining(names: Iterable[str]) -> str:
-    """THOR2 if it is among the names, otherwise the last."""
-    names = list(names)
-    return "THOR2" if "THOR2" in names else names[-1]
+def main_fusion(titles: Iterable[str]) -> str:
+    """Return THOR2 if it is among the titles, otherwise the last one."""
+    titles = list(titles)
+    return "THOR2" if "THOR2" in titles else titles[-1]
 
 
-def join_by(
+def fuse_by(
     rule: Rule, probabilities: Mapping[str, NDArray[np.floating[Any]]], temperatures: Mapping[str, float] | None = None
 ) -> tuple[NDArray[np.intp], NDArray[np.floating[Any]]]:
-    """Winning class [B] and its probability [B].
+    """Return the predicted class [B] and its fused probability [B].
 
     Args:
-        rule: how to join.
-        probabilities: [B, C] of each classifier.
-        temperatures: of each, for "calibrated".
+        rule: rule of the fusion.
+        probabilities: [B, C] class probabilities of each classifier.
+        temperatures: temperature of each classifier; needed for "calibrated".
     """
     if rule == "calibrated":
         assert temperatures is not None
-        probabilities = {name: with_temperature(found, temperatures[name]) for name, found in probabilities.items()}
+        probabilities = {name: with_temperature(values, temperatures[name]) for name, values in probabilities.items()}
         rule = "max"
     fused = fuse(cast(Mapping[Feature, NDArray[np.floating[Any]]], probabilities), rule)
     return fused.class_index, fused.confidence

@@ -1,4 +1,4 @@
-"""An evaluation as one page for people: `report.html` and its pictures."""
+"""The report of an evaluation as a page: `report.html` and its pictures."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -6,38 +6,42 @@ from typing import Any
 
 import numpy as np
 
-from training.baselines.baseline import TITLES
-from training.evaluation.frame_pictures import Gallery
+from training.baselines.names import TITLES
+from training.evaluation.frame_pictures import FramePictures
 from training.evaluation.fusion import RULES
-from training.evaluation.published import published, published_seconds
+from training.evaluation.published import Published, published, published_seconds
 from training.evaluation.results import COVERAGE
 from training.reports.html import Picture, Section, Table, write_page
-from training.reports.instance_pictures import draw_reliability
-from training.reports.plots import draw_accuracy, draw_confusion_counts
+from training.reports.plots import draw_accuracy, draw_confusion, draw_reliability
 
-__all__ = ["accuracy_table", "figure_text", "write_report_page"]
+__all__ = ["accuracy_table", "write_report_page"]
 
-WORST = 12
-"""Confusions shown."""
-
-NOTHING = {"mean": None, "std": None}
+NO_VALUE = {"mean": None, "std": None}
 
 BARS = ("forest", "PointNet", "THOR", "CE", "TOPS", "TOPS2", "THOR2")
-MOST_BARS = 8
-"""Cells that fit into a picture."""
+"""Columns of the bar charts."""
+
+MAX_GROUPS = 8
+"""Largest number of table rows that is also drawn as a bar chart."""
 
 
-def figure_text(figure: Mapping[str, Any]) -> str:
-    """Mean, and standard deviation if there are several runs."""
-    if figure["mean"] is None:
+def _mean_std(statistics: Mapping[str, Any]) -> str:
+    """Return the mean, and the standard deviation if there are several runs."""
+    if statistics["mean"] is None:
         return "–"
-    return f"{figure['mean']:.3f}" + ("" if figure["std"] is None else f" ±\u00a0{figure['std']:.3f}")
+    return f"{statistics['mean']:.3f}" + ("" if statistics["std"] is None else f" ±\u00a0{statistics['std']:.3f}")
 
 
-def accuracy_table(table: Mapping[str, Any], joinings: Sequence[str], methods: Sequence[str] = ()) -> Table:
-    """Header and rows of a table as `results` gives it; beside it, what is published of `methods` for its cells."""
+def accuracy_table(table: Mapping[str, Any], titles: Sequence[str], methods: Sequence[str] = ()) -> Table:
+    """Return header and rows of an accuracy table of `compute_results`.
+
+    Args:
+        table: an entry of `report["accuracy"][rule]`.
+        titles: fusions to show.
+        methods: published methods to show beside them, where a cell of the table has their values.
+    """
     methods = [method for method in methods if any(method in cell["published"] for cell in table["cells"])]
-    header = [", ".join(table["by"]), "instances", *joinings, *(f"{method}, published" for method in methods)]
+    header = [", ".join(table["by"]), "instances", *titles, *(f"{method}, published" for method in methods)]
     rows = []
     for cell in table["cells"]:
         others = [cell["published"].get(method) for method in methods]
@@ -45,42 +49,38 @@ def accuracy_table(table: Mapping[str, Any], joinings: Sequence[str], methods: S
             [
                 ", ".join(cell["where"].values()) or "all",
                 f"{cell['instances']:,}",
-                *(figure_text(cell["accuracy"][name]) for name in joinings),
+                *(_mean_std(cell["accuracy"][title]) for title in titles),
                 *("–" if value is None else f"{value:.3f}" for value in others),
             ]
         )
     return header, rows
 
 
-def write_report_page(found: Mapping[str, Any], gallery: Gallery, out: Path) -> None:
-    """Draw the pictures and write the page, which appears whole or not at all.
+def write_report_page(report: Mapping[str, Any], pictures: FramePictures, out: Path) -> None:
+    """Draw the plots and write the page.
 
     Args:
-        found: what `results` gives, with "dataset" (kind, path), "worst" (confusions) and "shown" (names of the
-            gallery's frames) added.
-        gallery: of the pictures taken on the way.
-        out: folder of the page; that of the gallery.
+        report: content of report.json.
+        pictures: pictures of the frames.
+        out: directory of the report.
 
     Raises:
-        OSError: something cannot be written.
+        OSError: a file cannot be written.
     """
     sections: list[Section] = []
-    if found["joinings"]:
+    if report["fusions"]:
         sections += [
-            *_accuracy(found, out),
-            _joined(found),
-            _confidence(found, out),
-            _confusions(found, gallery, out),
+            *_accuracy_sections(report, out),
+            _fusion_section(report),
+            _confidence_section(report, out),
+            _confusion_section(report, pictures, out),
         ]
-    pictures = [
-        Picture(_relative(gallery.frame(number), out), f"Frame {name}.", half=True)
-        for number, name in zip(gallery.shown, found["shown"], strict=True)
-    ]
-    text = "Green: named rightly. Red: the answer, and in brackets the truth. Answers of the first run."
-    sections += [("Frames", text, None, pictures), _measured(found)]
-    dataset, counts = found["dataset"], found["instances"]
-    runs = f"{len(found['runs'])} trained {'run' if len(found['runs']) == 1 else 'runs'}"
-    lead = f"{found['speed']['frames']:,} frames, {counts['scored']:,} instances scored, {runs}, {dataset['path']}"
+    sections += [_frame_section(report, pictures, out), _measurement_section(report)]
+    dataset, runs = report["dataset"], len(report["runs"])
+    lead = (
+        f"{report['speed']['frames']:,} frames, {report['instances']['scored']:,} instances of known objects, "
+        f"{runs} trained {'model' if runs == 1 else 'models'}. Dataset: {dataset['path']}"
+    )
     write_page(out / "report.html", title=f"Evaluation on {dataset['kind']}", lead=lead, sections=sections)
 
 
@@ -88,106 +88,135 @@ def _relative(path: Path, out: Path) -> str:
     return path.relative_to(out).as_posix()
 
 
-def _accuracy(found: Mapping[str, Any], out: Path) -> list[Section]:
-    known = published(found["dataset"]["kind"])
+def _accuracy_sections(report: Mapping[str, Any], out: Path) -> list[Section]:
+    known = published(report["dataset"]["kind"])
     methods = known.methods if known else ()
-    text = "Share of instances named rightly; those that could not be described count as wrong. CE reads colour alone, "
-    text += f"TOPS shape alone, TOPS2 both; several are joined by {found['rule']} (below, ways to join are compared). "
-    if not set(found["joinings"]).isdisjoint(TITLES.values()):
-        text += (
-            "Trained on the same views and asked about the same described instances: THOR, the predecessor, a library "
-        )
-        text += "of classifiers of shape; a random forest on colour histogram and extents; a coloured PointNet. "
-    if len(found["runs"]) > 1:
-        text += f"Mean and sample standard deviation over {len(found['runs'])} runs. "
-    if known:
-        text += f"Published figures: {known.source}. They are of {known.concerns}; only the same frames compare. "
-        text += f"Not found, so not shown: {known.missing}."
-    whole, *tables = found["accuracy"][found["rule"]]
-    sections: list[Section] = [("Accuracy", text, accuracy_table(whole, found["joinings"], methods), [])]
-    names = [name for name in BARS if name in found["joinings"]]
-    for number, table in enumerate(tables):
-        pictures = []
-        if names and 1 < len(table["cells"]) <= MOST_BARS:
-            cells = {"\n".join(cell["where"].values()): cell for cell in table["cells"]}
-            file = out / f"accuracy-{number}.png"
-            heights = {part: [cell["accuracy"][n]["mean"] for n in names] for part, cell in cells.items()}
-            draw_accuracy(names, heights, {part: cell["instances"] for part, cell in cells.items()}, file)
-            pictures = [Picture(file.name, f"Accuracy by {' and '.join(table['by'])}.")]
-        heading = f"By {' and '.join(table['by'])}"
-        sections.append((heading, "", accuracy_table(table, found["joinings"], methods), pictures))
+    first, *tables = report["accuracy"][report["rule"]]
+    table = accuracy_table(first, report["fusions"], methods)
+    sections = [Section("Accuracy", _accuracy_text(report, known), table)]
+    for number, each in enumerate(tables):
+        heading = f"Accuracy by {' and '.join(each['by'])}"
+        chart = _bar_chart(each, report["fusions"], heading, out / f"accuracy-{number}.png")
+        sections.append(Section(heading, "", accuracy_table(each, report["fusions"], methods), chart))
     return sections
 
 
-def _joined(found: Mapping[str, Any]) -> Section:
-    cells = {rule: found["accuracy"][rule][0]["cells"][0]["accuracy"] for rule in RULES}
-    joined = [n for n in found["joinings"] if "+" in n or n == "THOR2"]
-    rows = [[n, *(figure_text(cells[rule].get(n, NOTHING)) for rule in RULES)] for n in joined]
+def _accuracy_text(report: Mapping[str, Any], known: Published | None) -> str:
     text = (
-        "The paper's rule takes the classifier with the larger top-1 probability; the others take the largest mean "
-        "of the probabilities, or of their logarithms; \"calibrated\" is the paper's rule after each classifier's own "
-        f"temperature. thor2 recognize and the tables of this page use {found['rule']}."
+        "Fraction of the instances that are recognized correctly; an instance that could not be described counts as "
+        "incorrect. CE uses colour only, TOPS shape only, TOPS2 both. THOR2 is the fusion of TOPS and TOPS2; a plus "
+        f"sign marks other fusions. The fusion rule is {report['rule']}; other rules are compared below. "
     )
-    return "Ways to join classifiers", text, (["", *RULES], rows), []
+    if not set(report["fusions"]).isdisjoint(TITLES.values()):
+        text += (
+            "Baselines, trained on the same views and evaluated on the same instances: THOR, the predecessor, "
+            "a library of shape classifiers; a random forest on a colour histogram and side "
+            "lengths; a PointNet with colour. "
+        )
+    if len(report["runs"]) > 1:
+        text += f"Values are the mean and the sample standard deviation over {len(report['runs'])} models. "
+    if known:
+        text += (
+            f"Published values: {known.source}. They refer to {known.concerns}, and compare only on the same frames. "
+            f"Values that were not found: {known.missing}."
+        )
+    return text
 
 
-def _confidence(found: Mapping[str, Any], out: Path) -> Section:
+def _bar_chart(table: Mapping[str, Any], titles: Sequence[str], caption: str, path: Path) -> list[Picture]:
+    names = [name for name in BARS if name in titles]
+    if not names or not 1 < len(table["cells"]) <= MAX_GROUPS:
+        return []
+    cells = {"\n".join(cell["where"].values()): cell for cell in table["cells"]}
+    heights = {group: [cell["accuracy"][name]["mean"] for name in names] for group, cell in cells.items()}
+    draw_accuracy(names, heights, {group: cell["instances"] for group, cell in cells.items()}, path)
+    return [Picture(path.name, f"{caption}.")]
+
+
+def _fusion_section(report: Mapping[str, Any]) -> Section:
+    cells = {rule: report["accuracy"][rule][0]["cells"][0]["accuracy"] for rule in RULES}
+    titles = [title for title in report["fusions"] if "+" in title or title == "THOR2"]
+    rows = [[title, *(_mean_std(cells[rule].get(title, NO_VALUE)) for rule in RULES)] for title in titles]
+    text = (
+        "Accuracy on all instances by fusion rule. max, the paper's rule: the classifier with the higher top-1 "
+        "probability decides. mean and log-mean: the class with the highest mean probability, or mean log-probability. "
+        "calibrated: max after temperature scaling of each classifier. "
+        f"This page and the command thor2 recognize use {report['rule']}."
+    )
+    return Section("Fusion rules", text, (["fusion", *RULES], rows))
+
+
+def _confidence_section(report: Mapping[str, Any], out: Path) -> Section:
     columns = {
-        "expected calibration error": ("confidence", "expected_calibration_error"),
-        "calibrated": ("calibrated_confidence", "expected_calibration_error"),
-        "AUROC right or wrong": ("confidence", "auroc_right"),
-        f"accuracy of the surest {COVERAGE:.0%}": ("confidence", "accuracy_at_coverage"),
-        "their least confidence": ("confidence", "threshold_at_coverage"),
-        "AUROC known or unknown": ("confidence", "auroc_known"),
-        "after calibration": ("calibrated_confidence", "auroc_known"),
-        "unknown below that confidence": ("confidence", "unknown_refused"),
+        "calibration error": ("confidence", "expected_calibration_error"),
+        "calibration error, calibrated": ("calibrated_confidence", "expected_calibration_error"),
+        "AUROC correct/incorrect": ("confidence", "auroc_right"),
+        f"accuracy at {COVERAGE:.0%} coverage": ("confidence", "accuracy_at_coverage"),
+        "threshold": ("confidence", "threshold_at_coverage"),
+        "AUROC known/unknown": ("confidence", "auroc_known"),
+        "AUROC known/unknown, calibrated": ("calibrated_confidence", "auroc_known"),
+        "unknown objects rejected": ("confidence", "unknown_refused"),
     }
     rows = [
-        [name, *(figure_text(found[table].get(name, {}).get(key, NOTHING)) for table, key in columns.values())]
-        for name in found["confidence"]
+        [title, *(_mean_std(report[table].get(title, {}).get(key, NO_VALUE)) for table, key in columns.values())]
+        for title in report["confidence"]
     ]
+    temperatures = [f"{name} {_mean_std(t)}" for name, t in report["temperatures"].items() if t["runs"]]
     text = (
-        "Calibration error over 15 bins of equal width, before and after temperatures fitted on the synthetic views "
-        f"that each run's training held out{_temperatures(found)}. AUROC: the chance that a right answer is surer than "
-        "a wrong one, or that to an object of the training surer than that to another object. Where the least sure "
-        f"{1 - COVERAGE:.0%} of the answers to objects of the training are called unknown, the last column tells how "
-        "many of the other objects are."
+        "Calibration error is the expected calibration error over 15 bins. Calibrated columns use temperatures fitted "
+        "on the synthetic views that each training held out"
+        + (f" ({', '.join(temperatures)})" if temperatures else "; these models have no held-out set")
+        + ". AUROC is the probability that a correct answer has a higher confidence than an incorrect one, or a known "
+        "object than an unknown one; known objects are those the models were trained on. Open-set rejection: the "
+        f"threshold accepts {COVERAGE:.0%} of the known objects, and an instance below it is an unknown object. It "
+        "is the value for the option --unknown-below of thor2 recognize."
     )
-    draw_reliability(found["reliability"], found["main"], out / "reliability.png")
-    caption = f"How often {found['main']} is right, by its confidence."
-    return "Confidence", text, (["", *columns], rows), [Picture("reliability.png", caption, half=True)]
+    draw_reliability(report["reliability"], report["main"], out / "reliability.png")
+    caption = f"Accuracy of {report['main']} by confidence."
+    return Section("Confidence", text, (["", *columns], rows), [Picture("reliability.png", caption, half=True)])
 
 
-def _temperatures(found: Mapping[str, Any]) -> str:
-    known = [f"{name} {figure_text(t)}" for name, t in found["temperatures"].items() if t["runs"]]
-    return f" ({', '.join(known)})" if known else "; these runs held out none"
-
-
-def _confusions(found: Mapping[str, Any], gallery: Gallery, out: Path) -> Section:
-    counts, classes, main = np.array(found["confusion"]), found["classes"], found["main"]
-    draw_confusion_counts(counts, classes, main, out / "confusion.png")
-    pictures = [Picture("confusion.png", f"Counts of {main}'s answers, all runs together.")]
+def _confusion_section(report: Mapping[str, Any], pictures: FramePictures, out: Path) -> Section:
+    main = report["main"]
+    draw_confusion(np.array(report["confusion"]), report["classes"], main, out / "confusion.png")
+    shown = [Picture("confusion.png", f"Confusion matrix of {main}, summed over all models.")]
     rows = []
-    for worst in found["worst"]:
-        truth, answer = worst["truth"], worst["answer"]
-        rows.append([f"{truth} named {answer}", f"{worst['count']}", f"{worst['share']:.0%}"])
-        crop = gallery.confusion(truth, answer)
+    for pair in report["worst"]:
+        truth, prediction = pair["truth"], pair["answer"]
+        rows.append([truth, prediction, f"{pair['count']}", f"{pair['share']:.0%}"])
+        crop = pictures.confusion_path(truth, prediction)
         if crop.is_file():
-            pictures.append(Picture(_relative(crop, out), f"{truth} named {answer}", small=True))
+            shown.append(Picture(_relative(crop, out), f"{truth}, recognized as {prediction}", small=True))
     if not rows:
-        return "Confusions", "There are none.", None, pictures
-    text = "The most frequent confusions, each with the instance that the wrong answer was surest of."
-    return "Confusions", text, (["", "answers", "of all to this object"], rows), pictures
+        return Section("Confusions", "No object was confused with another one.", pictures=shown)
+    text = "The most frequent confusions, each with its most confident instance."
+    table = ["object", "recognized as", "count", "fraction of the object's instances"], rows
+    return Section("Confusions", text, table, shown)
 
 
-def _measured(found: Mapping[str, Any]) -> Section:
-    speed, counts = found["speed"], found["instances"]
-    rate = f"{speed['frames_per_second']:.2f}" if speed["frames_per_second"] else "–"
-    text = f"{rate} frames a second from files to all answers of all runs, compilation included"
-    if speed["median_seconds"]:
-        text += f"; median {speed['median_seconds']:.2f} s a frame"
-    text += "." + "".join(f" {name}: {seconds} s a frame." for name, seconds in published_seconds().items())
-    text += f" Runs: {', '.join(found['runs'])}."
-    rows = [[f"not described: {reason}", f"{n:,}"] for reason, n in counts["not_described"].items()]
-    rows += [[f"not scored, no class of the runs: {name}", f"{n:,}"] for name, n in counts["no_class"].items()]
-    return "How it was measured", text, (["", "instances"], rows) if rows else None, []
+def _frame_section(report: Mapping[str, Any], pictures: FramePictures, out: Path) -> Section:
+    text = (
+        "Answers of the first model. Green: correct. Red: incorrect, with the true object in brackets; none: the "
+        "instance could not be described."
+    )
+    shown = [
+        Picture(_relative(pictures.frame_path(number), out), f"Frame {name}.", half=True)
+        for number, name in zip(pictures.shown, report["shown"], strict=True)
+    ]
+    return Section("Frames", text, pictures=shown)
+
+
+def _measurement_section(report: Mapping[str, Any]) -> Section:
+    speed, counts = report["speed"], report["instances"]
+    text = f"Models: {', '.join(report['runs'])}. "
+    if speed["frames_per_second"]:
+        text += f"Speed: {speed['frames_per_second']:.2f} frames per second, "
+        text += "from reading the files to the answers of all models, compilation included"
+        text += f"; median {speed['median_seconds']:.2f} s per frame." if speed["median_seconds"] else "."
+    published_speed = [f"{name} {seconds} s" for name, seconds in published_seconds().items()]
+    text += f" Published times per frame: {', '.join(published_speed)}."
+    rows = [
+        [f"not described, counted as incorrect: {reason}", f"{n:,}"] for reason, n in counts["not_described"].items()
+    ]
+    rows += [[f"unknown object, not scored: {name}", f"{n:,}"] for name, n in counts["no_class"].items()]
+    return Section("Measurement", text, (["", "instances"], rows) if rows else None)

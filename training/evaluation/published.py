@@ -1,4 +1,4 @@
-"""Figures of publications, to stand beside our own for the same cell of a table; `published.json` tells the sources."""
+"""Published values that reports show beside the measured ones; `published.json` gives the sources."""
 
 import dataclasses
 import json
@@ -11,12 +11,12 @@ __all__ = ["Published", "published", "published_seconds"]
 
 @dataclasses.dataclass(frozen=True)
 class Published:
-    """What is known for a dataset.
+    """Published accuracies on a dataset.
 
     Attributes:
-        source: where the figures were seen.
-        concerns: the frames that they are of.
-        missing: which figures of the papers were not found.
+        source: where the values were found.
+        concerns: the frames that they refer to.
+        missing: values of the papers that were not found.
         methods: names of all methods, in the order of the file.
     """
 
@@ -26,19 +26,19 @@ class Published:
     methods: tuple[str, ...]
     _cells: Mapping[frozenset[tuple[str, str]], Mapping[str, float]]
 
-    def of(self, where: Mapping[str, str]) -> dict[str, float]:
-        """Method -> accuracy from 0 to 1 in the cell with just these values of attributes; often empty."""
+    def cell(self, where: Mapping[str, str]) -> dict[str, float]:
+        """Return method -> accuracy, from 0 to 1, for exactly these attribute values; often empty."""
         return {method: percent / 100 for method, percent in self._cells.get(frozenset(where.items()), {}).items()}
 
 
-def _file() -> dict[str, Any]:
+def _read() -> dict[str, Any]:
     text = resources.files("training.evaluation").joinpath("published.json").read_text(encoding="utf-8")
     return dict(json.loads(text))
 
 
 def published(kind: str) -> Published | None:
-    """The accuracies for a kind of dataset ("uwis", "ocid"); None if there are none."""
-    table = _file()["accuracy"].get(kind)
+    """Return the published accuracies for a kind of dataset ("uwis", "ocid"); None if there are none."""
+    table = _read()["accuracy"].get(kind)
     if table is None:
         return None
     cells = {frozenset(cell["where"].items()): cell["accuracy"] for cell in table["cells"]}
@@ -47,5 +47,5 @@ def published(kind: str) -> Published | None:
 
 
 def published_seconds() -> dict[str, float]:
-    """System -> seconds a frame."""
-    return dict(_file()["seconds_a_frame"])
+    """Return system -> seconds per frame."""
+    return dict(_read()["seconds_a_frame"])

@@ -1,4 +1,4 @@
-"""From the answers to every figure of a report, as one table that JSON holds."""
+"""All values of a report, computed from the answers, as one JSON table."""
 
 import dataclasses
 from collections import Counter
@@ -9,209 +9,241 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.recognition.fusion import DEFAULT_RULE
-from training.evaluation.accuracy import over_runs, parts, tables_of
-from training.evaluation.answers import FrameAnswers, InstanceAnswer
+from training.evaluation.accuracy import attribute_tables, group_by_attributes, summarize_runs
+from training.evaluation.answers import EvaluatedRun, FrameAnswers, InstanceAnswer, all_predictors
 from training.evaluation.confidence import accuracy_at_coverage, auroc, expected_calibration_error, reliability
-from training.evaluation.fusion import RULES, Rule, join_by, joinings, main_joining
+from training.evaluation.fusion import RULES, Rule, fuse_by, fusions, main_fusion
 from training.evaluation.published import published
 from training.readers.labelled import sequence_of
 
-__all__ = ["COVERAGE", "Answered", "answered", "results", "wrong_answers"]
+__all__ = ["COVERAGE", "Predictions", "compute_results", "fuse_answers", "incorrect_answers"]
 
 COVERAGE = 0.95
-"""Share of the answers that is kept where the least confident are called unknown."""
+"""Fraction of the answers to known objects that is accepted in the open-set metrics."""
 
-Columns = Sequence[tuple[int, str]]
-
-Temperatures = Sequence[Mapping[str, float]]
-"""A table a run: classifier or baseline -> temperature. Those that were not calibrated are not in it."""
+MOST_FREQUENT = 12
+"""Confusions listed in a report."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Answered:
-    """The answers of one run's joining to the instances that were described.
+class Predictions:
+    """Predictions of one fusion of one run.
 
     Attributes:
-        answer: [N] class indices.
-        confidence: [N].
+        class_index: [N] predicted classes.
+        confidence: [N] fused probabilities of these classes.
     """
 
-    answer: NDArray[np.intp]
+    class_index: NDArray[np.intp]
     confidence: NDArray[np.floating[Any]]
 
 
-def answered(
-    instances: Sequence[InstanceAnswer], columns: Columns, rule: Rule = DEFAULT_RULE, temperatures: Temperatures = ()
-) -> dict[str, dict[int, Answered]]:
-    """Joining -> run -> answers to those of `instances` that were described.
+def fuse_answers(
+    instances: Sequence[InstanceAnswer], runs: Sequence[EvaluatedRun], rule: Rule = DEFAULT_RULE
+) -> dict[str, dict[int, Predictions]]:
+    """Return fusion -> index of the run -> predictions for those of `instances` that were described.
 
-    The rule "calibrated" leaves out what lacks a temperature.
+    The rule "calibrated" leaves out classifiers without a temperature.
     """
+    predictors = all_predictors(runs)
     described = [i.probabilities for i in instances if i.probabilities is not None]
-    table = np.stack(described) if described else np.zeros((0, len(columns), 1), np.float32)  # [N, M, C]
-    found: dict[str, dict[int, Answered]] = {title: {} for title in joinings(name for _, name in columns)}
-    for run in sorted({run for run, _ in columns}):
-        known = temperatures[run] if rule == "calibrated" else {}
-        mine = {
-            name: table[:, k]
-            for k, (r, name) in enumerate(columns)
-            if r == run and (rule != "calibrated" or name in known)
+    table = np.stack(described) if described else np.zeros((0, len(predictors), 1), np.float32)  # [N, M, C]
+    predictions: dict[str, dict[int, Predictions]] = {title: {} for title in fusions(name for _, name in predictors)}
+    for index, run in enumerate(runs):
+        probabilities = {
+            name: table[:, column]
+            for column, (owner, name) in enumerate(predictors)
+            if owner == index and (rule != "calibrated" or name in run.temperatures)
         }
-        for title, group in joinings(mine).items():
-            found[title][run] = Answered(*join_by(rule, {name: mine[name] for name in group}, known))
-    return {title: by_run for title, by_run in found.items() if by_run}
+        for title, names in fusions(probabilities).items():
+            fused = fuse_by(rule, {name: probabilities[name] for name in names}, run.temperatures)
+            predictions[title][index] = Predictions(*fused)
+    return {title: by_run for title, by_run in predictions.items() if by_run}
 
 
-def wrong_answers(
-    frame: FrameAnswers, columns: Columns, classes: Sequence[str]
-) -> Iterable[tuple[InstanceAnswer, str, float]]:
-    """Instance, answer and confidence of every wrong answer of the main joining of any run, where there was a right."""
+def incorrect_answers(frame: FrameAnswers, runs: Sequence[EvaluatedRun]) -> Iterable[tuple[InstanceAnswer, str, float]]:
+    """Yield instance, predicted name and confidence for every incorrect answer of any run's main fusion."""
+    classes = runs[0].classes
     described = [i for i in frame.instances if i.probabilities is not None and i.truth in classes]
-    found = answered(described, columns)
-    for given in found[main_joining(found)].values():
-        for instance, answer, confidence in zip(described, given.answer, given.confidence, strict=True):
-            if classes[answer] != instance.truth:
-                yield instance, classes[answer], float(confidence)
+    predictions = fuse_answers(described, runs)
+    for by_run in predictions[main_fusion(predictions)].values():
+        for instance, index, confidence in zip(described, by_run.class_index, by_run.confidence, strict=True):
+            if classes[index] != instance.truth:
+                yield instance, classes[index], float(confidence)
 
 
-def _attributes(kind: str, frame: FrameAnswers) -> dict[str, str]:
-    # OCID's tables go by sequence: the folder of the frame.
-    sequence = {"sequence": sequence_of(frame.frame)} if kind == "ocid" else {}
-    return {**frame.attributes, **sequence}
-
-
-def results(
-    kind: str,
-    frames: Sequence[FrameAnswers],
-    columns: Columns,
-    runs: Sequence[str],
-    classes: Sequence[str],
-    temperatures: Temperatures,
-) -> dict[str, Any]:
-    """Every figure.
-
-    An instance that is a class of the runs is scored; one that could not be described counts as wrong. What is told of
-    confidence concerns the instances that were described.
+def compute_results(kind: str, runs: Sequence[EvaluatedRun], frames: Sequence[FrameAnswers]) -> dict[str, Any]:
+    """Return accuracy, confidence metrics, confusions and speed.
 
     Args:
-        kind: of the dataset: "uwis", "ocid", "bop", "frames".
-        frames: their answers.
-        columns: of the answers.
-        runs: names.
-        classes: names, in the order of the probabilities.
-        temperatures: of the runs.
+        kind: kind of dataset ("uwis", "ocid", "bop", "frames"); selects the tables and the published values.
+        runs: evaluated runs, which share their classes.
+        frames: the answers.
     """
-    labelled = [(i, _attributes(kind, frame)) for frame in frames for i in frame.instances]
-    scored = [(i, attributes) for i, attributes in labelled if i.truth in classes]
-    described = [i for i, _ in scored if i.probabilities is not None]
-    strangers = [i for i, _ in labelled if i.truth not in classes and i.probabilities is not None]
-    position = np.array([n for n, (i, _) in enumerate(scored) if i.probabilities is not None], np.intp)
-    truth = np.array([classes.index(i.truth) for i in described], np.intp)
-    seconds = [frame.seconds for frame in frames]
-    found: dict[str, Any] = {
-        "runs": list(runs),
+    classes = runs[0].classes
+    labelled = [(instance, _attributes(kind, frame)) for frame in frames for instance in frame.instances]
+    known = [(instance, attributes) for instance, attributes in labelled if instance.truth in classes]
+    unknown = [instance for instance, _ in labelled if instance.truth not in classes]
+    results: dict[str, Any] = {
+        "runs": [run.name for run in runs],
         "classes": list(classes),
         "rule": DEFAULT_RULE,
         "instances": {
             "labelled": len(labelled),
-            "scored": len(scored),
-            "not_described": dict(Counter(i.reason for i, _ in scored if i.probabilities is None)),
-            "no_class": dict(Counter(i.truth for i, _ in labelled if i.truth not in classes)),
+            "scored": len(known),
+            "not_described": dict(Counter(i.reason for i, _ in known if i.probabilities is None)),
+            "no_class": dict(Counter(i.truth for i in unknown)),
         },
-        "speed": {
-            "frames": len(frames),
-            "seconds": sum(seconds),
-            "frames_per_second": len(frames) / sum(seconds) if sum(seconds) else None,
-            "median_seconds": float(np.median(seconds)) if seconds else None,
-        },
-        "joinings": [],
+        "speed": _speed([frame.seconds for frame in frames]),
+        "fusions": [],
+        "worst": [],
     }
-    if not scored:
-        return found
-    by_rule = {rule: answered(described, columns, rule, temperatures) for rule in RULES}
-    found["joinings"] = list(by_rule[DEFAULT_RULE])
-    tables = tables_of(kind, [attributes for _, attributes in scored])
-    found["accuracy"] = {
-        rule: [_table(kind, names, scored, position, truth, given) for names in tables]
-        for rule, given in by_rule.items()
+    return results | _scores(kind, runs, known, unknown) if known else results
+
+
+def _attributes(kind: str, frame: FrameAnswers) -> dict[str, str]:
+    # OCID has a table by sequence, which is the directory of the frame.
+    sequence = {"sequence": sequence_of(frame.frame)} if kind == "ocid" else {}
+    return {**frame.attributes, **sequence}
+
+
+def _speed(seconds: Sequence[float]) -> dict[str, Any]:
+    return {
+        "frames": len(seconds),
+        "seconds": sum(seconds),
+        "frames_per_second": len(seconds) / sum(seconds) if sum(seconds) else None,
+        "median_seconds": float(np.median(seconds)) if seconds else None,
     }
-    given = by_rule[DEFAULT_RULE]
-    found["temperatures"] = {
-        name: dataclasses.asdict(over_runs([known[name] for known in temperatures if name in known]))
-        for name in dict.fromkeys(name for _, name in columns)
-    }
+
+
+def _scores(
+    kind: str,
+    runs: Sequence[EvaluatedRun],
+    known: Sequence[tuple[InstanceAnswer, Mapping[str, str]]],
+    unknown: Sequence[InstanceAnswer],
+) -> dict[str, Any]:
+    """Return the part of the results that needs instances of the runs' classes."""
+    classes = runs[0].classes
+    instances = [instance for instance, _ in known]
+    described = np.array([i.probabilities is not None for i in instances])
+    truth = np.array([classes.index(i.truth) for i in instances], np.intp)
+    by_rule = {rule: fuse_answers(instances, runs, rule) for rule in RULES}
+    attributes = [each for _, each in known]
+    tables = attribute_tables(kind, attributes)
+    main = main_fusion(by_rule[DEFAULT_RULE])
+    predictions = list(by_rule[DEFAULT_RULE][main].values())
+    confusion = _confusion(predictions, truth, described, len(classes))
     rules: dict[str, Rule] = {"confidence": DEFAULT_RULE, "calibrated_confidence": "calibrated"}
-    for key, rule in rules.items():
-        unknown = answered(strangers, columns, rule, temperatures)
-        found[key] = {name: _confidence(by_run, truth, unknown[name]) for name, by_run in by_rule[rule].items()}
-    found["main"] = main = main_joining(given)
-    confidence = np.concatenate([a.confidence for a in given[main].values()])
-    right = np.concatenate([a.answer == truth for a in given[main].values()])
-    bins = reliability(np.minimum(confidence, 1), right)
-    found["reliability"] = {
-        "answers": bins.answers.tolist(),
-        "accuracy": [None if np.isnan(v) else float(v) for v in bins.accuracy],
-        "confidence": [None if np.isnan(v) else float(v) for v in bins.confidence],
+    return {
+        "fusions": list(by_rule[DEFAULT_RULE]),
+        "accuracy": {
+            rule: [_accuracy(kind, names, attributes, _correct(fused, truth, described)) for names in tables]
+            for rule, fused in by_rule.items()
+        },
+        "temperatures": {
+            name: summarize_runs([run.temperatures[name] for run in runs if name in run.temperatures])
+            for name in dict.fromkeys(name for _, name in all_predictors(runs))
+        },
+        **{
+            key: _confidence(by_rule[rule], truth[described], fuse_answers(unknown, runs, rule))
+            for key, rule in rules.items()
+        },
+        "main": main,
+        "reliability": _reliability(predictions, truth[described]),
+        "confusion": confusion.tolist(),
+        "worst": _most_frequent(confusion, classes),
     }
-    missed = Counter(i.truth for i, _ in scored if i.probabilities is None)
-    found["confusion"] = _confusion(given[main], truth, [missed[name] for name in classes]).tolist()
-    return found
 
 
-def _table(
+def _correct(
+    fused: Mapping[str, Mapping[int, Predictions]], truth: NDArray[np.intp], described: NDArray[np.bool_]
+) -> dict[str, list[NDArray[np.bool_]]]:
+    """Return which instances each run's fusion predicts correctly; those that were not described are incorrect."""
+    correct: dict[str, list[NDArray[np.bool_]]] = {}
+    for title, by_run in fused.items():
+        correct[title] = []
+        for predictions in by_run.values():
+            marks = np.zeros(len(truth), bool)
+            marks[described] = predictions.class_index == truth[described]
+            correct[title].append(marks)
+    return correct
+
+
+def _accuracy(
     kind: str,
     names: Sequence[str],
-    scored: Sequence[tuple[InstanceAnswer, Mapping[str, str]]],
-    position: NDArray[np.intp],
-    truth: NDArray[np.intp],
-    given: Mapping[str, Mapping[int, Answered]],
+    attributes: Sequence[Mapping[str, str]],
+    correct: Mapping[str, Sequence[NDArray[np.bool_]]],
 ) -> dict[str, Any]:
-    """Accuracy of each joining in each cell; those of publications beside it."""
-    right: dict[str, list[NDArray[np.bool_]]] = {name: [] for name in given}
-    for name, by_run in given.items():
-        for a in by_run.values():
-            marks = np.zeros(len(scored), bool)
-            marks[position] = a.answer == truth
-            right[name].append(marks)
+    """Return the accuracy of each fusion by the named attributes, with published values of the same cells."""
     known = published(kind)
     cells = []
-    for values, rows in parts([attributes for _, attributes in scored], names).items():
+    for values, rows in group_by_attributes(attributes, names).items():
         where = dict(zip(names, values, strict=True))
-        accuracy = {n: dataclasses.asdict(over_runs([m[rows].mean() for m in marks])) for n, marks in right.items()}
-        others = known.of(where) if known else {}
+        accuracy = {title: summarize_runs([marks[rows].mean() for marks in each]) for title, each in correct.items()}
+        others = known.cell(where) if known else {}
         cells.append({"where": where, "instances": len(rows), "accuracy": accuracy, "published": others})
     return {"by": list(names), "cells": cells}
 
 
-def _confidence(by_run: Mapping[int, Answered], truth: NDArray[np.intp], unknown: Mapping[int, Answered]) -> Any:
-    """Of a joining: how far to trust it on objects of the training, and on others (`unknown`)."""
-    rows: dict[str, list[float]] = {
-        "expected_calibration_error": [],
-        "auroc_right": [],
-        "threshold_at_coverage": [],
-        "accuracy_at_coverage": [],
-        "auroc_known": [],
-        "unknown_refused": [],
+def _confidence(
+    fused: Mapping[str, Mapping[int, Predictions]],
+    truth: NDArray[np.intp],
+    unknown: Mapping[str, Mapping[int, Predictions]],
+) -> dict[str, Any]:
+    """Return confidence metrics of each fusion, on known objects and against unknown ones."""
+    metrics = {}
+    for title, by_run in fused.items():
+        rows = [_confidence_of_run(by_run[run], truth, unknown[title][run]) for run in by_run]
+        metrics[title] = {name: summarize_runs([row[name] for row in rows]) for name in rows[0]}
+    return metrics
+
+
+def _confidence_of_run(known: Predictions, truth: NDArray[np.intp], unknown: Predictions) -> dict[str, float]:
+    confidence, correct = np.minimum(known.confidence, 1), known.class_index == truth
+    of_unknown = np.minimum(unknown.confidence, 1)
+    accepted = accuracy_at_coverage(confidence, correct, COVERAGE)
+    every = np.concatenate([confidence, of_unknown])
+    return {
+        "expected_calibration_error": expected_calibration_error(confidence, correct),
+        "auroc_right": auroc(confidence, correct),
+        "threshold_at_coverage": accepted.threshold,
+        "accuracy_at_coverage": accepted.accuracy,
+        "auroc_known": auroc(every, np.arange(len(every)) < len(confidence)),
+        "unknown_refused": float((of_unknown < accepted.threshold).mean()) if len(of_unknown) else np.nan,
     }
-    for run, a in by_run.items():
-        confidence, right = np.minimum(a.confidence, 1), a.answer == truth
-        kept = accuracy_at_coverage(confidence, right, COVERAGE)
-        rows["expected_calibration_error"].append(expected_calibration_error(confidence, right))
-        rows["auroc_right"].append(auroc(confidence, right))
-        rows["threshold_at_coverage"].append(kept.threshold)
-        rows["accuracy_at_coverage"].append(kept.accuracy)
-        strange = np.minimum(unknown[run].confidence, 1)
-        if len(strange):
-            rows["unknown_refused"].append(float((strange < kept.threshold).mean()))
-            everything = np.concatenate([confidence, strange])
-            rows["auroc_known"].append(auroc(everything, np.arange(len(everything)) < len(confidence)))
-    return {name: dataclasses.asdict(over_runs(values)) for name, values in rows.items()}
 
 
-def _confusion(by_run: Mapping[int, Answered], truth: NDArray[np.intp], missed: Sequence[int]) -> NDArray[np.intp]:
-    """[C, C + 1] counts over all runs: rows the truth, columns the answers, the last one those not described."""
-    counts = np.zeros((len(missed), len(missed) + 1), np.intp)
-    for a in by_run.values():
-        np.add.at(counts, (truth, a.answer), 1)
-    counts[:, -1] = np.array(missed) * len(by_run)
+def _reliability(predictions: Sequence[Predictions], truth: NDArray[np.intp]) -> dict[str, list[Any]]:
+    """Return the bins of the reliability diagram, all runs together."""
+    confidence = np.concatenate([p.confidence for p in predictions])
+    correct = np.concatenate([p.class_index == truth for p in predictions])
+    bins = reliability(np.minimum(confidence, 1), correct)
+    return {
+        "answers": bins.answers.tolist(),
+        "accuracy": [None if np.isnan(value) else float(value) for value in bins.accuracy],
+        "confidence": [None if np.isnan(value) else float(value) for value in bins.confidence],
+    }
+
+
+def _confusion(
+    predictions: Sequence[Predictions], truth: NDArray[np.intp], described: NDArray[np.bool_], n_classes: int
+) -> NDArray[np.intp]:
+    """Return [C, C + 1] counts over all runs: rows are true classes, the last column instances not described."""
+    counts = np.zeros((n_classes, n_classes + 1), np.intp)
+    for each in predictions:
+        predicted = np.full(len(truth), n_classes)
+        predicted[described] = each.class_index
+        np.add.at(counts, (truth, predicted), 1)
     return counts
+
+
+def _most_frequent(confusion: NDArray[np.intp], classes: Sequence[str]) -> list[dict[str, Any]]:
+    """Return the most frequent confusions between two classes."""
+    pairs: list[dict[str, Any]] = [
+        {"truth": truth, "answer": answer, "count": int(row[j]), "share": float(row[j] / row.sum())}
+        for i, (truth, row) in enumerate(zip(classes, confusion, strict=True))
+        for j, answer in enumerate(classes)
+        if i != j and row[j]
+    ]
+    return sorted(pairs, key=lambda pair: -pair["count"])[:MOST_FREQUENT]

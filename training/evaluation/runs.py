@@ -1,6 +1,7 @@
-"""The trained runs that are evaluated together.
+"""Trained runs that are evaluated together.
 
-Folds of one training, several trainings of the same classes, or a training for each sequence of a dataset.
+These are the folds of one training, several trainings on the same classes, or one training for each sequence of a
+dataset.
 """
 
 import dataclasses
@@ -15,7 +16,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.files import content_digest, json_digest
 from thor2_jax.recognition.recognizer import DescribedFrame, Recognizer
 from thor2_jax.recognition.run_directory import RUN_FILE
-from training.baselines.baseline import Baseline, Seen
+from training.baselines.baseline import Baseline, BaselineInputs
 from training.baselines.files import baseline_file
 from training.baselines.load import load_baselines
 from training.fitting.run_directories import find_run_directories
@@ -26,14 +27,14 @@ __all__ = ["Run", "SequenceRun", "load_runs", "load_sequence_runs"]
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Run:
-    """A trained run, ready to answer.
+    """A trained run.
 
     Attributes:
-        name: its folder's; of a fold, its training's folder too.
-        digest: SHA-256 of what the folder holds of the model.
-        recognizer: reads the run.
-        baselines: those that the folder has.
-        temperatures: of the classifiers and baselines that were calibrated on held-out views.
+        name: name of its directory; of a fold, the training's directory too.
+        digest: SHA-256 of the files of its model.
+        recognizer: recognizer with the run's classifiers.
+        baselines: baselines in the run directory.
+        temperatures: temperatures of the classifiers and baselines that were calibrated on a held-out set.
     """
 
     name: str
@@ -44,30 +45,32 @@ class Run:
 
     @property
     def classes(self) -> tuple[str, ...]:
-        """Names, in the order of the probabilities."""
+        """Class names, in the order of the probabilities."""
         return self.recognizer.run.classes
 
     @property
-    def asked(self) -> tuple[str, ...]:
-        """Classifiers and baselines, in the order of their answers."""
+    def predictors(self) -> tuple[str, ...]:
+        """Names of the classifiers and baselines."""
         return (*self.recognizer.run.classifiers, *self.baselines)
 
-    def probabilities(self, frame: str, described: DescribedFrame, seen: Seen | None) -> dict[str, NDArray[np.float32]]:
-        """Classifier or baseline -> [B, C] probabilities of a frame's instances.
+    def probabilities(
+        self, frame: str, described: DescribedFrame, inputs: BaselineInputs | None
+    ) -> dict[str, NDArray[np.float32]]:
+        """Return classifier or baseline -> [B, C] class probabilities of a frame's instances.
 
         Args:
-            frame: its identifier.
-            described: the frame.
-            seen: what baselines read of it; None if no run has any.
+            frame: identifier of the frame.
+            described: the described frame.
+            inputs: inputs of the baselines; None if no run has any.
         """
-        said = {str(name): found for name, found in self.recognizer.probabilities(described.descriptors).items()}
-        if seen is not None:
-            said |= {name: baseline.probabilities(seen) for name, baseline in self.baselines.items()}
-        return said
+        values = {str(name): p for name, p in self.recognizer.probabilities(described.descriptors).items()}
+        if inputs is not None:
+            values |= {name: baseline.probabilities(inputs) for name, baseline in self.baselines.items()}
+        return values
 
 
 def _digest(path: Path) -> str:
-    baselines = baseline_file(path, "[!.]*")  # without temporary files
+    baselines = baseline_file(path, "[!.]*")  # without the temporary file of a killed process
     weights = [*sorted((path / "weights").rglob("*")), *sorted(baselines.parent.glob(baselines.name))]
     files = [file for file in (path / RUN_FILE, path / "network.npz", *weights) if file.is_file()]
     return content_digest(
@@ -78,42 +81,48 @@ def _digest(path: Path) -> str:
 
 
 def load_runs(paths: Sequence[Path]) -> list[Run]:
-    """Read the runs of `paths`, which share classes, descriptor and colour network: a frame is described once for all.
+    """Load runs that share classes, descriptor and colour network, so that a frame is described once for all.
+
+    Args:
+        paths: run directories, or directories with the folds of a training.
 
     Raises:
-        InputError: no run, one that cannot be read, one given twice, or runs that differ in what they share.
+        InputError: no run is given, one cannot be read or is given twice, or the runs differ in what they must share.
     """
-    folders = find_run_directories(paths)
-    if not folders:
-        raise InputError("model: no run folder is given")
-    runs = [_load(folder) for folder in folders]
-    seen: dict[str, Path] = {}
-    for folder, run in zip(folders, runs, strict=True):
-        if run.digest in seen:
-            raise InputError(f"model: {seen[run.digest]} and {folder} are the same run")
-        seen[run.digest] = folder
+    directories = find_run_directories(paths)
+    if not directories:
+        raise InputError("model: no run directory is given")
+    runs = [_load(directory) for directory in directories]
+    by_digest: dict[str, Path] = {}
+    for directory, run in zip(directories, runs, strict=True):
+        if run.digest in by_digest:
+            raise InputError(f"model: {by_digest[run.digest]} and {directory} are the same run; give it once")
+        by_digest[run.digest] = directory
         if run.classes != runs[0].classes:
             different = sorted(set(run.classes) ^ set(runs[0].classes))
             raise InputError(
-                f"model: {folders[0]} and {folder} have different classes "
-                f"({', '.join(different[:5]) or 'in another order'})"
+                f"model: {directories[0]} and {directory} have different classes "
+                f"({', '.join(different[:5]) or 'in another order'}); evaluate them separately"
             )
-        _check_same_descriptor(run, runs[0], folder, folders[0])
+        _check_same_descriptor(run, runs[0], directory, directories[0])
     return runs
 
 
-def _check_same_descriptor(run: Run, first: Run, folder: Path, first_folder: Path) -> None:
+def _check_same_descriptor(run: Run, first: Run, directory: Path, first_directory: Path) -> None:
     a, b = run.recognizer.run, first.recognizer.run
     if a.config != b.config or a.network.fingerprint != b.network.fingerprint:
-        raise InputError(f"model: {first_folder} and {folder} have different descriptors or colour networks")
+        raise InputError(
+            f"model: {first_directory} and {directory} have different descriptors or colour networks; "
+            "evaluate them separately"
+        )
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class SequenceRun(Run):
-    """Runs that were trained on the objects of one sequence each, as one: each answers the frames of its sequence.
+    """Several runs, each trained on the objects of one sequence; a frame is answered by the run of its sequence.
 
     Attributes:
-        recognizer: of any of them; describes the frames.
+        recognizer: recognizer of any of the runs; describes the frames.
         of_sequence: sequence -> its run. The sequence of a frame is its identifier without the last part.
     """
 
@@ -121,70 +130,77 @@ class SequenceRun(Run):
 
     @functools.cached_property
     def classes(self) -> tuple[str, ...]:
-        """Names of all runs, sorted."""
+        """Class names of all runs, sorted."""
         return tuple(sorted({name for run in self.of_sequence.values() for name in run.classes}))
 
-    def probabilities(self, frame: str, described: DescribedFrame, seen: Seen | None) -> dict[str, NDArray[np.float32]]:
-        """As of the sequence's own run, and 0 for objects that it does not know."""
+    def probabilities(
+        self, frame: str, described: DescribedFrame, inputs: BaselineInputs | None
+    ) -> dict[str, NDArray[np.float32]]:
+        """Return the class probabilities of the sequence's run; 0 for the classes of other runs."""
         run = self.of_sequence[sequence_of(frame)]
         columns = [self.classes.index(name) for name in run.classes]
-        found = {}
-        for name, values in run.probabilities(frame, described, seen).items():
-            found[name] = np.zeros((len(values), len(self.classes)), np.float32)
-            found[name][:, columns] = values
-        return found
+        padded = {}
+        for name, values in run.probabilities(frame, described, inputs).items():
+            padded[name] = np.zeros((len(values), len(self.classes)), np.float32)
+            padded[name][:, columns] = values
+        return padded
 
 
-def load_sequence_runs(folder: Path, frames: Iterable[str]) -> list[SequenceRun]:
-    """Read the runs of a folder that holds one, or the folds of one, for each sequence of a dataset.
+def load_sequence_runs(directory: Path, frames: Iterable[str]) -> list[SequenceRun]:
+    """Load the runs of a directory that holds a run, or the folds of one, for each sequence of a dataset.
 
-    That of the sequence a/b/c is in `folder`/a/b/c, `folder`/b/c or `folder`/c, whichever comes first.
+    The run of the sequence a/b/c is `directory`/a/b/c, `directory`/b/c or `directory`/c, whichever is found first.
 
     Args:
-        folder: of the runs.
+        directory: directory of the runs.
         frames: identifiers of the dataset's frames.
 
     Returns:
-        As many as each sequence has folds; their own temperatures are left out.
+        As many runs as each sequence has folds, without temperatures.
 
     Raises:
-        InputError: sequences without a run, a run that cannot be read, or runs that differ in classifiers, baselines,
-            folds, descriptor or colour network.
+        InputError: a sequence has no run, a run cannot be read, or runs differ in their classifiers, baselines, number
+            of folds, descriptor or colour network.
     """
     loaded: dict[Path, list[Run]] = {}
     of_sequence: dict[str, list[Run]] = {}
-    lacking = []
+    missing = []
     for sequence in dict.fromkeys(map(sequence_of, frames)):
-        own = next((folder / end for end in path_ends(sequence) if (folder / end).is_dir()), None)
-        if own is None:
-            lacking.append(sequence)
+        path = next((directory / end for end in path_ends(sequence) if (directory / end).is_dir()), None)
+        if path is None:
+            missing.append(sequence)
         else:
-            if own not in loaded:
-                loaded[own] = load_runs([own])
-            of_sequence[sequence] = loaded[own]
-    if lacking or not loaded:
-        raise InputError(f"model: {folder} has no run for {', '.join(lacking) or 'any sequence'}")
-    (first_folder, first), *others = loaded.items()
-    for own, runs in others:
-        if [run.asked for run in runs] != [run.asked for run in first]:
-            raise InputError(f"model: {first_folder} and {own} have different folds, classifiers or baselines")
-        _check_same_descriptor(runs[0], first[0], own, first_folder)
-    found = []
+            if path not in loaded:
+                loaded[path] = load_runs([path])
+            of_sequence[sequence] = loaded[path]
+    if missing or not loaded:
+        raise InputError(
+            f"model: {directory} has no run for {', '.join(missing) or 'any sequence'}; "
+            "train the missing ones with `thor2 train --sequences`"
+        )
+    (first_path, first), *others = loaded.items()
+    for path, runs in others:
+        if [run.predictors for run in runs] != [run.predictors for run in first]:
+            raise InputError(
+                f"model: {first_path} and {path} have different folds, classifiers or baselines; train them alike"
+            )
+        _check_same_descriptor(runs[0], first[0], path, first_path)
+    result = []
     for fold, run in enumerate(first):
-        mine = {sequence: runs[fold] for sequence, runs in of_sequence.items()}
-        digest = json_digest({sequence: run.digest for sequence, run in mine.items()})
-        name = f"{folder.absolute().name}/*" + (f"/fold-{fold}" if len(first) > 1 else "")
-        found.append(SequenceRun(name, digest, run.recognizer, run.baselines, of_sequence=mine))
-    return found
+        runs_of_fold = {sequence: runs[fold] for sequence, runs in of_sequence.items()}
+        digest = json_digest({sequence: run.digest for sequence, run in runs_of_fold.items()})
+        name = f"{directory.absolute().name}/*" + (f"/fold-{fold}" if len(first) > 1 else "")
+        result.append(SequenceRun(name, digest, run.recognizer, run.baselines, of_sequence=runs_of_fold))
+    return result
 
 
-def _load(folder: Path) -> Run:
-    recognizer = Recognizer.load(folder)
-    baselines, temperatures = load_baselines(folder, recognizer.run)
+def _load(directory: Path) -> Run:
+    recognizer = Recognizer.load(directory)
+    baselines, temperatures = load_baselines(directory, recognizer.run)
     temperatures |= recognizer.run.record.get("temperatures", {})
-    return Run(_name(folder), _digest(folder), recognizer, baselines, temperatures)
+    return Run(_name(directory), _digest(directory), recognizer, baselines, temperatures)
 
 
-def _name(folder: Path) -> str:
-    folder = folder.absolute()
-    return f"{folder.parent.name}/{folder.name}" if folder.name.startswith("fold-") else folder.name
+def _name(directory: Path) -> str:
+    directory = directory.absolute()
+    return f"{directory.parent.name}/{directory.name}" if directory.name.startswith("fold-") else directory.name

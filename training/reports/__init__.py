@@ -1,1 +1,1 @@
-"""Reports: HTML pages and plots."""
+"""HTML pages, plots and pictures of instances."""

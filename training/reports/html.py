@@ -1,4 +1,4 @@
-"""A one-page report: text, tables and pictures as plain HTML that needs nothing from elsewhere."""
+"""A report as one self-contained HTML page of text, tables and pictures."""
 
 import dataclasses
 import html
@@ -10,18 +10,18 @@ from thor2_jax.files import write_text
 __all__ = ["Picture", "Section", "Table", "write_page"]
 
 Table = tuple[Sequence[str], Sequence[Sequence[str]]]
-"""Header and rows; the first column holds names, the others figures."""
+"""Header and rows; the first column holds names, the others values."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Picture:
-    """A picture beside the page.
+    """A picture in a file next to the page.
 
     Attributes:
-        path: relative to the page.
-        caption: what it shows; also read out where it cannot be seen.
-        half: two of them stand side by side on a wide screen.
-        small: many of them stand side by side, on a narrow screen two.
+        path: path relative to the page.
+        caption: caption and alternative text.
+        half: takes half the width of a wide screen.
+        small: takes a fraction of the width, so that many pictures fit side by side.
     """
 
     path: str
@@ -30,8 +30,15 @@ class Picture:
     small: bool = False
 
 
-Section = tuple[str, str, Table | None, Sequence[Picture]]
-"""Heading, text, table, pictures."""
+@dataclasses.dataclass(frozen=True)
+class Section:
+    """A section of the page: a heading, and optionally a paragraph, a table and pictures."""
+
+    heading: str
+    text: str = ""
+    table: Table | None = None
+    pictures: Sequence[Picture] = ()
+
 
 _STYLE = """
 :root { color-scheme: light; }
@@ -66,25 +73,28 @@ def _figure(picture: Picture) -> str:
     return f'<figure{kind}><img src="{path}" alt="{caption}"><figcaption>{caption}</figcaption></figure>'
 
 
+def _section(section: Section) -> str:
+    elements = [f"<h2>{html.escape(section.heading)}</h2>"]
+    if section.text:
+        elements.append(f"<p>{html.escape(section.text)}</p>")
+    if section.table is not None:
+        elements.append(_table(section.table))
+    elements.append(f'<div class="pictures">{"".join(map(_figure, section.pictures))}</div>')
+    return "\n".join(elements)
+
+
 def write_page(path: str | Path, *, title: str, lead: str, sections: Sequence[Section]) -> None:
-    """Write the page; it appears whole or not at all.
+    """Write the page atomically.
 
     Raises:
-        OSError: it cannot be written.
+        OSError: the file cannot be written.
     """
-    parts = [f"<h1>{html.escape(title)}</h1>", f'<p class="lead">{html.escape(lead)}</p>']
-    for heading, text, table, pictures in sections:
-        parts.append(f"<h2>{html.escape(heading)}</h2>")
-        if text:
-            parts.append(f"<p>{html.escape(text)}</p>")
-        if table is not None:
-            parts.append(_table(table))
-        parts.append(f'<div class="pictures">{"".join(map(_figure, pictures))}</div>')
     write_text(
         path,
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         f"<title>{html.escape(title)}</title><style>{_STYLE}</style></head><body>\n"
-        + "\n".join(parts)
+        f'<h1>{html.escape(title)}</h1>\n<p class="lead">{html.escape(lead)}</p>\n'
+        + "\n".join(map(_section, sections))
         + "\n</body></html>\n",
     )

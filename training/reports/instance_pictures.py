@@ -1,4 +1,4 @@
-"""Pictures of an evaluation: frames with judged instances, crops of incorrect answers, the reliability diagram."""
+"""Pictures of recognized instances: frames with correct and incorrect answers, and crops."""
 
 import math
 from collections.abc import Mapping
@@ -6,15 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image
 
 from thor2_jax.files import atomic_write
 from thor2_jax.recognition.overlay import COLORS, UNRECOGNIZED, Annotation, draw_instances
-from training.reports.plots import save_figure
 
-__all__ = ["CORRECT", "INCORRECT", "draw_crop", "draw_judged", "draw_reliability"]
+__all__ = ["CORRECT", "INCORRECT", "draw_crop", "draw_judged"]
 
 CORRECT, INCORRECT = COLORS[2], UNRECOGNIZED
 """Bluish green and vermilion of the palette of Okabe and Ito, a green and a red that people with colour blindness can
@@ -74,30 +72,3 @@ def draw_crop(color: NDArray[np.uint8], mask: NDArray[np.bool_], path: Path) -> 
     picture = draw_instances(color[window], mask[window].astype(np.uint8), [Annotation(1, INCORRECT, "")])
     scale = _CROP_SIDE / max(picture.size)
     _save(picture.resize((max(1, round(picture.width * scale)), max(1, round(picture.height * scale)))), path)
-
-
-def draw_reliability(bins: Mapping[str, list[Any]], name: str, path: Path) -> None:
-    """Draw accuracy against confidence, and the number of answers in each bin.
-
-    Args:
-        bins: "answers" and "accuracy" of each bin; None for a bin without answers.
-        name: name of the fusion, for instance "THOR2".
-        path: path of the picture (PNG).
-
-    Raises:
-        OSError: the file cannot be written.
-    """
-    count = np.array(bins["answers"])
-    edges = np.linspace(0, 1, len(count) + 1)
-    accuracy = np.array([np.nan if value is None else value for value in bins["accuracy"]])
-    figure = Figure(figsize=(5.2, 5.5), layout="constrained")
-    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[3, 1])
-    upper.bar(edges[:-1], accuracy, 1 / len(count), align="edge", color="#56b4e9", edgecolor="white")
-    upper.plot([0, 1], [0, 1], color="#222222", linewidth=1, linestyle="--", label="perfect calibration")
-    upper.set(xlim=(0, 1), ylim=(0, 1), ylabel="accuracy")
-    upper.legend(frameon=False, loc="upper left")
-    lower.bar(edges[:-1], count, 1 / len(count), align="edge", color="#888888", edgecolor="white")
-    lower.set(xlabel=f"confidence of {name}", ylabel="answers")
-    for axes in (upper, lower):
-        axes.spines[["top", "right"]].set_visible(False)
-    save_figure(figure, path)

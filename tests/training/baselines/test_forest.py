@@ -1,4 +1,4 @@
-"""Measures against numpy, trees as arrays against scikit-learn's own."""
+"""Features of the random forest against NumPy, and its predictions against scikit-learn."""
 
 import numpy as np
 import pytest
@@ -6,8 +6,9 @@ from sklearn.ensemble import RandomForestClassifier
 
 import colornet
 import thor2_jax as thor2
-from training.baselines.baseline import Seen
-from training.baselines.forest import Forest, _nodes_of, forest_features
+from training.baselines.baseline import BaselineInputs
+from training.baselines.fit_forest import tree_arrays
+from training.baselines.forest import Forest, forest_features
 
 NETWORK = colornet.load_default()
 CONFIG = thor2.DescriptorConfig(homology="closed_form")
@@ -23,7 +24,7 @@ def normal(sizes: tuple[int, ...]) -> thor2.PointClouds:
     return thor2.view_normalize(thor2.PointClouds.pack(clouds, camera=[0, 0, -3]), CONFIG)
 
 
-def test_measures_of_clouds() -> None:
+def test_features_match_numpy() -> None:
     clouds = normal((400, 1, 0, 57))
     found = forest_features(clouds, NETWORK, CONFIG)
     assert found.shape == (4, 22 + 3 + 14)
@@ -49,21 +50,21 @@ def test_measures_of_clouds() -> None:
 
 
 @pytest.mark.parametrize("depth", [None, 1])
-def test_trees_answer_as_scikit_learns(depth: int | None) -> None:
+def test_predictions_match_scikit_learn(depth: int | None) -> None:
     rng = np.random.default_rng(0)
     x = rng.random((300, 5)).astype(np.float32)
     y = (x[:, 0] * 3).astype(int) + (x[:, 1] > 0.5)
     grown = RandomForestClassifier(9, min_samples_leaf=2, max_depth=depth, random_state=0).fit(x, y)
-    forest = Forest(_nodes_of(grown), NETWORK, CONFIG)
-    asked = np.concatenate([x, rng.random((50, 5)).astype(np.float32)])
-    np.testing.assert_allclose(forest.of_features(asked), grown.predict_proba(asked), atol=1e-6)
+    forest = Forest(tree_arrays(grown), NETWORK, CONFIG)
+    features = np.concatenate([x, rng.random((50, 5)).astype(np.float32)])
+    np.testing.assert_allclose(forest.predict(features), grown.predict_proba(features), atol=1e-6)
 
 
-def test_trees_of_one_leaf_and_missing_arrays() -> None:
+def test_single_leaf_trees_and_missing_arrays() -> None:
     grown = RandomForestClassifier(2, random_state=0).fit(np.zeros((4, 39), np.float32), [0, 0, 0, 1])
-    nodes = _nodes_of(grown)
+    nodes = tree_arrays(grown)
     forest = Forest(nodes, NETWORK, CONFIG)
-    seen = Seen(normal((60, 0)), np.zeros((2, 1), np.float32))
-    np.testing.assert_allclose(forest.probabilities(seen), grown.predict_proba(np.zeros((2, 39))), atol=1e-6)
-    with pytest.raises(ValueError, match="root is missing"):
+    inputs = BaselineInputs(normal((60, 0)), np.zeros((2, 1), np.float32))
+    np.testing.assert_allclose(forest.probabilities(inputs), grown.predict_proba(np.zeros((2, 39))), atol=1e-6)
+    with pytest.raises(ValueError, match="root"):
         Forest({name: nodes[name] for name in nodes if name != "root"}, NETWORK, CONFIG)

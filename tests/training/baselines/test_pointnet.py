@@ -1,11 +1,11 @@
-"""The PointNet: against the same sums in numpy, and what it must not depend on."""
+"""The PointNet baseline against a NumPy reference."""
 
 import numpy as np
 import pytest
 from flax import nnx
 
 import thor2_jax as thor2
-from training.baselines.baseline import Seen
+from training.baselines.baseline import BaselineInputs
 from training.baselines.pointnet import POINTS, ColoredPointNet, PointNet
 
 
@@ -13,15 +13,15 @@ def model() -> ColoredPointNet:
     return ColoredPointNet(PointNet(5, rngs=nnx.Rngs(3)))
 
 
-def seen(sizes: tuple[int, ...], seed: int = 0) -> Seen:
+def inputs(sizes: tuple[int, ...], seed: int = 0) -> BaselineInputs:
     rng = np.random.default_rng(seed)
     clouds = [(rng.random((n, 3)).astype(np.float32), rng.random((n, 3)).astype(np.float32)) for n in sizes]
-    return Seen(thor2.PointClouds.pack(clouds), np.zeros((len(sizes), 1), np.float32))
+    return BaselineInputs(thor2.PointClouds.pack(clouds), np.zeros((len(sizes), 1), np.float32))
 
 
-def test_against_numpy() -> None:
-    """A cloud of just as many points as are drawn: all of them are seen."""
-    given, net = seen((POINTS,)), model()
+def test_probabilities_match_numpy() -> None:
+    """The cloud has as many points as are sampled, so all of them are used."""
+    given, net = inputs((POINTS,)), model()
     arrays = {name: array.astype(np.float64) for name, array in net.arrays().items()}
     xyz = np.asarray(given.normal.points, np.float64)[0, :POINTS]
     rgb = np.asarray(given.normal.colors, np.float64)[0, :POINTS]
@@ -37,22 +37,22 @@ def test_against_numpy() -> None:
 
 @pytest.mark.parametrize("sizes", [(1,), (0, 7), (POINTS - 1, POINTS + 1, 900)])
 def test_any_number_of_points(sizes: tuple[int, ...]) -> None:
-    found = model().probabilities(seen(sizes))
+    found = model().probabilities(inputs(sizes))
     assert found.shape == (len(sizes), 5)
     np.testing.assert_allclose(found.sum(axis=1), 1, atol=1e-5)
 
 
-def test_a_cloud_is_answered_alike_alone_and_in_a_batch() -> None:
-    net, both = model(), seen((800, 500))
-    one = Seen(
+def test_cloud_gives_the_same_alone_and_in_a_batch() -> None:
+    net, both = model(), inputs((800, 500))
+    one = BaselineInputs(
         thor2.PointClouds.pack([(np.asarray(both.normal.points)[0, :800], np.asarray(both.normal.colors)[0, :800])]),
         both.tops[:1],
     )
     np.testing.assert_allclose(net.probabilities(one)[0], net.probabilities(both)[0], atol=1e-6)
 
 
-def test_arrays_make_the_same_network_again() -> None:
-    net, given = model(), seen((500,))
+def test_network_round_trips_through_arrays() -> None:
+    net, given = model(), inputs((500,))
     again = ColoredPointNet.with_arrays(net.arrays(), 5)
     np.testing.assert_array_equal(again.probabilities(given), net.probabilities(given))
     with pytest.raises(ValueError, match="head/bias"):

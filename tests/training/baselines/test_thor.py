@@ -1,4 +1,4 @@
-"""THOR's choices against tables written by hand, and its answers against those of the classifier chosen."""
+"""THOR: the rules that select classifiers, and the predictions of the library."""
 
 import itertools
 from typing import Any
@@ -9,21 +9,22 @@ from flax import nnx
 
 import thor2_jax as thor2
 from thor2_jax.recognition.classifier import MLP
-from training.baselines.baseline import Seen
-from training.baselines.thor import THOR, TYPES, camera_types, view_types
+from training.baselines.baseline import BaselineInputs
+from training.baselines.fit_thor import camera_types
+from training.baselines.thor import THOR, VIEW_TYPES, view_types
 
 CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=3, image_size=4)
 
 
-def test_types_of_cameras_are_those_of_the_published_lists() -> None:
-    """In steps of 5 degrees, as the published training has them, but for the cameras straight above and below."""
+def test_camera_types_match_the_published_lists() -> None:
+    """Compare all cameras of the published training, in steps of 5 degrees."""
     lying = set(range(40, 145, 5))
     front = set(range(0, 55, 5)) | set(range(130, 235, 5)) | set(range(310, 360, 5))
     side = set(range(40, 145, 5)) | set(range(220, 325, 5))
     top = set(range(0, 55, 5)) | set(range(130, 185, 5))
     for azimuth, polar in itertools.product(range(0, 360, 5), range(0, 185, 5)):
         expected = (azimuth in front and polar in lying, azimuth in side and polar in lying, polar in top)
-        assert camera_types(azimuth, polar) == tuple(np.array(TYPES)[list(expected)])
+        assert camera_types(azimuth, polar) == tuple(np.array(VIEW_TYPES)[list(expected)])
 
 
 @pytest.mark.parametrize(
@@ -44,14 +45,14 @@ def test_types_of_cameras_are_those_of_the_published_lists() -> None:
         ((1.0, 0.799, 0.639), ("front", "side")),
     ],
 )
-def test_types_by_areas_of_faces(areas: tuple[float, float, float], types: tuple[str, ...]) -> None:
+def test_view_types_by_face_areas(areas: tuple[float, float, float], types: tuple[str, ...]) -> None:
     assert view_types(*areas) == types
 
 
 def library() -> dict[Any, MLP]:
     return {
         (name, k): MLP(16 * k, 4, rngs=nnx.Rngs(10 * number + k))
-        for number, name in enumerate(TYPES)
+        for number, name in enumerate(VIEW_TYPES)
         for k in (1, 2, 3)
     }
 
@@ -59,23 +60,23 @@ def library() -> dict[Any, MLP]:
 def box(
     size: tuple[float, float, float], camera: tuple[float, float, float], edge: float | None = None
 ) -> tuple[Any, Any, Any]:
-    """A normalized box, with occlusion boundary at one x."""
+    """Return points of a normalized box, its camera and its occlusion boundary, which lies at x = edge."""
     xyz = np.array(list(itertools.product(*(np.linspace(0, side, 9) for side in size))), np.float32)
     return xyz, camera, np.zeros(len(xyz), bool) if edge is None else np.isclose(xyz[:, 0], edge)
 
 
-def seen(*boxes: tuple[Any, Any, Any]) -> Seen:
+def inputs(*boxes: tuple[Any, Any, Any]) -> BaselineInputs:
     clouds = [(xyz, np.zeros_like(xyz)) for xyz, _, _ in boxes]
     cameras = np.array([camera for _, camera, _ in boxes])
     normal = thor2.PointClouds.pack(clouds, camera=cameras, boundary=[edge for *_, edge in boxes])
     tops = np.random.default_rng(0).random((len(boxes), 48)).astype(np.float32)
-    return Seen(normal, tops)
+    return BaselineInputs(normal, tops)
 
 
-def test_the_surer_of_the_chosen_classifiers_answers() -> None:
+def test_most_confident_selected_classifier_decides() -> None:
     """Boxes of 0.2 x 0.1 x 0.05 have faces of 0.005 (x), 0.01 (y) and 0.02 (z); turned, they have two slices."""
     size = (0.2, 0.1, 0.05)
-    given = seen(
+    given = inputs(
         box(size, (0.1, 0.05, -3.0)),  # the largest face: front and side, all slices
         box(size, (-3.0, 0.05, 0.0)),  # the smallest: side and top
         box(size, (0.1, 0.05, -3.0), edge=size[0]),  # the far end is occluded: two slices
@@ -96,18 +97,18 @@ def test_the_surer_of_the_chosen_classifiers_answers() -> None:
         np.testing.assert_allclose(found[row], max(rows, key=np.max), atol=1e-6)
 
 
-def test_empty_clouds_of_a_padded_batch_do_no_harm() -> None:
+def test_empty_clouds_give_finite_probabilities() -> None:
     empty = np.zeros((0, 3), np.float32)
     normal = thor2.PointClouds.pack([(empty, empty)])
-    found = THOR(library(), CONFIG).probabilities(Seen(normal, np.zeros((1, 48), np.float32)))
+    found = THOR(library(), CONFIG).probabilities(BaselineInputs(normal, np.zeros((1, 48), np.float32)))
     assert found.shape == (1, 4) and np.isfinite(found).all()
 
 
-def test_arrays_make_the_same_library_again() -> None:
-    thor, given = THOR(library(), CONFIG), seen(box((0.2, 0.1, 0.05), (0.1, 0.05, -3.0)))
+def test_library_round_trips_through_arrays() -> None:
+    thor, given = THOR(library(), CONFIG), inputs(box((0.2, 0.1, 0.05), (0.1, 0.05, -3.0)))
     arrays = thor.arrays()
     again = THOR.with_arrays(arrays, CONFIG, 4)
     np.testing.assert_array_equal(again.probabilities(given), thor.probabilities(given))
     del arrays["side-2/head/bias"]
-    with pytest.raises(ValueError, match="head/bias is missing"):
+    with pytest.raises(ValueError, match="head/bias"):
         THOR.with_arrays(arrays, CONFIG, 4)

@@ -14,29 +14,29 @@ from training.evaluation.confidence import (
 )
 
 
-def test_calibration_error_counted_by_hand() -> None:
+def test_calibration_error_matches_hand_calculation() -> None:
     """Two answers in bin 7 of 15 (0.4667 to 0.5333), three in the last, one in the first."""
     confidence = [0.5, 0.52, 0.95, 0.97, 1.0, 0.0]
-    right = [True, False, True, True, False, False]
-    found = reliability(confidence, right)
-    assert found.answers.tolist() == [1] + [0] * 6 + [2] + [0] * 6 + [3]
-    assert found.accuracy[[0, 7, 14]] == pytest.approx([0, 1 / 2, 2 / 3])
-    assert found.confidence[[0, 7, 14]] == pytest.approx([0, 0.51, 2.92 / 3])
-    assert np.isnan(found.accuracy[1])
+    correct = [True, False, True, True, False, False]
+    result = reliability(confidence, correct)
+    assert result.answers.tolist() == [1] + [0] * 6 + [2] + [0] * 6 + [3]
+    assert result.accuracy[[0, 7, 14]] == pytest.approx([0, 1 / 2, 2 / 3])
+    assert result.confidence[[0, 7, 14]] == pytest.approx([0, 0.51, 2.92 / 3])
+    assert np.isnan(result.accuracy[1])
     by_hand = (1 * 0 + 2 * abs(0.5 - 0.51) + 3 * abs(2 / 3 - 2.92 / 3)) / 6
-    assert expected_calibration_error(confidence, right) == pytest.approx(by_hand)
+    assert expected_calibration_error(confidence, correct) == pytest.approx(by_hand)
 
 
-def test_bins_hold_their_upper_edge() -> None:
+def test_bins_include_their_upper_edge() -> None:
     assert reliability([0.5, 0.5000001, 1.0], [True] * 3, bins=2).answers.tolist() == [1, 2]
 
 
-def test_without_answers_there_is_no_error_to_tell() -> None:
+def test_metrics_without_answers_are_nan() -> None:
     assert math.isnan(expected_calibration_error([], []))
     assert all(math.isnan(value) for value in accuracy_at_coverage([], []))
 
 
-def test_auroc_is_the_share_of_pairs_in_order() -> None:
+def test_auroc_is_the_fraction_of_ordered_pairs() -> None:
     rng = np.random.default_rng(2)
     confidence, positive = rng.integers(0, 6, 40) / 5, rng.random(40) < 0.4
     pairs = [(0.5 if p == n else float(p > n)) for p in confidence[positive] for n in confidence[~positive]]
@@ -44,18 +44,18 @@ def test_auroc_is_the_share_of_pairs_in_order() -> None:
     assert math.isnan(auroc([0.1, 0.2], [True, True]))
 
 
-def test_coverage_counted_by_hand() -> None:
+def test_coverage_matches_hand_calculation() -> None:
     confidence = np.arange(1, 21) / 20
-    right = np.ones(20, bool)
-    right[[0, 5]] = False
-    found = accuracy_at_coverage(confidence, right)
-    assert (found.threshold, found.kept, found.accuracy) == pytest.approx((0.1, 0.95, 18 / 19))
-    assert accuracy_at_coverage(confidence, right, 1.0).accuracy == pytest.approx(0.9)
+    correct = np.ones(20, bool)
+    correct[[0, 5]] = False
+    result = accuracy_at_coverage(confidence, correct)
+    assert (result.threshold, result.kept, result.accuracy) == pytest.approx((0.1, 0.95, 18 / 19))
+    assert accuracy_at_coverage(confidence, correct, 1.0).accuracy == pytest.approx(0.9)
     tied = accuracy_at_coverage([0.5, 0.5, 0.9], [False, True, True], 0.5)
     assert (tied.threshold, tied.kept) == (0.5, 1.0)
 
 
-def test_bad_input_is_named() -> None:
+def test_invalid_arguments_are_refused() -> None:
     with pytest.raises(InputError, match=r"shapes \(2,\) and \(1,\)"):
         reliability([0.1, 0.2], [True])
     with pytest.raises(InputError, match=r"1\.5"):

@@ -1,4 +1,4 @@
-"""Which folders are runs, and which runs may be evaluated together."""
+"""Loading runs, and which runs can be evaluated together."""
 
 import dataclasses
 from collections.abc import Callable
@@ -39,7 +39,7 @@ def make(tmp_path: Path) -> Maker:
     return make
 
 
-def test_folds_are_loaded_with_names_and_digests(make: Maker, tmp_path: Path) -> None:
+def test_folds_have_names_and_digests(make: Maker, tmp_path: Path) -> None:
     for fold in range(2):
         make(f"both/fold-{fold}", seed=fold)
     runs = load_runs([tmp_path / "both"])
@@ -48,40 +48,39 @@ def test_folds_are_loaded_with_names_and_digests(make: Maker, tmp_path: Path) ->
     assert [run.digest for run in load_runs([tmp_path / "both"])] == [run.digest for run in runs]
 
 
-def test_a_digest_is_of_files_that_have_their_name(make: Maker) -> None:
+def test_digest_ignores_temporary_files(make: Maker) -> None:
     folder = make("run")
     before = load_runs([folder])[0].digest
     file = baseline_file(folder, "forest")
     file.parent.mkdir()
-    file.with_name(f".{file.stem}.x{file.suffix}").touch()  # of a process that was killed while it wrote
+    file.with_name(f".{file.stem}.x{file.suffix}").touch()  # left by a killed process
     assert load_runs([folder])[0].digest == before
 
 
-def test_runs_that_do_not_fit_together_are_refused(make: Maker, tmp_path: Path) -> None:
+def test_incompatible_runs_are_refused(make: Maker, tmp_path: Path) -> None:
     first = make("first")
     cases = {
         "different classes (c)": make("classes", ("a", "b", "c")),
         "different classes (in another order)": make("order", ("b", "a")),
         "different descriptors": make("config", config=dataclasses.replace(CONFIG, alpha=0.5)),
         "the same run": first,
-        "no run folder": tmp_path,
+        "run.json": tmp_path,
     }
-    for said, other in cases.items():
+    for message, other in cases.items():
         with pytest.raises(InputError, match="^model: ") as caught:
             load_runs([first, other])
-        assert said in str(caught.value) and str(other) in str(caught.value)
-    with pytest.raises(InputError, match="no run folder is given"):
+        assert message in str(caught.value) and str(other) in str(caught.value)
+    with pytest.raises(InputError, match="^model: "):
         load_runs([])
 
 
-def test_runs_of_sequences(make: Maker, tmp_path: Path) -> None:
-    """Against the runs one by one."""
+def test_each_sequence_is_answered_by_its_run(make: Maker, tmp_path: Path) -> None:
     for fold in range(2):
         make(f"runs/bottom/s1/fold-{fold}", ("b", "c"), seed=fold)
         make(f"runs/s2/fold-{fold}", ("a", "b"), seed=2 + fold)
     found = load_sequence_runs(tmp_path / "runs", ["x/bottom/s1/f1", "x/bottom/s1/f2", "x/top/s2/f1"])
     assert [run.name for run in found] == ["runs/*/fold-0", "runs/*/fold-1"]
-    assert all(run.classes == ("a", "b", "c") and run.asked == ("ce",) for run in found)
+    assert all(run.classes == ("a", "b", "c") and run.predictors == ("ce",) for run in found)
     assert found[0].digest != found[1].digest
     assert [run.digest for run in load_sequence_runs(tmp_path / "runs", ["x/top/s2/f1"])] != [r.digest for r in found]
 
@@ -97,7 +96,7 @@ def test_runs_of_sequences(make: Maker, tmp_path: Path) -> None:
             np.testing.assert_array_equal(values, expected.astype(np.float32))
 
 
-def test_runs_of_sequences_that_do_not_fit_together_are_refused(make: Maker, tmp_path: Path) -> None:
+def test_incompatible_sequence_runs_are_refused(make: Maker, tmp_path: Path) -> None:
     make("runs/s1")
     make("runs/s2/fold-0")
     make("runs/s2/fold-1", seed=1)
@@ -110,7 +109,7 @@ def test_runs_of_sequences_that_do_not_fit_together_are_refused(make: Maker, tmp
         ("s1", "s5"): "has no run for s5",
         (): "has no run for any sequence",
     }
-    for sequences, said in cases.items():
+    for sequences, message in cases.items():
         with pytest.raises(InputError, match="^model: ") as caught:
             load_sequence_runs(tmp_path / "runs", [f"{sequence}/frame" for sequence in sequences])
-        assert said in str(caught.value)
+        assert message in str(caught.value)

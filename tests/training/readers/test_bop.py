@@ -16,7 +16,8 @@ from PIL import Image
 from thor2_jax.errors import InputError
 from thor2_jax.recognition.frames import backproject
 from training import cli
-from training.evaluate import evaluate, summarize
+from training.evaluation.answering import answer_frames
+from training.evaluation.results import compute_results
 from training.evaluation.runs import Run as EvaluatedRun
 from training.readers import BOP, FrameFolder
 
@@ -391,17 +392,20 @@ def write_dataset(root: Path) -> Path:
 
 def test_accuracy_by_scene(tmp_path: Path) -> None:
     dataset = BOP(write_dataset(tmp_path), tmp_path / "names.yaml")
-    instances = evaluate(LabelIsClass(), dataset)  # type: ignore[arg-type]
-    assert [(i.frame, i.label, i.truth) for i in instances] == [
+    run = EvaluatedRun("run", "", LabelIsClass())  # type: ignore[arg-type]
+    answers = [answers for _, answers in answer_frames([run], dataset)]
+    assert [(frame.frame, i.label, i.truth) for frame in answers for i in frame.instances] == [
         ("000048/000001", 1, "mug"),
         ("000048/000001", 2, "bowl"),
         ("000048/000001", 3, "mug"),
         ("000049/000001", 2, "bowl"),
         ("000049/000001", 3, "mug"),
     ]
-    found = summarize(instances, ["TOPS"])
-    assert found["accuracy"]["all"]["all"] == {"instances": 5, "TOPS": 0.6} and found["unanswered"] == 2
-    assert {v: row["instances"] for v, row in found["accuracy"]["scene"].items()} == {"000048": 3, "000049": 2}
+    results = compute_results("bop", [run], answers)
+    first, by_scene = results["accuracy"]["max"]
+    assert first["cells"][0]["accuracy"]["TOPS"]["mean"] == 0.6
+    assert sum(results["instances"]["not_described"].values()) == 2
+    assert {cell["where"]["scene"]: cell["instances"] for cell in by_scene["cells"]} == {"000048": 3, "000049": 2}
 
 
 def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
@@ -418,7 +422,7 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     assert call(dataset, *model, "--names", tmp_path / "names.yaml", "--out", tmp_path / "report") == 0
     assert "5 instances scored" in capsys.readouterr().out
     assert json.loads((tmp_path / "report" / "report.json").read_text())["instances"]["scored"] == 5
-    assert call(dataset, *model) == 0  # obj_000014 is no class of the run
-    assert "5 are no class of the runs" in capsys.readouterr().out
+    assert call(dataset, *model) == 0  # without names, all objects are unknown
+    assert "5 are of no class" in capsys.readouterr().out
     assert call(tmp_path / "absent", *model) == 2
     assert capsys.readouterr().err == f"error: dataset: {tmp_path / 'absent'} is no folder\n"

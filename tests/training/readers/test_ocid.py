@@ -16,7 +16,8 @@ from PIL import Image
 from thor2_jax.errors import InputError
 from thor2_jax.recognition.frames import Intrinsics, backproject
 from training import cli
-from training.evaluate import evaluate, summarize
+from training.evaluation.answering import answer_frames
+from training.evaluation.results import compute_results
 from training.evaluation.runs import Run as EvaluatedRun
 from training.readers import OCID, FrameFolder
 from training.readers.ocid import fit_intrinsics
@@ -336,7 +337,7 @@ def test_the_camera_of_real_depth(shared: Path) -> None:
 
 
 class NamesInOrder:
-    """Stands in for a trained recognizer: the first instance of a frame is of its first class, others of the second."""
+    """Toy recognizer: the first instance of a frame is of the first class, the others of the second."""
 
     def __init__(self, classes: tuple[str, ...] = ("mug", "bowl")) -> None:
         network = SimpleNamespace(fingerprint="")
@@ -363,13 +364,20 @@ def test_accuracy_by_condition(tmp_path: Path) -> None:
     write_frame(tmp_path, "table/bottom/curved/seq36", objects=2)
     write_frame(tmp_path, "floor/top/mixed/seq08")
     names = write_names(tmp_path, {"seq36": ["mug", "bowl"], "seq08": ["bowl", "bowl", "banana"]})
-    instances = evaluate(NamesInOrder(), OCID(tmp_path, names))  # type: ignore[arg-type]
-    assert [(i.label, i.truth) for i in instances] == [(3, "mug"), (4, "bowl"), (2, "bowl"), (3, "bowl"), (4, "banana")]
-    table = summarize(instances, ["TOPS"])["accuracy"]
-    assert table["all"]["all"] == {"instances": 4, "TOPS": 0.75}
-    assert table["place"] == {"floor": {"instances": 2, "TOPS": 0.5}, "table": {"instances": 2, "TOPS": 1.0}}
-    assert {v: row["TOPS"] for v, row in table["camera"].items()} == {"lower": 1.0, "upper": 0.5}
-    assert {v: row["TOPS"] for v, row in table["type"].items()} == {"curved": 1.0, "mixed": 0.5}
+    run = EvaluatedRun("run", "", NamesInOrder())  # type: ignore[arg-type]
+    answers = [answers for _, answers in answer_frames([run], OCID(tmp_path, names))]
+    instances = [(i.label, i.truth) for frame in answers for i in frame.instances]
+    assert instances == [(3, "mug"), (4, "bowl"), (2, "bowl"), (3, "bowl"), (4, "banana")]
+    tables = compute_results("frames", [run], answers)["accuracy"]["max"]
+    accuracy = {
+        (*table["by"], *cell["where"].values()): (cell["instances"], cell["accuracy"]["TOPS"]["mean"])
+        for table in tables
+        for cell in table["cells"]
+    }
+    assert accuracy[()] == (4, 0.75)
+    assert accuracy["place", "floor"] == (2, 0.5) and accuracy["place", "table"] == (2, 1.0)
+    assert accuracy["camera", "lower"] == (2, 1.0) and accuracy["camera", "upper"] == (2, 0.5)
+    assert accuracy["type", "curved"] == (2, 1.0) and accuracy["type", "mixed"] == (2, 0.5)
 
 
 def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
@@ -382,7 +390,7 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     report = json.loads((tmp_path / "report" / "report.json").read_text())
     assert report["instances"]["scored"] == 2 and sum(report["instances"]["no_class"].values()) == 1
     page = (tmp_path / "report" / "report.html").read_text()
-    assert "<h2>Confusions</h2>\n<p>There are none.</p>" in page and "Runs: run." in page
+    assert "Models: run." in page and page.count("<img") == 4
     cell = report["accuracy"]["max"][0]["cells"][0]
     assert cell["instances"] == 2 and cell["accuracy"]["TOPS"]["mean"] == 1.0
     names.unlink()

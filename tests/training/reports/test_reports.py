@@ -1,4 +1,4 @@
-"""The page as a browser's parser reads it, and the pictures as files."""
+"""HTML pages, plots and the demo."""
 
 import dataclasses
 from html.parser import HTMLParser
@@ -11,15 +11,15 @@ from PIL import Image
 import colornet
 import thor2_jax as thor2
 from training import demo
-from training.evaluate import Instance
 from training.fitting.options import FitOptions
 from training.objects.builtin_objects import builtin_objects
-from training.reports.html import Picture, write_page
-from training.reports.plots import draw_accuracy, draw_confusion, draw_curves, draw_descriptor, draw_objects
+from training.reports.html import Picture, Section, write_page
+from training.reports.object_plots import draw_descriptor, draw_objects
+from training.reports.plots import draw_accuracy, draw_confusion, draw_curves, draw_reliability
 
 
 class Page(HTMLParser):
-    """Collects text, sources of pictures and tags that are open at the end."""
+    """Collects the text, the pictures and the tags left open."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -41,8 +41,8 @@ class Page(HTMLParser):
         self.text.append(data)
 
 
-def test_page_holds_what_it_is_given_and_no_markup_from_it(tmp_path: Path) -> None:
-    section = ("A < B", "x & y", (["name", "value"], [["<b>", "1"]]), [Picture("p.png", 'the "first"')])
+def test_page_escapes_its_content(tmp_path: Path) -> None:
+    section = Section("A < B", "x & y", (["name", "value"], [["<b>", "1"]]), [Picture("p.png", 'the "first"')])
     write_page(tmp_path / "page.html", title="T<script>", lead="l", sections=[section])
     page = Page((tmp_path / "page.html").read_text())
     assert page.open == []
@@ -56,14 +56,13 @@ def colors_in(path: Path) -> int:
         return len(np.unique(np.asarray(image.convert("RGB")).reshape(-1, 3), axis=0))
 
 
-def test_every_picture_is_drawn(tmp_path: Path) -> None:
+def test_every_plot_is_drawn(tmp_path: Path) -> None:
     some = dict(list(builtin_objects().items())[:3])
     draw_objects(some, tmp_path / "objects.png")
     draw_accuracy(("A", "B"), {"all": [0.5, 1.0], "few": [0.0, 0.25]}, {"all": 4, "few": 1}, tmp_path / "accuracy.png")
     draw_curves({"ce": [{"epoch": 1, "loss": 1.0, "accuracy": 0.5}]}, tmp_path / "curves.png")
-    answered = Instance("f", 1, "a", {}, {"THOR2": ("b", 0.9)})
-    silent = Instance("f", 2, "b", {}, {}, reason="too small")
-    draw_confusion([answered, silent], ("a", "b"), "THOR2", tmp_path / "confusion.png")
+    draw_confusion(np.array([[0, 1, 0], [0, 0, 1]]), ("a", "b"), "THOR2", tmp_path / "confusion.png")
+    draw_reliability({"answers": [0, 3], "accuracy": [None, 0.5]}, "THOR2", tmp_path / "reliability.png")
     points = np.random.default_rng(0).random((200, 3)) * (0.2, 0.1, 0.05) + (0, 0, 1)
     draw_descriptor(
         points,
@@ -74,19 +73,18 @@ def test_every_picture_is_drawn(tmp_path: Path) -> None:
         tmp_path / "descriptor.png",
     )
     found = sorted(p.name for p in tmp_path.iterdir())
-    assert found == ["accuracy.png", "confusion.png", "curves.png", "descriptor.png", "objects.png"]
+    assert found == ["accuracy.png", "confusion.png", "curves.png", "descriptor.png", "objects.png", "reliability.png"]
     assert all(colors_in(tmp_path / name) > 10 for name in found)
 
 
-def test_an_unwritable_folder_is_an_oserror_and_leaves_nothing(tmp_path: Path) -> None:
+def test_missing_directory_raises_oserror(tmp_path: Path) -> None:
     with pytest.raises(OSError):
         draw_curves({"ce": []}, tmp_path / "absent" / "curves.png")
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.slow
-def test_demo_in_small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The whole demonstration with few views, epochs and scenes."""
+def test_small_demo_is_interrupted_and_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     names = ("mug_blue", "soup_can_red", "cereal_box_yellow", "sponge", "white_bowl")
     everything = builtin_objects()
     monkeypatch.setattr(demo, "builtin_objects", lambda: {name: everything[name] for name in names})
@@ -94,44 +92,44 @@ def test_demo_in_small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     small = {"azimuth_step": 45.0, "polar_step": 30.0, "fit": FitOptions(epochs=4, batch_size=128)}
     monkeypatch.setattr(demo, "PROTOCOL", dataclasses.replace(demo.PROTOCOL, **small))
 
-    class Stopped(BaseException):
+    class Interrupted(BaseException):
         pass
 
-    def stopped_at(last: str) -> list[str]:
-        """Stop there; the stages until then."""
+    def interrupt_at(last: str) -> list[str]:
+        """Interrupt the demo at this stage; return the stages so far."""
         stages = []
 
-        def told(stage: str, done: int, total: int, note: str) -> None:
+        def report(stage: str, done: int, total: int, note: str) -> None:
             stages.append(stage)
             if stage == last:
-                raise Stopped
+                raise Interrupted
 
-        with pytest.raises(Stopped):
-            demo.run_demo(tmp_path, 1, told)
+        with pytest.raises(Interrupted):
+            demo.run_demo(tmp_path, 1, report)
         return list(dict.fromkeys(stages))
 
-    assert stopped_at("render views") == ["render views"]
-    assert stopped_at("fit tops")[-3:] == ["describe", "fit ce", "fit tops"]
-    assert "fit ce" not in stopped_at("recognize scenes")
+    assert interrupt_at("render views") == ["render views"]
+    assert interrupt_at("fit tops")[-3:] == ["describe", "fit ce", "fit tops"]
+    assert "fit ce" not in interrupt_at("recognize scenes")
     assert not (tmp_path / "report.html").exists()
-    with pytest.raises(thor2.InputError, match="seed 1, not 2"):
+    with pytest.raises(thor2.InputError, match="^out: .*seed 1, not 2"):
         demo.run_demo(tmp_path, 2)
     stages: dict[str, tuple[int, int]] = {}
-    figures = demo.run_demo(tmp_path, 1, lambda stage, done, total, note: stages.update({stage: (done, total)}))
+    summary = demo.run_demo(tmp_path, 1, lambda stage, done, total, note: stages.update({stage: (done, total)}))
     assert stages == {"compose scenes": (6, 6), "recognize scenes": (6, 6)}
     assert sorted(path.name for path in (tmp_path / "run").iterdir()) == [
         "curves.png", "metrics.jsonl", "network.npz", "run.json", "weights",
     ]  # fmt: skip
-    with pytest.raises(thor2.InputError, match="out: .* already contains report.html"):
+    with pytest.raises(thor2.InputError, match="^out: "):
         demo.run_demo(tmp_path, 1)
-    assert figures.names == ("CE", "TOPS", "TOPS2", "THOR2")
-    parts = {part: count for part, count in figures.instances.items() if part != "all"}
-    assert figures.instances["all"] == sum(parts.values()) > 6
-    for k in range(4):  # the whole is the mean of its parts
-        mean = sum(figures.accuracy[part][k] * count for part, count in parts.items()) / figures.instances["all"]
-        assert figures.accuracy["all"][k] == pytest.approx(mean)
-    assert figures.accuracy["all"][3] > 0.4  # chance is 0.2
+    assert summary.names == ("CE", "TOPS", "TOPS2", "THOR2")
+    subsets = {name: count for name, count in summary.instances.items() if name != "all"}
+    assert summary.instances["all"] == sum(subsets.values()) > 6
+    for k in range(4):  # the total accuracy is the weighted mean of the subsets
+        mean = sum(summary.accuracy[name][k] * count for name, count in subsets.items()) / summary.instances["all"]
+        assert summary.accuracy["all"][k] == pytest.approx(mean)
+    assert summary.accuracy["all"][3] > 0.4  # chance is 0.2
     page = Page((tmp_path / "report.html").read_text())
     assert page.open == [] and len(page.pictures) == 11
     assert all((tmp_path / str(picture["src"])).is_file() for picture in page.pictures)
-    assert dataclasses.asdict(figures).keys() <= set((tmp_path / "demo.json").read_text().split('"'))
+    assert dataclasses.asdict(summary).keys() <= set((tmp_path / "demo.json").read_text().split('"'))

@@ -1,0 +1,118 @@
+"""Fitting the PointNet baseline: Adam on cross-entropy, with a cosine schedule."""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+import optax  # type: ignore[import-untyped]
+from flax import nnx
+from numpy.typing import NDArray
+
+from thor2_jax.errors import InputError
+from training.baselines.pointnet import POINTS, ColoredPointNet, PointNet, point_features, random_indices
+from training.baselines.task import FitTask, FittedBaseline
+
+__all__ = ["fit_pointnet"]
+
+STORED_POINTS = 2 * POINTS
+"""Points stored for each view, so that every epoch can use a different sample of them."""
+
+RATES = 2e-3, 2e-5
+"""First and last learning rate of the cosine schedule."""
+
+BATCH_SIZE = 64
+
+
+class _Views(NamedTuple):
+    """V views: [V, STORED_POINTS, 3] points and colours in random order, [V, 3] boxes, [V] labels and view numbers."""
+
+    xyz: NDArray[np.float32]
+    rgb: NDArray[np.uint8]
+    box: NDArray[np.float32]
+    label: NDArray[np.int32]
+    view: NDArray[np.int32]
+
+    def draw(self, rows: NDArray[np.intp], rng: np.random.Generator) -> NDArray[np.float32]:
+        """Return network inputs for some views: a random sample of their points, mirrored at random in x and y."""
+        first = int(rng.integers(STORED_POINTS - POINTS + 1))
+        window = slice(first, first + POINTS)
+        x = np.array(point_features(self.xyz[rows, window].astype(np.float32), self.rgb[rows, window], self.box[rows]))
+        x[..., :2] *= rng.choice(np.array([-1, 1], np.float32), (len(rows), 1, 2))
+        return x
+
+
+def _read_views(task: FitTask) -> _Views:
+    total = sum(shard.views for shard in task.source.shards)
+    views = _Views(
+        np.zeros((total, STORED_POINTS, 3), np.float16),
+        np.zeros((total, STORED_POINTS, 3), np.uint8),
+        np.zeros((total, 3), np.float32),
+        np.zeros(total, np.int32),
+        np.zeros(total, np.int32),
+    )
+    row = 0
+    rng = np.random.default_rng(task.options.seed)
+    for index, shard in enumerate(task.source.shards):
+        normalized = task.source.read(index)
+        for (xyz, rgb), number in zip(normalized.clouds(), normalized.view, strict=True):
+            sample = random_indices(len(xyz), STORED_POINTS, rng)
+            views.xyz[row], views.rgb[row], views.box[row] = xyz[sample], rgb[sample], xyz.max(axis=0)
+            views.label[row], views.view[row] = shard.label, number
+            row += 1
+        task.progress("read for pointnet", row, total, "views")
+    return views
+
+
+@partial(jax.jit, static_argnums=0, donate_argnums=(1, 2))
+def _step(graph: Any, params: Any, optimizer: Any, x: jax.Array, label: jax.Array, rate: Any) -> Any:
+    def loss_of(params: Any) -> Any:
+        logits = nnx.merge(graph, params)(x)
+        loss = optax.softmax_cross_entropy_with_integer_labels(logits, label).mean()
+        return loss, (logits.argmax(axis=1) == label).mean()
+
+    (loss, accuracy), gradients = jax.value_and_grad(loss_of, has_aux=True)(params)
+    updates, optimizer = optax.adam(rate).update(gradients, optimizer, params)
+    return optax.apply_updates(params, updates), optimizer, loss, accuracy
+
+
+def fit_pointnet(task: FitTask) -> FittedBaseline:
+    """Fit a PointNet; each epoch uses every view once, with a random sample of points and random mirroring.
+
+    Raises:
+        InputError: the loss is not finite.
+    """
+    views = _read_views(task)
+    held_out = task.held_out(views.label, views.view)
+    model = _fit(task, views, np.flatnonzero(~held_out))
+    if not held_out.any():
+        return FittedBaseline(model, np.zeros((0, len(task.source.classes)), np.float32), views.label[held_out])
+    inputs = views.xyz[held_out, :POINTS], views.rgb[held_out, :POINTS], views.box[held_out]
+    return FittedBaseline(model, model.predict(*inputs), views.label[held_out])
+
+
+def _fit(task: FitTask, views: _Views, rows: NDArray[np.intp]) -> ColoredPointNet:
+    """Fit a PointNet on the views of these rows."""
+    epochs, batch_size = task.options.epochs, min(BATCH_SIZE, len(rows))
+    steps = len(rows) // batch_size
+    split: Any = nnx.split(PointNet(len(task.source.classes), rngs=nnx.Rngs(task.options.seed)))
+    graph, params = split
+    optimizer = optax.adam(0.0).init(params)
+    for epoch in range(epochs):
+        rng = np.random.default_rng((task.options.seed, epoch))
+        order = rng.permutation(rows)
+        total_accuracy = 0.0
+        for step in range(steps):
+            batch = order[step * batch_size : (step + 1) * batch_size]
+            x = views.draw(batch, rng)
+            progress = (epoch * steps + step) / (epochs * steps)
+            rate = np.float32(RATES[1] + (RATES[0] - RATES[1]) * (1 + np.cos(np.pi * progress)) / 2)
+            params, optimizer, loss, accuracy = _step(graph, params, optimizer, x, views.label[batch], rate)
+            total_accuracy += float(accuracy)
+            if not np.isfinite(loss):
+                raise InputError(
+                    f"baselines: the loss of pointnet is {loss} in epoch {epoch + 1}; check the views, or leave it out"
+                )
+            note = f"epoch {epoch + 1}, accuracy {total_accuracy / (step + 1):.3f}"
+            task.progress("fit pointnet", epoch * steps + step + 1, epochs * steps, note)
+    return ColoredPointNet(nnx.merge(graph, params))

@@ -1,0 +1,49 @@
+"""Answering labelled frames with the classifiers and baselines of several runs."""
+
+import time
+from collections.abc import Iterable, Iterator, Sequence
+
+import numpy as np
+
+from training.baselines.baseline import baseline_inputs
+from training.evaluation.answers import FrameAnswers, InstanceAnswer, all_predictors
+from training.evaluation.runs import Run
+from training.readers.labelled import LabelledFrame
+
+__all__ = ["answer_frames"]
+
+
+def answer_frames(runs: Sequence[Run], frames: Iterable[LabelledFrame]) -> Iterator[tuple[LabelledFrame, FrameAnswers]]:
+    """Yield every frame with its answers; a frame is described once for all runs.
+
+    Args:
+        runs: runs that share classes, descriptor and colour network, see `load_runs`.
+        frames: frames in memory, or an iterable that reads them.
+
+    Raises:
+        InputError: a frame cannot be read.
+    """
+    start = time.perf_counter()
+    for item in frames:
+        instances = _answer(runs, item)
+        yield item, FrameAnswers(item.identifier, item.attributes, time.perf_counter() - start, instances)
+        start = time.perf_counter()
+
+
+def _answer(runs: Sequence[Run], item: LabelledFrame) -> list[InstanceAnswer]:
+    recognizer = runs[0].recognizer
+    described = recognizer.describe(item.frame)
+    inputs = baseline_inputs(described, recognizer.run.config) if any(run.baselines for run in runs) else None
+    values = [run.probabilities(item.identifier, described, inputs) for run in runs]
+    table = np.stack([values[index][name] for index, name in all_predictors(runs)], axis=1)  # [B, M, C]
+    rows = {instance.label: row for row, instance in enumerate(described.usable)}
+    reasons = {instance.label: instance.reason for instance in described.instances}
+    answers = []
+    for label, truth in sorted(item.truth.items()):
+        if label in rows:
+            row = rows[label]
+            answers.append(InstanceAnswer(label, truth, described.usable[row].occluded, None, table[row]))
+        else:
+            reason = reasons.get(label) or "no pixels in the label image"
+            answers.append(InstanceAnswer(label, truth, reason=reason))
+    return answers
