@@ -15,6 +15,7 @@ from training.fitting.checkpoints import Checkpoints
 from training.fitting.fit import fit
 from training.fitting.options import EpochMetrics
 from training.fitting.samples import Samples, build_samples
+from training.fitting.steps import FitContext
 from training.rendering.view_sphere import view_angles
 
 __all__ = ["camera_types", "fit_thor"]
@@ -47,9 +48,8 @@ def fit_thor(task: FitTask) -> FittedBaseline:
         for k in range(1, config.n_slices + 1):
             library[name, k] = _fit_classifier(task, config, subset, marks, name, k)
         # Held-out views are not occluded: they are classified by all slices, as `THOR` does.
-        values = sample_probabilities(
-            library[name, config.n_slices], subset, np.flatnonzero(marks), "tops", task.network, config
-        )
+        context = FitContext("tops", task.network, config)
+        values = sample_probabilities(library[name, config.n_slices], subset, np.flatnonzero(marks), context)
         held_rows = rows[marks]
         better = values.max(axis=1) > best[held_rows].max(axis=1)
         best[held_rows[better]] = values[better]
@@ -67,10 +67,10 @@ def _fit_classifier(
         total_epochs = len(VIEW_TYPES) * config.n_slices * epochs
         task.progress("fit thor", number * epochs + metrics.epoch, total_epochs, note)
 
-    first = dataclasses.replace(config, n_slices=k)
+    context = FitContext("tops", task.network, dataclasses.replace(config, n_slices=k))
     with Checkpoints(task.scratch / f"{name}-{k}") as checkpoints:
         marks = held_out if held_out.any() else None
-        return fit(samples, task.network, first, "tops", task.options, checkpoints, marks, report)[0]
+        return fit(samples, context, task.options, checkpoints, marks, report)[0]
 
 
 def _types_of_views(task: FitTask) -> list[tuple[ViewType, ...]]:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from thor2_jax.errors import InputError
 from thor2_jax.recognition.run_directory import TrainedRun, load_run
-from training.baselines.files import Stored, baseline_file, write_baseline
+from training.baselines.files import StoredBaseline, baseline_file, write_baseline
 from training.baselines.fit_forest import fit_forest
 from training.baselines.fit_pointnet import fit_pointnet
 from training.baselines.fit_thor import fit_thor
@@ -76,5 +76,5 @@ def _train(
     fitted = _FIT[name](task)
     seconds = time.perf_counter() - start
     temperature = fit_temperature(fitted.probabilities, fitted.truth) if len(fitted.truth) else None
-    write_baseline(file, Stored(fitted.model.arrays(), temperature, seconds), run.classes)
+    write_baseline(file, StoredBaseline(fitted.model.arrays(), temperature, seconds), run.classes)
     shutil.rmtree(scratch)

@@ -11,7 +11,7 @@ from flax import nnx
 from numpy.typing import NDArray
 
 from training.baselines.baseline import BaselineInputs
-from training.baselines.files import arrays_of, model_with
+from training.baselines.files import load_arrays, model_arrays
 
 __all__ = ["POINTS", "ColoredPointNet", "PointNet", "point_features", "random_indices"]
 
@@ -72,7 +72,7 @@ class ColoredPointNet:
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return the weights by their paths."""
-        return arrays_of(self._model)
+        return model_arrays(self._model)
 
     @classmethod
     def with_arrays(cls, arrays: Mapping[str, NDArray[Any]], n_classes: int) -> "ColoredPointNet":
@@ -81,7 +81,7 @@ class ColoredPointNet:
         Raises:
             ValueError: an array is missing or has another shape.
         """
-        return cls(model_with(PointNet(n_classes, rngs=nnx.Rngs(0)), arrays))
+        return cls(load_arrays(PointNet(n_classes, rngs=nnx.Rngs(0)), arrays))
 
     def probabilities(self, inputs: BaselineInputs) -> NDArray[np.float32]:
         """Return class probabilities [B, C]; which points are sampled depends only on the number of points."""

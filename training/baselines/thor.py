@@ -28,7 +28,7 @@ from thor2_jax.descriptor.view_normalization import OCCLUSION_BIN, turn
 from thor2_jax.recognition.classifier import MLP
 from thor2_jax.types import PointClouds
 from training.baselines.baseline import BaselineInputs
-from training.baselines.files import arrays_of, model_with
+from training.baselines.files import load_arrays, model_arrays
 
 __all__ = ["THOR", "VIEW_TYPES", "Library", "ViewType", "view_types"]
 
@@ -143,5 +143,5 @@ class THOR:
                 prefix = f"{name}-{k}/"
                 weights = {key.removeprefix(prefix): a for key, a in arrays.items() if key.startswith(prefix)}
                 model = MLP(k * config.image_size**2, n_classes, rngs=nnx.Rngs(0))
-                library[name, k] = model_with(model, weights)
+                library[name, k] = load_arrays(model, weights)
         return cls(library, config)

@@ -390,7 +390,7 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     report = json.loads((tmp_path / "report" / "report.json").read_text())
     assert report["instances"]["scored"] == 2 and sum(report["instances"]["no_class"].values()) == 1
     page = (tmp_path / "report" / "report.html").read_text()
-    assert "Models: run." in page and page.count("<img") == 4
+    assert "Models: run." in page and "confusions/" not in page
     cell = report["accuracy"]["max"][0]["cells"][0]
     assert cell["instances"] == 2 and cell["accuracy"]["TOPS"]["mean"] == 1.0
     names.unlink()
@@ -417,7 +417,7 @@ def test_every_sequence_by_its_own_run(
     (models / "seq36").mkdir(parents=True)
     options = ("--model", models, "--names", names, "--per-sequence")
     assert call(monkeypatch, "evaluate", "ocid", tmp_path, *options) == 2
-    assert f"error: model: {models} has no run for table/top/mixed/seq08\n" in capsys.readouterr().err
+    assert f"error: model: {models} has no run for table/top/mixed/seq08; " in capsys.readouterr().err
     (models / "table/top/mixed/seq08").mkdir(parents=True)
     assert call(monkeypatch, "evaluate", "ocid", tmp_path, *options, "--out", tmp_path / "report") == 0
     report = json.loads((tmp_path / "report" / "report.json").read_text())
