@@ -1,1 +1,1 @@
-"""Synthetic views of meshes, datasets of them, fitting, evaluation, and the command line."""
+"""Synthetic views of meshes, training, evaluation and the command line."""

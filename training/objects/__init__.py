@@ -1,1 +1,1 @@
-"""Objects to train on: meshes from files, and the built-in objects."""
+"""Objects to train on: mesh files and built-in objects."""

@@ -1,11 +1,10 @@
-"""Eighteen household-like objects made by the program, so that a fresh machine needs no scans.
+"""Eighteen procedural household objects, so that the demo needs no scans.
 
     objects = builtin_objects()
     objects["mug_blue"].vertices        # metres, z up, standing on z = 0
 
-Two shapes serve to build them: surfaces of rings (turned on a lathe, or swept along a path) and boxes. Paint is a
-texture whose texels are coloured by rules in the surface's own coordinates, so that a stripe is where it would be on
-the real thing.
+They are built from surfaces of rings (surfaces of revolution, or swept along a path) and boxes. Texels are coloured by
+rules in the coordinates of the surface.
 """
 
 import math
@@ -24,29 +23,29 @@ COLOR_PAIRS = (
     ("mug_blue", "mug_white"),
     ("cereal_box_yellow", "cereal_box_blue"),
 )
-"""Same mesh, other paint."""
+"""Pairs with the same mesh and different colours."""
 
 SHAPE_PAIRS = (("white_bowl", "white_plate"), ("white_bowl", "white_cup"), ("yellow_bottle", "yellow_box"))
-"""Same colours in the same shares of the surface, other mesh."""
+"""Pairs with different meshes and the same colours in the same shares of the surface."""
 
 Color = tuple[int, int, int]
 Array = NDArray[np.float64]
 Mark = tuple[Color, Callable[..., Any]]
-"""A colour and where it goes: a function of the surface's coordinates (see `_lathe`, `_sweep`, `_box`) to booleans."""
+"""A colour and where it is applied: a boolean function of surface coordinates (see `_lathe`, `_sweep`, `_box`)."""
 
-# Each keeps its regions of the colour network under other light; greys are tinted, since a neutral one borders on many.
+# Each colour keeps its regions of the colour network under other light; neutral greys would not, so they are tinted.
 RED, GREEN, BLUE, YELLOW = (196, 22, 30), (22, 135, 58), (30, 70, 182), (236, 194, 24)
 ORANGE, BROWN, TAN, IVORY = (238, 112, 20), (116, 68, 30), (206, 160, 108), (238, 240, 204)
 LIME, TEAL, STEEL, DARK = (186, 214, 52), (20, 150, 152), (152, 152, 192), (30, 32, 66)
 
 SECTIONS = 48
-"""Vertices of a ring."""
+"""Number of vertices of a ring."""
 
 TEXELS = 192
 
 
 def _texture(base: Color, marks: Sequence[Mark], *coordinates: Array) -> NDArray[np.uint8]:
-    """An image [TEXELS, TEXELS, 3] of `base` with marks over it; coordinates are [TEXELS, TEXELS], bottom row first."""
+    """Return an image [TEXELS, TEXELS, 3] of `base` and marks; coordinates are [TEXELS, TEXELS], bottom row first."""
     image = np.empty((TEXELS, TEXELS, 3), np.uint8)
     image[:] = base
     for color, where in marks:
@@ -61,7 +60,7 @@ def _texel_centres() -> tuple[Array, Array]:
 
 
 def _rings(points: Array, v: Array, texture: NDArray[np.uint8]) -> TexturedMesh:
-    """The surface through rings [k, n, 3] (first point = last); u runs along a ring, `v` [k] across the rings."""
+    """Return the surface through closed rings [k, n, 3]; u runs along a ring, `v` [k] across the rings."""
     k, n = points.shape[:2]
     corner = np.arange(k * n).reshape(k, n)
     a, b, c, d = (part.ravel() for part in (corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1]))
@@ -71,7 +70,7 @@ def _rings(points: Array, v: Array, texture: NDArray[np.uint8]) -> TexturedMesh:
     faces = faces[np.linalg.norm(np.cross(second - first, third - first), axis=1) > 1e-12]
     u, v = np.meshgrid(np.linspace(0, 1, n), v)
     uv = np.stack([u.ravel(), v.ravel()], axis=1).astype(np.float32)
-    # Just inside, so that the last texel does not wrap round to the first.
+    # Clipped, so that the last texel does not wrap around to the first.
     uv = uv.clip(1e-4, 1 - 1e-4)
     return TexturedMesh(
         vertices,
@@ -83,13 +82,13 @@ def _rings(points: Array, v: Array, texture: NDArray[np.uint8]) -> TexturedMesh:
 
 
 def _along(points: Array) -> Array:
-    """Length of a line [k, d] up to each of its points, as a share of the whole [k]."""
+    """Return the relative arc length [k] of a line [k, d] at each of its points, from 0 to 1."""
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
     return length / length[-1]
 
 
 def _lathe(profile: ArrayLike, base: Color, *marks: Mark) -> TexturedMesh:
-    """A surface of revolution about z.
+    """Return a surface of revolution about z.
 
     Args:
         profile: [k, 2] radius and height, metres; runs up the outside, and for a vessel down the inside.
@@ -112,7 +111,7 @@ def _lathe(profile: ArrayLike, base: Color, *marks: Mark) -> TexturedMesh:
 def _sweep(
     path: ArrayLike, radii: ArrayLike, across: ArrayLike, base: Color, *marks: Mark, sides: int = 24
 ) -> TexturedMesh:
-    """A tube of elliptical section along a path in a plane, with flat ends.
+    """Return a tube with elliptical cross-section along a path in a plane, with flat ends.
 
     Args:
         path: [k, 3] metres.
@@ -134,7 +133,7 @@ def _sweep(
 
 
 def _box(size: tuple[float, float, float], base: Color, *marks: Mark) -> TexturedMesh:
-    """A box that stands on z = 0, centred over the origin.
+    """Return a box that stands on z = 0, centred over the origin.
 
     Args:
         size: along x, y, z, metres.
@@ -159,7 +158,7 @@ def _box(size: tuple[float, float, float], base: Color, *marks: Mark) -> Texture
 
 
 def _moved(mesh: TexturedMesh, position: ArrayLike = (0, 0, 0), axis: str = "z", degrees: float = 0.0) -> TexturedMesh:
-    """Turned about a coordinate axis, then moved."""
+    """Rotate a mesh about a coordinate axis, then translate it."""
     c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
     i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
     matrix = np.eye(4)
@@ -169,14 +168,14 @@ def _moved(mesh: TexturedMesh, position: ArrayLike = (0, 0, 0), axis: str = "z",
 
 
 def _standing(*parts: TexturedMesh) -> TexturedMesh:
-    """Parts joined and set down on z = 0 over the origin."""
+    """Merge parts and put them on z = 0 over the origin."""
     mesh = merge_meshes(parts)
     centre = mesh.centre
     return _moved(mesh, (-centre[0], -centre[1], -mesh.vertices[:, 2].min()))
 
 
 def _arc(radius: float, start: float, stop: float, n: int) -> Array:
-    """Points [n, 2] on a circle about the origin, angles in degrees."""
+    """Return points [n, 2] on a circle about the origin; angles in degrees."""
     angle = np.radians(np.linspace(start, stop, n))
     return radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
@@ -230,7 +229,7 @@ def _cereal_box(ground: Color, panel: Color, bowl: Color) -> TexturedMesh:
 
 
 def _crockery(profile: ArrayLike) -> TexturedMesh:
-    """Ivory with a blue rim: an eighth of the surface, half outside and half inside, whatever the shape."""
+    """Return ivory crockery with a blue rim on an eighth of the surface, for any shape."""
     return _lathe(profile, IVORY, (BLUE, lambda u, r, z, s: abs(s - 0.5) < 0.0625))
 
 
@@ -251,7 +250,7 @@ def _cup() -> TexturedMesh:
 
 
 RED_SHARE = 0.22
-"""Of the surface of the two yellow objects."""
+"""Share of red in the surface of the two yellow objects."""
 
 
 def _yellow_bottle() -> TexturedMesh:
@@ -372,7 +371,7 @@ def _wooden_spoon() -> TexturedMesh:
 
 
 def builtin_objects() -> dict[str, TexturedMesh]:
-    """All objects, by name; made anew at every call, always the same. Metres, z up, standing or lying on z = 0."""
+    """Return all objects by name, newly made and always the same; metres, z up, standing or lying on z = 0."""
     return {
         "soup_can_red": _soup_can(RED),
         "soup_can_green": _soup_can(GREEN),

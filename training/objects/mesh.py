@@ -13,10 +13,10 @@ __all__ = ["TexturedMesh", "merge_meshes"]
 
 @dataclasses.dataclass(frozen=True)
 class TexturedMesh:
-    """A coloured triangle mesh. Colours are sRGB as stored in the file, unlit.
+    """A coloured triangle mesh; colours are unlit sRGB.
 
-    Painted either with textures (`uv`, `textures`, `face_texture`) or with colours at the faces' corners
-    (`corner_colors`); the other kind is None or empty.
+    The colours are either in textures (`uv`, `textures`, `face_texture`) or at the corners of the faces
+    (`corner_colors`); the fields of the other kind are None or empty.
 
     Attributes:
         vertices: [V, 3] float64, metres.
@@ -36,19 +36,18 @@ class TexturedMesh:
 
     @property
     def centre(self) -> NDArray[np.float64]:
-        """Centre of the axis-aligned bounding box [3], metres: what a training camera looks at."""
+        """Centre of the axis-aligned bounding box [3], metres, at which training cameras look."""
         return (self.vertices.min(axis=0) + self.vertices.max(axis=0)) / 2
 
     def transformed(self, matrix: NDArray[np.float64]) -> "TexturedMesh":
-        """The mesh moved by a homogeneous matrix [4, 4]; the paint is shared."""
+        """Return the mesh transformed by a homogeneous matrix [4, 4]; the colours are shared."""
         return dataclasses.replace(self, vertices=self.vertices @ matrix[:3, :3].T + matrix[:3, 3])
 
     def colors_at(self, face: NDArray[np.integer], barycentric: NDArray[np.floating]) -> NDArray[np.uint8]:
-        """SRGB colours of points on the surface.
+        """Return the sRGB colours of points on the surface.
 
-        Textures are read at the nearest texel: in a training view a pixel spans several texels, so that bilinear
-        weights change nothing that the voxel mean keeps, and a mix across the border of a chart would bring in colours
-        the object does not have.
+        Textures are sampled at the nearest texel: a pixel of a training view spans several texels and is averaged in a
+        voxel, and bilinear weights would mix in foreign colours at the borders of a chart.
 
         Args:
             face: [n] integer, index into `faces`.
@@ -82,10 +81,10 @@ def _nearest_texel(image: NDArray[np.uint8], uv: NDArray[np.floating]) -> NDArra
 
 
 def merge_meshes(parts: Sequence[TexturedMesh]) -> TexturedMesh:
-    """One mesh of several, in the same frame.
+    """Merge meshes in the same frame into one.
 
     Raises:
-        InputError: some parts have textures and others corner colours.
+        InputError: Some meshes have textures and others corner colours.
     """
     if len(parts) == 1:
         return parts[0]
@@ -96,7 +95,7 @@ def merge_meshes(parts: Sequence[TexturedMesh]) -> TexturedMesh:
     if len(colors) == len(parts):
         return TexturedMesh(vertices, faces, corner_colors=np.concatenate(colors))
     if colors:
-        raise InputError("some parts of the mesh have textures and others colours at vertices; bake them into one kind")
+        raise InputError("some parts of the mesh have textures and others vertex colours; bake them into one kind")
     first = np.cumsum([0, *(len(part.textures) for part in parts[:-1])])
     return TexturedMesh(
         vertices,

@@ -21,10 +21,10 @@ MESH_SUFFIXES = (".glb", ".obj", ".ply")
 
 MAX_SIDE = 2.0
 MIN_SIDE = 0.001
-"""Plausible longest side of an object, metres: a scan in millimetres falls outside, and the camera stays outside it."""
+"""Range of an object's longest side, metres: rejects scans in millimetres and keeps the camera outside the object."""
 
 MAX_TEXTURE_COORDINATE = 2**23
-"""Of a texture coordinate: past it float32 has whole numbers alone, which tell no place in the image."""
+"""Largest texture coordinate: beyond it, float32 cannot represent fractions."""
 
 
 def _solid(vertices: NDArray[np.float64], faces: NDArray[np.int32], color: NDArray[np.uint8]) -> TexturedMesh:
@@ -38,14 +38,14 @@ def _solid(vertices: NDArray[np.float64], faces: NDArray[np.int32], color: NDArr
 
 
 def _part(geometry: trimesh.Trimesh) -> TexturedMesh:
-    """One geometry of a file.
+    """Convert one geometry of a file.
 
     Raises:
-        InputError: it has no colour, or one that would fill memory; or faces that name other vertices than its own.
+        InputError: The geometry has no colour, a texture that is too large, or faces with invalid vertex indices.
     """
     vertices, faces = np.asarray(geometry.vertices, np.float64), np.asarray(geometry.faces, np.int32)
     if faces.min() < 0 or faces.max() >= len(vertices):
-        raise InputError("faces that name vertices it does not have")
+        raise InputError("faces with invalid vertex indices; repair the mesh")
     visual: Any = geometry.visual
     if visual.kind == "vertex":
         return TexturedMesh(vertices, faces, corner_colors=np.asarray(visual.vertex_colors, np.uint8)[faces, :3])
@@ -76,10 +76,10 @@ def _part(geometry: trimesh.Trimesh) -> TexturedMesh:
 
 
 def _check(mesh: TexturedMesh) -> None:
-    """Hold what a parser made of a file to what `TexturedMesh` says of itself, and to the size of an object.
+    """Check the shapes, values and size of a parsed mesh.
 
     Raises:
-        InputError: it is something else.
+        InputError: The mesh is inconsistent, or not of an object's size.
     """
     vertices, faces, n = mesh.vertices, mesh.faces, len(mesh.faces)
     shapes: list[tuple[str, NDArray[Any] | None, tuple[int, ...]]] = [
@@ -95,17 +95,17 @@ def _check(mesh: TexturedMesh) -> None:
     if not np.isfinite(vertices).all():
         raise InputError(f"{(~np.isfinite(vertices)).any(axis=1).sum()} vertices are not finite")
     if mesh.uv is not None and not (np.abs(mesh.uv) <= MAX_TEXTURE_COORDINATE).all():
-        raise InputError(f"texture coordinates are not finite, or past {MAX_TEXTURE_COORDINATE}")
+        raise InputError(f"texture coordinates are not finite, or beyond {MAX_TEXTURE_COORDINATE}")
     longest = float(np.ptp(vertices[np.unique(faces)], axis=0).max())
     if not MIN_SIDE <= longest <= MAX_SIDE:
         raise InputError(f"longest side {longest:g}; expected {MIN_SIDE:g} to {MAX_SIDE:g} metres")
 
 
 def _check_obj_references(path: Path) -> None:
-    """An OBJ file without its material or texture would load as grey: name the missing file instead.
+    """Check that an OBJ file's materials and textures exist; without them it would be loaded as grey.
 
     Raises:
-        InputError: a file that `path` refers to is missing.
+        InputError: A file that `path` refers to is missing.
     """
 
     def arguments(file: Path, keyword: str) -> list[str]:
@@ -127,8 +127,8 @@ def load_mesh(path: str | Path) -> TexturedMesh:
     Colours are taken as stored, as sRGB; a base colour factor multiplies its texture, or stands alone without one.
 
     Raises:
-        InputError: the file is missing, unreadable, of another kind, without faces or colour, with vertices or
-            texture coordinates that are not finite or too far, or of no plausible size for an object in metres.
+        InputError: The file is missing, unreadable or of another format, has no faces or colours, has vertices or
+            texture coordinates that are not finite or too large, or is not of an object's size in metres.
     """
     path = Path(path)
     if path.suffix.lower() not in MESH_SUFFIXES:
@@ -138,7 +138,7 @@ def load_mesh(path: str | Path) -> TexturedMesh:
     try:
         if path.suffix.lower() == ".obj":
             _check_obj_references(path)
-        # Unprocessed: otherwise vertices that are not finite would be dropped in silence.
+        # Processing would silently drop vertices that are not finite.
         loaded = trimesh.load_scene(path, process=False).dump(concatenate=False)
         geometries = [part for part in loaded if isinstance(part, trimesh.Trimesh) and len(part.faces)]
         if not geometries:
@@ -147,7 +147,7 @@ def load_mesh(path: str | Path) -> TexturedMesh:
         _check(mesh)
     except InputError as error:
         raise InputError(f"mesh {path}: {error}") from error
-    # On a damaged file trimesh and the decoders of textures raise anything, and its arrays need not fit one another.
+    # For a damaged file, trimesh and the texture decoders raise exceptions of any type.
     except Exception as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise InputError(f"mesh {path}: cannot be read ({reason})") from error
@@ -155,10 +155,10 @@ def load_mesh(path: str | Path) -> TexturedMesh:
 
 
 def _mesh_in(folder: Path) -> Path | None:
-    """The one mesh file in a folder: `textured.*` first, then the only GLB, then the only file; None if there is none.
+    """Return the mesh file of a directory: `textured.*` first, then the only GLB, then the only file; None without any.
 
     Raises:
-        InputError: several, and no rule to choose by.
+        InputError: There are several, and none takes precedence.
     """
     files = sorted(file for file in folder.iterdir() if file.is_file() and file.suffix.lower() in MESH_SUFFIXES)
     named = [file for file in files if file.stem.lower() == "textured"]
@@ -174,29 +174,30 @@ def _mesh_in(folder: Path) -> Path | None:
 
 
 def find_meshes(folder: str | Path, names: Mapping[str, str] | None = None) -> dict[str, Path]:
-    """Object names to mesh files, sorted by name.
+    """Find mesh files: object name -> file, sorted by name.
 
     Args:
-        folder: holds `<scan>.glb` (or .obj, .ply) files, `<scan>/` folders with one mesh file each, or both.
-        names: object name -> scan (a folder's name or a file's stem). Without it every scan is an object under its own
-            name.
+        folder: directory with `<scan>.glb` (or .obj, .ply) files, `<scan>/` subdirectories with one mesh file each, or
+            both.
+        names: object name -> scan (a subdirectory's name or a file's stem). By default every scan is an object under
+            its own name.
 
     Raises:
-        InputError: the folder is missing or holds no mesh, a scan is there twice or is ambiguous, or `names` names
-            unknown scans.
+        InputError: The directory is missing or has no mesh, a scan exists twice or is ambiguous, or `names` has an
+            unknown scan.
     """
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(f"mesh folder {folder}: no such folder")
-    wanted = None if names is None else set(names.values())
+    requested = None if names is None else set(names.values())
     scans: dict[str, Path] = {}
     for entry in sorted(folder.iterdir()):
         if entry.is_dir():
-            # A folder that nobody asked for may be in any state.
-            name, path = entry.name, _mesh_in(entry) if wanted is None or entry.name in wanted else None
+            # Subdirectories that are not requested may be in any state.
+            name, path = entry.name, _mesh_in(entry) if requested is None or entry.name in requested else None
         else:
             name, path = entry.stem, entry if entry.suffix.lower() in MESH_SUFFIXES else None
-        if path is None or (wanted is not None and name not in wanted):
+        if path is None or (requested is not None and name not in requested):
             continue
         if name in scans:
             raise InputError(f"mesh folder {folder}: scan {name!r} is there twice ({scans[name].name}, {path.name})")
@@ -206,7 +207,7 @@ def find_meshes(folder: str | Path, names: Mapping[str, str] | None = None) -> d
             raise InputError(f"mesh folder {folder}: no {', '.join(MESH_SUFFIXES)} file in it or in its folders")
         return scans
     if not names:
-        raise InputError("names is empty; at least one object is needed")
+        raise InputError("names is empty; expected at least one object")
     unknown = sorted(set(names.values()) - set(scans))
     if unknown:
         raise InputError(f"mesh folder {folder}: no mesh for {', '.join(unknown)}")
@@ -217,7 +218,7 @@ def read_names(path: str | Path) -> dict[str, str]:
     """Read a table of object name -> scan from a JSON or YAML file.
 
     Raises:
-        InputError: the file is missing, not JSON or YAML, empty, or not a flat table of strings.
+        InputError: The file is missing, neither JSON nor YAML, empty, or not a flat table of strings.
     """
     path = Path(path)
     suffix = path.suffix.lower()

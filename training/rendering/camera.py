@@ -16,9 +16,9 @@ class Camera:
     """A pinhole camera; pixel centres have integer coordinates.
 
     Attributes:
-        width: pixels.
-        height: pixels.
-        intrinsics: in pixels.
+        width: image width, pixels.
+        height: image height, pixels.
+        intrinsics: focal lengths and principal point, pixels.
     """
 
     width: int
@@ -27,7 +27,7 @@ class Camera:
 
     @classmethod
     def from_field_of_view(cls, width: int, height: int, degrees: float) -> "Camera":
-        """A camera with square pixels, the axis through the image's centre, a horizontal field of view in degrees."""
+        """Return a camera with square pixels, a central principal point and a horizontal field of view in degrees."""
         f = width / 2 / math.tan(math.radians(degrees) / 2)
         return cls(width, height, Intrinsics(f, f, (width - 1) / 2, (height - 1) / 2))
 
@@ -38,14 +38,14 @@ TRAINING_CAMERA = Camera.from_field_of_view(800, 600, 40.0)
 
 @dataclasses.dataclass(frozen=True)
 class RenderedView:
-    """The part of a camera's image that an object can fill; the rest of the image is empty.
+    """A rendered view, cropped to the part of the camera's image that the object can cover; the rest is empty.
 
     Attributes:
-        color: [h, w, 3] uint8 sRGB, 0 where nothing is seen.
-        depth: [h, w] uint16, millimetres along the camera's z, rounded; 0 where nothing is seen.
-        intrinsics: of this part as an image of its own.
+        color: [h, w, 3] uint8 sRGB, 0 where nothing is visible.
+        depth: [h, w] uint16, depth along the camera's z axis, millimetres, rounded; 0 where nothing is visible.
+        intrinsics: intrinsics of the cropped image.
         pose: [4, 4] float64, camera to object frame.
-        corner: row and column of this part's first pixel in the camera's image.
+        corner: row and column of the cropped image's first pixel in the camera's image.
     """
 
     color: NDArray[np.uint8]
@@ -55,7 +55,7 @@ class RenderedView:
     corner: tuple[int, int]
 
     def full_image(self, camera: Camera = TRAINING_CAMERA) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
-        """The whole image of the camera that rendered the view: color [H, W, 3] uint8 and depth [H, W] uint16."""
+        """Return the uncropped image: color [H, W, 3] uint8 and depth [H, W] uint16; `camera` rendered the view."""
         rows, columns = (slice(c, c + n) for c, n in zip(self.corner, self.depth.shape, strict=True))
         color = np.zeros((camera.height, camera.width, 3), np.uint8)
         depth = np.zeros((camera.height, camera.width), np.uint16)

@@ -1,9 +1,9 @@
-"""RGB-D views of meshes by ray casting (embree): unlit surface colours, depth in millimetres.
+"""Render RGB-D views of meshes by ray casting (embree): unlit surface colours, depth in millimetres.
 
-    caster = RayCaster([mesh])                                    # once a mesh
+    caster = RayCaster([mesh])                                    # once per mesh
     view = render_view(caster, camera_pose(0.0, 1.2, mesh.centre))   # view.color, view.depth, view.intrinsics
 
-Scans carry the light of the studio baked into their textures, so no light is added.
+The textures of scans contain the light of the studio, so no light is added.
 """
 
 import dataclasses
@@ -23,12 +23,12 @@ __all__ = ["Hits", "RayCaster", "pixel_rays", "render_view"]
 
 @dataclasses.dataclass(frozen=True)
 class Hits:
-    """Where rays first meet a surface.
+    """First intersections of rays with surfaces.
 
     Attributes:
-        distance: [n] float32, in lengths of the ray's direction; inf where the ray meets nothing.
-        mesh: [n] int32, index of the mesh that is hit; -1 where none is.
-        color: [n, 3] uint8; 0 where nothing is hit.
+        distance: [n] float32, in units of the direction's length; inf without a hit.
+        mesh: [n] int32, index of the mesh that is hit; -1 without a hit.
+        color: [n, 3] uint8; 0 without a hit.
     """
 
     distance: NDArray[np.float32]
@@ -37,16 +37,16 @@ class Hits:
 
 
 class RayCaster:
-    """Meshes in one frame, indexed for ray casting. Cannot be pickled: build one in each process."""
+    """Meshes in one coordinate frame, indexed for ray casting. It cannot be pickled: create one in each process."""
 
     def __init__(self, meshes: Sequence[TexturedMesh]) -> None:
-        """Builds the index, about 20 ms for a mesh of 16,000 faces.
+        """Build the index, which takes about 20 ms for a mesh of 16,000 faces.
 
         Raises:
-            ValueError: no meshes.
+            ValueError: There are no meshes.
         """
         if not meshes:
-            raise ValueError("meshes is empty; at least one is needed")
+            raise ValueError("meshes is empty; expected at least one mesh")
         self.meshes = tuple(meshes)
         self._scene = EmbreeScene()
         for mesh in self.meshes:
@@ -55,7 +55,7 @@ class RayCaster:
         """[n, 3] float64: vertices of all faces of all meshes."""
 
     def cast(self, origin: NDArray[np.floating], directions: NDArray[np.floating]) -> Hits:
-        """First hit of each ray.
+        """Return the first hit of each ray.
 
         Args:
             origin: [3], common to all rays.
@@ -64,23 +64,23 @@ class RayCaster:
         directions = np.ascontiguousarray(directions, np.float32)
         origins = np.empty_like(directions)
         origins[:] = origin
-        found = self._scene.run(origins, directions, output=True)
-        hit = np.flatnonzero(found["primID"] >= 0)
+        result = self._scene.run(origins, directions, output=True)
+        hit = np.flatnonzero(result["primID"] >= 0)
         distance = np.full(len(directions), np.inf, np.float32)
-        distance[hit] = found["tfar"][hit]
-        which = np.full(len(directions), -1, np.int32)
-        which[hit] = found["geomID"][hit]
+        distance[hit] = result["tfar"][hit]
+        mesh_index = np.full(len(directions), -1, np.int32)
+        mesh_index[hit] = result["geomID"][hit]
         color = np.zeros((len(directions), 3), np.uint8)
-        barycentric = np.stack([found["u"], found["v"]], axis=1)
+        barycentric = np.stack([result["u"], result["v"]], axis=1)
         for index, mesh in enumerate(self.meshes):
-            here = hit[which[hit] == index]
+            here = hit[mesh_index[hit] == index]
             if len(here):
-                color[here] = mesh.colors_at(found["primID"][here], barycentric[here])
-        return Hits(distance, which, color)
+                color[here] = mesh.colors_at(result["primID"][here], barycentric[here])
+        return Hits(distance, mesh_index, color)
 
 
 def pixel_rays(intrinsics: Intrinsics, height: int, width: int) -> NDArray[np.float64]:
-    """Rays through the pixels [height * width, 3] float64 in the camera frame, z = 1: a ray's length is a depth."""
+    """Return rays through the pixels [height * width, 3] float64, camera frame, z = 1: hit distances are depths."""
     rays = np.ones((height, width, 3))
     rays[..., 0] = (np.arange(width) - intrinsics.cx) / intrinsics.fx
     rays[..., 1] = ((np.arange(height) - intrinsics.cy) / intrinsics.fy)[:, None]
@@ -88,7 +88,7 @@ def pixel_rays(intrinsics: Intrinsics, height: int, width: int) -> NDArray[np.fl
 
 
 def _pixel_box(vertices: NDArray[np.float64], pose: NDArray[np.float64], camera: Camera) -> tuple[int, int, int, int]:
-    """First and one-past-last row and column that the vertices can fill; never empty."""
+    """Return the range of rows and columns that the vertices can cover (first, end, first, end); never empty."""
     in_camera = (vertices - pose[:3, 3]) @ pose[:3, :3]
     if in_camera[:, 2].min() <= 0:
         return 0, camera.height, 0, camera.width
@@ -102,15 +102,15 @@ def _pixel_box(vertices: NDArray[np.float64], pose: NDArray[np.float64], camera:
 
 
 def render_view(caster: RayCaster, pose: NDArray[np.float64], camera: Camera = TRAINING_CAMERA) -> RenderedView:
-    """Colours and depth as seen from a pose.
+    """Render colours and depth from a pose.
 
     Args:
-        caster: the object.
+        caster: index of the object.
         pose: [4, 4] camera to object frame, as from `camera_pose`.
         camera: size and intrinsics of the whole image.
 
     Returns:
-        The part of the image where the object can be: a twentieth of the whole for a mug, and as much faster.
+        The part of the image that the object can cover: for a mug a twentieth of the image, and as much faster.
     """
     top, bottom, left, right = _pixel_box(caster.vertices, pose, camera)
     k = camera.intrinsics

@@ -1,4 +1,4 @@
-"""The sample frames of the service's page: scenes of the built-in objects, cut to the objects, as files.
+"""Write the sample frames of the service's page: scenes of the built-in objects, cropped to the objects.
 
 python -c "from training.rendering.sample_frames import write_sample_frames as w; w('thor2_jax/service/page/samples')"
 """
@@ -22,40 +22,40 @@ SAMPLES = (
     ("tools", "Tools and a sponge", 4, 5),
     ("clutter", "Seven close together", 6, 7),
 )
-"""Folder, title, seed and number of objects of each; picked by eye."""
+"""Directory, title, seed and number of objects of each sample; selected by eye."""
 
 LIGHT_CHANGE = 0.2
 NOISE = 0.5
-"""Noise is most of a depth image's bytes; four samples stay within 400 kB."""
+"""Noise dominates the size of a depth image; with this factor four samples take less than 400 kB."""
 
 MARGIN = 24
-"""Pixels around the objects."""
+"""Margin around the objects, pixels."""
 
 LEAST_WIDTH = 400
-"""Pixels of a sample that is 3/4 as high."""
+"""Smallest width of a sample, pixels; its height is 3/4 of the width."""
 
 
-def write_sample_frames(folder: str | Path) -> None:
-    """Write the frames and `index.json`, which lists them, over what is in `folder`.
+def write_sample_frames(directory: str | Path) -> None:
+    """Write the frames and their `index.json` to a directory; existing files are overwritten.
 
     Raises:
-        OSError: a file cannot be written.
+        OSError: A file cannot be written.
     """
-    folder, objects = Path(folder), builtin_objects()
+    directory, objects = Path(directory), builtin_objects()
     for name, _, seed, n_objects in SAMPLES:
         scene = compose_scene(
             objects, np.random.default_rng(seed), n_objects=n_objects, noise=NOISE, light=LIGHT_CHANGE
         )
-        _write(_cut(scene.frame), folder / name)
+        _write(_crop(scene.frame), directory / name)
     index = [{"folder": name, "title": title} for name, title, _, _ in SAMPLES]
-    (folder / "index.json").write_text(json.dumps(index, indent=1) + "\n")
+    (directory / "index.json").write_text(json.dumps(index, indent=1) + "\n")
 
 
-def _cut(frame: RGBDFrame) -> RGBDFrame:
+def _crop(frame: RGBDFrame) -> RGBDFrame:
     rows, columns = (np.flatnonzero((frame.labels > 0).any(axis=axis)) for axis in (1, 0))
-    needed = max(np.ptp(columns) + 1, (np.ptp(rows) + 1) * 4 / 3) + 2 * MARGIN
+    required = max(np.ptp(columns) + 1, (np.ptp(rows) + 1) * 4 / 3) + 2 * MARGIN
     height, width = frame.labels.shape
-    across = min(width, max(LEAST_WIDTH, 4 * round(needed / 4)))
+    across = min(width, max(LEAST_WIDTH, 4 * round(required / 4)))
     down = across * 3 // 4
     left = int(np.clip((columns[0] + columns[-1] - across) // 2, 0, width - across))
     top = int(np.clip((rows[0] + rows[-1] - down) // 2, 0, height - down))
@@ -64,9 +64,9 @@ def _cut(frame: RGBDFrame) -> RGBDFrame:
     return RGBDFrame(color, depth, labels, camera)
 
 
-def _write(frame: RGBDFrame, folder: Path) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(frame.color).save(folder / "color.jpg", quality=85, subsampling=0)
-    Image.fromarray(frame.depth).save(folder / "depth.png", optimize=True)
-    Image.fromarray(frame.labels).save(folder / "labels.png", optimize=True)
-    (folder / "intrinsics.json").write_text(json.dumps(dataclasses.asdict(frame.intrinsics)) + "\n")
+def _write(frame: RGBDFrame, directory: Path) -> None:
+    directory.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(frame.color).save(directory / "color.jpg", quality=85, subsampling=0)
+    Image.fromarray(frame.depth).save(directory / "depth.png", optimize=True)
+    Image.fromarray(frame.labels).save(directory / "labels.png", optimize=True)
+    (directory / "intrinsics.json").write_text(json.dumps(dataclasses.asdict(frame.intrinsics)) + "\n")

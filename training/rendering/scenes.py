@@ -1,10 +1,9 @@
-"""Cluttered table scenes of known objects, rendered with labels: what a recognizer trained on single views is tried on.
+"""Cluttered table scenes of known objects, rendered with labels, to evaluate recognizers.
 
     scene = compose_scene(builtin_objects(), np.random.default_rng(0))
     scene.frame, scene.truth[1], scene.visible[1], scene.occlusion(1)
 
-The table is the plane z = 0; objects rest on it, apart from one another, and hide one another from a camera that looks
-down.
+The table is the plane z = 0. Objects rest on it without touching and occlude one another in a camera that looks down.
 """
 
 import dataclasses
@@ -24,34 +23,34 @@ from training.rendering.view_sphere import camera_pose
 __all__ = ["SCENE_CAMERA", "Scene", "compose_scene"]
 
 SCENE_CAMERA = Camera(640, 480, Intrinsics(615.0, 615.0, 319.5, 239.5))
-"""Like a small active-stereo camera at VGA size: 55 degrees across."""
+"""Similar to a small active-stereo camera at VGA resolution, with a horizontal field of view of 55 degrees."""
 
 MIN_PIXELS = 50
-"""Instances of which fewer are seen are not labelled."""
+"""Instances with fewer visible pixels are not labelled."""
 
 MIN_GAP = 0.006
-"""Least distance between two objects' footprints, metres."""
+"""Smallest distance between the footprints of two objects, metres."""
 
 TABLE_RADIUS = 0.18
-"""Objects lie within this distance of the middle of the table, metres, unless there is no room."""
+"""Objects lie within this distance of the table's centre, metres, if there is space."""
 
 MAX_SENSOR_DEPTH = 4.0
-"""Metres; beyond it the sensor sees no depth."""
+"""Largest depth that the simulated sensor measures, metres."""
 
 EDGE_STEP = 0.02
-"""A step in depth between neighbouring pixels, metres, from which on depth may be missing."""
+"""Depth step between neighbouring pixels from which depth may be missing, metres."""
 
 Array = NDArray[np.float64]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Scene:
-    """A frame and what is in it.
+    """A frame and its ground truth.
 
     Attributes:
-        frame: colour, depth in millimetres, labels from 1 in no order; table and background are 0.
+        frame: colour, depth in millimetres, labels from 1 in no particular order; table and background are 0.
         truth: label -> object name.
-        visible: label -> share of the pixels the object would fill alone that show it, in (0, 1].
+        visible: label -> visible share of the pixels that the object covers without the others, in (0, 1].
     """
 
     frame: RGBDFrame
@@ -59,7 +58,7 @@ class Scene:
     visible: Mapping[int, float]
 
     def occlusion(self, label: int) -> str:
-        """How much of an instance is hidden: "none" (up to 5 %), "low" (up to 30 %) or "high"."""
+        """Return the degree of occlusion of an instance: "none" (up to 5 %), "low" (up to 30 %) or "high"."""
         share = self.visible[label]
         return "none" if share > 0.95 else "low" if share > 0.7 else "high"
 
@@ -83,10 +82,10 @@ class _Placed:
 
     def apart(self, other: "_Placed", x: float, y: float) -> bool:
         """Return whether this object, moved by x and y, is at least `MIN_GAP` from the other (separating axis test)."""
-        mine, theirs = self.corners + [x, y], other.corners
-        ahead = (self.normals @ theirs.T).min(axis=1) - (self.normals @ mine.T).max(axis=1)
-        behind = (other.normals @ mine.T).min(axis=1) - (other.normals @ theirs.T).max(axis=1)
-        return bool(max(ahead.max(), behind.max()) >= MIN_GAP)
+        moved, fixed = self.corners + [x, y], other.corners
+        gaps = (self.normals @ fixed.T).min(axis=1) - (self.normals @ moved.T).max(axis=1)
+        other_gaps = (other.normals @ moved.T).min(axis=1) - (other.normals @ fixed.T).max(axis=1)
+        return bool(max(gaps.max(), other_gaps.max()) >= MIN_GAP)
 
 
 SIDES = tuple(
@@ -98,14 +97,14 @@ SIDES = tuple(
         [[0, 0, 1], [0, 1, 0], [-1, 0, 0]],
     )
 )
-"""Turns [3, 3] that put each of the four sides down."""
+"""Rotations [3, 3] that put each of the four sides down."""
 
 
 def _rests(hull: Array) -> bool:
-    """Whether a body with these hull vertices [n, 3] stays as it is put down: middle above what touches the table.
+    """Return whether a body with these hull vertices [n, 3] is stable: its centre is above the contact area.
 
-    What is within 3 mm of the table counts as touching it, so a can rests on its side; the middle must be inside by 5
-    mm and by a tenth of the height, so a screwdriver does not stand on its handle.
+    Vertices within 3 mm of the table touch it, so that a can rests on its side; the centre must be inside by 5 mm and
+    by a tenth of the height, so that a screwdriver does not stand on its handle.
     """
     feet = hull[hull[:, 2] < hull[:, 2].min() + 0.003, :2]
     low, high = hull.min(axis=0), hull.max(axis=0)
@@ -117,7 +116,7 @@ def _rests(hull: Array) -> bool:
 
 
 def _put_down(mesh: TexturedMesh, rng: np.random.Generator) -> _Placed:
-    """As stored two times in three, else on a side it can rest on; any yaw; middle over the origin, lowest z = 0."""
+    """Put a mesh on the origin: upright two times in three, otherwise on a stable side, with a random yaw."""
     used = mesh.vertices[np.unique(mesh.faces)]
     hull = used[ConvexHull(used, qhull_options="QJ").vertices]
     sides = [turn for turn in SIDES if _rests(hull @ turn.T)]
@@ -135,11 +134,11 @@ def _put_down(mesh: TexturedMesh, rng: np.random.Generator) -> _Placed:
 
 
 def _in_line(new: _Placed, placed: Sequence[_Placed], towards: Array, rng: np.random.Generator) -> Array | None:
-    """A free place [2] in line with one already there and the camera, the taller in front; None if there is none."""
+    """Return a free position [2] in line with a placed object and the camera, the taller in front, or None."""
     anchor = placed[int(rng.integers(len(placed)))]
     middle = (anchor.corners.min(axis=0) + anchor.corners.max(axis=0)) / 2
     sideways = np.array([-towards[1], towards[0]])
-    # To one side, so that seldom all of it is hidden.
+    # Offset sideways, so that an object is rarely occluded completely.
     middle = middle + sideways * rng.choice([-1, 1]) * rng.uniform(0.15, 0.45) * np.ptp(anchor.corners @ sideways)
     forth = towards if new.height > anchor.height else -towards
     for distance in np.arange(0.0, 0.3, 0.006) + rng.uniform(0, 0.006):
@@ -152,7 +151,7 @@ def _in_line(new: _Placed, placed: Sequence[_Placed], towards: Array, rng: np.ra
 
 
 def _anywhere(new: _Placed, placed: Sequence[_Placed], rng: np.random.Generator) -> Array:
-    """A free place [2] on the table, farther out only if there is no room."""
+    """Return a free position [2] on the table; the radius grows only if there is no space."""
     reach = TABLE_RADIUS
     while True:
         angle, radius = rng.uniform(0, 2 * np.pi), reach * np.sqrt(rng.random())
@@ -174,7 +173,7 @@ def _arrange(
 
 
 def _table() -> TexturedMesh:
-    """A square of 1.6 m at z = 0 in planks of slightly different greyish brown."""
+    """Return a table: a square of 1.6 m at z = 0 with planks in slightly different greyish browns."""
     planks = np.random.default_rng(0).integers(-9, 10, (16, 1, 1))
     texture = (np.array([150, 138, 122]) + np.repeat(np.repeat(planks, 32, axis=0), 512, axis=1)).astype(np.uint8)
     texture[::32] = 96, 88, 78
@@ -185,7 +184,7 @@ def _table() -> TexturedMesh:
 
 
 def _sensed_depth(depth_m: Array, noise: float, rng: np.random.Generator) -> NDArray[np.uint16]:
-    """Depth [H, W] as a sensor gives it, millimetres.
+    """Return depth [H, W] with the errors of a sensor, millimetres.
 
     The standard deviation of the axial noise is `noise` times 1.2 mm + 1.9 mm (z / m - 0.4)^2 (Nguyen, Izadi and Lovell
     2012). Three in ten pixels at depth steps of more than `EDGE_STEP`, and all beyond `MAX_SENSOR_DEPTH`, are missing.
@@ -198,10 +197,10 @@ def _sensed_depth(depth_m: Array, noise: float, rng: np.random.Generator) -> NDA
         near_edge[rows, columns] |= step
         rows, columns = (slice(None), slice(None, -1)) if axis else (slice(None, -1), slice(None))
         near_edge[rows, columns] |= step
-    found = depth_m + noise * sigma * rng.standard_normal(depth_m.shape)
+    noisy = depth_m + noise * sigma * rng.standard_normal(depth_m.shape)
     lost = near_edge & (rng.random(depth_m.shape) < 0.3 * min(noise, 1.0))
-    seen = (depth_m > 0) & (depth_m < MAX_SENSOR_DEPTH) & ~lost
-    return np.where(seen, np.rint(found.clip(0.001) * 1000), 0).astype(np.uint16)
+    valid = (depth_m > 0) & (depth_m < MAX_SENSOR_DEPTH) & ~lost
+    return np.where(valid, np.rint(noisy.clip(0.001) * 1000), 0).astype(np.uint16)
 
 
 def compose_scene(
@@ -213,24 +212,24 @@ def compose_scene(
     noise: float = 1.0,
     light: float = 0.08,
 ) -> Scene:
-    """Put different objects on a table at random and render them from 0.7 to 1.1 m, looking down at 25 to 50 degrees.
+    """Place random objects on a table and render them from 0.7 to 1.1 m with a camera pitch of 25 to 50 degrees.
 
     Args:
         objects: name -> mesh; metres, z up.
-        rng: of everything random.
-        n_objects: how many of the objects.
-        camera: of the frame.
-        clutter: probability, in [0, 1], that an object is put in line with another and the camera, so that one hides
-            the other.
-        noise: of the sensor; 1 is a consumer depth camera's and a standard deviation of 2 in colour, 0 none.
-        light: colours are multiplied by a common gain within 1 +- light, and each channel by one within 1 +- light / 4.
+        rng: random number generator.
+        n_objects: number of objects in the scene, each a different one.
+        camera: camera of the frame.
+        clutter: probability, in [0, 1], that an object is placed in line with another and the camera, so that one
+            occludes the other.
+        noise: factor of the sensor noise; 1 is a consumer depth camera and a standard deviation of 2 in colour, 0 none.
+        light: colours are multiplied by a gain within 1 +- light, and each channel by another within 1 +- light / 4.
 
     Returns:
-        The scene. An instance of which fewer than `MIN_PIXELS` pixels are seen is not in it (its pixels are labelled
-        0), so that it may have fewer than `n_objects` labels.
+        The scene. An instance with fewer than `MIN_PIXELS` visible pixels is not labelled (its pixels are 0), so that
+        there may be fewer than `n_objects` labels.
 
     Raises:
-        InputError: a number outside its range, or more objects than there are.
+        InputError: A number is out of range, or there are fewer than `n_objects` objects.
     """
     if not 1 <= n_objects <= len(objects):
         raise InputError(f"n_objects is {n_objects!r}; it must be 1 to {len(objects)}, the number of objects")
@@ -249,12 +248,12 @@ def compose_scene(
     labels = hits.mesh.clip(0).astype(np.uint8 if n_objects < 256 else np.uint16).reshape(shape)
     truth, visible = {}, {}
     for label, (name, mesh) in enumerate(zip(names, meshes, strict=True), 1):
-        seen = int((labels == label).sum())
-        if seen < MIN_PIXELS:
+        pixels = int((labels == label).sum())
+        if pixels < MIN_PIXELS:
             labels[labels == label] = 0
             continue
         truth[label] = name
-        visible[label] = seen / int((render_view(RayCaster([mesh]), pose, camera).depth > 0).sum())
+        visible[label] = pixels / int((render_view(RayCaster([mesh]), pose, camera).depth > 0).sum())
 
     depth = np.where(hits.mesh >= 0, hits.distance, 0).astype(np.float64).reshape(shape)
     color = np.where(hits.mesh[:, None] >= 0, hits.color, np.array([92, 96, 104])).reshape(*shape, 3)

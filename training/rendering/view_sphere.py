@@ -1,8 +1,8 @@
-"""Camera poses on the view sphere around an object (paper, section "Training"), azimuth and polar angle in equal steps.
+"""Camera poses on the view sphere around an object (paper, section "Training"), in equal steps of two angles.
 
     poses = [camera_pose(azimuth, polar, mesh.centre) for azimuth, polar in view_angles()]   # 2,664 poses
 
-The object's frame is the scan's: z up. Polar angle 0 looks down on the object, pi/2 from the side, pi from below.
+The object's frame is that of the scan, with z up. The polar angle is 0 from above, pi/2 from the side, pi from below.
 """
 
 import math
@@ -15,18 +15,18 @@ from thor2_jax.errors import InputError
 __all__ = ["DISTANCE", "camera_pose", "view_angles"]
 
 DISTANCE = 1.5
-"""Metres between the camera and the centre of the object's bounding box."""
+"""Distance between the camera and the centre of the object's bounding box, metres."""
 
 
 def _steps(name: str, step: float, turn: float) -> int:
     count = turn / step if math.isfinite(step) and step > 0 else 0.0
     if round(count) < 1 or abs(count - round(count)) > 1e-6:
-        raise InputError(f"{name} must be degrees that divide {turn:g} evenly, not {step!r}")
+        raise InputError(f"{name} is {step!r}; expected degrees that divide {turn:g} evenly")
     return round(count)
 
 
 def view_angles(azimuth_step: float = 5.0, polar_step: float = 5.0) -> NDArray[np.float64]:
-    """All views of an object: azimuth from 0 up to, without, 2 pi and polar angle from 0 to pi, both poles included.
+    """Return the angles of all views: azimuth in [0, 2 pi) and polar angle in [0, pi], with both poles.
 
     Args:
         azimuth_step: degrees; divides 360.
@@ -36,7 +36,7 @@ def view_angles(azimuth_step: float = 5.0, polar_step: float = 5.0) -> NDArray[n
         [n, 2] float64, azimuth and polar angle in radians, azimuth varying fastest; 72 x 37 rows by default.
 
     Raises:
-        InputError: a step that is not positive or does not divide its range.
+        InputError: A step is not positive or does not divide its range.
     """
     azimuths = np.arange(n := _steps("azimuth_step", azimuth_step, 360)) * (2 * np.pi / n)
     polars = np.linspace(0, np.pi, _steps("polar_step", polar_step, 180) + 1)
@@ -46,16 +46,16 @@ def view_angles(azimuth_step: float = 5.0, polar_step: float = 5.0) -> NDArray[n
 def camera_pose(
     azimuth: float, polar: float, centre: NDArray[np.float64], distance: float = DISTANCE
 ) -> NDArray[np.float64]:
-    """Pose of a camera on the view sphere that looks at `centre`.
+    """Return the pose of a camera on the view sphere that looks at `centre`.
 
-    The image's down direction is that of growing polar angle. Away from the poles this is "z is up in the image"; at
-    the poles it is where the meridian of `azimuth` leads, so that the picture turns with the azimuth there.
+    The image's down direction is that of increasing polar angle: z is up in the image. At the poles it follows the
+    meridian of `azimuth`, so that the image rotates with the azimuth.
 
     Args:
         azimuth: radians, from the x axis towards the y axis.
         polar: radians, from the z axis.
-        centre: [3] metres.
-        distance: metres.
+        centre: [3], metres.
+        distance: from the camera to `centre`, metres.
 
     Returns:
         [4, 4] float64, camera to object frame; columns are the camera's x (right), y (down), z (forward) and position.

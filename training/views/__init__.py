@@ -1,1 +1,1 @@
-"""Training views: point clouds of rendered meshes, normalized, in memory and on disk."""
+"""Training views: normalized point clouds of rendered meshes, in memory and on disk."""

@@ -198,7 +198,7 @@ def test_texture_coordinates_that_are_not_finite(tmp_path: Path) -> None:
 
 def test_texture_coordinates_that_are_too_far(tmp_path: Path) -> None:
     material = PBRMaterial(baseColorTexture=Image.fromarray(CHECKERS))
-    for far, said in ((2.0**23, None), (1e30, "texture coordinates are not finite, or past 8388608")):
+    for far, said in ((2.0**23, None), (1e30, "texture coordinates")):
         visual = trimesh.visual.TextureVisuals(uv=QUAD_UV * [1, far], material=material)
         trimesh.Trimesh(QUAD, QUAD_FACES, visual=visual, process=False).export(tmp_path / "quad.glb")
         if said is None:
