@@ -28,7 +28,6 @@ import thor2_jax as thor2
 from benchmarks.clouds import sample_clouds
 from benchmarks.timing import time_calls
 from thor2_jax.descriptor.streaming import describe_stream
-from thor2_jax.descriptor.view_normalization import align_planes
 from thor2_jax.recognition.classifier import FEATURES, MLP
 from thor2_jax.recognition.run_directory import TrainedRun, input_size
 from training.objects.builtin_objects import builtin_objects
@@ -103,7 +102,7 @@ def engine_rates(clouds: list[Any]) -> dict[str, Any]:
     parts = {
         "whole, closed form": lambda: whole(packed, CLOSED),
         "whole, gudhi": lambda: whole(packed, GUDHI),
-        "align": lambda: align_planes(packed, CLOSED),
+        "align": lambda: thor2.align(packed, CLOSED).points,
         "strips": lambda: thor2.strips(aligned, NETWORK, CLOSED),
         "images and embeddings, closed form": lambda: thor2.describe_strips(strips, NETWORK, CLOSED),
         "images and embeddings, gudhi": lambda: thor2.describe_strips(strips, NETWORK, GUDHI),
@@ -120,7 +119,7 @@ def align_share(clouds: list[Any], rounds: int = 20) -> float:
     packed = thor2.PointClouds.pack(clouds, N_POINTS)
     shares = []
     for _ in range(rounds):
-        alone = time_calls(lambda: align_planes(packed, CLOSED), 0.0).median
+        alone = time_calls(lambda: thor2.align(packed, CLOSED).points, 0.0).median
         shares.append(alone / time_calls(lambda: whole(packed, CLOSED), 0.0).median)
     return median(shares)
 

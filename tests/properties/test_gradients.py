@@ -120,8 +120,8 @@ def test_the_whole_way_against_finite_differences(name: str, monkeypatch: pytest
         clouds: thor2.PointClouds, network: Any, config: thor2.DescriptorConfig, parameters: thor2.Parameters
     ) -> thor2.Descriptors:
         # What is compiled already has another frame in it.
-        planes, _ = view_normalization._align_planes.__wrapped__(clouds, parameters.sigma_s, parameters.alpha)
-        aligned = dataclasses.replace(clouds, points=jnp.swapaxes(planes, 1, 2))
+        points, camera = view_normalization._align.__wrapped__(clouds, parameters.sigma_s, parameters.alpha)
+        aligned = dataclasses.replace(clouds, points=points, camera=camera)
         return thor2.describe_aligned(aligned, network, config, parameters)
 
     loss = loss_of(describe, clouds, config)

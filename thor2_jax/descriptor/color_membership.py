@@ -49,8 +49,7 @@ def color_sets(colors: jax.Array, sets: RegionSets) -> jax.Array:
     Returns:
         [...] int32, rows of `sets.weights`.
     """
-    eight_bit = jnp.floor(colors * 255 + 0.5)
-    # Floats are faster here, and safe: a quotient is at least 1 / 10 away from the next integer.
-    level = jnp.floor((eight_bit + GRID_STEP / 2) * np.float32(1 / GRID_STEP))
+    eight_bit = jnp.floor(colors * 255 + 0.5).astype(jnp.int32)
+    level = (eight_bit + GRID_STEP // 2) // GRID_STEP
     color = (level[..., 0] * GRID_LEVELS + level[..., 1]) * GRID_LEVELS + level[..., 2]
-    return sets.of_color.at[color.astype(jnp.int32)].get(mode="clip").astype(jnp.int32)
+    return sets.of_color.at[color].get(mode="clip").astype(jnp.int32)

@@ -21,7 +21,7 @@ from thor2_jax.descriptor.color_membership import RegionSets, color_sets, region
 from thor2_jax.descriptor.persistence import diagrams_of_strips
 from thor2_jax.descriptor.persistence_images import count_past_window, persistence_images
 from thor2_jax.descriptor.slicing import strips_of_cloud
-from thor2_jax.descriptor.view_normalization import align_planes
+from thor2_jax.descriptor.view_normalization import align
 from thor2_jax.errors import InputError
 from thor2_jax.parameters import Parameters
 from thor2_jax.types import Descriptors, Diagrams, PointClouds, Strips
@@ -49,23 +49,11 @@ def _check_batch(clouds: PointClouds) -> None:
 _color_sets = jax.jit(color_sets)
 
 
-@partial(jax.jit, static_argnums=5)
-def _strips_of_planes(
-    points: jax.Array,
-    colors: jax.Array,
-    mask: jax.Array,
-    region_set: jax.Array,
-    sets: RegionSets,
-    config: DescriptorConfig,
-) -> Strips:
-    one = partial(strips_of_cloud, sets=sets, config=config)
-    return jax.vmap(one)(points, colors, mask, region_set)
-
-
 @partial(jax.jit, static_argnums=3)
 def _strips_of(aligned: PointClouds, region_set: jax.Array, sets: RegionSets, config: DescriptorConfig) -> Strips:
     planes = jnp.swapaxes(aligned.points, 1, 2)
-    return _strips_of_planes(planes, aligned.colors, aligned.mask, region_set, sets, config)
+    one = partial(strips_of_cloud, sets=sets, config=config)
+    return jax.vmap(one)(planes, aligned.colors, aligned.mask, region_set)
 
 
 def strips_by_sets(aligned: PointClouds, sets: RegionSets, config: DescriptorConfig) -> Strips:
@@ -169,10 +157,7 @@ def describe(
 def _describe_chunk(
     clouds: PointClouds, network: ColorNetwork, config: DescriptorConfig, parameters: Parameters | None
 ) -> Descriptors:
-    sets = _region_sets(network)
-    planes = align_planes(clouds, config, parameters)
-    strips = _strips_of_planes(planes, clouds.colors, clouds.mask, _color_sets(clouds.colors, sets), sets, config)
-    return describe_strips(strips, network, config, parameters)
+    return describe_aligned(align(clouds, config, parameters), network, config, parameters)
 
 
 @partial(jax.jit, static_argnums=(1, 2))

@@ -22,7 +22,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.parameters import Parameters
 from thor2_jax.types import PointClouds
 
-__all__ = ["align", "align_planes", "mirror", "turn", "view_normalize"]
+__all__ = ["align", "mirror", "turn", "view_normalize"]
 
 OCCLUSION_BIN = 0.01
 """Width of the bins along x in which boundary points are counted, scaled units."""
@@ -48,16 +48,11 @@ def _place(rotation: jax.Array, points: jax.Array, mask: jax.Array, camera: jax.
     return jnp.where(mask, points - low[:, None], 0), jnp.matmul(rotation, camera, precision=HIGHEST) - low
 
 
-def _count(flags: jax.Array) -> jax.Array:
-    """Count true flags [M], as a float: sums of floats are faster here, and exact below 2**24."""
-    return total(flags.astype(jnp.float32))
-
-
 def _frame(cloud: PointClouds, sigma_s: ArrayLike) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
     """Return the rotation [3, 3] of the view normalization, and the centred points [3, M], mask and camera for it."""
     points, mask = _planes(cloud)
     scaled = points * sigma_s
-    centre = total(jnp.where(mask, scaled, 0)) / jnp.maximum(_count(mask), 1)
+    centre = total(jnp.where(mask, scaled, 0)) / jnp.maximum(mask.sum(dtype=scaled.dtype), 1)
     # Padding moves to the mean, inside the convex hull, where it is never an extreme point.
     centred = jnp.where(mask, scaled - centre[:, None], 0)
     camera = cloud.camera * sigma_s - centre
@@ -76,7 +71,7 @@ def _frame(cloud: PointClouds, sigma_s: ArrayLike) -> tuple[jax.Array, jax.Array
     last = largest(jnp.where(mask, bins, -1))
     boundary = jnp.pad(cloud.boundary, (0, len(mask) - len(cloud.boundary))) & mask
     # A half turn about z moves the occluded end away from the first slice.
-    x_sign = jnp.where(_count(boundary & (bins <= 1)) > _count(boundary & (bins >= last - 1)), -x_sign, x_sign)
+    x_sign = jnp.where((boundary & (bins <= 1)).sum() > (boundary & (bins >= last - 1)).sum(), -x_sign, x_sign)
 
     x, z = axes[0] * x_sign, axes[2] * z_sign
     return jax.lax.stop_gradient(jnp.stack([x, jnp.cross(z, x), z])), centred, mask, camera
@@ -150,32 +145,21 @@ def turn(normal: PointClouds, config: DescriptorConfig, parameters: Parameters |
 
 
 @jax.jit
-def _align_planes(clouds: PointClouds, sigma_s: ArrayLike, alpha: ArrayLike) -> tuple[jax.Array, jax.Array]:
+def _align(clouds: PointClouds, sigma_s: ArrayLike, alpha: ArrayLike) -> tuple[jax.Array, jax.Array]:
     def one(cloud: PointClouds) -> tuple[jax.Array, jax.Array]:
         frame, points, mask, camera = _frame(cloud, sigma_s)
         # One rotation suffices: the translation between the two would cancel.
         rotation = jnp.matmul(_about_y(alpha), frame, precision=HIGHEST)
         points, camera = _place(rotation, points, mask, camera)
-        return points[:, : len(cloud.mask)], camera  # replacing the other fields would copy them
+        return points.T[: len(cloud.mask)], camera  # the other fields would be copied
 
     return jax.vmap(one)(clouds)
-
-
-@jax.jit
-def _align(clouds: PointClouds, sigma_s: ArrayLike, alpha: ArrayLike) -> tuple[jax.Array, jax.Array]:
-    planes, camera = _align_planes(clouds, sigma_s, alpha)
-    return jnp.swapaxes(planes, 1, 2), camera
 
 
 def align(clouds: PointClouds, config: DescriptorConfig, parameters: Parameters | None = None) -> PointClouds:
     """Normalize and turn clouds: `turn(view_normalize(clouds, config), config)`, in scaled units, ready for slicing."""
     points, camera = _align(clouds, *_sigma_s_and_alpha(config, parameters))
     return dataclasses.replace(clouds, points=points, camera=camera)
-
-
-def align_planes(clouds: PointClouds, config: DescriptorConfig, parameters: Parameters | None = None) -> jax.Array:
-    """Return the points of `align` as [B, 3, N], which saves two transpositions before slicing."""
-    return _align_planes(clouds, *_sigma_s_and_alpha(config, parameters))[0]
 
 
 @partial(jax.jit, static_argnums=1)
