@@ -1,13 +1,13 @@
-"""Mutation testing: small changes to the sources, one at a time, each of which a test must notice.
+"""Mutation testing: small changes to the sources, one at a time, each of which should make a test fail.
 
-    python tests/mutation.py --results mutants.jsonl --sample 10     # ten mutants a module; goes on where it was ended
-    python tests/mutation.py --results mutants.jsonl --survivors     # those that survived, once tests have been added
-    python tests/mutation.py --results mutants.jsonl --sample 0      # table and survivors of what has been run
+    python tests/mutation.py --results mutants.jsonl --sample 10     # ten mutants for each module; resumes
+    python tests/mutation.py --results mutants.jsonl --survivors     # survivors again, after adding tests
+    python tests/mutation.py --results mutants.jsonl --sample 0      # table and survivors of the results so far
 
-Needs the extra `mutation`. The checkout stays as it is: mutants live in a copy in a temporary folder, one process each.
-Cosmic Ray makes them; a place in the source is drawn first, one of its mutants second, so that an operator with many
-replacements counts no more than a number. Left out are places within annotations, which do nothing at run time, and
-replacements from one family of operators by another (+ by <<), nearly all of which are type errors.
+Requires the extra `mutation`. The checkout is not changed: mutants are tested in a copy in a temporary folder, each in
+its own process. Cosmic Ray generates them. A place in the source is drawn first and one of its mutants second, so that
+operators with many replacements have no larger share. Annotations are excluded, because they have no effect at run
+time, and so are replacements between families of operators (+ by <<), which are nearly always type errors.
 """
 
 import argparse
@@ -34,59 +34,56 @@ from cosmic_ray.plugins import get_operator, operator_names
 
 ROOT = Path(__file__).resolve().parents[1]
 
-TESTS = {
+FOLDERS = ("colornet", "thor2_jax", "thor2_jax/descriptor", "thor2_jax/recognition")
+"""Folders whose modules are mutated."""
+
+MORE_TESTS = {
     "colornet/__init__.py": ("colornet/test_files.py", "colornet/test_build.py"),
     "colornet/builder.py": ("colornet/test_build.py",),
-    "colornet/files.py": ("colornet/test_files.py",),
     "colornet/grid.py": ("colornet/test_color_math.py", "colornet/test_membership.py"),
     "colornet/lab.py": ("colornet/test_color_math.py", "colornet/test_build.py"),
     "colornet/mapper.py": ("colornet/test_color_math.py", "colornet/test_build.py"),
     "colornet/network.py": ("colornet/test_files.py", "colornet/test_membership.py"),
-    "colornet/regions.py": ("colornet/test_regions.py", "colornet/test_build.py"),
-    "thor2_jax/descriptor/bounding_box.py": (
-        "thor2_jax/descriptor/test_bounding_box.py",
-        "thor2_jax/descriptor/test_view_normalization.py",
-    ),
-    "thor2_jax/capacity.py": ("thor2_jax/test_capacity.py",),
-    "thor2_jax/recognition/classifier.py": ("thor2_jax/recognition/test_classifier.py",),
-    "thor2_jax/descriptor/color_membership.py": (
-        "thor2_jax/descriptor/test_color_membership.py",
-        "thor2_jax/test_types.py",
-    ),
-    "thor2_jax/config.py": ("thor2_jax/test_config.py",),
-    "thor2_jax/descriptor/describe.py": ("thor2_jax/descriptor/test_describe.py",),
-    "thor2_jax/recognition/frames.py": ("thor2_jax/recognition/test_frames.py", "thor2_jax/test_types.py"),
-    "thor2_jax/recognition/instance_clouds.py": (
-        "thor2_jax/recognition/test_instance_clouds.py",
-        "thor2_jax/test_types.py",
-    ),
-    "thor2_jax/recognition/occlusion.py": ("thor2_jax/recognition/test_occlusion.py", "thor2_jax/test_types.py"),
-    "thor2_jax/recognition/outlier_removal.py": (
-        "thor2_jax/recognition/test_outlier_removal.py",
-        "thor2_jax/recognition/test_instance_clouds.py",
-    ),
-    "thor2_jax/parameters.py": ("thor2_jax/test_types.py", "properties/test_reproducibility.py"),
-    "thor2_jax/descriptor/persistence.py": ("thor2_jax/descriptor/test_persistence.py",),
-    "thor2_jax/descriptor/persistence_images.py": ("thor2_jax/descriptor/test_persistence_images.py",),
-    "thor2_jax/descriptor/reductions.py": ("thor2_jax/descriptor/test_reductions.py",),
+    "colornet/regions.py": ("colornet/test_build.py",),
+    "thor2_jax/descriptor/bounding_box.py": ("thor2_jax/descriptor/test_view_normalization.py",),
+    "thor2_jax/descriptor/color_membership.py": ("thor2_jax/test_types.py",),
     "thor2_jax/descriptor/relaxation.py": ("properties/test_relaxation.py",),
-    "thor2_jax/descriptor/slicing.py": ("thor2_jax/descriptor/test_slicing.py",),
-    "thor2_jax/types.py": ("thor2_jax/test_types.py", "thor2_jax/descriptor/test_persistence.py"),
-    "thor2_jax/descriptor/view_normalization.py": ("thor2_jax/descriptor/test_view_normalization.py",),
-    "thor2_jax/recognition/voxel_grid.py": ("thor2_jax/recognition/test_voxel_grid.py",),
+    "thor2_jax/descriptor/released.py": ("thor2_jax/descriptor/test_slicing.py",),
+    "thor2_jax/parameters.py": ("thor2_jax/test_types.py", "properties/test_reproducibility.py"),
+    "thor2_jax/recognition/frames.py": ("thor2_jax/test_types.py",),
+    "thor2_jax/recognition/instance_clouds.py": ("thor2_jax/test_types.py",),
+    "thor2_jax/recognition/occlusion.py": ("thor2_jax/test_types.py",),
+    "thor2_jax/recognition/outlier_removal.py": ("thor2_jax/recognition/test_instance_clouds.py",),
+    "thor2_jax/types.py": ("thor2_jax/descriptor/test_persistence.py",),
 }
-"""The tests, below tests/, that hold a module to account: the quickest first."""
+"""Module -> test files below tests/ that check it in addition to its own one."""
+
+
+def tests_of(module: str) -> tuple[str, ...]:
+    """Return the test files of a module below tests/: tests/FOLDER/test_MODULE.py if it exists, and `MORE_TESTS`."""
+    path = Path(module)
+    own = f"{path.parent}/test_{path.name}"
+    return ((own,) if (ROOT / "tests" / own).exists() else ()) + MORE_TESTS.get(module, ())
+
+
+def tested_modules() -> dict[str, tuple[str, ...]]:
+    """Return the modules of `FOLDERS` that have tests, with their test files."""
+    modules = [f"{folder}/{path.name}" for folder in FOLDERS for path in sorted((ROOT / folder).glob("*.py"))]
+    return {module: tests_of(module) for module in modules if tests_of(module)}
+
+
+TESTS = tested_modules()
 
 FAMILIES = ({"Add", "Sub", "Mul", "Div", "FloorDiv", "Mod", "Pow"}, {"RShift", "LShift"}, {"BitOr", "BitAnd", "BitXor"})
-"""Of binary operators."""
+"""Families of binary operators."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Mutant:
-    """The `occurrence`-th change that an operator of Cosmic Ray makes to a module, counted through the file."""
+    """A change of a module: the occurrence with this number, counted through the file, of an operator of Cosmic Ray."""
 
     module: str
-    source: str  # digest of the module
+    source: str  # digest of the module's source
     operator: str
     occurrence: int
     line: int
@@ -100,7 +97,7 @@ def within_a_family(operator: str) -> bool:
 
 
 def annotations(source: str) -> list[tuple[tuple[int, int], tuple[int, int]]]:
-    """First and last (line, column) of every annotation."""
+    """Return the first and the last (line, column) of every annotation."""
     nodes = [
         annotation
         for node in ast.walk(ast.parse(source))
@@ -111,10 +108,10 @@ def annotations(source: str) -> list[tuple[tuple[int, int], tuple[int, int]]]:
 
 
 def mutants_by_place(module: str) -> list[list[Mutant]]:
-    """All mutants of a module, those of one place in the source together, in the order of the source."""
+    """Return all mutants of a module, grouped by their place in the source, in source order."""
     source = (ROOT / module).read_text()
     digest = hashlib.sha256(source.encode()).hexdigest()[:12]
-    left_out, tree = annotations(source), get_ast(source)
+    excluded, tree = annotations(source), get_ast(source)
     places: dict[tuple[tuple[int, int], tuple[int, int]], list[Mutant]] = defaultdict(list)
     for name in sorted(filter(within_a_family, operator_names())):
         operator = get_operator(name)
@@ -122,13 +119,13 @@ def mutants_by_place(module: str) -> list[list[Mutant]]:
             continue
         positions = (place for node in ast_nodes(tree) for place in operator().mutation_positions(node))
         for occurrence, (start, end) in enumerate(positions):
-            if not any(first <= start and end <= last for first, last in left_out):
+            if not any(first <= start and end <= last for first, last in excluded):
                 places[start, end].append(Mutant(module, digest, name, occurrence, start[0]))
     return [places[place] for place in sorted(places)]
 
 
-def drawn(module: str, sample: int | None, seed: int) -> list[Mutant]:
-    """A sample of a module's mutants, one a place; all of them if `sample` is None. A larger sample holds a smaller."""
+def draw_mutants(module: str, sample: int | None, seed: int) -> list[Mutant]:
+    """Draw mutants of a module, at most one for each place; all mutants if `sample` is None. Samples are nested."""
     places = mutants_by_place(module)
     if sample is None:
         return [mutant for place in places for mutant in place]
@@ -138,7 +135,7 @@ def drawn(module: str, sample: int | None, seed: int) -> list[Mutant]:
 
 
 class Sandbox:
-    """A copy of the checkout in which tests run."""
+    """A copy of the checkout in which mutants are tested."""
 
     def __init__(self, folder: Path) -> None:
         self.tree = folder / "tree"
@@ -148,7 +145,7 @@ class Sandbox:
         self.environment = {
             **os.environ,
             "PYTHONPATH": str(self.tree),
-            "PYTHONDONTWRITEBYTECODE": "1",  # a mutant may be as long and as old as the one before
+            "PYTHONDONTWRITEBYTECODE": "1",  # a mutant can have the size and time stamp of the previous one
             "JAX_COMPILATION_CACHE_DIR": str(folder / "compiled"),  # three times as fast
             "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
             "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
@@ -156,7 +153,7 @@ class Sandbox:
         self._limits: dict[str, float] = {}
 
     def test(self, module: str, limit: float | None = None) -> tuple[str, float]:
-        """Run a module's tests: killed, survived or timeout, and the seconds that it took."""
+        """Run the tests of a module; return "killed", "survived" or "timeout", and the seconds that it took."""
         options = ["-x", "-q", "-p", "no:cacheprovider", "-m", "not slow"]
         command = [sys.executable, "-m", "pytest", *options, *(f"tests/{name}" for name in TESTS[module])]
         start = time.monotonic()
@@ -175,7 +172,7 @@ class Sandbox:
         return outcome, time.monotonic() - start
 
     def limit(self, module: str) -> float:
-        """Seconds after which a mutant of the module counts as hanging; its tests must pass without a mutant."""
+        """Return the time limit for a mutant of the module in seconds; its tests must pass without a mutant."""
         if module not in self._limits:
             outcome, seconds = self.test(module)
             if outcome != "survived":
@@ -184,7 +181,7 @@ class Sandbox:
         return self._limits[module]
 
     def run(self, mutant: Mutant) -> dict[str, Any]:
-        """What becomes of a mutant, as a record for the file of results."""
+        """Test a mutant and return its record for the results file."""
         path, limit = self.tree / mutant.module, self.limit(mutant.module)
         source = path.read_text()
         changed = mutate_code(source, get_operator(mutant.operator)(), mutant.occurrence)
@@ -198,7 +195,7 @@ class Sandbox:
 
 
 def read_results(path: Path) -> dict[Mutant, dict[str, Any]]:
-    """The last record of each mutant of the sources as they are now."""
+    """Read the last record of each mutant of the current sources."""
     digests = {module: hashlib.sha256((ROOT / module).read_bytes()).hexdigest()[:12] for module in TESTS}
     fields = [field.name for field in dataclasses.fields(Mutant)]
     records = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
@@ -210,7 +207,7 @@ def read_results(path: Path) -> dict[Mutant, dict[str, Any]]:
 
 
 def print_report(results: dict[Mutant, dict[str, Any]]) -> None:
-    """The table by module, and the survivors with what was changed."""
+    """Print the table by module, and the survivors with their changes."""
     outcomes = ("killed", "survived", "timeout")
     rows = {module: [r["outcome"] for r in results.values() if r["module"] == module] for module in TESTS}
     rows["all"] = [record["outcome"] for record in results.values()]
@@ -225,26 +222,29 @@ def print_report(results: dict[Mutant, dict[str, Any]]) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Mutation testing; see the head of this file.")
+    parser = argparse.ArgumentParser(description="Mutation testing; see the docstring of this file.")
     parser.add_argument(
-        "modules", nargs="*", metavar="MODULE", help="as thor2_jax/descriptor/slicing.py; by default all"
+        "modules", nargs="*", metavar="MODULE", help="for example thor2_jax/descriptor/slicing.py; default: all"
     )
     parser.add_argument(
-        "--results", type=Path, required=True, help="one JSON line a mutant; what it has is not run again"
+        "--results",
+        type=Path,
+        required=True,
+        help="file of JSON lines, one for each mutant; resumes",
     )
-    parser.add_argument("--sample", type=int, help="mutants a module; by default all")
+    parser.add_argument("--sample", type=int, help="number of mutants for each module; default: all")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--survivors", action="store_true", help="run those again that survived, and no others")
+    parser.add_argument("--survivors", action="store_true", help="run only the survivors again")
     options = parser.parse_args()
     modules = options.modules or list(TESTS)
     if unknown := set(modules) - set(TESTS):
-        parser.error(f"no tests are known for {', '.join(sorted(unknown))}")
+        parser.error(f"MODULE is {', '.join(sorted(unknown))}; expected a module that has tests")
 
     results = read_results(options.results)
     if options.survivors:
         todo = [m for m, record in results.items() if record["outcome"] == "survived" and m.module in modules]
     else:
-        todo = [m for name in modules for m in drawn(name, options.sample, options.seed) if m not in results]
+        todo = [m for name in modules for m in draw_mutants(name, options.sample, options.seed) if m not in results]
     with tempfile.TemporaryDirectory() as folder:
         sandbox = Sandbox(Path(folder))
         for k, mutant in enumerate(todo, 1):
