@@ -108,7 +108,7 @@ def test_record() -> None:
         (lambda: Augmentations(sensor=Occlusion()), r"augmentations\.sensor is Occlusion\("),  # type: ignore[arg-type]
     ],
 )
-def test_values_outside_their_limits(make: Callable[[], Any], message: str) -> None:
+def test_settings_out_of_range_are_refused(make: Callable[[], Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         make()
 
@@ -319,7 +319,7 @@ def test_hidden_share(straight: float) -> None:
         assert np.mean(shares) == pytest.approx(0.35, abs=0.06)
 
 
-def test_share_of_views_that_nothing_hides() -> None:
+def test_share_of_views_without_occlusion() -> None:
     rng, augmentations = np.random.default_rng(0), Augmentations(occlusion=Occlusion(none=0.4))
     hidden = [not same(augment(MUG, augmentations, rng), MUG) for _ in range(600)]
     assert np.mean(hidden) == pytest.approx(0.6, abs=0.06)

@@ -128,7 +128,7 @@ def test_recognize(model: Path, images: Path, scene: Scene, tmp_path: Path, run:
         assert overlay.size == scene.frame.color.shape[1::-1]
 
 
-def test_recognize_calls_what_it_is_not_sure_of_unknown(model: Path, images: Path, run: Run) -> None:
+def test_unknown_below_makes_objects_unknown(model: Path, images: Path, run: Run) -> None:
     code, out, _ = run("recognize", "--model", model, *recognize(images), "--unknown-below", 1)
     assert code == 0 and "unrecognized" in out and "unknown" in out
     code, _, err = run("recognize", "--model", model, *recognize(images), "--unknown-below", 1.5)
@@ -158,7 +158,7 @@ def test_evaluate_frames(model: Path, images: Path, scene: Scene, tmp_path: Path
     assert code == 2 and "already contains" in one_line(err)
 
 
-def test_render_then_train_is_train(meshes: Path, model: Path, tmp_path: Path) -> None:
+def test_train_on_rendered_dataset_equals_train_on_meshes(meshes: Path, model: Path, tmp_path: Path) -> None:
     """Views written by `render` and read back train the same model as views rendered by `train`."""
     steps = ("--azimuth-step", 60, "--polar-step", 45, "--workers", 1)
     options = ("--epochs", 6, "--batch-size", 16, "--classifiers", "tops,tops2,ce")
@@ -228,7 +228,9 @@ def test_train_by_sequences(meshes: Path, tmp_path: Path, run: Run) -> None:
     assert sorted(p.name for p in out.iterdir()) == ["b", "table"]
 
 
-def test_one_bad_instance_among_many(model: Path, images: Path, scene: Scene, tmp_path: Path, run: Run) -> None:
+def test_one_invalid_instance_leaves_the_others_recognized(
+    model: Path, images: Path, scene: Scene, tmp_path: Path, run: Run
+) -> None:
     labels = scene.frame.labels.astype(np.uint8)
     labels[0, :5] = 9
     Image.fromarray(labels).save(tmp_path / "labels.png")
@@ -274,7 +276,7 @@ def spoil(folder: Path, source: Path) -> dict[str, tuple[str, Path, str]]:
     return cases
 
 
-def test_bad_images(model: Path, images: Path, tmp_path: Path, run: Run) -> None:
+def test_invalid_images_are_refused(model: Path, images: Path, tmp_path: Path, run: Run) -> None:
     for case, (argument, path, said) in spoil(tmp_path, images).items():
         changed = recognize(images, **{argument: path})
         code, _, err = run("recognize", "--model", model, *changed, "--out", tmp_path / "answer")
@@ -283,7 +285,7 @@ def test_bad_images(model: Path, images: Path, tmp_path: Path, run: Run) -> None
         assert not (tmp_path / "answer").exists(), case
 
 
-def test_bad_models(model: Path, images: Path, tmp_path: Path, run: Run) -> None:
+def test_invalid_models_are_refused(model: Path, images: Path, tmp_path: Path, run: Run) -> None:
     def spoiled(name: str, change: Callable[[Path], object]) -> Path:
         folder = tmp_path / name
         shutil.copytree(model, folder)
@@ -308,7 +310,7 @@ def test_bad_models(model: Path, images: Path, tmp_path: Path, run: Run) -> None
         assert said in one_line(err), path
 
 
-def test_bad_training_input(meshes: Path, tmp_path: Path, run: Run) -> None:
+def test_invalid_training_input_is_refused(meshes: Path, tmp_path: Path, run: Run) -> None:
     unknown = tmp_path / "names.json"
     unknown.write_text(json.dumps({"mug": "no_such_scan"}))
     broken = tmp_path / "broken"
@@ -359,7 +361,7 @@ def test_paper_protocol(meshes: Path, tmp_path: Path) -> None:
     assert of["default"]["samples"] == 2 * of["default"]["dataset"]["views"]
 
 
-def test_bad_datasets(model: Path, tmp_path: Path, run: Run) -> None:
+def test_missing_evaluation_datasets_are_refused(model: Path, tmp_path: Path, run: Run) -> None:
     for kind in ("uwis", "frames"):
         for path in (tmp_path / "absent", tmp_path):
             code, _, err = run("evaluate", kind, path, "--model", model)

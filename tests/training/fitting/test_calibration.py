@@ -44,7 +44,7 @@ def source(views: int) -> MemoryViews:
 
 
 @pytest.mark.parametrize("feature", ["ce", "tops2"])
-def test_samples_are_answered_as_their_clouds_are(feature: Feature, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sample_probabilities_equal_those_of_the_clouds(feature: Feature, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(calibration, "SAMPLES_PER_BATCH", 3)
     views = source(2)
     samples = build_samples(views, NETWORK, CONFIG)

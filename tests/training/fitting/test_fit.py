@@ -62,7 +62,7 @@ def same_bits(a: MLP, b: MLP) -> None:
         np.testing.assert_array_equal(one, other)
 
 
-def test_learns_to_tell_separable_classes_apart(separable: Samples, fitted: Fit) -> None:
+def test_separable_classes_are_learned(separable: Samples, fitted: Fit) -> None:
     curve: list[EpochMetrics] = []
     steps: list[tuple[int, int, int]] = []
     model, best = fitted(
@@ -77,14 +77,14 @@ def test_learns_to_tell_separable_classes_apart(separable: Samples, fitted: Fit)
 
 
 @pytest.mark.slow
-def test_a_feature_sees_no_more_than_its_descriptor(separable: Samples, fitted: Fit) -> None:
+def test_a_feature_uses_only_its_part_of_the_descriptor(separable: Samples, fitted: Fit) -> None:
     """Shape cannot tell class 1 from 2, colour cannot tell 0 from 1."""
     tops, ce = (answers(fitted(name, LONGER)[0], separable, name) for name in ("tops", "ce"))
     np.testing.assert_array_equal(tops == 0, separable.label == 0)
     np.testing.assert_array_equal(ce == 2, separable.label == 2)
 
 
-def test_what_is_held_out_is_measured_and_not_learnt(separable: Samples, fitted: Fit) -> None:
+def test_the_held_out_set_is_evaluated_but_not_trained_on(separable: Samples, fitted: Fit) -> None:
     """Held out with wrong labels, a third is never named rightly; the best epoch is one that names most rightly."""
     held_out = np.arange(48) >= 38
     wrong = dataclasses.replace(separable, label=np.where(held_out, 0, separable.label).astype(np.int32))
@@ -97,7 +97,7 @@ def test_what_is_held_out_is_measured_and_not_learnt(separable: Samples, fitted:
     assert final.accuracy > 0.8 and final.held_out_accuracy == pytest.approx((separable.label[held_out] == 0).mean())
 
 
-def test_the_same_seed_gives_the_same_bits_and_another_does_not(fitted: Fit) -> None:
+def test_only_the_same_seed_gives_bit_identical_weights(fitted: Fit) -> None:
     options = dataclasses.replace(QUICK, epochs=2)
     first, second = fitted(options=options)[0], fitted(options=options)[0]
     same_bits(first, second)
@@ -109,7 +109,7 @@ class Stopped(Exception):
     pass
 
 
-def test_going_on_gives_the_bits_of_never_having_stopped(separable: Samples, fitted: Fit, tmp_path: Path) -> None:
+def test_a_resumed_fit_gives_bit_identical_weights(separable: Samples, fitted: Fit, tmp_path: Path) -> None:
     held_out = np.arange(48) % 4 == 0
     expected: list[EpochMetrics] = []
     model, best = fitted(held_out=held_out, epoch_done=expected.append)
@@ -143,7 +143,7 @@ def test_going_on_gives_the_bits_of_never_having_stopped(separable: Samples, fit
     assert [dataclasses.replace(figures, samples_per_second=0) for figures in found] == without_rate
 
 
-def test_a_fit_that_is_done_only_gives_its_classifier(separable: Samples, tmp_path: Path) -> None:
+def test_a_finished_fit_returns_its_classifier_without_steps(separable: Samples, tmp_path: Path) -> None:
     def refuse(*_: object) -> None:
         raise AssertionError("a step was made")
 
@@ -156,14 +156,14 @@ def test_a_fit_that_is_done_only_gives_its_classifier(separable: Samples, tmp_pa
     assert first[1] == second[1]
 
 
-def test_inputs_are_scaled_block_by_block_to_a_root_mean_square_of_one(separable: Samples, fitted: Fit) -> None:
+def test_inputs_are_scaled_per_block_to_unit_root_mean_square(separable: Samples, fitted: Fit) -> None:
     model, _ = fitted(options=FitOptions(epochs=1))
     blocks = np.asarray(model.input_scale[...]) * np.asarray(described(separable).tops2)
     for block in np.split(blocks.reshape(48, 2, 144 + 110), [144], axis=2):
         assert np.sqrt((block.astype(np.float64) ** 2).mean()) == pytest.approx(1, rel=1e-4)
 
 
-def test_the_samples_are_left_alone_and_a_few_are_one_batch(separable: Samples, fitted: Fit) -> None:
+def test_samples_are_not_modified_and_few_make_one_batch(separable: Samples, fitted: Fit) -> None:
     few = dataclasses.replace(
         separable,
         strip_start=separable.strip_start[:6],
@@ -180,7 +180,7 @@ def test_the_samples_are_left_alone_and_a_few_are_one_batch(separable: Samples, 
         np.testing.assert_array_equal(a, b)
 
 
-def test_a_loss_that_is_not_finite_is_an_error_and_the_last_checkpoint_stays(
+def test_infinite_loss_is_refused_and_the_last_checkpoint_stays(
     separable: Samples, fitted: Fit, tmp_path: Path
 ) -> None:
     broken = dataclasses.replace(separable, color_count=separable.color_count * np.nan)
@@ -196,7 +196,7 @@ def test_a_loss_that_is_not_finite_is_an_error_and_the_last_checkpoint_stays(
         fit(separable, FitContext("ce", NETWORK, CONFIG), QUICK, checkpoints)
 
 
-def test_too_little_to_learn_from(separable: Samples, fitted: Fit) -> None:
+def test_too_few_training_samples_are_refused(separable: Samples, fitted: Fit) -> None:
     with pytest.raises(thor2.InputError, match="there are 1 samples to train on; at least 2"):
         fitted(held_out=np.arange(48) > 0)
 
@@ -210,14 +210,14 @@ def test_too_little_to_learn_from(separable: Samples, fitted: Fit) -> None:
         *[("learning_rates", value) for value in ((1e-2,), (0, 1e-3), (1e-2, -1), (math.nan, 1.0), (math.inf, 1.0))],
     ],
 )
-def test_bad_options_are_refused_by_name(name: str, value: object) -> None:
+def test_invalid_options_are_refused_by_name(name: str, value: object) -> None:
     with pytest.raises(thor2.InputError) as caught:
         FitOptions(**{name: value})
     assert str(caught.value).startswith(f"{name} is {value!r}; it must be")
     assert "\n" not in str(caught.value)
 
 
-def test_the_papers_options() -> None:
+def test_default_options_are_the_papers() -> None:
     options = FitOptions(seed=2**31 - 1)
     assert options.epochs == 100 and options.learning_rates == (1e-2, 1e-3)
     jax.random.key(options.seed)

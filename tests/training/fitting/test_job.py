@@ -83,7 +83,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, TrainedRun]:
     return out, train(out, ("tops", "ce"))
 
 
-def test_a_run_is_written_and_told_of(tmp_path: Path) -> None:
+def test_a_run_is_written_and_its_progress_is_reported(tmp_path: Path) -> None:
     told: list[tuple[str, int, int]] = []
 
     def progress(stage: str, done: int, total: int, note: str) -> None:
@@ -110,7 +110,7 @@ def test_a_run_is_written_and_told_of(tmp_path: Path) -> None:
         assert picture.width > 300
 
 
-def test_bad_input_is_told_before_any_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_invalid_input_is_refused_before_any_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def work(*_: Any, **__: Any) -> None:
         raise AssertionError("work was begun")
 
@@ -153,7 +153,7 @@ def stop_when(stage: str, step: int) -> Any:
     return progress
 
 
-def test_a_run_goes_on_and_ends_as_if_it_had_not_been_stopped(whole: tuple[Path, TrainedRun], tmp_path: Path) -> None:
+def test_an_interrupted_run_resumes_to_the_same_result(whole: tuple[Path, TrainedRun], tmp_path: Path) -> None:
     out = tmp_path / "run"
     for stage, step in (("fit ce", 2), ("fit ce", 9), ("fit ce", 14), ("fit tops", 1), ("fit tops", 18)):
         with pytest.raises(Stopped):
@@ -170,7 +170,7 @@ def test_a_run_goes_on_and_ends_as_if_it_had_not_been_stopped(whole: tuple[Path,
 
 
 @pytest.mark.parametrize("moved", ["nothing", "weights", "network.npz", "run.json"])
-def test_a_stop_while_the_run_is_put_in_place(
+def test_interrupted_while_the_run_is_published(
     moved: str, whole: tuple[Path, TrainedRun], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "run"
@@ -193,7 +193,7 @@ def test_a_stop_while_the_run_is_put_in_place(
     assert names(out) == FINISHED
 
 
-def test_a_stop_while_checkpoints_are_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_interrupted_while_checkpoints_are_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The run, or all its folds, is finished by then."""
     rmdir = os.rmdir
 
@@ -278,7 +278,7 @@ def test_a_full_disk(whole: tuple[Path, TrainedRun], tmp_path: Path, monkeypatch
     assert names(out) == FINISHED
 
 
-def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
+def test_an_unwritable_run_directory_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(thor2.InputError, match=f"out: {tmp_path / 'file' / 'run'} "):
         train(tmp_path / "file" / "run")
@@ -330,7 +330,7 @@ test_train.train(test_train.Path(sys.argv[2]), ("tops", "ce"))
 
 
 @pytest.mark.slow
-def test_a_killed_process_goes_on_to_the_same_bytes(whole: tuple[Path, TrainedRun], tmp_path: Path) -> None:
+def test_a_killed_training_resumes_to_the_same_bytes(whole: tuple[Path, TrainedRun], tmp_path: Path) -> None:
     out = tmp_path / "run"
     command = [sys.executable, "-c", _PROGRAM, str(Path(__file__).parent), str(out)]
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}

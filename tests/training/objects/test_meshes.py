@@ -52,7 +52,7 @@ def test_texture_the_right_way_up(tmp_path: Path, suffix: str) -> None:
     np.testing.assert_allclose(mesh.centre, [0.05, 0.05, 0])
 
 
-def test_base_colour_factor_multiplies_the_texture_or_stands_alone(tmp_path: Path) -> None:
+def test_base_colour_factor_with_and_without_a_texture(tmp_path: Path) -> None:
     factor = np.array([128, 255, 51, 255], np.uint8)
     textured_quad(PBRMaterial(baseColorTexture=Image.fromarray(CHECKERS), baseColorFactor=factor)).export(
         tmp_path / "both.glb"
@@ -128,7 +128,7 @@ def check_refused(path: Path, message: str) -> None:
     assert path.name in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_meshes_that_do_not_fit(tmp_path: Path) -> None:
+def test_inconsistent_meshes_are_refused(tmp_path: Path) -> None:
     check_refused(tmp_path / "missing.glb", "no such file")
     (tmp_path / "mesh.stl").touch()
     check_refused(tmp_path / "mesh.stl", "extension must be one of .glb, .obj, .ply")
@@ -164,7 +164,7 @@ def test_cut_off_files(tmp_path: Path, suffix: str, share: float) -> None:
     check_refused(path, f"mesh .*cut.{suffix}: ")
 
 
-def test_faces_that_point_nowhere(tmp_path: Path) -> None:
+def test_invalid_vertex_indices_are_refused(tmp_path: Path) -> None:
     obj = "mtllib paint.mtl\nusemtl a\nv 0 0 0\nv 0.1 0 0\nv 0.1 0.1 0\nvt 0 0\nvt 1 0\nvt 1 1\nf 1/1 2/2 9/3\n"
     (tmp_path / "paint.mtl").write_text("newmtl a\nKd 1 0 0\n")
     (tmp_path / "far.obj").write_text(obj)
@@ -290,7 +290,7 @@ def test_reading_names(tmp_path: Path) -> None:
         ("names.json", '{"mug": ""}', "both strings"),
     ],
 )
-def test_names_that_do_not_fit(tmp_path: Path, file: str, content: str, message: str) -> None:
+def test_invalid_names_files_are_refused(tmp_path: Path, file: str, content: str, message: str) -> None:
     (tmp_path / file).write_text(content)
     with pytest.raises(InputError, match=message) as caught:
         read_names(tmp_path / file)

@@ -67,7 +67,7 @@ def test_depth_of_a_box_from_above_is_exact() -> None:
     assert np.ptp(points[:, 1]) == pytest.approx(0.16, abs=2 * pixel)
 
 
-def test_against_another_intersection_and_the_cropped_part_misses_nothing() -> None:
+def test_matches_another_intersector_and_crops_nothing_visible() -> None:
     shape = trimesh.creation.capsule(height=0.12, radius=0.03, count=[12, 12])
     shape.apply_translation([0.02, -0.01, 0.03])
     pose = camera_pose(2.0, 1.9, np.array([0.0, 0.01, 0.05]), 0.6)

@@ -162,7 +162,7 @@ def test_light_changes_colours_by_a_gain() -> None:
         ({"light": float("nan")}, "light is nan"),
     ],
 )
-def test_numbers_outside_their_range(options: dict[str, float], message: str) -> None:
+def test_numbers_out_of_range_are_refused(options: dict[str, float], message: str) -> None:
     with pytest.raises(InputError, match=message):
         compose_scene(OBJECTS, np.random.default_rng(0), **options)
     with pytest.raises(InputError, match="n_objects"):

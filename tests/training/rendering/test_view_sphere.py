@@ -23,7 +23,7 @@ def test_number_of_views(azimuth_step: float, polar_step: float, count: int) -> 
 
 
 @pytest.mark.parametrize("step", [0.0, -5.0, 7.0, math.nan, math.inf, 400.0])
-def test_steps_that_do_not_fit(step: float) -> None:
+def test_invalid_steps_are_refused(step: float) -> None:
     with pytest.raises(InputError, match="^azimuth_step is"):
         view_angles(step, 5.0)
     with pytest.raises(InputError, match="^polar_step is"):

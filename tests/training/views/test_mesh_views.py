@@ -56,7 +56,7 @@ def test_one_point_a_voxel() -> None:
     assert 0.4 * surface < len(xyz) < 1.2 * surface
 
 
-def test_nothing_seen() -> None:
+def test_an_invisible_mesh_is_refused() -> None:
     with pytest.raises(InputError, match="^pose"):
         view_cloud(ball(), camera_pose(0.0, 1.0, np.array([0, 0, 9.0])))
 

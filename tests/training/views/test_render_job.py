@@ -96,7 +96,9 @@ class Stop(BaseException):
     """As KeyboardInterrupt, at a place of our choice."""
 
 
-def test_stopped_at_any_write_it_goes_on(whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rendering_interrupted_at_any_write_resumes(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Before and after each of the nine files that a job puts in place: manifest, shard, manifest, ..."""
     replace, left = os.replace, 0
 
@@ -158,7 +160,7 @@ render_job.render_dataset(objects, sys.argv[1], 60, 45, local_workers(int(sys.ar
         pytest.param([(1, 1), (5, 2), (3, 2), (2, 1)], marks=pytest.mark.thorough),
     ],
 )
-def test_killed_again_and_again_it_goes_on(whole: Path, tmp_path: Path, kills: list[tuple[int, int]]) -> None:
+def test_repeatedly_killed_rendering_resumes(whole: Path, tmp_path: Path, kills: list[tuple[int, int]]) -> None:
     out = tmp_path / "views"
     for step, workers in kills:
         command = [sys.executable, "-c", KILLED, str(out), str(step), str(workers)]
@@ -191,7 +193,7 @@ def test_a_finished_dataset_is_left_as_it_is(copied: Path) -> None:
     assert changed(copied) == before | {".lock": changed(copied)[".lock"]}
 
 
-def test_damaged_and_missing_shards_are_made_again_and_no_others(whole: Path, copied: Path) -> None:
+def test_only_damaged_and_missing_shards_are_rendered_again(whole: Path, copied: Path) -> None:
     bad, missing = copied / "0000-0001.safetensors", copied / "0001-0000.safetensors"
     content = bytearray(bad.read_bytes())
     content[1000] ^= 1
@@ -311,7 +313,7 @@ def full_disk() -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
-def test_a_full_disk_leaves_a_folder_to_go_on_with(whole: Path, copied: Path) -> None:
+def test_rendering_resumes_after_a_full_disk(whole: Path, copied: Path) -> None:
     (copied / "0001-0000.safetensors").unlink()
     with full_disk(), pytest.raises(OSError, match="File too large"):
         render_dataset(OBJECTS, copied, *STEPS)
@@ -322,9 +324,9 @@ def test_a_full_disk_leaves_a_folder_to_go_on_with(whole: Path, copied: Path) ->
     assert contents(copied) == contents(whole)
 
 
-def test_a_folder_that_cannot_be_made(tmp_path: Path) -> None:
+def test_an_unwritable_output_path_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(OSError, match="file"):
+    with pytest.raises(InputError, match="^out: "):
         render_dataset(OBJECTS, tmp_path / "file" / "views", *STEPS)
 
 
