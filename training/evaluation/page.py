@@ -138,9 +138,9 @@ def _fusion_section(report: Mapping[str, Any]) -> Section:
     titles = [title for title in report["fusions"] if "+" in title or title == "THOR2"]
     rows = [[title, *(_mean_std(cells[rule].get(title, NO_VALUE)) for rule in RULES)] for title in titles]
     text = (
-        "Accuracy on all instances by fusion rule. max, the paper's rule: the classifier with the higher top-1 "
-        "probability decides. mean and log-mean: the class with the highest mean probability, or mean log-probability. "
-        "calibrated: max after temperature scaling of each classifier. "
+        'Accuracy on all instances by fusion rule. With "max", the paper\'s rule, the classifier with the higher top-1 '
+        'probability decides. "mean" and "log-mean" take the class with the highest mean probability or mean '
+        'log-probability. "calibrated" is "max" after temperature scaling of each classifier. '
         f"This page and the command thor2 recognize use {report['rule']}."
     )
     return Section("Fusion rules", text, (["fusion", *RULES], rows))
@@ -169,7 +169,8 @@ def _confidence_section(report: Mapping[str, Any], out: Path) -> Section:
         + ". AUROC is the probability that a correct answer has a higher confidence than an incorrect one, or a known "
         "object than an unknown one; known objects are those the models were trained on. Open-set rejection: the "
         f"threshold accepts {COVERAGE:.0%} of the known objects, and an instance below it is an unknown object. It "
-        "is the value for the option --unknown-below of thor2 recognize."
+        "is the value for the option --unknown-below of thor2 recognize. A dash means that there is no value, for "
+        "instance because no answer is incorrect or the dataset has no unknown objects."
     )
     draw_reliability(report["reliability"], report["main"], out / "reliability.png")
     caption = f"Accuracy of {report['main']} by confidence."
