@@ -22,62 +22,68 @@ __all__ = [
 
 Feature = Literal["ce", "tops", "tops2"]
 FEATURES: tuple[Feature, ...] = ("ce", "tops", "tops2")
-"""What a classifier can be trained on: colour embeddings, TOPS, TOPS2."""
+"""Descriptors that a classifier can be trained on: colour embeddings, TOPS, TOPS2."""
 
 HIDDEN = (512, 256, 128, 64)
 
 
-FEW = 16
-"""Clouds up to which a classifier takes as long as reading its weights; of a frame's descriptors four fifths are 0."""
+SPARSE_BATCH = 16
+"""Largest batch whose first layer uses `_sparse_matmul`: up to it, a classifier takes as long as reading its weights,
+and about four fifths of them belong to inputs that are zero in every cloud of a frame."""
 
 
 def check_features(names: object, argument: str) -> tuple[Feature, ...]:
-    """`names` as a tuple of known features, in the order of FEATURES, or an InputError that names `argument`."""
+    """Return `names` as a tuple of known features in the order of FEATURES.
+
+    Raises:
+        InputError: a name is unknown or given twice, or there is none; the message names `argument`.
+    """
     values = tuple(names) if isinstance(names, (list, tuple)) else ()
     if not values or len(set(values)) != len(values) or not set(values) <= set(FEATURES):
-        raise InputError(f"{argument} is {names!r}; expected one or more different ones of {', '.join(FEATURES)}")
+        raise InputError(f"{argument} is {names!r}; expected one or more of {', '.join(FEATURES)}")
     return tuple(name for name in FEATURES if name in values)
 
 
 def feature_of(descriptors: Descriptors, name: Feature) -> jax.Array:
-    """The flat descriptor [B, F] that a classifier of this name reads."""
+    """Return the flat descriptor [B, F] that the classifier of this name reads."""
     return {"ce": descriptors.color, "tops": descriptors.tops, "tops2": descriptors.tops2}[name]
 
 
 @jax.custom_jvp
-def _product_of_sparse(x: jax.Array, kernel: jax.Array) -> jax.Array:
-    """`x @ kernel`, [B, F] and [F, H] to [B, H], from the rows of `kernel` that an entry of `x` other than 0 needs.
+def _sparse_matmul(x: jax.Array, kernel: jax.Array) -> jax.Array:
+    """Return `x @ kernel`, [B, F] times [F, H], reading only the rows of `kernel` where `x` has a non-zero entry.
 
-    There is room for a tenth of the rows, or a quarter. Where more are needed, it is the plain product.
+    The rows are gathered into an array of a tenth or a quarter of F. If more are needed, the plain product is computed.
     """
     needed = (x != 0).any(axis=0)
-    rooms = [-(-len(needed) // part) for part in (10, 4)]
+    capacities = [-(-len(needed) // divisor) for divisor in (10, 4)]
 
-    def of_needed(room: int) -> jax.Array:
-        row = jnp.nonzero(needed, size=room, fill_value=len(needed))[0]
+    def gathered(capacity: int) -> jax.Array:
+        row = jnp.nonzero(needed, size=capacity, fill_value=len(needed))[0]
         entries = x.at[:, row].get(mode="fill", fill_value=0)
         return jnp.matmul(entries, kernel.at[row].get(mode="clip"))
 
-    too_small = (needed.sum() > jnp.array(rooms)).sum()
-    return jax.lax.switch(too_small, [*[partial(of_needed, room) for room in rooms], lambda: jnp.matmul(x, kernel)])
+    branches = [*[partial(gathered, capacity) for capacity in capacities], lambda: jnp.matmul(x, kernel)]
+    return jax.lax.switch((needed.sum() > jnp.array(capacities)).sum(), branches)
 
 
-@_product_of_sparse.defjvp
-def _product_of_sparse_jvp(primals: Any, tangents: Any) -> Any:
-    # An entry that is 0 adds nothing, but its derivative does.
-    (x, kernel), (of_x, of_kernel) = primals, tangents
-    return _product_of_sparse(x, kernel), jnp.matmul(of_x, kernel) + jnp.matmul(x, of_kernel)
+@_sparse_matmul.defjvp
+def _sparse_matmul_jvp(primals: Any, tangents: Any) -> Any:
+    # A zero entry adds nothing to the product, but its derivative is not zero.
+    (x, kernel), (x_dot, kernel_dot) = primals, tangents
+    return _sparse_matmul(x, kernel), jnp.matmul(x_dot, kernel) + jnp.matmul(x, kernel_dot)
 
 
 class MLP(nnx.Module):
-    """512-256-128-64 hidden units, each layer followed by batch normalization, ReLU and dropout of 0.2; then logits.
+    """Multi-layer perceptron with 512, 256, 128 and 64 hidden units and one logit for each class.
 
-    Inputs are first scaled by fixed numbers of the training set (`input_scale`): images and colour counts differ a
-    thousandfold in size, and the first step of Adam would see only the larger.
+    Each hidden layer is followed by batch normalization, ReLU and dropout of 0.2. Inputs are first multiplied by
+    `input_scale`, fixed numbers computed from the training set: images and colour counts differ a thousandfold, and the
+    first step of Adam would depend on the counts only.
     """
 
     def __init__(self, n_inputs: int, n_classes: int, *, rngs: nnx.Rngs, dropout: float = 0.2) -> None:
-        """Fresh weights for inputs [B, n_inputs] and logits [B, n_classes]."""
+        """Initialize the weights for inputs [B, n_inputs] and logits [B, n_classes]."""
         sizes = (n_inputs, *HIDDEN)
         self.input_scale = nnx.BatchStat(jnp.ones(n_inputs))
         self.layers = nnx.List([nnx.Linear(a, b, rngs=rngs) for a, b in zip(sizes[:-1], sizes[1:], strict=True)])
@@ -86,14 +92,14 @@ class MLP(nnx.Module):
         self.head = nnx.Linear(HIDDEN[-1], n_classes, rngs=rngs)
 
     def __call__(self, x: jax.Array, *, train: bool = False, rngs: nnx.Rngs | None = None) -> jax.Array:
-        """Logits [B, n_classes] of descriptors [B, n_inputs].
+        """Return the logits [B, n_classes] of descriptors [B, n_inputs].
 
-        `train` uses the batch's own statistics, and dropout drawn from `rngs`.
+        With `train`, batch normalization uses the statistics of the batch, and dropout is drawn from `rngs`.
         """
         x = x * self.input_scale[...]
         for layer, norm in zip(self.layers, self.norms, strict=True):
-            if layer is self.layers[0] and not train and len(x) <= FEW:
-                x = _product_of_sparse(x, layer.kernel[...]) + jnp.asarray(layer.bias)
+            if layer is self.layers[0] and not train and len(x) <= SPARSE_BATCH:
+                x = _sparse_matmul(x, layer.kernel[...]) + jnp.asarray(layer.bias)
             else:
                 x = layer(x)
             x = nnx.relu(norm(x, use_running_average=not train))
@@ -102,5 +108,5 @@ class MLP(nnx.Module):
 
 
 def class_probabilities(model: MLP, descriptors: Descriptors, name: Feature) -> jax.Array:
-    """Softmax [B, n_classes] of a trained classifier of that name."""
+    """Return the class probabilities [B, n_classes] of a trained classifier that reads the descriptor `name`."""
     return jax.nn.softmax(model(feature_of(descriptors, name)))

@@ -1,6 +1,7 @@
 """One coloured point cloud for each instance of a frame (paper, section "Recognition").
 
-Valid depth, a voxel grid of 3 mm, outlier removal. What cannot be used is told, not dropped.
+Pixels with valid depth are put on a voxel grid of 3 mm, and outliers are removed. An instance that cannot be used is
+not dropped: its `reason` says why.
 """
 
 import dataclasses
@@ -15,25 +16,25 @@ from thor2_jax.recognition.voxel_grid import voxel_downsample
 __all__ = ["MAX_DEPTH", "MIN_DEPTH", "MIN_POINTS", "InstanceCloud", "instance_cloud", "instance_clouds"]
 
 MIN_DEPTH, MAX_DEPTH = 0.26, 2.5
-"""Metres between which depth is trusted."""
+"""Range of valid depth, metres."""
 
 CLOUD_VOXEL = 0.003
-"""Metres: side of a cube of the grid on which outliers are removed."""
+"""Voxel side of the grid on which outliers are removed, metres."""
 
 MIN_POINTS = 30
-"""Points on that grid that an instance needs."""
+"""Least number of points on that grid; an instance with fewer cannot be used."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class InstanceCloud:
-    """The cloud of one instance.
+    """The point cloud of an instance.
 
     Attributes:
         label: its number in the label image.
         points: [n, 3] float32, metres, OpenCV camera frame.
         colors: [n, 3] uint8, sRGB.
-        n_pixels: pixels of its mask.
-        kept_by_fallback: a rule of outlier removal would have dropped most of it and was left out.
+        n_pixels: number of pixels of its mask.
+        kept_by_fallback: a rule of outlier removal would have dropped most of it and was skipped.
         reason: why the cloud cannot be used; None if it can.
     """
 
@@ -46,12 +47,12 @@ class InstanceCloud:
 
 
 def instance_clouds(frame: RGBDFrame) -> list[InstanceCloud]:
-    """The clouds of all instances, in the order of `frame.instances`, those that cannot be used included."""
+    """Return the clouds of all instances in the order of `frame.instances`, including those that cannot be used."""
     return [instance_cloud(frame, label) for label in frame.instances]
 
 
 def instance_cloud(frame: RGBDFrame, label: int) -> InstanceCloud:
-    """The cloud of one instance, which may be one that cannot be used.
+    """Return the cloud of one instance; if it cannot be used, with a `reason`.
 
     Args:
         frame: the frame.
@@ -70,7 +71,7 @@ def instance_cloud(frame: RGBDFrame, label: int) -> InstanceCloud:
     if len(points) < MIN_POINTS:
         reason = (
             f"{len(points)} points ({len(pixels)} pixels, {len(valid)} of them with depth "
-            f"from {MIN_DEPTH} to {MAX_DEPTH} m); at least {MIN_POINTS} are needed"
+            f"from {MIN_DEPTH} to {MAX_DEPTH} m); expected at least {MIN_POINTS}"
         )
         return InstanceCloud(label, points, colors, len(pixels), reason=reason)
     kept, relaxed = remove_outliers(points)

@@ -1,9 +1,11 @@
-"""Which instances are hidden in part, and where (paper, section "Recognition").
+"""Detection of occluded instances and of their occlusion boundary (paper, section "Recognition").
 
-A pixel on the contour of an instance's mask belongs to the occlusion boundary if the pixel beside it belongs to another
-instance that is nearer, or if there is none beside it: the image ends. Masks leave gaps between objects and depth
-cameras give no depth along edges, where both are needed, so either side is looked for within a few steps away from the
-contour.
+A pixel on the contour of an instance's mask belongs to the occlusion boundary if its neighbour belongs to another
+instance that is nearer to the camera, or lies outside the image. Masks leave gaps between objects and depth cameras
+give no depth along edges, so both depths are searched for within a few pixels of the contour.
+
+An occluded object is recognized like any other. Its boundary points only decide the orientation of its cloud: view
+normalization turns it so that the occluded end does not come first along x. `Recognition.occluded` reports it.
 """
 
 import dataclasses
@@ -19,34 +21,34 @@ from thor2_jax.recognition.instance_clouds import InstanceCloud
 __all__ = ["Occlusion", "find_occlusion"]
 
 STEPS = 6
-"""Pixels looked at on either side of the contour for one with valid depth."""
+"""Pixels on either side of the contour that are searched for valid depth."""
 
 GAP = 3
-"""Background pixels between two masks that are passed over."""
+"""Largest number of background pixels between two masks that count as neighbours."""
 
 MARGIN = max(STEPS, GAP + 1)
-"""Pixels past the contour that are ever looked at."""
+"""Pixels around the mask that are searched at all."""
 
 NEARER = 0.01
-"""Metres by which the other instance must be nearer: more than depth noise between two that touch."""
+"""Metres by which the other instance must be nearer; depth noise between two touching objects is less."""
 
-MIN_SHARE = 0.05
-"""An instance is occluded if this share of its contour is occlusion boundary: a few noisy pixels are not."""
+MIN_BOUNDARY_SHARE = 0.05
+"""Least share of the contour that is occlusion boundary in an occluded instance; noise makes less."""
 
 BACKGROUND, OUTSIDE = 0, -1
-"""In the place of an instance's number: of none, and past the image's border."""
+"""Values in place of a label: no instance, and outside the image."""
 
-REACH = 0.012
-"""Metres from a boundary pixel's point within which the nearest point of the cloud is marked."""
+BOUNDARY_REACH = 0.012
+"""Largest distance in metres from a boundary pixel's point to the point of the cloud that it marks."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Occlusion:
-    """What hides an instance.
+    """Whether an instance is occluded, and where.
 
     Attributes:
-        occluded: it is hidden in part by another instance, or cut by the image's border.
-        boundary: [n] bool, points of its cloud that lie on the occlusion boundary; none if it is not occluded.
+        occluded: another instance hides a part of it, or the image border cuts it.
+        boundary: [n] bool, points of its cloud on the occlusion boundary; all False if it is not occluded.
     """
 
     occluded: bool
@@ -54,28 +56,28 @@ class Occlusion:
 
 
 def find_occlusion(frame: RGBDFrame, cloud: InstanceCloud) -> Occlusion:
-    """Occlusion of one instance of a frame.
+    """Find the occlusion boundary of one instance.
 
     Args:
         frame: the frame.
-        cloud: its cloud; one of `instance_clouds(frame)`.
+        cloud: the instance's cloud, from `instance_cloud`.
     """
     pixels = frame.instance_pixels[cloud.label]
     on_contour, on_boundary, own_depth = _contour(frame, cloud.label, pixels)
     boundary = np.zeros(len(cloud.points), bool)
-    occluded = bool(on_boundary.sum() >= MIN_SHARE * on_contour.sum())
+    occluded = bool(on_boundary.sum() >= MIN_BOUNDARY_SHARE * on_contour.sum())
     seen = on_boundary & (own_depth > 0)
     if occluded and seen.any() and len(cloud.points):
         edge = pixel_rays(pixels[seen], frame.labels.shape[1], frame.intrinsics) * own_depth[seen, None]
         distance, nearest = KDTree(cloud.points, leafsize=32, balanced_tree=False, compact_nodes=False).query(edge)
-        boundary[nearest[distance <= REACH]] = True
+        boundary[nearest[distance <= BOUNDARY_REACH]] = True
     return Occlusion(occluded, boundary)
 
 
 def _window(
     frame: RGBDFrame, pixels: NDArray[np.intp]
 ) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.intp]]:
-    """Labels and depth around a mask, `MARGIN` pixels more on every side, and the mask's flat indices there."""
+    """Return labels and depth in a window around a mask (with `MARGIN`), and the mask's flat indices in it."""
     height, width = frame.labels.shape
     row, column = np.divmod(pixels, width)
     top, left = row.min() - MARGIN, column.min() - MARGIN
@@ -90,7 +92,7 @@ def _window(
 def _contour(
     frame: RGBDFrame, label: int, pixels: NDArray[np.intp]
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.float32]]:
-    """For each pixel of the mask: is it on the contour, on the occlusion boundary, and how deep is the object there."""
+    """Return for each pixel of the mask: on the contour, on the occlusion boundary, depth of the object there."""
     window, depth, places = _window(frame, pixels)
     labels, depth = window.ravel(), depth.ravel()
     steps = (1, -1, window.shape[1], -window.shape[1])
@@ -99,7 +101,7 @@ def _contour(
     here = places[edge]
 
     def first_depth(start: NDArray[np.intp], step: NDArray[np.intp], wanted: Any) -> NDArray[np.float32]:
-        """First valid depth of an instance from each place on along its step; 0 where none is within `STEPS` pixels."""
+        """Return the first valid depth of an instance along each step; 0 if there is none within `STEPS` pixels."""
         at = start + step * np.arange(STEPS)[:, None]
         usable = (labels[at] == wanted) & (depth[at] > 0)
         first = at[usable.argmax(axis=0), np.arange(len(start))]

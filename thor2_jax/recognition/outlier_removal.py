@@ -1,8 +1,8 @@
-"""Outlier removal on one instance (paper, section "Recognition"): what a depth camera and a mask add to an object.
+"""Outlier removal on the cloud of an instance (paper, section "Recognition").
 
-A mask reaches past its object's edge, onto the background and onto pixels that "fly" between the two. Three rules:
-pixels at a step in depth fly; points with too few others around them are strays; small pieces apart from the rest are
-background.
+A mask extends past the edge of its object, onto the background and onto flying pixels between the two. Three rules
+remove them: flying pixels are found by steps in depth, stray points by the mean distance to their neighbours, and
+background by small pieces that are apart from the rest.
 """
 
 import math
@@ -17,28 +17,29 @@ from thor2_jax.recognition.frames import RGBDFrame
 
 __all__ = ["flying_pixels", "remove_outliers"]
 
-STEEPEST = 15.0
-"""Steepest depth, in pixel widths a pixel, that a surface is seen at (86 degrees from facing the camera)."""
+MAX_SLOPE = 15.0
+"""Steepest slope of a visible surface: change of depth from pixel to pixel, in pixel widths (86 degrees from facing the
+camera)."""
 
 NEIGHBORS = 30
-"""On a voxel grid of 3 mm. On a plane so many lie within 9 mm, at its corners within 19 mm."""
+"""Neighbours of a point on the voxel grid of 3 mm; on a plane, they lie within 9 mm, at its corners within 19 mm."""
 
-FARTHEST = 0.016
-"""Metres: largest mean distance of a point to its `NEIGHBORS` nearest others. At the corner of a plane it is 12 mm."""
+MAX_NEIGHBOR_DISTANCE = 0.016
+"""Largest mean distance of a point to its nearest `NEIGHBORS`, metres; at the corner of a plane it is 0.012."""
 
-CELL = 0.01
-"""Metres: side of the cells of grids. Those that touch, also at a corner, are one piece."""
+PIECE_CELL = 0.01
+"""Cell side of the grid that finds pieces, metres. Cells that touch, even at a corner, are one piece."""
 
-REACH = 100
-"""Cells from the middle of the cloud, along each axis, that a grid has at most; a point past them is in none. So grids
-stay small. These are 1 m, and all that lies farther counts as one piece."""
+GRID_REACH = 100
+"""Cells of that grid on either side of the cloud's median along each axis (1 m), which bounds its memory. All points
+outside count as one piece."""
 
-MIN_SHARE = 0.1
-"""Pieces with a smaller share of the largest piece's points are dropped."""
+MIN_PIECE_SHARE = 0.1
+"""Least size of a piece that is kept, as a share of the points of the largest piece."""
 
 
 def flying_pixels(frame: RGBDFrame, pixels: NDArray[np.intp]) -> NDArray[np.bool_]:
-    """Pixels behind a step in depth from one of the four beside them, within the same instance: no surface is so steep.
+    """Return which pixels are flying pixels: farther behind a 4-neighbour of their instance than `MAX_SLOPE` allows.
 
     Args:
         frame: the frame.
@@ -51,8 +52,8 @@ def flying_pixels(frame: RGBDFrame, pixels: NDArray[np.intp]) -> NDArray[np.bool
     labels, depth = frame.labels.ravel(), frame.depth_m.ravel()
     row, column = np.divmod(pixels, width)
     here, instance = depth[pixels], labels[pixels]
-    # Nearer than this beside a pixel, and it flies; at 0 there is no depth. Past the image, a pixel is beside itself.
-    nearest = here - STEEPEST / frame.intrinsics.fx * here
+    # A pixel is a flying pixel if a neighbour is closer than this. At the image border, a pixel is its own neighbour.
+    nearest = here - MAX_SLOPE / frame.intrinsics.fx * here
     flying = np.zeros(len(pixels), bool)
     for beside in (
         pixels + (column < width - 1),
@@ -66,15 +67,15 @@ def flying_pixels(frame: RGBDFrame, pixels: NDArray[np.intp]) -> NDArray[np.bool
 
 
 def _grid(points: NDArray[np.float64]) -> tuple[NDArray[np.int64], tuple[int, ...]]:
-    """Place [n] of each of `points` [3, n] on a flat grid of `CELL`s, and its shape; 0 for points past `REACH`.
+    """Return the flat cell index [n] of each of `points` [3, n] and the shape of the grid.
 
-    Two layers of cells on every side are empty, so that no cell touches the first.
+    Points past `GRID_REACH` get index 0. Two layers of cells on every side are empty, so that no cell touches the first.
     """
-    place = np.floor(points / CELL)
+    place = np.floor(points / PIECE_CELL)
     near = None
-    if np.ptp(place, axis=1).max() > REACH:
+    if np.ptp(place, axis=1).max() > GRID_REACH:
         place -= np.floor(np.median(place, axis=1, keepdims=True))
-        near = (np.abs(place) <= REACH).all(axis=0)
+        near = (np.abs(place) <= GRID_REACH).all(axis=0)
         place = np.where(near, place, 0)
     cells = (place - place.min(axis=1, keepdims=True)).astype(np.int64) + 2
     shape = tuple((cells.max(axis=1) + 3).tolist())
@@ -83,7 +84,7 @@ def _grid(points: NDArray[np.float64]) -> tuple[NDArray[np.int64], tuple[int, ..
 
 
 def _surrounded(points: NDArray[np.float64], cell: NDArray[np.int64], shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """Which of `points` [3, n] are sure to be among others, by the number and the moments of the points in cells.
+    """Return which of `points` [3, n] surely pass the neighbour rule, from counts and moments of grid cells.
 
     Where more than `NEIGHBORS` points lie in a point's cell and those that it touches, the mean distance to the nearest
     of them is at most the root of the mean square distance to all of them.
@@ -100,7 +101,7 @@ def _surrounded(points: NDArray[np.float64], cell: NDArray[np.int64], shape: tup
     count, x, y, z, squares = sums[:, cell]
     total = squares - 2 * (points * (x, y, z)).sum(axis=0) + count * square
     others = count - 1
-    return np.asarray((others >= NEIGHBORS) & (total <= others * FARTHEST**2))
+    return np.asarray((others >= NEIGHBORS) & (total <= others * MAX_NEIGHBOR_DISTANCE**2))
 
 
 def _among_others(points: NDArray[np.float64], cell: NDArray[np.int64], shape: tuple[int, ...]) -> NDArray[np.bool_]:
@@ -112,7 +113,7 @@ def _among_others(points: NDArray[np.float64], cell: NDArray[np.int64], shape: t
     if len(rest):
         tree = KDTree(points.T, leafsize=32, balanced_tree=False, compact_nodes=False)  # quick to build
         distances = tree.query(points[:, rest].T, k=NEIGHBORS + 1)[0][:, 1:]
-        among[rest] = distances.mean(axis=1) <= FARTHEST
+        among[rest] = distances.mean(axis=1) <= MAX_NEIGHBOR_DISTANCE
     return among
 
 
@@ -122,11 +123,11 @@ def _in_large_piece(cell: NDArray[np.int64], shape: tuple[int, ...]) -> NDArray[
     pieces, _ = ndimage.label(full, structure=np.ones((3, 3, 3)))
     piece = pieces.ravel()[cell]
     size = np.bincount(piece)
-    return np.asarray(size[piece] >= MIN_SHARE * size.max())
+    return np.asarray(size[piece] >= MIN_PIECE_SHARE * size.max())
 
 
 def remove_outliers(points: NDArray[Any]) -> tuple[NDArray[np.intp], bool]:
-    """Which points belong to the object.
+    """Return which points belong to the object.
 
     Args:
         points: [n, 3] metres, on a voxel grid of 3 mm.

@@ -9,7 +9,7 @@ import pytest
 from flax import nnx
 
 import thor2_jax as thor2
-from thor2_jax.recognition.classifier import FEATURES, FEW, HIDDEN, MLP, check_features, feature_of
+from thor2_jax.recognition.classifier import FEATURES, HIDDEN, MLP, SPARSE_BATCH, check_features, feature_of
 
 RNG = np.random.default_rng(0)
 apply = nnx.jit(lambda model, x: model(x))
@@ -51,19 +51,19 @@ def test_logits_against_numpy(n: int, model: MLP) -> None:
     np.testing.assert_allclose(found, numpy_logits(model, x, own_statistics=False), rtol=1e-4, atol=1e-4)
 
 
-@pytest.mark.parametrize("n", [1, FEW, FEW + 1])
+@pytest.mark.parametrize("n", [1, SPARSE_BATCH, SPARSE_BATCH + 1])
 @pytest.mark.parametrize("n_used", [0, 1, 4, 5, 9, 10, 33])  # of 33 inputs, rounded up, a tenth is 4, a quarter 9
 def test_logits_and_their_gradient_where_most_inputs_are_zero(n_used: int, n: int, model: MLP) -> None:
     x = np.zeros((n, 33), np.float32)
     x[:, RNG.permutation(33)[:n_used]] = RNG.normal(size=(n, n_used))
     np.testing.assert_allclose(apply(model, x), numpy_logits(model, x, own_statistics=False), rtol=1e-4, atol=1e-4)
 
-    # The same network without a look at zeros: rows past FEW, of which nothing is taken.
+    # The same network without a look at zeros: rows past SPARSE_BATCH, of which nothing is taken.
     def loss(x: jax.Array, past: int) -> jax.Array:
         return jnp.sin(model(jnp.pad(x, ((0, past), (0, 0))))[:n]).sum()
 
     found = jax.jit(jax.grad(loss), static_argnums=1)
-    expected = found(x, FEW + 1)
+    expected = found(x, SPARSE_BATCH + 1)
     assert n_used == 33 or float(jnp.abs(expected[x == 0]).min()) > 0
     np.testing.assert_allclose(found(x, 0), expected, rtol=1e-3, atol=1e-4)
 
