@@ -1,12 +1,12 @@
-"""A recognizer's pure part as one file that needs none of this code: described and classified by `jax.export`.
+"""Export of description and classification as one file of `jax.export` that runs without this package.
 
 >>> blob = export_recognizer(load_run("run"), n_points=2048, n_clouds=8)            # doctest: +SKIP
 
-Wherever jax is, and without `thor2_jax`:
+With jax alone:
 
 >>> exported = jax.export.deserialize(bytearray(blob))                              # doctest: +SKIP
->>> found = exported.call(points, colors, mask, camera, boundary)                   # doctest: +SKIP
->>> found["tops"], found["tops2"], found["overflow"]                                # doctest: +SKIP
+>>> result = exported.call(points, colors, mask, camera, boundary)                   # doctest: +SKIP
+>>> result["tops"], result["tops2"], result["overflow"]                                # doctest: +SKIP
 """
 
 import dataclasses
@@ -26,27 +26,27 @@ from thor2_jax.types import PointClouds
 __all__ = ["PLATFORMS", "export_recognizer"]
 
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
-"""Names that `jax.export` has for CPUs, NVIDIA and AMD GPUs, and TPUs."""
+"""Platform names of `jax.export`: CPUs, NVIDIA and AMD GPUs, TPUs."""
 
 
 def export_recognizer(run: TrainedRun, n_points: int, n_clouds: int, platforms: Sequence[str] = ("cpu",)) -> bytes:
-    """Clouds to class probabilities, for one padded size, weights included, as a serialized `jax.export.Exported`.
+    """Export the function from clouds of one padded size to class probabilities, weights included.
 
-    Diagrams are in closed form: a host callback cannot be exported, and both give the same values.
+    Diagrams are computed in closed form, since a host callback cannot be exported; the values are the same.
 
     Args:
-        run: trained.
+        run: the trained run.
         n_points: N, one of `capacity.POINT_BUCKETS`.
         n_clouds: B, one of `capacity.BATCH_BUCKETS`.
-        platforms: on which it can run, of `PLATFORMS`.
+        platforms: platforms to run on, from `PLATFORMS`.
 
     Returns:
-        Bytes of a function of the fields of `PointClouds` (points [B, N, 3], colors [B, N, 3], mask [B, N],
-        camera [B, 3], boundary [B, N]) that gives a dictionary: class probabilities [B, C] of each classifier, and
-        overflow [B].
+        Serialized `jax.export.Exported`: a function of the fields of `PointClouds` (points [B, N, 3], colors [B, N, 3],
+        mask [B, N], camera [B, 3], boundary [B, N]) that returns a dictionary with the class probabilities [B, C] of
+        each classifier and overflow [B].
 
     Raises:
-        InputError: sizes that are no buckets, or no such platforms.
+        InputError: a size is no bucket or a platform is unknown.
     """
     for name, value, buckets in (("n_points", n_points, POINT_BUCKETS), ("n_clouds", n_clouds, BATCH_BUCKETS)):
         if value not in buckets:

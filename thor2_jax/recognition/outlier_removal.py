@@ -69,7 +69,8 @@ def flying_pixels(frame: RGBDFrame, pixels: NDArray[np.intp]) -> NDArray[np.bool
 def _grid(points: NDArray[np.float64]) -> tuple[NDArray[np.int64], tuple[int, ...]]:
     """Return the flat cell index [n] of each of `points` [3, n] and the shape of the grid.
 
-    Points past `GRID_REACH` get index 0. Two layers of cells on every side are empty, so that no cell touches the first.
+    Points past `GRID_REACH` get index 0. Two layers of cells on every side are empty, so that no other cell touches
+    cell 0.
     """
     place = np.floor(points / PIECE_CELL)
     near = None

@@ -1,7 +1,7 @@
 """Datasets in the scene-wise format of BOP, the Benchmark for 6D Object Pose Estimation: YCB-Video and others.
 
 `<scene>/{rgb,depth}/<image>.png`, `<scene>/mask_visib/<image>_<instance>.png`, `scene_camera.json`, `scene_gt.json`
-and, if it is there, `scene_gt_info.json`; see docs/bop_datasets_format.md of github.com/thodan/bop_toolkit. The format
+and, optionally `scene_gt_info.json`; see docs/bop_datasets_format.md of github.com/thodan/bop_toolkit. The format
 numbers its objects; a YAML or JSON file names them, obj_id -> name.
 """
 
@@ -22,7 +22,7 @@ from training.storage.tables import read_table
 __all__ = ["BOP", "SMALLEST_VISIBLE"]
 
 SMALLEST_VISIBLE = 0.1
-"""Visible part of a silhouette from which on an instance is scored, as in BOP's own evaluation."""
+"""Least visible fraction of an instance that is scored, as in BOP's own evaluation."""
 
 
 class BOP(LabelledFrames):
@@ -30,12 +30,12 @@ class BOP(LabelledFrames):
 
     Label k + 1 is instance k of `scene_gt.json`. Masks may overlap, since BOP makes them with a tolerance in depth and
     counts pixels without depth as visible: a pixel of several masks belongs to the smallest of them. Instances with an
-    empty mask are not scored, nor are those of which `scene_gt_info.json` says that less than `SMALLEST_VISIBLE` is to
-    be seen; these keep their pixels, as they occlude others.
+    empty mask are not scored, nor are those whose visible fraction in `scene_gt_info.json` is below `SMALLEST_VISIBLE`;
+    they keep their pixels, since they occlude others.
     """
 
     def __init__(self, path: str | Path, names: str | Path | None = None) -> None:
-        """Finds the frames.
+        """Find the frames.
 
         Args:
             path: folder of scenes, or of one scene.
@@ -55,13 +55,13 @@ class BOP(LabelledFrames):
             raise InputError(
                 f"dataset: {path} has no scene_camera.json beside rgb/<number>.png or .jpg, nor a folder in it"
             )
-        # Its tables are read once a scene, as frames are asked for scene by scene.
+        # Frames are read scene by scene, so the tables of one scene are kept.
         self._scene = functools.lru_cache(maxsize=1)(_Scene)
         self._names_file = names
         self._names = None if names is None else _names(Path(names))
 
     def __getitem__(self, number: int) -> LabelledFrame:
-        """Read a frame; also refuses an image or object that a table lacks."""
+        """Read a frame; also raises InputError for an image or object that a table lacks."""
         folder, image = self._images[number]
         with with_context(folder.name):
             scene = self._scene(folder)
@@ -79,7 +79,7 @@ class BOP(LabelledFrames):
 
 
 class _Scene:
-    """The tables of a scene, and the images that they tell of."""
+    """The tables of a scene and its images."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -89,7 +89,7 @@ class _Scene:
         self._visible = read_table(info) if info.exists() else None
 
     def read(self, image: Path) -> tuple[RGBDFrame, dict[int, int]]:
-        """The frame of a colour image, and label -> obj_id of the instances that are scored."""
+        """Read the frame of a colour image, and label -> obj_id of the instances that are scored."""
         number = str(int(image.stem))
         with with_context(str(self._folder / "scene_camera.json")):
             intrinsics = _intrinsics(_entry(self._cameras, number))
@@ -140,7 +140,7 @@ def _entry(table: Mapping[Any, Any], number: str) -> Any:
 
 
 def _values(instances: Any, key: str, kind: type | tuple[type, ...]) -> list[Any]:
-    """The value of `key` of each instance of an image."""
+    """Return the value of `key` of each instance of an image."""
     try:
         values = [instance[key] for instance in instances]
     except (TypeError, KeyError):

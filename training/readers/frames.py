@@ -1,4 +1,4 @@
-"""Single labelled frames, a folder each: color.png, depth.png, mask.png, intrinsics.json, labels.json."""
+"""Labelled frames, one folder for each: color.png, depth.png, mask.png, intrinsics.json, labels.json."""
 
 import json
 from pathlib import Path
@@ -11,16 +11,16 @@ __all__ = ["FrameFolder"]
 
 
 class FrameFolder(LabelledFrames):
-    """The frames of a folder, or the one frame that it is.
+    """The frames in the folders of a folder, or the single frame in it.
 
-    `labels.json` holds {"labels": {"1": "mug", ...}}; other entries are passed over.
+    `labels.json` holds {"labels": {"1": "mug", ...}}; other entries are ignored.
     """
 
     def __init__(self, path: str | Path) -> None:
-        """Finds the frames.
+        """Find the frames.
 
         Raises:
-            InputError: there are none.
+            InputError: the folder holds no frame.
         """
         path = Path(path).absolute()  # so that every frame's folder has a name, that of "." too
         if not path.is_dir():

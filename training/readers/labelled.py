@@ -1,4 +1,4 @@
-"""Frames with the truth about them, and what every reader of a dataset is."""
+"""Labelled frames, and the interface of all dataset readers."""
 
 import abc
 import dataclasses
@@ -10,26 +10,25 @@ __all__ = ["LabelledFrame", "LabelledFrames", "path_ends", "sequence_of"]
 
 
 def sequence_of(identifier: str) -> str:
-    """The sequence a/b/c of the frame a/b/c/d."""
+    """Return the sequence of a frame: a/b/c for a/b/c/d."""
     return identifier.rpartition("/")[0]
 
 
 def path_ends(sequence: str) -> list[str]:
-    """What a sequence a/b/c may be called, the longest first: a/b/c, b/c, c."""
+    """Return the names that a sequence a/b/c may be given, longest first: a/b/c, b/c, c."""
     parts = sequence.split("/")
     return ["/".join(parts[start:]) for start in range(len(parts))]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class LabelledFrame:
-    """What every reader yields.
+    """A frame and the names of its objects.
 
     Attributes:
-        identifier: names the frame within its dataset.
+        identifier: name of the frame, unique in its dataset.
         frame: the images.
-        truth: label number -> object name, of the instances that are scored. An instance may have no pixel in the label
-            image.
-        attributes: what accuracy is broken down by, for instance {"occlusion": "high", "light": "1"}.
+        truth: label number -> object name of the instances that are scored; an instance may have no pixels.
+        attributes: conditions that accuracy is reported by, for instance {"occlusion": "high", "light": "1"}.
     """
 
     identifier: str
@@ -39,10 +38,10 @@ class LabelledFrame:
 
 
 class LabelledFrames(abc.ABC):
-    """The frames of a dataset, in an order that is always the same; each is read when it is asked for.
+    """The frames of a dataset in a fixed order; a frame is read when it is indexed.
 
     Attributes:
-        identifiers: of the frames, known without reading them.
+        identifiers: identifiers of all frames, known without reading them.
     """
 
     identifiers: Sequence[str]
@@ -55,11 +54,11 @@ class LabelledFrames(abc.ABC):
         """Read a frame.
 
         Raises:
-            IndexError: there is none of that number.
-            InputError: a file that is missing or damaged, or files that do not fit together; names the file.
+            IndexError: `number` is out of range.
+            InputError: a file is missing or damaged, or files do not belong together; names the file.
             OSError: a file cannot be opened.
         """
 
     def __iter__(self) -> Iterator[LabelledFrame]:
-        """Read them one at a time; raises as `[]`."""
+        """Read the frames one at a time; raises as indexing does."""
         return (self[number] for number in range(len(self)))

@@ -1,13 +1,13 @@
 """OCID, Object Clutter Indoor Dataset (Suchi et al., 2019), its subset YCB10: clutter that grows by an object a frame.
 
 `{table,floor}/{bottom,top}/{cuboid,curved,mixed}/<sequence>/{rgb,depth,label,pcd}`; 640 x 480, depth in millimetres.
-Two cameras film each sequence, the lower (`bottom`) and the upper (`top`) one. The dataset names no objects: a YAML or
-JSON file does, sequence -> names in the order in which the objects were placed, which is that of their labels:
+Two cameras film each sequence, the lower (`bottom`) and the upper (`top`) one. The dataset does not name its objects. A
+YAML or JSON file does: sequence -> names in the order in which the objects were placed, which is that of their labels:
 
     seq36: [mug, bowl, banana]                      # of both cameras
     table/top/mixed/seq21: [bowl, tomato_soup]      # the sequence's folder, or the end of its path
 
-The dataset tells no intrinsics. They are fitted to each frame's organized point cloud, whose points lie on the rays of
+The dataset has no intrinsics. They are fitted to each frame's organized point cloud, whose points lie on the rays of
 their pixels.
 """
 
@@ -34,7 +34,7 @@ _CAMERAS = {"bottom": "lower", "top": "upper"}
 _Sequence = tuple[str, str, str, str]  # place, camera, type, name: its folder
 
 _LARGEST_RESIDUAL = 5.0
-"""Pixels, root mean square. Depth noise of the sensor makes about one, another kind of cloud hundreds."""
+"""Largest root mean square residual of the fit, pixels: sensor noise makes about 1, another kind of cloud hundreds."""
 
 
 class OCID(LabelledFrames):
@@ -44,7 +44,7 @@ class OCID(LabelledFrames):
     """
 
     def __init__(self, path: str | Path, names: str | Path) -> None:
-        """Finds the frames and the names of their objects.
+        """Find the frames and the names of their objects.
 
         Args:
             path: folder `YCB10`, or the one that holds it.
@@ -69,7 +69,7 @@ class OCID(LabelledFrames):
         self.identifiers = ["/".join((*sequence, image.stem)) for sequence, image in self._images]
 
     def __getitem__(self, number: int) -> LabelledFrame:
-        """Read a frame; also refuses a cloud that gives no intrinsics, and a label without a name."""
+        """Read a frame; also raises InputError for a cloud without a pinhole camera and a label without a name."""
         sequence, image = self._images[number]
         place, camera, kind, _ = sequence
         with with_context(self.identifiers[number]):
@@ -79,7 +79,7 @@ class OCID(LabelledFrames):
 
 
 def _names(path: Path, sequences: Iterable[_Sequence]) -> dict[_Sequence, list[str]]:
-    """The names of each sequence's objects; the longest end of its path that the table has is its key."""
+    """Return the object names of each sequence, whose key is the longest end of its path in the table."""
     table = read_table(path)
     named: dict[_Sequence, list[str]] = {}
     lacking = []
@@ -98,7 +98,7 @@ def _names(path: Path, sequences: Iterable[_Sequence]) -> dict[_Sequence, list[s
 
 
 def _read(image: Path, first_object: int, names: list[str]) -> tuple[RGBDFrame, dict[int, str]]:
-    """The frame of a colour image, and the names of its labels."""
+    """Read the frame of a colour image and the names of its labels."""
     folder = image.parent.parent
     color = read_color(image)
     label_file = folder / "label" / image.name
@@ -121,19 +121,19 @@ def _read(image: Path, first_object: int, names: list[str]) -> tuple[RGBDFrame, 
 
 
 def fit_intrinsics(points: NDArray[np.float64]) -> Intrinsics:
-    """The pinhole camera of an organized cloud [H, W, 3] in the OpenCV camera frame; points without depth are NaN.
+    """Fit a pinhole camera to an organized cloud [H, W, 3] in the OpenCV camera frame; points without depth are NaN.
 
     Least squares of x / z over the columns, x / z = (column - cx) / fx, and of y / z over the rows. The pixel is exact
     and the ratio is not: in the dataset's clouds z is a mean over time, x and y are not.
 
     Raises:
-        InputError: the points are too few, or do not lie on the rays of such a camera; tells the fit.
+        InputError: the points are too few or do not lie on the rays of a pinhole camera; the message has the fit.
     """
     row, column = np.nonzero(np.isfinite(points).all(axis=-1) & (points[..., 2] > 0))
     if len(row) == 0 or np.ptp(row) == 0 or np.ptp(column) == 0:
         raise InputError(f"the cloud has {len(row)} points with depth; expected several rows and columns of them")
     x, y, z = points[row, column].T
-    with np.errstate(all="ignore"):  # a degenerate fit is told by its values
+    with np.errstate(all="ignore"):  # a degenerate fit shows in its values
         fx, cx, across = _line(column, x / z)
         fy, cy, down = _line(row, y / z)
     if not (fx > 0 and fy > 0 and max(across, down) < _LARGEST_RESIDUAL):

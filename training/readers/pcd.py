@@ -14,13 +14,13 @@ _KINDS = {"F": "f", "I": "i", "U": "u"}
 
 
 def read_organized_points(path: str | Path) -> NDArray[np.float64]:
-    """Read the points [HEIGHT, WIDTH, 3] of a PCD file in its own units (metres by custom), NaN where it has none.
+    """Read the points [HEIGHT, WIDTH, 3] of a PCD file in the file's unit (usually metres), NaN where it has none.
 
-    Fields other than x, y and z are passed over.
+    Fields other than x, y and z are ignored.
 
     Raises:
-        InputError: damaged, compressed, or without x, y and z; names the file.
-        OSError: it cannot be opened.
+        InputError: the file is damaged, compressed or without x, y and z; the message names it.
+        OSError: the file cannot be opened.
     """
     path = Path(path)
     content = path.read_bytes()
@@ -36,7 +36,10 @@ def read_organized_points(path: str | Path) -> NDArray[np.float64]:
     except (KeyError, IndexError, ValueError, TypeError, OverflowError):
         raise InputError(f"{path}: its header does not describe points with x, y and z") from None
     if min(width, height) < 1 or any(counts[axis] != 1 for axis in axes):
-        raise InputError(f"{path}: its header tells of {width} x {height} points with fields of {counts} numbers")
+        raise InputError(
+            f"{path}: its header has {width} x {height} points with fields of {counts} numbers; "
+            "expected at least one point and one number for each axis"
+        )
     if encoding == "binary":
         points = _binary(content[start:], record, width * height, axes, path)
     elif encoding == "ascii":
@@ -47,7 +50,7 @@ def read_organized_points(path: str | Path) -> NDArray[np.float64]:
 
 
 def _header(content: bytes, path: Path) -> tuple[dict[str, list[str]], int]:
-    """The header's lines, first word -> the others, and where the data begin."""
+    """Return the lines of the header (first word -> other words) and the offset of the data."""
     header: dict[str, list[str]] = {}
     start = 0
     while "DATA" not in header:

@@ -14,16 +14,16 @@ from training.storage.tables import parse_yaml
 __all__ = ["INTRINSICS", "NOT_SCORED", "UWISOccluded", "Video", "video_attributes"]
 
 INTRINSICS = Intrinsics(920.458618164062, 921.807800292969, 626.486083984375, 358.848205566406)
-"""Of the whole dataset."""
+"""The camera of all videos."""
 
 NOT_SCORED = frozenset({"ice_cream", "hot_sauce", "chips_can"})
-"""Names that stand in the dataset and are not scored in the paper."""
+"""Objects of the dataset that the paper does not score."""
 
 _FIRST_LOUNGE = 167
 
 
 class Video(NamedTuple):
-    """A row of the dataset's table of videos: which numbers show what."""
+    """A row of the dataset's table: conditions, and the numbers of the videos under them."""
 
     category: str
     occlusion: str
@@ -54,22 +54,22 @@ _VIDEOS = (
 
 
 def video_attributes(number: int) -> dict[str, str]:
-    """Environment of a video; for the numbers in the dataset's table also object category, occlusion and light."""
-    found = {"environment": "lounge" if number >= _FIRST_LOUNGE else "warehouse"}
+    """Return the environment of a video and, if the dataset's table lists it, object category, occlusion and light."""
+    attributes = {"environment": "lounge" if number >= _FIRST_LOUNGE else "warehouse"}
     for video in _VIDEOS:
         if number in video.numbers:
-            found |= {"category": video.category, "occlusion": video.occlusion, "light": video.light}
-    return found
+            attributes |= {"category": video.category, "occlusion": video.occlusion, "light": video.light}
+    return attributes
 
 
 class UWISOccluded(LabelledFrames):
     """The frames of the dataset or of a part of it, by video and frame number."""
 
     def __init__(self, path: str | Path) -> None:
-        """Finds the frames.
+        """Find the frames.
 
         Raises:
-            InputError: there are none.
+            InputError: the folder holds no frame.
         """
         path = Path(path)
         if not path.is_dir():
@@ -108,7 +108,7 @@ def _truth(path: Path) -> dict[int, str]:
     truth: dict[int, str] = {}
     for label, name in entries:
         if type(label) is not int or type(name) is not str:
-            raise InputError(f"{path}: {name!r} has the label {label!r}; expected a name and a whole number")
+            raise InputError(f"{path}: {name!r} has the label {label!r}; expected a name and an integer")
         if label in truth:
             raise InputError(f"{path}: {truth[label]!r} and {name!r} have the label {label}")
         truth[label] = name
