@@ -63,8 +63,8 @@ def _sparse_matmul(x: jax.Array, kernel: jax.Array) -> jax.Array:
         entries = x.at[:, row].get(mode="fill", fill_value=0)
         return jnp.matmul(entries, kernel.at[row].get(mode="clip"))
 
-    branches = [*[partial(gathered, capacity) for capacity in capacities], lambda: jnp.matmul(x, kernel)]
-    return jax.lax.switch((needed.sum() > jnp.array(capacities)).sum(), branches)
+    too_small = (needed.sum() > jnp.array(capacities)).sum()
+    return jax.lax.switch(too_small, [*[partial(gathered, n) for n in capacities], lambda: jnp.matmul(x, kernel)])
 
 
 @_sparse_matmul.defjvp

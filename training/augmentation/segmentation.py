@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, binary_erosion, maximum_filter
 
 from thor2_jax.recognition.frames import Intrinsics
-from thor2_jax.recognition.outlier_removal import CELL
+from thor2_jax.recognition.outlier_removal import PIECE_CELL
 from training.augmentation.pixels import FRAME_PIXEL, pixel_width, without
 from training.augmentation.settings import Range, check_fields
 from training.rendering.camera import TRAINING_CAMERA, RenderedView
 
 __all__ = ["Segmentation", "resegmented"]
 
-MAX_BACKGROUND_GAP = 2 * CELL
+MAX_BACKGROUND_GAP = 2 * PIECE_CELL
 """Largest distance of remaining background, metres: outlier removal treats adjacent cells as one component."""
 
 
