@@ -232,7 +232,9 @@ def test_evaluate(frames: Path, model: Path, environment: Any, call: Any, tmp_pa
     kept = {"frames/0.jpg", "answers.jsonl one"}  # confusions may change with later frames
     assert {name for name in found if "confusions" not in name} == kept
     assert all(found[name] == expected[name] for name in kept)
-    check_refused(call("evaluate", "frames", frames / "one", *command[3:], out), f"out: {out / 'answers.jsonl'} holds")
+    check_refused(
+        call("evaluate", "frames", frames / "one", *command[3:], out), f"out: {out} was written with dataset.path "
+    )
     assert call(*command, out)[0] == 0
     assert without_times(files(out)) == expected and files(out).keys() == files(whole).keys()
 
