@@ -1,9 +1,17 @@
 """Fixtures shared by all tests, the thorough tier, and the slow tier's time."""
 
+import os
+import tempfile
 from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
+
+# Read when JAX is imported, and inherited by the processes that tests start. Mixed dtypes are errors; compiled programs
+# are shared by the processes of a run, and kept for the next one.
+os.environ.setdefault("JAX_NUMPY_DTYPE_PROMOTION", "strict")
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", f"{tempfile.gettempdir()}/thor2-jax-tests-{os.getuid()}")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
 
 EXAMPLES = {"properties": (4, 60), "fuzz": (150, 3000)}
 """Folder of tests -> examples that Hypothesis draws for each, and those with --thorough."""
