@@ -3,13 +3,9 @@
 from pathlib import Path
 
 import numpy as np
+from helpers import as_8_bit
 
 import colornet
-
-
-def as_8_bit(colors: np.ndarray) -> np.ndarray:
-    """Round colours in [0, 1] to 8 bits, halves up."""
-    return np.floor(colors * np.float32(255) + np.float32(0.5)).astype(np.uint8)
 
 
 def test_region_weights_strip_by_strip(golden_files: tuple[Path, ...], network: colornet.ColorNetwork) -> None:

@@ -11,13 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 from flax import nnx
+from helpers import run_thor2, untrained_run
 from PIL import Image
 
 import colornet
 import thor2_jax as thor2
-from thor2_jax.recognition.classifier import MLP
-from thor2_jax.recognition.run_directory import TrainedRun, input_size, load_run, save_run
-from training import cli
+from thor2_jax.recognition.run_directory import TrainedRun, load_run, save_run
 from training.baselines.files import baseline_file, read_baseline
 from training.fitting.metrics_log import read_metrics
 from training.views.dataset import MANIFEST, Manifest
@@ -66,14 +65,11 @@ def kill(place: str, command: tuple[object, ...], environment: dict[str, str]) -
 
 
 @pytest.fixture
-def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Any:
+def call(capsys: pytest.CaptureFixture[str]) -> Any:
     """Run a command without a kill; return its exit status and standard error."""
 
     def run(*command: object) -> tuple[int, str]:
-        monkeypatch.setattr(sys, "argv", ["thor2", *map(str, command)])
-        with pytest.raises(SystemExit) as stop:
-            cli.main()
-        return int(stop.value.code or 0), capsys.readouterr().err
+        return run_thor2(*command), capsys.readouterr().err
 
     return run
 
@@ -125,9 +121,8 @@ def frames(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Run directory with random weights."""
     config = thor2.DescriptorConfig(homology="closed_form", n_slices=3, n_strips=8, image_size=8)
-    network, out = colornet.load_default(), tmp_path_factory.mktemp("model") / "run"
-    models = {name: MLP(input_size(name, config, 22), 2, rngs=nnx.Rngs(0)) for name in ("tops", "tops2")}
-    save_run(TrainedRun(config, network, ("brick", "stick"), models, {}), out)
+    out = tmp_path_factory.mktemp("model") / "run"
+    save_run(untrained_run(("brick", "stick"), ("tops", "tops2"), config), out)
     return out
 
 

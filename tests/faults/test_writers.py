@@ -8,15 +8,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from flax import nnx
+from helpers import untrained_run
 
 import colornet
 import thor2_jax as thor2
 from colornet.draw import draw_similarity
 from thor2_jax.files import write_text
-from thor2_jax.recognition.classifier import MLP
 from thor2_jax.recognition.overlay import draw_overlay
-from thor2_jax.recognition.run_directory import TrainedRun, input_size, load_run, save_run
+from thor2_jax.recognition.run_directory import load_run, save_run
 from training.evaluation.answers import AnswerFile, FrameAnswers
 from training.fitting.metrics_log import append_metrics, discard_later_epochs, read_metrics
 from training.fitting.options import EpochMetrics
@@ -26,10 +25,6 @@ CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=2, n_strips=5, 
 NETWORK = colornet.load_default()
 PHOTO = np.zeros((40, 50, 3), np.uint8)
 LABELS = np.ones((40, 50), np.uint8)
-
-
-def make_run() -> TrainedRun:
-    return TrainedRun(CONFIG, NETWORK, ("a", "b"), {"ce": MLP(input_size("ce", CONFIG, 22), 2, rngs=nnx.Rngs(0))}, {})
 
 
 WRITERS: dict[str, Callable[[Path], Any]] = {
@@ -62,7 +57,7 @@ def test_files_are_written_atomically(name: str, number: int, tmp_path: Path, di
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS], ids=["full", "read-only"])
 def test_a_run_directory_is_written_atomically(number: int, tmp_path: Path, disk: Any) -> None:
-    run = make_run()
+    run = untrained_run(("a", "b"), ("ce",))
     disk.reset(0, 0)
     save_run(run, tmp_path / "whole")
     steps = disk.count

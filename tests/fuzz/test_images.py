@@ -1,6 +1,5 @@
 """Damaged frames: PNG and JPEG images, intrinsics."""
 
-import io
 import json
 import struct
 import zlib
@@ -10,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers import encode_image, png_file, with_checksums
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
@@ -22,21 +22,15 @@ RNG = np.random.default_rng(0)
 SHAPE = (24, 17)
 
 
-def encoded(pixels: np.ndarray, kind: str, **options: Any) -> bytes:
-    stream = io.BytesIO()
-    Image.fromarray(pixels).save(stream, kind, **options)
-    return stream.getvalue()
-
-
 COLOR = RNG.integers(0, 256, (*SHAPE, 3), dtype=np.uint8)
 PALETTE = Image.fromarray(RNG.integers(0, 4, SHAPE, dtype=np.uint8)).convert("P")
 FILES: dict[str, tuple[Callable[[Path], Any], bytes]] = {
-    "color.png": (read_color, encoded(COLOR, "PNG")),
-    "alpha.png": (read_color, encoded(np.dstack([COLOR, COLOR[..., 0]]), "PNG")),
-    "color.jpg": (read_color, encoded(COLOR, "JPEG")),
-    "depth.png": (read_depth, encoded(RNG.integers(0, 2**16, SHAPE).astype(np.uint16), "PNG")),
-    "depth.tiff": (read_depth, encoded(RNG.integers(0, 2**16, SHAPE).astype(np.uint16), "TIFF")),
-    "labels.png": (read_labels, encoded(RNG.integers(0, 9, SHAPE, dtype=np.uint8), "PNG")),
+    "color.png": (read_color, encode_image(COLOR, "PNG")),
+    "alpha.png": (read_color, encode_image(np.dstack([COLOR, COLOR[..., 0]]), "PNG")),
+    "color.jpg": (read_color, encode_image(COLOR, "JPEG")),
+    "depth.png": (read_depth, encode_image(RNG.integers(0, 2**16, SHAPE).astype(np.uint16), "PNG")),
+    "depth.tiff": (read_depth, encode_image(RNG.integers(0, 2**16, SHAPE).astype(np.uint16), "TIFF")),
+    "labels.png": (read_labels, encode_image(RNG.integers(0, 9, SHAPE, dtype=np.uint8), "PNG")),
 }
 
 
@@ -47,12 +41,6 @@ def chunks(content: bytes) -> list[tuple[bytes, bytes]]:
         found.append((content[at + 4 : at + 8], content[at + 8 : at + 8 + length]))
         at += 12 + length
     return found
-
-
-def png(parts: list[tuple[bytes, bytes]]) -> bytes:
-    """A PNG file of chunks with the right lengths and checksums, whatever is in them."""
-    body = (struct.pack(">I", len(d)) + k + d + struct.pack(">I", zlib.crc32(k + d)) for k, d in parts)
-    return b"\x89PNG\r\n\x1a\n" + b"".join(body)
 
 
 @pytest.mark.parametrize("name", FILES)
@@ -78,7 +66,7 @@ def test_png_chunks_with_right_checksums(name: str, data: st.DataObject, attempt
     elif body:
         body = data.draw(damaged(body, 1))
     path = tmp_path / name
-    path.write_bytes(png([*parts[:k], (kind, body), *parts[k + 1 :]]))
+    path.write_bytes(png_file(with_checksums(*parts[:k], (kind, body), *parts[k + 1 :])))
     attempt(lambda: read(path))
 
 
@@ -87,7 +75,11 @@ def test_an_image_that_would_fill_memory_is_refused(size: tuple[int, int], attem
     """With all its rows of zeros: a few hundred kilobytes of file, or as few as the header alone."""
     rows = zlib.compress(bytes(min((size[0] * 3 + 1) * size[1], 2**26)), 9)
     path = tmp_path / "bomb.png"
-    path.write_bytes(png([(b"IHDR", struct.pack(">IIBBBBB", *size, 8, 2, 0, 0, 0)), (b"IDAT", rows), (b"IEND", b"")]))
+    path.write_bytes(
+        png_file(
+            with_checksums((b"IHDR", struct.pack(">IIBBBBB", *size, 8, 2, 0, 0, 0)), (b"IDAT", rows), (b"IEND", b""))
+        )
+    )
     assert attempt(lambda: read_color(path)) is None
     with pytest.raises(InputError, match="bomb.png"):
         read_color(path)
@@ -97,7 +89,7 @@ def test_text_that_would_fill_memory(attempt: Any, tmp_path: Path) -> None:
     parts = chunks(FILES["color.png"][1])
     bomb = (b"zTXt", b"key\0\0" + zlib.compress(bytes(2**26), 9))
     path = tmp_path / "bomb.png"
-    path.write_bytes(png([parts[0], bomb, *parts[1:]]))
+    path.write_bytes(png_file(with_checksums(parts[0], bomb, *parts[1:])))
     attempt(lambda: read_color(path))
 
 
@@ -105,7 +97,7 @@ def test_other_kinds_of_images_are_refused(tmp_path: Path) -> None:
     """Of what Pillow opens, some formats run other programs, and none is documented."""
     for kind in ("BMP", "GIF", "PPM", "EPS"):
         path = tmp_path / "color.png"
-        path.write_bytes(encoded(COLOR, kind))
+        path.write_bytes(encode_image(COLOR, kind))
         with pytest.raises(InputError, match="color.png is damaged or no image"):
             read_color(path)
 

@@ -7,27 +7,22 @@ from typing import Any
 
 import numpy as np
 import pytest
-from flax import nnx
+from helpers import untrained_run
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import colornet
 import thor2_jax as thor2
-from thor2_jax.recognition.classifier import MLP
-from thor2_jax.recognition.run_directory import TrainedRun, input_size, load_run, save_run
+from thor2_jax.recognition.run_directory import load_run, save_run
 from thor2_jax.testing import damaged
 from training.baselines.files import StoredBaseline, read_baseline, write_baseline
 from training.evaluation.answers import AnswerFile, FrameAnswers, InstanceAnswer
 from training.fitting.metrics_log import read_metrics
 
-CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=2, n_strips=5, image_size=8)
-
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("runs") / "run"
-    model = MLP(input_size("ce", CONFIG, 22), 2, rngs=nnx.Rngs(0))
-    save_run(TrainedRun(CONFIG, colornet.load_default(), ("mug", "bowl"), {"ce": model}, {"epochs": 3}), path)
+    save_run(untrained_run(("mug", "bowl"), ("ce",), record={"epochs": 3}), path)
     return path
 
 

@@ -4,22 +4,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from flax import nnx
+from helpers import untrained_run
 
-import colornet
 import thor2_jax as thor2
 from thor2_jax.export import export_recognizer
-from thor2_jax.recognition.classifier import FEATURES, MLP
-from thor2_jax.recognition.run_directory import TrainedRun, input_size
+from thor2_jax.recognition.classifier import FEATURES
+from thor2_jax.recognition.run_directory import TrainedRun
 
 CONFIG = thor2.DescriptorConfig()
 
 
 @pytest.fixture(scope="module")
 def run() -> TrainedRun:
-    network = colornet.load_default()
-    classifiers = {name: MLP(input_size(name, CONFIG, network.n_regions), 3, rngs=nnx.Rngs(7)) for name in FEATURES}
-    return TrainedRun(CONFIG, network, ("a", "b", "c"), classifiers, {})
+    return untrained_run("abc", config=CONFIG)
 
 
 LOADER = """

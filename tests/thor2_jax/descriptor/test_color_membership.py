@@ -3,6 +3,7 @@
 import jax
 import numpy as np
 import pytest
+from helpers import as_8_bit
 
 import colornet
 from thor2_jax.descriptor.color_membership import color_sets, region_sets
@@ -13,10 +14,6 @@ NETWORK = colornet.load_default()
 def weights(colors: np.ndarray) -> np.ndarray:
     sets = region_sets(NETWORK)
     return np.asarray(sets.weights[jax.jit(color_sets)(colors, sets)])
-
-
-def eight_bit(colors: np.ndarray) -> np.ndarray:
-    return np.floor(colors * np.float32(255) + np.float32(0.5)).astype(np.uint8)
 
 
 @pytest.mark.parametrize("n", [0, 1, 2, 9999])
@@ -33,12 +30,12 @@ def test_every_level_of_a_channel_and_every_half_between_two() -> None:
     for axis in range(3):
         colors = np.full((len(values), 3), 0.5, np.float32)
         colors[:, axis] = values
-        np.testing.assert_array_equal(weights(colors), NETWORK.membership(eight_bit(colors)))
+        np.testing.assert_array_equal(weights(colors), NETWORK.membership(as_8_bit(colors)))
 
 
 def test_floating_colours_in_any_shape() -> None:
     colors = np.random.default_rng(0).random((4, 5, 3)).astype(np.float32)
     found = weights(colors)
     assert found.shape == (4, 5, 22) and found.dtype == np.float32
-    np.testing.assert_array_equal(found, NETWORK.membership(eight_bit(colors)))
+    np.testing.assert_array_equal(found, NETWORK.membership(as_8_bit(colors)))
     np.testing.assert_allclose(found.sum(axis=-1), 1, atol=1e-6)

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import aligned_cloud
 from scipy.spatial.transform import Rotation
 from scipy.special import ndtr
 
@@ -23,16 +24,6 @@ CONFIGS = {
     for homology in ("gudhi", "closed_form")
 }
 Cloud = tuple[np.ndarray, np.ndarray]
-
-
-def aligned_cloud(seed: int, n: int, size: tuple[float, float, float] = (0.76, 0.4, 0.68)) -> Cloud:
-    """Random points in the first octant, none within 1e-5 of a border of the paper's slices and strips."""
-    rng = np.random.default_rng(seed)
-    points = (rng.random((n, 3)) * size).astype(np.float32)
-    for axis, width in ((0, 0.025), (2, 0.1)):
-        border = np.round(points[:, axis] / width) * width
-        points[np.abs(points[:, axis] - border) < 1e-5, axis] += np.float32(1e-3)
-    return points, rng.integers(0, 256, (n, 3), dtype=np.uint8)
 
 
 def camera_cloud(seed: int, n: int = 900) -> Cloud:

@@ -1,13 +1,11 @@
 """One batch on eight devices and in two processes against one device, each in processes of their own."""
 
 import json
-import socket
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import finish_programs, free_port, start_program
 
 _CLOUDS = """
 import json, sys
@@ -64,20 +62,8 @@ np.save(sys.argv[1], np.asarray(thor2.describe(packed, network, thor2.Descriptor
 """
 
 
-def start(code: str, *arguments: object, flags: str = "") -> subprocess.Popen[str]:
-    command = [sys.executable, "-c", _CLOUDS + code, *map(str, arguments)]
-    environment = {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu", "PATH": "/usr/bin:/bin"}
-    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-
-
-def finish(process: subprocess.Popen[str]) -> str:
-    out, err = process.communicate(timeout=300)
-    assert process.returncode == 0, err[-3000:]
-    return out
-
-
 def test_eight_devices_give_the_numbers_of_one() -> None:
-    told = json.loads(finish(start(_DEVICES, flags="--xla_force_host_platform_device_count=8")).splitlines()[-1])
+    told = json.loads(finish_programs(start_program(_CLOUDS + _DEVICES, devices=8))[0].splitlines()[-1])
     assert told["worst"]["closed_form"] <= 1e-6 and told["worst"]["gudhi"] <= 1e-6
     assert len(told["refused"]) == 2
     assert "multiple of the 8 devices" in told["refused"][0] and "shard_clouds" in told["refused"][1]
@@ -85,11 +71,8 @@ def test_eight_devices_give_the_numbers_of_one() -> None:
 
 @pytest.mark.slow
 def test_two_processes_give_the_numbers_of_one(tmp_path: Path) -> None:
-    with socket.socket() as free:
-        free.bind(("localhost", 0))
-        port = free.getsockname()[1]
-    for process in [start(_PROCESS, port, rank, tmp_path) for rank in range(2)]:
-        finish(process)
-    finish(start(_ALONE, tmp_path / "alone.npy"))
+    port = free_port()
+    finish_programs(*(start_program(_CLOUDS + _PROCESS, port, rank, tmp_path) for rank in range(2)))
+    finish_programs(start_program(_CLOUDS + _ALONE, tmp_path / "alone.npy"))
     parts = np.concatenate([np.load(tmp_path / f"{rank}.npy") for rank in range(2)])
     np.testing.assert_allclose(parts, np.load(tmp_path / "alone.npy"), atol=1e-6)

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import aligned_cloud
 
 import colornet
 import thor2_jax as thor2
@@ -41,16 +42,6 @@ def expected_strips(points: np.ndarray, rgb: np.ndarray, released: bool) -> dict
                 out["color"][a, b] = weights[here].sum(axis=0) / (here.sum() if released else 1)
     out["overflow"] = np.sum((i >= 7) | (j >= 31))
     return out
-
-
-def aligned_cloud(seed: int, n: int, size: tuple[float, float, float] = (0.76, 0.4, 0.68)) -> Cloud:
-    """Random points in the first octant, none within 1e-5 of a border of the paper's slices and strips."""
-    rng = np.random.default_rng(seed)
-    points = (rng.random((n, 3)) * size).astype(np.float32)
-    for axis, width in ((0, 0.025), (2, 0.1)):
-        border = np.round(points[:, axis] / width) * width
-        points[np.abs(points[:, axis] - border) < 1e-5, axis] += np.float32(1e-3)
-    return points, rng.integers(0, 256, (n, 3), dtype=np.uint8)
 
 
 @pytest.mark.parametrize("config", [PAPER, RELEASED], ids=["paper", "released"])

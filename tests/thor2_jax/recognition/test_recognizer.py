@@ -5,13 +5,12 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
-from flax import nnx
+from helpers import untrained_run
 
-import colornet
 import thor2_jax as thor2
-from thor2_jax.recognition.classifier import FEATURES, MLP, feature_of
+from thor2_jax.recognition.classifier import feature_of
 from thor2_jax.recognition.recognizer import Recognizer
-from thor2_jax.recognition.run_directory import TrainedRun, input_size
+from thor2_jax.recognition.run_directory import TrainedRun
 
 CLASSES = ("a", "b", "c", "d")
 INTRINSICS = thor2.Intrinsics(600.0, 600.0, 159.5, 119.5)
@@ -20,12 +19,7 @@ CONFIG = thor2.DescriptorConfig(homology="closed_form")
 
 @pytest.fixture(scope="module")
 def run() -> TrainedRun:
-    network = colornet.load_default()
-    classifiers = {
-        name: MLP(input_size(name, CONFIG, network.n_regions), len(CLASSES), rngs=nnx.Rngs(k))
-        for k, name in enumerate(FEATURES)
-    }
-    return TrainedRun(CONFIG, network, CLASSES, classifiers, {})
+    return untrained_run(CLASSES, config=CONFIG)
 
 
 @pytest.fixture(scope="module")

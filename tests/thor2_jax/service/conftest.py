@@ -1,6 +1,5 @@
 """A run with random weights, a frame, and a running service that most tests share."""
 
-import io
 import json
 import re
 import signal
@@ -13,37 +12,25 @@ from pathlib import Path
 import httpx
 import numpy as np
 import pytest
-from flax import nnx
-from PIL import Image
+from helpers import encode_image, untrained_run
 
-import colornet
 import thor2_jax as thor2
-from thor2_jax.recognition.classifier import FEATURES, MLP
-from thor2_jax.recognition.run_directory import TrainedRun, input_size, save_run
+from thor2_jax.recognition.run_directory import save_run
 
 Files = dict[str, bytes]
 CAMERA = {"fx": 600.0, "fy": 600.0, "cx": 159.5, "cy": 119.5}
 
 
-def png(image: np.ndarray, **options: object) -> bytes:
-    stream = io.BytesIO()
-    Image.fromarray(image).save(stream, "PNG", **options)
-    return stream.getvalue()
-
-
 @pytest.fixture(scope="session")
 def encode() -> Callable[..., bytes]:
-    return png
+    return encode_image
 
 
 @pytest.fixture(scope="session")
 def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    config, network = thor2.DescriptorConfig(), colornet.load_default()
-    classifiers = {
-        name: MLP(input_size(name, config, network.n_regions), 7, rngs=nnx.Rngs(k)) for k, name in enumerate(FEATURES)
-    }
+    run = untrained_run("abcdefg", config=thor2.DescriptorConfig(), record={"meshes": "/a/local/path"})
     folder = tmp_path_factory.mktemp("service") / "run"
-    save_run(TrainedRun(config, network, tuple("abcdefg"), classifiers, {"meshes": "/a/local/path"}), folder)
+    save_run(run, folder)
     return folder
 
 
@@ -62,7 +49,7 @@ def frame() -> thor2.RGBDFrame:
 
 @pytest.fixture(scope="session")
 def files(frame: thor2.RGBDFrame) -> Files:
-    images = {name: png(getattr(frame, name)) for name in ("color", "depth", "labels")}
+    images = {name: encode_image(getattr(frame, name)) for name in ("color", "depth", "labels")}
     return {**images, "intrinsics": json.dumps(CAMERA).encode()}
 
 

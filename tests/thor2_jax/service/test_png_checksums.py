@@ -1,6 +1,5 @@
 """The service and the library refuse a PNG with an invalid checksum, even if its pixels can be decoded."""
 
-import io
 import json
 import struct
 import zlib
@@ -8,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
+from helpers import encode_image, png_file, with_checksums
 
 from thor2_jax.errors import InputError
 from thor2_jax.recognition.frames import read_frame
@@ -17,17 +16,6 @@ from thor2_jax.service.problem import RequestError
 
 Chunk = tuple[bytes, bytes, int]
 KINDS = (b"IHDR", b"PLTE", b"tEXt", b"IDAT", b"IDAT", b"IDAT", b"tIME")
-
-
-def with_checksums(*chunks: tuple[bytes, bytes]) -> list[Chunk]:
-    return [(kind, content, zlib.crc32(kind + content)) for kind, content in chunks]
-
-
-def png(chunks: list[Chunk]) -> bytes:
-    packed = (
-        struct.pack(">I", len(content)) + kind + content + struct.pack(">I", crc) for kind, content, crc in chunks
-    )
-    return b"\x89PNG\r\n\x1a\n" + b"".join(packed)
 
 
 @pytest.fixture
@@ -48,14 +36,9 @@ def labels() -> list[Chunk]:
 
 @pytest.fixture
 def others() -> dict[str, bytes]:
-    def encoded(image: np.ndarray) -> bytes:
-        stream = io.BytesIO()
-        Image.fromarray(image).save(stream, "PNG")
-        return stream.getvalue()
-
     return {
-        "color": encoded(np.zeros((12, 16, 3), np.uint8)),
-        "depth": encoded(np.ones((12, 16), np.uint16)),
+        "color": encode_image(np.zeros((12, 16, 3), np.uint8)),
+        "depth": encode_image(np.ones((12, 16), np.uint16)),
         "intrinsics": json.dumps({"fx": 9, "fy": 9, "cx": 8, "cy": 6}).encode(),
     }
 
@@ -67,7 +50,7 @@ def read(files: dict[str, bytes], folder: Path) -> np.ndarray:
 
 
 def test_valid_checksums(labels: list[Chunk], others: dict[str, bytes], tmp_path: Path) -> None:
-    files = {**others, "labels": png(labels)}
+    files = {**others, "labels": png_file(labels)}
     expected = np.indices((12, 16)).sum(axis=0) % 2
     np.testing.assert_array_equal(decode_frame(**files).labels, expected)
     np.testing.assert_array_equal(read(files, tmp_path), expected)
@@ -80,7 +63,7 @@ def test_invalid_checksum(labels: list[Chunk], others: dict[str, bytes], tmp_pat
     assert kind == KINDS[k]
     changed = bytes([*content[:-1], content[-1] ^ 1])
     labels[k] = (kind, content, crc ^ 1) if damage == "checksum" else (kind, changed, crc)
-    files = {**others, "labels": png(labels)}
+    files = {**others, "labels": png_file(labels)}
     with pytest.raises(RequestError) as error:
         decode_frame(**files)
     assert (error.value.status, error.value.field) == (422, "labels")

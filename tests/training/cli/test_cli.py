@@ -3,16 +3,15 @@
 import dataclasses
 import json
 import shutil
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import run_thor2
 from PIL import Image
 
 from thor2_jax.recognition.run_directory import load_run, save_run
-from training import cli
 from training.objects.builtin_objects import builtin_objects
 from training.rendering.scenes import Scene, compose_scene
 
@@ -58,24 +57,12 @@ def images(tmp_path_factory: pytest.TempPathFactory, scene: Scene) -> Path:
     return folder
 
 
-def call(*arguments: object) -> int:
-    before = sys.argv
-    sys.argv = ["thor2", *map(str, arguments)]
-    try:
-        cli.main()
-    except SystemExit as stop:
-        return int(stop.code or 0)
-    finally:
-        sys.argv = before
-    return 0
-
-
 @pytest.fixture
 def run(capsys: pytest.CaptureFixture[str]) -> Run:
     """Run a command; exit code, standard output, standard error."""
 
     def run(*arguments: object) -> tuple[int, str, str]:
-        code = call(*arguments)
+        code = run_thor2(*arguments)
         out, err = capsys.readouterr()
         return code, out, err
 
@@ -88,7 +75,7 @@ def model(meshes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("model") / "run"
     steps = ("--azimuth-step", 60, "--polar-step", 45, "--workers", 1)
     options = ("--epochs", 6, "--batch-size", 16, "--classifiers", "tops,tops2,ce")
-    assert call("train", "--meshes", meshes, "--out", out, *steps, *options) == 0
+    assert run_thor2("train", "--meshes", meshes, "--out", out, *steps, *options) == 0
     return out
 
 
@@ -163,8 +150,8 @@ def test_train_on_rendered_dataset_equals_train_on_meshes(meshes: Path, model: P
     steps = ("--azimuth-step", 60, "--polar-step", 45, "--workers", 1)
     options = ("--epochs", 6, "--batch-size", 16, "--classifiers", "tops,tops2,ce")
     varied = ("--illumination", "--sensor", "--occlusion", "--segmentation")
-    assert call("render", "--meshes", meshes, "--out", tmp_path / "views", *steps, *varied) == 0
-    assert call("train", "--dataset", tmp_path / "views", "--out", tmp_path / "run", *options) == 0
+    assert run_thor2("render", "--meshes", meshes, "--out", tmp_path / "views", *steps, *varied) == 0
+    assert run_thor2("train", "--dataset", tmp_path / "views", "--out", tmp_path / "run", *options) == 0
     assert not (model / "views").exists()
     first, second = (json.loads((f / "run.json").read_text()) for f in (model, tmp_path / "run"))
     assert first["record"]["curves"] == second["record"]["curves"]
@@ -192,7 +179,7 @@ def test_train_by_sequences(meshes: Path, tmp_path: Path, run: Run) -> None:
     soup, cereal, mug = NAMES
     table, out = tmp_path / "table.yaml", tmp_path / "runs"
     steps = ("--azimuth-step", 90, "--polar-step", 45, "--workers", 1)
-    assert call("render", "--meshes", meshes, "--out", tmp_path / "views", *steps) == 0
+    assert run_thor2("render", "--meshes", meshes, "--out", tmp_path / "views", *steps) == 0
     options = ("--sequences", table, "--epochs", 1, "--batch-size", 16, "--classifiers", "ce")
     arguments = ("train", "--dataset", tmp_path / "views", "--out", out, *options)
     table.write_text(json.dumps({"table/a": [soup, mug]}))
@@ -352,7 +339,7 @@ def test_paper_protocol(meshes: Path, tmp_path: Path) -> None:
     """Plain views, each in four mirrors; what is given takes the place of the protocol's numbers."""
     options = ("--azimuth-step", 90, "--polar-step", 45, "--workers", 1, "--epochs", 1, "--classifiers", "ce")
     for name, paper in (("paper", ["--paper"]), ("default", [])):
-        assert call("train", "--meshes", meshes, "--out", tmp_path / name, *options, *paper) == 0
+        assert run_thor2("train", "--meshes", meshes, "--out", tmp_path / name, *options, *paper) == 0
     of = {name: json.loads((tmp_path / name / "run.json").read_text())["record"] for name in ("paper", "default")}
     assert of["paper"]["samples"] == 4 * of["paper"]["dataset"]["views"] == 4 * 3 * 4 * 5
     assert of["paper"]["batch_size"] == 128 and of["default"]["batch_size"] > 100

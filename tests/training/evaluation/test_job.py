@@ -5,13 +5,13 @@ import os
 import signal
 import subprocess
 import sys
-from html.parser import HTMLParser
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from helpers import ParsedPage
 from PIL import Image
 
 import thor2_jax as thor2
@@ -150,37 +150,12 @@ def test_runs_may_have_different_classifiers(tmp_path: Path) -> None:
     assert np.sum(found["confusion"]) == 20 and np.sum(found["confusion"], axis=0)[-1] == 4
 
 
-class Page(HTMLParser):
-    """Collects pictures, headings' text and tags that are open at the end."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.text: list[str] = []
-        self.pictures: list[dict[str, str | None]] = []
-        self.seen: set[str] = set()
-        self.open: list[str] = []
-        self.feed(text)
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.seen.add(tag)
-        if tag == "img":
-            self.pictures.append(dict(attrs))
-        elif tag != "meta":
-            self.open.append(tag)
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        self.text.append(data)
-
-
 @pytest.mark.parametrize("n", [1, 2, 15])
 def test_page_for_datasets_of_any_size(tmp_path: Path, n: int) -> None:
     found = evaluate_toys(tmp_path, n)
     report = tmp_path / "report"
-    page = Page((report / "report.html").read_text())
-    assert page.open == [] and not page.seen & {"script", "link"}
+    page = ParsedPage((report / "report.html").read_text())
+    assert page.open == [] and not page.tags & {"script", "link"}
     assert all(p["alt"] and (report / str(p["src"])).is_file() for p in page.pictures)
     shown = [p for p in page.pictures if str(p["src"]).startswith("frames/")]
     assert len(shown) == min(n, 12) and len(found["shown"]) == len(shown)
@@ -205,7 +180,7 @@ def test_page_without_described_or_known_instances(tmp_path: Path) -> None:
         dataset = OneFrame(LabelledFrame("f", frame, truth, {}))
         description = {"kind": "frames", "path": name}
         evaluate_dataset(toys(tmp_path / "log"), dataset, description, tmp_path / name)
-        assert Page((tmp_path / name / "report.html").read_text()).open == []
+        assert ParsedPage((tmp_path / name / "report.html").read_text()).open == []
 
 
 def test_outlines_show_correct_and_incorrect_answers(tmp_path: Path) -> None:

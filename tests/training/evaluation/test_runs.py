@@ -7,14 +7,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from flax import nnx
+from helpers import untrained_run
 
 import colornet
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.describe import describe
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.classifier import MLP
-from thor2_jax.recognition.run_directory import TrainedRun, input_size, save_run
+from thor2_jax.recognition.run_directory import save_run
 from thor2_jax.types import PointClouds
 from training.baselines.files import baseline_file
 from training.evaluation.runs import load_runs, load_sequence_runs
@@ -27,13 +26,11 @@ Maker = Callable[..., Path]
 @pytest.fixture
 def make(tmp_path: Path) -> Maker:
     """Write an untrained run of colour alone."""
-    network = colornet.load_default()
 
     def make(
         name: str, classes: tuple[str, ...] = ("a", "b"), seed: int = 0, config: DescriptorConfig = CONFIG
     ) -> Path:
-        model = MLP(input_size("ce", config, network.n_regions), len(classes), rngs=nnx.Rngs(seed))
-        save_run(TrainedRun(config, network, classes, {"ce": model}, {}), tmp_path / name)
+        save_run(untrained_run(classes, ("ce",), config, seed=seed), tmp_path / name)
         return tmp_path / name
 
     return make

@@ -1,15 +1,12 @@
 """Training over eight devices and over two processes against one device, each in processes of their own."""
 
 import json
-import os
-import socket
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from helpers import finish_programs, free_port, start_program
 
 _PROGRAM = """
 import json, sys
@@ -43,29 +40,6 @@ for fold, run in enumerate(runs):
 """
 
 
-def start(out: Path, devices: int, port: int = 0, rank: int = 0, local_devices: int = 1) -> subprocess.Popen[str]:
-    arguments = [str(out), str(port), str(rank), str(devices)]
-    environment = {
-        **os.environ,
-        "PYTHONPATH": str(Path(__file__).parents[3]),
-        "XLA_FLAGS": f"--xla_force_host_platform_device_count={local_devices}",
-        "JAX_PLATFORMS": "cpu",
-    }
-    command = [sys.executable, "-c", _PROGRAM, *arguments]
-    return subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
-
-
-def finish(*processes: subprocess.Popen[str]) -> None:
-    try:
-        for process in processes:
-            _, err = process.communicate(timeout=120)
-            assert process.returncode == 0, err[-3000:]
-    finally:
-        for process in processes:
-            process.kill()
-            process.communicate()
-
-
 def curve(out: Path) -> list[tuple[Any, ...]]:
     rows = [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
     assert [(row["fold"], row["epoch"]) for row in rows] == [(fold, epoch) for fold in (0, 1) for epoch in range(1, 5)]
@@ -80,25 +54,22 @@ def saved(out: Path, rank: int, fold: int) -> dict[str, np.ndarray]:
 @pytest.fixture(scope="module")
 def alone(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("alone") / "run"
-    finish(start(out, 1))
+    finish_programs(start_program(_PROGRAM, out, 0, 0, 1))
     return out
 
 
 @pytest.mark.slow
 def test_eight_devices_learn_as_one_does(alone: Path, tmp_path: Path) -> None:
-    finish(start(tmp_path / "run", 8, local_devices=8))
+    finish_programs(start_program(_PROGRAM, tmp_path / "run", 0, 0, 8, devices=8))
     np.testing.assert_allclose(curve(tmp_path / "run"), curve(alone), rtol=2e-3, atol=2e-3)
 
 
 @pytest.mark.slow
 def test_two_processes_reach_the_weights_of_one(alone: Path, tmp_path: Path) -> None:
     """The bits of one process with two devices; the curve of one device."""
-    with socket.socket() as free:
-        free.bind(("localhost", 0))
-        port = free.getsockname()[1]
-    pair = [start(tmp_path / "pair", 2, port, rank) for rank in (0, 1)]
-    finish(*pair)
-    finish(start(tmp_path / "one", 2, local_devices=2))
+    port = free_port()
+    finish_programs(*(start_program(_PROGRAM, tmp_path / "pair", port, rank, 2) for rank in (0, 1)))
+    finish_programs(start_program(_PROGRAM, tmp_path / "one", 0, 0, 2, devices=2))
     np.testing.assert_allclose(curve(tmp_path / "pair"), curve(alone), rtol=2e-3, atol=2e-3)
     assert sorted(path.name for path in (tmp_path / "pair").iterdir()) == [
         "curves.png",

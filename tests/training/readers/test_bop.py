@@ -1,7 +1,6 @@
 """BOP's format on small datasets in the exact layout; images and cameras against OpenCV, and a real frame."""
 
 import json
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,11 +10,11 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from helpers import run_thor2
 from PIL import Image
 
 from thor2_jax.errors import InputError
 from thor2_jax.recognition.frames import backproject
-from training import cli
 from training.evaluation.answering import answer_frames
 from training.evaluation.results import compute_results
 from training.evaluation.runs import Run as EvaluatedRun
@@ -409,20 +408,13 @@ def test_accuracy_by_scene(tmp_path: Path) -> None:
 
 
 def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    def call(*arguments: object) -> int:
-        monkeypatch.setattr(sys, "argv", ["thor2", "evaluate", "bop", *map(str, arguments)])
-        try:
-            cli.main()
-        except SystemExit as stop:
-            return int(stop.code or 0)
-        return 0
-
     monkeypatch.setattr("training.evaluation.runs.load_runs", lambda paths: [EvaluatedRun("run", "0", LabelIsClass())])
     dataset, model = write_dataset(tmp_path), ("--model", tmp_path / "run")
-    assert call(dataset, *model, "--names", tmp_path / "names.yaml", "--out", tmp_path / "report") == 0
+    options = ("--names", tmp_path / "names.yaml", "--out", tmp_path / "report")
+    assert run_thor2("evaluate", "bop", dataset, *model, *options) == 0
     assert "5 instances scored" in capsys.readouterr().out
     assert json.loads((tmp_path / "report" / "report.json").read_text())["instances"]["scored"] == 5
-    assert call(dataset, *model) == 0  # without names, all objects are unknown
+    assert run_thor2("evaluate", "bop", dataset, *model) == 0  # without names, all objects are unknown
     assert "5 are of no class" in capsys.readouterr().out
-    assert call(tmp_path / "absent", *model) == 2
+    assert run_thor2("evaluate", "bop", tmp_path / "absent", *model) == 2
     assert capsys.readouterr().err == f"error: dataset: {tmp_path / 'absent'} is no folder\n"

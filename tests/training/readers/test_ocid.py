@@ -2,7 +2,6 @@
 
 import json
 import struct
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from helpers import run_thor2
 from PIL import Image
 
 from thor2_jax.errors import InputError
 from thor2_jax.recognition.frames import Intrinsics, backproject
-from training import cli
 from training.evaluation.answering import answer_frames
 from training.evaluation.results import compute_results
 from training.evaluation.runs import Run as EvaluatedRun
@@ -351,15 +350,6 @@ class NamesInOrder:
         return {"tops": np.array([[0.9, 0.1] if k == 0 else [0.2, 0.8] for k in range(len(clouds))]).reshape(-1, 2)}
 
 
-def call(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
-    monkeypatch.setattr(sys, "argv", ["thor2", *map(str, arguments)])
-    try:
-        cli.main()
-    except SystemExit as stop:
-        return int(stop.code or 0)
-    return 0
-
-
 def test_accuracy_by_condition(tmp_path: Path) -> None:
     write_frame(tmp_path, "table/bottom/curved/seq36", objects=2)
     write_frame(tmp_path, "floor/top/mixed/seq08")
@@ -385,7 +375,7 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     names = write_names(tmp_path)
     monkeypatch.setattr("training.evaluation.runs.load_runs", lambda paths: [EvaluatedRun("run", "0", NamesInOrder())])
     options = ("--model", tmp_path / "run", "--names", names)
-    assert call(monkeypatch, "evaluate", "ocid", tmp_path, *options, "--out", tmp_path / "report") == 0
+    assert run_thor2("evaluate", "ocid", tmp_path, *options, "--out", tmp_path / "report") == 0
     assert "2 instances scored" in capsys.readouterr().out
     report = json.loads((tmp_path / "report" / "report.json").read_text())
     assert report["instances"]["scored"] == 2 and sum(report["instances"]["no_class"].values()) == 1
@@ -394,7 +384,7 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     cell = report["accuracy"]["max"][0]["cells"][0]
     assert cell["instances"] == 2 and cell["accuracy"]["TOPS"]["mean"] == 1.0
     names.unlink()
-    assert call(monkeypatch, "evaluate", "ocid", tmp_path, *options) == 2
+    assert run_thor2("evaluate", "ocid", tmp_path, *options) == 2
     assert capsys.readouterr().err == f"error: {names}: No such file or directory\n"
 
 
@@ -416,14 +406,14 @@ def test_every_sequence_by_its_own_run(
     models = tmp_path / "runs"
     (models / "seq36").mkdir(parents=True)
     options = ("--model", models, "--names", names, "--per-sequence")
-    assert call(monkeypatch, "evaluate", "ocid", tmp_path, *options) == 2
+    assert run_thor2("evaluate", "ocid", tmp_path, *options) == 2
     assert f"error: model: {models} has no run for table/top/mixed/seq08; " in capsys.readouterr().err
     (models / "table/top/mixed/seq08").mkdir(parents=True)
-    assert call(monkeypatch, "evaluate", "ocid", tmp_path, *options, "--out", tmp_path / "report") == 0
+    assert run_thor2("evaluate", "ocid", tmp_path, *options, "--out", tmp_path / "report") == 0
     report = json.loads((tmp_path / "report" / "report.json").read_text())
     assert report["runs"] == ["runs/*"] and report["classes"] == ["apple", "banana", "bowl", "mug"]
     by = {tuple(table["by"]): table["cells"] for table in report["accuracy"]["max"]}
     shares = {cell["where"]["sequence"]: cell["accuracy"]["TOPS"]["mean"] for cell in by["sequence",]}
     assert [round(share, 3) for share in shares.values()] == [1.0, 1.0, 0.667]
-    assert call(monkeypatch, "evaluate", "ocid", tmp_path, *options, tmp_path) == 2
+    assert run_thor2("evaluate", "ocid", tmp_path, *options, tmp_path) == 2
     assert "2 models are given" in capsys.readouterr().err

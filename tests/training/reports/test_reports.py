@@ -1,11 +1,11 @@
 """HTML pages, plots and the demo."""
 
 import dataclasses
-from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import ParsedPage
 from PIL import Image
 
 import colornet
@@ -18,33 +18,10 @@ from training.reports.object_plots import draw_descriptor, draw_objects
 from training.reports.plots import draw_accuracy, draw_confusion, draw_curves, draw_reliability
 
 
-class Page(HTMLParser):
-    """Collects the text, the pictures and the tags left open."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.text: list[str] = []
-        self.pictures: list[dict[str, str | None]] = []
-        self.open: list[str] = []
-        self.feed(text)
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        if tag == "img":
-            self.pictures.append(dict(attrs))
-        elif tag != "meta":
-            self.open.append(tag)
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        self.text.append(data)
-
-
 def test_page_escapes_its_content(tmp_path: Path) -> None:
     section = Section("A < B", "x & y", (["name", "value"], [["<b>", "1"]]), [Picture("p.png", 'the "first"')])
     write_page(tmp_path / "page.html", title="T<script>", lead="l", sections=[section])
-    page = Page((tmp_path / "page.html").read_text())
+    page = ParsedPage((tmp_path / "page.html").read_text())
     assert page.open == []
     assert {"T<script>", "A < B", "x & y", "<b>", 'the "first"'} <= set(page.text)
     assert page.pictures == [{"src": "p.png", "alt": 'the "first"'}]
@@ -129,7 +106,7 @@ def test_small_demo_is_interrupted_and_resumes(tmp_path: Path, monkeypatch: pyte
         mean = sum(summary.accuracy[name][k] * count for name, count in subsets.items()) / summary.instances["all"]
         assert summary.accuracy["all"][k] == pytest.approx(mean)
     assert summary.accuracy["all"][3] > 0.4  # chance is 0.2
-    page = Page((tmp_path / "report.html").read_text())
+    page = ParsedPage((tmp_path / "report.html").read_text())
     assert page.open == [] and len(page.pictures) == 11
     assert all((tmp_path / str(picture["src"])).is_file() for picture in page.pictures)
     assert dataclasses.asdict(summary).keys() <= set((tmp_path / "demo.json").read_text().split('"'))

@@ -1,0 +1,146 @@
+"""Helpers of several test files: untrained runs, small clouds and images, the command line, programs, HTML pages."""
+
+import io
+import os
+import socket
+import struct
+import subprocess
+import sys
+import zlib
+from collections.abc import Sequence
+from html.parser import HTMLParser
+from pathlib import Path
+from unittest import mock
+
+import numpy as np
+from flax import nnx
+from PIL import Image
+
+import colornet
+import thor2_jax as thor2
+from thor2_jax.recognition.classifier import FEATURES, MLP
+from thor2_jax.recognition.run_directory import TrainedRun, input_size
+
+SMALL_CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=2, n_strips=5, image_size=8)
+"""A descriptor that compiles quickly."""
+
+
+def untrained_run(
+    classes: Sequence[str],
+    features: Sequence[str] = FEATURES,
+    config: thor2.DescriptorConfig = SMALL_CONFIG,
+    record: dict[str, object] | None = None,
+    seed: int = 0,
+) -> TrainedRun:
+    """Return a run whose classifiers have random weights, other ones for each feature."""
+    network = colornet.load_default()
+    classifiers = {
+        name: MLP(input_size(name, config, network.n_regions), len(classes), rngs=nnx.Rngs(seed + k))
+        for k, name in enumerate(features)
+    }
+    return TrainedRun(config, network, tuple(classes), classifiers, record or {})
+
+
+def aligned_cloud(
+    seed: int, n: int, size: tuple[float, float, float] = (0.76, 0.4, 0.68)
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return random points in the first octant, none within 1e-5 of a border of slices or strips, and colours."""
+    rng = np.random.default_rng(seed)
+    points = (rng.random((n, 3)) * size).astype(np.float32)
+    for axis, width in ((0, 0.025), (2, 0.1)):
+        border = np.round(points[:, axis] / width) * width
+        points[np.abs(points[:, axis] - border) < 1e-5, axis] += np.float32(1e-3)
+    return points, rng.integers(0, 256, (n, 3), dtype=np.uint8)
+
+
+def as_8_bit(colors: np.ndarray) -> np.ndarray:
+    """Round colours in [0, 1], float32, to the nearest of 256 levels, halves up."""
+    return np.floor(colors * np.float32(255) + np.float32(0.5)).astype(np.uint8)
+
+
+def encode_image(pixels: np.ndarray, kind: str = "PNG", **options: object) -> bytes:
+    """Return an image file's bytes."""
+    stream = io.BytesIO()
+    Image.fromarray(pixels).save(stream, kind, **options)
+    return stream.getvalue()
+
+
+def png_file(chunks: Sequence[tuple[bytes, bytes, int]]) -> bytes:
+    """Return a PNG file of chunks (kind, content, checksum), whatever is in them."""
+    packed = (struct.pack(">I", len(content)) + kind + content + struct.pack(">I", c) for kind, content, c in chunks)
+    return b"\x89PNG\r\n\x1a\n" + b"".join(packed)
+
+
+def with_checksums(*chunks: tuple[bytes, bytes]) -> list[tuple[bytes, bytes, int]]:
+    """Return PNG chunks (kind, content) with their correct checksums."""
+    return [(kind, content, zlib.crc32(kind + content)) for kind, content in chunks]
+
+
+def run_thor2(*arguments: object) -> int:
+    """Run the command line in this process and return its exit status."""
+    from training import cli
+
+    with mock.patch.object(sys, "argv", ["thor2", *map(str, arguments)]):
+        try:
+            cli.main()
+        except SystemExit as stop:
+            return int(stop.code or 0)
+    return 0
+
+
+def free_port() -> int:
+    """Return a TCP port that no process listens on."""
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        return int(free.getsockname()[1])
+
+
+def start_program(code: str, *arguments: object, devices: int = 1) -> subprocess.Popen[str]:
+    """Start a Python program on the CPU, which JAX divides into some devices."""
+    environment = os.environ | {
+        "PYTHONPATH": str(Path(__file__).parents[1]),
+        "XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}",
+        "JAX_PLATFORMS": "cpu",
+    }
+    command = [sys.executable, "-c", code, *map(str, arguments)]
+    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def finish_programs(*processes: subprocess.Popen[str]) -> list[str]:
+    """Wait for programs, assert that none failed, and return what each wrote to standard output."""
+    outputs = []
+    try:
+        for process in processes:
+            out, err = process.communicate(timeout=300)
+            assert process.returncode == 0, err[-3000:]
+            outputs.append(out)
+    finally:
+        for process in processes:
+            process.kill()
+            process.communicate()
+    return outputs
+
+
+class ParsedPage(HTMLParser):
+    """An HTML page: its texts, attributes of its pictures, its tags, and tags that are open at the end."""
+
+    def __init__(self, content: str) -> None:
+        super().__init__()
+        self.text: list[str] = []
+        self.pictures: list[dict[str, str | None]] = []
+        self.tags: set[str] = set()
+        self.open: list[str] = []
+        self.feed(content)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.add(tag)
+        if tag == "img":
+            self.pictures.append(dict(attrs))
+        elif tag != "meta":
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text.append(data)
