@@ -7,9 +7,8 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, settings
 
-# Read when JAX is imported, and inherited by the processes that tests start. Mixed dtypes are errors; compiled programs
-# are shared by the processes of a run, and kept for the next one.
-os.environ.setdefault("JAX_NUMPY_DTYPE_PROMOTION", "strict")
+# Read when JAX is imported and inherited by subprocesses: the processes of a run share their compiled programs, and the
+# next run finds them.
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", f"{tempfile.gettempdir()}/thor2-jax-tests-{os.getuid()}")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
 

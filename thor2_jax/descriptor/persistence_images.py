@@ -14,9 +14,9 @@ __all__ = ["count_past_window", "persistence_images"]
 
 def _at_edges(centres: jax.Array, variance: ArrayLike, config: DescriptorConfig) -> jax.Array:
     """Return 2 CDF - 1 of the normal distributions at `centres` [..., J] at the pixel edges, [..., P + 1, J]."""
-    edges = (jnp.arange(config.image_size + 1) - 1) * config.sigma_2
+    edges = (jnp.arange(config.image_size + 1, dtype=centres.dtype) - 1) * config.sigma_2
     # `ndtr` costs four times as much, for digits of far tails that an image does not need.
-    return erf((edges.astype(centres.dtype)[:, None] - centres[..., None, :]) * jax.lax.rsqrt(2 * variance))
+    return erf((edges[:, None] - centres[..., None, :]) * jax.lax.rsqrt(2 * variance))
 
 
 def _weight(persistence: jax.Array, exponent: ArrayLike) -> jax.Array:

@@ -57,4 +57,4 @@ def _round_scaled(values: jax.Array, scale: int) -> jax.Array:
     )
     past_half = (upper * scale - (whole + 0.5)) + (values - upper) * scale
     round_up = (past_half > 0) | ((past_half == 0) & (whole % 2 == 1))
-    return whole + round_up
+    return whole + round_up.astype(whole.dtype)
