@@ -1,4 +1,4 @@
-"""Clouds to measure on: views of real scans where they are at hand, else of the built-in objects."""
+"""Clouds for benchmarks: views of real scans if available, otherwise of the built-in objects."""
 
 from pathlib import Path
 
@@ -29,10 +29,10 @@ def _objects() -> tuple[str, list[TexturedMesh]]:
 
 
 def sample_clouds(count: int, n_points: int, seed: int = 0) -> tuple[str, list[Cloud]]:
-    """Clouds of exactly `n_points` points, and what they are.
+    """Return a description of the clouds, and `count` clouds of exactly `n_points` points.
 
-    Points are pixels of a view drawn at random, without repetition where the view has enough of them; beyond that many
-    clouds, views repeat with another draw.
+    Points are drawn at random from the pixels of a view, without repetition if the view has enough of them. If there
+    are fewer views than clouds, views are reused with other random points.
     """
     rng = np.random.default_rng(seed)
     name, meshes = _objects()

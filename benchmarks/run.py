@@ -1,7 +1,7 @@
-"""The engine beside its peer, in one run on the same clouds: `python -m benchmarks.run [--out FOLDER] [--quick]`.
+"""Compare the library with a peer in one run on the same clouds: `python -m benchmarks.run [--out FOLDER] [--quick]`.
 
-Prints tables; writes cpu.json and cpu.png. Compile time is apart, and every figure is the median of repeated calls. The
-peer runs in two processes.
+The script prints tables and writes cpu.json and cpu.png. Compile times are reported separately, and all other figures
+are medians of repeated calls. The peer runs in two processes.
 """
 
 import argparse
@@ -41,7 +41,7 @@ PEER_CLOUDS, PEER_PROCESSES = 64, 2
 
 
 def peer_start() -> None:
-    """Make a peer once a process."""
+    """Create the peer, once for each process."""
     global peer
     from benchmarks.peer import Peer
 
@@ -53,7 +53,7 @@ def peer_describe(cloud: Any) -> float:
 
 
 def peer_agrees(clouds: list[Any]) -> float:
-    """Largest difference of the two on the same aligned clouds, relative to the largest entry."""
+    """Return the largest difference from the peer on the same aligned clouds, relative to the largest entry."""
     from benchmarks.peer import Peer
 
     other, worst = Peer(), 0.0
@@ -67,9 +67,9 @@ def peer_agrees(clouds: list[Any]) -> float:
 
 
 def beside_peer(clouds: list[Any], rounds: int = 7) -> dict[str, Any]:
-    """Clouds a second of the peer in two processes, warm, and how many times as fast the engine is.
+    """Return the clouds per second of the peer in two warm processes, and the speed of the library relative to it.
 
-    Peer and engine take turns, so that whatever else slows the machine meets both; medians of the rounds.
+    The peer and the library take turns, so that other load on the machine affects both; values are medians of rounds.
     """
     packed = thor2.PointClouds.pack(clouds, N_POINTS)
     few = clouds[:PEER_CLOUDS]
@@ -88,13 +88,13 @@ def beside_peer(clouds: list[Any], rounds: int = 7) -> dict[str, Any]:
 
 
 def whole(packed: thor2.PointClouds, config: thor2.DescriptorConfig) -> Any:
-    """The whole way, to both descriptors."""
+    """Compute both descriptors from unaligned clouds."""
     found = thor2.describe(packed, NETWORK, config)
     return found.tops, found.tops2
 
 
 def engine_rates(clouds: list[Any]) -> dict[str, Any]:
-    """Clouds a second of the whole way and of its parts."""
+    """Return the clouds per second of the complete pipeline and of its stages."""
     packed = thor2.PointClouds.pack(clouds, N_POINTS)
     aligned = thor2.align(packed, CLOSED)
     strips = thor2.strips(aligned, NETWORK, CLOSED)
@@ -115,7 +115,7 @@ def engine_rates(clouds: list[Any]) -> dict[str, Any]:
 
 
 def align_share(clouds: list[Any], rounds: int = 20) -> float:
-    """Time of the alignment in that of the whole way (closed form), in turns; the median of the rounds."""
+    """Return the share of the alignment in the time of the pipeline (closed form), median of rounds."""
     packed = thor2.PointClouds.pack(clouds, N_POINTS)
     shares = []
     for _ in range(rounds):
@@ -125,7 +125,7 @@ def align_share(clouds: list[Any], rounds: int = 20) -> float:
 
 
 def against_size(quick: bool) -> dict[str, list[list[float]]]:
-    """Median seconds of `describe` (closed form) by number of points at 64 clouds, and by number of clouds."""
+    """Return median seconds of `describe` (closed form) by number of points, for 64 clouds, and by number of clouds."""
     by_points, by_clouds = [], []
     for n in (512, 1024, 2048) if quick else (512, 1024, 2048, 4096, 8192):
         packed = thor2.PointClouds.pack(sample_clouds(64, n)[1], n)
@@ -137,7 +137,7 @@ def against_size(quick: bool) -> dict[str, list[list[float]]]:
 
 
 def stream(clouds: list[Any], count: int) -> dict[str, float]:
-    """Seconds for `count` clouds through `describe_stream`, and the process's peak memory afterwards in GiB."""
+    """Return the seconds that `describe_stream` takes for `count` clouds, and the peak memory of the process in GiB."""
     start = time.perf_counter()
     endless = itertools.islice(itertools.cycle(clouds), count)
     described = sum(len(found.overflow) for found in describe_stream(endless, NETWORK, CLOSED, N_POINTS))
@@ -146,7 +146,7 @@ def stream(clouds: list[Any], count: int) -> dict[str, float]:
 
 
 def frame_latency(calls: int) -> dict[str, float]:
-    """Milliseconds from decoded arrays to names, a frame of 640 x 480 with six objects, three classifiers loaded."""
+    """Return the milliseconds to recognize a decoded frame of 640 x 480 with six objects and three classifiers."""
     classifiers = {name: MLP(input_size(name, CLOSED, NETWORK.n_regions), 17, rngs=nnx.Rngs(0)) for name in FEATURES}
     run = TrainedRun(CLOSED, NETWORK, tuple(map(str, range(17))), classifiers, {})
     recognizer = thor2.Recognizer(run)
@@ -168,7 +168,7 @@ def frame_latency(calls: int) -> dict[str, float]:
 
 
 def draw(sizes: dict[str, list[list[float]]], path: Path) -> None:
-    """Time against the number of points and of clouds, both logarithmic, with the fixed and the linear part fitted."""
+    """Plot times against the numbers of points and of clouds, with a fitted constant plus linear model."""
     figure = Figure(figsize=(9, 3.8), layout="constrained")
     FigureCanvasAgg(figure)
     for axes, (name, rows) in zip(figure.subplots(1, 2), sizes.items(), strict=True):
@@ -189,10 +189,10 @@ def draw(sizes: dict[str, list[list[float]]], path: Path) -> None:
 
 
 def main() -> None:
-    """Measure, print, write."""
+    """Run all measurements, print them, and write the results."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
-    parser.add_argument("--quick", action="store_true", help="fewer sizes and calls")
+    parser.add_argument("--quick", action="store_true", help="use fewer sizes and calls")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     name, clouds = sample_clouds(BATCH, N_POINTS)
@@ -222,8 +222,8 @@ def main() -> None:
         peer = beside_peer(clouds)
         rate = f"{peer['clouds_per_s']:10,.0f} clouds/s"
         print(f"{'peer, two processes':38s} {rate}   same aligned clouds: differs by {agreement:.1e}")
-        told = ", ".join(f"{name} {ratio:.1f}" for name, ratio in peer["ratio"].items())
-        print(f"times as fast as the peer, in turns: {told}")
+        ratios = ", ".join(f"{name} {ratio:.1f}" for name, ratio in peer["ratio"].items())
+        print(f"times as fast as the peer, in turns: {ratios}")
         result["peer"] = {"difference": agreement, **peer}
     result["frame"] = frame_latency(40 if options.quick else 200)
     print("frame of six objects: p50 {p50_ms:.1f} ms, p99 {p99_ms:.1f} ms".format(**result["frame"]))

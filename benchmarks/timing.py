@@ -1,4 +1,4 @@
-"""Time of a function on a device: first call apart, then the fastest and the median of repeated calls."""
+"""Timing of functions on a device: the first call, and the fastest and the median of later calls."""
 
 import dataclasses
 import statistics
@@ -13,7 +13,7 @@ __all__ = ["Timing", "time_calls"]
 
 @dataclasses.dataclass(frozen=True)
 class Timing:
-    """Seconds: `first` holds compilation, `best` and `median` are of later calls."""
+    """Seconds of the first call, which includes compilation, and the best and the median of later calls."""
 
     first: float
     best: float
@@ -21,7 +21,7 @@ class Timing:
 
 
 def time_calls(function: Callable[[], Any], seconds: float = 2.0, least: int = 5) -> Timing:
-    """Call `function` until `seconds` have passed and `least` calls are done; results are waited for."""
+    """Call `function` at least `least` times and for at least `seconds`, waiting for each result."""
 
     def once() -> float:
         start = time.perf_counter()

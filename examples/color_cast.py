@@ -1,8 +1,8 @@
-"""Recover the gain and the colour cast of a light by gradient descent through the colour embedding.
+"""Estimate the gain and the colour cast of a lamp by gradient descent through the colour embedding.
 
-A view of every built-in object is seen once in the light of its model and once under a lamp that dims and tints it, by
-a camera with noise. The relaxed descriptor's colour part is differentiable in the points' colours, so the lamp follows
-from the difference of the two embeddings: `python examples/color_cast.py [--out FOLDER]`.
+A view of every built-in object is seen once in neutral light and once under a lamp that dims and tints it, by a camera
+with noise. The colour embedding of the relaxed descriptor is differentiable in the colours of the points, so that the
+lamp follows from minimizing the difference of the two embeddings: `python examples/color_cast.py [--out FOLDER]`.
 """
 
 import argparse
@@ -24,27 +24,27 @@ from training.rendering.view_sphere import camera_pose
 from training.views.mesh_views import view_cloud
 
 LAMP = np.array([0.80, 0.66, 0.55], np.float32)
-"""What the lamp multiplies red, green and blue by: gain 0.67, warm."""
+"""Factors of the lamp for red, green and blue: a warm light with a gain of 0.67."""
 
 N_POINTS = 512
-"""Points of each cloud that are used."""
+"""Number of points of each cloud."""
 
 STEPS = 200
 NOISE = 0.02
-"""Standard deviation of the camera's noise, of a channel in [0, 1]."""
+"""Standard deviation of the camera noise, for channels in [0, 1]."""
 
 TEMPERATURE = 20.0
-"""HyAB units of the softmax over colours. Cold, the loss has steps and the descent gets stuck: at 5 it ends 3 % off, at
-1 a quarter off."""
+"""Temperature of the softmax over colours, units of HyAB. At low temperatures descent gets stuck in steps:
+the result is off by 3 % at 5 and by 25 % at 1."""
 
 
 def under(light: jax.Array, clouds: thor2.PointClouds) -> thor2.PointClouds:
-    """The clouds with their colours multiplied by `light` [3]."""
+    """Multiply the colours of clouds by `light` [3]."""
     return dataclasses.replace(clouds, colors=jnp.clip(clouds.colors * light, 0, 1))
 
 
 def main() -> None:
-    """Recover the lamp, print the figures, draw a picture."""
+    """Estimate the lamp, print the results, and draw a figure."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("color-cast"))
     out = parser.parse_args().out
@@ -99,7 +99,7 @@ def draw(
     history: list[tuple[float, np.ndarray]],
     path: Path,
 ) -> None:
-    """The objects in both lights and with the lamp taken off again, and the way there."""
+    """Draw the objects in both lights and with the estimated lamp removed, and the progress of the descent."""
     figure = Figure(figsize=(11, 5.2), layout="constrained")
     FigureCanvasAgg(figure)
     upper, lower = figure.subfigures(2, 1, height_ratios=(1, 1.6))
