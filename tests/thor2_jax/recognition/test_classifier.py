@@ -76,7 +76,7 @@ def test_the_papers_layers() -> None:
     assert model.dropout.rate == 0.2
 
 
-def test_training_uses_the_batchs_statistics_and_moves_the_running_ones() -> None:
+def test_training_uses_batch_statistics_and_moves_running_ones() -> None:
     model = MLP(33, 5, rngs=nnx.Rngs(0), dropout=0.0)
     x = RNG.normal(size=(16, 33)).astype(np.float32)
     expected = numpy_logits(model, x, own_statistics=True)

@@ -134,7 +134,7 @@ def test_fewest_points(pixels: int, usable: bool) -> None:
     cloud = only(frame_of(flat(2250), patch((1, 5, 6, 10, 10 + pixels))))
     assert (cloud.reason is None) == usable
     if not usable:
-        assert f"{pixels} points" in str(cloud.reason) and f"at least {MIN_POINTS} are needed" in str(cloud.reason)
+        assert f"{pixels} points" in str(cloud.reason) and f"at least {MIN_POINTS}" in str(cloud.reason)
 
 
 def test_many_pixels_in_few_voxels() -> None:

@@ -59,7 +59,7 @@ def test_the_steepest_slope(slope: float, flies: bool, turns: int) -> None:
     np.testing.assert_array_equal(found, flies & (depth.ravel() > depth.min() * 1.001))
 
 
-def test_other_instances_and_the_background_do_not_make_pixels_fly() -> None:
+def test_other_instances_make_no_flying_pixels() -> None:
     labels = np.zeros((9, 20), np.uint8)
     labels[:, 5:10], labels[:, 10:15] = 1, 2
     frame = frame_of(np.where(labels == 1, 1200, 700).astype(np.uint16), labels)
@@ -187,7 +187,7 @@ def test_a_gap_of_two_cells_parts_a_gap_within_one_does_not(
 
 
 @pytest.mark.parametrize(("strays", "relaxed"), [(1599, False), (1600, False), (1601, True)])
-def test_the_rule_of_neighbours_is_left_out_where_it_would_drop_more_than_half(strays: int, relaxed: bool) -> None:
+def test_the_neighbour_rule_is_skipped_if_it_drops_more_than_half(strays: int, relaxed: bool) -> None:
     plane = grid(40, 40)
     scattered = grid(41, 41, 0.03)[:strays] + [0, 0, 1]
     kept, found = remove_outliers(np.concatenate([plane, scattered]))

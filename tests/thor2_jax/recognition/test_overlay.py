@@ -74,7 +74,7 @@ def outside(boxes: list[tuple[tuple[int, int, int, int], str]], shape: tuple[int
     return free
 
 
-def test_outlines_lie_within_the_masks_and_leave_the_inside_alone(tmp_path: Path, boxes: list) -> None:
+def test_outlines_lie_on_the_inner_edge_of_the_masks(tmp_path: Path, boxes: list) -> None:
     labels = discs([(120, 150), (300, 400)], 60)
     labels[300:320, 390:410] = 0  # a hole has an outline too
     answers = [named(1), Recognition(label=2, reason="too few points")]

@@ -119,7 +119,7 @@ def test_shapes_that_do_not_fit(points: tuple[int, ...], colors: tuple[int, ...]
 
 
 @pytest.mark.parametrize(("side", "doublings"), [(20, 0), (21, 1), (50, 2)])
-def test_a_cloud_that_no_bucket_holds_gets_a_grid_twice_as_coarse(side: int, doublings: int) -> None:
+def test_a_cloud_past_the_largest_bucket_gets_larger_voxels(side: int, doublings: int) -> None:
     points = np.stack(np.meshgrid(*[np.arange(side)] * 3, indexing="ij"), axis=-1).reshape(-1, 3).astype(np.float64)
     colors = np.zeros((len(points), 3))
     found, _ = downsample_to_fit(points, colors, 1.0)
