@@ -1,4 +1,4 @@
-"""Fixtures shared by all tests, the thorough tier, and the slow tier's time."""
+"""Fixtures shared by all tests, the tiers of tests, and the compilation cache."""
 
 import os
 import tempfile
@@ -13,7 +13,7 @@ os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", f"{tempfile.gettempdir()}/tho
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
 
 EXAMPLES = {"properties": (4, 60), "fuzz": (150, 3000)}
-"""Folder of tests -> examples that Hypothesis draws for each, and those with --thorough."""
+"""Directory of tests -> number of Hypothesis examples for each test, by default and with --thorough."""
 
 for folder, numbers in EXAMPLES.items():
     for tier, number in zip(("quick", "thorough"), numbers, strict=True):
@@ -30,42 +30,35 @@ SHARED = Path(__file__).resolve().parents[1].parent / "shared"
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--thorough", action="store_true", help="many more examples of laws and damaged files")
+    parser.addoption("--thorough", action="store_true", help="run all tests, with many more examples of each property")
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    if not config.getoption("thorough"):
-        left_out = [item for item in items if item.get_closest_marker("thorough")]
-        config.hook.pytest_deselected(items=left_out)
-        items[:] = [item for item in items if item not in left_out]
-
-
-def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    reports = [r for group in terminalreporter.stats.values() for r in group if isinstance(r, pytest.TestReport)]
-    slow = [report for report in reports if "slow" in report.keywords]
-    if slow:
-        seconds, whole = (sum(report.duration for report in some) for some in (slow, reports))
-        n_tests = len({report.nodeid for report in slow})
-        terminalreporter.write_line(f"slow tier: {n_tests} tests, {seconds:.0f} of {whole:.0f} seconds")
+    """Leave out slow tests unless --thorough or -m selects them, or they are named by their file and `::`."""
+    if config.getoption("thorough") or config.getoption("markexpr") or any("::" in arg for arg in config.args):
+        return
+    slow = [item for item in items if item.get_closest_marker("slow")]
+    config.hook.pytest_deselected(items=slow)
+    items[:] = [item for item in items if not item.get_closest_marker("slow")]
 
 
 def pytest_collectstart(collector: pytest.Collector) -> None:
-    """A test takes the settings that hold while its file is imported."""
+    """Load the profile of a directory: tests keep the settings that are active while their file is imported."""
     folder = collector.path.parent.name if isinstance(collector, pytest.Module) else ""
     if folder in EXAMPLES:
         settings.load_profile(f"{folder}-{'thorough' if collector.config.getoption('thorough') else 'quick'}")
 
 
 def pytest_collectreport() -> None:
-    """Other folders' tests have Hypothesis as they know it."""
+    """Restore the default settings of Hypothesis for other directories."""
     settings.load_profile("default")
 
 
 @pytest.fixture(scope="session")
 def shared() -> Path:
-    """The folder of real scans, frames and golden files beside the checkout; skips where it is absent."""
+    """Directory of real scans, frames and golden files beside the checkout; skips the test if it is absent."""
     if not SHARED.is_dir():
-        pytest.skip("no shared/ folder with real scans beside the checkout")
+        pytest.skip("no shared/ directory with real scans beside the checkout")
     return SHARED
 
 

@@ -139,6 +139,7 @@ def test_what_an_obj_refers_to(
     check(attempt(lambda: load_mesh(place / "quad.obj")))
 
 
+@pytest.mark.slow
 def test_a_texture_that_would_fill_memory(folder: Path, attempt: Any) -> None:
     stream = io.BytesIO()
     Image.new("RGB", (13_000, 13_000)).save(stream, "PNG")

@@ -63,12 +63,12 @@ QUICK = {
 
 
 def ways(*capacities: int) -> list[Any]:
-    """Backends, ways of calling and buckets: each with each if --thorough, otherwise each at least once."""
+    """Backends, ways of calling and buckets: each at least once; their other combinations are slow."""
     found = []
     for n in capacities:
         for mode in ("plain", "jit", "vmap"):
             for homology in ("closed_form", "gudhi"):
-                marks = () if (homology, mode, n) in QUICK else pytest.mark.thorough
+                marks = () if (homology, mode, n) in QUICK else pytest.mark.slow
                 found.append(pytest.param((homology, mode, n), marks=marks, id=f"{homology}-{mode}-{n}"))
     return found
 

@@ -158,6 +158,7 @@ def test_how_tight_the_theorem_is() -> None:
     assert shares == sorted(shares) and 0.38 < shares[-1] < 1 / math.sqrt(5), shares
 
 
+@pytest.mark.slow
 @given(aligned=aligned_batches(max_points=256, margin=0.2), factor=st.sampled_from([0.02, 0.01]))
 def test_the_relaxation_becomes_the_hard_descriptor(aligned: thor2.PointClouds, factor: float) -> None:
     def describe_at(clouds: thor2.PointClouds, config: thor2.DescriptorConfig) -> thor2.Descriptors:

@@ -81,6 +81,7 @@ def test_degrees_of_occlusion() -> None:
     assert [graded.occlusion(k) for k in shares] == ["none", "none", "low", "low", "high", "high"]
 
 
+@pytest.mark.slow
 def test_clutter_hides() -> None:
     def hidden(clutter: float) -> float:
         return float(

@@ -157,7 +157,7 @@ render_job.render_dataset(objects, sys.argv[1], 60, 45, local_workers(int(sys.ar
     [
         # Odd: with a file written under its temporary name; even: with a shard that is not listed, or is.
         [(4, 1)],
-        pytest.param([(1, 1), (5, 2), (3, 2), (2, 1)], marks=pytest.mark.thorough),
+        pytest.param([(1, 1), (5, 2), (3, 2), (2, 1)], marks=pytest.mark.slow),
     ],
 )
 def test_repeatedly_killed_rendering_resumes(whole: Path, tmp_path: Path, kills: list[tuple[int, int]]) -> None:
