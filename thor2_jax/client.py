@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from thor2_jax.errors import InputError
 from thor2_jax.recognition.recognizer import Recognition
 
 __all__ = ["Client", "ServiceError", "multipart"]
@@ -85,9 +86,12 @@ class Client:
             images [B, S, P, P], embeddings [B, S, R, J] and overflow [B].
 
         Raises:
+            InputError: `clouds` is empty.
             ServiceError: the service returned an error.
             OSError: the service cannot be reached.
         """
+        if not clouds:
+            raise InputError("clouds is empty; expected at least one pair (xyz, rgb)")
         body = io.BytesIO()
         np.savez_compressed(
             body,

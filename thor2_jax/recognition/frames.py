@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, ImageFile
 
 from thor2_jax.errors import InputError, with_context
 
@@ -24,6 +24,7 @@ __all__ = [
     "Intrinsics",
     "RGBDFrame",
     "backproject",
+    "has_16_bit_channels",
     "parse_intrinsics",
     "pixel_rays",
     "read_color",
@@ -202,6 +203,11 @@ def backproject(depth_m: NDArray[Any], intrinsics: Intrinsics) -> NDArray[Any]:
     return (rays * depth_m.reshape(-1, 1)).astype(depth_m.dtype).reshape(height, width, 3)
 
 
+def has_16_bit_channels(image: ImageFile.ImageFile) -> bool:
+    """Return whether a newly opened image has 16 bits per channel, which Pillow reduces to 8 in colour images."""
+    return any(";16" in str(tile.args) for tile in image.tile)
+
+
 def _read_image(path: str | Path, argument: str) -> tuple[NDArray[Any], str]:
     """Read an image file; return its pixels and its Pillow mode.
 
@@ -215,6 +221,8 @@ def _read_image(path: str | Path, argument: str) -> tuple[NDArray[Any], str]:
             with Image.open(stream, formats=IMAGE_FORMATS) as image:
                 if image.width * image.height > MAX_IMAGE_PIXELS:
                     raise ValueError(f"{image.width} x {image.height} pixels; expected at most {MAX_IMAGE_PIXELS}")
+                if argument == "color" and has_16_bit_channels(image):
+                    raise ValueError("16 bits per channel; expected 8: convert the image")
                 image.verify()  # decoding does not check the checksums of a PNG
             stream.seek(0)
             with Image.open(stream, formats=IMAGE_FORMATS) as image:

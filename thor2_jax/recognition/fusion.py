@@ -18,10 +18,11 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import softmax
 
 from thor2_jax.recognition.classifier import Feature
 
-__all__ = ["DEFAULT_RULE", "FUSION_RULES", "Fused", "FusionRule", "fuse"]
+__all__ = ["DEFAULT_RULE", "FUSION_RULES", "Fused", "FusionRule", "fuse", "fused_probabilities", "with_temperature"]
 
 FusionRule = Literal["max", "mean", "log-mean"]
 FUSION_RULES: tuple[FusionRule, ...] = ("max", "mean", "log-mean")
@@ -45,6 +46,29 @@ class Fused(NamedTuple):
     classifier: NDArray[np.str_]
 
 
+def with_temperature(probabilities: NDArray[np.floating[Any]], temperature: float) -> NDArray[np.float64]:
+    """Return softmax(log(probabilities) / temperature), [N, C].
+
+    A temperature above 1 lowers the confidence, one below 1 raises it; the most probable class does not change.
+    Logarithms of probabilities are logits up to a constant, which the softmax removes.
+    """
+    logits = np.log(np.maximum(np.asarray(probabilities, np.float64), np.finfo(np.float32).tiny))
+    return np.asarray(softmax(logits / temperature, axis=1))
+
+
+def fused_probabilities(
+    probabilities: Mapping[Feature, NDArray[np.floating[Any]]], rule: FusionRule = DEFAULT_RULE
+) -> NDArray[np.floating[Any]]:
+    """Return the fused class probabilities [B, C]; the arguments are those of `fuse`."""
+    stacked = np.stack([probabilities[name] for name in probabilities])  # [M, B, C]
+    if rule == "max":
+        return np.asarray(stacked[stacked.max(axis=2).argmax(axis=0), np.arange(stacked.shape[1])])
+    if rule == "mean":
+        return np.asarray(stacked.astype(np.float64).mean(axis=0))
+    fused = np.exp(np.log(np.maximum(stacked, np.finfo(np.float32).tiny, dtype=np.float64)).mean(axis=0))
+    return np.asarray(fused / fused.sum(axis=1, keepdims=True))
+
+
 def fuse(probabilities: Mapping[Feature, NDArray[np.floating[Any]]], rule: FusionRule = DEFAULT_RULE) -> Fused:
     """Fuse the class probabilities of several classifiers.
 
@@ -54,13 +78,6 @@ def fuse(probabilities: Mapping[Feature, NDArray[np.floating[Any]]], rule: Fusio
     """
     names = np.array(list(probabilities))
     stacked = np.stack([probabilities[name] for name in probabilities])  # [M, B, C]
-    clouds = np.arange(stacked.shape[1])
-    if rule == "max":
-        fused = stacked[stacked.max(axis=2).argmax(axis=0), clouds]
-    elif rule == "mean":
-        fused = stacked.astype(np.float64).mean(axis=0)
-    else:
-        fused = np.exp(np.log(np.maximum(stacked, np.finfo(np.float32).tiny, dtype=np.float64)).mean(axis=0))
-        fused /= fused.sum(axis=1, keepdims=True)
+    fused = fused_probabilities(probabilities, rule)
     index = fused.argmax(axis=1)
-    return Fused(index, fused.max(axis=1), names[stacked[:, clouds, index].argmax(axis=0)])
+    return Fused(index, fused.max(axis=1), names[stacked[:, np.arange(len(index)), index].argmax(axis=0)])

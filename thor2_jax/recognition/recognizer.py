@@ -34,6 +34,9 @@ __all__ = ["THOR2", "DescribedFrame", "Recognition", "Recognizer", "concatenate_
 THOR2: tuple[Feature, ...] = ("tops", "tops2")
 """The two classifiers whose fusion is THOR2."""
 
+MAX_OVERFLOW = 0.5
+"""Largest overflow of an answer with a name, as a fraction of the points: beyond it, too little is described."""
+
 CHUNK = 4
 """Instances described and classified in one call: while the device computes a chunk, the host prepares the next."""
 
@@ -47,8 +50,8 @@ class Recognition:
     Attributes:
         label: its number in the label image.
         name: the object's name. None if the instance could not be described (fewer points than
-            `instance_clouds.MIN_POINTS`) or if its confidence is below the recognizer's `unknown_below`: an unknown
-            object.
+            `instance_clouds.MIN_POINTS`), if more than half of its points overflow (`MAX_OVERFLOW`), or if its
+            confidence is below the recognizer's `unknown_below`: an unknown object.
         confidence: fused probability of the most probable class, also of an unknown object; None if the instance could
             not be described.
         classifier: the classifier that gives this class the largest probability ("tops" or "tops2").
@@ -240,19 +243,26 @@ class Recognizer:
         probabilities: Mapping[Feature, NDArray[np.float32]],
         overflows: NDArray[Any],
     ) -> Recognition:
-        confidence = float(fused.confidence[row])
-        unknown = confidence < self.unknown_below
+        confidence, overflow = float(fused.confidence[row]), int(overflows[row])
+        reason = None
+        if overflow > MAX_OVERFLOW * len(instance.points):
+            reason = (
+                f"overflow: {overflow} points and pairs of {len(instance.points)} points lie outside the descriptor's "
+                "grid; check the intrinsics and the depth scale"
+            )
+        elif confidence < self.unknown_below:
+            reason = f"unknown: a confidence of {confidence:.3f}, below {self.unknown_below:g}"
         return Recognition(
             label=instance.label,
-            name=None if unknown else self.run.classes[fused.class_index[row]],
+            name=self.run.classes[fused.class_index[row]] if reason is None else None,
             confidence=confidence,
             classifier=str(fused.classifier[row]),
             top={name: self._top(values[row]) for name, values in probabilities.items()},
             occluded=instance.occluded,
-            overflow=int(overflows[row]),
+            overflow=overflow,
             points_used=len(instance.points),
             kept_by_fallback=instance.kept_by_fallback,
-            reason=f"unknown: a confidence of {confidence:.3f}, below {self.unknown_below:g}" if unknown else None,
+            reason=reason,
         )
 
     def _top(self, probabilities: NDArray[np.float32], count: int = 5) -> list[tuple[str, float]]:

@@ -51,6 +51,7 @@ def explained_frame(
     prepared: PreparedRequest,
     recognitions: Sequence[Recognition],
     results: Sequence[CloudResult],
+    calibrated_confidences: Sequence[float | None],
     config: DescriptorConfig,
     timings: dict[str, float],
 ) -> ExplainedFrame:
@@ -60,23 +61,26 @@ def explained_frame(
         prepared: the decoded frame, with its label map.
         recognitions: one per instance.
         results: one per usable instance, in the order of the instances.
+        calibrated_confidences: likewise, see `InferenceEngine.calibrated_confidences`.
         config: configuration of the descriptors.
         timings: stage -> milliseconds.
     """
     assert prepared.label_map is not None
-    remaining = iter(results)
+    remaining = iter(zip(results, calibrated_confidences, strict=True))
     instances: list[ExplainedInstance] = []
     for instance, recognition in zip(prepared.instances, recognitions, strict=True):
         details = None
         if instance.reason is None:
-            result = next(remaining)
+            result, confidence = next(remaining)
             if len(instances) < MAX_EXPLAINED:
-                details = _details(instance, result, config)
+                details = _details(instance, result, confidence, config)
         instances.append(ExplainedInstance(**dict(instance_answer(recognition)), details=details))
     return ExplainedFrame(instances=instances, label_map=prepared.label_map, timings=timings)
 
 
-def _details(instance: PreparedInstance, result: CloudResult, config: DescriptorConfig) -> Details:
+def _details(
+    instance: PreparedInstance, result: CloudResult, calibrated_confidence: float | None, config: DescriptorConfig
+) -> Details:
     aligned = result.aligned[: len(instance.points)]
     shown = np.random.default_rng(0).permutation(len(aligned))[:MAX_SHOWN_POINTS]
     peak = float(result.images.max())
@@ -85,6 +89,7 @@ def _details(instance: PreparedInstance, result: CloudResult, config: Descriptor
         points=aligned[shown].astype(float).round(4).tolist(),
         colors=instance.colors[shown].tolist(),
         slice_borders=_slice_borders(aligned[:, 2], config),
+        calibrated_confidence=calibrated_confidence,
         image_peak=peak,
         slices=[
             SliceDetails(image=image.tolist(), strips=_strip_colors(colors))

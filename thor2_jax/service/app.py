@@ -35,8 +35,13 @@ FRAME_FIELDS = ("color", "depth", "labels", "intrinsics")
 FRAME_ERRORS = error_responses(400, 408, 413, 415, 422, 429, 503, 504)
 
 
-def create_app(settings: Settings) -> FastAPI:
+def create_app(settings: Settings, workers: int = 1) -> FastAPI:
     """Create the ASGI application. Its processes and threads run for the duration of its lifespan.
+
+    Args:
+        settings: settings of this process.
+        workers: number of processes that share a socket. With several, the lifespan starts when this one is ready, so
+            that the server accepts no connection before; a single process answers with status 503 until then.
 
     Raises:
         InputError: the run cannot be read, or lacks a classifier.
@@ -47,6 +52,8 @@ def create_app(settings: Settings) -> FastAPI:
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
         await run_in_threadpool(service.start)
         with _stop_accepting_on_signal(service):
+            if workers > 1:
+                await run_in_threadpool(service.wait_until_ready)
             yield
         await run_in_threadpool(service.close)
 
@@ -60,7 +67,7 @@ def create_app(settings: Settings) -> FastAPI:
     )
     app.state.service = service
     app.add_middleware(RequestCounter, metrics=service.metrics)
-    app.include_router(_health_routes(service))
+    app.include_router(_health_routes(service, workers))
     token = settings.token
     authenticated = (
         APIRouter(dependencies=[Depends(_token_check(token))], responses=error_responses(401)) if token else APIRouter()
@@ -99,7 +106,7 @@ def _stop_accepting_on_signal(service: Service) -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def _health_routes(service: Service) -> APIRouter:
+def _health_routes(service: Service, workers: int) -> APIRouter:
     routes = APIRouter()
 
     @routes.get("/healthz")
@@ -108,11 +115,10 @@ def _health_routes(service: Service) -> APIRouter:
         return schemas.Health(status="alive")
 
     @routes.get("/readyz", responses=error_responses(503))
-    async def readyz() -> schemas.Health:
-        """Report whether all programs are compiled and requests are accepted."""
-        if service.state != "ready":
-            raise RequestError(503, None, f"The service is {service.state}.")
-        return schemas.Health(status="ready")
+    async def readyz() -> schemas.Readiness:
+        """Report whether requests are accepted, and by how many processes: only ready ones receive requests."""
+        service.check_ready()
+        return schemas.Readiness(status="ready", ready_workers=service.metrics.count_ready_workers(), workers=workers)
 
     return routes
 
@@ -229,13 +235,13 @@ def _encode_npz(results: Sequence[CloudResult]) -> bytes:
 
 
 def _problem_response(status: int, problem: Problem, headers: dict[str, str] | None = None) -> JSONResponse:
-    return JSONResponse(problem.model_dump(), status, headers)
+    return JSONResponse(problem.model_dump(exclude_defaults=True), status, headers)
 
 
 async def _on_request_error(_: Request, error: Exception) -> Response:
     assert isinstance(error, RequestError)
     headers = {401: {"WWW-Authenticate": "Bearer"}, 429: {"Retry-After": "1"}, 503: {"Retry-After": "1"}}
-    return _problem_response(error.status, Problem(field=error.field, message=error.message), headers.get(error.status))
+    return _problem_response(error.status, error.problem, headers.get(error.status))
 
 
 async def _on_http_exception(_: Request, error: Exception) -> Response:

@@ -1,7 +1,7 @@
 """HTTP connections with limits on the request head; uvicorn itself has neither a timeout nor a size limit there."""
 
 import asyncio
-from typing import Any
+from typing import Any, cast
 
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
@@ -17,6 +17,24 @@ MAX_HEAD = 2**20
 """Maximum number of bytes received between the first byte of a request head and its end."""
 
 
+class _SafeTransport:
+    """Transport that discards data once it is closing.
+
+    Between the reset of a connection and the notification of the application, uvloop raises an error for each write.
+    """
+
+    def __init__(self, transport: Any) -> None:
+        self._transport = transport
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._transport, name)
+
+    def write(self, data: bytes) -> None:
+        """Send data, or discard it if the connection is closing."""
+        if not self._transport.is_closing():
+            self._transport.write(data)
+
+
 class TimedConnection(HttpToolsProtocol):
     """uvicorn connection that is closed if a request head arrives too slowly or is too large.
 
@@ -29,7 +47,7 @@ class TimedConnection(HttpToolsProtocol):
 
     def connection_made(self, transport: Any) -> None:
         """Start the timer of the first request head."""
-        super().connection_made(transport)
+        super().connection_made(cast(asyncio.Transport, _SafeTransport(transport)))
         self._expect_head(HEAD_SECONDS)
 
     def data_received(self, data: bytes) -> None:

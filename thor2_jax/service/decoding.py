@@ -6,6 +6,7 @@ Sizes are checked before anything is decompressed, and every error names the fie
 import io
 import math
 import zipfile
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from pydantic import ValidationError
 
 from thor2_jax.capacity import POINT_BUCKETS
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.frames import Intrinsics, RGBDFrame, parse_intrinsics
+from thor2_jax.recognition.frames import Intrinsics, RGBDFrame, has_16_bit_channels, parse_intrinsics
 from thor2_jax.service.problem import RequestError
 from thor2_jax.service.schemas import Clouds
 from thor2_jax.service.settings import (
@@ -37,16 +38,24 @@ def decode_frame(color: bytes, depth: bytes, labels: bytes, intrinsics: bytes) -
     """Decode a frame from the contents of its files (formats of `frames.read_frame`; depth and labels only as PNG).
 
     Raises:
-        RequestError: 413 or 422.
+        RequestError: 413 or 422, with the errors of all fields.
     """
-    camera = _decode_intrinsics(intrinsics)
-    images = {
-        "color": _decode_image("color", color, ("PNG", "JPEG"), ("RGB", "RGBA")),
-        "depth": _decode_image("depth", depth, ("PNG",), ("I;16",)),
-        "labels": _decode_image("labels", labels, ("PNG",), ("L", "P", "I;16", "I")),
+    decoders: dict[str, Callable[[], Any]] = {
+        "color": lambda: _decode_image("color", color, ("PNG", "JPEG"), ("RGB", "RGBA")),
+        "depth": lambda: _decode_image("depth", depth, ("PNG",), ("I;16",)),
+        "labels": lambda: _decode_image("labels", labels, ("PNG",), ("L", "P", "I;16", "I")),
+        "intrinsics": lambda: _decode_intrinsics(intrinsics),
     }
+    fields, errors = {}, []
+    for name, decode in decoders.items():
+        try:
+            fields[name] = decode()
+        except RequestError as error:
+            errors.append(error)
+    if errors:
+        raise RequestError.merge(errors)
     try:
-        frame = RGBDFrame(np.ascontiguousarray(images["color"][..., :3]), images["depth"], images["labels"], camera)
+        frame = RGBDFrame(**fields | {"color": np.ascontiguousarray(fields["color"][..., :3])})
     except InputError as error:
         raise RequestError(422, str(error).split(maxsplit=1)[0], f"{error}.") from None
     if len(frame.instances) > MAX_INSTANCES:
@@ -80,6 +89,8 @@ def _decode_image(field: str, content: bytes, formats: tuple[str, ...], modes: t
         raise image_error(413, f"has {width} x {height} pixels; expected at most {MAX_IMAGE_PIXELS}")
     if image.mode not in modes:
         raise image_error(422, f"is {_mode_name(image.mode)}; expected {' or '.join(map(_mode_name, modes))}")
+    if field == "color" and has_16_bit_channels(image):
+        raise image_error(422, "has 16 bits per channel; expected 8")
     try:
         image.verify()  # Decoding alone ignores the checksums of a PNG's pixels.
         return np.asarray(Image.open(io.BytesIO(content), formats=formats))

@@ -1,7 +1,7 @@
 """The compiled model: descriptors and class probabilities for batches of a few sizes, all compiled before serving."""
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import jax
@@ -13,6 +13,7 @@ from thor2_jax.descriptor.describe import describe_strips, strips
 from thor2_jax.descriptor.view_normalization import align
 from thor2_jax.errors import InputError
 from thor2_jax.recognition.classifier import Feature
+from thor2_jax.recognition.fusion import fuse, fused_probabilities, with_temperature
 from thor2_jax.recognition.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.recognition.recognizer import THOR2, Recognition, Recognizer
 from thor2_jax.recognition.run_directory import load_run
@@ -68,12 +69,15 @@ class InferenceEngine:
         self.max_batch = settings.max_batch
         self._recognizer = Recognizer(self.run, settings.unknown_below)
 
-    def warm_up(self) -> Iterator[tuple[int, int]]:
-        """Compile every batch shape that `infer` can use, and yield each one as (points, clouds)."""
-        for n_points in (n for n in POINT_BUCKETS if n >= MIN_POINTS_BUCKET):
-            for n_clouds in (b for b in BATCH_BUCKETS if MIN_BATCH_BUCKET <= b <= _padded_batch(self.max_batch)):
-                self._infer([], n_clouds, n_points)
-                yield n_points, n_clouds
+    @property
+    def batch_shapes(self) -> list[tuple[int, int]]:
+        """Every batch shape that `infer` can use, as (clouds, points)."""
+        batches = [b for b in BATCH_BUCKETS if MIN_BATCH_BUCKET <= b <= _padded_batch(self.max_batch)]
+        return [(b, n) for n in POINT_BUCKETS if n >= MIN_POINTS_BUCKET for b in batches]
+
+    def compile(self, n_clouds: int, n_points: int) -> None:
+        """Compile the programs for one of `batch_shapes`."""
+        self._infer([], n_clouds, n_points)
 
     def infer(self, instances: Sequence[PreparedInstance]) -> list[CloudResult]:
         """Describe and classify at most `max_batch` clouds."""
@@ -110,6 +114,21 @@ class InferenceEngine:
         shape = len(results), len(self.run.classes)
         probabilities = {name: np.reshape([r.probabilities[name] for r in results], shape) for name in THOR2}
         return self._recognizer.recognitions(instances, probabilities, [r.overflow for r in results])
+
+    def calibrated_confidences(self, results: Sequence[CloudResult]) -> list[float | None]:
+        """Return the confidence of each cloud's most probable class after temperature scaling of both classifiers.
+
+        None without temperatures, which training fits on a held-out set (`thor2 train --folds`).
+        """
+        temperatures = self.run.record.get("temperatures", {})
+        if not results or not set(THOR2) <= set(temperatures):
+            return [None] * len(results)
+        probabilities = {name: np.stack([r.probabilities[name] for r in results]) for name in THOR2}
+        index = fuse(probabilities).class_index
+        calibrated = fused_probabilities(
+            {name: with_temperature(p, temperatures[name]) for name, p in probabilities.items()}
+        )
+        return [float(p) for p in calibrated[np.arange(len(results)), index]]
 
 
 def _enable_compilation_cache(directory: Path) -> None:

@@ -1,5 +1,6 @@
 """Prometheus metrics of the service, including the number of compilations after warm-up (expected to be zero)."""
 
+import contextlib
 import os
 from pathlib import Path
 
@@ -20,8 +21,6 @@ class Metrics:
     """Metrics of one process, or of all workers if `PROMETHEUS_MULTIPROC_DIR` names their shared directory."""
 
     def __init__(self) -> None:
-        if SHARED_DIRECTORY in os.environ:
-            _remove_dead_workers(Path(os.environ[SHARED_DIRECTORY]))
         registry = self._registry = CollectorRegistry()
         self.requests = Counter("thor2_requests", "Answered requests.", ["path", "status"], registry=registry)
         self.stages = Histogram(
@@ -37,17 +36,29 @@ class Metrics:
         self.in_progress = Gauge(
             "thor2_requests_waiting", "Requests in progress.", registry=registry, multiprocess_mode="livesum"
         )
+        self.ready_workers = Gauge(
+            "thor2_ready_workers", "Processes that accept requests.", registry=registry, multiprocess_mode="livesum"
+        )
         self.compilations = Counter(
             "thor2_compilations_after_warm_up", "Programs compiled after warm-up.", registry=registry
         )
 
     def text(self) -> bytes:
         """Return the metrics in the Prometheus text format."""
+        return generate_latest(self._merged())
+
+    def count_ready_workers(self) -> int:
+        """Return the number of living processes that accept requests."""
+        return int(self._merged().get_sample_value("thor2_ready_workers") or 0)
+
+    def _merged(self) -> CollectorRegistry:
+        """Return the registry of this process, or one that merges those of all workers."""
         if SHARED_DIRECTORY not in os.environ:
-            return generate_latest(self._registry)
-        all_workers = CollectorRegistry()
-        MultiProcessCollector(all_workers)
-        return generate_latest(all_workers)
+            return self._registry
+        _remove_dead_workers(Path(os.environ[SHARED_DIRECTORY]))
+        merged = CollectorRegistry()
+        MultiProcessCollector(merged)
+        return merged
 
 
 def _remove_dead_workers(directory: Path) -> None:
@@ -57,7 +68,8 @@ def _remove_dead_workers(directory: Path) -> None:
         try:
             os.kill(pid, 0)
         except ProcessLookupError:
-            mark_process_dead(pid)
+            with contextlib.suppress(FileNotFoundError):  # Another worker has removed the file.
+                mark_process_dead(pid)
 
 
 class CompilationCounter:

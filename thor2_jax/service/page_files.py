@@ -13,7 +13,6 @@ HEADERS = {
     # The page loads from and connects to its own server only, has no inline code and cannot be framed.
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; "
     "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
-    "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
     "Cache-Control": "no-cache",  # Browsers revalidate each file and transfer it only if it changed.
 }

@@ -50,7 +50,12 @@ class AdmittedRequest:
 
 
 class Service:
-    """One process of the service."""
+    """One process of the service.
+
+    Attributes:
+        state: "starting", "ready", "stopping" or "failed".
+        progress: description of the current step of the warm-up.
+    """
 
     def __init__(self, settings: Settings) -> None:
         """Load the run. Raises InputError if it cannot be read."""
@@ -58,6 +63,7 @@ class Service:
         self.metrics = Metrics()
         self.engine = InferenceEngine(settings)
         self.state = "starting"
+        self.progress = ""
         self._compilations = CompilationCounter(self.metrics.compilations)
         self._in_progress = self._accepted = self._finished = 0
 
@@ -71,12 +77,14 @@ class Service:
         self._warm_up_thread.start()
 
     def _warm_up(self) -> None:
-        start, compiled = time.monotonic(), 0
+        start, shapes = time.monotonic(), self.engine.batch_shapes
         try:
-            for _ in self.engine.warm_up():
+            for k, (n_clouds, n_points) in enumerate(shapes, 1):
                 if self.state != "starting":
                     return
-                compiled += 1
+                self.progress = f"compiling {k} of {len(shapes)}"
+                log.info("%s: %d clouds of %d points", self.progress, n_clouds, n_points)
+                self.engine.compile(n_clouds, n_points)
         except Exception:
             log.exception("warm-up failed")
             self.state = "failed"
@@ -84,11 +92,25 @@ class Service:
         self._compilations.start()
         if self.state == "starting":
             self.state = "ready"
-        log.info("ready: %d batch shapes compiled in %.1f s", compiled, time.monotonic() - start)
+            self.metrics.ready_workers.set(1)
+        log.info("ready: %d batch shapes compiled in %.1f s", len(shapes), time.monotonic() - start)
+
+    def wait_until_ready(self) -> None:
+        """Return when the warm-up has ended. Raises RuntimeError if it failed."""
+        self._warm_up_thread.join()
+        if self.state == "failed":
+            raise RuntimeError("warm-up failed")
+
+    def check_ready(self) -> None:
+        """Raise RequestError (503) unless the service accepts requests."""
+        if self.state != "ready":
+            progress = f": {self.progress}" if self.state == "starting" and self.progress else ""
+            raise RequestError(503, None, f"The service is {self.state}{progress}.")
 
     def stop_accepting(self) -> None:
         """Refuse new requests; requests in progress are still answered."""
         self.state = "stopping"
+        self.metrics.ready_workers.set(0)
 
     def close(self) -> None:
         """Finish requests in progress, then stop processes and threads."""
@@ -107,8 +129,7 @@ class Service:
             RequestError: 503 if the service is not ready, 429 if the queue is full; at the deadline, 408 if the body
                 has not arrived and 504 otherwise.
         """
-        if self.state != "ready":
-            raise RequestError(503, None, f"The service is {self.state}.")
+        self.check_ready()
         if self._in_progress >= self.settings.queue:
             raise RequestError(429, None, f"The queue is full: {self.settings.queue} requests are in progress.")
         request = AdmittedRequest(self.settings.deadline)
@@ -138,8 +159,11 @@ class Service:
         """Recognize a frame and return the evidence as well. Raises RequestError."""
         prepared, results = await self._infer_frame(files, True, request)
         recognitions = self.engine.recognize(prepared.instances, results)
+        confidences = self.engine.calibrated_confidences(results)
         config = self.engine.run.config
-        return await asyncio.to_thread(explained_frame, prepared, recognitions, results, config, request.milliseconds())
+        return await asyncio.to_thread(
+            explained_frame, prepared, recognitions, results, confidences, config, request.milliseconds()
+        )
 
     async def describe(self, content: bytes, is_npz: bool, request: AdmittedRequest) -> list[CloudResult]:
         """Describe the clouds of an npz or JSON body. Raises RequestError."""

@@ -92,7 +92,7 @@ def _run_process(pipe: Connection) -> None:
     while True:
         try:
             function, arguments = pipe.recv()
-        except EOFError:
+        except (EOFError, OSError):  # The service has ended or was killed.
             return
         outcome: tuple[Any, Exception | None]
         try:
@@ -101,7 +101,10 @@ def _run_process(pipe: Connection) -> None:
             outcome = None, error
         except Exception:
             outcome = None, RuntimeError(traceback.format_exc())
-        pipe.send(outcome)
+        try:
+            pipe.send(outcome)
+        except OSError:  # As above.
+            return
 
 
 class _PreparationProcess:

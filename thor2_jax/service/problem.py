@@ -1,10 +1,11 @@
 """Errors of the API: an HTTP status and a JSON body that names the field concerned."""
 
+from collections.abc import Sequence
 from typing import Any
 
 from pydantic import BaseModel, Field
 
-__all__ = ["Problem", "RequestError", "deadline_exceeded", "error_responses"]
+__all__ = ["FieldError", "Problem", "RequestError", "deadline_exceeded", "error_responses"]
 
 _DESCRIPTIONS = {
     400: "The body cannot be parsed.",
@@ -20,19 +21,38 @@ _DESCRIPTIONS = {
 }
 
 
-class Problem(BaseModel):
-    """The body of an error response."""
+class FieldError(BaseModel):
+    """Error of one field of a request."""
 
     field: str | None = Field(description="Field of the request that caused the error; null if there is none.")
     message: str = Field(description="Description of the error in one sentence.")
 
 
+class Problem(FieldError):
+    """The body of an error response."""
+
+    further: list[FieldError] = Field(default=[], description="Errors of further fields; absent if there are none.")
+
+
 class RequestError(Exception):
     """Error response of a request: a status and the fields of `Problem`. It can be pickled."""
 
-    def __init__(self, status: int, field: str | None, message: str) -> None:
-        super().__init__(status, field, message)
+    def __init__(self, status: int, field: str | None, message: str, *further: tuple[str | None, str]) -> None:
+        super().__init__(status, field, message, *further)
         self.status, self.field, self.message = status, field, message
+        self.further = further
+
+    @classmethod
+    def merge(cls, errors: "Sequence[RequestError]") -> "RequestError":
+        """Combine the errors of several fields; the first one determines the status."""
+        first, *others = errors
+        return cls(first.status, first.field, first.message, *[(error.field, error.message) for error in others])
+
+    @property
+    def problem(self) -> Problem:
+        """The body of the response."""
+        further = [FieldError(field=field, message=message) for field, message in self.further]
+        return Problem(field=self.field, message=self.message, further=further)
 
 
 def error_responses(*statuses: int) -> dict[int | str, dict[str, Any]]:

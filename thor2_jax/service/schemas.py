@@ -24,6 +24,7 @@ __all__ = [
     "InstanceAnswer",
     "LabelMap",
     "ModelAnswer",
+    "Readiness",
     "SliceDetails",
     "StripColors",
 ]
@@ -92,6 +93,9 @@ class Details(BaseModel):
     )
     colors: list[tuple[int, int, int]] = Field(description="sRGB colours of these points.")
     slice_borders: list[tuple[float, float]] = Field(description="Start and end of each slice along z.")
+    calibrated_confidence: float | None = Field(
+        description="Confidence after temperature scaling; null if the model was trained without a held-out set."
+    )
     image_peak: float = Field(description="Maximum of the persistence images.")
     slices: list[SliceDetails]
 
@@ -174,6 +178,14 @@ class ColorNetworkAnswer(BaseModel):
     edge_weights: list[float] = Field(description="[E] HyAB distance between the two mean colours.")
     similarity: list[list[float]] = Field(description="[R, R] similarity matrix Delta.")
     fingerprint: str
+
+
+class Readiness(BaseModel):
+    """Readiness of the service."""
+
+    status: str
+    ready_workers: int = Field(description="Number of processes that accept requests.")
+    workers: int = Field(description="Number of processes, including those that are starting.")
 
 
 class Health(BaseModel):

@@ -40,13 +40,14 @@ def serve(settings: Settings, host: str = "127.0.0.1", port: int = 8080, workers
     log_config = copy.deepcopy(LOGGING_CONFIG)
     log_config["loggers"]["thor2_jax.service"] = {"handlers": ["default"], "level": "INFO", "propagate": False}
     config = uvicorn.Config(
-        functools.partial(create_app, settings),
+        functools.partial(create_app, settings, workers),
         factory=True,
         workers=workers,
         http=TimedConnection,
         ws="none",
         access_log=False,
         server_header=False,
+        headers=[("X-Content-Type-Options", "nosniff")],
         log_config=log_config,
         timeout_graceful_shutdown=int(settings.deadline) + 5,
         timeout_worker_healthcheck=60,  # A worker does not answer while it imports modules.
@@ -54,15 +55,17 @@ def serve(settings: Settings, host: str = "127.0.0.1", port: int = 8080, workers
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with socket.create_server((host, port), family=family, backlog=config.backlog) as listener:
         url_host = f"[{host}]" if ":" in host else host
-        log.info("listening at http://%s:%d", url_host, listener.getsockname()[1])
+        url = f"http://{url_host}:{listener.getsockname()[1]}"
         if workers == 1:
             # uvicorn raises the signal again after the shutdown, which then is a normal exit.
             signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
             config.load()
+            log.info("listening at %s", url)
             with contextlib.suppress(KeyboardInterrupt):
                 uvicorn.Server(config).run([listener])
         else:
             InferenceEngine(settings)  # Report an unreadable run once, not once per worker.
+            log.info("listening at %s; requests wait until a worker is ready", url)
             listener.set_inheritable(True)
             with tempfile.TemporaryDirectory() as directory:
                 os.environ["PROMETHEUS_MULTIPROC_DIR"] = directory

@@ -76,6 +76,8 @@ class Settings:
         for name in ("queue", "deadline", "processes"):
             if not getattr(self, name) > 0:
                 raise InputError(f"{name} is {getattr(self, name)}; expected a positive number")
+        if self.cache is not None and self.cache.exists() and not self.cache.is_dir():
+            raise InputError(f"cache is {self.cache}, a file; expected a directory, which may be new")
         if self.max_batch not in BATCH_BUCKETS:
             raise InputError(f"max_batch is {self.max_batch}; expected one of {', '.join(map(str, BATCH_BUCKETS))}")
         if self.token is not None and not (self.token and self.token.isascii() and self.token.isprintable()):

@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.recognition.classifier import FEATURES, Feature
-from thor2_jax.recognition.fusion import FUSION_RULES, FusionRule, fuse
+from thor2_jax.recognition.fusion import FUSION_RULES, FusionRule, fuse, with_temperature
 from training.baselines.names import TITLES
-from training.fitting.temperature import with_temperature
 
 __all__ = ["RULES", "Rule", "fuse_by", "fusions", "main_fusion"]
 

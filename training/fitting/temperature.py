@@ -10,28 +10,15 @@ from scipy.special import log_softmax
 
 from thor2_jax.errors import InputError
 
-__all__ = ["fit_temperature", "negative_log_likelihood", "with_temperature"]
+__all__ = ["fit_temperature", "negative_log_likelihood"]
 
 Floats = NDArray[np.floating[Any]]
 
 
-def with_temperature(probabilities: Floats, temperature: float) -> NDArray[np.float64]:
-    """Return softmax(log(probabilities) / temperature), [N, C].
-
-    A temperature above 1 lowers the confidence, one below 1 raises it; the most probable class does not change.
-    Logarithms of probabilities are logits up to a constant, which the softmax removes.
-    """
-    return np.exp(_log_softmax(probabilities, temperature))
-
-
-def _log_softmax(probabilities: Floats, temperature: float) -> NDArray[np.float64]:
-    logits = np.log(np.maximum(np.asarray(probabilities, np.float64), np.finfo(np.float32).tiny))
-    return np.asarray(log_softmax(logits / temperature, axis=1))
-
-
 def negative_log_likelihood(probabilities: Floats, truth: NDArray[np.integer[Any]], temperature: float = 1.0) -> float:
     """Return the mean of -log p(true class) over [N, C] probabilities with true class indices `truth` [N]."""
-    return float(-_log_softmax(probabilities, temperature)[np.arange(len(truth)), truth].mean())
+    logits = np.log(np.maximum(np.asarray(probabilities, np.float64), np.finfo(np.float32).tiny))
+    return float(-log_softmax(logits / temperature, axis=1)[np.arange(len(truth)), truth].mean())
 
 
 def fit_temperature(probabilities: Floats, truth: NDArray[np.integer[Any]]) -> float:

@@ -36,18 +36,19 @@ LEAST_WIDTH = 400
 
 
 def write_sample_frames(directory: str | Path) -> None:
-    """Write the frames and their `index.json` to a directory; existing files are overwritten.
+    """Write the frames, and `index.json` with their titles and objects, to a directory; files are overwritten.
 
     Raises:
         OSError: A file cannot be written.
     """
     directory, objects = Path(directory), builtin_objects()
-    for name, _, seed, n_objects in SAMPLES:
+    index = []
+    for name, title, seed, n_objects in SAMPLES:
         scene = compose_scene(
             objects, np.random.default_rng(seed), n_objects=n_objects, noise=NOISE, light=LIGHT_CHANGE
         )
         _write(_crop(scene.frame), directory / name)
-    index = [{"folder": name, "title": title} for name, title, _, _ in SAMPLES]
+        index.append({"folder": name, "title": title, "objects": sorted(set(scene.truth.values()))})
     (directory / "index.json").write_text(json.dumps(index, indent=1) + "\n")
 
 

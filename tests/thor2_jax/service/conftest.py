@@ -18,6 +18,8 @@ import thor2_jax as thor2
 from thor2_jax.recognition.run_directory import save_run
 
 Files = dict[str, bytes]
+SAMPLE_INDEX = Path(thor2.__file__).parent / "service" / "page" / "samples" / "index.json"
+CLASSES = tuple(sorted({name for sample in json.loads(SAMPLE_INDEX.read_text()) for name in sample["objects"]}))
 CAMERA = {"fx": 600.0, "fy": 600.0, "cx": 159.5, "cy": 119.5}
 
 
@@ -28,10 +30,16 @@ def encode() -> Callable[..., bytes]:
 
 @pytest.fixture(scope="session")
 def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    run = untrained_run("abcdefg", config=thor2.DescriptorConfig(), record={"meshes": "/a/local/path"})
+    run = untrained_run(CLASSES, config=thor2.DescriptorConfig(), record={"meshes": "/a/local/path"})
     folder = tmp_path_factory.mktemp("service") / "run"
     save_run(run, folder)
     return folder
+
+
+@pytest.fixture(scope="session")
+def classes() -> tuple[str, ...]:
+    """The classes of the run: the objects of the page's sample frames."""
+    return CLASSES
 
 
 @pytest.fixture(scope="session")

@@ -13,6 +13,7 @@ from PIL import Image
 import colornet
 import thor2_jax as thor2
 from thor2_jax.client import Client, ServiceError
+from thor2_jax.errors import InputError
 
 
 @pytest.fixture(scope="module")
@@ -100,10 +101,10 @@ def test_empty_and_degenerate_clouds(server: Any, http: httpx.Client) -> None:
     assert http.post("/v1/describe", json={"clouds": [{"points": [], "colors": []}]}).status_code == 200
 
 
-def test_model_and_color_network(server: Any, http: httpx.Client) -> None:
+def test_model_and_color_network(server: Any, http: httpx.Client, classes: tuple[str, ...]) -> None:
     network = colornet.load_default()
     model = Client(server.url).model()
-    assert model["classes"] == list("abcdefg") and set(model["classifiers"]) == {"ce", "tops", "tops2"}
+    assert model["classes"] == list(classes) and set(model["classifiers"]) == {"ce", "tops", "tops2"}
     assert model["descriptor"]["n_slices"] == 7 and model["color_network"] == network.fingerprint
     assert "local/path" not in str(model)
     answer = http.get("/v1/colornet").json()
@@ -112,9 +113,14 @@ def test_model_and_color_network(server: Any, http: httpx.Client) -> None:
     assert len(answer["edges"]) == len(answer["edge_weights"]) == len(network.edges)
 
 
+READY = {"status": "ready", "ready_workers": 1, "workers": 1}
+
+
 def test_health_page_and_unknown_paths(http: httpx.Client) -> None:
-    assert http.get("/healthz").json() == {"status": "alive"} and http.get("/readyz").json() == {"status": "ready"}
+    assert http.get("/healthz").json() == {"status": "alive"} and http.get("/readyz").json() == READY
     assert http.get("/").headers["content-type"].startswith("text/html")
+    for path in ("/", "/healthz", "/v1/model", "/metrics", "/openapi.json", "/missing"):
+        assert http.get(path).headers.get_list("x-content-type-options") == ["nosniff"]
     for path in ("/nothing", "/../app.py", "/%2e%2e/app.py"):
         missing = http.get(path)
         assert missing.status_code == 404 and set(missing.json()) == {"field", "message"}
@@ -126,6 +132,11 @@ def test_client_raises_service_error(server: Any, files: dict[str, bytes]) -> No
     with pytest.raises(ServiceError, match="depth") as error:
         Client(server.url).recognize(**files | {"depth": b"not an image"})
     assert (error.value.status, error.value.field, error.value.retry_after) == (422, "depth", None)
+
+
+def test_client_refuses_an_empty_list_of_clouds() -> None:
+    with pytest.raises(InputError, match="clouds"):
+        Client("http://127.0.0.1:1").describe([])
 
 
 def test_client_reads_files(server: Any, files: dict[str, bytes], tmp_path: Path) -> None:

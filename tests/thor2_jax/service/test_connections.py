@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import socket
+import struct
 import threading
 import time
 from collections.abc import Iterator
@@ -12,6 +13,7 @@ import pytest
 import uvicorn
 
 from thor2_jax.service import connections
+from thor2_jax.service.page_files import PageFiles
 
 WORK = 1.0
 HEAD = b"%s /%s HTTP/1.1\r\nHost: x\r\n%s\r\n"
@@ -28,11 +30,10 @@ async def application(scope: Any, receive: Any, send: Any) -> None:
     await send({"type": "http.response.body", "body": b"done"})
 
 
-@pytest.fixture
-def address(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    monkeypatch.setattr(connections, "HEAD_SECONDS", WORK / 4)
-    monkeypatch.setattr(connections, "EARLY_ANSWER_SECONDS", WORK)
-    config = uvicorn.Config(application, http=connections.TimedConnection, lifespan="off", log_level="critical")
+@contextlib.contextmanager
+def serve(app: Any) -> Iterator[Any]:
+    """Serve an application in a thread, and yield its address."""
+    config = uvicorn.Config(app, http=connections.TimedConnection, lifespan="off", log_config=None)
     with socket.create_server(("127.0.0.1", 0)) as listening:
         server = uvicorn.Server(config)
         thread = threading.Thread(target=server.run, args=([listening],))
@@ -40,6 +41,14 @@ def address(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
         yield listening.getsockname()
         server.should_exit = True
         thread.join()
+
+
+@pytest.fixture
+def address(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    monkeypatch.setattr(connections, "HEAD_SECONDS", WORK / 4)
+    monkeypatch.setattr(connections, "EARLY_ANSWER_SECONDS", WORK)
+    with serve(application) as listening_address:
+        yield listening_address
 
 
 def until_closed(address: Any, sent: bytes, then: bytes = b"") -> int:
@@ -105,3 +114,20 @@ def test_many_pipelined_requests(address: Any) -> None:
         while received := connection.recv(2**16):
             answers += received
     assert answers.count(b"done") == count
+
+
+def test_reset_connections_leave_no_traceback(caplog: pytest.LogCaptureFixture) -> None:
+    """Pipelined requests for static files whose client resets the connection while they are answered."""
+    with serve(PageFiles()) as address:
+        for count in (1, 3, 50) * 4:
+            with socket.create_connection(address) as connection:
+                connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+                connection.sendall(HEAD % (b"GET", b"samples/clutter/color.jpg", b"") * count)
+                time.sleep(0.002 * count)
+        with socket.create_connection(address, timeout=30) as connection:
+            connection.sendall(HEAD % (b"GET", b"style.css", b"") * 20 + HEAD % (b"GET", b"", b"Connection: close\r\n"))
+            answers = b""
+            while received := connection.recv(2**16):
+                answers += received
+    assert answers.count(b"HTTP/1.1 200") == 21
+    assert not [record for record in caplog.records if record.levelname == "ERROR"]

@@ -114,7 +114,9 @@ def explained(instance: Any, count: int, config: thor2.DescriptorConfig, z: np.n
     empty = LabelMap(width=1, height=1, labels=[0], lengths=[1])
     instances = [dataclasses.replace(instance, label=k) for k in range(count)]
     recognitions = [thor2.Recognition(label=k, name="a") for k in range(count)]
-    return explained_frame(PreparedRequest(instances, {}, empty), recognitions, [result] * count, config, {})
+    return explained_frame(
+        PreparedRequest(instances, {}, empty), recognitions, [result] * count, [None] * count, config, {}
+    )
 
 
 def test_details_are_limited_to_the_first_instances(described: DescribedFrame) -> None:

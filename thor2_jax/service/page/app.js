@@ -1,14 +1,16 @@
 // Main module of the page: choose a frame, recognize it, show its objects.
 
 import { showDetails } from "./details.js";
-import { element, percent, rgb } from "./drawing.js";
-import { ink, Overlay, paints } from "./overlay.js";
+import { breakable, confidenceOf, element, percent, rgb } from "./drawing.js";
+import { instanceColors, Overlay, textColor } from "./overlay.js";
 import * as service from "./service.js";
 
 const FIELDS = ["color", "depth", "labels", "intrinsics"];
+const RETRY_MS = 1000;
 const byId = (id) => document.getElementById(id);
+const pause = (milliseconds) => new Promise((resolve) => setTimeout(resolve, milliseconds));
 
-const overlay = new Overlay(byId("overlay"), select);
+const overlay = new Overlay(byId("overlay"), (label) => select(label, true));
 let loaded = null; // The model and the mean colours of its colour regions.
 let frame = null; // The answer that is shown.
 let currentRequest = new AbortController();
@@ -30,7 +32,7 @@ function clearProblems() {
   byId("problem").hidden = true;
 }
 
-/** Show an error beside the field concerned if it is on the page, otherwise above the result. */
+/** Show the errors of a request, each beside its field if that is on the page, otherwise above the result. */
 function showProblem(problem, fields = []) {
   setStatus("");
   if (problem.status === 401) {
@@ -38,28 +40,46 @@ function showProblem(problem, fields = []) {
     // The first request is sent without a token: that is not an error of the user.
     if (byId("token").value) markField("token", problem.message);
     byId("token").focus();
-  } else if (fields.includes(problem.field)) {
-    markField(problem.field, problem.message);
-    byId(problem.field).focus();
-  } else {
-    byId("problem").textContent = problem.message;
-    byId("problem").hidden = false;
+    return;
   }
+  const errors = [problem, ...(problem.further ?? [])];
+  const marked = errors.filter(({ field }) => fields.includes(field));
+  marked.forEach(({ field, message }) => markField(field, message));
+  if (marked.length) {
+    byId("upload").open = true;
+    byId(marked[0].field).focus();
+  }
+  const others = errors.filter((error) => !marked.includes(error));
+  byId("problem").textContent = others.map(({ message }) => message).join(" ");
+  byId("problem").hidden = !others.length;
   if (!(problem instanceof service.Problem)) throw problem;
 }
 
-async function recognize(what, fileSource, fields) {
+/** Call `request` again for as long as the service is starting. */
+async function whenStarted(request, signal) {
+  for (;;) {
+    try {
+      return await request();
+    } catch (problem) {
+      if (problem.status !== 503 || !problem.message.includes("starting") || signal.aborted) throw problem;
+      setStatus(`${problem.message} The frame is recognized when it is ready.`, true);
+      await pause(RETRY_MS);
+    }
+  }
+}
+
+async function recognize(title, fileSource, fields) {
   currentRequest.abort();
   const { signal } = (currentRequest = new AbortController());
   clearProblems();
-  setStatus(`Recognizing ${what}`, true);
+  setStatus(`Recognizing ${title}`, true);
   byId("result").setAttribute("aria-busy", "true");
   try {
     loaded ??= await load();
     const files = await fileSource();
-    const answer = await service.explain(files, signal);
+    const answer = await whenStarted(() => service.explain(files, signal), signal);
     const bitmap = await createImageBitmap(files.color, { imageOrientation: "none" });
-    if (!signal.aborted) show(what, answer, bitmap);
+    if (!signal.aborted) show(title, answer, bitmap);
   } catch (problem) {
     if (signal.aborted) return;
     hideResult();
@@ -71,66 +91,86 @@ async function recognize(what, fileSource, fields) {
 
 function hideResult() {
   frame = null;
-  byId("result").hidden = byId("details").hidden = true;
+  byId("result").hidden = true;
+  byId("chooser").classList.remove("compact");
 }
 
-function show(what, answer, bitmap) {
+function show(title, answer, bitmap) {
   frame = answer;
   const { instances, timings } = answer;
   const named = instances.filter(({ name }) => name !== null);
   const count = `${instances.length} ${instances.length === 1 ? "object" : "objects"}`;
-  const unnamed = instances.length - named.length;
-  if (!instances.length) setStatus(`${what}: no objects: the label image is 0 everywhere.`);
-  else setStatus(`${what}: ${count}${unnamed ? `, ${unnamed} of them unknown` : ""}.`);
+  const unknown = instances.length - named.length;
+  if (!instances.length) setStatus(`${title}: no objects: the label image is 0 everywhere.`);
+  else setStatus(`${title}: ${count}${unknown ? `, ${unknown} of them unknown` : ""}.`);
+  byId("chooser").classList.add("compact");
+  byId("upload").open = false;
   byId("result").hidden = false;
   byId("details").hidden = true;
-  const colors = paints(instances);
+  const colors = instanceColors(instances);
   byId("objects").replaceChildren(...instances.map((instance, k) => element("li", {}, objectButton(instance, colors[k]))));
   const stages = Object.entries(timings).map(([stage, ms]) => `${stage}\u00a0${ms.toFixed(ms < 10 ? 1 : 0)}\u00a0ms`);
   byId("timings").textContent = stages.join(" · ");
   const first = named[0] ?? instances[0];
   overlay.show(bitmap, instances, answer.label_map, first?.label);
   if (first) select(first.label);
-  if (byId("status").getBoundingClientRect().top > innerHeight / 2) byId("status").scrollIntoView();
+  scrollTo({ top: 0 });
+  if (byId("overlay").getBoundingClientRect().bottom > innerHeight) byId("status").scrollIntoView();
 }
 
 function objectButton(instance, color) {
-  const { label, name, confidence, classifier, occluded, unrecognized } = instance;
-  const facts = name === null ? unrecognized : `${classifier.toUpperCase()} is surer${occluded ? " · partly occluded" : ""}`;
+  const { label, name, occluded, unrecognized } = instance;
+  const facts = unrecognized ?? (occluded ? "partly occluded" : "");
   const swatch = element("span", { className: "swatch" }, label);
   swatch.style.background = rgb(color);
-  swatch.style.color = ink(color);
+  swatch.style.color = textColor(color);
   const button = element(
     "button",
-    { type: "button", onclick: () => select(label) },
+    { type: "button", onclick: () => select(label, true) },
     swatch,
-    element("span", { className: "name" }, name ?? "unknown object"),
-    element("span", { className: "sure" }, name === null ? "" : percent(confidence)),
+    element("span", { className: "name" }, ...breakable(name ?? "unknown object")),
+    element("span", { className: "confidence" }, name === null ? "" : percent(confidenceOf(instance))),
     element("span", { className: "facts hint" }, facts),
   );
   button.dataset.label = label;
   return button;
 }
 
-function select(label) {
+function select(label, byUser = false) {
   for (const button of byId("objects").querySelectorAll("button")) {
     button.setAttribute("aria-pressed", button.dataset.label === String(label));
   }
   overlay.select(label);
-  showDetails(frame.instances.find((one) => one.label === label), loaded.model, loaded.regions);
+  showDetails(frame.instances.find((instance) => instance.label === label), loaded.model, loaded.regions);
+  if (byUser && byId("details-title").getBoundingClientRect().bottom > innerHeight) byId("details").scrollIntoView();
 }
 
+/** Load the model, and try again while the service cannot be reached. */
 async function load() {
-  const [model, network] = await Promise.all([service.model(), service.colornet()]);
-  byId("token-section").hidden = true;
-  byId("model-title").textContent = `Objects known to the model: ${model.classes.length}`;
-  byId("classes").replaceChildren(...model.classes.map((name) => element("li", {}, name)));
-  byId("model").hidden = false;
-  return { model, regions: network.mean_rgb };
+  for (;;) {
+    try {
+      const [model, network] = await Promise.all([service.model(), service.colornet()]);
+      byId("token-section").hidden = true;
+      showClasses(model.classes);
+      await showSamples(model.classes);
+      return { model, regions: network.mean_rgb };
+    } catch (problem) {
+      if (![0, 502, 503, 504].includes(problem.status)) throw problem;
+      await pause(RETRY_MS);
+    }
+  }
 }
 
-async function showSamples() {
-  const buttons = (await service.samples()).map(({ folder, title }) => {
+function showClasses(classes) {
+  byId("model-title").textContent = `This model knows ${classes.length} ${classes.length === 1 ? "object" : "objects"}`;
+  byId("classes").replaceChildren(...classes.map((name) => element("li", {}, name)));
+  byId("model").hidden = false;
+}
+
+/** Offer the sample frames all of whose objects the model knows. */
+async function showSamples(classes) {
+  const samples = (await service.samples()).filter(({ objects }) => objects.every((name) => classes.includes(name)));
+  const buttons = samples.map(({ folder, title }) => {
     const picture = element("img", { src: `samples/${folder}/color.jpg`, alt: "", loading: "lazy" });
     const button = element("button", { type: "button" }, picture, element("span", {}, title));
     button.setAttribute("aria-pressed", "false");
@@ -141,6 +181,10 @@ async function showSamples() {
     return button;
   });
   byId("samples").replaceChildren(...buttons);
+  byId("no-samples").hidden = samples.length > 0;
+  if (!samples.length) byId("upload").open = true;
+  const invitation = `${samples.length ? "Choose a sample or upload a frame" : "Upload a frame"}. Its objects are outlined and named here.`;
+  if (byId("status").hasAttribute("data-empty")) byId("status").textContent = invitation;
 }
 
 function press(chosen) {
@@ -158,7 +202,7 @@ byId("upload-form").addEventListener("submit", (event) => {
     return;
   }
   press(null);
-  recognize(files.color.name, async () => files, FIELDS);
+  recognize(service.visible(files.color.name), async () => files, FIELDS);
 });
 
 byId("token-form").addEventListener("submit", async (event) => {
@@ -174,20 +218,19 @@ byId("token-form").addEventListener("submit", async (event) => {
 });
 
 async function watchReady() {
-  const state = (name, text) => {
+  const setState = (name, text) => {
     byId("ready").dataset.state = name;
     byId("ready").textContent = text;
   };
   try {
     await service.ready();
-    state("ready", "Ready");
+    setState("ready", "Ready");
   } catch (problem) {
-    if (problem.status === 503) state("waiting", "Starting");
-    else state("failed", "Not reachable");
-    setTimeout(watchReady, 2000);
+    if (problem.status === 503) setState("waiting", problem.message.replace(/^The service is (.)|\.$/g, (_, c) => c?.toUpperCase() ?? ""));
+    else setState("failed", "Not reachable");
+    setTimeout(watchReady, RETRY_MS);
   }
 }
 
 watchReady();
-showSamples().catch(showProblem);
 load().then((value) => (loaded = value), showProblem);

@@ -1,9 +1,9 @@
 // Details of one object: its cloud, its slices, and the probabilities of both classifiers.
 
-import { element, keepDrawn, percent, rgb, themed } from "./drawing.js";
+import { breakable, element, keepDrawn, percent, rgb, themed } from "./drawing.js";
 
 const byId = (id) => document.getElementById(id);
-const TITLES = { tops: "TOPS: shape", tops2: "TOPS2: shape, colour" };
+const TITLES = { tops: "TOPS: shape", tops2: "TOPS2: shape and colour" };
 
 /** Fill the section. `regions` are the mean colours of the colour regions. */
 export function showDetails(instance, model, regions) {
@@ -15,18 +15,20 @@ export function showDetails(instance, model, regions) {
   byId("details").hidden = false;
   if (details === null) return;
   keepDrawn(byId("cloud"), (context, width, height) => drawCloud(context, width, height, instance));
-  byId("cloud").setAttribute("aria-label", `Point cloud of ${name}, side view, with slices from bottom to top.`);
+  byId("cloud").setAttribute("aria-label", `Point cloud of ${name ?? "the object"}, side view, with slices from bottom to top.`);
   const { sigma_1: thickness, sigma_s: perMetre } = model.descriptor;
   byId("cloud-hint").textContent = `Aligned and cut into slices of ${+((100 * thickness) / perMetre).toFixed(1)} cm.`;
-  byId("classifiers").replaceChildren(...Object.keys(instance.top).map((which) => topFive(instance, which)));
+  byId("classifiers").replaceChildren(...Object.keys(instance.top).map((classifier) => topFive(instance, classifier)));
+  byId("confidence-help").textContent = confidenceHelp(details.calibrated_confidence);
   showSlices(details, model, regions);
 }
 
-function facts({ name, label, confidence, occluded, points_used, overflow, kept_by_fallback }) {
-  if (name === null) return `Label ${label}`;
+function facts({ label, confidence, occluded, points_used, overflow, kept_by_fallback, details }) {
+  if (confidence === null) return `Label ${label}`;
+  const calibrated = details?.calibrated_confidence ?? null;
   return [
     `Label ${label}`,
-    `confidence ${percent(confidence)}`,
+    `confidence ${percent(confidence)} (${calibrated === null ? "not calibrated" : `calibrated: ${percent(calibrated)}`})`,
     occluded ? "partly occluded" : "not occluded",
     `${points_used} points`,
     ...(overflow ? [`overflow: ${overflow} points or pairs outside the descriptor`] : []),
@@ -34,26 +36,32 @@ function facts({ name, label, confidence, occluded, points_used, overflow, kept_
   ].join(" · ");
 }
 
+function confidenceHelp(calibrated) {
+  const fusion = "The named class has the highest geometric mean of both probabilities; normalized, it is the confidence. ";
+  if (calibrated !== null) return `${fusion}The calibrated confidence (temperature scaling on a held-out set) estimates the accuracy of such answers.`;
+  return `${fusion}It is not calibrated, since the model was trained without a held-out set: expect fewer correct answers than it suggests.`;
+}
+
 function reason({ unrecognized, details }) {
   if (unrecognized !== null) return unrecognized.charAt(0).toUpperCase() + unrecognized.slice(1) + ".";
   return details === null ? "Details are limited to the first objects of a frame." : "";
 }
 
-function topFive(instance, which) {
-  const rows = instance.top[which].flatMap(({ name, probability }) => {
+function topFive(instance, classifier) {
+  const rows = instance.top[classifier].flatMap(({ name, probability }) => {
     const bar = element("div");
     bar.style.setProperty("--share", `${100 * probability}%`);
     const cell = element("td", { colSpan: 2 }, bar);
     cell.setAttribute("aria-hidden", "true");
     return [
-      element("tr", {}, element("th", { scope: "row" }, name), element("td", {}, percent(probability))),
+      element("tr", {}, element("th", { scope: "row" }, ...breakable(name)), element("td", {}, percent(probability))),
       element("tr", { className: "bar" }, cell),
     ];
   });
-  const title = element("h3", {}, TITLES[which] ?? which.toUpperCase());
-  const surer = instance.classifier === which;
-  if (surer) title.append(element("span", { className: "badge" }, "surer"));
-  return element("div", { className: surer ? "surer" : "" }, title, element("table", {}, element("tbody", {}, ...rows)));
+  const title = element("h3", {}, TITLES[classifier] ?? classifier.toUpperCase());
+  const isHigher = instance.classifier === classifier;
+  if (isHigher) title.append(element("span", { className: "badge" }, "higher probability"));
+  return element("div", { className: isHigher ? "higher" : "" }, title, element("table", {}, element("tbody", {}, ...rows)));
 }
 
 function drawCloud(context, width, height, { details, points_used }) {
@@ -95,36 +103,88 @@ function drawCloud(context, width, height, { details, points_used }) {
 function showSlices({ slices }, model, regions) {
   const total = ({ weights }) => weights.reduce((sum, weight) => sum + weight, 0);
   const highest = Math.max(...slices.flatMap(({ strips }) => strips.map(total)), 1e-6);
-  const drawings = slices.map(({ image, strips }, k) => {
+  const drawings = slices.flatMap(({ image, strips }, k) => {
+    if (!strips.length) return [];
     const points = Math.round(strips.reduce((sum, strip) => sum + total(strip), 0));
-    const shape = element("canvas", { className: "image", width: image.length, height: image.length, role: "img" });
-    shape.setAttribute("aria-label", `Persistence image of slice ${k}${points ? "" : ": empty"}.`);
-    if (points) drawImage(shape, image);
-    else shape.classList.add("empty");
+    const shape = element("canvas", { className: "image", role: "img" });
+    shape.setAttribute("aria-label", `Persistence image of slice ${k}: birth to the right, persistence upwards.`);
     const colors = element("canvas", { className: "strips", role: "img" });
-    const where = `${points} points in ${strips.length} strips, most of ${mainColor(strips, regions)}`;
-    colors.setAttribute("aria-label", `Colour of slice ${k}: ${points ? where : "empty"}.`);
+    const content = `${points} points in ${strips.length} strips, most of ${mainColor(strips, regions)}`;
+    colors.setAttribute("aria-label", `Colour of slice ${k}: ${content}.`);
     const count = model.descriptor.convention === "released" ? `${strips.length} strips` : `${points} points`;
-    const title = element("header", {}, element("h4", {}, `Slice ${k}`), element("p", { className: "hint" }, points ? count : "empty"));
-    const item = element("li", {}, title, shape, colors);
-    return { item, colors, strips };
+    const title = element("header", {}, element("h4", {}, `Slice ${k}`), element("p", { className: "hint" }, count));
+    return [{ item: element("li", {}, title, shape, colors), shape, colors, image, strips }];
   });
   byId("slices").replaceChildren(...drawings.map(({ item }) => item));
-  for (const { colors, strips } of drawings) {
+  const empty = slices.flatMap(({ strips }, k) => (strips.length ? [] : [k]));
+  byId("empty-slices").textContent = empty.length ? `Without points: slice ${empty.join(", ")}.` : "";
+  for (const { shape, colors, image, strips } of drawings) {
+    const pixels = imagePixels(image);
+    keepDrawn(shape, (context, width, height) => {
+      const plot = drawAxes(context, width, height, model.descriptor, "persistence");
+      context.imageSmoothingEnabled = false;
+      context.drawImage(pixels, plot.left, plot.top, plot.width, plot.height);
+    });
     keepDrawn(colors, (context, width, height) => {
-      // An image starts one pixel before the first strip; with this offset, strips lie below their births.
-      const step = width / Math.max(model.descriptor.image_size, model.descriptor.n_strips + 1);
+      const plot = drawAxes(context, width, height, model.descriptor, "points", Math.ceil(highest));
+      const step = plot.width / model.descriptor.image_size;
       for (const { strip, regions: present, weights } of strips) {
-        let y = height;
+        let y = plot.top + plot.height;
         present.forEach((region, k) => {
-          const tall = (weights[k] / highest) * (height - 4);
+          const tall = (weights[k] / highest) * plot.height;
           y -= tall;
           context.fillStyle = rgb(regions[region]);
-          context.fillRect((strip + 1) * step, y, step, tall);
+          // An image starts one pixel before the first strip; with this offset, strips lie below their births.
+          context.fillRect(plot.left + (strip + 1) * step, y, step, tall);
         });
       }
     });
   }
+}
+
+/** Draw the axes of a chart whose horizontal axis is the birth, and return the area inside. */
+function drawAxes(context, width, height, { image_size, sigma_2: pixel, sigma_s: perMetre }, vertical, peak) {
+  const plot = { left: 26, top: 5, width: width - 32, height: height - 32 };
+  const perPixel = (100 * pixel) / perMetre; // Centimetres; an image starts one pixel before 0.
+  const last = (image_size - 1) * perPixel;
+  const ticks = [0, 10, 20, 30].filter((value) => value <= last);
+  context.fillStyle = themed("--well");
+  context.fillRect(plot.left, plot.top, plot.width, plot.height);
+  context.strokeStyle = context.fillStyle = themed("--muted");
+  context.font = "10px system-ui, sans-serif";
+  context.textBaseline = "middle";
+  const line = (x, y, dx, dy) => {
+    context.beginPath();
+    context.moveTo(x, y);
+    context.lineTo(x + dx, y + dy);
+    context.stroke();
+  };
+  const bottom = plot.top + plot.height;
+  line(plot.left - 0.5, plot.top, 0, plot.height);
+  line(plot.left, bottom + 0.5, plot.width, 0);
+  const share = (value) => (value / perPixel + 1) / image_size;
+  const isEnd = (value) => value === 0 || value === ticks.at(-1);
+  for (const value of ticks) {
+    const x = plot.left + share(value) * plot.width;
+    line(x, bottom, 0, 3);
+    context.textAlign = "center";
+    if (isEnd(value)) context.fillText(value, x, bottom + 9);
+  }
+  context.textAlign = "right";
+  const heights = peak === undefined ? ticks.map((value) => [value, share(value)]) : [[0, 0], [peak, 1]];
+  for (const [value, place] of heights) {
+    const y = bottom - place * plot.height;
+    line(plot.left, y, -3, 0);
+    if (peak !== undefined || isEnd(value)) context.fillText(value, plot.left - 5, Math.min(y, bottom - 2));
+  }
+  context.textAlign = "center";
+  context.fillText("birth (cm)", plot.left + plot.width / 2, bottom + 20);
+  context.save();
+  context.translate(7, plot.top + plot.height / 2);
+  context.rotate(-Math.PI / 2);
+  context.fillText(peak === undefined ? `${vertical} (cm)` : vertical, 0, 0);
+  context.restore();
+  return plot;
 }
 
 function mainColor(strips, regions) {
@@ -142,17 +202,19 @@ const MAGMA = [
   [254, 194, 135], [252, 253, 191],
 ];
 
-function drawImage(canvas, image) {
+function imagePixels(image) {
   const size = image.length;
+  const canvas = element("canvas", { width: size, height: size });
   const context = canvas.getContext("2d");
   const pixels = context.createImageData(size, size);
   image.forEach((column, birth) =>
     column.forEach((value, persistence) => {
-      const place = (value / 255) * (MAGMA.length - 1);
-      const below = Math.min(Math.floor(place), MAGMA.length - 2);
-      const color = MAGMA[below].map((low, k) => low + (MAGMA[below + 1][k] - low) * (place - below));
+      const position = (value / 255) * (MAGMA.length - 1);
+      const below = Math.min(Math.floor(position), MAGMA.length - 2);
+      const color = MAGMA[below].map((low, k) => low + (MAGMA[below + 1][k] - low) * (position - below));
       pixels.data.set([...color, 255], 4 * ((size - 1 - persistence) * size + birth));
     }),
   );
   context.putImageData(pixels, 0, 0);
+  return canvas;
 }

@@ -34,7 +34,19 @@ export const themed = (name) => getComputedStyle(document.documentElement).getPr
 
 export const rgb = ([red, green, blue]) => `rgb(${red} ${green} ${blue})`;
 
-export const percent = (share) => `${(100 * share).toFixed(share < 0.0995 ? 1 : 0)}\u00a0%`;
+/** Format a probability; instead of 0 % and 100 %, the result is "<0.1 %" and ">99.9 %". */
+export function percent(probability) {
+  if (probability >= 0.9995) return ">99.9\u00a0%";
+  if (probability < 0.0005) return "<0.1\u00a0%";
+  const digits = probability >= 0.995 || probability < 0.0995 ? 1 : 0;
+  return `${(100 * probability).toFixed(digits)}\u00a0%`;
+}
+
+/** Return the calibrated confidence of an instance where there is one. */
+export const confidenceOf = ({ confidence, details }) => details?.calibrated_confidence ?? confidence;
+
+/** Split a name at its underscores, so that a line can break there. */
+export const breakable = (name) => name.split(/(?<=_)/).flatMap((piece) => [piece, element("wbr")]);
 
 /** Create an element with properties and children. */
 export function element(tag, properties = {}, ...children) {

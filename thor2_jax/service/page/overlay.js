@@ -1,25 +1,31 @@
 // The colour image with the outlines and names of its objects, and the object at a position.
 
-import { keepDrawn, percent, rgb } from "./drawing.js";
+import { confidenceOf, keepDrawn, percent, rgb } from "./drawing.js";
 
-// Okabe and Ito's palette, as in the images of the command line.
-const PAINTS = [[86, 180, 233], [240, 228, 66], [0, 158, 115], [204, 121, 167], [0, 114, 178]];
-const UNRECOGNIZED = [213, 94, 0];
+// Five colours of Okabe and Ito, as in the images of the command line, and eleven more that differ from them.
+const COLORS = [
+  [86, 180, 233], [240, 228, 66], [0, 158, 115], [204, 121, 167], [0, 114, 178], [170, 255, 195], [145, 30, 180],
+  [220, 190, 255], [128, 128, 0], [70, 240, 240], [128, 0, 0], [255, 250, 200], [0, 0, 117], [191, 239, 69],
+  [240, 50, 230], [154, 99, 36],
+];
+const UNKNOWN = [213, 94, 0];
 
 const SMALL = 480; // Images narrower than this (CSS pixels) get smaller letters and thinner lines.
 
+const MAX_COVER = 1 / 3; // Largest fraction of an object's bounding box that a tag may cover.
+
 // Penalties of tag positions: names preferably lie beside their objects, labels on them.
-const NAME_COSTS = { above: 0, below: 0.3, on: 0.6 };
-const LABEL_COSTS = { above: 0.6, below: 0.6, on: 0 };
+const NAME_COSTS = { above: 0, below: 0.3, on: 0.6, left: 0.6, right: 0.6 };
+const LABEL_COSTS = { above: 0.6, below: 0.6, on: 0, left: 0.6, right: 0.6 };
 
 /** Return a colour for each instance. */
-export function paints(instances) {
+export function instanceColors(instances) {
   let named = 0;
-  return instances.map(({ name }) => (name === null ? UNRECOGNIZED : PAINTS[named++ % PAINTS.length]));
+  return instances.map(({ name }) => (name === null ? UNKNOWN : COLORS[named++ % COLORS.length]));
 }
 
 /** Return the text colour for a background colour. */
-export const ink = ([red, green, blue]) => (0.299 * red + 0.587 * green + 0.114 * blue > 100 ? "#000" : "#fff");
+export const textColor = ([red, green, blue]) => (0.299 * red + 0.587 * green + 0.114 * blue > 100 ? "#000" : "#fff");
 
 export class Overlay {
   /** Draw on `canvas`; `onSelect(label)` is called when an object is clicked. */
@@ -37,7 +43,7 @@ export class Overlay {
   }
 
   show(bitmap, instances, labelMap, selected) {
-    Object.assign(this, { bitmap, instances, selected, colors: paints(instances), regions: new Regions(labelMap) });
+    Object.assign(this, { bitmap, instances, selected, colors: instanceColors(instances), regions: new Regions(labelMap) });
     this.canvas.style.aspectRatio = `${bitmap.width} / ${bitmap.height}`;
     const names = instances.map(({ name }) => name ?? "unknown object").join(", ");
     this.canvas.setAttribute("aria-label", `Colour image with the outlines of its objects: ${names || "none"}.`);
@@ -114,14 +120,16 @@ export class Overlay {
     const place = (k, text, costs) => {
       const { label } = this.instances[k];
       const others = this.tags.filter((tag) => tag.label !== label);
-      const room = { width: context.measureText(text).width + size, height: size + 8 };
+      const padding = small ? 4 : 8;
+      const room = { width: context.measureText(text).width + padding + 4, height: size + padding };
       const box = this.freePlace(label, room, others, costs, width, height);
       if (!box) return;
       this.tags = [...others, { label, text, box, color: this.colors[k], font: context.font, isSelected: this.isSelected(k) }];
     };
     this.instances.forEach(({ label }, k) => place(k, `${label}`, LABEL_COSTS));
-    this.instances.forEach(({ name, confidence }, k) => {
-      place(k, name === null ? "unknown" : small ? name : `${name} ${percent(confidence)}`, NAME_COSTS);
+    this.instances.forEach((instance, k) => {
+      const { name } = instance;
+      place(k, name === null ? "unknown" : small ? name : `${name} ${percent(confidenceOf(instance))}`, NAME_COSTS);
     });
   }
 
@@ -131,26 +139,45 @@ export class Overlay {
     if (!region || room.width > width) return;
     const across = width / this.regions.width;
     const down = height / this.regions.height;
-    const ys = {
-      above: region.top * down - room.height - 3,
-      below: region.bottom * down + 3,
-      on: ((region.top + region.bottom) * down - room.height) / 2,
-    };
+    const [left, right] = [region.left * across, region.right * across];
+    const [top, bottom] = [region.top * down, region.bottom * down];
+    const along = (low, high, share, size) => low + (high - low) * share - size / 2;
     let best = { cost: Infinity };
-    for (const [where, y] of Object.entries(ys)) {
-      for (const part of [0.5, 0.25, 0.75, 0, 1]) {
-        const middle = (region.left + (region.right - region.left) * part) * across;
+    for (const share of [0.5, 0.25, 0.75, 0, 1]) {
+      const x = along(left, right, share, room.width);
+      const y = along(top, bottom, share, room.height);
+      const positions = {
+        above: [x, top - room.height - 3],
+        below: [x, bottom + 3],
+        on: [x, along(top, bottom, 0.5, room.height)],
+        left: [left - room.width - 3, y],
+        right: [right + 3, y],
+      };
+      for (const [where, position] of Object.entries(positions)) {
         const box = {
           ...room,
-          x: Math.max(0, Math.min(width - room.width, middle - room.width / 2)),
-          y: Math.max(0, Math.min(height - room.height, y)),
+          x: Math.max(0, Math.min(width - room.width, position[0])),
+          y: Math.max(0, Math.min(height - room.height, position[1])),
         };
-        if (others.some((other) => overlap(box, other.box))) continue;
-        const cost = 3 * this.hidden(label, box) + costs[where] + Math.abs(part - 0.5);
+        if (others.some((other) => overlap(box, other.box)) || this.covers(box, across, down)) continue;
+        const cost = 3 * this.hidden(label, box) + costs[where] + Math.abs(share - 0.5);
         if (cost < best.cost) best = { cost, box };
       }
     }
     return best.box;
+  }
+
+  /** Return whether a box covers too much of an object. */
+  covers(box, across, down) {
+    return this.instances.some(({ label }) => {
+      const region = this.regions.of(label);
+      if (!region) return false;
+      const [left, right] = [region.left * across, region.right * across];
+      const [top, bottom] = [region.top * down, region.bottom * down];
+      const width = Math.min(box.x + box.width, right) - Math.max(box.x, left);
+      const height = Math.min(box.y + box.height, bottom) - Math.max(box.y, top);
+      return width > 0 && height > 0 && width * height > MAX_COVER * (right - left) * (bottom - top);
+    });
   }
 
   /** Return the fraction of a box that lies on objects other than `label`. */
@@ -172,7 +199,7 @@ export class Overlay {
     context.roundRect(box.x, box.y, box.width, box.height, 4);
     context.stroke();
     context.fill();
-    context.fillStyle = ink(color);
+    context.fillStyle = textColor(color);
     context.textAlign = "center";
     context.textBaseline = "middle";
     context.fillText(text, box.x + box.width / 2, box.y + box.height / 2 + 0.5);

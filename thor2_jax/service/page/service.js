@@ -3,10 +3,9 @@
 let token = "";
 
 export class Problem extends Error {
-  constructor(status, field, message) {
+  constructor(status, field, message, further = []) {
     super(message);
-    this.status = status;
-    this.field = field;
+    Object.assign(this, { status, field, further });
   }
 }
 
@@ -14,24 +13,33 @@ export function useToken(value) {
   token = value;
 }
 
+/** Escape control characters and characters that change the direction of text. */
+export function visible(text) {
+  return text.replace(/[\u0000-\u001f\u007f-\u009f\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069]/g, (character) => {
+    return `\\u${character.charCodeAt(0).toString(16).padStart(4, "0")}`;
+  });
+}
+
 async function call(path, options = {}) {
   const headers = token ? { Authorization: `Bearer ${token}` } : {};
-  let answer;
+  let response;
   try {
-    answer = await fetch(path, { ...options, headers });
+    response = await fetch(path, { ...options, headers });
   } catch (error) {
     if (error.name === "AbortError") throw error;
     throw new Problem(0, null, "The service cannot be reached. It may be down, or the files may be too large.");
   }
-  if (answer.ok) return answer;
-  const { field = null, message = `The service answered with status ${answer.status}.` } = await answer
-    .json()
-    .catch(() => ({}));
-  const again = answer.headers.has("Retry-After") ? " Try again in a moment." : "";
-  throw new Problem(answer.status, field, message + again);
+  if (response.ok) return response;
+  const { field = null, message = `The service answered with status ${response.status}.`, further } = await parse(
+    response,
+  ).catch(() => ({}));
+  const again = response.status === 429 ? " Try again in a moment." : "";
+  throw new Problem(response.status, field, message + again, further);
 }
 
-const json = async (path, options) => (await call(path, options)).json();
+const parse = async (response) =>
+  JSON.parse(await response.text(), (_, value) => (typeof value === "string" ? visible(value) : value));
+const json = async (path, options) => parse(await call(path, options));
 
 export const ready = () => call("readyz");
 export const model = () => json("v1/model");
