@@ -48,7 +48,6 @@ LIGHT = 0.4
 
 N_SHOWN = 6
 NAMES = ("CE", "TOPS", "TOPS2", "THOR2")
-FEATURES = ("ce", "tops", "tops2")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -133,7 +132,7 @@ def _train(objects: Mapping[str, TexturedMesh], out: Path, seed: int, progress: 
             seed=seed,
         )
         options = dataclasses.replace(PROTOCOL.fit, seed=seed)
-        (run,) = train_run(dataset, out, FEATURES, options, progress, mirrors=PROTOCOL.mirrors)
+        (run,) = train_run(dataset, out, ("ce", "tops", "tops2"), options, progress, mirrors=PROTOCOL.mirrors)
     shutil.rmtree(out / VIEWS, ignore_errors=True)
     return run
 

@@ -15,7 +15,7 @@ import thor2_jax as thor2
 from thor2_jax.recognition.run_directory import load_run, save_run
 from thor2_jax.testing import damaged
 from training.baselines.files import StoredBaseline, read_baseline, write_baseline
-from training.evaluation.answers import AnswerFile, FrameAnswers, InstanceAnswer
+from training.evaluation.answers import AnswerFile, FrameAnswers, InstancePrediction
 from training.fitting.metrics_log import read_metrics
 
 
@@ -92,9 +92,9 @@ def answers(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     path = tmp_path_factory.mktemp("answers") / "answers.jsonl"
     file = AnswerFile(path, ASKED)
     for number in range(2):
-        said = InstanceAnswer(1, "mug", probabilities=np.array([[0.25, 0.75]], np.float32))
+        said = InstancePrediction(1, "mug", probabilities=np.array([[0.25, 0.75]], np.float32))
         file.append(
-            FrameAnswers(f"frame {number}", {"light": "1"}, 0.5, [said, InstanceAnswer(2, "can", reason="few")])
+            FrameAnswers(f"frame {number}", {"light": "1"}, 0.5, [said, InstancePrediction(2, "can", reason="few")])
         )
     return path.read_bytes()
 

@@ -18,7 +18,7 @@ from scipy.spatial import KDTree
 from thor2_jax.recognition.frames import RGBDFrame, pixel_rays
 from thor2_jax.recognition.instance_clouds import InstanceCloud
 
-__all__ = ["Occlusion", "find_occlusion"]
+__all__ = ["OcclusionBoundary", "find_occlusion"]
 
 STEPS = 6
 """Pixels on either side of the contour that are searched for valid depth."""
@@ -43,7 +43,7 @@ BOUNDARY_REACH = 0.012
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Occlusion:
+class OcclusionBoundary:
     """Whether an instance is occluded, and where.
 
     Attributes:
@@ -55,7 +55,7 @@ class Occlusion:
     boundary: NDArray[np.bool_]
 
 
-def find_occlusion(frame: RGBDFrame, cloud: InstanceCloud) -> Occlusion:
+def find_occlusion(frame: RGBDFrame, cloud: InstanceCloud) -> OcclusionBoundary:
     """Find the occlusion boundary of one instance.
 
     Args:
@@ -71,7 +71,7 @@ def find_occlusion(frame: RGBDFrame, cloud: InstanceCloud) -> Occlusion:
         edge = pixel_rays(pixels[seen], frame.labels.shape[1], frame.intrinsics) * own_depth[seen, None]
         distance, nearest = KDTree(cloud.points, leafsize=32, balanced_tree=False, compact_nodes=False).query(edge)
         boundary[nearest[distance <= BOUNDARY_REACH]] = True
-    return Occlusion(occluded, boundary)
+    return OcclusionBoundary(occluded, boundary)
 
 
 def _window(

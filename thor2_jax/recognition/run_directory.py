@@ -35,7 +35,7 @@ from thor2_jax.recognition.classifier import MLP, Feature, check_features
 
 __all__ = ["RUN_FILE", "TrainedRun", "input_size", "load_run", "save_run"]
 
-FORMAT = 1
+RUN_FORMAT = 1
 """Version of the layout above. Directories of version 0.1 have a `digest` in run.json, which is not read."""
 
 RUN_FILE = "run.json"
@@ -112,7 +112,7 @@ def _description(run: TrainedRun, weights: Path) -> dict[str, Any]:
     """Return the content of run.json for a run whose weights are already on disk."""
     n_inputs = {name: input_size(name, run.config, run.network.n_regions) for name in run.classifiers}
     return {
-        "format": FORMAT,
+        "format": RUN_FORMAT,
         "descriptor_version": DESCRIPTOR_VERSION,
         "descriptor_config": dataclasses.asdict(run.config),
         "color_network": run.network.fingerprint,
@@ -162,9 +162,9 @@ def _read_description(path: Path) -> dict[str, Any]:
         raise InputError(f"model: {path} is no run directory (it has no run.json)") from None
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"model: {path / RUN_FILE} cannot be read: {error}") from None
-    if not isinstance(description, dict) or description.get("format") != FORMAT:
+    if not isinstance(description, dict) or description.get("format") != RUN_FORMAT:
         value = description.get("format") if isinstance(description, dict) else type(description).__name__
-        raise InputError(f"model: {path / RUN_FILE} has format {value!r}; this version reads {FORMAT}")
+        raise InputError(f"model: {path / RUN_FILE} has format {value!r}; this version reads {RUN_FORMAT}")
     if description.get("descriptor_version") != DESCRIPTOR_VERSION:
         raise InputError(
             f"model: {path} was trained on descriptor version {description.get('descriptor_version')!r}; "

@@ -18,14 +18,14 @@ from thor2_jax.capacity import POINT_BUCKETS
 from thor2_jax.errors import InputError
 from thor2_jax.recognition.frames import Intrinsics, RGBDFrame, has_16_bit_channels, parse_intrinsics
 from thor2_jax.service.problem import RequestError
-from thor2_jax.service.schemas import Clouds
+from thor2_jax.service.schemas import CloudsBody
 from thor2_jax.service.settings import (
     MAX_BODY,
+    MAX_CLOUD_COORDINATE,
     MAX_CLOUDS,
-    MAX_COORDINATE,
-    MAX_IMAGE_PIXELS,
     MAX_INSTANCES,
     MAX_INTRINSICS_BYTES,
+    MAX_UPLOAD_PIXELS,
 )
 
 __all__ = ["CloudArrays", "decode_frame", "decode_json_clouds", "decode_npz_clouds"]
@@ -85,8 +85,8 @@ def _decode_image(field: str, content: bytes, formats: tuple[str, ...], modes: t
     except Exception:  # Damaged files make the decoders raise many types of exception.
         raise image_error(422, f"is not a {' or '.join(formats)} image, or its header is damaged") from None
     width, height = image.size
-    if width * height > MAX_IMAGE_PIXELS:
-        raise image_error(413, f"has {width} x {height} pixels; expected at most {MAX_IMAGE_PIXELS}")
+    if width * height > MAX_UPLOAD_PIXELS:
+        raise image_error(413, f"has {width} x {height} pixels; expected at most {MAX_UPLOAD_PIXELS}")
     if image.mode not in modes:
         raise image_error(422, f"is {_mode_name(image.mode)}; expected {' or '.join(map(_mode_name, modes))}")
     if field == "color" and has_16_bit_channels(image):
@@ -104,9 +104,9 @@ def _mode_name(mode: str) -> str:
 
 
 def decode_json_clouds(content: bytes) -> CloudArrays:
-    """Decode clouds from JSON (`schemas.Clouds`). Raises RequestError (422)."""
+    """Decode clouds from JSON (`schemas.CloudsBody`). Raises RequestError (422)."""
     try:
-        body = Clouds.model_validate_json(content)
+        body = CloudsBody.model_validate_json(content)
     except ValidationError as error:
         first = error.errors(include_url=False, include_context=False, include_input=False)[0]
         field = ".".join(map(str, first["loc"]))[:200] or "body"
@@ -185,6 +185,6 @@ def _decode_npy(name: str, archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> 
 def _check_cloud(field: str, points: NDArray[Any], colors: NDArray[np.uint8]) -> tuple[Any, NDArray[np.uint8]]:
     if colors.shape != points.shape:
         raise RequestError(422, f"{field}.colors", f"{field} has {len(points)} points and {len(colors)} colors.")
-    if not (np.abs(points) <= MAX_COORDINATE).all():
-        raise RequestError(422, field, f"{field} has coordinates that are not within {MAX_COORDINATE} m.")
+    if not (np.abs(points) <= MAX_CLOUD_COORDINATE).all():
+        raise RequestError(422, field, f"{field} has coordinates that are not within {MAX_CLOUD_COORDINATE} m.")
     return points.astype(np.float32), colors

@@ -5,14 +5,14 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field
 
 from thor2_jax.capacity import POINT_BUCKETS
-from thor2_jax.service.settings import MAX_CLOUDS, MAX_COORDINATE, MAX_EXPLAINED
+from thor2_jax.service.settings import MAX_CLOUD_COORDINATE, MAX_CLOUDS, MAX_EXPLAINED
 
 __all__ = [
     "CLOUDS_BODY",
     "FRAME_FORM",
     "NPZ",
     "Candidate",
-    "Clouds",
+    "CloudsBody",
     "ColorNetworkAnswer",
     "DescribeAnswer",
     "DescriptorAnswer",
@@ -33,7 +33,7 @@ NPZ = "application/octet-stream"
 """Content type of npz files."""
 
 Milliseconds = dict[str, float]
-Coordinate = Annotated[float, Field(ge=-MAX_COORDINATE, le=MAX_COORDINATE, allow_inf_nan=False)]
+Coordinate = Annotated[float, Field(ge=-MAX_CLOUD_COORDINATE, le=MAX_CLOUD_COORDINATE, allow_inf_nan=False)]
 Channel = Annotated[int, Field(ge=0, le=255)]
 
 
@@ -125,7 +125,7 @@ class ExplainedFrame(BaseModel):
     timings: Milliseconds = Field(description="Milliseconds per stage: upload, decode, clouds, device, total.")
 
 
-class Cloud(BaseModel):
+class CloudBody(BaseModel):
     """A coloured point cloud in the camera frame (x right, y down, z forward)."""
 
     model_config = ConfigDict(extra="forbid")
@@ -137,11 +137,11 @@ class Cloud(BaseModel):
     )
 
 
-class Clouds(BaseModel):
+class CloudsBody(BaseModel):
     """The body of /v1/describe."""
 
     model_config = ConfigDict(extra="forbid")
-    clouds: Annotated[list[Cloud], Field(min_length=1, max_length=MAX_CLOUDS)]
+    clouds: Annotated[list[CloudBody], Field(min_length=1, max_length=MAX_CLOUDS)]
 
 
 class DescriptorAnswer(BaseModel):
@@ -226,8 +226,8 @@ FRAME_FORM: dict[str, Any] = {
 
 
 def _clouds_body() -> dict[str, Any]:
-    schema = Clouds.model_json_schema()
-    schema["properties"]["clouds"]["items"] = schema.pop("$defs")["Cloud"]  # References cannot be resolved.
+    schema = CloudsBody.model_json_schema()
+    schema["properties"]["clouds"]["items"] = schema.pop("$defs")["CloudBody"]  # References cannot be resolved.
     binary = {"type": "string", "format": "binary"}
     return {"required": True, "content": {"application/json": {"schema": schema}, NPZ: {"schema": binary}}}
 

@@ -9,22 +9,22 @@ from thor2_jax.errors import InputError
 __all__ = [
     "MAX_BODY",
     "MAX_CLOUDS",
-    "MAX_COORDINATE",
+    "MAX_CLOUD_COORDINATE",
     "MAX_EXPLAINED",
-    "MAX_IMAGE_PIXELS",
+    "MAX_UPLOAD_PIXELS",
     "MAX_INSTANCES",
     "MAX_INTRINSICS_BYTES",
     "MAX_LABEL_RUNS",
     "Settings",
 ]
 
-MAX_COORDINATE = 100.0
+MAX_CLOUD_COORDINATE = 100.0
 """Largest absolute value of a coordinate of a cloud, in metres."""
 
 MAX_BODY = 16 * 2**20
 """Maximum size of a request body, and of the arrays it decompresses to, in bytes."""
 
-MAX_IMAGE_PIXELS = 1920 * 1080
+MAX_UPLOAD_PIXELS = 1920 * 1080
 """Maximum number of pixels of an image."""
 
 MAX_INSTANCES = 256

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from thor2_jax.config import DescriptorConfig
-from thor2_jax.types import PointClouds
+from thor2_jax.types import Cloud, PointClouds
 
 __all__ = [
     "KINDS",
@@ -32,7 +32,6 @@ __all__ = [
     "settled",
 ]
 
-Cloud = tuple[NDArray[np.float32], NDArray[np.uint8]]
 Points = NDArray[np.float64]
 
 LATTICE = 1 / 2048

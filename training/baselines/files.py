@@ -23,7 +23,7 @@ from thor2_jax.files import atomic_write, content_digest, json_digest
 
 __all__ = ["StoredBaseline", "baseline_file", "load_arrays", "model_arrays", "read_baseline", "write_baseline"]
 
-FORMAT = 1
+BASELINE_FORMAT = 1
 
 
 def baseline_file(run: Path, name: str) -> Path:
@@ -60,7 +60,7 @@ def write_baseline(path: Path, stored: StoredBaseline, classes: Sequence[str]) -
         OSError: if the file cannot be written.
     """
     about = {
-        "format": FORMAT,
+        "format": BASELINE_FORMAT,
         "classes": list(classes),
         "temperature": stored.temperature,
         "seconds": round(stored.seconds, 1),
@@ -86,9 +86,9 @@ def read_baseline(path: Path, classes: Sequence[str]) -> StoredBaseline:
         with safetensors.safe_open(path, "numpy") as file:
             about = json.loads(file.metadata()["about"])
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        if about["format"] != FORMAT:
+        if about["format"] != BASELINE_FORMAT:
             raise InputError(
-                f"model: {path} has format {about['format']!r}; expected {FORMAT}; train the baseline again"
+                f"model: {path} has format {about['format']!r}; expected {BASELINE_FORMAT}; train the baseline again"
             )
         if about.pop("digest") != _digest(arrays, about):
             raise ValueError("its digest does not match")

@@ -9,14 +9,13 @@ from sklearn.ensemble import RandomForestClassifier
 from thor2_jax.descriptor.view_normalization import mirror
 from training.baselines.forest import Forest, forest_features
 from training.baselines.task import FitTask, FittedBaseline
-from training.fitting.samples import MIRRORS
+from training.fitting.samples import MIRRORS, VIEWS_PER_BATCH
 from training.views.normalized_views import padded_batches
 
 __all__ = ["fit_forest", "tree_arrays"]
 
 TREES = 200
 MIN_LEAF_SAMPLES = 2
-VIEWS_PER_BATCH = 64
 
 
 def tree_arrays(forest: RandomForestClassifier) -> dict[str, NDArray[Any]]:

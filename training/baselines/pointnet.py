@@ -20,7 +20,7 @@ POINTS = 384
 
 SHARED = (64, 128, 384)
 HEAD = 256
-CLOUDS_PER_BATCH = 256
+INFERENCE_BATCH = 256
 SAMPLING_SEED = 0
 
 
@@ -99,8 +99,8 @@ class ColoredPointNet:
     def predict(self, xyz: NDArray[Any], rgb: NDArray[Any], box: NDArray[Any]) -> NDArray[np.float32]:
         """Return class probabilities [V, C] for sampled points [V, POINTS, 3], their colours and boxes [V, 3]."""
         chunks = []
-        for first in range(0, len(xyz), CLOUDS_PER_BATCH):
-            rows = np.resize(np.arange(first, min(first + CLOUDS_PER_BATCH, len(xyz))), CLOUDS_PER_BATCH)
+        for first in range(0, len(xyz), INFERENCE_BATCH):
+            rows = np.resize(np.arange(first, min(first + INFERENCE_BATCH, len(xyz))), INFERENCE_BATCH)
             values = _probabilities(self._graph, self._params, xyz[rows].astype(np.float32), rgb[rows], box[rows])
             chunks.append(np.asarray(values)[: len(xyz) - first])
         return np.concatenate(chunks)

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 
 from training.baselines.baseline import baseline_inputs
-from training.evaluation.answers import FrameAnswers, InstanceAnswer, all_predictors
+from training.evaluation.answers import FrameAnswers, InstancePrediction, all_predictors
 from training.evaluation.runs import Run
 from training.readers.labelled import LabelledFrame
 
@@ -30,7 +30,7 @@ def answer_frames(runs: Sequence[Run], frames: Iterable[LabelledFrame]) -> Itera
         start = time.perf_counter()
 
 
-def _answer(runs: Sequence[Run], item: LabelledFrame) -> list[InstanceAnswer]:
+def _answer(runs: Sequence[Run], item: LabelledFrame) -> list[InstancePrediction]:
     recognizer = runs[0].recognizer
     described = recognizer.describe(item.frame)
     inputs = baseline_inputs(described, recognizer.run.config) if any(run.baselines for run in runs) else None
@@ -42,8 +42,8 @@ def _answer(runs: Sequence[Run], item: LabelledFrame) -> list[InstanceAnswer]:
     for label, truth in sorted(item.truth.items()):
         if label in rows:
             row = rows[label]
-            answers.append(InstanceAnswer(label, truth, described.usable[row].occluded, None, table[row]))
+            answers.append(InstancePrediction(label, truth, described.usable[row].occluded, None, table[row]))
         else:
             reason = reasons.get(label) or "no pixels in the label image"
-            answers.append(InstanceAnswer(label, truth, reason=reason))
+            answers.append(InstancePrediction(label, truth, reason=reason))
     return answers

@@ -18,7 +18,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.files import write_text
 from training.storage.jobs import check_same_job
 
-__all__ = ["AnswerFile", "EvaluatedRun", "FrameAnswers", "InstanceAnswer", "all_predictors"]
+__all__ = ["AnswerFile", "EvaluatedRun", "FrameAnswers", "InstancePrediction", "all_predictors"]
 
 
 class EvaluatedRun(Protocol):
@@ -47,7 +47,7 @@ def all_predictors(runs: Sequence[EvaluatedRun]) -> tuple[tuple[int, str], ...]:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class InstanceAnswer:
+class InstancePrediction:
     """Class probabilities for one labelled instance.
 
     Attributes:
@@ -79,7 +79,7 @@ class FrameAnswers:
     frame: str
     attributes: Mapping[str, str]
     seconds: float
-    instances: Sequence[InstanceAnswer]
+    instances: Sequence[InstancePrediction]
 
 
 class AnswerFile:
@@ -159,5 +159,5 @@ def _decode(line: str | bytes) -> FrameAnswers:
             instance["probabilities"] = np.array(instance["probabilities"], np.float32)
             if instance["probabilities"].ndim != 2:
                 raise ValueError(f"the probabilities of frame {values['frame']!r} are not a table")
-        instances.append(InstanceAnswer(**instance))
+        instances.append(InstancePrediction(**instance))
     return FrameAnswers(values["frame"], values["attributes"], values["seconds"], instances)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from thor2_jax.recognition.fusion import DEFAULT_RULE
 from training.evaluation.accuracy import attribute_tables, group_by_attributes, summarize_runs
-from training.evaluation.answers import EvaluatedRun, FrameAnswers, InstanceAnswer, all_predictors
+from training.evaluation.answers import EvaluatedRun, FrameAnswers, InstancePrediction, all_predictors
 from training.evaluation.confidence import accuracy_at_coverage, auroc, expected_calibration_error, reliability
 from training.evaluation.fusion import RULES, Rule, fuse_by, fusions, main_fusion
 from training.evaluation.published import published
@@ -39,7 +39,7 @@ class Predictions:
 
 
 def fuse_answers(
-    instances: Sequence[InstanceAnswer], runs: Sequence[EvaluatedRun], rule: Rule = DEFAULT_RULE
+    instances: Sequence[InstancePrediction], runs: Sequence[EvaluatedRun], rule: Rule = DEFAULT_RULE
 ) -> dict[str, dict[int, Predictions]]:
     """Return fusion -> index of the run -> predictions for those of `instances` that were described.
 
@@ -61,7 +61,9 @@ def fuse_answers(
     return {title: by_run for title, by_run in predictions.items() if by_run}
 
 
-def incorrect_answers(frame: FrameAnswers, runs: Sequence[EvaluatedRun]) -> Iterable[tuple[InstanceAnswer, str, float]]:
+def incorrect_answers(
+    frame: FrameAnswers, runs: Sequence[EvaluatedRun]
+) -> Iterable[tuple[InstancePrediction, str, float]]:
     """Yield instance, predicted name and confidence for every incorrect answer of any run's main fusion."""
     classes = runs[0].classes
     described = [i for i in frame.instances if i.probabilities is not None and i.truth in classes]
@@ -119,8 +121,8 @@ def _speed(seconds: Sequence[float]) -> dict[str, Any]:
 def _scores(
     kind: str,
     runs: Sequence[EvaluatedRun],
-    known: Sequence[tuple[InstanceAnswer, Mapping[str, str]]],
-    unknown: Sequence[InstanceAnswer],
+    known: Sequence[tuple[InstancePrediction, Mapping[str, str]]],
+    unknown: Sequence[InstancePrediction],
 ) -> dict[str, Any]:
     """Return the part of the results that needs instances of the runs' classes."""
     classes = runs[0].classes

@@ -28,7 +28,7 @@ LIGHT_CHANGE = 0.2
 NOISE = 0.5
 """Noise dominates the size of a depth image; with this factor four samples take less than 400 kB."""
 
-MARGIN = 24
+CROP_MARGIN = 24
 """Margin around the objects, pixels."""
 
 LEAST_WIDTH = 400
@@ -54,7 +54,7 @@ def write_sample_frames(directory: str | Path) -> None:
 
 def _crop(frame: RGBDFrame) -> RGBDFrame:
     rows, columns = (np.flatnonzero((frame.labels > 0).any(axis=axis)) for axis in (1, 0))
-    required = max(np.ptp(columns) + 1, (np.ptp(rows) + 1) * 4 / 3) + 2 * MARGIN
+    required = max(np.ptp(columns) + 1, (np.ptp(rows) + 1) * 4 / 3) + 2 * CROP_MARGIN
     height, width = frame.labels.shape
     across = min(width, max(LEAST_WIDTH, 4 * round(required / 4)))
     down = across * 3 // 4

@@ -31,7 +31,7 @@ from training.rendering.view_sphere import camera_pose, view_angles
 from training.storage.workers import local_workers
 
 __all__ = [
-    "MIN_POINTS",
+    "MIN_VIEW_POINTS",
     "RenderProgress",
     "ViewCloud",
     "ViewTask",
@@ -46,7 +46,7 @@ __all__ = [
 
 SIGMA_S = DescriptorConfig().sigma_s
 
-MIN_POINTS = 30
+MIN_VIEW_POINTS = 30
 """Views with fewer points are left out: too little of the object is visible to describe it."""
 
 VIEWS_PER_TASK = 256
@@ -153,8 +153,8 @@ def _all_clouds(task: ViewTask) -> Iterator[ViewCloud]:
 
 
 def render_task(task: ViewTask) -> list[ViewCloud]:
-    """Return the clouds of a task that have at least `MIN_POINTS` points, ordered by view and copy."""
-    return [cloud for cloud in _all_clouds(task) if len(cloud.xyz) >= MIN_POINTS]
+    """Return the clouds of a task that have at least `MIN_VIEW_POINTS` points, ordered by view and copy."""
+    return [cloud for cloud in _all_clouds(task) if len(cloud.xyz) >= MIN_VIEW_POINTS]
 
 
 def _mesh(source: Path | TexturedMesh) -> TexturedMesh:
@@ -167,15 +167,15 @@ def checked_meshes(
     """Yield each object's name and mesh, one in memory at a time; finds unusable meshes before the long rendering.
 
     Raises:
-        InputError: There are no meshes, or a mesh is unreadable or has no view of at least `MIN_POINTS` points.
+        InputError: There are no meshes, or a mesh is unreadable or has no view of at least `MIN_VIEW_POINTS` points.
     """
     if not meshes:
         raise InputError("meshes is empty; expected at least one mesh")
     for name, source in meshes.items():
         mesh = _mesh(source)
-        if not any(len(cloud.xyz) >= MIN_POINTS for cloud in _all_clouds(ViewTask(name, mesh, angles))):
+        if not any(len(cloud.xyz) >= MIN_VIEW_POINTS for cloud in _all_clouds(ViewTask(name, mesh, angles))):
             raise InputError(
-                f"object {name!r}: none of its {len(angles)} views has at least {MIN_POINTS} points; check the "
+                f"object {name!r}: none of its {len(angles)} views has at least {MIN_VIEW_POINTS} points; check the "
                 "mesh or leave it out"
             )
         yield name, mesh
@@ -218,7 +218,7 @@ def render_views(
 
     Returns:
         name -> clouds (xyz [n, 3] float32 metres in the camera frame, rgb [n, 3] uint8), in the order of `meshes` and
-        `view_angles`; views with fewer than `MIN_POINTS` points are left out.
+        `view_angles`; views with fewer than `MIN_VIEW_POINTS` points are left out.
 
     Raises:
         InputError: There are no meshes, a mesh is unreadable or never visible, or a step or `workers` is invalid.

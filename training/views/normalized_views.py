@@ -13,12 +13,19 @@ from thor2_jax.descriptor.view_normalization import view_normalize
 from thor2_jax.errors import InputError
 from thor2_jax.types import Cloud, PointClouds
 
-__all__ = ["MAX_COORDINATE", "COORDINATE_STEP", "NormalizedViews", "ViewSource", "normalize_views", "padded_batches"]
+__all__ = [
+    "MAX_VIEW_LENGTH",
+    "COORDINATE_STEP",
+    "NormalizedViews",
+    "ViewSource",
+    "normalize_views",
+    "padded_batches",
+]
 
 COORDINATE_STEP = 2.0**-14
 """Resolution of the coordinates, scaled units (0.024 mm)."""
 
-MAX_COORDINATE = COORDINATE_STEP * np.iinfo(np.uint16).max
+MAX_VIEW_LENGTH = COORDINATE_STEP * np.iinfo(np.uint16).max
 """Largest coordinate, scaled units (1.6 m): multiples of `COORDINATE_STEP` up to it fit into 16 bits."""
 
 CLOUDS_PER_BATCH = 64
@@ -106,7 +113,7 @@ def normalize_views(
         config: only `sigma_s` is used.
 
     Raises:
-        InputError: A cloud has more points than the largest bucket, or is longer than `MAX_COORDINATE`.
+        InputError: A cloud has more points than the largest bucket, or is longer than `MAX_VIEW_LENGTH`.
     """
     xyz = [np.zeros((0, 3), np.float32)]
     # Always on the CPU: an accelerator rounds differently, and rendering should not occupy its memory.
@@ -116,9 +123,9 @@ def normalize_views(
             padded, mask = np.asarray(normal.points)[:count], np.asarray(normal.mask)[:count]
             xyz.append(np.rint(padded[mask] / np.float32(COORDINATE_STEP)) * np.float32(COORDINATE_STEP))
     points = np.concatenate(xyz)
-    if not (points <= MAX_COORDINATE).all():
+    if not (points <= MAX_VIEW_LENGTH).all():
         raise InputError(
-            f"a view is {points.max():.3g} scaled units long; at most {MAX_COORDINATE:.3g} can be stored; scale the "
+            f"a view is {points.max():.3g} scaled units long; at most {MAX_VIEW_LENGTH:.3g} can be stored; scale the "
             "mesh to metres"
         )
     return NormalizedViews(

@@ -30,7 +30,7 @@ from training.storage.locks import locked
 from training.storage.workers import IN_PROCESS, WorkerPool
 from training.views.dataset import MANIFEST, Manifest, Shard, ViewDataset, encode
 from training.views.mesh_views import (
-    MIN_POINTS,
+    MIN_VIEW_POINTS,
     SIGMA_S,
     RenderProgress,
     ViewCloud,
@@ -39,7 +39,7 @@ from training.views.mesh_views import (
     render_task,
     view_tasks,
 )
-from training.views.normalized_views import COORDINATE_STEP, MAX_COORDINATE, normalize_views
+from training.views.normalized_views import COORDINATE_STEP, MAX_VIEW_LENGTH, normalize_views
 
 __all__ = ["render_dataset"]
 
@@ -62,9 +62,9 @@ def _objects(meshes: Mapping[str, Path | TexturedMesh], angles: NDArray[np.float
     objects = []
     for name, mesh in checked_meshes(meshes, angles):
         diameter = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
-        if SIGMA_S * diameter > MAX_COORDINATE:
+        if SIGMA_S * diameter > MAX_VIEW_LENGTH:
             raise InputError(
-                f"object {name!r} has a diameter of {diameter:.2f} m; at most {MAX_COORDINATE / SIGMA_S:.2f} m can be "
+                f"object {name!r} has a diameter of {diameter:.2f} m; at most {MAX_VIEW_LENGTH / SIGMA_S:.2f} m can be "
                 "stored; scale the mesh to metres"
             )
         objects.append({"name": name, "mesh": _digest(mesh)})
@@ -208,7 +208,7 @@ def render_dataset(
         "sigma_s": SIGMA_S,
         "voxel": DESCRIPTOR_VOXEL,
         "step": COORDINATE_STEP,
-        "min_points": MIN_POINTS,
+        "min_points": MIN_VIEW_POINTS,
         "camera": {**dataclasses.asdict(TRAINING_CAMERA), "distance": DISTANCE},
         "azimuth_step": float(azimuth_step),
         "polar_step": float(polar_step),

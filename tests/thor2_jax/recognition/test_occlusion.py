@@ -9,7 +9,7 @@ from scipy.spatial.distance import cdist
 
 from thor2_jax.recognition.frames import Intrinsics, RGBDFrame
 from thor2_jax.recognition.instance_clouds import InstanceCloud, instance_clouds
-from thor2_jax.recognition.occlusion import Occlusion, find_occlusion
+from thor2_jax.recognition.occlusion import OcclusionBoundary, find_occlusion
 from training.readers import UWISOccluded
 
 HEIGHT, WIDTH = 120, 160
@@ -17,7 +17,7 @@ CAMERA = Intrinsics(300.0, 300.0, 79.5, 59.5)
 BACK, FRONT = 1, 2
 
 
-def occlusions(depth: np.ndarray, labels: np.ndarray) -> dict[int, tuple[InstanceCloud, Occlusion]]:
+def occlusions(depth: np.ndarray, labels: np.ndarray) -> dict[int, tuple[InstanceCloud, OcclusionBoundary]]:
     frame = RGBDFrame(np.zeros((*labels.shape, 3), np.uint8), depth, labels, CAMERA)
     return {cloud.label: (cloud, find_occlusion(frame, cloud)) for cloud in instance_clouds(frame)}
 

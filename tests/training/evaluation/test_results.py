@@ -8,7 +8,7 @@ import pytest
 from sklearn.metrics import confusion_matrix
 
 from training.evaluation.accuracy import attribute_tables, group_by_attributes, summarize_runs
-from training.evaluation.answers import FrameAnswers, InstanceAnswer
+from training.evaluation.answers import FrameAnswers, InstancePrediction
 from training.evaluation.fusion import fuse_by, fusions, main_fusion
 from training.evaluation.published import published, published_seconds
 from training.evaluation.results import compute_results, incorrect_answers
@@ -41,7 +41,7 @@ def synthetic_frames(n: int = 60) -> list[FrameAnswers]:
             table = rng.dirichlet(np.ones(3), N_PREDICTORS).astype(np.float32)
             gone = number % 7 == 0
             instances.append(
-                InstanceAnswer(label, truth, False, "too few points" if gone else None, None if gone else table)
+                InstancePrediction(label, truth, False, "too few points" if gone else None, None if gone else table)
             )
         attributes = {"environment": "lounge" if k % 2 else "warehouse", "occlusion": ("none", "low", "high")[k % 3]}
         frames.append(FrameAnswers(f"{k}/0", attributes, 0.5, instances))
@@ -96,8 +96,8 @@ def test_calibrated_fusion_uses_the_temperatures() -> None:
 def test_temperatures_reduce_the_calibration_error() -> None:
     """3 of 4 answers with confidence 0.99 are correct; a temperature turns 0.99 into 0.75 and the error into zero."""
     rows = [np.array([[0.99, 0.01]] * 2, np.float32)] * 40
-    instances = [InstanceAnswer(k, "can" if k % 4 == 0 else "bowl", probabilities=p) for k, p in enumerate(rows)]
-    unknown = [InstanceAnswer(99, "dragon", probabilities=np.array([[0.6, 0.4]] * 2, np.float32))]
+    instances = [InstancePrediction(k, "can" if k % 4 == 0 else "bowl", probabilities=p) for k, p in enumerate(rows)]
+    unknown = [InstancePrediction(99, "dragon", probabilities=np.array([[0.6, 0.4]] * 2, np.float32))]
     frame = FrameAnswers("f", {}, 1.0, instances + unknown)
     temperature = np.log(99) / np.log(3)
     runs = [
@@ -132,7 +132,7 @@ def test_results_match_numpy_and_sklearn() -> None:
     lost = sum(i.probabilities is None for i, _ in scored)
     assert report["instances"]["not_described"] == {"too few points": lost}
 
-    def is_correct(i: InstanceAnswer, rows: list[int]) -> bool:
+    def is_correct(i: InstancePrediction, rows: list[int]) -> bool:
         if i.probabilities is None:
             return False
         row = max(rows, key=lambda k: i.probabilities[k].max())  # type: ignore[index]
@@ -181,14 +181,16 @@ def test_results_match_numpy_and_sklearn() -> None:
 
 def test_incorrect_answers_are_those_of_the_main_fusion() -> None:
     sure = np.array([[0, 0, 1], [0, 0, 1], [1, 0, 0], [1, 0, 0], [0.9, 0.1, 0]], np.float32)
-    instances = [InstanceAnswer(1, "mug", probabilities=sure), InstanceAnswer(2, "dragon", probabilities=sure)]
+    instances = [InstancePrediction(1, "mug", probabilities=sure), InstancePrediction(2, "dragon", probabilities=sure)]
     found = list(incorrect_answers(FrameAnswers("f", {}, 0.1, instances), RUNS))
     assert [(i.label, answer, confidence) for i, answer, confidence in found] == [(1, "bowl", 1.0)]
 
 
 @pytest.mark.parametrize("kept", [0, 1])
 def test_results_of_no_or_one_instance(kept: int) -> None:
-    frame = FrameAnswers("f", {}, 0.0, [InstanceAnswer(1, "mug", probabilities=np.eye(3, dtype=np.float32)[:2])][:kept])
+    frame = FrameAnswers(
+        "f", {}, 0.0, [InstancePrediction(1, "mug", probabilities=np.eye(3, dtype=np.float32)[:2])][:kept]
+    )
     report = compute_results("frames", RUNS[:1], [frame])
     assert report["instances"]["scored"] == kept and report["speed"]["frames_per_second"] is None
     assert report["fusions"] == (["TOPS", "TOPS2", "THOR2"] if kept else [])
@@ -198,7 +200,7 @@ def test_results_of_no_or_one_instance(kept: int) -> None:
 
 
 def test_instances_not_described_are_incorrect() -> None:
-    frame = FrameAnswers("f", {}, 1.0, [InstanceAnswer(1, "mug", reason="too few points")])
+    frame = FrameAnswers("f", {}, 1.0, [InstancePrediction(1, "mug", reason="too few points")])
     report = compute_results("frames", RUNS, [frame])
     accuracy = report["accuracy"]["log-mean"][0]["cells"][0]["accuracy"]
     assert accuracy["THOR2"] == {"mean": 0.0, "std": 0.0, "runs": 2}
@@ -218,7 +220,7 @@ def test_grouping_by_attributes() -> None:
 
 
 def test_ocid_has_a_table_by_sequence() -> None:
-    answer = InstanceAnswer(1, "mug", probabilities=np.eye(3, dtype=np.float32)[:2])
+    answer = InstancePrediction(1, "mug", probabilities=np.eye(3, dtype=np.float32)[:2])
     names = ["table/bottom/mixed/seq1", "table/bottom/mixed/seq2"]
     frames = [FrameAnswers(f"{name}/{k}", {"camera": "lower"}, 1.0, [answer]) for name in names for k in range(2)]
     tables = compute_results("ocid", RUNS[:1], frames)["accuracy"]["max"]

@@ -17,7 +17,7 @@ from training.views.dataset import Manifest, ViewDataset, encode
 from training.views.mesh_views import render_views
 from training.views.normalized_views import (
     COORDINATE_STEP,
-    MAX_COORDINATE,
+    MAX_VIEW_LENGTH,
     NormalizedViews,
     normalize_views,
     padded_batches,
@@ -91,7 +91,7 @@ def test_empty_views_and_views_beyond_the_range() -> None:
     assert len(encode(nothing)) > 0
     line = np.linspace(0, 1, 50, dtype=np.float32)[:, None] * np.array([0, 0, 1], np.float32)
     rgb = np.zeros((50, 3), np.uint8)
-    assert views_of([(line * np.float32(MAX_COORDINATE / 2.5), rgb)]).xyz.max() == MAX_COORDINATE
+    assert views_of([(line * np.float32(MAX_VIEW_LENGTH / 2.5), rgb)]).xyz.max() == MAX_VIEW_LENGTH
     with pytest.raises(InputError, match="a view is 4.05 scaled units long"):
         views_of([(line, rgb), (line * np.float32(1.62), rgb)])
 

@@ -18,7 +18,7 @@ from training.rendering.view_sphere import DISTANCE, camera_pose, view_angles
 from training.views import mesh_views as views
 from training.views.mesh_views import (
     DESCRIPTOR_VOXEL,
-    MIN_POINTS,
+    MIN_VIEW_POINTS,
     SIGMA_S,
     ViewTask,
     render_task,
@@ -104,7 +104,7 @@ def test_views_of_few_points_are_left_out() -> None:
     sheet = ball(0.03)
     sheet.vertices[:, 2] *= 0.005  # seen edge on from the side
     clouds = render_views({"sheet": sheet}, 180, 90)["sheet"]
-    assert len(clouds) == 4 and min(len(xyz) for xyz, _ in clouds) >= MIN_POINTS
+    assert len(clouds) == 4 and min(len(xyz) for xyz, _ in clouds) >= MIN_VIEW_POINTS
 
 
 def test_bad_requests(tmp_path: Path) -> None:
