@@ -2,15 +2,20 @@
 
 import os
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
+import jax
 import pytest
 from hypothesis import HealthCheck, settings
 
-# Read when JAX is imported and inherited by subprocesses: the processes of a run share their compiled programs, and the
-# next run finds them.
+# Subprocesses inherit these: the processes of a run share their compiled programs, and the next run finds them.
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", f"{tempfile.gettempdir()}/thor2-jax-tests-{os.getuid()}")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
+jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE_DIR"])
+jax.config.update(
+    "jax_persistent_cache_min_compile_time_secs", float(os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"])
+)
 
 EXAMPLES = {"properties": (4, 60), "fuzz": (150, 3000)}
 """Directory of tests -> number of Hypothesis examples for each test, by default and with --thorough."""
@@ -25,6 +30,9 @@ for folder, numbers in EXAMPLES.items():
             database=None,
             suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
         )
+
+STRICT = ("descriptor", "golden", "properties")
+"""Directories whose tests allow no implicit dtype promotion; Flax, which other tests use, relies on it."""
 
 SHARED = Path(__file__).resolve().parents[1].parent / "shared"
 
@@ -52,6 +60,12 @@ def pytest_collectstart(collector: pytest.Collector) -> None:
 def pytest_collectreport() -> None:
     """Restore the default settings of Hypothesis for other directories."""
     settings.load_profile("default")
+
+
+@pytest.fixture(autouse=True)
+def strict_dtype_promotion(request: pytest.FixtureRequest) -> Iterator[None]:
+    with jax.numpy_dtype_promotion("strict" if request.path.parent.name in STRICT else "standard"):
+        yield
 
 
 @pytest.fixture(scope="session")

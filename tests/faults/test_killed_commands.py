@@ -194,8 +194,9 @@ def test_train(meshes: Path, frames: Path, environment: Any, call: Any, tmp_path
     assert call(*command, out)[0] == 0
     assert equal_models(load_run(out), run)
     found = files(out)
-    assert {name for name in found if "weights" not in name} == {name for name in expected if "weights" not in name}
-    assert found["curves.png"] == expected["curves.png"] and found["network.npz"] == expected["network.npz"]
+    assert found.keys() == expected.keys()
+    different = {name for name in found if found[name] != expected[name]}  # these two hold measured times
+    assert different <= {"metrics.jsonl", "baselines/forest.safetensors"}
     first, second = (read_baseline(baseline_file(folder, "forest"), run.classes) for folder in (out, whole))
     assert all(np.array_equal(second.arrays[name], array) for name, array in first.arrays.items())
 

@@ -47,7 +47,7 @@ def test_descriptions(data: st.DataObject, run: Path, attempt: Any, monkeypatch:
         part = data.draw(damaged(json.dumps(table[key]).encode()))
         other = json.dumps(table | {key: "PART"}).encode().replace(b'"PART"', part)
     with monkeypatch.context() as patch:
-        patch.setattr("thor2_jax.recognition.run_directory._restore_weights", lambda path, n_inputs, n_classes: None)
+        patch.setattr("thor2_jax.recognition.run_directory.model_from_arrays", lambda create, arrays: None)
         loaded = damaged_and_back(run / "run.json", other, lambda: load_run(run), attempt)
     if loaded is not None:
         assert isinstance(loaded.config, thor2.DescriptorConfig) and isinstance(loaded.record, dict)
@@ -75,7 +75,7 @@ def test_odd_numbers(value: str, run: Path, attempt: Any) -> None:
 
 
 def test_sizes_that_would_fill_memory(run: Path, attempt: Any, tmp_path: Path) -> None:
-    """The digest of the weights is compared before any array is made."""
+    """The shapes of the weights are compared before any array is made."""
     path = Path(shutil.copytree(run, tmp_path / "run"))
     for key in ("n_slices", "n_strips"):
         table = json.loads((run / "run.json").read_bytes())

@@ -172,7 +172,7 @@ def soft_regions(colors: jax.Array, sets: RegionSets, temperature: float) -> jax
     row = (levels[..., 0] * GRID_LEVELS + levels[..., 1]) * GRID_LEVELS + levels[..., 2]
 
     reach = 0.5 + temperature / (1 + temperature)
-    closeness = 1 - ((scaled[:, None] - levels) / reach) ** 2
+    closeness = 1 - ((scaled[:, None] - levels.astype(scaled.dtype)) / reach) ** 2
     # The nearest colour always stays; at a tiny temperature rounding could exclude it.
     chosen = exists & ((closeness > 0).all(axis=-1) | ~_OFFSETS.any(axis=-1))
     fade = 2 * jnp.log(jnp.where(closeness > 0, closeness, 1e-7)).sum(axis=-1)

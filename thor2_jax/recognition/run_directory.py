@@ -1,42 +1,44 @@
 """Run directories: a trained model on disk with everything that recognition needs.
 
-RUN/run.json         format, descriptor version and constants, class names, classifiers and SHA-256 of their weights,
-                     and a record of the training
-RUN/network.npz      the colour network whose regions the descriptors use
-RUN/weights/NAME/    parameters and batch statistics of one classifier (Orbax)
+RUN/run.json                    format, descriptor version and constants, class names, classifiers and SHA-256 of their
+                                weights, and a record of the training
+RUN/network.npz                 the colour network whose regions the descriptors use
+RUN/weights/NAME.safetensors    parameters and batch statistics of one classifier
 
 These three are the model: none of them may be deleted or edited. `thor2 train` adds files that recognition does not
 read, and each of them may be deleted: `baselines/` (models that `thor2 evaluate` compares with), `metrics.jsonl` and
 `curves.png` (loss and accuracy of each epoch) and, while a training is unfinished, `checkpoints/` and `views/`, from
 which an interrupted training resumes. With several folds, each of `fold-0/`, `fold-1/`, ... is a run directory.
 
-A run directory appears under its name only when it is complete, and everything is checked when it is loaded.
+A run directory appears under its name only when it is complete, and everything is checked when it is loaded. Two
+trainings that are equal (see `training.fitting.fit`) give the same bytes in these three.
 """
 
 import dataclasses
 import json
 import shutil
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
-import numpy as np
-import orbax.checkpoint as ocp  # type: ignore[import-untyped]
+import safetensors
+import safetensors.numpy
 from flax import nnx
 
 import colornet
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig, Relaxation
 from thor2_jax.errors import InputError
-from thor2_jax.files import check_output_directory, directory_digest
+from thor2_jax.files import check_output_directory, content_digest
 from thor2_jax.recognition.classifier import MLP, Feature, check_features
+from thor2_jax.recognition.orbax_weights import load_orbax_classifier
+from thor2_jax.recognition.weights import model_arrays, model_from_arrays
 
-__all__ = ["RUN_FILE", "TrainedRun", "input_size", "load_run", "save_run"]
+__all__ = ["RUN_FILE", "TrainedRun", "input_size", "load_run", "save_run", "weights_file"]
 
-RUN_FORMAT = 1
-"""Version of the layout above. Directories of version 0.1 have a `digest` in run.json, which is not read."""
+RUN_FORMAT = 2
+"""Version of the layout above. Format 1 has Orbax checkpoints (RUN/weights/NAME/) and is still read."""
 
 RUN_FILE = "run.json"
 
@@ -66,22 +68,6 @@ def input_size(feature: Feature, config: DescriptorConfig, n_regions: int) -> in
     return config.n_slices * {"ce": embedding, "tops": image, "tops2": image + embedding}[feature]
 
 
-def _checkpointer() -> Any:
-    """Return an Orbax checkpointer for this process alone; in a job of several it would wait for the others."""
-    process = jax.process_index()
-    alone = ocp.options.MultiprocessingOptions(primary_host=process, active_processes={process})
-    return ocp.StandardCheckpointer(multiprocessing_options=alone)
-
-
-def _weights_digest(path: Path, n_inputs: int, n_classes: int) -> str:
-    """Return the SHA-256, in hexadecimal, of a classifier's files and sizes.
-
-    It is compared before Orbax reads anything: Orbax does not notice all damage, and where it does, its unfinished
-    reads print tracebacks from their threads.
-    """
-    return directory_digest(path, f"{n_inputs} {n_classes}")
-
-
 def save_run(run: TrainedRun, path: str | Path) -> None:
     """Write a run directory. It appears under its name only when it is complete.
 
@@ -92,25 +78,22 @@ def save_run(run: TrainedRun, path: str | Path) -> None:
     path = Path(path).resolve()
     check_output_directory(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
+    unfinished = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
     try:
-        partial.chmod(0o755)
-        colornet.save(run.network, partial / "network.npz")
-        with _checkpointer() as checkpointer:
-            for name, model in run.classifiers.items():
-                state = nnx.to_pure_dict(nnx.state(model, (nnx.Param, nnx.BatchStat)))
-                checkpointer.save(partial / "weights" / name, jax.tree.map(np.asarray, state))
-            checkpointer.wait_until_finished()
-        (partial / RUN_FILE).write_text(json.dumps(_description(run, partial / "weights"), indent=2) + "\n")
-        partial.rename(path)
+        unfinished.chmod(0o755)
+        colornet.save(run.network, unfinished / "network.npz")
+        (unfinished / "weights").mkdir()
+        contents = {name: safetensors.numpy.save(model_arrays(model)) for name, model in run.classifiers.items()}
+        for name, content in contents.items():
+            weights_file(unfinished, name).write_bytes(content)
+        (unfinished / RUN_FILE).write_text(json.dumps(_description(run, contents), indent=2) + "\n")
+        unfinished.rename(path)
     except BaseException:
-        shutil.rmtree(partial, ignore_errors=True)
+        shutil.rmtree(unfinished, ignore_errors=True)
         raise
 
 
-def _description(run: TrainedRun, weights: Path) -> dict[str, Any]:
-    """Return the content of run.json for a run whose weights are already on disk."""
-    n_inputs = {name: input_size(name, run.config, run.network.n_regions) for name in run.classifiers}
+def _description(run: TrainedRun, weights: Mapping[Feature, bytes]) -> dict[str, Any]:
     return {
         "format": RUN_FORMAT,
         "descriptor_version": DESCRIPTOR_VERSION,
@@ -118,7 +101,7 @@ def _description(run: TrainedRun, weights: Path) -> dict[str, Any]:
         "color_network": run.network.fingerprint,
         "classes": list(run.classes),
         "classifiers": list(run.classifiers),
-        "weights": {name: _weights_digest(weights / name, n, len(run.classes)) for name, n in n_inputs.items()},
+        "weights": {name: content_digest([content]) for name, content in weights.items()},
         "record": run.record,
     }
 
@@ -148,10 +131,11 @@ def load_run(path: str | Path) -> TrainedRun:
         raise InputError(f"model: {path / 'network.npz'} cannot be read: {error}") from None
     if network.fingerprint != fingerprint:
         raise InputError(f"model: {path / 'network.npz'} is not the colour network that run.json names")
+    load = load_orbax_classifier if description["format"] == 1 else _load_classifier
     classifiers = {}
     for name in names:
-        n_inputs = input_size(name, config, network.n_regions)
-        classifiers[name] = _load_classifier(path / "weights" / name, n_inputs, len(classes), digests[name])
+        sizes = input_size(name, config, network.n_regions), len(classes)
+        classifiers[name] = load(path / "weights" / name, partial(_create_mlp, *sizes), digests[name])
     return TrainedRun(config, network, tuple(classes), classifiers, record)
 
 
@@ -162,9 +146,9 @@ def _read_description(path: Path) -> dict[str, Any]:
         raise InputError(f"model: {path} is no run directory (it has no run.json)") from None
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"model: {path / RUN_FILE} cannot be read: {error}") from None
-    if not isinstance(description, dict) or description.get("format") != RUN_FORMAT:
+    if not isinstance(description, dict) or description.get("format") not in (1, RUN_FORMAT):
         value = description.get("format") if isinstance(description, dict) else type(description).__name__
-        raise InputError(f"model: {path / RUN_FILE} has format {value!r}; this version reads {RUN_FORMAT}")
+        raise InputError(f"model: {path / RUN_FILE} has format {value!r}; expected 1 or {RUN_FORMAT}")
     if description.get("descriptor_version") != DESCRIPTOR_VERSION:
         raise InputError(
             f"model: {path} was trained on descriptor version {description.get('descriptor_version')!r}; "
@@ -178,23 +162,26 @@ def _config(constants: Mapping[str, Any]) -> DescriptorConfig:
     return DescriptorConfig(**{**constants, "relaxation": None if relaxation is None else Relaxation(**relaxation)})
 
 
-def _load_classifier(path: Path, n_inputs: int, n_classes: int, digest: str) -> MLP:
-    if not path.is_dir():
-        raise InputError(f"model: {path} is missing")
-    if digest != _weights_digest(path, n_inputs, n_classes):
-        raise InputError(f"model: {path} is damaged, or not of {n_inputs} inputs and {n_classes} classes")
-    return _restore_weights(path, n_inputs, n_classes)
+def weights_file(run: Path, name: str) -> Path:
+    """Return the path of a classifier's weights in a run directory."""
+    return run / "weights" / f"{name}.safetensors"
 
 
-def _restore_weights(path: Path, n_inputs: int, n_classes: int) -> MLP:
+def _create_mlp(n_inputs: int, n_classes: int) -> MLP:
+    return MLP(n_inputs, n_classes, rngs=nnx.Rngs(0))
+
+
+def _load_classifier(path: Path, create: Callable[[], MLP], digest: str) -> MLP:
+    path = path.with_suffix(".safetensors")
     try:
-        with _checkpointer() as checkpointer:
-            model = MLP(n_inputs, n_classes, rngs=nnx.Rngs(0))
-            state = nnx.state(model, (nnx.Param, nnx.BatchStat))
-            restored = checkpointer.restore(path, jax.tree.map(np.asarray, nnx.to_pure_dict(state)))
-    except Exception as error:  # Orbax raises whatever its storage layers raise
-        reason = str(error).strip().splitlines() or [type(error).__name__]
-        raise InputError(f"model: {path} cannot be read: {reason[0][:300]}") from None
-    nnx.replace_by_pure_dict(state, jax.tree.map(jnp.asarray, restored))
-    nnx.update(model, state)
-    return model
+        content = path.read_bytes()
+    except FileNotFoundError:
+        raise InputError(f"model: {path} is missing; copy the whole run directory") from None
+    except OSError as error:
+        raise InputError(f"model: {path} cannot be read ({error.strerror})") from None
+    if content_digest([content]) != digest:
+        raise InputError(f"model: {path} is damaged: its SHA-256 is not the one in {RUN_FILE}")
+    try:
+        return model_from_arrays(create, safetensors.numpy.load(content))
+    except (ValueError, safetensors.SafetensorError) as error:
+        raise InputError(f"model: {path} does not fit the classifier ({error})") from None

@@ -10,18 +10,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import flax.traverse_util
-import jax.numpy as jnp
 import numpy as np
 import safetensors
 import safetensors.numpy
-from flax import nnx
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
 from thor2_jax.files import atomic_write, content_digest, json_digest
 
-__all__ = ["StoredBaseline", "baseline_file", "load_arrays", "model_arrays", "read_baseline", "write_baseline"]
+__all__ = ["StoredBaseline", "baseline_file", "read_baseline", "write_baseline"]
 
 BASELINE_FORMAT = 1
 
@@ -99,31 +96,3 @@ def read_baseline(path: Path, classes: Sequence[str]) -> StoredBaseline:
         raise
     except (OSError, ValueError, KeyError, TypeError, safetensors.SafetensorError) as error:
         raise InputError(f"model: {path} cannot be read ({error}); remove it and train the baseline again") from None
-
-
-def _flat(state: Any) -> dict[str, Any]:
-    return dict(flax.traverse_util.flatten_dict(nnx.to_pure_dict(state)))
-
-
-def model_arrays(model: nnx.Module) -> dict[str, NDArray[Any]]:
-    """Return the parameters and batch statistics of a model by their paths."""
-    state = nnx.state(model, (nnx.Param, nnx.BatchStat))
-    return {"/".join(map(str, path)): np.asarray(array) for path, array in _flat(state).items()}
-
-
-def load_arrays(model: nnx.Module, arrays: Mapping[str, NDArray[Any]]) -> Any:
-    """Set the parameters and batch statistics of `model`, and return it.
-
-    Raises:
-        ValueError: if an array is missing or has another shape.
-    """
-    state = nnx.state(model, (nnx.Param, nnx.BatchStat))
-    loaded = {}
-    for path, own in _flat(state).items():
-        name = "/".join(map(str, path))
-        if name not in arrays or arrays[name].shape != own.shape:
-            raise ValueError(f"{name} is missing or does not have the shape {own.shape}")
-        loaded[path] = jnp.asarray(arrays[name])
-    nnx.replace_by_pure_dict(state, flax.traverse_util.unflatten_dict(loaded))
-    nnx.update(model, state)
-    return model

@@ -10,8 +10,8 @@ import numpy as np
 from flax import nnx
 from numpy.typing import NDArray
 
+from thor2_jax.recognition.weights import model_arrays, model_from_arrays
 from training.baselines.baseline import BaselineInputs
-from training.baselines.files import load_arrays, model_arrays
 
 __all__ = ["POINTS", "ColoredPointNet", "PointNet", "point_features", "random_indices"]
 
@@ -81,7 +81,7 @@ class ColoredPointNet:
         Raises:
             ValueError: an array is missing or has another shape.
         """
-        return cls(load_arrays(PointNet(n_classes, rngs=nnx.Rngs(0)), arrays))
+        return cls(model_from_arrays(lambda: PointNet(n_classes, rngs=nnx.Rngs(0)), arrays))
 
     def probabilities(self, inputs: BaselineInputs) -> NDArray[np.float32]:
         """Return class probabilities [B, C]; which points are sampled depends only on the number of points."""

@@ -26,9 +26,9 @@ from numpy.typing import NDArray
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.view_normalization import OCCLUSION_BIN, turn
 from thor2_jax.recognition.classifier import MLP
+from thor2_jax.recognition.weights import model_arrays, model_from_arrays
 from thor2_jax.types import PointClouds
 from training.baselines.baseline import BaselineInputs
-from training.baselines.files import load_arrays, model_arrays
 
 __all__ = ["THOR", "VIEW_TYPES", "Library", "ViewType", "view_types"]
 
@@ -97,6 +97,10 @@ def _slice_counts(normal: PointClouds, config: DescriptorConfig) -> NDArray[np.i
     return np.clip(np.floor(top / config.sigma_1).astype(np.intp) + 1, 1, config.n_slices)
 
 
+def _create_mlp(n_inputs: int, n_classes: int) -> MLP:
+    return MLP(n_inputs, n_classes, rngs=nnx.Rngs(0))
+
+
 class THOR:
     """A library of classifiers and the rules that select from it."""
 
@@ -142,6 +146,5 @@ class THOR:
             for k in range(1, config.n_slices + 1):
                 prefix = f"{name}-{k}/"
                 weights = {key.removeprefix(prefix): a for key, a in arrays.items() if key.startswith(prefix)}
-                model = MLP(k * config.image_size**2, n_classes, rngs=nnx.Rngs(0))
-                library[name, k] = load_arrays(model, weights)
+                library[name, k] = model_from_arrays(partial(_create_mlp, k * config.image_size**2, n_classes), weights)
         return cls(library, config)

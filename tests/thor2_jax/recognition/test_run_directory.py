@@ -2,16 +2,19 @@
 
 import dataclasses
 import gc
+import hashlib
 import json
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 import pytest
+import safetensors.numpy
 from flax import nnx
 
 import colornet
@@ -19,6 +22,7 @@ import thor2_jax as thor2
 from thor2_jax.recognition.classifier import FEATURES, MLP
 from thor2_jax.recognition.recognizer import Recognizer
 from thor2_jax.recognition.run_directory import TrainedRun, input_size, load_run, save_run
+from thor2_jax.recognition.weights import model_arrays
 
 CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=2, n_strips=5, image_size=8, alpha=0.5)
 CLASSES = ("a mug", "b", "ç")
@@ -103,7 +107,7 @@ def test_nothing_is_left_behind_when_saving_fails(broken: str, tmp_path: Path, m
     if broken == "network":
         monkeypatch.setattr(colornet, "save", fail)
     elif broken == "weights":
-        monkeypatch.setattr(ocp.StandardCheckpointer, "save", fail)
+        monkeypatch.setattr(safetensors.numpy, "save", fail)
     else:
         run = dataclasses.replace(run, record={"not JSON": object()})
     with pytest.raises(TypeError if broken == "json" else OSError):
@@ -124,16 +128,13 @@ def edited(**changes: Any) -> Callable[[Path], None]:
     return edit
 
 
+def weights(path: Path, name: str) -> Path:
+    return path / "weights" / f"{name}.safetensors"
+
+
 def damage_weights(path: Path) -> None:
-    for file in (path / "weights" / "tops").rglob("*"):
-        if file.is_file():
-            file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
-
-
-def damage_data(path: Path) -> None:
-    """Cut the arrays themselves, with all that describes them in place."""
-    for file in (path / "weights" / "ce").rglob("d/*"):
-        file.write_bytes(file.read_bytes()[:-1000])
+    file = weights(path, "tops")
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
 
 
 @pytest.mark.parametrize("relaxation", [None, thor2.Relaxation(color=2.0)], ids=["hard", "relaxed"])
@@ -143,16 +144,55 @@ def test_every_constant_is_restored(relaxation: thor2.Relaxation | None, tmp_pat
     assert load_run(tmp_path / "run").config == config
 
 
-def test_the_digest_of_earlier_versions_is_ignored(copied: Path) -> None:
-    edited(digest="0" * 64)(copied)
-    assert load_run(copied).config == CONFIG
+def write_format_1(run: TrainedRun, path: Path) -> None:
+    """Write a run directory as version 0.1 did: Orbax checkpoints, and a digest of run.json in itself."""
+    save_run(run, path)
+    digests = {}
+    for name, model in run.classifiers.items():
+        weights(path, name).unlink()
+        with ocp.StandardCheckpointer() as checkpointer:
+            state = nnx.to_pure_dict(nnx.state(model, (nnx.Param, nnx.BatchStat)))
+            checkpointer.save(path / "weights" / name, jax.tree.map(np.asarray, state))
+        sha256 = hashlib.sha256(f"{input_size(name, CONFIG, 22)} {len(CLASSES)}".encode())
+        for file in sorted(file for file in (path / "weights" / name).rglob("*") if file.is_file()):
+            content = file.read_bytes()
+            sha256.update(f"{file.relative_to(path / 'weights' / name).as_posix()} {len(content)}".encode() + content)
+        digests[name] = sha256.hexdigest()
+    edited(format=1, weights=digests, digest="0" * 64)(path)
+
+
+def test_format_1_is_still_read(tmp_path: Path) -> None:
+    run = make_run()
+    write_format_1(run, tmp_path / "run")
+    loaded = load_run(tmp_path / "run")
+    assert loaded.record == run.record
+    for name, model in run.classifiers.items():
+        jax.tree.map(np.testing.assert_array_equal, model_arrays(loaded.classifiers[name]), model_arrays(model))
+    file = max((tmp_path / "run" / "weights" / "ce").rglob("d/*"), key=lambda file: file.stat().st_size)
+    file.write_bytes(file.read_bytes()[:-1])
+    with pytest.raises(thor2.InputError, match="weights/ce is damaged"):
+        load_run(tmp_path / "run")
+
+
+def test_equal_runs_have_equal_bytes(saved: Path, tmp_path: Path) -> None:
+    save_run(make_run(), tmp_path / "run")
+    files = sorted(file.relative_to(saved) for file in saved.rglob("*") if file.is_file())
+    assert len(files) == 4
+    assert all((saved / file).read_bytes() == (tmp_path / "run" / file).read_bytes() for file in files)
 
 
 def flip_a_bit(path: Path) -> None:
-    file = max((path / "weights" / "ce").rglob("d/*"), key=lambda file: file.stat().st_size)
-    content = bytearray(file.read_bytes())
+    content = bytearray(weights(path, "ce").read_bytes())
     content[len(content) // 2] ^= 1
-    file.write_bytes(content)
+    weights(path, "ce").write_bytes(content)
+
+
+def swap_weights(path: Path) -> None:
+    """Store arrays of other shapes, with their own SHA-256 in run.json."""
+    content = weights(path, "ce").read_bytes()
+    weights(path, "tops").write_bytes(content)
+    sha256 = hashlib.sha256(content).hexdigest()
+    edited(weights={"tops": sha256, "ce": sha256})(path)
 
 
 def other_network(path: Path) -> None:
@@ -166,14 +206,14 @@ DAMAGES: dict[str, tuple[Callable[[Path], Any], str]] = {
     "cut run.json": (lambda path: (path / "run.json").write_text('{"format": 1,'), "run.json cannot be read"),
     "binary run.json": (lambda path: (path / "run.json").write_bytes(b"\xff\xfe\x00"), "run.json cannot be read"),
     "a list": (lambda path: (path / "run.json").write_text("[1]"), "run.json has format 'list'"),
-    "other format": (edited(format=2), "run.json has format 2"),
+    "other format": (edited(format=3), "run.json has format 3"),
     "other version": (edited(descriptor_version=99), "descriptor version 99"),
     "no record": (edited(record=[1]), "run.json: TypeError"),
     "no classes": (edited(classes=None), "run.json: KeyError: 'classes'"),
     "empty classes": (edited(classes=[]), "classes is []"),
     "numbered classes": (edited(classes=[1, 2, 3]), "classes is [1, 2, 3]"),
     "one string": (edited(classes="abc"), "classes is 'abc'"),
-    "more classes": (edited(classes=["a", "b", "c", "d"]), "weights/ce is damaged, or not of 220 inputs and 4 classes"),
+    "more classes": (edited(classes=["a", "b", "c", "d"]), "weights/ce.safetensors does not fit"),
     "unknown classifier": (edited(classifiers=["shape"]), "classifiers is ['shape']"),
     "missing classifier": (edited(classifiers=["ce", "tops", "tops2"]), "run.json: KeyError: 'tops2'"),
     "unknown constant": (edited(descriptor_config={**CONSTANTS, "beta": 1}), "beta"),
@@ -181,18 +221,14 @@ DAMAGES: dict[str, tuple[Callable[[Path], Any], str]] = {
     "no relaxation": (edited(descriptor_config={**CONSTANTS, "relaxation": 5}), "run.json: TypeError"),
     "list of constants": (edited(descriptor_config=[1]), "run.json: TypeError"),
     "bad constant": (edited(descriptor_config={**CONSTANTS, "sigma_s": -1}), "DescriptorConfig.sigma_s is -1"),
-    "other constant": (edited(descriptor_config={**CONSTANTS, "n_slices": 3}), "not of 330 inputs and 3 classes"),
+    "other constant": (edited(descriptor_config={**CONSTANTS, "n_slices": 3}), "weights/ce.safetensors does not fit"),
     "no network": (lambda path: (path / "network.npz").unlink(), "network.npz cannot be read"),
     "cut network": (lambda path: (path / "network.npz").write_bytes(b"PK\x03\x04"), "network.npz cannot be read"),
     "other network": (other_network, "network.npz is not the colour network"),
-    "cut weights": (damage_weights, "weights/tops is damaged"),
-    "cut data": (damage_data, "weights/ce is damaged"),
-    "flipped bit": (flip_a_bit, "weights/ce is damaged"),
-    "no weights": (lambda path: shutil.rmtree(path / "weights" / "tops"), "weights/tops is missing"),
-    "empty weights": (
-        lambda path: (shutil.rmtree(path / "weights" / "tops"), (path / "weights" / "tops").mkdir()),
-        "weights/tops is damaged",
-    ),
+    "cut weights": (damage_weights, "weights/tops.safetensors is damaged"),
+    "flipped bit": (flip_a_bit, "weights/ce.safetensors is damaged"),
+    "swapped weights": (swap_weights, "weights/tops.safetensors does not fit"),
+    "no weights": (lambda path: weights(path, "tops").unlink(), "weights/tops.safetensors is missing"),
 }
 
 
