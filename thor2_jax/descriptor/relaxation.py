@@ -18,12 +18,12 @@ import numpy as np
 
 from colornet.grid import GRID_LEVELS, GRID_STEP, grid_colors
 from thor2_jax.config import DescriptorConfig, Relaxation
+from thor2_jax.descriptor.bounding_box import HIGHEST
 from thor2_jax.descriptor.color_membership import RegionSets
 from thor2_jax.types import Strips
 
 __all__ = ["hyab", "interval_log_weights", "relaxed_strips", "soft_regions", "to_lab"]
 
-HIGHEST = jax.lax.Precision.HIGHEST
 
 _TO_XYZ = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
 """Matrix from linear sRGB to XYZ, as rounded in IEC 61966-2-1."""
