@@ -1,0 +1,150 @@
+"""Embeddings: their length, what must not matter, files, and damaged files."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import safetensors.numpy
+from helpers import SMALL_CONFIG
+
+import thor2_jax as thor2
+from thor2_jax.gallery.embedding import N_SCALARS, Embedding, EmbeddingSizes, cloud_statistics, load_default
+
+SIZES = EmbeddingSizes(cell=4, hidden=(16, 16), learned=8, color=6)
+
+
+def random_embedding(seed: int = 0) -> Embedding:
+    embedding = Embedding.create(SMALL_CONFIG, sizes=SIZES, seed=seed)
+    basis = embedding.model.color_basis
+    basis[...] = jnp.asarray(np.random.default_rng(seed).normal(size=basis[...].shape), jnp.float32)
+    return embedding
+
+
+@pytest.fixture(scope="module")
+def embedding() -> Embedding:
+    return random_embedding()
+
+
+def box_cloud(seed: int, n: int = 300) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    points = rng.random((n, 3)) * [0.2, 0.11, 0.05] + [0, 0, 0.6]
+    points[:, 0] *= 0.5 + 0.5 * rng.random(n)
+    return points.astype(np.float32), rng.integers(0, 256, (n, 3), dtype=np.uint8)
+
+
+@pytest.fixture(scope="module")
+def clouds() -> thor2.PointClouds:
+    return thor2.PointClouds.pack([box_cloud(k) for k in range(3)])
+
+
+def test_embeddings_have_unit_length(embedding: Embedding, clouds: thor2.PointClouds) -> None:
+    values = np.asarray(embedding.embed(clouds))
+    assert values.shape == (3, embedding.size) and embedding.size == 8 + 6 + 22
+    np.testing.assert_allclose(np.linalg.norm(values, axis=1), 1, atol=1e-5)
+    assert (values[0] @ values[1]) < 1 - 1e-4
+
+
+def test_aligned_clouds_give_the_same_embedding(embedding: Embedding, clouds: thor2.PointClouds) -> None:
+    aligned = thor2.align(clouds, embedding.config)
+    np.testing.assert_allclose(embedding.embed_aligned(aligned), embedding.embed(clouds), atol=1e-5)
+
+
+def test_padding_and_batch_do_not_matter(embedding: Embedding) -> None:
+    alone = embedding.embed(thor2.PointClouds.pack([box_cloud(0)], capacity=512))
+    padded = embedding.embed(thor2.PointClouds.pack([box_cloud(1), box_cloud(0)], capacity=1024))
+    np.testing.assert_allclose(padded[1], alone[0], atol=1e-5)
+
+
+def test_large_batches_are_computed_in_chunks(embedding: Embedding) -> None:
+    clouds = [box_cloud(k % 3) for k in range(66)]
+    values = np.asarray(embedding.embed(thor2.PointClouds.pack(clouds)))
+    np.testing.assert_allclose(values[:3], values[63:66], atol=1e-5)
+
+
+def test_an_empty_cloud_has_a_finite_embedding(embedding: Embedding) -> None:
+    empty = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
+    assert np.isfinite(embedding.embed(thor2.PointClouds.pack([empty, box_cloud(0)]))).all()
+
+
+def test_statistics_of_a_cloud() -> None:
+    colors = jnp.asarray([[[0.0, 0.5, 1.0], [1.0, 0.5, 1.0], [9.0, 9.0, 9.0]]])
+    mask = jnp.asarray([[True, True, False]])
+    values = cloud_statistics(jnp.asarray([[0.5, 0.25, 0.125]]), colors, mask, jnp.asarray([[3.0, 1.0]]))[0]
+    expected = [1, 0.5, 0.25, 0.75, np.sqrt(2) / 20, 0.5, 0.5, 1, 0.5, 0, 0, 0.5, np.sqrt(0.75), 0.5]
+    np.testing.assert_allclose(values, expected, atol=1e-6)
+    assert len(expected) == N_SCALARS + 2
+
+
+def test_block_weights_are_the_shares_of_the_similarity(clouds: thor2.PointClouds) -> None:
+    values, learned = [], []
+    for weights in ([1.0, 1.0, 1.0], [2.0, 0.0, 0.0]):
+        embedding = random_embedding()
+        embedding.model.block_weights[...] = jnp.asarray(weights)
+        values.append(np.asarray(embedding.embed(clouds)))
+        learned.append(values[-1][:, :8])
+    np.testing.assert_allclose(learned[0] * np.sqrt(3), learned[1], atol=1e-4)
+    assert not values[1][:, 8:].any()
+
+
+def test_a_file_gives_the_same_embeddings(tmp_path: Path, clouds: thor2.PointClouds, embedding: Embedding) -> None:
+    embedding.save(tmp_path / "embedding.safetensors")
+    loaded = Embedding.load(tmp_path / "embedding.safetensors")
+    assert loaded.fingerprint == embedding.fingerprint != random_embedding(1).fingerprint
+    assert (loaded.config, loaded.sizes) == (embedding.config, embedding.sizes)
+    np.testing.assert_array_equal(loaded.embed(clouds), embedding.embed(clouds))
+    loaded.save(tmp_path / "again.safetensors")
+    assert (tmp_path / "again.safetensors").read_bytes() == (tmp_path / "embedding.safetensors").read_bytes()
+
+
+def rewritten(path: Path, **changes: object) -> None:
+    """Replace values in the metadata of a file."""
+    with safetensors.safe_open(path, "numpy") as stored:
+        about = json.loads(stored.metadata()["embedding"])
+        arrays = {name: stored.get_tensor(name) for name in stored.keys()}
+    path.write_bytes(safetensors.numpy.save(arrays, {"embedding": json.dumps({**about, **changes})}))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"format": 99},
+        {"descriptor_version": 99},
+        {"color_network": "of another run"},
+        {"sizes": dataclasses.asdict(EmbeddingSizes())},
+        {"sizes": {"cell": 0}},
+        {"descriptor_config": {}},
+    ],
+    ids=str,
+)
+def test_a_file_of_another_kind_is_rejected(tmp_path: Path, embedding: Embedding, changes: dict[str, object]) -> None:
+    path = tmp_path / "embedding.safetensors"
+    embedding.save(path)
+    rewritten(path, **changes)
+    with pytest.raises(thor2.InputError, match=r"embedding.safetensors"):
+        Embedding.load(path)
+
+
+def test_a_damaged_or_missing_file_is_rejected(tmp_path: Path, embedding: Embedding) -> None:
+    path = tmp_path / "embedding.safetensors"
+    with pytest.raises(thor2.InputError, match=r"embedding.safetensors"):
+        Embedding.load(path)
+    embedding.save(path)
+    for content in (b"", path.read_bytes()[:-1], b"\0" * 400, safetensors.numpy.save({"x": np.zeros(3)})):
+        path.write_bytes(content)
+        with pytest.raises(thor2.InputError, match=r"embedding.safetensors"):
+            Embedding.load(path)
+
+
+def test_sizes_past_the_largest_embedding_are_rejected() -> None:
+    with pytest.raises(thor2.InputError, match="300"):
+        Embedding.create(SMALL_CONFIG, sizes=EmbeddingSizes(learned=272, color=6))
+    with pytest.raises(thor2.InputError, match="EmbeddingSizes"):
+        EmbeddingSizes(hidden=(0,))
+
+
+def test_the_packaged_embedding_is_small_enough() -> None:
+    embedding = load_default()
+    assert embedding.size <= 256 and len(embedding._content) <= 5_000_000

@@ -1,0 +1,346 @@
+"""Embeddings of clouds: unit vectors that are close for views of one object, also of objects without training.
+
+    embedding = load_default()                              # packaged, trained on procedural objects
+    similarity = embedding.embed(clouds) @ embedding.embed(others).T
+
+An embedding has three blocks, each of unit length before it is weighted: the output of a trained network on the
+descriptor, the colour embeddings of the strips projected to their principal components, and the colour histogram. The
+last two depend little on what the network was trained on. `training.embedding` fits the network.
+"""
+
+import dataclasses
+import functools
+import json
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import safetensors
+import safetensors.numpy
+from flax import nnx
+
+import colornet
+from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig, Relaxation
+from thor2_jax.descriptor.chunking import map_chunks
+from thor2_jax.descriptor.describe import describe_strips, strips
+from thor2_jax.descriptor.view_normalization import align
+from thor2_jax.errors import InputError
+from thor2_jax.files import atomic_write, content_digest
+from thor2_jax.recognition.weights import model_arrays, model_from_arrays
+from thor2_jax.types import Descriptors, PointClouds
+
+__all__ = [
+    "MAX_EMBEDDING_SIZE",
+    "Embedding",
+    "EmbeddingNetwork",
+    "EmbeddingSizes",
+    "cloud_statistics",
+    "load_default",
+]
+
+EMBEDDING_FORMAT = 1
+"""Version of the file: float16 arrays of the network, and JSON metadata."""
+
+MAX_EMBEDDING_SIZE = 256
+"""Largest length of an embedding."""
+
+N_SCALARS = 12
+"""Statistics of a cloud before its colour histogram."""
+
+_METADATA = "embedding"
+# safetensors writes several metadata keys in a random order, and equal embeddings shall have equal bytes.
+
+
+@dataclasses.dataclass(frozen=True)
+class EmbeddingSizes:
+    """Sizes of the network of an embedding.
+
+    Attributes:
+        cell: outputs of the layer that is shared by all strip positions.
+        hidden: units of the hidden layers.
+        learned: length of the network's block of the embedding.
+        color: length of the block of projected colour embeddings.
+
+    Raises:
+        InputError: a size is not a positive integer (`color` may be 0).
+    """
+
+    cell: int = 20
+    hidden: tuple[int, ...] = (256, 256)
+    learned: int = 128
+    color: int = 106
+
+    def __post_init__(self) -> None:
+        values = (self.cell, *self.hidden, self.learned, self.color + 1)
+        if not all(type(value) is int and value > 0 for value in values):
+            raise InputError(f"EmbeddingSizes is {dataclasses.asdict(self)}; expected positive integers")
+
+
+def _unit(x: jax.Array) -> jax.Array:
+    """Scale the last axis to unit length; zeros stay zeros."""
+    return x * jax.lax.rsqrt(jnp.maximum(jnp.square(x).sum(axis=-1, keepdims=True), 1e-12))
+
+
+def cloud_statistics(extents: jax.Array, colors: jax.Array, mask: jax.Array, region_mass: jax.Array) -> jax.Array:
+    """Return the statistics of clouds that the network reads beside the descriptor, all of order 1.
+
+    Args:
+        extents: [B, 3] side lengths of the bounding box, longest first, scaled units.
+        colors: [B, N, 3] sRGB in [0, 1].
+        mask: [B, N] bool.
+        region_mass: [B, R] points in each colour region.
+
+    Returns:
+        [B, 12 + R] float32: extents, size of the box, number of points, mean and standard deviation of the colours,
+        ratio of the two longest extents, and the square root of the colour histogram, which has unit length.
+    """
+    count = mask.sum(axis=1, keepdims=True, dtype=jnp.float32)
+    weight = mask[..., None] / jnp.maximum(count, 1)[..., None]
+    mean = (colors * weight).sum(axis=1)
+    deviation = jnp.sqrt(jnp.maximum((jnp.square(colors) * weight).sum(axis=1) - jnp.square(mean), 0))
+    scalars = [
+        2 * extents,
+        3 * jnp.cbrt(extents.prod(axis=1, keepdims=True)),
+        jnp.sqrt(count) / 20,
+        mean,
+        deviation,
+        extents[:, 1:2] / jnp.maximum(extents[:, :1], 1e-6),
+    ]
+    histogram = region_mass / jnp.maximum(region_mass.sum(axis=1, keepdims=True), 1e-6)
+    return jnp.concatenate([*scalars, jnp.sqrt(histogram)], axis=1)
+
+
+class EmbeddingNetwork(nnx.Module):
+    """Network of an embedding: one linear layer on each strip position of each slice, then fully connected layers.
+
+    At a position, the layer reads the row of the persistence image born there and the colour embedding of the strip.
+    Empty positions contribute zero.
+    """
+
+    def __init__(
+        self, config: DescriptorConfig, n_regions: int, sizes: EmbeddingSizes = EmbeddingSizes(), *, rngs: nnx.Rngs
+    ) -> None:
+        """Initialize the weights; the colour basis is zero and the blocks have equal weights."""
+        self.positions = max(config.image_size, config.n_strips)
+        n_cells = config.n_slices * self.positions
+        widths = (n_cells * sizes.cell + N_SCALARS + n_regions, *sizes.hidden)
+        he = nnx.initializers.he_normal()
+        self.cell = nnx.Linear(config.image_size + n_regions, sizes.cell, kernel_init=he, rngs=rngs)
+        self.layers = nnx.List(
+            [
+                nnx.Linear(a, b, use_bias=False, kernel_init=he, rngs=rngs)
+                for a, b in zip(widths[:-1], widths[1:], strict=True)
+            ]
+        )
+        self.norms = nnx.List([nnx.BatchNorm(n, momentum=0.9, rngs=rngs) for n in sizes.hidden])
+        self.dropout = nnx.Dropout(0.15)
+        self.head = nnx.Linear(sizes.hidden[-1], sizes.learned, use_bias=False, kernel_init=he, rngs=rngs)
+        n_colors = config.n_slices * n_regions * config.n_strips
+        self.color_basis = nnx.BatchStat(jnp.zeros((n_colors, sizes.color)))
+        self.block_weights = nnx.BatchStat(jnp.ones(3))
+
+    def learned(
+        self, descriptors: Descriptors, statistics: jax.Array, *, train: bool = False, rngs: nnx.Rngs | None = None
+    ) -> jax.Array:
+        """Return the learned block [B, learned], of unit length.
+
+        Args:
+            descriptors: of B clouds.
+            statistics: [B, 12 + R], from `cloud_statistics`.
+            train: normalize by the statistics of the batch, and drop units.
+            rngs: generators of the dropout.
+        """
+        colors = jnp.swapaxes(jnp.sqrt(jnp.maximum(descriptors.embeddings, 0)), -1, -2)
+        cells = [100 * descriptors.images, 0.5 * colors]
+        padded = [jnp.pad(a, ((0, 0), (0, 0), (0, self.positions - a.shape[2]), (0, 0))) for a in cells]
+        bias = jnp.asarray(self.cell.bias)
+        x = nnx.relu(self.cell(jnp.concatenate(padded, axis=-1))) - nnx.relu(bias)
+        scale = jnp.where(jnp.arange(statistics.shape[1]) < N_SCALARS, 1, 2)
+        x = jnp.concatenate([x.reshape(len(x), -1), statistics * scale], axis=1)
+        for layer, norm in zip(self.layers, self.norms, strict=True):
+            x = nnx.relu(norm(layer(x), use_running_average=not train))
+            x = self.dropout(x, deterministic=not train, rngs=rngs)
+        return _unit(self.head(x))
+
+    def __call__(self, descriptors: Descriptors, statistics: jax.Array) -> jax.Array:
+        """Return the embeddings [B, D], of unit length; the arguments are those of `learned`."""
+        histogram = statistics[:, N_SCALARS:]
+        colors = color_features(descriptors.embeddings) @ self.color_basis[...]
+        blocks = [self.learned(descriptors, statistics), _unit(colors), histogram]
+        weights = jnp.sqrt(self.block_weights[...])
+        return _unit(jnp.concatenate([w * block for w, block in zip(weights, blocks, strict=True)], axis=1))
+
+
+def color_features(embeddings: jax.Array) -> jax.Array:
+    """Return the square roots of colour embeddings [B, S, R, J], flat and of unit length."""
+    return _unit(jnp.sqrt(jnp.maximum(embeddings, 0)).reshape(len(embeddings), -1))
+
+
+def _extents(aligned: PointClouds, alpha: float) -> jax.Array:
+    """Return the side lengths [B, 3] of the clouds' boxes before the turn by alpha, longest first."""
+    c, s = np.float32(np.cos(alpha)), np.float32(np.sin(alpha))
+    x, y, z = jnp.moveaxis(aligned.points, -1, 0)
+    sides = []
+    for values in (c * x + s * z, y, c * z - s * x):
+        high = jnp.where(aligned.mask, values, -jnp.inf).max(axis=1)
+        sides.append(high - jnp.where(aligned.mask, values, jnp.inf).min(axis=1))
+    extents = jnp.stack(sides, axis=1)
+    return -jnp.sort(-jnp.where(jnp.isfinite(extents), extents, 0), axis=1)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1, 2, 3))
+def _embed(
+    graph: Any,
+    config: DescriptorConfig,
+    network: colornet.ColorNetwork,
+    are_aligned: bool,
+    state: Any,
+    clouds: PointClouds,
+) -> jax.Array:
+    model = nnx.merge(graph, state)
+
+    def embed(clouds: PointClouds) -> jax.Array:
+        aligned = clouds if are_aligned else align(clouds, config)
+        occupied = strips(aligned, network, config)
+        mass = occupied.color.sum(axis=(1, 2))
+        statistics = cloud_statistics(_extents(aligned, config.alpha), aligned.colors, aligned.mask, mass)
+        return model(describe_strips(occupied, network, config), statistics)
+
+    return map_chunks(embed, clouds)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Embedding:
+    """A network with everything that determines its embeddings.
+
+    Attributes:
+        config: constants of the descriptor, which is always computed in closed form.
+        network: the colour network.
+        sizes: sizes of the network.
+        model: the network of the embedding. Do not change it: compiled functions and `fingerprint` keep its arrays.
+    """
+
+    config: DescriptorConfig
+    network: colornet.ColorNetwork
+    sizes: EmbeddingSizes
+    model: EmbeddingNetwork
+
+    @classmethod
+    def create(
+        cls,
+        config: DescriptorConfig | None = None,
+        network: colornet.ColorNetwork | None = None,
+        sizes: EmbeddingSizes | None = None,
+        seed: int = 0,
+    ) -> "Embedding":
+        """Return an embedding with random weights.
+
+        Args:
+            config: by default the paper's descriptor.
+            network: by default the packaged colour network.
+            sizes: of the network.
+            seed: seed for the weights.
+
+        Raises:
+            InputError: the embedding would have more than `MAX_EMBEDDING_SIZE` numbers, or more colour components than
+                there are colour embeddings.
+        """
+        config = dataclasses.replace(config or DescriptorConfig(), homology="closed_form")
+        network, sizes = network or colornet.load_default(), sizes or EmbeddingSizes()
+        size = sizes.learned + sizes.color + network.n_regions
+        if size > MAX_EMBEDDING_SIZE:
+            raise InputError(f"sizes give embeddings of {size} numbers; expected at most {MAX_EMBEDDING_SIZE}")
+        return cls(config, network, sizes, EmbeddingNetwork(config, network.n_regions, sizes, rngs=nnx.Rngs(seed)))
+
+    @property
+    def size(self) -> int:
+        """Length D of an embedding."""
+        return self.sizes.learned + self.sizes.color + self.network.n_regions
+
+    @functools.cached_property
+    def _split(self) -> tuple[Any, Any]:
+        graph, state = nnx.split(self.model)
+        # The values of the file, so that a stored embedding is the same as the one in memory.
+        return graph, jax.tree.map(lambda a: a.astype(jnp.float16).astype(jnp.float32), state)
+
+    def embed(self, clouds: PointClouds) -> jax.Array:
+        """Return the embeddings [B, D] float32 of clouds in metres, each of unit length.
+
+        Each shape [B, N] of the batch compiles once for all embeddings of the same sizes and descriptor.
+        """
+        return self._embed(clouds, are_aligned=False)
+
+    def embed_aligned(self, aligned: PointClouds) -> jax.Array:
+        """Return the embeddings of clouds that are already aligned, for example to candidate orientations."""
+        return self._embed(aligned, are_aligned=True)
+
+    def _embed(self, clouds: PointClouds, are_aligned: bool) -> jax.Array:
+        graph, state = self._split
+        return _embed(graph, self.config, self.network, are_aligned, state, clouds)
+
+    @functools.cached_property
+    def _content(self) -> bytes:
+        about = {
+            "format": EMBEDDING_FORMAT,
+            "descriptor_version": DESCRIPTOR_VERSION,
+            "descriptor_config": dataclasses.asdict(self.config),
+            "color_network": self.network.fingerprint,
+            "sizes": dataclasses.asdict(self.sizes),
+        }
+        arrays = {name: array.astype(np.float16) for name, array in model_arrays(self.model).items()}
+        return safetensors.numpy.save(arrays, {_METADATA: json.dumps(about, sort_keys=True)})
+
+    @functools.cached_property
+    def fingerprint(self) -> str:
+        """SHA-256 of the file; embeddings of other fingerprints cannot be compared."""
+        return content_digest([self._content])
+
+    def save(self, path: str | Path) -> None:
+        """Write the embedding to a file (safetensors, float16), atomically.
+
+        Raises:
+            OSError: the file cannot be written.
+        """
+        with atomic_write(path) as temporary:
+            temporary.write_bytes(self._content)
+
+    @classmethod
+    def load(cls, path: str | Path, network: colornet.ColorNetwork | None = None) -> "Embedding":
+        """Read an embedding.
+
+        Args:
+            path: file that `save` wrote.
+            network: colour network that the embedding was fitted with; by default the packaged one.
+
+        Raises:
+            InputError: the file is missing or damaged, or its format, descriptor version or colour network is another
+                one. The message names the file.
+        """
+        path, network = Path(path), network or colornet.load_default()
+        try:
+            with safetensors.safe_open(path, "numpy") as stored:
+                about = json.loads(stored.metadata()[_METADATA])
+                arrays = {name: stored.get_tensor(name).astype(np.float32) for name in stored.keys()}
+            current = (EMBEDDING_FORMAT, DESCRIPTOR_VERSION, network.fingerprint)
+            for field, expected in zip(("format", "descriptor_version", "color_network"), current, strict=True):
+                if about[field] != expected:
+                    raise InputError(f"{field} is {about[field]!r}; expected {expected!r}; fit the embedding again")
+            relaxation = about["descriptor_config"].pop("relaxation")
+            config = DescriptorConfig(
+                **about["descriptor_config"], relaxation=None if relaxation is None else Relaxation(**relaxation)
+            )
+            sizes = EmbeddingSizes(**{**about["sizes"], "hidden": tuple(about["sizes"]["hidden"])})
+            model = model_from_arrays(lambda: cls.create(config, network, sizes).model, arrays)
+        except InputError as error:
+            raise InputError(f"embedding: {path}: {error}") from None
+        except (OSError, safetensors.SafetensorError, ValueError, KeyError, TypeError, AttributeError) as error:
+            raise InputError(f"embedding: {path} is missing or damaged ({type(error).__name__}: {error})") from None
+        return cls(config, network, sizes, model)
+
+
+@functools.cache
+def load_default() -> Embedding:
+    """Return the packaged embedding, trained on procedural objects; `python -m training.embedding.build` makes it."""
+    return Embedding.load(Path(__file__).with_name("data") / "embedding.safetensors")
