@@ -76,6 +76,13 @@ def with_checksums(*chunks: tuple[bytes, bytes]) -> list[tuple[bytes, bytes, int
     return [(kind, content, zlib.crc32(kind + content)) for kind, content in chunks]
 
 
+def deep_png(height: int, width: int) -> bytes:
+    """Return a PNG of 16 bits per channel, which Pillow cannot write: an RGB image of zeros."""
+    header = struct.pack(">IIBBBBB", width, height, 16, 2, 0, 0, 0)
+    rows = zlib.compress(bytes(1 + 6 * width) * height)
+    return png_file(with_checksums((b"IHDR", header), (b"IDAT", rows), (b"IEND", b"")))
+
+
 def run_thor2(*arguments: object) -> int:
     """Run the command line in this process and return its exit status."""
     from training import cli

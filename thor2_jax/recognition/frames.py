@@ -204,12 +204,12 @@ def backproject(depth_m: NDArray[Any], intrinsics: Intrinsics) -> NDArray[Any]:
 
 
 def has_16_bit_channels(image: ImageFile.ImageFile) -> bool:
-    """Return whether a newly opened image has 16 bits per channel, which Pillow reduces to 8 in colour images."""
-    return any(";16" in str(tile.args) for tile in image.tile)
+    """Return whether a newly opened colour image has 16 bits per channel, of which Pillow keeps 8."""
+    return image.mode.startswith("RGB") and any(";16" in str(tile.args) for tile in image.tile)
 
 
 def _read_image(path: str | Path, argument: str) -> tuple[NDArray[Any], str]:
-    """Read an image file; return its pixels and its Pillow mode.
+    """Read an image file; return its pixels and its Pillow mode, with ";16" for colour of 16 bits per channel.
 
     Raises:
         InputError: the file is damaged, not of `IMAGE_FORMATS` or larger than `MAX_IMAGE_PIXELS`; names `argument` and
@@ -221,12 +221,11 @@ def _read_image(path: str | Path, argument: str) -> tuple[NDArray[Any], str]:
             with Image.open(stream, formats=IMAGE_FORMATS) as image:
                 if image.width * image.height > MAX_IMAGE_PIXELS:
                     raise ValueError(f"{image.width} x {image.height} pixels; expected at most {MAX_IMAGE_PIXELS}")
-                if argument == "color" and has_16_bit_channels(image):
-                    raise ValueError("16 bits per channel; expected 8: convert the image")
                 image.verify()  # decoding does not check the checksums of a PNG
             stream.seek(0)
             with Image.open(stream, formats=IMAGE_FORMATS) as image:
-                return np.asarray(image), image.mode
+                mode = f"{image.mode};16" if has_16_bit_channels(image) else image.mode
+                return np.asarray(image), mode
         # On damaged files, the decoders raise many kinds of exception; nothing but the content can cause them here.
         except Exception as error:
             reason = " ".join(str(error).split()) or type(error).__name__

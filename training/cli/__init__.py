@@ -1,6 +1,11 @@
 """The command line `thor2`: one module per command; each parses its options and calls one function."""
 
-from training.cli import colornet, demo, evaluate, recognize, render, serve, train
-from training.cli.app import app, main
+import os
+
+# XLA reports the features it expects of cached programs as errors. The variable is read when JAX is imported.
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+
+from training.cli import colornet, demo, evaluate, recognize, render, serve, train  # noqa: E402
+from training.cli.app import app, main  # noqa: E402
 
 __all__ = ["app", "colornet", "demo", "evaluate", "main", "recognize", "render", "serve", "train"]

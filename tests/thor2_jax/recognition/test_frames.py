@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from helpers import deep_png
 from PIL import Image
 
 from thor2_jax.errors import InputError
@@ -280,6 +281,12 @@ def test_color_files_that_are_not_rgb(tmp_path: Path, mode: str) -> None:
     Image.new(mode, (7, 5)).save(path)
     with pytest.raises(InputError, match=r"^color: .*expected 8-bit RGB$"):
         read_color(path)
+
+
+def test_color_files_of_16_bit(tmp_path: Path) -> None:
+    (tmp_path / "color.png").write_bytes(deep_png(12, 16))
+    with pytest.raises(InputError, match="^color: .*;16"):
+        read_color(tmp_path / "color.png")
 
 
 def test_color_files_with_an_alpha_channel(tmp_path: Path) -> None:

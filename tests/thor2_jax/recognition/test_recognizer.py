@@ -9,7 +9,8 @@ from helpers import untrained_run
 
 import thor2_jax as thor2
 from thor2_jax.recognition.classifier import feature_of
-from thor2_jax.recognition.recognizer import Recognizer
+from thor2_jax.recognition.prepared_instance import PreparedInstance
+from thor2_jax.recognition.recognizer import THOR2, Recognizer
 from thor2_jax.recognition.run_directory import TrainedRun
 
 CLASSES = ("a", "b", "c", "d")
@@ -103,6 +104,23 @@ def test_answers_below_a_confidence_have_no_name(recognizer: Recognizer, run: Tr
             Recognizer(run, value)
 
 
+def test_half_of_the_points_may_overflow_with_a_name(recognizer: Recognizer) -> None:
+    colors, boundary = np.zeros((100, 3), np.uint8), np.zeros(100, bool)
+    instance = PreparedInstance(1, np.zeros((100, 3), np.float32), colors, boundary)
+    probabilities = {name: np.full((2, 4), [0.7, 0.1, 0.1, 0.1], np.float32) for name in THOR2}
+    named, refused = recognizer.recognitions([instance, instance], probabilities, np.array([50, 51]))
+    assert named.name == "a" and named.reason is None and named.overflow == 50
+    assert refused.name is None and refused.overflow == 51 and refused.confidence == named.confidence
+    assert refused.reason is not None and "overflow" in refused.reason
+
+
+@pytest.mark.parametrize("change", [{"fx": 1e-9}, {"cx": 1e8}, {"fx": 20.0, "fy": 20.0}])
+def test_no_names_with_absurd_intrinsics(recognizer: Recognizer, change: dict[str, float]) -> None:
+    frame = tilted(patches())
+    answers = recognizer.recognize(dataclasses.replace(frame, intrinsics=dataclasses.replace(INTRINSICS, **change)))
+    assert [answer.name for answer in answers] == [None] * 4
+
+
 def test_probabilities_are_the_classifiers_on_the_descriptors(recognizer: Recognizer, run: TrainedRun) -> None:
     """Against the same layers in NumPy, float64."""
     described = recognizer.describe(tilted(patches()))
@@ -138,7 +156,7 @@ def test_a_cloud_past_the_largest_bucket_is_made_coarser(recognizer: Recognizer)
     wide = thor2.Intrinsics(200.0, 200.0, n / 2, n / 2)
     frame = thor2.RGBDFrame(np.full((n, n, 3), 90, np.uint8), depth, np.ones((n, n), np.uint8), wide)
     (answer,) = recognizer.recognize(frame)
-    assert answer.reason is None
+    assert answer.reason is not None and "overflow" in answer.reason
     assert 1000 < answer.points_used <= 8192
     assert answer.overflow > 0
 

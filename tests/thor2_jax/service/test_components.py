@@ -24,6 +24,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.service.app import create_app
 from thor2_jax.service.batching import Batcher
 from thor2_jax.service.metrics import CompilationCounter
+from thor2_jax.service.pipeline import Service
 from thor2_jax.service.preparation import PreparationPool, prepare_clouds
 from thor2_jax.service.problem import RequestError
 from thor2_jax.service.settings import MAX_BODY, Settings
@@ -175,7 +176,7 @@ def frame_request(files: dict[str, bytes]) -> Callable[[httpx.AsyncClient], Any]
     return lambda client: client.post("/v1/recognize", files=files)
 
 
-def test_token_is_required_except_for_health(app: FastAPI) -> None:
+def test_token_is_required_except_for_health_and_page(app: FastAPI) -> None:
     guarded = [("POST", f"/v1/{name}") for name in ("recognize", "explain", "describe")]
     guarded += [("GET", "/v1/model"), ("GET", "/v1/colornet")]
     for method, path in [*guarded, ("GET", "/metrics")]:
@@ -184,8 +185,10 @@ def test_token_is_required_except_for_health(app: FastAPI) -> None:
             (answer,) = calls(app, lambda c, m=method, p=path, h=headers: c.request(m, p, headers=h))
             assert answer.status_code == 401 and answer.headers["www-authenticate"] == "Bearer"
             assert answer.json()["field"] == "Authorization"
-    model, health = calls(app, lambda c: c.get("/v1/model"), lambda c: c.get("/healthz", headers={"Authorization": ""}))
-    assert model.status_code == 200 and health.status_code == 200
+    assert calls(app, lambda c: c.get("/v1/model"))[0].status_code == 200
+    public = ("/healthz", "/openapi.json", "/", "/app.js", "/samples/index.json", "/samples/clutter/depth.png")
+    for answer in calls(app, *(lambda c, p=path: c.get(p, headers={"Authorization": ""}) for path in public)):
+        assert answer.status_code == 200
 
 
 def test_requests_are_refused_unless_ready(
@@ -196,6 +199,28 @@ def test_requests_are_refused_unless_ready(
         ready, answer = calls(app, lambda c: c.get("/readyz"), frame_request(files))
         assert ready.status_code == answer.status_code == 503 and answer.headers["retry-after"] == "1"
         assert state in answer.json()["message"]
+
+
+def test_progress_of_the_warm_up_is_reported(
+    run_dir: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    service = Service(Settings(run_dir, max_batch=16, processes=1))
+    messages = []
+
+    def compile_shape(*_: int) -> None:
+        with pytest.raises(RequestError) as error:
+            service.check_ready()
+        messages.append(error.value.message)
+
+    monkeypatch.setattr(service.engine, "compile", compile_shape)
+    with caplog.at_level("INFO"):
+        service.start()
+        service.wait_until_ready()
+        service.close()
+    steps = [f"compiling {k} of 6" for k in range(1, 7)]
+    assert [step in message for step, message in zip(steps, messages, strict=True)] == [True] * 6
+    assert [step in caplog.text for step in steps] == [True] * 6
+    assert service.metrics.count_ready_workers() == 0
 
 
 def test_full_queue_is_429_and_deadline_504(
@@ -274,6 +299,15 @@ def test_dead_worker_has_no_requests_in_progress(tmp_path: Path) -> None:
 
 
 def test_settings_out_of_range() -> None:
-    for wrong in ({"queue": 0}, {"deadline": 0.0}, {"processes": 0}, {"max_batch": 3}, {"token": ""}, {"token": "é"}):
+    cache = Path(__file__)
+    for wrong in (
+        {"cache": cache},
+        {"queue": 0},
+        {"deadline": 0.0},
+        {"processes": 0},
+        {"max_batch": 3},
+        {"token": ""},
+        {"token": "é"},
+    ):
         with pytest.raises(InputError, match=next(iter(wrong))):
             Settings(Path("run"), **wrong)

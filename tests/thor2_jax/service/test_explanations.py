@@ -15,10 +15,10 @@ import thor2_jax as thor2
 from thor2_jax.descriptor.describe import strips
 from thor2_jax.recognition.recognizer import DescribedFrame
 from thor2_jax.service.answers import explained_frame
-from thor2_jax.service.engine import CloudResult
+from thor2_jax.service.engine import CloudResult, InferenceEngine
 from thor2_jax.service.preparation import PreparedRequest, prepare_frame
 from thor2_jax.service.schemas import LabelMap
-from thor2_jax.service.settings import MAX_EXPLAINED, MAX_LABEL_RUNS
+from thor2_jax.service.settings import MAX_EXPLAINED, MAX_LABEL_RUNS, Settings
 
 Files = dict[str, bytes]
 
@@ -80,6 +80,21 @@ def test_details_match_the_library(answer: Any, described: DescribedFrame) -> No
             assert (rgb == all_colors[distance.argmin(axis=1)]).all(axis=1).mean() > 0.99
         borders = np.array(details["slice_borders"])
         np.testing.assert_allclose(borders, 0.1 * np.column_stack([np.arange(7), np.arange(1, 8)]), atol=1e-9)
+
+
+def test_calibrated_confidence_uses_the_temperatures(run_dir: Path) -> None:
+    rng = np.random.default_rng(0)
+    engine = InferenceEngine(Settings(run_dir))
+    shape = len(engine.run.classes)
+    probabilities = {name: rng.dirichlet(np.full(shape, 0.1)).astype(np.float32) for name in ("tops", "tops2")}
+    empty = np.zeros(0, np.float32)
+    result = CloudResult(empty, empty, 0, probabilities, empty, empty)
+    assert engine.calibrated_confidences([result]) == [None] and engine.calibrated_confidences([]) == []
+    engine.run.record["temperatures"] = {"tops": 2.0, "tops2": 3.0}
+    (confidence,) = engine.calibrated_confidences([result])
+    logits = np.log(probabilities["tops"]) / 2 + np.log(probabilities["tops2"]) / 3
+    expected = np.exp(logits / 2) / np.exp(logits / 2).sum()
+    assert confidence == pytest.approx(expected[np.prod(list(probabilities.values()), axis=0).argmax()], rel=1e-4)
 
 
 def test_label_map_decodes_to_the_label_image(answer: Any, frame: thor2.RGBDFrame) -> None:

@@ -12,6 +12,7 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
+from helpers import deep_png
 from PIL import Image
 
 from thor2_jax.service.connections import HEAD_SECONDS
@@ -87,6 +88,26 @@ def test_images_of_other_modes_and_formats(
         ("labels", gif.getvalue()),
     ):
         check_refused(http.post("/v1/recognize", files=files | {field: content}), 422, field)
+
+
+def test_color_of_16_bits_per_channel(http: httpx.Client, files: Files) -> None:
+    check_refused(http.post("/v1/recognize", files=files | {"color": deep_png(240, 320)}), 422, "color", "16", "8")
+
+
+def test_errors_of_all_fields_are_returned(http: httpx.Client, files: Files) -> None:
+    answer = http.post("/v1/recognize", files=files | dict.fromkeys(("color", "labels", "intrinsics"), b"damaged"))
+    problem = answer.json()
+    assert answer.status_code == 422 and problem["field"] == "color"
+    assert [error["field"] for error in problem["further"]] == ["labels", "intrinsics"]
+
+
+def test_absurd_intrinsics_give_no_names(http: httpx.Client, files: Files) -> None:
+    camera = json.loads(files["intrinsics"])
+    for change in ({"fx": 1e-9}, {"cx": 1e8}, {"fx": 20, "fy": 20}):
+        answer = http.post("/v1/recognize", files=files | {"intrinsics": json.dumps(camera | change).encode()})
+        instances = answer.json()["instances"]
+        assert [one["name"] for one in instances] == [None] * 4
+        assert all(one["unrecognized"] for one in instances)
 
 
 def test_images_of_different_sizes(http: httpx.Client, files: Files, encode: Callable[..., bytes]) -> None:
