@@ -9,6 +9,7 @@ View normalization rotates a cloud to a pose that does not depend on the pose of
 
 import dataclasses
 from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +23,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.parameters import Parameters
 from thor2_jax.types import PointClouds
 
-__all__ = ["align", "mirror", "turn", "view_normalize"]
+__all__ = ["Normalization", "align", "boxed", "mirror", "oriented", "place_aligned", "turn", "view_normalize"]
 
 OCCLUSION_BIN = 0.01
 """Width of the bins along x in which boundary points are counted, scaled units."""
@@ -48,8 +49,30 @@ def _place(rotation: jax.Array, points: jax.Array, mask: jax.Array, camera: jax.
     return jnp.where(mask, points - low[:, None], 0), jnp.matmul(rotation, camera, precision=HIGHEST) - low
 
 
-def _frame(cloud: PointClouds, sigma_s: ArrayLike) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """Return the rotation [3, 3] of the view normalization, and the centred points [3, M], mask and camera for it."""
+class Normalization(NamedTuple):
+    """What the orientation of one cloud is computed from.
+
+    Attributes:
+        axes: [3, 3], axes of the minimal box as rows, the longest side first.
+        low: [3], least coordinates along the axes.
+        high: [3], largest coordinates along the axes.
+        points: [3, M], scaled units, mean zero; padding is 0.
+        mask: [M] bool, False on padding.
+        boundary: [M] bool, points on the occlusion boundary.
+        camera: [3], position of the camera relative to the mean.
+    """
+
+    axes: jax.Array
+    low: jax.Array
+    high: jax.Array
+    points: jax.Array
+    mask: jax.Array
+    boundary: jax.Array
+    camera: jax.Array
+
+
+def boxed(cloud: PointClouds, sigma_s: ArrayLike) -> Normalization:
+    """Scale and centre one cloud and find its minimal box."""
     points, mask = _planes(cloud)
     scaled = points * sigma_s
     centre = total(jnp.where(mask, scaled, 0)) / jnp.maximum(mask.sum(dtype=scaled.dtype), 1)
@@ -58,27 +81,35 @@ def _frame(cloud: PointClouds, sigma_s: ArrayLike) -> tuple[jax.Array, jax.Array
     camera = cloud.camera * sigma_s - centre
 
     axes, low, high = minimal_box(centred)
+    boundary = jnp.pad(cloud.boundary, (0, len(mask) - len(cloud.boundary))) & mask
+    return Normalization(axes, low, high, centred, mask, boundary, camera)
+
+
+def oriented(found: Normalization) -> jax.Array:
+    """Return the rotation [3, 3] of the view normalization: the axes of the box with their signs."""
+    axes, low, high = found.axes, found.low, found.high
     middle = (low + high) / 2
 
     # The mean is the origin: if the middle is positive, the mean lies below the middle.
     x_sign = jnp.where(middle[0] < 0, -1.0, 1.0)
     # A half turn about x moves a camera from +z to -z.
-    camera_z = jnp.matmul(axes[2], camera, precision=HIGHEST) - middle[2]
+    camera_z = jnp.matmul(axes[2], found.camera, precision=HIGHEST) - middle[2]
     z_sign = jnp.where(camera_z > 0, -1.0, 1.0)
 
     x_low = jnp.minimum(low[0] * x_sign, high[0] * x_sign)
-    bins = jnp.floor(rotate(axes[:1], centred)[0] * x_sign / OCCLUSION_BIN - x_low / OCCLUSION_BIN)
-    last = largest(jnp.where(mask, bins, -1))
-    boundary = jnp.pad(cloud.boundary, (0, len(mask) - len(cloud.boundary))) & mask
+    bins = jnp.floor(rotate(axes[:1], found.points)[0] * x_sign / OCCLUSION_BIN - x_low / OCCLUSION_BIN)
+    last = largest(jnp.where(found.mask, bins, -1))
     # A half turn about z moves the occluded end away from the first slice.
-    x_sign = jnp.where((boundary & (bins <= 1)).sum() > (boundary & (bins >= last - 1)).sum(), -x_sign, x_sign)
+    first_end, last_end = (found.boundary & (bins <= 1)).sum(), (found.boundary & (bins >= last - 1)).sum()
+    x_sign = jnp.where(first_end > last_end, -x_sign, x_sign)
 
     x, z = axes[0] * x_sign, axes[2] * z_sign
-    return jax.lax.stop_gradient(jnp.stack([x, jnp.cross(z, x), z])), centred, mask, camera
+    return jax.lax.stop_gradient(jnp.stack([x, jnp.cross(z, x), z]))
 
 
 def _normalize_one(cloud: PointClouds, sigma_s: ArrayLike) -> PointClouds:
-    points, camera = _place(*_frame(cloud, sigma_s))
+    found = boxed(cloud, sigma_s)
+    points, camera = _place(oriented(found), found.points, found.mask, found.camera)
     return dataclasses.replace(cloud, points=points.T[: len(cloud.mask)], camera=camera)
 
 
@@ -144,14 +175,20 @@ def turn(normal: PointClouds, config: DescriptorConfig, parameters: Parameters |
     return _turn(normal, _sigma_s_and_alpha(config, parameters)[1])
 
 
+def place_aligned(rotation: jax.Array, found: Normalization, alpha: ArrayLike) -> tuple[jax.Array, jax.Array]:
+    """Rotate one cloud, turn it by alpha and translate it to the first octant; return points [M, 3] and camera [3]."""
+    # One rotation suffices: the translation between the two would cancel.
+    turned = jnp.matmul(_about_y(alpha), rotation, precision=HIGHEST)
+    points, camera = _place(turned, found.points, found.mask, found.camera)
+    return points.T, camera
+
+
 @jax.jit
 def _align(clouds: PointClouds, sigma_s: ArrayLike, alpha: ArrayLike) -> tuple[jax.Array, jax.Array]:
     def one(cloud: PointClouds) -> tuple[jax.Array, jax.Array]:
-        frame, points, mask, camera = _frame(cloud, sigma_s)
-        # One rotation suffices: the translation between the two would cancel.
-        rotation = jnp.matmul(_about_y(alpha), frame, precision=HIGHEST)
-        points, camera = _place(rotation, points, mask, camera)
-        return points.T[: len(cloud.mask)], camera  # the other fields would be copied
+        found = boxed(cloud, sigma_s)
+        points, camera = place_aligned(oriented(found), found, alpha)
+        return points[: len(cloud.mask)], camera  # the other fields would be copied
 
     return jax.vmap(one)(clouds)
 

@@ -1,0 +1,220 @@
+"""Galleries on disk: changes are atomic, other writers' changes are kept, damage is refused in one line."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from thor2_jax.errors import InputError
+from thor2_jax.gallery import store
+from thor2_jax.gallery.clouds import CompactClouds
+from thor2_jax.gallery.gallery import Gallery, GalleryObject
+from thor2_jax.gallery.store import gallery_stamp, load_gallery, update_gallery
+from thor2_jax.recognition.prepared_instance import PreparedInstance
+
+FINGERPRINT = "f" * 64
+
+
+def enrolled(seed: int, n_views: int = 2) -> GalleryObject:
+    rng = np.random.default_rng(seed)
+    embeddings = rng.normal(size=(2 * n_views, 16))
+    views = [
+        PreparedInstance(
+            1, rng.random((50, 3), np.float32), rng.integers(0, 256, (50, 3), np.uint8), np.zeros(50, bool)
+        )
+        for _ in range(n_views)
+    ]
+    embeddings /= np.linalg.norm(embeddings, axis=1, keepdims=True)
+    return GalleryObject(embeddings.astype(np.float16), CompactClouds.of(views), "frames", "2026-01-02")
+
+
+def add(name: str, seed: int, **options: bool) -> Callable[[Gallery], Gallery]:
+    return lambda gallery: gallery.with_object(name, enrolled(seed), **options)
+
+
+@pytest.fixture
+def directory(tmp_path: Path) -> Path:
+    path = tmp_path / "run" / "gallery"
+    for seed, name in enumerate(("mug", "bowl")):
+        update_gallery(path, add(name, seed), FINGERPRINT)
+    return path
+
+
+def content(directory: Path) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(directory)): path.read_bytes()
+        for path in sorted(directory.rglob("*"))
+        if path.is_file() and path.name != ".lock"
+    }
+
+
+def test_what_is_loaded_is_what_was_stored(directory: Path) -> None:
+    stored = load_gallery(directory, FINGERPRINT)
+    assert stored.gallery.names == ("mug", "bowl") and stored.generation == 2
+    for seed, views in enumerate(stored.gallery.objects.values()):
+        expected = enrolled(seed)
+        np.testing.assert_array_equal(views.embeddings, expected.embeddings)
+        np.testing.assert_array_equal(views.clouds.points, expected.clouds.points)
+        np.testing.assert_array_equal(views.clouds.colors, expected.clouds.colors)
+        assert (views.source, views.date) == ("frames", "2026-01-02")
+    (first, _) = json.loads((directory / "index.json").read_text())["objects"]
+    assert {**first, "file": ""} == {"name": "mug", "file": "", "views": 2, "source": "frames", "date": "2026-01-02"}
+
+
+def test_a_missing_gallery_is_empty(tmp_path: Path) -> None:
+    assert load_gallery(tmp_path / "none", FINGERPRINT).gallery.names == ()
+    assert gallery_stamp(tmp_path / "none") is None and list(tmp_path.iterdir()) == []
+
+
+def test_forgetting_restores_the_gallery_and_removes_the_file(directory: Path) -> None:
+    before, stamp = content(directory), gallery_stamp(directory)
+    update_gallery(directory, add("new", 5), FINGERPRINT)
+    assert gallery_stamp(directory) != stamp
+    update_gallery(directory, lambda gallery: gallery.without("new"), FINGERPRINT)
+    update_gallery(directory, lambda gallery: gallery, FINGERPRINT)
+    after = content(directory)
+    assert after.keys() == before.keys()
+    assert all(after[name] == before[name] for name in before if name != "index.json")
+
+
+def test_a_known_state_is_not_read_again(directory: Path) -> None:
+    stored = load_gallery(directory)
+    changed = update_gallery(directory, add("new", 5), FINGERPRINT, stored)
+    again = load_gallery(directory, FINGERPRINT, changed)
+    assert again.gallery.names == ("mug", "bowl", "new")
+    assert [v.clouds for v in again.gallery.objects.values()] == [v.clouds for v in changed.gallery.objects.values()]
+
+
+def test_another_writers_change_is_kept(directory: Path) -> None:
+    stale = load_gallery(directory, FINGERPRINT)
+    update_gallery(directory, add("new", 5), FINGERPRINT)
+    assert update_gallery(directory, add("box", 6), FINGERPRINT, stale).gallery.names == ("mug", "bowl", "new", "box")
+
+
+@pytest.mark.parametrize("failing", ["_object_content", "write_text", "_write_durably"])
+def test_a_failed_change_leaves_the_gallery_as_it_was(
+    failing: str, directory: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = content(directory)
+
+    def fail(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(store, failing, fail)
+    with pytest.raises(OSError, match="No space"):
+        update_gallery(directory, add("new", 5), FINGERPRINT)
+    assert content(directory) == before
+
+
+def test_a_refused_change_leaves_the_gallery_as_it_was(directory: Path) -> None:
+    before = content(directory)
+    with pytest.raises(InputError, match="'mug'"):
+        update_gallery(directory, add("mug", 5), FINGERPRINT)
+    assert content(directory) == before
+
+
+def test_a_gallery_of_another_embedding_is_refused(directory: Path) -> None:
+    before = content(directory)
+    for act in (lambda: load_gallery(directory, "0" * 64), lambda: update_gallery(directory, add("x", 1), "0" * 64)):
+        with pytest.raises(InputError, match="embedding ffffffff.*00000000"):
+            act()
+    assert content(directory) == before
+
+
+DAMAGES: dict[str, Callable[[Path], object]] = {
+    "cut index": lambda path: (path / "index.json").write_text('{"format": 1'),
+    "a list": lambda path: (path / "index.json").write_text("[]"),
+    "other format": lambda path: edit(path, format=2),
+    "no objects": lambda path: edit(path, objects=[{}]),
+    "other path": lambda path: edit(path, objects=[{"name": "a", "file": "../../x", "source": "", "date": ""}]),
+    "missing file": lambda path: next((path / "objects").iterdir()).unlink(),
+    "cut file": lambda path: cut(next((path / "objects").iterdir())),
+}
+
+
+def edit(path: Path, **changes: object) -> None:
+    index = json.loads((path / "index.json").read_text())
+    (path / "index.json").write_text(json.dumps({**index, **changes}))
+
+
+def cut(file: Path) -> None:
+    file.write_bytes(file.read_bytes()[:-10])
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_damage_is_refused_in_one_line(damage: str, directory: Path) -> None:
+    DAMAGES[damage](directory)
+    before = content(directory)
+    for act in (lambda: load_gallery(directory), lambda: update_gallery(directory, add("new", 5), FINGERPRINT)):
+        with pytest.raises(InputError, match="^gallery: ") as caught:
+            act()
+        assert "\n" not in str(caught.value) and str(directory) in str(caught.value)
+    assert content(directory) == before
+
+
+PROGRAM = """
+    import os, signal, sys
+    from pathlib import Path
+    sys.path.insert(0, {tests!r})
+    from test_store import FINGERPRINT, add
+    from thor2_jax.gallery import store
+    directory, step = Path({directory!r}), {step!r}
+    if step:
+        original = getattr(store, step)
+        def killed(*arguments):
+            if step == "_remove_orphans" or {after}:
+                original(*arguments)
+            os.kill(os.getpid(), signal.SIGKILL)
+        setattr(store, step, killed)
+    for name in {names!r}:
+        store.update_gallery(directory, add(name, len(name)), FINGERPRINT)
+"""
+
+
+def writer(directory: Path, names: list[str], step: str = "", after: bool = False) -> subprocess.Popen[bytes]:
+    program = PROGRAM.format(
+        tests=str(Path(__file__).parent), directory=str(directory), step=step, names=names, after=after
+    )
+    return subprocess.Popen(
+        [sys.executable, "-c", textwrap.dedent(program)], env={**os.environ, "JAX_PLATFORMS": "cpu"}
+    )
+
+
+@pytest.mark.parametrize(
+    ("step", "after"),
+    [("_remove_orphans", True), ("_write_durably", True), ("write_text", False), ("write_text", True)],
+)
+def test_a_killed_writer_leaves_the_gallery_before_or_after(step: str, after: bool, directory: Path) -> None:
+    before = load_gallery(directory).gallery.names
+    assert writer(directory, ["new"], step, after).wait() == -signal.SIGKILL
+    finished = step == "write_text" and after
+    assert load_gallery(directory).gallery.names == (*before, *(["new"] if finished else []))
+    update_gallery(directory, lambda gallery: gallery, FINGERPRINT)
+    assert len(list((directory / "objects").iterdir())) == 2 + finished
+
+
+def test_two_writers_at_once_both_succeed(directory: Path) -> None:
+    names = [[f"a{k}" for k in range(12)], [f"b{k}" for k in range(12)]]
+    writers = [writer(directory, each) for each in names]
+    assert [process.wait() for process in writers] == [0, 0]
+    assert set(load_gallery(directory).gallery.names) == {"mug", "bowl", *names[0], *names[1]}
+
+
+def test_a_writer_that_waits_too_long_gives_up(directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(store, "LOCK_SECONDS", 0.1)
+    before = content(directory)
+
+    def nested(gallery: Gallery) -> Gallery:
+        update_gallery(directory, add("inner", 1), FINGERPRINT)
+        return gallery
+
+    with pytest.raises(InputError, match="another process"):
+        update_gallery(directory, nested, FINGERPRINT)
+    assert content(directory) == before

@@ -1,0 +1,91 @@
+"""Nearest views: an exact search in chunks, and an approximate index behind the same interface.
+
+>>> search = ExactSearch(np.eye(3, dtype=np.float16))
+>>> search.nearest(np.array([[0.6, 0.8, 0]], np.float32), 2)[1]
+array([[1, 0]])
+"""
+
+import importlib
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thor2_jax.errors import InputError
+
+__all__ = ["ExactSearch", "IndexSearch", "ViewSearch"]
+
+CHUNK = 2**16
+"""Views per matrix product: 64 MB as float32 at 256 numbers each."""
+
+
+class ViewSearch(Protocol):
+    """Search for the views of largest cosine similarity."""
+
+    def nearest(self, queries: NDArray[np.float32], count: int) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
+        """Return similarities and indices [Q, min(count, N)] of the nearest views, the nearest first.
+
+        Args:
+            queries: [Q, D] of unit length.
+            count: number of views.
+        """
+
+
+class ExactSearch:
+    """Exact search by matrix products in chunks; its memory does not grow with the number of views."""
+
+    def __init__(self, embeddings: NDArray[np.float16]) -> None:
+        """Keep embeddings [N, D] of unit length; one chunk of them is also kept as float32."""
+        self._embeddings = embeddings
+        self._single = embeddings.astype(np.float32) if len(embeddings) <= CHUNK else None
+
+    def nearest(self, queries: NDArray[np.float32], count: int) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
+        """See `ViewSearch.nearest`; views of equal similarity are in the order of their indices."""
+        similarity, index = np.zeros((len(queries), 0), np.float32), np.zeros((len(queries), 0), np.intp)
+        for start in range(0, len(self._embeddings), CHUNK):
+            chunk = self._embeddings[start : start + CHUNK] if self._single is None else self._single
+            products = queries @ chunk.T.astype(np.float32, copy=False)
+            best = _largest(products, count)
+            index = np.concatenate([index, best + start], axis=1)
+            similarity = np.concatenate([similarity, np.take_along_axis(products, best, axis=1)], axis=1)
+            best = _largest(similarity, count)
+            index, similarity = (np.take_along_axis(values, best, axis=1) for values in (index, similarity))
+        return similarity, index
+
+
+def _largest(values: NDArray[np.float32], count: int) -> NDArray[np.intp]:
+    """Return the indices [Q, min(count, N)] of the largest values [Q, N], the largest first, ties by index."""
+    if values.shape[1] > count:
+        chosen = np.sort(np.argpartition(-values, count - 1, axis=1)[:, :count], axis=1)
+    else:
+        chosen = np.broadcast_to(np.arange(values.shape[1]), values.shape)
+    order = np.argsort(-np.take_along_axis(values, chosen, axis=1), axis=1, kind="stable")
+    return np.take_along_axis(chosen, order, axis=1)
+
+
+class IndexSearch:
+    """Approximate search by a graph of views (HNSW) from the package usearch, for galleries of many objects."""
+
+    def __init__(self, embeddings: NDArray[np.float16], threads: int = 0) -> None:
+        """Build the index of embeddings [N, D] of unit length.
+
+        Args:
+            embeddings: embeddings of the views.
+            threads: threads that build the index; 0 uses all cores.
+
+        Raises:
+            InputError: usearch is not installed.
+        """
+        try:
+            usearch: Any = importlib.import_module("usearch.index")
+        except ModuleNotFoundError:
+            raise InputError("index is usearch, which is not installed; run pip install 'thor2-jax[index]'") from None
+        self._size = len(embeddings)
+        self._index = usearch.Index(ndim=embeddings.shape[1], metric="ip", dtype="f16")
+        self._index.add(np.arange(len(embeddings)), embeddings, threads=threads)
+
+    def nearest(self, queries: NDArray[np.float32], count: int) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
+        """See `ViewSearch.nearest`; some of the nearest views may be missed, and others returned in their place."""
+        matches = self._index.search(queries.astype(np.float16), min(count, self._size))
+        distances, keys = np.atleast_2d(matches.distances), np.atleast_2d(matches.keys)
+        return (1 - distances).astype(np.float32), keys.astype(np.intp)
