@@ -34,7 +34,7 @@ def _swapped(found: Normalization) -> Normalization:
 
 @partial(jax.jit, static_argnums=(1, 2))
 def _orientations(clouds: PointClouds, config: DescriptorConfig, count: int) -> PointClouds:
-    half_turn = np.diag(np.array([-1, -1, 1], np.float32))
+    half_turn = jnp.diag(jnp.array([-1, -1, 1], jnp.float32))
 
     def one(cloud: PointClouds) -> tuple[jax.Array, jax.Array]:
         found = boxed(cloud, np.float32(config.sigma_s))

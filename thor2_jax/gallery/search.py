@@ -41,7 +41,8 @@ class ExactSearch:
 
     def nearest(self, queries: NDArray[np.float32], count: int) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
         """See `ViewSearch.nearest`; views of equal similarity are in the order of their indices."""
-        similarity, index = np.zeros((len(queries), 0), np.float32), np.zeros((len(queries), 0), np.intp)
+        similarity: NDArray[np.float32] = np.zeros((len(queries), 0), np.float32)
+        index: NDArray[np.intp] = np.zeros((len(queries), 0), np.intp)
         for start in range(0, len(self._embeddings), CHUNK):
             chunk = self._embeddings[start : start + CHUNK] if self._single is None else self._single
             products = queries @ chunk.T.astype(np.float32, copy=False)
@@ -49,7 +50,8 @@ class ExactSearch:
             index = np.concatenate([index, best + start], axis=1)
             similarity = np.concatenate([similarity, np.take_along_axis(products, best, axis=1)], axis=1)
             best = _largest(similarity, count)
-            index, similarity = (np.take_along_axis(values, best, axis=1) for values in (index, similarity))
+            index = np.take_along_axis(index, best, axis=1)
+            similarity = np.take_along_axis(similarity, best, axis=1)
         return similarity, index
 
 
