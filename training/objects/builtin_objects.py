@@ -7,7 +7,6 @@ They are built from surfaces of rings (surfaces of revolution, or swept along a 
 rules in the coordinates of the surface.
 """
 
-import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -15,6 +14,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from training.objects.mesh import TexturedMesh, merge_meshes
+from training.objects.surfaces import (
+    arc_lengths,
+    box_surface,
+    moved,
+    revolved_surface,
+    standing,
+    superellipse,
+    texel_centres,
+    tube_surface,
+)
 
 __all__ = ["COLOR_PAIRS", "SHAPE_PAIRS", "builtin_objects"]
 
@@ -53,40 +62,6 @@ def _texture(base: Color, marks: Sequence[Mark], *coordinates: Array) -> NDArray
     return image[::-1]
 
 
-def _texel_centres() -> tuple[Array, Array]:
-    centres = (np.arange(TEXELS) + 0.5) / TEXELS
-    u, v = np.meshgrid(centres, centres)
-    return u, v
-
-
-def _rings(points: Array, v: Array, texture: NDArray[np.uint8]) -> TexturedMesh:
-    """Return the surface through closed rings [k, n, 3]; u runs along a ring, `v` [k] across the rings."""
-    k, n = points.shape[:2]
-    corner = np.arange(k * n).reshape(k, n)
-    a, b, c, d = (part.ravel() for part in (corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1]))
-    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
-    vertices = points.reshape(-1, 3)
-    first, second, third = np.moveaxis(vertices[faces], 1, 0)
-    faces = faces[np.linalg.norm(np.cross(second - first, third - first), axis=1) > 1e-12]
-    u, v = np.meshgrid(np.linspace(0, 1, n), v)
-    uv = np.stack([u.ravel(), v.ravel()], axis=1).astype(np.float32)
-    # Clipped, so that the last texel does not wrap around to the first.
-    uv = uv.clip(1e-4, 1 - 1e-4)
-    return TexturedMesh(
-        vertices,
-        faces.astype(np.int32),
-        uv=uv[faces],
-        textures=(texture,),
-        face_texture=np.zeros(len(faces), np.int32),
-    )
-
-
-def _along(points: Array) -> Array:
-    """Return the relative arc length [k] of a line [k, d] at each of its points, from 0 to 1."""
-    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
-    return length / length[-1]
-
-
 def _lathe(profile: ArrayLike, base: Color, *marks: Mark) -> TexturedMesh:
     """Return a surface of revolution about z.
 
@@ -97,15 +72,12 @@ def _lathe(profile: ArrayLike, base: Color, *marks: Mark) -> TexturedMesh:
             profile.
     """
     line = np.asarray(profile, np.float64)
-    v = _along(line)
-    theta = np.linspace(0, 2 * np.pi, SECTIONS + 1)
-    ring = np.stack([np.cos(theta), np.sin(theta), np.ones_like(theta)], axis=1)
-    points = line[:, [0, 0, 1]][:, None, :] * ring
-    turn, height = _texel_centres()
+    v = arc_lengths(line)
+    turn, height = texel_centres(TEXELS)
     r, z = (np.interp(height, v, line[:, k]) for k in (0, 1))
     share = np.cumsum(r[:, :1], axis=0)
     share = np.broadcast_to((share - r[:, :1] / 2) / share[-1], r.shape)
-    return _rings(points, v, _texture(base, marks, turn, r, z, share))
+    return revolved_surface(line, _texture(base, marks, turn, r, z, share), superellipse(SECTIONS))
 
 
 def _sweep(
@@ -121,15 +93,7 @@ def _sweep(
         marks: functions of the angle (turns; 0 in the plane, 0.25 across it) and of the share [0, 1] of the length.
         sides: vertices of a ring.
     """
-    line, size, normal = (np.asarray(values, np.float64) for values in (path, radii, across))
-    tangent = np.gradient(line, axis=0)
-    inward = np.cross(normal, tangent / np.linalg.norm(tangent, axis=1, keepdims=True))
-    theta = np.linspace(0, 2 * np.pi, sides + 1)[None, :, None]
-    around = size[:, None, :1] * np.cos(theta) * inward[:, None] + size[:, None, 1:] * np.sin(theta) * normal
-    ends = np.broadcast_to(line[[0, -1], None], (2, sides + 1, 3))
-    points = np.concatenate([ends[:1], line[:, None] + around, ends[1:]])
-    v = np.concatenate([[0.0], _along(line), [1.0]])
-    return _rings(points, v, _texture(base, marks, *_texel_centres()))
+    return tube_surface(path, radii, across, _texture(base, marks, *texel_centres(TEXELS)), superellipse(sides))
 
 
 def _box(size: tuple[float, float, float], base: Color, *marks: Mark) -> TexturedMesh:
@@ -141,37 +105,8 @@ def _box(size: tuple[float, float, float], base: Color, *marks: Mark) -> Texture
         marks: functions of the side (0: -y, the front, 1: +x, 2: +y, 3: -x, 4: top, 5: bottom) and of u (to the right,
             seen from outside) and v (up) in [0, 1].
     """
-    x, y, z = size[0] / 2, size[1] / 2, size[2]
-    ring = np.array([[-x, -y], [x, -y], [x, y], [-x, y]])
-    quads = [[[*ring[k], 0], [*ring[(k + 1) % 4], 0], [*ring[(k + 1) % 4], z], [*ring[k], z]] for k in range(4)]
-    quads.append([[*p, z] for p in ring])
-    quads.append([[*p, 0] for p in ring[::-1]])
-    faces = np.concatenate([[[4 * k, 4 * k + 1, 4 * k + 2], [4 * k, 4 * k + 2, 4 * k + 3]] for k in range(6)])
-    corners = np.tile(np.array([[[0, 0], [1, 0], [1, 1]], [[0, 0], [1, 1], [0, 1]]], np.float32), (6, 1, 1))
-    return TexturedMesh(
-        np.asarray(quads, np.float64).reshape(-1, 3),
-        faces.astype(np.int32),
-        uv=corners.clip(1e-4, 1 - 1e-4),
-        textures=tuple(_texture(base, marks, np.full((TEXELS, TEXELS), k), *_texel_centres()) for k in range(6)),
-        face_texture=np.repeat(np.arange(6, dtype=np.int32), 2),
-    )
-
-
-def _moved(mesh: TexturedMesh, position: ArrayLike = (0, 0, 0), axis: str = "z", degrees: float = 0.0) -> TexturedMesh:
-    """Rotate a mesh about a coordinate axis, then translate it."""
-    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
-    i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
-    matrix = np.eye(4)
-    matrix[[i, i, j, j], [i, j, i, j]] = c, -s, s, c
-    matrix[:3, 3] = position
-    return mesh.transformed(matrix)
-
-
-def _standing(*parts: TexturedMesh) -> TexturedMesh:
-    """Merge parts and put them on z = 0 over the origin."""
-    mesh = merge_meshes(parts)
-    centre = mesh.centre
-    return _moved(mesh, (-centre[0], -centre[1], -mesh.vertices[:, 2].min()))
+    textures = [_texture(base, marks, np.full((TEXELS, TEXELS), k), *texel_centres(TEXELS)) for k in range(6)]
+    return box_surface(size, textures)
 
 
 def _arc(radius: float, start: float, stop: float, n: int) -> Array:
@@ -282,7 +217,7 @@ def _banana() -> TexturedMesh:
         (BROWN, lambda u, t: (abs(u - 0.3) < 0.02) & (abs(t - 0.45) < 0.06)),
         sides=12,
     )
-    return _standing(body)
+    return standing(body)
 
 
 def _apple() -> TexturedMesh:
@@ -297,14 +232,14 @@ def _apple() -> TexturedMesh:
     )
     line = np.array([[0, 0, 0.019], [0.001, 0, 0.026], [0.003, 0, 0.034], [0.006, 0, 0.041]])
     stem = _sweep(line, [[0.0022] * 2, [0.0022] * 2, [0.0022] * 2, [0.003] * 2], (0, 1, 0), BROWN, sides=8)
-    return _standing(body, stem)
+    return standing(body, stem)
 
 
 def _tennis_ball() -> TexturedMesh:
     phi = np.radians(np.linspace(-90, 90, 33))
     profile = 0.0335 * np.stack([np.cos(phi).clip(0), np.sin(phi)], axis=1)
     seam = lambda u, r, z, s: abs(np.arctan2(z, r) - 0.75 * np.sin(4 * np.pi * u)) < 0.085  # noqa: E731
-    return _standing(_lathe(profile, LIME, (IVORY, seam)))
+    return standing(_lathe(profile, LIME, (IVORY, seam)))
 
 
 def _sponge() -> TexturedMesh:
@@ -337,7 +272,7 @@ def _screwdriver() -> TexturedMesh:
         (DARK, lambda u, r, z, s: (z > 0.012) & (z < 0.080) & (u * 6 % 1 < 0.4)),
         (DARK, lambda u, r, z, s: (z > 0.084) & (z < 0.1015)),
     )
-    return _standing(_moved(tool, axis="y", degrees=90))
+    return standing(moved(tool, axis="y", degrees=90))
 
 
 def _hammer() -> TexturedMesh:
@@ -356,7 +291,7 @@ def _hammer() -> TexturedMesh:
         (0, 0.100),
     ]
     head = _lathe(profile, STEEL, (DARK, lambda u, r, z, s: (z > 0.024) & (z < 0.066)))
-    return _standing(handle, _moved(head, (0.222, 0.045, 0), axis="x", degrees=90))
+    return standing(handle, moved(head, (0.222, 0.045, 0), axis="x", degrees=90))
 
 
 def _wooden_spoon() -> TexturedMesh:
@@ -367,7 +302,7 @@ def _wooden_spoon() -> TexturedMesh:
     thick = np.where(bowl > 0, 0.0045, 0.0055)
     path = np.stack([x, np.zeros_like(x), z], axis=1)
     hollow = lambda u, t: (((t - 0.855) / 0.105) ** 2 + ((u - 0.5) / 0.17) ** 2 < 1) | (t < 0.06)  # noqa: E731
-    return _standing(_sweep(path, np.stack([thick, half], axis=1), (0, 1, 0), TAN, (BROWN, hollow)))
+    return standing(_sweep(path, np.stack([thick, half], axis=1), (0, 1, 0), TAN, (BROWN, hollow)))
 
 
 def builtin_objects() -> dict[str, TexturedMesh]:
