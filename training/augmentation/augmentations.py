@@ -3,9 +3,10 @@
     augmentations = Augmentations(illumination=Illumination(), occlusion=Occlusion())
     copy = augment(render_view(caster, pose), augmentations, np.random.default_rng(0))
 
-An augmented copy has the pose of its view. Illumination changes its colours only; segmentation adds or removes pixels
-along the outline; occlusion removes pixels behind another object; the sensor perturbs or removes depth. Where pixels
-are added or removed, colour and depth change together. The view as rendered is always kept as copy 0.
+An augmented copy has the pose of its view. Illumination and registration change its colours only; segmentation adds or
+removes pixels along the outline; the base removes the lowest pixels; occlusion removes pixels behind another object;
+the sensor perturbs or removes depth. Where pixels are added or removed, colour and depth change together. The view as
+rendered is always kept as copy 0.
 """
 
 import dataclasses
@@ -16,9 +17,11 @@ import numpy as np
 from thor2_jax.errors import InputError
 from thor2_jax.recognition.frames import RGBDFrame
 from thor2_jax.recognition.outlier_removal import flying_pixels
+from training.augmentation.base import Base, without_base
 from training.augmentation.illumination import Illumination, relit
 from training.augmentation.occlusion import Occlusion, occluded
 from training.augmentation.pixels import without
+from training.augmentation.registration import Registration, misregistered
 from training.augmentation.segmentation import Segmentation, resegmented
 from training.augmentation.sensor import Sensor, sensed
 from training.rendering.camera import RenderedView
@@ -35,6 +38,8 @@ class Augmentations:
         sensor: noise and faults of the depth sensor.
         occlusion: another object in front.
         segmentation: masks that are too small or too large.
+        registration: colour that is blurred and shifted against depth.
+        base: masks without the lowest part of the object.
         copies: number of augmented copies of each view.
 
     Raises:
@@ -46,6 +51,8 @@ class Augmentations:
     occlusion: Occlusion | None = None
     segmentation: Segmentation | None = None
     copies: int = 2
+    registration: Registration | None = None
+    base: Base | None = None
 
     def __post_init__(self) -> None:
         kinds = {
@@ -53,6 +60,8 @@ class Augmentations:
             "sensor": Sensor,
             "occlusion": Occlusion,
             "segmentation": Segmentation,
+            "registration": Registration,
+            "base": Base,
         }
         for name, kind in kinds.items():
             value = getattr(self, name)
@@ -62,7 +71,8 @@ class Augmentations:
             raise InputError(f"augmentations.copies is {self.copies!r}; it must be an integer of at least 1")
 
     def __bool__(self) -> bool:
-        return any((self.illumination, self.sensor, self.occlusion, self.segmentation))
+        settings = self.illumination, self.sensor, self.occlusion, self.segmentation, self.registration, self.base
+        return any(settings)
 
     def record(self) -> dict[str, Any]:
         """Return all settings as JSON holds them: None for a disabled augmentation, ranges as lists."""
@@ -76,8 +86,8 @@ class Augmentations:
 def augment(view: RenderedView, augmentations: Augmentations, rng: np.random.Generator) -> RenderedView:
     """Return an augmented copy of a view; it is determined by the arguments and the state of `rng`.
 
-    The order is illumination, segmentation, occlusion, sensor. Flying pixels are removed after segmentation and sensor,
-    as recognition does.
+    The order is illumination, registration, segmentation, base, occlusion, sensor. Flying pixels are removed after
+    segmentation and sensor, as recognition does.
 
     Args:
         view: view as rendered; not modified.
@@ -90,8 +100,12 @@ def augment(view: RenderedView, augmentations: Augmentations, rng: np.random.Gen
     """
     if augmentations.illumination:
         view = relit(view, augmentations.illumination, rng)
+    if augmentations.registration:
+        view = misregistered(view, augmentations.registration, rng)
     if augmentations.segmentation:
         view = resegmented(view, augmentations.segmentation, rng)
+    if augmentations.base:
+        view = without_base(view, augmentations.base, rng)
     if augmentations.occlusion:
         view = occluded(view, augmentations.occlusion, rng)
     if augmentations.sensor:

@@ -14,8 +14,10 @@ from thor2_jax.errors import InputError
 from thor2_jax.recognition.frames import Intrinsics, RGBDFrame, backproject
 from thor2_jax.recognition.instance_clouds import instance_clouds
 from training.augmentation.augmentations import Augmentations, _without_flying, augment
+from training.augmentation.base import Base
 from training.augmentation.illumination import Illumination
 from training.augmentation.occlusion import Occlusion, _silhouettes
+from training.augmentation.registration import Registration
 from training.augmentation.segmentation import Segmentation, _background, _widened
 from training.augmentation.sensor import Sensor, sensed
 from training.objects.builtin_objects import builtin_objects
@@ -25,12 +27,14 @@ from training.rendering.view_sphere import camera_pose
 from training.views.mesh_views import cloud_of
 
 OBJECTS = builtin_objects()
-ALL = Augmentations(Illumination(), Sensor(), Occlusion(), Segmentation())
+ALL = Augmentations(Illumination(), Sensor(), Occlusion(), Segmentation(), 2, Registration(), Base(missing=1))
 SWITCHES: dict[str, Any] = {
     "illumination": Illumination(),
     "sensor": Sensor(),
     "occlusion": Occlusion(),
     "segmentation": Segmentation(),
+    "registration": Registration(),
+    "base": Base(missing=1),
 }
 NO_LIGHT = Illumination(gamma=(1, 1), gain=(1, 1), cast=0, shading=(0, 0), saturation=(1, 1), veil=(0, 0), noise=(0, 0))
 NO_SENSOR = Sensor(axial=(0, 0), lateral=0, missing=0, flying=0)
@@ -82,7 +86,7 @@ def test_off() -> None:
 def test_record() -> None:
     record = Augmentations(illumination=Illumination(), copies=3).record()
     assert record == json.loads(json.dumps(record))
-    assert list(record) == ["illumination", "sensor", "occlusion", "segmentation", "copies"]
+    assert set(record) == {*SWITCHES, "copies"}
     assert record["sensor"] is None and record["copies"] == 3 and record["illumination"]["gain"] == [0.4, 1.6]
     assert Augmentations(**SWITCHES).record() == ALL.record() != record
     assert hash(Augmentations(**SWITCHES)) == hash(ALL)
@@ -103,6 +107,8 @@ def test_record() -> None:
         (lambda: Occlusion(none=float("inf")), r"occlusion\.none is inf"),
         (lambda: Segmentation(tilt=(0.0, 90.0)), r"segmentation\.tilt is \(0\.0, 90\.0\)"),
         (lambda: Segmentation(pixels=[-3, 3]), r"segmentation\.pixels is \[-3, 3\]"),  # type: ignore[arg-type]
+        (lambda: Registration(shift=-1), r"registration\.shift is -1"),
+        (lambda: Base(height=(0.2, 0.3)), r"base\.height is \(0\.2, 0\.3\)"),
         (lambda: Augmentations(copies=0), r"augmentations\.copies is 0"),
         (lambda: Augmentations(copies=True), r"augmentations\.copies is True"),
         (lambda: Augmentations(sensor=Occlusion()), r"augmentations\.sensor is Occlusion\("),  # type: ignore[arg-type]
@@ -441,3 +447,54 @@ def test_background_left_is_about_what_outlier_removal_leaves() -> None:
     assert np.mean(recognized) == pytest.approx(np.mean(left), abs=0.015)
     assert np.corrcoef(left, recognized)[0, 1] > 0.7
     assert 0.005 < np.mean(left) < 0.5 * np.mean(unfiltered)
+
+
+# Registration of colour and depth.
+
+
+def test_colors_are_shifted_against_depth() -> None:
+    depth = wall()
+    view = flat_view(depth, f=1500.0)  # pixels of 1 mm, as in a real frame
+    view.color[:, 30:] = (200, 50, 25)
+    shifts = set()
+    for seed in range(60):
+        result = varied(view, seed, registration=Registration(shifted=1, shift=4, blur=(0, 0)))
+        assert np.array_equal(result.depth, depth)
+        column = int(np.flatnonzero((result.color[30, 10:50] == (200, 50, 25)).all(axis=1))[0]) + 10
+        shifts.add(column - 30)
+    assert shifts == set(range(-4, 5))
+
+
+def test_the_background_shows_at_the_shifted_outline() -> None:
+    result = varied(flat_view(wall(), f=1500.0), 1, registration=Registration(shifted=1, shift=10, blur=(0, 0)))
+    colors, counts = np.unique(result.color.reshape(-1, 3), axis=0, return_counts=True)
+    assert len(colors) == 2 and counts.max() >= 50 * 50 and [100, 100, 100] in colors.tolist()
+
+
+def test_blur_keeps_a_uniform_color() -> None:
+    view = flat_view(wall(margin=9), f=1500.0)
+    result = varied(view, 0, registration=Registration(shifted=0, blur=(3, 3)))
+    np.testing.assert_allclose(result.color, view.color, atol=1)
+    view.color[39, 39] = 255
+    result = varied(view, 0, registration=Registration(shifted=0, blur=(3, 3)))
+    assert 100 < result.color[39, 39, 0] < 110
+
+
+# The base.
+
+
+def test_the_lowest_centimetre_is_removed() -> None:
+    for seed in range(5):
+        result = varied(MUG, seed, base=Base(missing=1, height=(0.01, 0.01), upright=1))
+        points = backproject(MUG.depth / 1000, MUG.intrinsics) @ MUG.pose[:3, :3].T + MUG.pose[:3, 3]
+        z = points[..., 2] - points[..., 2][MUG.depth > 0].min()
+        # The depth is rounded to 1 mm.
+        assert not result.depth[(z < 0.008) & (MUG.depth > 0)].any()
+        kept = (z > 0.012) & (MUG.depth > 0)
+        assert np.array_equal(result.depth[kept], MUG.depth[kept])
+
+
+def test_flat_objects_keep_their_base() -> None:
+    plate = view_of("white_plate", polar=0.1)
+    assert same(varied(plate, 0, base=Base(missing=1, height=(0.1, 0.1), upright=1)), plate)
+    assert same(varied(MUG, 0, base=Base(missing=0)), MUG)

@@ -1,0 +1,58 @@
+"""Procedural objects: deterministic, of the size of household objects, all visible, with siblings."""
+
+import numpy as np
+import pytest
+
+from training.objects.mesh import TexturedMesh
+from training.objects.procedural import _FAMILIES, SIZES, procedural_object
+from training.rendering.ray_caster import RayCaster, render_view
+from training.rendering.view_sphere import camera_pose
+
+SEEDS = range(60)
+OBJECTS = [procedural_object(seed) for seed in SEEDS]
+
+
+def mean_color(mesh: TexturedMesh) -> np.ndarray:
+    return np.mean([texture.reshape(-1, 3).mean(axis=0) for texture in mesh.textures], axis=0)
+
+
+def test_a_seed_determines_the_object() -> None:
+    for seed in (0, 1, 13, 123_456):
+        one, other = procedural_object(seed), procedural_object(seed)
+        assert np.array_equal(one.vertices, other.vertices) and np.array_equal(one.faces, other.faces)
+        assert all(np.array_equal(a, b) for a, b in zip(one.textures, other.textures, strict=True))
+
+
+def test_objects_stand_and_have_a_household_size() -> None:
+    for mesh in OBJECTS:
+        assert np.isfinite(mesh.vertices).all() and mesh.faces.max() < len(mesh.vertices)
+        np.testing.assert_allclose(mesh.vertices[:, 2].min(), 0, atol=1e-9)
+        np.testing.assert_allclose(mesh.centre[:2], 0, atol=1e-9)
+        assert SIZES[0] - 1e-9 <= np.ptp(mesh.vertices, axis=0).max() <= SIZES[1] * 1.0001
+
+
+@pytest.mark.parametrize("family", [family for _, family in _FAMILIES])
+def test_every_family_is_visible_from_all_sides(family) -> None:
+    texture = np.full((4, 4, 3), 90, np.uint8)
+    for seed in range(5):
+        mesh = family(np.random.default_rng(seed), lambda part: texture)
+        for polar in (0.1, 1.5, 3.0):
+            view = render_view(RayCaster([mesh]), camera_pose(0.3, polar, mesh.centre))
+            assert (view.depth > 0).sum() > 20 and (view.color[view.depth > 0] == 90).all()
+
+
+def test_siblings_share_shape_or_paint() -> None:
+    for seed in range(0, len(OBJECTS), 5):
+        first, second, third, fourth, _ = OBJECTS[seed : seed + 5]
+        assert np.array_equal(first.vertices, second.vertices)
+        assert not np.array_equal(first.textures[0], second.textures[0])
+        assert np.array_equal(third.textures[0], fourth.textures[0])
+        assert third.vertices.shape != fourth.vertices.shape or not np.allclose(third.vertices, fourth.vertices)
+
+
+def test_shapes_and_colors_differ() -> None:
+    extents = np.array([np.sort(np.ptp(mesh.vertices, axis=0)) for mesh in OBJECTS[::5]])
+    colors = np.array([mean_color(mesh) for mesh in OBJECTS[::5]])
+    for values, least in ((extents, 1e-3), (colors, 2)):
+        distance = np.linalg.norm(values[:, None] - values, axis=-1)
+        assert distance[~np.eye(len(values), dtype=bool)].min() > least
