@@ -123,7 +123,7 @@ def _texture(rng: Rng, palette: list[Array]) -> Image:
         color = palette[rng.integers(len(palette))]
         image[_PATTERNS[rng.integers(len(_PATTERNS))](rng, u, v)] = color
     if rng.random() < 0.5:
-        image *= 1 + rng.uniform(0.02, 0.25) * (2 * _noise(rng, rng.integers(2, 9)) - 1)[..., None]
+        image *= 1 + rng.uniform(0.02, 0.25) * (2 * _noise(rng, int(rng.integers(2, 9))) - 1)[..., None]
     if rng.random() < 0.4:
         image += rng.normal(0, rng.uniform(2, 12), (TEXELS, TEXELS, 1))
     return image[::-1].clip(0, 255).astype(np.uint8)
@@ -156,7 +156,7 @@ def _ellipse(rng: Rng, u: Array, v: Array) -> NDArray[np.bool_]:
 
 
 def _blobs(rng: Rng, u: Array, v: Array) -> NDArray[np.bool_]:
-    return _noise(rng, rng.integers(3, 14)) > rng.uniform(0.4, 0.75)
+    return _noise(rng, int(rng.integers(3, 14))) > rng.uniform(0.4, 0.75)
 
 
 def _lettering(rng: Rng, u: Array, v: Array) -> NDArray[np.bool_]:
