@@ -41,13 +41,13 @@ def test_exactly_one_pair_of_nodes_is_redundant(rebuilt: Rebuilt) -> None:
     colors, graph = grid_colors(), rebuilt.graph
     sets = [set(m.tolist()) for m in graph.members]
     means = to_lab(np.array([colors[m].mean(axis=0) for m in graph.members]), MEAN_WHITE)
-    found = [
+    redundant = [
         (graph.names[i], graph.names[j], len(a & b), len(a), len(b), round(float(hyab(means[i], means[j])), 1))
         for i, a in enumerate(sets)
         for j, b in enumerate(sets[:i])
         if len(a & b) > 0.95 * min(len(a), len(b)) and hyab(means[i], means[j]) <= EPS
     ]
-    assert found == [("cube19_cluster0", "cube18_cluster0", 841, 853, 1279, 4.4)]
+    assert redundant == [("cube19_cluster0", "cube18_cluster0", 841, 853, 1279, 4.4)]
 
 
 def test_regions_are_numbered_like_kmapper_nodes(rebuilt: Rebuilt) -> None:

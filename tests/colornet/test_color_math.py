@@ -65,26 +65,26 @@ def test_neighborhoods_equal_those_of_brute_force() -> None:
     lab = some_colors(600)
     distances = cdist(lab, lab, hyab_by_hand)
     near = (distances <= EPS) & ~np.eye(len(lab), dtype=bool)
-    found = hyab_neighbors(lab, EPS).toarray()
+    neighbors = hyab_neighbors(lab, EPS).toarray()
     assert near.sum() > 1000
-    np.testing.assert_array_equal(found > 0, near)
-    np.testing.assert_allclose(found[near], distances[near], atol=1e-12)
+    np.testing.assert_array_equal(neighbors > 0, near)
+    np.testing.assert_allclose(neighbors[near], distances[near], atol=1e-12)
 
 
 def test_neighborhoods_on_the_border_of_the_ball() -> None:
     """For differences in lightness only, HyAB, the Euclidean distance and the radius are equal."""
     lab = np.array([[10.0, 3.0, 4.0], [17.0, 3.0, 4.0], [17.1, 3.0, 4.0], [24.1, 3.0, 4.0]])
-    found = hyab_neighbors(lab, 7.0).toarray() > 0
+    neighbors = hyab_neighbors(lab, 7.0).toarray() > 0
     expected = np.abs(lab[:, None, 0] - lab[None, :, 0]) <= 7.0
-    np.testing.assert_array_equal(found, expected & ~np.eye(4, dtype=bool))
+    np.testing.assert_array_equal(neighbors, expected & ~np.eye(4, dtype=bool))
 
 
 def test_clusters_equal_those_of_a_dense_matrix() -> None:
     lab = some_colors(600)
     dense = DBSCAN(eps=EPS, min_samples=MIN_SAMPLES, metric="precomputed").fit_predict(cdist(lab, lab, hyab_by_hand))
-    found = HyabDBSCAN().fit_predict(lab)
-    assert found.max() >= 1 and found.min() == -1
-    np.testing.assert_array_equal(found, dense)
+    labels = HyabDBSCAN().fit_predict(lab)
+    assert labels.max() >= 1 and labels.min() == -1
+    np.testing.assert_array_equal(labels, dense)
 
 
 def test_lens() -> None:

@@ -14,9 +14,9 @@ def test_region_weights_strip_by_strip(golden_files: tuple[Path, ...], network: 
             aligned, expected = golden["aligned"].astype(np.float64), golden["paper_color"]
             weights = network.membership(as_8_bit(golden["colors"]))
         i, j = np.floor(aligned[:, 2] / 0.1).astype(int), np.floor(aligned[:, 0] / 0.025).astype(int)
-        found = np.zeros((7, 31, 22))
-        np.add.at(found, (i, j), weights)
-        np.testing.assert_allclose(found, expected, atol=1e-4, err_msg=path.name)
+        color = np.zeros((7, 31, 22))
+        np.add.at(color, (i, j), weights)
+        np.testing.assert_allclose(color, expected, atol=1e-4, err_msg=path.name)
         assert expected.sum(axis=-1).any()
 
 

@@ -42,14 +42,14 @@ def test_similarity_of_random_graphs() -> None:
         pairs = np.array([(i, j) for i in range(n) for j in range(i + 1, n)], np.int64).reshape(-1, 2)
         edges = pairs[rng.random(len(pairs)) < 0.3]
         weights = rng.uniform(1, 100, len(edges))
-        found = similarity(n, edges, weights)
-        np.testing.assert_allclose(found, 1 / (1 + floyd_warshall(n, edges, weights)), rtol=1e-13)
-        np.testing.assert_array_equal(found, found.T)
+        delta = similarity(n, edges, weights)
+        np.testing.assert_allclose(delta, 1 / (1 + floyd_warshall(n, edges, weights)), rtol=1e-13)
+        np.testing.assert_array_equal(delta, delta.T)
 
 
 def test_regions_without_a_path_are_not_similar() -> None:
-    found = similarity(3, np.array([[0, 2]]), np.array([4.0]))
-    np.testing.assert_array_equal(found, [[1, 0, 0.2], [0, 1, 0], [0.2, 0, 1]])
+    delta = similarity(3, np.array([[0, 2]]), np.array([4.0]))
+    np.testing.assert_array_equal(delta, [[1, 0, 0.2], [0, 1, 0], [0.2, 0, 1]])
 
 
 def test_mean_color() -> None:

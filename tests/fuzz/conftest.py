@@ -13,20 +13,20 @@ import pytest
 from thor2_jax.errors import InputError
 
 SECONDS = 5
-"""Of the processor: others may hold this process up."""
+"""CPU time that a reader may take; elapsed time would depend on other processes."""
 
 MEMORY = 2**30
-"""Bytes that a reader may take from the system beyond what the process has."""
+"""Bytes that a reader may allocate beyond what the process holds."""
 
 
-class TookTooLong(BaseException):
-    """Past every `except Exception`."""
+class TimeLimitExceeded(BaseException):
+    """Not an `Exception`, so that no handler of the reader catches it."""
 
 
 @contextlib.contextmanager
 def limits() -> Iterator[None]:
     def stop(*_: Any) -> None:
-        raise TookTooLong
+        raise TimeLimitExceeded
 
     pages = int(Path("/proc/self/statm").read_text().split()[0])
     before = resource.getrlimit(resource.RLIMIT_AS)
@@ -43,11 +43,11 @@ def limits() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def attempt() -> Callable[..., Any]:
-    """Calls a reader under the limits: its answer, or None where it refuses in one line of bounded length."""
+    """Return a function that calls a reader under the limits and returns its result, or None if it raises one line."""
 
     def call(read: Callable[[], Any], refusals: Any = (InputError, OSError)) -> Any:
         with warnings.catch_warnings(), limits():
-            warnings.simplefilter("ignore")  # of decoders, about what is damaged
+            warnings.simplefilter("ignore")  # decoders warn about damaged files
             try:
                 return read()
             except refusals as error:

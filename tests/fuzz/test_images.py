@@ -35,12 +35,12 @@ FILES: dict[str, tuple[Callable[[Path], Any], bytes]] = {
 
 
 def chunks(content: bytes) -> list[tuple[bytes, bytes]]:
-    found, at = [], 8
+    parts, at = [], 8
     while at + 8 <= len(content):
         (length,) = struct.unpack(">I", content[at : at + 4])
-        found.append((content[at + 4 : at + 8], content[at + 8 : at + 8 + length]))
+        parts.append((content[at + 4 : at + 8], content[at + 8 : at + 8 + length]))
         at += 12 + length
-    return found
+    return parts
 
 
 @pytest.mark.parametrize("name", FILES)
@@ -49,14 +49,14 @@ def test_images(name: str, data: st.DataObject, attempt: Any, tmp_path: Path) ->
     read, content = FILES[name]
     path = tmp_path / name
     path.write_bytes(data.draw(damaged(content)))
-    found = attempt(lambda: read(path))
-    if found is not None:
-        assert found.ndim in (2, 3) and found.dtype.kind == "u" and found.size > 0
+    image = attempt(lambda: read(path))
+    if image is not None:
+        assert image.ndim in (2, 3) and image.dtype.kind == "u" and image.size > 0
 
 
 @pytest.mark.parametrize("name", [name for name in FILES if name.endswith("png")])
 @given(data=st.data())
-def test_png_chunks_with_right_checksums(name: str, data: st.DataObject, attempt: Any, tmp_path: Path) -> None:
+def test_damaged_png_chunks_with_valid_checksums(name: str, data: st.DataObject, attempt: Any, tmp_path: Path) -> None:
     read, content = FILES[name]
     parts = chunks(content)
     k = data.draw(st.integers(0, len(parts) - 1))
@@ -72,7 +72,7 @@ def test_png_chunks_with_right_checksums(name: str, data: st.DataObject, attempt
 
 @pytest.mark.parametrize("size", [(65_000, 65_000), (2**31 - 1, 2**31 - 1), (13_000, 13_000), (170_000_000, 1)])
 def test_an_image_that_would_fill_memory_is_refused(size: tuple[int, int], attempt: Any, tmp_path: Path) -> None:
-    """With all its rows of zeros: a few hundred kilobytes of file, or as few as the header alone."""
+    """The file has a few hundred kilobytes of compressed zeros, or little more than a header."""
     rows = zlib.compress(bytes(min((size[0] * 3 + 1) * size[1], 2**26)), 9)
     path = tmp_path / "bomb.png"
     path.write_bytes(
@@ -94,7 +94,7 @@ def test_text_that_would_fill_memory(attempt: Any, tmp_path: Path) -> None:
 
 
 def test_other_kinds_of_images_are_refused(tmp_path: Path) -> None:
-    """Of what Pillow opens, some formats run other programs, and none is documented."""
+    """Some formats that Pillow opens run other programs; only documented formats are read."""
     for kind in ("BMP", "GIF", "PPM", "EPS"):
         path = tmp_path / "color.png"
         path.write_bytes(encode_image(COLOR, kind))
@@ -109,9 +109,12 @@ INTRINSICS = json.dumps({"fx": 600.5, "fy": 601.0, "cx": 320, "cy": 240.25, "dep
 def test_intrinsics(content: bytes, attempt: Any, tmp_path: Path) -> None:
     path = tmp_path / "k.json"
     path.write_bytes(content)
-    found = attempt(lambda: read_intrinsics(path))
-    if found is not None:
-        assert found.fx > 0 and np.isfinite([found.fx, found.fy, found.cx, found.cy, found.depth_scale]).all()
+    intrinsics = attempt(lambda: read_intrinsics(path))
+    if intrinsics is not None:
+        assert (
+            intrinsics.fx > 0
+            and np.isfinite([intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy, intrinsics.depth_scale]).all()
+        )
 
 
 @pytest.mark.parametrize(

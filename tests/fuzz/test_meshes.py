@@ -49,7 +49,7 @@ NAMES = ("textured.glb", "painted.glb", "quad.obj", "binary.ply", "text.ply")
 
 
 def check(mesh: TexturedMesh | None) -> None:
-    """A mesh that is read can be rendered: every index is one, every number finite."""
+    """Assert that a mesh that was read can be rendered: indices are in range and numbers are finite."""
     if mesh is None:
         return
     assert np.isfinite(mesh.vertices).all() and 0 <= mesh.faces.min() <= mesh.faces.max() < len(mesh.vertices)
@@ -67,7 +67,7 @@ def test_meshes(name: str, data: st.DataObject, folder: Path, attempt: Any) -> N
 
 
 def glb(table: bytes, binary: bytes) -> bytes:
-    """A GLB file with the right lengths of what it holds."""
+    """Return a GLB file with valid lengths of its chunks."""
     parts = [(b"JSON", table + b" " * (-len(table) % 4)), (b"BIN\0", binary + b"\0" * (-len(binary) % 4))]
     body = b"".join(struct.pack("<I", len(content)) + kind + content for kind, content in parts)
     return struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body
@@ -80,7 +80,9 @@ def parts_of(content: bytes) -> tuple[bytes, bytes]:
 
 @pytest.mark.parametrize("name", ["textured.glb", "painted.glb"])
 @given(data=st.data(), table_first=st.booleans())
-def test_glb_with_right_lengths(name: str, data: st.DataObject, table_first: bool, folder: Path, attempt: Any) -> None:
+def test_damaged_glb_with_valid_lengths(
+    name: str, data: st.DataObject, table_first: bool, folder: Path, attempt: Any
+) -> None:
     table, binary = parts_of((folder / name).read_bytes())
     if table_first:
         table = data.draw(damaged(table, 2))
@@ -101,7 +103,7 @@ def numbers_in(table: Any, place: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]
 @pytest.mark.parametrize("name", ["textured.glb", "painted.glb"])
 @pytest.mark.parametrize("value", [-1, 0, 3, 2**31 - 1, 10**12])
 def test_every_number_of_a_glb_table(name: str, value: int, folder: Path, attempt: Any) -> None:
-    """Counts, offsets, types, indices of nodes: some would fill memory or go round in circles."""
+    """Replaces counts, offsets, types and indices of nodes; some values would fill memory or form a cycle."""
     table, binary = parts_of((folder / name).read_bytes())
     path = folder / "damaged.glb"
     for place in numbers_in(json.loads(table)):
@@ -114,7 +116,7 @@ def test_every_number_of_a_glb_table(name: str, value: int, folder: Path, attemp
         check(attempt(lambda: load_mesh(path)))
 
 
-def test_nodes_that_go_round_in_circles(folder: Path, attempt: Any) -> None:
+def test_cyclic_nodes(folder: Path, attempt: Any) -> None:
     table, binary = parts_of((folder / "painted.glb").read_bytes())
     changed = json.loads(table)
     for k, node in enumerate(changed["nodes"]):
@@ -126,7 +128,7 @@ def test_nodes_that_go_round_in_circles(folder: Path, attempt: Any) -> None:
 
 @pytest.mark.parametrize("name", ["quad.mtl", "texture"])
 @given(data=st.data())
-def test_what_an_obj_refers_to(
+def test_damaged_material_and_texture_of_an_obj(
     name: str, data: st.DataObject, folder: Path, attempt: Any, tmp_path_factory: Any
 ) -> None:
     others = {p.name: p.read_bytes() for p in folder.iterdir() if p.suffix in (".mtl", ".png", ".jpeg", ".jpg")}
@@ -172,5 +174,5 @@ def test_tables_of_names(suffix: str, data: st.DataObject, folder: Path, attempt
     content = b'{"mug": "025_mug", "bowl": "024_bowl"}' if suffix == "json" else b"mug: 025_mug\nbowl: 024_bowl\n"
     path = folder / f"names.{suffix}"
     path.write_bytes(data.draw(damaged(content)))
-    found = attempt(lambda: read_names(path))
-    assert found is None or all(type(a) is type(b) is str for a, b in found.items())
+    names = attempt(lambda: read_names(path))
+    assert names is None or all(type(a) is type(b) is str for a, b in names.items())

@@ -1,4 +1,4 @@
-"""Damaged run directories, and damaged files of a training and an evaluation."""
+"""Damaged run directories, and damaged files of trainings and evaluations."""
 
 import json
 import shutil
@@ -26,7 +26,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def damaged_and_back(path: Path, content: bytes, read: Any, attempt: Any) -> Any:
+def read_damaged(path: Path, content: bytes, read: Any, attempt: Any) -> Any:
+    """Call a reader while a file has another content, and restore the file."""
     before = path.read_bytes()
     path.write_bytes(content)
     try:
@@ -37,7 +38,7 @@ def damaged_and_back(path: Path, content: bytes, read: Any, attempt: Any) -> Any
 
 @given(data=st.data())
 def test_descriptions(data: st.DataObject, run: Path, attempt: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A damaged run.json is refused or is read as a run of the right types. Weights are not restored."""
+    """A damaged run.json is refused or read as a run with valid types; weights are not restored here."""
     content = (run / "run.json").read_bytes()
     if data.draw(st.booleans()):
         other = data.draw(damaged(content))
@@ -48,7 +49,7 @@ def test_descriptions(data: st.DataObject, run: Path, attempt: Any, monkeypatch:
         other = json.dumps(table | {key: "PART"}).encode().replace(b'"PART"', part)
     with monkeypatch.context() as patch:
         patch.setattr("thor2_jax.recognition.run_directory.model_from_arrays", lambda create, arrays: None)
-        loaded = damaged_and_back(run / "run.json", other, lambda: load_run(run), attempt)
+        loaded = read_damaged(run / "run.json", other, lambda: load_run(run), attempt)
     if loaded is not None:
         assert isinstance(loaded.config, thor2.DescriptorConfig) and isinstance(loaded.record, dict)
         assert loaded.classes and all(isinstance(name, str) for name in loaded.classes)
@@ -61,8 +62,8 @@ def test_files_of_weights_and_network(data: st.DataObject, run: Path, attempt: A
     path = data.draw(st.sampled_from(files))
     other = data.draw(damaged(path.read_bytes()))
     same = other == path.read_bytes()
-    found = damaged_and_back(path, other, lambda: same or load_run(run), attempt)
-    assert (found is None) == (not same)
+    loaded = read_damaged(path, other, lambda: same or load_run(run), attempt)
+    assert (loaded is None) == (not same)
 
 
 @pytest.mark.parametrize("value", ["9" * 5000, "[" * 10**5, "1e400", "-1", "null"])
@@ -71,11 +72,11 @@ def test_odd_numbers(value: str, run: Path, attempt: Any) -> None:
         table = json.loads((run / "run.json").read_bytes())
         table["descriptor_config"][key] = "PART"
         other = json.dumps(table).replace('"PART"', value).encode()
-        assert damaged_and_back(run / "run.json", other, lambda: load_run(run), attempt) is None
+        assert read_damaged(run / "run.json", other, lambda: load_run(run), attempt) is None
 
 
 def test_sizes_that_would_fill_memory(run: Path, attempt: Any, tmp_path: Path) -> None:
-    """The shapes of the weights are compared before any array is made."""
+    """The shapes of the weights are compared before any array is allocated."""
     path = Path(shutil.copytree(run, tmp_path / "run"))
     for key in ("n_slices", "n_strips"):
         table = json.loads((run / "run.json").read_bytes())
@@ -84,17 +85,19 @@ def test_sizes_that_would_fill_memory(run: Path, attempt: Any, tmp_path: Path) -
         assert attempt(lambda: load_run(path)) is None
 
 
-ASKED = {"runs": ["a"], "classes": ["mug", "bowl"]}
+EVALUATION = {"runs": ["a"], "classes": ["mug", "bowl"]}
 
 
 @pytest.fixture(scope="module")
 def answers(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     path = tmp_path_factory.mktemp("answers") / "answers.jsonl"
-    file = AnswerFile(path, ASKED)
+    file = AnswerFile(path, EVALUATION)
     for number in range(2):
-        said = InstancePrediction(1, "mug", probabilities=np.array([[0.25, 0.75]], np.float32))
+        prediction = InstancePrediction(1, "mug", probabilities=np.array([[0.25, 0.75]], np.float32))
         file.append(
-            FrameAnswers(f"frame {number}", {"light": "1"}, 0.5, [said, InstancePrediction(2, "can", reason="few")])
+            FrameAnswers(
+                f"frame {number}", {"light": "1"}, 0.5, [prediction, InstancePrediction(2, "can", reason="few")]
+            )
         )
     return path.read_bytes()
 
@@ -103,9 +106,9 @@ def answers(tmp_path_factory: pytest.TempPathFactory) -> bytes:
 def test_answers(data: st.DataObject, answers: bytes, attempt: Any, tmp_path_factory: Any) -> None:
     path = tmp_path_factory.getbasetemp() / "answers.jsonl"
     path.write_bytes(data.draw(damaged(answers)))
-    found = attempt(lambda: AnswerFile(path, ASKED))
-    if found is not None:
-        tables = [instance.probabilities for frame in found.frames for instance in frame.instances]
+    file = attempt(lambda: AnswerFile(path, EVALUATION))
+    if file is not None:
+        tables = [instance.probabilities for frame in file.frames for instance in frame.instances]
         assert all(table is None or (table.dtype, table.ndim) == (np.float32, 2) for table in tables)
 
 
@@ -115,10 +118,10 @@ def test_baselines(data: st.DataObject, attempt: Any, tmp_path_factory: Any) -> 
     stored = StoredBaseline({"a": np.arange(6.0).reshape(2, 3), "b": np.array([1], np.int32)}, 1.5, 2.0)
     write_baseline(path, stored, ["mug"])
     path.write_bytes(data.draw(damaged(path.read_bytes())))
-    found = attempt(lambda: read_baseline(path, ["mug"]))
-    if found is not None:
-        assert (found.temperature, found.seconds) == (1.5, 2.0) and found.arrays.keys() == stored.arrays.keys()
-        assert all(np.array_equal(found.arrays[name], array) for name, array in stored.arrays.items())
+    loaded = attempt(lambda: read_baseline(path, ["mug"]))
+    if loaded is not None:
+        assert (loaded.temperature, loaded.seconds) == (1.5, 2.0) and loaded.arrays.keys() == stored.arrays.keys()
+        assert all(np.array_equal(loaded.arrays[name], array) for name, array in stored.arrays.items())
 
 
 ROWS = b"".join(
@@ -128,11 +131,11 @@ ROWS = b"".join(
 
 
 @given(content=damaged(ROWS))
-def test_figures(content: bytes, attempt: Any, tmp_path_factory: Any) -> None:
+def test_metrics(content: bytes, attempt: Any, tmp_path_factory: Any) -> None:
     path = tmp_path_factory.getbasetemp() / "metrics.jsonl"
     path.write_bytes(content)
-    found = attempt(lambda: read_metrics(path))
-    assert found is None or all((row["fold"], row["classifier"], row["epoch"]) for row in found)
+    rows = attempt(lambda: read_metrics(path))
+    assert rows is None or all((row["fold"], row["classifier"], row["epoch"]) for row in rows)
 
 
 def test_whole_runs_are_read(run: Path) -> None:

@@ -27,10 +27,10 @@ from training.views.dataset import MANIFEST, Manifest, Shard, ViewDataset, encod
 from training.views.normalized_views import NormalizedViews
 
 HEIGHT, WIDTH = 6, 8
-LAUGHS = "\n".join(
+YAML_BOMB = "\n".join(
     ["a0: &a0 [x, x, x, x, x, x, x, x]"] + [f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 8)}]" for k in range(1, 12)]
 ).encode()
-"""A few hundred bytes of YAML that are 8^12 words when they are written out."""
+"""A few hundred bytes of YAML that expand to 8^12 words."""
 
 
 def save(path: Path, pixels: np.ndarray) -> None:
@@ -106,7 +106,7 @@ def folders(path: Path) -> tuple[Any, list[str]]:
 
 @pytest.mark.parametrize("make", [bop, ocid, uwis, folders], ids=lambda make: make.__name__)
 def test_datasets(make: Any, attempt: Any, tmp_path_factory: pytest.TempPathFactory) -> None:
-    """One table or cloud of a small dataset is damaged; the whole is read."""
+    """One table or cloud of a small dataset is damaged, and the whole dataset is read."""
     path = tmp_path_factory.mktemp(make.__name__)
     read, names = make(path)
     assert len(read()) == 1
@@ -114,23 +114,23 @@ def test_datasets(make: Any, attempt: Any, tmp_path_factory: pytest.TempPathFact
 
     @settings(settings.get_profile("fuzz-quick"))
     @given(data=st.data(), name=st.sampled_from(names))
-    def law(data: st.DataObject, name: str) -> None:
+    def damage(data: st.DataObject, name: str) -> None:
         (path / name).write_bytes(data.draw(damaged(whole[name])))
         try:
-            found = attempt(read)
+            frames = attempt(read)
         finally:
             (path / name).write_bytes(whole[name])
-        assert found is None or all(type(v) is str for item in found for v in item.truth.values())
+        assert frames is None or all(type(v) is str for item in frames for v in item.truth.values())
 
-    law()
+    damage()
     for name in names:
-        for content in (LAUGHS, b"[" * 5000, b"!!int ''", b"!!timestamp 2020-99-99", b"? [a]\n: b", b"2: &a [*a]"):
+        for content in (YAML_BOMB, b"[" * 5000, b"!!int ''", b"!!timestamp 2020-99-99", b"? [a]\n: b", b"2: &a [*a]"):
             (path / name).write_bytes(content)
             attempt(read)
             (path / name).write_bytes(whole[name])
 
 
-@pytest.mark.parametrize("content", [LAUGHS, b"a: " + b"[" * 5000, b"!!int ''", b"a: &b [*b]", b"a: !!float ''"])
+@pytest.mark.parametrize("content", [YAML_BOMB, b"a: " + b"[" * 5000, b"!!int ''", b"a: &b [*b]", b"a: !!float ''"])
 def test_odd_yaml(content: bytes, attempt: Any, tmp_path: Path) -> None:
     path = tmp_path / "table.yaml"
     path.write_bytes(content)
@@ -143,8 +143,8 @@ def test_odd_yaml(content: bytes, attempt: Any, tmp_path: Path) -> None:
 def test_point_clouds(kind: str, data: st.DataObject, attempt: Any, tmp_path_factory: Any) -> None:
     path = tmp_path_factory.getbasetemp() / "a.pcd"
     path.write_bytes(data.draw(damaged(pcd(kind))))
-    found = attempt(lambda: read_organized_points(path))
-    assert found is None or (found.ndim == 3 and found.shape[2] == 3)
+    points = attempt(lambda: read_organized_points(path))
+    assert points is None or (points.ndim == 3 and points.shape[2] == 3)
 
 
 @pytest.fixture(scope="module")
@@ -154,10 +154,10 @@ def views(tmp_path_factory: pytest.TempPathFactory) -> Path:
     counts = np.array([5, 7])
     xyz = rng.integers(0, 2**14, (12, 3)).astype(np.float32) / 2**14
     numbers = np.array([0, 1], np.int32)
-    found = NormalizedViews(
+    normalized = NormalizedViews(
         xyz, rng.integers(0, 256, (12, 3), dtype=np.uint8), counts, 0, numbers, np.zeros(2, np.int32)
     )
-    content = encode(found)
+    content = encode(normalized)
     (path / "0000-0000.safetensors").write_bytes(content)
     shard = Shard("0000-0000.safetensors", hashlib.sha256(content).hexdigest(), 0, 2, 0, 12)
     Manifest({"descriptor_version": 1, "objects": [{"name": "mug", "mesh": "0"}], "shards": 1}, (shard,)).write(path)
@@ -178,18 +178,18 @@ def test_views(name: str, data: st.DataObject, views: Path, attempt: Any) -> Non
 
 
 def check_views(name: str, other: bytes, views: Path, attempt: Any) -> None:
-    """With another content, a file is refused, unless that says the same."""
+    """Assert that a file with another content is refused unless its meaning is the same."""
     content = (views / name).read_bytes()
     (views / name).write_bytes(other)
     try:
-        found = attempt(lambda: read_views(views))
+        loaded = attempt(lambda: read_views(views))
     finally:
         (views / name).write_bytes(content)
-    assert (found is None) == (said(name, other) != said(name, content))
+    assert (loaded is None) == (meaning(name, other) != meaning(name, content))
 
 
-def said(name: str, content: bytes) -> Any:
-    """Of a manifest, neither how it is laid out nor where its checksum stands."""
+def meaning(name: str, content: bytes) -> Any:
+    """Return a manifest without its layout and the position of its checksum; other files as they are."""
     if name != MANIFEST:
         return content
     try:
@@ -199,15 +199,15 @@ def said(name: str, content: bytes) -> Any:
         return None
 
 
-def test_manifests_laid_out_otherwise(views: Path, attempt: Any) -> None:
+def test_the_layout_of_a_manifest_does_not_matter(views: Path, attempt: Any) -> None:
     table = json.loads((views / MANIFEST).read_bytes())
     for other in (table, {"sha256": table["sha256"], **table}, {**table, "views": 2.0}):
         check_views(MANIFEST, json.dumps(other).encode(), views, attempt)
 
 
 @given(data=st.data())
-def test_a_manifest_with_a_right_checksum(data: st.DataObject, views: Path, attempt: Any) -> None:
-    """As of another program: the table is whole, and says something else."""
+def test_a_damaged_manifest_with_a_valid_checksum(data: st.DataObject, views: Path, attempt: Any) -> None:
+    """The JSON is valid but was changed, as by another program."""
     content = (views / MANIFEST).read_bytes()
     table = json.loads(content)
     del table["sha256"]
@@ -226,7 +226,7 @@ def test_a_manifest_with_a_right_checksum(data: st.DataObject, views: Path, atte
 
 @given(data=st.data())
 def test_networks(data: st.DataObject, attempt: Any, tmp_path_factory: Any) -> None:
-    """The whole file, or one of its arrays in an archive with the right checksums."""
+    """Damages the whole file, or one of its arrays in an archive with valid checksums."""
     path = tmp_path_factory.getbasetemp() / "network.npz"
     content = NETWORK_FILE
     if data.draw(st.booleans()):
@@ -241,9 +241,9 @@ def test_networks(data: st.DataObject, attempt: Any, tmp_path_factory: Any) -> N
                 target.writestr(member, data.draw(damaged(head, 1)) + part[256:] if member == name else part)
         content = stream.getvalue()
     path.write_bytes(content)
-    found = attempt(lambda: colornet.load(path), (ValueError, OSError))
-    if found is not None:
-        weights = found.membership(np.arange(300, dtype=np.uint16).astype(np.uint8).reshape(-1, 3))
+    network = attempt(lambda: colornet.load(path), (ValueError, OSError))
+    if network is not None:
+        weights = network.membership(np.arange(300, dtype=np.uint16).astype(np.uint8).reshape(-1, 3))
         np.testing.assert_allclose(weights.sum(axis=1), 1, rtol=1e-6)
 
 
@@ -252,7 +252,7 @@ NETWORK_FILE = (Path(colornet.__file__).parent / "data" / "network.npz").read_by
 
 @pytest.mark.parametrize("times", [400, 4000])
 def test_an_archive_that_would_fill_memory(times: int, attempt: Any, tmp_path: Path) -> None:
-    """Zeros: a thousandth of their size in the file."""
+    """An array of zeros takes a thousandth of its size in the archive."""
     path = tmp_path / "bomb.npz"
     header = io.BytesIO()
     np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": (times * 2**17,)})
@@ -269,7 +269,7 @@ def test_an_archive_that_would_fill_memory(times: int, attempt: Any, tmp_path: P
 
 @settings(max_examples=10)
 @given(network=networks())
-def test_networks_come_back(network: colornet.ColorNetwork, tmp_path_factory: Any) -> None:
+def test_networks_round_trip(network: colornet.ColorNetwork, tmp_path_factory: Any) -> None:
     path = tmp_path_factory.getbasetemp() / "network.npz"
     network.save(path)
     assert colornet.load(path).fingerprint == network.fingerprint

@@ -59,11 +59,11 @@ Array = np.ndarray
 def render(mesh: TexturedMesh, azimuth: float, polar: float) -> tuple[Array, Array]:
     """Return the depth [H, W] in whole millimetres (0: background) and the colour [H, W, 3] seen from 1.5 m."""
     outward = np.array([math.sin(polar) * math.cos(azimuth), math.sin(polar) * math.sin(azimuth), math.cos(polar)])
-    right = np.array([-math.sin(azimuth), math.cos(azimuth), 0])
-    down = np.cross(-outward, right)
+    sideways = np.array([-math.sin(azimuth), math.cos(azimuth), 0])
+    down = np.cross(-outward, sideways)
     used = mesh.vertices[np.unique(mesh.faces)]
     position = (used.min(axis=0) + used.max(axis=0)) / 2 + DISTANCE * outward
-    vertices = (mesh.vertices - position) @ np.stack([right, down, -outward]).T
+    vertices = (mesh.vertices - position) @ np.stack([sideways, down, -outward]).T
     focal, centre = WIDTH / 2 / math.tan(FIELD_OF_VIEW / 2), (np.array([WIDTH, HEIGHT]) - 1) / 2
     depth, color = np.full((HEIGHT, WIDTH), np.inf), np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     for number, face in enumerate(mesh.faces):

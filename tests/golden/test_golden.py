@@ -1,4 +1,4 @@
-"""Every stage of the descriptor against outputs computed outside the engine.
+"""Each stage of the descriptor against outputs of an independent implementation.
 
 Views of built-in objects, from `make_golden.py`, and views of real scans where the folder `shared` is present.
 """
@@ -17,7 +17,7 @@ TOLERANCE = 1e-6
 """Absolute for images, diagrams and colour matrices, relative for embeddings (float32 sums)."""
 
 NEAR = 1e-7
-"""A point this close to a slice or strip border, in scaled units, may be counted on either side of it."""
+"""Distance to a border of slices or strips, in scaled units, below which rounding may change the side of a point."""
 
 BACKENDS = ("gudhi", "closed_form")
 
@@ -55,7 +55,7 @@ def normalized(paths: tuple[Path, ...]) -> tuple[list[np.ndarray], np.ndarray]:
 
 
 def test_no_point_lies_on_a_border(golden_files: tuple[Path, ...]) -> None:
-    """All strips can be compared below, with no allowance for points that fall on the other side."""
+    """No point is close enough to a border for rounding to change its strip, so that all strips can be compared."""
     for path in golden_files:
         points = load(path)["aligned"].astype(np.float64)
         for axis, width in ((0, 0.025), (2, 0.1)):
@@ -97,7 +97,7 @@ def test_boxes_are_no_larger_than_the_references(golden_files: tuple[Path, ...])
 
 
 def test_boxes_are_as_small_as_an_exhaustive_search(golden_files: tuple[Path, ...]) -> None:
-    """The search of trimesh tries every face of the convex hull as a side of the box."""
+    """The search in trimesh tries every face of the convex hull as a side of the box."""
     ratios = []
     for path, points in zip(golden_files, normalized(golden_files)[0], strict=True):
         smallest = np.prod(trimesh.bounds.oriented_bounds(load(path)["points"].astype(np.float64))[1])
@@ -120,7 +120,7 @@ def test_normalization_is_a_rigid_motion(golden_files: tuple[Path, ...]) -> None
 
 
 @pytest.mark.slow
-def test_files_are_those_of_the_script(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_script_reproduces_the_files(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(Path(__file__).parent)
     import make_golden
 

@@ -1,4 +1,4 @@
-"""The ways of calling the software that every law is held to."""
+"""The backends, execution modes and buckets in which every property is tested."""
 
 import dataclasses
 import functools
@@ -12,27 +12,27 @@ import thor2_jax as thor2
 
 NETWORK = colornet.load_default()
 SIZE = 4
-"""Clouds in a batch; two batches of two under vmap."""
+"""Number of clouds in a batch; under vmap, two batches of two."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Pipeline:
-    """The functions under test, called plainly, under jit, or under vmap, with clouds padded to one capacity."""
+    """The functions under test, called directly, under jit or under vmap, with clouds padded to one capacity."""
 
     config: thor2.DescriptorConfig
     mode: str
     capacity: int
 
-    def _called(self, function: Any, *arguments: Any) -> Any:
+    def _call(self, function: Any, *arguments: Any) -> Any:
         return _compiled(function, self.config, self.mode)(*arguments)
 
     def describe(self, clouds: thor2.PointClouds, parameters: thor2.Parameters | None = None) -> thor2.Descriptors:
-        return self._called(thor2.describe, clouds, parameters or thor2.Parameters.of(NETWORK, self.config))
+        return self._call(thor2.describe, clouds, parameters or thor2.Parameters.of(NETWORK, self.config))
 
     def describe_aligned(
         self, aligned: thor2.PointClouds, parameters: thor2.Parameters | None = None
     ) -> thor2.Descriptors:
-        return self._called(thor2.describe_aligned, aligned, parameters or thor2.Parameters.of(NETWORK, self.config))
+        return self._call(thor2.describe_aligned, aligned, parameters or thor2.Parameters.of(NETWORK, self.config))
 
 
 @functools.cache
@@ -63,14 +63,14 @@ QUICK = {
 
 
 def ways(*capacities: int) -> list[Any]:
-    """Backends, ways of calling and buckets: each at least once; their other combinations are slow."""
-    found = []
+    """Return all combinations of backend, mode and bucket; those that are not in QUICK are marked slow."""
+    parameters = []
     for n in capacities:
         for mode in ("plain", "jit", "vmap"):
             for homology in ("closed_form", "gudhi"):
                 marks = () if (homology, mode, n) in QUICK else pytest.mark.slow
-                found.append(pytest.param((homology, mode, n), marks=marks, id=f"{homology}-{mode}-{n}"))
-    return found
+                parameters.append(pytest.param((homology, mode, n), marks=marks, id=f"{homology}-{mode}-{n}"))
+    return parameters
 
 
 def pipeline_of(way: tuple[Any, str, int]) -> Pipeline:
@@ -79,11 +79,11 @@ def pipeline_of(way: tuple[Any, str, int]) -> Pipeline:
 
 @pytest.fixture(scope="session", params=ways(512, 1024))
 def pipeline(request: pytest.FixtureRequest) -> Pipeline:
-    """Backend, way of calling and bucket."""
+    """Backend, mode and bucket."""
     return pipeline_of(request.param)
 
 
 @pytest.fixture(scope="session", params=ways(512))
 def small_pipeline(request: pytest.FixtureRequest) -> Pipeline:
-    """Backend and way of calling, in the smallest bucket."""
+    """Backend and mode, in the smallest bucket."""
     return pipeline_of(request.param)

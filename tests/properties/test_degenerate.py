@@ -1,4 +1,4 @@
-"""Degenerate clouds: no NaN and no infinity, neither in values nor in gradients, hard and relaxed, jit and vmap."""
+"""Degenerate clouds: values and gradients are finite, hard and relaxed, under jit and vmap."""
 
 import dataclasses
 from typing import Any
@@ -42,7 +42,7 @@ CLOUDS = {
     "tiny": 1e-20 * BALL,
 }
 GREYS = np.linspace(0, 1, 256).astype(np.float32)
-"""Black, white, every grey, halfway between grid colours or on them."""
+"""Every grey from black to white, on grid colours and between them."""
 
 
 def packed() -> thor2.PointClouds:
@@ -69,28 +69,28 @@ def test_values_and_gradients_are_finite(name: str, aligned: bool) -> None:
 
     def outputs(cloud: thor2.PointClouds, points: Any, colors: Any, parameters: Any) -> Any:
         one = dataclasses.replace(cloud, points=points, colors=colors)
-        found = describe(jax.tree.map(lambda a: a[None], one), NETWORK, config, parameters)
-        return found.tops2.sum() + (found.tops2**2).sum(), found
+        descriptors = describe(jax.tree.map(lambda a: a[None], one), NETWORK, config, parameters)
+        return descriptors.tops2.sum() + (descriptors.tops2**2).sum(), descriptors
 
     def each(cloud: thor2.PointClouds) -> Any:
         parameters = thor2.Parameters.of(NETWORK, config)
         differentiated = jax.value_and_grad(outputs, argnums=(1, 2, 3), has_aux=True)
         return differentiated(cloud, cloud.points, cloud.colors, parameters)
 
-    (_, found), gradients = jax.jit(jax.vmap(each))(clouds)
+    (_, descriptors), gradients = jax.jit(jax.vmap(each))(clouds)
     for k, cloud in enumerate(CLOUDS):
-        of_cloud = jax.tree.map(lambda a: a[k], (found, gradients))  # noqa: B023
+        of_cloud = jax.tree.map(lambda a: a[k], (descriptors, gradients))  # noqa: B023
         try:
             assert_finite(of_cloud)
         except AssertionError as error:
             raise AssertionError(f"{cloud}: {error}") from None
-    empty = jax.tree.map(lambda a: np.asarray(a[0]), (found.tops2, gradients))
+    empty = jax.tree.map(lambda a: np.asarray(a[0]), (descriptors.tops2, gradients))
     assert not any(leaf.any() for leaf in jax.tree.leaves(empty))
 
 
 @pytest.mark.parametrize("exponent", [0.5, 1.0, 2.0])
 def test_strips_without_persistence(exponent: float) -> None:
-    """Every strip holds one point: no persistence at all, whatever the exponent of the weight."""
+    """If every strip holds one point, all persistences are 0, for any exponent of the weight."""
     points = np.stack([(np.arange(8) + 0.5) * 0.025, np.full(8, 0.1), np.full(8, 0.05)], axis=1)
     config = CONFIGS["closed_form"]
     aligned = thor2.PointClouds.pack([(points, np.full((8, 3), 0.5))], 16)

@@ -1,4 +1,4 @@
-"""Laws on the way from a frame to its clouds."""
+"""Properties of the clouds of a frame."""
 
 from hypothesis import given
 

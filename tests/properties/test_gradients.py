@@ -35,7 +35,7 @@ def x64() -> Iterator[None]:
 
 
 def in_cells(seed: int) -> np.ndarray:
-    """Points of the first octant, none near a border of slices and strips, so that no small step crosses one."""
+    """Return points of the first octant that stay in their slice and strip after a small step."""
     rng = np.random.default_rng(seed)
     cells = rng.integers(0, [8, 1, 3], (COUNT, 3))
     return (cells + rng.uniform(0.1, 0.9, (COUNT, 3))) * [0.025, 0.25, 0.1]
@@ -61,10 +61,10 @@ def parameters_of(config: thor2.DescriptorConfig, dtype: Any = np.float64) -> th
     return jax.tree.map(lambda a: jnp.asarray(a, dtype), exact)
 
 
-def probed(found: thor2.Descriptors) -> jax.Array:
-    """A sum with weights of either sign over every output."""
-    probe = jnp.asarray(np.random.default_rng(5).normal(size=found.tops2.shape[-1]), found.tops2.dtype)
-    return (found.tops2 * probe).sum()
+def probed(descriptors: thor2.Descriptors) -> jax.Array:
+    """Return a sum of all outputs with random weights of both signs."""
+    probe = jnp.asarray(np.random.default_rng(5).normal(size=descriptors.tops2.shape[-1]), descriptors.tops2.dtype)
+    return (descriptors.tops2 * probe).sum()
 
 
 def loss_of(describe: Loss, clouds: thor2.PointClouds, config: thor2.DescriptorConfig) -> Loss:
@@ -76,11 +76,11 @@ def loss_of(describe: Loss, clouds: thor2.PointClouds, config: thor2.DescriptorC
 
 
 def assert_differences_agree(loss: Loss, *arguments: Any, step: float = 1e-6) -> list[float]:
-    """Each leaf's gradient along a random direction against a central difference; returns the derivatives found."""
+    """Compare each leaf's derivative along a random direction with a central difference; return the derivatives."""
     leaves, tree = jax.tree.flatten(arguments)
     value = jax.jit(lambda *leaves: loss(*jax.tree.unflatten(tree, leaves)))
     gradients = jax.tree.leaves(jax.jit(jax.grad(loss, argnums=tuple(range(len(arguments)))))(*arguments))
-    rng, found = np.random.default_rng(1), []
+    rng, derivatives = np.random.default_rng(1), []
     for k, (leaf, gradient) in enumerate(zip(leaves, gradients, strict=True)):
         assert gradient.dtype == np.float64
         direction = rng.normal(size=leaf.shape) * float(step * jnp.abs(leaf).max())
@@ -88,8 +88,8 @@ def assert_differences_agree(loss: Loss, *arguments: Any, step: float = 1e-6) ->
         expected = float(ends[0] - ends[1]) / 2 / step
         along = float((gradient * direction).sum()) / step
         assert along == pytest.approx(expected, rel=2e-5, abs=1e-6), f"argument {k}"
-        found.append(along)
-    return found
+        derivatives.append(along)
+    return derivatives
 
 
 @pytest.mark.usefixtures("x64")
@@ -97,16 +97,16 @@ def assert_differences_agree(loss: Loss, *arguments: Any, step: float = 1e-6) ->
 def test_aligned_clouds_against_finite_differences(name: str) -> None:
     config, aligned = CONFIGS[name], clouds_of(in_cells)
     loss = loss_of(thor2.describe_aligned, aligned, config)
-    found = assert_differences_agree(loss, aligned.points, aligned.colors, parameters_of(config))
-    points, colors, similarity, alpha, sigma_s, variance, weight = found
-    assert 0 not in (points, similarity, variance, weight) and alpha == sigma_s == 0  # what is aligned stays so
+    derivatives = assert_differences_agree(loss, aligned.points, aligned.colors, parameters_of(config))
+    points, colors, similarity, alpha, sigma_s, variance, weight = derivatives
+    assert 0 not in (points, similarity, variance, weight) and alpha == sigma_s == 0  # the clouds are already aligned
     assert (colors != 0) == (config.relaxation is not None)
 
 
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize("name", ["closed_form", "relaxed"])
-def test_the_whole_way_against_finite_differences(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In a frame that stands still: no gradient goes through it."""
+def test_describe_against_finite_differences(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The frame is fixed, since no gradient goes through it."""
     config, clouds = CONFIGS[name], clouds_of(in_metres, 1)
     frame = jnp.asarray(np.linalg.qr(np.random.default_rng(2).normal(size=(3, 3)))[0])
 
@@ -119,14 +119,14 @@ def test_the_whole_way_against_finite_differences(name: str, monkeypatch: pytest
     def describe(
         clouds: thor2.PointClouds, network: Any, config: thor2.DescriptorConfig, parameters: thor2.Parameters
     ) -> thor2.Descriptors:
-        # What is compiled already has another frame in it.
+        # The function that is already compiled contains another frame.
         points, camera = view_normalization._align.__wrapped__(clouds, parameters.sigma_s, parameters.alpha)
         aligned = dataclasses.replace(clouds, points=points, camera=camera)
         return thor2.describe_aligned(aligned, network, config, parameters)
 
     loss = loss_of(describe, clouds, config)
-    found = assert_differences_agree(loss, clouds.points, clouds.colors, parameters_of(config))
-    points, colors, similarity, alpha, sigma_s, variance, weight = found
+    derivatives = assert_differences_agree(loss, clouds.points, clouds.colors, parameters_of(config))
+    points, colors, similarity, alpha, sigma_s, variance, weight = derivatives
     assert 0 not in (points, similarity, sigma_s, variance, weight)
     for value in (colors, alpha):
         assert (value != 0) == (config.relaxation is not None)
@@ -134,7 +134,7 @@ def test_the_whole_way_against_finite_differences(name: str, monkeypatch: pytest
 
 @pytest.mark.usefixtures("x64")
 def test_points_and_scale_agree_on_scaling() -> None:
-    """All points scaled about the camera turn no frame: the same change as that of sigma_s, frame search included."""
+    """Scaling all points about the camera keeps the frame and has the same effect as scaling sigma_s."""
     clouds, parameters = clouds_of(in_metres), parameters_of(CLOSED)
     loss = loss_of(thor2.describe, clouds, CLOSED)
     points, gradients = jax.jit(jax.grad(loss, argnums=(0, 2)))(clouds.points, clouds.colors, parameters)
@@ -149,7 +149,7 @@ RELAXED = pytest.param(("relaxed", "relaxed-gudhi"), marks=pytest.mark.slow, id=
 
 
 @pytest.mark.parametrize("names", [pytest.param(("closed_form", "gudhi"), id="hard"), RELAXED])
-def test_both_backends_and_one_cloud_at_a_time_give_the_same_gradient(names: tuple[str, str]) -> None:
+def test_gradients_of_backends_and_of_single_clouds_agree(names: tuple[str, str]) -> None:
     clouds = clouds_of(in_cells, 3, np.float32)
     parameters = parameters_of(CLOSED, np.float32)
     whole = []
@@ -174,19 +174,19 @@ def test_both_backends_and_one_cloud_at_a_time_give_the_same_gradient(names: tup
 def test_default_parameters_are_those_of_network_and_config() -> None:
     clouds = clouds_of(in_metres, 2, np.float32)
     config = dataclasses.replace(CLOSED, alpha=0.6, sigma_s=2.0, image_variance=0.0005, persistence_weight=1.5)
-    plain = thor2.describe(clouds, NETWORK, config)
-    given = thor2.describe(clouds, NETWORK, CLOSED, thor2.Parameters.of(NETWORK, config))
+    by_default = thor2.describe(clouds, NETWORK, config)
+    explicit = thor2.describe(clouds, NETWORK, CLOSED, thor2.Parameters.of(NETWORK, config))
     for name in ("images", "embeddings", "overflow"):
-        np.testing.assert_array_equal(getattr(given, name), getattr(plain, name))
-    assert np.abs(np.asarray(plain.tops2 - thor2.describe(clouds, NETWORK, CLOSED).tops2)).max() > 0.01
+        np.testing.assert_array_equal(getattr(explicit, name), getattr(by_default, name))
+    assert np.abs(np.asarray(by_default.tops2 - thor2.describe(clouds, NETWORK, CLOSED).tops2)).max() > 0.01
 
 
-def test_other_values_compile_nothing(caplog: pytest.LogCaptureFixture) -> None:
+def test_other_parameter_values_do_not_recompile(caplog: pytest.LogCaptureFixture) -> None:
     clouds, parameters = clouds_of(in_metres, 2, np.float32), thor2.Parameters.of(NETWORK, CLOSED)
     thor2.describe(clouds, NETWORK, CLOSED)
     others = [jax.tree.map(lambda a, k=k: a * (1 + 0.1 * k), parameters) for k in range(3)]
     with jax.log_compiles(), caplog.at_level(logging.WARNING):
-        found = [np.asarray(thor2.describe(clouds, NETWORK, CLOSED, other).tops2) for other in others]
+        outputs = [np.asarray(thor2.describe(clouds, NETWORK, CLOSED, other).tops2) for other in others]
     compiled = [record.getMessage() for record in caplog.records if "Finished XLA compilation" in record.getMessage()]
     assert not [line for line in compiled if "reshape" not in line and "concatenate" not in line], compiled
-    assert np.abs(found[0] - found[1]).max() > 0 and np.abs(found[1] - found[2]).max() > 0
+    assert np.abs(outputs[0] - outputs[1]).max() > 0 and np.abs(outputs[1] - outputs[2]).max() > 0

@@ -38,7 +38,7 @@ def cloud_in_cells(seed: int, count: int) -> tuple[np.ndarray, np.ndarray]:
     return points.astype(np.float32), rng.integers(0, 256, (count, 3), dtype=np.uint8)
 
 
-def test_points_that_hard_slices_leave_out_are_left_out() -> None:
+def test_points_outside_the_hard_slices_are_left_out() -> None:
     points = np.array(
         [[0.01, 0.1, 0.05], [0.012, 0.3, 0.05], [-0.1, 0, 0.05], [0.1, 0, -0.2], [0.9, 0, 0], [0.1, 0, 2]]
     )
@@ -57,22 +57,22 @@ def test_weights_of_intervals_are_differences_of_sigmoids() -> None:
             return 1 / (1 + np.exp(-(at[:, None] - edge) / temperature))
 
         expected = np.where(lower > 0, below(lower), 1) - below(upper)
-        found = np.exp(interval_log_weights(jnp.asarray(at, jnp.float32), 0.1, 7, temperature))
-        np.testing.assert_allclose(found, expected, atol=2e-5)
-        np.testing.assert_allclose(found.sum(axis=1), 1 - below(upper[-1:])[:, 0], atol=2e-5)
+        weights = np.exp(interval_log_weights(jnp.asarray(at, jnp.float32), 0.1, 7, temperature))
+        np.testing.assert_allclose(weights, expected, atol=2e-5)
+        np.testing.assert_allclose(weights.sum(axis=1), 1 - below(upper[-1:])[:, 0], atol=2e-5)
 
 
 def test_lab_and_hyab_against_colour_science() -> None:
     rng = np.random.default_rng(0)
     rgb = np.concatenate([rng.integers(0, 256, (2000, 3)), np.repeat(np.arange(256)[:, None], 3, axis=1)])
     expected = exact_lab(rgb, GRID_WHITE)
-    found = to_lab(jnp.asarray(rgb / 255, jnp.float32))
-    np.testing.assert_allclose(found, expected, atol=2e-4)
-    np.testing.assert_allclose(hyab(found, found[::-1]), exact_hyab(expected, expected[::-1]), atol=1e-3)
+    lab = to_lab(jnp.asarray(rgb / 255, jnp.float32))
+    np.testing.assert_allclose(lab, expected, atol=2e-4)
+    np.testing.assert_allclose(hyab(lab, lab[::-1]), exact_hyab(expected, expected[::-1]), atol=1e-3)
 
 
 def test_cold_colours_are_in_the_hard_regions() -> None:
-    """Also where another grid colour is nearer by HyAB, and at the ends of the channels."""
+    """Includes colours with another grid colour nearer by HyAB, and the ends of the channels."""
     rgb = np.random.default_rng(0).integers(0, 256, (4000, 3), dtype=np.uint8)
     rgb[:1000] = np.random.default_rng(1).choice([0, 1, 2, 253, 254, 255], (1000, 3))
     colors = jnp.asarray(rgb / 255, jnp.float32)
@@ -81,7 +81,7 @@ def test_cold_colours_are_in_the_hard_regions() -> None:
 
 
 def test_warm_colours_are_shared_by_the_softmax() -> None:
-    """On a grid colour, against a loop in float64 over the 27 around."""
+    """Compare grid colours with a loop in float64 over their 27 neighbours."""
     temperature, reach = 4.0, 0.5 + 4 / 5
     ends = np.random.default_rng(0).choice([0, 5, 10, 245, 250, 255], (12, 3)).tolist()
     for rgb in ([120, 35, 200], [0, 255, 5], [0, 0, 0], *ends):
@@ -94,8 +94,8 @@ def test_warm_colours_are_shared_by_the_softmax() -> None:
                 share = np.exp(-float(distance) / temperature) * np.prod((1 - (steps / reach) ** 2) ** 2)
                 total += share
                 expected += share * NETWORK.membership(other.astype(np.uint8))
-        found = soft_regions(jnp.asarray([rgb], jnp.float32) / 255, SETS, temperature)[0]
-        np.testing.assert_allclose(found, expected / total, atol=1e-5)
+        weights = soft_regions(jnp.asarray([rgb], jnp.float32) / 255, SETS, temperature)[0]
+        np.testing.assert_allclose(weights, expected / total, atol=1e-5)
 
 
 @pytest.mark.parametrize("temperature", [0.3, 2.0, 30.0])
@@ -137,9 +137,9 @@ def test_gradients_flow_where_the_hard_ones_are_zero() -> None:
             changed = thor2.turn(dataclasses.replace(normal, colors=colors), config, other)
             return (thor2.describe_aligned(changed, NETWORK, config, other).tops2[0] * probe).sum()
 
-        for found in gradient((parameters.alpha, normal.colors)):
-            assert np.isfinite(np.asarray(found)).all()
-            assert bool(np.asarray(found).any()) == (config.relaxation is not None)
+        for leaf in gradient((parameters.alpha, normal.colors)):
+            assert np.isfinite(np.asarray(leaf)).all()
+            assert bool(np.asarray(leaf).any()) == (config.relaxation is not None)
 
 
 def test_both_backends_agree() -> None:

@@ -1,4 +1,4 @@
-"""Same seed, same machine: same bytes, twice. Across batch sizes the same up to rounding, across buckets too."""
+"""Equal seeds give equal bytes on one machine; other batch sizes and buckets give equal values up to rounding."""
 
 import os
 import subprocess
@@ -43,8 +43,9 @@ for k in range(8):
 packed = thor2.PointClouds.pack([cloud for views in clouds.values() for cloud in views])
 hasher = hashlib.sha256()
 for homology in ("gudhi", "closed_form"):
-    found = thor2.describe(packed, colornet.load_default(), thor2.DescriptorConfig(homology=homology))
-    hasher.update(np.asarray(found.tops2).tobytes())
+
+    descriptors = thor2.describe(packed, colornet.load_default(), thor2.DescriptorConfig(homology=homology))
+    hasher.update(np.asarray(descriptors.tops2).tobytes())
 config = thor2.DescriptorConfig(homology="closed_form", n_slices=3, n_strips=8, image_size=8)
 with tempfile.TemporaryDirectory() as folder:
     options = FitOptions(2, batch_size=4, seed=5)
@@ -56,12 +57,12 @@ print(hasher.hexdigest())
 
 
 @pytest.mark.slow
-def test_the_same_bytes_of_descriptors_and_weights_in_two_processes() -> None:
+def test_two_processes_give_equal_descriptors_and_weights() -> None:
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
-    found = [
+    digests = [
         subprocess.run(
             [sys.executable, "-c", PROGRAM], env=environment, capture_output=True, text=True, check=True
         ).stdout
         for _ in range(2)
     ]
-    assert found[0] == found[1] and len(found[0].strip()) == 64
+    assert digests[0] == digests[1] and len(digests[0].strip()) == 64

@@ -1,4 +1,4 @@
-"""What a descriptor's numbers are: masses, linearity, stability, the equations, the limit of the relaxation."""
+"""Values of descriptors: masses, linearity, stability, the equations, and the limit of the relaxation."""
 
 import dataclasses
 import math
@@ -78,7 +78,7 @@ def test_other_networks(aligned: thor2.PointClouds, network: colornet.ColorNetwo
 @pytest.mark.parametrize("convention", ["paper", "released"])
 @given(data=st.data(), reach=st.sampled_from([1.0, 1.6]))
 def test_equations(convention: Any, pipeline: Any, data: st.DataObject, reach: float) -> None:
-    """The released preset among them; overflow is told by the same count."""
+    """Both conventions follow the equations, and overflow is the same count."""
     ways = dataclasses.replace(pipeline, config=dataclasses.replace(pipeline.config, convention=convention))
     aligned = data.draw(laws.packed(laws.aligned_clouds(CONFIG, reach=reach), SIZE, pipeline.capacity))
     laws.assert_follows_equations(ways.describe_aligned, aligned, NETWORK, ways.config)
@@ -86,7 +86,7 @@ def test_equations(convention: Any, pipeline: Any, data: st.DataObject, reach: f
 
 @given(aligned=aligned_batches(), exponent=st.integers(1, 37), seed=laws.seeds())
 def test_overflow_is_never_silent(aligned: thor2.PointClouds, exponent: int, seed: int) -> None:
-    """Points anywhere that float32 can say: strays as far as 10^37, on either side of the origin."""
+    """Some points lie up to 10^37 from the origin, close to the limit of float32."""
     rng = np.random.default_rng(seed)
     points = np.asarray(aligned.points, np.float64)
     stray = rng.random(points.shape[:2]) < 0.05
@@ -98,14 +98,14 @@ def test_overflow_is_never_silent(aligned: thor2.PointClouds, exponent: int, see
 
 
 @pytest.mark.parametrize("far", [1e7, 1e8, 1e37])
-def test_what_is_too_far_to_be_sliced_overflows(far: float) -> None:
-    """Hundredths of it do not fit into 32 bits; squares of a cloud as large are infinite, its frame no numbers."""
+def test_points_too_far_to_be_sliced_are_counted_in_overflow(far: float) -> None:
+    """The distance in hundredths does not fit into 32 bits, and squared distances overflow float32."""
     points = np.array([[0.1, 0.1, 0.15], [far, 0.1, 0.15], [-far, 0.1, 0.15], [0.1, 0.2, far]])
     clouds = thor2.PointClouds.pack([(points, np.zeros((4, 3)))], 512)
     whole = np.random.default_rng(0).random((40, 3)) * far * 1e13 if far < 1e20 else np.full((40, 3), far)
     for config in (CONFIG, thor2.DescriptorConfig.released(homology="closed_form")):
-        found = thor2.describe_aligned(clouds, NETWORK, config)
-        assert int(found.overflow[0]) == 3 and np.isfinite(np.asarray(found.tops2)).all()
+        descriptors = thor2.describe_aligned(clouds, NETWORK, config)
+        assert int(descriptors.overflow[0]) == 3 and np.isfinite(np.asarray(descriptors.tops2)).all()
         moved = thor2.describe(thor2.PointClouds.pack([(whole, np.zeros((40, 3)))], 512), NETWORK, config)
         assert int(moved.overflow[0]) == 40 and not np.asarray(moved.tops2).any()
 
@@ -115,14 +115,14 @@ def test_mirrored_strips(aligned: thor2.PointClouds, axis: str) -> None:
     laws.assert_mirrored_strips(lambda clouds: thor2.strips(clouds, NETWORK, CONFIG), aligned, CONFIG, axis)
 
 
-def test_a_hidden_end_turns_the_cloud() -> None:
+def test_an_occluded_end_flips_the_cloud() -> None:
     seen: set[int] = set()
 
     @settings(settings.get_profile("properties-quick"), max_examples=15)
     @given(clouds=laws.packed(laws.camera_clouds(), SIZE, 512), seed=laws.seeds())
     def law(clouds: thor2.PointClouds, seed: int) -> None:
-        found = laws.assert_flip_follows_rule(lambda clouds: thor2.view_normalize(clouds, CONFIG), clouds, seed)
-        seen.update(found.tolist())
+        flipped = laws.assert_flip_follows_rule(lambda clouds: thor2.view_normalize(clouds, CONFIG), clouds, seed)
+        seen.update(flipped.tolist())
 
     law()
     assert {0, 1} <= seen
@@ -138,8 +138,8 @@ def test_stability(pipeline: Any, data: st.DataObject, seed: int, eps: float) ->
     assert share <= 1 / math.sqrt(5) + 0.01
 
 
-def test_how_tight_the_theorem_is() -> None:
-    """The larger a persistence, the nearer to 1 / sqrt(5) of the bound; the rest is for births that move."""
+def test_the_stability_bound_is_tight() -> None:
+    """The change approaches 1 / sqrt(5) of the bound for large persistences; the remainder allows for moving births."""
 
     def share(height: float) -> float:
         both = [
@@ -160,7 +160,7 @@ def test_how_tight_the_theorem_is() -> None:
 
 @pytest.mark.slow
 @given(aligned=aligned_batches(max_points=256, margin=0.2), factor=st.sampled_from([0.02, 0.01]))
-def test_the_relaxation_becomes_the_hard_descriptor(aligned: thor2.PointClouds, factor: float) -> None:
+def test_the_relaxation_converges_to_the_hard_descriptor(aligned: thor2.PointClouds, factor: float) -> None:
     def describe_at(clouds: thor2.PointClouds, config: thor2.DescriptorConfig) -> thor2.Descriptors:
         return thor2.describe_aligned(clouds, NETWORK, config)
 

@@ -45,15 +45,15 @@ def test_what_is_exported_gives_the_same_answers_without_this_code(run: TrainedR
     arguments = [str(tmp_path / name) for name in ("loader.py", "recognizer.jax", "clouds.npz", "found.npz")]
     done = subprocess.run([sys.executable, *arguments], capture_output=True, text=True, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    found = np.load(tmp_path / "found.npz")
-    assert set(found) == {*FEATURES, "overflow"}
+    outputs = np.load(tmp_path / "found.npz")
+    assert set(outputs) == {*FEATURES, "overflow"}
 
     described = thor2.describe(packed, run.network, CONFIG)  # gudhi: the other backend
-    np.testing.assert_array_equal(found["overflow"], described.overflow)
+    np.testing.assert_array_equal(outputs["overflow"], described.overflow)
     expected = thor2.Recognizer(run).probabilities(described)
     for name in FEATURES:
-        np.testing.assert_allclose(found[name], expected[name], rtol=0, atol=1e-6)
-        np.testing.assert_allclose(found[name].sum(axis=1), 1, atol=1e-5)
+        np.testing.assert_allclose(outputs[name], expected[name], rtol=0, atol=1e-6)
+        np.testing.assert_allclose(outputs[name].sum(axis=1), 1, atol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -65,6 +65,6 @@ def test_what_is_exported_gives_the_same_answers_without_this_code(run: TrainedR
         ({"platforms": ()}, "platforms is"),
     ],
 )
-def test_sizes_and_platforms_that_are_refused(run: TrainedRun, given: dict, complaint: str) -> None:
-    with pytest.raises(thor2.InputError, match=complaint):
-        export_recognizer(run, **{"n_points": 512, "n_clouds": 1, **given})
+def test_sizes_and_platforms_that_are_refused(run: TrainedRun, options: dict, expected: str) -> None:
+    with pytest.raises(thor2.InputError, match=expected):
+        export_recognizer(run, **{"n_points": 512, "n_clouds": 1, **options})

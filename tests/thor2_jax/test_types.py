@@ -42,10 +42,10 @@ def test_packing_on_the_host_gives_equal_numpy_arrays() -> None:
     packed = thor2.PointClouds.pack(clouds, 16, [1.0, 2.0, 3.0], boundary)
     on_host = thor2.PointClouds.pack(clouds, 16, [1.0, 2.0, 3.0], boundary, on_host=True)
     for field in dataclasses.fields(packed):
-        expected, found = getattr(packed, field.name), getattr(on_host, field.name)
-        assert isinstance(expected, jax.Array) and isinstance(found, np.ndarray)
-        assert found.dtype == expected.dtype
-        np.testing.assert_array_equal(found, expected)
+        expected, actual = getattr(packed, field.name), getattr(on_host, field.name)
+        assert isinstance(expected, jax.Array) and isinstance(actual, np.ndarray)
+        assert actual.dtype == expected.dtype
+        np.testing.assert_array_equal(actual, expected)
 
 
 def test_pack_takes_colors_capacity_camera_and_boundary() -> None:
@@ -130,14 +130,18 @@ def test_layout_of_the_flat_descriptors() -> None:
     """TOPS2 has a block [image | embedding] for each slice, both flattened in C order."""
     images = RNG.random((2, 7, 32, 32)).astype(np.float32)
     embeddings = RNG.random((2, 7, 22, 31)).astype(np.float32)
-    found = thor2.Descriptors(jnp.asarray(images), jnp.asarray(embeddings), jnp.zeros(2, jnp.int32))
-    assert found.tops.shape == (2, 7168) and found.color.shape == (2, 4774) and found.tops2.shape == (2, 11942)
+    descriptors = thor2.Descriptors(jnp.asarray(images), jnp.asarray(embeddings), jnp.zeros(2, jnp.int32))
+    assert (
+        descriptors.tops.shape == (2, 7168)
+        and descriptors.color.shape == (2, 4774)
+        and descriptors.tops2.shape == (2, 11942)
+    )
     for b, s, p, q in [(0, 0, 0, 0), (1, 0, 31, 31), (0, 3, 4, 17), (1, 6, 31, 0)]:
-        assert found.tops[b, s * 1024 + p * 32 + q] == images[b, s, p, q]
-        assert found.tops2[b, s * 1706 + p * 32 + q] == images[b, s, p, q]
+        assert descriptors.tops[b, s * 1024 + p * 32 + q] == images[b, s, p, q]
+        assert descriptors.tops2[b, s * 1706 + p * 32 + q] == images[b, s, p, q]
     for b, s, r, j in [(0, 0, 0, 0), (1, 0, 21, 30), (0, 3, 4, 17), (1, 6, 21, 0)]:
-        assert found.color[b, s * 682 + r * 31 + j] == embeddings[b, s, r, j]
-        assert found.tops2[b, s * 1706 + 1024 + r * 31 + j] == embeddings[b, s, r, j]
+        assert descriptors.color[b, s * 682 + r * 31 + j] == embeddings[b, s, r, j]
+        assert descriptors.tops2[b, s * 1706 + 1024 + r * 31 + j] == embeddings[b, s, r, j]
 
 
 def test_records_are_frozen() -> None:

@@ -50,11 +50,11 @@ def assert_labels_are_names(instance_clouds: Clouds, frame: RGBDFrame, seed: int
     """Assert that other label numbers give the same clouds, bit by bit."""
     numbers = np.random.default_rng(seed).permutation(np.arange(1, 256))
     other = np.concatenate([[0], numbers]).astype(np.uint16)
-    found = {
+    clouds = {
         c.label: c for c in instance_clouds(RGBDFrame(frame.color, frame.depth, other[frame.labels], frame.intrinsics))
     }
     for cloud in instance_clouds(frame):
-        same = found.pop(int(other[cloud.label]))
+        same = clouds.pop(int(other[cloud.label]))
         assert (same.n_pixels, same.kept_by_fallback, same.reason) == (
             cloud.n_pixels,
             cloud.kept_by_fallback,
@@ -62,7 +62,7 @@ def assert_labels_are_names(instance_clouds: Clouds, frame: RGBDFrame, seed: int
         )
         np.testing.assert_array_equal(same.points, cloud.points)
         np.testing.assert_array_equal(same.colors, cloud.colors)
-    assert not found
+    assert not clouds
 
 
 def assert_depth_units_agree(instance_clouds: Clouds, frame: RGBDFrame) -> None:

@@ -44,11 +44,11 @@ __all__ = [
 Describe = Callable[[PointClouds], Descriptors]
 
 
-def _compare(found: Descriptors, expected: Descriptors, config: DescriptorConfig, drift: float | None) -> None:
+def _compare(actual: Descriptors, expected: Descriptors, config: DescriptorConfig, drift: float | None) -> None:
     if drift is None:
-        assert_equal(found, expected)
+        assert_equal(actual, expected)
     else:
-        assert_near(found, expected, config, drift)
+        assert_near(actual, expected, config, drift)
 
 
 def assert_permutation_invariant(
@@ -239,9 +239,9 @@ def assert_object_unity(describe: Describe, aligned: PointClouds, config: Descri
         m: first slice that is removed.
     """
     keep = aligned.mask & (np.asarray(aligned.points[..., 2]) < m * config.sigma_1)
-    found, expected = describe(dataclasses.replace(aligned, mask=keep)), describe(aligned)
+    descriptors, expected = describe(dataclasses.replace(aligned, mask=keep)), describe(aligned)
     for name in ("images", "embeddings"):
-        whole, cut = (np.asarray(getattr(d, name)) for d in (expected, found))
+        whole, cut = (np.asarray(getattr(d, name)) for d in (expected, descriptors))
         np.testing.assert_array_equal(cut[:, :m], whole[:, :m], err_msg=name)
         assert not cut[:, m:].any(), f"{name} of removed slices"
 
@@ -273,14 +273,14 @@ def assert_flip_follows_rule(
     boundary = mask & clear & (end | (rng.random(mask.shape) < 0.1)) & (rng.random(mask.shape) < 0.7)
     bins = np.floor(x)
     flips = (boundary & (bins <= 1)).sum(axis=1) > (boundary & (bins >= last[:, None] - 1)).sum(axis=1)
-    found = normalize(dataclasses.replace(clouds, boundary=jnp.asarray(boundary)))
+    with_boundary = normalize(dataclasses.replace(clouds, boundary=jnp.asarray(boundary)))
     sides = points.max(axis=1, keepdims=True)
     turned = np.where(mask[..., None], sides * [1, 1, 0] - points * [1, 1, -1], 0)
     longest = x.max(axis=1)
     ambiguous = (longest > 0.5) & (np.abs(longest - np.round(longest)) <= 1e-4 / OCCLUSION_BIN)
     for b in np.flatnonzero(~ambiguous):
         expected = turned[b] if flips[b] else points[b]
-        np.testing.assert_allclose(found.points[b], expected, rtol=0, atol=8 * UNIT * float(sides[b].max()))
+        np.testing.assert_allclose(with_boundary.points[b], expected, rtol=0, atol=8 * UNIT * float(sides[b].max()))
     return np.where(ambiguous, -1, flips)
 
 
@@ -308,7 +308,7 @@ def assert_mirrored_strips(
     plain = strips(with_points(aligned, spread))
     flipped = spread.copy()
     flipped[..., k] = size - spread[..., k]
-    found = strips(with_points(aligned, flipped))
+    mirrored = strips(with_points(aligned, flipped))
     expected = dataclasses.replace(plain)
     if axis == "y":
         occupied = np.asarray(plain.occupied)
@@ -317,9 +317,9 @@ def assert_mirrored_strips(
         order = (lambda a: a[:, :, ::-1]) if axis == "x" else (lambda a: a[:, ::-1])
         low, high = order(plain.low), order(plain.high)
         expected = dataclasses.replace(plain, occupied=order(plain.occupied), color=order(plain.color))
-    np.testing.assert_array_equal(found.occupied, expected.occupied)
-    np.testing.assert_array_equal(found.color, expected.color)
-    np.testing.assert_array_equal(found.overflow, expected.overflow)
+    np.testing.assert_array_equal(mirrored.occupied, expected.occupied)
+    np.testing.assert_array_equal(mirrored.color, expected.color)
+    np.testing.assert_array_equal(mirrored.overflow, expected.overflow)
     atol = 2 * UNIT * size if axis == "y" else 0
-    np.testing.assert_allclose(found.low, low, rtol=0, atol=atol)
-    np.testing.assert_allclose(found.high, high, rtol=0, atol=atol)
+    np.testing.assert_allclose(mirrored.low, low, rtol=0, atol=atol)
+    np.testing.assert_allclose(mirrored.high, high, rtol=0, atol=atol)

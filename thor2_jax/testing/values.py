@@ -46,9 +46,9 @@ def assert_image_mass(images: NDArray[np.floating], diagrams: Diagrams, config: 
     expected = (persistence * inside[0] * inside[1]).sum(axis=-1)
     total, most = np.asarray(images, np.float64).sum(axis=(-2, -1)), persistence.sum(axis=-1)
     # Births and deaths are rounded: their difference is off by 2 units of the death.
-    off = image_rounding(most, config) + 2 * UNIT * (deaths * image_lipschitz(persistence, config)).sum(axis=-1)
-    assert (np.abs(total - expected) <= off).all(), f"mass is off by {np.abs(total - expected).max():.3g}"
-    assert (total <= most + off).all()
+    difference = image_rounding(most, config) + 2 * UNIT * (deaths * image_lipschitz(persistence, config)).sum(axis=-1)
+    assert (np.abs(total - expected) <= difference).all(), f"mass is off by {np.abs(total - expected).max():.3g}"
+    assert (total <= most + difference).all()
 
 
 def assert_color_mass(strips: Strips, clouds: PointClouds) -> None:
@@ -78,14 +78,16 @@ def assert_embedding_linear(
         factors: coefficients of the linear combination.
     """
     combined = factors[0] * similarities[0] + factors[1] * similarities[1]
-    first, second, found = (describe_with(clouds, np.asarray(s, np.float32)) for s in (*similarities, combined))
+    first, second, descriptors = (describe_with(clouds, np.asarray(s, np.float32)) for s in (*similarities, combined))
     size = sum(abs(f) * np.abs(s) for f, s in zip(factors, similarities, strict=True))
     bound = np.asarray(describe_with(clouds, np.asarray(size, np.float32)).embeddings, np.float64)
     expected = sum(f * np.asarray(d.embeddings, np.float64) for f, d in zip(factors, (first, second), strict=True))
-    off = np.abs(np.asarray(found.embeddings, np.float64) - expected)
-    assert (off <= 2 * embedding_rounding(found.embeddings.shape[-2]) * bound).all(), f"off by {off.max():.3g}"
+    difference = np.abs(np.asarray(descriptors.embeddings, np.float64) - expected)
+    assert (difference <= 2 * embedding_rounding(descriptors.embeddings.shape[-2]) * bound).all(), (
+        f"off by {difference.max():.3g}"
+    )
     for other in (first, second):
-        np.testing.assert_array_equal(other.images, found.images)
+        np.testing.assert_array_equal(other.images, descriptors.images)
 
 
 def assert_embedding_additive(describe: Describe, first: PointClouds, second: PointClouds) -> None:
@@ -102,8 +104,8 @@ def assert_embedding_additive(describe: Describe, first: PointClouds, second: Po
         for c in (first, second)
     ]
     a, b, both = (np.asarray(describe(c).embeddings, np.float64) for c in (first, second, joined(*halves)))
-    off = np.abs(a + b - both)
-    assert (off <= 2 * embedding_rounding(both.shape[-2]) * both).all(), f"off by {off.max():.3g}"
+    difference = np.abs(a + b - both)
+    assert (difference <= 2 * embedding_rounding(both.shape[-2]) * both).all(), f"off by {difference.max():.3g}"
 
 
 def moved_within_strips(aligned: PointClouds, config: DescriptorConfig, seed: int, eps: float) -> PointClouds:
@@ -150,23 +152,23 @@ def assert_stable(
     Returns:
         The largest quotient of the change of an image and its bound, at most 1 / sqrt(5) up to rounding.
     """
-    found = [diagrams(clouds) for clouds in (before, after)]
-    np.testing.assert_array_equal(found[0].mask, found[1].mask)
-    np.testing.assert_array_equal(found[0].births, found[1].births)
-    p, q = (np.where(d.mask, np.asarray(d.deaths, np.float64) - np.asarray(d.births, np.float64), 0) for d in found)
+    pairs = [diagrams(clouds) for clouds in (before, after)]
+    np.testing.assert_array_equal(pairs[0].mask, pairs[1].mask)
+    np.testing.assert_array_equal(pairs[0].births, pairs[1].births)
+    p, q = (np.where(d.mask, np.asarray(d.deaths, np.float64) - np.asarray(d.births, np.float64), 0) for d in pairs)
     largest = np.maximum(p, q)
     rounding = 8 * UNIT * (1 + np.abs(np.asarray(before.points)).max(initial=0))
     moves = np.abs(p - q)
     assert moves.max(initial=0) <= 2 * eps + rounding, f"a pair moves by {moves.max():.3g}, points by {eps:.3g}"
     images = [np.asarray(describe(clouds).images, np.float64) for clouds in (before, after)]
-    off = np.abs(images[0] - images[1]).sum(axis=(-2, -1))
+    difference = np.abs(images[0] - images[1]).sum(axis=(-2, -1))
     slack = 2 * image_rounding(largest.sum(axis=-1), config) + rounding * image_lipschitz(largest, config).sum(axis=-1)
     tight = (moves * image_lipschitz(largest, config)).sum(axis=-1)
-    assert (off <= tight + slack).all(), f"an image moves by {off.max():.3g}"
+    assert (difference <= tight + slack).all(), f"an image moves by {difference.max():.3g}"
     constant = math.sqrt(5) * image_lipschitz(largest.max(axis=-1, initial=0), config)
     bound = constant * moves.sum(axis=-1)
-    assert (off <= bound + slack).all()
-    return float((off / np.where(bound > 100 * slack, bound, np.inf)).max(initial=0))
+    assert (difference <= bound + slack).all()
+    return float((difference / np.where(bound > 100 * slack, bound, np.inf)).max(initial=0))
 
 
 def _references(aligned: PointClouds, network: ColorNetwork, config: DescriptorConfig) -> list[Reference]:
@@ -187,17 +189,17 @@ def assert_follows_equations(
         network: the colour network.
         config: without relaxation.
     """
-    found = describe(aligned)
+    descriptors = describe(aligned)
     for b, expected in enumerate(_references(aligned, network, config)):
-        assert int(found.overflow[b]) == expected.overflow
-        off = np.abs(np.asarray(found.images[b], np.float64) - expected.images).sum(axis=(-2, -1))
+        assert int(descriptors.overflow[b]) == expected.overflow
+        difference = np.abs(np.asarray(descriptors.images[b], np.float64) - expected.images).sum(axis=(-2, -1))
         drift = 8 * UNIT * image_lipschitz(expected.persistence, config).sum(axis=-1)
-        assert (off <= image_rounding(expected.persistence.sum(axis=-1), config) + drift).all(), (
-            f"image: {off.max():.3g}"
+        assert (difference <= image_rounding(expected.persistence.sum(axis=-1), config) + drift).all(), (
+            f"image: {difference.max():.3g}"
         )
-        off = np.abs(np.asarray(found.embeddings[b], np.float64) - expected.embeddings)
-        assert (off <= 2 * embedding_rounding(network.n_regions) * expected.embeddings).all(), (
-            f"colour: {off.max():.3g}"
+        difference = np.abs(np.asarray(descriptors.embeddings[b], np.float64) - expected.embeddings)
+        assert (difference <= 2 * embedding_rounding(network.n_regions) * expected.embeddings).all(), (
+            f"colour: {difference.max():.3g}"
         )
 
 
@@ -209,10 +211,10 @@ def assert_overflow_told(
     The same count is computed in NumPy. If it is 0, every point is in the embedding and every pair in the window.
     """
     counted = [reference.overflow for reference in _references(aligned, network, config)]
-    found = describe(aligned)
-    assert np.asarray(found.overflow).tolist() == counted
+    descriptors = describe(aligned)
+    assert np.asarray(descriptors.overflow).tolist() == counted
     for name in ("images", "embeddings"):
-        assert np.isfinite(np.asarray(getattr(found, name))).all(), name
+        assert np.isfinite(np.asarray(getattr(descriptors, name))).all(), name
 
 
 def assert_relaxation_converges(
@@ -237,23 +239,23 @@ def assert_relaxation_converges(
         factor: multiplies the default temperatures, at most 0.02.
     """
     soft = Relaxation(**{name: factor * value for name, value in dataclasses.asdict(Relaxation()).items()})
-    found = describe_at(aligned, dataclasses.replace(config, relaxation=soft))
+    descriptors = describe_at(aligned, dataclasses.replace(config, relaxation=soft))
     hard = describe_at(aligned, config)
-    np.testing.assert_array_equal(found.overflow, hard.overflow)
+    np.testing.assert_array_equal(descriptors.overflow, hard.overflow)
     leak = math.exp(-0.2 * min(config.sigma_2 / soft.strip, config.sigma_1 / soft.slice))
     for b, expected in enumerate(_references(aligned, network, config)):
         n = expected.counts.sum()
         bias = 2 * soft.extremum * np.log(2 * np.maximum(expected.counts, 1)) * (expected.counts > 0)
         moved = bias + 2 * n * leak + 16 * UNIT
         constant = image_lipschitz(expected.persistence + moved, config)
-        off = np.abs(np.asarray(found.images[b], np.float64) - np.asarray(hard.images[b], np.float64)).sum(
+        difference = np.abs(np.asarray(descriptors.images[b], np.float64) - np.asarray(hard.images[b], np.float64)).sum(
             axis=(-2, -1)
         )
         most = (expected.persistence + moved).sum(axis=-1)
-        assert (off <= (moved * constant).sum(axis=-1) + 2 * image_rounding(most, config)).all(), (
-            f"image: {off.max():.3g}"
+        assert (difference <= (moved * constant).sum(axis=-1) + 2 * image_rounding(most, config)).all(), (
+            f"image: {difference.max():.3g}"
         )
-        off = np.abs(np.asarray(found.embeddings[b]) - np.asarray(hard.embeddings[b]))
+        difference = np.abs(np.asarray(descriptors.embeddings[b]) - np.asarray(hard.embeddings[b]))
         # Weights are sums of n exponentials and softmaxes of 27, each good to a few units.
         bound = 100 * UNIT * np.asarray(hard.embeddings[b]) + n * leak
-        assert (off <= bound + n * 64 * UNIT).all(), f"colour: {off.max():.3g}"
+        assert (difference <= bound + n * 64 * UNIT).all(), f"colour: {difference.max():.3g}"

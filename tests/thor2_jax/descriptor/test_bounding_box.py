@@ -1,4 +1,4 @@
-"""Minimal boxes against exact rectangles (OpenCV), exact hulls (SciPy), an exhaustive search (trimesh), known boxes."""
+"""Bounding boxes against rectangles (OpenCV), hulls (SciPy), an exhaustive search (trimesh) and known boxes."""
 
 import itertools
 
@@ -16,14 +16,14 @@ compiled_box, compiled_support = jax.jit(minimal_box), jax.jit(support_points)
 
 
 def padded(points: np.ndarray, capacity: int = 512) -> np.ndarray:
-    """Centred points, [3, N], padded with zeros."""
+    """Return the centred points, [3, N], padded with zeros."""
     out = np.zeros((3, capacity), np.float32)
     out[:, : len(points)] = (points - (points.mean(axis=0) if len(points) else 0)).T
     return out
 
 
 def box_of(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Axes, float64, and the side lengths along them, from the points themselves."""
+    """Return the axes, float64, and the side lengths along them, measured on the points."""
     axes, low, high = (np.asarray(part, np.float64) for part in compiled_box(padded(points)))
     if len(points) == 0:
         return axes, np.zeros(3)
@@ -33,7 +33,7 @@ def box_of(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def shapes() -> list[np.ndarray]:
-    """Clouds like those of objects: flat, long, round, half seen; turned any way."""
+    """Return randomly rotated clouds like those of objects: flat, long, round and partial."""
     rng = np.random.default_rng(0)
     clouds = []
     for k in range(24):
@@ -62,7 +62,7 @@ DEGENERATE = {
 
 
 @pytest.mark.parametrize("name", DEGENERATE)
-def test_axes_are_orthonormal_and_finite_whatever_the_cloud(name: str) -> None:
+def test_axes_of_degenerate_clouds_are_orthonormal(name: str) -> None:
     axes, sides = box_of(DEGENERATE[name])
     np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-5)
     assert sides[0] >= sides[1] - 1e-5 and sides[1] >= sides[2] - 1e-5
@@ -81,18 +81,18 @@ def test_finds_a_known_box(seed: int) -> None:
     sides = np.sort(rng.uniform(0.1, 1, 3))[::-1]
     corners = np.array(list(itertools.product((0, 1), repeat=3)))
     points = np.concatenate([corners, rng.random((301, 3))]) * sides
-    found = box_of(points @ Rotation.random(random_state=seed).as_matrix().T)[1]
-    assert np.prod(found) <= 1.03 * np.prod(sides)
-    np.testing.assert_allclose(found, sides, rtol=0.03)
+    lengths = box_of(points @ Rotation.random(random_state=seed).as_matrix().T)[1]
+    assert np.prod(lengths) <= 1.03 * np.prod(sides)
+    np.testing.assert_allclose(lengths, sides, rtol=0.03)
 
 
-def test_volumes_against_an_exhaustive_search_over_the_hulls_faces() -> None:
+def test_volumes_against_an_exhaustive_search() -> None:
     ratios = [np.prod(box_of(points)[1]) / np.prod(trimesh.bounds.oriented_bounds(points)[1]) for points in shapes()]
     assert np.median(ratios) <= 1.02
     assert max(ratios) <= 1.08
 
 
-def test_seen_along_each_axis_the_box_is_a_minimum_area_rectangle() -> None:
+def test_each_side_is_a_minimum_area_rectangle() -> None:
     ratios = []
     for points in shapes():
         axes, sides = box_of(points)
@@ -109,13 +109,13 @@ def test_support_points_are_vertices_of_the_hull() -> None:
         centred = padded(points).astype(np.float64)
         frame = np.linalg.svd(centred.T, full_matrices=False)[2]
         principal = (frame @ centred).astype(np.float32)
-        found = np.asarray(compiled_support(principal))
-        assert found.shape == (3, 66)
+        support = np.asarray(compiled_support(principal))
+        assert support.shape == (3, 66)
         cloud = principal[:, : len(points)].T
         corners = {tuple(row) for row in cloud[ConvexHull(cloud).vertices].tolist()}
-        chosen = {tuple(row) for row in found.T.tolist()}
+        chosen = {tuple(row) for row in support.T.tolist()}
         assert chosen <= corners and len(chosen) >= 15
-        for axis in range(3):  # among them the extremes of each axis
+        for axis in range(3):  # includes the extremes of each axis
             assert {tuple(cloud[k].tolist()) for k in (cloud[:, axis].argmin(), cloud[:, axis].argmax())} <= chosen
 
 
@@ -130,11 +130,11 @@ def test_padding_does_not_change_the_box(capacity: int) -> None:
     np.testing.assert_allclose(np.abs(axes @ box_of(points)[0].T), np.eye(3), atol=1e-4)
 
 
-def test_a_mirrored_projection_turns_the_other_way() -> None:
-    """So the signs of the frame that the search starts from do not matter."""
-    angle = jax.jit(_minimum_area_angle)
+def test_a_mirrored_projection_has_the_opposite_angle() -> None:
+    """The signs of the initial frame of the search therefore do not matter."""
+    minimum_area_angle = jax.jit(_minimum_area_angle)
     for seed in range(5):
         xy = np.random.default_rng(seed).normal(size=(2, 80)).astype(np.float32)
-        found = float(angle(xy))
-        assert 0 < abs(found) < np.pi / 4
-        assert float(angle(xy * np.array([[1], [-1]], np.float32))) == pytest.approx(-found, abs=1e-6)
+        angle = float(minimum_area_angle(xy))
+        assert 0 < abs(angle) < np.pi / 4
+        assert float(minimum_area_angle(xy * np.array([[1], [-1]], np.float32))) == pytest.approx(-angle, abs=1e-6)

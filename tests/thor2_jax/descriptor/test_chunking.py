@@ -1,4 +1,4 @@
-"""Large batches in chunks: their sizes, and results in the order of the clouds."""
+"""Chunks of large batches: their sizes, and the order of the results."""
 
 import jax
 import numpy as np
@@ -9,7 +9,7 @@ from thor2_jax.descriptor.chunking import CHUNKS_PER_STEP, chunk_size, map_chunk
 
 
 def clouds_of(count: int, capacity: int) -> thor2.PointClouds:
-    """Cloud k lies at x = k."""
+    """Return clouds, the k-th of which lies at x = k."""
     points = np.zeros((count, capacity, 3), np.float32)
     points[:, :, 0] = np.arange(count)[:, None]
     return thor2.PointClouds.pack([(cloud, np.zeros((capacity, 3), np.uint8)) for cloud in points], capacity)

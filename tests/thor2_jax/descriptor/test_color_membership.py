@@ -1,4 +1,4 @@
-"""Region weights on the device against the colour network's own, in NumPy."""
+"""Region weights in JAX against those of the colour network, in NumPy."""
 
 import jax
 import numpy as np
@@ -19,12 +19,12 @@ def weights(colors: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("n", [0, 1, 2, 9999])
 def test_eight_bit_colours(n: int) -> None:
     rgb = np.random.default_rng(n).integers(0, 256, (n, 3), dtype=np.uint8)
-    found = weights(rgb.astype(np.float32) / np.float32(255))
-    np.testing.assert_array_equal(found, NETWORK.membership(rgb))
+    region_weights = weights(rgb.astype(np.float32) / np.float32(255))
+    np.testing.assert_array_equal(region_weights, NETWORK.membership(rgb))
 
 
 def test_every_level_of_a_channel_and_every_half_between_two() -> None:
-    """Means of two 8-bit colours lie on halves, and the floats around them: single precision decides."""
+    """Means of two 8-bit colours lie between two levels, where single precision decides the rounding."""
     halves = (np.arange(511) / 510).astype(np.float32)
     values = np.concatenate([halves, np.nextafter(halves, np.float32(0)), np.nextafter(halves, np.float32(1))])
     for axis in range(3):
@@ -35,7 +35,7 @@ def test_every_level_of_a_channel_and_every_half_between_two() -> None:
 
 def test_floating_colours_in_any_shape() -> None:
     colors = np.random.default_rng(0).random((4, 5, 3)).astype(np.float32)
-    found = weights(colors)
-    assert found.shape == (4, 5, 22) and found.dtype == np.float32
-    np.testing.assert_array_equal(found, NETWORK.membership(as_8_bit(colors)))
-    np.testing.assert_allclose(found.sum(axis=-1), 1, atol=1e-6)
+    region_weights = weights(colors)
+    assert region_weights.shape == (4, 5, 22) and region_weights.dtype == np.float32
+    np.testing.assert_array_equal(region_weights, NETWORK.membership(as_8_bit(colors)))
+    np.testing.assert_allclose(region_weights.sum(axis=-1), 1, atol=1e-6)

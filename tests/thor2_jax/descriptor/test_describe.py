@@ -1,4 +1,4 @@
-"""The whole way from clouds to TOPS and TOPS2 against NumPy in float64, and what must not matter."""
+"""TOPS and TOPS2 of clouds against NumPy in float64, and changes that must not affect them."""
 
 import dataclasses
 import logging
@@ -27,7 +27,7 @@ Cloud = tuple[np.ndarray, np.ndarray]
 
 
 def camera_cloud(seed: int, n: int = 900) -> Cloud:
-    """A lopsided box of a thing, in metres before the camera."""
+    """Return an asymmetric cloud in front of the camera, in metres, and its colours."""
     rng = np.random.default_rng(seed)
     points = rng.random((n, 3)) * [0.2, 0.11, 0.05]
     points = points[points[:, 0] / 0.2 + points[:, 1] / 0.11 < 1.5]
@@ -36,7 +36,7 @@ def camera_cloud(seed: int, n: int = 900) -> Cloud:
 
 
 def expected_descriptor(points: np.ndarray, rgb: np.ndarray, released: bool) -> tuple[np.ndarray, np.ndarray, int]:
-    """Images [7, 32, 32], embeddings [7, 22, 31] and overflow of one aligned cloud, from the equations."""
+    """Return images [7, 32, 32], embeddings [7, 22, 31] and overflow of one aligned cloud, from the equations."""
     x, y, z = points.astype(np.float64).T
     if released:
         x, y, z = np.round(x, 2), np.round(y, 2), np.round(z, 1)
@@ -62,59 +62,63 @@ def expected_descriptor(points: np.ndarray, rgb: np.ndarray, released: bool) -> 
 @pytest.mark.parametrize("name", CONFIGS)
 def test_aligned_clouds_against_numpy(name: str) -> None:
     config = CONFIGS[name]
-    sizes = [(0.76, 0.4, 0.68), (0.4, 0.7, 0.3), (0.9, 1.2, 0.9)]  # the last one overflows in every way
+    sizes = [(0.76, 0.4, 0.68), (0.4, 0.7, 0.3), (0.9, 1.2, 0.9)]  # the last one overflows along every axis
     clouds = [aligned_cloud(k, n, sizes[k % 3]) for k, n in enumerate((512, 333, 511, 1, 2, 0))]
-    found = thor2.describe_aligned(thor2.PointClouds.pack(clouds), NETWORK, config)
+    descriptors = thor2.describe_aligned(thor2.PointClouds.pack(clouds), NETWORK, config)
     for b, (points, rgb) in enumerate(clouds):
         images, embeddings, overflow = expected_descriptor(points, rgb, config.convention == "released")
-        np.testing.assert_allclose(found.images[b], images, atol=2e-6)
-        np.testing.assert_allclose(found.embeddings[b], embeddings, rtol=1e-5, atol=1e-5)
-        assert int(found.overflow[b]) == overflow
-    assert int(found.overflow[2]) > 0 and found.overflow.dtype == jnp.int32
-    assert (found.tops.shape, found.color.shape, found.tops2.shape) == ((6, 7168), (6, 4774), (6, 11942))
-    assert found.tops2.dtype == jnp.float32
+        np.testing.assert_allclose(descriptors.images[b], images, atol=2e-6)
+        np.testing.assert_allclose(descriptors.embeddings[b], embeddings, rtol=1e-5, atol=1e-5)
+        assert int(descriptors.overflow[b]) == overflow
+    assert int(descriptors.overflow[2]) > 0 and descriptors.overflow.dtype == jnp.int32
+    assert (descriptors.tops.shape, descriptors.color.shape, descriptors.tops2.shape) == (
+        (6, 7168),
+        (6, 4774),
+        (6, 11942),
+    )
+    assert descriptors.tops2.dtype == jnp.float32
 
 
-def test_persistence_past_the_window_is_counted_on_its_own() -> None:
+def test_persistence_beyond_the_image_is_counted() -> None:
     points = np.array([[0.01, 0, 0.05], [0.01, 0.7, 0.05], [0.03, 0, 0.05], [0.03, 0.8, 0.05]], np.float32)
     clouds = thor2.PointClouds.pack([(points, np.zeros((4, 3), np.uint8))])
     assert thor2.describe_aligned(clouds, NETWORK, CLOSED).overflow.tolist() == [1]
 
 
-def test_describe_is_align_and_then_the_rest() -> None:
+def test_describe_equals_its_steps() -> None:
     clouds = thor2.PointClouds.pack([camera_cloud(0), camera_cloud(1)])
     whole = thor2.describe(clouds, NETWORK, CLOSED)
     aligned = thor2.align(clouds, CLOSED)
-    for parts in (
+    for by_steps in (
         thor2.describe_aligned(aligned, NETWORK, CLOSED),
         thor2.describe_strips(thor2.strips(aligned, NETWORK, CLOSED), NETWORK, CLOSED),
     ):
-        np.testing.assert_array_equal(whole.tops2, parts.tops2)
+        np.testing.assert_array_equal(whole.tops2, by_steps.tops2)
 
 
-def test_empty_clouds_in_a_batch_are_zero_and_disturb_nobody() -> None:
+def test_empty_clouds_give_zeros_and_do_not_affect_others() -> None:
     empty, cloud = (np.zeros((0, 3)), np.zeros((0, 3))), camera_cloud(0)
     config = thor2.DescriptorConfig()
-    found = thor2.describe(thor2.PointClouds.pack([empty, cloud, empty]), NETWORK, config)
-    company = thor2.describe(thor2.PointClouds.pack([cloud, cloud, camera_cloud(1)]), NETWORK, config)
-    np.testing.assert_array_equal(found.tops2[0], 0)
-    np.testing.assert_array_equal(found.tops2[2], 0)
-    assert found.overflow.tolist()[::2] == [0, 0]
-    np.testing.assert_array_equal(found.tops2[1], company.tops2[0])
-    np.testing.assert_array_equal(found.tops2[1], company.tops2[1])
+    with_empty = thor2.describe(thor2.PointClouds.pack([empty, cloud, empty]), NETWORK, config)
+    without_empty = thor2.describe(thor2.PointClouds.pack([cloud, cloud, camera_cloud(1)]), NETWORK, config)
+    np.testing.assert_array_equal(with_empty.tops2[0], 0)
+    np.testing.assert_array_equal(with_empty.tops2[2], 0)
+    assert with_empty.overflow.tolist()[::2] == [0, 0]
+    np.testing.assert_array_equal(with_empty.tops2[1], without_empty.tops2[0])
+    np.testing.assert_array_equal(with_empty.tops2[1], without_empty.tops2[1])
 
 
 def test_batches_in_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each cloud as in a small batch, in value and in gradient, through callbacks too; whole groups and a rest."""
+    """Values and gradients equal those of a small batch, with callbacks and with a last, smaller chunk."""
     monkeypatch.setattr(chunking, "MAX_CHUNK_CLOUDS", 8)
     monkeypatch.setattr(chunking, "CHUNKS_PER_STEP", 2)
     config, count = thor2.DescriptorConfig(homology="gudhi"), 27
     few = thor2.PointClouds.pack([camera_cloud(seed, 300) for seed in range(8)], 512)
     order = np.arange(count) % 8
     many = jax.tree.map(lambda a: a[order], few)
-    expected, found = thor2.describe(few, NETWORK, config), thor2.describe(many, NETWORK, config)
+    expected, descriptors = thor2.describe(few, NETWORK, config), thor2.describe(many, NETWORK, config)
     for name in ("images", "embeddings", "overflow"):
-        np.testing.assert_allclose(getattr(found, name), np.asarray(getattr(expected, name))[order], atol=1e-6)
+        np.testing.assert_allclose(getattr(descriptors, name), np.asarray(getattr(expected, name))[order], atol=1e-6)
 
     def mass(points: jax.Array, clouds: thor2.PointClouds) -> jax.Array:
         return thor2.describe(dataclasses.replace(clouds, points=points), NETWORK, config).images.sum()
@@ -124,14 +128,14 @@ def test_batches_in_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("homology", ["gudhi", "closed_form"])
-def test_padding_and_company_do_not_matter(homology: str) -> None:
+def test_padding_and_other_clouds_do_not_matter(homology: str) -> None:
     config = thor2.DescriptorConfig(homology=homology)
     clouds = [aligned_cloud(k, n) for k, n in enumerate((512, 37, 300))]
-    together = thor2.describe_aligned(thor2.PointClouds.pack(clouds), NETWORK, config)
+    in_batch = thor2.describe_aligned(thor2.PointClouds.pack(clouds), NETWORK, config)
     for b, cloud in enumerate(clouds):
         for capacity in (512, 700):
             alone = thor2.describe_aligned(thor2.PointClouds.pack([cloud], capacity), NETWORK, config)
-            np.testing.assert_allclose(alone.tops2[0], together.tops2[b], rtol=1e-6, atol=1e-6)
+            np.testing.assert_allclose(alone.tops2[0], in_batch.tops2[b], rtol=1e-6, atol=1e-6)
 
 
 def test_order_and_duplicates() -> None:
@@ -140,26 +144,26 @@ def test_order_and_duplicates() -> None:
     packed = thor2.PointClouds.pack(
         [(points, rgb), (points[order], rgb[order]), (np.tile(points, (2, 1)), np.tile(rgb, (2, 1)))]
     )
-    found = thor2.describe_aligned(packed, NETWORK, CLOSED)
-    np.testing.assert_array_equal(found.tops[1], found.tops[0])
-    np.testing.assert_array_equal(found.tops[2], found.tops[0])
-    np.testing.assert_allclose(found.color[1], found.color[0], rtol=1e-5)
-    np.testing.assert_allclose(found.color[2], 2 * found.color[0], rtol=1e-5)
+    descriptors = thor2.describe_aligned(packed, NETWORK, CLOSED)
+    np.testing.assert_array_equal(descriptors.tops[1], descriptors.tops[0])
+    np.testing.assert_array_equal(descriptors.tops[2], descriptors.tops[0])
+    np.testing.assert_allclose(descriptors.color[1], descriptors.color[0], rtol=1e-5)
+    np.testing.assert_allclose(descriptors.color[2], 2 * descriptors.color[0], rtol=1e-5)
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_rigid_motion_of_cloud_and_camera(seed: int) -> None:
-    """A point on a border of strips may change sides; hardly a strip may differ."""
+    """Points on the border of a strip may change sides, so that few strips may differ."""
     points, rgb = camera_cloud(seed)
     motion, shift = Rotation.random(random_state=seed + 10).as_matrix(), np.array([0.1, 0.2, -0.4])
-    found = thor2.describe(
+    descriptors = thor2.describe(
         thor2.PointClouds.pack([(points, rgb), (points @ motion.T + shift, rgb)], camera=[[0, 0, 0], shift]),
         NETWORK,
         CLOSED,
     )
-    differ = np.abs(np.asarray(found.embeddings[0] - found.embeddings[1])).max(axis=1) > 1e-3
-    assert differ.sum() <= 2 < 30 < np.asarray(found.embeddings[0]).any(axis=1).sum()
-    assert (np.abs(np.asarray(found.images[0] - found.images[1])) > 1e-4).mean() < 0.01
+    differ = np.abs(np.asarray(descriptors.embeddings[0] - descriptors.embeddings[1])).max(axis=1) > 1e-3
+    assert differ.sum() <= 2 < 30 < np.asarray(descriptors.embeddings[0]).any(axis=1).sum()
+    assert (np.abs(np.asarray(descriptors.images[0] - descriptors.images[1])) > 1e-4).mean() < 0.01
 
 
 DEGENERATE = {
@@ -185,15 +189,15 @@ def degenerate() -> thor2.PointClouds:
 
 
 def test_degenerate_clouds_give_finite_numbers() -> None:
-    found = thor2.describe(degenerate(), NETWORK, CLOSED)
-    assert np.isfinite(np.asarray(found.tops2)).all()
-    described = np.asarray(found.embeddings).any(axis=(1, 2, 3))
+    descriptors = thor2.describe(degenerate(), NETWORK, CLOSED)
+    assert np.isfinite(np.asarray(descriptors.tops2)).all()
+    described = np.asarray(descriptors.embeddings).any(axis=(1, 2, 3))
     np.testing.assert_array_equal(described, [len(points) > 0 for points in DEGENERATE.values()])
 
 
 @pytest.mark.parametrize("homology", ["gudhi", "closed_form"])
 def test_inside_a_callers_jit_and_vmap(homology: str) -> None:
-    """With a network never seen before, so that nothing of the first trace may be kept for the calls after it."""
+    """Uses a new network, so that no result of an earlier trace can be reused."""
     network = dataclasses.replace(NETWORK, n_raw_nodes={"gudhi": 24, "closed_form": 25}[homology])
     config = thor2.DescriptorConfig(homology=homology)
     packed = thor2.PointClouds.pack([aligned_cloud(k, n) for k, n in enumerate((512, 0, 33, 1))])
@@ -201,9 +205,9 @@ def test_inside_a_callers_jit_and_vmap(homology: str) -> None:
     plain = thor2.describe_aligned(packed, network, config)
     pairs = jax.tree.map(lambda a: a.reshape(2, 2, *a.shape[1:]), packed)
     mapped = jax.vmap(lambda clouds: thor2.describe_aligned(clouds, network, config))(pairs)
-    for found in (jitted, mapped):
-        np.testing.assert_allclose(found.tops2.reshape(4, -1), plain.tops2, rtol=1e-6, atol=1e-6)
-        np.testing.assert_array_equal(found.overflow.reshape(4), plain.overflow)
+    for descriptors in (jitted, mapped):
+        np.testing.assert_allclose(descriptors.tops2.reshape(4, -1), plain.tops2, rtol=1e-6, atol=1e-6)
+        np.testing.assert_array_equal(descriptors.overflow.reshape(4), plain.overflow)
 
 
 def test_both_backends_give_the_same_floats() -> None:
@@ -217,7 +221,7 @@ def test_both_backends_give_the_same_floats() -> None:
     np.testing.assert_array_equal(first.overflow, second.overflow)
 
 
-def test_what_is_no_batch_of_clouds_is_refused() -> None:
+def test_input_that_is_no_batch_of_clouds_is_refused() -> None:
     packed = thor2.PointClouds.pack([aligned_cloud(0, 5)])
     one, batches = jax.tree.map(lambda a: a[0], packed), jax.tree.map(lambda a: a[None], packed)
     for function in (thor2.describe, thor2.describe_aligned, thor2.strips):
@@ -231,9 +235,9 @@ def test_what_is_no_batch_of_clouds_is_refused() -> None:
         thor2.diagrams([], CLOSED)
 
 
-def test_compiles_once_a_bucket(caplog: pytest.LogCaptureFixture) -> None:
-    """Every size of cloud that shares its bucket and its batch size shares one compilation."""
-    config = thor2.DescriptorConfig(homology="closed_form", alpha=0.7)  # of no other test
+def test_compiles_once_per_bucket(caplog: pytest.LogCaptureFixture) -> None:
+    """Clouds of all sizes with the same bucket and batch size share one compilation."""
+    config = thor2.DescriptorConfig(homology="closed_form", alpha=0.7)  # used by no other test
 
     def compiled(sizes: tuple[int, ...], network: colornet.ColorNetwork = NETWORK) -> list[str]:
         caplog.clear()
@@ -242,7 +246,7 @@ def test_compiles_once_a_bucket(caplog: pytest.LogCaptureFixture) -> None:
             jax.block_until_ready(thor2.describe(packed, network, config))
         lines = [record.getMessage() for record in caplog.records]
         names = [line.split()[4] for line in lines if line.startswith("Finished XLA compilation of")]
-        return [name for name in names if "convert_element_type" not in name]  # one for each dtype and shape
+        return [name for name in names if "convert_element_type" not in name]  # compiled for each dtype and shape
 
     def camera_like(n: int) -> Cloud:
         return np.random.default_rng(n).random((n, 3)) * 0.1, np.zeros((n, 3), np.uint8)

@@ -1,4 +1,4 @@
-"""Diagrams of both backends against one gudhi tree a slice, built the plain way from the definition."""
+"""Diagrams of both backends against one gudhi tree for each slice, built from the definition."""
 
 from functools import partial
 from typing import Any
@@ -16,7 +16,7 @@ GUDHI, CLOSED = thor2.DescriptorConfig(), thor2.DescriptorConfig(homology="close
 
 
 def plain_pairs(points: np.ndarray) -> list[np.ndarray]:
-    """Slice by slice: two vertices and an edge a strip into a simplex tree; its finite H0 pairs, [k, 2] sorted."""
+    """Return the finite H0 pairs of each slice, [k, 2] sorted: each strip is two vertices and an edge of a complex."""
     i, j = np.floor(points[:, 2] / 0.1).astype(int), np.floor(points[:, 0] / 0.025).astype(int)
     slices = []
     for a in range(7):
@@ -46,19 +46,19 @@ def pack(clouds: list[np.ndarray], capacity: int | None = None) -> thor2.PointCl
 
 
 @pytest.mark.parametrize("config", [GUDHI, CLOSED], ids=["gudhi", "closed_form"])
-def test_pairs_against_a_tree_a_slice(config: thor2.DescriptorConfig) -> None:
+def test_pairs_against_one_tree_per_slice(config: thor2.DescriptorConfig) -> None:
     rng = np.random.default_rng(0)
     clouds = [random_cloud(rng, n) for n in (0, 1, 2, 3, 50, 333, 512, 511)]
-    found = thor2.diagrams(pack(clouds), config)
-    assert found.births.shape == found.deaths.shape == found.mask.shape == (8, 7, 31)
-    assert found.births.dtype == found.deaths.dtype == jnp.float32
+    diagrams = thor2.diagrams(pack(clouds), config)
+    assert diagrams.births.shape == diagrams.deaths.shape == diagrams.mask.shape == (8, 7, 31)
+    assert diagrams.births.dtype == diagrams.deaths.dtype == jnp.float32
     for b, points in enumerate(clouds):
         for s, expected in enumerate(plain_pairs(points.astype(np.float64))):
-            mask = np.asarray(found.mask[b, s])
-            pairs = np.stack([found.births[b, s], found.deaths[b, s]], axis=1)[mask]
+            mask = np.asarray(diagrams.mask[b, s])
+            pairs = np.stack([diagrams.births[b, s], diagrams.deaths[b, s]], axis=1)[mask]
             np.testing.assert_allclose(pairs, expected, atol=2e-7)
-            np.testing.assert_array_equal(np.asarray(found.births[b, s])[~mask], 0)
-            np.testing.assert_array_equal(np.asarray(found.deaths[b, s])[~mask], 0)
+            np.testing.assert_array_equal(np.asarray(diagrams.births[b, s])[~mask], 0)
+            np.testing.assert_array_equal(np.asarray(diagrams.deaths[b, s])[~mask], 0)
 
 
 def assert_same(first: Any, second: Any) -> None:
@@ -67,7 +67,7 @@ def assert_same(first: Any, second: Any) -> None:
 
 
 @pytest.mark.parametrize("convention", ["paper", "released"])
-def test_both_backends_give_the_same_floats_on_a_thousand_clouds(convention: str) -> None:
+def test_both_backends_give_equal_pairs(convention: str) -> None:
     rng = np.random.default_rng(1)
     clouds = [random_cloud(rng, int(n)) for n in rng.integers(0, 257, 1000)]
     for start in range(0, 1000, 250):
@@ -83,7 +83,7 @@ def test_both_backends_give_the_same_floats_on_a_thousand_clouds(convention: str
 def strips_of(n_clouds: int) -> thor2.Strips:
     rng = np.random.default_rng(2)
     low = rng.random((n_clouds, 7, 31)).astype(np.float32)
-    high = low + rng.random(low.shape).astype(np.float32) * rng.integers(0, 2, low.shape)  # some of length zero
+    high = low + rng.random(low.shape).astype(np.float32) * rng.integers(0, 2, low.shape)  # some have length zero
     occupied = rng.random(low.shape) < 0.5
     return thor2.Strips(
         low=jnp.where(occupied, low, 0),
@@ -105,7 +105,7 @@ def test_with_and_without_jit_and_vmap(n_clouds: int) -> None:
             assert_same(function(strips), expected)
 
 
-def test_one_callback_a_batch(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_callback_per_batch(monkeypatch: pytest.MonkeyPatch) -> None:
     trees = []
     make = gudhi.SimplexTree
     monkeypatch.setattr(gudhi, "SimplexTree", lambda: trees.append(1) or make())

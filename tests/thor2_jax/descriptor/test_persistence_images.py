@@ -14,21 +14,21 @@ from thor2_jax.descriptor.persistence_images import count_past_window, persisten
 
 CONFIG = thor2.DescriptorConfig()
 TOLERANCE = 1e-6
-"""A death in single precision is 6e-8 off, and the Gaussian is narrow; pixels reach 0.2."""
+"""Deaths are rounded by 6e-8, which the narrow Gaussian amplifies; pixels reach 0.2."""
 
 
 def imager() -> persim.PersistenceImager:
-    """The window of the paper, set last: the size of a pixel would move it. What is called sigma is a variance."""
-    made = persim.PersistenceImager(
+    """Return an imager with the window of the paper, set after `pixel_size`, which moves it; `sigma` is a variance."""
+    result = persim.PersistenceImager(
         birth_range=(0, 0.75),
         pers_range=(0, 0.75),
         kernel_params={"sigma": [[0.00025, 0.0], [0.0, 0.00025]]},
         weight="persistence",
         weight_params={"n": 1.0},
     )
-    made.pixel_size = 0.025
-    made.birth_range = made.pers_range = (-0.025, 0.775)
-    return made
+    result.pixel_size = 0.025
+    result.birth_range = result.pers_range = (-0.025, 0.775)
+    return result
 
 
 def strip_of(births: np.ndarray) -> np.ndarray:
@@ -36,7 +36,7 @@ def strip_of(births: np.ndarray) -> np.ndarray:
 
 
 def diagram(births: np.ndarray, deaths: np.ndarray, n_strips: int = 31) -> thor2.Diagrams:
-    """One slice's: a pair stands where its strip does."""
+    """Return the diagram of one slice, each pair at the index of its strip."""
     out, mask = np.zeros((2, n_strips), np.float32), np.zeros(n_strips, bool)
     out[:, strip_of(births)], mask[strip_of(births)] = (births, deaths), True
     return thor2.Diagrams(jnp.asarray(out[0]), jnp.asarray(out[1]), jnp.asarray(mask))
@@ -51,10 +51,10 @@ def random_pairs(seed: int, n: int) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("n", [1, 2, 7, 31])
 def test_against_persim(n: int) -> None:
     births, deaths = random_pairs(n, n)
-    found = jax.jit(persistence_images, static_argnums=1)(diagram(births, deaths), CONFIG)
+    image = jax.jit(persistence_images, static_argnums=1)(diagram(births, deaths), CONFIG)
     expected = imager().transform(np.stack([births, deaths], axis=1), skew=True)
-    assert expected.shape == found.shape == (32, 32)
-    np.testing.assert_allclose(found, expected, atol=TOLERANCE)
+    assert expected.shape == image.shape == (32, 32)
+    np.testing.assert_allclose(image, expected, atol=TOLERANCE)
 
 
 def test_against_normal_cdfs_in_float64() -> None:
@@ -67,13 +67,13 @@ def test_against_normal_cdfs_in_float64() -> None:
     np.testing.assert_allclose(persistence_images(diagram(births, deaths), CONFIG), expected, atol=TOLERANCE)
 
 
-def test_an_empty_diagram_and_pairs_of_length_zero_are_black() -> None:
+def test_empty_diagrams_and_zero_persistence_give_zeros() -> None:
     np.testing.assert_array_equal(persistence_images(diagram(np.zeros(0), np.zeros(0)), CONFIG), 0)
     births = np.arange(5) * 0.1
     np.testing.assert_array_equal(persistence_images(diagram(births, births), CONFIG), 0)
 
 
-def test_padding_adds_nothing_whatever_it_holds() -> None:
+def test_values_of_padding_do_not_matter() -> None:
     births, deaths = random_pairs(1, 9)
     clean = diagram(births, deaths)
     dirty = thor2.Diagrams(
@@ -82,7 +82,7 @@ def test_padding_adds_nothing_whatever_it_holds() -> None:
     np.testing.assert_array_equal(persistence_images(dirty, CONFIG), persistence_images(clean, CONFIG))
 
 
-def test_another_size_of_image() -> None:
+def test_another_image_size() -> None:
     config = thor2.DescriptorConfig(image_size=17, image_variance=0.001)
     births, deaths = np.array([0.1, 0.2]), np.array([0.3, 0.25])
     edges = (np.arange(18) - 1) * 0.025
@@ -91,46 +91,46 @@ def test_another_size_of_image() -> None:
     np.testing.assert_allclose(persistence_images(diagram(births, deaths), config), expected, atol=TOLERANCE)
 
 
-def test_pairs_past_the_window_are_counted() -> None:
+def test_pairs_beyond_the_window_are_counted() -> None:
     rng = np.random.default_rng(0)
     births = np.broadcast_to((np.arange(31) * 0.025).astype(np.float32), (3, 7, 31))
     persistence = rng.uniform(0, 1.5, births.shape).astype(np.float32)
     persistence = np.where(np.abs(persistence - 0.775) < 1e-4, 0, persistence)
     mask = rng.random(births.shape) < 0.6
     pairs = thor2.Diagrams(jnp.asarray(births), jnp.asarray(births + persistence), jnp.asarray(mask))
-    found = count_past_window(pairs, CONFIG)
-    np.testing.assert_array_equal(found, (mask & (persistence > 0.775)).sum(axis=(1, 2)))
-    assert found.dtype == jnp.int32
+    counts = count_past_window(pairs, CONFIG)
+    np.testing.assert_array_equal(counts, (mask & (persistence > 0.775)).sum(axis=(1, 2)))
+    assert counts.dtype == jnp.int32
 
 
 def test_gradient_against_finite_differences() -> None:
     births, deaths = random_pairs(2, 6)
     probe = np.random.default_rng(0).random((32, 32))
 
-    def value(d: np.ndarray) -> float:
+    def expected_sum(d: np.ndarray) -> float:
         edges = (np.arange(33) - 1) * 0.025
         tables = np.diff(ndtr((edges - np.stack([births, d - births])[..., None]) / np.sqrt(0.00025)))
         return float(np.einsum("kp,kq,k,pq->", *tables, d - births, probe))
 
-    def found(d: jax.Array) -> jax.Array:
+    def probed_sum(d: jax.Array) -> jax.Array:
         pairs = diagram(births, deaths)
         pairs = thor2.Diagrams(pairs.births, pairs.deaths.at[strip_of(births)].set(d), pairs.mask)
         return (persistence_images(pairs, CONFIG) * jnp.asarray(probe, jnp.float32)).sum()
 
-    gradient = jax.grad(found)(jnp.asarray(deaths, jnp.float32))
+    gradient = jax.grad(probed_sum)(jnp.asarray(deaths, jnp.float32))
     for k in range(6):
         step = np.eye(6)[k] * 1e-6
-        expected = (value(deaths + step) - value(deaths - step)) / 2e-6
+        expected = (expected_sum(deaths + step) - expected_sum(deaths - step)) / 2e-6
         assert float(gradient[k]) == pytest.approx(expected, rel=1e-3, abs=1e-4)
 
 
 def test_any_number_of_slices_at_once() -> None:
     one = [diagram(*random_pairs(seed, 9)) for seed in range(6)]
     stacked = jax.tree.map(lambda *fields: jnp.stack(fields).reshape(2, 3, 31), *one)
-    found = persistence_images(stacked, CONFIG)
-    assert found.shape == (2, 3, 32, 32)
+    images = persistence_images(stacked, CONFIG)
+    assert images.shape == (2, 3, 32, 32)
     for k, pairs in enumerate(one):
-        np.testing.assert_allclose(found[k // 3, k % 3], persistence_images(pairs, CONFIG), atol=TOLERANCE)
+        np.testing.assert_allclose(images[k // 3, k % 3], persistence_images(pairs, CONFIG), atol=TOLERANCE)
 
 
 @pytest.mark.parametrize("exponent", [0.5, 1.0, 2.0])
@@ -142,5 +142,5 @@ def test_other_weights_and_variances(exponent: float, variance: float) -> None:
     expected = np.einsum("kp,kq,k->pq", *tables, (deaths - births) ** exponent)
     by_config = dataclasses.replace(CONFIG, image_variance=variance, persistence_weight=exponent)
     pairs = diagram(births, deaths)
-    for found in (persistence_images(pairs, by_config), persistence_images(pairs, CONFIG, variance, exponent)):
-        np.testing.assert_allclose(found, np.broadcast_to(expected, found.shape), atol=TOLERANCE)
+    for image in (persistence_images(pairs, by_config), persistence_images(pairs, CONFIG, variance, exponent)):
+        np.testing.assert_allclose(image, np.broadcast_to(expected, image.shape), atol=TOLERANCE)

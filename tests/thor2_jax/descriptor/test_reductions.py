@@ -32,19 +32,19 @@ def test_against_numpy(length: int) -> None:
     values = numbers(3, length, seed=length)
     for name, results in both_ways(values).items():
         expected = REDUCTIONS[name][1](values.astype(np.float64), axis=-1)
-        for found in results:
-            assert found.shape == (3,) and found.dtype == jnp.float32
-            np.testing.assert_allclose(found, expected, rtol=0, atol=2e-7 * length if name == "total" else 0)
+        for result in results:
+            assert result.shape == (3,) and result.dtype == jnp.float32
+            np.testing.assert_allclose(result, expected, rtol=0, atol=2e-7 * length if name == "total" else 0)
 
 
 @pytest.mark.parametrize("name", REDUCTIONS)
 @pytest.mark.parametrize("shape", [(16,), (0, 16), (2, 0, 16), (2, 3, 32)])
 def test_any_leading_axes_without_jit(name: str, shape: tuple[int, ...]) -> None:
     plain, oracle = REDUCTIONS[name]
-    found = plain(jnp.asarray(numbers(*shape)))
+    result = plain(jnp.asarray(numbers(*shape)))
     expected = oracle(numbers(*shape).astype(np.float64), axis=-1)
-    assert found.shape == shape[:-1]
-    np.testing.assert_allclose(found, expected, atol=1e-5)
+    assert result.shape == shape[:-1]
+    np.testing.assert_allclose(result, expected, atol=1e-5)
 
 
 def test_infinities_and_ties() -> None:
@@ -62,9 +62,9 @@ def test_fold_combines_entries_a_row_apart(length: int) -> None:
     values = numbers(2, length)
     expected = values.astype(np.float64).reshape(2, ROWS, length // ROWS)
     for op, oracle in ((jnp.add, np.sum), (jnp.minimum, np.min)):
-        found = fold(jnp.asarray(values), op)
-        assert found.shape == (2, length // ROWS)
-        np.testing.assert_allclose(found, oracle(expected, axis=1), atol=1e-5)
+        folded = fold(jnp.asarray(values), op)
+        assert folded.shape == (2, length // ROWS)
+        np.testing.assert_allclose(folded, oracle(expected, axis=1), atol=1e-5)
 
 
 @pytest.mark.parametrize("length", [1, 15, 17, 47])
@@ -81,39 +81,39 @@ FEW = (*range(1, 21), 24, 32, 33, 40, 48, 64, 66, 80, 96, 112, 127, 128, 130)
 @pytest.fixture(scope="module", params=[FEW, pytest.param(range(1, 131), marks=pytest.mark.slow)], ids=["few", "all"])
 def argmaxes(request: pytest.FixtureRequest) -> Callable[[np.ndarray], dict[int, np.ndarray]]:
     """Map a length to `argmax` over that many first entries of each row of an [8, 130] array, compiled together."""
-    together = jax.jit(lambda values: {length: argmax(values[:, :length]) for length in request.param})
-    return lambda values: {length: np.asarray(found) for length, found in together(values).items()}
+    compiled = jax.jit(lambda values: {length: argmax(values[:, :length]) for length in request.param})
+    return lambda values: {length: np.asarray(index) for length, index in compiled(values).items()}
 
 
 def test_argmax_of_any_length(argmaxes: Callable[[np.ndarray], dict[int, np.ndarray]]) -> None:
     values = numbers(8, 130)
-    for length, found in argmaxes(values).items():
-        assert found.shape == (8,) and found.dtype == np.int32
-        np.testing.assert_array_equal(found, values[:, :length].argmax(axis=1))
+    for length, index in argmaxes(values).items():
+        assert index.shape == (8,) and index.dtype == np.int32
+        np.testing.assert_array_equal(index, values[:, :length].argmax(axis=1))
 
 
 def test_argmax_in_every_place(argmaxes: Callable[[np.ndarray], dict[int, np.ndarray]]) -> None:
     for start in range(0, 123, 8):
         values, place = np.full((8, 130), -np.inf, np.float32), start + np.arange(8)
         values[np.arange(8), place] = -3.0
-        for length, found in argmaxes(values).items():
-            np.testing.assert_array_equal(found[place < length], place[place < length])
-            assert (0 <= found).all() and (found < length).all()
+        for length, index in argmaxes(values).items():
+            np.testing.assert_array_equal(index[place < length], place[place < length])
+            assert (0 <= index).all() and (index < length).all()
 
 
 def test_argmax_of_ties_is_one_of_them(argmaxes: Callable[[np.ndarray], dict[int, np.ndarray]]) -> None:
     values = np.random.default_rng(1).integers(0, 3, (8, 130)).astype(np.float32)
     values[0], values[1] = 0, -np.inf
-    for length, found in argmaxes(values).items():
-        assert (0 <= found).all() and (found < length).all()
-        np.testing.assert_array_equal(values[np.arange(8), found], values[:, :length].max(axis=1))
+    for length, index in argmaxes(values).items():
+        assert (0 <= index).all() and (index < length).all()
+        np.testing.assert_array_equal(values[np.arange(8), index], values[:, :length].max(axis=1))
 
 
 def test_argmax_under_vmap_and_without_other_axes() -> None:
     values = numbers(2, 3, 66)
-    together = jax.jit(lambda x: (argmax(x), jax.vmap(argmax)(x), jax.vmap(jax.vmap(argmax))(x), argmax(x[1, 2])))
-    *found, last = together(values)
-    for index in found:
+    compiled = jax.jit(lambda x: (argmax(x), jax.vmap(argmax)(x), jax.vmap(jax.vmap(argmax))(x), argmax(x[1, 2])))
+    *indices, last = compiled(values)
+    for index in indices:
         np.testing.assert_array_equal(index, values.argmax(axis=-1))
     assert last.shape == () and int(last) == values[1, 2].argmax()
     assert int(argmax(jnp.asarray([3.0, 5.0, 4.0]))) == 1  # not compiled

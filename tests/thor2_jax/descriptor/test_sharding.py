@@ -1,4 +1,4 @@
-"""One batch on eight devices and in two processes against one device, each in processes of their own."""
+"""One batch on eight devices and in two processes against one device, each in separate processes."""
 
 import json
 from pathlib import Path
@@ -35,24 +35,24 @@ for homology in ("closed_form", "gudhi"):
     assert len(many.images.sharding.device_set) == 8
     worst[homology] = max(float(abs(np.asarray(a) - np.asarray(b)).max()) for a, b in
                           zip(jax.tree.leaves(one), jax.tree.leaves(many), strict=True))
-refused = []
+errors = []
 for bad in (lambda: shard_clouds(thor2.PointClouds.pack(list(clouds(6)), 512), batch_mesh()),
             lambda: describe_sharded(packed, network, config)):
     try:
         bad()
     except thor2.InputError as error:
-        refused.append(str(error))
-print(json.dumps({"worst": worst, "refused": refused}))
+        errors.append(str(error))
+print(json.dumps({"worst": worst, "errors": errors}))
 """
 
 _PROCESS = """
 port, rank, folder = sys.argv[1], int(sys.argv[2]), sys.argv[3]
 jax.distributed.initialize(f"localhost:{port}", 2, rank)
-mine = list(clouds(8))[rank * 4 : rank * 4 + 4]
+clouds_of_rank = list(clouds(8))[rank * 4 : rank * 4 + 4]
 config = thor2.DescriptorConfig(homology="gudhi")
-found = describe_sharded(shard_clouds(thor2.PointClouds.pack(mine, 512), batch_mesh()), network, config)
-assert found.images.shape[0] == 8
-tops2 = [np.asarray(s.data) for s in found.tops2.addressable_shards]
+descriptors = describe_sharded(shard_clouds(thor2.PointClouds.pack(clouds_of_rank, 512), batch_mesh()), network, config)
+assert descriptors.images.shape[0] == 8
+tops2 = [np.asarray(s.data) for s in descriptors.tops2.addressable_shards]
 np.save(f"{folder}/{rank}.npy", np.concatenate(tops2))
 """
 
@@ -62,17 +62,17 @@ np.save(sys.argv[1], np.asarray(thor2.describe(packed, network, thor2.Descriptor
 """
 
 
-def test_eight_devices_give_the_numbers_of_one() -> None:
-    told = json.loads(finish_programs(start_program(_CLOUDS + _DEVICES, devices=8))[0].splitlines()[-1])
-    assert told["worst"]["closed_form"] <= 1e-6 and told["worst"]["gudhi"] <= 1e-6
-    assert len(told["refused"]) == 2
-    assert "multiple of the 8 devices" in told["refused"][0] and "shard_clouds" in told["refused"][1]
+def test_eight_devices_equal_one() -> None:
+    output = json.loads(finish_programs(start_program(_CLOUDS + _DEVICES, devices=8))[0].splitlines()[-1])
+    assert output["worst"]["closed_form"] <= 1e-6 and output["worst"]["gudhi"] <= 1e-6
+    assert len(output["errors"]) == 2
+    assert "multiple of 8" in output["errors"][0] and "shard_clouds" in output["errors"][1]
 
 
 @pytest.mark.slow
-def test_two_processes_give_the_numbers_of_one(tmp_path: Path) -> None:
+def test_two_processes_equal_one(tmp_path: Path) -> None:
     port = free_port()
     finish_programs(*(start_program(_CLOUDS + _PROCESS, port, rank, tmp_path) for rank in range(2)))
     finish_programs(start_program(_CLOUDS + _ALONE, tmp_path / "alone.npy"))
-    parts = np.concatenate([np.load(tmp_path / f"{rank}.npy") for rank in range(2)])
-    np.testing.assert_allclose(parts, np.load(tmp_path / "alone.npy"), atol=1e-6)
+    sharded = np.concatenate([np.load(tmp_path / f"{rank}.npy") for rank in range(2)])
+    np.testing.assert_allclose(sharded, np.load(tmp_path / "alone.npy"), atol=1e-6)

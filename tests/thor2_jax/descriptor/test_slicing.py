@@ -48,16 +48,16 @@ def expected_strips(points: np.ndarray, rgb: np.ndarray, released: bool) -> dict
 @pytest.mark.parametrize("sizes", [(0,), (1, 2), (333, 0, 512), (0, 0)])
 def test_strips_against_numpy(sizes: tuple[int, ...], config: thor2.DescriptorConfig) -> None:
     clouds = [aligned_cloud(k, n) for k, n in enumerate(sizes)]
-    found = thor2.strips(thor2.PointClouds.pack(clouds), NETWORK, config)
+    strips = thor2.strips(thor2.PointClouds.pack(clouds), NETWORK, config)
     for b, (points, rgb) in enumerate(clouds):
         expected = expected_strips(points.astype(np.float64), rgb, config.convention == "released")
-        for field in dataclasses.fields(found):
-            actual = np.asarray(getattr(found, field.name)[b])
+        for field in dataclasses.fields(strips):
+            actual = np.asarray(getattr(strips, field.name)[b])
             np.testing.assert_allclose(actual, expected[field.name], atol=1e-5, err_msg=f"{b} {field.name}")
 
 
 def test_the_released_rule_on_many_random_clouds() -> None:
-    """All coordinates at once, in the hundreds of thousands: single precision must not round another way."""
+    """Compares hundreds of thousands of coordinates, which single precision must round like double precision."""
     rng = np.random.default_rng(0)
     points = (rng.random((300, 512, 3)) * [0.8, 0.4, 1.2]).astype(np.float32)
     mask = np.ones((300, 512), bool)
@@ -65,21 +65,21 @@ def test_the_released_rule_on_many_random_clouds() -> None:
     for b in range(300):
         slices, strips = released_rule(points[b].astype(np.float64))
         np.testing.assert_array_equal(i[b], slices)
-        np.testing.assert_array_equal(np.minimum(j[b], 31), strips)  # digitize has no number past 31
+        np.testing.assert_array_equal(np.minimum(j[b], 31), strips)  # digitize returns 31 for all larger values
 
 
 def test_the_released_rounding_at_every_half() -> None:
-    """Floats on and right beside each half of 0.01 and 0.1, where a product in single precision goes wrong."""
+    """Tests the floats at and next to each half of 0.01 and 0.1, where a product in single precision rounds wrongly."""
     x = np.concatenate([(np.arange(79) + 0.5) / 100, np.arange(78) / 100]).astype(np.float32)
     z = np.concatenate([(np.arange(12) + 0.5) / 10, np.arange(13) / 10]).astype(np.float32)
     for column, values in ((0, x), (2, z)):
         near = [values, np.nextafter(values, np.float32(9)), np.nextafter(values, np.float32(-9))]
         points = np.zeros((3 * len(values), 3), np.float32)
         points[:, column] = np.maximum(np.concatenate(near), 0)
-        found = jax.jit(lambda p: slices_and_strips(p[:, 0], p[:, 2], jnp.ones(len(p), bool), RELEASED))(points)
+        indices = jax.jit(lambda p: slices_and_strips(p[:, 0], p[:, 2], jnp.ones(len(p), bool), RELEASED))(points)
         slices, strips = released_rule(points.astype(np.float64))
-        np.testing.assert_array_equal(found[0], slices)
-        np.testing.assert_array_equal(np.minimum(found[1], 31), strips)
+        np.testing.assert_array_equal(indices[0], slices)
+        np.testing.assert_array_equal(np.minimum(indices[1], 31), strips)
 
 
 def test_padding_does_not_occupy_levels_in_the_released_rule() -> None:
@@ -88,8 +88,8 @@ def test_padding_does_not_occupy_levels_in_the_released_rule() -> None:
     np.testing.assert_array_equal(i[:2], [0, 1])
 
 
-def test_levels_from_twice_the_slices_on_are_past_the_end_in_the_released_rule() -> None:
-    """Whatever their rank: 1.3 is the last level that counts, 1.4 the first that does not."""
+def test_levels_past_twice_the_slices_overflow_if_released() -> None:
+    """For any rank, 1.3 is the last level that counts, and 1.4 the first that does not."""
     for far, number in ((1.3, 1), (1.4, 14)):
         points = jnp.array([[0.1, 0.1, 0], [0.1, 0.1, far]], jnp.float32)
         i, _ = slices_and_strips(points[:, 0], points[:, 2], jnp.ones(2, bool), RELEASED)
@@ -102,21 +102,21 @@ def test_overflow_is_the_number_of_points_left_out(
     size: tuple[float, float, float], config: thor2.DescriptorConfig
 ) -> None:
     clouds = [aligned_cloud(k, n, size) for k, n in enumerate((500, 77))]
-    found = thor2.strips(thor2.PointClouds.pack(clouds), NETWORK, config)
+    strips = thor2.strips(thor2.PointClouds.pack(clouds), NETWORK, config)
     for b, (points, rgb) in enumerate(clouds):
         expected = expected_strips(points.astype(np.float64), rgb, config.convention == "released")
-        assert int(found.overflow[b]) == expected["overflow"] > 0
-        np.testing.assert_array_equal(found.occupied[b], expected["occupied"])
-        np.testing.assert_allclose(found.color[b], expected["color"], atol=1e-5)
+        assert int(strips.overflow[b]) == expected["overflow"] > 0
+        np.testing.assert_array_equal(strips.occupied[b], expected["occupied"])
+        np.testing.assert_allclose(strips.color[b], expected["color"], atol=1e-5)
 
 
-def test_points_outside_on_every_side_are_counted_and_land_nowhere() -> None:
+def test_points_outside_on_every_side_are_counted() -> None:
     far = [[1e12, 0, 0], [0, 0, 1e12], [3e38, 3e38, 3e38], [-0.5, 0, 0], [0, 0, -0.5], [0.7751, 0, 0], [0, 0, 0.7001]]
     points = np.array([[0.01, 0.2, 0.01], *far], np.float32)
-    found = thor2.strips(thor2.PointClouds.pack([(points, np.zeros(points.shape))]), NETWORK, PAPER)
-    assert int(found.overflow[0]) == len(far)
-    np.testing.assert_array_equal(np.argwhere(np.asarray(found.occupied)), [[0, 0, 0]])
-    assert float(found.color.sum()) == pytest.approx(1)
+    strips = thor2.strips(thor2.PointClouds.pack([(points, np.zeros(points.shape))]), NETWORK, PAPER)
+    assert int(strips.overflow[0]) == len(far)
+    np.testing.assert_array_equal(np.argwhere(np.asarray(strips.occupied)), [[0, 0, 0]])
+    assert float(strips.color.sum()) == pytest.approx(1)
 
 
 def test_order_duplicates_and_padding() -> None:
@@ -129,19 +129,19 @@ def test_order_duplicates_and_padding() -> None:
         "duplicates": (thor2.PointClouds.pack([(np.tile(points, (3, 1)), np.tile(rgb, (3, 1)))]), 3),
     }
     for name, (clouds, times) in others.items():
-        found = thor2.strips(clouds, NETWORK, PAPER)
+        strips = thor2.strips(clouds, NETWORK, PAPER)
         for field in ("low", "high", "occupied"):
-            np.testing.assert_array_equal(getattr(found, field), getattr(plain, field), err_msg=name)
-        np.testing.assert_allclose(found.color, times * plain.color, atol=1e-5, err_msg=name)
+            np.testing.assert_array_equal(getattr(strips, field), getattr(plain, field), err_msg=name)
+        np.testing.assert_allclose(strips.color, times * plain.color, atol=1e-5, err_msg=name)
 
 
-def test_gradients_reach_one_point_an_extreme() -> None:
+def test_gradients_reach_one_point_per_extreme() -> None:
     points, rgb = aligned_cloud(1, 333)
     clouds = thor2.PointClouds.pack([(points, rgb)], capacity=400)
 
     def span(x: jax.Array) -> jax.Array:
-        found = thor2.strips(dataclasses.replace(clouds, points=x), NETWORK, PAPER)
-        return (found.high - found.low).sum()
+        strips = thor2.strips(dataclasses.replace(clouds, points=x), NETWORK, PAPER)
+        return (strips.high - strips.low).sum()
 
     gradient = np.asarray(jax.grad(span)(clouds.points))[0]
     expected = np.zeros((400, 3))

@@ -1,4 +1,4 @@
-"""A stream of clouds against one batch of all, and that it is read and forgotten as it goes."""
+"""A stream of clouds against one batch; clouds are read when they are needed."""
 
 from collections.abc import Iterator
 
@@ -22,11 +22,11 @@ def clouds(count: int, seed: int = 0) -> Iterator[tuple[np.ndarray, np.ndarray]]
 
 @pytest.mark.parametrize("count", [1, 4, 9])
 def test_against_one_batch(count: int) -> None:
-    parts = list(describe_stream(clouds(count), NETWORK, CONFIG, capacity=512, batch=4))
-    assert [len(p.overflow) for p in parts] == [4] * (count // 4) + ([count % 4] if count % 4 else [])
+    batches = list(describe_stream(clouds(count), NETWORK, CONFIG, capacity=512, batch=4))
+    assert [len(p.overflow) for p in batches] == [4] * (count // 4) + ([count % 4] if count % 4 else [])
     whole = thor2.describe(thor2.PointClouds.pack(list(clouds(count)), 512), NETWORK, CONFIG)
-    np.testing.assert_allclose(np.concatenate([p.tops2 for p in parts]), whole.tops2, atol=1e-5)
-    np.testing.assert_array_equal(np.concatenate([p.overflow for p in parts]), whole.overflow)
+    np.testing.assert_allclose(np.concatenate([p.tops2 for p in batches]), whole.tops2, atol=1e-5)
+    np.testing.assert_array_equal(np.concatenate([p.overflow for p in batches]), whole.overflow)
 
 
 def test_an_empty_stream() -> None:

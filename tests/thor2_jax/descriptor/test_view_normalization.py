@@ -1,4 +1,4 @@
-"""View normalization: a rigid motion that depends on nothing but the object and the camera."""
+"""View normalization: a rigid motion that depends only on the object and the camera."""
 
 import dataclasses
 
@@ -14,11 +14,11 @@ import thor2_jax as thor2
 CONFIG = thor2.DescriptorConfig()
 COLOR = np.float32(0.5)
 
-# Compiling takes nearly all the time of these tests: they share three shapes, [1, 512], [1, 1024] and [4, 512].
+# These tests share three shapes, [1, 512], [1, 1024] and [4, 512], since compilation dominates their time.
 
 
 def object_cloud(seed: int, n: int = 400) -> np.ndarray:
-    """A lopsided thing about 0.2 m long, half a metre before the camera: no symmetry leaves its frame open."""
+    """Return an asymmetric cloud 0.2 m long at a distance of 0.5 m, whose frame is not ambiguous."""
     rng = np.random.default_rng(seed)
     body = rng.random((n, 3)) * [0.2, 0.11, 0.05]
     keep = (body[:, 0] / 0.2 + body[:, 1] / 0.11 < rng.uniform(0.9, 1.3)) | (body[:, 2] < 0.02)
@@ -33,13 +33,13 @@ def normalized(points: np.ndarray, **options: object) -> np.ndarray:
     return np.asarray(thor2.view_normalize(pack(points, **options), CONFIG).points[0, : len(points)], np.float64)
 
 
-def in_company(points: np.ndarray) -> list[np.ndarray]:
-    """Four clouds: another one, none, `points`, another one."""
+def among_others(points: np.ndarray) -> list[np.ndarray]:
+    """Return four clouds: another one, an empty one, `points`, another one."""
     return [object_cloud(50), np.zeros((0, 3)), points, object_cloud(51)]
 
 
 def rigid_motion(before: np.ndarray, after: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Rotation and shift with after = before @ rotation + shift, and the largest error (Kabsch)."""
+    """Return rotation and shift with after = before @ rotation + shift, and the largest error (Kabsch)."""
     u, _, v = np.linalg.svd((before - before.mean(0)).T @ (after - after.mean(0)))
     rotation = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ v))]) @ v
     shift = after.mean(0) - before.mean(0) @ rotation
@@ -71,14 +71,14 @@ def test_a_rigid_motion_of_cloud_and_camera_changes_nothing(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_order_duplicates_and_company_change_nothing(seed: int) -> None:
+def test_order_duplicates_and_other_clouds_change_nothing(seed: int) -> None:
     points = object_cloud(seed)
     expected = normalized(points)
     order = np.random.default_rng(seed).permutation(len(points))
     np.testing.assert_allclose(normalized(points[order]), expected[order], atol=5e-6)
     doubled = np.concatenate([points, points])
     np.testing.assert_allclose(normalized(doubled)[: len(points)], expected, atol=5e-6)
-    batch = thor2.view_normalize(pack(*in_company(points)), CONFIG)
+    batch = thor2.view_normalize(pack(*among_others(points)), CONFIG)
     np.testing.assert_allclose(batch.points[2, : len(points)], expected, atol=5e-6)
 
 
@@ -90,11 +90,11 @@ def test_padding_changes_nothing() -> None:
 def test_padding_stays_zero_and_an_empty_cloud_stays_empty() -> None:
     points = object_cloud(0)
     for step in (thor2.view_normalize, thor2.align):
-        found = step(pack(*in_company(points)), CONFIG)
-        np.testing.assert_array_equal(found.points[2, len(points) :], 0)
-        np.testing.assert_array_equal(found.points[1], 0)
-        assert np.isfinite(np.asarray(found.camera)).all()
-        np.testing.assert_array_equal(np.asarray(found.mask).sum(axis=1)[1:3], [0, len(points)])
+        result = step(pack(*among_others(points)), CONFIG)
+        np.testing.assert_array_equal(result.points[2, len(points) :], 0)
+        np.testing.assert_array_equal(result.points[1], 0)
+        assert np.isfinite(np.asarray(result.camera)).all()
+        np.testing.assert_array_equal(np.asarray(result.mask).sum(axis=1)[1:3], [0, len(points)])
 
 
 DEGENERATE = {
@@ -120,8 +120,8 @@ def test_degenerate_clouds_move_rigidly_too(name: str) -> None:
 
 @pytest.mark.parametrize("height", [0.03, 0.045, 0.055, 0.07])
 @pytest.mark.parametrize("heavy", ["below", "above"])
-def test_the_camera_s_side_is_told_from_the_box_s_middle(height: float, heavy: str) -> None:
-    """A camera beside a slab whose mean lies near one of its large faces."""
+def test_the_camera_side_is_relative_to_the_middle_of_the_box(height: float, heavy: str) -> None:
+    """The camera is beside a slab whose mean lies near one of its large faces."""
     rng = np.random.default_rng(0)
     points = rng.random((450, 3)) * [0.4, 0.3, 0.1]
     points[:400, 2] = 0 if heavy == "below" else 0.1
@@ -129,8 +129,8 @@ def test_the_camera_s_side_is_told_from_the_box_s_middle(height: float, heavy: s
     assert float(normal.camera[0, 2]) <= float(normal.points[0, : len(points), 2].max()) / 2
 
 
-def test_the_camera_is_brought_to_the_near_side() -> None:
-    """The same cloud from two opposite sides: a half turn about x apart."""
+def test_the_camera_is_on_the_near_side() -> None:
+    """One cloud with the camera on opposite sides differs by a rotation by pi about x."""
     points = object_cloud(3)
     normal = thor2.view_normalize(pack(points), CONFIG)
     after = np.asarray(normal.points[0, : len(points)], np.float64)
@@ -144,7 +144,7 @@ def test_the_camera_is_brought_to_the_near_side() -> None:
 
 @pytest.mark.parametrize(("at_start", "at_end"), [(3, 2), (1, 0), (2, 2), (0, 0), (2, 3), (0, 5)])
 def test_the_occluded_end_does_not_come_first(at_start: int, at_end: int) -> None:
-    """A half turn about z exactly when the first two bins of 0.01 hold more boundary points than the last two."""
+    """A rotation by pi about z exactly if the first two bins of 0.01 hold more boundary points than the last two."""
     points = object_cloud(5, 1200)
     assert 512 < len(points) <= 1024
     plain = normalized(points)
@@ -154,10 +154,10 @@ def test_the_occluded_end_does_not_come_first(at_start: int, at_end: int) -> Non
     assert len(first) > 5 and len(last) > 5
     boundary = np.zeros(len(points), bool)
     boundary[np.concatenate([first[:at_start], last[:at_end], middle[:40]])] = True
-    found = normalized(points, boundary=[boundary])
+    with_boundary = normalized(points, boundary=[boundary])
     sides = plain.max(axis=0)
     turned = np.stack([sides[0] - plain[:, 0], sides[1] - plain[:, 1], plain[:, 2]], axis=1)
-    np.testing.assert_allclose(found, turned if at_start > at_end else plain, atol=1e-5)
+    np.testing.assert_allclose(with_boundary, turned if at_start > at_end else plain, atol=1e-5)
 
 
 def test_colours_mask_and_boundary_pass_through() -> None:
@@ -165,15 +165,15 @@ def test_colours_mask_and_boundary_pass_through() -> None:
     colors = np.random.default_rng(0).random(points.shape).astype(np.float32)
     edge = np.arange(len(points)) % 7 == 0
     clouds = thor2.PointClouds.pack([(points, colors)], boundary=[edge])
-    found = thor2.align(clouds, CONFIG)
+    aligned = thor2.align(clouds, CONFIG)
     for name in ("colors", "mask", "boundary"):
-        np.testing.assert_array_equal(getattr(found, name), getattr(clouds, name))
+        np.testing.assert_array_equal(getattr(aligned, name), getattr(clouds, name))
 
 
 @pytest.mark.parametrize("alpha", [np.pi / 4, -0.3])
 def test_turn_is_the_rotation_matrix_about_y_by_minus_alpha(alpha: float) -> None:
     config = dataclasses.replace(CONFIG, alpha=float(alpha))
-    clouds = pack(*in_company(object_cloud(1)))
+    clouds = pack(*among_others(object_cloud(1)))
     normal = thor2.view_normalize(clouds, CONFIG)
     aligned = thor2.turn(normal, config)
     for i in (0, 2, 3):
@@ -190,16 +190,16 @@ def test_turn_is_the_rotation_matrix_about_y_by_minus_alpha(alpha: float) -> Non
 
 @pytest.mark.parametrize("axes", ["", "x", "y", "xy", "xyz"])
 def test_mirror_keeps_the_box(axes: str) -> None:
-    normal = thor2.view_normalize(pack(*in_company(object_cloud(1))), CONFIG)
-    found = thor2.mirror(normal, axes)
+    normal = thor2.view_normalize(pack(*among_others(object_cloud(1))), CONFIG)
+    mirrored = thor2.mirror(normal, axes)
     mask = np.asarray(normal.mask[2])
-    before, after = np.asarray(normal.points[2])[mask], np.asarray(found.points[2])[mask]
+    before, after = np.asarray(normal.points[2])[mask], np.asarray(mirrored.points[2])[mask]
     for k, letter in enumerate("xyz"):
         expected = before[:, k].max() - before[:, k] if letter in axes else before[:, k]
         np.testing.assert_array_equal(after[:, k], expected)
-    np.testing.assert_array_equal(np.asarray(found.points[2])[~mask], 0)
-    np.testing.assert_array_equal(found.points[1], 0)
-    np.testing.assert_array_equal(thor2.mirror(found, axes).mask, normal.mask)
+    np.testing.assert_array_equal(np.asarray(mirrored.points[2])[~mask], 0)
+    np.testing.assert_array_equal(mirrored.points[1], 0)
+    np.testing.assert_array_equal(thor2.mirror(mirrored, axes).mask, normal.mask)
 
 
 def test_mirror_refuses_another_axis() -> None:
@@ -208,7 +208,7 @@ def test_mirror_refuses_another_axis() -> None:
 
 
 def test_gradients_are_those_of_the_fixed_frame() -> None:
-    """No gradient goes through the frame: a point's is the rotation, and it is finite for a cube as well."""
+    """No gradient goes through the frame: that of a point is the rotation, which is finite for a cube as well."""
 
     @jax.jit
     @jax.grad
@@ -219,11 +219,11 @@ def test_gradients_are_those_of_the_fixed_frame() -> None:
         clouds = pack(points)
         gradient = np.asarray(gradient_of_height(clouds.points, clouds))
         assert np.isfinite(gradient).all() and np.abs(gradient).max() > 0
-        np.testing.assert_allclose(gradient[0, : len(points)].sum(axis=0), 0, atol=1e-3)  # a shift changes nothing
+        np.testing.assert_allclose(gradient[0, : len(points)].sum(axis=0), 0, atol=1e-3)  # invariant to shifts
 
 
 def test_large_batches_of_small_rotations_are_exact() -> None:
-    """Version 0.10.2 of jax got this kernel wrong past 32,768 rows on CPUs (jax issue 39103) and is excluded for it."""
+    """Jax 0.10.2, which is excluded, miscompiles this kernel beyond 32,768 rows on CPUs (jax issue 39103)."""
     matrix = jnp.asarray(Rotation.from_euler("z", 0.0).as_matrix(), jnp.float32)
     rows = jnp.zeros((40_000, 3)).at[:, 0].set(jnp.arange(40_000.0))
     kernel = jax.vmap(lambda row: jnp.sum((matrix @ row) ** 2))

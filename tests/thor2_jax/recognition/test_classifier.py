@@ -16,7 +16,7 @@ apply = nnx.jit(lambda model, x: model(x))
 train = nnx.jit(lambda model, x, rngs=None: model(x, train=True, rngs=rngs))
 
 
-def settled(n_inputs: int, n_classes: int) -> MLP:
+def random_classifier(n_inputs: int, n_classes: int) -> MLP:
     """A classifier whose batch statistics and scales are not the ones it was born with."""
     model = MLP(n_inputs, n_classes, rngs=nnx.Rngs(0))
     model.input_scale[...] = jnp.asarray(RNG.uniform(0.5, 2, n_inputs), jnp.float32)
@@ -30,7 +30,7 @@ def settled(n_inputs: int, n_classes: int) -> MLP:
 
 @pytest.fixture(scope="module")
 def model() -> MLP:
-    return settled(33, 5)
+    return random_classifier(33, 5)
 
 
 def numpy_logits(model: MLP, x: np.ndarray, own_statistics: bool) -> np.ndarray:
@@ -46,9 +46,9 @@ def numpy_logits(model: MLP, x: np.ndarray, own_statistics: bool) -> np.ndarray:
 @pytest.mark.parametrize("n", [0, 1, 2, 7])
 def test_logits_against_numpy(n: int, model: MLP) -> None:
     x = RNG.normal(size=(n, 33)).astype(np.float32)
-    found = apply(model, jnp.asarray(x))
-    assert found.shape == (n, 5)
-    np.testing.assert_allclose(found, numpy_logits(model, x, own_statistics=False), rtol=1e-4, atol=1e-4)
+    logits = apply(model, jnp.asarray(x))
+    assert logits.shape == (n, 5)
+    np.testing.assert_allclose(logits, numpy_logits(model, x, own_statistics=False), rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize("n", [1, SPARSE_BATCH, SPARSE_BATCH + 1])
@@ -62,10 +62,10 @@ def test_logits_and_their_gradient_where_most_inputs_are_zero(n_used: int, n: in
     def loss(x: jax.Array, past: int) -> jax.Array:
         return jnp.sin(model(jnp.pad(x, ((0, past), (0, 0))))[:n]).sum()
 
-    found = jax.jit(jax.grad(loss), static_argnums=1)
-    expected = found(x, SPARSE_BATCH + 1)
+    gradient = jax.jit(jax.grad(loss), static_argnums=1)
+    expected = gradient(x, SPARSE_BATCH + 1)
     assert n_used == 33 or float(jnp.abs(expected[x == 0]).min()) > 0
-    np.testing.assert_allclose(found(x, 0), expected, rtol=1e-3, atol=1e-4)
+    np.testing.assert_allclose(gradient(x, 0), expected, rtol=1e-3, atol=1e-4)
 
 
 def test_the_papers_layers() -> None:
@@ -109,9 +109,9 @@ def test_bad_features_are_refused(names: object) -> None:
 
 
 def test_each_feature_is_its_descriptor() -> None:
-    found = thor2.Descriptors(
+    descriptors = thor2.Descriptors(
         jnp.asarray(RNG.random((2, 7, 32, 32))), jnp.asarray(RNG.random((2, 7, 22, 31))), jnp.zeros(2, jnp.int32)
     )
-    sizes = {name: feature_of(found, name).shape for name in FEATURES}
+    sizes = {name: feature_of(descriptors, name).shape for name in FEATURES}
     assert sizes == {"ce": (2, 4774), "tops": (2, 7168), "tops2": (2, 11942)}
-    np.testing.assert_array_equal(feature_of(found, "ce"), found.color)
+    np.testing.assert_array_equal(feature_of(descriptors, "ce"), descriptors.color)

@@ -114,9 +114,9 @@ def test_color_of_another_type(kind: Any) -> None:
 @pytest.mark.parametrize("name", ["depth", "labels"])
 @pytest.mark.parametrize("shape", [(7, 5), (5, 6), (5, 7, 1), (35,), ()])
 def test_images_of_another_size(name: str, shape: tuple[int, ...]) -> None:
-    given = arrays()
+    fields = arrays()
     with pytest.raises(InputError, match=rf"^{name} has shape .*\(5, 7\)"):
-        RGBDFrame(**{**given, name: np.zeros(shape, given[name].dtype)})
+        RGBDFrame(**{**fields, name: np.zeros(shape, fields[name].dtype)})
 
 
 @pytest.mark.parametrize("kind", [np.uint8, np.int16, np.int32, bool, np.complex64, object])
@@ -213,19 +213,19 @@ def test_rays_of_single_pixels() -> None:
 @pytest.fixture
 def files(tmp_path: Path) -> dict[str, Path]:
     """The frame of `arrays()` as files."""
-    given = arrays()
+    fields = arrays()
     paths = {name: tmp_path / f"{name}.png" for name in ("color", "depth", "labels")}
     for name, path in paths.items():
-        Image.fromarray(given[name]).save(path)
+        Image.fromarray(fields[name]).save(path)
     paths["intrinsics"] = tmp_path / "intrinsics.json"
     paths["intrinsics"].write_text(json.dumps(dataclasses.asdict(CAMERA)))
     return paths
 
 
 def test_a_frame_of_files(files: dict[str, Path]) -> None:
-    frame, given = read_frame(**files), arrays()
+    frame, expected = read_frame(**files), arrays()
     for name in ("color", "depth", "labels"):
-        np.testing.assert_array_equal(getattr(frame, name), given[name])
+        np.testing.assert_array_equal(getattr(frame, name), expected[name])
     assert frame.depth.dtype == np.uint16 and frame.intrinsics == CAMERA
 
 
@@ -297,8 +297,8 @@ def test_color_files_with_an_alpha_channel(tmp_path: Path) -> None:
 
 def test_color_files_of_jpeg(tmp_path: Path) -> None:
     Image.new("RGB", (7, 5), (200, 100, 50)).save(tmp_path / "c.jpg", quality=95)
-    found = read_color(tmp_path / "c.jpg")
-    assert found.shape == (5, 7, 3) and np.abs(found.astype(int) - (200, 100, 50)).max() <= 3
+    color = read_color(tmp_path / "c.jpg")
+    assert color.shape == (5, 7, 3) and np.abs(color.astype(int) - (200, 100, 50)).max() <= 3
 
 
 @pytest.mark.parametrize("mode", ["L", "P", "RGB", "1"])
@@ -318,9 +318,9 @@ def test_depth_files_of_16_bit(tmp_path: Path) -> None:
     """Written by OpenCV, an encoder of its own."""
     depth = np.array([[0, 1, 255], [256, 40_000, 65_535]], np.uint16)
     assert cv2.imwrite(str(tmp_path / "d.png"), depth)
-    found = read_depth(tmp_path / "d.png")
-    assert found.dtype == np.uint16
-    np.testing.assert_array_equal(found, depth)
+    loaded = read_depth(tmp_path / "d.png")
+    assert loaded.dtype == np.uint16
+    np.testing.assert_array_equal(loaded, depth)
 
 
 @pytest.mark.parametrize("value", [-1, 65_536])
@@ -376,13 +376,13 @@ def test_label_files_that_hold_no_numbers(tmp_path: Path, mode: str) -> None:
         ('{"fx": 500, "fy": 500, "cx": 3, "cy": 2, "depth_scale": 0}', "intrinsics.depth_scale is 0"),
     ],
 )
-def test_intrinsics_files_that_do_not_fit(tmp_path: Path, text: str, complaint: str) -> None:
+def test_intrinsics_files_that_do_not_fit(tmp_path: Path, text: str, expected: str) -> None:
     path = tmp_path / "k.json"
     path.write_bytes(text.encode("latin-1"))
     with pytest.raises(InputError) as caught:
         read_intrinsics(path)
     message = str(caught.value)
-    assert complaint in message and str(path) in message and "\n" not in message
+    assert expected in message and str(path) in message and "\n" not in message
 
 
 def test_an_integer_past_every_float(tmp_path: Path) -> None:

@@ -29,10 +29,10 @@ def flat(millimetres: int = 800) -> np.ndarray:
     return np.full((HEIGHT, WIDTH), millimetres, np.uint16)
 
 
-def patch(*parts: tuple[int, int, int, int, int], kind: Any = np.uint8) -> np.ndarray:
+def patch(*rectangles: tuple[int, int, int, int, int], kind: Any = np.uint8) -> np.ndarray:
     """Labels; each part is (label, first row, end row, first column, end column)."""
     labels = np.zeros((HEIGHT, WIDTH), kind)
-    for label, top, bottom, left, right in parts:
+    for label, top, bottom, left, right in rectangles:
         labels[top:bottom, left:right] = label
     return labels
 
@@ -267,12 +267,12 @@ def test_a_patch_of_wall_beside_a_plane_stays_from_a_tenth_on(columns: int, stay
 def test_single_pixels_of_wrong_depth_go() -> None:
     rng = np.random.default_rng(0)
     depth, labels = np.full((HEIGHT, WIDTH), 0.8), patch((1, 60, 180, 80, 240))
-    wrong = np.zeros(labels.shape, bool)
-    wrong[66:176:11, 86:236:13] = True
-    depth[wrong] = np.where(rng.random(int(wrong.sum())) < 0.5, rng.uniform(0.3, 0.7, wrong.sum()), 1.2)
+    incorrect = np.zeros(labels.shape, bool)
+    incorrect[66:176:11, 86:236:13] = True
+    depth[incorrect] = np.where(rng.random(int(incorrect.sum())) < 0.5, rng.uniform(0.3, 0.7, incorrect.sum()), 1.2)
     cloud = only(frame_of(depth, labels))
     assert np.abs(cloud.points[:, 2] - 0.8).max() < 1e-6 and not cloud.kept_by_fallback
-    near_one = ndimage.binary_dilation(wrong, iterations=2)
+    near_one = ndimage.binary_dilation(incorrect, iterations=2)
     assert lost(cloud, depth, (labels == 1) & ~near_one) == 0
 
 

@@ -42,8 +42,8 @@ def rows_of(points: np.ndarray) -> np.ndarray:
 
 
 def test_the_farther_block_is_occluded_along_the_common_edge() -> None:
-    found = occlusions(*scene())
-    cloud, occlusion = found[BACK]
+    occlusion_by_label = occlusions(*scene())
+    cloud, occlusion = occlusion_by_label[BACK]
     assert occlusion.occluded
     assert occlusion.boundary.shape == (len(cloud.points),) and occlusion.boundary.dtype == bool
     marked = cloud.points[occlusion.boundary]
@@ -175,9 +175,9 @@ def test_an_instance_without_depth() -> None:
 def test_instances_of_one_pixel() -> None:
     labels = np.zeros((HEIGHT, WIDTH), np.uint16)
     labels[50, 50], labels[0, 0] = 500, 600
-    found = occlusions(np.full(labels.shape, 800, np.uint16), labels)
-    assert not found[500][1].occluded and found[600][1].occluded
-    assert found[500][1].boundary.shape == (1,)
+    occlusion_by_label = occlusions(np.full(labels.shape, 800, np.uint16), labels)
+    assert not occlusion_by_label[500][1].occluded and occlusion_by_label[600][1].occluded
+    assert occlusion_by_label[500][1].boundary.shape == (1,)
 
 
 # Against a walk around the mask
@@ -224,10 +224,10 @@ def test_against_a_walk_around_the_mask(seed: int) -> None:
     answers = []
     for cloud in instance_clouds(frame):
         occluded, marked = by_walking(frame, cloud)
-        found = find_occlusion(frame, cloud)
-        assert found.occluded == occluded
+        occlusion = find_occlusion(frame, cloud)
+        assert occlusion.occluded == occluded
         # An edge point halfway between two points of the cloud may mark either.
-        assert (found.boundary != marked).sum() <= 0.02 * len(marked)
+        assert (occlusion.boundary != marked).sum() <= 0.02 * len(marked)
         answers.append(occluded)
     assert any(answers) and len(answers) >= 5
 
@@ -238,9 +238,9 @@ def test_against_a_walk_around_the_mask(seed: int) -> None:
 def test_scenes_by_degree_of_occlusion(shared: Path) -> None:
     """Few instances of the scenes without occlusion (one may touch another), most of those with high occlusion."""
     dataset = UWISOccluded(shared / "data" / "scenes-dev")
-    found: dict[str, list[bool]] = {"none": [], "low": [], "high": []}
+    occluded: dict[str, list[bool]] = {"none": [], "low": [], "high": []}
     for item, _ in zip(dataset, range(12), strict=False):
         for cloud in instance_clouds(item.frame):
-            found[item.attributes["occlusion"]].append(find_occlusion(item.frame, cloud).occluded)
-    share = {degree: np.mean(flags) for degree, flags in found.items()}
+            occluded[item.attributes["occlusion"]].append(find_occlusion(item.frame, cloud).occluded)
+    share = {degree: np.mean(flags) for degree, flags in occluded.items()}
     assert share["none"] < 0.15 < share["low"] < share["high"] and share["high"] > 0.5

@@ -43,9 +43,9 @@ def test_flying_pixels_against_a_loop(shape: tuple[int, int], spread: int) -> No
     labels = rng.choice([0, 2, 5], shape, p=[0.1, 0.7, 0.2]).astype(np.uint8)
     frame = frame_of(depth, labels)
     for label, pixels in frame.instance_pixels.items():
-        found = flying_pixels(frame, pixels)
-        assert found.shape == pixels.shape and found.dtype == bool
-        np.testing.assert_array_equal(found, flying_by_loop(depth, labels, label).ravel()[pixels])
+        flying = flying_pixels(frame, pixels)
+        assert flying.shape == pixels.shape and flying.dtype == bool
+        np.testing.assert_array_equal(flying, flying_by_loop(depth, labels, label).ravel()[pixels])
 
 
 @pytest.mark.parametrize("turns", range(4))
@@ -55,8 +55,8 @@ def test_the_steepest_slope(slope: float, flies: bool, turns: int) -> None:
     depth = np.broadcast_to(0.6 * (1 - slope / CAMERA.fx) ** -np.arange(12.0), (7, 12))
     depth = np.rot90(depth, turns).astype(np.float32).copy()
     frame = frame_of(depth, np.ones(depth.shape, np.uint8))
-    found = flying_pixels(frame, np.arange(depth.size))
-    np.testing.assert_array_equal(found, flies & (depth.ravel() > depth.min() * 1.001))
+    flying = flying_pixels(frame, np.arange(depth.size))
+    np.testing.assert_array_equal(flying, flies & (depth.ravel() > depth.min() * 1.001))
 
 
 def test_other_instances_make_no_flying_pixels() -> None:

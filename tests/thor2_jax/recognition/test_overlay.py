@@ -45,7 +45,7 @@ def drawn(color: np.ndarray, labels: np.ndarray, answers: list[Recognition], pat
 @pytest.fixture
 def boxes(monkeypatch: pytest.MonkeyPatch) -> list[tuple[tuple[int, int, int, int], str]]:
     """Every label that is drawn: the rectangle behind it (last column and row included) and its text."""
-    found: list[tuple[tuple[int, int, int, int], str]] = []
+    labels: list[tuple[tuple[int, int, int, int], str]] = []
     rectangle, text = ImageDraw.ImageDraw.rectangle, ImageDraw.ImageDraw.multiline_text
     last: list[tuple[int, int, int, int]] = []
 
@@ -59,12 +59,12 @@ def boxes(monkeypatch: pytest.MonkeyPatch) -> list[tuple[tuple[int, int, int, in
         left, top, right, bottom = self.multiline_textbbox(xy, words, rest[1], spacing=options["spacing"])
         box = last[-1]
         assert box[0] < left and box[1] < top and right <= box[2] and bottom <= box[3], "the text leaves its box"
-        found.append((box, words))
+        labels.append((box, words))
         text(self, xy, words, *rest, **options)
 
     monkeypatch.setattr(ImageDraw.ImageDraw, "rectangle", with_rectangle)
     monkeypatch.setattr(ImageDraw.ImageDraw, "multiline_text", with_text)
-    return found
+    return labels
 
 
 def outside(boxes: list[tuple[tuple[int, int, int, int], str]], shape: tuple[int, int]) -> np.ndarray:

@@ -64,15 +64,15 @@ def test_every_instance_is_answered_in_the_order_of_labels(recognizer: Recognize
 
 def test_what_both_find_likely_wins(recognizer: Recognizer) -> None:
     described = recognizer.describe(tilted(patches()))
-    found = recognizer.probabilities(described.descriptors, ("tops", "tops2"))
-    named = [answer for answer in recognizer.recognize(tilted(patches())) if answer.reason is None]
-    assert len(named) == 3
-    for row, answer in enumerate(named):
-        together = np.sqrt(found["tops"][row].astype(np.float64) * found["tops2"][row])
-        best = int(together.argmax())
+    probabilities = recognizer.probabilities(described.descriptors, ("tops", "tops2"))
+    recognized = [answer for answer in recognizer.recognize(tilted(patches())) if answer.reason is None]
+    assert len(recognized) == 3
+    for row, answer in enumerate(recognized):
+        fused = np.sqrt(probabilities["tops"][row].astype(np.float64) * probabilities["tops2"][row])
+        best = int(fused.argmax())
         assert answer.name == CLASSES[best]
-        assert answer.confidence == pytest.approx(together[best] / together.sum(), rel=1e-6)
-        assert answer.classifier == max(("tops", "tops2"), key=lambda name: found[name][row][best])
+        assert answer.confidence == pytest.approx(fused[best] / fused.sum(), rel=1e-6)
+        assert answer.classifier == max(("tops", "tops2"), key=lambda name: probabilities[name][row][best])
 
 
 def test_by_the_paper_s_rule_the_more_confident_classifier_wins(run: TrainedRun) -> None:
@@ -91,10 +91,10 @@ def test_by_the_paper_s_rule_the_more_confident_classifier_wins(run: TrainedRun)
 
 def test_answers_below_a_confidence_have_no_name(recognizer: Recognizer, run: TrainedRun) -> None:
     all_named = recognizer.recognize(tilted(patches()))
-    sure = sorted(answer.confidence for answer in all_named if answer.confidence is not None)
-    assert len(set(sure)) == 3
-    for answer, named in zip(Recognizer(run, sure[1]).recognize(tilted(patches())), all_named, strict=True):
-        if named.confidence is None or named.confidence >= sure[1]:
+    confidences = sorted(answer.confidence for answer in all_named if answer.confidence is not None)
+    assert len(set(confidences)) == 3
+    for answer, named in zip(Recognizer(run, confidences[1]).recognize(tilted(patches())), all_named, strict=True):
+        if named.confidence is None or named.confidence >= confidences[1]:
             assert answer == named
         else:
             assert answer.name is None and answer.reason is not None and answer.reason.startswith("unknown: ")
@@ -124,7 +124,7 @@ def test_no_names_with_absurd_intrinsics(recognizer: Recognizer, change: dict[st
 def test_probabilities_are_the_classifiers_on_the_descriptors(recognizer: Recognizer, run: TrainedRun) -> None:
     """Against the same layers in NumPy, float64."""
     described = recognizer.describe(tilted(patches()))
-    for name, found in recognizer.probabilities(described.descriptors).items():
+    for name, probabilities in recognizer.probabilities(described.descriptors).items():
         model = run.classifiers[name]
         x = np.asarray(feature_of(described.descriptors, name), np.float64) * np.asarray(model.input_scale[...])
         for layer, norm in zip(model.layers, model.norms, strict=True):
@@ -133,16 +133,16 @@ def test_probabilities_are_the_classifiers_on_the_descriptors(recognizer: Recogn
             x = np.maximum(x * np.asarray(norm.scale[...]) + np.asarray(norm.bias[...]), 0)
         logits = x @ np.asarray(model.head.kernel[...], np.float64) + np.asarray(model.head.bias[...])
         expected = np.exp(logits - logits.max(axis=1, keepdims=True))
-        np.testing.assert_allclose(found, expected / expected.sum(axis=1, keepdims=True), atol=1e-5)
+        np.testing.assert_allclose(probabilities, expected / expected.sum(axis=1, keepdims=True), atol=1e-5)
 
 
 def test_an_instance_does_not_depend_on_the_others(recognizer: Recognizer) -> None:
     labels = patches()
-    together = {a.label: a for a in recognizer.recognize(tilted(labels))}
+    in_frame = {a.label: a for a in recognizer.recognize(tilted(labels))}
     for label in (3, 7, 200):
         (alone,) = recognizer.recognize(tilted(np.where(labels == label, labels, 0).astype(np.uint8)))
-        assert alone.name == together[label].name
-        assert alone.confidence == pytest.approx(together[label].confidence, abs=1e-5)
+        assert alone.name == in_frame[label].name
+        assert alone.confidence == pytest.approx(in_frame[label].confidence, abs=1e-5)
 
 
 def test_a_frame_without_instances_has_no_answers(recognizer: Recognizer) -> None:
@@ -165,10 +165,10 @@ def test_more_instances_than_are_described_at_once(recognizer: Recognizer) -> No
     labels = squares(9)  # two batches of four, then one
     parts = [np.where((labels >= first) & (labels < first + 4), labels, 0) for first in (1, 5, 9)]
     expected = [answer for part in parts for answer in recognizer.recognize(tilted(part))]
-    found = recognizer.recognize(tilted(labels))
-    assert [a.label for a in found] == list(range(1, 10)) and all(a.reason is None for a in found)
-    assert [(a.name, a.points_used) for a in found] == [(a.name, a.points_used) for a in expected]
-    assert [a.confidence for a in found] == pytest.approx([a.confidence for a in expected], abs=1e-5)
+    answers = recognizer.recognize(tilted(labels))
+    assert [a.label for a in answers] == list(range(1, 10)) and all(a.reason is None for a in answers)
+    assert [(a.name, a.points_used) for a in answers] == [(a.name, a.points_used) for a in expected]
+    assert [a.confidence for a in answers] == pytest.approx([a.confidence for a in expected], abs=1e-5)
 
 
 @pytest.mark.slow

@@ -59,10 +59,10 @@ def test_input_sizes() -> None:
 
 
 def test_what_is_loaded_is_what_was_saved(saved: Path) -> None:
-    run, found = make_run(), load_run(saved)
-    assert (found.config, found.classes, found.record) == (run.config, run.classes, run.record)
-    assert found.network.fingerprint == run.network.fingerprint
-    assert tuple(found.classifiers) == ("ce", "tops")
+    run, loaded = make_run(), load_run(saved)
+    assert (loaded.config, loaded.classes, loaded.record) == (run.config, run.classes, run.record)
+    assert loaded.network.fingerprint == run.network.fingerprint
+    assert tuple(loaded.classifiers) == ("ce", "tops")
     rng = np.random.default_rng(0)
     images, color = rng.random((1, 2, 8, 8), np.float32), rng.random((1, 2, 22, 5), np.float32)
     descriptors = thor2.Descriptors(jnp.asarray(images), jnp.asarray(color), jnp.zeros(1, jnp.int32))

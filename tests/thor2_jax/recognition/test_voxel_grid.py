@@ -27,10 +27,10 @@ def test_means_of_cubes(count: int, size: float) -> None:
     rng = np.random.default_rng(count)
     points = rng.uniform(-0.1, 0.2, (count, 3))
     colors = rng.uniform(0, 1, (count, 3))
-    found_points, found_colors = voxel_downsample(points, colors, size)
+    mean_points, mean_colors = voxel_downsample(points, colors, size)
     expected_points, expected_colors = by_dictionary(points, colors, size)
-    np.testing.assert_allclose(found_points, expected_points, rtol=0, atol=1e-15)
-    np.testing.assert_allclose(found_colors, expected_colors, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(mean_points, expected_points, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(mean_colors, expected_colors, rtol=0, atol=1e-15)
 
 
 def test_several_points_share_a_cube() -> None:
@@ -44,16 +44,16 @@ def test_several_points_share_a_cube() -> None:
 def test_types_are_kept_and_colors_rounded_halves_up() -> None:
     points = np.array([[0, 0, 0], [0.001, 0, 0], [1, 0, 0]], np.float32)
     colors = np.array([[0, 10, 255], [1, 11, 254], [7, 8, 9]], np.uint8)
-    found_points, found_colors = voxel_downsample(points, colors, 0.01)
-    assert found_points.dtype == np.float32 and found_colors.dtype == np.uint8
-    np.testing.assert_allclose(found_points, [[0.0005, 0, 0], [1, 0, 0]], atol=1e-7)
-    np.testing.assert_array_equal(found_colors, [[1, 11, 255], [7, 8, 9]])
+    mean_points, mean_colors = voxel_downsample(points, colors, 0.01)
+    assert mean_points.dtype == np.float32 and mean_colors.dtype == np.uint8
+    np.testing.assert_allclose(mean_points, [[0.0005, 0, 0], [1, 0, 0]], atol=1e-7)
+    np.testing.assert_array_equal(mean_colors, [[1, 11, 255], [7, 8, 9]])
 
 
 def test_bright_colors_do_not_wrap() -> None:
     points = np.zeros((1001, 3), np.float32)
-    found = voxel_downsample(points, np.full((1001, 3), 255, np.uint8), 0.01)[1]
-    np.testing.assert_array_equal(found, [[255, 255, 255]])
+    colors = voxel_downsample(points, np.full((1001, 3), 255, np.uint8), 0.01)[1]
+    np.testing.assert_array_equal(colors, [[255, 255, 255]])
 
 
 def test_the_grid_starts_half_a_cube_below_the_cloud() -> None:
@@ -122,7 +122,7 @@ def test_shapes_that_do_not_fit(points: tuple[int, ...], colors: tuple[int, ...]
 def test_a_cloud_past_the_largest_bucket_gets_larger_voxels(side: int, doublings: int) -> None:
     points = np.stack(np.meshgrid(*[np.arange(side)] * 3, indexing="ij"), axis=-1).reshape(-1, 3).astype(np.float64)
     colors = np.zeros((len(points), 3))
-    found, _ = downsample_to_fit(points, colors, 1.0)
+    downsampled, _ = downsample_to_fit(points, colors, 1.0)
     expected, _ = voxel_downsample(points, colors, 2.0**doublings)
-    np.testing.assert_array_equal(found, expected)
-    assert len(found) <= 8192
+    np.testing.assert_array_equal(downsampled, expected)
+    assert len(downsampled) <= 8192
