@@ -1,4 +1,4 @@
-"""The smallest bucket is chosen, at every border."""
+"""Choice of point and batch buckets."""
 
 from collections.abc import Callable
 
@@ -20,6 +20,6 @@ def test_buckets_double() -> None:
 
 
 @pytest.mark.parametrize(("pick", "name", "n"), [(point_bucket, "n_points", 8193), (batch_bucket, "n_clouds", 257)])
-def test_past_the_largest_bucket(pick: Callable[[int], int], name: str, n: int) -> None:
+def test_sizes_beyond_the_largest_bucket_are_refused(pick: Callable[[int], int], name: str, n: int) -> None:
     with pytest.raises(InputError, match=rf"^{name} is {n}\b.*\b{n - 1}\b"):
         pick(n)

@@ -1,3 +1,5 @@
+"""Exported recognizers."""
+
 import subprocess
 import sys
 from pathlib import Path
@@ -24,13 +26,13 @@ import sys
 import jax, jax.export, numpy as np
 exported = jax.export.deserialize(bytearray(open(sys.argv[1], "rb").read()))
 fields = np.load(sys.argv[2])
-found = exported.call(*(fields[name] for name in ("points", "colors", "mask", "camera", "boundary")))
+outputs = exported.call(*(fields[name] for name in ("points", "colors", "mask", "camera", "boundary")))
 assert not any(name.split(".")[0] in ("thor2_jax", "colornet", "flax", "gudhi") for name in sys.modules)
-np.savez(sys.argv[3], **found)
+np.savez(sys.argv[3], **outputs)
 """
 
 
-def test_what_is_exported_gives_the_same_answers_without_this_code(run: TrainedRun, tmp_path: Path) -> None:
+def test_an_exported_recognizer_runs_without_this_package(run: TrainedRun, tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
     sizes = [(0.2, 0.1, 0.06), (0.1, 0.1, 0.02), (0.3, 0.05, 0.05)]
     clouds = [
@@ -42,10 +44,10 @@ def test_what_is_exported_gives_the_same_answers_without_this_code(run: TrainedR
     (tmp_path / "recognizer.jax").write_bytes(blob)
     names = ("points", "colors", "mask", "camera", "boundary")
     np.savez(tmp_path / "clouds.npz", **{name: np.asarray(getattr(packed, name)) for name in names})
-    arguments = [str(tmp_path / name) for name in ("loader.py", "recognizer.jax", "clouds.npz", "found.npz")]
+    arguments = [str(tmp_path / name) for name in ("loader.py", "recognizer.jax", "clouds.npz", "outputs.npz")]
     done = subprocess.run([sys.executable, *arguments], capture_output=True, text=True, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    outputs = np.load(tmp_path / "found.npz")
+    outputs = np.load(tmp_path / "outputs.npz")
     assert set(outputs) == {*FEATURES, "overflow"}
 
     described = thor2.describe(packed, run.network, CONFIG)  # gudhi: the other backend
@@ -57,7 +59,7 @@ def test_what_is_exported_gives_the_same_answers_without_this_code(run: TrainedR
 
 
 @pytest.mark.parametrize(
-    ("given", "complaint"),
+    ("options", "expected"),
     [
         ({"n_points": 500}, "n_points is 500"),
         ({"n_clouds": 3}, "n_clouds is 3"),
@@ -65,6 +67,6 @@ def test_what_is_exported_gives_the_same_answers_without_this_code(run: TrainedR
         ({"platforms": ()}, "platforms is"),
     ],
 )
-def test_sizes_and_platforms_that_are_refused(run: TrainedRun, options: dict, expected: str) -> None:
+def test_invalid_sizes_and_platforms_are_refused(run: TrainedRun, options: dict, expected: str) -> None:
     with pytest.raises(thor2.InputError, match=expected):
         export_recognizer(run, **{"n_points": 512, "n_clouds": 1, **options})

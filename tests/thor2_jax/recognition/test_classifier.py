@@ -17,7 +17,7 @@ train = nnx.jit(lambda model, x, rngs=None: model(x, train=True, rngs=rngs))
 
 
 def random_classifier(n_inputs: int, n_classes: int) -> MLP:
-    """A classifier whose batch statistics and scales are not the ones it was born with."""
+    """Return a classifier with random batch statistics and scales."""
     model = MLP(n_inputs, n_classes, rngs=nnx.Rngs(0))
     model.input_scale[...] = jnp.asarray(RNG.uniform(0.5, 2, n_inputs), jnp.float32)
     for norm in model.norms:
@@ -52,15 +52,17 @@ def test_logits_against_numpy(n: int, model: MLP) -> None:
 
 
 @pytest.mark.parametrize("n", [1, SPARSE_BATCH, SPARSE_BATCH + 1])
-@pytest.mark.parametrize("n_used", [0, 1, 4, 5, 9, 10, 33])  # of 33 inputs, rounded up, a tenth is 4, a quarter 9
-def test_logits_and_their_gradient_where_most_inputs_are_zero(n_used: int, n: int, model: MLP) -> None:
+@pytest.mark.parametrize(
+    "n_used", [0, 1, 4, 5, 9, 10, 33]
+)  # a tenth of 33 inputs, rounded up, is 4, and a quarter is 9
+def test_logits_and_gradients_where_most_inputs_are_zero(n_used: int, n: int, model: MLP) -> None:
     x = np.zeros((n, 33), np.float32)
     x[:, RNG.permutation(33)[:n_used]] = RNG.normal(size=(n, n_used))
     np.testing.assert_allclose(apply(model, x), numpy_logits(model, x, own_statistics=False), rtol=1e-4, atol=1e-4)
 
-    # The same network without a look at zeros: rows past SPARSE_BATCH, of which nothing is taken.
-    def loss(x: jax.Array, past: int) -> jax.Array:
-        return jnp.sin(model(jnp.pad(x, ((0, past), (0, 0))))[:n]).sum()
+    # More rows than SPARSE_BATCH, of which only the first count, switch off the sparse product.
+    def loss(x: jax.Array, extra_rows: int) -> jax.Array:
+        return jnp.sin(model(jnp.pad(x, ((0, extra_rows), (0, 0))))[:n]).sum()
 
     gradient = jax.jit(jax.grad(loss), static_argnums=1)
     expected = gradient(x, SPARSE_BATCH + 1)
@@ -86,7 +88,7 @@ def test_training_uses_batch_statistics_and_moves_running_ones() -> None:
     np.testing.assert_allclose(model.norms[0].var[...], 0.9 + 0.1 * first.var(axis=0), atol=1e-5)
 
 
-def test_dropout_is_for_training_alone() -> None:
+def test_dropout_is_active_only_in_training() -> None:
     model = MLP(33, 5, rngs=nnx.Rngs(0))
     x = jnp.asarray(RNG.normal(size=(7, 33)), jnp.float32)
     np.testing.assert_array_equal(apply(model, x), apply(model, x))

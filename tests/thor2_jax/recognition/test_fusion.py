@@ -1,4 +1,4 @@
-"""Fusion of the classifiers: the three rules against SciPy and by hand."""
+"""Fusion of the classifiers: the three rules against SciPy and known values."""
 
 import jax
 import numpy as np
@@ -25,7 +25,7 @@ def test_the_means_against_scipy(n: int, rule: FusionRule) -> None:
 
 
 def test_a_class_that_one_classifier_rules_out_loses() -> None:
-    """A probability of 0 has no logarithm: both give it to the third class."""
+    """Classes with a probability of 0 have no logarithm; both classifiers rule out the third class."""
     result = fuse({"tops": np.array([[0.9, 0.1, 0.0]], np.float32), "tops2": np.array([[0.0, 1.0, 0.0]], np.float32)})
     assert result.class_index[0] == 1 and result.confidence[0] == pytest.approx(1) and result.classifier[0] == "tops2"
 

@@ -1,4 +1,4 @@
-"""Instance clouds: which pixels become points; and analytic scenes, of which the object is kept and the rest is not."""
+"""Instance clouds: which pixels become points, and which points of analytic scenes are kept."""
 
 from pathlib import Path
 from typing import Any
@@ -30,7 +30,7 @@ def flat(millimetres: int = 800) -> np.ndarray:
 
 
 def patch(*rectangles: tuple[int, int, int, int, int], kind: Any = np.uint8) -> np.ndarray:
-    """Labels; each part is (label, first row, end row, first column, end column)."""
+    """Return labels; each rectangle is (label, first row, end row, first column, end column)."""
     labels = np.zeros((HEIGHT, WIDTH), kind)
     for label, top, bottom, left, right in rectangles:
         labels[top:bottom, left:right] = label
@@ -38,19 +38,19 @@ def patch(*rectangles: tuple[int, int, int, int, int], kind: Any = np.uint8) -> 
 
 
 def pixels_of(points: np.ndarray) -> np.ndarray:
-    """(row, column) of points, unrounded."""
+    """Return the rows and columns of points, unrounded."""
     x, y, z = points.T.astype(np.float64)
     return np.stack([y / z * CAMERA.fy + CAMERA.cy, x / z * CAMERA.fx + CAMERA.cx], axis=1)
 
 
 def voxels_by_loop(frame: RGBDFrame, label: int) -> np.ndarray:
-    """Means of an instance's points in each cube of 3 mm, pixel by pixel, float64."""
+    """Return the means of an instance's points in each cube of 3 mm, in float64, with a loop over the pixels."""
     camera, points = frame.intrinsics, []
     for row, column in zip(*np.nonzero(frame.labels == label), strict=True):
         z = float(np.float32(frame.depth[row, column] / 1000))
         if 0.26 <= z <= 2.5:
             points.append(((column - camera.cx) / camera.fx * z, (row - camera.cy) / camera.fy * z, z))
-    # The clouds are float32, and a point at a cube's face must fall on the same side.
+    # Rounded to float32 as the clouds are, so that points at the face of a cube fall on the same side.
     array = np.array(points, np.float32).astype(np.float64)
     cubes: dict[tuple[int, ...], list[np.ndarray]] = {}
     keys = np.floor((array - (array.min(axis=0) - 0.0015)) / 0.003).astype(int)
@@ -67,7 +67,7 @@ def only(frame: RGBDFrame) -> InstanceCloud:
 # Which pixels become points
 
 
-def test_one_cloud_an_instance_in_the_order_of_labels() -> None:
+def test_one_cloud_per_instance_in_the_order_of_labels() -> None:
     labels = patch((7, 20, 60, 30, 90), (300, 100, 160, 200, 260), (2, 180, 200, 30, 80), kind=np.uint16)
     frame = frame_of(flat(), labels)
     clouds = instance_clouds(frame)
@@ -91,7 +91,7 @@ def test_points_are_voxel_means_of_backprojected_pixels() -> None:
     assert len(set(distance.argmin(axis=1))) == len(cloud.points) >= 0.9 * len(expected)
 
 
-def test_colors_are_those_of_the_mask_alone() -> None:
+def test_colors_are_those_of_the_mask() -> None:
     labels = patch((1, 50, 110, 60, 150))
     color = np.where(labels[..., None] == 1, np.array([200, 10, 30]), np.array([0, 255, 0])).astype(np.uint8)
     np.testing.assert_array_equal(np.unique(only(frame_of(flat(), labels, color)).colors, axis=0), [[200, 10, 30]])
@@ -108,7 +108,7 @@ def test_colors_stay_with_their_points() -> None:
 
 
 @pytest.mark.parametrize(("millimetres", "used"), [(0, False), (259, False), (260, True), (2500, True), (2501, False)])
-def test_depth_that_is_trusted(millimetres: int, used: bool) -> None:
+def test_valid_depth(millimetres: int, used: bool) -> None:
     cloud = only(frame_of(flat(millimetres), patch((1, 20, 220, 20, 300))))
     assert (cloud.reason is None) == used and (len(cloud.points) > 1000) == used
     assert cloud.n_pixels == 200 * 280
@@ -129,8 +129,8 @@ def test_instances_without_depth() -> None:
 
 
 @pytest.mark.parametrize(("pixels", "usable"), [(MIN_POINTS - 1, False), (MIN_POINTS, True)])
-def test_fewest_points(pixels: int, usable: bool) -> None:
-    """Pixels 2.25 m away are 3.75 mm apart: a voxel each."""
+def test_minimum_number_of_points(pixels: int, usable: bool) -> None:
+    """Pixels at a distance of 2.25 m are 3.75 mm apart, one in each voxel."""
     cloud = only(frame_of(flat(2250), patch((1, 5, 6, 10, 10 + pixels))))
     assert (cloud.reason is None) == usable
     if not usable:
@@ -157,24 +157,24 @@ def test_thousands_of_instances() -> None:
 
 
 def rays() -> np.ndarray:
-    """[H, W, 3]: what depth is multiplied by."""
+    """Return the ray of each pixel at depth 1, [H, W, 3]."""
     row, column = np.mgrid[:HEIGHT, :WIDTH]
     return np.stack([(column - CAMERA.cx) / CAMERA.fx, (row - CAMERA.cy) / CAMERA.fy, np.ones(row.shape)], axis=-1)
 
 
-def lost(cloud: InstanceCloud, depth: np.ndarray, pixels: np.ndarray) -> int:
-    """How many of `pixels` [H, W] bool are in none of the cloud's voxels: farther from its points than one is wide."""
+def count_lost(cloud: InstanceCloud, depth: np.ndarray, pixels: np.ndarray) -> int:
+    """Count the `pixels`, [H, W] bool, that are farther from all points of the cloud than a voxel's diagonal."""
     points = rays()[pixels] * depth[pixels][:, None]
     return int((KDTree(cloud.points).query(points)[0] > 0.003 * np.sqrt(3)).sum())
 
 
 def plane_depth(normal: np.ndarray, distance: float) -> np.ndarray:
-    """Metres: a plane through (0, 0, distance)."""
+    """Return the depth of a plane through (0, 0, distance), in metres."""
     return distance * normal[2] / (rays() @ normal)
 
 
 def box_depth(rotation: np.ndarray, sides: np.ndarray, centre: np.ndarray) -> np.ndarray:
-    """Metres: where each ray enters a box, 0 where it misses it."""
+    """Return the depth of a box in metres, 0 where a ray misses it."""
     start, direction = -centre @ rotation, rays() @ rotation
     ends = np.stack([(sign * sides / 2 - start) / direction for sign in (-1, 1)])
     enters, leaves = ends.min(axis=0).max(axis=-1), ends.max(axis=0).min(axis=-1)
@@ -182,7 +182,10 @@ def box_depth(rotation: np.ndarray, sides: np.ndarray, centre: np.ndarray) -> np
 
 
 def rod_depth(radius: float, turn: float) -> tuple[np.ndarray, np.ndarray]:
-    """Metres, and places along the axis: a round rod 0.2 m long, 0.8 m away, `turn` degrees out of the image plane."""
+    """Return the depth of a rod, in metres, and positions along its axis.
+
+    The rod is 0.2 m long, 0.8 m away and `turn` degrees out of the image plane.
+    """
     axis, centre = Rotation.from_euler("y", turn, degrees=True).apply([1, 0, 0]), np.array([0, 0, 0.8])
     across, start = rays() - (rays() @ axis)[..., None] * axis, (centre @ axis) * axis - centre
     a, b, c = (across**2).sum(axis=-1), 2 * across @ start, start @ start - radius**2
@@ -196,7 +199,7 @@ def rod_depth(radius: float, turn: float) -> tuple[np.ndarray, np.ndarray]:
 def test_every_point_of_a_facing_plane_is_kept(distance: float) -> None:
     depth, labels = np.full((HEIGHT, WIDTH), distance), patch((1, 60, 180, 80, 240))
     cloud = only(frame_of(depth, labels))
-    assert lost(cloud, depth, labels == 1) == 0 and not cloud.kept_by_fallback
+    assert count_lost(cloud, depth, labels == 1) == 0 and not cloud.kept_by_fallback
 
 
 @pytest.mark.parametrize("turn", [(60, 0), (-60, 0), (0, 60), (0, -60), (40, 40), (65, 20)])
@@ -204,19 +207,19 @@ def test_every_point_of_a_turned_plane_is_kept(turn: tuple[int, int]) -> None:
     depth = plane_depth(Rotation.from_euler("xy", turn, degrees=True).apply([0, 0, 1]), 0.8)
     labels = patch((1, 70, 170, 110, 210))
     cloud = only(frame_of(depth, labels))
-    assert lost(cloud, depth, labels == 1) == 0 and not cloud.kept_by_fallback
+    assert count_lost(cloud, depth, labels == 1) == 0 and not cloud.kept_by_fallback
 
 
 @pytest.mark.parametrize("seed", range(12))
 def test_every_point_of_a_box_is_kept(seed: int) -> None:
-    """Corners and edges included, as long as no face is seen at more than about 65 degrees."""
+    """Includes corners and edges; no face is seen at more than about 65 degrees."""
     rng = np.random.default_rng(seed)
     turns = (Rotation.random(rng=rng).as_matrix() for _ in range(1000))
     rotation = next(turn for turn in turns if (np.abs(turn[2]) > 0.45).all())
     depth = box_depth(rotation, rng.uniform(0.05, 0.13, 3), np.array([0.01, -0.02, 0.8]))
     cloud = only(frame_of(depth, (depth > 0).astype(np.uint8)))
     assert (depth > 0).sum() > 2000
-    assert lost(cloud, depth, depth > 0) == 0 and not cloud.kept_by_fallback
+    assert count_lost(cloud, depth, depth > 0) == 0 and not cloud.kept_by_fallback
 
 
 @pytest.mark.parametrize("radius", [0.004, 0.007])
@@ -224,13 +227,13 @@ def test_every_point_of_a_box_is_kept(seed: int) -> None:
 def test_a_rod_keeps_its_ends(radius: float, turn: float) -> None:
     depth, place = rod_depth(radius, turn)
     cloud = only(frame_of(depth, (depth > 0).astype(np.uint8)))
-    assert lost(cloud, depth, depth > 0) == 0 and not cloud.kept_by_fallback
+    assert count_lost(cloud, depth, depth > 0) == 0 and not cloud.kept_by_fallback
     assert np.ptp(place[depth > 0]) > 0.19
 
 
 @pytest.mark.parametrize(("width", "fallback"), [(2, True), (4, False), (5, False), (8, False)])
 def test_a_flat_strip_is_kept(width: int, fallback: bool) -> None:
-    """0.26 m long, 3 mm to 1 cm wide; one or two voxels wide, 1 cm at either end may be missing."""
+    """The strip is 0.26 m long and 3 mm to 1 cm wide; narrow ones may lose 1 cm at either end."""
     labels = patch((1, 20, 220, 100, 100 + width))
     cloud = only(frame_of(flat(800), labels))
     assert cloud.reason is None and cloud.kept_by_fallback == fallback
@@ -239,32 +242,32 @@ def test_a_flat_strip_is_kept(width: int, fallback: bool) -> None:
 
 @pytest.mark.parametrize("reach", [0, 1, 2, 3])
 @pytest.mark.parametrize("wall", [0.9, 1.4, 2.4, 2.6, 0.0])
-def test_a_plane_whose_mask_reaches_over_the_edge(reach: int, wall: float) -> None:
-    """Onto flying pixels, one wide, and the wall behind: the plane alone is left, its corners included."""
+def test_a_mask_that_extends_beyond_its_plane(reach: int, wall: float) -> None:
+    """The mask includes a border of flying pixels and the wall behind; only the plane is kept, with its corners."""
     rng = np.random.default_rng(reach)
     plane, labels = patch((1, 60, 180, 80, 240)) == 1, patch((1, 60 - reach, 180 + reach, 80 - reach, 240 + reach))
     edge = ndimage.binary_dilation(plane, np.ones((3, 3))) & ~plane
     depth = np.where(plane, 0.8, wall)
     depth[edge] = rng.uniform(0.83, max(wall, 1.0), int(edge.sum()))
     cloud = only(frame_of(depth, labels))
-    assert lost(cloud, depth, plane) == 0 and not cloud.kept_by_fallback
+    assert count_lost(cloud, depth, plane) == 0 and not cloud.kept_by_fallback
     assert np.abs(cloud.points[:, 2] - 0.8).max() < 1e-6
 
 
 @pytest.mark.parametrize(("columns", "stays"), [(10, False), (30, True)])
-def test_a_patch_of_wall_beside_a_plane_stays_from_a_tenth_on(columns: int, stays: bool) -> None:
-    """A patch of 6 and of 18 hundredths of the plane's voxels; the column at the step flies."""
+def test_a_patch_of_wall_stays_if_larger_than_a_tenth(columns: int, stays: bool) -> None:
+    """The patches have 6 % and 18 % of the plane's voxels; the column at the step consists of flying pixels."""
     depth = np.where(np.arange(WIDTH) < 240, 0.8, 1.3) * np.ones((HEIGHT, 1))
     labels = patch((1, 40, 200, 80, 240), (1, 90, 150, 240, 240 + columns))
     cloud = only(frame_of(depth, labels))
     far = cloud.points[:, 2] > 1
     assert far.any() == stays and not cloud.kept_by_fallback
-    assert lost(cloud, depth, (labels == 1) & (depth < 1)) == 0
+    assert count_lost(cloud, depth, (labels == 1) & (depth < 1)) == 0
     if stays:
         assert pixels_of(cloud.points[far])[:, 1].min() > 240.5
 
 
-def test_single_pixels_of_wrong_depth_go() -> None:
+def test_single_pixels_of_incorrect_depth_are_removed() -> None:
     rng = np.random.default_rng(0)
     depth, labels = np.full((HEIGHT, WIDTH), 0.8), patch((1, 60, 180, 80, 240))
     incorrect = np.zeros(labels.shape, bool)
@@ -273,11 +276,11 @@ def test_single_pixels_of_wrong_depth_go() -> None:
     cloud = only(frame_of(depth, labels))
     assert np.abs(cloud.points[:, 2] - 0.8).max() < 1e-6 and not cloud.kept_by_fallback
     near_one = ndimage.binary_dilation(incorrect, iterations=2)
-    assert lost(cloud, depth, (labels == 1) & ~near_one) == 0
+    assert count_lost(cloud, depth, (labels == 1) & ~near_one) == 0
 
 
 def test_flying_pixels_between_a_dome_and_a_wall() -> None:
-    """With noise, and a mask that follows a round edge."""
+    """The depth is noisy, and the mask follows a round edge."""
     rng = np.random.default_rng(2)
     rows, columns = np.mgrid[:HEIGHT, :WIDTH]
     distance = np.hypot(rows - 120, columns - 160)
@@ -290,21 +293,21 @@ def test_flying_pixels_between_a_dome_and_a_wall() -> None:
     cloud, before = only(frame), voxels_by_loop(frame, 1)
     assert (before[:, 2] > 0.88).sum() > 300
     assert (cloud.points[:, 2] > 0.88).sum() <= 0.02 * (before[:, 2] > 0.88).sum()
-    assert lost(cloud, depth / 1000, labels.astype(bool) & ~ring) == 0
+    assert count_lost(cloud, depth / 1000, labels.astype(bool) & ~ring) == 0
 
 
 def test_a_surface_steeper_than_the_limit_is_kept_and_flagged() -> None:
-    """Edge-on, 18 pixel widths a pixel: all but the nearest column would fly."""
+    """Depth grows by 18 pixel widths per pixel, so that all but the nearest column are flying pixels."""
     depth = 0.8 * (1 - 18 / CAMERA.fx) ** (100 - np.arange(WIDTH)) * np.ones((HEIGHT, 1))
     labels = patch((1, 80, 160, 100, 130))
     cloud = only(frame_of(depth, labels))
     assert cloud.reason is None and cloud.kept_by_fallback
-    assert lost(cloud, depth, labels == 1) == 0
+    assert count_lost(cloud, depth, labels == 1) == 0
 
 
 @pytest.mark.parametrize(("deep", "flagged"), [(7, False), (8, False), (9, True)])
-def test_a_fallback_where_more_than_half_of_the_pixels_fly(deep: int, flagged: bool) -> None:
-    """`deep` of 16 columns lie behind a comb's teeth, one step back each."""
+def test_fallback_if_more_than_half_are_flying_pixels(deep: int, flagged: bool) -> None:
+    """`deep` of 16 columns are flying pixels behind the teeth of a comb."""
     depth, labels = np.full((HEIGHT, WIDTH), 0.8), patch((1, 60, 180, 100, 260))
     behind = (np.arange(WIDTH) - 100) % 16
     teeth = {7: (1, 3, 5, 7, 9, 11, 13), 8: (1, 3, 5, 7, 9, 10, 12, 13), 9: (1, 2, 4, 5, 7, 8, 10, 11, 13)}[deep]
@@ -315,7 +318,7 @@ def test_a_fallback_where_more_than_half_of_the_pixels_fly(deep: int, flagged: b
 
 
 def test_objects_seen_through_gaps_are_kept_and_flagged() -> None:
-    """Single pixels 18 mm apart: none has thirty others near enough."""
+    """The visible pixels are 18 mm apart, so that none has thirty near neighbours."""
     labels = patch()
     labels[10:230:12, 10:310:12] = 1
     cloud = only(frame_of(flat(900), labels))
@@ -324,18 +327,18 @@ def test_objects_seen_through_gaps_are_kept_and_flagged() -> None:
 
 
 def test_both_halves_of_an_object_behind_a_bar_are_kept() -> None:
-    labels = patch((1, 40, 120, 20, 240), (2, 40, 120, 120, 180))  # the bar hides 8 cm
+    labels = patch((1, 40, 120, 20, 240), (2, 40, 120, 120, 180))  # the bar occludes 8 cm
     cloud = instance_clouds(frame_of(flat(), labels))[0]
-    assert lost(cloud, flat() / 1000, labels == 1) == 0
+    assert count_lost(cloud, flat() / 1000, labels == 1) == 0
     columns = pixels_of(cloud.points)[:, 1]
     left, right = (columns < 120).sum(), (columns >= 179.5).sum()
     assert left + right == len(columns) and left / right == pytest.approx(100 / 60, rel=0.1)
 
 
-def test_specks_apart_from_the_object_are_dropped() -> None:
+def test_small_separate_pieces_are_dropped() -> None:
     labels = patch((1, 40, 120, 20, 140), (1, 60, 75, 200, 215))
     cloud = only(frame_of(flat(), labels))
-    assert lost(cloud, flat() / 1000, patch((1, 40, 120, 20, 140)) == 1) == 0
+    assert count_lost(cloud, flat() / 1000, patch((1, 40, 120, 20, 140)) == 1) == 0
     assert pixels_of(cloud.points)[:, 1].max() < 141
 
 
@@ -343,7 +346,7 @@ def test_specks_apart_from_the_object_are_dropped() -> None:
 
 
 def test_scenes_lose_little(shared: Path) -> None:
-    """Simulated frames: outlier removal drops a few hundredths of each object, never most of one."""
+    """Outlier removal drops at most 15 % of each object of simulated frames."""
     for item, _ in zip(UWISOccluded(shared / "data" / "scenes-dev"), range(3), strict=False):
         points = backproject(item.frame.depth_m, item.frame.intrinsics)
         for cloud in instance_clouds(item.frame):

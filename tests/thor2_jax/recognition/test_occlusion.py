@@ -1,4 +1,4 @@
-"""The occlusion rule: on scenes with a known answer, and against a walk around the mask pixel by pixel."""
+"""The occlusion rule on scenes with known boundaries, and against a loop over the pixels of the mask."""
 
 from pathlib import Path
 
@@ -23,7 +23,7 @@ def occlusions(depth: np.ndarray, labels: np.ndarray) -> dict[int, tuple[Instanc
 
 
 def scene(back: int = 800, front: int = 700, table: int = 1000) -> tuple[np.ndarray, np.ndarray]:
-    """A block (columns 30 to 79) and to its right another one (columns 80 to 129); depth in millimetres."""
+    """Return depth in millimetres and labels of two adjacent blocks, at columns 30 to 79 and 80 to 129."""
     labels = np.zeros((HEIGHT, WIDTH), np.uint8)
     labels[30:90, 30:80] = BACK
     labels[40:100, 80:130] = FRONT
@@ -38,7 +38,7 @@ def rows_of(points: np.ndarray) -> np.ndarray:
     return points[:, 1] / points[:, 2] * CAMERA.fy + CAMERA.cy
 
 
-# Scenes with a known answer
+# Scenes with known boundaries
 
 
 def test_the_farther_block_is_occluded_along_the_common_edge() -> None:
@@ -67,7 +67,7 @@ def test_nearer_by_more_than_noise(front: int, occluded: bool) -> None:
     assert occlusions(*scene(front=front))[BACK][1].occluded == occluded
 
 
-def test_background_in_front_is_no_other_instance() -> None:
+def test_nearer_background_does_not_occlude() -> None:
     for _, occlusion in occlusions(*scene(back=800, front=800, table=500)).values():
         assert not occlusion.occluded
 
@@ -107,8 +107,8 @@ def test_one_pixel_off_the_border_is_whole() -> None:
     assert occlusions(np.full(labels.shape, 800, np.uint16), labels)[1][1].occluded
 
 
-def test_a_few_pixels_are_no_occlusion() -> None:
-    """The contour of the block is 216 pixels long; 5 hundredths of it are 10.8."""
+def test_a_few_pixels_do_not_count_as_occlusion() -> None:
+    """The contour of the block is 216 pixels long, of which 5 % are 10.8."""
     for touching, occluded in ((10, False), (11, True)):
         depth, labels = scene()
         labels[40 + touching :, 80:130] = 0
@@ -116,7 +116,7 @@ def test_a_few_pixels_are_no_occlusion() -> None:
         assert occlusion.occluded == occluded and occlusion.boundary.any() == occluded
 
 
-def test_exactly_the_least_share_is_occlusion() -> None:
+def test_exactly_the_minimum_share_is_occlusion() -> None:
     """The contour of the narrowed block is 200 pixels long."""
     for touching, occluded in ((9, False), (10, True)):
         depth, labels = scene()
@@ -125,7 +125,7 @@ def test_exactly_the_least_share_is_occlusion() -> None:
         assert occlusions(depth, labels)[BACK][1].occluded == occluded
 
 
-# What cameras and masks leave out
+# Missing depth and gaps between masks
 
 
 @pytest.mark.parametrize(("missing", "occluded"), [(0, True), (3, True), (5, True), (6, False)])
@@ -139,7 +139,7 @@ def test_depth_that_is_missing_along_the_edge(whose: str, missing: int, occluded
     marked = columns_of(cloud.points[occlusion.boundary])
     if missing <= 3:
         assert marked.min() > 72
-    elif whose == "own":  # the edge is 13 mm and more away from the nearest point of the cloud
+    elif whose == "own":  # the edge is at least 13 mm from the cloud
         assert len(marked) == 0
 
 
@@ -180,11 +180,11 @@ def test_instances_of_one_pixel() -> None:
     assert occlusion_by_label[500][1].boundary.shape == (1,)
 
 
-# Against a walk around the mask
+# Against a loop over the pixels
 
 
-def by_walking(frame: RGBDFrame, cloud: InstanceCloud) -> tuple[bool, np.ndarray]:
-    """The rule where masks leave no gaps and no depth is missing, so that only direct neighbours are looked at."""
+def occlusion_by_loop(frame: RGBDFrame, cloud: InstanceCloud) -> tuple[bool, np.ndarray]:
+    """Apply the rule to masks without gaps or missing depth, where only direct neighbours matter."""
     height, width = frame.labels.shape
     contour, edge = 0, []
     for row, column in zip(*np.nonzero(frame.labels == cloud.label), strict=True):
@@ -209,8 +209,8 @@ def by_walking(frame: RGBDFrame, cloud: InstanceCloud) -> tuple[bool, np.ndarray
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_against_a_walk_around_the_mask(seed: int) -> None:
-    """Instances that fill the picture, each of its own depth with bumps on it."""
+def test_against_a_loop_over_the_pixels(seed: int) -> None:
+    """The instances fill the image, each at another depth and with a rough surface."""
     rng = np.random.default_rng(seed)
     shape = (61, 83)
     count = 9
@@ -223,10 +223,10 @@ def test_against_a_walk_around_the_mask(seed: int) -> None:
     frame = RGBDFrame(np.zeros((*shape, 3), np.uint8), depth.astype(np.float32), labels, CAMERA)
     answers = []
     for cloud in instance_clouds(frame):
-        occluded, marked = by_walking(frame, cloud)
+        occluded, marked = occlusion_by_loop(frame, cloud)
         occlusion = find_occlusion(frame, cloud)
         assert occlusion.occluded == occluded
-        # An edge point halfway between two points of the cloud may mark either.
+        # A boundary pixel halfway between two points may mark either.
         assert (occlusion.boundary != marked).sum() <= 0.02 * len(marked)
         answers.append(occluded)
     assert any(answers) and len(answers) >= 5
@@ -236,7 +236,7 @@ def test_against_a_walk_around_the_mask(seed: int) -> None:
 
 
 def test_scenes_by_degree_of_occlusion(shared: Path) -> None:
-    """Few instances of the scenes without occlusion (one may touch another), most of those with high occlusion."""
+    """The share of occluded instances grows with the degree of occlusion of the scene."""
     dataset = UWISOccluded(shared / "data" / "scenes-dev")
     occluded: dict[str, list[bool]] = {"none": [], "low": [], "high": []}
     for item, _ in zip(dataset, range(12), strict=False):

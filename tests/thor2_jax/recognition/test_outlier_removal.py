@@ -1,4 +1,4 @@
-"""The rules of outlier removal against plain loops over pixels and distances, and dense grids labelled by scipy."""
+"""The rules of outlier removal against loops over pixels and distances, and grids labelled by SciPy."""
 
 from typing import Any
 
@@ -20,7 +20,7 @@ def frame_of(depth: np.ndarray, labels: np.ndarray) -> RGBDFrame:
 
 
 def flying_by_loop(depth: np.ndarray, labels: np.ndarray, label: int) -> np.ndarray:
-    """[H, W] bool: pixel by pixel, millimetres."""
+    """Return the flying pixels of an instance, [H, W] bool, with a loop; depth in millimetres."""
     height, width = labels.shape
     flying = np.zeros(labels.shape, bool)
     for row in range(height):
@@ -36,7 +36,7 @@ def flying_by_loop(depth: np.ndarray, labels: np.ndarray, label: int) -> np.ndar
 @pytest.mark.parametrize("shape", [(1, 1), (1, 9), (9, 1), (2, 2), (17, 23)])
 @pytest.mark.parametrize("spread", [15, 60, 900])
 def test_flying_pixels_against_a_loop(shape: tuple[int, int], spread: int) -> None:
-    """Noise on a plane, holes without depth, several instances that touch."""
+    """Tests a noisy plane with missing depth and several instances that touch."""
     rng = np.random.default_rng(spread)
     depth = (900 + rng.integers(0, spread, shape)).astype(np.uint16)
     depth[rng.random(shape) < 0.1] = 0
@@ -51,7 +51,7 @@ def test_flying_pixels_against_a_loop(shape: tuple[int, int], spread: int) -> No
 @pytest.mark.parametrize("turns", range(4))
 @pytest.mark.parametrize(("slope", "flies"), [(14.5, False), (15.5, True)])
 def test_the_steepest_slope(slope: float, flies: bool, turns: int) -> None:
-    """Depths that grow by `slope` pixel widths a pixel: all fly but the nearest row or column, or none does."""
+    """Depth grows by `slope` pixel widths per pixel; all pixels except the nearest row or column fly, or none does."""
     depth = np.broadcast_to(0.6 * (1 - slope / CAMERA.fx) ** -np.arange(12.0), (7, 12))
     depth = np.rot90(depth, turns).astype(np.float32).copy()
     frame = frame_of(depth, np.ones(depth.shape, np.uint8))
@@ -67,8 +67,8 @@ def test_other_instances_make_no_flying_pixels() -> None:
         assert not flying_pixels(frame, pixels).any()
 
 
-def test_the_image_does_not_go_on_at_its_other_side() -> None:
-    """The last pixel of a row and the first of the next are neighbours in memory only."""
+def test_the_image_does_not_wrap_around() -> None:
+    """The last pixel of a row and the first of the next are adjacent in memory, but not neighbours."""
     depth = np.array([[1000, 1000, 1000], [500, 500, 500]], np.uint16)
     labels = np.array([[0, 0, 1], [1, 0, 0]], np.uint8)
     frame = frame_of(depth, labels)
@@ -80,11 +80,11 @@ def test_no_pixels() -> None:
     assert flying_pixels(frame, np.zeros(0, np.intp)).shape == (0,)
 
 
-# Strays and pieces
+# Isolated points and connected components
 
 
 def kept_by_loops(points: np.ndarray) -> tuple[np.ndarray, bool]:
-    """30 others at a mean distance of 16 mm or less; pieces of a dense grid of 1 cm that 26-neighbours join."""
+    """Apply the neighbour rule (30 neighbours within 16 mm on average), and keep large components of a 1 cm grid."""
     points = points.astype(np.float64)
     nearest = np.sort(cdist(points, points), axis=1)[:, 1:31]
     among = np.array([len(row) == 30 and float(np.mean(row)) <= 0.016 for row in nearest])
@@ -99,8 +99,8 @@ def kept_by_loops(points: np.ndarray) -> tuple[np.ndarray, bool]:
     return index[[int((piece == k).sum()) * 10 >= largest for k in piece]], bool(relaxed)
 
 
-def assert_as_by_loops(points: np.ndarray) -> int:
-    """And how many are kept."""
+def assert_equals_loops(points: np.ndarray) -> int:
+    """Assert that outlier removal equals the loops, and return the number of points that are kept."""
     kept, relaxed = remove_outliers(points)
     expected, expected_relaxed = kept_by_loops(points)
     np.testing.assert_array_equal(kept, expected)
@@ -112,48 +112,48 @@ def assert_as_by_loops(points: np.ndarray) -> int:
 @pytest.mark.parametrize("side", [0.01, 0.03, 0.06, 0.2])
 @pytest.mark.parametrize("kind", [np.float32, np.float64])
 def test_outliers_against_loops(count: int, side: float, kind: Any) -> None:
-    """Dense in the middle, strays around."""
+    """Tests clouds that are dense in the middle, with isolated points around."""
     rng = np.random.default_rng(count)
     points = (rng.normal(size=(count, 3)) * side * rng.uniform(0.1, 1, (count, 1))).astype(kind)
     before = points.copy()
-    assert assert_as_by_loops(points) > 0
+    assert assert_equals_loops(points) > 0
     np.testing.assert_array_equal(points, before)
 
 
 @pytest.mark.parametrize("share", [0.02, 0.06, 0.1, 0.15, 0.3, 1.0])
 @pytest.mark.parametrize("depth", [1, 4, 10])
 def test_clouds_on_the_voxel_grid_against_loops(share: float, depth: int) -> None:
-    """One point in some of the cubes of 3 mm of a slab, thin or thick, from nearly empty to full."""
+    """Some of the 3 mm cubes of a thin or thick slab hold one point."""
     rng = np.random.default_rng(depth)
     cubes = np.argwhere(rng.random((20, 20, depth)) < share)
     cubes = cubes[rng.permutation(len(cubes))[:1200]]
     points = (cubes + rng.random(cubes.shape)) * 0.003 - [0.03, 0.01, -0.8]
-    assert_as_by_loops(points)
+    assert_equals_loops(points)
 
 
 def grid(rows: int, columns: int, spacing: float = 0.003) -> np.ndarray:
-    """A plane of rows x columns points, its corner at the origin."""
+    """Return a plane of rows x columns points with a corner at the origin."""
     row, column = np.mgrid[:rows, :columns]
     return np.stack([column, row, np.zeros_like(row)], axis=-1).reshape(-1, 3) * spacing
 
 
 @pytest.mark.parametrize("start", [0.0, 0.0017, 0.0031, 0.0052])
 def test_a_point_that_leaves_a_block_along_its_diagonal(start: float) -> None:
-    """31 points or more in the cells around it are not enough if they are at the far end of them."""
+    """31 points in adjacent cells are not enough if they are too far away."""
     block = np.argwhere(np.ones((4, 4, 4))) * 0.003
     away = np.arange(0.001, 0.02, 0.0005)
-    counts = [assert_as_by_loops(np.concatenate([block, [[-d] * 3]]) + start) for d in away]
+    counts = [assert_equals_loops(np.concatenate([block, [[-d] * 3]]) + start) for d in away]
     assert counts[0] == 65 and counts[-1] == 64
 
 
-def test_small_clusters_stay_from_thirty_others_on() -> None:
+def test_small_clusters_stay_from_31_points() -> None:
     plane, cube = grid(15, 15), np.argwhere(np.ones((4, 3, 3))) * 0.003 + [0.1, 0.1, 0.8]
     sizes = np.arange(22, 36)
-    counts = [assert_as_by_loops(np.concatenate([plane, cube[:size]])) - 225 for size in sizes]
+    counts = [assert_equals_loops(np.concatenate([plane, cube[:size]])) - 225 for size in sizes]
     np.testing.assert_array_equal(counts, np.where(sizes > 30, sizes, 0))
 
 
-def test_strays_go() -> None:
+def test_isolated_points_are_removed() -> None:
     plane = grid(40, 40)
     strays = np.array([[0.06, 0.06, -0.05], [0.2, 0.06, 0], [-0.03, -0.03, 0], [0.06, 0.06, 0.4]])
     kept, relaxed = remove_outliers(np.concatenate([strays, plane]))
@@ -162,7 +162,7 @@ def test_strays_go() -> None:
 
 
 @pytest.mark.parametrize(("size", "stays"), [(99, False), (100, True), (101, True)])
-def test_pieces_stay_from_a_tenth_of_the_largest_on(size: int, stays: bool) -> None:
+def test_pieces_stay_from_a_tenth_of_the_largest(size: int, stays: bool) -> None:
     plane = grid(25, 40) + 0.001
     piece = grid(11, 10)[:size] + [0.2, 0, 0.001]
     kept, relaxed = remove_outliers(np.concatenate([plane, piece]))
@@ -173,10 +173,8 @@ def test_pieces_stay_from_a_tenth_of_the_largest_on(size: int, stays: bool) -> N
 @pytest.mark.parametrize(("gap", "joined"), [(0.009, True), (0.021, False)])
 @pytest.mark.parametrize("direction", [[1, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0], [0, -1, 0], [0, 0, -1]])
 @pytest.mark.parametrize("start", [0.0, 0.0042, -0.7])
-def test_a_gap_of_two_cells_parts_a_gap_within_one_does_not(
-    gap: float, joined: bool, direction: list[int], start: float
-) -> None:
-    """A small square off one of the sides of a large block."""
+def test_a_gap_of_two_cells_separates_components(gap: float, joined: bool, direction: list[int], start: float) -> None:
+    """A small square lies beside one of the sides of a large block."""
     z, y, x = np.mgrid[:10, :10, :10]
     block = np.stack([x, y, z], axis=-1).reshape(-1, 3) * 0.003
     small = block[(block <= 0.0121).all(axis=1)][:90]
@@ -187,16 +185,16 @@ def test_a_gap_of_two_cells_parts_a_gap_within_one_does_not(
 
 
 @pytest.mark.parametrize(("strays", "relaxed"), [(1599, False), (1600, False), (1601, True)])
-def test_the_neighbour_rule_is_skipped_if_it_drops_more_than_half(strays: int, relaxed: bool) -> None:
+def test_the_neighbour_rule_is_skipped_if_it_drops_most(strays: int, relaxed: bool) -> None:
     plane = grid(40, 40)
     scattered = grid(41, 41, 0.03)[:strays] + [0, 0, 1]
-    kept, found = remove_outliers(np.concatenate([plane, scattered]))
-    assert found is relaxed
-    np.testing.assert_array_equal(kept, np.arange(1600))  # strays are pieces of their own
+    kept, skipped = remove_outliers(np.concatenate([plane, scattered]))
+    assert skipped is relaxed
+    np.testing.assert_array_equal(kept, np.arange(1600))  # each scattered point is a component
 
 
 @pytest.mark.parametrize("count", [1, 29, 30])
-def test_all_of_a_cloud_without_thirty_others_is_kept(count: int) -> None:
+def test_clouds_of_at_most_30_points_are_kept(count: int) -> None:
     kept, relaxed = remove_outliers(grid(1, count))
     np.testing.assert_array_equal(kept, np.arange(count))
     assert relaxed

@@ -1,4 +1,4 @@
-"""The picture of answers: compared with outlines of scipy, and with text drawn on its own."""
+"""Overlays of answers against outlines computed by SciPy and the rectangles of the drawn text."""
 
 import math
 from pathlib import Path
@@ -21,7 +21,7 @@ def photo(height: int = 480, width: int = 640) -> np.ndarray:
 
 
 def discs(centres: list[tuple[int, int]], radius: int, shape: tuple[int, int] = (480, 640)) -> np.ndarray:
-    """Labels 1, 2, ... of discs around (row, column) places."""
+    """Return the labels 1, 2, ... of discs around (row, column) centres."""
     row, column = np.indices(shape)
     labels = np.zeros(shape, np.uint8)
     for number, (r, c) in enumerate(centres, start=1):
@@ -44,7 +44,7 @@ def drawn(color: np.ndarray, labels: np.ndarray, answers: list[Recognition], pat
 
 @pytest.fixture
 def boxes(monkeypatch: pytest.MonkeyPatch) -> list[tuple[tuple[int, int, int, int], str]]:
-    """Every label that is drawn: the rectangle behind it (last column and row included) and its text."""
+    """Record each label that is drawn: the rectangle behind it, last column and row included, and its text."""
     labels: list[tuple[tuple[int, int, int, int], str]] = []
     rectangle, text = ImageDraw.ImageDraw.rectangle, ImageDraw.ImageDraw.multiline_text
     last: list[tuple[int, int, int, int]] = []
@@ -76,7 +76,7 @@ def outside(boxes: list[tuple[tuple[int, int, int, int], str]], shape: tuple[int
 
 def test_outlines_lie_on_the_inner_edge_of_the_masks(tmp_path: Path, boxes: list) -> None:
     labels = discs([(120, 150), (300, 400)], 60)
-    labels[300:320, 390:410] = 0  # a hole has an outline too
+    labels[300:320, 390:410] = 0  # holes have an outline too
     answers = [named(1), Recognition(label=2, reason="too few points")]
     picture = drawn(photo(), labels, answers, tmp_path / "a.png")
     free = outside(boxes, labels.shape)
@@ -99,7 +99,7 @@ def test_touching_neighbours_keep_their_own_outlines(tmp_path: Path, boxes: list
     assert (picture[rows, 298:300] == COLORS[0]).all() and (picture[rows, 300:302] == COLORS[1]).all()
 
 
-def test_labels_tell_everything_and_lie_apart_inside_the_picture(tmp_path: Path, boxes: list) -> None:
+def test_labels_are_complete_and_do_not_overlap(tmp_path: Path, boxes: list) -> None:
     labels = discs([(5, 5), (5, 630), (470, 5), (470, 630), (240, 320), (250, 340), (260, 330)], 40)
     answers = [
         named(1, "mug"),
@@ -127,7 +127,7 @@ def test_labels_tell_everything_and_lie_apart_inside_the_picture(tmp_path: Path,
     assert count.max() == 1
 
 
-def test_letters_are_seen_on_their_box(tmp_path: Path, boxes: list) -> None:
+def test_text_is_legible_on_its_box(tmp_path: Path, boxes: list) -> None:
     labels = discs([(100, 100), (100, 300), (100, 500), (350, 100), (350, 300), (350, 500)], 40)
     answers = [*(named(k) for k in range(1, 6)), Recognition(label=6)]
     picture = drawn(photo(), labels, answers, tmp_path / "a.png")
@@ -136,7 +136,7 @@ def test_letters_are_seen_on_their_box(tmp_path: Path, boxes: list) -> None:
         ink = (255, 255, 255) if paint == (0, 114, 178) else (0, 0, 0)
         assert (inside == paint).all(axis=1).mean() > 0.5
         assert 0.02 < (inside == ink).all(axis=1).mean() < 0.5
-        assert contrast(ink, paint) > 4.5  # what WCAG asks of text
+        assert contrast(ink, paint) > 4.5  # minimum of WCAG for text
 
 
 def contrast(a: tuple[int, ...], b: tuple[int, ...]) -> float:
@@ -148,9 +148,9 @@ def linear(value: float) -> float:
     return value / 12.92 if value <= 0.04045 else ((value + 0.055) / 1.055) ** 2.4
 
 
-def test_a_label_beside_its_instance_is_joined_to_it(tmp_path: Path, boxes: list) -> None:
+def test_a_leader_connects_a_label_with_its_instance(tmp_path: Path, boxes: list) -> None:
     labels = np.zeros((480, 640), np.uint8)
-    labels[140:340, 220:420] = 1  # hems a small instance in, whose label must go elsewhere
+    labels[140:340, 220:420] = 1  # surrounds a small instance, whose label must move away
     labels[238:242, 318:322] = 2
     picture = drawn(photo(), labels, [named(1), named(2)], tmp_path / "a.png")
     ((left, top, right, bottom), _) = boxes[1]
@@ -166,7 +166,7 @@ def test_long_names_shrink_to_fit(tmp_path: Path, boxes: list) -> None:
     assert text.startswith("an_object_of_long_name 0.76") and 0 <= left < right < 160
 
 
-def test_sizes_grow_with_the_picture(tmp_path: Path, boxes: list) -> None:
+def test_sizes_scale_with_the_image(tmp_path: Path, boxes: list) -> None:
     for scale in (1, 3):
         labels = discs([(240 * scale, 320 * scale)], 60 * scale, (480 * scale, 640 * scale))
         picture = drawn(photo(*labels.shape), labels, [named(1)], tmp_path / f"{scale}.png")
@@ -196,8 +196,8 @@ def test_one_pixel(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("label", [0, 4, -1, 300])
-def test_an_answer_about_no_instance(tmp_path: Path, label: int) -> None:
-    with pytest.raises(InputError, match=f"answers: label {label} is no instance"):
+def test_an_answer_without_an_instance(tmp_path: Path, label: int) -> None:
+    with pytest.raises(InputError, match=f"answers: label {label} "):
         draw_overlay(photo(), discs([(100, 100)], 20), [named(1), named(label)], tmp_path / "a.png")
     assert list(tmp_path.iterdir()) == []
 
@@ -253,4 +253,4 @@ def test_real_frames(shared: Path, tmp_path: Path, boxes: list) -> None:
         assert (~outside(boxes, labels.shape)).sum() == covered, "labels overlap"
         changed = (picture != pixels).any(axis=2) & outside(boxes, labels.shape)
         assert changed[labels > 0].mean() < 0.35
-        assert changed[labels == 0].sum() < 2 * math.hypot(*labels.shape)  # leaders alone
+        assert changed[labels == 0].sum() < 2 * math.hypot(*labels.shape)  # only leaders

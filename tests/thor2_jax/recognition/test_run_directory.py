@@ -1,4 +1,4 @@
-"""Run directories: what is loaded is what was saved; anything else is refused in one line."""
+"""Run directories: a saved run is loaded unchanged, and a damaged one is refused in one line."""
 
 import dataclasses
 import gc
@@ -58,7 +58,7 @@ def test_input_sizes() -> None:
     assert sizes == {"ce": 4774, "tops": 7168, "tops2": 11942}
 
 
-def test_what_is_loaded_is_what_was_saved(saved: Path) -> None:
+def test_saving_and_loading_round_trips(saved: Path) -> None:
     run, loaded = make_run(), load_run(saved)
     assert (loaded.config, loaded.classes, loaded.record) == (run.config, run.classes, run.record)
     assert loaded.network.fingerprint == run.network.fingerprint
@@ -244,7 +244,7 @@ def small_heap() -> Iterator[None]:
 @pytest.mark.usefixtures("small_heap")
 @pytest.mark.parametrize("name", DAMAGES)
 def test_a_damaged_run_directory_is_refused_in_one_line(name: str, copied: Path) -> None:
-    """A failed read leaves nothing behind: that would warn when it is collected, and a warning is an error here."""
+    """A failed read leaves no open file, which would warn at garbage collection; warnings are errors here."""
     damage, words = DAMAGES[name]
     damage(copied)
     with pytest.raises(thor2.InputError) as caught:

@@ -1,4 +1,4 @@
-"""The voxel grid against a dictionary of cubes, filled point by point."""
+"""The voxel grid against a dictionary of cubes."""
 
 import math
 import re
@@ -11,7 +11,7 @@ from thor2_jax.recognition.voxel_grid import downsample_to_fit, voxel_downsample
 
 
 def by_dictionary(points: np.ndarray, values: np.ndarray, size: float) -> tuple[np.ndarray, np.ndarray]:
-    """Means of the points and of the values in each cube, cubes in lexicographic order; float64."""
+    """Return the means of points and values in each cube, in lexicographic order and float64."""
     points, values = points.astype(np.float64), values.astype(np.float64)
     low = points.min(axis=0) - size / 2
     cubes: dict[tuple[int, ...], list[int]] = {}
@@ -34,7 +34,7 @@ def test_means_of_cubes(count: int, size: float) -> None:
 
 
 def test_several_points_share_a_cube() -> None:
-    """Else the comparison above would also pass for a function that changes nothing."""
+    """Otherwise the comparison above would also pass for the identity."""
     rng = np.random.default_rng(0)
     points = rng.uniform(0, 0.1, (500, 3))
     assert 1 < len(voxel_downsample(points, points, 0.05)[0]) < 30
@@ -94,13 +94,12 @@ def test_sizes_that_are_not_positive(size: float) -> None:
 
 @pytest.mark.parametrize("turns", range(3))
 def test_as_many_cubes_as_numbers_of_63_bits(turns: int) -> None:
-    """2^61 are numbered, 2^62 are not; the axes differ in length."""
+    """A grid of 2^61 cubes is accepted, and one of 2^62 is refused; the axes differ in length."""
     span = np.roll(np.array([2.0**10, 2.0**30, 2.0**21]) - 1, turns)
     points = np.stack([np.zeros(3), span])
     np.testing.assert_array_equal(voxel_downsample(points, points, 1.0)[0], points)
     points[1, turns] = 2**11 - 1
-    message = f"size is 1.0; too small for a cloud that spans {points[1].tolist()}"
-    with pytest.raises(InputError, match=f"^{re.escape(message)}$"):
+    with pytest.raises(InputError, match=f"^size is 1.0;.*{re.escape(str(points[1].tolist()))}"):
         voxel_downsample(points, points, 1.0)
 
 
@@ -108,7 +107,7 @@ def test_as_many_cubes_as_numbers_of_63_bits(turns: int) -> None:
 def test_points_that_are_not_finite(value: float) -> None:
     points = np.zeros((4, 3))
     points[1, 2] = points[3, 0] = value
-    with pytest.raises(InputError, match=r"^points has 2 points that are not finite$"):
+    with pytest.raises(InputError, match=r"^points has 2 "):
         voxel_downsample(points, np.zeros((4, 3)), 0.01)
 
 
@@ -119,7 +118,7 @@ def test_shapes_that_do_not_fit(points: tuple[int, ...], colors: tuple[int, ...]
 
 
 @pytest.mark.parametrize(("side", "doublings"), [(20, 0), (21, 1), (50, 2)])
-def test_a_cloud_past_the_largest_bucket_gets_larger_voxels(side: int, doublings: int) -> None:
+def test_clouds_beyond_the_largest_bucket_get_larger_voxels(side: int, doublings: int) -> None:
     points = np.stack(np.meshgrid(*[np.arange(side)] * 3, indexing="ij"), axis=-1).reshape(-1, 3).astype(np.float64)
     colors = np.zeros((len(points), 3))
     downsampled, _ = downsample_to_fit(points, colors, 1.0)
