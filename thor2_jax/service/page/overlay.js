@@ -160,7 +160,7 @@ export class Overlay {
           y: Math.max(0, Math.min(height - room.height, position[1])),
         };
         if (others.some((other) => overlap(box, other.box)) || this.covers(box, across, down)) continue;
-        const cost = 3 * this.hidden(label, box) + costs[where] + Math.abs(share - 0.5);
+        const cost = 3 * this.hidden(label, box, costs.on) + costs[where] + Math.abs(share - 0.5);
         if (cost < best.cost) best = { cost, box };
       }
     }
@@ -180,12 +180,12 @@ export class Overlay {
     });
   }
 
-  /** Return the fraction of a box that lies on objects other than `label`. */
-  hidden(label, box) {
+  /** Return the fraction of a box that lies on objects; its own object, `label`, counts with a weight. */
+  hidden(label, box, ownWeight) {
     let hits = 0;
     for (let k = 0; k < 27; k++) {
       const under = this.regionAt(box.x + (box.width * ((k % 9) + 0.5)) / 9, box.y + (box.height * (Math.floor(k / 9) + 0.5)) / 3);
-      if (under !== 0 && under !== label) hits++;
+      if (under !== 0) hits += under === label ? ownWeight : 1;
     }
     return hits / 27;
   }
