@@ -274,7 +274,8 @@ def parse_intrinsics(content: bytes) -> Intrinsics:
     try:
         values = json.loads(content)
     except (ValueError, RecursionError) as error:
-        raise InputError(f"intrinsics is no valid JSON ({error}); expected an object with fx, fy, cx, cy") from None
+        reason = {UnicodeDecodeError: "not UTF-8", RecursionError: "nested too deeply"}.get(type(error), error)
+        raise InputError(f"intrinsics is no valid JSON ({reason}); expected an object with fx, fy, cx, cy") from None
     return Intrinsics.of(values)
 
 
