@@ -38,12 +38,11 @@ def _orientations(clouds: PointClouds, config: DescriptorConfig, count: int) -> 
 
     def one(cloud: PointClouds) -> tuple[jax.Array, jax.Array]:
         found = boxed(cloud, np.float32(config.sigma_s))
-        rotations = [oriented(found)]
-        if count == 4:
-            rotations.append(oriented(_swapped(found)))
-        if count > 1:
-            rotations += [half_turn @ rotation for rotation in rotations]
-        placed = [place_aligned(rotation, found, np.float32(config.alpha)) for rotation in rotations]
+        rotations = []
+        for box in (found, _swapped(found)):
+            rotation = oriented(box)
+            rotations += [rotation, half_turn @ rotation]
+        placed = [place_aligned(rotation, found, np.float32(config.alpha)) for rotation in rotations[:count]]
         points, cameras = zip(*placed, strict=True)
         return jnp.stack(points)[:, : len(cloud.mask)], jnp.stack(cameras)
 

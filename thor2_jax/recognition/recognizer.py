@@ -6,13 +6,18 @@
 [(1, 'mug', 0.98), (2, 'bowl', 0.71)]
 
 Each instance of the frame is prepared on the host (`prepare_instance`), described (`describe`), classified by the MLPs
-of the run and named by the fusion of their probabilities (`fuse`).
+of the run and named by the fusion of their probabilities (`fuse`). A gallery recognizes objects without training:
+
+>>> recognizer.enroll("teapot", [frame])                                            # doctest: +SKIP
+>>> recognizer.forget("teapot")                                                     # doctest: +SKIP
+
+Its scores name an instance alone, or combined with the classifiers (`ClassUnion.combine`).
 """
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import jax
 import numpy as np
@@ -21,15 +26,35 @@ from numpy.typing import ArrayLike, NDArray
 
 from thor2_jax.capacity import BATCH_BUCKETS, POINT_BUCKETS, batch_bucket, point_bucket
 from thor2_jax.descriptor.describe import describe
-from thor2_jax.errors import InputError
+from thor2_jax.errors import InputError, with_context
+from thor2_jax.gallery.embedding import Embedding
+from thor2_jax.gallery.gallery import Gallery
+from thor2_jax.gallery.objects import ObjectGallery
+from thor2_jax.gallery.store import GALLERY_DIRECTORY
 from thor2_jax.recognition.classifier import MLP, Feature, check_features, class_probabilities
 from thor2_jax.recognition.frames import RGBDFrame
-from thor2_jax.recognition.fusion import DEFAULT_RULE, FUSION_RULES, Fused, FusionRule, fuse
+from thor2_jax.recognition.fusion import DEFAULT_RULE, FUSION_RULES, FusionRule, fused_probabilities
 from thor2_jax.recognition.prepared_instance import PreparedInstance, pack_instances, prepare_instance
 from thor2_jax.recognition.run_directory import TrainedRun, load_run
 from thor2_jax.types import Descriptors, PointClouds
 
-__all__ = ["THOR2", "DescribedFrame", "Recognition", "Recognizer", "concatenate_padded"]
+__all__ = [
+    "ANSWER_SOURCES",
+    "EMBEDDING_FILE",
+    "THOR2",
+    "AnswerBy",
+    "DescribedFrame",
+    "Recognition",
+    "Recognizer",
+    "concatenate_padded",
+]
+
+AnswerBy = Literal["classifiers", "gallery", "both"]
+ANSWER_SOURCES: tuple[AnswerBy, ...] = ("classifiers", "gallery", "both")
+"""What a recognizer may answer by."""
+
+EMBEDDING_FILE = "embedding.safetensors"
+"""Embedding of a run directory, in place of the packaged one."""
 
 THOR2: tuple[Feature, ...] = ("tops", "tops2")
 """The two classifiers whose fusion is THOR2."""
@@ -52,10 +77,10 @@ class Recognition:
         name: the object's name. None if the instance could not be described (fewer points than
             `instance_clouds.MIN_POINTS`), if more than half of its points overflow (`MAX_OVERFLOW`), or if its
             confidence is below the recognizer's `unknown_below`: an unknown object.
-        confidence: fused probability of the most probable class, also of an unknown object; None if the instance could
-            not be described.
-        classifier: the classifier that gives this class the largest probability ("tops" or "tops2").
-        top: classifier -> its five most probable (name, probability) pairs.
+        confidence: fused probability of the most probable class, or the score of the gallery, also of an unknown
+            object; None if the instance could not be described.
+        classifier: the classifier that gives this class the largest probability ("tops" or "tops2"), or "gallery".
+        top: classifier or "gallery" -> its five most probable (name, probability) pairs.
         occluded: another instance hides a part of it, or the image border cuts it.
         overflow: points and persistence pairs outside the descriptor's grid, see `Descriptors`.
         points_used: points of the described cloud.
@@ -99,36 +124,163 @@ class DescribedFrame:
 
 
 class Recognizer:
-    """A trained run, ready to recognize the objects of a frame.
+    """A trained run and a gallery, ready to recognize the objects of a frame.
 
-    Its functions compile once for each point bucket and batch bucket; `warm_up` compiles them in advance.
+    Attributes:
+        run: the trained run.
+        objects: the enrolled objects, on disk after `load`.
+        unknown_below: least confidence of an answer with a name.
+        rule: fusion rule of the classifiers.
+
+    Its functions compile once for each point bucket and batch bucket; `warm_up` compiles them in advance. Enrolling and
+    forgetting objects compiles nothing.
     """
 
-    def __init__(self, run: TrainedRun, unknown_below: float = 0.0, rule: FusionRule = DEFAULT_RULE) -> None:
-        """Prepare every classifier of `run`.
+    def __init__(
+        self,
+        run: TrainedRun,
+        unknown_below: float = 0.0,
+        rule: FusionRule = DEFAULT_RULE,
+        *,
+        embedding: Embedding | None = None,
+        answer_by: AnswerBy | None = None,
+    ) -> None:
+        """Prepare every classifier of `run`, and an empty gallery in memory.
 
         Args:
             run: the trained run.
             unknown_below: least confidence, from 0 to 1, of an answer with a name. An object of no trained class tends
                 to get less. The report of `thor2 evaluate` has the threshold that keeps 95 % of the answers.
             rule: fusion rule, see `fusion`; the paper's is "max".
+            embedding: embedding of the gallery; by default the packaged one.
+            answer_by: what answers, see `answers_by`; by default what the run's record stores.
 
         Raises:
-            InputError: `unknown_below` is not between 0 and 1, or `rule` is unknown.
+            InputError: `unknown_below` is not between 0 and 1, or `rule` or `answer_by` is unknown.
         """
         if rule not in FUSION_RULES:
             raise InputError(f"rule is {rule!r}; expected one of {', '.join(FUSION_RULES)}")
         if not 0 <= unknown_below <= 1:
             raise InputError(f"unknown_below is {unknown_below}; expected a confidence from 0 to 1")
+        _check_answer_by(answer_by)
         self.run = run
         self.unknown_below = unknown_below
         self.rule: FusionRule = rule
+        self.objects = ObjectGallery(run.classes, embedding)
+        self._answer_by = answer_by
         self._classify = {name: _compiled(name, model) for name, model in run.classifiers.items()}
 
     @classmethod
-    def load(cls, run_dir: str | Path, unknown_below: float = 0.0, rule: FusionRule = DEFAULT_RULE) -> "Recognizer":
-        """Read a run directory; raises as `run_directory.load_run` and `Recognizer`."""
-        return cls(load_run(run_dir), unknown_below, rule)
+    def load(
+        cls,
+        run_dir: str | Path,
+        unknown_below: float = 0.0,
+        rule: FusionRule = DEFAULT_RULE,
+        *,
+        gallery: str | Path | None = None,
+        answer_by: AnswerBy | None = None,
+    ) -> "Recognizer":
+        """Read a run directory; raises as `run_directory.load_run`, `load_gallery` and `Recognizer`.
+
+        Args:
+            run_dir: the run directory.
+            unknown_below: see `Recognizer`.
+            rule: see `Recognizer`.
+            gallery: directory of the gallery; by default `gallery` in the run directory. Objects that are enrolled or
+                forgotten later are written to it.
+            answer_by: see `Recognizer`.
+        """
+        run_dir = Path(run_dir)
+        run, file = load_run(run_dir), run_dir / EMBEDDING_FILE
+        embedding = Embedding.load(file, run.network) if file.is_file() else None
+        recognizer = cls(run, unknown_below, rule, embedding=embedding, answer_by=answer_by)
+        recognizer.objects.open(Path(gallery) if gallery is not None else run_dir / GALLERY_DIRECTORY)
+        return recognizer
+
+    @property
+    def gallery(self) -> Gallery:
+        """The enrolled objects."""
+        return self.objects.gallery
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """All names that may be answered: trained classes, without forgotten ones, and enrolled objects."""
+        return self.objects.union.names
+
+    def answers_by(self, answer_by: AnswerBy | None = None) -> AnswerBy:
+        """Return what answers: "classifiers", "gallery" or "both".
+
+        Args:
+            answer_by: the wanted source; by default that of the constructor or of the run's record. Without classifiers
+                it is always the gallery, with an empty gallery always the classifiers, and otherwise both by default.
+        """
+        _check_answer_by(answer_by)
+        if not self._classify:
+            return "gallery"
+        if not self.gallery.objects:
+            return "classifiers"
+        return answer_by or self._answer_by or self.run.record.get("answer_by") or "both"
+
+    def enroll(
+        self,
+        name: str,
+        frames: Sequence[RGBDFrame | tuple[RGBDFrame, int]],
+        *,
+        extend: bool = False,
+        replace: bool = False,
+    ) -> None:
+        """Enroll an object from frames, so that the next frame is recognized with it.
+
+        A recognizer from `load` also writes it to the gallery on disk.
+
+        Args:
+            name: name of the object.
+            frames: frames whose label image has the object as its only instance, or pairs of a frame and the label
+                number of the object.
+            extend: add the views to those of an object with this name.
+            replace: discard the views, and the output of the classifiers, of an object with this name.
+
+        Raises:
+            InputError: a frame has several instances and no number, an instance has too few points, or the name exists
+                and neither `extend` nor `replace` is given. Nothing is enrolled.
+            OSError: the gallery cannot be written; it is as before.
+        """
+        views = []
+        for number, item in enumerate(frames):
+            frame, label = item if isinstance(item, tuple) else (item, None)
+            with with_context(f"frames[{number}]"):
+                views.append(self.prepare_view(frame, label))
+        self.objects.enroll(name, views, "frames", extend=extend, replace=replace)
+
+    def prepare_view(self, frame: RGBDFrame, label: int | None = None) -> PreparedInstance:
+        """Return one instance of a frame as a view to enroll.
+
+        Args:
+            frame: the frame.
+            label: number of the instance; not needed if it is the only one.
+
+        Raises:
+            InputError: the frame has no such instance, several and no number is given, or it has too few points.
+        """
+        if label is None and len(frame.instances) != 1:
+            raise InputError(f"labels has {len(frame.instances)} instances; expected one, or give the object's number")
+        if label is not None and label not in frame.instances:
+            raise InputError(f"instance is {label}; expected one of {', '.join(map(str, frame.instances)) or 'none'}")
+        view = prepare_instance(frame, frame.instances[0] if label is None else label, self.run.config.sigma_s)
+        if view.reason is not None:
+            raise InputError(f"instance {view.label} cannot be enrolled: {view.reason}")
+        return view
+
+    def forget(self, name: str) -> None:
+        """Forget an object: remove its views, and never answer its trained class again.
+
+        Every answer is then as if the object had not been enrolled.
+
+        Raises:
+            InputError: no object has this name.
+            OSError: the gallery cannot be written; it is as before.
+        """
+        self.objects.forget(name)
 
     def warm_up(self, max_points: int = 2048, max_instances: int = 16) -> int:
         """Compile everything for frames of up to `max_instances` instances with up to `max_points` points each.
@@ -145,6 +297,9 @@ class Recognizer:
         rows = [b for b in BATCH_BUCKETS if b <= batch_bucket(max_instances)]
         shapes = [(b, n) for n in points for b in rows if b <= CHUNK]
         described = [describe(pack_instances([], b, n), self.run.network, self.run.config) for b, n in shapes]
+        if self.answers_by() != "classifiers":
+            for b, n in shapes:
+                self.objects.embed(pack_instances([], b, n))
         for b in rows:
             self.probabilities(concatenate_padded(described[:1], b))
         return len(shapes) + len(rows)
@@ -188,76 +343,112 @@ class Recognizer:
         computing = {name: self._classify[name](descriptors) for name in names}
         return {name: np.asarray(values) for name, values in computing.items()}
 
-    def recognize(self, frame: RGBDFrame, classifiers: Sequence[Feature] = THOR2) -> list[Recognition]:
+    def recognize(
+        self, frame: RGBDFrame, classifiers: Sequence[Feature] = THOR2, answer_by: AnswerBy | None = None
+    ) -> list[Recognition]:
         """Recognize every instance of a frame; the answers are in the order of the label numbers.
 
         Args:
             frame: color, depth, labels and intrinsics.
             classifiers: the classifiers that are fused; by default the paper's two.
+            answer_by: what answers, see `answers_by`.
 
         Raises:
             InputError: a classifier that the run does not have. An instance that cannot be described is no error: the
                 `reason` of its answer says why.
         """
-        names = check_features(classifiers, "classifiers")
+        answer_by = self.answers_by(answer_by)
+        names = check_features(classifiers, "classifiers") if answer_by != "gallery" else ()
         missing = [name for name in names if name not in self._classify]
         if missing:
             raise InputError(f"classifiers: the run has no {', '.join(missing)}, only {', '.join(self._classify)}")
 
-        def compute(instances: Sequence[PreparedInstance]) -> tuple[Any, dict[Feature, Any]]:
-            descriptors = self._describe_chunk(instances)
-            return descriptors.overflow, {name: self._classify[name](descriptors) for name in names}
+        def compute(instances: Sequence[PreparedInstance]) -> tuple[Any, dict[Feature, Any], dict[str, Any]]:
+            clouds = pack_instances(instances, _padded_rows(len(instances)))
+            descriptors = describe(clouds, self.run.network, self.run.config)
+            embeddings = {} if answer_by == "classifiers" else {"gallery": self.objects.embed(clouds)}
+            return descriptors.overflow, {name: self._classify[name](descriptors) for name in names}, embeddings
 
         instances, chunks = self._by_chunks(frame, compute)
         n_usable = sum(instance.reason is None for instance in instances)
-        overflow, probabilities = concatenate_padded(chunks, _padded_rows(n_usable))
-        return self.recognitions(instances, probabilities, overflow)
+        overflow, probabilities, embeddings = concatenate_padded(chunks, _padded_rows(n_usable))
+        return self.recognitions(instances, probabilities, overflow, embeddings.get("gallery"))
 
     def recognitions(
         self,
         instances: Sequence[PreparedInstance],
         probabilities: Mapping[Feature, NDArray[np.float32]],
         overflow: ArrayLike,
+        embeddings: NDArray[np.float32] | None = None,
     ) -> list[Recognition]:
-        """Fuse the classifiers and return the answer for each instance of a frame.
+        """Fuse the classifiers and the gallery and return the answer for each instance of a frame.
 
         Args:
             instances: all of them; the usable ones are the first rows of the other arguments, in order.
-            probabilities: classifier -> class probabilities [B, C].
+            probabilities: classifier -> class probabilities [B, C]; empty if the gallery alone answers.
             overflow: [B] int, of the descriptors.
+            embeddings: [B, K, D] from `ObjectGallery.embed`; None if the classifiers alone answer.
         """
-        fused, overflows = fuse(probabilities, self.rule), np.asarray(overflow)
-        rows = iter(range(len(overflows)))
+        overflows = np.asarray(overflow)
+        n_usable = sum(instance.reason is None for instance in instances)
+        scores = None if embeddings is None else self.gallery.scores(np.asarray(embeddings)[:n_usable])
+        values = self.combined({name: p[:n_usable] for name, p in probabilities.items()}, scores)
+        union = self.objects.union
+        by_source: dict[str, NDArray[Any]] = {
+            name: union.of_classifiers(np.asarray(p)[:n_usable]) for name, p in probabilities.items()
+        }
+        if scores is not None:
+            by_source["gallery"] = union.of_gallery(scores)
+        rows = iter(range(n_usable))
         return [
-            self._recognition(instance, next(rows), fused, probabilities, overflows)
+            self._recognition(instance, next(rows), values, by_source, overflows)
             if instance.reason is None
             else Recognition(instance.label, reason=instance.reason)
             for instance in instances
         ]
 
+    def combined(
+        self, probabilities: Mapping[Feature, NDArray[np.float32]], scores: NDArray[np.float32] | None
+    ) -> NDArray[np.floating[Any]]:
+        """Return the values [B, n] of all `classes`, whose largest one is the answer and its confidence.
+
+        Args:
+            probabilities: classifier -> class probabilities [B, C]; empty if the gallery alone answers.
+            scores: [B, n_objects] of the gallery; None if the classifiers alone answer.
+        """
+        if scores is None:
+            return self.objects.union.of_classifiers(fused_probabilities(probabilities, self.rule))
+        if not probabilities:
+            return self.objects.union.of_gallery(scores)
+        return self.objects.union.combine(fused_probabilities(probabilities, self.rule), scores)
+
     def _recognition(
         self,
         instance: PreparedInstance,
         row: int,
-        fused: Fused,
-        probabilities: Mapping[Feature, NDArray[np.float32]],
+        values: NDArray[np.floating[Any]],
+        by_source: Mapping[str, NDArray[Any]],
         overflows: NDArray[Any],
     ) -> Recognition:
-        confidence, overflow = float(fused.confidence[row]), int(overflows[row])
+        names, overflow = self.classes, int(overflows[row])
+        best = int(values[row].argmax()) if names else -1
+        confidence = float(values[row, best]) if names else 0.0
         reason = None
         if overflow > MAX_OVERFLOW * len(instance.points):
             reason = (
                 f"overflow: {overflow} points and pairs of {len(instance.points)} points lie outside the descriptor's "
                 "grid; check the intrinsics and the depth scale"
             )
+        elif not names:
+            reason = "unknown: no object is enrolled"
         elif confidence < self.unknown_below:
             reason = f"unknown: a confidence of {confidence:.3f}, below {self.unknown_below:g}"
         return Recognition(
             label=instance.label,
-            name=self.run.classes[fused.class_index[row]] if reason is None else None,
+            name=names[best] if reason is None else None,
             confidence=confidence,
-            classifier=str(fused.classifier[row]),
-            top={name: self._top(values[row]) for name, values in probabilities.items()},
+            classifier=max(by_source, key=lambda name: by_source[name][row, best]) if names else None,
+            top={name: _top(names, of_source[row]) for name, of_source in by_source.items()},
             occluded=instance.occluded,
             overflow=overflow,
             points_used=len(instance.points),
@@ -265,9 +456,15 @@ class Recognizer:
             reason=reason,
         )
 
-    def _top(self, probabilities: NDArray[np.float32], count: int = 5) -> list[tuple[str, float]]:
-        best = np.argsort(-probabilities, kind="stable")[:count]
-        return [(self.run.classes[i], float(probabilities[i])) for i in best]
+
+def _check_answer_by(answer_by: str | None) -> None:
+    if answer_by not in (None, *ANSWER_SOURCES):
+        raise InputError(f"answer_by is {answer_by!r}; expected one of {', '.join(ANSWER_SOURCES)}")
+
+
+def _top(names: Sequence[str], values: NDArray[Any], count: int = 5) -> list[tuple[str, float]]:
+    best = np.argsort(-values, kind="stable")[:count]
+    return [(names[i], float(values[i])) for i in best]
 
 
 def _padded_rows(n: int) -> int:

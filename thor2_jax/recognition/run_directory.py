@@ -8,7 +8,9 @@ RUN/weights/NAME.safetensors    parameters and batch statistics of one classifie
 These three are the model: none of them may be deleted or edited. `thor2 train` adds files that recognition does not
 read, and each of them may be deleted: `baselines/` (models that `thor2 evaluate` compares with), `metrics.jsonl` and
 `curves.png` (loss and accuracy of each epoch) and, while a training is unfinished, `checkpoints/` and `views/`, from
-which an interrupted training resumes. With several folds, each of `fold-0/`, `fold-1/`, ... is a run directory.
+which an interrupted training resumes. `gallery/` has enrolled objects (see `gallery.store`), and
+`embedding.safetensors`, if it exists, their embedding in place of the packaged one. A run that was made by enrolling
+has neither classes nor classifiers. With several folds, each of `fold-0/`, `fold-1/`, ... is a run directory.
 
 A run directory appears under its name only when it is complete, and everything is checked when it is loaded. Two
 trainings that are equal (see `training.fitting.fit`) give the same bytes in these three.
@@ -50,7 +52,7 @@ class TrainedRun:
     Attributes:
         config: constants of the descriptor.
         network: the colour network.
-        classes: class names, in the order of a classifier's outputs.
+        classes: class names, in the order of a classifier's outputs; none in a run of enrolled objects only.
         classifiers: feature -> trained MLP.
         record: how the run was made (options, counts, training metrics), as JSON holds it.
     """
@@ -118,12 +120,17 @@ def load_run(path: str | Path) -> TrainedRun:
     try:
         config = _config(description["descriptor_config"])
         classes, record = description["classes"], dict(description["record"])
-        names = check_features(description["classifiers"], "classifiers")
+        # A run of enrolled objects only has neither.
+        names = check_features(description["classifiers"], "classifiers") if description["classifiers"] else ()
         fingerprint = description["color_network"]
         digests = {name: description["weights"][name] for name in names}
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"model: {path / RUN_FILE}: {type(error).__name__}: {error}") from None
-    if not isinstance(classes, list) or not classes or not all(isinstance(name, str) for name in classes):
+    if (
+        not isinstance(classes, list)
+        or not all(isinstance(name, str) for name in classes)
+        or bool(names) > bool(classes)
+    ):
         raise InputError(f"model: {path / RUN_FILE}: classes is {classes!r}; expected a list of names")
     try:
         network = colornet.load(path / "network.npz")

@@ -1,0 +1,204 @@
+"""Recognizers that are taught: enrolling, forgetting, what answers. The weights are random: the way is checked."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers import SMALL_CONFIG, untrained_run
+
+import thor2_jax as thor2
+from thor2_jax.gallery.augment import augmented_copies
+from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
+from thor2_jax.gallery.enrollment import QUERY_ORIENTATIONS
+from thor2_jax.gallery.objects import ObjectGallery
+from thor2_jax.gallery.union import ClassUnion
+from thor2_jax.recognition.recognizer import EMBEDDING_FILE
+from thor2_jax.recognition.run_directory import TrainedRun, load_run, save_run
+
+INTRINSICS = thor2.Intrinsics(600.0, 600.0, 159.5, 119.5)
+SIZES = EmbeddingSizes(4, (16,), 8, 4)
+
+
+@pytest.fixture(scope="module")
+def embedding() -> Embedding:
+    return Embedding.create(SMALL_CONFIG, sizes=SIZES)
+
+
+@pytest.fixture(scope="module")
+def run() -> TrainedRun:
+    return untrained_run(("a", "b", "c"), ("tops", "tops2"))
+
+
+def frame(*shapes: tuple[int, int, int, int, tuple[int, int, int]], seed: int = 0) -> thor2.RGBDFrame:
+    """A frame with rectangles (top, left, height, width, colour) on planes that fall off to the right."""
+    rng = np.random.default_rng(seed)
+    color = rng.integers(100, 120, (240, 320, 3), np.uint8)
+    depth = np.broadcast_to(600 + np.arange(320) // 2, (240, 320)).astype(np.uint16)
+    labels = np.zeros((240, 320), np.uint8)
+    for number, (top, left, height, width, rgb) in enumerate(shapes, 1):
+        place = slice(top, top + height), slice(left, left + width)
+        labels[place] = number
+        color[place] = np.clip(np.array(rgb) + rng.integers(-9, 10, (height, width, 3)), 0, 255)
+    return thor2.RGBDFrame(color, depth, labels, INTRINSICS)
+
+
+RED, BLUE = (20, 20, 60, 120, (220, 30, 30)), (120, 180, 90, 60, (30, 40, 220))
+CLUTTER = frame(RED, BLUE, (150, 40, 40, 40, (90, 200, 60)))
+
+
+def taught(run: TrainedRun, embedding: Embedding, **options: object) -> thor2.Recognizer:
+    recognizer = thor2.Recognizer(run, embedding=embedding, **options)  # type: ignore[arg-type]
+    recognizer.enroll("brick", [frame(RED, seed=1), (CLUTTER, 1)])
+    recognizer.enroll("book", [frame(BLUE, seed=2)])
+    return recognizer
+
+
+def test_enrolled_objects_are_recognized_without_training(embedding: Embedding) -> None:
+    recognizer = taught(untrained_run((), ()), embedding)
+    assert recognizer.classes == ("brick", "book") and recognizer.answers_by() == "gallery"
+    answers = recognizer.recognize(frame(RED, BLUE, seed=3))
+    assert [answer.name for answer in answers] == ["brick", "book"]
+    for answer in answers:
+        assert answer.classifier == "gallery" and list(answer.top) == ["gallery"] and answer.confidence is not None
+        assert answer.top["gallery"][0] == (answer.name, pytest.approx(answer.confidence))
+
+
+def test_forgetting_restores_every_answer(run: TrainedRun, embedding: Embedding) -> None:
+    plain = thor2.Recognizer(run, embedding=embedding)
+    before = plain.recognize(CLUTTER)
+    plain.enroll("brick", [frame(RED)])
+    assert plain.recognize(CLUTTER) != before
+    plain.forget("brick")
+    assert plain.recognize(CLUTTER) == before
+    recognizer = taught(run, embedding)
+    before = recognizer.recognize(CLUTTER)
+    recognizer.enroll("pen", [(CLUTTER, 3)])
+    assert [answer.name for answer in recognizer.recognize(CLUTTER, answer_by="gallery")] == ["brick", "book", "pen"]
+    recognizer.forget("pen")
+    assert recognizer.recognize(CLUTTER) == before
+
+
+def test_both_answers_by_the_union_of_classes(run: TrainedRun, embedding: Embedding) -> None:
+    recognizer = taught(run, embedding)
+    assert recognizer.answers_by() == "both" and recognizer.classes == ("a", "b", "c", "brick", "book")
+    for answer in recognizer.recognize(CLUTTER):
+        assert list(answer.top) == ["tops", "tops2", "gallery"] and 0 <= answer.confidence <= 1  # type: ignore[operator]
+    by_classifiers = recognizer.recognize(CLUTTER, answer_by="classifiers")
+    expected = thor2.Recognizer(run).recognize(CLUTTER)
+    assert [(a.name, a.confidence) for a in by_classifiers] == [(a.name, a.confidence) for a in expected]
+
+
+def test_the_record_and_the_argument_choose_what_answers(run: TrainedRun, embedding: Embedding) -> None:
+    stored = taught(dataclasses.replace(run, record={"answer_by": "gallery"}), embedding)
+    assert (stored.answers_by(), stored.answers_by("both")) == ("gallery", "both")
+    assert taught(run, embedding, answer_by="classifiers").answers_by() == "classifiers"
+    with pytest.raises(thor2.InputError, match="answer_by is 'all'"):
+        thor2.Recognizer(run, answer_by="all")  # type: ignore[arg-type]
+
+
+def test_a_forgotten_class_is_never_answered(run: TrainedRun, embedding: Embedding) -> None:
+    recognizer = thor2.Recognizer(run, embedding=embedding)
+    first = {answer.name for answer in recognizer.recognize(CLUTTER)}
+    for name in first:
+        recognizer.forget(name)  # type: ignore[arg-type]
+    left = set("abc") - first
+    assert set(recognizer.classes) == left
+    for answer in recognizer.recognize(CLUTTER):
+        assert answer.name in left or (answer.name is None and not left)
+        assert all(name in left for top in answer.top.values() for name, _ in top)
+    with pytest.raises(thor2.InputError, match="name"):
+        recognizer.forget(next(iter(first)))  # type: ignore[arg-type]
+
+
+def test_a_trained_class_needs_extend_or_replace(run: TrainedRun, embedding: Embedding) -> None:
+    recognizer = thor2.Recognizer(run, embedding=embedding)
+    with pytest.raises(thor2.InputError, match="'a' is a trained class"):
+        recognizer.enroll("a", [frame(RED)])
+    assert recognizer.gallery.names == ()
+    recognizer.enroll("a", [frame(RED)], extend=True)
+    recognizer.enroll("b", [frame(BLUE)], replace=True)
+    assert (recognizer.gallery.names, recognizer.gallery.hidden) == (("a", "b"), ("b",))
+    assert recognizer.classes == ("a", "c", "b")
+
+
+def test_unusable_views_are_refused_and_nothing_changes(run: TrainedRun, embedding: Embedding) -> None:
+    recognizer = taught(run, embedding)
+    before = recognizer.gallery
+    small = frame((5, 5, 4, 4, (0, 0, 0)))
+    for frames, words in (
+        ([frame(RED), CLUTTER], r"frames\[1\].*3 instances"),
+        ([(CLUTTER, 9)], "instance is 9"),
+        ([small], "cannot be enrolled"),
+        ([], "views is empty"),
+    ):
+        with pytest.raises(thor2.InputError, match=words):
+            recognizer.enroll("new", frames)  # type: ignore[arg-type]
+    assert recognizer.gallery is before
+
+
+def test_few_views_get_augmented_copies_and_meshes_none(embedding: Embedding) -> None:
+    recognizer = taught(untrained_run((), ()), embedding)
+    views = [recognizer.prepare_view(CLUTTER, label) for label in (1, 2)]
+    copies = augmented_copies(views)
+    assert len(copies) == 8 and len(augmented_copies(views * 5)) == 0
+    for copy, again in zip(copies, augmented_copies(views), strict=True):
+        np.testing.assert_array_equal(copy.points, again.points)
+        assert len(copy.points) == len(copy.colors) == len(copy.boundary) >= 30
+    recognizer.objects.enroll("mesh", views, "mesh")
+    recognizer.objects.enroll("frames", views, "frames")
+    sizes = {name: len(views.embeddings) for name, views in recognizer.gallery.objects.items()}
+    assert (sizes["mesh"], sizes["frames"]) == (4, 20) and recognizer.gallery.objects["frames"].embeddings.shape[
+        1
+    ] <= 256
+
+
+def test_a_run_directory_keeps_its_gallery(embedding: Embedding, tmp_path: Path) -> None:
+    path = tmp_path / "run"
+    save_run(untrained_run((), ()), path)
+    embedding.save(path / EMBEDDING_FILE)
+    assert load_run(path).classes == ()
+    first, second = thor2.Recognizer.load(path), thor2.Recognizer.load(path)
+    assert first.recognize(CLUTTER)[0].name is None
+    first.enroll("brick", [(CLUTTER, 1)])
+    assert second.classes == () and second.objects.refresh() and not second.objects.refresh()
+    second.enroll("book", [(CLUTTER, 2)])
+    assert first.objects.refresh() and first.classes == second.classes == ("brick", "book")
+    assert first.recognize(CLUTTER) == second.recognize(CLUTTER) == thor2.Recognizer.load(path).recognize(CLUTTER)
+    elsewhere = thor2.Recognizer.load(path, gallery=tmp_path / "elsewhere")
+    elsewhere.enroll("pen", [(CLUTTER, 3)])
+    assert first.objects.refresh() is False and (tmp_path / "elsewhere" / "index.json").is_file()
+
+
+def test_another_embedding_embeds_the_views_again(embedding: Embedding, tmp_path: Path) -> None:
+    path, other = tmp_path / "run", Embedding.create(SMALL_CONFIG, sizes=SIZES, seed=1)
+    save_run(untrained_run((), ()), path)
+    embedding.save(path / EMBEDDING_FILE)
+    thor2.Recognizer.load(path).enroll("brick", [(CLUTTER, 1)])
+    other.save(path / EMBEDDING_FILE)
+    with pytest.raises(thor2.InputError, match="gallery.*reembed"):
+        thor2.Recognizer.load(path)
+    ObjectGallery((), other).open(path / "gallery", reembed=True)
+    expected = thor2.Recognizer(untrained_run((), ()), embedding=other)
+    expected.enroll("brick", [(CLUTTER, 1)])
+    found = thor2.Recognizer.load(path).gallery.objects["brick"].embeddings
+    np.testing.assert_array_equal(found, expected.gallery.objects["brick"].embeddings)
+    assert json.loads((path / "gallery" / "index.json").read_text())["embedding"] == other.fingerprint
+
+
+def test_embeddings_of_a_query_have_one_row_per_orientation(embedding: Embedding) -> None:
+    recognizer = thor2.Recognizer(untrained_run((), ()), embedding=embedding)
+    packed = recognizer.describe(CLUTTER).packed
+    assert recognizer.objects.embed(packed).shape == (4, QUERY_ORIENTATIONS, embedding.size)
+
+
+def test_combined_values_of_classes_and_objects() -> None:
+    union = ClassUnion(("a", "b", "c"), ("x", "b"), ("c",))
+    assert union.names == ("a", "b", "x")
+    p, s = np.array([[0.5, 0.4, 0.1]]), np.array([[0.25, 0.9]])
+    np.testing.assert_allclose(union.of_classifiers(p), [[0.5, 0.4, 0]])
+    np.testing.assert_allclose(union.of_gallery(s), [[0, 0.9, 0.25]])
+    np.testing.assert_allclose(union.combine(p, s), [[0.375, np.sqrt(0.3 * 0.9), 0.25]])
+    same = ClassUnion(("a", "b"))
+    assert same.of_classifiers(p) is p and same.combine(p[:, :2], np.zeros((1, 0))) == pytest.approx(p[:, :2])

@@ -1,0 +1,69 @@
+"""Augmented copies of enrolled views that need no mesh: light, sensor noise, and masks that are cut.
+
+One to five views of an object show little of what a camera makes of it. The copies are drawn from the cloud itself, so
+that embedding a view again, with another embedding, gives the same copies.
+"""
+
+import zlib
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thor2_jax.recognition.instance_clouds import MIN_POINTS
+from thor2_jax.recognition.prepared_instance import PreparedInstance
+
+__all__ = ["augmented_copies", "augmented_view"]
+
+MAX_COPIES = 8
+"""Copies of a single view; fewer of each where there are more views."""
+
+LUMA = np.array([0.299, 0.587, 0.114], np.float32)
+"""Luma coefficients of red, green and blue (ITU-R BT.601)."""
+
+
+def augmented_copies(views: Sequence[PreparedInstance]) -> list[PreparedInstance]:
+    """Return copies of the views of one object: about `MAX_COPIES` in all, none for more than that many views."""
+    copies = MAX_COPIES // max(len(views), 1)
+    return [augmented_view(view, copy) for view in views for copy in range(copies)]
+
+
+def augmented_view(view: PreparedInstance, copy: int) -> PreparedInstance:
+    """Return an augmented copy of a view; it is determined by the arguments.
+
+    Args:
+        view: a view with at least one point.
+        copy: number of the copy.
+    """
+    rng = np.random.default_rng([zlib.crc32(np.ascontiguousarray(view.colors).tobytes()), len(view.points), copy])
+    points, keep = _sensed(view.points, rng), ~_cut(view.points, rng)
+    if keep.sum() < MIN_POINTS:
+        keep[:] = True
+    colors = _relit(view.colors, rng)
+    return PreparedInstance(view.label, points[keep], colors[keep], view.boundary[keep], view.occluded)
+
+
+def _relit(colors: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
+    """Return the colours under another light: gamma, gain, colour cast, saturation, stray light and noise."""
+    gamma, gain, saturation = rng.uniform(0.8, 1.25), rng.uniform(0.75, 1.25), rng.uniform(0.75, 1.3)
+    cast, veil = rng.uniform(0.94, 1.06, 3), rng.uniform(0, 0.05)
+    values = (colors / np.float32(255)) ** np.float32(gamma) * np.float32(gain) * cast.astype(np.float32)
+    grey = (values @ LUMA)[:, None]
+    values = (grey + np.float32(saturation) * (values - grey)) * np.float32(1 - veil) + np.float32(veil)
+    values += np.float32(rng.uniform(0, 0.01)) * rng.standard_normal(values.shape, np.float32)
+    return np.rint(255 * values).clip(0, 255).astype(np.uint8)
+
+
+def _sensed(points: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:
+    """Return the points with noise along their rays, with the deviation of a depth camera at half of its noise."""
+    deviation = rng.uniform(0, 0.5) * (0.0012 + 0.0019 * (points[:, 2:] - 0.4) ** 2)
+    noise = deviation * rng.standard_normal((len(points), 1))
+    return (points * (1 + noise / np.maximum(points[:, 2:], 0.1))).astype(np.float32)
+
+
+def _cut(points: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.bool_]:
+    """Return the points that a mask misses on one side of the silhouette, at most an eighth of them."""
+    angle = rng.uniform(0, 2 * np.pi)
+    rays = points[:, :2] / np.maximum(points[:, 2:], 0.1)
+    along = rays @ np.array([np.cos(angle), np.sin(angle)])
+    return np.asarray(along < np.quantile(along, rng.uniform(0, 0.125)))

@@ -1,0 +1,81 @@
+"""Views of an object, embedded for a gallery, and queries embedded in several orientations."""
+
+import datetime
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thor2_jax.capacity import point_bucket
+from thor2_jax.descriptor.orientations import candidate_orientations
+from thor2_jax.errors import InputError
+from thor2_jax.gallery.augment import augmented_copies
+from thor2_jax.gallery.clouds import CompactClouds
+from thor2_jax.gallery.embedding import Embedding
+from thor2_jax.gallery.gallery import GalleryObject
+from thor2_jax.recognition.prepared_instance import PreparedInstance, pack_instances
+from thor2_jax.types import PointClouds
+
+__all__ = ["QUERY_ORIENTATIONS", "embed_orientations", "embed_views", "enrolled_views"]
+
+QUERY_ORIENTATIONS = 4
+"""Candidate orientations of a query, whose scores are averaged."""
+
+VIEW_ORIENTATIONS = 2
+"""Candidate orientations of an enrolled view, the first of those of a query; each is a view of its own."""
+
+ROWS = 4
+"""Clouds embedded in one call, as recognition does."""
+
+
+def embed_orientations(embedding: Embedding, clouds: PointClouds, count: int = QUERY_ORIENTATIONS) -> Any:
+    """Return the embeddings [B, count, D] of candidate orientations of clouds in metres."""
+    flat = embedding.embed_aligned(candidate_orientations(clouds, embedding.config, count))
+    return flat.reshape(-1, count, flat.shape[-1])
+
+
+def embed_views(
+    embedding: Embedding,
+    clouds: CompactClouds,
+    source: str,
+    pack: Callable[[Sequence[PreparedInstance]], PointClouds] | None = None,
+) -> NDArray[np.float16]:
+    """Return the embeddings [E, D] of an object's views.
+
+    Args:
+        embedding: the embedding.
+        clouds: the views.
+        source: "mesh", or where else they come from: a few views get augmented copies.
+        pack: function that packs up to `ROWS` views as a batch; its shapes determine what is compiled.
+    """
+    views = list(clouds.views())
+    if source != "mesh":
+        views += augmented_copies(views)
+    # Views of similar size share a bucket.
+    views.sort(key=lambda view: point_bucket(len(view.points)))
+    batches = []
+    for start in range(0, len(views), ROWS):
+        chunk = views[start : start + ROWS]
+        packed = pack(chunk) if pack else pack_instances(chunk, ROWS)
+        batches.append((len(chunk), embed_orientations(embedding, packed)))
+    embedded = [np.asarray(batch)[:count, :VIEW_ORIENTATIONS] for count, batch in batches]
+    return np.concatenate(embedded).reshape(-1, embedded[0].shape[-1]).astype(np.float16)
+
+
+def enrolled_views(
+    embedding: Embedding,
+    views: Iterable[PreparedInstance],
+    source: str,
+    pack: Callable[[Sequence[PreparedInstance]], PointClouds] | None = None,
+) -> GalleryObject:
+    """Return the views of an object as a gallery stores them; the arguments are those of `embed_views`.
+
+    Raises:
+        InputError: there is no view, or one has no points or is too large.
+    """
+    clouds = CompactClouds.of(list(views))
+    if not len(clouds):
+        raise InputError("views is empty; expected at least one view of the object")
+    date = datetime.datetime.now().astimezone().isoformat(timespec="seconds")
+    return GalleryObject(embed_views(embedding, clouds, source, pack), clouds, source, date)

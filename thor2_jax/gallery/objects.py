@@ -1,0 +1,174 @@
+"""The enrolled objects of a recognizer: a gallery that can be taught, in memory or on disk, with its embedding."""
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from thor2_jax.errors import InputError
+from thor2_jax.gallery.clouds import CompactClouds
+from thor2_jax.gallery.embedding import Embedding, load_default
+from thor2_jax.gallery.enrollment import embed_orientations, embed_views, enrolled_views
+from thor2_jax.gallery.gallery import Gallery, GalleryObject
+from thor2_jax.gallery.store import StoredGallery, gallery_stamp, load_gallery, update_gallery
+from thor2_jax.gallery.union import ClassUnion
+from thor2_jax.recognition.prepared_instance import PreparedInstance
+from thor2_jax.types import PointClouds
+
+__all__ = ["ObjectGallery"]
+
+_NO_VIEWS = GalleryObject(np.zeros((0, 1), np.float16), CompactClouds.of([]), "", "")
+
+
+class ObjectGallery:
+    """Enrolled objects beside the trained classes of a run.
+
+    Each change is one immutable gallery in place of another, so that another thread reads the one or the other.
+    """
+
+    def __init__(self, trained: tuple[str, ...], embedding: Embedding | None = None) -> None:
+        """Begin with an empty gallery in memory.
+
+        Args:
+            trained: class names of the run.
+            embedding: embedding of the views; by default the packaged one.
+        """
+        self._trained = trained
+        self._embedding = embedding
+        self._directory: Path | None = None
+        self._stored = StoredGallery(Gallery(""), {}, 0)
+        self._stamp: tuple[int, int, int] | None = None
+
+    def open(self, directory: Path, *, reembed: bool = False) -> None:
+        """Read the gallery in a directory, which may not exist yet, and write all later changes to it.
+
+        Args:
+            directory: directory of the gallery.
+            reembed: embed all views again, with the embedding of this run, whatever they were embedded by.
+
+        Raises:
+            InputError: see `refresh`.
+            OSError: the gallery cannot be written; it is as before.
+        """
+        self._directory, self._stamp = directory, None
+        if reembed and gallery_stamp(directory) is not None:
+            self._change(self._reembedded)
+        else:
+            self.refresh()
+
+    @property
+    def embedding(self) -> Embedding:
+        """The embedding of the views; the packaged one is read when it is first needed."""
+        if self._embedding is None:
+            self._embedding = load_default()
+        return self._embedding
+
+    @property
+    def gallery(self) -> Gallery:
+        """The gallery."""
+        return self._stored.gallery
+
+    @property
+    def union(self) -> ClassUnion:
+        """The trained classes and the objects of the gallery."""
+        return ClassUnion(self._trained, self.gallery.names, self.gallery.hidden)
+
+    def embed(self, clouds: PointClouds) -> jax.Array:
+        """Return the embeddings [B, K, D] of clouds in metres in K orientations, for `Gallery.scores`."""
+        embeddings: jax.Array = embed_orientations(self.embedding, clouds)
+        return embeddings
+
+    def refresh(self) -> bool:
+        """Read the gallery again if it has changed on disk, and return whether it has.
+
+        Raises:
+            InputError: it cannot be read, or has another embedding; the gallery in memory stays.
+        """
+        stamp = None if self._directory is None else gallery_stamp(self._directory)
+        if self._directory is None or stamp == self._stamp:
+            return False
+        self._stored = load_gallery(self._directory, self.embedding.fingerprint, self._stored)
+        self._stamp = stamp
+        return True
+
+    def _change(self, change: Callable[[Gallery], Gallery], embedding: str | None = None) -> None:
+        if self._directory is None:
+            self._stored = dataclasses.replace(self._stored, gallery=change(self.gallery))
+        else:
+            self._stored = update_gallery(self._directory, change, embedding, self._stored)
+            self._stamp = gallery_stamp(self._directory)
+
+    def check(self, name: str, *, extend: bool = False, replace: bool = False) -> None:
+        """Raise InputError if `enroll` would refuse the name; a check before views are rendered or embedded."""
+        self._with_objects(self.gallery, {name: _NO_VIEWS}, extend, replace)
+
+    def _with_objects(
+        self, gallery: Gallery, objects: Mapping[str, GalleryObject], extend: bool, replace: bool
+    ) -> Gallery:
+        for name, views in objects.items():
+            gallery = gallery.with_object(name, views, extend=extend, replace=replace)
+            if name in self._trained and name not in gallery.hidden:
+                if replace:
+                    gallery = dataclasses.replace(gallery, hidden=(*gallery.hidden, name))
+                elif not extend:
+                    raise InputError(
+                        f"name: {name!r} is a trained class; add views to it (--extend) or replace it (--replace)"
+                    )
+        return gallery
+
+    def enroll(
+        self,
+        name: str,
+        views: Sequence[PreparedInstance],
+        source: str,
+        *,
+        extend: bool = False,
+        replace: bool = False,
+        pack: Callable[[Sequence[PreparedInstance]], PointClouds] | None = None,
+    ) -> None:
+        """Enroll an object from prepared views.
+
+        Args:
+            name: name of the object.
+            views: its views.
+            source: "frames", or "mesh" for views that get no augmented copies.
+            extend: add the views to those of an object with this name.
+            replace: discard the views, and the output of the classifiers, of an object with this name.
+            pack: see `enrollment.embed_views`.
+
+        Raises:
+            InputError: a view cannot be used, or the name exists and neither `extend` nor `replace` is given. Nothing
+                is enrolled.
+            OSError: the gallery cannot be written; it is as before.
+        """
+        self.check(name, extend=extend, replace=replace)
+        self.add({name: enrolled_views(self.embedding, views, source, pack)}, extend=extend, replace=replace)
+
+    def add(self, objects: Mapping[str, GalleryObject], *, extend: bool = False, replace: bool = False) -> None:
+        """Add embedded objects in one change; the arguments and errors are those of `enroll`."""
+        fingerprint = self.embedding.fingerprint
+        self._change(
+            lambda gallery: dataclasses.replace(
+                self._with_objects(gallery, objects, extend, replace), embedding=fingerprint
+            ),
+            fingerprint,
+        )
+
+    def forget(self, name: str) -> None:
+        """Remove the views of an object, and never answer its trained class again.
+
+        Raises:
+            InputError: no object has this name.
+            OSError: the gallery cannot be written; it is as before.
+        """
+
+        def change(gallery: Gallery) -> Gallery:
+            return gallery.without(name, hide=name in self._trained and name not in gallery.hidden)
+
+        self._change(change, self.embedding.fingerprint)
+
+    def _reembedded(self, gallery: Gallery) -> Gallery:
+        embedding = self.embedding
+        return gallery.reembed(embedding.fingerprint, lambda clouds, source: embed_views(embedding, clouds, source))
