@@ -10,7 +10,7 @@ from training.fitting.samples import Samples
 
 @pytest.fixture
 def separable() -> Samples:
-    """48 samples of 2 x 5 strips: three classes, short strips of one colour, long ones of it, long ones of another."""
+    """Return 48 samples of 2 x 5 strips; the classes differ in the length or the colour of the strips."""
     n, strips = 48, 10
     rng = np.random.default_rng(0)
     label = np.arange(n, dtype=np.int32) % 3

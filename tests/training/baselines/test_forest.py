@@ -26,27 +26,27 @@ def normal(sizes: tuple[int, ...]) -> thor2.PointClouds:
 
 def test_features_match_numpy() -> None:
     clouds = normal((400, 1, 0, 57))
-    found = forest_features(clouds, NETWORK, CONFIG)
-    assert found.shape == (4, 22 + 3 + 14)
+    features = forest_features(clouds, NETWORK, CONFIG)
+    assert features.shape == (4, 22 + 3 + 14)
     aligned = np.asarray(thor2.turn(clouds, CONFIG).points, np.float64)
     points, mask = np.asarray(clouds.points, np.float64), np.asarray(clouds.mask)
     colors = np.rint(np.asarray(clouds.colors) * 255).astype(np.uint8)
-    for row, (n, features) in enumerate(zip((400, 1, 0, 57), found, strict=True)):
+    for row, (n, expected) in enumerate(zip((400, 1, 0, 57), features, strict=True)):
         here = mask[row]
         assert here.sum() == n
         if not n:
-            np.testing.assert_array_equal(features, 0)
+            np.testing.assert_array_equal(expected, 0)
             continue
-        np.testing.assert_allclose(features[:22], NETWORK.membership(colors[row, here]).mean(axis=0), atol=1e-5)
-        np.testing.assert_allclose(features[22:25], points[row, here].max(axis=0), rtol=1e-6)
+        np.testing.assert_allclose(expected[:22], NETWORK.membership(colors[row, here]).mean(axis=0), atol=1e-5)
+        np.testing.assert_allclose(expected[22:25], points[row, here].max(axis=0), rtol=1e-6)
         x, y, z = aligned[row, here].T
         for k in range(7):
             inside = np.floor(z / CONFIG.sigma_1) == k
             strips = np.floor(x[inside] / CONFIG.sigma_2)
             wide = (np.ptp(strips) + 1) * CONFIG.sigma_2 if inside.any() else 0
             deep = np.ptp(y[inside]) if inside.any() else 0
-            assert features[25 + k] == pytest.approx(wide, abs=1e-6)
-            assert features[32 + k] == pytest.approx(deep, abs=1e-6)
+            assert expected[25 + k] == pytest.approx(wide, abs=1e-6)
+            assert expected[32 + k] == pytest.approx(deep, abs=1e-6)
 
 
 @pytest.mark.parametrize("depth", [None, 1])

@@ -94,9 +94,9 @@ def test_all_baselines_learn_and_are_calibrated(trained: Path) -> None:
     assert set(run.temperatures) == {"tops", *BASELINES} and run.temperatures["tops"] == 1.5
     inputs = baseline_inputs(described(5), CONFIG)
     for name, model in run.baselines.items():
-        found = model.probabilities(inputs)
-        np.testing.assert_allclose(found.sum(axis=1), 1, atol=1e-5)
-        assert (found.argmax(axis=1) == np.repeat([0, 1], 4)).mean() == 1, name
+        probabilities = model.probabilities(inputs)
+        np.testing.assert_allclose(probabilities.sum(axis=1), 1, atol=1e-5)
+        assert (probabilities.argmax(axis=1) == np.repeat([0, 1], 4)).mean() == 1, name
 
 
 def test_existing_baselines_are_not_trained_again(trained: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -178,10 +178,10 @@ def test_run_with_checkpoints_is_not_finished(tmp_path: Path) -> None:
 
 def test_left_out_classes_are_not_in_the_views() -> None:
     source = MemoryViews({"a": clouds()["plank"][:2], "b": clouds()["cube"][:3], "c": clouds()["cube"][3:4]}, CONFIG)
-    found = WithoutClasses(source, ["b"])
-    assert found.classes == ("a", "c") and [(s.label, s.views) for s in found.shards] == [(0, 2), (1, 1)]
-    assert found.record["views"] == 3 and found.record["digest"] == found.digest != source.digest
-    views = found.read(1)
+    remaining = WithoutClasses(source, ["b"])
+    assert remaining.classes == ("a", "c") and [(s.label, s.views) for s in remaining.shards] == [(0, 2), (1, 1)]
+    assert remaining.record["views"] == 3 and remaining.record["digest"] == remaining.digest != source.digest
+    views = remaining.read(1)
     assert views.label == 1
     np.testing.assert_array_equal(views.xyz, normalize_views(clouds()["cube"][3:4], 1, [0], [0], CONFIG).xyz)
     with pytest.raises(InputError, match=r"\bd\b"):

@@ -21,10 +21,10 @@ def inputs(sizes: tuple[int, ...], seed: int = 0) -> BaselineInputs:
 
 def test_probabilities_match_numpy() -> None:
     """The cloud has as many points as are sampled, so all of them are used."""
-    given, net = inputs((POINTS,)), model()
+    cloud, net = inputs((POINTS,)), model()
     arrays = {name: array.astype(np.float64) for name, array in net.arrays().items()}
-    xyz = np.asarray(given.normal.points, np.float64)[0, :POINTS]
-    rgb = np.asarray(given.normal.colors, np.float64)[0, :POINTS]
+    xyz = np.asarray(cloud.normal.points, np.float64)[0, :POINTS]
+    rgb = np.asarray(cloud.normal.colors, np.float64)[0, :POINTS]
     x = np.concatenate([xyz - xyz.max(axis=0) / 2, rgb - 0.5], axis=1)
     for k in range(3):
         x = np.maximum(x @ arrays[f"shared/{k}/kernel"] + arrays[f"shared/{k}/bias"], 0)
@@ -32,14 +32,14 @@ def test_probabilities_match_numpy() -> None:
     x = np.maximum(x.max(axis=0) @ arrays["hidden/kernel"] + arrays["hidden/bias"], 0)
     logits = x @ arrays["head/kernel"] + arrays["head/bias"]
     expected = np.exp(logits) / np.exp(logits).sum()
-    np.testing.assert_allclose(net.probabilities(given)[0], expected, atol=1e-5)
+    np.testing.assert_allclose(net.probabilities(cloud)[0], expected, atol=1e-5)
 
 
 @pytest.mark.parametrize("sizes", [(1,), (0, 7), (POINTS - 1, POINTS + 1, 900)])
 def test_any_number_of_points(sizes: tuple[int, ...]) -> None:
-    found = model().probabilities(inputs(sizes))
-    assert found.shape == (len(sizes), 5)
-    np.testing.assert_allclose(found.sum(axis=1), 1, atol=1e-5)
+    probabilities = model().probabilities(inputs(sizes))
+    assert probabilities.shape == (len(sizes), 5)
+    np.testing.assert_allclose(probabilities.sum(axis=1), 1, atol=1e-5)
 
 
 def test_cloud_gives_the_same_alone_and_in_a_batch() -> None:
@@ -52,8 +52,8 @@ def test_cloud_gives_the_same_alone_and_in_a_batch() -> None:
 
 
 def test_network_round_trips_through_arrays() -> None:
-    net, given = model(), inputs((500,))
+    net, cloud = model(), inputs((500,))
     again = ColoredPointNet.with_arrays(net.arrays(), 5)
-    np.testing.assert_array_equal(again.probabilities(given), net.probabilities(given))
+    np.testing.assert_array_equal(again.probabilities(cloud), net.probabilities(cloud))
     with pytest.raises(ValueError, match="head/bias"):
         ColoredPointNet.with_arrays(net.arrays(), 6)

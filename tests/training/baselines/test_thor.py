@@ -74,13 +74,13 @@ def inputs(*boxes: tuple[Any, Any, Any]) -> BaselineInputs:
 
 
 def test_most_confident_selected_classifier_decides() -> None:
-    """Boxes of 0.2 x 0.1 x 0.05 have faces of 0.005 (x), 0.01 (y) and 0.02 (z); turned, they have two slices."""
+    """Boxes of 0.2 x 0.1 x 0.05 have faces of 0.005 (x), 0.01 (y) and 0.02 (z); rotated, they have two slices."""
     size = (0.2, 0.1, 0.05)
-    given = inputs(
-        box(size, (0.1, 0.05, -3.0)),  # the largest face: front and side, all slices
-        box(size, (-3.0, 0.05, 0.0)),  # the smallest: side and top
+    clouds = inputs(
+        box(size, (0.1, 0.05, -3.0)),  # largest face: front and side, all slices
+        box(size, (-3.0, 0.05, 0.0)),  # smallest face: side and top
         box(size, (0.1, 0.05, -3.0), edge=size[0]),  # the far end is occluded: two slices
-        box(size, (0.1, 0.05, -3.0), edge=0.0),  # the near end is
+        box(size, (0.1, 0.05, -3.0), edge=0.0),  # the near end is occluded
         box((0.1, 0.1, 0.1), (0.0, -2.0, 0.0)),  # all equal: front
     )
     models = library()
@@ -91,24 +91,24 @@ def test_most_confident_selected_classifier_decides() -> None:
         (("front", "side"), 3),
         (("front",), 3),
     ]
-    found = THOR(models, CONFIG).probabilities(given)
+    probabilities = THOR(models, CONFIG).probabilities(clouds)
     for row, (types, k) in enumerate(expected):
-        rows = [np.asarray(nnx.softmax(models[name, k](given.tops[row : row + 1, : 16 * k])))[0] for name in types]
-        np.testing.assert_allclose(found[row], max(rows, key=np.max), atol=1e-6)
+        rows = [np.asarray(nnx.softmax(models[name, k](clouds.tops[row : row + 1, : 16 * k])))[0] for name in types]
+        np.testing.assert_allclose(probabilities[row], max(rows, key=np.max), atol=1e-6)
 
 
 def test_empty_clouds_give_finite_probabilities() -> None:
     empty = np.zeros((0, 3), np.float32)
     normal = thor2.PointClouds.pack([(empty, empty)])
-    found = THOR(library(), CONFIG).probabilities(BaselineInputs(normal, np.zeros((1, 48), np.float32)))
-    assert found.shape == (1, 4) and np.isfinite(found).all()
+    probabilities = THOR(library(), CONFIG).probabilities(BaselineInputs(normal, np.zeros((1, 48), np.float32)))
+    assert probabilities.shape == (1, 4) and np.isfinite(probabilities).all()
 
 
 def test_library_round_trips_through_arrays() -> None:
-    thor, given = THOR(library(), CONFIG), inputs(box((0.2, 0.1, 0.05), (0.1, 0.05, -3.0)))
+    thor, clouds = THOR(library(), CONFIG), inputs(box((0.2, 0.1, 0.05), (0.1, 0.05, -3.0)))
     arrays = thor.arrays()
     again = THOR.with_arrays(arrays, CONFIG, 4)
-    np.testing.assert_array_equal(again.probabilities(given), thor.probabilities(given))
+    np.testing.assert_array_equal(again.probabilities(clouds), thor.probabilities(clouds))
     del arrays["side-2/head/bias"]
     with pytest.raises(ValueError, match="head/bias"):
         THOR.with_arrays(arrays, CONFIG, 4)

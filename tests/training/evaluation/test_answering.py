@@ -1,4 +1,4 @@
-"""Answers for frames in memory, with a toy recognizer."""
+"""Answers to frames in memory, with a stand-in for the recognizer."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -14,7 +14,7 @@ from training.readers.labelled import LabelledFrame
 
 
 class ToyRecognizer:
-    """Stands in for a trained recognizer: the k-th usable instance of a frame is row k of the given probabilities."""
+    """Stand-in for a recognizer: the k-th usable instance of a frame has row k of the given probabilities."""
 
     run = SimpleNamespace(classes=("mug", "bowl", "can"), classifiers={"tops": None, "tops2": None})
 

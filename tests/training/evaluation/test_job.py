@@ -1,4 +1,4 @@
-"""Evaluations with toy recognizers: interrupted, resumed and refused ones; the page and the pictures."""
+"""Evaluations with stand-ins for recognizers: interrupted, resumed and refused ones; the page and its pictures."""
 
 import json
 import os
@@ -26,7 +26,7 @@ CLASSES = ("bowl", "can", "mug")
 
 
 class ToyDataset(LabelledFrames):
-    """Frame k has labels 1 to 3; 3 is an unknown object, 2 lacks pixels in each 4th frame. The first pixel is k."""
+    """Frames with labels 1 to 3, whose first pixel is the frame number; 3 is unknown, 2 is missing in every fourth."""
 
     def __init__(self, n: int, prefix: str = "frame") -> None:
         self.identifiers = [f"{prefix}{k}" for k in range(n)]
@@ -88,8 +88,8 @@ def evaluate_toys(folder: Path, n: int, kill_at: int | None = None) -> dict[str,
     return evaluate_dataset(toys(folder / "log", kill_at), ToyDataset(n), description, folder / "report")
 
 
-def without_times(found: dict[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in found.items() if name != "speed"}
+def without_times(report: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in report.items() if name != "speed"}
 
 
 def test_killed_evaluation_resumes_with_the_same_result(tmp_path: Path) -> None:
@@ -104,7 +104,7 @@ def test_killed_evaluation_resumes_with_the_same_result(tmp_path: Path) -> None:
     assert not (report / "report.json").exists()
     assert len((report / "answers.jsonl").read_text().splitlines()) == 1 + 5
     with (report / "answers.jsonl").open("a") as file:
-        file.write('{"frame": "frame5", "attrib')  # as left by a kill during a write
+        file.write('{"frame": "frame5", "attrib')  # as after a kill during a write
     resumed = evaluate_toys(tmp_path / "killed", 9)
     assert (tmp_path / "killed" / "log").read_text().split() == [str(k) for k in range(9)]
     assert without_times(resumed) == without_times(whole)
@@ -128,7 +128,7 @@ def test_answered_frames_are_not_read_again(tmp_path: Path) -> None:
 
 def test_runs_may_have_different_classifiers(tmp_path: Path) -> None:
     stages: list[tuple[str, int, int, str]] = []
-    found = evaluate_dataset(
+    report = evaluate_dataset(
         toys(tmp_path / "log"),
         ToyDataset(5),
         {"kind": "frames", "path": "toys"},
@@ -136,35 +136,35 @@ def test_runs_may_have_different_classifiers(tmp_path: Path) -> None:
         lambda *stage: stages.append(stage),
     )
     assert [done for _, done, _, _ in stages] == list(range(6)) and "frames/s" in stages[-1][3]
-    assert found == json.loads((tmp_path / "report" / "report.json").read_text())
-    accuracy = found["accuracy"]["max"][0]["cells"][0]["accuracy"]
+    assert report == json.loads((tmp_path / "report" / "report.json").read_text())
+    accuracy = report["accuracy"]["max"][0]["cells"][0]["accuracy"]
     assert {name: figure["runs"] for name, figure in accuracy.items()} == {
         "CE": 1, "TOPS": 2, "TOPS2": 2, "CE+TOPS": 1, "CE+TOPS2": 1, "THOR2": 2, "CE+TOPS+TOPS2": 1,
     }  # fmt: skip
-    assert found["instances"] == {
+    assert report["instances"] == {
         "labelled": 15,
         "scored": 10,
         "not_described": {"no pixels in the label image": 2},
         "no_class": {"dragon": 5},
     }
-    assert np.sum(found["confusion"]) == 20 and np.sum(found["confusion"], axis=0)[-1] == 4
+    assert np.sum(report["confusion"]) == 20 and np.sum(report["confusion"], axis=0)[-1] == 4
 
 
 @pytest.mark.parametrize("n", [1, 2, 15])
 def test_page_for_datasets_of_any_size(tmp_path: Path, n: int) -> None:
-    found = evaluate_toys(tmp_path, n)
-    report = tmp_path / "report"
-    page = ParsedPage((report / "report.html").read_text())
+    report = evaluate_toys(tmp_path, n)
+    directory = tmp_path / "report"
+    page = ParsedPage((directory / "report.html").read_text())
     assert page.open == [] and not page.tags & {"script", "link"}
-    assert all(p["alt"] and (report / str(p["src"])).is_file() for p in page.pictures)
+    assert all(p["alt"] and (directory / str(p["src"])).is_file() for p in page.pictures)
     shown = [p for p in page.pictures if str(p["src"]).startswith("frames/")]
-    assert len(shown) == min(n, 12) and len(found["shown"]) == len(shown)
+    assert len(shown) == min(n, 12) and len(report["shown"]) == len(shown)
     crops = {str(p["src"]) for p in page.pictures if str(p["src"]).startswith("confusions/")}
-    assert len(crops) == len(found["worst"])
-    whole = found["accuracy"][found["rule"]][0]["cells"][0]["accuracy"]["THOR2"]
+    assert len(crops) == len(report["worst"])
+    whole = report["accuracy"][report["rule"]][0]["cells"][0]["accuracy"]["THOR2"]
     assert f"{whole['mean']:.3f} ±\u00a0{whole['std']:.3f}" in page.text
     for picture in page.pictures:
-        with Image.open(report / str(picture["src"])) as image:
+        with Image.open(directory / str(picture["src"])) as image:
             image.load()
             assert max(image.size) <= 2000
 
@@ -215,9 +215,9 @@ def test_answers_of_another_evaluation_are_refused(tmp_path: Path) -> None:
         "frames 3, not 4": (runs, ToyDataset(4), same),
         "digest1": (runs[:1], ToyDataset(3), same),
     }
-    for value, (given, dataset, description) in cases.items():
+    for value, (evaluated, dataset, description) in cases.items():
         with pytest.raises(InputError, match="^out: ") as caught:
-            evaluate_dataset(given, dataset, description, report)
+            evaluate_dataset(evaluated, dataset, description, report)
         assert value in str(caught.value) and "\n" not in str(caught.value)
     assert (report / "answers.jsonl").read_bytes() == before
 
@@ -252,8 +252,8 @@ def test_temporary_files_of_a_killed_process_are_ignored(tmp_path: Path) -> None
     for name in ("whole", "killed"):
         (tmp_path / name / "report").mkdir(parents=True)
     (tmp_path / "killed" / "report" / ".answers.x.jsonl").write_text('{"data')
-    found = [without_times(evaluate_toys(tmp_path / name, 2)) for name in ("whole", "killed")]
-    assert found[0] == found[1]
+    reports = [without_times(evaluate_toys(tmp_path / name, 2)) for name in ("whole", "killed")]
+    assert reports[0] == reports[1]
 
 
 def test_second_evaluation_into_a_directory_is_refused(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ CLASSES = ("bowl", "can", "mug")
 
 
 class ToyRun(NamedTuple):
-    """What the results need of a run."""
+    """The attributes of a run that the results use."""
 
     name: str
     predictors: tuple[str, ...]
@@ -70,7 +70,7 @@ def test_fusions_have_the_titles_of_the_paper() -> None:
 
 
 def test_fusion_rules_match_hand_calculation() -> None:
-    """The larger top-1 is 0.7; the means are 0.31, 0.34, 0.35; only the second class is above 0 in both."""
+    """The maximum is 0.7, the means are 0.31, 0.34 and 0.35, and only the second class is above 0 in both."""
     both = {"tops": np.array([[0.0, 0.3, 0.7]]), "tops2": np.array([[0.62, 0.38, 0.0]])}
     index, confidence = fuse_by("max", both)
     assert (index[0], confidence[0]) == (2, 0.7)
@@ -84,7 +84,7 @@ def test_fusion_rules_match_hand_calculation() -> None:
 
 
 def test_calibrated_fusion_uses_the_temperatures() -> None:
-    """At a temperature of 4, 0.9 against 0.1 becomes 9 ** 0.25 to 1, or 0.634: less than 0.8."""
+    """A temperature of 4 turns 0.9 into 9 ** 0.25 / (9 ** 0.25 + 1) = 0.634, which is less than 0.8."""
     both = {"tops": np.array([[0.9, 0.1]]), "tops2": np.array([[0.2, 0.8]])}
     assert fuse_by("max", both)[0][0] == 0
     index, confidence = fuse_by("calibrated", both, {"tops": 4.0, "tops2": 1.0})
@@ -182,8 +182,8 @@ def test_results_match_numpy_and_sklearn() -> None:
 def test_incorrect_answers_are_those_of_the_main_fusion() -> None:
     sure = np.array([[0, 0, 1], [0, 0, 1], [1, 0, 0], [1, 0, 0], [0.9, 0.1, 0]], np.float32)
     instances = [InstancePrediction(1, "mug", probabilities=sure), InstancePrediction(2, "dragon", probabilities=sure)]
-    found = list(incorrect_answers(FrameAnswers("f", {}, 0.1, instances), RUNS))
-    assert [(i.label, answer, confidence) for i, answer, confidence in found] == [(1, "bowl", 1.0)]
+    incorrect = list(incorrect_answers(FrameAnswers("f", {}, 0.1, instances), RUNS))
+    assert [(i.label, answer, confidence) for i, answer, confidence in incorrect] == [(1, "bowl", 1.0)]
 
 
 @pytest.mark.parametrize("kept", [0, 1])
@@ -210,9 +210,9 @@ def test_instances_not_described_are_incorrect() -> None:
 
 def test_grouping_by_attributes() -> None:
     attributes = [{"a": "x", "b": "high"}, {"a": "x", "b": "none"}, {"a": "y"}, {"a": "x", "b": "high"}]
-    found = group_by_attributes(attributes, ("a", "b"))
-    assert {k: v.tolist() for k, v in found.items()} == {("x", "none"): [1], ("x", "high"): [0, 3]}
-    assert list(found) == [("x", "none"), ("x", "high")]
+    groups = group_by_attributes(attributes, ("a", "b"))
+    assert {k: v.tolist() for k, v in groups.items()} == {("x", "none"): [1], ("x", "high"): [0, 3]}
+    assert list(groups) == [("x", "none"), ("x", "high")]
     assert group_by_attributes(attributes, ())[()].tolist() == [0, 1, 2, 3]
     assert attribute_tables("bop", attributes) == [(), ("a",), ("b",)]
     assert attribute_tables("uwis", [{"environment": "lounge"}]) == [(), ("environment",)]
@@ -231,9 +231,9 @@ def test_ocid_has_a_table_by_sequence() -> None:
 
 def test_published_values_have_a_source() -> None:
     for kind in ("uwis", "ocid"):
-        found = published(kind)
-        assert found is not None and "2305.03815" in found.source and found.missing
-        assert found.cell({"environment": "moon"}) == {}
+        values = published(kind)
+        assert values is not None and "2305.03815" in values.source and values.missing
+        assert values.cell({"environment": "moon"}) == {}
     uwis = published("uwis")
     assert uwis is not None and uwis.cell({})["THOR (MLP)"] == pytest.approx(0.5222)
     assert uwis.cell({"environment": "lounge", "occlusion": "high"}) == {"THOR (MLP)": pytest.approx(0.5188)}

@@ -25,7 +25,7 @@ Maker = Callable[..., Path]
 
 @pytest.fixture
 def make(tmp_path: Path) -> Maker:
-    """Write an untrained run of colour alone."""
+    """Return a function that writes an untrained run with CE only."""
 
     def make(
         name: str, classes: tuple[str, ...] = ("a", "b"), seed: int = 0, config: DescriptorConfig = CONFIG
@@ -75,16 +75,16 @@ def test_each_sequence_is_answered_by_its_run(make: Maker, tmp_path: Path) -> No
     for fold in range(2):
         make(f"runs/bottom/s1/fold-{fold}", ("b", "c"), seed=fold)
         make(f"runs/s2/fold-{fold}", ("a", "b"), seed=2 + fold)
-    found = load_sequence_runs(tmp_path / "runs", ["x/bottom/s1/f1", "x/bottom/s1/f2", "x/top/s2/f1"])
-    assert [run.name for run in found] == ["runs/*/fold-0", "runs/*/fold-1"]
-    assert all(run.classes == ("a", "b", "c") and run.predictors == ("ce",) for run in found)
-    assert found[0].digest != found[1].digest
-    assert [run.digest for run in load_sequence_runs(tmp_path / "runs", ["x/top/s2/f1"])] != [r.digest for r in found]
+    runs = load_sequence_runs(tmp_path / "runs", ["x/bottom/s1/f1", "x/bottom/s1/f2", "x/top/s2/f1"])
+    assert [run.name for run in runs] == ["runs/*/fold-0", "runs/*/fold-1"]
+    assert all(run.classes == ("a", "b", "c") and run.predictors == ("ce",) for run in runs)
+    assert runs[0].digest != runs[1].digest
+    assert [run.digest for run in load_sequence_runs(tmp_path / "runs", ["x/top/s2/f1"])] != [r.digest for r in runs]
 
     rng = np.random.default_rng(0)
     clouds = PointClouds.pack([(rng.random((50, 3)), rng.random((50, 3))) for _ in range(3)])
     described = SimpleNamespace(descriptors=describe(clouds, colornet.load_default(), CONFIG))
-    for fold, run in enumerate(found):
+    for fold, run in enumerate(runs):
         for frame, own, columns in (("x/bottom/s1/f2", "bottom/s1", [1, 2]), ("x/top/s2/f1", "s2", [0, 1])):
             (alone,) = load_runs([tmp_path / "runs" / own / f"fold-{fold}"])
             values = run.probabilities(frame, described, None)["ce"]  # type: ignore[arg-type]

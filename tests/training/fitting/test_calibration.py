@@ -1,4 +1,4 @@
-"""Temperatures of a fold's classifiers: what they are fitted on, and where they are kept."""
+"""Temperatures of the classifiers of a fold: the samples that they are fitted to, and where they are stored."""
 
 from pathlib import Path
 
@@ -51,7 +51,7 @@ def test_sample_probabilities_equal_those_of_the_clouds(feature: Feature, monkey
     model = MLP(input_size(feature, CONFIG, NETWORK.n_regions), 2, rngs=nnx.Rngs(0))
     rows = np.array([7, 0, 3, 5])
     context = FitContext(feature, NETWORK, CONFIG)
-    found = sample_probabilities(model, samples, rows, context)
+    probabilities = sample_probabilities(model, samples, rows, context)
     expected = []
     for index in range(2):
         ((_, normal),) = padded_batches(views.read(index).clouds(), 2)
@@ -59,17 +59,17 @@ def test_sample_probabilities_equal_those_of_the_clouds(feature: Feature, monkey
             aligned = thor2.turn(thor2.mirror(normal, axes), CONFIG)
             described = thor2.describe_aligned(aligned, NETWORK, CONFIG)
             expected.append(np.asarray(class_probabilities(model, described, feature)))
-    np.testing.assert_allclose(found, np.concatenate(expected)[rows], atol=1e-5)
+    np.testing.assert_allclose(probabilities, np.concatenate(expected)[rows], atol=1e-5)
     assert sample_probabilities(model, samples, rows[:0], context).shape == (0, 2)
 
 
-def test_temperatures_are_those_of_the_samples_held_out() -> None:
+def test_temperatures_are_fitted_to_the_held_out_set() -> None:
     samples = build_samples(source(3), NETWORK, CONFIG)
     model = MLP(input_size("tops", CONFIG, NETWORK.n_regions), 2, rngs=nnx.Rngs(0))
     held_out = samples.view == 1
-    found = temperatures({"tops": model}, samples, held_out, NETWORK, CONFIG)
-    said = sample_probabilities(model, samples, np.flatnonzero(held_out), FitContext("tops", NETWORK, CONFIG))
-    assert found == {"tops": fit_temperature(said, samples.label[held_out])}
+    fitted = temperatures({"tops": model}, samples, held_out, NETWORK, CONFIG)
+    probabilities = sample_probabilities(model, samples, np.flatnonzero(held_out), FitContext("tops", NETWORK, CONFIG))
+    assert fitted == {"tops": fit_temperature(probabilities, samples.label[held_out])}
     assert temperatures({"tops": model}, samples, None, NETWORK, CONFIG) == {}
 
 

@@ -1,4 +1,4 @@
-"""Fitting: it learns what can be learnt, the same way every time, and says so when it cannot."""
+"""Fitting: separable classes are learned, results are reproducible, and invalid input is refused."""
 
 import dataclasses
 import math
@@ -22,7 +22,7 @@ from training.fitting.samples import Samples, expand
 from training.fitting.steps import FitContext
 
 NETWORK = colornet.load_default()
-CONFIG = thor2.DescriptorConfig(n_slices=2, n_strips=5, image_size=12)  # small, so that it is quick
+CONFIG = thor2.DescriptorConfig(n_slices=2, n_strips=5, image_size=12)  # small, to compile quickly
 QUICK = FitOptions(epochs=8, batch_size=16, seed=3)
 LONGER = dataclasses.replace(QUICK, epochs=12)
 
@@ -31,7 +31,7 @@ Fit = Callable[..., tuple[MLP, int]]
 
 @pytest.fixture
 def fitted(tmp_path: Path, separable: Samples) -> Fit:
-    """`fit` on the separable samples, in a folder of its own."""
+    """Return `fit` on the separable samples, with a new checkpoint directory for each call."""
     folders = (tmp_path / str(number) for number in range(99))
 
     def run(
@@ -66,33 +66,33 @@ def test_separable_classes_are_learned(separable: Samples, fitted: Fit) -> None:
     curve: list[EpochMetrics] = []
     steps: list[tuple[int, int, int]] = []
     model, best = fitted(
-        epoch_done=curve.append, progress=lambda done, total, figures: steps.append((done, total, figures.epoch))
+        epoch_done=curve.append, progress=lambda done, total, metrics: steps.append((done, total, metrics.epoch))
     )
     assert (answers(model, separable, "tops2") == separable.label).all()
-    assert [figures.epoch for figures in curve] == list(range(1, 9))
+    assert [metrics.epoch for metrics in curve] == list(range(1, 9))
     assert curve[-1].loss < curve[0].loss / 3 and curve[-1].accuracy > 0.8
-    assert best == min(curve, key=lambda figures: figures.loss).epoch
-    assert all(math.isfinite(figures.loss) and figures.held_out_accuracy is None for figures in curve)
+    assert best == min(curve, key=lambda metrics: metrics.loss).epoch
+    assert all(math.isfinite(metrics.loss) and metrics.held_out_accuracy is None for metrics in curve)
     assert steps == [(done, 24, (done + 2) // 3) for done in range(1, 25)]
 
 
 @pytest.mark.slow
 def test_a_feature_uses_only_its_part_of_the_descriptor(separable: Samples, fitted: Fit) -> None:
-    """Shape cannot tell class 1 from 2, colour cannot tell 0 from 1."""
+    """Shape does not distinguish classes 1 and 2, and colour does not distinguish classes 0 and 1."""
     tops, ce = (answers(fitted(name, LONGER)[0], separable, name) for name in ("tops", "ce"))
     np.testing.assert_array_equal(tops == 0, separable.label == 0)
     np.testing.assert_array_equal(ce == 2, separable.label == 2)
 
 
 def test_the_held_out_set_is_evaluated_but_not_trained_on(separable: Samples, fitted: Fit) -> None:
-    """Held out with wrong labels, a third is never named rightly; the best epoch is one that names most rightly."""
+    """The held-out set is mislabelled, which limits its accuracy; the best epoch has the highest accuracy."""
     held_out = np.arange(48) >= 38
-    wrong = dataclasses.replace(separable, label=np.where(held_out, 0, separable.label).astype(np.int32))
+    mislabelled = dataclasses.replace(separable, label=np.where(held_out, 0, separable.label).astype(np.int32))
     curve: list[EpochMetrics] = []
-    model, best = fitted(samples=wrong, held_out=held_out, epoch_done=curve.append)
-    right = answers(model, separable, "tops2")[held_out] == 0
-    assert max(figures.held_out_accuracy or 0 for figures in curve) == curve[best - 1].held_out_accuracy
-    assert curve[best - 1].held_out_accuracy == pytest.approx(right.mean())
+    model, best = fitted(samples=mislabelled, held_out=held_out, epoch_done=curve.append)
+    correct = answers(model, separable, "tops2")[held_out] == 0
+    assert max(metrics.held_out_accuracy or 0 for metrics in curve) == curve[best - 1].held_out_accuracy
+    assert curve[best - 1].held_out_accuracy == pytest.approx(correct.mean())
     final = curve[-1]
     assert final.accuracy > 0.8 and final.held_out_accuracy == pytest.approx((separable.label[held_out] == 0).mean())
 
@@ -105,7 +105,7 @@ def test_only_the_same_seed_gives_bit_identical_weights(fitted: Fit) -> None:
     assert np.abs(other.head.kernel[...] - first.head.kernel[...]).max() > 1e-3
 
 
-class Stopped(Exception):
+class Interrupted(Exception):
     pass
 
 
@@ -113,16 +113,16 @@ def test_a_resumed_fit_gives_bit_identical_weights(separable: Samples, fitted: F
     held_out = np.arange(48) % 4 == 0
     expected: list[EpochMetrics] = []
     model, best = fitted(held_out=held_out, epoch_done=expected.append)
-    found: list[EpochMetrics] = []
+    curve: list[EpochMetrics] = []
 
     def stop_at(step: int) -> Callable[[int, int, EpochMetrics], None]:
-        def progress(done: int, total: int, figures: EpochMetrics) -> None:
+        def progress(done: int, total: int, metrics: EpochMetrics) -> None:
             if done == step:
-                raise Stopped
+                raise Interrupted
 
         return progress
 
-    for step in (3, 4, 9, None):  # in the second and in the third epoch; the third call begins with the second
+    for step in (3, 4, 9, None):  # in the first, second and third epoch
         with Checkpoints(tmp_path / "stopped") as checkpoints:
             progress = stop_at(step) if step else lambda *_: None
             try:
@@ -133,19 +133,19 @@ def test_a_resumed_fit_gives_bit_identical_weights(separable: Samples, fitted: F
                     checkpoints,
                     held_out,
                     progress,
-                    found.append,
+                    curve.append,
                 )
-            except Stopped:
+            except Interrupted:
                 continue
     same_bits(again[0], model)
     assert again[1] == best
-    without_rate = [dataclasses.replace(figures, samples_per_second=0) for figures in expected]
-    assert [dataclasses.replace(figures, samples_per_second=0) for figures in found] == without_rate
+    without_rate = [dataclasses.replace(metrics, samples_per_second=0) for metrics in expected]
+    assert [dataclasses.replace(metrics, samples_per_second=0) for metrics in curve] == without_rate
 
 
 def test_a_finished_fit_returns_its_classifier_without_steps(separable: Samples, tmp_path: Path) -> None:
     def refuse(*_: object) -> None:
-        raise AssertionError("a step was made")
+        raise AssertionError("the fit made a step")
 
     options = dataclasses.replace(QUICK, epochs=2)
     with Checkpoints(tmp_path) as checkpoints:
@@ -174,7 +174,7 @@ def test_samples_are_not_modified_and_few_make_one_batch(separable: Samples, fit
     arrays = [getattr(few, field.name) for field in dataclasses.fields(few)]
     before = [np.copy(a) for a in arrays]
     steps: list[int] = []
-    fitted("tops", FitOptions(epochs=1), few, progress=lambda done, total, figures: steps.append(done))
+    fitted("tops", FitOptions(epochs=1), few, progress=lambda done, total, metrics: steps.append(done))
     assert steps == [1]
     for a, b in zip(arrays, before, strict=True):
         np.testing.assert_array_equal(a, b)
@@ -197,7 +197,7 @@ def test_infinite_loss_is_refused_and_the_last_checkpoint_stays(
 
 
 def test_too_few_training_samples_are_refused(separable: Samples, fitted: Fit) -> None:
-    with pytest.raises(thor2.InputError, match="there are 1 samples to train on; at least 2"):
+    with pytest.raises(thor2.InputError, match="1 samples"):
         fitted(held_out=np.arange(48) > 0)
 
 
@@ -213,7 +213,7 @@ def test_too_few_training_samples_are_refused(separable: Samples, fitted: Fit) -
 def test_invalid_options_are_refused_by_name(name: str, value: object) -> None:
     with pytest.raises(thor2.InputError) as caught:
         FitOptions(**{name: value})
-    assert str(caught.value).startswith(f"{name} is {value!r}; it must be")
+    assert str(caught.value).startswith(f"{name} is {value!r};")
     assert "\n" not in str(caught.value)
 
 

@@ -1,4 +1,4 @@
-"""From views to a run folder, at once, in several goes, and by folds."""
+"""Trainings: uninterrupted, interrupted and resumed, and with several folds."""
 
 import errno
 import json
@@ -71,23 +71,23 @@ def names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
-def told_of(path: Path) -> list[tuple[Any, ...]]:
+def logged_rows(path: Path) -> list[tuple[Any, ...]]:
     rows = metrics.read_metrics(path / "metrics.jsonl")
     return [(row["fold"], row["classifier"], row["epoch"], row["loss"], row["accuracy"]) for row in rows]
 
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, TrainedRun]:
-    """A run trained at one go."""
+    """A run of an uninterrupted training."""
     out = tmp_path_factory.mktemp("whole") / "run"
     return out, train(out, ("tops", "ce"))
 
 
 def test_a_run_is_written_and_its_progress_is_reported(tmp_path: Path) -> None:
-    told: list[tuple[str, int, int]] = []
+    stages: list[tuple[str, int, int]] = []
 
     def progress(stage: str, done: int, total: int, note: str) -> None:
-        told.append((stage, done, total))
+        stages.append((stage, done, total))
         if stage != "describe":
             assert "loss" in note and "accuracy" in note and "samples/s" in note
 
@@ -95,24 +95,24 @@ def test_a_run_is_written_and_its_progress_is_reported(tmp_path: Path) -> None:
     run = train(out, progress=progress)
     assert run.classes == ("red brick", "stick") and tuple(run.classifiers) == ("tops",)
     fit_steps = [("fit tops", done, 18) for done in range(1, 19)]
-    assert told == [("describe", 6, 12), ("describe", 12, 12), *fit_steps]
+    assert stages == [("describe", 6, 12), ("describe", 12, 12), *fit_steps]
     assert names(out) == FINISHED
-    found = load_run(out)
-    assert (found.classes, found.config, found.record) == (run.classes, CONFIG, run.record)
-    record = found.record
+    loaded = load_run(out)
+    assert (loaded.classes, loaded.config, loaded.record) == (run.classes, CONFIG, run.record)
+    record = loaded.record
     assert (record["samples"], record["batch_size"], record["folds"], record["held_out_accuracy"]) == (24, 4, 1, {})
     assert record["dataset"] == source().record and record["dataset"]["views"] == 12
     curve = record["curves"]["tops"]
     assert [row["epoch"] for row in curve] == [1, 2, 3]
     assert record["kept_epochs"] == {"tops": min(curve, key=lambda row: row["loss"])["epoch"]}
-    assert [(0, "tops", *row.values()) for row in curve] == told_of(out)
+    assert [(0, "tops", *row.values()) for row in curve] == logged_rows(out)
     with Image.open(out / "curves.png") as picture:
         assert picture.width > 300
 
 
 def test_invalid_input_is_refused_before_any_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def work(*_: Any, **__: Any) -> None:
-        raise AssertionError("work was begun")
+        raise AssertionError("the training started")
 
     monkeypatch.setattr(module, "build_samples", work)
     (tmp_path / "run").mkdir()
@@ -125,30 +125,30 @@ def test_invalid_input_is_refused_before_any_work(tmp_path: Path, monkeypatch: p
 
 
 @pytest.mark.parametrize(
-    ("bad", "folds", "said"),
+    ("bad", "folds", "message"),
     [
         ({}, 1, "views of 0 classes"),
         ({"mug": [], "box": clouds()["stick"]}, 1, "class 'mug' has no views"),
         ({"mug": clouds()["stick"]}, 1, "views of 1 classes"),
-        (clouds(views=3), 4, "folds is 4, but class 'red brick' has only 3 views"),
+        (clouds(views=3), 4, "folds is 4, .*'red brick'"),
     ],
 )
 def test_nothing_is_written_for_bad_views(
-    bad: Mapping[str, list[Cloud]], folds: int, said: str, tmp_path: Path
+    bad: Mapping[str, list[Cloud]], folds: int, message: str, tmp_path: Path
 ) -> None:
-    with pytest.raises(thor2.InputError, match=said):
+    with pytest.raises(thor2.InputError, match=message):
         train_run(MemoryViews(bad, CONFIG), tmp_path / "run", ["tops"], OPTIONS, config=CONFIG, folds=folds)
     assert names(tmp_path) == []
 
 
-class Stopped(BaseException):
-    """As Ctrl+C."""
+class Interrupted(BaseException):
+    """Like KeyboardInterrupt, not an Exception."""
 
 
 def stop_when(stage: str, step: int) -> Any:
     def progress(now: str, done: int, total: int, note: str) -> None:
         if (now, done) == (stage, step):
-            raise Stopped
+            raise Interrupted
 
     return progress
 
@@ -156,14 +156,14 @@ def stop_when(stage: str, step: int) -> Any:
 def test_an_interrupted_run_resumes_to_the_same_result(whole: tuple[Path, TrainedRun], tmp_path: Path) -> None:
     out = tmp_path / "run"
     for stage, step in (("fit ce", 2), ("fit ce", 9), ("fit ce", 14), ("fit tops", 1), ("fit tops", 18)):
-        with pytest.raises(Stopped):
+        with pytest.raises(Interrupted):
             train(out, ("tops", "ce"), progress=stop_when(stage, step))
         with pytest.raises(thor2.InputError, match=r"has no run\.json"):
             load_run(out)
     run = train(out, ("tops", "ce"))
     same_weights(run, whole[1])
     assert run.record == whole[1].record
-    assert told_of(out) == told_of(whole[0])
+    assert logged_rows(out) == logged_rows(whole[0])
     assert names(out) == FINISHED
     with pytest.raises(thor2.InputError, match="out: .* already contains"):
         train(out, ("tops", "ce"))
@@ -178,15 +178,15 @@ def test_interrupted_while_the_run_is_published(
 
     def stopping(self: Path, target: Path) -> Path:
         if self.parent.name == "run" and moved == "nothing":
-            raise Stopped
-        found = rename(self, target)
+            raise Interrupted
+        renamed = rename(self, target)
         if self.name == moved and target.parent == out:
-            raise Stopped
-        return found
+            raise Interrupted
+        return renamed
 
     with monkeypatch.context() as patch:
         patch.setattr(Path, "rename", stopping)
-        with pytest.raises(Stopped):
+        with pytest.raises(Interrupted):
             train(out, ("tops", "ce"))
     assert (out / "run.json").exists() == (moved == "run.json")
     same_weights(train(out, ("tops", "ce")), whole[1])
@@ -194,16 +194,16 @@ def test_interrupted_while_the_run_is_published(
 
 
 def test_interrupted_while_checkpoints_are_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The run, or all its folds, is finished by then."""
+    """Checkpoints are removed after the last fold is finished."""
     rmdir = os.rmdir
 
     def stopping(path: Any, **options: Any) -> None:
         if Path(path).name.endswith("checkpoints"):
-            raise Stopped
+            raise Interrupted
         rmdir(path, **options)
 
     monkeypatch.setattr(os, "rmdir", stopping)
-    with pytest.raises(Stopped):
+    with pytest.raises(Interrupted):
         train_run(source(), tmp_path / "run", ["tops"], OPTIONS, config=CONFIG, folds=2)
     assert module.is_finished(tmp_path / "run")
     assert [load_run(folder).record["fold"] for folder in find_run_directories([tmp_path / "run"])] == [0, 1]
@@ -211,7 +211,7 @@ def test_interrupted_while_checkpoints_are_removed(tmp_path: Path, monkeypatch: 
 
 def test_other_options_or_views_are_refused(tmp_path: Path) -> None:
     out = tmp_path / "run"
-    with pytest.raises(Stopped):
+    with pytest.raises(Interrupted):
         train(out, progress=stop_when("fit tops", 8))
     before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
     cases: list[tuple[str, dict[str, Any]]] = [
@@ -221,8 +221,8 @@ def test_other_options_or_views_are_refused(tmp_path: Path) -> None:
         (r"classifiers\[0\] \"tops\", not \"ce\"", {"features": ("tops", "ce")}),
         ("folds 1, not 3", {"folds": 3}),
     ]
-    for said, changes in cases:
-        with pytest.raises(thor2.InputError, match=f"out: {out} was written with {said}"):
+    for message, changes in cases:
+        with pytest.raises(thor2.InputError, match=f"out: {out} was written with {message}"):
             train(out, **changes)
     with pytest.raises(thor2.InputError, match=f'was written with dataset "{source().digest}", not '):
         train_run(source(1), out, ["tops"], OPTIONS, config=CONFIG)
@@ -234,21 +234,21 @@ def test_other_options_or_views_are_refused(tmp_path: Path) -> None:
         train(out)
 
 
-def test_a_damaged_checkpoint_is_named(tmp_path: Path) -> None:
+def test_a_damaged_checkpoint_is_refused(tmp_path: Path) -> None:
     out = tmp_path / "run"
-    with pytest.raises(Stopped):
+    with pytest.raises(Interrupted):
         train(out, progress=stop_when("fit tops", 8))
     last = out / "checkpoints" / "fold-0" / "tops" / "1"
     largest = max((path for path in last.rglob("*") if path.is_file()), key=lambda path: path.stat().st_size)
     largest.write_bytes(largest.read_bytes()[:-1])
-    with pytest.raises(thor2.InputError, match=f"checkpoint: {last} cannot be read: it is damaged"):
+    with pytest.raises(thor2.InputError, match=f"checkpoint: {last} .*damaged"):
         train(out)
     shutil.rmtree(last.parent)
     train(out)
 
 
 def test_a_full_disk(whole: tuple[Path, TrainedRun], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever cannot be written, the run goes on from the last checkpoint once there is room."""
+    """A training that could not write any of its files resumes from the last checkpoint."""
     out = tmp_path / "run"
 
     def full(*_: Any, **__: Any) -> None:
@@ -286,17 +286,17 @@ def test_an_unwritable_run_directory_is_refused(tmp_path: Path) -> None:
 
 def test_folds(tmp_path: Path) -> None:
     out = tmp_path / "run"
-    told: list[str] = []
+    interrupted: list[str] = []
 
     def progress(stage: str, done: int, total: int, note: str) -> None:
-        if stage == "fold 1: fit tops" and done == 9 and not told:
-            told.append(stage)
-            raise Stopped
+        if stage == "fold 1: fit tops" and done == 9 and not interrupted:
+            interrupted.append(stage)
+            raise Interrupted
 
     def run() -> list[TrainedRun]:
         return train_run(source(views=6), out, ["tops"], OPTIONS, progress, CONFIG, folds=3)
 
-    with pytest.raises(Stopped):
+    with pytest.raises(Interrupted):
         run()
     first = load_run(out / "fold-0")
     assert names(out) == ["checkpoints", "curves.png", "fold-0", "metrics.jsonl"]
@@ -305,16 +305,16 @@ def test_folds(tmp_path: Path) -> None:
     assert names(out / "fold-2") == ["network.npz", "run.json", "weights"]
     same_weights(runs[0], first)
     assert [run.record["fold"] for run in runs] == [0, 1, 2]
-    assert told_of(out) == [
+    assert logged_rows(out) == [
         (fold, "tops", row["epoch"], row["loss"], row["accuracy"])
-        for fold, found in enumerate(runs)
-        for row in found.record["curves"]["tops"]
+        for fold, fold_run in enumerate(runs)
+        for row in fold_run.record["curves"]["tops"]
     ]
-    for found in runs:
-        curve = found.record["curves"]["tops"]
+    for fold_run in runs:
+        curve = fold_run.record["curves"]["tops"]
         best = max(row["held_out_accuracy"] for row in curve)
-        assert found.record["held_out_accuracy"] == {"tops": best}
-        assert curve[found.record["kept_epochs"]["tops"] - 1]["held_out_accuracy"] == best
+        assert fold_run.record["held_out_accuracy"] == {"tops": best}
+        assert curve[fold_run.record["kept_epochs"]["tops"] - 1]["held_out_accuracy"] == best
     with pytest.raises(AssertionError):
         same_weights(runs[0], runs[1])
     with pytest.raises(thor2.InputError, match="out: .* already contains"):
@@ -324,8 +324,8 @@ def test_folds(tmp_path: Path) -> None:
 _PROGRAM = """
 import sys
 sys.path.insert(0, sys.argv[1])
-import test_train
-test_train.train(test_train.Path(sys.argv[2]), ("tops", "ce"))
+import test_job
+test_job.train(test_job.Path(sys.argv[2]), ("tops", "ce"))
 """
 
 
@@ -348,7 +348,7 @@ def test_a_killed_training_resumes_to_the_same_bytes(whole: tuple[Path, TrainedR
     assert json.loads((out / "checkpoints" / "begun.json").read_text())["epochs"] == 3
     subprocess.run(command, env=environment, check=True)
     same_weights(load_run(out), whole[1])
-    assert (out / "weights").is_dir() and told_of(out) == told_of(whole[0])
+    assert (out / "weights").is_dir() and logged_rows(out) == logged_rows(whole[0])
     first, second = (json.loads((folder / "run.json").read_text()) for folder in (out, whole[0]))
     assert first["record"] == second["record"]
     assert names(out) == FINISHED

@@ -1,4 +1,4 @@
-"""Training over eight devices and over two processes against one device, each in processes of their own."""
+"""Training on eight devices and in two processes against one device, each in separate processes."""
 
 import json
 from pathlib import Path
@@ -29,9 +29,9 @@ def clouds(size, low, high):
 
 config = thor2.DescriptorConfig(homology="closed_form", n_slices=3, n_strips=8, image_size=8)
 views = {"brick": clouds((0.1, 0.05, 0.03), 0, 99), "stick": clouds((0.2, 0.02, 0.02), 99, 255)}
-told = []
+stages = []
 runs = train_run(MemoryViews(views, config), out, ["tops2"], FitOptions(epochs=4, batch_size=16),
-                 lambda *stage: told.append(stage), config, folds=2)
+                 lambda *stage: stages.append(stage), config, folds=2)
 assert len(jax.devices()) == int(sys.argv[4])
 for fold, run in enumerate(runs):
     state = nnx.to_flat_state(nnx.state(run.classifiers["tops2"]))
@@ -59,14 +59,14 @@ def alone(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-def test_eight_devices_learn_as_one_does(alone: Path, tmp_path: Path) -> None:
+def test_eight_devices_give_the_curve_of_one(alone: Path, tmp_path: Path) -> None:
     finish_programs(start_program(_PROGRAM, tmp_path / "run", 0, 0, 8, devices=8))
     np.testing.assert_allclose(curve(tmp_path / "run"), curve(alone), rtol=2e-3, atol=2e-3)
 
 
 @pytest.mark.slow
 def test_two_processes_reach_the_weights_of_one(alone: Path, tmp_path: Path) -> None:
-    """The bits of one process with two devices; the curve of one device."""
+    """Weights equal those of one process with two devices, and the curve that of one device."""
     port = free_port()
     finish_programs(*(start_program(_PROGRAM, tmp_path / "pair", port, rank, 2) for rank in (0, 1)))
     finish_programs(start_program(_PROGRAM, tmp_path / "one", 0, 0, 2, devices=2))
@@ -81,7 +81,7 @@ def test_two_processes_reach_the_weights_of_one(alone: Path, tmp_path: Path) -> 
         expected = saved(tmp_path / "one", 0, fold)
         assert len(expected) > 20
         for rank in (0, 1):
-            found = saved(tmp_path / "pair", rank, fold)
-            assert found.keys() == expected.keys()
+            arrays = saved(tmp_path / "pair", rank, fold)
+            assert arrays.keys() == expected.keys()
             for name, value in expected.items():
-                np.testing.assert_array_equal(found[name], value, err_msg=name)
+                np.testing.assert_array_equal(arrays[name], value, err_msg=name)

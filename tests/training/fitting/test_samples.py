@@ -1,4 +1,4 @@
-"""Training samples against the same views described one at a time."""
+"""Training samples against descriptors of the same views, computed one by one."""
 
 import dataclasses
 from typing import Any
@@ -50,14 +50,14 @@ def test_every_view_is_used_mirrored_in_four_ways(
 ) -> None:
     monkeypatch.setattr(module, "VIEWS_PER_BATCH", 2)
     source = MemoryViews({"mug": views(0, (300, 299, 1)), "box": views(1, (40,))}, config)
-    told: list[int] = []
-    samples = build_samples(source, NETWORK, config, told.append, PAPER_MIRRORS)
+    progress: list[int] = []
+    samples = build_samples(source, NETWORK, config, progress.append, PAPER_MIRRORS)
     assert samples.classes == ("mug", "box") and len(samples) == 16
-    assert told == [2, 1, 1]
+    assert progress == [2, 1, 1]
     assert sorted(zip(samples.label.tolist(), samples.view.tolist(), strict=True)) == sorted(
         [(0, v) for v in range(3)] * 4 + [(1, 0)] * 4
     )
-    found = thor2.describe_strips(expanded(samples, np.arange(16), config), NETWORK, config)
+    descriptors = thor2.describe_strips(expanded(samples, np.arange(16), config), NETWORK, config)
     for label in range(2):
         for number, cloud in enumerate(source.read(label).clouds()):
             rows = np.flatnonzero((samples.label == label) & (samples.view == number))
@@ -65,13 +65,13 @@ def test_every_view_is_used_mirrored_in_four_ways(
             for row, axes in zip(rows, PAPER_MIRRORS, strict=True):
                 aligned = thor2.turn(thor2.mirror(normal, axes), config)
                 expected = thor2.describe_aligned(aligned, NETWORK, config)
-                # Relaxed strips add up many small numbers, in another order in another batch.
+                # Relaxed strips are sums of many small numbers, whose order depends on the batch.
                 tolerance = 1e-6 if config.relaxation is None else 1e-4
-                np.testing.assert_allclose(found.images[row], expected.images[0], atol=tolerance)
-                np.testing.assert_allclose(found.embeddings[row], expected.embeddings[0], rtol=1e-5, atol=1e-3)
+                np.testing.assert_allclose(descriptors.images[row], expected.images[0], atol=tolerance)
+                np.testing.assert_allclose(descriptors.embeddings[row], expected.embeddings[0], rtol=1e-5, atol=1e-3)
 
 
-def test_counts_are_whole_and_add_up_to_the_points() -> None:
+def test_counts_are_integers_that_sum_to_the_points() -> None:
     sizes = (300, 40, 1)
     samples = build_samples(MemoryViews({"a": views(0, sizes), "b": views(1, (5,))}, CONFIG), NETWORK, CONFIG)
     assert samples.color_count.dtype == np.float32 and (samples.color_count % 1 == 0).all()
@@ -101,7 +101,7 @@ def test_expansion_under_jit_is_the_same() -> None:
 
 
 def test_a_sample_is_small() -> None:
-    """A hundredth of its TOPS2 descriptor."""
+    """A sample takes less than a fifteenth of its TOPS2 descriptor."""
     samples = build_samples(MemoryViews({"a": views(0, (300,)), "b": views(1, (300,))}, CONFIG), NETWORK, CONFIG)
     assert samples.nbytes / len(samples) < 4 * 11942 / 15
     fields = [getattr(samples, f.name) for f in dataclasses.fields(samples) if f.name != "classes"]
@@ -115,7 +115,7 @@ class Shard:
 
 
 class Shards:
-    """A source of two shards of one class, the first with two copies of one view, and one of another."""
+    """A source with two shards of one class, the first with two copies of one view, and one shard of another class."""
 
     classes = ("mug", "box")
     digest = "d"
@@ -128,11 +128,11 @@ class Shards:
         first = dataclasses.replace(mug, xyz=mug.xyz[:cut], rgb=mug.rgb[:cut], counts=mug.counts[:2], **numbers)
         numbers = {"view": np.array([9], np.int32), "copy": np.array([0], np.int32)}
         second = dataclasses.replace(mug, xyz=mug.xyz[cut:], rgb=mug.rgb[cut:], counts=mug.counts[2:], **numbers)
-        self._parts = [first, second, box]
-        self.shards = [Shard(part.label, len(part)) for part in self._parts]
+        self._chunks = [first, second, box]
+        self.shards = [Shard(views.label, len(views)) for views in self._chunks]
 
     def read(self, index: int) -> NormalizedViews:
-        return self._parts[index]
+        return self._chunks[index]
 
 
 def test_shards_of_a_class_and_copies_of_a_view() -> None:
@@ -147,8 +147,8 @@ def test_shards_of_a_class_and_copies_of_a_view() -> None:
 
 
 def test_the_digest_is_that_of_the_views() -> None:
-    def digest(**given: list[Cloud]) -> str:
-        return MemoryViews(given, CONFIG).digest
+    def digest(**clouds: list[Cloud]) -> str:
+        return MemoryViews(clouds, CONFIG).digest
 
     one, two = views(0, (3, 4)), views(1, (5,))
     other = [(one[0][0], one[0][1] ^ 1), one[1]]
@@ -158,8 +158,8 @@ def test_the_digest_is_that_of_the_views() -> None:
 
 
 def test_bad_views_are_refused() -> None:
-    def build(given: dict[str, list[Cloud]]) -> Samples:
-        return build_samples(MemoryViews(given, CONFIG), NETWORK, CONFIG)
+    def build(clouds: dict[str, list[Cloud]]) -> Samples:
+        return build_samples(MemoryViews(clouds, CONFIG), NETWORK, CONFIG)
 
     with pytest.raises(thor2.InputError, match="views of 0 classes"):
         build({})

@@ -1,4 +1,4 @@
-"""The built-in objects: sizes, closed surfaces, and pairs that only colour or only shape tells apart."""
+"""The built-in objects: sizes, closed surfaces, and pairs that differ only in colour or only in shape."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ OBJECTS = builtin_objects()
 
 
 def color_shares(mesh: TexturedMesh, n: int = 40_000) -> dict[tuple[int, ...], float]:
-    """Colours and the share of the surface they cover, by points spread evenly over it."""
+    """Return the share of the surface that each colour covers, estimated from uniform samples."""
     shape = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     points, face = trimesh.sample.sample_surface(shape, n, seed=0)
     weights = trimesh.triangles.points_to_barycentric(shape.triangles[face], points)[:, 1:]
@@ -27,7 +27,7 @@ def test_names_and_pairs() -> None:
 
 
 @pytest.mark.parametrize("name", OBJECTS)
-def test_an_object_of_plausible_size_on_the_ground(name: str) -> None:
+def test_objects_have_plausible_sizes_and_stand_on_the_ground(name: str) -> None:
     mesh = OBJECTS[name]
     size = np.ptp(mesh.vertices, axis=0)
     assert 0.05 < size.max() < 0.25 and size.min() > 0.015
@@ -44,14 +44,14 @@ def test_surfaces_are_closed_and_face_one_way(name: str) -> None:
     assert shape.is_watertight and shape.is_winding_consistent and shape.volume > 0
 
 
-def test_always_the_same() -> None:
+def test_objects_are_deterministic() -> None:
     for name, mesh in builtin_objects().items():
         assert np.array_equal(mesh.vertices, OBJECTS[name].vertices)
         assert all(np.array_equal(a, b) for a, b in zip(mesh.textures, OBJECTS[name].textures, strict=True))
 
 
 @pytest.mark.parametrize("pair", COLOR_PAIRS)
-def test_only_colour_tells_apart(pair: tuple[str, str]) -> None:
+def test_pairs_that_differ_only_in_colour(pair: tuple[str, str]) -> None:
     one, other = (OBJECTS[name] for name in pair)
     assert np.array_equal(one.vertices, other.vertices) and np.array_equal(one.faces, other.faces)
     network = colornet.load_default()
@@ -59,12 +59,12 @@ def test_only_colour_tells_apart(pair: tuple[str, str]) -> None:
     def regions(mesh: TexturedMesh) -> np.ndarray:
         return sum(share * network.membership(np.array(c, np.uint8)) for c, share in color_shares(mesh).items())
 
-    # Two distributions over the colour regions differ by 2 at most.
+    # The distance of two distributions over the colour regions is at most 2.
     assert np.abs(regions(one) - regions(other)).sum() > 0.8
 
 
 @pytest.mark.parametrize("pair", SHAPE_PAIRS)
-def test_only_shape_tells_apart(pair: tuple[str, str]) -> None:
+def test_pairs_that_differ_only_in_shape(pair: tuple[str, str]) -> None:
     one, other = (OBJECTS[name] for name in pair)
     shares, others = color_shares(one), color_shares(other)
     assert set(shares) == set(others)
@@ -80,5 +80,5 @@ def test_colours_keep_their_regions_under_other_light() -> None:
     assert len(colors) >= 10
     for color in colors:
         lit = np.array(color) * rng.uniform(0.9, 1.1, (200, 1)) + rng.normal(0, 3, (200, 3))
-        found = network.membership(np.rint(lit).clip(0, 255).astype(np.uint8)).mean(axis=0)
-        assert np.abs(found - network.membership(np.array(color, np.uint8))).sum() < 0.1, color
+        weights = network.membership(np.rint(lit).clip(0, 255).astype(np.uint8)).mean(axis=0)
+        assert np.abs(weights - network.membership(np.array(color, np.uint8))).sum() < 0.1, color

@@ -1,4 +1,4 @@
-"""PCD files packed byte by byte, whole and damaged."""
+"""Valid and damaged PCD files."""
 
 import struct
 from pathlib import Path
@@ -30,16 +30,16 @@ def write(path: Path, data: str, old: str = "", new: str = "") -> Path:
 
 @pytest.mark.parametrize("data", DATA)
 def test_points(tmp_path: Path, data: str) -> None:
-    found = read_organized_points(write(tmp_path / "cloud.pcd", data))
-    assert found.dtype == np.float64
-    np.testing.assert_array_equal(found, POINTS)
+    points = read_organized_points(write(tmp_path / "cloud.pcd", data))
+    assert points.dtype == np.float64
+    np.testing.assert_array_equal(points, POINTS)
     np.testing.assert_array_equal(
         read_organized_points(write(tmp_path / "cloud.pcd", data, "COUNT 1 1 1 1 1\n", "")), POINTS
     )
 
 
 def test_points_among_other_fields(tmp_path: Path) -> None:
-    """A field of several numbers, padding, doubles and shorts, axes out of order; lines end in CR LF."""
+    """The file has a field of three numbers, padding, other number types, another order of axes and CR LF line ends."""
     path = tmp_path / "cloud.pcd"
     header = (
         "VERSION .7\r\nFIELDS _ z normal x _ y\r\nSIZE 1 8 4 4 2 4\r\nTYPE U F F F I F\r\nCOUNT 3 1 3 1 1 1\r\n"
@@ -81,16 +81,16 @@ def test_points_among_other_fields(tmp_path: Path) -> None:
     ],
 )
 @pytest.mark.parametrize("data", DATA)
-def test_headers_that_are_damaged(tmp_path: Path, data: str, old: str, new: str) -> None:
+def test_damaged_headers(tmp_path: Path, data: str, old: str, new: str) -> None:
     path = write(tmp_path / "cloud.pcd", data, old, new)
     with pytest.raises(InputError) as caught:
         read_organized_points(path)
     assert str(path) in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_clouds_that_are_compressed(tmp_path: Path) -> None:
+def test_compressed_clouds_are_refused(tmp_path: Path) -> None:
     path = write(tmp_path / "cloud.pcd", "binary", "DATA binary", "DATA binary_compressed")
-    with pytest.raises(InputError, match=r"has DATA binary_compressed; expected ascii or binary$"):
+    with pytest.raises(InputError, match=r"DATA binary_compressed"):
         read_organized_points(path)
 
 
@@ -98,15 +98,15 @@ def test_clouds_that_are_compressed(tmp_path: Path) -> None:
 @pytest.mark.parametrize("lacking", [1, 30, 10_000])
 def test_files_that_are_cut_off(tmp_path: Path, data: str, lacking: int) -> None:
     path = write(tmp_path / "cloud.pcd", data)
-    lacking += data == "ascii"  # the last line break alone is not missed
+    lacking += data == "ascii"  # a missing last line break is accepted
     path.write_bytes(path.read_bytes()[:-lacking])
-    with pytest.raises(InputError, match=r"cloud\.pcd (is cut off|does not hold 6 lines of 5 numbers|is no PCD file)"):
+    with pytest.raises(InputError, match=r"cloud\.pcd "):
         read_organized_points(path)
 
 
 @pytest.mark.parametrize("word", ["", "x", "1,5", "1 2"])
-def test_numbers_that_are_damaged(tmp_path: Path, word: str) -> None:
+def test_damaged_numbers(tmp_path: Path, word: str) -> None:
     path = tmp_path / "cloud.pcd"
     path.write_bytes(HEADER.format("ascii").encode() + DATA["ascii"].replace(b"2.5 ", f"{word} ".encode()))
-    with pytest.raises(InputError, match=r"cloud\.pcd does not hold 6 lines of 5 numbers$"):
+    with pytest.raises(InputError, match=r"cloud\.pcd .*6 lines of 5 numbers"):
         read_organized_points(path)

@@ -1,4 +1,4 @@
-"""Ray casting against analytic depths of a sphere and a box, and against another intersection in float64."""
+"""Ray casting against analytic depths of a sphere and a box, and against Moeller and Trumbore in float64."""
 
 import numpy as np
 import pytest
@@ -18,8 +18,8 @@ def painted(shape: trimesh.Trimesh, color: tuple[int, int, int] = (200, 30, 40))
     return TexturedMesh(np.array(shape.vertices), np.array(shape.faces, np.int32), corner_colors=colors)
 
 
-def nearest_by_hand(shape: trimesh.Trimesh, origin: np.ndarray, rays: np.ndarray) -> np.ndarray:
-    """Moeller and Trumbore's intersection of every ray with every triangle in float64; 0 where there is none."""
+def intersect_triangles(shape: trimesh.Trimesh, origin: np.ndarray, rays: np.ndarray) -> np.ndarray:
+    """Return the depth along each ray with the algorithm of Moeller and Trumbore in float64; 0 without a hit."""
     nearest = np.full(len(rays), np.inf)
     for a, b, c in shape.triangles:
         p = np.cross(rays, c - a)
@@ -35,7 +35,7 @@ def nearest_by_hand(shape: trimesh.Trimesh, origin: np.ndarray, rays: np.ndarray
 def test_field_of_view() -> None:
     k = CAMERA.intrinsics
     assert (k.cx, k.cy) == (80, 60) and k.fx == k.fy
-    # The image's outer borders, half a pixel beyond the outermost centres, are seen at half the angle.
+    # The borders of the image, half a pixel beyond the outer pixel centres, are at half the angle.
     assert np.degrees(np.arctan(80.5 / k.fx)) == pytest.approx(15)
 
 
@@ -75,7 +75,7 @@ def test_matches_another_intersector_and_crops_nothing_visible() -> None:
     assert view.depth.size < CAMERA.width * CAMERA.height / 2
     _, depth = view.full_image(CAMERA)
     rays = pixel_rays(CAMERA.intrinsics, CAMERA.height, CAMERA.width) @ pose[:3, :3].T
-    expected = nearest_by_hand(shape, pose[:3, 3], rays)
+    expected = intersect_triangles(shape, pose[:3, 3], rays)
     expected = expected.reshape(depth.shape)
     assert np.array_equal(depth > 0, expected > 0)
     assert np.abs(depth - expected * 1000).max() <= 0.501

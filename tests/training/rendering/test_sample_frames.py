@@ -1,4 +1,4 @@
-"""The packaged sample frames are those that the module makes, and small."""
+"""The packaged sample frames are up to date and small."""
 
 import json
 from pathlib import Path
@@ -24,11 +24,11 @@ def test_packaged_samples_are_up_to_date_and_small(tmp_path: Path) -> None:
     assert {path.name for path in PACKAGED.iterdir()} == {one["folder"] for one in index} | {"index.json"}
     assert sum(path.stat().st_size for path in PACKAGED.rglob("*") if path.is_file()) < 400_000
     for one in index:
-        made, packaged = read(tmp_path / one["folder"]), read(PACKAGED / one["folder"])
-        assert made.intrinsics == packaged.intrinsics
-        # Ray casting and JPEG may round differently elsewhere.
+        rendered, packaged = read(tmp_path / one["folder"]), read(PACKAGED / one["folder"])
+        assert rendered.intrinsics == packaged.intrinsics
+        # Ray casting and JPEG may round differently on other machines.
         for name, tolerance in (("labels", 0), ("depth", 1), ("color", 4)):
-            difference = np.abs(getattr(made, name).astype(int) - getattr(packaged, name))
+            difference = np.abs(getattr(rendered, name).astype(int) - getattr(packaged, name))
             assert (difference <= tolerance).mean() > 0.999, (one, name)
 
 

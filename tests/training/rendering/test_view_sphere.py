@@ -1,4 +1,4 @@
-"""Camera poses against spherical coordinates written out, and the golden clouds' convention."""
+"""Camera poses against spherical coordinates."""
 
 import math
 

@@ -49,9 +49,9 @@ def test_every_plot_is_drawn(tmp_path: Path) -> None:
         "box",
         tmp_path / "descriptor.png",
     )
-    found = sorted(p.name for p in tmp_path.iterdir())
-    assert found == ["accuracy.png", "confusion.png", "curves.png", "descriptor.png", "objects.png", "reliability.png"]
-    assert all(colors_in(tmp_path / name) > 10 for name in found)
+    files = sorted(p.name for p in tmp_path.iterdir())
+    assert files == ["accuracy.png", "confusion.png", "curves.png", "descriptor.png", "objects.png", "reliability.png"]
+    assert all(colors_in(tmp_path / name) > 10 for name in files)
 
 
 def test_missing_directory_raises_oserror(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Reading datasets of views: what was written comes back, and what is damaged is refused by name."""
+"""Datasets of views: they are read as written, and damaged files are refused by name."""
 
 import dataclasses
 import hashlib
@@ -44,8 +44,8 @@ def views_of(clouds: list[Cloud]) -> NormalizedViews:
     return normalize_views(clouds, 3, range(len(clouds)), [0] * len(clouds), CONFIG)
 
 
-def test_what_was_rendered_comes_back_normalized(written: Path) -> None:
-    """Against `view_normalize` of the same clouds one by one: no coordinate is off by more than half a step."""
+def test_views_are_read_normalized(written: Path) -> None:
+    """Coordinates differ from those of `view_normalize`, cloud by cloud, by at most half a step."""
     dataset = ViewDataset.open(written)
     assert dataset.classes == ("tennis_ball", "screwdriver")
     assert len(dataset) == 60 and [(shard.label, shard.views) for shard in dataset.shards] == [(0, 30), (1, 30)]
@@ -62,7 +62,7 @@ def test_what_was_rendered_comes_back_normalized(written: Path) -> None:
             assert np.array_equal(rgb, cloud[1])
 
 
-def test_files_hold_exactly_what_normalization_gives(written: Path) -> None:
+def test_files_contain_the_normalized_views(written: Path) -> None:
     clouds = render_views(OBJECTS, 60, 45)["tennis_ball"]
     views, read = views_of(clouds), ViewDataset.open(written).read(0)
     assert np.array_equal(views.xyz, read.xyz)
@@ -79,7 +79,7 @@ def test_digest_and_record(written: Path) -> None:
     assert [entry["name"] for entry in record["job"]["objects"]] == list(OBJECTS)
 
 
-def test_few_bytes_a_view(written: Path) -> None:
+def test_a_view_takes_few_bytes(written: Path) -> None:
     dataset = ViewDataset.open(written)
     size = sum(path.stat().st_size for path in written.iterdir())
     assert size < 9 * sum(shard.points for shard in dataset.shards) + 60 * 100
@@ -92,7 +92,7 @@ def test_empty_views_and_views_beyond_the_range() -> None:
     line = np.linspace(0, 1, 50, dtype=np.float32)[:, None] * np.array([0, 0, 1], np.float32)
     rgb = np.zeros((50, 3), np.uint8)
     assert views_of([(line * np.float32(MAX_VIEW_LENGTH / 2.5), rgb)]).xyz.max() == MAX_VIEW_LENGTH
-    with pytest.raises(InputError, match="a view is 4.05 scaled units long"):
+    with pytest.raises(InputError, match="4.05 scaled units"):
         views_of([(line, rgb), (line * np.float32(1.62), rgb)])
 
 
