@@ -98,7 +98,8 @@ def test_killed_evaluation_resumes_with_the_same_result(tmp_path: Path) -> None:
     whole = evaluate_toys(tmp_path / "whole", 9)
     program = f"import runpy; from pathlib import Path; m = runpy.run_path({__file__!r}); "
     program += f"m['evaluate_toys'](Path({str(tmp_path / 'killed')!r}), 9, kill_at=5)"
-    killed = subprocess.run([sys.executable, "-c", program], capture_output=True, timeout=120)
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    killed = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, timeout=120)
     assert killed.returncode == -signal.SIGKILL, killed.stderr.decode()[-500:]
     report = tmp_path / "killed" / "report"
     assert not (report / "report.json").exists()
