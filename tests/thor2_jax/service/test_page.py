@@ -151,7 +151,8 @@ def test_click_shows_the_details_of_an_object(open_page: Callable[..., Page]) ->
         shown = tables.nth(k).locator("tr:not(.bar) td").all_inner_texts()
         shares = [float(text.strip("<>%\xa0")) for text in shown]
         assert len(shares) == 5 and shares == sorted(shares, reverse=True)
-    expect(page.locator(".badge")).to_have_count(1)
+    expect(page.locator(".badge")).to_have_text("higher probability")
+    expect(page.locator("#evidence > details")).to_contain_text("Higher probability")
 
 
 def test_keyboard_navigation(open_page: Callable[..., Page], classes: tuple[str, ...]) -> None:
