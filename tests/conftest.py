@@ -16,6 +16,7 @@ jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE
 jax.config.update(
     "jax_persistent_cache_min_compile_time_secs", float(os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"])
 )
+os.environ.setdefault("THOR2_CACHE", "off")  # commands keep no programs in the home directory
 
 EXAMPLES = {"properties": (4, 60), "fuzz": (150, 3000)}
 """Directory of tests -> number of Hypothesis examples for each test, by default and with --thorough."""

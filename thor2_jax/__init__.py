@@ -1,14 +1,49 @@
-"""THOR2 (Samani and Banerjee, 2024) in JAX: coloured point clouds to TOPS and TOPS2, RGB-D frames to object names."""
+"""THOR2 (Samani and Banerjee, 2024) in JAX: coloured point clouds to TOPS and TOPS2, RGB-D frames to object names.
+
+Names are imported when they are first used, so that importing the package does not import JAX.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
 
 import thor2_jax.jax_version  # noqa: F401  first: it refuses versions of jax that give wrong numbers
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig, Relaxation
-from thor2_jax.descriptor.describe import describe, describe_aligned, describe_strips, diagrams, strips
-from thor2_jax.descriptor.view_normalization import align, mirror, turn, view_normalize
 from thor2_jax.errors import InputError
-from thor2_jax.parameters import Parameters
-from thor2_jax.recognition.frames import Intrinsics, RGBDFrame, read_frame
-from thor2_jax.recognition.recognizer import Recognition, Recognizer
-from thor2_jax.types import Descriptors, Diagrams, PointClouds, Strips
+
+if TYPE_CHECKING:
+    from thor2_jax.descriptor.describe import describe, describe_aligned, describe_strips, diagrams, strips
+    from thor2_jax.descriptor.view_normalization import align, mirror, turn, view_normalize
+    from thor2_jax.parameters import Parameters
+    from thor2_jax.recognition.frames import Intrinsics, RGBDFrame, read_frame
+    from thor2_jax.recognition.recognizer import Recognition, Recognizer
+    from thor2_jax.types import Descriptors, Diagrams, PointClouds, Strips
+else:
+    _MODULES = {
+        "descriptor.describe": ("describe", "describe_aligned", "describe_strips", "diagrams", "strips"),
+        "descriptor.view_normalization": ("align", "mirror", "turn", "view_normalize"),
+        "parameters": ("Parameters",),
+        "recognition.frames": ("Intrinsics", "RGBDFrame", "read_frame"),
+        "recognition.recognizer": ("Recognition", "Recognizer"),
+        "types": ("Descriptors", "Diagrams", "PointClouds", "Strips"),
+    }
+    _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
+    _SUBMODULES = ("capacity", "client", "descriptor", "export", "recognition", "testing", *_MODULES)
+
+    def __getattr__(name: str) -> Any:
+        if name in _MODULE_OF:
+            value = getattr(importlib.import_module(f"thor2_jax.{_MODULE_OF[name]}"), name)
+        elif name in _SUBMODULES:
+            value = importlib.import_module(f"thor2_jax.{name}")
+        else:
+            raise AttributeError(f"module 'thor2_jax' has no attribute {name!r}")
+        globals()[name] = value
+        return value
+
+    def __dir__() -> list[str]:
+        return sorted({*globals(), *_MODULE_OF, *_SUBMODULES})
+
+
+__version__ = "0.1.0"
 
 __all__ = [
     "DESCRIPTOR_VERSION",

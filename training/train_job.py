@@ -26,7 +26,7 @@ from training.views.sequences import sequence_sources
 __all__ = ["TrainJob", "run_train_job"]
 
 Display = Callable[[], AbstractContextManager[Progress]]
-"""Opens a progress display, such as `training.cli.app.progress_bars`."""
+"""Opens a progress display, such as `training.cli.progress.show_progress`."""
 
 
 @dataclasses.dataclass(frozen=True)

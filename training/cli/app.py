@@ -1,67 +1,58 @@
-"""The typer application and what its commands share: the console, progress bars and option types.
+"""The typer application and what its commands share: the console and option types.
 
 Invalid input ends a command with one line on standard error and exit code 2.
 """
 
-import contextlib
 import sys
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NoReturn
 
 import typer
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 
+from thor2_jax import __version__
 from thor2_jax.errors import InputError
+from thor2_jax.printable import escape_characters
+from training.cli.compilation_cache import enable_compilation_cache
 
-__all__ = ["ModelOption", "UnknownOption", "app", "console", "main", "progress_bars", "split_names"]
+__all__ = ["ModelOption", "QuietOption", "UnknownOption", "app", "console", "main", "show_help", "split_names"]
 
 app = typer.Typer(
-    no_args_is_help=True,
-    add_completion=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
     help="Recognize objects on cluttered tables in RGB-D frames, trained on synthetic views only (THOR2 in JAX).",
 )
-# Without a terminal, rich would truncate tables at 80 columns.
-console = Console(width=None if sys.stdout.isatty() else 160)
+# Without a terminal, rich would truncate tables at 80 columns. Names of objects may look like markup.
+console = Console(width=None if sys.stdout.isatty() else 160, markup=False, emoji=False)
 
 UnknownOption = Annotated[
     float,
     typer.Option("--unknown-below", help="Instances with a lower confidence are unknown objects (0 to 1)."),
 ]
 ModelOption = Annotated[Path, typer.Option("--model", help="Run directory of a trained model.")]
+QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress.")]
 
 
-@contextlib.contextmanager
-def progress_bars() -> Iterator[Callable[[str, int, int, str], None]]:
-    """Yield a callback (stage, done, total, note) that shows one progress bar per stage on standard error."""
-    tasks: dict[str, TaskID] = {}
-    with Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[note]}"),
-        console=Console(stderr=True),
-    ) as bars:
+def show_help(context: typer.Context) -> None:
+    """Print the help of a group of commands if none of them is given."""
+    if context.invoked_subcommand is None:
+        print(context.get_help(), end="")
 
-        def show(stage: str, done: int, total: int, note: str) -> None:
-            if stage not in tasks:
-                # A resumed stage starts at what is already done, so that the remaining time is estimated correctly.
-                tasks[stage] = bars.add_task(stage, total=total, completed=done, note=note)
-            bars.update(tasks[stage], completed=done, total=total, note=note)
 
-        yield show
+def _show_version(requested: bool) -> None:
+    if requested:
+        print(f"thor2 {__version__}")
+        raise typer.Exit
+
+
+@app.callback(invoke_without_command=True)
+def thor2(
+    context: typer.Context,
+    version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and exit.")
+    ] = False,
+) -> None:
+    show_help(context)
 
 
 def split_names(names: str) -> list[str]:
@@ -72,14 +63,20 @@ def split_names(names: str) -> list[str]:
 def main() -> None:
     """Run the command line (entry point of the console script)."""
     try:
-        app(standalone_mode=True)
+        enable_compilation_cache()
+        status = app(standalone_mode=False)
+    except typer.TyperException as error:
+        context = getattr(error, "ctx", None)
+        advice = f"; see {context.command_path} --help" if context else ""
+        _exit_with(error.format_message().rstrip(".") + advice)
     except InputError as error:
         _exit_with(str(error))
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
         _exit_with(f"{where}{error.strerror or error}")
+    raise SystemExit(status)
 
 
-def _exit_with(message: str) -> None:
-    print(f"error: {' '.join(message.splitlines())}", file=sys.stderr)
+def _exit_with(message: str) -> NoReturn:
+    print(f"error: {escape_characters(' '.join(message.split()))}", file=sys.stderr)
     raise SystemExit(2)

@@ -6,13 +6,15 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from training.cli.app import app, console, progress_bars
+from training.cli.app import QuietOption, app, console
+from training.cli.progress import show_progress
 
 
 @app.command()
 def demo(
     out: Annotated[Path, typer.Option(help="Directory for the report, its pictures and the trained run.")],
     seed: Annotated[int, typer.Option(help="Seed for the training and the scenes.")] = 0,
+    quiet: QuietOption = False,
 ) -> None:
     """Train on built-in objects, recognize cluttered scenes of them and write a report; no download, a few minutes.
 
@@ -20,7 +22,7 @@ def demo(
     """
     from training.demo import run_demo
 
-    with progress_bars() as progress:
+    with show_progress(quiet) as progress:
         figures = run_demo(out, seed, progress)
     table = Table("", *figures.names)
     for part, values in figures.accuracy.items():

@@ -10,9 +10,12 @@ import typer
 from rich.table import Table
 
 from thor2_jax.errors import InputError
-from training.cli.app import app, console, progress_bars
+from training.cli.app import QuietOption, app, console, show_help
+from training.cli.progress import show_progress
 
-evaluate_app = typer.Typer(no_args_is_help=True, help="Measure the accuracy of trained runs on a labelled dataset.")
+evaluate_app = typer.Typer(
+    callback=show_help, invoke_without_command=True, help="Measure the accuracy of trained runs on a labelled dataset."
+)
 app.add_typer(evaluate_app, name="evaluate")
 
 DatasetArgument = Annotated[Path, typer.Argument(help="Directory of the dataset.")]
@@ -27,19 +30,31 @@ ReportOption = Annotated[
 
 
 @evaluate_app.command()
-def uwis(dataset: DatasetArgument, model: ModelsOption, runs: MoreModels = None, out: ReportOption = None) -> None:
+def uwis(
+    dataset: DatasetArgument,
+    model: ModelsOption,
+    runs: MoreModels = None,
+    out: ReportOption = None,
+    quiet: QuietOption = False,
+) -> None:
     """UW-IS Occluded: <video>/images/<id>_{rgb,depth,labels}.png and <id>_poses.yaml."""
     from training.readers.uwis import UWISOccluded
 
-    _evaluate("uwis", UWISOccluded(dataset), dataset, [*model, *(runs or [])], out)
+    _evaluate("uwis", UWISOccluded(dataset), dataset, [*model, *(runs or [])], out, quiet)
 
 
 @evaluate_app.command()
-def frames(dataset: DatasetArgument, model: ModelsOption, runs: MoreModels = None, out: ReportOption = None) -> None:
+def frames(
+    dataset: DatasetArgument,
+    model: ModelsOption,
+    runs: MoreModels = None,
+    out: ReportOption = None,
+    quiet: QuietOption = False,
+) -> None:
     """Single frames: <frame>/{color,depth,mask}.png, intrinsics.json, labels.json."""
     from training.readers.frames import FrameFolder
 
-    _evaluate("frames", FrameFolder(dataset), dataset, [*model, *(runs or [])], out)
+    _evaluate("frames", FrameFolder(dataset), dataset, [*model, *(runs or [])], out, quiet)
 
 
 @evaluate_app.command()
@@ -54,11 +69,12 @@ def ocid(
         bool, typer.Option(help="RUN holds one run per sequence, as written by `train --sequences`.")
     ] = False,
     out: ReportOption = None,
+    quiet: QuietOption = False,
 ) -> None:
     """OCID, subset YCB10: {table,floor}/{bottom,top}/<type>/<sequence>/{rgb,depth,label,pcd}."""
     from training.readers.ocid import OCID
 
-    _evaluate("ocid", OCID(dataset, names), dataset, [*model, *(runs or [])], out, per_sequence, names)
+    _evaluate("ocid", OCID(dataset, names), dataset, [*model, *(runs or [])], out, quiet, per_sequence, names)
 
 
 @evaluate_app.command()
@@ -68,11 +84,12 @@ def bop(
     names: Annotated[Path | None, typer.Option(help="YAML or JSON table: obj_id -> name. Default: obj_000001.")] = None,
     runs: MoreModels = None,
     out: ReportOption = None,
+    quiet: QuietOption = False,
 ) -> None:
     """BOP format (YCB-Video and others): <scene>/{rgb,depth,mask_visib}, scene_camera.json and scene_gt.json."""
     from training.readers.bop import BOP
 
-    _evaluate("bop", BOP(dataset, names), dataset, [*model, *(runs or [])], out, names=names)
+    _evaluate("bop", BOP(dataset, names), dataset, [*model, *(runs or [])], out, quiet, names=names)
 
 
 def _evaluate(
@@ -81,6 +98,7 @@ def _evaluate(
     dataset: Path,
     models: list[Path],
     out: Path | None,
+    quiet: bool,
     per_sequence: bool = False,
     names: Path | None = None,
 ) -> None:
@@ -94,7 +112,7 @@ def _evaluate(
     description = {"kind": kind, "path": str(dataset.resolve())}
     if names:
         description["names"] = hashlib.sha256(names.read_bytes()).hexdigest()
-    with tempfile.TemporaryDirectory() as temporary, progress_bars() as progress:
+    with tempfile.TemporaryDirectory() as temporary, show_progress(quiet) as progress:
         runs = load_sequence_runs(models[0], frames.identifiers) if per_sequence else load_runs(models)
         report = evaluate_dataset(runs, frames, description, out or Path(temporary) / "report", progress)
     _print_report(report)

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
+from thor2_jax.printable import escape_characters
 from training.cli.app import ModelOption, UnknownOption, app, console
 
 
@@ -33,7 +34,7 @@ def recognize(
     for r in recognitions:
         confidence = "" if r.confidence is None else f"{r.confidence:.3f}"
         note = r.reason or ("outlier filter relaxed" if r.kept_by_fallback else "")
-        name = r.name or "unrecognized"
+        name = escape_characters(r.name or "unrecognized")
         occluded = "yes" if r.occluded else "no"
         row = (str(r.label), name, confidence, r.classifier or "", occluded, str(r.points_used), str(r.overflow), note)
         table.add_row(*row)

@@ -6,7 +6,8 @@ from typing import Annotated, Literal
 import typer
 
 from thor2_jax.errors import InputError
-from training.cli.app import app, console, progress_bars
+from training.cli.app import QuietOption, app, console
+from training.cli.progress import show_progress
 
 
 @app.command()
@@ -31,6 +32,7 @@ def render(
     segmentation: Annotated[bool, typer.Option("--segmentation", help="Augment: inexact masks.")] = False,
     copies: Annotated[int, typer.Option(help="Augmented copies of each view, if there are augmentations.")] = 2,
     seed: Annotated[int, typer.Option(help="Seed for the augmentations.")] = 0,
+    quiet: QuietOption = False,
 ) -> None:
     """Render views of meshes to a dataset for `train --dataset`. An interrupted rendering resumes."""
     from training.augmentation.augmentations import Augmentations
@@ -53,7 +55,7 @@ def render(
     )
     found = find_meshes(meshes, read_names(names) if names else None)
     pool = local_workers(workers) if engine == "local" else ray_workers(workers, address)
-    with progress_bars() as progress:
+    with show_progress(quiet) as progress:
         dataset = render_dataset(
             found,
             out,

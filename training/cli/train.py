@@ -1,12 +1,14 @@
 """`thor2 train`: train a recognizer."""
 
+import functools
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from thor2_jax.errors import InputError
-from training.cli.app import app, console, progress_bars, split_names
+from training.cli.app import QuietOption, app, console, split_names
+from training.cli.progress import show_progress
 
 
 @app.command()
@@ -47,6 +49,7 @@ def train(
     ] = None,
     processes: Annotated[int, typer.Option(min=1, help="Number of processes that train together.")] = 1,
     process: Annotated[int, typer.Option(min=0, help="Index of this process.")] = 0,
+    quiet: QuietOption = False,
 ) -> None:
     """Train a recognizer on synthetic views of meshes. An interrupted training resumes.
 
@@ -85,7 +88,7 @@ def train(
         sequences=sequences,
         workers=workers,
     )
-    for directory, runs in run_train_job(job, progress_bars).items():
+    for directory, runs in run_train_job(job, functools.partial(show_progress, quiet)).items():
         for run in runs:
             for name, accuracy in run.record["held_out_accuracy"].items():
                 console.print(f"fold {run.record['fold']}: {name} has a held-out accuracy of {accuracy:.3f}")
