@@ -17,6 +17,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from thor2_jax.errors import InputError
 from thor2_jax.files import atomic_write
+from thor2_jax.printable import escape_characters
 
 if TYPE_CHECKING:
     from thor2_jax.recognition.recognizer import Recognition
@@ -201,7 +202,8 @@ def _draw_labels(
     covered = np.pad(instances, ((1, 0), (1, 0))).cumsum(axis=0, dtype=np.int32).cumsum(axis=1, dtype=np.int32)
     placed: list[tuple[_Box, _Lettering, Paint]] = []
     for mask, annotation in zip(masks, annotations, strict=True):
-        lettering = _fit(draw, annotation.text, size, picture.size) if annotation.text else None
+        text = escape_characters(annotation.text, _can_draw)
+        lettering = _fit(draw, text, size, picture.size) if text else None
         if lettering is not None:
             box = _place(lettering, mask.box, [other for other, _, _ in placed], covered)
             placed.append((box, lettering, annotation.paint))
@@ -226,6 +228,16 @@ def _fit(draw: ImageDraw.ImageDraw, text: str, size: int, space: tuple[int, int]
 @functools.lru_cache(maxsize=32)
 def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
     return ImageFont.load_default(size)
+
+
+@functools.lru_cache(maxsize=4096)
+def _can_draw(character: str) -> bool:
+    """Return whether the font has a character; it draws the same box for all those that it lacks."""
+    return character in " \n" or (character.isprintable() and _ink_of(character) != _ink_of("\U0010ffff"))
+
+
+def _ink_of(character: str) -> bytes:
+    return bytes(_font(_SMALLEST_LETTERS).getmask(character))
 
 
 def _place(lettering: _Lettering, target: _Box, placed: Sequence[_Box], covered: NDArray[np.int32]) -> _Box:

@@ -15,6 +15,7 @@ import contextlib
 import logging
 import os
 import re
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
@@ -151,10 +152,19 @@ def _system_error(error: Exception) -> tuple[int | None, str]:
 
 @contextlib.contextmanager
 def _quiet_orbax() -> Iterator[None]:
-    """Suppress orbax's log, in which its threads print tracebacks of the errors that are raised anyway."""
-    logger = logging.getLogger("absl")
-    before, logger.disabled = logger.disabled, True
+    """Suppress the tracebacks that orbax's threads log or print for errors that are raised anyway.
+
+    After an error, its threads find their event loop closed, also later; that message stays suppressed.
+    """
+    logger, hook = logging.getLogger("absl"), sys.excepthook
+
+    def print_others(kind: type[BaseException], error: BaseException, traceback: TracebackType | None) -> None:
+        if not (kind is RuntimeError and str(error) == "Event loop is closed"):
+            hook(kind, error, traceback)
+
+    before, logger.disabled, sys.excepthook = logger.disabled, True, print_others
     try:
         yield
+        sys.excepthook = hook
     finally:
         logger.disabled = before

@@ -16,7 +16,7 @@ from thor2_jax.types import PointClouds
 from training.objects.mesh import TexturedMesh
 from training.rendering.ray_caster import RayCaster, render_view
 from training.rendering.view_sphere import camera_pose
-from training.reports.plots import save_figure
+from training.reports.plots import name_style, plain_text, save_figure
 
 __all__ = ["draw_descriptor", "draw_objects"]
 
@@ -37,7 +37,7 @@ def draw_objects(objects: Mapping[str, TexturedMesh], path: str | Path) -> None:
         axes.imshow(picture)
         row, column = picture.shape[0] / 2, picture.shape[1] / 2
         axes.set(xlim=(column - half, column + half), ylim=(row + half, row - half))
-        axes.set_title(name, fontsize=9, y=-0.12)
+        axes.set_title(plain_text(name), fontsize=9, y=-0.12, **name_style())
     for axes in figure.axes:
         axes.set_axis_off()
     save_figure(figure, path)
@@ -101,7 +101,7 @@ def _draw_side_view(axes: Any, aligned: PointClouds, levels: NDArray[np.floating
     axes.set_aspect("equal")
     axes.set_xlabel("x (scaled units)")
     axes.set_ylabel("z (scaled units), lines between slices")
-    axes.set_title(f"{name}: {len(points)} points", fontsize=10)
+    axes.set_title(plain_text(f"{name}: {len(points)} points"), fontsize=10, **name_style())
 
 
 def _draw_color_vectors(axes: Any, color: NDArray[np.floating[Any]], network: ColorNetwork) -> None:

@@ -1,5 +1,6 @@
 """Plots of trainings and evaluations (matplotlib, PNG)."""
 
+import functools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -7,11 +8,13 @@ from typing import Any
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.font_manager import fontManager, get_font
 from numpy.typing import NDArray
 
 from thor2_jax.files import atomic_write
+from thor2_jax.printable import escape_characters
 
-__all__ = ["draw_accuracy", "draw_confusion", "draw_curves", "draw_reliability", "save_figure"]
+__all__ = ["draw_accuracy", "draw_confusion", "draw_curves", "draw_reliability", "name_style", "plain_text", "save_figure"]
 
 _DPI = 130
 _COLORS = ("#56b4e9", "#e69f00", "#009e73", "#222222", "#cc79a7", "#0072b2", "#d55e00", "#f0e442")
@@ -27,6 +30,29 @@ def save_figure(figure: Figure, path: str | Path) -> None:
     FigureCanvasAgg(figure)
     with atomic_write(path) as temporary:
         figure.savefig(temporary, dpi=_DPI, format="png")
+
+
+_FONTS = ("DejaVu Sans", "Noto Sans CJK SC", "Noto Sans CJK JP", "WenQuanYi Zen Hei", "Arial Unicode MS", "Noto Emoji")
+"""Fonts for names, those that are installed; matplotlib has the first one."""
+
+
+@functools.cache
+def _installed_fonts() -> tuple[list[str], frozenset[int]]:
+    """Return the installed fonts of _FONTS and the characters that they have."""
+    files = {font.name: font.fname for font in fontManager.ttflist if font.name in _FONTS}
+    characters = frozenset(code for file in files.values() for code in get_font(file).get_charmap())
+    return [name for name in _FONTS if name in files], characters
+
+
+def plain_text(name: str) -> str:
+    """Return a name as matplotlib draws it character by character: no mathtext, and escapes for missing characters."""
+    _, characters = _installed_fonts()
+    return escape_characters(name, lambda c: c == "\n" or (c.isprintable() and ord(c) in characters)).replace("$", r"\$")
+
+
+def name_style() -> dict[str, Any]:
+    """Return the properties of a text that holds names."""
+    return {"fontfamily": _installed_fonts()[0]}
 
 
 def draw_accuracy(
@@ -52,7 +78,8 @@ def draw_accuracy(
         heights = [values[k] for values in accuracy.values()]
         bars = axes.bar(places, heights, width * 0.92, label=name, color=_COLORS[k % len(_COLORS)])
         axes.bar_label(bars, fmt="%.2f", fontsize=8, padding=2 if crowded else 1, rotation=90 if crowded else 0)
-    axes.set_xticks(range(len(accuracy)), [f"{subset}\n{counts[subset]} instances" for subset in accuracy])
+    ticks = [plain_text(f"{subset}\n{counts[subset]} instances") for subset in accuracy]
+    axes.set_xticks(range(len(accuracy)), ticks, **name_style())
     axes.set_ylim(0, 1.15 if crowded else 1.08)
     axes.set_yticks(np.arange(0, 1.01, 0.2))
     axes.set_ylabel("accuracy")
@@ -74,7 +101,7 @@ def draw_confusion(counts: NDArray[np.integer[Any]], classes: Sequence[str], nam
     Raises:
         OSError: the file cannot be written.
     """
-    columns = [*classes, "none"]
+    columns = [*map(plain_text, classes), "none"]
     if not counts[:, -1].any():
         columns, counts = columns[:-1], counts[:, :-1]
     share = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
@@ -85,8 +112,8 @@ def draw_confusion(counts: NDArray[np.integer[Any]], classes: Sequence[str], nam
     for i, j in zip(*np.nonzero(counts), strict=True):
         ink = "white" if share[i, j] > 0.5 else "black"
         axes.text(j, i, str(counts[i, j]), ha="center", va="center", fontsize=8, color=ink)
-    axes.set_xticks(range(len(columns)), columns, rotation=90, fontsize=8)
-    axes.set_yticks(range(len(classes)), classes, fontsize=8)
+    axes.set_xticks(range(len(columns)), columns, rotation=90, fontsize=8, **name_style())
+    axes.set_yticks(range(len(classes)), columns[: len(classes)], fontsize=8, **name_style())
     axes.set_xlabel(f"recognized by {name} as")
     axes.set_ylabel("object")
     save_figure(figure, path)

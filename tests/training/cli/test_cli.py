@@ -119,7 +119,7 @@ def test_unknown_below_makes_objects_unknown(model: Path, images: Path, run: Run
     code, out, _ = run("recognize", "--model", model, *recognize(images), "--unknown-below", 1)
     assert code == 0 and "unrecognized" in out and "unknown" in out
     code, _, err = run("recognize", "--model", model, *recognize(images), "--unknown-below", 1.5)
-    assert code == 2 and one_line(err) == "error: unknown_below is 1.5; it must be from 0 to 1"
+    assert code == 2 and "unknown_below is 1.5" in one_line(err)
 
 
 def test_evaluate_frames(model: Path, images: Path, scene: Scene, tmp_path: Path, run: Run) -> None:
