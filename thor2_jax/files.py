@@ -1,5 +1,6 @@
 """Atomic writes, digests, and the check of output directories."""
 
+import functools
 import hashlib
 import json
 import tempfile
@@ -7,7 +8,7 @@ from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-from colornet.files import atomic_write
+from colornet.files import atomic_write, errors_name, remove_leftovers
 from thor2_jax.errors import InputError
 
 __all__ = [
@@ -15,7 +16,10 @@ __all__ = [
     "check_output_directory",
     "content_digest",
     "directory_digest",
+    "errors_name",
+    "file_digest",
     "json_digest",
+    "remove_leftovers",
     "write_text",
 ]
 
@@ -75,6 +79,18 @@ def directory_digest(directory: Path, prefix: str = "") -> str:
             yield content
 
     return content_digest(parts())
+
+
+def file_digest(path: Path) -> str:
+    """Return the SHA-256 of a file's content; a file that did not change since the last call is not read again."""
+    status = path.stat()
+    return _file_digest(path.absolute(), status.st_mtime_ns, status.st_size)
+
+
+@functools.lru_cache(maxsize=64)
+def _file_digest(path: Path, modified: int, size: int) -> str:
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def json_digest(value: Any) -> str:

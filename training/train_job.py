@@ -1,5 +1,6 @@
 """The job of `thor2 train`: render or open the views, train the runs, train their baselines."""
 
+import contextlib
 import dataclasses
 import shutil
 from collections.abc import Callable, Sequence
@@ -8,19 +9,23 @@ from pathlib import Path
 
 import jax
 
+from thor2_jax.errors import InputError
+from thor2_jax.files import remove_leftovers
 from thor2_jax.recognition.classifier import check_features
 from thor2_jax.recognition.run_directory import TrainedRun
 from training.baselines.job import train_baselines
 from training.baselines.names import check_baselines
-from training.fitting.job import VIEWS, check_out, check_trained, is_finished, train_run
+from training.fitting.checkpoints import CHECKPOINTS
+from training.fitting.job import VIEWS, check_out, check_trained, finished_record, is_finished, train_run
 from training.fitting.options import Progress
-from training.fitting.protocol import Protocol
+from training.fitting.protocol import DEFAULT, PAPER, Protocol
 from training.objects.meshes import find_meshes, read_names
+from training.storage.jobs import check_same_job
 from training.storage.workers import local_workers
 from training.views.dataset import ViewDataset
 from training.views.left_out import WithoutClasses
 from training.views.normalized_views import ViewSource
-from training.views.render_job import render_dataset
+from training.views.render_job import dataset_job, render_dataset
 from training.views.sequences import sequence_sources
 
 __all__ = ["TrainJob", "run_train_job"]
@@ -64,38 +69,96 @@ def run_train_job(job: TrainJob, display: Display) -> dict[Path, list[TrainedRun
     """Train everything that the job asks for and that is not finished yet.
 
     Returns:
-        Run directory -> the runs of its folds that this call has trained.
+        Run directory -> the runs of its folds that this call has trained; none if they were finished.
 
     Raises:
         InputError: An option is invalid, or a directory holds the results of another job.
         OSError: A file cannot be written.
     """
     baselines = check_baselines(job.baselines)
-    if job.sequences is None and not (baselines and is_finished(job.out)):
-        check_out(job.out)
     features = check_features(job.classifiers, "classifiers")
+    if job.sequences is None:
+        if not is_finished(job.out):
+            check_out(job.out)
+        elif job.meshes is not None:
+            _check_finished_views(job)
+            if not baselines:
+                return {job.out: []}
     source = _open_views(job, display)
     if job.leave_out:
         source = WithoutClasses(source, job.leave_out)
     sources = {job.out: source}
-    options, mirrors = job.protocol.fit, job.protocol.mirrors
     if job.sequences is not None:
         sources = {job.out / sequence: views for sequence, views in sequence_sources(source, job.sequences).items()}
-        for directory in filter(is_finished, sources):
-            check_trained(sources[directory], directory, features, options, job.folds, mirrors)
+    protocol = job.protocol
+    for directory, views in sources.items():
+        _check_batch_size(protocol, views)
+        if not is_finished(directory):
+            check_out(directory)
+        elif not baselines or job.sequences is not None:
+            check_trained(views.digest, directory, features, protocol.fit, job.folds, protocol.mirrors)
     runs: dict[Path, list[TrainedRun]] = {}
     for directory, views in sources.items():
         runs[directory] = []
         with display() as progress:
             if not is_finished(directory):
                 runs[directory] = train_run(
-                    views, directory, features, options, progress, folds=job.folds, mirrors=mirrors
+                    views, directory, features, protocol.fit, progress, folds=job.folds, mirrors=protocol.mirrors
                 )
             if baselines and jax.process_index() == 0:
                 train_baselines(directory, views, baselines, progress)
     if job.meshes is not None and jax.process_index() == 0:
-        shutil.rmtree(job.out / VIEWS)
+        _remove(job.out / VIEWS)
     return runs
+
+
+def _check_batch_size(protocol: Protocol, source: ViewSource) -> None:
+    """Raise InputError if a batch is larger than all samples; the defaults are reduced to their number instead."""
+    size, n_views = protocol.fit.batch_size, sum(shard.views for shard in source.shards)
+    n_samples = n_views * len(protocol.mirrors)
+    if size > n_samples and size not in (DEFAULT.fit.batch_size, PAPER.fit.batch_size):
+        raise InputError(
+            f"batch_size is {size}; expected at most {n_samples}, the number of samples ({n_views} views in "
+            f"{len(protocol.mirrors)} mirrors)"
+        )
+
+
+def _check_finished_views(job: TrainJob) -> None:
+    """Raise InputError if a finished run was trained on views of other meshes; remove what a killed process left.
+
+    Its own views are removed, other ones stay: another training may read them.
+    """
+    record = finished_record(job.out)
+    protocol, left_out = job.protocol, sorted(set(job.leave_out))
+    requested = dataset_job(
+        _find_meshes(job), protocol.azimuth_step, protocol.polar_step, protocol.augmentations, protocol.fit.seed
+    )
+    stored = record["dataset"]
+    check_same_job(
+        job.out,
+        {"dataset": stored.get("job"), "leave_out": stored.get("classes_left_out", [])},
+        {"dataset": requested, "leave_out": left_out},
+    )
+    if not job.baselines:
+        check_trained(stored["digest"], job.out, job.classifiers, protocol.fit, job.folds, protocol.mirrors)
+    remove_leftovers(job.out)
+    for name in (VIEWS, CHECKPOINTS):
+        shutil.rmtree(job.out / f".{name}", ignore_errors=True)
+    with contextlib.suppress(InputError):
+        if ViewDataset.open(job.out / VIEWS).manifest.job == stored["job"]:
+            _remove(job.out / VIEWS)
+
+
+def _remove(directory: Path) -> None:
+    """Rename a directory first: whenever the process is killed, it is either complete or marked as a leftover."""
+    leftover = directory.with_name(f".{directory.name}")
+    shutil.rmtree(leftover, ignore_errors=True)
+    shutil.rmtree(directory.rename(leftover))
+
+
+def _find_meshes(job: TrainJob) -> dict[str, Path]:
+    assert job.meshes is not None
+    return find_meshes(job.meshes, read_names(job.names) if job.names else None)
 
 
 def _open_views(job: TrainJob, display: Display) -> ViewSource:
@@ -103,8 +166,7 @@ def _open_views(job: TrainJob, display: Display) -> ViewSource:
     if job.meshes is None:
         assert job.dataset is not None
         return ViewDataset.open(job.dataset)
-    meshes = find_meshes(job.meshes, read_names(job.names) if job.names else None)
-    protocol = job.protocol
+    meshes, protocol = _find_meshes(job), job.protocol
     with display() as progress:
         return render_dataset(
             meshes,

@@ -208,19 +208,22 @@ def has_16_bit_channels(image: ImageFile.ImageFile) -> bool:
     return image.mode.startswith("RGB") and any(";16" in str(tile.args) for tile in image.tile)
 
 
-def _read_image(path: str | Path, argument: str) -> tuple[NDArray[Any], str]:
+def _read_image(path: str | Path, argument: str, lossless: bool = False) -> tuple[NDArray[Any], str]:
     """Read an image file; return its pixels and its Pillow mode, with ";16" for colour of 16 bits per channel.
 
     Raises:
-        InputError: the file is damaged, not of `IMAGE_FORMATS` or larger than `MAX_IMAGE_PIXELS`; names `argument` and
-            the file.
+        InputError: the file is damaged, not of `IMAGE_FORMATS`, larger than `MAX_IMAGE_PIXELS` or, with `lossless`, has
+            JPEG compression; names `argument` and the file.
         OSError: the file cannot be opened.
     """
+    expected = "PNG or TIFF without JPEG compression" if lossless else ", ".join(IMAGE_FORMATS)
     with open(path, "rb") as stream:
         try:
             with Image.open(stream, formats=IMAGE_FORMATS) as image:
                 if image.width * image.height > MAX_IMAGE_PIXELS:
                     raise ValueError(f"{image.width} x {image.height} pixels; expected at most {MAX_IMAGE_PIXELS}")
+                if lossless and "JPEG" in (image.format, str(image.info.get("compression")).upper()):
+                    raise ValueError("JPEG compression changes label numbers")
                 image.verify()  # decoding does not check the checksums of a PNG
             stream.seek(0)
             with Image.open(stream, formats=IMAGE_FORMATS) as image:
@@ -229,9 +232,7 @@ def _read_image(path: str | Path, argument: str) -> tuple[NDArray[Any], str]:
         # On damaged files, the decoders raise many kinds of exception; nothing but the content can cause them here.
         except Exception as error:
             reason = " ".join(str(error).split()) or type(error).__name__
-            raise InputError(
-                f"{argument}: {path} is damaged or no image ({reason}); expected {', '.join(IMAGE_FORMATS)}"
-            ) from None
+            raise InputError(f"{argument}: {path} is no valid image ({reason}); expected {expected}") from None
 
 
 def read_color(path: str | Path) -> NDArray[np.uint8]:
@@ -257,7 +258,7 @@ def read_depth(path: str | Path) -> NDArray[np.uint16]:
 
 def read_labels(path: str | Path) -> NDArray[Any]:
     """Read a one-channel or indexed image [H, W] of integers. Raises InputError and OSError as `read_frame`."""
-    pixels, _ = _read_image(path, "labels")
+    pixels, _ = _read_image(path, "labels", lossless=True)
     if pixels.ndim != 2 or pixels.dtype.kind not in "ui":
         raise InputError(
             f"labels: {path} has shape {pixels.shape} and type {pixels.dtype}; expected one channel of integers"
@@ -297,7 +298,7 @@ def read_frame(*, color: str | Path, depth: str | Path, labels: str | Path, intr
     Args:
         color: 8-bit RGB image (PNG, JPEG or TIFF; an alpha channel is dropped).
         depth: 16-bit one-channel image in 1 / depth_scale metres, by default millimetres.
-        labels: one-channel or indexed image of instance numbers, 8 or 16 bits; 0 is background.
+        labels: one-channel or indexed image of instance numbers, 8 or 16 bits, lossless; 0 is background.
         intrinsics: JSON file, see `parse_intrinsics`.
 
     Raises:

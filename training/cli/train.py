@@ -64,6 +64,13 @@ def train(
 
     if (meshes is None) == (dataset is None):
         raise InputError("give exactly one of --meshes and --dataset")
+    for option, value in (("names", names), ("azimuth-step", azimuth_step), ("polar-step", polar_step)):
+        if dataset is not None and value is not None:
+            raise InputError(f"{option} is {value}; expected only with --meshes: the views of a --dataset are rendered")
+    if coordinator is None and (processes, process) != (1, 0):
+        raise InputError(f"processes is {processes} and process {process}; several processes need --coordinator")
+    if process >= processes:
+        raise InputError(f"process is {process}; expected less than --processes, which is {processes}")
     if sequences is not None and (dataset is None or leave_out):
         raise InputError(f"sequences is {sequences}; it requires --dataset and excludes --leave-out")
     if coordinator is not None:
@@ -89,6 +96,9 @@ def train(
         workers=workers,
     )
     for directory, runs in run_train_job(job, functools.partial(show_progress, quiet)).items():
+        if not runs:
+            console.print(f"finished already: nothing was trained; the run is in {directory}")
+            continue
         for run in runs:
             for name, accuracy in run.record["held_out_accuracy"].items():
                 console.print(f"fold {run.record['fold']}: {name} has a held-out accuracy of {accuracy:.3f}")

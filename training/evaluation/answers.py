@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
-from thor2_jax.files import write_text
+from thor2_jax.files import errors_name, write_text
 from training.storage.jobs import check_same_job
 
 __all__ = ["AnswerFile", "EvaluatedRun", "FrameAnswers", "InstancePrediction", "all_predictors"]
@@ -74,12 +74,14 @@ class FrameAnswers:
         attributes: attributes given by the reader.
         seconds: time to read, describe and classify the frame.
         instances: labelled instances, ordered by label number.
+        files: SHA-256 of each file that the frame was read from; empty in answers of version 0.1.0.
     """
 
     frame: str
     attributes: Mapping[str, str]
     seconds: float
     instances: Sequence[InstancePrediction]
+    files: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
 
 class AnswerFile:
@@ -127,7 +129,7 @@ class AnswerFile:
             OSError: the file cannot be written.
         """
         line = _encode(answers)
-        with self._path.open("a", encoding="utf-8") as file:
+        with errors_name(self._path), self._path.open("a", encoding="utf-8") as file:
             file.write(line + "\n")
         self.frames.append(_decode(line))
 
@@ -146,6 +148,7 @@ def _encode(answers: FrameAnswers) -> str:
         "frame": answers.frame,
         "attributes": dict(answers.attributes),
         "seconds": round(answers.seconds, 4),
+        "files": dict(answers.files),
         "instances": instances,
     }
     return json.dumps(values)
@@ -160,4 +163,5 @@ def _decode(line: str | bytes) -> FrameAnswers:
             if instance["probabilities"].ndim != 2:
                 raise ValueError(f"the probabilities of frame {values['frame']!r} are not a table")
         instances.append(InstancePrediction(**instance))
-    return FrameAnswers(values["frame"], values["attributes"], values["seconds"], instances)
+    files = dict(values.get("files", {}))
+    return FrameAnswers(values["frame"], values["attributes"], values["seconds"], instances, files)

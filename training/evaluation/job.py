@@ -4,15 +4,16 @@ REPORT/answers.jsonl               class probabilities of every classifier, writ
 REPORT/report.json, report.html    written last
 """
 
+import dataclasses
 import json
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from thor2_jax.config import DESCRIPTOR_VERSION
 from thor2_jax.errors import InputError
-from thor2_jax.files import check_output_directory, write_text
+from thor2_jax.files import check_output_directory, file_digest, remove_leftovers, write_text
 from training.evaluation.answering import answer_frames
 from training.evaluation.answers import AnswerFile, all_predictors
 from training.evaluation.frame_pictures import FramePictures
@@ -26,6 +27,9 @@ from training.storage.locks import locked
 __all__ = ["evaluate_dataset"]
 
 ANSWERS = "answers.jsonl"
+
+MAX_LISTED = 20
+"""Names that an error message shows."""
 
 
 def evaluate_dataset(
@@ -50,11 +54,14 @@ def evaluate_dataset(
         The content of report.json.
 
     Raises:
-        InputError: `out` holds something else, or the answers of another evaluation; another process is writing to it;
-            or a frame cannot be read. Answers so far are kept.
+        InputError: `out` holds something else, or the answers of another evaluation or of files that have changed;
+            another process is writing to it; a frame cannot be read; or no instance is of a class of the runs. Answers
+            so far are kept.
         OSError: a file cannot be written.
     """
     check_output_directory(out, ANSWERS)
+    if not out.exists():
+        frames[0]  # raises if it cannot be read, before anything is written
     with locked(out):
         return _evaluate(runs, frames, dataset, out, progress)
 
@@ -71,21 +78,50 @@ def _evaluate(
         "classifiers": [list(predictor) for predictor in all_predictors(runs)],
     }
     file = AnswerFile(out / ANSWERS, header)
-    for number, (answers, identifier) in enumerate(zip(file.frames, frames.identifiers, strict=False)):
-        if answers.frame != identifier:
-            raise InputError(
-                f"out: frame {number} in {out / ANSWERS} is {answers.frame!r}, but the dataset has {identifier!r}; "
-                "give another directory"
-            )
+    _check_unchanged(file, frames, out, progress)
+    for directory in (out, out / "frames", out / "confusions"):
+        remove_leftovers(directory)
     pictures = FramePictures(out, runs, len(frames))
     for answers in file.frames:
         pictures.restore(answers)
     _answer_rest(runs, frames, file, pictures, progress)
     report = {"dataset": description, "digests": digests, **compute_results(dataset["kind"], runs, file.frames)}
+    if not report["instances"]["scored"]:
+        raise InputError(
+            f"model: no instance of the dataset is of a class of the runs; the dataset has "
+            f"{_listed(report['instances']['no_class'])}, the runs know {_listed(runs[0].classes)}; check the names, "
+            "or give other runs"
+        )
     report["shown"] = [file.frames[number].frame for number in pictures.shown]
     write_report_page(report, pictures, out)
     write_text(out / "report.json", json.dumps(report, indent=1) + "\n")
     return report
+
+
+def _listed(names: Iterable[str]) -> str:
+    first = sorted(names)[:MAX_LISTED]
+    return ", ".join(first) + (", ..." if len(first) == MAX_LISTED else "") if first else "no names"
+
+
+def _file_digests(files: Sequence[Path]) -> dict[str, str]:
+    """Return the SHA-256 of each file; a missing one has none."""
+    return {str(path.resolve()): file_digest(path) for path in files if path.is_file()}
+
+
+def _check_unchanged(file: AnswerFile, frames: LabelledFrames, out: Path, progress: Progress) -> None:
+    """Raise InputError if frames that are already answered have another name or other files now."""
+    for number, (answers, identifier) in enumerate(zip(file.frames, frames.identifiers, strict=False)):
+        if answers.frame != identifier:
+            raise InputError(
+                f"out: frame {number} in {out / ANSWERS} is {answers.frame!r}, but the dataset has {identifier!r}; "
+                "choose another directory"
+            )
+        if answers.files:
+            stored, current = answers.files.items(), _file_digests(frames.files(number)).items()
+            if stored != current:
+                path = min(stored ^ current)[0]
+                raise InputError(f"out: {out} was written before {path} changed; choose another directory")
+        progress("check files", number + 1, len(file.frames), "")
 
 
 def _answer_rest(
@@ -96,6 +132,6 @@ def _answer_rest(
     rest = (frames[number] for number in range(first, len(frames)))
     for number, (item, answers) in enumerate(answer_frames(runs, rest), first):
         pictures.draw(number, item, answers)  # before the frame counts as done
-        file.append(answers)
+        file.append(dataclasses.replace(answers, files=_file_digests(frames.files(number))))
         rate = (number + 1 - first) / (time.perf_counter() - start)
         progress("evaluate", number + 1, len(frames), f"{rate:.2f} frames/s, {item.identifier}")

@@ -26,7 +26,7 @@ import colornet
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
 from thor2_jax.descriptor.sharding import batch_mesh
 from thor2_jax.errors import InputError
-from thor2_jax.files import check_output_directory, write_text
+from thor2_jax.files import check_output_directory, remove_leftovers, write_text
 from thor2_jax.recognition.classifier import MLP, Feature, check_features
 from thor2_jax.recognition.run_directory import RUN_FILE, TrainedRun, load_run, save_run
 from training.fitting.calibration import temperatures
@@ -42,7 +42,7 @@ from training.storage.jobs import check_same_job
 from training.storage.locks import locked
 from training.views.normalized_views import ViewSource
 
-__all__ = ["VIEWS", "check_out", "check_trained", "is_finished", "train_run"]
+__all__ = ["VIEWS", "check_out", "check_trained", "finished_record", "is_finished", "train_run"]
 
 VIEWS = "views"
 BEGUN = "begun.json"
@@ -54,6 +54,30 @@ CONFIG = DescriptorConfig(homology="closed_form")
 
 CURVE = ("epoch", "loss", "accuracy", "held_out_accuracy")
 """Metrics of an epoch that the record keeps: those that a repeated training reproduces."""
+
+
+def _job_record(
+    digest: str,
+    features: Sequence[Feature],
+    options: FitOptions,
+    config: DescriptorConfig,
+    network: colornet.ColorNetwork,
+    folds: int,
+    mirrors: Sequence[str],
+) -> dict[str, Any]:
+    return {
+        "descriptor_version": DESCRIPTOR_VERSION,
+        "descriptor_config": dataclasses.asdict(config),
+        "color_network": network.fingerprint,
+        "dataset": digest,
+        "classifiers": list(features),
+        "folds": folds,
+        "mirrors": list(mirrors),
+        "epochs": options.epochs,
+        "learning_rates": list(options.learning_rates),
+        "batch_size": options.batch_size,
+        "seed": options.seed,
+    }
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,19 +107,9 @@ class _Training:
     @property
     def record(self) -> dict[str, Any]:
         """Everything that determines the trained run, as JSON holds it."""
-        return {
-            "descriptor_version": DESCRIPTOR_VERSION,
-            "descriptor_config": dataclasses.asdict(self.config),
-            "color_network": self.network.fingerprint,
-            "dataset": self.source.digest,
-            "classifiers": list(self.features),
-            "folds": self.folds,
-            "mirrors": list(self.mirrors),
-            "epochs": self.options.epochs,
-            "learning_rates": list(self.options.learning_rates),
-            "batch_size": self.options.batch_size,
-            "seed": self.options.seed,
-        }
+        return _job_record(
+            self.source.digest, self.features, self.options, self.config, self.network, self.folds, self.mirrors
+        )
 
     def check_begun(self) -> None:
         """Raise InputError if `out` holds an interrupted training of another job."""
@@ -126,8 +140,8 @@ def is_finished(out: Path) -> bool:
 
 
 def check_trained(
-    source: ViewSource,
-    out: str | Path,
+    digest: str,
+    out: Path,
     features: Sequence[str],
     options: FitOptions,
     folds: int = 1,
@@ -135,15 +149,31 @@ def check_trained(
 ) -> None:
     """Raise if a finished run differs from what `train_run` trains for the same arguments.
 
+    Args:
+        digest: digest of the labelled views.
+        out: directory of the finished run.
+        features: as for `train_run`, like the others.
+        options: fit options.
+        folds: number of folds.
+        mirrors: mirrors in which each view is used.
+
     Raises:
         InputError: The run was trained with another value, which is named, or cannot be read.
     """
-    out = Path(out).absolute()
     names = check_features(features, "classifiers")
-    training = _Training(source, out, names, options, CONFIG, colornet.load_default(), folds, tuple(mirrors))
-    record = load_run(out if (out / RUN_FILE).is_file() else out / "fold-0").record
+    requested = _job_record(digest, names, options, CONFIG, colornet.load_default(), folds, mirrors)
+    record = finished_record(out)
     stored = {**record, "dataset": record["dataset"]["digest"]}
-    check_same_job(out, {name: stored.get(name) for name in training.record}, training.record)
+    check_same_job(out, {name: stored.get(name) for name in requested}, requested)
+
+
+def finished_record(out: Path) -> Mapping[str, Any]:
+    """Return the record of a finished run, or of the first fold of one.
+
+    Raises:
+        InputError: The run cannot be read.
+    """
+    return load_run(out if (out / RUN_FILE).is_file() else out / "fold-0").record
 
 
 def _wait_for_all(point: str) -> None:
@@ -207,6 +237,7 @@ def train_run(
                 locks.enter_context(locked(out / CHECKPOINTS))
                 training.check_begun()
             training.begin()
+            remove_leftovers(out)
         _wait_for_all("begun")
         runs = [
             _train_fold(training, samples, fold, fold_of == fold if folds > 1 else None, progress)

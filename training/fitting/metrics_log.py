@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from thor2_jax.errors import InputError
-from thor2_jax.files import write_text
+from thor2_jax.files import errors_name, write_text
 from training.fitting.options import EpochMetrics
 
 __all__ = ["append_metrics", "discard_later_epochs", "read_metrics"]
@@ -15,7 +15,7 @@ __all__ = ["append_metrics", "discard_later_epochs", "read_metrics"]
 def append_metrics(path: Path, fold: int, classifier: str, metrics: EpochMetrics) -> None:
     """Append the metrics of one epoch."""
     row = {"fold": fold, "classifier": classifier, **dataclasses.asdict(metrics)}
-    with path.open("a", encoding="utf-8") as file:
+    with errors_name(path), path.open("a", encoding="utf-8") as file:
         file.write(json.dumps(row) + "\n")
 
 

@@ -70,6 +70,13 @@ class BOP(LabelledFrames):
             truth = {label: self._name(obj_id) for label, obj_id in objects.items()}
         return LabelledFrame(self.identifiers[number], frame, truth, {"scene": folder.name})
 
+    def files(self, number: int) -> list[Path]:
+        """Return the files of a frame: its images, its masks and the tables of its scene."""
+        folder, image = self._images[number]
+        tables = [folder / f"scene_{name}.json" for name in ("camera", "gt", "gt_info")]
+        masks = sorted((folder / "mask_visib").glob(f"{image.stem}_*.png"))
+        return [image, folder / "depth" / f"{image.stem}.png", *masks, *(table for table in tables if table.exists())]
+
     def _name(self, obj_id: int) -> str:
         if self._names is None:
             return f"obj_{obj_id:06d}"

@@ -1,6 +1,7 @@
 """Labelled frames, one folder for each: color.png, depth.png, mask.png, intrinsics.json, labels.json."""
 
 import json
+from collections.abc import Iterable
 from pathlib import Path
 
 from thor2_jax.errors import InputError, with_context
@@ -8,6 +9,8 @@ from thor2_jax.recognition.frames import read_frame
 from training.readers.labelled import LabelledFrame, LabelledFrames
 
 __all__ = ["FrameFolder"]
+
+FILES = ("color.png", "depth.png", "mask.png", "intrinsics.json", "labels.json")
 
 
 class FrameFolder(LabelledFrames):
@@ -34,14 +37,23 @@ class FrameFolder(LabelledFrames):
         """Read a frame."""
         folder = self._folders[number]
         with with_context(folder.name):
-            frame = read_frame(
-                color=folder / "color.png",
-                depth=folder / "depth.png",
-                labels=folder / "mask.png",
-                intrinsics=folder / "intrinsics.json",
-            )
-            truth = _truth(folder / "labels.json")
+            color, depth, mask, intrinsics, labels = self.files(number)
+            frame = read_frame(color=color, depth=depth, labels=mask, intrinsics=intrinsics)
+            truth = _truth(labels)
+            if truth and set(truth).isdisjoint(frame.instances):
+                raise InputError(
+                    f"{labels} has the labels {_listed(truth)}, but {mask} has only {_listed(frame.instances)}; "
+                    "expected at least one in both: check that the files belong together"
+                )
         return LabelledFrame(folder.name, frame, truth, {})
+
+    def files(self, number: int) -> list[Path]:
+        """Return the files of a frame."""
+        return [self._folders[number] / name for name in FILES]
+
+
+def _listed(labels: Iterable[int]) -> str:
+    return ", ".join(map(str, sorted(labels))) or "background"
 
 
 def _truth(path: Path) -> dict[int, str]:

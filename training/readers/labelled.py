@@ -3,6 +3,7 @@
 import abc
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 
 from thor2_jax.recognition.frames import RGBDFrame
 
@@ -58,6 +59,10 @@ class LabelledFrames(abc.ABC):
             InputError: a file is missing or damaged, or files do not belong together; names the file.
             OSError: a file cannot be opened.
         """
+
+    def files(self, number: int) -> Sequence[Path]:
+        """Return the files that a frame is read from; by default none are known."""
+        return ()
 
     def __iter__(self) -> Iterator[LabelledFrame]:
         """Read the frames one at a time; raises as indexing does."""

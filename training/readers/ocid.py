@@ -70,12 +70,19 @@ class OCID(LabelledFrames):
 
     def __getitem__(self, number: int) -> LabelledFrame:
         """Read a frame; also raises InputError for a cloud without a pinhole camera and a label without a name."""
-        sequence, image = self._images[number]
+        sequence, _ = self._images[number]
         place, camera, kind, _ = sequence
         with with_context(self.identifiers[number]):
-            frame, truth = _read(image, _FIRST_OBJECT[place], self._names[sequence])
+            frame, truth = _read(self.files(number), _FIRST_OBJECT[place], self._names[sequence])
         attributes = {"place": place, "camera": _CAMERAS[camera], "type": kind}
         return LabelledFrame(self.identifiers[number], frame, truth, attributes)
+
+    def files(self, number: int) -> list[Path]:
+        """Return the files of a frame."""
+        image = self._images[number][1]
+        folder = image.parent.parent
+        cloud = folder / "pcd" / f"{image.stem}.pcd"
+        return [image, folder / "depth" / image.name, folder / "label" / image.name, cloud]
 
 
 def _names(path: Path, sequences: Iterable[_Sequence]) -> dict[_Sequence, list[str]]:
@@ -97,19 +104,17 @@ def _names(path: Path, sequences: Iterable[_Sequence]) -> dict[_Sequence, list[s
     return named
 
 
-def _read(image: Path, first_object: int, names: list[str]) -> tuple[RGBDFrame, dict[int, str]]:
-    """Read the frame of a colour image and the names of its labels."""
-    folder = image.parent.parent
+def _read(files: Iterable[Path], first_object: int, names: list[str]) -> tuple[RGBDFrame, dict[int, str]]:
+    """Read a frame and the names of its labels."""
+    image, depth_file, label_file, cloud_file = files
     color = read_color(image)
-    label_file = folder / "label" / image.name
     labels = read_labels(label_file)
-    cloud_file = folder / "pcd" / f"{image.stem}.pcd"
     points = read_organized_points(cloud_file)
     with with_context(str(cloud_file)):
         if points.shape[:2] != color.shape[:2]:
             raise InputError(f"the cloud has {points.shape[:2]} points; color has {color.shape[:2]} (rows, columns)")
         intrinsics = fit_intrinsics(points)
-    depth = read_depth(folder / "depth" / image.name)
+    depth = read_depth(depth_file)
     frame = RGBDFrame(color, depth, labels * (labels >= first_object), intrinsics)
     unnamed = [label for label in frame.instances if label - first_object >= len(names)]
     if unnamed:

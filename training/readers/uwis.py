@@ -82,17 +82,19 @@ class UWISOccluded(LabelledFrames):
 
     def __getitem__(self, number: int) -> LabelledFrame:
         """Read a frame."""
-        video, color = self._frames[number]
-        stem, identifier = _stem(color), self.identifiers[number]
+        video, _ = self._frames[number]
+        identifier = self.identifiers[number]
+        color, depth, labels, poses = self.files(number)
         with with_context(identifier):
-            frame = RGBDFrame(
-                read_color(color),
-                read_depth(color.with_name(f"{stem}_depth.png")),
-                read_labels(color.with_name(f"{stem}_labels.png")),
-                INTRINSICS,
-            )
-            truth = _truth(color.with_name(f"{stem}_poses.yaml"))
+            frame = RGBDFrame(read_color(color), read_depth(depth), read_labels(labels), INTRINSICS)
+            truth = _truth(poses)
         return LabelledFrame(identifier, frame, truth, video_attributes(int(video.name)))
+
+    def files(self, number: int) -> list[Path]:
+        """Return the files of a frame."""
+        color = self._frames[number][1]
+        names = "rgb.png", "depth.png", "labels.png", "poses.yaml"
+        return [color.with_name(f"{_stem(color)}_{name}") for name in names]
 
 
 def _stem(color: Path) -> str:

@@ -14,7 +14,15 @@ from numpy.typing import NDArray
 from thor2_jax.files import atomic_write
 from thor2_jax.printable import escape_characters
 
-__all__ = ["draw_accuracy", "draw_confusion", "draw_curves", "draw_reliability", "name_style", "plain_text", "save_figure"]
+__all__ = [
+    "draw_accuracy",
+    "draw_confusion",
+    "draw_curves",
+    "draw_reliability",
+    "name_style",
+    "plain_text",
+    "save_figure",
+]
 
 _DPI = 130
 _COLORS = ("#56b4e9", "#e69f00", "#009e73", "#222222", "#cc79a7", "#0072b2", "#d55e00", "#f0e442")
@@ -47,7 +55,8 @@ def _installed_fonts() -> tuple[list[str], frozenset[int]]:
 def plain_text(name: str) -> str:
     """Return a name as matplotlib draws it character by character: no mathtext, and escapes for missing characters."""
     _, characters = _installed_fonts()
-    return escape_characters(name, lambda c: c == "\n" or (c.isprintable() and ord(c) in characters)).replace("$", r"\$")
+    shown = escape_characters(name, lambda c: c == "\n" or (c.isprintable() and ord(c) in characters))
+    return shown.replace("$", r"\$")
 
 
 def name_style() -> dict[str, Any]:

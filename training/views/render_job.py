@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
 from thor2_jax.errors import InputError, with_context
-from thor2_jax.files import atomic_write, check_output_directory, content_digest
+from thor2_jax.files import atomic_write, check_output_directory, content_digest, remove_leftovers
 from thor2_jax.recognition.prepared_instance import DESCRIPTOR_VOXEL
 from training.augmentation.augmentations import Augmentations
 from training.objects.mesh import TexturedMesh
@@ -41,7 +41,7 @@ from training.views.mesh_views import (
 )
 from training.views.normalized_views import COORDINATE_STEP, MAX_VIEW_LENGTH, normalize_views
 
-__all__ = ["render_dataset"]
+__all__ = ["dataset_job", "render_dataset"]
 
 CLOUDS_PER_SHARD = 256
 """Clouds per shard, rounded down to whole views: a few megabytes, about a second of rendering."""
@@ -71,11 +71,6 @@ def _objects(meshes: Mapping[str, Path | TexturedMesh], angles: NDArray[np.float
     return objects
 
 
-def _leftovers(directory: Path) -> set[Path]:
-    """Return the temporary files of a process that was killed."""
-    return {path for pattern in (f".{Path(MANIFEST).stem}.*", f".*{SUFFIX}") for path in directory.glob(pattern)}
-
-
 def _is_intact(shard: Shard, directory: Path) -> bool:
     try:
         shard.content(directory)
@@ -95,8 +90,7 @@ def _begin(directory: Path, job: Mapping[str, Any]) -> Manifest:
     stored = Manifest.parse(path.read_bytes(), path) if path.exists() else None
     if stored:
         check_same_job(directory, stored.job, job)
-    for leftover in _leftovers(directory):
-        leftover.unlink()
+    remove_leftovers(directory)
     shards = stored.shards if stored else ()
     manifest = Manifest(job, tuple(shard for shard in shards if _is_intact(shard, directory)))
     if manifest != stored:
@@ -165,6 +159,38 @@ class _Plan:
         }
 
 
+def dataset_job(
+    meshes: Mapping[str, Path | TexturedMesh],
+    azimuth_step: float,
+    polar_step: float,
+    augmentations: Augmentations | None,
+    seed: int,
+) -> dict[str, Any]:
+    """Return everything that determines a dataset, as JSON holds it; see `render_dataset` for the arguments.
+
+    Raises:
+        InputError: An argument is invalid.
+    """
+    if seed < 0:
+        raise InputError(f"seed is {seed}; it must be at least 0")
+    angles = view_angles(azimuth_step, polar_step)
+    objects = _objects(meshes, angles)
+    plan = _Plan(angles, clouds_per_view(augmentations), tuple(entry["name"] for entry in objects))
+    return {
+        "descriptor_version": DESCRIPTOR_VERSION,
+        "sigma_s": SIGMA_S,
+        "voxel": DESCRIPTOR_VOXEL,
+        "step": COORDINATE_STEP,
+        "min_points": MIN_VIEW_POINTS,
+        "camera": {**dataclasses.asdict(TRAINING_CAMERA), "distance": DISTANCE},
+        "azimuth_step": float(azimuth_step),
+        "polar_step": float(polar_step),
+        "variations": {"seed": seed, **augmentations.record()} if augmentations else None,
+        "objects": objects,
+        "shards": len(plan.shards),
+    }
+
+
 def render_dataset(
     meshes: Mapping[str, Path | TexturedMesh],
     out: str | Path,
@@ -198,24 +224,9 @@ def render_dataset(
     """
     out = Path(out)
     check_output_directory(out, MANIFEST)
-    if seed < 0:
-        raise InputError(f"seed is {seed}; it must be at least 0")
+    job = dataset_job(meshes, azimuth_step, polar_step, augmentations, seed)
     angles = view_angles(azimuth_step, polar_step)
-    objects = _objects(meshes, angles)
-    plan = _Plan(angles, clouds_per_view(augmentations), tuple(entry["name"] for entry in objects))
-    job = {
-        "descriptor_version": DESCRIPTOR_VERSION,
-        "sigma_s": SIGMA_S,
-        "voxel": DESCRIPTOR_VOXEL,
-        "step": COORDINATE_STEP,
-        "min_points": MIN_VIEW_POINTS,
-        "camera": {**dataclasses.asdict(TRAINING_CAMERA), "distance": DISTANCE},
-        "azimuth_step": float(azimuth_step),
-        "polar_step": float(polar_step),
-        "variations": {"seed": seed, **augmentations.record()} if augmentations else None,
-        "objects": objects,
-        "shards": len(plan.shards),
-    }
+    plan = _Plan(angles, clouds_per_view(augmentations), tuple(entry["name"] for entry in job["objects"]))
     with locked(out):
         done = {shard.file: shard for shard in _begin(out, job).shards}
         progress(_clouds(done), plan.clouds)
