@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from thor2_jax.files import check_output_directory, write_text
+from thor2_jax.files import check_output_directory, remove_leftovers, write_text
 from thor2_jax.recognition.overlay import draw_overlay
 from thor2_jax.recognition.run_directory import TrainedRun, load_run
 from training.evaluation.answering import answer_frames
@@ -88,6 +88,8 @@ def run_demo(out: str | Path, seed: int = 0, progress: Progress = lambda stage, 
     check_output_directory(out, resumable=("run", "pictures", "demo.json"))
     pictures = out / "pictures"
     pictures.mkdir(parents=True, exist_ok=True)
+    for directory in (out, pictures):
+        remove_leftovers(directory)
     objects = builtin_objects()
     trained = _train(objects, out / "run", seed, progress)
     scenes = _compose_scenes(objects, seed, progress)

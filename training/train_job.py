@@ -124,9 +124,9 @@ def _check_batch_size(protocol: Protocol, source: ViewSource) -> None:
 
 
 def _check_finished_views(job: TrainJob) -> None:
-    """Raise InputError if a finished run was trained on views of other meshes; remove what a killed process left.
+    """Raise InputError if a finished run is of another job; without baselines, remove what a killed process left.
 
-    Its own views are removed, other ones stay: another training may read them.
+    Views of this job are removed, other ones stay: another training may read them.
     """
     record = finished_record(job.out)
     protocol, left_out = job.protocol, sorted(set(job.leave_out))
@@ -139,8 +139,9 @@ def _check_finished_views(job: TrainJob) -> None:
         {"dataset": stored.get("job"), "leave_out": stored.get("classes_left_out", [])},
         {"dataset": requested, "leave_out": left_out},
     )
-    if not job.baselines:
-        check_trained(stored["digest"], job.out, job.classifiers, protocol.fit, job.folds, protocol.mirrors)
+    if job.baselines:
+        return
+    check_trained(stored["digest"], job.out, job.classifiers, protocol.fit, job.folds, protocol.mirrors)
     remove_leftovers(job.out)
     for name in (VIEWS, CHECKPOINTS):
         shutil.rmtree(job.out / f".{name}", ignore_errors=True)

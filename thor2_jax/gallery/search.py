@@ -81,7 +81,9 @@ class IndexSearch:
         try:
             usearch: Any = importlib.import_module("usearch.index")
         except ModuleNotFoundError:
-            raise InputError("index is usearch, which is not installed; run pip install 'thor2-jax[index]'") from None
+            raise InputError(
+                "index is usearch, which is not installed; run pip install -c constraints.txt '.[index]'"
+            ) from None
         self._size = len(embeddings)
         self._index = usearch.Index(ndim=embeddings.shape[1], metric="ip", dtype="f16")
         self._index.add(np.arange(len(embeddings)), embeddings, threads=threads)

@@ -11,7 +11,7 @@
         describe = lambda clouds: thor2.describe_aligned(clouds, network, config)
         assert_permutation_invariant(describe, clouds, seed, config)
 
-Requires the extra `testing`: pip install 'thor2-jax[testing]'. All batches of a strategy have the same shape, so that a
+Requires the extra `testing`: pip install -c constraints.txt '.[testing]'. All batches of a strategy have the same shape, so that a
 property compiles once. Assertions compare bit by bit or with derived tolerances (`tolerances`).
 """
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from thor2_jax.errors import InputError
+from thor2_jax.files import remove_leftovers
 from thor2_jax.recognition.run_directory import TrainedRun, load_run
 from training.baselines.files import StoredBaseline, baseline_file, write_baseline
 from training.baselines.fit_forest import fit_forest
@@ -69,6 +70,7 @@ def _train(
         record["epochs"], tuple(record["learning_rates"]), record["batch_size"], record["seed"]
     )
     file = baseline_file(directory, name)
+    remove_leftovers(file.parent)
     scratch = file.with_name(f".{name}")
     scratch.mkdir(parents=True, exist_ok=True)
     start = time.perf_counter()

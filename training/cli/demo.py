@@ -12,7 +12,9 @@ from training.cli.progress import show_progress
 
 @app.command()
 def demo(
-    out: Annotated[Path, typer.Option(help="Directory for the report, its pictures and the trained run.")],
+    out: Annotated[Path, typer.Option(help="Directory for the report, its pictures and the trained run.")] = Path(
+        "demo-report"
+    ),
     seed: Annotated[int, typer.Option(help="Seed for the training and the scenes.")] = 0,
     quiet: QuietOption = False,
 ) -> None:

@@ -21,13 +21,14 @@ def recognize(
     out: Annotated[Path | None, typer.Option(help="Directory for recognition.json and overlay.png.")] = None,
 ) -> None:
     """Recognize every instance of one RGB-D frame."""
-    from thor2_jax.files import check_output_directory
+    from thor2_jax.files import check_output_directory, remove_leftovers
     from thor2_jax.recognition.frames import read_frame
     from thor2_jax.recognition.recognizer import Recognizer
     from thor2_jax.recognition.result_files import RESULT_FILES, write_recognitions
 
     if out is not None:
         check_output_directory(out, resumable=RESULT_FILES)
+        remove_leftovers(out)
     frame = read_frame(color=color, depth=depth, labels=labels, intrinsics=intrinsics)
     recognitions = Recognizer.load(model, unknown_below).recognize(frame)
     table = Table("label", "name", "confidence", "classifier", "occluded", "points", "overflow", "note")

@@ -33,7 +33,9 @@ def serve(
     except ModuleNotFoundError as error:
         if (error.name or "").startswith("thor2_jax"):
             raise
-        raise InputError(f"{error.name} is not installed; serve requires: pip install 'thor2-jax[serve]'") from None
+        raise InputError(
+            f"{error.name} is not installed; install it: pip install -c constraints.txt '.[serve]'"
+        ) from None
     from thor2_jax.service.settings import Settings
 
     settings = Settings(

@@ -98,7 +98,10 @@ def _check(mesh: TexturedMesh) -> None:
         raise InputError(f"texture coordinates are not finite, or beyond {MAX_TEXTURE_COORDINATE}")
     longest = float(np.ptp(vertices[np.unique(faces)], axis=0).max())
     if not MIN_SIDE <= longest <= MAX_SIDE:
-        raise InputError(f"longest side {longest:g}; expected {MIN_SIDE:g} to {MAX_SIDE:g} metres")
+        unit = " (is it in millimetres?)" if longest > MAX_SIDE else ""
+        raise InputError(
+            f"longest side {longest:g}{unit}; expected {MIN_SIDE:g} to {MAX_SIDE:g} metres; scale the mesh"
+        )
 
 
 def _check_obj_references(path: Path) -> None:

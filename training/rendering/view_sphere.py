@@ -17,6 +17,9 @@ __all__ = ["DISTANCE", "camera_pose", "view_angles"]
 DISTANCE = 1.5
 """Distance between the camera and the centre of the object's bounding box, metres."""
 
+MAX_VIEWS = 10**6
+"""Largest number of views of an object: 375 times the paper's."""
+
 
 def _steps(name: str, step: float, turn: float) -> int:
     count = turn / step if math.isfinite(step) and step > 0 else 0.0
@@ -36,10 +39,16 @@ def view_angles(azimuth_step: float = 5.0, polar_step: float = 5.0) -> NDArray[n
         [n, 2] float64, azimuth and polar angle in radians, azimuth varying fastest; 72 x 37 rows by default.
 
     Raises:
-        InputError: A step is not positive or does not divide its range.
+        InputError: A step is not positive, does not divide its range or gives more than `MAX_VIEWS` views.
     """
-    azimuths = np.arange(n := _steps("azimuth_step", azimuth_step, 360)) * (2 * np.pi / n)
-    polars = np.linspace(0, np.pi, _steps("polar_step", polar_step, 180) + 1)
+    n, n_polar = _steps("azimuth_step", azimuth_step, 360), _steps("polar_step", polar_step, 180) + 1
+    if n * n_polar > MAX_VIEWS:
+        raise InputError(
+            f"azimuth_step {azimuth_step:g} and polar_step {polar_step:g} give {n * n_polar:.0e} views per object; "
+            f"expected at most {MAX_VIEWS:.0e}; choose larger steps"
+        )
+    azimuths = np.arange(n) * (2 * np.pi / n)
+    polars = np.linspace(0, np.pi, n_polar)
     return np.stack([np.tile(azimuths, len(polars)), np.repeat(polars, n)], axis=1)
 
 

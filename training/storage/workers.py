@@ -115,7 +115,7 @@ def ray_workers(workers: int, address: str | None = None) -> WorkerPool:
         ray: Any = importlib.import_module("ray")
     except ModuleNotFoundError:
         raise InputError(
-            "engine is ray, but the package ray is not installed; run pip install 'thor2-jax[cluster]'"
+            "engine is ray, which is not installed; install it: pip install -c constraints.txt '.[cluster]'"
         ) from None
 
     def run(function: Callable[[A], B], items: Iterable[A]) -> Generator[B, None, None]:

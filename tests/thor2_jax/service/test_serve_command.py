@@ -68,4 +68,4 @@ def test_missing_package_names_the_extra(
     monkeypatch.setattr(sys, "argv", ["thor2", "serve", "--model", str(run_dir)])
     with pytest.raises(SystemExit) as end:
         main()
-    assert end.value.code == 2 and "thor2-jax[serve]" in capsys.readouterr().err
+    assert end.value.code == 2 and "'.[serve]'" in capsys.readouterr().err

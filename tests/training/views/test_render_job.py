@@ -355,7 +355,7 @@ def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest
     assert contents(tmp_path / "views") == before
     monkeypatch.setitem(sys.modules, "ray", None)
     code, _, err = run("--azimuth-step", "180", "--engine", "ray")
-    assert code == 2 and "thor2-jax[cluster]" in err
+    assert code == 2 and "'.[cluster]'" in err
     assert run("--engine", "cloud")[0] == 2
     assert run("--address", "head:6379")[0] == 2
 
