@@ -168,10 +168,14 @@ def test_train_by_folds(meshes: Path, tmp_path: Path, run: Run) -> None:
     (tmp_path / "run" / "views").mkdir()
     (tmp_path / "run" / "views" / "manifest.json").write_bytes(bytes(9))
     before = {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()}
-    for source in (arguments, ("train", "--dataset", tmp_path / "run" / "views", "--out", tmp_path / "run")):
-        code, _, err = run(*source)
-        assert code == 2 and "already contains" in one_line(err)
-        assert {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()} == before
+    code, out, _ = run(*arguments)
+    assert code == 0 and "nothing was trained" in out
+    code, _, err = run("train", "--dataset", tmp_path / "run" / "views", "--out", tmp_path / "run")
+    assert code == 2 and "manifest.json" in one_line(err)
+    for change in (("--epochs", 2), ("--seed", 1), ("--polar-step", 90), ("--leave-out", NAMES[0])):
+        code, _, err = run(*arguments, *change)
+        assert code == 2 and "was written with" in one_line(err)
+    assert {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()} == before
 
 
 def test_train_by_sequences(meshes: Path, tmp_path: Path, run: Run) -> None:

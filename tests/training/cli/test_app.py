@@ -1,0 +1,106 @@
+"""Options that all commands share, and errors of usage."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from helpers import run_thor2
+
+import thor2_jax as thor2
+
+ROOT = Path(__file__).parents[3]
+
+
+def output(*arguments: str, **environment: str) -> str:
+    """Return what a command prints in a process of its own."""
+    command = [sys.executable, "-c", "from training.cli import main; main()", *arguments]
+    return subprocess.run(
+        command, capture_output=True, text=True, check=True, env=os.environ | environment | {"PYTHONPATH": str(ROOT)}
+    ).stdout
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("recognize",),
+        ("trian",),
+        ("render", "--workers", "0", "--meshes", "m", "--out", "o"),
+        ("train", "--out", "o", "--epochs", "many"),
+        ("train", "--out", "o", "--no-such-option"),
+        ("evaluate", "frames"),
+        ("evaluate", "coco", "d"),
+        ("render", "--meshes", "m", "--out", "o", "--engine", "slurm"),
+    ],
+)
+def test_a_usage_error_is_one_line(arguments: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_thor2(*arguments) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and len(err.splitlines()) == 1
+    assert err.startswith("error: ") and err.endswith("--help\n")
+
+
+def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_thor2("--version") == 0
+    assert capsys.readouterr().out == f"thor2 {thor2.__version__}\n"
+    assert re.search(r"path = \"thor2_jax/__init__.py\"", (ROOT / "pyproject.toml").read_text())
+
+
+@pytest.mark.parametrize("arguments", [(), ("-h",), ("evaluate",), ("evaluate", "-h"), ("train", "-h")])
+def test_short_help(arguments: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_thor2(*arguments) == 0
+    assert "Usage:" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", ["train", "render", "demo", "evaluate frames", "evaluate uwis", "evaluate bop"])
+def test_long_commands_can_be_quiet(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_thor2(*command.split(), "--help") == 0
+    assert "--quiet" in capsys.readouterr().out
+
+
+def test_the_demo_has_a_default_directory(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_thor2("demo", "--help") == 0
+    assert "demo-report" in capsys.readouterr().out
+
+
+def test_the_shell_completes_commands() -> None:
+    environment = {"_THOR2_COMPLETE": "complete_bash", "COMP_WORDS": "thor2 re", "COMP_CWORD": "1"}
+    code = "import sys; sys.argv[0] = 'thor2'; from training.cli.app import app; import training.cli; app()"
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        env=os.environ | environment | {"PYTHONPATH": str(ROOT)},
+    )
+    assert done.stdout.split() == ["recognize", "render"], done.stderr
+
+
+def test_help_and_version_import_no_jax() -> None:
+    code = "import training.cli, thor2_jax, sys; sys.exit('jax' in sys.modules or 'scipy' in sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True, env=os.environ | {"PYTHONPATH": str(ROOT)})
+
+
+def test_public_names_are_imported_when_used() -> None:
+    assert set(thor2.__all__) <= set(dir(thor2))
+    for name in thor2.__all__:
+        assert getattr(thor2, name) is not None
+    assert thor2.capacity.POINT_BUCKETS and thor2.export.export_recognizer
+    with pytest.raises(AttributeError, match="no_such_name"):
+        _ = thor2.no_such_name
+
+
+def test_errors_show_control_characters_escaped(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_thor2("train", "--meshes", tmp_path / "a\x1b[2Jb\u202ec", "--out", tmp_path / "run") == 2
+    err = capsys.readouterr().err
+    assert "\x1b" not in err and "\u202e" not in err and r"a\x1b[2Jb\u202ec" in err
+
+
+def test_install_commands_are_those_of_the_documentation() -> None:
+    commands = {
+        match
+        for path in [*ROOT.glob("thor2_jax/**/*.py"), *ROOT.glob("training/**/*.py"), *ROOT.glob("docs/*.md")]
+        for match in re.findall(r"pip install [^`\n]*?'[^']*\[\w+\]'", path.read_text())
+    }
+    assert commands and all(re.fullmatch(r"pip install -c constraints.txt (-e )?'\.\[\w+\]'", c) for c in commands)

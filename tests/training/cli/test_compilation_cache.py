@@ -1,0 +1,70 @@
+"""Compiled programs in the user's cache directory."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from thor2_jax.errors import InputError
+from training.cli.compilation_cache import enable_compilation_cache
+
+ROOT = Path(__file__).parents[3]
+
+COMPILES = """
+from training.cli.compilation_cache import enable_compilation_cache
+enable_compilation_cache()
+import jax, jax.numpy as jnp
+jax.jit(lambda x: jnp.sin(x) @ x.T + 1)(jnp.ones((5, 5))).block_until_ready()
+"""
+
+
+@pytest.fixture
+def environment(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """An environment without a cache, and a user's cache directory."""
+    for name in list(os.environ):
+        if name.startswith(("JAX_", "THOR2_")):
+            monkeypatch.delenv(name)
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
+    return tmp_path / "home" / "thor2-jax" / "xla"
+
+
+def test_programs_are_kept_for_the_next_process(environment: Path) -> None:
+    def run() -> set[str]:
+        variables = os.environ | {"PYTHONPATH": str(ROOT), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
+        done = subprocess.run([sys.executable, "-c", COMPILES], capture_output=True, text=True, env=variables)
+        assert done.returncode == 0 and done.stderr == ""
+        return {path.name for path in environment.glob("*/*-cache")}
+
+    first = run()
+    assert first and run() == first
+
+
+def test_the_cache_can_be_moved_or_disabled(environment: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("THOR2_CACHE", "off")
+    enable_compilation_cache()
+    assert os.environ["JAX_COMPILATION_CACHE_DIR"] == "" and not environment.exists()
+    monkeypatch.setenv("THOR2_CACHE", str(tmp_path / "elsewhere"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("JAX_COMPILATION_CACHE_DIR", "")
+        enable_compilation_cache()
+        assert Path(os.environ["JAX_COMPILATION_CACHE_DIR"]).parent == tmp_path / "elsewhere"
+
+
+def test_a_cache_of_the_environment_is_left_alone(environment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "/mine")
+    enable_compilation_cache()
+    assert os.environ["JAX_COMPILATION_CACHE_DIR"] == "/mine" and not environment.exists()
+
+
+def test_an_unusable_cache_directory(environment: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One that cannot be created is no cache; a file is refused."""
+    monkeypatch.setenv("THOR2_CACHE", "/proc/no-such-directory")
+    enable_compilation_cache()
+    assert os.environ["JAX_COMPILATION_CACHE_DIR"] == ""
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("THOR2_CACHE", str(tmp_path / "file"))
+    with pytest.raises(InputError, match="THOR2_CACHE"):
+        enable_compilation_cache()

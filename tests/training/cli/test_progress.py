@@ -1,0 +1,50 @@
+"""Progress on standard error where it is no terminal, and without any."""
+
+import sys
+import time
+from typing import Any
+
+import pytest
+
+from training.cli import progress
+from training.cli.progress import show_progress
+
+
+def test_lines_come_every_few_seconds(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [100.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    with show_progress() as show:
+        for done in range(41):
+            show("describe", done, 40, "views")
+            now[0] += 1
+        show("describe", 40, 40, "views")
+        show("fit", 7, 9, "")
+    err = capsys.readouterr().err
+    lines = err.splitlines()
+    assert "\x1b" not in err and "\r" not in err
+    assert lines[0] == "describe: 0 of 40, views" and lines[-1] == "fit: 7 of 9"
+    assert len(lines) == 2 + 40 // 5  # one at the start of each stage, and one every five seconds
+    assert "20 of 40" in lines[4] and "20 s left" in lines[4]
+
+
+def test_a_line_is_written_at_once(capsys: pytest.CaptureFixture[str]) -> None:
+    start = time.monotonic()
+    with show_progress() as show:
+        show("render", 0, 10, "")
+        assert capsys.readouterr().err == "render: 0 of 10\n"
+    assert time.monotonic() - start < 1
+
+
+def test_quiet_shows_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    with show_progress(quiet=True) as show:
+        show("render", 0, 10, "")
+        show("render", 10, 10, "")
+    assert capsys.readouterr() == ("", "")
+
+
+def test_a_terminal_gets_bars(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    with show_progress() as show:
+        show("render [red]", 3, 10, "of [/x]")
+    err: Any = capsys.readouterr().err
+    assert "━" in err and "render [red]" in err and "3/10" in err and "of [/x]" in err
