@@ -232,7 +232,7 @@ def _read_image(path: str | Path, argument: str, lossless: bool = False) -> tupl
         # On damaged files, the decoders raise many kinds of exception; nothing but the content can cause them here.
         except Exception as error:
             reason = " ".join(str(error).split()) or type(error).__name__
-            raise InputError(f"{argument}: {path} is no valid image ({reason}); expected {expected}") from None
+            raise InputError(f"{argument}: {path} is damaged or no image ({reason}); expected {expected}") from None
 
 
 def read_color(path: str | Path) -> NDArray[np.uint8]:

@@ -198,10 +198,10 @@ def test_train_by_sequences(meshes: Path, tmp_path: Path, run: Run) -> None:
     table.write_text(json.dumps({"b": [cereal, soup], "c": [soup, mug]}))
     for change in (("--epochs", 2), ("--batch-size", 8), ("--seed", 1), ("--folds", 2), ("--classifiers", "ce,tops")):
         code, _, err = run(*arguments, *change)
-        assert code == 2 and "b holds a run that was trained with" in one_line(err)
+        assert code == 2 and "b was written with" in one_line(err)
     assert sorted(out.rglob("*")) == before
     cases = {
-        json.dumps({"b": [cereal, mug]}): "b holds a run that was trained with dataset",
+        json.dumps({"b": [cereal, mug]}): "b was written with dataset",
         "{}": "has no sequence",
         '{"c": ["dragon"]}': "no class dragon",
         '{"c": "mug"}': "c is 'mug'",

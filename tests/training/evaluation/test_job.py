@@ -170,18 +170,82 @@ def test_page_for_datasets_of_any_size(tmp_path: Path, n: int) -> None:
             assert max(image.size) <= 2000
 
 
-def test_page_without_described_or_known_instances(tmp_path: Path) -> None:
-    for name, truth in (("undescribed", {1: "mug"}), ("unknown", {1: "dragon"})):
-        frame = thor2.RGBDFrame(
-            np.zeros((8, 8, 3), np.uint8),
-            np.zeros((8, 8), np.uint16),
-            np.zeros((8, 8), np.uint8),
-            thor2.Intrinsics(1.0, 1.0, 0.0, 0.0),
-        )
-        dataset = OneFrame(LabelledFrame("f", frame, truth, {}))
-        description = {"kind": "frames", "path": name}
-        evaluate_dataset(toys(tmp_path / "log"), dataset, description, tmp_path / name)
-        assert ParsedPage((tmp_path / name / "report.html").read_text()).open == []
+def evaluate_empty_frame(tmp_path: Path, name: str) -> Path:
+    """Evaluate a frame without pixels of its only object, which has this name."""
+    frame = thor2.RGBDFrame(
+        np.zeros((8, 8, 3), np.uint8),
+        np.zeros((8, 8), np.uint16),
+        np.zeros((8, 8), np.uint8),
+        thor2.Intrinsics(1.0, 1.0, 0.0, 0.0),
+    )
+    dataset = OneFrame(LabelledFrame("f", frame, {1: name}, {}))
+    evaluate_dataset(toys(tmp_path / "log"), dataset, {"kind": "frames", "path": name}, tmp_path / name)
+    return tmp_path / name
+
+
+def test_page_without_described_instances(tmp_path: Path) -> None:
+    report = evaluate_empty_frame(tmp_path, "mug")
+    assert ParsedPage((report / "report.html").read_text()).open == []
+
+
+def test_an_evaluation_without_known_objects_is_refused(tmp_path: Path) -> None:
+    """The message has the names of the dataset and of the runs."""
+    with pytest.raises(InputError, match="dragon.*bowl, can, mug"):
+        evaluate_empty_frame(tmp_path, "dragon")
+    assert not (tmp_path / "dragon" / "report.json").exists()
+
+
+class FileDataset(ToyDataset):
+    """Toy frames that say they are read from one file each."""
+
+    def __init__(self, directory: Path, n: int) -> None:
+        super().__init__(n)
+        self._directory = directory
+        for number in range(n):
+            (directory / f"{number}.png").write_bytes(bytes([number]))
+
+    def files(self, number: int) -> list[Path]:
+        return [self._directory / f"{number}.png"]
+
+
+def test_answers_for_changed_files_are_refused(tmp_path: Path) -> None:
+    """The message names the file; unchanged files are no reason to recompute anything."""
+    dataset, description, log = FileDataset(tmp_path, 3), {"kind": "frames", "path": "toys"}, tmp_path / "log"
+    report = tmp_path / "report"
+    first = evaluate_dataset(toys(log), dataset, description, report)
+    answers = (report / "answers.jsonl").read_bytes()
+    assert without_times(evaluate_dataset(toys(log), dataset, description, report)) == without_times(first)
+    for content in (b"changed", None):
+        if content is None:
+            (tmp_path / "1.png").unlink()
+        else:
+            (tmp_path / "1.png").write_bytes(content)
+        with pytest.raises(InputError, match=r"^out: .*1\.png"):
+            evaluate_dataset(toys(log), dataset, description, report)
+    (tmp_path / "1.png").write_bytes(bytes([1]))
+    lines = [json.loads(line) for line in answers.splitlines()]
+    for line in lines[1:]:
+        del line["files"]  # as version 0.1.0 wrote them
+    (report / "answers.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    evaluate_dataset(toys(log), dataset, description, report)
+
+
+def test_leftovers_of_a_kill_are_removed(tmp_path: Path) -> None:
+    evaluate_toys(tmp_path, 2)
+    for name in (".report.ab12_xyz.json", "frames/.0.12345678.jpg"):
+        (tmp_path / "report" / name).touch()
+    evaluate_toys(tmp_path, 2)
+    assert not [path for path in (tmp_path / "report").rglob(".*") if path.name != LOCK]
+
+
+def test_an_unreadable_first_frame_leaves_no_directory(tmp_path: Path) -> None:
+    class Unreadable(ToyDataset):
+        def __getitem__(self, number: int) -> LabelledFrame:
+            raise InputError("color.png is damaged")
+
+    with pytest.raises(InputError, match="damaged"):
+        evaluate_dataset(toys(tmp_path / "log"), Unreadable(2), {"kind": "frames", "path": "t"}, tmp_path / "report")
+    assert not (tmp_path / "report").exists()
 
 
 def test_outlines_show_correct_and_incorrect_answers(tmp_path: Path) -> None:

@@ -414,7 +414,7 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     assert run_thor2("evaluate", "bop", dataset, *model, *options) == 0
     assert "5 instances scored" in capsys.readouterr().out
     assert json.loads((tmp_path / "report" / "report.json").read_text())["instances"]["scored"] == 5
-    assert run_thor2("evaluate", "bop", dataset, *model) == 0  # without names, all objects are unknown
-    assert "5 are of no class" in capsys.readouterr().out
+    assert run_thor2("evaluate", "bop", dataset, *model) == 2  # without names, all objects are unknown
+    assert "obj_000001" in capsys.readouterr().err
     assert run_thor2("evaluate", "bop", tmp_path / "absent", *model) == 2
     assert capsys.readouterr().err == f"error: dataset: {tmp_path / 'absent'} is no folder\n"
