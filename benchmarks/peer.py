@@ -1,7 +1,7 @@
-"""The same descriptor from the libraries that one would pick otherwise, one cloud at a time, in float64.
+"""The same descriptor computed with common libraries, one cloud at a time, in float64.
 
-Open3D's oriented box (PCA of the convex hull) and OpenCV's minimum-area rectangle for view normalization, NumPy loops
-over slices and strips, persim's PersistenceImager, NumPy colour matrices. The equations are those of the product.
+View normalization uses Open3D's oriented box (PCA of the convex hull) and OpenCV's minimum-area rectangle. NumPy loops
+over slices and strips, persim's PersistenceImager and NumPy matrices compute the rest by the same equations.
 """
 
 import math
@@ -21,7 +21,7 @@ N_SLICES, N_STRIPS = 7, 31
 
 
 class Peer:
-    """Descriptor of one cloud after another."""
+    """Describes clouds one by one."""
 
     def __init__(self) -> None:
         cv2.setNumThreads(1)
@@ -35,7 +35,7 @@ class Peer:
         )
 
     def normalize(self, xyz: NDArray[np.float32]) -> NDArray[np.float64]:
-        """View normalization of [n, 3] metres seen from the origin; [n, 3] scaled units."""
+        """Return the view-normalized points [n, 3], scaled units, of points [n, 3] in metres, camera at the origin."""
         points = xyz.astype(np.float64) * SIGMA_S
         cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
         box = cloud.get_oriented_bounding_box()
@@ -60,14 +60,14 @@ class Peer:
         return turned - turned.min(axis=0)
 
     def describe(self, xyz: NDArray[np.float32], rgb: NDArray[np.uint8]) -> tuple[NDArray[np.float64], ...]:
-        """TOPS [7168] and TOPS2 [11942] of one cloud."""
+        """Return TOPS [7168] and TOPS2 [11942] of one cloud."""
         p = self.normalize(xyz)
         c, s = math.cos(math.pi / 4), math.sin(math.pi / 4)
         p = np.stack([c * p[:, 0] - s * p[:, 2], p[:, 1], s * p[:, 0] + c * p[:, 2]], axis=1)
         return self.describe_aligned(p - p.min(axis=0), rgb)
 
     def describe_aligned(self, p: NDArray[np.float64], rgb: NDArray[np.uint8]) -> tuple[NDArray[np.float64], ...]:
-        """TOPS [7168] and TOPS2 [11942] of one aligned cloud [n, 3], scaled units."""
+        """Return TOPS [7168] and TOPS2 [11942] of one aligned cloud [n, 3] in scaled units."""
         weights = self.network.membership(rgb)
         level, strip = np.floor(p[:, 2] / SIGMA_1).astype(int), np.floor(p[:, 0] / SIGMA_2).astype(int)
         images, embeddings = np.zeros((N_SLICES, 32, 32)), np.zeros((N_SLICES, 22, N_STRIPS))

@@ -1,7 +1,7 @@
-"""Clouds a second on an accelerator, and the share of its limits that is reached: `python -m benchmarks.run_gpu`.
+"""Throughput on an accelerator, absolute and relative to its limits: `python -m benchmarks.run_gpu`.
 
-Prints one table and writes gpu.json with the device's name. XLA's cost analysis counts bytes and operations of the
-compiled functions; the limits are those of the device, from a table below.
+Prints a table and writes gpu.json with the name of the device. XLA's cost analysis counts the bytes and operations of
+the compiled functions; `LIMITS` holds the limits of the device.
 """
 
 import argparse
@@ -17,23 +17,23 @@ from benchmarks.clouds import sample_clouds
 from benchmarks.timing import time_calls
 
 LIMITS = {"NVIDIA H200": (4.8e12, 67e12)}
-"""Device -> bytes a second of its memory, float32 operations a second outside tensor cores (the maker's data sheet)."""
+"""Device -> memory bandwidth in bytes/s, and float32 operations/s without tensor cores, from its data sheet."""
 
 BATCH, N_POINTS = 4096, 2048
 
 
 def cost(function: Any, *arguments: Any) -> tuple[float, float]:
-    """Bytes and operations of one call, counted by XLA; a gudhi callback is not in them."""
-    found = jax.jit(function).lower(*arguments).compile().cost_analysis() or {}
-    return float(found.get("bytes accessed", 0.0)), float(found.get("flops", 0.0))
+    """Return the bytes and operations of one call as counted by XLA, without the gudhi callback."""
+    analysis = jax.jit(function).lower(*arguments).compile().cost_analysis() or {}
+    return float(analysis.get("bytes accessed", 0.0)), float(analysis.get("flops", 0.0))
 
 
 def main() -> None:
-    """Measure, print, write."""
+    """Measure both backends, print the table and write the file."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
     parser.add_argument("--clouds", type=int, default=BATCH)
-    parser.add_argument("--any-device", action="store_true", help="a CPU too, to try the command")
+    parser.add_argument("--any-device", action="store_true", help="accept a CPU, to try the command")
     options = parser.parse_args()
     device = jax.devices()[0]
     if device.platform == "cpu" and not options.any_device:
@@ -54,8 +54,8 @@ def main() -> None:
             for count, limit in ((size, memory), (operations, arithmetic))
         ]
         rate = len(clouds) / timing.median
-        told = [f"{share:.1%}" if share is not None else "unknown" for share in shares]
-        print(f"{homology:12s} {rate:12,.0f} {timing.first:13.1f} {told[0]:>10s} {told[1]:>14s}")
+        percentages = [f"{share:.1%}" if share is not None else "unknown" for share in shares]
+        print(f"{homology:12s} {rate:12,.0f} {timing.first:13.1f} {percentages[0]:>10s} {percentages[1]:>14s}")
         rows[homology] = {
             "clouds_per_s": rate,
             "first_call_s": timing.first,

@@ -1,8 +1,8 @@
-"""The service under load over loopback: `python -m benchmarks.run_service [--out FILE] [--soak N]`.
+"""Load test of the service over loopback: `python -m benchmarks.run_service [--out FILE] [--soak N]`.
 
-Frames of six objects: a plain loop, callers one after another, then requests at a fixed rate that waits for no answer
-(latency counts from when a request was due), and twice the highest rate whose p99 stays under 250 ms. Options that are
-not known here go to `thor2 serve`.
+Measures frames of six objects in a plain loop, with callers that wait for each answer, with requests at fixed rates
+(latency counts from the due time), and at twice the highest rate with a 99th percentile below 250 ms. Other options
+are passed to `thor2 serve`.
 """
 
 import argparse
@@ -41,34 +41,34 @@ Files = dict[str, bytes]
 
 
 def make_run(folder: Path) -> None:
-    """A run with random weights: the way is what is measured."""
+    """Write a run directory with random weights, since accuracy does not matter here."""
     config, network = thor2.DescriptorConfig(homology="closed_form"), colornet.load_default()
     classifiers = {name: MLP(input_size(name, config, network.n_regions), 17, rngs=nnx.Rngs(0)) for name in FEATURES}
     save_run(TrainedRun(config, network, tuple(map(str, range(17))), classifiers, {}), folder)
 
 
 def make_frames(count: int, n_objects: int) -> list[Files]:
-    """Rendered frames of 640 x 480, as files."""
+    """Return rendered frames of 640 x 480 as the bytes of their files."""
 
     def png(image: Any) -> bytes:
         stream = io.BytesIO()
         Image.fromarray(image).save(stream, "PNG")
         return stream.getvalue()
 
-    objects, found, seed = builtin_objects(), [], 0
-    while len(found) < count:
+    objects, frames, seed = builtin_objects(), [], 0
+    while len(frames) < count:
         frame = compose_scene(objects, np.random.default_rng(seed), n_objects=n_objects).frame
         seed += 1
         if len(frame.instances) == n_objects:
             camera = {name: getattr(frame.intrinsics, name) for name in ("fx", "fy", "cx", "cy", "depth_scale")}
             images = {name: png(getattr(frame, name)) for name in ("color", "depth")}
-            found.append(
+            frames.append(
                 {**images, "labels": png(frame.labels.astype(np.uint8)), "intrinsics": json.dumps(camera).encode()}
             )
-    return found
+    return frames
 
 
-def spread(milliseconds: list[float]) -> dict[str, float]:
+def percentiles(milliseconds: list[float]) -> dict[str, float]:
     return {f"p{p}_ms": round(float(np.percentile(milliseconds, p)), 1) if milliseconds else 0.0 for p in (50, 99)}
 
 
@@ -81,11 +81,11 @@ def plain_loop(run: Path, frames: list[Files], calls: int) -> dict[str, float]:
         start = time.perf_counter()
         recognizer.recognize(decode_frame(**frames[k % len(frames)]))
         times.append((time.perf_counter() - start) * 1e3)
-    return {"frames_per_s": round(1e3 * calls / sum(times), 1), **spread(times)}
+    return {"frames_per_s": round(1e3 * calls / sum(times), 1), **percentiles(times)}
 
 
 class Server:
-    """`thor2 serve` on a free port."""
+    """A process of `thor2 serve` on a free port."""
 
     def __init__(self, run: Path, *options: str) -> None:
         with socket.create_server(("127.0.0.1", 0)) as free:
@@ -100,16 +100,16 @@ class Server:
                 break
             except OSError:
                 if self.process.poll() is not None:
-                    raise RuntimeError("the server ended") from None
+                    raise RuntimeError("the server exited before it was ready") from None
         self.ready_after = time.monotonic() - start
 
     def get(self, path: str) -> str:
-        """Text of a page."""
+        """Return the text at a path."""
         with urllib.request.urlopen(f"http://127.0.0.1:{self.port}{path}", timeout=10) as answer:
             return answer.read().decode()
 
     def memory(self) -> float:
-        """MiB of the server and the processes it started, shared pages counted once (Pss)."""
+        """Return the memory of the server and its subprocesses in MiB, with shared pages counted once (PSS)."""
         total, waiting = 0, [self.process.pid]
         while waiting:
             pid = waiting.pop()
@@ -120,13 +120,13 @@ class Server:
         return round(total / 1024, 1)
 
     def stop(self) -> None:
-        """Ask it to end, and wait."""
+        """Terminate the server and wait until it has exited."""
         self.process.send_signal(signal.SIGTERM)
         self.process.wait(60)
 
 
-async def ask(port: int, request: bytes) -> int:
-    """Status of one request on a connection of its own; 0 if there was no whole answer."""
+async def request_status(port: int, request: bytes) -> int:
+    """Return the status of one request on a new connection, 0 if the answer is incomplete."""
     try:
         reader, writer = await asyncio.open_connection("127.0.0.1", port)
         writer.write(request)
@@ -139,29 +139,29 @@ async def ask(port: int, request: bytes) -> int:
         return 0
 
 
-async def callers(port: int, requests: list[bytes], count: int, at_once: int) -> dict[str, Any]:
-    """`at_once` callers, each waiting for its answer before it asks again."""
+async def closed_loop(port: int, requests: list[bytes], count: int, at_once: int) -> dict[str, Any]:
+    """Measure requests from `at_once` callers that wait for each answer before the next request."""
     times, statuses, numbers = [], Counter[int](), iter(range(count))
 
     async def caller() -> None:
         for k in numbers:
             start = time.perf_counter()
-            statuses[await ask(port, requests[k % len(requests)])] += 1
+            statuses[await request_status(port, requests[k % len(requests)])] += 1
             times.append((time.perf_counter() - start) * 1e3)
 
     start = time.perf_counter()
     await asyncio.gather(*(caller() for _ in range(at_once)))
     rate = count / (time.perf_counter() - start)
-    return {"callers": at_once, "frames_per_s": round(rate, 1), **spread(times), "statuses": dict(statuses)}
+    return {"callers": at_once, "frames_per_s": round(rate, 1), **percentiles(times), "statuses": dict(statuses)}
 
 
-async def at_rate(port: int, requests: list[bytes], rate: float, seconds: float) -> dict[str, Any]:
-    """Requests at a fixed rate, whatever happens to earlier ones."""
+async def open_loop(port: int, requests: list[bytes], rate: float, seconds: float) -> dict[str, Any]:
+    """Measure requests at a fixed rate that does not depend on the answers."""
     accepted, statuses = [], Counter[int]()
 
     async def one(k: int, due: float) -> None:
         await asyncio.sleep(due - time.perf_counter())
-        status = await ask(port, requests[k % len(requests)])
+        status = await request_status(port, requests[k % len(requests)])
         statuses[status] += 1
         if status == 200:
             accepted.append((time.perf_counter() - due) * 1e3)
@@ -172,24 +172,26 @@ async def at_rate(port: int, requests: list[bytes], rate: float, seconds: float)
     return {
         "rate": rate,
         "answered_per_s": round(len(accepted) / elapsed, 1),
-        **spread(accepted),
+        **percentiles(accepted),
         "statuses": dict(statuses),
     }
 
 
-def sustained(found: dict[str, Any]) -> bool:
-    return set(found["statuses"]) == {200} and found["p99_ms"] < LIMIT_MS
+def sustained(result: dict[str, Any]) -> bool:
+    return set(result["statuses"]) == {200} and result["p99_ms"] < LIMIT_MS
 
 
 def main() -> None:
-    """Measure, print, write."""
+    """Measure the service, print the figures and write the file."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, help="JSON file for the figures")
-    parser.add_argument("--seconds", type=float, default=4.0, help="of each rate")
+    parser.add_argument("--seconds", type=float, default=4.0, help="duration of each rate")
     parser.add_argument("--rates", type=float, nargs="+", default=RATES)
-    parser.add_argument("--soak", type=int, default=0, help="instead, so many frames of one object, with the memory")
+    parser.add_argument(
+        "--soak", type=int, default=0, help="instead, measure the memory during this many frames of one object"
+    )
     options, serve_options = parser.parse_known_args()
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # so that the server ends with this
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # exit through `finally`, which stops the server
     with tempfile.TemporaryDirectory() as folder:
         run = Path(folder) / "run"
         make_run(run)
@@ -203,7 +205,7 @@ def main() -> None:
         server = Server(run, *serve_options)
         try:
             print(f"ready after {server.ready_after:.1f} s")
-            asyncio.run(callers(server.port, requests, 32, 4))
+            asyncio.run(closed_loop(server.port, requests, 32, 4))
             if options.soak:
                 result["soak"] = soak(server, requests, options.soak)
             else:
@@ -226,29 +228,29 @@ def multipart_request(files: Files) -> bytes:
 def measure(server: Server, requests: list[bytes], rates: list[float], seconds: float) -> dict[str, Any]:
     result: dict[str, Any] = {"service": [], "rates": []}
     for at_once in (1, 8):
-        result["service"].append(asyncio.run(callers(server.port, requests, 100, at_once)))
+        result["service"].append(asyncio.run(closed_loop(server.port, requests, 100, at_once)))
         print("service", result["service"][-1])
     for rate in rates:
-        result["rates"].append(asyncio.run(at_rate(server.port, requests, rate, seconds)))
+        result["rates"].append(asyncio.run(open_loop(server.port, requests, rate, seconds)))
         print("rate", result["rates"][-1])
         if not sustained(result["rates"][-1]):
             break
-    highest = max((found["rate"] for found in result["rates"] if sustained(found)), default=rates[0])
+    highest = max((row["rate"] for row in result["rates"] if sustained(row)), default=rates[0])
     result["sustained_rate"] = highest
-    result["twice"] = asyncio.run(at_rate(server.port, requests, 2 * highest, seconds))
+    result["twice"] = asyncio.run(open_loop(server.port, requests, 2 * highest, seconds))
     print("twice", result["twice"])
     return result
 
 
 def soak(server: Server, requests: list[bytes], count: int) -> dict[str, Any]:
-    before, parts, statuses = server.memory(), [], Counter[int]()
+    before, memory, statuses = server.memory(), [], Counter[int]()
     print(f"0 requests: {before} MiB")
     for done in range(0, count, count // 10):
-        found = asyncio.run(callers(server.port, requests, count // 10, 8))
-        statuses.update(found["statuses"])
-        parts.append(server.memory())
-        print(f"{done + count // 10} requests: {parts[-1]} MiB, {found['frames_per_s']} frames/s")
-    return {"requests": count, "statuses": dict(statuses), "mib_before": before, "mib": parts}
+        load = asyncio.run(closed_loop(server.port, requests, count // 10, 8))
+        statuses.update(load["statuses"])
+        memory.append(server.memory())
+        print(f"{done + count // 10} requests: {memory[-1]} MiB, {load['frames_per_s']} frames/s")
+    return {"requests": count, "statuses": dict(statuses), "mib_before": before, "mib": memory}
 
 
 if __name__ == "__main__":

@@ -1,15 +1,15 @@
-"""THOR2-L: learn the descriptor's numbers together with the classifiers that read it, and compare it with THOR2.
+"""THOR2-L: learn parameters of the descriptor together with the classifiers, and compare it with THOR2.
 
-Delta (kept a similarity), the variance of the persistence images and the exponent of their weight are learned by
-gradients of the loss of both classifiers; THOR2 is trained by the same steps with these numbers held. Same synthetic
-views, seeds and epochs, then scenes that training never saw:
-`python examples/learn_descriptor.py [--out FOLDER]` trains on built-in objects, and
+Gradients of the loss of both classifiers update Delta (as a similarity matrix), the variance of the persistence images
+and the exponent of their weight. THOR2 is trained by the same steps with these parameters fixed, on the same synthetic
+views and with the same seeds and epochs. Both are evaluated on scenes that are not used in training.
+`python examples/learn_descriptor.py [--out DIRECTORY]` trains on built-in objects, and
 
     python examples/learn_descriptor.py --meshes MESHES --names names.json --azimuth-step 20 --polar-step 15 \
         --epochs 5 --evaluate-uwis DATASET --evaluate-frames FRAMES
 
-on scans. What was learned becomes the config and the colour network of an ordinary run, FOLDER/thor2-l, for
-`thor2 recognize --model`.
+trains on scans. The learned parameters are saved in the config and the colour network of the run directory
+DIRECTORY/thor2-l, for `thor2 recognize --model`.
 """
 
 import argparse
@@ -55,22 +55,22 @@ CONFIG = thor2.DescriptorConfig(homology="closed_form")
 PAIRS = np.triu_indices(NETWORK.n_regions, 1)
 
 RATE = 0.01
-"""Largest step of Adam for what is learned, with a cosine decay; all of it is logarithms or logits."""
+"""Initial learning rate of the descriptor's parameters (logarithms and logits), with a cosine decay."""
 
 N_SCENES, LIGHT = 20, 0.4
-"""Scenes of built-in objects, and how much brighter or darker than the training views they are at most."""
+"""Number of scenes of built-in objects, and their largest relative change of brightness."""
 
 LOOK_ALIKES = sorted({name for pair in COLOR_PAIRS + SHAPE_PAIRS for name in pair})
-"""The built-in objects that differ from another one in colour alone or in shape alone."""
+"""The built-in objects that differ from another one only in colour or only in shape."""
 
 
-class Free(NamedTuple):
-    """What is learned of the descriptor, without bounds.
+class LearnedValues(NamedTuple):
+    """The learned parameters of the descriptor, transformed to be unbounded.
 
     Attributes:
         similarity: logits of Delta above the diagonal.
-        image_variance: logarithm.
-        persistence_weight: logarithm.
+        image_variance: logarithm of the variance.
+        persistence_weight: logarithm of the exponent.
     """
 
     similarity: jax.Array
@@ -78,14 +78,14 @@ class Free(NamedTuple):
     persistence_weight: jax.Array
 
     @classmethod
-    def start(cls) -> "Free":
-        """The paper's numbers."""
+    def start(cls) -> "LearnedValues":
+        """Return the values of the paper."""
         delta = NETWORK.similarity[PAIRS]
         numbers = (np.log(delta / (1 - delta)), np.log(CONFIG.image_variance), np.log(CONFIG.persistence_weight))
         return cls(*(jnp.asarray(values, jnp.float32) for values in numbers))
 
     def parameters(self) -> thor2.Parameters:
-        """A symmetric Delta in (0, 1) with diagonal 1, and positive numbers."""
+        """Return parameters with a symmetric Delta in (0, 1) with diagonal 1, and positive other values."""
         upper = jnp.zeros((NETWORK.n_regions,) * 2).at[PAIRS].set(jax.nn.sigmoid(self.similarity))
         return dataclasses.replace(
             thor2.Parameters.of(NETWORK, CONFIG),
@@ -96,29 +96,29 @@ class Free(NamedTuple):
 
 
 class State(NamedTuple):
-    """All that training changes: of each classifier weights and batch statistics; the descriptor; Adam's state."""
+    """The state of the training: weights and batch statistics of the classifiers, the descriptor, and Adam's state."""
 
     weights: dict[str, Any]
     rest: dict[str, Any]
-    free: Free
+    free: LearnedValues
     optimizer: Any
 
 
-def described(batch: Batch, free: Free) -> thor2.Descriptors:
-    """Descriptors of a batch of samples."""
+def described(batch: Batch, free: LearnedValues) -> thor2.Descriptors:
+    """Return the descriptors of a batch of samples."""
     strips = expand(batch, region_sets(NETWORK).weights, CONFIG)
     return thor2.describe_strips(strips, NETWORK, CONFIG, free.parameters())
 
 
 @partial(jax.jit, static_argnums=0, donate_argnums=1)
 def train_step(graphs: Any, state: State, batch: Batch, rates: tuple[Any, Any], key: jax.Array) -> State:
-    """One step of Adam on the sum of both classifiers' losses; `rates` are for the weights and for what is free."""
+    """Make one step of Adam on the sum of both losses; `rates` are those of the weights and of the descriptor."""
 
-    def loss_of(weights: dict[str, Any], free: Free) -> Any:
-        found, loss, rest = described(batch, free), jnp.zeros(()), {}
+    def loss_of(weights: dict[str, Any], free: LearnedValues) -> Any:
+        descriptors, loss, rest = described(batch, free), jnp.zeros(()), {}
         for name, graph in graphs:
             model = nnx.merge(graph, weights[name], state.rest[name], copy=True)
-            logits = model(feature_of(found, name), train=True, rngs=nnx.Rngs(dropout=key))
+            logits = model(feature_of(descriptors, name), train=True, rngs=nnx.Rngs(dropout=key))
             loss += optax.softmax_cross_entropy_with_integer_labels(logits, batch.label).mean()
             rest[name] = nnx.state(model, nnx.Not(nnx.Param))
         return loss, rest
@@ -134,7 +134,7 @@ def train_step(graphs: Any, state: State, batch: Batch, rates: tuple[Any, Any], 
 
 
 def train(samples: Samples, options: FitOptions, learn: bool) -> TrainedRun:
-    """Train both classifiers, and the descriptor with them if `learn`."""
+    """Train both classifiers, and the descriptor too if `learn`."""
     graphs: list[Any] = []
     weights: dict[str, Any] = {}
     rest: dict[str, Any] = {}
@@ -146,7 +146,7 @@ def train(samples: Samples, options: FitOptions, learn: bool) -> TrainedRun:
         split: Any = nnx.split(model, nnx.Param, ...)
         graph, weights[name], rest[name] = split
         graphs.append((name, graph))
-    free = Free.start()
+    free = LearnedValues.start()
     state = State(weights, rest, free, optax.adam(1.0).init((weights, free)))
 
     rng, key = np.random.default_rng(options.seed), jax.random.key(options.seed)
@@ -161,45 +161,47 @@ def train(samples: Samples, options: FitOptions, learn: bool) -> TrainedRun:
             step = epoch * n_steps + number
             state = train_step(tuple(graphs), state, batch, (rate, decay(step)), jax.random.fold_in(key, step))
 
-    found = state.free.parameters()
-    # Read again as float32, these are the numbers that the classifiers were trained with.
+    parameters = state.free.parameters()
+    # Converted to float32, these are the values that the classifiers were trained with.
     config = dataclasses.replace(
         CONFIG,
-        image_variance=float(found.image_variance),
-        persistence_weight=float(found.persistence_weight),
+        image_variance=float(parameters.image_variance),
+        persistence_weight=float(parameters.persistence_weight),
     )
-    network = dataclasses.replace(NETWORK, similarity=np.asarray(found.similarity, np.float64))
+    network = dataclasses.replace(NETWORK, similarity=np.asarray(parameters.similarity, np.float64))
     classifiers = {name: nnx.merge(graph, state.weights[name], state.rest[name]) for name, graph in graphs}
     record = {"epochs": options.epochs, "seed": options.seed, "learned": learn}
     return TrainedRun(config, network, samples.classes, classifiers, record)
 
 
 def arguments() -> tuple[argparse.ArgumentParser, argparse.Namespace]:
-    """The command line, checked."""
+    """Parse and check the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=Path("learn-descriptor"), help="folder of picture and run")
-    parser.add_argument("--seeds", type=int, default=3, help="each is one training of THOR2 and one of THOR2-L")
+    parser.add_argument(
+        "--out", type=Path, default=Path("learn-descriptor"), help="directory for the picture and the run"
+    )
+    parser.add_argument("--seeds", type=int, default=3, help="number of trainings of THOR2 and of THOR2-L")
     parser.add_argument("--epochs", type=int, default=3)
     parser.add_argument("--azimuth-step", type=float, default=40.0, help="degrees between training views")
     parser.add_argument("--polar-step", type=float, default=45.0, help="degrees between training views")
-    parser.add_argument("--meshes", type=Path, help="folder of meshes, in place of the built-in objects")
+    parser.add_argument("--meshes", type=Path, help="directory of meshes, instead of the built-in objects")
     parser.add_argument("--names", type=Path, help="table: object name -> mesh (default: all meshes)")
-    parser.add_argument("--evaluate-uwis", type=Path, nargs="+", default=[], help="in UW-IS Occluded's layout")
-    parser.add_argument("--evaluate-frames", type=Path, nargs="+", default=[], help="folders of labelled frames")
+    parser.add_argument(
+        "--evaluate-uwis", type=Path, nargs="+", default=[], help="datasets in the layout of UW-IS Occluded"
+    )
+    parser.add_argument("--evaluate-frames", type=Path, nargs="+", default=[], help="directories of labelled frames")
     options = parser.parse_args()
     if options.seeds < 1:
-        parser.error(f"--seeds is {options.seeds}; it must be at least 1")
+        parser.error(f"--seeds is {options.seeds}; expected at least 1")
     if (options.meshes is None) != (not options.evaluate_uwis and not options.evaluate_frames):
-        parser.error(
-            "--meshes goes with --evaluate-uwis or --evaluate-frames: built-in objects have scenes of their own"
-        )
+        parser.error("--meshes and one of --evaluate-uwis and --evaluate-frames need each other; give both or neither")
     if options.names and options.meshes is None:
-        parser.error("--names goes with --meshes")
+        parser.error("--names needs --meshes")
     return parser, options
 
 
-def trials(options: argparse.Namespace) -> tuple[Mapping[str, Any], dict[str, Iterable[LabelledFrame]]]:
-    """The objects to train on, and the sets of frames to compare on."""
+def load_sets(options: argparse.Namespace) -> tuple[Mapping[str, Any], dict[str, Iterable[LabelledFrame]]]:
+    """Return the objects to train on and the sets of frames to evaluate on."""
     if options.meshes is None:
         every = builtin_objects()
         objects = {name: every[name] for name in LOOK_ALIKES}
@@ -212,7 +214,7 @@ def trials(options: argparse.Namespace) -> tuple[Mapping[str, Any], dict[str, It
 
 
 def main() -> None:
-    """Train, compare, print the figures, draw a picture."""
+    """Train and evaluate both, print the accuracies and draw a picture."""
     parser, options = arguments()
     try:
         fits = [FitOptions(epochs=options.epochs, seed=seed) for seed in range(options.seeds)]
@@ -223,12 +225,12 @@ def main() -> None:
 
 
 def compare(options: argparse.Namespace, fits: Sequence[FitOptions]) -> None:
-    """Everything after the check of the arguments."""
+    """Train, evaluate and report with checked options."""
     start = time.perf_counter()
-    objects, sets = trials(options)
+    objects, sets = load_sets(options)
     for title, frames in sets.items():
         if not any(name in objects for item in frames for name in item.truth.values()):
-            raise thor2.InputError(f"{title}: none of its names is among those of the objects to train on")
+            raise thor2.InputError(f"{title} contains none of the objects to train on; expected at least one")
     source = MemoryViews(render_views(objects, options.azimuth_step, options.polar_step), CONFIG)
     samples = build_samples(source, NETWORK, CONFIG)
     print(f"{len(samples)} samples of {len(objects)} objects, {time.perf_counter() - start:.0f} s", flush=True)
@@ -237,10 +239,10 @@ def compare(options: argparse.Namespace, fits: Sequence[FitOptions]) -> None:
     names = list(fusions(THOR2))
     accuracy: dict[str, dict[str, list[list[float]]]] = {title: {name: [] for name in runs} for title in sets}
     for fit in fits:
-        for name, found in runs.items():
-            found.append(train(samples, fit, learn=name == "THOR2-L"))
+        for name, trained in runs.items():
+            trained.append(train(samples, fit, learn=name == "THOR2-L"))
             for title, frames in sets.items():
-                run = Run(name, "", thor2.Recognizer(found[-1]))
+                run = Run(name, "", thor2.Recognizer(trained[-1]))
                 results = compute_results("frames", [run], [answers for _, answers in answer_frames([run], frames)])
                 cell = results["accuracy"][results["rule"]][0]["cells"][0]
                 accuracy[title][name].append([cell["accuracy"][fusion]["mean"] for fusion in names])
@@ -259,7 +261,7 @@ def compare(options: argparse.Namespace, fits: Sequence[FitOptions]) -> None:
 
 
 def report(names: Sequence[str], accuracy: Mapping[str, Mapping[str, Any]], learned: Sequence[TrainedRun]) -> None:
-    """Print mean and deviation over the seeds, and what was learned."""
+    """Print mean and standard deviation of the accuracies over the seeds, and the learned parameters."""
     print(f"{'accuracy':44}" + "".join(f"{name:>16}" for name in names))
     for title, runs in accuracy.items():
         for name, rows in runs.items():
@@ -277,7 +279,7 @@ def report(names: Sequence[str], accuracy: Mapping[str, Mapping[str, Any]], lear
 
 
 def draw(batch: Batch, learned: TrainedRun, accuracy: Mapping[str, Mapping[str, Any]], column: int, path: Path) -> None:
-    """Delta, a persistence image and the accuracies, before and after."""
+    """Draw Delta, a persistence image and the accuracies, before and after."""
     figure = Figure(figsize=(12, 7.5), layout="constrained")
     FigureCanvasAgg(figure)
     upper, lower = figure.subfigures(2, 1, height_ratios=(1.2, 1))

@@ -1,10 +1,10 @@
-"""Refine a view normalization by gradient descent, so that a partly hidden cloud meets its stored descriptor.
+"""Refine the view normalization of occluded clouds by gradient descent on the difference to a stored descriptor.
 
-Of every built-in object one clean view's relaxed descriptor is stored. Then the far end of the view is hidden, depth
-and colour get noise, and the minimal box of what is left gives another frame. From there a small rotation and a shift
-of the normalized cloud descend on the difference to the stored descriptor. What is hidden must not count: in each
-slice's block only the columns whose strips lie wholly before the cut do (the paper's object unity, strip by strip):
-`python examples/refine_normalization.py [--out FOLDER] [--seed N]`.
+The relaxed descriptor of a clean view of each built-in object is stored. Then the far end of the view is occluded and
+noise is added to depth and colour, so that the minimal box of the rest gives another frame. Gradient descent finds a
+small rotation and a shift of the normalized cloud that reduce the difference to the stored descriptor. Only columns
+whose strips lie completely before the occluded end are compared (the paper's object unity, strip by strip):
+`python examples/refine_normalization.py [--out DIRECTORY] [--seed N]`.
 """
 
 import argparse
@@ -30,38 +30,38 @@ from training.views.mesh_views import view_cloud
 
 HARD = thor2.DescriptorConfig(homology="closed_form")
 SOFT = dataclasses.replace(HARD, relaxation=thor2.Relaxation(slice=0.02, strip=0.01, extremum=0.01, color=10.0))
-"""Warmer than the default: a cold descriptor has a step wherever a point changes its strip, and descent gets stuck."""
+"""Higher temperatures than the default: at low ones, the loss is almost a step function, and descent gets stuck."""
 
 N_POINTS = 1024
-"""At most so many points of a clean view are used."""
+"""Largest number of points of a clean view."""
 
 HIDDEN = 0.1, 0.3
-"""Least and largest share of a view's points that are hidden."""
+"""Smallest and largest occluded share of the points of a view."""
 
 TILT = np.radians(20)
-"""The edge of what is in front is up to so far from square to the object's long side."""
+"""Largest angle between the edge of the occluder and the normal of the object's long side, radians."""
 
 EDGE = 0.004
 """Points within this distance of the edge, in the image at unit distance, are marked as occlusion boundary."""
 
 DEPTH_NOISE, COLOR_NOISE = 0.002, 5.0
-"""Standard deviations: metres along the ray, and of 255."""
+"""Standard deviations of the depth along the ray, metres, and of colour levels."""
 
 STEPS, RATE = 100, 0.01
-"""Of Adam, with a cosine decay; radians and, a fifth of it, scaled units."""
+"""Number of steps and learning rate of Adam, with a cosine decay; a fifth of the rate is used for the shift."""
 
 PRIOR = 0.1
-"""Weight of the rotation's square: where little is left to compare, the frame of the box is the better guess."""
+"""Weight of the squared rotation, which keeps the frame of the box where few columns can be compared."""
 
 ANOTHER_BOX = 45.0
-"""Degrees; beyond it the sides of the box have changed places, which no descent undoes."""
+"""Error in degrees beyond which the sides of the box are interchanged, which gradient descent cannot correct."""
 
 
 class Motion(NamedTuple):
-    """What is learned. A shift along y changes no descriptor, so it stays 0.
+    """The optimized rotation and shift of each cloud; the shift along y stays 0, since it changes no descriptor.
 
     Attributes:
-        rotation: [B, 3] rotation vectors about the clouds' middles, radians.
+        rotation: [B, 3] rotation vectors about the centres of the clouds, radians.
         shift: [B, 3] scaled units.
     """
 
@@ -70,14 +70,14 @@ class Motion(NamedTuple):
 
 
 class Columns(NamedTuple):
-    """Which columns of each slice's blocks are compared: `images` [B, S, P] and `embeddings` [B, S, J], bool."""
+    """Masks of the compared columns of each slice: `images` [B, S, P] and `embeddings` [B, S, J], bool."""
 
     images: jax.Array
     embeddings: jax.Array
 
 
-def hide(clean: tuple[np.ndarray, np.ndarray], far: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
-    """The cloud (xyz, rgb) without its end in the direction `far`, with noise; and its points at the edge."""
+def occlude(clean: tuple[np.ndarray, np.ndarray], far: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
+    """Return the cloud (xyz, rgb) with noise without its end in the direction `far`, and a mask of its edge points."""
     xyz, rgb = clean
     angle = rng.uniform(-TILT, TILT)
     direction = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]) @ far[:2]
@@ -91,16 +91,16 @@ def hide(clean: tuple[np.ndarray, np.ndarray], far: np.ndarray, rng: np.random.G
 
 
 def frames(clouds: thor2.PointClouds, turned: thor2.PointClouds) -> list[Rotation]:
-    """The rotation that took each cloud to its turned one."""
-    found = []
+    """Return the rotation from each cloud to its rotated copy."""
+    rotations = []
     for before, after, mask in zip(*map(np.asarray, (clouds.points, turned.points, clouds.mask)), strict=True):
         before, after = before[mask], after[mask]
-        found.append(Rotation.align_vectors(after - after.mean(axis=0), before - before.mean(axis=0))[0])
-    return found
+        rotations.append(Rotation.align_vectors(after - after.mean(axis=0), before - before.mean(axis=0))[0])
+    return rotations
 
 
 def moved(normal: thor2.PointClouds, motion: Motion) -> thor2.PointClouds:
-    """Normalized clouds, rotated, aligned and shifted."""
+    """Rotate, align and shift normalized clouds."""
     inside = normal.mask[..., None]
     middle = (normal.points * inside).sum(axis=1, keepdims=True) / inside.sum(axis=1, keepdims=True)
     x, y, z = motion.rotation.T
@@ -112,34 +112,34 @@ def moved(normal: thor2.PointClouds, motion: Motion) -> thor2.PointClouds:
 
 
 def before_cut(aligned: thor2.PointClouds) -> Columns:
-    """Columns of the strips that end, along the object's long side, before the first point of the boundary."""
+    """Return the columns of the strips that end before the first boundary point along the object's long side."""
     c, s = np.cos(HARD.alpha), np.sin(HARD.alpha)
     along = c * aligned.points[..., 0] + s * aligned.points[..., 2]
     cut = jnp.where(aligned.boundary, along, jnp.inf).min(axis=1)
     ends_x, ends_z = (jnp.arange(1, n + 1) for n in (HARD.n_strips, HARD.n_slices))
     whole = c * HARD.sigma_2 * ends_x + s * HARD.sigma_1 * ends_z[:, None] <= cut[:, None, None]
-    # Strip j is born at the border of pixels j and j + 1, and its Gaussian reaches a pixel further.
+    # The birth of strip j is at the border of pixels j and j + 1, and its Gaussian extends one pixel further.
     return Columns(images=jnp.pad(whole[..., 1:], ((0, 0), (0, 0), (0, 2))), embeddings=whole)
 
 
-def difference(found: thor2.Descriptors, stored: thor2.Descriptors, columns: Columns) -> jax.Array:
-    """[B] squared differences over the columns, images and embeddings each by the square of all that is stored."""
-    total = jnp.zeros(len(found.overflow))
+def difference(descriptors: thor2.Descriptors, stored: thor2.Descriptors, columns: Columns) -> jax.Array:
+    """Return the squared differences [B] over the columns, relative to the stored images and embeddings."""
+    total = jnp.zeros(len(descriptors.overflow))
     for name, counted in columns._asdict().items():
-        one, other = getattr(found, name), getattr(stored, name)
+        one, other = getattr(descriptors, name), getattr(stored, name)
         square = (jnp.square(one - other) * counted[:, :, None]).sum(axis=(1, 2, 3))
         total += square / jnp.square(other).sum(axis=(1, 2, 3))
     return total
 
 
 def main() -> None:
-    """Refine the frames of all views, print the figures, draw a picture."""
+    """Refine the frames of all views, print the differences and draw a picture."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("refine-normalization"))
-    parser.add_argument("--seed", type=int, default=0, help="of views, hidden parts and noise")
+    parser.add_argument("--seed", type=int, default=0, help="seed for views, occluders and noise")
     options = parser.parse_args()
     if options.seed < 0:
-        parser.error(f"--seed is {options.seed}; it must be at least 0")
+        parser.error(f"--seed is {options.seed}; expected at least 0")
     options.out.mkdir(parents=True, exist_ok=True)
     start = time.perf_counter()
     network, rng = colornet.load_default(), np.random.default_rng(options.seed)
@@ -153,9 +153,9 @@ def main() -> None:
     clean = thor2.PointClouds.pack(views, N_POINTS)
     clean_normal = thor2.view_normalize(clean, HARD)
     far = [frame.inv().apply([1.0, 0.0, 0.0]) for frame in frames(clean, clean_normal)]
-    parts = [hide(view, direction, rng) for view, direction in zip(views, far, strict=True)]
-    edges = [edge for *_, edge in parts]
-    seen = thor2.PointClouds.pack([(xyz, rgb) for xyz, rgb, _ in parts], N_POINTS, boundary=edges)
+    occluded = [occlude(view, direction, rng) for view, direction in zip(views, far, strict=True)]
+    edges = [edge for *_, edge in occluded]
+    seen = thor2.PointClouds.pack([(xyz, rgb) for xyz, rgb, _ in occluded], N_POINTS, boundary=edges)
 
     normal = thor2.view_normalize(seen, HARD)
     aligned = thor2.turn(clean_normal, HARD)
@@ -202,16 +202,16 @@ def main() -> None:
 
 
 def report(names: list[str], figures: dict[str, np.ndarray], compared: np.ndarray, near: np.ndarray) -> None:
-    """Print a row a view, then medians and how many are better."""
+    """Print a row for each view, the medians, and how many views improve."""
     print(f"{'before > after':18}{'relaxed difference':>20}{'hard difference':>20}{'degrees off':>20}")
     for k, name in enumerate(names):
         cells = [f"{before:.3g} > {after:.3g}" for before, after in (values[:, k] for values in figures.values())]
         if not compared[k]:
-            cells[:2] = "nothing before", "the cut"
+            cells[:2] = "nothing to", "compare"
         print(f"{name:18}" + "".join(f"{cell:>20}" for cell in cells))
     groups = {
         "all views": np.ones(len(names), bool),
-        "something is before the cut": compared,
+        "some columns are compared": compared,
         f"and the box is less than {ANOTHER_BOX:.0f} degrees off": near,
     }
     for title, rows in groups.items():
@@ -233,7 +233,7 @@ def draw(
     near: np.ndarray,
     out: Path,
 ) -> None:
-    """One view before and after, over the stored one, and all views' figures."""
+    """Draw one view before and after over the stored one, and the differences of all views."""
     figure = Figure(figsize=(11, 7), layout="constrained")
     FigureCanvasAgg(figure)
     upper, lower = figure.subfigures(2, 1, height_ratios=(1, 1.1))
@@ -241,7 +241,7 @@ def draw(
     titles = (f"{name} in the frame of its box, {own['angle'][0]:.1f}° off", f"refined, {own['angle'][1]:.1f}° off")
     for axes, cloud, title in zip(upper.subplots(1, 2, sharex=True, sharey=True), others, titles, strict=True):
         for k, (shown, color, label) in enumerate(
-            ((stored, "#aaaaaa", "stored view"), (cloud, "#d55e00", "seen: partly hidden, noisy"))
+            ((stored, "#aaaaaa", "stored view"), (cloud, "#d55e00", "occluded, noisy view"))
         ):
             x, y, z = np.asarray(shown.points)[np.asarray(shown.mask)].T
             axes.scatter(x, z, s=3, color=color, label=label, zorder=2 + k)

@@ -1,4 +1,4 @@
-"""Voxel grid: one point a cube, the mean of the points in it (the rule of Open3D's `voxel_down_sample`)."""
+"""Voxel grid: replaces the points of each voxel by their mean, as Open3D's `voxel_down_sample` does."""
 
 from typing import Any
 
@@ -14,37 +14,39 @@ __all__ = ["downsample_to_fit", "voxel_downsample"]
 def voxel_downsample(
     points: NDArray[np.floating[Any]], colors: NDArray[Any], size: float
 ) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Replace the points of each cube by their mean, and their colours by theirs.
+    """Replace the points and colours of each voxel by their means.
 
-    The grid starts half a cube below the cloud's least coordinates, as Open3D's does.
+    The grid starts half a voxel below the smallest coordinates of the cloud, as in Open3D.
 
     Args:
-        points: [n, 3] floats, n may be 0.
+        points: [n, 3] floats; n may be 0.
         colors: [n, c] uint8 or floats.
-        size: side of a cube, in the points' unit.
+        size: side length of a voxel, in the unit of the points.
 
     Returns:
-        points [m, 3] and colors [m, c] of the types given (uint8 means are rounded, halves up), cubes in lexicographic
-        order.
+        points [m, 3] and colors [m, c] in the dtypes of the input, voxels in lexicographic order; means of uint8 are
+        rounded, halves up.
 
     Raises:
-        InputError: a size that is not positive, points that are not finite, or other shapes.
+        InputError: The size is not positive or too small for the cloud, points are not finite, or shapes are invalid.
     """
     if not size > 0:
-        raise InputError(f"size is {size!r}; it must be positive")
+        raise InputError(f"size is {size!r}; expected a positive number")
     if points.ndim != 2 or points.shape[1] != 3 or colors.ndim != 2 or len(colors) != len(points):
         raise InputError(f"points and colors have shapes {points.shape} and {colors.shape}; expected [n, 3] and [n, c]")
     if len(points) == 0:
         return points.copy(), colors.copy()
     if not np.isfinite(points).all():
-        raise InputError(f"points has {int((~np.isfinite(points)).any(axis=1).sum())} points that are not finite")
-    exact = points.T.astype(np.float64, order="C")  # planes: three reductions over memory in a row
+        n_invalid = int((~np.isfinite(points)).any(axis=1).sum())
+        raise InputError(f"points has {n_invalid} rows that are not finite; expected finite coordinates")
+    exact = points.T.astype(np.float64, order="C")  # coordinates in contiguous rows, which reductions read faster
     cubes = np.floor((exact - (exact.min(axis=1, keepdims=True) - size / 2)) / size).astype(np.int64)
     extent = cubes.max(axis=1) + 1
     if float(extent[0]) * float(extent[1]) * float(extent[2]) >= 2**62:
-        raise InputError(f"size is {size!r}; too small for a cloud that spans {np.ptp(exact, axis=1).tolist()}")
+        sides = np.ptp(exact, axis=1).tolist()
+        raise InputError(f"size is {size!r}; expected a larger one for a cloud with side lengths {sides}")
     key = (cubes[0] * extent[1] + cubes[1]) * extent[2] + cubes[2]
-    # In place of `np.unique`: pixels come in rows, and a stable sort makes use of what is in order already.
+    # Faster than `np.unique`: pixels come in rows, and a stable sort benefits from entries that are already in order.
     order = np.argsort(key, kind="stable")
     cube = np.empty_like(order)
     in_order = key.take(order)
@@ -63,12 +65,12 @@ def voxel_downsample(
 def downsample_to_fit(
     points: NDArray[np.floating[Any]], colors: NDArray[Any], size: float
 ) -> tuple[NDArray[Any], NDArray[Any]]:
-    """`voxel_downsample`, with a side twice as large as long as no bucket holds the cloud."""
+    """Call `voxel_downsample` with the size doubled until the cloud fits into the largest bucket."""
     while True:
-        found = voxel_downsample(points, colors, size)
+        downsampled = voxel_downsample(points, colors, size)
         try:
-            point_bucket(len(found[0]))
+            point_bucket(len(downsampled[0]))
         except InputError:
             size *= 2
         else:
-            return found
+            return downsampled

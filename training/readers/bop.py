@@ -47,7 +47,7 @@ class BOP(LabelledFrames):
         """
         path = Path(path).absolute()  # so that a scene's folder has a name, that of "." too
         if not path.is_dir():
-            raise InputError(f"dataset: {path} is no folder")
+            raise InputError(f"dataset: {path} is not a directory; expected a dataset")
         scenes = sorted(f.parent for f in [*path.glob("scene_camera.json"), *path.glob("*/scene_camera.json")])
         self._images = [(scene, image) for scene in scenes for image in _images(scene / "rgb")]
         self.identifiers = [f"{scene.name}/{image.stem}" for scene, image in self._images]

@@ -1,4 +1,4 @@
-"""Labelled frames, one folder for each: color.png, depth.png, mask.png, intrinsics.json, labels.json."""
+"""Labelled frames, one directory each: color.png, depth.png, mask.png, intrinsics.json, labels.json."""
 
 import json
 from collections.abc import Iterable
@@ -14,23 +14,23 @@ FILES = ("color.png", "depth.png", "mask.png", "intrinsics.json", "labels.json")
 
 
 class FrameFolder(LabelledFrames):
-    """The frames in the folders of a folder, or the single frame in it.
+    """The frames in the subdirectories of a directory, or the single frame in the directory itself.
 
-    `labels.json` holds {"labels": {"1": "mug", ...}}; other entries are ignored.
+    `labels.json` contains {"labels": {"1": "mug", ...}}; other entries are ignored.
     """
 
     def __init__(self, path: str | Path) -> None:
         """Find the frames.
 
         Raises:
-            InputError: the folder holds no frame.
+            InputError: The path is not a directory, or contains no frame.
         """
-        path = Path(path).absolute()  # so that every frame's folder has a name, that of "." too
+        path = Path(path).absolute()  # gives "." a name
         if not path.is_dir():
-            raise InputError(f"dataset: {path} is no folder")
+            raise InputError(f"dataset: {path} is not a directory; expected a dataset")
         self._folders = sorted(f.parent for f in [*path.glob("labels.json"), *path.glob("*/labels.json")])
         if not self._folders:
-            raise InputError(f"dataset: {path} has no frame, neither labels.json nor */labels.json")
+            raise InputError(f"dataset: {path} has no labels.json and no */labels.json; expected a directory of frames")
         self.identifiers = [folder.name for folder in self._folders]
 
     def __getitem__(self, number: int) -> LabelledFrame:
@@ -60,12 +60,12 @@ def _truth(path: Path) -> dict[int, str]:
     try:
         entries = [(int(label), name) for label, name in json.loads(path.read_bytes())["labels"].items()]
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        raise InputError(f'{path} does not hold {{"labels": {{"<number>": "<name>", ...}}}}') from None
+        raise InputError(f'{path} is invalid; expected {{"labels": {{"<number>": "<name>", ...}}}}') from None
     truth: dict[int, str] = {}
     for label, name in entries:
         if not isinstance(name, str):
-            raise InputError(f"{path}: {name!r} is no object name")
+            raise InputError(f"{path}: label {label} has the name {name!r}; expected a string")
         if label in truth:
-            raise InputError(f"{path}: {truth[label]!r} and {name!r} have the label {label}")
+            raise InputError(f"{path}: label {label} has the names {truth[label]!r} and {name!r}; expected one")
         truth[label] = name
     return truth

@@ -56,7 +56,7 @@ class OCID(LabelledFrames):
         """
         path = Path(path)
         if not path.is_dir():
-            raise InputError(f"dataset: {path} is no folder")
+            raise InputError(f"dataset: {path} is not a directory; expected a dataset")
         self._root = path / "YCB10" if (path / "YCB10").is_dir() else path
         self._images: list[tuple[_Sequence, Path]] = []
         for place, camera in itertools.product(_FIRST_OBJECT, _CAMERAS):

@@ -73,7 +73,7 @@ class UWISOccluded(LabelledFrames):
         """
         path = Path(path)
         if not path.is_dir():
-            raise InputError(f"dataset: {path} is no folder")
+            raise InputError(f"dataset: {path} is not a directory; expected a dataset")
         videos = sorted((f for f in path.iterdir() if f.name.isdecimal()), key=lambda f: int(f.name))
         self._frames = [(video, c) for video in videos for c in sorted((video / "images").glob("*_rgb.png"))]
         if not self._frames:

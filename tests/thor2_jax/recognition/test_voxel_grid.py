@@ -88,7 +88,7 @@ def test_arguments_are_left_alone() -> None:
 
 @pytest.mark.parametrize("size", [0, -0.01, float("nan")])
 def test_sizes_that_are_not_positive(size: float) -> None:
-    with pytest.raises(InputError, match=r"^size is .*positive$"):
+    with pytest.raises(InputError, match="^size is "):
         voxel_downsample(np.zeros((2, 3)), np.zeros((2, 3)), size)
 
 

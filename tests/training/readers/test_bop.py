@@ -322,7 +322,7 @@ def test_invalid_instances(tmp_path: Path, file: str, entry: Any, expected: str)
 )
 def test_directories_that_are_not_a_dataset(tmp_path: Path, damage: Callable[[Path], object]) -> None:
     damage(write_image(tmp_path / "000048"))
-    for path, expected in ((tmp_path, "has no scene_camera.json"), (tmp_path / "absent", "is no folder")):
+    for path, expected in ((tmp_path, "has no scene_camera.json"), (tmp_path / "absent", "is not a directory")):
         assert error_message(path).startswith(f"dataset: {path} {expected}")
 
 
@@ -417,4 +417,4 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     assert run_thor2("evaluate", "bop", dataset, *model) == 2  # without names, all objects are unknown
     assert "obj_000013, obj_000014, the runs know bowl, mug" in capsys.readouterr().err
     assert run_thor2("evaluate", "bop", tmp_path / "absent", *model) == 2
-    assert capsys.readouterr().err == f"error: dataset: {tmp_path / 'absent'} is no folder\n"
+    assert capsys.readouterr().err == f"error: dataset: {tmp_path / 'absent'} is not a directory; expected a dataset\n"

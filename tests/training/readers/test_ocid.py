@@ -255,8 +255,8 @@ def test_images_of_different_sizes(tmp_path: Path) -> None:
 def test_paths_that_are_not_a_dataset(tmp_path: Path) -> None:
     names = write_names(tmp_path)
     for path, expected in (
-        (tmp_path / "absent", "is no folder"),
-        (names, "is no folder"),
+        (tmp_path / "absent", "is not a directory"),
+        (names, "is not a directory"),
         (tmp_path, "has no {table,floor}"),
     ):
         with pytest.raises(InputError, match=r"^dataset: ") as caught:
