@@ -22,9 +22,9 @@ Cloud = tuple[NDArray[np.float32], NDArray[np.uint8]]
 
 def _objects() -> tuple[str, list[TexturedMesh]]:
     if SCANS.is_dir():
-        found = list(find_meshes(SCANS).values())
-        step = max(1, len(found) // N_OBJECTS)
-        return "views of real scans", [load_mesh(path) for path in found[::step][:N_OBJECTS]]
+        paths = list(find_meshes(SCANS).values())
+        step = max(1, len(paths) // N_OBJECTS)
+        return "views of real scans", [load_mesh(path) for path in paths[::step][:N_OBJECTS]]
     return "views of built-in objects", list(builtin_objects().values())
 
 

@@ -1,4 +1,4 @@
-"""Compare the library with a peer in one run on the same clouds: `python -m benchmarks.run [--out FOLDER] [--quick]`.
+"""Compare the library with a peer in one run on the same clouds: `python -m benchmarks.run [--out DIRECTORY] [--quick]`.
 
 The script prints tables and writes cpu.json and cpu.png. Compile times are reported separately, and all other figures
 are medians of repeated calls. The peer runs in two processes.
@@ -58,11 +58,11 @@ def peer_agrees(clouds: list[Any]) -> float:
 
     other, worst = Peer(), 0.0
     aligned = thor2.align(thor2.PointClouds.pack(clouds), CLOSED)
-    found = np.asarray(thor2.describe_aligned(aligned, NETWORK, CLOSED).tops2)
+    tops2 = np.asarray(thor2.describe_aligned(aligned, NETWORK, CLOSED).tops2)
     for k, (_, rgb) in enumerate(clouds):
         points = np.asarray(aligned.points[k])[np.asarray(aligned.mask[k])].astype(np.float64)
         expected = other.describe_aligned(points, rgb)[1]
-        worst = max(worst, float(np.abs(found[k] - expected).max() / np.abs(expected).max()))
+        worst = max(worst, float(np.abs(tops2[k] - expected).max() / np.abs(expected).max()))
     return worst
 
 
@@ -89,8 +89,8 @@ def beside_peer(clouds: list[Any], rounds: int = 7) -> dict[str, Any]:
 
 def whole(packed: thor2.PointClouds, config: thor2.DescriptorConfig) -> Any:
     """Compute both descriptors from unaligned clouds."""
-    found = thor2.describe(packed, NETWORK, config)
-    return found.tops, found.tops2
+    descriptors = thor2.describe(packed, NETWORK, config)
+    return descriptors.tops, descriptors.tops2
 
 
 def engine_rates(clouds: list[Any]) -> dict[str, Any]:
@@ -99,7 +99,7 @@ def engine_rates(clouds: list[Any]) -> dict[str, Any]:
     aligned = thor2.align(packed, CLOSED)
     strips = thor2.strips(aligned, NETWORK, CLOSED)
 
-    parts = {
+    calls = {
         "whole, closed form": lambda: whole(packed, CLOSED),
         "whole, gudhi": lambda: whole(packed, GUDHI),
         "align": lambda: thor2.align(packed, CLOSED).points,
@@ -108,7 +108,7 @@ def engine_rates(clouds: list[Any]) -> dict[str, Any]:
         "images and embeddings, gudhi": lambda: thor2.describe_strips(strips, NETWORK, GUDHI),
     }
     rates = {}
-    for name, call in parts.items():
+    for name, call in calls.items():
         timing = time_calls(call)
         rates[name] = {"clouds_per_s": len(clouds) / timing.median, "first_call_s": timing.first}
     return rates
@@ -140,7 +140,7 @@ def stream(clouds: list[Any], count: int) -> dict[str, float]:
     """Return the seconds that `describe_stream` takes for `count` clouds, and the peak memory of the process in GiB."""
     start = time.perf_counter()
     endless = itertools.islice(itertools.cycle(clouds), count)
-    described = sum(len(found.overflow) for found in describe_stream(endless, NETWORK, CLOSED, N_POINTS))
+    described = sum(len(descriptors.overflow) for descriptors in describe_stream(endless, NETWORK, CLOSED, N_POINTS))
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     return {"clouds": described, "seconds": time.perf_counter() - start, "peak_gib": peak}
 
@@ -173,13 +173,13 @@ def draw(sizes: dict[str, list[list[float]]], path: Path) -> None:
     FigureCanvasAgg(figure)
     for axes, (name, rows) in zip(figure.subplots(1, 2), sizes.items(), strict=True):
         x, seconds = np.array(rows).T
-        slope, fixed = np.polyfit(x, seconds, 1, w=1 / seconds)  # of relative errors
+        slope, fixed = np.polyfit(x, seconds, 1, w=1 / seconds)  # minimizes relative errors
         each = f"{slope * 1e6:.3g} µs a {'point' if name == 'points' else 'cloud'}"
         axes.loglog(x, seconds * 1e3, "o-", color="#0072b2", label="describe, closed form")
         axes.loglog(x, (fixed + slope * x) * 1e3, "--", color="#888888", label=f"{fixed * 1e3:.3g} ms + {each}")
         axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axes.yaxis.set_major_formatter("{x:g}")
-        axes.set_xlabel("points a cloud (64 clouds)" if name == "points" else f"clouds ({N_POINTS} points each)")
+        axes.set_xlabel("points per cloud (64 clouds)" if name == "points" else f"clouds ({N_POINTS} points each)")
         axes.set_xticks(x, [f"{int(size):,}" for size in x])
         axes.minorticks_off()
         axes.set_ylabel("milliseconds")

@@ -2,7 +2,7 @@
 
 A view of every built-in object is seen once in neutral light and once under a lamp that dims and tints it, by a camera
 with noise. The colour embedding of the relaxed descriptor is differentiable in the colours of the points, so that the
-lamp follows from minimizing the difference of the two embeddings: `python examples/color_cast.py [--out FOLDER]`.
+lamp follows from minimizing the difference of the two embeddings: `python examples/color_cast.py [--out DIRECTORY]`.
 """
 
 import argparse
@@ -83,19 +83,19 @@ def main() -> None:
         log_light = optax.apply_updates(log_light, updates)
         history.append((float(value), np.exp(np.asarray(log_light))))
 
-    found = np.exp(np.asarray(log_light))
+    estimate = np.exp(np.asarray(log_light))
     print(f"lamp      {LAMP}   gain {LAMP.mean():.3f}")
-    print(f"recovered {found.round(3)}   gain {found.mean():.3f}")
-    print(f"largest error {np.abs(found / LAMP - 1).max():.1%} (at the start {np.abs(1 / LAMP - 1).max():.0%})")
+    print(f"recovered {estimate.round(3)}   gain {estimate.mean():.3f}")
+    print(f"largest error {np.abs(estimate / LAMP - 1).max():.1%} (at the start {np.abs(1 / LAMP - 1).max():.0%})")
     print(f"{time.perf_counter() - start:.0f} s")
-    draw(model, seen, found, history, out / "color_cast.png")
+    draw(model, seen, estimate, history, out / "color_cast.png")
     print(f"picture: {out / 'color_cast.png'}")
 
 
 def draw(
     model: thor2.PointClouds,
     seen: thor2.PointClouds,
-    found: np.ndarray,
+    estimate: np.ndarray,
     history: list[tuple[float, np.ndarray]],
     path: Path,
 ) -> None:
@@ -103,7 +103,7 @@ def draw(
     figure = Figure(figsize=(11, 5.2), layout="constrained")
     FigureCanvasAgg(figure)
     upper, lower = figure.subfigures(2, 1, height_ratios=(1, 1.6))
-    shown = {"model": model, "under the lamp": seen, "lamp taken off": under(jnp.asarray(1 / found), seen)}
+    shown = {"model": model, "under the lamp": seen, "lamp removed": under(jnp.asarray(1 / estimate), seen)}
     for axes, (title, clouds) in zip(upper.subplots(1, 3), shown.items(), strict=True):
         for k, shift in ((14, 0.0), (2, 0.35), (12, 0.65)):
             mask = np.asarray(clouds.mask[k])

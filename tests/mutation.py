@@ -35,7 +35,7 @@ from cosmic_ray.plugins import get_operator, operator_names
 ROOT = Path(__file__).resolve().parents[1]
 
 FOLDERS = ("colornet", "thor2_jax", "thor2_jax/descriptor", "thor2_jax/recognition")
-"""Folders whose modules are mutated."""
+"""Directories whose modules are mutated."""
 
 MORE_TESTS = {
     "colornet/__init__.py": ("colornet/test_files.py", "colornet/test_build.py"),
@@ -212,8 +212,10 @@ def print_report(results: dict[Mutant, dict[str, Any]]) -> None:
     rows = {module: [r["outcome"] for r in results.values() if r["module"] == module] for module in TESTS}
     rows["all"] = [record["outcome"] for record in results.values()]
     print("\n| module | mutants | killed | survived | timed out |\n|---|--:|--:|--:|--:|")
-    for module, found in rows.items():
-        print(f"| {module} | {len(found)} | {' | '.join(str(found.count(name)) for name in outcomes)} |")
+    for module, module_outcomes in rows.items():
+        print(
+            f"| {module} | {len(module_outcomes)} | {' | '.join(str(module_outcomes.count(name)) for name in outcomes)} |"
+        )
     noticed = len(rows["all"]) - rows["all"].count("survived")
     print(f"\nkilled or timed out: {noticed / max(len(rows['all']), 1):.1%}")
     for mutant, record in results.items():

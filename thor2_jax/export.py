@@ -56,10 +56,10 @@ def export_recognizer(run: TrainedRun, n_points: int, n_clouds: int, platforms: 
     config = dataclasses.replace(run.config, homology="closed_form")
 
     def recognize(*fields: jax.Array) -> dict[str, jax.Array]:
-        found = describe(PointClouds(*fields), run.network, config)
+        descriptors = describe(PointClouds(*fields), run.network, config)
         return {
-            "overflow": found.overflow,
-            **{name: class_probabilities(model, found, name) for name, model in run.classifiers.items()},
+            "overflow": descriptors.overflow,
+            **{name: class_probabilities(model, descriptors, name) for name, model in run.classifiers.items()},
         }
 
     shape = jax.ShapeDtypeStruct

@@ -48,7 +48,7 @@ class Rebuilt:
 
 @pytest.fixture(scope="session")
 def rebuilt(tmp_path_factory: pytest.TempPathFactory) -> Rebuilt:
-    """`colornet.build()`, once a session."""
+    """Run `colornet.build()` once per session."""
     folder = tmp_path_factory.mktemp("build")
     root = Path(colornet.__file__).resolve().parents[1]
     command = [sys.executable, "-W", "error", "-c", _BUILD, str(folder / "network.npz"), str(folder / "graph.npz")]

@@ -15,11 +15,11 @@ from .conftest import Rebuilt
 
 def test_packaged_network_is_the_result_of_build(rebuilt: Rebuilt, network: colornet.ColorNetwork) -> None:
     for field in dataclasses.fields(network):
-        made, packaged = getattr(rebuilt.network, field.name), getattr(network, field.name)
-        if np.asarray(packaged).dtype == np.float64:  # another processor may round a cube root the other way
-            np.testing.assert_allclose(made, packaged, rtol=1e-12, err_msg=field.name)
+        built, packaged = getattr(rebuilt.network, field.name), getattr(network, field.name)
+        if np.asarray(packaged).dtype == np.float64:  # another processor may round a cube root differently
+            np.testing.assert_allclose(built, packaged, rtol=1e-12, err_msg=field.name)
         else:
-            np.testing.assert_array_equal(made, packaged, err_msg=field.name)
+            np.testing.assert_array_equal(built, packaged, err_msg=field.name)
     assert rebuilt.network.fingerprint == network.fingerprint
 
 
@@ -54,9 +54,9 @@ def test_regions_are_numbered_like_kmapper_nodes(rebuilt: Rebuilt) -> None:
     colors, graph = grid_colors(), rebuilt.graph
     members, region = merge_redundant(colors, graph.members, EPS)
     kept = [name for name in graph.names if name != "cube19_cluster0"]
-    named = dict(zip(graph.names, region.tolist(), strict=True))
-    assert [named[name] for name in kept] == list(range(22))
-    assert named["cube19_cluster0"] == named["cube18_cluster0"]
+    region_of_node = dict(zip(graph.names, region.tolist(), strict=True))
+    assert [region_of_node[name] for name in kept] == list(range(22))
+    assert region_of_node["cube19_cluster0"] == region_of_node["cube18_cluster0"]
     for r, rows in enumerate(members):
         np.testing.assert_array_equal(np.flatnonzero(rebuilt.network.region_bits >> np.uint32(r) & 1), rows)
 
@@ -75,7 +75,7 @@ def test_edges_are_shared_colors_and_the_hue_cut(rebuilt: Rebuilt) -> None:
 
 
 def test_every_node_lies_in_one_cube_of_the_cover(rebuilt: Rebuilt) -> None:
-    """The cover by hand: 3 x 8 intervals of equal length, each widened by its overlap, hue cut at xi - pi."""
+    """The cover has 3 x 8 intervals of equal length, each widened by its overlap, and hue is cut at xi - pi."""
     lab = to_lab(grid_colors(), GRID_WHITE)
     chroma = np.sqrt(lab[:, 1] ** 2 + lab[:, 2] ** 2)
     hue = np.arctan2(lab[:, 2], lab[:, 1]) + np.pi / 8
@@ -91,7 +91,7 @@ def test_every_node_lies_in_one_cube_of_the_cover(rebuilt: Rebuilt) -> None:
             assert inside.size > 0
             place.append(set(inside.tolist()))
         cubes.append(place)
-    joined = {(i, j) for i, j in rebuilt.graph.cyclic.tolist()}
-    for i, j in joined:  # the two ends of the hue circle, in one chroma interval
+    cyclic_pairs = {(i, j) for i, j in rebuilt.graph.cyclic.tolist()}
+    for i, j in cyclic_pairs:  # the two ends of the hue circle, in one chroma interval
         assert cubes[i][0] & cubes[j][0]
         assert {min(cubes[i][1]), max(cubes[j][1])} == {0, 7}

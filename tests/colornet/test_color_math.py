@@ -1,4 +1,4 @@
-"""CIELAB, HyAB and HyAB neighbourhoods against written-out formulas and brute force."""
+"""CIELAB, HyAB and HyAB neighbourhoods against reference formulas and brute force."""
 
 import numpy as np
 import pytest
@@ -13,8 +13,8 @@ from colornet.mapper import EPS, MIN_SAMPLES, HyabDBSCAN, _cube_number, hyab_nei
 WHITES = (GRID_WHITE, MEAN_WHITE)
 
 
-def lab_by_hand(rgb: NDArray[np.generic], white: tuple[float, float]) -> NDArray[np.float64]:
-    """CIELAB from the formulas of IEC 61966-2-1 and CIE 15."""
+def reference_lab(rgb: NDArray[np.generic], white: tuple[float, float]) -> NDArray[np.float64]:
+    """Return CIELAB by the formulas of IEC 61966-2-1 and CIE 15."""
     encoded = np.asarray(rgb, np.float64) / 255
     linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
     matrix = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
@@ -24,12 +24,12 @@ def lab_by_hand(rgb: NDArray[np.generic], white: tuple[float, float]) -> NDArray
     return np.stack([116 * f[..., 1] - 16, 500 * (f[..., 0] - f[..., 1]), 200 * (f[..., 1] - f[..., 2])], axis=-1)
 
 
-def hyab_by_hand(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
+def reference_hyab(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
     return float(abs(one[0] - other[0]) + ((one[1] - other[1]) ** 2 + (one[2] - other[2]) ** 2) ** 0.5)
 
 
 def some_colors(n: int) -> NDArray[np.float64]:
-    """Two blocks of near colours and some random ones, in CIELAB."""
+    """Return two blocks of similar colours and some random ones, in CIELAB."""
     colors = grid_colors()
     rows = np.random.default_rng(0).choice(len(colors), n // 3, replace=False)
     for center in ([180, 90, 60], [40, 60, 200]):
@@ -41,12 +41,12 @@ def some_colors(n: int) -> NDArray[np.float64]:
 @pytest.mark.parametrize("white", WHITES)
 def test_lab_of_the_whole_grid(white: tuple[float, float]) -> None:
     colors = grid_colors()
-    np.testing.assert_allclose(to_lab(colors, white), lab_by_hand(colors, white), atol=1e-9)
+    np.testing.assert_allclose(to_lab(colors, white), reference_lab(colors, white), atol=1e-9)
 
 
 def test_lab_of_means_and_of_one_color() -> None:
     mean = np.array([12.25, 200.5, 99.125])
-    np.testing.assert_allclose(to_lab(mean, MEAN_WHITE), lab_by_hand(mean, MEAN_WHITE), atol=1e-9)
+    np.testing.assert_allclose(to_lab(mean, MEAN_WHITE), reference_lab(mean, MEAN_WHITE), atol=1e-9)
     assert to_lab(np.zeros((0, 3)), MEAN_WHITE).shape == (0, 3)
 
 
@@ -57,13 +57,13 @@ def test_white_and_black() -> None:
 
 def test_hyab() -> None:
     lab = some_colors(40)
-    expected = [[hyab_by_hand(one, other) for other in lab] for one in lab]
+    expected = [[reference_hyab(one, other) for other in lab] for one in lab]
     np.testing.assert_allclose(hyab(lab[:, None], lab[None]), expected, atol=1e-12)
 
 
 def test_neighborhoods_equal_those_of_brute_force() -> None:
     lab = some_colors(600)
-    distances = cdist(lab, lab, hyab_by_hand)
+    distances = cdist(lab, lab, reference_hyab)
     near = (distances <= EPS) & ~np.eye(len(lab), dtype=bool)
     neighbors = hyab_neighbors(lab, EPS).toarray()
     assert near.sum() > 1000
@@ -81,7 +81,7 @@ def test_neighborhoods_on_the_border_of_the_ball() -> None:
 
 def test_clusters_equal_those_of_a_dense_matrix() -> None:
     lab = some_colors(600)
-    dense = DBSCAN(eps=EPS, min_samples=MIN_SAMPLES, metric="precomputed").fit_predict(cdist(lab, lab, hyab_by_hand))
+    dense = DBSCAN(eps=EPS, min_samples=MIN_SAMPLES, metric="precomputed").fit_predict(cdist(lab, lab, reference_hyab))
     labels = HyabDBSCAN().fit_predict(lab)
     assert labels.max() >= 1 and labels.min() == -1
     np.testing.assert_array_equal(labels, dense)

@@ -30,7 +30,7 @@ def test_every_region_shows_its_mean_color(
 
 
 @pytest.mark.parametrize("draw", DRAW)
-def test_no_folder(
+def test_a_missing_directory_is_an_error(
     network: colornet.ColorNetwork, tmp_path: Path, draw: Callable[[colornet.ColorNetwork, Path], None]
 ) -> None:
     with pytest.raises(OSError):

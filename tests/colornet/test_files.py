@@ -41,16 +41,16 @@ def test_arrays_are_read_only_copies(network: colornet.ColorNetwork) -> None:
     arrays = {
         name: np.array(value) if isinstance(value, np.ndarray) else value for name, value in contents(network).items()
     }
-    made = colornet.ColorNetwork(**arrays)
+    copy = colornet.ColorNetwork(**arrays)
     arrays["mean_rgb"][0] = 0
     arrays["similarity"][0] = 0
-    assert made.fingerprint == network.fingerprint
-    for name, value in contents(made).items():
+    assert copy.fingerprint == network.fingerprint
+    for name, value in contents(copy).items():
         if isinstance(value, np.ndarray):
             with pytest.raises(ValueError, match="read-only"):
                 value[0] = 0
         with pytest.raises(dataclasses.FrozenInstanceError):
-            setattr(made, name, value)
+            setattr(copy, name, value)
 
 
 def test_fingerprint_distinguishes_networks(network: colornet.ColorNetwork) -> None:
@@ -58,19 +58,19 @@ def test_fingerprint_distinguishes_networks(network: colornet.ColorNetwork) -> N
     again = dataclasses.replace(network)
     assert again is not network and again == network and hash(again) == hash(network) and network != "network"
     assert dataclasses.replace(network, n_raw_nodes=24) != network
-    seen = {network.fingerprint}
+    fingerprints = {network.fingerprint}
     for name in ("mean_rgb", "edge_weights", "similarity"):
         changed = np.array(getattr(network, name))
         changed.flat[-1] += 1e-6
-        seen.add(dataclasses.replace(network, **{name: changed}).fingerprint)
-    seen.add(dataclasses.replace(network, cyclic=~network.cyclic).fingerprint)
-    seen.add(dataclasses.replace(network, edges=network.edges[:, ::-1]).fingerprint)
-    seen.add(dataclasses.replace(network, n_raw_nodes=24).fingerprint)
+        fingerprints.add(dataclasses.replace(network, **{name: changed}).fingerprint)
+    fingerprints.add(dataclasses.replace(network, cyclic=~network.cyclic).fingerprint)
+    fingerprints.add(dataclasses.replace(network, edges=network.edges[:, ::-1]).fingerprint)
+    fingerprints.add(dataclasses.replace(network, n_raw_nodes=24).fingerprint)
     swapped = np.array(network.region_bits)
     first, other = 0, int(np.flatnonzero(swapped != swapped[0])[0])
     swapped[[first, other]] = swapped[[other, first]]
-    seen.add(dataclasses.replace(network, region_bits=swapped).fingerprint)
-    assert len(seen) == 8
+    fingerprints.add(dataclasses.replace(network, region_bits=swapped).fingerprint)
+    assert len(fingerprints) == 8
 
 
 @pytest.mark.parametrize(
@@ -90,7 +90,7 @@ def test_fingerprint_distinguishes_networks(network: colornet.ColorNetwork) -> N
         ({"region_bits": np.zeros(140608, np.uint32)}, "region_bits[0] is 0"),
         ({"region_bits": np.full(140608, 1 << 22, np.uint32)}, "region_bits has 0x400000"),
         ({"member_counts": np.zeros(22, np.int64)}, "member_counts is [0, 0"),
-        ({"similarity": np.full((22, 22), np.nan)}, "similarity has a value that is not finite"),
+        ({"similarity": np.full((22, 22), np.nan)}, "similarity has a value"),
         ({"n_raw_nodes": 21}, "n_raw_nodes is 21"),
         ({"n_raw_nodes": 23.0}, "n_raw_nodes is 23.0"),
     ],
@@ -161,7 +161,7 @@ def test_the_packaged_network_is_read_once() -> None:
     assert colornet.load_default() is colornet.load_default()
 
 
-def test_no_flipped_byte_passes_for_another_network(network: colornet.ColorNetwork, tmp_path: Path) -> None:
+def test_flipped_bytes_are_refused_or_have_no_effect(network: colornet.ColorNetwork, tmp_path: Path) -> None:
     path = tmp_path / "network.npz"
     network.save(path)
     good = path.read_bytes()
@@ -172,19 +172,19 @@ def test_no_flipped_byte_passes_for_another_network(network: colornet.ColorNetwo
         data[place] ^= 0x55
         path.write_bytes(data)
         try:
-            assert colornet.load(path).fingerprint == network.fingerprint  # a time stamp, say: nothing that is read
+            assert colornet.load(path).fingerprint == network.fingerprint  # bytes that are not read, as of a time stamp
         except ValueError as error:
             assert str(path) in str(error) and "\n" not in str(error)
             refused += 1
     assert refused > 150
 
 
-def test_a_network_cannot_be_saved_where_there_is_no_folder(network: colornet.ColorNetwork, tmp_path: Path) -> None:
+def test_saving_to_a_missing_directory_is_an_error(network: colornet.ColorNetwork, tmp_path: Path) -> None:
     with pytest.raises(OSError):
         network.save(tmp_path / "nowhere" / "network.npz")
 
 
-def test_loading_needs_neither_kmapper_nor_the_rest_of_the_project() -> None:
+def test_loading_imports_neither_kmapper_nor_other_packages() -> None:
     script = "import colornet, sys; colornet.load_default().membership; print(*sys.modules)"
     root = Path(colornet.__file__).resolve().parents[1]
     done = subprocess.run([sys.executable, "-c", script], cwd=root, capture_output=True, text=True, check=True)

@@ -11,7 +11,7 @@ from colornet.grid import GRID_SIZE, grid_colors
 COLORS = hnp.arrays(np.uint8, hnp.array_shapes(min_dims=1, max_dims=3, min_side=0, max_side=5).map(lambda s: (*s, 3)))
 
 
-def weights_by_hand(network: colornet.ColorNetwork, color: list[int]) -> list[float]:
+def reference_weights(network: colornet.ColorNetwork, color: list[int]) -> list[float]:
     r, g, b = (int(round(channel / 5)) for channel in color)
     bits = int(network.region_bits[(r * 52 + g) * 52 + b])
     regions = [k for k in range(22) if bits >> k & 1]
@@ -43,7 +43,7 @@ def test_weights(rgb: np.ndarray) -> None:
     assert weights.dtype == np.float32
     np.testing.assert_array_equal(rgb, before)
     np.testing.assert_allclose(weights.sum(axis=-1), 1, atol=1e-6)
-    expected = [weights_by_hand(network, color) for color in rgb.reshape(-1, 3).tolist()]
+    expected = [reference_weights(network, color) for color in rgb.reshape(-1, 3).tolist()]
     np.testing.assert_allclose(weights.reshape(-1, 22), np.reshape(expected, (-1, 22)), rtol=1e-7)
 
 

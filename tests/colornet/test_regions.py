@@ -8,7 +8,7 @@ from colornet.grid import grid_colors
 from colornet.lab import MEAN_WHITE, hyab, to_lab
 from colornet.regions import mean_color, merge_redundant, relabel, similarity
 
-from .test_color_math import hyab_by_hand, lab_by_hand
+from .test_color_math import reference_hyab, reference_lab
 
 
 def floyd_warshall(n: int, edges: NDArray[np.int64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -29,8 +29,8 @@ def test_similarity_of_the_packaged_network(network: colornet.ColorNetwork) -> N
     member = (network.region_bits[:, None] >> np.arange(22, dtype=np.uint32) & 1).astype(np.float64)
     means = (member.T @ colors) / member.sum(axis=0)[:, None]
     np.testing.assert_allclose(network.mean_rgb, means, rtol=1e-13)
-    lab = lab_by_hand(means, MEAN_WHITE)
-    weights = np.array([hyab_by_hand(lab[i], lab[j]) for i, j in network.edges])
+    lab = reference_lab(means, MEAN_WHITE)
+    weights = np.array([reference_hyab(lab[i], lab[j]) for i, j in network.edges])
     np.testing.assert_allclose(network.edge_weights, weights, rtol=1e-11)
     expected = 1 / (1 + floyd_warshall(22, network.edges, weights))
     np.testing.assert_allclose(network.similarity, expected, rtol=1e-11)
@@ -69,9 +69,9 @@ def test_only_nodes_with_shared_members_and_color_merge() -> None:
         "alone": ([whole], [0]),
     }
     for name, (members, expected) in cases.items():
-        joined, region = merge_redundant(colors, members, eps=7.0)
+        merged, region = merge_redundant(colors, members, eps=7.0)
         assert region.tolist() == expected, name
-        for k, rows in enumerate(joined):
+        for k, rows in enumerate(merged):
             union = set().union(*(m.tolist() for m, r in zip(members, expected, strict=True) if r == k))
             assert rows.tolist() == sorted(union), name
 

@@ -98,7 +98,7 @@ def test_other_kinds_of_images_are_refused(tmp_path: Path) -> None:
     for kind in ("BMP", "GIF", "PPM", "EPS"):
         path = tmp_path / "color.png"
         path.write_bytes(encode_image(COLOR, kind))
-        with pytest.raises(InputError, match="color.png is damaged or no image"):
+        with pytest.raises(InputError, match="color.png"):
             read_color(path)
 
 

@@ -41,8 +41,8 @@ _default_parameters = functools.lru_cache(maxsize=8)(Parameters.of)
 
 def _check_batch(clouds: PointClouds) -> None:
     if not isinstance(clouds, PointClouds) or clouds.points.ndim != 3:
-        given = f"points {list(clouds.points.shape)}" if isinstance(clouds, PointClouds) else type(clouds).__name__
-        raise InputError(f"clouds is {given}; expected PointClouds with points [B, N, 3]; use PointClouds.pack")
+        actual = f"points {list(clouds.points.shape)}" if isinstance(clouds, PointClouds) else type(clouds).__name__
+        raise InputError(f"clouds is {actual}; expected PointClouds with points [B, N, 3]; use PointClouds.pack")
 
 
 # Compiled apart from `_strips_of`: fused into its scatter, the look-up would be repeated, one number at a time.

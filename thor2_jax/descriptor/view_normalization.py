@@ -85,22 +85,25 @@ def boxed(cloud: PointClouds, sigma_s: ArrayLike) -> Normalization:
     return Normalization(axes, low, high, centred, mask, boundary, camera)
 
 
-def oriented(found: Normalization) -> jax.Array:
+def oriented(normalization: Normalization) -> jax.Array:
     """Return the rotation [3, 3] of the view normalization: the axes of the box with their signs."""
-    axes, low, high = found.axes, found.low, found.high
+    axes, low, high = normalization.axes, normalization.low, normalization.high
     middle = (low + high) / 2
 
     # The mean is the origin: if the middle is positive, the mean lies below the middle.
     x_sign = jnp.where(middle[0] < 0, -1.0, 1.0)
     # A half turn about x moves a camera from +z to -z.
-    camera_z = jnp.matmul(axes[2], found.camera, precision=HIGHEST) - middle[2]
+    camera_z = jnp.matmul(axes[2], normalization.camera, precision=HIGHEST) - middle[2]
     z_sign = jnp.where(camera_z > 0, -1.0, 1.0)
 
     x_low = jnp.minimum(low[0] * x_sign, high[0] * x_sign)
-    bins = jnp.floor(rotate(axes[:1], found.points)[0] * x_sign / OCCLUSION_BIN - x_low / OCCLUSION_BIN)
-    last = largest(jnp.where(found.mask, bins, -1))
+    bins = jnp.floor(rotate(axes[:1], normalization.points)[0] * x_sign / OCCLUSION_BIN - x_low / OCCLUSION_BIN)
+    last = largest(jnp.where(normalization.mask, bins, -1))
     # A half turn about z moves the occluded end away from the first slice.
-    first_end, last_end = (found.boundary & (bins <= 1)).sum(), (found.boundary & (bins >= last - 1)).sum()
+    first_end, last_end = (
+        (normalization.boundary & (bins <= 1)).sum(),
+        (normalization.boundary & (bins >= last - 1)).sum(),
+    )
     x_sign = jnp.where(first_end > last_end, -x_sign, x_sign)
 
     x, z = axes[0] * x_sign, axes[2] * z_sign
@@ -108,8 +111,8 @@ def oriented(found: Normalization) -> jax.Array:
 
 
 def _normalize_one(cloud: PointClouds, sigma_s: ArrayLike) -> PointClouds:
-    found = boxed(cloud, sigma_s)
-    points, camera = _place(oriented(found), found.points, found.mask, found.camera)
+    normalization = boxed(cloud, sigma_s)
+    points, camera = _place(oriented(normalization), normalization.points, normalization.mask, normalization.camera)
     return dataclasses.replace(cloud, points=points.T[: len(cloud.mask)], camera=camera)
 
 
@@ -175,19 +178,19 @@ def turn(normal: PointClouds, config: DescriptorConfig, parameters: Parameters |
     return _turn(normal, _sigma_s_and_alpha(config, parameters)[1])
 
 
-def place_aligned(rotation: jax.Array, found: Normalization, alpha: ArrayLike) -> tuple[jax.Array, jax.Array]:
+def place_aligned(rotation: jax.Array, normalization: Normalization, alpha: ArrayLike) -> tuple[jax.Array, jax.Array]:
     """Rotate one cloud, turn it by alpha and translate it to the first octant; return points [M, 3] and camera [3]."""
     # One rotation suffices: the translation between the two would cancel.
     turned = jnp.matmul(_about_y(alpha), rotation, precision=HIGHEST)
-    points, camera = _place(turned, found.points, found.mask, found.camera)
+    points, camera = _place(turned, normalization.points, normalization.mask, normalization.camera)
     return points.T, camera
 
 
 @jax.jit
 def _align(clouds: PointClouds, sigma_s: ArrayLike, alpha: ArrayLike) -> tuple[jax.Array, jax.Array]:
     def one(cloud: PointClouds) -> tuple[jax.Array, jax.Array]:
-        found = boxed(cloud, sigma_s)
-        points, camera = place_aligned(oriented(found), found, alpha)
+        normalization = boxed(cloud, sigma_s)
+        points, camera = place_aligned(oriented(normalization), normalization, alpha)
         return points[: len(cloud.mask)], camera  # the other fields would be copied
 
     return jax.vmap(one)(clouds)

@@ -97,7 +97,7 @@ def _contour(
     labels, depth = window.ravel(), depth.ravel()
     steps = (1, -1, window.shape[1], -window.shape[1])
     edges = [np.flatnonzero(labels[places + step] != label) for step in steps]
-    edge, step = np.concatenate(edges), np.repeat(steps, [len(found) for found in edges])
+    edge, step = np.concatenate(edges), np.repeat(steps, [len(indices) for indices in edges])
     here = places[edge]
 
     def first_depth(start: NDArray[np.intp], step: NDArray[np.intp], wanted: Any) -> NDArray[np.float32]:

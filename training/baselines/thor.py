@@ -121,7 +121,7 @@ class THOR:
             for key in sorted({key for keys in selected for key in keys})
         }
         rows = [
-            max((values[key][row] for key in keys), key=lambda found: float(found.max()))
+            max((values[key][row] for key in keys), key=lambda row_values: float(row_values.max()))
             for row, keys in enumerate(selected)
         ]
         return np.stack(rows).astype(np.float32)

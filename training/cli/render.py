@@ -53,11 +53,11 @@ def render(
         segmentation=Segmentation() if segmentation else None,
         copies=copies,
     )
-    found = find_meshes(meshes, read_names(names) if names else None)
+    paths = find_meshes(meshes, read_names(names) if names else None)
     pool = local_workers(workers) if engine == "local" else ray_workers(workers, address)
     with show_progress(quiet) as progress:
         dataset = render_dataset(
-            found,
+            paths,
             out,
             azimuth_step,
             polar_step,

@@ -45,7 +45,7 @@ def _first_difference(field: str, stored: Any, requested: Any) -> tuple[str, Any
         inner = [(f"{field}[{index}]", *pair) for index, pair in enumerate(pairs)]
     elif stored != requested:
         return field, stored, requested
-    return next((found for entry in inner if (found := _first_difference(*entry))), None)
+    return next((difference for entry in inner if (difference := _first_difference(*entry))), None)
 
 
 def _shown(value: Any) -> str:

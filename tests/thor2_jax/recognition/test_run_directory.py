@@ -84,9 +84,9 @@ def test_a_run_directory_has_three_entries_and_is_readable(saved: Path) -> None:
 def test_an_existing_path_is_refused(saved: Path, tmp_path: Path) -> None:
     before = (saved / "run.json").read_bytes()
     (tmp_path / "file").write_text("x")
-    for taken in (saved, tmp_path / "file"):
-        with pytest.raises(thor2.InputError, match=f"out: {taken} "):
-            save_run(make_run(), taken)
+    for existing in (saved, tmp_path / "file"):
+        with pytest.raises(thor2.InputError, match=f"out: {existing} "):
+            save_run(make_run(), existing)
     assert (saved / "run.json").read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
 
@@ -245,10 +245,10 @@ def small_heap() -> Iterator[None]:
 @pytest.mark.parametrize("name", DAMAGES)
 def test_a_damaged_run_directory_is_refused_in_one_line(name: str, copied: Path) -> None:
     """A failed read leaves no open file, which would warn at garbage collection; warnings are errors here."""
-    damage, words = DAMAGES[name]
+    damage, expected = DAMAGES[name]
     damage(copied)
     with pytest.raises(thor2.InputError) as caught:
         load_run(copied)
     gc.collect()
     message = str(caught.value)
-    assert message.startswith("model: ") and words in message and "\n" not in message and len(message) < 700
+    assert message.startswith("model: ") and expected in message and "\n" not in message and len(message) < 700

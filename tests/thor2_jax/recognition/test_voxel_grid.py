@@ -113,7 +113,7 @@ def test_points_that_are_not_finite(value: float) -> None:
 
 @pytest.mark.parametrize(("points", "colors"), [((4, 2), (4, 3)), ((4, 3), (3, 3)), ((12,), (4, 3)), ((4, 3), (4,))])
 def test_shapes_that_do_not_fit(points: tuple[int, ...], colors: tuple[int, ...]) -> None:
-    with pytest.raises(InputError, match=r"^points and colors have shapes"):
+    with pytest.raises(InputError, match="shapes"):
         voxel_downsample(np.zeros(points), np.zeros(colors), 0.01)
 
 

@@ -184,12 +184,12 @@ def test_infinite_loss_is_refused_and_the_last_checkpoint_stays(
     separable: Samples, fitted: Fit, tmp_path: Path
 ) -> None:
     broken = dataclasses.replace(separable, color_count=separable.color_count * np.nan)
-    with pytest.raises(thor2.InputError, match="loss of ce is nan in epoch 1"):
+    with pytest.raises(thor2.InputError, match="loss of ce is nan .*1"):
         fitted("ce", samples=broken)
     with Checkpoints(tmp_path / "c") as checkpoints:
         fit(separable, FitContext("ce", NETWORK, CONFIG), dataclasses.replace(QUICK, epochs=2), checkpoints)
     with Checkpoints(tmp_path / "c") as checkpoints:
-        with pytest.raises(thor2.InputError, match="loss of ce is nan in epoch 3"):
+        with pytest.raises(thor2.InputError, match="loss of ce is nan .*3"):
             fit(broken, FitContext("ce", NETWORK, CONFIG), QUICK, checkpoints)
     with Checkpoints(tmp_path / "c") as checkpoints:
         assert checkpoints.last_epoch == 2

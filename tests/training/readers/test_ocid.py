@@ -184,7 +184,7 @@ def test_sequences_without_names(tmp_path: Path) -> None:
     for sequence in ("table/bottom/curved/seq36", "table/top/curved/seq36", "floor/top/mixed/seq08"):
         write_frame(tmp_path, sequence)
     names = write_names(tmp_path, {"table/top/curved/seq36": ["a", "b", "c"]})
-    with pytest.raises(InputError, match=r"names\.yaml lacks the sequences table/bottom/curved/seq36, floor/top/mixed"):
+    with pytest.raises(InputError, match=r"names\.yaml .*table/bottom/curved/seq36, floor/top/mixed"):
         OCID(tmp_path, names)
 
 
