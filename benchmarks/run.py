@@ -1,4 +1,4 @@
-"""Compare the library with a peer in one run on the same clouds: `python -m benchmarks.run [--out DIRECTORY] [--quick]`.
+"""Compare the library with a peer on the same clouds: `python -m benchmarks.run [--out DIRECTORY] [--quick]`.
 
 The script prints tables and writes cpu.json and cpu.png. Compile times are reported separately, and all other figures
 are medians of repeated calls. The peer runs in two processes.

@@ -212,10 +212,8 @@ def print_report(results: dict[Mutant, dict[str, Any]]) -> None:
     rows = {module: [r["outcome"] for r in results.values() if r["module"] == module] for module in TESTS}
     rows["all"] = [record["outcome"] for record in results.values()]
     print("\n| module | mutants | killed | survived | timed out |\n|---|--:|--:|--:|--:|")
-    for module, module_outcomes in rows.items():
-        print(
-            f"| {module} | {len(module_outcomes)} | {' | '.join(str(module_outcomes.count(name)) for name in outcomes)} |"
-        )
+    for module, observed in rows.items():
+        print(f"| {module} | {len(observed)} | {' | '.join(str(observed.count(name)) for name in outcomes)} |")
     noticed = len(rows["all"]) - rows["all"].count("survived")
     print(f"\nkilled or timed out: {noticed / max(len(rows['all']), 1):.1%}")
     for mutant, record in results.items():

@@ -102,7 +102,7 @@ def test_reembedding_replaces_all_embeddings(gallery: Gallery) -> None:
     assert other.objects["mug"].clouds is gallery.objects["mug"].clouds
 
 
-def test_compact_clouds_keep_points_to_a_twentieth_of_a_millimetre() -> None:
+def test_compact_clouds_keep_points_to_0_05_mm() -> None:
     views = [view(0, 3), view(1, 50)]
     clouds = CompactClouds.of(views[:1]) + CompactClouds.of(views[1:])
     assert len(clouds) == 2 and clouds.points.dtype == np.int16
