@@ -14,10 +14,11 @@ from thor2_jax.gallery.augment import augmented_copies
 from thor2_jax.gallery.clouds import CompactClouds
 from thor2_jax.gallery.embedding import Embedding
 from thor2_jax.gallery.gallery import GalleryObject
-from thor2_jax.recognition.prepared_instance import PreparedInstance, pack_instances
+from thor2_jax.recognition.frames import RGBDFrame
+from thor2_jax.recognition.prepared_instance import PreparedInstance, pack_instances, prepare_instance
 from thor2_jax.types import PointClouds
 
-__all__ = ["QUERY_ORIENTATIONS", "embed_orientations", "embed_views", "enrolled_views"]
+__all__ = ["QUERY_ORIENTATIONS", "embed_orientations", "embed_views", "enrolled_views", "instance_view"]
 
 QUERY_ORIENTATIONS = 4
 """Candidate orientations of a query, whose scores are averaged."""
@@ -33,6 +34,27 @@ def embed_orientations(embedding: Embedding, clouds: PointClouds, count: int = Q
     """Return the embeddings [B, count, D] of candidate orientations of clouds in metres."""
     flat = embedding.embed_aligned(candidate_orientations(clouds, embedding.config, count))
     return flat.reshape(-1, count, flat.shape[-1])
+
+
+def instance_view(frame: RGBDFrame, label: int | None, sigma_s: float) -> PreparedInstance:
+    """Return one instance of a frame as a view to enroll.
+
+    Args:
+        frame: the frame.
+        label: number of the instance; None if it is the only one.
+        sigma_s: scaled units per metre, see `DescriptorConfig`.
+
+    Raises:
+        InputError: the frame has no such instance, or several and no number is given, or the instance cannot be used.
+    """
+    if label is None and len(frame.instances) != 1:
+        raise InputError(f"labels has {len(frame.instances)} instances; expected one, or give the object's number")
+    if label is not None and label not in frame.instances:
+        raise InputError(f"instance is {label}; expected one of {', '.join(map(str, frame.instances)) or 'none'}")
+    view = prepare_instance(frame, frame.instances[0] if label is None else label, sigma_s)
+    if view.reason is not None:
+        raise InputError(f"instance {view.label} cannot be enrolled: {view.reason}")
+    return view
 
 
 def embed_views(
@@ -58,8 +80,8 @@ def embed_views(
     for start in range(0, len(views), ROWS):
         chunk = views[start : start + ROWS]
         packed = pack(chunk) if pack else pack_instances(chunk, ROWS)
-        batches.append((len(chunk), embed_orientations(embedding, packed)))
-    embedded = [np.asarray(batch)[:count, :VIEW_ORIENTATIONS] for count, batch in batches]
+        batches.append((len(chunk), embed_orientations(embedding, packed, VIEW_ORIENTATIONS)))
+    embedded = [np.asarray(batch)[:count] for count, batch in batches]
     return np.concatenate(embedded).reshape(-1, embedded[0].shape[-1]).astype(np.float16)
 
 

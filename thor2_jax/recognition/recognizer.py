@@ -28,6 +28,7 @@ from thor2_jax.capacity import BATCH_BUCKETS, POINT_BUCKETS, batch_bucket, point
 from thor2_jax.descriptor.describe import describe
 from thor2_jax.errors import InputError, with_context
 from thor2_jax.gallery.embedding import Embedding
+from thor2_jax.gallery.enrollment import instance_view
 from thor2_jax.gallery.gallery import Gallery
 from thor2_jax.gallery.objects import ObjectGallery
 from thor2_jax.gallery.store import GALLERY_DIRECTORY
@@ -179,6 +180,7 @@ class Recognizer:
         *,
         gallery: str | Path | None = None,
         answer_by: AnswerBy | None = None,
+        reembed: bool = False,
     ) -> "Recognizer":
         """Read a run directory; raises as `run_directory.load_run`, `load_gallery` and `Recognizer`.
 
@@ -189,12 +191,13 @@ class Recognizer:
             gallery: directory of the gallery; by default `gallery` in the run directory. Objects that are enrolled or
                 forgotten later are written to it.
             answer_by: see `Recognizer`.
+            reembed: embed the views of the gallery again, after a change of the run's embedding.
         """
         run_dir = Path(run_dir)
         run, file = load_run(run_dir), run_dir / EMBEDDING_FILE
         embedding = Embedding.load(file, run.network) if file.is_file() else None
         recognizer = cls(run, unknown_below, rule, embedding=embedding, answer_by=answer_by)
-        recognizer.objects.open(Path(gallery) if gallery is not None else run_dir / GALLERY_DIRECTORY)
+        recognizer.objects.open(Path(gallery) if gallery is not None else run_dir / GALLERY_DIRECTORY, reembed=reembed)
         return recognizer
 
     @property
@@ -249,27 +252,8 @@ class Recognizer:
         for number, item in enumerate(frames):
             frame, label = item if isinstance(item, tuple) else (item, None)
             with with_context(f"frames[{number}]"):
-                views.append(self.prepare_view(frame, label))
+                views.append(instance_view(frame, label, self.run.config.sigma_s))
         self.objects.enroll(name, views, "frames", extend=extend, replace=replace)
-
-    def prepare_view(self, frame: RGBDFrame, label: int | None = None) -> PreparedInstance:
-        """Return one instance of a frame as a view to enroll.
-
-        Args:
-            frame: the frame.
-            label: number of the instance; not needed if it is the only one.
-
-        Raises:
-            InputError: the frame has no such instance, several and no number is given, or it has too few points.
-        """
-        if label is None and len(frame.instances) != 1:
-            raise InputError(f"labels has {len(frame.instances)} instances; expected one, or give the object's number")
-        if label is not None and label not in frame.instances:
-            raise InputError(f"instance is {label}; expected one of {', '.join(map(str, frame.instances)) or 'none'}")
-        view = prepare_instance(frame, frame.instances[0] if label is None else label, self.run.config.sigma_s)
-        if view.reason is not None:
-            raise InputError(f"instance {view.label} cannot be enrolled: {view.reason}")
-        return view
 
     def forget(self, name: str) -> None:
         """Forget an object: remove its views, and never answer its trained class again.

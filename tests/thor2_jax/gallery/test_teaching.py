@@ -11,7 +11,7 @@ from helpers import SMALL_CONFIG, untrained_run
 import thor2_jax as thor2
 from thor2_jax.gallery.augment import augmented_copies
 from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
-from thor2_jax.gallery.enrollment import QUERY_ORIENTATIONS
+from thor2_jax.gallery.enrollment import QUERY_ORIENTATIONS, instance_view
 from thor2_jax.gallery.objects import ObjectGallery
 from thor2_jax.gallery.union import ClassUnion
 from thor2_jax.recognition.recognizer import EMBEDDING_FILE
@@ -140,7 +140,7 @@ def test_unusable_views_are_refused_and_nothing_changes(run: TrainedRun, embeddi
 
 def test_few_views_get_augmented_copies_and_meshes_none(embedding: Embedding) -> None:
     recognizer = taught(untrained_run((), ()), embedding)
-    views = [recognizer.prepare_view(CLUTTER, label) for label in (1, 2)]
+    views = [instance_view(CLUTTER, label, 2.5) for label in (1, 2)]
     copies = augmented_copies(views)
     assert len(copies) == 8 and len(augmented_copies(views * 5)) == 0
     for copy, again in zip(copies, augmented_copies(views), strict=True):

@@ -1,0 +1,104 @@
+"""`thor2 enroll`: teach a run new objects, without training."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from typer.core import TyperCommand
+
+from thor2_jax.errors import InputError
+from training.cli.app import app, console, progress_bars
+
+if TYPE_CHECKING:
+    from thor2_jax.recognition.prepared_instance import PreparedInstance
+
+
+class _ManyFrames(TyperCommand):
+    """A command whose option --frames takes all values up to the next option."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        expanded: list[str] = []
+        taking = False
+        for argument in args:
+            if argument.startswith("-") and argument != "-":
+                taking = argument == "--frames"
+                expanded += [] if taking else [argument]
+            else:
+                expanded += ["--frames", argument] if taking else [argument]
+        return super().parse_args(ctx, expanded)
+
+
+@app.command(cls=_ManyFrames)
+def enroll(
+    model: Annotated[Path, typer.Option("--model", help="Run directory; created if it does not exist.")],
+    name: Annotated[str | None, typer.Argument(help="Name of the object. Default: every labelled object.")] = None,
+    mesh: Annotated[Path | None, typer.Option(help="Mesh of the object (GLB, OBJ, PLY), in metres.")] = None,
+    frames: Annotated[
+        list[Path] | None, typer.Option(metavar="DIR...", help="Folders of labelled frames, or labelled frames.")
+    ] = None,
+    label_name: Annotated[str | None, typer.Option(help="Name of the object in labels.json. Default: NAME.")] = None,
+    color: Annotated[Path | None, typer.Option(help="Color image of one frame, PNG or JPEG.")] = None,
+    depth: Annotated[Path | None, typer.Option(help="Depth image, 16-bit PNG.")] = None,
+    labels: Annotated[Path | None, typer.Option(help="Instance labels, PNG; 0 is background.")] = None,
+    intrinsics: Annotated[Path | None, typer.Option(help="JSON with fx, fy, cx, cy and depth_scale.")] = None,
+    instance: Annotated[int | None, typer.Option(help="Label number of the object in this frame.")] = None,
+    extend: Annotated[bool, typer.Option("--extend", help="Add views to an object that exists.")] = False,
+    replace: Annotated[bool, typer.Option("--replace", help="Discard the views of an object that exists.")] = False,
+) -> None:
+    """Enroll an object from a mesh, from labelled frames, or from one frame; it is recognized at once.
+
+    Without NAME, every labelled object of the frames is enrolled. A frame is a folder with color.png, depth.png,
+    mask.png, intrinsics.json and labels.json.
+    """
+    from thor2_jax.gallery.enrollment import instance_view
+    from training.enrollment import enroll_objects, labelled_views, mesh_views
+
+    images = {"color": color, "depth": depth, "labels": labels, "intrinsics": intrinsics, "instance": instance}
+    _check_sources(name, mesh, frames, label_name, images)
+    skipped: list[str] = []
+
+    def read(sigma_s: float) -> Mapping[str, Sequence["PreparedInstance"]]:
+        if mesh is not None:
+            assert name is not None
+            return {name: mesh_views(mesh)}
+        if frames:
+            views, unusable = labelled_views(frames, sigma_s, label_name or name)
+            skipped.extend(f"skipped: {each.reason}" for each in unusable)
+            return views if name is None else {name: [view for found in views.values() for view in found]}
+        from thor2_jax.recognition.frames import read_frame
+
+        assert name is not None and color and depth and labels and intrinsics and instance is not None
+        frame = read_frame(color=color, depth=depth, labels=labels, intrinsics=intrinsics)
+        return {name: [instance_view(frame, instance, sigma_s)]}
+
+    with progress_bars() as progress:
+        counts = enroll_objects(
+            model,
+            read,
+            "frames" if mesh is None else "mesh",
+            name=name,
+            extend=extend,
+            replace=replace,
+            report=progress,
+        )
+    for line in skipped:
+        console.print(line, markup=False)
+    for each, count in counts.items():
+        console.print(f"{each}: {count} views", markup=False)
+    console.print(f"enrolled in {model}", markup=False)
+
+
+def _check_sources(
+    name: str | None, mesh: Path | None, frames: list[Path] | None, label_name: str | None, images: dict[str, Any]
+) -> None:
+    given = [option for option, value in images.items() if value is not None]
+    if bool(mesh) + bool(frames) + bool(given) != 1:
+        raise InputError("give exactly one of --mesh, --frames, and --color with --depth, --labels, --intrinsics, ...")
+    if given and len(given) < len(images):
+        missing = ", ".join(f"--{option}" for option in images if option not in given)
+        raise InputError(f"{given[0]} is given without {missing}; one frame needs all of them")
+    if name is None and (not frames or label_name is not None):
+        raise InputError("name is missing; only --frames without --label-name enrolls every labelled object")
+    if label_name is not None and not frames:
+        raise InputError(f"label_name is {label_name!r}; it belongs to --frames")

@@ -1,0 +1,19 @@
+"""`thor2 forget`: remove an object from a run."""
+
+from typing import Annotated
+
+import typer
+
+from training.cli.app import ModelOption, app, console
+
+
+@app.command()
+def forget(
+    name: Annotated[str, typer.Argument(help="Name of an enrolled object or of a trained class.")], model: ModelOption
+) -> None:
+    """Forget an object: its views are removed, and a trained class is never answered again."""
+    from thor2_jax.recognition.recognizer import Recognizer
+
+    recognizer = Recognizer.load(model)
+    recognizer.forget(name)
+    console.print(f"{name} is forgotten; {model} knows {len(recognizer.classes)} objects", markup=False)

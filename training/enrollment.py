@@ -1,0 +1,165 @@
+"""Enrolling objects in the gallery of a run directory: from meshes, and from folders of labelled frames.
+
+enroll_objects(Path("run"), {"mug": mesh_views(Path("mug.glb"))}, "mesh")
+"""
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thor2_jax.errors import InputError, with_context
+from thor2_jax.gallery.enrollment import enrolled_views, instance_view
+from thor2_jax.gallery.objects import ObjectGallery
+from thor2_jax.gallery.store import GALLERY_DIRECTORY
+from thor2_jax.recognition.prepared_instance import PreparedInstance
+from thor2_jax.recognition.recognizer import Recognizer
+from thor2_jax.recognition.run_directory import TrainedRun, load_run, save_run
+from training.augmentation.augmentations import Augmentations
+from training.augmentation.illumination import Illumination
+from training.augmentation.occlusion import Occlusion
+from training.augmentation.segmentation import Segmentation
+from training.augmentation.sensor import Sensor
+from training.objects.mesh import TexturedMesh
+from training.objects.meshes import load_mesh
+from training.readers.frames import FrameFolder
+from training.views.mesh_views import ViewTask, render_task
+
+__all__ = ["SkippedInstance", "enroll_objects", "labelled_views", "mesh_views"]
+
+MESH_VIEWS = 60
+"""Cameras around a mesh; each view is enrolled as rendered and in one augmented copy."""
+
+AUGMENTATIONS = Augmentations(Illumination(), Sensor(), Occlusion(), Segmentation(), copies=1)
+
+Report = Callable[[str, int, int, str], object]
+
+
+def _evenly_spread(count: int) -> NDArray[np.float64]:
+    """Return azimuth and polar angle [count, 2] of directions that cover the sphere evenly (a Fibonacci spiral)."""
+    index = np.arange(count)
+    golden_angle = np.pi * (3 - np.sqrt(5))
+    return np.stack([index * golden_angle % (2 * np.pi), np.arccos(1 - (2 * index + 1) / count)], axis=1)
+
+
+def mesh_views(mesh: Path | TexturedMesh) -> list[PreparedInstance]:
+    """Render a mesh from all sides.
+
+    Raises:
+        InputError: the mesh cannot be read, is too large or too small to be in metres, or has no usable view.
+        OSError: the file cannot be opened.
+    """
+    name = mesh.name if isinstance(mesh, Path) else "mesh"
+    task = ViewTask(
+        name, load_mesh(mesh) if isinstance(mesh, Path) else mesh, _evenly_spread(MESH_VIEWS), 0, AUGMENTATIONS
+    )
+    views = [
+        PreparedInstance(number, cloud.xyz, cloud.rgb, np.zeros(len(cloud.xyz), bool))
+        for number, cloud in enumerate(render_task(task))
+    ]
+    if not views:
+        raise InputError(f"mesh: {name} has too few points in every view; expected an object of a few centimetres")
+    return views
+
+
+@dataclasses.dataclass(frozen=True)
+class SkippedInstance:
+    """A labelled instance that cannot be enrolled.
+
+    Attributes:
+        frame: identifier of its frame.
+        name: name of the object.
+        reason: why it cannot be used.
+    """
+
+    frame: str
+    name: str
+    reason: str
+
+
+def labelled_views(
+    directories: Sequence[Path], sigma_s: float, label_name: str | None = None
+) -> tuple[dict[str, list[PreparedInstance]], list[SkippedInstance]]:
+    """Return object -> its views in folders of labelled frames, and the instances that cannot be used.
+
+    Args:
+        directories: folders of frames, or single frames, see `FrameFolder`.
+        sigma_s: scaled units per metre, see `DescriptorConfig`.
+        label_name: only the object that labels.json gives this name.
+
+    Raises:
+        InputError: a folder or a frame cannot be read, or an object has no usable view.
+    """
+    views: dict[str, list[PreparedInstance]] = {}
+    skipped: list[SkippedInstance] = []
+    for directory in directories:
+        for item in FrameFolder(directory):
+            for label, name in sorted(item.truth.items()):
+                if label_name not in (None, name):
+                    continue
+                views.setdefault(name, [])
+                try:
+                    with with_context(item.identifier):
+                        views[name].append(instance_view(item.frame, label, sigma_s))
+                except InputError as error:
+                    skipped.append(SkippedInstance(item.identifier, name, str(error)))
+    empty = [name for name, found in views.items() if not found]
+    if empty:
+        reason = next(instance.reason for instance in skipped if instance.name == empty[0])
+        raise InputError(f"frames: {empty[0]!r} has no view that can be enrolled ({reason})")
+    if not views:
+        shown = ", ".join(map(str, directories))
+        wanted = "an object" if label_name is None else repr(label_name)
+        raise InputError(f"frames: no frame of {shown} has a label for {wanted}; see labels.json")
+    return views, skipped
+
+
+def enroll_objects(
+    model: Path,
+    read: Callable[[float], Mapping[str, Sequence[PreparedInstance]]],
+    source: str,
+    *,
+    name: str | None = None,
+    extend: bool = False,
+    replace: bool = False,
+    report: Report = lambda stage, done, total, note: None,
+) -> dict[str, int]:
+    """Enroll objects in the gallery of a run directory, in one change; one that does not exist is created.
+
+    Args:
+        model: the run directory.
+        read: function of sigma_s that returns object -> views.
+        source: "mesh" or "frames".
+        name: the name that `read` will return, if there is one: it is checked before anything is read.
+        extend: add the views to those of objects that exist.
+        replace: discard the views of objects that exist.
+        report: called with ("enroll", objects done, number of objects, name).
+
+    Returns:
+        Object -> number of its views in the gallery.
+
+    Raises:
+        InputError: the run directory cannot be read, a view cannot be used, or a name exists and neither `extend` nor
+            `replace` is given. Nothing is enrolled.
+        OSError: a file cannot be written; the gallery is as before.
+    """
+    is_new = not model.exists() or (model.is_dir() and not any(model.iterdir()))
+    objects = ObjectGallery(()) if is_new else Recognizer.load(model).objects
+    config = objects.embedding.config if is_new else load_run(model).config
+    if name is not None:
+        objects.check(name, extend=extend, replace=replace)
+    views = read(config.sigma_s)
+    for each in views:
+        objects.check(each, extend=extend, replace=replace)
+    added = {}
+    for number, (each, found) in enumerate(views.items()):
+        report("enroll", number, len(views), each)
+        added[each] = enrolled_views(objects.embedding, found, source)
+    report("enroll", len(views), len(views), "")
+    if is_new:
+        save_run(TrainedRun(config, objects.embedding.network, (), {}, {}), model)
+        objects.open(model / GALLERY_DIRECTORY)
+    objects.add(added, extend=extend, replace=replace)
+    return {each: len(objects.gallery.objects[each].clouds) for each in views}
