@@ -10,6 +10,7 @@ import zlib
 from collections.abc import Sequence
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
 import numpy as np
@@ -18,6 +19,7 @@ from PIL import Image
 
 import colornet
 import thor2_jax as thor2
+from thor2_jax.gallery.objects import ObjectGallery
 from thor2_jax.recognition.classifier import FEATURES, MLP
 from thor2_jax.recognition.run_directory import TrainedRun, input_size
 
@@ -39,6 +41,19 @@ def untrained_run(
         for k, name in enumerate(features)
     }
     return TrainedRun(config, network, tuple(classes), classifiers, record or {})
+
+
+class UntaughtRecognizer:
+    """Base of toy recognizers: no object is enrolled."""
+
+    run: Any
+
+    @property
+    def objects(self) -> ObjectGallery:
+        return ObjectGallery(tuple(self.run.classes))
+
+    def answers_by(self) -> str:
+        return "classifiers"
 
 
 def aligned_cloud(

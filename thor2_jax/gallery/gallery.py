@@ -13,7 +13,7 @@ import functools
 from collections.abc import Callable, Mapping
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from thor2_jax.errors import InputError
 from thor2_jax.gallery.clouds import CompactClouds
@@ -156,7 +156,7 @@ class Gallery:
                 pass
         return ExactSearch(self._embeddings)
 
-    def scores(self, embeddings: NDArray[np.floating]) -> NDArray[np.float32]:
+    def scores(self, embeddings: ArrayLike) -> NDArray[np.float32]:
         """Return the scores [B, n_objects] of each object, from 0 to 1, in the order of `names`.
 
         Args:

@@ -27,7 +27,7 @@ from thor2_jax.files import atomic_write, content_digest, write_text
 from thor2_jax.gallery.clouds import CompactClouds
 from thor2_jax.gallery.gallery import Gallery, GalleryObject, check_name
 
-__all__ = ["GALLERY_DIRECTORY", "StoredGallery", "update_gallery", "load_gallery", "gallery_stamp"]
+__all__ = ["GALLERY_DIRECTORY", "INDEX_FILE", "StoredGallery", "update_gallery", "load_gallery", "gallery_stamp"]
 
 GALLERY_FORMAT = 1
 """Version of the layout above."""
@@ -35,7 +35,7 @@ GALLERY_FORMAT = 1
 GALLERY_DIRECTORY = "gallery"
 """Name of the gallery in a run directory."""
 
-INDEX = "index.json"
+INDEX_FILE = "index.json"
 
 LOCK_SECONDS = 20.0
 """Time that a writer waits for another one; a change takes milliseconds."""
@@ -59,7 +59,7 @@ class StoredGallery:
 def gallery_stamp(directory: Path) -> tuple[int, int, int] | None:
     """Return a value that differs after every change of the gallery in a directory; None if there is no gallery."""
     try:
-        status = (directory / INDEX).stat()
+        status = (directory / INDEX_FILE).stat()
     except FileNotFoundError:
         return None
     return status.st_mtime_ns, status.st_ino, status.st_size
@@ -87,7 +87,9 @@ def load_gallery(directory: Path, embedding: str | None = None, known: StoredGal
             )
         with contextlib.suppress(_Replaced):
             return _load_objects(directory, index, known)
-    raise InputError(f"gallery: {directory / INDEX} names files that do not exist; restore the directory from a copy")
+    raise InputError(
+        f"gallery: {directory / INDEX_FILE} names files that do not exist; restore the directory from a copy"
+    )
 
 
 class _Replaced(Exception):
@@ -95,7 +97,7 @@ class _Replaced(Exception):
 
 
 def _read_index(directory: Path) -> dict[str, Any] | None:
-    path = directory / INDEX
+    path = directory / INDEX_FILE
     try:
         index = json.loads(path.read_bytes())
         fields = {"format": int, "generation": int, "embedding": str, "objects": list, "hidden": list}
@@ -219,7 +221,7 @@ def update_gallery(
                     written.append(path)
                     _write_durably(path, content)
             index = _index(gallery, files, stored.generation + 1)
-            write_text(directory / INDEX, json.dumps(index, indent=1, ensure_ascii=False) + "\n")
+            write_text(directory / INDEX_FILE, json.dumps(index, indent=1, ensure_ascii=False) + "\n")
         except BaseException:
             for path in written:
                 path.unlink(missing_ok=True)

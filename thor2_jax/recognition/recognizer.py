@@ -358,6 +358,16 @@ class Recognizer:
         overflow, probabilities, embeddings = concatenate_padded(chunks, _padded_rows(n_usable))
         return self.recognitions(instances, probabilities, overflow, embeddings.get("gallery"))
 
+    def gallery_scores(self, described: DescribedFrame) -> NDArray[np.float32]:
+        """Return the scores [B, n_objects] of the gallery, one row for each row of the descriptors."""
+        usable = described.usable
+        chunks = [usable[start : start + CHUNK] for start in range(0, len(usable), CHUNK)]
+        embeddings = [self.objects.embed(pack_instances(chunk, _padded_rows(len(chunk)))) for chunk in chunks]
+        scores = np.zeros((len(described.descriptors.overflow), len(self.gallery.names)), np.float32)
+        if chunks:
+            scores[: len(usable)] = self.gallery.scores(concatenate_padded(embeddings, len(scores))[: len(usable)])
+        return scores
+
     def recognitions(
         self,
         instances: Sequence[PreparedInstance],

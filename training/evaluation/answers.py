@@ -37,6 +37,10 @@ class EvaluatedRun(Protocol):
         """Names of the classifiers and baselines."""
 
     @property
+    def answer_by(self) -> str:
+        """What the recognizer answers by: "classifiers", "gallery" or "both"."""
+
+    @property
     def temperatures(self) -> Mapping[str, float]:
         """Temperatures of the calibrated classifiers and baselines."""
 

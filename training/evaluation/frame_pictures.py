@@ -77,7 +77,7 @@ class FramePictures:
         judged = {i.label: (False, f"none ({i.truth})") for i in known}
         described = [i for i in known if i.probabilities is not None]
         predictions = fuse_answers(described, self._runs)
-        first = next(iter(predictions[main_fusion(predictions)].values()))
+        first = next(iter(predictions[main_fusion(predictions, self._runs[0].answer_by)].values()))
         for instance, index in zip(described, first.class_index, strict=True):
             name = self._classes[index]
             correct = name == instance.truth

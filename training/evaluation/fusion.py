@@ -11,15 +11,18 @@ from thor2_jax.recognition.classifier import FEATURES, Feature
 from thor2_jax.recognition.fusion import FUSION_RULES, FusionRule, fuse, with_temperature
 from training.baselines.names import TITLES
 
-__all__ = ["RULES", "Rule", "fuse_by", "fusions", "main_fusion"]
+__all__ = ["BOTH", "GALLERY", "RULES", "Rule", "fuse_by", "fusions", "main_fusion"]
 
 Rule = FusionRule | Literal["calibrated"]
 RULES: tuple[Rule, ...] = (*FUSION_RULES, "calibrated")
 """The rules of `fuse`, and "calibrated": the rule "max" on temperature-scaled probabilities."""
 
+GALLERY, BOTH = "gallery", "both"
+"""Columns of the gallery alone and of THOR2 combined with it, which no rule fuses with others."""
+
 
 def fusions(available: Iterable[str]) -> dict[str, tuple[str, ...]]:
-    """Return title -> names for each available baseline alone and for every combination of the available classifiers.
+    """Return title -> names for each available baseline and gallery alone and for every combination of classifiers.
 
     Titles are those of the paper: CE, TOPS, ..., THOR2 (TOPS and TOPS2).
     """
@@ -27,13 +30,21 @@ def fusions(available: Iterable[str]) -> dict[str, tuple[str, ...]]:
     features = [name for name in FEATURES if name in names]
     groups = [group for size in range(1, len(features) + 1) for group in itertools.combinations(features, size)]
     baselines: dict[str, tuple[str, ...]] = {title: (name,) for name, title in TITLES.items() if name in names}
-    return baselines | {"THOR2" if group == ("tops", "tops2") else "+".join(group).upper(): group for group in groups}
+    classifiers = {"THOR2" if group == ("tops", "tops2") else "+".join(group).upper(): group for group in groups}
+    return baselines | classifiers | {name: (name,) for name in (GALLERY, BOTH) if name in names}
 
 
-def main_fusion(titles: Iterable[str]) -> str:
-    """Return THOR2 if it is among the titles, otherwise the last one."""
+def main_fusion(titles: Iterable[str], answer_by: str = "classifiers") -> str:
+    """Return the column that the recognizer answers by.
+
+    Args:
+        titles: the columns, at least one.
+        answer_by: "classifiers" (THOR2 if it is among the titles, otherwise the last one), "gallery" or "both".
+    """
     titles = list(titles)
-    return "THOR2" if "THOR2" in titles else titles[-1]
+    if answer_by in titles:
+        return answer_by
+    return "THOR2" if "THOR2" in titles else [title for title in titles if title not in (GALLERY, BOTH)][-1]
 
 
 def fuse_by(
@@ -46,6 +57,9 @@ def fuse_by(
         probabilities: [B, C] class probabilities of each classifier.
         temperatures: temperature of each classifier; needed for "calibrated".
     """
+    if set(probabilities) <= {GALLERY, BOTH}:
+        (values,) = probabilities.values()  # scores, which need not sum to 1
+        return values.argmax(axis=1), values.max(axis=1)
     if rule == "calibrated":
         assert temperatures is not None
         probabilities = {name: with_temperature(values, temperatures[name]) for name, values in probabilities.items()}

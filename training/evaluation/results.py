@@ -68,7 +68,7 @@ def incorrect_answers(
     classes = runs[0].classes
     described = [i for i in frame.instances if i.probabilities is not None and i.truth in classes]
     predictions = fuse_answers(described, runs)
-    for by_run in predictions[main_fusion(predictions)].values():
+    for by_run in predictions[main_fusion(predictions, runs[0].answer_by)].values():
         for instance, index, confidence in zip(described, by_run.class_index, by_run.confidence, strict=True):
             if classes[index] != instance.truth:
                 yield instance, classes[index], float(confidence)
@@ -132,7 +132,7 @@ def _scores(
     by_rule = {rule: fuse_answers(instances, runs, rule) for rule in RULES}
     attributes = [each for _, each in known]
     tables = attribute_tables(kind, attributes)
-    main = main_fusion(by_rule[DEFAULT_RULE])
+    main = main_fusion(by_rule[DEFAULT_RULE], runs[0].answer_by)
     predictions = list(by_rule[DEFAULT_RULE][main].values())
     confusion = _confusion(predictions, truth, described, len(classes))
     rules: dict[str, Rule] = {"confidence": DEFAULT_RULE, "calibrated_confidence": "calibrated"}

@@ -14,11 +14,13 @@ from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
 from thor2_jax.files import content_digest, json_digest
-from thor2_jax.recognition.recognizer import DescribedFrame, Recognizer
+from thor2_jax.gallery.store import GALLERY_DIRECTORY, INDEX_FILE
+from thor2_jax.recognition.recognizer import EMBEDDING_FILE, THOR2, DescribedFrame, Recognizer
 from thor2_jax.recognition.run_directory import RUN_FILE
 from training.baselines.baseline import Baseline, BaselineInputs
 from training.baselines.files import baseline_file
 from training.baselines.load import load_baselines
+from training.evaluation.fusion import BOTH, GALLERY
 from training.fitting.run_directories import find_run_directories
 from training.readers.labelled import path_ends, sequence_of
 
@@ -45,34 +47,51 @@ class Run:
 
     @property
     def classes(self) -> tuple[str, ...]:
-        """Class names, in the order of the probabilities."""
-        return self.recognizer.run.classes
+        """Names of the trained classes and the enrolled objects, in the order of the probabilities."""
+        return self.recognizer.objects.union.names
 
     @property
     def predictors(self) -> tuple[str, ...]:
-        """Names of the classifiers and baselines."""
-        return (*self.recognizer.run.classifiers, *self.baselines)
+        """Names of the classifiers and baselines; "gallery" and "both" if objects are enrolled."""
+        classifiers = self.recognizer.run.classifiers
+        if not self.recognizer.objects.gallery.objects:
+            return (*classifiers, *self.baselines)
+        return (*classifiers, *self.baselines, GALLERY, *([BOTH] if set(THOR2) <= set(classifiers) else []))
+
+    @property
+    def answer_by(self) -> str:
+        """What the recognizer answers by: "classifiers", "gallery" or "both"."""
+        return self.recognizer.answers_by()
 
     def probabilities(
         self, frame: str, described: DescribedFrame, inputs: BaselineInputs | None
     ) -> dict[str, NDArray[np.float32]]:
-        """Return classifier or baseline -> [B, C] class probabilities of a frame's instances.
+        """Return classifier, baseline or gallery -> [B, C] class probabilities or scores of a frame's instances.
 
         Args:
             frame: identifier of the frame.
             described: the described frame.
             inputs: inputs of the baselines; None if no run has any.
         """
-        values = {str(name): p for name, p in self.recognizer.probabilities(described.descriptors).items()}
+        by_classifiers = self.recognizer.probabilities(described.descriptors)
+        values = {str(name): p for name, p in by_classifiers.items()}
         if inputs is not None:
             values |= {name: baseline.probabilities(inputs) for name, baseline in self.baselines.items()}
+        union = self.recognizer.objects.union
+        values = {name: union.of_classifiers(p) for name, p in values.items()}
+        if GALLERY in self.predictors:
+            scores = self.recognizer.gallery_scores(described)
+            values[GALLERY] = union.of_gallery(scores)
+        if BOTH in self.predictors:
+            values[BOTH] = self.recognizer.combined({name: by_classifiers[name] for name in THOR2}, scores)
         return values
 
 
 def _digest(path: Path) -> str:
     baselines = baseline_file(path, "[!.]*")  # without the temporary file of a killed process
     weights = [*sorted((path / "weights").rglob("*")), *sorted(baselines.parent.glob(baselines.name))]
-    files = [file for file in (path / RUN_FILE, path / "network.npz", *weights) if file.is_file()]
+    enrolled = path / EMBEDDING_FILE, path / GALLERY_DIRECTORY / INDEX_FILE  # the index has the digests of the objects
+    files = [file for file in (path / RUN_FILE, path / "network.npz", *weights, *enrolled) if file.is_file()]
     return content_digest(
         part
         for file in files

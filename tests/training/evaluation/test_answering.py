@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers import UntaughtRecognizer
 
 import thor2_jax as thor2
 from training.evaluation.answering import answer_frames
@@ -13,7 +14,7 @@ from training.evaluation.runs import Run
 from training.readers.labelled import LabelledFrame
 
 
-class ToyRecognizer:
+class ToyRecognizer(UntaughtRecognizer):
     """Stand-in for a recognizer: the k-th usable instance of a frame has row k of the given probabilities."""
 
     run = SimpleNamespace(classes=("mug", "bowl", "can"), classifiers={"tops": None, "tops2": None})

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import ParsedPage
+from helpers import ParsedPage, UntaughtRecognizer
 from PIL import Image
 
 import thor2_jax as thor2
@@ -56,7 +56,7 @@ class OneFrame(LabelledFrames):
         return self.item
 
 
-class ToyRecognizer:
+class ToyRecognizer(UntaughtRecognizer):
     """Returns random probabilities, seeded by run and frame, and logs each frame that it describes."""
 
     def __init__(self, seed: int, log: Path, features: tuple[str, ...], kill_at: int | None = None) -> None:

@@ -23,6 +23,7 @@ class ToyRun(NamedTuple):
     predictors: tuple[str, ...]
     classes: tuple[str, ...] = CLASSES
     temperatures: Mapping[str, float] = {}
+    answer_by: str = "classifiers"
 
 
 RUNS = [ToyRun("a", ("tops", "tops2")), ToyRun("b", ("ce", "tops", "tops2"))]
@@ -67,6 +68,19 @@ def test_fusions_have_the_titles_of_the_paper() -> None:
     assert fusions([]) == {}
     assert main_fusion(fusions(["ce", "tops", "tops2"])) == "THOR2"
     assert main_fusion(fusions(["ce", "tops"])) == "CE+TOPS"
+    titles = fusions(["ce", "tops", "tops2", "gallery", "both"])
+    assert list(titles)[-2:] == ["gallery", "both"]
+    assert [main_fusion(titles, source) for source in ("classifiers", "gallery", "both")] == [
+        "THOR2",
+        "gallery",
+        "both",
+    ]
+    assert main_fusion(fusions(["ce", "gallery"])) == "CE" and main_fusion(["gallery"], "gallery") == "gallery"
+
+
+def test_scores_of_the_gallery_are_not_normalized() -> None:
+    index, confidence = fuse_by("log-mean", {"gallery": np.array([[0.2, 0.1], [0.0, 0.7]])})
+    assert list(index) == [0, 1] and list(confidence) == [0.2, 0.7]
 
 
 def test_fusion_rules_match_hand_calculation() -> None:

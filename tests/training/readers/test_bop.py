@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from helpers import run_thor2
+from helpers import run_thor2, UntaughtRecognizer
 from PIL import Image
 
 from thor2_jax.errors import InputError
@@ -363,7 +363,7 @@ def test_a_real_frame(shared: Path, tmp_path: Path) -> None:
 # To the end
 
 
-class LabelIsClass:
+class LabelIsClass(UntaughtRecognizer):
     """Stands in for a trained recognizer: instance 1 is a mug, every other a bowl, the last of a frame too small."""
 
     run = SimpleNamespace(classes=("mug", "bowl"), classifiers={"tops": None})

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from helpers import run_thor2
+from helpers import run_thor2, UntaughtRecognizer
 from PIL import Image
 
 from thor2_jax.errors import InputError
@@ -335,7 +335,7 @@ def test_the_camera_of_real_depth(shared: Path) -> None:
 # Evaluation
 
 
-class NamesInOrder:
+class NamesInOrder(UntaughtRecognizer):
     """Stand-in for a recognizer that predicts the first class for the first instance and the second for all others."""
 
     def __init__(self, classes: tuple[str, ...] = ("mug", "bowl")) -> None:

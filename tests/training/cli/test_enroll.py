@@ -1,0 +1,212 @@
+"""Enrolling, forgetting and listing objects on the command line, and what the other commands make of such a run."""
+
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from helpers import SMALL_CONFIG, run_thor2, untrained_run
+from PIL import Image
+
+from thor2_jax.gallery import embedding as embeddings
+from thor2_jax.gallery import objects as gallery_objects
+from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
+from thor2_jax.recognition.recognizer import Recognizer
+from thor2_jax.recognition.run_directory import load_run, save_run
+from training import enrollment
+
+COLORS = {"brick": (220, 30, 30), "book": (30, 40, 220), "leaf": (60, 200, 60)}
+
+
+@pytest.fixture(autouse=True)
+def small_embedding(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Replace the packaged embedding by a small one with random weights, which compiles quickly."""
+    small = Embedding.create(SMALL_CONFIG, sizes=EmbeddingSizes(4, (16,), 8, 4))
+    for module in (embeddings, gallery_objects):
+        monkeypatch.setattr(module, "load_default", lambda: small)
+    monkeypatch.setattr(enrollment, "MESH_VIEWS", 3)
+
+
+def write_frame(directory: Path, objects: dict[int, str], seed: int = 0) -> Path:
+    """A frame with a rectangle for each object."""
+    rng = np.random.default_rng(seed)
+    color = rng.integers(100, 120, (240, 320, 3), np.uint8)
+    mask = np.zeros((240, 320), np.uint8)
+    for place, (label, name) in enumerate(objects.items()):
+        window = slice(30, 140 if name == "brick" else 90), slice(20 + 100 * place, 100 + 100 * place)
+        mask[window] = label
+        color[window] = np.clip(np.array(COLORS[name]) + rng.integers(-9, 10, (*mask[window].shape, 3)), 0, 255)
+    depth = np.broadcast_to(600 + np.arange(320) // 2, (240, 320)).astype(np.uint16)
+    directory.mkdir(parents=True)
+    for name, image in (("color", color), ("depth", depth), ("mask", mask)):
+        Image.fromarray(image).save(directory / f"{name}.png")
+    (directory / "intrinsics.json").write_text('{"fx": 600, "fy": 600, "cx": 159.5, "cy": 119.5}')
+    (directory / "labels.json").write_text(json.dumps({"labels": {str(k): name for k, name in objects.items()}}))
+    return directory
+
+
+@pytest.fixture
+def frames(tmp_path: Path) -> Path:
+    for number in range(2):
+        write_frame(tmp_path / "frames" / f"00{number}", {1: "brick", 5: "book"}, number)
+    return tmp_path / "frames"
+
+
+@pytest.fixture
+def model(frames: Path, tmp_path: Path) -> Path:
+    assert run_thor2("enroll", "--frames", frames, "--model", tmp_path / "run") == 0
+    return tmp_path / "run"
+
+
+def error_of(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    capsys.readouterr()
+    assert run_thor2(*arguments) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ") and error.count("\n") == 1
+    return error
+
+
+def files(directory: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(directory)): p.read_bytes() for p in sorted(directory.rglob("*")) if p.is_file()}
+
+
+def one_frame(frame: Path, instance: int) -> list[object]:
+    names = {"color": "color.png", "depth": "depth.png", "labels": "mask.png", "intrinsics": "intrinsics.json"}
+    return [*(v for option, file in names.items() for v in (f"--{option}", frame / file)), "--instance", instance]
+
+
+def test_every_labelled_object_is_enrolled_in_a_new_run(model: Path, frames: Path, tmp_path: Path) -> None:
+    assert load_run(model).classes == () and load_run(model).classifiers == {}
+    gallery = Recognizer.load(model).gallery
+    assert {name: len(views.clouds) for name, views in gallery.objects.items()} == {"brick": 2, "book": 2}
+    out = tmp_path / "answers"
+    frame = frames / "001"
+    arguments = [str(value) for value in one_frame(frame, 1)[:-2]]
+    assert run_thor2("recognize", "--model", model, *arguments, "--out", out) == 0
+    answers = json.loads((out / "recognition.json").read_text())
+    assert [(answer["label"], answer["name"]) for answer in answers] == [(1, "brick"), (5, "book")]
+
+
+def test_evaluation_has_a_gallery_column(model: Path, tmp_path: Path) -> None:
+    frames = tmp_path / "test"
+    write_frame(frames / "a", {2: "book", 3: "brick", 4: "leaf"}, 7)
+    assert run_thor2("evaluate", "frames", frames, "--model", model, "--out", tmp_path / "report") == 0
+    report = json.loads((tmp_path / "report" / "report.json").read_text())
+    assert report["main"] == "gallery" and report["fusions"] == ["gallery"]
+    cell = report["accuracy"][report["rule"]][0]["cells"][0]
+    assert cell["instances"] == 2 and cell["accuracy"]["gallery"]["mean"] == 1.0
+    assert report["instances"]["no_class"] == {"leaf": 1}
+
+
+def test_a_trained_run_answers_by_both(frames: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    model = tmp_path / "run"
+    save_run(untrained_run(("brick", "mug"), ("tops", "tops2")), model)
+    assert "'brick' is a trained class" in error_of(capsys, "enroll", "--frames", frames, "--model", model)
+    assert run_thor2("enroll", "book", "--model", model, "--frames", frames) == 0
+    assert run_thor2("evaluate", "frames", frames, "--model", model, "--out", tmp_path / "report") == 0
+    report = json.loads((tmp_path / "report" / "report.json").read_text())
+    assert report["main"] == "both" and {"THOR2", "gallery", "both"} <= set(report["fusions"])
+    assert report["classes"] == ["brick", "mug", "book"]
+    assert run_thor2("forget", "mug", "--model", model) == 0
+    assert Recognizer.load(model).classes == ("brick", "book")
+    assert "'mug'" in error_of(capsys, "forget", "mug", "--model", model)
+
+
+def test_several_folders_follow_one_option(frames: Path, tmp_path: Path) -> None:
+    more = write_frame(tmp_path / "more", {9: "leaf"}, 3)
+    model = tmp_path / "run"
+    assert run_thor2("enroll", "--frames", frames / "000", frames / "001", more, "--model", model) == 0
+    counts = {name: len(v.clouds) for name, v in Recognizer.load(model).gallery.objects.items()}
+    assert counts == {"brick": 2, "book": 2, "leaf": 1}
+
+
+def test_a_named_object_comes_from_its_label_name(model: Path, frames: Path) -> None:
+    more = ("--model", model, "--frames", frames / "000")
+    assert run_thor2("enroll", "red thing", *more, "--label-name", "brick") == 0
+    assert run_thor2("enroll", "brick", *more, "--extend") == 0
+    counts = {name: len(v.clouds) for name, v in Recognizer.load(model).gallery.objects.items()}
+    assert counts == {"brick": 3, "book": 2, "red thing": 1}
+    assert run_thor2("enroll", "brick", *more, "--replace") == 0
+    assert len(Recognizer.load(model).gallery.objects["brick"].clouds) == 1
+
+
+def test_one_frame_enrolls_one_instance(model: Path, frames: Path) -> None:
+    assert run_thor2("enroll", "single", "--model", model, *one_frame(frames / "000", 5)) == 0
+    assert len(Recognizer.load(model).gallery.objects["single"].clouds) == 1
+
+
+def test_a_mesh_is_enrolled_from_all_sides(model: Path, tmp_path: Path) -> None:
+    box = trimesh.creation.box((0.1, 0.2, 0.15))
+    box.visual.vertex_colors = [[200, 100, 50, 255]] * len(box.vertices)
+    box.export(tmp_path / "box.ply")
+    assert run_thor2("enroll", "box", "--model", model, "--mesh", tmp_path / "box.ply") == 0
+    views = Recognizer.load(model).gallery.objects["box"]
+    assert views.source == "mesh" and len(views.clouds) == 6 and len(views.embeddings) == 12
+
+
+def test_objects_lists_views_source_and_date(model: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_thor2("objects", "--model", model) == 0
+    table = capsys.readouterr().out
+    for name in ("brick", "book"):
+        assert re.search(rf"{name}\W+2\W+frames\W+20\d\d-\d\d-\d\dT", table)
+    before = files(model / "gallery" / "objects")
+    assert run_thor2("objects", "--model", model, "--reembed") == 0
+    assert files(model / "gallery" / "objects") == before
+
+
+def test_forgetting_an_object(model: Path, frames: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = json.loads((model / "gallery" / "index.json").read_text())
+    write = ("enroll", "new", "--model", model, *one_frame(frames / "000", 5))
+    assert run_thor2(*write) == 0 and run_thor2("forget", "new", "--model", model) == 0
+    after = json.loads((model / "gallery" / "index.json").read_text())
+    assert after["objects"] == before["objects"] and after["generation"] == before["generation"] + 2
+    assert "'new'" in error_of(capsys, "forget", "new", "--model", model)
+
+
+def in_millimetres(tmp_path: Path) -> Path:
+    box = trimesh.creation.box((100, 200, 150))
+    box.visual.vertex_colors = [[200, 100, 50, 255]] * len(box.vertices)
+    box.export(tmp_path / "mm.ply")
+    return tmp_path / "mm.ply"
+
+
+BAD: dict[str, tuple[Callable[[Path, Path], list[object]], str]] = {
+    "existing name": (lambda tmp, frames: ["--frames", frames], "'brick'"),
+    "no source": (lambda tmp, frames: ["new"], "--mesh"),
+    "two sources": (lambda tmp, frames: ["new", "--frames", frames, "--mesh", tmp / "a.ply"], "--mesh"),
+    "half a frame": (lambda tmp, frames: ["new", *one_frame(frames / "000", 5)[:-2]], "--instance"),
+    "mesh without a name": (lambda tmp, frames: ["--mesh", in_millimetres(tmp)], "name"),
+    "millimetres": (lambda tmp, frames: ["new", "--mesh", in_millimetres(tmp)], "mm.ply"),
+    "no mesh": (lambda tmp, frames: ["new", "--mesh", tmp / "none.glb"], "none.glb"),
+    "no folder": (lambda tmp, frames: ["new", "--frames", tmp / "none"], "none"),
+    "another label name": (lambda tmp, frames: ["new", "--frames", frames], "'new'"),
+    "no such instance": (lambda tmp, frames: ["new", *one_frame(frames / "000", 4)], "instance is 4"),
+    "empty name": (lambda tmp, frames: ["", *one_frame(frames / "000", 5)], "name is ''"),
+    "extend and replace": (lambda tmp, frames: ["--frames", frames, "--extend", "--replace"], "extend and replace"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input_changes_nothing(
+    case: str, model: Path, frames: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments, words = BAD[case]
+    given, before = arguments(tmp_path, frames), files(model)
+    assert words in error_of(capsys, "enroll", *given, "--model", model)
+    assert files(model) == before
+    if case not in ("existing name", "extend and replace"):
+        error_of(capsys, "enroll", *given, "--model", tmp_path / "other")
+        assert not (tmp_path / "other").exists()
+
+
+def test_too_few_points_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    frame = write_frame(tmp_path / "frame", {1: "brick"})
+    mask = np.zeros((240, 320), np.uint8)
+    mask[10:13, 10:13] = 1
+    Image.fromarray(mask).save(frame / "mask.png")
+    for given in (["--frames", frame], ["new", *one_frame(frame, 1)]):
+        assert "points" in error_of(capsys, "enroll", *given, "--model", tmp_path / "run")
+    assert not (tmp_path / "run").exists()
