@@ -3,6 +3,7 @@
 enroll_objects(Path("run"), {"mug": mesh_views(Path("mug.glb"))}, "mesh")
 """
 
+import contextlib
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -22,6 +23,7 @@ from training.augmentation.illumination import Illumination
 from training.augmentation.occlusion import Occlusion
 from training.augmentation.segmentation import Segmentation
 from training.augmentation.sensor import Sensor
+from training.fitting.options import Progress
 from training.objects.mesh import TexturedMesh
 from training.objects.meshes import load_mesh
 from training.readers.frames import FrameFolder
@@ -34,7 +36,9 @@ MESH_VIEWS = 60
 
 AUGMENTATIONS = Augmentations(Illumination(), Sensor(), Occlusion(), Segmentation(), copies=1)
 
-Report = Callable[[str, int, int, str], object]
+
+def _show_nothing(stage: str, done: int, total: int, note: str) -> None:
+    """Show nothing."""
 
 
 def _evenly_spread(count: int) -> NDArray[np.float64]:
@@ -124,7 +128,7 @@ def enroll_objects(
     name: str | None = None,
     extend: bool = False,
     replace: bool = False,
-    report: Report = lambda stage, done, total, note: None,
+    progress: Callable[[], contextlib.AbstractContextManager[Progress]] = lambda: contextlib.nullcontext(_show_nothing),
 ) -> dict[str, int]:
     """Enroll objects in the gallery of a run directory, in one change; one that does not exist is created.
 
@@ -135,7 +139,8 @@ def enroll_objects(
         name: the name that `read` will return, if there is one: it is checked before anything is read.
         extend: add the views to those of objects that exist.
         replace: discard the views of objects that exist.
-        report: called with ("enroll", objects done, number of objects, name).
+        progress: function that shows the progress of embedding, like `progress_bars` of the command line; its context
+            is called with ("enroll", objects done, number of objects, name).
 
     Returns:
         Object -> number of its views in the gallery.
@@ -154,10 +159,11 @@ def enroll_objects(
     for each in views:
         objects.check(each, extend=extend, replace=replace)
     added = {}
-    for number, (each, found) in enumerate(views.items()):
-        report("enroll", number, len(views), each)
-        added[each] = enrolled_views(objects.embedding, found, source)
-    report("enroll", len(views), len(views), "")
+    with progress() as report:
+        for number, (each, found) in enumerate(views.items()):
+            report("enroll", number, len(views), each)
+            added[each] = enrolled_views(objects.embedding, found, source)
+        report("enroll", len(views), len(views), "")
     if is_new:
         save_run(TrainedRun(config, objects.embedding.network, (), {}, {}), model)
         objects.open(model / GALLERY_DIRECTORY)

@@ -19,8 +19,6 @@ from thor2_jax.types import PointClouds
 
 __all__ = ["ObjectGallery"]
 
-_NO_VIEWS = GalleryObject(np.zeros((0, 1), np.float16), CompactClouds.of([]), "", "")
-
 
 class ObjectGallery:
     """Enrolled objects beside the trained classes of a run.
@@ -102,7 +100,8 @@ class ObjectGallery:
 
     def check(self, name: str, *, extend: bool = False, replace: bool = False) -> None:
         """Raise InputError if `enroll` would refuse the name; a check before views are rendered or embedded."""
-        self._with_objects(self.gallery, {name: _NO_VIEWS}, extend, replace)
+        none = GalleryObject(np.zeros((0, self.embedding.size), np.float16), CompactClouds.of([]), "", "")
+        self._with_objects(self.gallery, {name: none}, extend, replace)
 
     def _with_objects(
         self, gallery: Gallery, objects: Mapping[str, GalleryObject], extend: bool, replace: bool

@@ -72,16 +72,8 @@ def enroll(
         frame = read_frame(color=color, depth=depth, labels=labels, intrinsics=intrinsics)
         return {name: [instance_view(frame, instance, sigma_s)]}
 
-    with progress_bars() as progress:
-        counts = enroll_objects(
-            model,
-            read,
-            "frames" if mesh is None else "mesh",
-            name=name,
-            extend=extend,
-            replace=replace,
-            report=progress,
-        )
+    source = "frames" if mesh is None else "mesh"
+    counts = enroll_objects(model, read, source, name=name, extend=extend, replace=replace, progress=progress_bars)
     for line in skipped:
         console.print(line, markup=False)
     for each, count in counts.items():

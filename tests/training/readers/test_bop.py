@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from helpers import run_thor2, UntaughtRecognizer
+from helpers import UntaughtRecognizer, run_thor2
 from PIL import Image
 
 from thor2_jax.errors import InputError
