@@ -139,7 +139,7 @@ def enroll_objects(
         name: the name that `read` will return, if there is one: it is checked before anything is read.
         extend: add the views to those of objects that exist.
         replace: discard the views of objects that exist.
-        progress: function that shows the progress of embedding, like `progress_bars` of the command line; its context
+        progress: function that shows the progress of embedding, like `show_progress` of the command line; its context
             is called with ("enroll", objects done, number of objects, name).
 
     Returns:

@@ -1,6 +1,7 @@
 """`thor2 enroll`: teach a run new objects, without training."""
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -8,7 +9,8 @@ import typer
 from typer.core import TyperCommand
 
 from thor2_jax.errors import InputError
-from training.cli.app import app, console, progress_bars
+from training.cli.app import QuietOption, app, console
+from training.cli.progress import show_progress
 
 if TYPE_CHECKING:
     from thor2_jax.recognition.prepared_instance import PreparedInstance
@@ -45,6 +47,7 @@ def enroll(
     instance: Annotated[int | None, typer.Option(help="Label number of the object in this frame.")] = None,
     extend: Annotated[bool, typer.Option("--extend", help="Add views to an object that exists.")] = False,
     replace: Annotated[bool, typer.Option("--replace", help="Discard the views of an object that exists.")] = False,
+    quiet: QuietOption = False,
 ) -> None:
     """Enroll an object from a mesh, from labelled frames, or from one frame; it is recognized at once.
 
@@ -73,12 +76,14 @@ def enroll(
         return {name: [instance_view(frame, instance, sigma_s)]}
 
     source = "frames" if mesh is None else "mesh"
-    counts = enroll_objects(model, read, source, name=name, extend=extend, replace=replace, progress=progress_bars)
+    counts = enroll_objects(
+        model, read, source, name=name, extend=extend, replace=replace, progress=partial(show_progress, quiet)
+    )
     for line in skipped:
-        console.print(line, markup=False)
+        console.print(line)
     for each, count in counts.items():
-        console.print(f"{each}: {count} views", markup=False)
-    console.print(f"enrolled in {model}", markup=False)
+        console.print(f"{each}: {count} views")
+    console.print(f"enrolled in {model}")
 
 
 def _check_sources(

@@ -16,4 +16,4 @@ def forget(
 
     recognizer = Recognizer.load(model)
     recognizer.forget(name)
-    console.print(f"{name} is forgotten; {model} knows {len(recognizer.classes)} objects", markup=False)
+    console.print(f"{name} is forgotten; {model} knows {len(recognizer.classes)} objects")
