@@ -81,7 +81,7 @@ def encode_image(pixels: np.ndarray, kind: str = "PNG", **options: object) -> by
 
 
 def png_file(chunks: Sequence[tuple[bytes, bytes, int]]) -> bytes:
-    """Return a PNG file of chunks (kind, content, checksum), whatever is in them."""
+    """Return a PNG file of chunks (kind, content, checksum), which may be invalid."""
     packed = (struct.pack(">I", len(content)) + kind + content + struct.pack(">I", c) for kind, content, c in chunks)
     return b"\x89PNG\r\n\x1a\n" + b"".join(packed)
 

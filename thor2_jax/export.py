@@ -46,7 +46,7 @@ def export_recognizer(run: TrainedRun, n_points: int, n_clouds: int, platforms: 
         each classifier and overflow [B].
 
     Raises:
-        InputError: a size is no bucket or a platform is unknown.
+        InputError: A size is not a bucket, or a platform is unknown.
     """
     for name, value, buckets in (("n_points", n_points, POINT_BUCKETS), ("n_clouds", n_clouds, BATCH_BUCKETS)):
         if value not in buckets:

@@ -188,7 +188,7 @@ def test_train(meshes: Path, frames: Path, environment: Any, call: Any, tmp_path
         if "run.json" in found:
             assert equal_models(load_run(out), run)
         else:
-            check_refused(call("evaluate", "frames", frames, "--model", out), f"{out} is no run directory")
+            check_refused(call("evaluate", "frames", frames, "--model", out), f"{out} is not a run directory")
         if "checkpoints/begun.json" in found:
             check_refused(call(*command, out, "--epochs", 3), f"{out} was written with epochs 2, not 3")
     assert call(*command, out)[0] == 0

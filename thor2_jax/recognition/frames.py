@@ -89,7 +89,7 @@ class Intrinsics:
         """Make intrinsics from a mapping with fx, fy, cx, cy and optionally depth_scale; other entries are ignored.
 
         Raises:
-            InputError: `values` is no mapping, lacks an entry or has an invalid one.
+            InputError: `values` is not a mapping, lacks an entry or has an invalid one.
         """
         if not isinstance(values, Mapping):
             raise InputError(f"intrinsics is a {type(values).__name__}; expected a mapping with fx, fy, cx, cy")
@@ -270,13 +270,13 @@ def parse_intrinsics(content: bytes) -> Intrinsics:
     """Make intrinsics from JSON text: an object with fx, fy, cx, cy and optionally depth_scale (depth units per metre).
 
     Raises:
-        InputError: `content` is no valid JSON, or as `Intrinsics.of`.
+        InputError: `content` is not valid JSON, or as `Intrinsics.of`.
     """
     try:
         values = json.loads(content)
     except (ValueError, RecursionError) as error:
         reason = {UnicodeDecodeError: "not UTF-8", RecursionError: "nested too deeply"}.get(type(error), error)
-        raise InputError(f"intrinsics is no valid JSON ({reason}); expected an object with fx, fy, cx, cy") from None
+        raise InputError(f"intrinsics is not valid JSON ({reason}); expected an object with fx, fy, cx, cy") from None
     return Intrinsics.of(values)
 
 

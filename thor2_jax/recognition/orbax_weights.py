@@ -39,7 +39,7 @@ def load_orbax_classifier(path: Path, create: Callable[[], MLP], digest: str) ->
         with ocp.StandardCheckpointer(multiprocessing_options=alone) as checkpointer:
             target = jax.tree.map(lambda a: np.zeros(a.shape, a.dtype), shapes)
             restored = checkpointer.restore(path, target)
-    except Exception as error:  # Orbax raises whatever its storage layers raise
+    except Exception as error:  # Orbax passes on all exceptions of its storage layers
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0][:300]
         raise InputError(f"model: {path} cannot be read ({reason})") from None
     return model_from_arrays(create, {"/".join(map(str, keys)): a for keys, a in _leaves(restored)})

@@ -112,7 +112,7 @@ def load_run(path: str | Path) -> TrainedRun:
     """Read a run directory.
 
     Raises:
-        InputError: the path is no run directory, a file is damaged, the format or the descriptor version is another
+        InputError: the path is not a run directory, a file is damaged, the format or the descriptor version is another
             one, or the files do not belong together. The message names the file.
     """
     path = Path(path).absolute()
@@ -150,7 +150,7 @@ def _read_description(path: Path) -> dict[str, Any]:
     try:
         description = json.loads((path / RUN_FILE).read_text())
     except FileNotFoundError:
-        raise InputError(f"model: {path} is no run directory (it has no run.json)") from None
+        raise InputError(f"model: {path} is not a run directory; expected one with run.json") from None
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"model: {path / RUN_FILE} cannot be read: {error}") from None
     if not isinstance(description, dict) or description.get("format") not in (1, RUN_FORMAT):

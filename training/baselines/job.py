@@ -45,9 +45,9 @@ def train_baselines(
         options: options of the fits; by default those of the run.
 
     Raises:
-        InputError: a baseline is unknown, `path` is no run directory, the views are not those of the run, or a baseline
-            cannot be trained on them.
-        OSError: a file cannot be written.
+        InputError: A baseline is unknown, `path` is not a run directory, the views are not those of the run, or a
+            baseline cannot be trained on them.
+        OSError: A file cannot be written.
     """
     names = check_baselines(names)
     for directory in find_run_directories([Path(path)]):

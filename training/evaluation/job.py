@@ -46,7 +46,7 @@ def evaluate_dataset(
     Args:
         runs: runs, as returned by `load_runs` or `load_sequence_runs`.
         frames: the dataset.
-        dataset: "kind" (uwis, ocid, bop, frames), "path", and whatever else the frames depend on.
+        dataset: "kind" (uwis, ocid, bop, frames), "path", and all other values that the frames depend on.
         out: directory of the report: new, empty, or of the same evaluation.
         progress: called with ("evaluate", frames done, number of frames, note).
 

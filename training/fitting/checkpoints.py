@@ -91,7 +91,7 @@ class Checkpoints:
                 self._manager.save(epoch, args=ocp.args.StandardSave(host), metrics={"score": score})
             if jax.process_index() == 0:
                 write_text(self._path(epoch) / DIGEST_FILE, directory_digest(self._path(epoch) / "default"))
-        except Exception as error:  # orbax raises whatever its storage layers raise
+        except Exception as error:  # orbax passes on all exceptions of its storage layers
             number, reason = _system_error(error)
             message = f"the checkpoint of epoch {epoch} cannot be written: {reason}"
             raise OSError(number, message, str(self.directory)) from None
@@ -128,7 +128,7 @@ class Checkpoints:
             for leaf, expected in zip(jax.tree.leaves(state), jax.tree.leaves(target), strict=True):
                 if (leaf.shape, leaf.dtype) != (expected.shape, expected.dtype):
                     raise ValueError(f"it has {leaf.dtype} {leaf.shape}; expected {expected.dtype} {expected.shape}")
-        except Exception as error:  # orbax raises whatever its storage layers raise
+        except Exception as error:  # orbax passes on all exceptions of its storage layers
             raise InputError(
                 f"checkpoint: {path} cannot be read ({_first_line(error)}); remove {self.directory} to restart this fit"
             ) from None

@@ -14,7 +14,7 @@ def find_run_directories(paths: Iterable[Path]) -> list[Path]:
     """Return the run directories among `paths`; a directory with fold-0, fold-1, ... is replaced by its folds.
 
     Raises:
-        InputError: a training is not finished. A path that is no run directory is refused when it is loaded.
+        InputError: A training is not finished. A path that is not a run directory is refused when it is loaded.
     """
     directories: list[Path] = []
     for path in map(Path, paths):

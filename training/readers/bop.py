@@ -42,7 +42,7 @@ class BOP(LabelledFrames):
             names: YAML or JSON file, obj_id -> name. Default: obj_000001 and so on.
 
         Raises:
-            InputError: there are no frames, or `names` is damaged.
+            InputError: There are no frames, or `names` is damaged.
             OSError: `names` cannot be opened.
         """
         path = Path(path).absolute()  # so that a scene's folder has a name, that of "." too

@@ -51,7 +51,7 @@ class OCID(LabelledFrames):
             names: YAML or JSON file, see the module.
 
         Raises:
-            InputError: there are no frames, or `names` is damaged or lacks sequences; it says which.
+            InputError: There are no frames, or `names` is damaged or lacks sequences, which the message lists.
             OSError: `names` cannot be opened.
         """
         path = Path(path)

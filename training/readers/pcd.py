@@ -56,7 +56,7 @@ def _header(content: bytes, path: Path) -> tuple[dict[str, list[str]], int]:
     while "DATA" not in header:
         end = content.find(b"\n", start)
         if end < 0:
-            raise InputError(f"{path} is no PCD file; it has no line DATA")
+            raise InputError(f"{path} is not a PCD file; expected a line DATA")
         words = content[start:end].decode("ascii", errors="replace").split()
         if words:
             header[words[0]] = words[1:]

@@ -360,11 +360,11 @@ def test_label_files_that_are_not_integers(tmp_path: Path, mode: str) -> None:
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("", "is no valid JSON"),
-        ("{", "is no valid JSON"),
-        ("fx: 500", "is no valid JSON"),
-        ("[" * 100_000, "is no valid JSON"),
-        ("\xff", "is no valid JSON"),
+        ("", "is not valid JSON"),
+        ("{", "is not valid JSON"),
+        ("fx: 500", "is not valid JSON"),
+        ("[" * 100_000, "is not valid JSON"),
+        ("\xff", "is not valid JSON"),
         ("[500, 500, 3, 2]", "intrinsics is a list"),
         ("null", "intrinsics is a NoneType"),
         ('{"fx": 500, "fy": 500}', "intrinsics lacks cx, cy"),

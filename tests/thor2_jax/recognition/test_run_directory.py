@@ -201,8 +201,8 @@ def other_network(path: Path) -> None:
 
 
 DAMAGES: dict[str, tuple[Callable[[Path], Any], str]] = {
-    "no folder": (shutil.rmtree, "run is no run directory"),
-    "no run.json": (lambda path: (path / "run.json").unlink(), "run is no run directory"),
+    "no folder": (shutil.rmtree, "run is not a run directory"),
+    "no run.json": (lambda path: (path / "run.json").unlink(), "run is not a run directory"),
     "cut run.json": (lambda path: (path / "run.json").write_text('{"format": 1,'), "run.json cannot be read"),
     "binary run.json": (lambda path: (path / "run.json").write_bytes(b"\xff\xfe\x00"), "run.json cannot be read"),
     "a list": (lambda path: (path / "run.json").write_text("[1]"), "run.json has format 'list'"),

@@ -1,4 +1,4 @@
-"""The rendering job: the same bytes whatever interrupts it and wherever it runs; other jobs and folders are refused."""
+"""The rendering job: equal bytes after interruptions and on all worker pools; directories of other jobs are refused."""
 
 import contextlib
 import dataclasses
