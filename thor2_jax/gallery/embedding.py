@@ -68,7 +68,7 @@ class EmbeddingSizes:
     """
 
     cell: int = 20
-    hidden: tuple[int, ...] = (256, 256)
+    hidden: tuple[int, ...] = (384, 256)
     learned: int = 128
     color: int = 106
 

@@ -1,0 +1,1 @@
+"""Fitting of embeddings on views of many objects, most of them procedural."""

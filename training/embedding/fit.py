@@ -1,0 +1,168 @@
+"""Fit an embedding by a proxy loss: each object has a learned unit vector, to which its views should be most similar.
+
+The loss is the cross-entropy of the scaled cosines between a view and all proxies, less a margin for the view's own
+(Movshovitz-Attias et al., "No Fuss Distance Metric Learning Using Proxies", ICCV 2017; Wang et al., "CosFace", CVPR
+2018). The proxies are discarded; on a new object, views are compared with views.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax  # type: ignore[import-untyped]
+from flax import nnx
+from numpy.typing import NDArray
+
+from colornet import ColorNetwork
+from thor2_jax.config import DescriptorConfig
+from thor2_jax.descriptor.describe import describe_strips
+from thor2_jax.errors import InputError
+from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes, color_features
+from thor2_jax.types import Descriptors, Strips
+from training.embedding.samples import Batch, Samples
+
+__all__ = ["EmbeddingFit", "fit_embedding"]
+
+BASIS_SAMPLES = 2048
+"""Samples whose colour embeddings determine the principal components."""
+
+
+@dataclasses.dataclass(frozen=True)
+class EmbeddingFit:
+    """Options of a fit.
+
+    Attributes:
+        epochs: passes over the samples.
+        batch_size: samples of a step.
+        rate: learning rate of AdamW at the first step; it falls to 0 along a cosine.
+        margin: subtracted from the cosine between a view and its own proxy.
+        seed: seed for weights, proxies, sample order and dropout.
+
+    Raises:
+        InputError: a value is out of range.
+    """
+
+    epochs: int = 10
+    batch_size: int = 256
+    rate: float = 2e-3
+    margin: float = 0.12
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if min(self.epochs, self.batch_size - 1) < 1 or not (self.rate > 0 and 0 <= self.margin < 1):
+            raise InputError(
+                f"{self}; expected at least 1 epoch, batches of at least 2, a positive rate and a margin in [0, 1)"
+            )
+
+
+def _descriptors(length: jax.Array, color: jax.Array, network: ColorNetwork, config: DescriptorConfig) -> Descriptors:
+    length = length.astype(jnp.float32)
+    strips = Strips(
+        low=jnp.zeros_like(length),
+        high=length,
+        occupied=length > 0,  # a strip of one point has no persistence, so its pair adds nothing to the image
+        color=color.astype(jnp.float32),
+        overflow=jnp.zeros(len(length), jnp.int32),
+    )
+    return describe_strips(strips, network, config)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _color_features(network: ColorNetwork, config: DescriptorConfig, batch: Batch) -> jax.Array:
+    return color_features(_descriptors(batch.length, batch.color, network, config).embeddings)
+
+
+def _color_basis(
+    samples: Samples, network: ColorNetwork, config: DescriptorConfig, size: int, batch_size: int
+) -> NDArray[np.float32]:
+    """Return the principal components [F, size] of the colour features, not centred: projections keep cosines."""
+    rows = np.arange(len(samples))[:: max(1, len(samples) // BASIS_SAMPLES)][:BASIS_SAMPLES]
+    rows = np.resize(rows, -(-len(rows) // batch_size) * batch_size)
+    features = np.concatenate(
+        [_color_features(network, config, samples.take(chunk)) for chunk in rows.reshape(-1, batch_size)]
+    )
+    variances, vectors = np.linalg.eigh(features @ features.T)
+    largest = slice(-1, -size - 1, -1)
+    basis = features.T @ (vectors[:, largest] / np.sqrt(np.maximum(variances[largest], 1e-6)))
+    return np.pad(basis, ((0, 0), (0, size - basis.shape[1])))
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1, 2, 3, 4), donate_argnums=5)
+def _step(
+    graph: Any, optimizer: Any, margin: float, network: ColorNetwork, config: DescriptorConfig, state: Any, batch: Batch
+) -> tuple[Any, jax.Array]:
+    """Make one step and return the next state and the loss before it."""
+    parameters, rest, moments, key = state
+    key, dropout = jax.random.split(key)
+    descriptors = _descriptors(batch.length, batch.color, network, config)
+
+    def loss_of(parameters: Any) -> Any:
+        model = nnx.merge(graph, parameters["model"], rest, copy=True)
+        learned = model.learned(descriptors, batch.statistics, train=True, rngs=nnx.Rngs(dropout=dropout))
+        proxies = parameters["proxies"]
+        cosine = learned @ (proxies / jnp.linalg.norm(proxies, axis=0))
+        own = jax.nn.one_hot(batch.label, cosine.shape[1])
+        logits = jnp.exp(parameters["log_scale"]) * (cosine - margin * own)
+        loss = optax.softmax_cross_entropy_with_integer_labels(logits, batch.label).mean()
+        return loss, nnx.state(model, nnx.Not(nnx.Param))
+
+    (loss, rest), gradients = jax.value_and_grad(loss_of, has_aux=True)(parameters)
+    updates, moments = optimizer.update(gradients, moments, parameters)
+    return (optax.apply_updates(parameters, updates), rest, moments, key), loss
+
+
+def fit_embedding(
+    samples: Samples,
+    network: ColorNetwork,
+    config: DescriptorConfig,
+    options: EmbeddingFit,
+    sizes: EmbeddingSizes | None = None,
+    progress: Callable[[int, int, float], object] = lambda epoch, epochs, loss: None,
+) -> Embedding:
+    """Fit an embedding; on the same machine, equal arguments give equal weights.
+
+    Args:
+        samples: of at least two objects.
+        network: colour network of the samples.
+        config: descriptor of the samples.
+        options: of the fit.
+        sizes: of the network.
+        progress: called after each epoch with (epochs done, number of epochs, mean loss).
+
+    Raises:
+        InputError: there are fewer samples than in a batch, or the loss is not finite.
+    """
+    n_steps = len(samples) // options.batch_size
+    if n_steps < 1:
+        raise InputError(f"there are {len(samples)} samples; expected at least {options.batch_size}; add views")
+    embedding = Embedding.create(config, network, sizes, options.seed)
+    config = embedding.config
+    basis = _color_basis(samples, network, config, embedding.sizes.color, options.batch_size)
+    embedding.model.color_basis[...] = jnp.asarray(basis)
+    split: Any = nnx.split(embedding.model, nnx.Param, ...)
+    graph, parameters, rest = split
+    key, proxy_key = jax.random.split(jax.random.key(options.seed))
+    n_objects = int(samples.label.max()) + 1
+    parameters = {
+        "model": parameters,
+        "proxies": jax.random.normal(proxy_key, (embedding.sizes.learned, n_objects)),
+        "log_scale": jnp.log(16.0),
+    }
+    optimizer = optax.adamw(optax.cosine_decay_schedule(options.rate, n_steps * options.epochs), weight_decay=1e-3)
+    state = parameters, rest, optimizer.init(parameters), key
+    for epoch in range(options.epochs):
+        order = np.random.default_rng([options.seed, epoch]).permutation(len(samples))
+        total = jnp.zeros(())
+        for rows in order[: n_steps * options.batch_size].reshape(n_steps, -1):
+            state, loss = _step(graph, optimizer, options.margin, network, config, state, samples.take(rows))
+            total += loss
+        mean = float(total) / n_steps
+        if not np.isfinite(mean):
+            raise InputError(f"the loss is {mean} in epoch {epoch + 1}; expected a finite one; lower the rate")
+        progress(epoch + 1, options.epochs, mean)
+    model = nnx.merge(graph, state[0]["model"], state[1])
+    return dataclasses.replace(embedding, model=model)
