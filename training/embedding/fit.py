@@ -91,6 +91,11 @@ def _color_basis(
     return np.pad(basis, ((0, 0), (0, size - basis.shape[1])))
 
 
+@functools.cache  # equal optimizers share the compiled step
+def _adamw(rate: float, n_steps: int) -> Any:
+    return optax.adamw(optax.cosine_decay_schedule(rate, n_steps), weight_decay=1e-3)
+
+
 @functools.partial(jax.jit, static_argnums=(0, 1, 2, 3, 4), donate_argnums=5)
 def _step(
     graph: Any, optimizer: Any, margin: float, network: ColorNetwork, config: DescriptorConfig, state: Any, batch: Batch
@@ -152,7 +157,7 @@ def fit_embedding(
         "proxies": jax.random.normal(proxy_key, (embedding.sizes.learned, n_objects)),
         "log_scale": jnp.log(16.0),
     }
-    optimizer = optax.adamw(optax.cosine_decay_schedule(options.rate, n_steps * options.epochs), weight_decay=1e-3)
+    optimizer = _adamw(options.rate, n_steps * options.epochs)
     state = parameters, rest, optimizer.init(parameters), key
     for epoch in range(options.epochs):
         order = np.random.default_rng([options.seed, epoch]).permutation(len(samples))

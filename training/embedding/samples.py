@@ -204,7 +204,8 @@ def build_samples(
     """Render views of objects and sample them, or resume an interrupted sampling in a directory.
 
     Args:
-        sources: objects; labels are indices into this sequence.
+        sources: objects; labels are indices into this sequence. An object that occurs n times has n times the views
+            and the label of its first occurrence.
         directory: new, or of the same arguments.
         network: colour network.
         config: descriptor. Static.
@@ -222,6 +223,7 @@ def build_samples(
     if len(sources) < 2 or views < 1:
         raise InputError(f"there are {len(sources)} objects with {views} views each; expected at least 2 with 1 view")
     directory = Path(directory)
+    label_of = {source: index for index, source in reversed(list(enumerate(sources)))}
     job = {
         "descriptor_version": DESCRIPTOR_VERSION,
         "descriptor_config": dataclasses.asdict(config),
@@ -240,12 +242,12 @@ def build_samples(
         progress((len(starts) - len(missing)) * OBJECTS_PER_SHARD, len(sources))
         with closing(pool(render_clouds, _tasks(sources, missing, views, seed))) as results:
             for first, rendered in zip(missing, results, strict=True):
-                labels = [label for label, _ in rendered]
-                for label in range(first, min(first + OBJECTS_PER_SHARD, len(sources))):
-                    if label not in labels:
-                        raise InputError(f"object {sources[label]} has no view with enough points; leave it out")
+                visible = {index for index, _ in rendered}
+                for index in range(first, min(first + OBJECTS_PER_SHARD, len(sources))):
+                    if index not in visible:
+                        raise InputError(f"object {sources[index]} has no view with enough points; leave it out")
                 rng = np.random.default_rng([seed, len(sources), first])
-                clouds = [cloud for _, cloud in rendered]
+                labels, clouds = [label_of[sources[index]] for index, _ in rendered], [cloud for _, cloud in rendered]
                 with atomic_write(files[first]) as temporary:
                     arrays = sample_clouds(clouds, labels, network, config, copies, rng)
                     temporary.write_bytes(safetensors.numpy.save(arrays))

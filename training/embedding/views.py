@@ -53,9 +53,9 @@ class ViewTask:
     """Views of some objects, to be rendered by one process.
 
     Attributes:
-        sources: label -> object.
+        sources: index -> object.
         views: number of views of each object.
-        seed: seed for cameras and augmentations. The views of an object do not depend on the other objects.
+        seed: seed for cameras and augmentations, with the index.
     """
 
     sources: Mapping[int, ObjectSource]
@@ -69,19 +69,19 @@ def _random_angles(rng: np.random.Generator) -> tuple[float, float]:
 
 
 def render_clouds(task: ViewTask) -> list[tuple[int, Cloud]]:
-    """Return label and cloud of the views that have at least `MIN_VIEW_POINTS` points.
+    """Return the object's index and the cloud of the views that have at least `MIN_VIEW_POINTS` points.
 
     Raises:
         InputError: a mesh is unreadable.
     """
     clouds = []
-    for label, source in task.sources.items():
+    for index, source in task.sources.items():
         mesh = load_mesh(source) if isinstance(source, Path) else procedural_object(source)
         caster = RayCaster([mesh])
-        rng = np.random.default_rng([task.seed, label])
+        rng = np.random.default_rng([task.seed, index])
         for _ in range(task.views):
             view = render_view(caster, camera_pose(*_random_angles(rng), mesh.centre), CAMERA)
             cloud = cloud_of(view if rng.random() < UNCHANGED else augment(view, AUGMENTATIONS, rng))
             if len(cloud[0]) >= MIN_VIEW_POINTS:
-                clouds.append((label, cloud))
+                clouds.append((index, cloud))
     return clouds

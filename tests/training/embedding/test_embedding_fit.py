@@ -1,0 +1,158 @@
+"""Fitting of embeddings: samples, orientations, resumption, determinism, and what a short fit achieves."""
+
+import dataclasses
+from collections.abc import Generator
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+from helpers import SMALL_CONFIG
+
+import colornet
+import thor2_jax as thor2
+from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
+from training.embedding import fit, samples
+from training.embedding.build import main
+from training.embedding.fit import EmbeddingFit, fit_embedding
+from training.embedding.samples import Samples, build_samples, sample_clouds
+from training.embedding.views import ViewTask, render_clouds
+from training.storage.workers import IN_PROCESS
+
+NETWORK = colornet.load_default()
+SIZES = EmbeddingSizes(cell=6, hidden=(32, 32), learned=16, color=10)
+OBJECTS = range(0, 40, 5)
+OPTIONS = EmbeddingFit(epochs=12, batch_size=32, rate=5e-3)
+
+whole_embedding = nnx.jit(lambda model, *inputs: model(*inputs))
+learned_block = nnx.jit(lambda model, *inputs: model.learned(*inputs))
+
+
+@pytest.fixture(scope="module")
+def directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("embedding") / "samples"
+
+
+@pytest.fixture(scope="module")
+def views(directory: Path) -> Samples:
+    return build_samples(OBJECTS, directory, NETWORK, SMALL_CONFIG, views=6)
+
+
+def test_views_depend_on_seed_and_object_only() -> None:
+    one = render_clouds(ViewTask({3: 15, 4: 20}, 2, 0))
+    again = render_clouds(ViewTask({4: 20}, 2, 0))
+    assert [index for index, _ in one] == [3, 3, 4, 4]
+    for (_, expected), (_, actual) in zip(one[2:], again, strict=True):
+        assert all(np.array_equal(a, b) for a, b in zip(expected, actual, strict=True))
+    other = render_clouds(ViewTask({4: 20}, 2, 1))
+    assert not np.array_equal(other[0][1][0], again[0][1][0])
+
+
+def test_samples_of_views(views: Samples) -> None:
+    assert len(views) == 2 * 6 * len(OBJECTS) and set(views.label) == set(range(len(OBJECTS)))
+    batch = views.take(np.array([5, 0, 5]))
+    assert batch.length.shape == (3, 2, 5) and batch.color.shape == (3, 2, 5, 22)
+    assert np.array_equal(batch.color[0], batch.color[2]) and batch.label[0] == batch.label[2] == views.label[5]
+    assert (batch.length > 0).any(axis=(1, 2)).all() and np.isfinite(batch.statistics).all()
+
+
+def test_a_repeated_object_has_one_label(tmp_path: Path) -> None:
+    repeated = build_samples([5, 10, 5], tmp_path / "samples", NETWORK, SMALL_CONFIG, views=2, copies=1)
+    assert sorted(repeated.label) == [0, 0, 0, 0, 1, 1]
+    first = repeated.statistics[repeated.label == 0]
+    assert len(np.unique(first, axis=0)) == 4
+
+
+def test_unturned_samples_have_the_descriptor_of_their_cloud(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(samples, "_random_axes", lambda sides, rng: np.tile(np.eye(3, dtype=np.float32), (64, 1, 1)))
+    rendered = render_clouds(ViewTask({0: 0, 1: 10}, 3, 0))
+    order = np.argsort([len(cloud[0]) for _, cloud in rendered], kind="stable")
+    rng = np.random.default_rng(0)
+    fields = sample_clouds([cloud for _, cloud in rendered], [0] * len(rendered), NETWORK, SMALL_CONFIG, 1, rng)
+    start = np.concatenate([[0], np.cumsum(fields.pop("strips"))])
+    batch = Samples(start=start, shape=(2, 5), **fields).take(np.arange(len(rendered)))
+    embedding = Embedding.create(SMALL_CONFIG, sizes=SIZES)
+    clouds = thor2.PointClouds.pack([rendered[k][1] for k in order])
+    expected = {mirror: embedding.embed_aligned(aligned(clouds, mirror)) for mirror in ("", "x")}
+    descriptors = fit._descriptors(jnp.asarray(batch.length), jnp.asarray(batch.color), NETWORK, embedding.config)
+    actual = whole_embedding(nnx.merge(*embedding._split), descriptors, batch.statistics)
+    similarity = [np.asarray((actual * values).sum(axis=1)) for values in expected.values()]
+    np.testing.assert_allclose(np.max(similarity, axis=0), 1, atol=1e-3)
+
+
+def aligned(clouds: thor2.PointClouds, mirror: str) -> thor2.PointClouds:
+    return thor2.turn(thor2.mirror(thor2.view_normalize(clouds, SMALL_CONFIG), mirror), SMALL_CONFIG)
+
+
+def test_random_axes_are_rotations_with_nearly_equal_sides_swapped() -> None:
+    sides = np.array([[1, 0.9, 0.2]] * 400 + [[1, 0.5, 0.2]] * 400, np.float32)
+    axes = samples._random_axes(sides, np.random.default_rng(0))
+    np.testing.assert_allclose(axes @ np.swapaxes(axes, 1, 2), np.tile(np.eye(3), (800, 1, 1)), atol=1e-5)
+    along_x = axes[:, 0, 0] > np.cos(np.radians(10.1))
+    assert 0.4 < along_x[:400].mean() < 0.6 and along_x[400:].all()
+
+
+def test_an_interrupted_sampling_resumes(
+    directory: Path, views: Samples, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(samples, "OBJECTS_PER_SHARD", 3)
+
+    def interrupted(function, items) -> Generator:
+        for number, item in enumerate(items):
+            if number == 2:
+                raise KeyboardInterrupt
+            yield function(item)
+
+    arguments = NETWORK, SMALL_CONFIG, 2
+    with pytest.raises(KeyboardInterrupt):
+        build_samples(OBJECTS, tmp_path / "one", *arguments, pool=interrupted)
+    assert len(list((tmp_path / "one").glob("*.safetensors"))) == 2
+    done = []
+    resumed = build_samples(OBJECTS, tmp_path / "one", *arguments, progress=lambda *numbers: done.append(numbers))
+    assert done == [(6, 8), (8, 8)]
+    whole = build_samples(OBJECTS, tmp_path / "two", *arguments, pool=IN_PROCESS)
+    for field in dataclasses.fields(Samples):
+        assert np.array_equal(getattr(resumed, field.name), getattr(whole, field.name))
+    with pytest.raises(thor2.InputError, match="views"):
+        build_samples(OBJECTS, tmp_path / "one", NETWORK, SMALL_CONFIG, 3)
+
+
+def test_views_of_one_object_become_more_similar(views: Samples) -> None:
+    losses = []
+    fitted = fit_embedding(views, NETWORK, SMALL_CONFIG, OPTIONS, SIZES, lambda *numbers: losses.append(numbers))
+    again = fit_embedding(views, NETWORK, SMALL_CONFIG, OPTIONS, SIZES)
+    assert losses[11][:2] == (12, 12) and losses[11][2] < 0.5 * losses[0][2]
+    assert fitted.fingerprint == again.fingerprint
+    batch = views.take(np.arange(len(views)))
+    descriptors = fit._descriptors(jnp.asarray(batch.length), jnp.asarray(batch.color), NETWORK, fitted.config)
+    same = batch.label[:, None] == batch.label
+    gaps = []
+    for embedding in (Embedding.create(SMALL_CONFIG, sizes=SIZES), fitted):
+        learned = np.asarray(learned_block(embedding.model, descriptors, batch.statistics))
+        similarity = learned @ learned.T
+        gaps.append(similarity[same].mean() - similarity[~same].mean())
+    assert gaps[1] > 1.5 * gaps[0]
+    basis = np.asarray(fitted.model.color_basis[...])
+    np.testing.assert_allclose(basis.T @ basis, np.eye(10), atol=1e-3)
+
+
+@pytest.mark.parametrize("options", [{"epochs": 0}, {"batch_size": 1}, {"rate": 0.0}, {"margin": 1.0}], ids=str)
+def test_options_out_of_range_are_rejected(options: dict[str, float]) -> None:
+    with pytest.raises(thor2.InputError, match=next(iter(options))):
+        EmbeddingFit(**options)
+
+
+def test_too_few_samples_or_objects_are_rejected(views: Samples, tmp_path: Path) -> None:
+    with pytest.raises(thor2.InputError, match="4096"):
+        fit_embedding(views, NETWORK, SMALL_CONFIG, EmbeddingFit(batch_size=4096))
+    with pytest.raises(thor2.InputError, match="1 objects"):
+        build_samples([3], tmp_path / "samples", NETWORK, SMALL_CONFIG, 2)
+
+
+@pytest.mark.slow
+def test_the_command_writes_an_embedding(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "embedding.safetensors"
+    main(["--out", str(out), "--objects", "24", "--views", "6", "--epochs", "1", "--workers", "1"])
+    assert capsys.readouterr().out.split()[-1] == Embedding.load(out).fingerprint
+    assert [path.name for path in tmp_path.iterdir()] == [out.name]
