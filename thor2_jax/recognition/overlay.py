@@ -6,6 +6,7 @@ draw_overlay(frame.color, frame.labels, recognizer.recognize(frame), "overlay.pn
 from __future__ import annotations
 
 import functools
+import importlib.util
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -202,8 +203,7 @@ def _draw_labels(
     covered = np.pad(instances, ((1, 0), (1, 0))).cumsum(axis=0, dtype=np.int32).cumsum(axis=1, dtype=np.int32)
     placed: list[tuple[_Box, _Lettering, Paint]] = []
     for mask, annotation in zip(masks, annotations, strict=True):
-        text = escape_characters(annotation.text, _can_draw)
-        lettering = _fit(draw, text, size, picture.size) if text else None
+        lettering = _fit(draw, annotation.text, size, picture.size) if annotation.text else None
         if lettering is not None:
             box = _place(lettering, mask.box, [other for other, _, _ in placed], covered)
             placed.append((box, lettering, annotation.paint))
@@ -216,8 +216,10 @@ def _draw_labels(
 
 def _fit(draw: ImageDraw.ImageDraw, text: str, size: int, space: tuple[int, int]) -> _Lettering | None:
     """Return the text in the largest letters, up to `size`, that fit into `space` (width, height); None if none do."""
+    wide = not all(map(_can_draw, text))
+    text = escape_characters(text, functools.partial(_can_draw, wide=wide))
     for letters in range(size, _SMALLEST_LETTERS - 1, -1):
-        font, padding = _font(letters), letters // 4
+        font, padding = _font(letters, wide), letters // 4
         left, top, right, bottom = draw.multiline_textbbox((0, 0), text, font, spacing=padding)
         width, height = math.ceil(right - left) + 2 * padding, math.ceil(bottom - top) + 2 * padding
         if width <= space[0] and height <= space[1]:
@@ -226,18 +228,22 @@ def _fit(draw: ImageDraw.ImageDraw, text: str, size: int, space: tuple[int, int]
 
 
 @functools.lru_cache(maxsize=32)
-def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    return ImageFont.load_default(size)
+def _font(size: int, wide: bool = False) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    """Return Pillow's font or, with `wide`, the one that comes with matplotlib, which has many more characters."""
+    matplotlib = importlib.util.find_spec("matplotlib") if wide else None
+    if matplotlib is None or matplotlib.origin is None:
+        return ImageFont.load_default(size)
+    return ImageFont.truetype(Path(matplotlib.origin).with_name("mpl-data") / "fonts" / "ttf" / "DejaVuSans.ttf", size)
 
 
 @functools.lru_cache(maxsize=4096)
-def _can_draw(character: str) -> bool:
-    """Return whether the font has a character; it draws the same box for all those that it lacks."""
-    return character in " \n" or (character.isprintable() and _ink_of(character) != _ink_of("\U0010ffff"))
+def _can_draw(character: str, wide: bool = False) -> bool:
+    """Return whether a font has a character; it draws the same box for all those that it lacks."""
 
+    def shape(text: str) -> bytes:
+        return bytes(_font(_SMALLEST_LETTERS, wide).getmask(text))
 
-def _ink_of(character: str) -> bytes:
-    return bytes(_font(_SMALLEST_LETTERS).getmask(character))
+    return character in " \n" or (character.isprintable() and shape(character) != shape("\U0010ffff"))
 
 
 def _place(lettering: _Lettering, target: _Box, placed: Sequence[_Box], covered: NDArray[np.int32]) -> _Box:

@@ -18,6 +18,9 @@ evaluate_app = typer.Typer(
 )
 app.add_typer(evaluate_app, name="evaluate")
 
+MAX_LISTED = 10
+"""Labels that the summary lists."""
+
 DatasetArgument = Annotated[Path, typer.Argument(help="Directory of the dataset.")]
 ModelsOption = Annotated[
     list[Path], typer.Option("--model", help="Run directory, or the directory of a training with several folds.")
@@ -112,12 +115,13 @@ def _evaluate(
     description = {"kind": kind, "path": str(dataset.resolve())}
     if names:
         description["names"] = hashlib.sha256(names.read_bytes()).hexdigest()
+    finished = out is not None and (out / "report.json").is_file()
     with tempfile.TemporaryDirectory() as temporary, show_progress(quiet) as progress:
         runs = load_sequence_runs(models[0], frames.identifiers) if per_sequence else load_runs(models)
         report = evaluate_dataset(runs, frames, description, out or Path(temporary) / "report", progress)
     _print_report(report)
     if out is not None:
-        console.print(f"report: {out / 'report.html'}")
+        console.print(f"report: {out / 'report.html'}{' (was finished: nothing was recomputed)' if finished else ''}")
 
 
 def _print_report(report: Mapping[str, Any]) -> None:
@@ -138,6 +142,10 @@ def _print_report(report: Mapping[str, Any]) -> None:
         f"{counts['scored']} instances scored, {sum(counts['not_described'].values())} of them could not be described "
         f"(counted as incorrect); {sum(counts['no_class'].values())} are of no class of the runs"
     )
+    if report["no_pixels"]:
+        missing = [f"{entry['label']} of frame {entry['frame']}" for entry in report["no_pixels"]]
+        more = ", ..." if len(missing) > MAX_LISTED else ""
+        console.print(f"labels without pixels in the label image: {', '.join(missing[:MAX_LISTED])}{more}")
     if speed["frames_per_second"]:
         console.print(
             f"{speed['frames']} frames, {speed['frames_per_second']:.2f} a second with compilation; "

@@ -10,7 +10,10 @@ from training.evaluation.answers import FrameAnswers, InstancePrediction, all_pr
 from training.evaluation.runs import Run
 from training.readers.labelled import LabelledFrame
 
-__all__ = ["answer_frames"]
+__all__ = ["NO_PIXELS", "answer_frames"]
+
+NO_PIXELS = "no pixels in the label image"
+"""Why an instance that the labels name could not be described."""
 
 
 def answer_frames(runs: Sequence[Run], frames: Iterable[LabelledFrame]) -> Iterator[tuple[LabelledFrame, FrameAnswers]]:
@@ -44,6 +47,6 @@ def _answer(runs: Sequence[Run], item: LabelledFrame) -> list[InstancePrediction
             row = rows[label]
             answers.append(InstancePrediction(label, truth, described.usable[row].occluded, None, table[row]))
         else:
-            reason = reasons.get(label) or "no pixels in the label image"
+            reason = reasons.get(label) or NO_PIXELS
             answers.append(InstancePrediction(label, truth, reason=reason))
     return answers

@@ -14,7 +14,7 @@ from typing import Any
 from thor2_jax.config import DESCRIPTOR_VERSION
 from thor2_jax.errors import InputError
 from thor2_jax.files import check_output_directory, file_digest, remove_leftovers, write_text
-from training.evaluation.answering import answer_frames
+from training.evaluation.answering import NO_PIXELS, answer_frames
 from training.evaluation.answers import AnswerFile, all_predictors
 from training.evaluation.frame_pictures import FramePictures
 from training.evaluation.page import write_report_page
@@ -92,6 +92,12 @@ def _evaluate(
             f"{_listed(report['instances']['no_class'])}, the runs know {_listed(runs[0].classes)}; check the names, "
             "or give other runs"
         )
+    report["no_pixels"] = [
+        {"frame": answers.frame, "label": instance.label, "truth": instance.truth}
+        for answers in file.frames
+        for instance in answers.instances
+        if instance.reason == NO_PIXELS
+    ]
     report["shown"] = [file.frames[number].frame for number in pictures.shown]
     write_report_page(report, pictures, out)
     write_text(out / "report.json", json.dumps(report, indent=1) + "\n")
