@@ -180,7 +180,8 @@ def test_train(meshes: Path, frames: Path, environment: Any, call: Any, tmp_path
     command, whole, out = ("train", "--meshes", meshes, *options, "--out"), tmp_path / "whole", tmp_path / "run"
     assert call(*command, whole)[0] == 0
     expected, run = files(whole), load_run(whole)
-    for place in ("after checkpoints/fold-0/ce/1", "before run.json", "before baselines/forest.safetensors"):
+    places = "checkpoints/fold-0/ce/1", "curves.png", "run.json", "baselines/forest.safetensors", ".views"
+    for place in (f"{'after' if place == places[0] else 'before'} {place}" for place in places):
         kill(place, (*command, out), environment)
         found = files(out)
         assert all(found[name] == expected[name] for name in {"curves.png", "network.npz"} & found.keys())
@@ -193,6 +194,7 @@ def test_train(meshes: Path, frames: Path, environment: Any, call: Any, tmp_path
             check_refused(call(*command, out, "--epochs", 3), f"{out} was written with epochs 2, not 3")
     assert call(*command, out)[0] == 0
     assert equal_models(load_run(out), run)
+    assert not list(out.glob(".*")) and not (out / "views").exists()
     found = files(out)
     assert found.keys() == expected.keys()
     different = {name for name in found if found[name] != expected[name]}  # these two hold measured times

@@ -48,7 +48,7 @@ def test_files_are_written_atomically(name: str, number: int, tmp_path: Path, di
         try:
             WRITERS[name](path)
         except OSError as error:
-            assert error.errno == number
+            assert error.errno == number and error.filename == str(path)
             assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
         else:
             break
@@ -85,8 +85,8 @@ def test_answers_resume_after_a_full_disk(tmp_path: Path, disk: Any) -> None:
         disk.reset(step, errno.ENOSPC)
         try:
             file.append(answers(kept))
-        except OSError:
-            pass
+        except OSError as error:
+            assert error.filename == str(path)
         else:
             kept += 1
         disk.reset(0, 0)
@@ -100,7 +100,7 @@ def test_metrics_resume_after_a_full_disk(tmp_path: Path, disk: Any) -> None:
     append_metrics(path, 0, "ce", _metrics(1))
     for step in (1, 2):
         disk.reset(step, errno.ENOSPC)
-        with pytest.raises(OSError):
+        with pytest.raises(OSError, match="metrics.jsonl"):
             append_metrics(path, 0, "ce", _metrics(2))
         disk.reset(0, 0)
         assert [row["epoch"] for row in read_metrics(path)] == [1]

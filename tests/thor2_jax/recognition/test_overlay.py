@@ -254,3 +254,14 @@ def test_real_frames(shared: Path, tmp_path: Path, boxes: list) -> None:
         changed = (picture != pixels).any(axis=2) & outside(boxes, labels.shape)
         assert changed[labels > 0].mean() < 0.35
         assert changed[labels == 0].sum() < 2 * math.hypot(*labels.shape)  # only leaders
+
+
+@pytest.mark.parametrize(
+    "name, drawn", [("Tasse ä", "Tasse ä"), ("\U0001f34e", r"\U0001f34e"), ("a\u202eb", r"a\u202eb"), ("\x1b", r"\x1b")]
+)
+def test_missing_characters_are_escaped(name: str, drawn: str, tmp_path: Path) -> None:
+    labels = np.zeros((480, 640), np.uint8)
+    labels[80:120, 20:60] = 1
+    draw_overlay(photo(), labels, [Recognition(label=1, name=name)], tmp_path / "overlay.png")
+    lettering = overlay._fit(ImageDraw.Draw(Image.new("RGB", (9, 9))), name, 20, (400, 200))
+    assert lettering is not None and lettering.text == drawn

@@ -137,12 +137,82 @@ def test_evaluate_frames(model: Path, images: Path, scene: Scene, tmp_path: Path
     assert report["instances"]["scored"] == whole["instances"] == len(scene.truth)
     assert whole["accuracy"]["THOR2"] == {"mean": pytest.approx(right), "std": 0.0, "runs": 2}
     before = (tmp_path / "report" / "answers.jsonl").read_bytes()
-    assert run(*command)[0] == 0
+    code, out, _ = run(*command)
+    assert code == 0 and "nothing was recomputed" in out
     assert (tmp_path / "report" / "answers.jsonl").read_bytes() == before
     code, _, err = run("evaluate", "frames", images.parent, "--model", model, "--out", tmp_path / "report")
     assert code == 2 and "runs" in one_line(err)
     code, _, err = run("evaluate", "frames", images.parent, "--model", model, "--out", tmp_path / "answer")
     assert code == 2 and "already contains" in one_line(err)
+
+
+def test_evaluate_refuses_changed_labels(model: Path, images: Path, tmp_path: Path, run: Run) -> None:
+    frames = tmp_path / "frames"
+    shutil.copytree(images, frames / "one")
+    command = ("evaluate", "frames", frames, "--model", model, "--out", tmp_path / "report", "--quiet")
+    code, out, err = run(*command)
+    assert code == 0 and err == "" and "without pixels" not in out
+    labels = frames / "one" / "labels.json"
+    names = json.loads(labels.read_text())["labels"]
+    labels.write_text(json.dumps({"labels": dict(zip(names, reversed(names.values()), strict=True))}))
+    code, _, err = run(*command)
+    assert code == 2 and "labels.json" in one_line(err)
+    labels.write_text(json.dumps({"labels": names | {"200": "mug_white"}}))
+    code, out, _ = run(*command[:-2], tmp_path / "other")
+    assert code == 0 and "200 of frame one" in out
+
+
+def test_any_name_of_an_object(model: Path, images: Path, scene: Scene, tmp_path: Path, run: Run) -> None:
+    """Names may look like markup, mathtext or terminal commands, and have any characters."""
+    names = ("$\\frac{", "[red]mug[/x]", "茶碗\u202e\x1b[2J")
+    shown = dict(zip(NAMES, (*names[:2], r"茶碗\u202e\x1b[2J"), strict=True))
+    renamed, trained = dict(zip(NAMES, names, strict=True)), load_run(model)
+    save_run(dataclasses.replace(trained, classes=tuple(renamed[name] for name in trained.classes)), tmp_path / "run")
+    shutil.copytree(images, tmp_path / "frames" / "one")
+    truth = {label: renamed[name] for label, name in scene.truth.items()}
+    (tmp_path / "frames" / "one" / "labels.json").write_text(json.dumps({"labels": truth}))
+    _, expected, _ = run("recognize", "--model", model, *recognize(images))
+    code, out, _ = run("recognize", "--model", tmp_path / "run", *recognize(images), "--out", tmp_path / "answer")
+    assert code == 0 and all((name in expected) == (shown[name] in out) for name in NAMES)
+    assert "\x1b" not in out and "\u202e" not in out
+    code, _, _ = run(
+        "evaluate", "frames", tmp_path / "frames", "--model", tmp_path / "run", "--out", tmp_path / "report"
+    )
+    assert code == 0 and (tmp_path / "report" / "confusion.png").is_file()
+
+
+def test_output_is_checked_before_the_work(meshes: Path, images: Path, tmp_path: Path, run: Run) -> None:
+    """The inputs are read later, and are missing."""
+    absent = tmp_path / "absent"
+    for out in (Path("/proc/no/directory"), images / "color.png" / "run"):
+        for command in (
+            ("recognize", "--model", absent, *recognize(absent)),
+            ("train", "--meshes", absent),
+            ("train", "--dataset", absent),
+            ("render", "--meshes", meshes),
+            ("demo",),
+        ):
+            code, _, err = run(*command, "--out", out)
+            assert code == 2 and f"out: {out}" in one_line(err), command
+
+
+def test_options_without_effect_are_refused(meshes: Path, tmp_path: Path, run: Run) -> None:
+    dataset, out = ("--dataset", tmp_path / "views"), tmp_path / "run"
+    cases: tuple[tuple[str, tuple[object, ...]], ...] = (
+        ("names", (*dataset, "--names", tmp_path / "names.json")),
+        ("azimuth-step", (*dataset, "--azimuth-step", 20)),
+        ("polar-step", (*dataset, "--polar-step", 20)),
+        ("processes", (*dataset, "--processes", 2)),
+        ("process", (*dataset, "--process", 1)),
+        ("process", (*dataset, "--coordinator", "localhost:1", "--processes", 2, "--process", 2)),
+        ("azimuth_step", ("--meshes", meshes, "--azimuth-step", 1e-9)),
+    )
+    for option, arguments in cases:
+        code, _, err = run("train", *arguments, "--out", out)
+        assert code == 2 and option in one_line(err), option
+        assert not out.exists()
+    code, _, err = run("render", "--meshes", meshes, "--azimuth-step", 1e-9, "--out", out)
+    assert code == 2 and "azimuth_step" in one_line(err) and not out.exists()
 
 
 def test_train_on_rendered_dataset_equals_train_on_meshes(meshes: Path, model: Path, tmp_path: Path) -> None:
@@ -168,6 +238,8 @@ def test_train_by_folds(meshes: Path, tmp_path: Path, run: Run) -> None:
     (tmp_path / "run" / "views").mkdir()
     (tmp_path / "run" / "views" / "manifest.json").write_bytes(bytes(9))
     before = {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()}
+    (tmp_path / "run" / ".views").mkdir()
+    (tmp_path / "run" / ".curves.12345678.png").touch()
     code, out, _ = run(*arguments)
     assert code == 0 and "nothing was trained" in out
     code, _, err = run("train", "--dataset", tmp_path / "run" / "views", "--out", tmp_path / "run")
@@ -176,6 +248,12 @@ def test_train_by_folds(meshes: Path, tmp_path: Path, run: Run) -> None:
         code, _, err = run(*arguments, *change)
         assert code == 2 and "was written with" in one_line(err)
     assert {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()} == before
+    # A training that is killed at the very end leaves its own views.
+    shutil.rmtree(tmp_path / "run" / "views")
+    switches = ("--illumination", "--sensor", "--occlusion", "--segmentation")
+    assert run("render", "--meshes", meshes, "--out", tmp_path / "run" / "views", *steps, *switches)[0] == 0
+    assert run(*arguments)[0] == 0
+    assert not [path for path in (tmp_path / "run").iterdir() if path.name[0] == "." or path.name == "views"]
 
 
 def test_train_by_sequences(meshes: Path, tmp_path: Path, run: Run) -> None:
@@ -242,6 +320,7 @@ def spoil(folder: Path, source: Path) -> dict[str, tuple[str, Path, str]]:
     half = folder / "half.png"
     with Image.open(source / "mask.png") as mask:
         mask.crop((0, 0, 100, 100)).save(half)
+        mask.save(lossy := folder / "lossy.jpg")
     eight = folder / "eight.png"
     Image.fromarray(np.zeros((480, 640), np.uint8)).save(eight)
     cases = {
@@ -250,6 +329,7 @@ def spoil(folder: Path, source: Path) -> dict[str, tuple[str, Path, str]]:
         "truncated": ("depth", truncated, "truncated.png"),
         "other size": ("labels", half, "(100, 100)"),
         "8-bit depth": ("depth", eight, "uint8"),
+        "lossy labels": ("labels", lossy, "JPEG"),
         "colour is grey": ("color", eight, "RGB"),
         "intrinsics are an image": ("intrinsics", eight, "JSON"),
     }
@@ -335,6 +415,8 @@ def test_invalid_training_input_is_refused(meshes: Path, tmp_path: Path, run: Ru
     # The views are good for another try.
     code, _, err = run("train", "--meshes", meshes, "--out", out, *coarse, "--folds", 99)
     assert code == 2 and "99" in one_line(err)
+    code, _, err = run("train", "--meshes", meshes, "--out", out, *coarse, "--batch-size", 100_000)
+    assert code == 2 and "batch_size is 100000" in one_line(err)
     assert [p.name for p in out.iterdir()] == ["views"]
     assert run("train", "--meshes", meshes, "--out", out, *coarse, "--epochs", 1, "--classifiers", "ce")[0] == 0
 

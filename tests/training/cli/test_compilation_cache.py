@@ -5,14 +5,18 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from helpers import encode_image, untrained_run
 
 from thor2_jax.errors import InputError
+from thor2_jax.recognition.run_directory import save_run
 from training.cli.compilation_cache import enable_compilation_cache
 
 ROOT = Path(__file__).parents[3]
 
 COMPILES = """
+from thor2_jax.recognition.run_directory import save_run
 from training.cli.compilation_cache import enable_compilation_cache
 enable_compilation_cache()
 import jax, jax.numpy as jnp
@@ -68,3 +72,28 @@ def test_an_unusable_cache_directory(environment: Path, tmp_path: Path, monkeypa
     monkeypatch.setenv("THOR2_CACHE", str(tmp_path / "file"))
     with pytest.raises(InputError, match="THOR2_CACHE"):
         enable_compilation_cache()
+
+
+@pytest.mark.slow
+def test_a_second_recognition_compiles_nothing(environment: Path, tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    labels = np.zeros((240, 320), np.uint8)
+    labels[20:100, 20:90] = 1
+    depth = np.broadcast_to(600 + np.arange(320) // 2, labels.shape).astype(np.uint16)
+    color = rng.integers(0, 256, (*labels.shape, 3), dtype=np.uint8)
+    for name, image in (("color", color), ("depth", depth), ("labels", labels)):
+        (tmp_path / f"{name}.png").write_bytes(encode_image(image))
+    (tmp_path / "intrinsics.json").write_text('{"fx": 600, "fy": 600, "cx": 159.5, "cy": 119.5}')
+    save_run(untrained_run(("brick", "stick"), ("tops", "tops2")), tmp_path / "run")
+    files = [part for name in ("color", "depth", "labels") for part in (f"--{name}", tmp_path / f"{name}.png")]
+    command = ["recognize", "--model", tmp_path / "run", *files, "--intrinsics", tmp_path / "intrinsics.json"]
+
+    def run() -> tuple[set[str], str]:
+        variables = os.environ | {"PYTHONPATH": str(ROOT), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
+        program = [sys.executable, "-m", "training.cli", *map(str, command)]
+        done = subprocess.run(program, capture_output=True, text=True, env=variables)
+        assert done.returncode == 0 and done.stderr == ""
+        return {path.name for path in environment.glob("*/*-cache")}, done.stdout
+
+    first = run()
+    assert len(first[0]) > 5 and run() == first

@@ -1,6 +1,7 @@
 """Checkpoints: which epochs are kept, what they restore, and what remains after a failure."""
 
 import errno
+import sys
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 
 import thor2_jax as thor2
-from training.fitting.checkpoints import Checkpoints
+from training.fitting.checkpoints import Checkpoints, _quiet_orbax
 
 
 class State(NamedTuple):
@@ -119,3 +120,19 @@ def test_another_structure_is_refused(tmp_path: Path) -> None:
         checkpoints.save(1, state(1), 0.0)
         with pytest.raises(thor2.InputError, match="checkpoint: "):
             checkpoints.last(state(0, 99))
+
+
+def test_threads_of_a_failed_save_print_no_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They find their event loop closed, while the error is raised and after it; other errors are printed."""
+    printed = []
+    monkeypatch.setattr(sys, "excepthook", lambda kind, error, traceback: printed.append(str(error)))
+    hook = sys.excepthook
+    with _quiet_orbax():
+        pass
+    assert sys.excepthook is hook
+    with pytest.raises(OSError), _quiet_orbax():
+        sys.excepthook(RuntimeError, RuntimeError("Event loop is closed"), None)
+        raise OSError("disk full")
+    sys.excepthook(RuntimeError, RuntimeError("Event loop is closed"), None)
+    sys.excepthook(RuntimeError, RuntimeError("another"), None)
+    assert printed == ["another"]

@@ -11,6 +11,7 @@ import pytest
 from PIL import Image
 
 from thor2_jax.errors import InputError
+from thor2_jax.recognition.frames import read_labels
 from training.readers import FrameFolder, UWISOccluded
 from training.readers.uwis import INTRINSICS, video_attributes
 
@@ -240,6 +241,34 @@ def test_one_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert [(item.identifier, item.truth) for item in FrameFolder(folder)] == [("only", {1: "mug"})]
     monkeypatch.chdir(folder)
     assert [item.identifier for item in FrameFolder(".")] == ["only"]
+
+
+def test_labels_of_another_mask_are_refused(tmp_path: Path) -> None:
+    """Some labels may have no pixels, but not all of them."""
+    write_frame(tmp_path / "a" / "a", {"labels": {"1": "mug", "200": "bowl"}})
+    assert FrameFolder(tmp_path / "a")[0].truth == {1: "mug", 200: "bowl"}
+    write_frame(tmp_path / "b" / "b", {"labels": {"7": "mug", "200": "bowl"}})
+    with pytest.raises(InputError, match=r"labels.json has the labels 7, 200, .*mask.png has only 1, 2"):
+        FrameFolder(tmp_path / "b")[0]
+
+
+def test_lossy_labels_are_refused(tmp_path: Path) -> None:
+    folder = write_frame(tmp_path / "a", {"labels": {"1": "mug"}})
+    with Image.open(folder / "mask.png") as mask:
+        mask.save(folder / "lossy", "JPEG")
+        mask.save(folder / "lossy.tiff", "TIFF", compression="jpeg")
+        mask.save(folder / "lossless.tiff", "TIFF", compression="tiff_lzw")
+        assert np.array_equal(read_labels(folder / "lossless.tiff"), np.asarray(mask))
+    for name in ("lossy", "lossy.tiff"):
+        with pytest.raises(InputError, match=f"labels: .*{name}.*JPEG"):
+            read_labels(folder / name)
+
+
+def test_files_of_a_frame(tmp_path: Path) -> None:
+    folder = write_frame(tmp_path / "a", {"labels": {"1": "mug"}})
+    assert sorted(FrameFolder(tmp_path).files(0)) == sorted(folder.iterdir())
+    images = write_uwis(tmp_path, "41", "000000", MUG)
+    assert sorted(UWISOccluded(tmp_path).files(0)) == sorted(images.iterdir())
 
 
 @pytest.mark.parametrize("name", ["color.png", "depth.png", "mask.png", "intrinsics.json"])

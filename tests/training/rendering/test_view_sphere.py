@@ -49,3 +49,9 @@ def test_z_is_up_in_the_image_away_from_the_poles() -> None:
         if 0.1 < polar < 3.0:
             pose = camera_pose(azimuth, polar, np.zeros(3))
             assert pose[2, 1] < 0 and pose[2, 0] == 0
+
+
+def test_too_many_views_are_refused() -> None:
+    for steps in ((1e-9, 5), (5, 1e-9), (0.1, 0.1)):
+        with pytest.raises(InputError, match="azimuth_step .* polar_step"):
+            view_angles(*steps)

@@ -15,7 +15,7 @@ from training.fitting.options import FitOptions
 from training.objects.builtin_objects import builtin_objects
 from training.reports.html import Picture, Section, write_page
 from training.reports.object_plots import draw_descriptor, draw_objects
-from training.reports.plots import draw_accuracy, draw_confusion, draw_curves, draw_reliability
+from training.reports.plots import draw_accuracy, draw_confusion, draw_curves, draw_reliability, plain_text
 
 
 def test_page_escapes_its_content(tmp_path: Path) -> None:
@@ -52,6 +52,17 @@ def test_every_plot_is_drawn(tmp_path: Path) -> None:
     files = sorted(p.name for p in tmp_path.iterdir())
     assert files == ["accuracy.png", "confusion.png", "curves.png", "descriptor.png", "objects.png", "reliability.png"]
     assert all(colors_in(tmp_path / name) > 10 for name in files)
+
+
+def test_plots_draw_any_name(tmp_path: Path) -> None:
+    """Names are no mathtext, and no character is missing from the fonts: matplotlib would raise or warn."""
+    names = ["$\\frac{", "$x$", "[red]mug[/x]", "茶碗", "\U0001f34e", "a\u202eb", "Tasse ä"]
+    draw_confusion(np.eye(7, 8, dtype=int), names, "THOR2", tmp_path / "confusion.png")
+    draw_accuracy(("A",), {name: [0.5] for name in names}, dict.fromkeys(names, 4), tmp_path / "accuracy.png")
+    mug = builtin_objects()["mug_blue"]
+    draw_objects(dict.fromkeys(names, mug), tmp_path / "objects.png")
+    assert all(colors_in(path) > 10 for path in tmp_path.iterdir())
+    assert plain_text("$x$ a\u202eb") == r"\$x\$ a\u202eb"
 
 
 def test_missing_directory_raises_oserror(tmp_path: Path) -> None:
