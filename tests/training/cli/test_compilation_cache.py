@@ -16,7 +16,6 @@ from training.cli.compilation_cache import enable_compilation_cache
 ROOT = Path(__file__).parents[3]
 
 COMPILES = """
-from thor2_jax.recognition.run_directory import save_run
 from training.cli.compilation_cache import enable_compilation_cache
 enable_compilation_cache()
 import jax, jax.numpy as jnp
