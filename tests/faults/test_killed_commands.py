@@ -1,4 +1,4 @@
-"""Every command that writes, killed while it writes: named files are complete, and the same command resumes."""
+"""Commands that are killed while they write: files under their final names are complete, and commands resume."""
 
 import json
 import os
@@ -153,11 +153,11 @@ def test_render(meshes: Path, environment: Any, call: Any, tmp_path: Path) -> No
     expected = files(whole)
     for place in (f"before {MANIFEST}", "before 0001-0000.safetensors"):
         kill(place, (*command, out), environment)
-        found = files(out)
-        if MANIFEST in found:
-            manifest = Manifest.parse(found.pop(MANIFEST), out)
-            assert not manifest.finished and {shard.file for shard in manifest.shards} <= found.keys()
-        assert found.items() <= expected.items()
+        written = files(out)
+        if MANIFEST in written:
+            manifest = Manifest.parse(written.pop(MANIFEST), out)
+            assert not manifest.finished and {shard.file for shard in manifest.shards} <= written.keys()
+        assert written.items() <= expected.items()
         check_refused(call("train", "--dataset", out, "--out", tmp_path / "run"), str(out / MANIFEST))
     check_refused(call(*command, out, "--seed", 1, "--sensor"), f"out: {out} was written with variations null")
     assert call(*command, out)[0] == 0
@@ -206,12 +206,12 @@ def test_train(meshes: Path, frames: Path, environment: Any, call: Any, tmp_path
 # Frames
 
 
-def without_times(found: dict[str, bytes]) -> dict[str, Any]:
+def without_times(contents: dict[str, bytes]) -> dict[str, Any]:
     """Return the contents of a report without its timings and its HTML page."""
-    kept: dict[str, Any] = {name: content for name, content in found.items() if name.endswith((".jpg", ".png"))}
-    if "report.json" in found:
-        kept["report.json"] = {k: v for k, v in json.loads(found["report.json"]).items() if k != "speed"}
-    for line in found.get("answers.jsonl", b"").splitlines()[1:]:
+    kept: dict[str, Any] = {name: content for name, content in contents.items() if name.endswith((".jpg", ".png"))}
+    if "report.json" in contents:
+        kept["report.json"] = {k: v for k, v in json.loads(contents["report.json"]).items() if k != "speed"}
+    for line in contents.get("answers.jsonl", b"").splitlines()[1:]:
         answers = json.loads(line)
         kept[f"answers.jsonl {answers['frame']}"] = answers["instances"]
     return kept
@@ -226,10 +226,10 @@ def test_evaluate(frames: Path, model: Path, environment: Any, call: Any, tmp_pa
     assert call(*command, whole)[0] == 0
     expected = without_times(files(whole))
     kill("before frames/1.jpg", (*command, out), environment)
-    found = without_times(files(out))
+    written = without_times(files(out))
     kept = {"frames/0.jpg", "answers.jsonl one"}  # confusions may change with later frames
-    assert {name for name in found if "confusions" not in name} == kept
-    assert all(found[name] == expected[name] for name in kept)
+    assert {name for name in written if "confusions" not in name} == kept
+    assert all(written[name] == expected[name] for name in kept)
     check_refused(
         call("evaluate", "frames", frames / "one", *command[3:], out), f"out: {out} was written with dataset.path "
     )

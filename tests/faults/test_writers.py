@@ -1,4 +1,4 @@
-"""Every writer on a disk that becomes full or read-only at each of its steps: no partial files, no lost ones."""
+"""All writers on a disk that becomes full or read-only at any step: no file is partial or lost."""
 
 import dataclasses
 import errno

@@ -1,4 +1,4 @@
-"""Embeddings: their length, what must not matter, files, and damaged files."""
+"""Embeddings: their length, invariances, files, and damaged files."""
 
 import dataclasses
 import json

@@ -1,4 +1,4 @@
-"""Galleries on disk: changes are atomic, other writers' changes are kept, damage is refused in one line."""
+"""Galleries on disk: atomic changes, concurrent writers, and damaged files."""
 
 import json
 import os

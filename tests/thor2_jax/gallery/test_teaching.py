@@ -1,4 +1,4 @@
-"""Recognizers that are taught: enrolling, forgetting, what answers. The weights are random: the way is checked."""
+"""Enrolling, forgetting and answering with galleries; the weights are random, since accuracy is not checked."""
 
 import dataclasses
 import json
@@ -32,7 +32,7 @@ def run() -> TrainedRun:
 
 
 def frame(*shapes: tuple[int, int, int, int, tuple[int, int, int]], seed: int = 0) -> thor2.RGBDFrame:
-    """A frame with rectangles (top, left, height, width, colour) on planes that fall off to the right."""
+    """Return a frame of tilted rectangles (top, left, height, width, colour); depth grows to the right."""
     rng = np.random.default_rng(seed)
     color = rng.integers(100, 120, (240, 320, 3), np.uint8)
     depth = np.broadcast_to(600 + np.arange(320) // 2, (240, 320)).astype(np.uint16)

@@ -20,7 +20,7 @@ def run_serve(*options: str) -> str:
 
 
 def serve(*options: str) -> str:
-    """Run the command, which must fail, and return its only line that is no information."""
+    """Run the command, which must fail, and return its error line."""
     (line,) = [line for line in run_serve(*options).splitlines() if not line.startswith("INFO: ")]
     assert line.startswith("error: ")
     return line

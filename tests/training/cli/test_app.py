@@ -1,4 +1,4 @@
-"""Options that all commands share, and errors of usage."""
+"""Options of all commands, and usage errors."""
 
 import os
 import re
@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[3]
 
 
 def output(*arguments: str, **environment: str) -> str:
-    """Return what a command prints in a process of its own."""
+    """Return the output of a command in a separate process."""
     command = [sys.executable, "-c", "from training.cli import main; main()", *arguments]
     return subprocess.run(
         command, capture_output=True, text=True, check=True, env=os.environ | environment | {"PYTHONPATH": str(ROOT)}

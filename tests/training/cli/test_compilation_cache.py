@@ -63,7 +63,7 @@ def test_a_cache_of_the_environment_is_left_alone(environment: Path, monkeypatch
 
 
 def test_an_unusable_cache_directory(environment: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One that cannot be created is no cache; a file is refused."""
+    """A directory that cannot be created is ignored, and a file is refused."""
     monkeypatch.setenv("THOR2_CACHE", "/proc/no-such-directory")
     enable_compilation_cache()
     assert os.environ["JAX_COMPILATION_CACHE_DIR"] == ""

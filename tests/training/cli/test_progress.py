@@ -1,4 +1,4 @@
-"""Progress on standard error where it is no terminal, and without any."""
+"""Progress on a standard error that is not a terminal, and without standard error."""
 
 import sys
 import time
