@@ -144,7 +144,7 @@ class Recognizer:
         rule: FusionRule = DEFAULT_RULE,
         *,
         embedding: Embedding | None = None,
-        answer_by: AnswerBy | None = None,
+        answer_by: str | None = None,
     ) -> None:
         """Prepare every classifier of `run`, and an empty gallery in memory.
 
@@ -163,12 +163,11 @@ class Recognizer:
             raise InputError(f"rule is {rule!r}; expected one of {', '.join(FUSION_RULES)}")
         if not 0 <= unknown_below <= 1:
             raise InputError(f"unknown_below is {unknown_below}; expected a confidence from 0 to 1")
-        _check_answer_by(answer_by)
         self.run = run
         self.unknown_below = unknown_below
         self.rule: FusionRule = rule
         self.objects = ObjectGallery(run.classes, embedding)
-        self._answer_by = answer_by
+        self._answer_by = _check_answer_by(answer_by)
         self._classify = {name: _compiled(name, model) for name, model in run.classifiers.items()}
 
     @classmethod
@@ -179,7 +178,7 @@ class Recognizer:
         rule: FusionRule = DEFAULT_RULE,
         *,
         gallery: str | Path | None = None,
-        answer_by: AnswerBy | None = None,
+        answer_by: str | None = None,
         reembed: bool = False,
     ) -> "Recognizer":
         """Read a run directory; raises as `run_directory.load_run`, `load_gallery` and `Recognizer`.
@@ -210,19 +209,19 @@ class Recognizer:
         """All names that may be answered: trained classes, without forgotten ones, and enrolled objects."""
         return self.objects.union.names
 
-    def answers_by(self, answer_by: AnswerBy | None = None) -> AnswerBy:
+    def answers_by(self, answer_by: str | None = None) -> AnswerBy:
         """Return what answers: "classifiers", "gallery" or "both".
 
         Args:
             answer_by: the wanted source; by default that of the constructor or of the run's record. Without classifiers
                 it is always the gallery, with an empty gallery always the classifiers, and otherwise both by default.
         """
-        _check_answer_by(answer_by)
+        wanted = _check_answer_by(answer_by) or self._answer_by or _check_answer_by(self.run.record.get("answer_by"))
         if not self._classify:
             return "gallery"
         if not self.gallery.objects:
             return "classifiers"
-        return answer_by or self._answer_by or self.run.record.get("answer_by") or "both"
+        return wanted or "both"
 
     def enroll(
         self,
@@ -328,7 +327,7 @@ class Recognizer:
         return {name: np.asarray(values) for name, values in computing.items()}
 
     def recognize(
-        self, frame: RGBDFrame, classifiers: Sequence[Feature] = THOR2, answer_by: AnswerBy | None = None
+        self, frame: RGBDFrame, classifiers: Sequence[Feature] = THOR2, answer_by: str | None = None
     ) -> list[Recognition]:
         """Recognize every instance of a frame; the answers are in the order of the label numbers.
 
@@ -341,8 +340,8 @@ class Recognizer:
             InputError: a classifier that the run does not have. An instance that cannot be described is no error: the
                 `reason` of its answer says why.
         """
-        answer_by = self.answers_by(answer_by)
-        names = check_features(classifiers, "classifiers") if answer_by != "gallery" else ()
+        source = self.answers_by(answer_by)
+        names = check_features(classifiers, "classifiers") if source != "gallery" else ()
         missing = [name for name in names if name not in self._classify]
         if missing:
             raise InputError(f"classifiers: the run has no {', '.join(missing)}, only {', '.join(self._classify)}")
@@ -350,7 +349,7 @@ class Recognizer:
         def compute(instances: Sequence[PreparedInstance]) -> tuple[Any, dict[Feature, Any], dict[str, Any]]:
             clouds = pack_instances(instances, _padded_rows(len(instances)))
             descriptors = describe(clouds, self.run.network, self.run.config)
-            embeddings = {} if answer_by == "classifiers" else {"gallery": self.objects.embed(clouds)}
+            embeddings = {} if source == "classifiers" else {"gallery": self.objects.embed(clouds)}
             return descriptors.overflow, {name: self._classify[name](descriptors) for name in names}, embeddings
 
         instances, chunks = self._by_chunks(frame, compute)
@@ -451,9 +450,13 @@ class Recognizer:
         )
 
 
-def _check_answer_by(answer_by: str | None) -> None:
-    if answer_by not in (None, *ANSWER_SOURCES):
-        raise InputError(f"answer_by is {answer_by!r}; expected one of {', '.join(ANSWER_SOURCES)}")
+def _check_answer_by(value: str | None) -> AnswerBy | None:
+    for source in ANSWER_SOURCES:
+        if value == source:
+            return source
+    if value is not None:
+        raise InputError(f"answer_by is {value!r}; expected one of {', '.join(ANSWER_SOURCES)}")
+    return None
 
 
 def _top(names: Sequence[str], values: NDArray[Any], count: int = 5) -> list[tuple[str, float]]:

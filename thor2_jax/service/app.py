@@ -184,7 +184,7 @@ def _add_model_routes(routes: APIRouter, service: Service) -> None:
         """Return the classes and the configuration of the model."""
         run = service.engine.run
         return schemas.ModelAnswer(
-            classes=list(run.classes),
+            classes=list(service.engine.classes),
             classifiers=list(run.classifiers),
             descriptor_version=DESCRIPTOR_VERSION,
             descriptor=pydantic_core.to_jsonable_python(run.config),

@@ -16,7 +16,6 @@ from thor2_jax.recognition.classifier import Feature
 from thor2_jax.recognition.fusion import fuse, fused_probabilities, with_temperature
 from thor2_jax.recognition.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.recognition.recognizer import THOR2, Recognition, Recognizer
-from thor2_jax.recognition.run_directory import load_run
 from thor2_jax.service.settings import Settings
 
 __all__ = ["CloudResult", "InferenceEngine"]
@@ -36,6 +35,7 @@ class CloudResult:
         probabilities: classifier -> [C] float32.
         aligned: [N, 3] float32, the aligned cloud in scaled units, with padding.
         strip_colors: [S, J, R] float32, strip colour vectors.
+        enrolled: [K, D] float32, embeddings for the gallery; None if the classifiers alone answer.
     """
 
     images: NDArray[np.float32]
@@ -44,6 +44,7 @@ class CloudResult:
     probabilities: dict[Feature, NDArray[np.float32]]
     aligned: NDArray[np.float32]
     strip_colors: NDArray[np.float32]
+    enrolled: NDArray[np.float32] | None = None
 
 
 class InferenceEngine:
@@ -57,8 +58,10 @@ class InferenceEngine:
         """
         if settings.cache is not None:
             _enable_compilation_cache(settings.cache)
-        run = load_run(settings.model)
-        missing = [name for name in THOR2 if name not in run.classifiers]
+        self._recognizer = Recognizer.load(settings.model, settings.unknown_below)
+        run = self._recognizer.run
+        self._classifiers = THOR2 if run.classifiers else ()
+        missing = [name for name in self._classifiers if name not in run.classifiers]
         if missing:
             raise InputError(
                 f"model: {settings.model} has no classifier {', '.join(missing)}; "
@@ -66,8 +69,14 @@ class InferenceEngine:
             )
         # The closed form computes the same pairs as gudhi without a host callback.
         self.run = dataclasses.replace(run, config=dataclasses.replace(run.config, homology="closed_form"))
+        self._recognizer.run = self.run
+        self._embeds = self._recognizer.answers_by() != "classifiers"
         self.max_batch = settings.max_batch
-        self._recognizer = Recognizer(self.run, settings.unknown_below)
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """All names that may be answered."""
+        return self._recognizer.classes
 
     @property
     def batch_shapes(self) -> list[tuple[int, int]]:
@@ -85,10 +94,12 @@ class InferenceEngine:
         return self._infer(instances, _padded_batch(len(instances)), max(point_bucket(largest), MIN_POINTS_BUCKET))
 
     def _infer(self, instances: Sequence[PreparedInstance], n_clouds: int, n_points: int) -> list[CloudResult]:
-        aligned = align(pack_instances(instances, n_clouds, n_points), self.run.config)
+        clouds = pack_instances(instances, n_clouds, n_points)
+        aligned = align(clouds, self.run.config)
         cloud_strips = strips(aligned, self.run.network, self.run.config)
         descriptors = describe_strips(cloud_strips, self.run.network, self.run.config)
-        probabilities = self._recognizer.probabilities(descriptors, THOR2)
+        probabilities = self._recognizer.probabilities(descriptors, self._classifiers)
+        enrolled = np.asarray(self._recognizer.objects.embed(clouds)) if self._embeds else None
         arrays = (
             descriptors.images,
             descriptors.embeddings,
@@ -105,6 +116,7 @@ class InferenceEngine:
                 {name: p[k] for name, p in probabilities.items()},
                 points[k],
                 colors[k],
+                None if enrolled is None else enrolled[k],
             )
             for k in range(len(instances))
         ]
@@ -112,16 +124,20 @@ class InferenceEngine:
     def recognize(self, instances: Sequence[PreparedInstance], results: Sequence[CloudResult]) -> list[Recognition]:
         """Return a recognition per instance of a frame; `results` are those of the usable instances, in order."""
         shape = len(results), len(self.run.classes)
-        probabilities = {name: np.reshape([r.probabilities[name] for r in results], shape) for name in THOR2}
-        return self._recognizer.recognitions(instances, probabilities, [r.overflow for r in results])
+        probabilities = {
+            name: np.reshape([r.probabilities[name] for r in results], shape) for name in self._classifiers
+        }
+        enrolled = [r.enrolled for r in results if r.enrolled is not None]
+        embeddings = np.array(enrolled, np.float32) if self._embeds else None
+        return self._recognizer.recognitions(instances, probabilities, [r.overflow for r in results], embeddings)
 
     def calibrated_confidences(self, results: Sequence[CloudResult]) -> list[float | None]:
         """Return the confidence of each cloud's most probable class after temperature scaling of both classifiers.
 
-        None without temperatures, which training fits on a held-out set (`thor2 train --folds`).
+        None without temperatures, which training fits on a held-out set (`thor2 train --folds`), and with a gallery.
         """
         temperatures = self.run.record.get("temperatures", {})
-        if not results or not set(THOR2) <= set(temperatures):
+        if not results or self._embeds or not set(THOR2) <= set(temperatures):
             return [None] * len(results)
         probabilities = {name: np.stack([r.probabilities[name] for r in results]) for name in THOR2}
         index = fuse(probabilities).class_index

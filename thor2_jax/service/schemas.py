@@ -50,12 +50,14 @@ class InstanceAnswer(BaseModel):
     label: int = Field(description="Number of the instance in the label image.")
     name: str | None = Field(description="Name of the object; null if it is unknown or cannot be recognized.")
     confidence: float | None = Field(
-        description="Probability of the most probable class after fusion of the classifiers."
+        description="Fused probability of the most probable class, or the score of the gallery."
     )
     classifier: str | None = Field(
-        description="Classifier that gives this class the higher probability: tops or tops2."
+        description="Classifier that gives this class the highest probability: tops or tops2, or gallery."
     )
-    top: dict[str, list[Candidate]] = Field(description="Five most probable classes of each classifier.")
+    top: dict[str, list[Candidate]] = Field(
+        description="Five most probable classes of each classifier, and of the gallery."
+    )
     occluded: bool = Field(description="Partly hidden by another instance or cut off by the image border.")
     overflow: int = Field(description="Number of points and persistence pairs outside the descriptor's grid.")
     points_used: int = Field(description="Number of points of the described cloud.")

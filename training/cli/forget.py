@@ -4,6 +4,7 @@ from typing import Annotated
 
 import typer
 
+from thor2_jax.printable import escape_characters
 from training.cli.app import ModelOption, app, console
 
 
@@ -16,4 +17,4 @@ def forget(
 
     recognizer = Recognizer.load(model)
     recognizer.forget(name)
-    console.print(f"{name} is forgotten; {model} knows {len(recognizer.classes)} objects")
+    console.print(f"{escape_characters(name)} is forgotten; {model} knows {len(recognizer.classes)} objects")

@@ -4,8 +4,8 @@ from typing import Annotated
 
 import typer
 from rich.table import Table
-from rich.text import Text
 
+from thor2_jax.printable import escape_characters
 from training.cli.app import ModelOption, app, console
 
 
@@ -29,5 +29,5 @@ def objects(
         if name in enrolled:
             views, date = str(len(enrolled[name].clouds)), enrolled[name].date
             sources.append(enrolled[name].source)
-        table.add_row(Text(name), views, " and ".join(sources), date)
+        table.add_row(escape_characters(name), views, " and ".join(sources), date)
     console.print(table)

@@ -18,6 +18,9 @@ def recognize(
     labels: Annotated[Path, typer.Option(help="Instance labels, PNG; 0 is background.")],
     intrinsics: Annotated[Path, typer.Option(help="JSON with fx, fy, cx, cy (pixels) and optionally depth_scale.")],
     unknown_below: UnknownOption = 0.0,
+    answer_by: Annotated[
+        str | None, typer.Option(help="classifiers, gallery or both. Default: what the run has.")
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="Directory for recognition.json and overlay.png.")] = None,
 ) -> None:
     """Recognize every instance of one RGB-D frame."""
@@ -30,7 +33,7 @@ def recognize(
         check_output_directory(out, resumable=RESULT_FILES)
         remove_leftovers(out)
     frame = read_frame(color=color, depth=depth, labels=labels, intrinsics=intrinsics)
-    recognitions = Recognizer.load(model, unknown_below).recognize(frame)
+    recognitions = Recognizer.load(model, unknown_below, answer_by=answer_by).recognize(frame)
     table = Table("label", "name", "confidence", "classifier", "occluded", "points", "overflow", "note")
     for r in recognitions:
         confidence = "" if r.confidence is None else f"{r.confidence:.3f}"

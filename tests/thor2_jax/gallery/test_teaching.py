@@ -11,7 +11,7 @@ from helpers import SMALL_CONFIG, untrained_run
 import thor2_jax as thor2
 from thor2_jax.gallery.augment import augmented_copies
 from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
-from thor2_jax.gallery.enrollment import QUERY_ORIENTATIONS, instance_view
+from thor2_jax.gallery.enrollment import ORIENTATIONS, instance_view
 from thor2_jax.gallery.objects import ObjectGallery
 from thor2_jax.gallery.union import ClassUnion
 from thor2_jax.recognition.recognizer import EMBEDDING_FILE
@@ -190,7 +190,7 @@ def test_another_embedding_embeds_the_views_again(embedding: Embedding, tmp_path
 def test_embeddings_of_a_query_have_one_row_per_orientation(embedding: Embedding) -> None:
     recognizer = thor2.Recognizer(untrained_run((), ()), embedding=embedding)
     packed = recognizer.describe(CLUTTER).packed
-    assert recognizer.objects.embed(packed).shape == (4, QUERY_ORIENTATIONS, embedding.size)
+    assert recognizer.objects.embed(packed).shape == (4, ORIENTATIONS, embedding.size)
 
 
 def test_combined_values_of_classes_and_objects() -> None:
