@@ -183,21 +183,21 @@ def test_train(meshes: Path, frames: Path, environment: Any, call: Any, tmp_path
     places = "checkpoints/fold-0/ce/1", "curves.png", "run.json", "baselines/forest.safetensors", ".views"
     for place in (f"{'after' if place == places[0] else 'before'} {place}" for place in places):
         kill(place, (*command, out), environment)
-        found = files(out)
-        assert all(found[name] == expected[name] for name in {"curves.png", "network.npz"} & found.keys())
+        written = files(out)
+        assert all(written[name] == expected[name] for name in {"curves.png", "network.npz"} & written.keys())
         assert [row["epoch"] for row in read_metrics(out / "metrics.jsonl")] in ([], [1], [1, 2])
-        if "run.json" in found:
+        if "run.json" in written:
             assert equal_models(load_run(out), run)
         else:
             check_refused(call("evaluate", "frames", frames, "--model", out), f"{out} is not a run directory")
-        if "checkpoints/begun.json" in found:
+        if "checkpoints/begun.json" in written:
             check_refused(call(*command, out, "--epochs", 3), f"{out} was written with epochs 2, not 3")
     assert call(*command, out)[0] == 0
     assert equal_models(load_run(out), run)
     assert not list(out.glob(".*")) and not (out / "views").exists()
-    found = files(out)
-    assert found.keys() == expected.keys()
-    different = {name for name in found if found[name] != expected[name]}  # these two hold measured times
+    written = files(out)
+    assert written.keys() == expected.keys()
+    different = {name for name in written if written[name] != expected[name]}  # these two hold measured times
     assert different <= {"metrics.jsonl", "baselines/forest.safetensors"}
     first, second = (read_baseline(baseline_file(folder, "forest"), run.classes) for folder in (out, whole))
     assert all(np.array_equal(second.arrays[name], array) for name, array in first.arrays.items())

@@ -25,11 +25,13 @@ NEARLY_EQUAL = 0.85
 """Least ratio of the second side of the box to the first at which the two are also swapped."""
 
 
-def _swapped(found: Normalization) -> Normalization:
+def _swapped(normalization: Normalization) -> Normalization:
     """Swap the first two axes of a box whose first two sides are nearly equal."""
-    sides = found.high - found.low
+    sides = normalization.high - normalization.low
     order = jnp.where(sides[1] > NEARLY_EQUAL * sides[0], jnp.array([1, 0, 2]), jnp.arange(3))
-    return found._replace(axes=found.axes[order], low=found.low[order], high=found.high[order])
+    return normalization._replace(
+        axes=normalization.axes[order], low=normalization.low[order], high=normalization.high[order]
+    )
 
 
 @partial(jax.jit, static_argnums=(1, 2))
@@ -37,12 +39,12 @@ def _orientations(clouds: PointClouds, config: DescriptorConfig, count: int) -> 
     half_turn = jnp.diag(jnp.array([-1, -1, 1], jnp.float32))
 
     def one(cloud: PointClouds) -> tuple[jax.Array, jax.Array]:
-        found = boxed(cloud, np.float32(config.sigma_s))
+        normalization = boxed(cloud, np.float32(config.sigma_s))
         rotations = []
-        for box in (found, _swapped(found)):
+        for box in (normalization, _swapped(normalization)):
             rotation = oriented(box)
             rotations += [rotation, half_turn @ rotation]
-        placed = [place_aligned(rotation, found, np.float32(config.alpha)) for rotation in rotations[:count]]
+        placed = [place_aligned(rotation, normalization, np.float32(config.alpha)) for rotation in rotations[:count]]
         points, cameras = zip(*placed, strict=True)
         return jnp.stack(points)[:, : len(cloud.mask)], jnp.stack(cameras)
 

@@ -152,9 +152,9 @@ def _values(instances: Any, key: str, kind: type | tuple[type, ...]) -> list[Any
         values = [instance[key] for instance in instances]
     except (TypeError, KeyError):
         raise InputError(f"an image's entry is not a list of {{{key}: <number>, ...}}") from None
-    wrong = [value for value in values if not isinstance(value, kind) or isinstance(value, bool)]
-    if wrong:
-        raise InputError(f"{key} is {wrong[0]!r}; expected a number")
+    invalid = [value for value in values if not isinstance(value, kind) or isinstance(value, bool)]
+    if invalid:
+        raise InputError(f"{key} is {invalid[0]!r}; expected a number")
     return values
 
 

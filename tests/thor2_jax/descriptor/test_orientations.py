@@ -30,26 +30,26 @@ LONG, SQUARE = (0.2, 0.1, 0.06), (0.12, 0.115, 0.06)
 @pytest.mark.parametrize("count", ORIENTATION_COUNTS)
 def test_the_first_orientation_is_that_of_align(count: int) -> None:
     batch = clouds(LONG, SQUARE, LONG)
-    found, expected = candidate_orientations(batch, CONFIG, count), thor2.align(batch, CONFIG)
-    assert found.points.shape == (3 * count, *batch.points.shape[1:])
-    np.testing.assert_allclose(found.points[::count], expected.points, atol=1e-6)
-    np.testing.assert_allclose(found.camera[::count], expected.camera, atol=1e-6)
-    np.testing.assert_array_equal(found.colors[::count], batch.colors)
-    np.testing.assert_array_equal(found.mask[count - 1 :: count], batch.mask)
+    oriented, expected = candidate_orientations(batch, CONFIG, count), thor2.align(batch, CONFIG)
+    assert oriented.points.shape == (3 * count, *batch.points.shape[1:])
+    np.testing.assert_allclose(oriented.points[::count], expected.points, atol=1e-6)
+    np.testing.assert_allclose(oriented.camera[::count], expected.camera, atol=1e-6)
+    np.testing.assert_array_equal(oriented.colors[::count], batch.colors)
+    np.testing.assert_array_equal(oriented.mask[count - 1 :: count], batch.mask)
 
 
 def test_the_second_orientation_is_a_half_turn_about_z() -> None:
     batch = clouds(LONG, SQUARE)
     turned = candidate_orientations(batch, CONFIG, 2)
     mirrored = thor2.turn(thor2.mirror(thor2.view_normalize(batch, CONFIG), "xy"), CONFIG)
-    found = np.asarray(turned.points)[1::2]
-    np.testing.assert_allclose(found, mirrored.points, atol=2e-6)
+    points = np.asarray(turned.points)[1::2]
+    np.testing.assert_allclose(points, mirrored.points, atol=2e-6)
 
 
 def test_sides_are_swapped_only_if_nearly_equal() -> None:
-    found = candidate_orientations(clouds(LONG, SQUARE), CONFIG, 4)
-    points = np.asarray(found.points).reshape(2, 4, -1, 3)
-    mask = np.asarray(found.mask).reshape(2, 4, -1)
+    oriented = candidate_orientations(clouds(LONG, SQUARE), CONFIG, 4)
+    points = np.asarray(oriented.points).reshape(2, 4, -1, 3)
+    mask = np.asarray(oriented.mask).reshape(2, 4, -1)
     width = [np.ptp(points[cloud, k][mask[cloud, k]][:, 1]) for cloud in range(2) for k in (0, 2)]
     assert width[0] == pytest.approx(width[1], abs=1e-6)
     assert width[3] > width[2] + 0.01
@@ -58,8 +58,8 @@ def test_sides_are_swapped_only_if_nearly_equal() -> None:
 
 def test_an_empty_cloud_stays_empty() -> None:
     empty = thor2.PointClouds.pack([(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))])
-    found = candidate_orientations(empty, CONFIG, 4)
-    assert not found.mask.any() and bool(jnp.isfinite(found.points).all())
+    oriented = candidate_orientations(empty, CONFIG, 4)
+    assert not oriented.mask.any() and bool(jnp.isfinite(oriented.points).all())
 
 
 @pytest.mark.parametrize("count", [0, 3, 5])

@@ -106,10 +106,10 @@ def test_compact_clouds_keep_points_to_0_05_mm() -> None:
     views = [view(0, 3), view(1, 50)]
     clouds = CompactClouds.of(views[:1]) + CompactClouds.of(views[1:])
     assert len(clouds) == 2 and clouds.points.dtype == np.int16
-    for found, expected in zip(clouds.views(), views, strict=True):
-        np.testing.assert_allclose(found.points, expected.points, atol=3e-5)
-        np.testing.assert_array_equal(found.colors, expected.colors)
-        np.testing.assert_array_equal(found.boundary, expected.boundary)
+    for restored, expected in zip(clouds.views(), views, strict=True):
+        np.testing.assert_allclose(restored.points, expected.points, atol=3e-5)
+        np.testing.assert_array_equal(restored.colors, expected.colors)
+        np.testing.assert_array_equal(restored.boundary, expected.boundary)
     again = CompactClouds.of(list(clouds.views()))
     np.testing.assert_array_equal(again.points, clouds.points)
 

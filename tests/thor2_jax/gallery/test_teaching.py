@@ -182,8 +182,8 @@ def test_another_embedding_embeds_the_views_again(embedding: Embedding, tmp_path
     ObjectGallery((), other).open(path / "gallery", reembed=True)
     expected = thor2.Recognizer(untrained_run((), ()), embedding=other)
     expected.enroll("brick", [(CLUTTER, 1)])
-    found = thor2.Recognizer.load(path).gallery.objects["brick"].embeddings
-    np.testing.assert_array_equal(found, expected.gallery.objects["brick"].embeddings)
+    embeddings = thor2.Recognizer.load(path).gallery.objects["brick"].embeddings
+    np.testing.assert_array_equal(embeddings, expected.gallery.objects["brick"].embeddings)
     assert json.loads((path / "gallery" / "index.json").read_text())["embedding"] == other.fingerprint
 
 

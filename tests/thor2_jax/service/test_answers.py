@@ -124,8 +124,8 @@ def test_health_page_and_unknown_paths(http: httpx.Client) -> None:
     for path in ("/nothing", "/../app.py", "/%2e%2e/app.py"):
         missing = http.get(path)
         assert missing.status_code == 404 and set(missing.json()) == {"field", "message"}
-    wrong = http.get("/v1/recognize")
-    assert wrong.status_code == 405 and wrong.headers["allow"] == "POST"
+    wrong_method = http.get("/v1/recognize")
+    assert wrong_method.status_code == 405 and wrong_method.headers["allow"] == "POST"
 
 
 def test_client_raises_service_error(server: Any, files: dict[str, bytes]) -> None:

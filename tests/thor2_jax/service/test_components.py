@@ -300,7 +300,7 @@ def test_dead_worker_has_no_requests_in_progress(tmp_path: Path) -> None:
 
 def test_settings_out_of_range() -> None:
     cache = Path(__file__)
-    for wrong in (
+    for invalid in (
         {"cache": cache},
         {"queue": 0},
         {"deadline": 0.0},
@@ -309,5 +309,5 @@ def test_settings_out_of_range() -> None:
         {"token": ""},
         {"token": "é"},
     ):
-        with pytest.raises(InputError, match=next(iter(wrong))):
-            Settings(Path("run"), **wrong)
+        with pytest.raises(InputError, match=next(iter(invalid))):
+            Settings(Path("run"), **invalid)
