@@ -130,7 +130,7 @@ def test_invalid_input_is_refused_before_any_work(tmp_path: Path, monkeypatch: p
         ({}, 1, "views of 0 classes"),
         ({"mug": [], "box": clouds()["stick"]}, 1, "class 'mug' has no views"),
         ({"mug": clouds()["stick"]}, 1, "views of 1 classes"),
-        (clouds(views=3), 4, "folds is 4, .*'red brick'"),
+        (clouds(views=3), 4, "folds is 4.*'red brick'"),
     ],
 )
 def test_nothing_is_written_for_bad_views(
