@@ -30,9 +30,6 @@ GAMMA = 4.0
 RIDGE = 0.3
 """Regularization; chosen on held-out frames."""
 
-INDEXED_VIEWS = 500_000
-"""Number of views from which an index is used if its package is installed."""
-
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class GalleryObject:
@@ -67,17 +64,17 @@ class Gallery:
         embedding: fingerprint of the embedding that the views are embedded by.
         objects: name -> its views, in the order of enrolment.
         hidden: trained classes that were forgotten or replaced; no classifier answers by them.
-        search: kind of search, "exact" or "usearch"; by default usearch, where it is installed, for galleries of at
-            least `INDEXED_VIEWS` embeddings.
+        search: kind of search, "exact" or "usearch". An index answers queries among millions of views in milliseconds,
+            but is built again, in minutes, after every change.
     """
 
     embedding: str
     objects: Mapping[str, GalleryObject] = dataclasses.field(default_factory=dict)
     hidden: tuple[str, ...] = ()
-    search: str | None = None
+    search: str = "exact"
 
     def __post_init__(self) -> None:
-        if self.search not in (None, "exact", "usearch"):
+        if self.search not in ("exact", "usearch"):
             raise InputError(f"search is {self.search!r}; expected 'exact' or 'usearch'")
 
     @property
@@ -147,14 +144,7 @@ class Gallery:
 
     @functools.cached_property
     def _search(self) -> ViewSearch:
-        if self.search == "usearch":
-            return IndexSearch(self._embeddings)
-        if self.search is None and len(self._embeddings) >= INDEXED_VIEWS:
-            try:
-                return IndexSearch(self._embeddings)
-            except InputError:  # not installed
-                pass
-        return ExactSearch(self._embeddings)
+        return IndexSearch(self._embeddings) if self.search == "usearch" else ExactSearch(self._embeddings)
 
     def scores(self, embeddings: ArrayLike) -> NDArray[np.float32]:
         """Return the scores [B, n_objects] of each object, from 0 to 1, in the order of `names`.

@@ -26,17 +26,22 @@ class ObjectGallery:
     Each change is one immutable gallery in place of another, so that another thread reads the one or the other.
     """
 
-    def __init__(self, trained: tuple[str, ...], embedding: Embedding | None = None) -> None:
+    def __init__(self, trained: tuple[str, ...], embedding: Embedding | None = None, search: str = "exact") -> None:
         """Begin with an empty gallery in memory.
 
         Args:
             trained: class names of the run.
             embedding: embedding of the views; by default the packaged one.
+            search: "exact" or "usearch", see `Gallery`.
+
+        Raises:
+            InputError: `search` is unknown.
         """
         self._trained = trained
+        self._search = search
         self._embedding = embedding
         self._directory: Path | None = None
-        self._stored = StoredGallery(Gallery(""), {}, 0)
+        self._stored = StoredGallery(Gallery("", search=search), {}, 0)
         self._stamp: tuple[int, int, int] | None = None
 
     def open(self, directory: Path, *, reembed: bool = False) -> None:
@@ -87,7 +92,7 @@ class ObjectGallery:
         stamp = None if self._directory is None else gallery_stamp(self._directory)
         if self._directory is None or stamp == self._stamp:
             return False
-        self._stored = load_gallery(self._directory, self.embedding.fingerprint, self._stored)
+        self._set(load_gallery(self._directory, self.embedding.fingerprint, self._stored))
         self._stamp = stamp
         return True
 
@@ -95,8 +100,11 @@ class ObjectGallery:
         if self._directory is None:
             self._stored = dataclasses.replace(self._stored, gallery=change(self.gallery))
         else:
-            self._stored = update_gallery(self._directory, change, embedding, self._stored)
+            self._set(update_gallery(self._directory, change, embedding, self._stored))
             self._stamp = gallery_stamp(self._directory)
+
+    def _set(self, stored: StoredGallery) -> None:
+        self._stored = dataclasses.replace(stored, gallery=dataclasses.replace(stored.gallery, search=self._search))
 
     def check(self, name: str, *, extend: bool = False, replace: bool = False) -> None:
         """Raise InputError if `enroll` would refuse the name; a check before views are rendered or embedded."""

@@ -145,6 +145,7 @@ class Recognizer:
         *,
         embedding: Embedding | None = None,
         answer_by: str | None = None,
+        search: str = "exact",
     ) -> None:
         """Prepare every classifier of `run`, and an empty gallery in memory.
 
@@ -155,6 +156,7 @@ class Recognizer:
             rule: fusion rule, see `fusion`; the paper's is "max".
             embedding: embedding of the gallery; by default the packaged one.
             answer_by: what answers, see `answers_by`; by default what the run's record stores.
+            search: search in the gallery, "exact" or "usearch" (extra `index`), see `Gallery`.
 
         Raises:
             InputError: `unknown_below` is not between 0 and 1, or `rule` or `answer_by` is unknown.
@@ -166,7 +168,7 @@ class Recognizer:
         self.run = run
         self.unknown_below = unknown_below
         self.rule: FusionRule = rule
-        self.objects = ObjectGallery(run.classes, embedding)
+        self.objects = ObjectGallery(run.classes, embedding, search)
         self._answer_by = _check_answer_by(answer_by)
         self._classify = {name: _compiled(name, model) for name, model in run.classifiers.items()}
 
@@ -179,6 +181,7 @@ class Recognizer:
         *,
         gallery: str | Path | None = None,
         answer_by: str | None = None,
+        search: str = "exact",
         reembed: bool = False,
     ) -> "Recognizer":
         """Read a run directory; raises as `run_directory.load_run`, `load_gallery` and `Recognizer`.
@@ -190,12 +193,13 @@ class Recognizer:
             gallery: directory of the gallery; by default `gallery` in the run directory. Objects that are enrolled or
                 forgotten later are written to it.
             answer_by: see `Recognizer`.
+            search: see `Recognizer`.
             reembed: embed the views of the gallery again, after a change of the run's embedding.
         """
         run_dir = Path(run_dir)
         run, file = load_run(run_dir), run_dir / EMBEDDING_FILE
         embedding = Embedding.load(file, run.network) if file.is_file() else None
-        recognizer = cls(run, unknown_below, rule, embedding=embedding, answer_by=answer_by)
+        recognizer = cls(run, unknown_below, rule, embedding=embedding, answer_by=answer_by, search=search)
         recognizer.objects.open(Path(gallery) if gallery is not None else run_dir / GALLERY_DIRECTORY, reembed=reembed)
         return recognizer
 

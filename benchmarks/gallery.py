@@ -1,0 +1,164 @@
+"""Galleries: search among 100,000 objects, and the time to teach one: `python -m benchmarks.gallery search|teach`.
+
+search  synthetic embeddings: time of a query of 16 embeddings, memory, and the recall of the index
+teach   one object more in a warm process with a gallery of 60, from a mesh and from five views; forgetting it
+
+Prints a table and writes gallery-search.json or gallery-teach.json.
+"""
+
+import argparse
+import json
+import resource
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.timing import time_calls
+from thor2_jax.gallery.clouds import CompactClouds
+from thor2_jax.gallery.embedding import Embedding
+from thor2_jax.gallery.enrollment import instance_view
+from thor2_jax.gallery.gallery import NEAREST, GalleryObject
+from thor2_jax.gallery.objects import ObjectGallery
+from thor2_jax.gallery.search import ExactSearch, IndexSearch, ViewSearch
+from thor2_jax.recognition.recognizer import EMBEDDING_FILE, Recognizer
+from thor2_jax.recognition.run_directory import TrainedRun, save_run
+from training.enrollment import mesh_views
+from training.objects.builtin_objects import builtin_objects
+from training.rendering.scenes import compose_scene
+
+SIZE = 256
+QUERIES = 16
+
+
+def synthetic_embeddings(n_objects: int, n_views: int, seed: int = 0) -> NDArray[np.float16]:
+    """Return views [n_objects * n_views, SIZE] of unit length, each object's around a random centre (cosine 0.8)."""
+    rng = np.random.default_rng(seed)
+    embeddings = np.empty((n_objects * n_views, SIZE), np.float16)
+    for first in range(0, n_objects, 1000):
+        count = min(1000, n_objects - first)
+        centres = rng.standard_normal((count, 1, SIZE), np.float32)
+        views = centres + 0.75 * rng.standard_normal((count, n_views, SIZE), np.float32)
+        views /= np.linalg.norm(views, axis=-1, keepdims=True)
+        embeddings[first * n_views : (first + count) * n_views] = views.reshape(-1, SIZE)
+    return embeddings
+
+
+def queries_near(embeddings: NDArray[np.float16], count: int, seed: int = 1) -> NDArray[np.float32]:
+    """Return queries [count, SIZE] of unit length, each near a random view."""
+    rng = np.random.default_rng(seed)
+    queries = embeddings[rng.integers(len(embeddings), size=count)].astype(np.float32)
+    queries += rng.standard_normal(queries.shape, np.float32) * np.float32(0.75 / np.sqrt(SIZE))
+    return queries / np.linalg.norm(queries, axis=1, keepdims=True)
+
+
+def peak_memory() -> float:
+    """Return the largest resident size of this process so far, GB."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+
+
+def measure_search(options: argparse.Namespace) -> dict[str, Any]:
+    """Return times, memory and recall of both searches; the index may hold fewer objects."""
+    report: dict[str, Any] = {"size": SIZE, "queries": QUERIES, "nearest": NEAREST}
+
+    def measure(name: str, n_objects: int, build: Callable[[NDArray[np.float16]], ViewSearch]) -> None:
+        embeddings = synthetic_embeddings(n_objects, options.views)
+        queries = queries_near(embeddings, QUERIES)
+        start = time.perf_counter()
+        search = build(embeddings)
+        built = time.perf_counter() - start
+        timing = time_calls(lambda: search.nearest(queries, NEAREST), least=3)
+        row = {
+            "objects": n_objects,
+            "views": len(embeddings),
+            "build_seconds": built,
+            "query_seconds": timing.median,
+            "peak_gigabytes": peak_memory(),
+        }
+        if isinstance(search, IndexSearch):
+            many = queries_near(embeddings, 200, seed=2)
+            expected, found = ExactSearch(embeddings).nearest(many, NEAREST)[1], search.nearest(many, NEAREST)[1]
+            pairs = list(zip(expected, found, strict=True))
+            for count in (1, 10, NEAREST):
+                hits = [len(np.intersect1d(a[:count], b[:count])) / count for a, b in pairs]
+                row[f"recall_at_{count}"] = float(np.mean(hits))
+        report[name] = row
+        print(name, json.dumps(row), flush=True)
+
+    measure("exact", options.objects, ExactSearch)
+    measure("exact, as the index", options.index_objects, ExactSearch)
+    measure("usearch", options.index_objects, IndexSearch)
+    return report
+
+
+def measure_teaching(options: argparse.Namespace) -> dict[str, Any]:
+    """Return the seconds to enroll an object from a mesh and from five views, and to forget it."""
+    rng = np.random.default_rng(0)
+    meshes = builtin_objects()
+    scenes = [compose_scene(meshes, np.random.default_rng(k), n_objects=6) for k in range(8)]
+    name = max(meshes, key=lambda each: sum(each in scene.truth.values() for scene in scenes))
+    frames = [
+        (scene.frame, label)
+        for scene in scenes
+        for label, truth in scene.truth.items()
+        if truth == name and label in scene.frame.instances
+    ][:5]
+    embedding = Embedding.create()
+    with tempfile.TemporaryDirectory() as temporary:
+        model = Path(temporary) / "run"
+        save_run(TrainedRun(embedding.config, embedding.network, (), {}, {}), model)
+        embedding.save(model / EMBEDDING_FILE)
+        recognizer = Recognizer.load(model)
+        view = instance_view(*frames[0], embedding.config.sigma_s)
+        clouds = CompactClouds.of([view] * 60)
+        embeddings = rng.standard_normal((60, 120, embedding.size), np.float32)
+        embeddings /= np.linalg.norm(embeddings, axis=-1, keepdims=True)
+        views = {
+            f"object {k}": GalleryObject(e.astype(np.float16), clouds, "mesh", "") for k, e in enumerate(embeddings)
+        }
+        recognizer.objects.add(views)
+        report = {}
+        for attempt in range(options.repeats + 1):  # the first one compiles
+            before = [str(answer) for answer in recognizer.recognize(scenes[0].frame)]
+            report["mesh"] = _seconds(lambda: _enroll_mesh(recognizer.objects, meshes[name]))
+            report["forget"] = _seconds(lambda: recognizer.forget("new"))
+            report[f"{len(frames)} views"] = _seconds(lambda: recognizer.enroll("new", frames))
+            recognizer.forget("new")
+            report["answers restored"] = before == [str(answer) for answer in recognizer.recognize(scenes[0].frame)]
+            print("compiling:" if attempt == 0 else "warm:", json.dumps(report), flush=True)
+    return report
+
+
+def _enroll_mesh(objects: ObjectGallery, mesh: Any) -> None:
+    objects.enroll("new", mesh_views(mesh), "mesh")
+
+
+def _seconds(function: Callable[[], object]) -> float:
+    start = time.perf_counter()
+    function()
+    return time.perf_counter() - start
+
+
+def main() -> None:
+    """Run one of the two measurements and write the file."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=["search", "teach"])
+    parser.add_argument("--objects", type=int, default=100_000)
+    parser.add_argument("--views", type=int, default=50, help="views of each object")
+    parser.add_argument(
+        "--index-objects", type=int, default=100_000, help="objects in the index, which takes long to build"
+    )
+    parser.add_argument("--repeats", type=int, default=2)
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
+    options = parser.parse_args()
+    report = measure_search(options) if options.what == "search" else measure_teaching(options)
+    options.out.mkdir(parents=True, exist_ok=True)
+    (options.out / f"gallery-{options.what}.json").write_text(json.dumps(report, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
