@@ -8,7 +8,7 @@ import argparse
 import shutil
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import colornet
@@ -16,15 +16,18 @@ from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
 from thor2_jax.gallery.embedding import Embedding
 from training.embedding.fit import EmbeddingFit, fit_embedding
-from training.embedding.samples import build_samples
-from training.embedding.views import ObjectSource
+from training.embedding.sampling import ObjectSource, build_samples
+from training.fitting.options import Progress
 from training.objects.meshes import find_meshes
 from training.storage.workers import local_workers
 
 __all__ = ["build_embedding", "main"]
 
-OBJECTS, VIEWS, EPOCHS = 2400, 12, 12
+OBJECTS, VIEWS, EPOCHS = 3000, 16, 10
 """Procedural objects, views of each, and passes over their samples, for the packaged embedding."""
+
+MESH_WEIGHT = 6
+"""Views of a mesh for each view of a procedural object: its own objects matter most to a run."""
 
 
 def build_embedding(
@@ -32,33 +35,29 @@ def build_embedding(
     objects: int = OBJECTS,
     views: int = VIEWS,
     epochs: int = EPOCHS,
-    meshes: Path | None = None,
+    meshes: Sequence[Path] = (),
     workers: int = 2,
-    report: Callable[[str], object] = lambda line: None,
+    progress: Progress = lambda stage, done, total, note: None,
 ) -> Embedding:
-    """Fit an embedding and write it to `out`; see the module.
+    """Fit an embedding and write it to a file, or resume an interrupted build.
 
     Args:
-        out: file to write.
+        out: file to write. The samples are in OUT.samples until it is written.
         objects: number of procedural objects.
-        views: views of each object.
+        views: views of each procedural object, and a sixth of the views of each mesh.
         epochs: passes over the samples.
-        meshes: directory of other objects, as for `find_meshes`.
+        meshes: files of other objects.
         workers: rendering processes; they do not affect the result.
-        report: called with each line of progress.
+        progress: called with (stage, done, total, note).
 
     Raises:
-        InputError: an option is out of range, a mesh is unreadable, or `out`.samples is of other options.
+        InputError: an option is out of range, a mesh is unreadable, or OUT.samples is of other options.
         OSError: a file cannot be written.
     """
     options = EmbeddingFit(epochs=epochs)
-    sources: list[ObjectSource] = [*range(objects), *(find_meshes(meshes).values() if meshes else ())]
+    sources: list[ObjectSource] = [*range(objects), *(mesh for mesh in meshes for _ in range(MESH_WEIGHT))]
     network, config = colornet.load_default(), DescriptorConfig(homology="closed_form")
-    directory, start = out.with_name(f"{out.name}.samples"), time.monotonic()
-
-    def tell(line: str) -> None:
-        report(f"{time.monotonic() - start:6.0f} s  {line}")
-
+    directory = out.with_name(f"{out.name}.samples")
     samples = build_samples(
         sources,
         directory,
@@ -66,14 +65,14 @@ def build_embedding(
         config,
         views,
         pool=local_workers(workers),
-        progress=lambda done, total: tell(f"views of {done} of {total} objects"),
+        progress=lambda done, total: progress("render for the embedding", done, total, ""),
     )
     embedding = fit_embedding(
         samples,
         network,
         config,
         options,
-        progress=lambda done, total, loss: tell(f"epoch {done} of {total}: loss {loss:.3f}"),
+        progress=lambda done, total, loss: progress("embedding", done, total, f"loss {loss:.3f}"),
     )
     embedding.save(out)
     shutil.rmtree(directory)
@@ -89,12 +88,20 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--epochs", type=int, default=EPOCHS, help="passes over the samples (%(default)s)")
     parser.add_argument("--meshes", type=Path, help="directory of other objects (GLB, OBJ, PLY)")
     parser.add_argument("--workers", type=int, default=2, help="rendering processes (%(default)s)")
-    options = vars(parser.parse_args(arguments))
+    options = parser.parse_args(arguments)
+    start = time.monotonic()
+
+    def show(stage: str, done: int, total: int, note: str) -> None:
+        print(f"{time.monotonic() - start:6.0f} s  {stage}: {done} of {total} {note}", file=sys.stderr, flush=True)
+
     try:
-        embedding = build_embedding(**options, report=lambda line: print(line, file=sys.stderr, flush=True))
+        meshes = list(find_meshes(options.meshes).values()) if options.meshes else []
+        embedding = build_embedding(
+            options.out, options.objects, options.views, options.epochs, meshes, options.workers, show
+        )
     except InputError as error:
         raise SystemExit(f"error: {error}") from None
-    print(f"{options['out']}: {embedding.fingerprint}")
+    print(f"{options.out}: {embedding.fingerprint}")
 
 
 if __name__ == "__main__":

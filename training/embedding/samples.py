@@ -1,43 +1,28 @@
-"""Samples that an embedding is fitted on: the strips of views in random orientations.
+"""Samples that an embedding is fitted on: the strips of clouds in random orientations.
 
-    samples = build_samples(sources, "samples", views=16, pool=local_workers(2))
-    batch = samples.take(np.arange(256))
-
-A sample stores its occupied strips, a tenth of all, and the statistics of its cloud. Shards on disk hold the samples of
-some objects each, so that an interrupted sampling resumes at the first missing shard.
+A sample stores its occupied strips, a tenth of all, and the statistics of its cloud.
 """
 
 import dataclasses
-import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import safetensors.numpy
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from colornet import ColorNetwork
-from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
+from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.describe import strips
 from thor2_jax.descriptor.view_normalization import turn, view_normalize
-from thor2_jax.errors import InputError
-from thor2_jax.files import atomic_write, write_text
 from thor2_jax.gallery.embedding import cloud_statistics
 from thor2_jax.types import Cloud, PointClouds
-from training.embedding.views import AUGMENTATIONS, ObjectSource, ViewTask, render_clouds
-from training.storage.jobs import check_same_job
-from training.storage.locks import locked
-from training.storage.workers import IN_PROCESS, WorkerPool
 from training.views.normalized_views import padded_batches
 
-__all__ = ["Batch", "Samples", "build_samples", "sample_clouds"]
+__all__ = ["Batch", "Samples", "concatenate_fields", "sample_clouds"]
 
-OBJECTS_PER_SHARD = 32
 CLOUDS_PER_BATCH = 64
 
 NEARLY_EQUAL = 0.85
@@ -45,8 +30,6 @@ NEARLY_EQUAL = 0.85
 
 MAX_ROTATION = 10.0
 """Largest random rotation of a normalized cloud, degrees."""
-
-JOB = "job.json"
 
 
 class Batch(NamedTuple):
@@ -183,89 +166,9 @@ def sample_clouds(
                     "label": label,
                 }
             )
-    return _concatenate(chunks)
+    return concatenate_fields(chunks)
 
 
-def _concatenate(chunks: Sequence[Mapping[str, NDArray[Any]]]) -> dict[str, NDArray[Any]]:
+def concatenate_fields(chunks: Sequence[Mapping[str, NDArray[Any]]]) -> dict[str, NDArray[Any]]:
+    """Concatenate the fields of samples."""
     return {name: np.concatenate([chunk[name] for chunk in chunks]) for name in chunks[0]}
-
-
-def build_samples(
-    sources: Sequence[ObjectSource],
-    directory: str | Path,
-    network: ColorNetwork,
-    config: DescriptorConfig,
-    views: int,
-    copies: int = 2,
-    seed: int = 0,
-    pool: WorkerPool = IN_PROCESS,
-    progress: Callable[[int, int], object] = lambda done, total: None,
-) -> Samples:
-    """Render views of objects and sample them, or resume an interrupted sampling in a directory.
-
-    Args:
-        sources: objects; labels are indices into this sequence. An object that occurs n times has n times the views
-            and the label of its first occurrence.
-        directory: new, or of the same arguments.
-        network: colour network.
-        config: descriptor. Static.
-        views: number of views of each object.
-        copies: samples of each view, in random orientations.
-        seed: seed for cameras, augmentations and orientations.
-        pool: worker processes that render; does not affect the result.
-        progress: called with (objects done, number of objects) at the start and after each shard.
-
-    Raises:
-        InputError: there are fewer than two objects or no views, a mesh is unreadable or is visible in none of its
-            views, or the directory holds samples of other arguments or is written by another process.
-        OSError: the directory cannot be written.
-    """
-    if len(sources) < 2 or views < 1:
-        raise InputError(f"there are {len(sources)} objects with {views} views each; expected at least 2 with 1 view")
-    directory = Path(directory)
-    label_of = {source: index for index, source in reversed(list(enumerate(sources)))}
-    job = {
-        "descriptor_version": DESCRIPTOR_VERSION,
-        "descriptor_config": dataclasses.asdict(config),
-        "color_network": network.fingerprint,
-        "objects": [str(source) for source in sources],
-        "views": views,
-        "copies": copies,
-        "seed": seed,
-        "augmentations": AUGMENTATIONS.record(),
-    }
-    with locked(directory):
-        _begin(directory, job)
-        starts = range(0, len(sources), OBJECTS_PER_SHARD)
-        files = {first: directory / f"{first:05d}.safetensors" for first in starts}
-        missing = [first for first in starts if not files[first].is_file()]
-        progress((len(starts) - len(missing)) * OBJECTS_PER_SHARD, len(sources))
-        with closing(pool(render_clouds, _tasks(sources, missing, views, seed))) as results:
-            for first, rendered in zip(missing, results, strict=True):
-                visible = {index for index, _ in rendered}
-                for index in range(first, min(first + OBJECTS_PER_SHARD, len(sources))):
-                    if index not in visible:
-                        raise InputError(f"object {sources[index]} has no view with enough points; leave it out")
-                rng = np.random.default_rng([seed, len(sources), first])
-                labels, clouds = [label_of[sources[index]] for index, _ in rendered], [cloud for _, cloud in rendered]
-                with atomic_write(files[first]) as temporary:
-                    arrays = sample_clouds(clouds, labels, network, config, copies, rng)
-                    temporary.write_bytes(safetensors.numpy.save(arrays))
-                progress(min(first + OBJECTS_PER_SHARD, len(sources)), len(sources))
-        fields = _concatenate([safetensors.numpy.load_file(file) for file in files.values()])
-    start = np.concatenate([[0], np.cumsum(fields.pop("strips"), dtype=np.int64)])
-    return Samples(start=start, shape=(config.n_slices, config.n_strips), **fields)
-
-
-def _begin(directory: Path, job: Mapping[str, Any]) -> None:
-    """Write the job to a new directory, or check that the directory is of this job."""
-    path = directory / JOB
-    if path.is_file():
-        check_same_job(directory, json.loads(path.read_text()), job)
-    else:
-        write_text(path, json.dumps(job, indent=1) + "\n")
-
-
-def _tasks(sources: Sequence[ObjectSource], starts: Sequence[int], views: int, seed: int) -> Iterator[ViewTask]:
-    for first in starts:
-        yield ViewTask(dict(list(enumerate(sources))[first : first + OBJECTS_PER_SHARD]), views, seed)

@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from training.objects.mesh import TexturedMesh, merge_meshes
-from training.objects.surfaces import (
+from training.objects.mesh import (
+    TexturedMesh,
     arc_lengths,
     box_surface,
+    merge_meshes,
     moved,
     revolved_surface,
     standing,

@@ -1,14 +1,28 @@
-"""A coloured triangle mesh and the colour at a point of its surface."""
+"""A coloured triangle mesh, the colour at a point of its surface, and surfaces that meshes are built from (metres)."""
 
 import dataclasses
+import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from thor2_jax.errors import InputError
 
-__all__ = ["TexturedMesh", "merge_meshes"]
+__all__ = [
+    "TexturedMesh",
+    "arc_lengths",
+    "box_surface",
+    "merge_meshes",
+    "moved",
+    "revolved_surface",
+    "standing",
+    "superellipse",
+    "texel_centres",
+    "tube_surface",
+]
+
+Array = NDArray[np.float64]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,3 +120,120 @@ def merge_meshes(parts: Sequence[TexturedMesh]) -> TexturedMesh:
             [part.face_texture + k for part, k in zip(parts, first, strict=True) if part.face_texture is not None]
         ).astype(np.int32),
     )
+
+
+def texel_centres(n: int) -> tuple[Array, Array]:
+    """Return the coordinates u and v [n, n] of the centres of a texture's texels, bottom row first."""
+    centres = (np.arange(n) + 0.5) / n
+    u, v = np.meshgrid(centres, centres)
+    return u, v
+
+
+def _ring_surface(points: Array, v: Array, texture: NDArray[np.uint8]) -> TexturedMesh:
+    """Return the surface through closed rings [k, n, 3]; u runs along a ring, `v` [k] across the rings."""
+    k, n = points.shape[:2]
+    corner = np.arange(k * n).reshape(k, n)
+    a, b, c, d = (part.ravel() for part in (corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1]))
+    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+    vertices = points.reshape(-1, 3)
+    first, second, third = np.moveaxis(vertices[faces], 1, 0)
+    faces = faces[np.linalg.norm(np.cross(second - first, third - first), axis=1) > 1e-12]
+    u, v = np.meshgrid(np.linspace(0, 1, n), v)
+    uv = np.stack([u.ravel(), v.ravel()], axis=1).astype(np.float32)
+    # Clipped, so that the last texel does not wrap around to the first.
+    uv = uv.clip(1e-4, 1 - 1e-4)
+    return TexturedMesh(
+        vertices,
+        faces.astype(np.int32),
+        uv=uv[faces],
+        textures=(texture,),
+        face_texture=np.zeros(len(faces), np.int32),
+    )
+
+
+def arc_lengths(points: Array) -> Array:
+    """Return the relative arc length [k] of a line [k, d] at each of its points, from 0 to 1."""
+    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    return length / length[-1]
+
+
+def superellipse(sides: int, exponent: float = 2.0) -> Array:
+    """Return a closed ring [sides + 1, 2] of radius 1 along the axes: a circle for 2, more like a square above."""
+    theta = np.linspace(0, 2 * np.pi, sides + 1)
+    ring = np.stack([np.cos(theta), np.sin(theta)], axis=1)
+    return np.sign(ring) * np.abs(ring) ** (2 / exponent)
+
+
+def revolved_surface(profile: ArrayLike, texture: NDArray[np.uint8], ring: Array) -> TexturedMesh:
+    """Return a surface of revolution about z.
+
+    Args:
+        profile: [k, 2] radius and height, metres; runs up the outside, and for a vessel down the inside.
+        texture: image; u is the angle, v the arc length of the profile.
+        ring: [n, 2] cross-section of radius 1, from `superellipse`.
+    """
+    line = np.asarray(profile, np.float64)
+    section = np.concatenate([ring, np.ones((len(ring), 1))], axis=1)
+    return _ring_surface(line[:, [0, 0, 1]][:, None, :] * section, arc_lengths(line), texture)
+
+
+def tube_surface(
+    path: ArrayLike, radii: ArrayLike, across: ArrayLike, texture: NDArray[np.uint8], ring: Array
+) -> TexturedMesh:
+    """Return a tube along a path in a plane, with flat ends.
+
+    Args:
+        path: [k, 3] metres.
+        radii: [k, 2] metres, in the plane and across it.
+        across: [3] unit normal of the plane.
+        texture: image; u is the angle (0 in the plane, 0.25 across it), v the arc length.
+        ring: [n, 2] cross-section of radius 1, from `superellipse`.
+    """
+    line, size, normal = (np.asarray(values, np.float64) for values in (path, radii, across))
+    tangent = np.gradient(line, axis=0)
+    inward = np.cross(normal, tangent / np.linalg.norm(tangent, axis=1, keepdims=True))
+    x, y = ring.T[:, None, :, None]
+    around = size[:, None, :1] * x * inward[:, None] + size[:, None, 1:] * y * normal
+    ends = np.broadcast_to(line[[0, -1], None], (2, len(ring), 3))
+    points = np.concatenate([ends[:1], line[:, None] + around, ends[1:]])
+    return _ring_surface(points, np.concatenate([[0.0], arc_lengths(line), [1.0]]), texture)
+
+
+def box_surface(size: Sequence[float], textures: Sequence[NDArray[np.uint8]]) -> TexturedMesh:
+    """Return a box that stands on z = 0, centred over the origin.
+
+    Args:
+        size: along x, y, z, metres.
+        textures: of the sides -y (the front), +x, +y, -x, top and bottom, seen from outside.
+    """
+    x, y, z = size[0] / 2, size[1] / 2, size[2]
+    ring = np.array([[-x, -y], [x, -y], [x, y], [-x, y]])
+    quads = [[[*ring[k], 0], [*ring[(k + 1) % 4], 0], [*ring[(k + 1) % 4], z], [*ring[k], z]] for k in range(4)]
+    quads.append([[*p, z] for p in ring])
+    quads.append([[*p, 0] for p in ring[::-1]])
+    faces = np.concatenate([[[4 * k, 4 * k + 1, 4 * k + 2], [4 * k, 4 * k + 2, 4 * k + 3]] for k in range(6)])
+    corners = np.tile(np.array([[[0, 0], [1, 0], [1, 1]], [[0, 0], [1, 1], [0, 1]]], np.float32), (6, 1, 1))
+    return TexturedMesh(
+        np.asarray(quads, np.float64).reshape(-1, 3),
+        faces.astype(np.int32),
+        uv=corners.clip(1e-4, 1 - 1e-4),
+        textures=tuple(textures),
+        face_texture=np.repeat(np.arange(6, dtype=np.int32), 2),
+    )
+
+
+def moved(mesh: TexturedMesh, position: ArrayLike = (0, 0, 0), axis: str = "z", degrees: float = 0.0) -> TexturedMesh:
+    """Rotate a mesh about a coordinate axis, then translate it."""
+    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
+    matrix = np.eye(4)
+    matrix[[i, i, j, j], [i, j, i, j]] = c, -s, s, c
+    matrix[:3, 3] = position
+    return mesh.transformed(matrix)
+
+
+def standing(*parts: TexturedMesh) -> TexturedMesh:
+    """Merge parts and put them on z = 0 over the origin."""
+    mesh = merge_meshes(parts)
+    centre = mesh.centre
+    return moved(mesh, (-centre[0], -centre[1], -mesh.vertices[:, 2].min()))

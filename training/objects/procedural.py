@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import zoom
 
-from training.objects.mesh import TexturedMesh, merge_meshes
-from training.objects.surfaces import (
+from training.objects.mesh import (
+    TexturedMesh,
     box_surface,
+    merge_meshes,
     moved,
     revolved_surface,
     standing,

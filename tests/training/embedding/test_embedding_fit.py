@@ -13,11 +13,11 @@ from helpers import SMALL_CONFIG
 import colornet
 import thor2_jax as thor2
 from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
-from training.embedding import fit, samples
+from training.embedding import fit, samples, sampling
 from training.embedding.build import main
 from training.embedding.fit import EmbeddingFit, fit_embedding
-from training.embedding.samples import Samples, build_samples, sample_clouds
-from training.embedding.views import ViewTask, render_clouds
+from training.embedding.samples import Samples, sample_clouds
+from training.embedding.sampling import ViewTask, build_samples, render_clouds
 from training.storage.workers import IN_PROCESS
 
 NETWORK = colornet.load_default()
@@ -96,7 +96,7 @@ def test_random_axes_are_rotations_with_nearly_equal_sides_swapped() -> None:
 def test_an_interrupted_sampling_resumes(
     directory: Path, views: Samples, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(samples, "OBJECTS_PER_SHARD", 3)
+    monkeypatch.setattr(sampling, "OBJECTS_PER_SHARD", 3)
 
     def interrupted(function, items) -> Generator:
         for number, item in enumerate(items):

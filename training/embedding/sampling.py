@@ -1,0 +1,187 @@
+"""Sample views of objects from random cameras, with stronger augmentation than for classifiers.
+
+    samples = build_samples(range(400), "samples", network, config, views=16, pool=local_workers(2))
+
+An embedding is used on cameras and objects that it never saw; a classifier is fitted on its own objects. Shards on disk
+hold the samples of some objects each, so that an interrupted sampling resumes at the first missing shard.
+"""
+
+import dataclasses
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import safetensors.numpy
+
+from colornet import ColorNetwork
+from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
+from thor2_jax.errors import InputError
+from thor2_jax.files import atomic_write, write_text
+from thor2_jax.types import Cloud
+from training.augmentation.augmentations import Augmentations, augment
+from training.augmentation.base import Base
+from training.augmentation.illumination import Illumination
+from training.augmentation.occlusion import Occlusion
+from training.augmentation.registration import Registration
+from training.augmentation.segmentation import Segmentation
+from training.augmentation.sensor import Sensor
+from training.embedding.samples import Samples, concatenate_fields, sample_clouds
+from training.objects.meshes import load_mesh
+from training.objects.procedural import procedural_object
+from training.rendering.camera import Camera
+from training.rendering.ray_caster import RayCaster, render_view
+from training.rendering.view_sphere import camera_pose
+from training.storage.jobs import check_same_job
+from training.storage.locks import locked
+from training.storage.workers import IN_PROCESS, WorkerPool
+from training.views.mesh_views import MIN_VIEW_POINTS, cloud_of
+
+__all__ = ["AUGMENTATIONS", "ObjectSource", "ViewTask", "build_samples", "render_clouds"]
+
+OBJECTS_PER_SHARD = 32
+
+JOB = "job.json"
+
+AUGMENTATIONS = Augmentations(
+    illumination=Illumination(gamma=(0.6, 1.6), gain=(0.4, 1.7), cast=0.15, saturation=(0.4, 1.7), veil=(0.0, 0.12)),
+    sensor=Sensor(axial=(0.3, 1.5)),
+    occlusion=Occlusion(none=0.45),
+    segmentation=Segmentation(),
+    registration=Registration(),
+    base=Base(),
+)
+
+UNCHANGED = 0.2
+"""Share of views without augmentation."""
+
+CAMERA = Camera.from_field_of_view(540, 405, 40.0)
+"""Half the pixels of the training camera: still two for each voxel of a cloud."""
+
+FROM_ABOVE = 0.7
+"""Share of views whose camera looks down on the object or is slightly below its middle, as on a table."""
+
+ObjectSource = int | Path
+"""The seed of a procedural object, or a mesh file."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ViewTask:
+    """Views of some objects, to be rendered by one process.
+
+    Attributes:
+        sources: index -> object.
+        views: number of views of each object.
+        seed: seed for cameras and augmentations, with the index.
+    """
+
+    sources: Mapping[int, ObjectSource]
+    views: int
+    seed: int
+
+
+def _random_angles(rng: np.random.Generator) -> tuple[float, float]:
+    low, high = (-0.15, 0.97) if rng.random() < FROM_ABOVE else (-1.0, 1.0)
+    return rng.uniform(0, 2 * np.pi), float(np.arccos(rng.uniform(low, high)))
+
+
+def render_clouds(task: ViewTask) -> list[tuple[int, Cloud]]:
+    """Return the object's index and the cloud of the views that have at least `MIN_VIEW_POINTS` points.
+
+    Raises:
+        InputError: a mesh is unreadable.
+    """
+    clouds = []
+    for index, source in task.sources.items():
+        mesh = load_mesh(source) if isinstance(source, Path) else procedural_object(source)
+        caster = RayCaster([mesh])
+        rng = np.random.default_rng([task.seed, index])
+        for _ in range(task.views):
+            view = render_view(caster, camera_pose(*_random_angles(rng), mesh.centre), CAMERA)
+            cloud = cloud_of(view if rng.random() < UNCHANGED else augment(view, AUGMENTATIONS, rng))
+            if len(cloud[0]) >= MIN_VIEW_POINTS:
+                clouds.append((index, cloud))
+    return clouds
+
+
+def build_samples(
+    sources: Sequence[ObjectSource],
+    directory: str | Path,
+    network: ColorNetwork,
+    config: DescriptorConfig,
+    views: int,
+    copies: int = 2,
+    seed: int = 0,
+    pool: WorkerPool = IN_PROCESS,
+    progress: Callable[[int, int], object] = lambda done, total: None,
+) -> Samples:
+    """Render views of objects and sample them, or resume an interrupted sampling in a directory.
+
+    Args:
+        sources: objects; labels are indices into this sequence. An object that occurs n times has n times the views
+            and the label of its first occurrence.
+        directory: new, or of the same arguments.
+        network: colour network.
+        config: descriptor. Static.
+        views: number of views of each object.
+        copies: samples of each view, in random orientations.
+        seed: seed for cameras, augmentations and orientations.
+        pool: worker processes that render; does not affect the result.
+        progress: called with (objects done, number of objects) at the start and after each shard.
+
+    Raises:
+        InputError: there are fewer than two objects or no views, a mesh is unreadable or is visible in none of its
+            views, or the directory holds samples of other arguments or is written by another process.
+        OSError: the directory cannot be written.
+    """
+    if len(sources) < 2 or views < 1:
+        raise InputError(f"there are {len(sources)} objects with {views} views each; expected at least 2 with 1 view")
+    directory = Path(directory)
+    label_of = {source: index for index, source in reversed(list(enumerate(sources)))}
+    job = {
+        "descriptor_version": DESCRIPTOR_VERSION,
+        "descriptor_config": dataclasses.asdict(config),
+        "color_network": network.fingerprint,
+        "objects": [str(source) for source in sources],
+        "views": views,
+        "copies": copies,
+        "seed": seed,
+        "augmentations": AUGMENTATIONS.record(),
+    }
+    with locked(directory):
+        _begin(directory, job)
+        starts = range(0, len(sources), OBJECTS_PER_SHARD)
+        files = {first: directory / f"{first:05d}.safetensors" for first in starts}
+        missing = [first for first in starts if not files[first].is_file()]
+        progress((len(starts) - len(missing)) * OBJECTS_PER_SHARD, len(sources))
+        with closing(pool(render_clouds, _tasks(sources, missing, views, seed))) as results:
+            for first, rendered in zip(missing, results, strict=True):
+                visible = {index for index, _ in rendered}
+                for index in range(first, min(first + OBJECTS_PER_SHARD, len(sources))):
+                    if index not in visible:
+                        raise InputError(f"object {sources[index]} has no view with enough points; leave it out")
+                rng = np.random.default_rng([seed, len(sources), first])
+                labels, clouds = [label_of[sources[index]] for index, _ in rendered], [cloud for _, cloud in rendered]
+                with atomic_write(files[first]) as temporary:
+                    arrays = sample_clouds(clouds, labels, network, config, copies, rng)
+                    temporary.write_bytes(safetensors.numpy.save(arrays))
+                progress(min(first + OBJECTS_PER_SHARD, len(sources)), len(sources))
+        fields = concatenate_fields([safetensors.numpy.load_file(file) for file in files.values()])
+    start = np.concatenate([[0], np.cumsum(fields.pop("strips"), dtype=np.int64)])
+    return Samples(start=start, shape=(config.n_slices, config.n_strips), **fields)
+
+
+def _begin(directory: Path, job: Mapping[str, Any]) -> None:
+    """Write the job to a new directory, or check that the directory is of this job."""
+    path = directory / JOB
+    if path.is_file():
+        check_same_job(directory, json.loads(path.read_text()), job)
+    else:
+        write_text(path, json.dumps(job, indent=1) + "\n")
+
+
+def _tasks(sources: Sequence[ObjectSource], starts: Sequence[int], views: int, seed: int) -> Iterator[ViewTask]:
+    for first in starts:
+        yield ViewTask(dict(list(enumerate(sources))[first : first + OBJECTS_PER_SHARD]), views, seed)
