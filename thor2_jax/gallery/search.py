@@ -15,8 +15,11 @@ from thor2_jax.errors import InputError
 
 __all__ = ["ExactSearch", "IndexSearch", "ViewSearch"]
 
-CHUNK = 2**16
-"""Views per matrix product: 64 MB as float32 at 256 numbers each."""
+CHUNK = 2**14
+"""Views per matrix product: 16 MB as float32 at 256 numbers each."""
+
+FAST_VIEWS = 2**17
+"""Largest number of views that are also kept as float32 (134 MB): their conversion takes half of a query."""
 
 
 class ViewSearch(Protocol):
@@ -32,19 +35,18 @@ class ViewSearch(Protocol):
 
 
 class ExactSearch:
-    """Exact search by matrix products in chunks; its memory does not grow with the number of views."""
+    """Exact search by matrix products in chunks; it needs little memory beside the embeddings."""
 
     def __init__(self, embeddings: NDArray[np.float16]) -> None:
-        """Keep embeddings [N, D] of unit length; one chunk of them is also kept as float32."""
-        self._embeddings = embeddings
-        self._single = embeddings.astype(np.float32) if len(embeddings) <= CHUNK else None
+        """Keep embeddings [N, D] of unit length, as float32 if they are few."""
+        self._embeddings = embeddings.astype(np.float32) if len(embeddings) <= FAST_VIEWS else embeddings
 
     def nearest(self, queries: NDArray[np.float32], count: int) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
         """See `ViewSearch.nearest`; views of equal similarity are in the order of their indices."""
         similarity: NDArray[np.float32] = np.zeros((len(queries), 0), np.float32)
         index: NDArray[np.intp] = np.zeros((len(queries), 0), np.intp)
         for start in range(0, len(self._embeddings), CHUNK):
-            chunk = self._embeddings[start : start + CHUNK] if self._single is None else self._single
+            chunk = self._embeddings[start : start + CHUNK]
             products = queries @ chunk.T.astype(np.float32, copy=False)
             best = _largest(products, count)
             index = np.concatenate([index, best + start], axis=1)
