@@ -43,6 +43,7 @@ class ObjectGallery:
         self._directory: Path | None = None
         self._stored = StoredGallery(Gallery("", search=search), {}, 0)
         self._stamp: tuple[int, int, int] | None = None
+        self._union = self._stored.gallery, ClassUnion(trained)
 
     def open(self, directory: Path, *, reembed: bool = False) -> None:
         """Read the gallery in a directory, which may not exist yet, and write all later changes to it.
@@ -76,7 +77,12 @@ class ObjectGallery:
     @property
     def union(self) -> ClassUnion:
         """The trained classes and the objects of the gallery."""
-        return ClassUnion(self._trained, self.gallery.names, self.gallery.hidden)
+        gallery, union = self._union
+        if gallery is not self.gallery:
+            gallery = self.gallery
+            union = ClassUnion(self._trained, gallery.names, gallery.hidden)
+            self._union = gallery, union
+        return union
 
     def embed(self, clouds: PointClouds) -> jax.Array:
         """Return the embeddings [B, K, D] of clouds in metres in K orientations, for `Gallery.scores`."""

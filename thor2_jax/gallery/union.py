@@ -29,18 +29,21 @@ class ClassUnion:
     @functools.cached_property
     def names(self) -> tuple[str, ...]:
         """All names."""
-        shown = tuple(name for name in self.trained if name not in self.hidden)
-        return (*shown, *(name for name in self.enrolled if name not in shown))
+        hidden = set(self.hidden)
+        shown = [name for name in self.trained if name not in hidden]
+        return tuple(dict.fromkeys([*shown, *self.enrolled]))
 
     @functools.cached_property
     def has_output(self) -> NDArray[np.bool_]:
         """[n] bool, whether the classifiers have an output for each name."""
-        return np.array([name in self.trained and name not in self.hidden for name in self.names], bool)
+        shown = set(self.trained) - set(self.hidden)
+        return np.array([name in shown for name in self.names], bool)
 
     @functools.cached_property
     def has_views(self) -> NDArray[np.bool_]:
         """[n] bool, whether the gallery has views for each name."""
-        return np.array([name in self.enrolled for name in self.names], bool)
+        enrolled = set(self.enrolled)
+        return np.array([name in enrolled for name in self.names], bool)
 
     def of_classifiers(self, probabilities: Values) -> Values:
         """Return class probabilities [B, C] in the order of `names` [B, n]; 0 for names without an output."""
@@ -54,7 +57,8 @@ class ClassUnion:
         if owners == self.names:
             return values
         result = np.zeros((len(values), len(self.names)), values.dtype)
-        columns = [owners.index(name) for name, has in zip(self.names, known, strict=True) if has]
+        column = {name: index for index, name in enumerate(owners)}
+        columns = [column[name] for name, has in zip(self.names, known, strict=True) if has]
         result[:, known] = values[:, columns]
         return result
 
