@@ -43,6 +43,14 @@ def train(
         Path | None,
         typer.Option(help="YAML or JSON table: sequence -> its objects. One run per sequence, in OUT/<sequence>."),
     ] = None,
+    embedding: Annotated[
+        int,
+        typer.Option(
+            min=0,
+            metavar="N",
+            help="Also fit an embedding, on the meshes and N procedural objects, in place of the packaged one.",
+        ),
+    ] = 0,
     workers: Annotated[int, typer.Option(min=1, help="Rendering processes.")] = 2,
     coordinator: Annotated[
         str | None, typer.Option(help="HOST:PORT of process 0, for training with several processes.")
@@ -59,6 +67,7 @@ def train(
 
     With --baselines, a finished run gets the baselines that it lacks. With --sequences, one run is trained for each
     sequence, on its objects only (see `thor2 evaluate ocid --per-sequence`); finished runs must have the same options.
+    With --embedding, objects are enrolled in the run with an embedding of its own; 400 procedural objects are enough.
     """
     import jax
 
@@ -71,13 +80,18 @@ def train(
         raise InputError(f"processes is {processes} and process {process}; several processes need --coordinator")
     if process >= processes:
         raise InputError(f"process is {process}; expected less than --processes, which is {processes}")
+    if embedding and (meshes is None or folds > 1):
+        raise InputError(f"embedding is {embedding}; it requires --meshes and excludes --folds")
     if sequences is not None and (dataset is None or leave_out):
         raise InputError(f"sequences is {sequences}; it requires --dataset and excludes --leave-out")
     if coordinator is not None:
         if meshes is not None:
             raise InputError("coordinator: several processes need a --dataset that all of them can read, not --meshes")
         jax.distributed.initialize(coordinator, processes, process)
+    from thor2_jax.recognition.recognizer import EMBEDDING_FILE
+    from training.embedding.build import build_embedding
     from training.fitting.protocol import DEFAULT, PAPER
+    from training.objects.meshes import find_meshes, read_names
     from training.train_job import TrainJob, run_train_job
 
     job = TrainJob(
@@ -95,7 +109,18 @@ def train(
         sequences=sequences,
         workers=workers,
     )
-    for directory, runs in run_train_job(job, functools.partial(show_progress, quiet)).items():
+    trained = run_train_job(job, functools.partial(show_progress, quiet))
+    if embedding and meshes is not None and not (out / EMBEDDING_FILE).is_file():
+        paths = find_meshes(meshes, read_names(names) if names else None)
+        with show_progress(quiet) as progress:
+            build_embedding(
+                out / EMBEDDING_FILE,
+                embedding,
+                meshes=[path for name, path in paths.items() if name not in job.leave_out],
+                workers=workers,
+                progress=progress,
+            )
+    for directory, runs in trained.items():
         if not runs:
             console.print(f"finished already: nothing was trained; the run is in {directory}")
             continue

@@ -44,7 +44,7 @@ def build_embedding(
     Args:
         out: file to write. The samples are in OUT.samples until it is written.
         objects: number of procedural objects.
-        views: views of each procedural object, and a sixth of the views of each mesh.
+        views: views of each procedural object; a mesh has `MESH_WEIGHT` times as many.
         epochs: passes over the samples.
         meshes: files of other objects.
         workers: rendering processes; they do not affect the result.

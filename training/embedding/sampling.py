@@ -155,7 +155,7 @@ def build_samples(
         starts = range(0, len(sources), OBJECTS_PER_SHARD)
         files = {first: directory / f"{first:05d}.safetensors" for first in starts}
         missing = [first for first in starts if not files[first].is_file()]
-        progress((len(starts) - len(missing)) * OBJECTS_PER_SHARD, len(sources))
+        progress(min((len(starts) - len(missing)) * OBJECTS_PER_SHARD, len(sources)), len(sources))
         with closing(pool(render_clouds, _tasks(sources, missing, views, seed))) as results:
             for first, rendered in zip(missing, results, strict=True):
                 visible = {index for index, _ in rendered}

@@ -11,6 +11,8 @@ import pytest
 from helpers import run_thor2
 from PIL import Image
 
+from thor2_jax.gallery.embedding import Embedding, load_default
+from thor2_jax.recognition.recognizer import Recognizer
 from thor2_jax.recognition.run_directory import load_run, save_run
 from training.objects.builtin_objects import builtin_objects
 from training.rendering.scenes import Scene, compose_scene
@@ -204,6 +206,7 @@ def test_options_without_effect_are_refused(meshes: Path, tmp_path: Path, run: R
         ("polar-step", (*dataset, "--polar-step", 20)),
         ("processes", (*dataset, "--processes", 2)),
         ("process", (*dataset, "--process", 1)),
+        ("embedding", (*dataset, "--embedding", 9)),
         ("process", (*dataset, "--coordinator", "localhost:1", "--processes", 2, "--process", 2)),
         ("azimuth_step", ("--meshes", meshes, "--azimuth-step", 1e-9)),
     )
@@ -225,6 +228,20 @@ def test_train_on_rendered_dataset_equals_train_on_meshes(meshes: Path, model: P
     assert not (model / "views").exists()
     first, second = (json.loads((f / "run.json").read_text()) for f in (model, tmp_path / "run"))
     assert first["record"]["curves"] == second["record"]["curves"]
+
+
+@pytest.mark.slow
+def test_train_with_an_embedding_of_its_own(meshes: Path, tmp_path: Path, run: Run) -> None:
+    steps = ("--azimuth-step", 90, "--polar-step", 90, "--workers", 1, "--epochs", 1, "--classifiers", "tops")
+    command = ("train", "--meshes", meshes, "--out", tmp_path / "run", *steps, "--embedding", 8)
+    assert run(*command)[0] == 0
+    file = tmp_path / "run" / "embedding.safetensors"
+    embedding = Embedding.load(file)
+    assert embedding.fingerprint != load_default().fingerprint
+    assert Recognizer.load(tmp_path / "run").gallery.embedding == embedding.fingerprint
+    file.unlink()
+    assert run(*command)[0] == 0 and Embedding.load(file).fingerprint == embedding.fingerprint
+    assert not list(tmp_path.glob("run/*.samples"))
 
 
 def test_train_by_folds(meshes: Path, tmp_path: Path, run: Run) -> None:
