@@ -236,11 +236,10 @@ def test_train_with_an_embedding_of_its_own(meshes: Path, tmp_path: Path, run: R
     command = ("train", "--meshes", meshes, "--out", tmp_path / "run", *steps, "--embedding", 8)
     assert run(*command)[0] == 0
     file = tmp_path / "run" / "embedding.safetensors"
-    embedding = Embedding.load(file)
-    assert embedding.fingerprint != load_default().fingerprint
-    assert Recognizer.load(tmp_path / "run").gallery.embedding == embedding.fingerprint
-    file.unlink()
-    assert run(*command)[0] == 0 and Embedding.load(file).fingerprint == embedding.fingerprint
+    content = file.read_bytes()
+    assert Embedding.load(file).fingerprint != load_default().fingerprint
+    assert Recognizer.load(tmp_path / "run").objects.embedding.fingerprint == Embedding.load(file).fingerprint
+    assert run(*command)[0] == 0 and file.read_bytes() == content
     assert not list(tmp_path.glob("run/*.samples"))
 
 
