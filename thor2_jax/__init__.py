@@ -14,8 +14,9 @@ if TYPE_CHECKING:
     from thor2_jax.descriptor.describe import describe, describe_aligned, describe_strips, diagrams, strips
     from thor2_jax.descriptor.view_normalization import align, mirror, turn, view_normalize
     from thor2_jax.parameters import Parameters
+    from thor2_jax.recognition.answers import Recognition
     from thor2_jax.recognition.frames import Intrinsics, RGBDFrame, read_frame
-    from thor2_jax.recognition.recognizer import Recognition, Recognizer
+    from thor2_jax.recognizer import Recognizer
     from thor2_jax.types import Descriptors, Diagrams, PointClouds, Strips
 else:
     _MODULES = {
@@ -23,7 +24,8 @@ else:
         "descriptor.view_normalization": ("align", "mirror", "turn", "view_normalize"),
         "parameters": ("Parameters",),
         "recognition.frames": ("Intrinsics", "RGBDFrame", "read_frame"),
-        "recognition.recognizer": ("Recognition", "Recognizer"),
+        "recognition.answers": ("Recognition",),
+        "recognizer": ("Recognizer",),
         "types": ("Descriptors", "Diagrams", "PointClouds", "Strips"),
     }
     _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}

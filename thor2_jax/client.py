@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.recognizer import Recognition
+from thor2_jax.recognition.answers import Recognition
 
 __all__ = ["Client", "ServiceError", "multipart"]
 

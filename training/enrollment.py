@@ -16,8 +16,8 @@ from thor2_jax.gallery.enrollment import enrolled_views, instance_view
 from thor2_jax.gallery.objects import ObjectGallery
 from thor2_jax.gallery.store import GALLERY_DIRECTORY
 from thor2_jax.recognition.prepared_instance import PreparedInstance
-from thor2_jax.recognition.recognizer import Recognizer
 from thor2_jax.recognition.run_directory import TrainedRun, load_run, save_run
+from thor2_jax.recognizer import Recognizer
 from training.augmentation.augmentations import Augmentations
 from training.augmentation.illumination import Illumination
 from training.augmentation.occlusion import Occlusion

@@ -21,7 +21,7 @@ from thor2_jax.files import atomic_write
 from thor2_jax.printable import escape_characters
 
 if TYPE_CHECKING:
-    from thor2_jax.recognition.recognizer import Recognition
+    from thor2_jax.recognition.answers import Recognition
 
 __all__ = ["COLORS", "UNRECOGNIZED", "Annotation", "Paint", "draw_instances", "draw_overlay"]
 

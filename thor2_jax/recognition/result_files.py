@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from thor2_jax.files import write_text
+from thor2_jax.recognition.answers import Recognition
 from thor2_jax.recognition.frames import RGBDFrame
 from thor2_jax.recognition.overlay import draw_overlay
-from thor2_jax.recognition.recognizer import Recognition
 
 __all__ = ["RESULT_FILES", "write_recognitions"]
 

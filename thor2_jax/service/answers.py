@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.config import DescriptorConfig
+from thor2_jax.recognition.answers import Recognition
 from thor2_jax.recognition.prepared_instance import PreparedInstance
-from thor2_jax.recognition.recognizer import Recognition
 from thor2_jax.service.engine import CloudResult
 from thor2_jax.service.preparation import PreparedRequest
 from thor2_jax.service.schemas import (

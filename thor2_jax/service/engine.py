@@ -12,10 +12,11 @@ from thor2_jax.capacity import BATCH_BUCKETS, POINT_BUCKETS, batch_bucket, point
 from thor2_jax.descriptor.describe import describe_strips, strips
 from thor2_jax.descriptor.view_normalization import align
 from thor2_jax.errors import InputError
+from thor2_jax.recognition.answers import Recognition
 from thor2_jax.recognition.classifier import Feature
 from thor2_jax.recognition.fusion import fuse, fused_probabilities, with_temperature
 from thor2_jax.recognition.prepared_instance import PreparedInstance, pack_instances
-from thor2_jax.recognition.recognizer import THOR2, Recognition, Recognizer
+from thor2_jax.recognizer import THOR2, Recognizer
 from thor2_jax.service.settings import Settings
 
 __all__ = ["CloudResult", "InferenceEngine"]

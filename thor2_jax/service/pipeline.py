@@ -7,8 +7,8 @@ import threading
 import time
 from collections.abc import AsyncIterator, Iterator
 
+from thor2_jax.recognition.answers import Recognition
 from thor2_jax.recognition.prepared_instance import PreparedInstance
-from thor2_jax.recognition.recognizer import Recognition
 from thor2_jax.service.answers import explained_frame
 from thor2_jax.service.batching import Batcher
 from thor2_jax.service.engine import CloudResult, InferenceEngine

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.view_normalization import view_normalize
-from thor2_jax.recognition.recognizer import DescribedFrame
+from thor2_jax.recognition.answers import DescribedFrame
 from thor2_jax.types import PointClouds
 
 __all__ = ["Baseline", "BaselineInputs", "baseline_inputs"]

@@ -13,7 +13,7 @@ def forget(
     name: Annotated[str, typer.Argument(help="Name of an enrolled object or of a trained class.")], model: ModelOption
 ) -> None:
     """Forget an object: its views are removed, and a trained class is never answered again."""
-    from thor2_jax.recognition.recognizer import Recognizer
+    from thor2_jax.recognizer import Recognizer
 
     recognizer = Recognizer.load(model)
     recognizer.forget(name)

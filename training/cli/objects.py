@@ -17,7 +17,7 @@ def objects(
     ] = False,
 ) -> None:
     """List the trained classes and the enrolled objects: number of views, source and date of enrolment."""
-    from thor2_jax.recognition.recognizer import Recognizer
+    from thor2_jax.recognizer import Recognizer
 
     recognizer = Recognizer.load(model, reembed=reembed)
     table = Table("name", "views", "source", "enrolled")

@@ -26,8 +26,8 @@ def recognize(
     """Recognize every instance of one RGB-D frame."""
     from thor2_jax.files import check_output_directory, remove_leftovers
     from thor2_jax.recognition.frames import read_frame
-    from thor2_jax.recognition.recognizer import Recognizer
     from thor2_jax.recognition.result_files import RESULT_FILES, write_recognitions
+    from thor2_jax.recognizer import Recognizer
 
     if out is not None:
         check_output_directory(out, resumable=RESULT_FILES)

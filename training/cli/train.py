@@ -88,7 +88,7 @@ def train(
         if meshes is not None:
             raise InputError("coordinator: several processes need a --dataset that all of them can read, not --meshes")
         jax.distributed.initialize(coordinator, processes, process)
-    from thor2_jax.recognition.recognizer import EMBEDDING_FILE
+    from thor2_jax.recognizer import EMBEDDING_FILE
     from training.embedding.build import build_embedding
     from training.fitting.protocol import DEFAULT, PAPER
     from training.objects.meshes import find_meshes, read_names

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from thor2_jax.errors import InputError
 from thor2_jax.files import content_digest, json_digest
 from thor2_jax.gallery.store import GALLERY_DIRECTORY, INDEX_FILE
-from thor2_jax.recognition.recognizer import EMBEDDING_FILE, THOR2, DescribedFrame, Recognizer
+from thor2_jax.recognition.answers import DescribedFrame
 from thor2_jax.recognition.run_directory import RUN_FILE
+from thor2_jax.recognizer import EMBEDDING_FILE, THOR2, Recognizer
 from training.baselines.baseline import Baseline, BaselineInputs
 from training.baselines.files import baseline_file
 from training.baselines.load import load_baselines

@@ -10,8 +10,8 @@ from scipy import ndimage
 
 from thor2_jax.errors import InputError
 from thor2_jax.recognition import overlay
+from thor2_jax.recognition.answers import Recognition
 from thor2_jax.recognition.overlay import COLORS, UNRECOGNIZED, draw_overlay
-from thor2_jax.recognition.recognizer import Recognition
 
 GREY = 90
 

@@ -20,9 +20,9 @@ from flax import nnx
 import colornet
 import thor2_jax as thor2
 from thor2_jax.recognition.classifier import FEATURES, MLP
-from thor2_jax.recognition.recognizer import Recognizer
 from thor2_jax.recognition.run_directory import TrainedRun, input_size, load_run, save_run
 from thor2_jax.recognition.weights import model_arrays
+from thor2_jax.recognizer import Recognizer
 
 CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=2, n_strips=5, image_size=8, alpha=0.5)
 CLASSES = ("a mug", "b", "ç")

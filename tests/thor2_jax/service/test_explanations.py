@@ -13,7 +13,7 @@ import pytest
 import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.describe import strips
-from thor2_jax.recognition.recognizer import DescribedFrame
+from thor2_jax.recognition.answers import DescribedFrame
 from thor2_jax.service.answers import explained_frame
 from thor2_jax.service.engine import CloudResult, InferenceEngine
 from thor2_jax.service.preparation import PreparedRequest, prepare_frame

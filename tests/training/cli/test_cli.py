@@ -12,8 +12,8 @@ from helpers import run_thor2
 from PIL import Image
 
 from thor2_jax.gallery.embedding import Embedding, load_default
-from thor2_jax.recognition.recognizer import Recognizer
 from thor2_jax.recognition.run_directory import load_run, save_run
+from thor2_jax.recognizer import Recognizer
 from training.objects.builtin_objects import builtin_objects
 from training.rendering.scenes import Scene, compose_scene
 

@@ -14,8 +14,8 @@ from PIL import Image
 from thor2_jax.gallery import embedding as embeddings
 from thor2_jax.gallery import objects as gallery_objects
 from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
-from thor2_jax.recognition.recognizer import Recognizer
 from thor2_jax.recognition.run_directory import load_run, save_run
+from thor2_jax.recognizer import Recognizer
 from training import enrollment
 
 COLORS = {"brick": (220, 30, 30), "book": (30, 40, 220), "leaf": (60, 200, 60)}

@@ -10,8 +10,8 @@ from helpers import untrained_run
 import thor2_jax as thor2
 from thor2_jax.recognition.classifier import feature_of
 from thor2_jax.recognition.prepared_instance import PreparedInstance
-from thor2_jax.recognition.recognizer import THOR2, Recognizer
 from thor2_jax.recognition.run_directory import TrainedRun
+from thor2_jax.recognizer import THOR2, Recognizer
 
 CLASSES = ("a", "b", "c", "d")
 INTRINSICS = thor2.Intrinsics(600.0, 600.0, 159.5, 119.5)

@@ -14,7 +14,6 @@ of the run and named by the fusion of their probabilities (`fuse`). A gallery re
 Its scores name an instance alone, or combined with the classifiers (`ClassUnion.combine`).
 """
 
-import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -32,22 +31,20 @@ from thor2_jax.gallery.enrollment import instance_view
 from thor2_jax.gallery.gallery import Gallery
 from thor2_jax.gallery.objects import ObjectGallery
 from thor2_jax.gallery.store import GALLERY_DIRECTORY
+from thor2_jax.recognition.answers import MAX_OVERFLOW, DescribedFrame, Recognition, concatenate_padded
 from thor2_jax.recognition.classifier import MLP, Feature, check_features, class_probabilities
 from thor2_jax.recognition.frames import RGBDFrame
 from thor2_jax.recognition.fusion import DEFAULT_RULE, FUSION_RULES, FusionRule, fused_probabilities
 from thor2_jax.recognition.prepared_instance import PreparedInstance, pack_instances, prepare_instance
 from thor2_jax.recognition.run_directory import TrainedRun, load_run
-from thor2_jax.types import Descriptors, PointClouds
+from thor2_jax.types import Descriptors
 
 __all__ = [
     "ANSWER_SOURCES",
     "EMBEDDING_FILE",
     "THOR2",
     "AnswerBy",
-    "DescribedFrame",
-    "Recognition",
     "Recognizer",
-    "concatenate_padded",
 ]
 
 AnswerBy = Literal["classifiers", "gallery", "both"]
@@ -60,68 +57,10 @@ EMBEDDING_FILE = "embedding.safetensors"
 THOR2: tuple[Feature, ...] = ("tops", "tops2")
 """The two classifiers whose fusion is THOR2."""
 
-MAX_OVERFLOW = 0.5
-"""Largest overflow of an answer with a name, as a fraction of the points: beyond it, too little is described."""
-
 CHUNK = 4
 """Instances described and classified in one call: while the device computes a chunk, the host prepares the next."""
 
 T = TypeVar("T")
-
-
-@dataclasses.dataclass(frozen=True)
-class Recognition:
-    """The answer for one instance of a frame.
-
-    Attributes:
-        label: its number in the label image.
-        name: the object's name. None if the instance could not be described (fewer points than
-            `instance_clouds.MIN_POINTS`), if more than half of its points overflow (`MAX_OVERFLOW`), or if its
-            confidence is below the recognizer's `unknown_below`: an unknown object.
-        confidence: fused probability of the most probable class, or the score of the gallery, also of an unknown
-            object; None if the instance could not be described.
-        classifier: the classifier that gives this class the largest probability ("tops" or "tops2"), or "gallery".
-        top: classifier or "gallery" -> its five most probable (name, probability) pairs.
-        occluded: another instance hides a part of it, or the image border cuts it.
-        overflow: points and persistence pairs outside the descriptor's grid, see `Descriptors`.
-        points_used: points of the described cloud.
-        kept_by_fallback: a rule of outlier removal would have dropped most of the cloud and was skipped.
-        reason: why `name` is None; None if it is not.
-    """
-
-    label: int
-    name: str | None = None
-    confidence: float | None = None
-    classifier: str | None = None
-    top: dict[str, list[tuple[str, float]]] = dataclasses.field(default_factory=dict)
-    occluded: bool = False
-    overflow: int = 0
-    points_used: int = 0
-    kept_by_fallback: bool = False
-    reason: str | None = None
-
-
-@dataclasses.dataclass(frozen=True)
-class DescribedFrame:
-    """The instances of a frame and the descriptors of those that can be used.
-
-    Attributes:
-        instances: every instance, in the order of the label numbers.
-        descriptors: NumPy arrays with one row for each of `usable`, padded to a batch bucket.
-    """
-
-    instances: Sequence[PreparedInstance]
-    descriptors: Descriptors
-
-    @property
-    def usable(self) -> list[PreparedInstance]:
-        """The instances that were described, in the order of the rows."""
-        return [instance for instance in self.instances if instance.reason is None]
-
-    @property
-    def packed(self) -> PointClouds:
-        """The described clouds in metres, padded as `descriptors` are."""
-        return pack_instances(self.usable, len(self.descriptors.overflow))
 
 
 class Recognizer:
@@ -472,17 +411,6 @@ def _padded_rows(n: int) -> int:
     """Return the number of rows that `n` instances are padded to: whole largest batches, then a batch bucket."""
     whole = n // BATCH_BUCKETS[-1] * BATCH_BUCKETS[-1]
     return n if n == whole > 0 else whole + batch_bucket(max(n - whole, 1))
-
-
-def concatenate_padded(batches: Sequence[T], n_rows: int) -> T:
-    """Concatenate batches (pytrees of arrays) along the first axis, on the host, with zeros up to `n_rows`."""
-
-    def concatenate(*arrays: jax.Array) -> NDArray[Any]:
-        padding = np.zeros((n_rows - sum(map(len, arrays)), *arrays[0].shape[1:]), arrays[0].dtype)
-        return np.concatenate([*arrays, padding])
-
-    concatenated: T = jax.tree.map(concatenate, *batches)
-    return concatenated
 
 
 def _compiled(name: Feature, model: MLP) -> Callable[[Descriptors], jax.Array]:

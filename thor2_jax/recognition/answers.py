@@ -1,0 +1,85 @@
+"""Records of recognition: the described instances of a frame, and the answers for them."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, TypeVar
+
+import jax
+import numpy as np
+from numpy.typing import NDArray
+
+from thor2_jax.recognition.prepared_instance import PreparedInstance, pack_instances
+from thor2_jax.types import Descriptors, PointClouds
+
+__all__ = ["MAX_OVERFLOW", "DescribedFrame", "Recognition", "concatenate_padded"]
+
+MAX_OVERFLOW = 0.5
+"""Largest overflow of an answer with a name, as a fraction of the points: beyond it, too little is described."""
+
+T = TypeVar("T")
+
+
+@dataclasses.dataclass(frozen=True)
+class Recognition:
+    """The answer for one instance of a frame.
+
+    Attributes:
+        label: its number in the label image.
+        name: the object's name. None if the instance could not be described (fewer points than
+            `instance_clouds.MIN_POINTS`), if more than half of its points overflow (`MAX_OVERFLOW`), or if its
+            confidence is below the recognizer's `unknown_below`: an unknown object.
+        confidence: fused probability of the most probable class, or the score of the gallery, also of an unknown
+            object; None if the instance could not be described.
+        classifier: the classifier that gives this class the largest probability ("tops" or "tops2"), or "gallery".
+        top: classifier or "gallery" -> its five most probable (name, probability) pairs.
+        occluded: another instance hides a part of it, or the image border cuts it.
+        overflow: points and persistence pairs outside the descriptor's grid, see `Descriptors`.
+        points_used: points of the described cloud.
+        kept_by_fallback: a rule of outlier removal would have dropped most of the cloud and was skipped.
+        reason: why `name` is None; None if it is not.
+    """
+
+    label: int
+    name: str | None = None
+    confidence: float | None = None
+    classifier: str | None = None
+    top: dict[str, list[tuple[str, float]]] = dataclasses.field(default_factory=dict)
+    occluded: bool = False
+    overflow: int = 0
+    points_used: int = 0
+    kept_by_fallback: bool = False
+    reason: str | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class DescribedFrame:
+    """The instances of a frame and the descriptors of those that can be used.
+
+    Attributes:
+        instances: every instance, in the order of the label numbers.
+        descriptors: NumPy arrays with one row for each of `usable`, padded to a batch bucket.
+    """
+
+    instances: Sequence[PreparedInstance]
+    descriptors: Descriptors
+
+    @property
+    def usable(self) -> list[PreparedInstance]:
+        """The instances that were described, in the order of the rows."""
+        return [instance for instance in self.instances if instance.reason is None]
+
+    @property
+    def packed(self) -> PointClouds:
+        """The described clouds in metres, padded as `descriptors` are."""
+        return pack_instances(self.usable, len(self.descriptors.overflow))
+
+
+def concatenate_padded(batches: Sequence[T], n_rows: int) -> T:
+    """Concatenate batches (pytrees of arrays) along the first axis, on the host, with zeros up to `n_rows`."""
+
+    def concatenate(*arrays: jax.Array) -> NDArray[Any]:
+        padding = np.zeros((n_rows - sum(map(len, arrays)), *arrays[0].shape[1:]), arrays[0].dtype)
+        return np.concatenate([*arrays, padding])
+
+    concatenated: T = jax.tree.map(concatenate, *batches)
+    return concatenated
