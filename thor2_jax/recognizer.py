@@ -58,7 +58,7 @@ THOR2: tuple[Feature, ...] = ("tops", "tops2")
 """The two classifiers whose fusion is THOR2."""
 
 CHUNK = 4
-"""Instances described and classified in one call: while the device computes a chunk, the host prepares the next."""
+"""Default of `Recognizer.chunk`."""
 
 T = TypeVar("T")
 
@@ -71,6 +71,8 @@ class Recognizer:
         objects: the enrolled objects, on disk after `load`.
         unknown_below: least confidence of an answer with a name.
         rule: fusion rule of the classifiers.
+        chunk: instances described and classified in one call. While the device computes a chunk, the host prepares the
+            next. For a single frame, one large chunk starts sooner, since fewer functions are compiled.
 
     Its functions compile once for each point bucket and batch bucket; `warm_up` compiles them in advance. Enrolling and
     forgetting objects compiles nothing.
@@ -106,6 +108,7 @@ class Recognizer:
             raise InputError(f"unknown_below is {unknown_below}; expected a confidence from 0 to 1")
         self.run = run
         self.unknown_below = unknown_below
+        self.chunk = CHUNK
         self.rule: FusionRule = rule
         self.objects = ObjectGallery(run.classes, embedding, search)
         self._answer_by = _check_answer_by(answer_by)
@@ -221,7 +224,7 @@ class Recognizer:
         """
         points = [n for n in POINT_BUCKETS if n <= point_bucket(max_points)]
         rows = [b for b in BATCH_BUCKETS if b <= batch_bucket(max_instances)]
-        shapes = [(b, n) for n in points for b in rows if b <= CHUNK]
+        shapes = [(b, n) for n in points for b in rows if b <= self.chunk]
         described = [describe(pack_instances([], b, n), self.run.network, self.run.config) for b, n in shapes]
         if self.answers_by() != "classifiers":
             for b, n in shapes:
@@ -251,7 +254,7 @@ class Recognizer:
             instances.append(instance)
             if instance.reason is None:
                 chunk.append(instance)
-                if len(chunk) == CHUNK:
+                if len(chunk) == self.chunk:
                     results.append(compute(chunk))
                     chunk = []
         if chunk or not results:
@@ -303,7 +306,7 @@ class Recognizer:
     def gallery_scores(self, described: DescribedFrame) -> NDArray[np.float32]:
         """Return the scores [B, n_objects] of the gallery, one row for each row of the descriptors."""
         usable = described.usable
-        chunks = [usable[start : start + CHUNK] for start in range(0, len(usable), CHUNK)]
+        chunks = [usable[start : start + self.chunk] for start in range(0, len(usable), self.chunk)]
         embeddings = [self.objects.embed(pack_instances(chunk, _padded_rows(len(chunk)))) for chunk in chunks]
         scores = np.zeros((len(described.descriptors.overflow), len(self.gallery.names)), np.float32)
         if chunks:

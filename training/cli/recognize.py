@@ -24,6 +24,7 @@ def recognize(
     out: Annotated[Path | None, typer.Option(help="Directory for recognition.json and overlay.png.")] = None,
 ) -> None:
     """Recognize every instance of one RGB-D frame."""
+    from thor2_jax.capacity import BATCH_BUCKETS
     from thor2_jax.files import check_output_directory, remove_leftovers
     from thor2_jax.recognition.frames import read_frame
     from thor2_jax.recognition.result_files import RESULT_FILES, write_recognitions
@@ -33,7 +34,9 @@ def recognize(
         check_output_directory(out, resumable=RESULT_FILES)
         remove_leftovers(out)
     frame = read_frame(color=color, depth=depth, labels=labels, intrinsics=intrinsics)
-    recognitions = Recognizer.load(model, unknown_below, answer_by=answer_by).recognize(frame)
+    recognizer = Recognizer.load(model, unknown_below, answer_by=answer_by)
+    recognizer.chunk = BATCH_BUCKETS[-1]
+    recognitions = recognizer.recognize(frame)
     table = Table("label", "name", "confidence", "classifier", "occluded", "points", "overflow", "note")
     for r in recognitions:
         confidence = "" if r.confidence is None else f"{r.confidence:.3f}"
