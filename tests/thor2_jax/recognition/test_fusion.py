@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.stats import gmean
 
-from thor2_jax.recognition.fusion import FusionRule, fuse
+from thor2_jax.recognition.fusion import FusionRule, fuse, with_temperature
 
 RNG = np.random.default_rng(0)
 
@@ -45,3 +45,11 @@ def test_the_first_classifier_wins_a_tie_and_one_is_enough() -> None:
     first, second = np.array([[0.3, 0.7]]), np.array([[0.7, 0.3]])
     assert fuse({"tops": first, "tops2": second}, "max") == (np.array([1]), np.array([0.7]), np.array(["tops"]))
     assert fuse({"tops2": second}).classifier.tolist() == ["tops2"]
+
+
+@pytest.mark.parametrize("temperature", [0.5, 1.0, 2.5])
+def test_a_temperature_is_a_power_of_the_probabilities(temperature: float) -> None:
+    probabilities = np.array([[0.5, 0.3, 0.2], [0.01, 0.98, 0.01]])
+    powers = probabilities ** (1 / temperature)
+    expected = powers / powers.sum(axis=1, keepdims=True)
+    np.testing.assert_allclose(with_temperature(probabilities, temperature), expected, rtol=1e-12)
