@@ -17,6 +17,7 @@ jax.config.update(
     "jax_persistent_cache_min_compile_time_secs", float(os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"])
 )
 os.environ.setdefault("THOR2_CACHE", "off")  # commands keep no programs in the home directory
+os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"  # as the command line sets it; importing jax has set 1
 
 EXAMPLES = {"properties": (4, 60), "fuzz": (150, 3000)}
 """Directory of tests -> number of Hypothesis examples for each test, by default and with --thorough."""

@@ -30,7 +30,8 @@ Loss = Callable[..., jax.Array]
 
 @pytest.fixture
 def x64() -> Iterator[None]:
-    with jax.enable_x64(True):
+    """Compute in float64; constants of the engine stay float32 and are promoted."""
+    with jax.enable_x64(True), jax.numpy_dtype_promotion("standard"):
         yield
 
 
