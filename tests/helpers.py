@@ -15,6 +15,7 @@ from unittest import mock
 
 import numpy as np
 from flax import nnx
+from numpy.typing import NDArray
 from PIL import Image
 
 import colornet
@@ -22,6 +23,7 @@ import thor2_jax as thor2
 from thor2_jax.gallery.objects import ObjectGallery
 from thor2_jax.recognition.classifier import FEATURES, MLP
 from thor2_jax.recognition.run_directory import TrainedRun, input_size
+from training.rendering.camera import Camera, RenderedView
 
 SMALL_CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=2, n_strips=5, image_size=8)
 """A descriptor that compiles quickly."""
@@ -166,3 +168,12 @@ class ParsedPage(HTMLParser):
 
     def handle_data(self, data: str) -> None:
         self.text.append(data)
+
+
+def full_image(view: RenderedView, camera: Camera) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
+    """Return the uncropped image of a view: color [H, W, 3] uint8 and depth [H, W] uint16; `camera` rendered it."""
+    rows, columns = (slice(c, c + n) for c, n in zip(view.corner, view.depth.shape, strict=True))
+    color = np.zeros((camera.height, camera.width, 3), np.uint8)
+    depth = np.zeros((camera.height, camera.width), np.uint16)
+    color[rows, columns], depth[rows, columns] = view.color, view.depth
+    return color, depth

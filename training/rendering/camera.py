@@ -53,11 +53,3 @@ class RenderedView:
     intrinsics: Intrinsics
     pose: NDArray[np.float64]
     corner: tuple[int, int]
-
-    def full_image(self, camera: Camera = TRAINING_CAMERA) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
-        """Return the uncropped image: color [H, W, 3] uint8 and depth [H, W] uint16; `camera` rendered the view."""
-        rows, columns = (slice(c, c + n) for c, n in zip(self.corner, self.depth.shape, strict=True))
-        color = np.zeros((camera.height, camera.width, 3), np.uint8)
-        depth = np.zeros((camera.height, camera.width), np.uint16)
-        color[rows, columns], depth[rows, columns] = self.color, self.depth
-        return color, depth

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers import full_image
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, binary_erosion, distance_transform_cdt
 
@@ -137,7 +138,7 @@ def test_a_pure_function_of_its_arguments(on: dict[str, Any]) -> None:
         assert not result.color[result.depth == 0].any()
         xyz, rgb = cloud_of(result)
         assert len(xyz) == len(rgb) > 30
-        full_color, full_depth = result.full_image(TRAINING_CAMERA)
+        full_color, full_depth = full_image(result, TRAINING_CAMERA)
         assert full_depth.sum() == result.depth.sum() and full_color.shape == (600, 800, 3)
 
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
+from helpers import full_image
 
 from thor2_jax.recognition.frames import Intrinsics, backproject
 from training.objects.mesh import TexturedMesh
@@ -43,7 +44,7 @@ def test_depth_of_a_sphere() -> None:
     radius, distance = 0.1, 0.8
     mesh = painted(trimesh.creation.icosphere(subdivisions=5, radius=radius))
     view = render_view(RayCaster([mesh]), camera_pose(0.7, 1.1, np.zeros(3), distance), CAMERA)
-    _, depth = view.full_image(CAMERA)
+    _, depth = full_image(view, CAMERA)
     rays = pixel_rays(CAMERA.intrinsics, CAMERA.height, CAMERA.width)
     # |t r - (0, 0, d)| = R, nearer root; z of r is 1, so t is the depth.
     rr = (rays**2).sum(axis=1)
@@ -73,7 +74,7 @@ def test_matches_another_intersector_and_crops_nothing_visible() -> None:
     pose = camera_pose(2.0, 1.9, np.array([0.0, 0.01, 0.05]), 0.6)
     view = render_view(RayCaster([painted(shape)]), pose, CAMERA)
     assert view.depth.size < CAMERA.width * CAMERA.height / 2
-    _, depth = view.full_image(CAMERA)
+    _, depth = full_image(view, CAMERA)
     rays = pixel_rays(CAMERA.intrinsics, CAMERA.height, CAMERA.width) @ pose[:3, :3].T
     expected = intersect_triangles(shape, pose[:3, 3], rays)
     expected = expected.reshape(depth.shape)
@@ -113,7 +114,8 @@ def test_camera_inside_the_bounding_box_sees_the_whole_image() -> None:
 def test_off_centre_intrinsics() -> None:
     camera = Camera(100, 80, Intrinsics(150.0, 140.0, 20.0, 60.0))
     mesh = painted(trimesh.creation.icosphere(subdivisions=3, radius=0.01))
-    color, depth = render_view(RayCaster([mesh]), camera_pose(0.2, 1.3, np.zeros(3), 0.5), camera).full_image(camera)
+    view = render_view(RayCaster([mesh]), camera_pose(0.2, 1.3, np.zeros(3), 0.5), camera)
+    color, depth = full_image(view, camera)
     rows, columns = np.nonzero(depth)
     assert rows.mean() == pytest.approx(60, abs=0.3) and columns.mean() == pytest.approx(20, abs=0.3)
     assert (color[rows, columns] == [200, 30, 40]).all()
