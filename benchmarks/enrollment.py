@@ -59,10 +59,11 @@ def embed(embedding: Embedding, views: Sequence[PreparedInstance]) -> NDArray[np
     embedded = np.zeros((len(views), 1, 1), np.float32)
     for start in range(0, len(views), ROWS):
         rows = order[start : start + ROWS]
-        found = np.asarray(embed_orientations(embedding, pack_instances([views[k] for k in rows], ROWS)))[: len(rows)]
+        packed = pack_instances([views[k] for k in rows], ROWS)
+        batch = np.asarray(embed_orientations(embedding, packed))[: len(rows)]
         if start == 0:
-            embedded = np.zeros((len(views), *found.shape[1:]), np.float32)
-        embedded[rows] = found
+            embedded = np.zeros((len(views), *batch.shape[1:]), np.float32)
+        embedded[rows] = batch
     return embedded
 
 

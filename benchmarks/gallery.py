@@ -81,8 +81,8 @@ def measure_search(options: argparse.Namespace) -> dict[str, Any]:
         }
         if isinstance(search, IndexSearch):
             many = queries_near(embeddings, 200, seed=2)
-            expected, found = ExactSearch(embeddings).nearest(many, NEAREST)[1], search.nearest(many, NEAREST)[1]
-            pairs = list(zip(expected, found, strict=True))
+            exact, approximate = (s.nearest(many, NEAREST)[1] for s in (ExactSearch(embeddings), search))
+            pairs = list(zip(exact, approximate, strict=True))
             for count in (1, 10, NEAREST):
                 hits = [len(np.intersect1d(a[:count], b[:count])) / count for a, b in pairs]
                 row[f"recall_at_{count}"] = float(np.mean(hits))
