@@ -122,7 +122,8 @@ class RGBDFrame:
         color: [H, W, 3] uint8, sRGB.
         depth: [H, W] distance along the optical axis: unsigned integers in 1 / `intrinsics.depth_scale` metres
             (millimetres by default) or floats in metres; 0, and in floats also NaN or infinity, where there is none.
-        labels: [H, W] integers; 0 is background, every other number an instance.
+        labels: [H, W] integers; 0 is background, every other number an instance. None for a frame that is not yet
+            segmented: `thor2_jax.segmentation.segmented` returns it with labels.
         intrinsics: the camera of all three images; a mapping is converted by `Intrinsics.of`.
 
     Raises:
@@ -131,17 +132,18 @@ class RGBDFrame:
 
     color: NDArray[np.uint8]
     depth: NDArray[Any]
-    labels: NDArray[Any]
+    labels: NDArray[Any] | None
     intrinsics: Intrinsics
 
     def __post_init__(self) -> None:
-        color, depth, labels = (np.asarray(getattr(self, name)) for name in ("color", "depth", "labels"))
+        color, depth = np.asarray(self.color), np.asarray(self.depth)
+        labels = None if self.labels is None else np.asarray(self.labels)
         if color.ndim != 3 or color.shape[2] != 3 or 0 in color.shape:
             raise InputError(f"color has shape {color.shape}; expected [H, W, 3]")
         if color.dtype != np.uint8:
             raise InputError(f"color has type {color.dtype}; expected uint8")
         for name, image in (("depth", depth), ("labels", labels)):
-            if image.shape != color.shape[:2]:
+            if image is not None and image.shape != color.shape[:2]:
                 raise InputError(
                     f"{name} has shape {image.shape}; expected {color.shape[:2]} (rows, columns), as color"
                 )
@@ -149,9 +151,9 @@ class RGBDFrame:
             raise InputError(
                 f"depth has type {depth.dtype}; expected uint16 or uint32 (1 / depth_scale metres) or floats (metres)"
             )
-        if labels.dtype.kind not in "ui":
+        if labels is not None and labels.dtype.kind not in "ui":
             raise InputError(f"labels has type {labels.dtype}; expected integers")
-        if labels.min() < 0:
+        if labels is not None and labels.min() < 0:
             raise InputError(f"labels has the value {labels.min()}; expected 0 or more")
         camera = self.intrinsics
         intrinsics = camera if isinstance(camera, Intrinsics) else Intrinsics.of(camera)
@@ -165,10 +167,24 @@ class RGBDFrame:
             return np.divide(self.depth, self.intrinsics.depth_scale, dtype=np.float32)
         return np.where(np.isfinite(self.depth), self.depth, 0).astype(np.float32)
 
+    @property
+    def label_image(self) -> NDArray[Any]:
+        """`labels` of a frame that has them.
+
+        Raises:
+            InputError: the frame has no labels.
+        """
+        if self.labels is None:
+            raise InputError("labels is None; expected an image of instance numbers: give labels, or segment the frame")
+        return self.labels
+
     @cached_property
     def instance_pixels(self) -> dict[int, NDArray[np.intp]]:
-        """Label number -> sorted flat indices (row * W + column) of its pixels, in the order of `instances`."""
-        flat = self.labels.ravel()
+        """Label number -> sorted flat indices (row * W + column) of its pixels, in the order of `instances`.
+
+        Raises InputError as `label_image`.
+        """
+        flat = self.label_image.ravel()
         pixels = np.flatnonzero(flat != 0)  # several times as fast on booleans as on integers
         order = np.argsort(flat[pixels], kind="stable")
         pixels = pixels[order]
@@ -177,7 +193,7 @@ class RGBDFrame:
 
     @cached_property
     def instances(self) -> tuple[int, ...]:
-        """Label numbers of the frame in increasing order, without 0."""
+        """Label numbers of the frame in increasing order, without 0; raises InputError as `label_image`."""
         return tuple(self.instance_pixels)
 
 
@@ -292,13 +308,16 @@ def read_intrinsics(path: str | Path) -> Intrinsics:
         return parse_intrinsics(content)
 
 
-def read_frame(*, color: str | Path, depth: str | Path, labels: str | Path, intrinsics: str | Path) -> RGBDFrame:
+def read_frame(
+    *, color: str | Path, depth: str | Path, labels: str | Path | None = None, intrinsics: str | Path
+) -> RGBDFrame:
     """Read a frame from files.
 
     Args:
         color: 8-bit RGB image (PNG, JPEG or TIFF; an alpha channel is dropped).
         depth: 16-bit one-channel image in 1 / depth_scale metres, by default millimetres.
         labels: one-channel or indexed image of instance numbers, 8 or 16 bits, lossless; 0 is background.
+            None for a frame without labels.
         intrinsics: JSON file, see `parse_intrinsics`.
 
     Raises:
@@ -306,4 +325,5 @@ def read_frame(*, color: str | Path, depth: str | Path, labels: str | Path, intr
             the argument.
         OSError: a file cannot be opened.
     """
-    return RGBDFrame(read_color(color), read_depth(depth), read_labels(labels), read_intrinsics(intrinsics))
+    label_image = None if labels is None else read_labels(labels)
+    return RGBDFrame(read_color(color), read_depth(depth), label_image, read_intrinsics(intrinsics))

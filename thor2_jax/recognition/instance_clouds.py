@@ -66,7 +66,7 @@ def instance_cloud(frame: RGBDFrame, label: int) -> InstanceCloud:
     if not steep:
         trusted &= ~flying
     valid, depth = pixels[trusted], depth[trusted]
-    points = (pixel_rays(valid, frame.labels.shape[1], frame.intrinsics) * depth[:, None]).astype(np.float32)
+    points = (pixel_rays(valid, frame.depth.shape[1], frame.intrinsics) * depth[:, None]).astype(np.float32)
     points, colors = voxel_downsample(points, frame.color.reshape(-1, 3).take(valid, axis=0), CLOUD_VOXEL)
     if len(points) < MIN_POINTS:
         reason = (

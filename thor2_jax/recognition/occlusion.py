@@ -68,7 +68,7 @@ def find_occlusion(frame: RGBDFrame, cloud: InstanceCloud) -> OcclusionBoundary:
     occluded = bool(on_boundary.sum() >= MIN_BOUNDARY_SHARE * on_contour.sum())
     seen = on_boundary & (own_depth > 0)
     if occluded and seen.any() and len(cloud.points):
-        edge = pixel_rays(pixels[seen], frame.labels.shape[1], frame.intrinsics) * own_depth[seen, None]
+        edge = pixel_rays(pixels[seen], frame.depth.shape[1], frame.intrinsics) * own_depth[seen, None]
         distance, nearest = KDTree(cloud.points, leafsize=32, balanced_tree=False, compact_nodes=False).query(edge)
         boundary[nearest[distance <= BOUNDARY_REACH]] = True
     return OcclusionBoundary(occluded, boundary)
@@ -78,14 +78,14 @@ def _window(
     frame: RGBDFrame, pixels: NDArray[np.intp]
 ) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.intp]]:
     """Return labels and depth in a window around a mask (with `MARGIN`), and the mask's flat indices in it."""
-    height, width = frame.labels.shape
+    height, width = frame.depth.shape
     row, column = np.divmod(pixels, width)
     top, left = row.min() - MARGIN, column.min() - MARGIN
     shape = row.max() - top + MARGIN + 1, column.max() - left + MARGIN + 1
     inside = slice(max(top, 0), min(top + shape[0], height)), slice(max(left, 0), min(left + shape[1], width))
     here = tuple(slice(part.start - first, part.stop - first) for part, first in zip(inside, (top, left), strict=True))
     labels, depth = np.full(shape, OUTSIDE, np.int64), np.zeros(shape, np.float32)
-    labels[here], depth[here] = frame.labels[inside], frame.depth_m[inside]
+    labels[here], depth[here] = frame.label_image[inside], frame.depth_m[inside]
     return labels, depth, (row - top) * shape[1] + column - left
 
 

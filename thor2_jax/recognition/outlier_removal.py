@@ -48,8 +48,8 @@ def flying_pixels(frame: RGBDFrame, pixels: NDArray[np.intp]) -> NDArray[np.bool
     Returns:
         [n] bool; False where there is no depth.
     """
-    height, width = frame.labels.shape
-    labels, depth = frame.labels.ravel(), frame.depth_m.ravel()
+    height, width = frame.depth.shape
+    labels, depth = frame.label_image.ravel(), frame.depth_m.ravel()
     row, column = np.divmod(pixels, width)
     here, instance = depth[pixels], labels[pixels]
     # A pixel is a flying pixel if a neighbour is closer than this. At the image border, a pixel is its own neighbour.

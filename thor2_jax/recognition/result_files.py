@@ -22,6 +22,6 @@ def write_recognitions(out: Path, frame: RGBDFrame, recognitions: Sequence[Recog
         OSError: A file cannot be written.
     """
     out.mkdir(parents=True, exist_ok=True)
-    draw_overlay(frame.color, frame.labels, recognitions, out / RESULT_FILES[0])
+    draw_overlay(frame.color, frame.label_image, recognitions, out / RESULT_FILES[0])
     rows = [dataclasses.asdict(recognition) for recognition in recognitions]
     write_text(out / RESULT_FILES[1], json.dumps(rows, indent=1) + "\n")

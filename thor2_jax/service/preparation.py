@@ -57,7 +57,7 @@ def prepare_frame(files: dict[str, bytes], sigma_s: float, with_label_map: bool)
         raise RequestError(
             422, "intrinsics", "intrinsics place the points of an instance too far apart; check fx, fy and depth_scale."
         ) from None
-    label_map = _encode_label_map(frame.labels) if with_label_map else None
+    label_map = _encode_label_map(frame.label_image) if with_label_map else None
     return PreparedRequest(instances, {"decode": decoded - start, "clouds": time.perf_counter() - decoded}, label_map)
 
 

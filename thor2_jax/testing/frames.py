@@ -51,7 +51,7 @@ def assert_labels_are_names(instance_clouds: Clouds, frame: RGBDFrame, seed: int
     numbers = np.random.default_rng(seed).permutation(np.arange(1, 256))
     other = np.concatenate([[0], numbers]).astype(np.uint16)
     clouds = {
-        c.label: c for c in instance_clouds(RGBDFrame(frame.color, frame.depth, other[frame.labels], frame.intrinsics))
+        c.label: c for c in instance_clouds(RGBDFrame(frame.color, frame.depth, other[frame.label_image], frame.intrinsics))
     }
     for cloud in instance_clouds(frame):
         same = clouds.pop(int(other[cloud.label]))
@@ -67,7 +67,7 @@ def assert_labels_are_names(instance_clouds: Clouds, frame: RGBDFrame, seed: int
 
 def assert_depth_units_agree(instance_clouds: Clouds, frame: RGBDFrame) -> None:
     """Assert that depth in integer units and in metres gives the same clouds, bit by bit."""
-    other = RGBDFrame(frame.color, frame.depth_m, frame.labels, frame.intrinsics)
+    other = RGBDFrame(frame.color, frame.depth_m, frame.label_image, frame.intrinsics)
     for first, second in zip(instance_clouds(frame), instance_clouds(other), strict=True):
         assert first.reason == second.reason
         np.testing.assert_array_equal(first.points, second.points)

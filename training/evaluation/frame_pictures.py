@@ -66,10 +66,10 @@ class FramePictures:
         for instance, prediction, confidence in incorrect_answers(answers, self._runs):
             if confidence > self._highest.get((instance.truth, prediction), -1.0):
                 self._highest[instance.truth, prediction] = confidence
-                mask = item.frame.labels == instance.label
+                mask = item.frame.label_image == instance.label
                 draw_crop(item.frame.color, mask, self.confusion_path(instance.truth, prediction))
         if number in self.shown:
-            draw_judged(item.frame.color, item.frame.labels, self._judge(answers), self.frame_path(number))
+            draw_judged(item.frame.color, item.frame.label_image, self._judge(answers), self.frame_path(number))
 
     def _judge(self, answers: FrameAnswers) -> dict[int, tuple[bool, str]]:
         """Return label -> (correct, text) for the instances of known objects."""

@@ -53,15 +53,15 @@ def write_sample_frames(directory: str | Path) -> None:
 
 
 def _crop(frame: RGBDFrame) -> RGBDFrame:
-    rows, columns = (np.flatnonzero((frame.labels > 0).any(axis=axis)) for axis in (1, 0))
+    rows, columns = (np.flatnonzero((frame.label_image > 0).any(axis=axis)) for axis in (1, 0))
     required = max(np.ptp(columns) + 1, (np.ptp(rows) + 1) * 4 / 3) + 2 * CROP_MARGIN
-    height, width = frame.labels.shape
+    height, width = frame.depth.shape
     across = min(width, max(LEAST_WIDTH, 4 * round(required / 4)))
     down = across * 3 // 4
     left = int(np.clip((columns[0] + columns[-1] - across) // 2, 0, width - across))
     top = int(np.clip((rows[0] + rows[-1] - down) // 2, 0, height - down))
     camera = dataclasses.replace(frame.intrinsics, cx=frame.intrinsics.cx - left, cy=frame.intrinsics.cy - top)
-    color, depth, labels = (a[top : top + down, left : left + across] for a in (frame.color, frame.depth, frame.labels))
+    color, depth, labels = (a[top : top + down, left : left + across] for a in (frame.color, frame.depth, frame.label_image))
     return RGBDFrame(color, depth, labels, camera)
 
 
@@ -69,5 +69,5 @@ def _write(frame: RGBDFrame, directory: Path) -> None:
     directory.mkdir(parents=True, exist_ok=True)
     Image.fromarray(frame.color).save(directory / "color.jpg", quality=85, subsampling=0)
     Image.fromarray(frame.depth).save(directory / "depth.png", optimize=True)
-    Image.fromarray(frame.labels).save(directory / "labels.png", optimize=True)
+    Image.fromarray(frame.label_image).save(directory / "labels.png", optimize=True)
     (directory / "intrinsics.json").write_text(json.dumps(dataclasses.asdict(frame.intrinsics)) + "\n")

@@ -175,6 +175,16 @@ def test_no_instance() -> None:
     assert frame.instances == () and frame.instance_pixels == {}
 
 
+def test_a_frame_without_labels() -> None:
+    frame = RGBDFrame(**arrays() | {"labels": None})
+    assert frame.labels is None and frame.depth_m.shape == (5, 7)
+    for read in ("label_image", "instance_pixels", "instances"):
+        with pytest.raises(InputError, match=r"^labels is None;"):
+            getattr(frame, read)
+    labelled = dataclasses.replace(frame, labels=arrays()["labels"])
+    assert labelled.instances == RGBDFrame(**arrays()).instances
+
+
 def test_as_many_instances_as_pixels() -> None:
     """Time must not grow with pixels times instances, which would take minutes here."""
     labels = np.arange(280 * 250, dtype=np.int32).reshape(280, 250)
@@ -227,6 +237,12 @@ def test_a_frame_of_files(files: dict[str, Path]) -> None:
     for name in ("color", "depth", "labels"):
         np.testing.assert_array_equal(getattr(frame, name), expected[name])
     assert frame.depth.dtype == np.uint16 and frame.intrinsics == CAMERA
+
+
+def test_a_frame_of_files_without_labels(files: dict[str, Path]) -> None:
+    del files["labels"]
+    frame = read_frame(**files)
+    assert frame.labels is None and np.array_equal(frame.depth, read_depth(files["depth"]))
 
 
 @pytest.mark.parametrize("name", ["color", "depth", "labels", "intrinsics"])
