@@ -51,7 +51,8 @@ def assert_labels_are_names(instance_clouds: Clouds, frame: RGBDFrame, seed: int
     numbers = np.random.default_rng(seed).permutation(np.arange(1, 256))
     other = np.concatenate([[0], numbers]).astype(np.uint16)
     clouds = {
-        c.label: c for c in instance_clouds(RGBDFrame(frame.color, frame.depth, other[frame.label_image], frame.intrinsics))
+        c.label: c
+        for c in instance_clouds(RGBDFrame(frame.color, frame.depth, other[frame.label_image], frame.intrinsics))
     }
     for cloud in instance_clouds(frame):
         same = clouds.pop(int(other[cloud.label]))

@@ -61,7 +61,9 @@ def _crop(frame: RGBDFrame) -> RGBDFrame:
     left = int(np.clip((columns[0] + columns[-1] - across) // 2, 0, width - across))
     top = int(np.clip((rows[0] + rows[-1] - down) // 2, 0, height - down))
     camera = dataclasses.replace(frame.intrinsics, cx=frame.intrinsics.cx - left, cy=frame.intrinsics.cy - top)
-    color, depth, labels = (a[top : top + down, left : left + across] for a in (frame.color, frame.depth, frame.label_image))
+    color, depth, labels = (
+        a[top : top + down, left : left + across] for a in (frame.color, frame.depth, frame.label_image)
+    )
     return RGBDFrame(color, depth, labels, camera)
 
 
