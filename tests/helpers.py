@@ -49,6 +49,7 @@ class UntaughtRecognizer:
     """Base of toy recognizers: no object is enrolled."""
 
     run: Any
+    unknown_below = 0.0
 
     @property
     def objects(self) -> ObjectGallery:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["RunStatistics", "attribute_tables", "group_by_attributes", "summarize_runs"]
+__all__ = ["RunStatistics", "attribute_tables", "group_by_attributes", "summarize_rows", "summarize_runs"]
 
 _ORDER = {"none": 0, "low": 1, "high": 2}
 
@@ -66,3 +66,8 @@ def summarize_runs(values: Sequence[float]) -> dict[str, Any]:
         len(finite),
     )
     return dataclasses.asdict(statistics)
+
+
+def summarize_rows(rows: Sequence[Mapping[str, float]]) -> dict[str, Any]:
+    """Return `summarize_runs` of every value of the runs' rows, which have the same names; at least one row."""
+    return {name: summarize_runs([row[name] for row in rows]) for name in rows[0]}

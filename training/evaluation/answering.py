@@ -5,6 +5,7 @@ from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
+from thor2_jax.recognition.frames import RGBDFrame, pixel_rays
 from training.baselines.baseline import baseline_inputs
 from training.evaluation.answers import FrameAnswers, InstancePrediction, all_predictors
 from training.evaluation.runs import Run
@@ -43,10 +44,24 @@ def _answer(runs: Sequence[Run], item: LabelledFrame) -> list[InstancePrediction
     reasons = {instance.label: instance.reason for instance in described.instances}
     answers = []
     for label, truth in sorted(item.truth.items()):
+        position = _position(item.frame, label)
         if label in rows:
             row = rows[label]
-            answers.append(InstancePrediction(label, truth, described.usable[row].occluded, None, table[row]))
+            occluded = described.usable[row].occluded
+            answers.append(InstancePrediction(label, truth, occluded, None, table[row], position))
         else:
             reason = reasons.get(label) or NO_PIXELS
-            answers.append(InstancePrediction(label, truth, reason=reason))
+            answers.append(InstancePrediction(label, truth, reason=reason, position=position))
     return answers
+
+
+def _position(frame: RGBDFrame, label: int) -> tuple[float, float, float] | None:
+    """Return the median x, y and z of an instance's points, rounded to 0.1 mm; None if no pixel has depth."""
+    pixels = frame.instance_pixels.get(label, np.zeros(0, np.intp))
+    depth = frame.depth_m.ravel()[pixels]
+    pixels, depth = pixels[depth > 0], depth[depth > 0]
+    if not len(pixels):
+        return None
+    points = pixel_rays(pixels, frame.labels.shape[1], frame.intrinsics) * depth[:, None]
+    x, y, z = np.median(points, axis=0).round(4).tolist()
+    return x, y, z

@@ -44,6 +44,10 @@ class EvaluatedRun(Protocol):
     def temperatures(self) -> Mapping[str, float]:
         """Temperatures of the calibrated classifiers and baselines."""
 
+    @property
+    def threshold(self) -> float:
+        """Confidence below which the recognizer answers that an object is unknown; 0 if it names every object."""
+
 
 def all_predictors(runs: Sequence[EvaluatedRun]) -> tuple[tuple[int, str], ...]:
     """Return (index of the run, name) of every classifier and baseline of all runs."""
@@ -60,6 +64,8 @@ class InstancePrediction:
         occluded: the recognizer found the instance to be occluded.
         reason: why the instance could not be described; None if it was.
         probabilities: [M, C] float32, one row for each of `all_predictors`; None if the instance was not described.
+        position: median x, y and z of its points in the camera frame, metres; None if no pixel has depth, and in
+            answers of earlier versions.
     """
 
     label: int
@@ -67,6 +73,7 @@ class InstancePrediction:
     occluded: bool = False
     reason: str | None = None
     probabilities: NDArray[np.float32] | None = None
+    position: tuple[float, float, float] | None = None
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -166,6 +173,9 @@ def _decode(line: str | bytes) -> FrameAnswers:
             instance["probabilities"] = np.array(instance["probabilities"], np.float32)
             if instance["probabilities"].ndim != 2:
                 raise ValueError(f"the probabilities of frame {values['frame']!r} are not a table")
+        if instance.get("position") is not None:
+            x, y, z = map(float, instance["position"])
+            instance["position"] = x, y, z
         instances.append(InstancePrediction(**instance))
     files = dict(values.get("files", {}))
     return FrameAnswers(values["frame"], values["attributes"], values["seconds"], instances, files)

@@ -17,6 +17,7 @@ __all__ = [
     "auroc",
     "expected_calibration_error",
     "reliability",
+    "unknown_named",
 ]
 
 BINS = 15
@@ -124,3 +125,30 @@ def accuracy_at_coverage(confidence: ArrayLike, correct: ArrayLike, coverage: fl
     threshold = np.sort(values)[len(values) - accepted]
     kept = values >= threshold
     return Coverage(float(threshold), float(kept.mean()), float(marks[kept].mean()))
+
+
+def unknown_named(correct: ArrayLike, unknown: ArrayLike, kept: ArrayLike = 0.95) -> NDArray[np.float64]:
+    """Return the share of unknown objects that are named where a share `kept` of the correct answers is kept.
+
+    The threshold is the largest confidence that keeps at least this share; an answer with this confidence is kept.
+
+    Args:
+        correct: [N], confidences of the correct answers.
+        unknown: [M], confidences of the answers to unknown objects.
+        kept: [...], from 0 to 1.
+
+    Returns:
+        [...] shares; NaN if there is no correct answer or no unknown object.
+
+    Raises:
+        InputError: `kept` is not from 0 to 1.
+    """
+    ordered, others, shares = np.sort(np.asarray(correct, np.float64)), np.asarray(unknown), np.asarray(kept)
+    if not np.all((shares >= 0) & (shares <= 1)):
+        raise InputError(f"kept has values from {shares.min()} to {shares.max()}; expected 0 to 1")
+    if not len(ordered) or not len(others):
+        return np.full(shares.shape, np.nan)
+    # 0.95 * 20 is slightly more than 19 in floating point. Keeping nothing takes a threshold above all confidences.
+    count = np.ceil(np.round(shares * len(ordered), 9)).astype(np.intp)
+    threshold = np.append(ordered, np.inf)[len(ordered) - count]
+    return np.asarray((others >= threshold[..., None]).mean(axis=-1))

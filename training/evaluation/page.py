@@ -12,7 +12,7 @@ from training.evaluation.fusion import RULES
 from training.evaluation.published import Published, published, published_seconds
 from training.evaluation.results import COVERAGE
 from training.reports.html import Picture, Section, Table, write_page
-from training.reports.plots import draw_accuracy, draw_confusion, draw_reliability
+from training.reports.plots import draw_accuracy, draw_confusion, draw_known_unknown, draw_reliability
 
 __all__ = ["accuracy_table", "write_report_page"]
 
@@ -72,7 +72,9 @@ def write_report_page(report: Mapping[str, Any], pictures: FramePictures, out: P
         sections += [
             *_accuracy_sections(report, out),
             _fusion_section(report),
+            *_placement_sections(report),
             _confidence_section(report, out),
+            *_unknown_sections(report, out),
             _confusion_section(report, pictures, out),
         ]
     sections += [_frame_section(report, pictures, out), _measurement_section(report)]
@@ -144,6 +146,71 @@ def _fusion_section(report: Mapping[str, Any]) -> Section:
         f"This page and the command thor2 recognize use {report['rule']}."
     )
     return Section("Fusion rules", text, (["fusion", *RULES], rows))
+
+
+def _placement_sections(report: Mapping[str, Any]) -> list[Section]:
+    """Return the section on placements; none if every instance is a placement of its own."""
+    placements, overall = report["placements"], report["accuracy"][report["rule"]][0]["cells"][0]
+    if placements["count"] == overall["instances"]:
+        return []
+    header = ["", "accuracy over instances", "accuracy over placements", "steadiness"]
+    rows = [
+        [
+            title,
+            _mean_std(overall["accuracy"][title]),
+            _mean_std(placements["accuracy"][title]),
+            _mean_std(placements["steadiness"][title]),
+        ]
+        for title in report["fusions"]
+    ]
+    text = (
+        f"The {overall['instances']:,} instances are {placements['count']:,} placements: an object that does not move "
+        "in neighbouring frames is one placement, since its answers are not independent. Accuracy over placements is "
+        "the mean of the placements' accuracies. Steadiness is the share of instances with the most frequent answer of "
+        "their placement, among placements of at least two instances."
+    )
+    return [Section("Placements", text, (header, rows))]
+
+
+def _unknown_sections(report: Mapping[str, Any], out: Path) -> list[Section]:
+    """Return the section on rejection; none without unknown objects and without a threshold."""
+    shares, curve, main = report["rejection"], report["known_unknown"], report["main"]
+    n_unknown = sum(report["instances"]["no_class"].values())
+    if curve is None and not shares["threshold"]["runs"]:
+        return []
+    n_known = report["instances"]["scored"]
+    rows = [
+        [f"known, recognized correctly ({n_known:,} instances)", "accuracy", "accuracy_at_threshold"],
+        ["known, recognized incorrectly", "incorrect", "incorrect_at_threshold"],
+    ]
+    table = [[name, *(_mean_std(shares[key]) for key in keys)] for name, *keys in rows]
+    if n_unknown:
+        table.append(
+            [f"unknown, named ({n_unknown:,} instances)", "1.000", _mean_std(shares["unknown_named_at_threshold"])]
+        )
+    header = ["objects", "without rejection", f"threshold {_mean_std(shares['threshold'])}"]
+    if not shares["threshold"]["runs"]:
+        header, table = header[:2], [row[:2] for row in table]
+    text = (
+        f"Shares of the instances for {main}. An answer whose confidence is below the threshold has no name: the "
+        "object is unknown. "
+    )
+    text += (
+        "The threshold is the one that the models store."
+        if shares["threshold"]["runs"]
+        else "These models store no threshold."
+    )
+    pictures = []
+    if curve is not None:
+        named = report["confidence"][main]["unknown_named"]
+        draw_known_unknown(curve, (COVERAGE, named["mean"]), main, out / "known-unknown.png")
+        text += (
+            f" With one that keeps {COVERAGE:.0%} of the correct answers, {_mean_std(named)} of the unknown objects "
+        )
+        text += "have a name."
+        caption = f"Unknown objects that {main} names, by the share of its correct answers that a threshold keeps."
+        pictures = [Picture("known-unknown.png", caption, half=True)]
+    return [Section("Unknown objects", text, (header, table), pictures)]
 
 
 def _confidence_section(report: Mapping[str, Any], out: Path) -> Section:

@@ -9,17 +9,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.recognition.fusion import DEFAULT_RULE
-from training.evaluation.accuracy import attribute_tables, group_by_attributes, summarize_runs
+from training.evaluation.accuracy import attribute_tables, group_by_attributes, summarize_rows, summarize_runs
 from training.evaluation.answers import EvaluatedRun, FrameAnswers, InstancePrediction, all_predictors
-from training.evaluation.confidence import accuracy_at_coverage, auroc, expected_calibration_error, reliability
+from training.evaluation.confidence import (
+    accuracy_at_coverage,
+    auroc,
+    expected_calibration_error,
+    reliability,
+    unknown_named,
+)
 from training.evaluation.fusion import RULES, Rule, fuse_by, fusions, main_fusion
+from training.evaluation.placements import find_placements, placement_accuracy, steadiness
 from training.evaluation.published import published
 from training.readers.labelled import sequence_of
 
 __all__ = ["COVERAGE", "Predictions", "compute_results", "fuse_answers", "incorrect_answers"]
 
 COVERAGE = 0.95
-"""Fraction of the answers to known objects that is accepted in the open-set metrics."""
+"""Fraction of the answers to known objects, or of the correct ones, that is accepted in the open-set metrics."""
+
+CURVE = tuple(k / 100 for k in range(101))
+"""Shares of the correct answers at which the known/unknown curve is computed."""
 
 MOST_FREQUENT = 12
 """Confusions listed in a report."""
@@ -85,6 +95,8 @@ def compute_results(kind: str, runs: Sequence[EvaluatedRun], frames: Sequence[Fr
     classes = runs[0].classes
     labelled = [(instance, _attributes(kind, frame)) for frame in frames for instance in frame.instances]
     known = [(instance, attributes) for instance, attributes in labelled if instance.truth in classes]
+    placement = np.concatenate([np.zeros(0, np.intp), *find_placements(frames)])
+    placement = placement[[instance.truth in classes for instance, _ in labelled]]
     unknown = [instance for instance, _ in labelled if instance.truth not in classes]
     results: dict[str, Any] = {
         "runs": [run.name for run in runs],
@@ -100,7 +112,7 @@ def compute_results(kind: str, runs: Sequence[EvaluatedRun], frames: Sequence[Fr
         "fusions": [],
         "worst": [],
     }
-    return results | _scores(kind, runs, known, unknown) if known else results
+    return results | _scores(kind, runs, known, placement, unknown) if known else results
 
 
 def _attributes(kind: str, frame: FrameAnswers) -> dict[str, str]:
@@ -122,6 +134,7 @@ def _scores(
     kind: str,
     runs: Sequence[EvaluatedRun],
     known: Sequence[tuple[InstancePrediction, Mapping[str, str]]],
+    placement: NDArray[np.intp],
     unknown: Sequence[InstancePrediction],
 ) -> dict[str, Any]:
     """Return the part of the results that needs instances of the runs' classes."""
@@ -133,7 +146,9 @@ def _scores(
     attributes = [each for _, each in known]
     tables = attribute_tables(kind, attributes)
     main = main_fusion(by_rule[DEFAULT_RULE], runs[0].answer_by)
-    predictions = list(by_rule[DEFAULT_RULE][main].values())
+    by_run = by_rule[DEFAULT_RULE][main]
+    predictions = list(by_run.values())
+    unknown_predictions = fuse_answers(unknown, runs, DEFAULT_RULE)[main]
     confusion = _confusion(predictions, truth, described, len(classes))
     rules: dict[str, Rule] = {"confidence": DEFAULT_RULE, "calibrated_confidence": "calibrated"}
     return {
@@ -150,7 +165,12 @@ def _scores(
             key: _confidence(by_rule[rule], truth[described], fuse_answers(unknown, runs, rule))
             for key, rule in rules.items()
         },
+        "placements": _placements(by_rule[DEFAULT_RULE], placement, truth, described),
         "main": main,
+        "rejection": summarize_rows(
+            [_rejection(by_run[run], truth, described, unknown_predictions[run], runs[run].threshold) for run in by_run]
+        ),
+        "known_unknown": _known_unknown([(by_run[run], unknown_predictions[run]) for run in by_run], truth[described]),
         "reliability": _reliability(predictions, truth[described]),
         "confusion": confusion.tolist(),
         "worst": _most_frequent(confusion, classes),
@@ -197,7 +217,7 @@ def _confidence(
     metrics = {}
     for title, by_run in fused.items():
         rows = [_confidence_of_run(by_run[run], truth, unknown[title][run]) for run in by_run]
-        metrics[title] = {name: summarize_runs([row[name] for row in rows]) for name in rows[0]}
+        metrics[title] = summarize_rows(rows)
     return metrics
 
 
@@ -213,7 +233,74 @@ def _confidence_of_run(known: Predictions, truth: NDArray[np.intp], unknown: Pre
         "accuracy_at_coverage": accepted.accuracy,
         "auroc_known": auroc(every, np.arange(len(every)) < len(confidence)),
         "unknown_refused": float((of_unknown < accepted.threshold).mean()) if len(of_unknown) else np.nan,
+        "unknown_named": float(unknown_named(confidence[correct], of_unknown, COVERAGE)),
     }
+
+
+def _placements(
+    fused: Mapping[str, Mapping[int, Predictions]],
+    placement: NDArray[np.intp],
+    truth: NDArray[np.intp],
+    described: NDArray[np.bool_],
+) -> dict[str, Any]:
+    """Return the number of placements, and accuracy over placements and steadiness of each fusion."""
+    correct = _correct(fused, truth, described)
+    return {
+        "count": len(np.unique(placement)),
+        "accuracy": {
+            title: summarize_runs([placement_accuracy(placement, marks) for marks in each])
+            for title, each in correct.items()
+        },
+        "steadiness": {
+            title: summarize_runs([steadiness(placement, _class_or_none(p, described)) for p in by_run.values()])
+            for title, by_run in fused.items()
+        },
+    }
+
+
+def _class_or_none(predictions: Predictions, described: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Return the predicted class of every instance [N]; -1 of those that were not described."""
+    answers = np.full(len(described), -1, np.intp)
+    answers[described] = predictions.class_index
+    return answers
+
+
+def _rejection(
+    known: Predictions,
+    truth: NDArray[np.intp],
+    described: NDArray[np.bool_],
+    unknown: Predictions,
+    threshold: float,
+) -> dict[str, float]:
+    """Return shares of the known and the unknown objects without rejection and at the run's threshold."""
+    correct = np.zeros(len(truth), bool)
+    correct[described] = known.class_index == truth[described]
+    named = described.copy()
+    named[described] = known.confidence >= threshold
+    return {
+        "threshold": threshold or np.nan,
+        "accuracy": float(correct.mean()),
+        "incorrect": float((described & ~correct).mean()),
+        "accuracy_at_threshold": float((correct & named).mean()),
+        "incorrect_at_threshold": float((named & ~correct).mean()),
+        "unknown_named_at_threshold": float((unknown.confidence >= threshold).mean())
+        if len(unknown.confidence)
+        else np.nan,
+    }
+
+
+def _known_unknown(
+    predictions: Sequence[tuple[Predictions, Predictions]], truth: NDArray[np.intp]
+) -> dict[str, list[float]] | None:
+    """Return the known/unknown curve, the mean over the runs; None without unknown objects or correct answers.
+
+    Args:
+        predictions: predictions for known and for unknown objects of each run.
+        truth: [N] classes of the known objects.
+    """
+    named = np.array([unknown_named(k.confidence[k.class_index == truth], u.confidence, CURVE) for k, u in predictions])
+    named = named[np.isfinite(named).all(axis=1)]
+    return {"kept": list(CURVE), "named": named.mean(axis=0).tolist()} if len(named) else None
 
 
 def _reliability(predictions: Sequence[Predictions], truth: NDArray[np.intp]) -> dict[str, list[Any]]:

@@ -64,6 +64,11 @@ class Run:
         """What the recognizer answers by: "classifiers", "gallery" or "both"."""
         return self.recognizer.answers_by()
 
+    @property
+    def threshold(self) -> float:
+        """Confidence below which the recognizer answers that an object is unknown; 0 if it names every object."""
+        return self.recognizer.unknown_below
+
     def probabilities(
         self, frame: str, described: DescribedFrame, inputs: BaselineInputs | None
     ) -> dict[str, NDArray[np.float32]]:
@@ -152,6 +157,11 @@ class SequenceRun(Run):
     def classes(self) -> tuple[str, ...]:
         """Class names of all runs, sorted."""
         return tuple(sorted({name for run in self.of_sequence.values() for name in run.classes}))
+
+    @property
+    def threshold(self) -> float:
+        """0: the runs of the sequences have different thresholds."""
+        return 0.0
 
     def probabilities(
         self, frame: str, described: DescribedFrame, inputs: BaselineInputs | None

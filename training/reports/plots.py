@@ -18,6 +18,7 @@ __all__ = [
     "draw_accuracy",
     "draw_confusion",
     "draw_curves",
+    "draw_known_unknown",
     "draw_reliability",
     "name_style",
     "plain_text",
@@ -152,6 +153,34 @@ def draw_reliability(bins: Mapping[str, Sequence[Any]], name: str, path: str | P
     lower.set(xlabel=f"confidence of {name}", ylabel="answers")
     for axes in (upper, lower):
         axes.spines[["top", "right"]].set_visible(False)
+    save_figure(figure, path)
+
+
+def draw_known_unknown(
+    curve: Mapping[str, Sequence[float]], marked: tuple[float, float], name: str, path: str | Path
+) -> None:
+    """Draw the share of unknown objects that are named against the share of correct answers that are kept.
+
+    Args:
+        curve: "kept" and "named".
+        marked: a point of the curve, which is emphasized.
+        name: name of the recognizer.
+        path: path of the picture.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    figure = Figure(figsize=(5.2, 4.2), layout="constrained")
+    axes = figure.add_subplot()
+    axes.step(curve["kept"], curve["named"], where="pre", color=_COLORS[5])
+    axes.plot([0, 1], [0, 1], color="#222222", linewidth=1, linestyle="--", label="confidence tells nothing")
+    kept, named = marked
+    axes.plot([kept], [named], "o", color=_COLORS[6], label=f"{named:.0%} named where {kept:.0%} are kept")
+    axes.set(xlim=(0, 1.01), ylim=(0, 1.02))
+    axes.set_xlabel(f"correct answers of {name} kept")
+    axes.set_ylabel("unknown objects named")
+    axes.legend(frameon=False, loc="upper left")
+    axes.spines[["top", "right"]].set_visible(False)
     save_figure(figure, path)
 
 

@@ -11,6 +11,7 @@ from training.evaluation.confidence import (
     auroc,
     expected_calibration_error,
     reliability,
+    unknown_named,
 )
 
 
@@ -62,3 +63,23 @@ def test_invalid_arguments_are_refused() -> None:
         auroc([1.5, 0.2], [True, False])
     with pytest.raises(InputError, match="coverage is 0"):
         accuracy_at_coverage([0.5], [True], 0)
+
+
+def test_unknown_named_matches_a_search_of_thresholds() -> None:
+    """The oracle tries every threshold and takes the largest one that keeps enough."""
+    rng = np.random.default_rng(3)
+    correct, unknown = rng.integers(0, 12, 20) / 11, rng.integers(0, 12, 15) / 11
+    kept = np.array([0.05, 0.5, 0.95, 1.0])
+    by_search = []
+    for share in kept:
+        enough = [t for t in np.unique(correct) if (correct >= t).sum() >= share * len(correct) - 1e-9]
+        by_search.append(np.mean(unknown >= max(enough)))
+    assert unknown_named(correct, unknown, kept).tolist() == pytest.approx(by_search)
+    assert unknown_named([0.9, 0.8, 0.7], [0.95, 0.75, 0.1], 2 / 3) == pytest.approx(1 / 3)
+    assert unknown_named([0.5], [0.9], 0.0) == 0
+
+
+def test_unknown_named_without_answers_is_nan() -> None:
+    assert np.isnan(unknown_named([], [0.5])) and np.isnan(unknown_named([0.5], [], [0.1, 0.2])).all()
+    with pytest.raises(InputError, match="kept"):
+        unknown_named([0.5], [0.5], 1.5)

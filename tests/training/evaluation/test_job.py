@@ -162,6 +162,8 @@ def test_page_for_datasets_of_any_size(tmp_path: Path, n: int) -> None:
     assert len(shown) == min(n, 12) and len(report["shown"]) == len(shown)
     crops = {str(p["src"]) for p in page.pictures if str(p["src"]).startswith("confusions/")}
     assert len(crops) == len(report["worst"])
+    assert "known-unknown.png" in {p["src"] for p in page.pictures} and "Unknown objects" in page.text
+    assert "Placements" not in page.text  # every toy is arranged anew
     whole = report["accuracy"][report["rule"]][0]["cells"][0]["accuracy"]["THOR2"]
     assert f"{whole['mean']:.3f} ±\u00a0{whole['std']:.3f}" in page.text
     for picture in page.pictures:
@@ -326,3 +328,23 @@ def test_second_evaluation_into_a_directory_is_refused(tmp_path: Path) -> None:
     with locked(tmp_path / "report"), pytest.raises(InputError, match="^out: "):
         evaluate_toys(tmp_path, 2)
     evaluate_toys(tmp_path, 2)
+
+
+def test_page_of_a_video_and_of_stored_thresholds(tmp_path: Path) -> None:
+    """Two frames of one unmoved object are one placement; the threshold 0.5 is in the header."""
+    first = ToyDataset(2)[1]
+
+    class Video(LabelledFrames):
+        identifiers = ["v/0", "v/1"]
+
+        def __getitem__(self, number: int) -> LabelledFrame:
+            return LabelledFrame(self.identifiers[number], first.frame, {2: "mug"}, {})
+
+    runs = toys(tmp_path / "log")
+    for run in runs:
+        run.recognizer.unknown_below = 0.5
+    report = evaluate_dataset(runs, Video(), {"kind": "frames", "path": "v"}, tmp_path / "report")
+    page = ParsedPage((tmp_path / "report" / "report.html").read_text())
+    assert report["placements"]["count"] == 1 and report["placements"]["steadiness"]["THOR2"]["mean"] == 1
+    assert page.open == [] and {"Placements", "Unknown objects"} <= set(page.text)
+    assert any(text.startswith("threshold 0.500") for text in page.text)

@@ -24,6 +24,7 @@ class ToyRun(NamedTuple):
     classes: tuple[str, ...] = CLASSES
     temperatures: Mapping[str, float] = {}
     answer_by: str = "classifiers"
+    threshold: float = 0.0
 
 
 RUNS = [ToyRun("a", ("tops", "tops2")), ToyRun("b", ("ce", "tops", "tops2"))]
@@ -198,6 +199,50 @@ def test_incorrect_answers_are_those_of_the_main_fusion() -> None:
     instances = [InstancePrediction(1, "mug", probabilities=sure), InstancePrediction(2, "dragon", probabilities=sure)]
     incorrect = list(incorrect_answers(FrameAnswers("f", {}, 0.1, instances), RUNS))
     assert [(i.label, answer, confidence) for i, answer, confidence in incorrect] == [(1, "bowl", 1.0)]
+
+
+def sure_of(name: str, confidence: float) -> np.ndarray:
+    """Return probabilities of TOPS and TOPS2 that give a class this confidence and share the rest."""
+    row = np.full(3, (1 - confidence) / 2)
+    row[CLASSES.index(name)] = confidence
+    return np.stack([row, row]).astype(np.float32)
+
+
+def test_rejection_and_placements_match_hand_calculation() -> None:
+    """A mug in four frames, correct in two; a can in one; three dragons. The threshold 0.75 rejects the less sure."""
+    answers = [("mug", 0.9), ("mug", 0.7), ("can", 0.8), ("bowl", 0.6)]
+    dragons: list[tuple[str, float]] = [("mug", 0.8), ("can", 0.65), ("can", 0.5)]
+    frames = [
+        FrameAnswers("f", {}, 1.0, [InstancePrediction(1, "mug", False, None, sure_of(*answer), (0.0, 0.0, 1.0))])
+        for answer in answers
+    ]
+    frames.append(FrameAnswers("g", {}, 1.0, [InstancePrediction(1, "can", False, None, sure_of("can", 0.95))]))
+    frames += [FrameAnswers("h", {}, 1.0, [InstancePrediction(1, "dragon", False, None, sure_of(*d))]) for d in dragons]
+    frames.append(FrameAnswers("i", {}, 1.0, [InstancePrediction(1, "can", reason="too few points")]))
+    report = compute_results("frames", [ToyRun("a", ("tops", "tops2"), threshold=0.75)], frames)
+    placements = report["placements"]
+    assert placements["count"] == 3
+    assert placements["accuracy"]["THOR2"]["mean"] == pytest.approx((2 / 4 + 1 + 0) / 3)
+    assert placements["steadiness"]["THOR2"]["mean"] == pytest.approx(2 / 4)
+    assert {name: value["mean"] for name, value in report["rejection"].items()} == {
+        "threshold": 0.75,
+        "accuracy": pytest.approx(3 / 6),
+        "incorrect": pytest.approx(2 / 6),
+        "accuracy_at_threshold": pytest.approx(2 / 6),
+        "incorrect_at_threshold": pytest.approx(1 / 6),
+        "unknown_named_at_threshold": pytest.approx(1 / 3),
+    }
+    curve = report["known_unknown"]
+    points = dict(zip(curve["kept"], curve["named"], strict=True))
+    assert [points[0.0], points[0.33], points[0.5], points[0.95], points[1.0]] == pytest.approx([0, 0, 0, 1 / 3, 1 / 3])
+    assert report["confidence"]["THOR2"]["unknown_named"]["mean"] == pytest.approx(1 / 3)
+
+
+def test_runs_without_threshold_or_unknown_objects() -> None:
+    frames = [FrameAnswers("f", {}, 1.0, [InstancePrediction(1, "mug", False, None, sure_of("mug", 0.9))])]
+    report = compute_results("frames", RUNS[:1], frames)
+    assert report["known_unknown"] is None
+    assert report["rejection"]["threshold"]["runs"] == report["rejection"]["unknown_named_at_threshold"]["runs"] == 0
 
 
 @pytest.mark.parametrize("kept", [0, 1])

@@ -15,7 +15,14 @@ from training.fitting.options import FitOptions
 from training.objects.builtin_objects import builtin_objects
 from training.reports.html import Picture, Section, write_page
 from training.reports.object_plots import draw_descriptor, draw_objects
-from training.reports.plots import draw_accuracy, draw_confusion, draw_curves, draw_reliability, plain_text
+from training.reports.plots import (
+    draw_accuracy,
+    draw_confusion,
+    draw_curves,
+    draw_known_unknown,
+    draw_reliability,
+    plain_text,
+)
 
 
 def test_page_escapes_its_content(tmp_path: Path) -> None:
@@ -39,6 +46,7 @@ def test_every_plot_is_drawn(tmp_path: Path) -> None:
     draw_accuracy(("A", "B"), {"all": [0.5, 1.0], "few": [0.0, 0.25]}, {"all": 4, "few": 1}, tmp_path / "accuracy.png")
     draw_curves({"ce": [{"epoch": 1, "loss": 1.0, "accuracy": 0.5}]}, tmp_path / "curves.png")
     draw_confusion(np.array([[0, 1, 0], [0, 0, 1]]), ("a", "b"), "THOR2", tmp_path / "confusion.png")
+    draw_known_unknown({"kept": [0, 0.5, 1], "named": [0, 0.1, 1]}, (0.5, 0.1), "THOR2", tmp_path / "known-unknown.png")
     draw_reliability({"answers": [0, 3], "accuracy": [None, 0.5]}, "THOR2", tmp_path / "reliability.png")
     points = np.random.default_rng(0).random((200, 3)) * (0.2, 0.1, 0.05) + (0, 0, 1)
     draw_descriptor(
@@ -50,7 +58,10 @@ def test_every_plot_is_drawn(tmp_path: Path) -> None:
         tmp_path / "descriptor.png",
     )
     files = sorted(p.name for p in tmp_path.iterdir())
-    assert files == ["accuracy.png", "confusion.png", "curves.png", "descriptor.png", "objects.png", "reliability.png"]
+    assert files == [
+        "accuracy.png", "confusion.png", "curves.png", "descriptor.png", "known-unknown.png", "objects.png",
+        "reliability.png",
+    ]  # fmt: skip
     assert all(colors_in(tmp_path / name) > 10 for name in files)
 
 
