@@ -62,6 +62,6 @@ def _position(frame: RGBDFrame, label: int) -> tuple[float, float, float] | None
     pixels, depth = pixels[depth > 0], depth[depth > 0]
     if not len(pixels):
         return None
-    points = pixel_rays(pixels, frame.labels.shape[1], frame.intrinsics) * depth[:, None]
+    points = pixel_rays(pixels, frame.depth.shape[1], frame.intrinsics) * depth[:, None]
     x, y, z = np.median(points, axis=0).round(4).tolist()
     return x, y, z
