@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 import colornet
+from thor2_jax.tables import read_table
 from thor2_jax.testing import damaged, networks
 from training.objects.meshes import read_names
 from training.readers.bop import BOP
@@ -22,7 +23,6 @@ from training.readers.frames import FrameFolder
 from training.readers.ocid import OCID
 from training.readers.pcd import read_organized_points
 from training.readers.uwis import UWISOccluded
-from training.storage.tables import read_table
 from training.views.dataset import MANIFEST, Manifest, Shard, ViewDataset, encode
 from training.views.normalized_views import NormalizedViews
 

@@ -9,14 +9,11 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from thor2_jax.recognition.frames import RGBDFrame, pixel_rays
+from thor2_jax.recognition.frames import MAX_DEPTH, MIN_DEPTH, RGBDFrame, pixel_rays
 from thor2_jax.recognition.outlier_removal import flying_pixels, remove_outliers
 from thor2_jax.recognition.voxel_grid import voxel_downsample
 
 __all__ = ["MAX_DEPTH", "MIN_DEPTH", "MIN_POINTS", "InstanceCloud", "instance_cloud", "instance_clouds"]
-
-MIN_DEPTH, MAX_DEPTH = 0.26, 2.5
-"""Range of valid depth, metres."""
 
 CLOUD_VOXEL = 0.003
 """Voxel side of the grid on which outliers are removed, metres."""
@@ -71,8 +68,17 @@ def instance_cloud(frame: RGBDFrame, label: int) -> InstanceCloud:
     if len(points) < MIN_POINTS:
         reason = (
             f"{len(points)} points ({len(pixels)} pixels, {len(valid)} of them with depth "
-            f"from {MIN_DEPTH} to {MAX_DEPTH} m); expected at least {MIN_POINTS}"
+            f"from {MIN_DEPTH} to {MAX_DEPTH} m); expected at least {MIN_POINTS}{_unit_question(frame)}"
         )
         return InstanceCloud(label, points, colors, len(pixels), reason=reason)
     kept, relaxed = remove_outliers(points)
     return InstanceCloud(label, points.take(kept, axis=0), colors.take(kept, axis=0), len(pixels), steep or relaxed)
+
+
+def _unit_question(frame: RGBDFrame) -> str:
+    """Ask whether the unit of depth is right if no instance of the frame has usable depth."""
+    if frame.has_usable_depth:
+        return ""
+    if frame.depth.dtype.kind == "f":
+        return "; no instance has such depth: is depth, in floating point, in metres?"
+    return f"; no instance has such depth: is depth_scale right? It is {frame.intrinsics.depth_scale:g} units per metre"

@@ -12,8 +12,8 @@ from trimesh.visual.material import PBRMaterial, SimpleMaterial, empty_material
 
 from thor2_jax.errors import InputError
 from thor2_jax.recognition.frames import MAX_IMAGE_PIXELS
+from thor2_jax.tables import parse_json, parse_yaml
 from training.objects.mesh import TexturedMesh, merge_meshes
-from training.storage.tables import parse_json, parse_yaml
 
 __all__ = ["MESH_SUFFIXES", "find_meshes", "load_mesh", "read_names"]
 

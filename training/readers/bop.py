@@ -5,7 +5,6 @@ and, optionally `scene_gt_info.json`; see docs/bop_datasets_format.md of github.
 numbers its objects; a YAML or JSON file names them, obj_id -> name.
 """
 
-import dataclasses
 import functools
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,8 +15,8 @@ from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError, with_context
 from thor2_jax.recognition.frames import Intrinsics, RGBDFrame, read_color, read_depth, read_labels
+from thor2_jax.tables import read_table
 from training.readers.labelled import LabelledFrame, LabelledFrames
-from training.storage.tables import read_table
 
 __all__ = ["BOP", "SMALLEST_VISIBLE"]
 
@@ -163,6 +162,4 @@ def _intrinsics(entry: Any) -> Intrinsics:
         matrix, scale = entry["cam_K"], entry["depth_scale"]
     except (TypeError, KeyError):
         raise InputError("an image's entry is not {cam_K: <9 numbers>, depth_scale: <number>, ...}") from None
-    intrinsics = Intrinsics.of_matrix(matrix, scale)
-    # The format has millimetres per depth unit, Intrinsics have depth units per metre.
-    return dataclasses.replace(intrinsics, depth_scale=1000 / scale)
+    return Intrinsics.of({"cam_K": matrix, "depth_scale": scale})

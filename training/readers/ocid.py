@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError, with_context
 from thor2_jax.recognition.frames import Intrinsics, RGBDFrame, read_color, read_depth, read_labels
+from thor2_jax.tables import read_table
 from training.readers.labelled import LabelledFrame, LabelledFrames, path_ends
 from training.readers.pcd import read_organized_points
-from training.storage.tables import read_table
 
 __all__ = ["OCID", "fit_intrinsics"]
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from thor2_jax.recognition.frames import RGBDFrame
+from thor2_jax.recognition.frames import Intrinsics, RGBDFrame
 from training.objects.builtin_objects import builtin_objects
 from training.rendering.scenes import compose_scene
 
@@ -72,4 +72,9 @@ def _write(frame: RGBDFrame, directory: Path) -> None:
     Image.fromarray(frame.color).save(directory / "color.jpg", quality=85, subsampling=0)
     Image.fromarray(frame.depth).save(directory / "depth.png", optimize=True)
     Image.fromarray(frame.label_image).save(directory / "labels.png", optimize=True)
-    (directory / "intrinsics.json").write_text(json.dumps(dataclasses.asdict(frame.intrinsics)) + "\n")
+    (directory / "intrinsics.json").write_text(json.dumps(_known(frame.intrinsics)) + "\n")
+
+
+def _known(intrinsics: Intrinsics) -> dict[str, float]:
+    """Return the attributes that are given."""
+    return {name: value for name, value in dataclasses.asdict(intrinsics).items() if value}

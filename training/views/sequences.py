@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from thor2_jax.errors import InputError
-from training.storage.tables import read_table
+from thor2_jax.tables import read_table
 from training.views.left_out import WithoutClasses
 from training.views.normalized_views import ViewSource
 

@@ -44,7 +44,7 @@ def arrays(height: int = 5, width: int = 7) -> dict[str, Any]:
 
 @pytest.mark.parametrize("name", ["fx", "fy", "cx", "cy", "depth_scale"])
 @pytest.mark.parametrize(
-    "value", [math.nan, math.inf, -math.inf, "500", None, True, [500], 1 + 0j, 1.1e9, -1.1e9, 2 * 10**30, 10**400]
+    "value", [math.nan, math.inf, -math.inf, "500", True, [500], 1 + 0j, 1.1e9, -1.1e9, 2 * 10**30, 10**400]
 )
 def test_intrinsics_that_are_not_finite_numbers(name: str, value: Any) -> None:
     values = {"fx": 500, "fy": 500, "cx": 3, "cy": 2, name: value}
@@ -76,14 +76,14 @@ def test_intrinsics_that_are_incomplete(missing: str) -> None:
         Intrinsics.of(values)
 
 
-@pytest.mark.parametrize("values", [None, 3, [500, 500, 3, 2], "fx"])
+@pytest.mark.parametrize("values", [None, 3, [500, 500, 3, 2], "fx", b"fx"])
 def test_intrinsics_that_are_not_a_mapping(values: Any) -> None:
-    with pytest.raises(InputError, match=rf"^intrinsics is a {type(values).__name__};"):
+    with pytest.raises(InputError, match=rf"^intrinsics is a {type(values).__name__}(;| of shape)"):
         Intrinsics.of(values)
 
 
 def test_other_entries_of_intrinsics_are_ignored() -> None:
-    assert Intrinsics.of({"fx": 1, "fy": 2, "cx": 3, "cy": 4, "width": 640}) == Intrinsics(1, 2, 3, 4, 1000.0)
+    assert Intrinsics.of({"fx": 1, "fy": 2, "cx": 3, "cy": 4, "name": "left"}) == Intrinsics(1, 2, 3, 4, 1000.0)
     assert Intrinsics.of({"fx": 1, "fy": 2, "cx": 3, "cy": 4, "depth_scale": 5}).depth_scale == 5
 
 
@@ -320,14 +320,8 @@ def test_color_files_of_jpeg(tmp_path: Path) -> None:
 @pytest.mark.parametrize("mode", ["L", "P", "RGB", "1"])
 def test_depth_files_that_are_not_16_bit(tmp_path: Path, mode: str) -> None:
     Image.new(mode, (7, 5)).save(tmp_path / "d.png")
-    with pytest.raises(InputError, match=r"^depth: .*16 bits"):
+    with pytest.raises(InputError, match=r"^depth: .*expected one channel of 16-bit"):
         read_depth(tmp_path / "d.png")
-
-
-def test_depth_files_of_float(tmp_path: Path) -> None:
-    Image.fromarray(np.ones((5, 7), np.float32)).save(tmp_path / "d.tiff")
-    with pytest.raises(InputError, match=r"^depth: .*type float32; expected"):
-        read_depth(tmp_path / "d.tiff")
 
 
 def test_depth_files_of_16_bit(tmp_path: Path) -> None:
@@ -376,12 +370,12 @@ def test_label_files_that_are_not_integers(tmp_path: Path, mode: str) -> None:
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("", "is not valid JSON"),
+        ("", "intrinsics is a NoneType"),
         ("{", "is not valid JSON"),
-        ("fx: 500", "is not valid JSON"),
+        ("fx: 500", "intrinsics lacks fy, cx, cy"),
         ("[" * 100_000, "is not valid JSON"),
-        ("\xff", "is not valid JSON"),
-        ("[500, 500, 3, 2]", "intrinsics is a list"),
+        ("\xff", "is neither JSON, YAML"),
+        ("[500, 500, 3, 2]", "intrinsics is a list of shape (4,)"),
         ("null", "intrinsics is a NoneType"),
         ('{"fx": 500, "fy": 500}', "intrinsics lacks cx, cy"),
         ('{"fx": "500", "fy": 500, "cx": 3, "cy": 2}', "intrinsics.fx is '500'"),

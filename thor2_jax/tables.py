@@ -1,11 +1,9 @@
-"""Tables in JSON and YAML files."""
+"""Values in JSON and YAML files."""
 
 import json
 import math
 from pathlib import Path
 from typing import Any
-
-import yaml
 
 from thor2_jax.errors import InputError
 
@@ -34,6 +32,8 @@ def parse_yaml(content: bytes) -> Any:
     Raises:
         ValueError: if the file is damaged, larger than `MAX_YAML_BYTES` or expands to more than `MAX_YAML_VALUES`.
     """
+    import yaml
+
     if len(content) > MAX_YAML_BYTES:
         raise ValueError(f"it has {len(content)} bytes; expected at most {MAX_YAML_BYTES}")
     try:

@@ -2,7 +2,7 @@
 
 import pytest
 
-from training.storage import tables
+from thor2_jax import tables
 
 
 def test_shared_and_nested_yaml_values_are_read() -> None:
