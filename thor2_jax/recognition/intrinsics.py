@@ -192,7 +192,8 @@ def _of_pinhole(values: Mapping[Any, Any]) -> Intrinsics:
     if None not in (width, height) and _is_number(scale) and 0 < scale <= MAX_BOP_CAMERA_SCALE:
         scale = 1000 / scale  # BOP's camera.json
     distortion = _supported(values.get("distortion_model"), _given(values, "distortion", ()))
-    return Intrinsics(*(values[name] for name in _PINHOLE), scale, width, height, distortion)
+    fx, fy, cx, cy = (values[name] for name in _PINHOLE)
+    return Intrinsics(fx, fy, cx, cy, scale, width, height, distortion)
 
 
 def _of_realsense(values: Mapping[Any, Any]) -> Intrinsics:
