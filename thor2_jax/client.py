@@ -1,14 +1,22 @@
 """Client of the inference service.
 
 >>> client = Client("http://127.0.0.1:8080")                                        # doctest: +SKIP
->>> client.recognize(color="c.png", depth="d.png", labels="l.png", intrinsics="k.json")     # doctest: +SKIP
+>>> frame = {"color": "c.png", "depth": "d.png", "labels": "l.png", "intrinsics": "k.json"}
+>>> client.recognize(**frame)                                                       # doctest: +SKIP
 [Recognition(label=1, name='mug', confidence=0.98, ...)]
+
+A service that teaches (`thor2 serve --teach`) enrolls and forgets objects:
+
+>>> client.enroll("teapot", **frame, instance=3)["views"]                           # doctest: +SKIP
+1
+>>> client.forget("teapot")                                                         # doctest: +SKIP
 """
 
 import io
 import json
 import secrets
 import urllib.error
+import urllib.parse
 import urllib.request
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -72,10 +80,7 @@ class Client:
             ServiceError: the service returned an error.
             OSError: a file cannot be read, or the service cannot be reached.
         """
-        files = {name: _read(file) for name, file in (("color", color), ("depth", depth), ("labels", labels))}
-        files["intrinsics"] = (
-            json.dumps(dict(intrinsics)).encode() if isinstance(intrinsics, Mapping) else _read(intrinsics)
-        )
+        files = _frame_files(color, depth, labels, intrinsics)
         answer = json.loads(self._request("/v1/recognize", *multipart(files)))
         return [_recognition(instance) for instance in answer["instances"]]
 
@@ -107,8 +112,71 @@ class Client:
         """Return the classes, classifiers, descriptor version and configuration of the model. Raises as `describe`."""
         return json.loads(self._request("/v1/model"))
 
-    def _request(self, path: str, content_type: str | None = None, body: bytes | None = None) -> bytes:
-        request = urllib.request.Request(self._url + path, data=body)
+    def objects(self) -> list[dict[str, Any]]:
+        """Return the objects that may be answered: name, trained, views, source and date. Raises as `describe`."""
+        return json.loads(self._request("/v1/objects"))["objects"]
+
+    def enroll(
+        self,
+        name: str,
+        *,
+        color: str | Path | bytes,
+        depth: str | Path | bytes,
+        labels: str | Path | bytes,
+        intrinsics: Any,
+        instance: int,
+        extend: bool = False,
+        replace: bool = False,
+    ) -> dict[str, Any]:
+        """Enroll an object from one instance of a frame; all processes of the service recognize it from now on.
+
+        Args:
+            name: name of the object.
+            color: see `recognize`.
+            depth: see `recognize`.
+            labels: see `recognize`.
+            intrinsics: see `recognize`.
+            instance: number of the object in `labels`.
+            extend: add the view to those of an object with this name.
+            replace: discard the views, and the output of the classifiers, of an object with this name.
+
+        Returns:
+            The record of the object, as in `objects`, with the generation of the gallery, for `undo`, and timings.
+
+        Raises:
+            ServiceError: as `describe`; status 409 if the name exists and neither `extend` nor `replace` is given.
+            OSError: as `recognize`.
+        """
+        files = _frame_files(color, depth, labels, intrinsics)
+        flags = {"extend": str(extend).lower(), "replace": str(replace).lower()}
+        fields = {"name": name, "instance": str(instance), **flags}
+        files |= {field: value.encode() for field, value in fields.items()}
+        return json.loads(self._request("/v1/objects", *multipart(files)))
+
+    def forget(self, name: str) -> int:
+        """Forget an object, and return the generation of the gallery, for `undo`.
+
+        Raises:
+            ServiceError: as `describe`; status 404 if no object has this name.
+            OSError: the service cannot be reached.
+        """
+        path = f"/v1/objects/{urllib.parse.quote(name, safe='')}"
+        return int(json.loads(self._request(path, method="DELETE"))["generation"])
+
+    def undo(self, generation: int) -> int:
+        """Take back the change of the gallery that gave it this generation, and return the new one.
+
+        Raises:
+            ServiceError: as `describe`; status 409 if another change was made since.
+            OSError: the service cannot be reached.
+        """
+        form = multipart({"generation": str(generation).encode()})
+        return int(json.loads(self._request("/v1/objects/undo", *form))["generation"])
+
+    def _request(
+        self, path: str, content_type: str | None = None, body: bytes | None = None, method: str | None = None
+    ) -> bytes:
+        request = urllib.request.Request(self._url + path, data=body, method=method)
         if content_type is not None:
             request.add_header("Content-Type", content_type)
         if self._token is not None:
@@ -119,6 +187,16 @@ class Client:
         except urllib.error.HTTPError as error:
             with error:
                 raise _service_error(error) from None
+
+
+def _frame_files(
+    color: str | Path | bytes, depth: str | Path | bytes, labels: str | Path | bytes, intrinsics: Any
+) -> dict[str, bytes]:
+    files = {name: _read(file) for name, file in (("color", color), ("depth", depth), ("labels", labels))}
+    files["intrinsics"] = (
+        json.dumps(dict(intrinsics)).encode() if isinstance(intrinsics, Mapping) else _read(intrinsics)
+    )
+    return files
 
 
 def _read(file: str | Path | bytes) -> bytes:

@@ -1,7 +1,7 @@
 """Views of an object, embedded for a gallery, and queries embedded in several orientations."""
 
 import datetime
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,15 @@ from thor2_jax.recognition.frames import RGBDFrame
 from thor2_jax.recognition.prepared_instance import PreparedInstance, pack_instances, prepare_instance
 from thor2_jax.types import PointClouds
 
-__all__ = ["ORIENTATIONS", "embed_orientations", "embed_views", "enrolled_views", "instance_view"]
+__all__ = [
+    "ORIENTATIONS",
+    "embed_orientations",
+    "embed_views",
+    "enrolled_object",
+    "enrolled_views",
+    "instance_view",
+    "views_to_embed",
+]
 
 ORIENTATIONS = 2
 """Candidate orientations of a view, each of which is embedded, and of a query, whose scores are averaged. Four are no
@@ -55,40 +63,38 @@ def instance_view(frame: RGBDFrame, label: int | None, sigma_s: float) -> Prepar
     return view
 
 
-def embed_views(
-    embedding: Embedding,
-    clouds: CompactClouds,
-    source: str,
-    pack: Callable[[Sequence[PreparedInstance]], PointClouds] | None = None,
-) -> NDArray[np.float16]:
+def views_to_embed(clouds: CompactClouds, source: str) -> list[PreparedInstance]:
+    """Return an object's views as they are embedded: a few that do not come from a mesh get augmented copies."""
+    views = list(clouds.views())
+    return views if source == "mesh" else views + augmented_copies(views)
+
+
+def embed_views(embedding: Embedding, clouds: CompactClouds, source: str) -> NDArray[np.float16]:
     """Return the embeddings [E, D] of an object's views.
 
     Args:
         embedding: the embedding.
         clouds: the views.
-        source: "mesh", or where else they come from: a few views get augmented copies.
-        pack: function that packs up to `ROWS` views as a batch; its shapes determine what is compiled.
+        source: "mesh", or where else they come from.
     """
-    views = list(clouds.views())
-    if source != "mesh":
-        views += augmented_copies(views)
     # Views of similar size share a bucket.
-    views.sort(key=lambda view: point_bucket(len(view.points)))
+    views = sorted(views_to_embed(clouds, source), key=lambda view: point_bucket(len(view.points)))
     batches = []
     for start in range(0, len(views), ROWS):
         chunk = views[start : start + ROWS]
-        packed = pack(chunk) if pack else pack_instances(chunk, ROWS)
-        batches.append((len(chunk), embed_orientations(embedding, packed)))
+        batches.append((len(chunk), embed_orientations(embedding, pack_instances(chunk, ROWS))))
     embedded = [np.asarray(batch)[:count] for count, batch in batches]
     return np.concatenate(embedded).reshape(-1, embedded[0].shape[-1]).astype(np.float16)
 
 
-def enrolled_views(
-    embedding: Embedding,
-    views: Iterable[PreparedInstance],
-    source: str,
-    pack: Callable[[Sequence[PreparedInstance]], PointClouds] | None = None,
-) -> GalleryObject:
+def enrolled_object(embeddings: NDArray[Any], clouds: CompactClouds, source: str) -> GalleryObject:
+    """Return an object that is enrolled now; `embeddings` [..., D] are those of `views_to_embed`."""
+    date = datetime.datetime.now().astimezone().isoformat(timespec="seconds")
+    flat = embeddings.reshape(-1, embeddings.shape[-1]).astype(np.float16)
+    return GalleryObject(flat, clouds, source, date)
+
+
+def enrolled_views(embedding: Embedding, views: Iterable[PreparedInstance], source: str) -> GalleryObject:
     """Return the views of an object as a gallery stores them; the arguments are those of `embed_views`.
 
     Raises:
@@ -97,5 +103,4 @@ def enrolled_views(
     clouds = CompactClouds.of(list(views))
     if not len(clouds):
         raise InputError("views is empty; expected at least one view of the object")
-    date = datetime.datetime.now().astimezone().isoformat(timespec="seconds")
-    return GalleryObject(embed_views(embedding, clouds, source, pack), clouds, source, date)
+    return enrolled_object(embed_views(embedding, clouds, source), clouds, source)

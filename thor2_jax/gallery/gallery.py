@@ -98,9 +98,7 @@ class Gallery:
         if extend and replace:
             raise InputError("extend and replace are both given; choose one")
         if name in self.objects and not (extend or replace):
-            raise InputError(
-                f"name: {name!r} is enrolled already; extend it with more views (--extend) or replace it (--replace)"
-            )
+            raise InputError(f"name: {name!r} is enrolled already; add views to it (extend) or replace it (replace)")
         if name in self.objects and extend:
             views = self.objects[name] + views
         return dataclasses.replace(self, objects={**self.objects, name: views})

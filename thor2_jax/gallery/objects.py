@@ -1,6 +1,7 @@
 """The enrolled objects of a recognizer: a gallery that can be taught, in memory or on disk, with its embedding."""
 
 import dataclasses
+import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from thor2_jax.gallery.clouds import CompactClouds
 from thor2_jax.gallery.embedding import Embedding, load_default
 from thor2_jax.gallery.enrollment import embed_orientations, embed_views, enrolled_views
 from thor2_jax.gallery.gallery import Gallery, GalleryObject
-from thor2_jax.gallery.store import StoredGallery, gallery_stamp, load_gallery, update_gallery
+from thor2_jax.gallery.store import StoredGallery, gallery_stamp, load_gallery, undo_change, update_gallery
 from thor2_jax.gallery.union import ClassUnion
 from thor2_jax.recognition.prepared_instance import PreparedInstance
 from thor2_jax.types import PointClouds
@@ -23,7 +24,12 @@ __all__ = ["ObjectGallery"]
 class ObjectGallery:
     """Enrolled objects beside the trained classes of a run.
 
-    Each change is one immutable gallery in place of another, so that another thread reads the one or the other.
+    Each change is one immutable gallery in place of another, so that another thread reads the one or the other. A
+    shallow copy shares the gallery, and neither sees what is changed through the other one before it is refreshed.
+
+    Attributes:
+        lock_seconds: time that a change waits for another process that writes to the gallery; None is the default of
+            `store`.
     """
 
     def __init__(self, trained: tuple[str, ...], embedding: Embedding | None = None, search: str = "exact") -> None:
@@ -42,7 +48,7 @@ class ObjectGallery:
         self._embedding = embedding
         self._directory: Path | None = None
         self._stored = StoredGallery(Gallery("", search=search), {}, 0)
-        self._stamp: tuple[int, int, int] | None = None
+        self.lock_seconds: float | None = None
         self._union = self._stored.gallery, ClassUnion(trained)
 
     def open(self, directory: Path, *, reembed: bool = False) -> None:
@@ -56,7 +62,7 @@ class ObjectGallery:
             InputError: see `refresh`.
             OSError: the gallery cannot be written; it is as before.
         """
-        self._directory, self._stamp = directory, None
+        self._directory, self._stored = directory, dataclasses.replace(self._stored, stamp=None)
         if reembed and gallery_stamp(directory) is not None:
             self._change(self._reembedded)
         else:
@@ -73,6 +79,16 @@ class ObjectGallery:
     def gallery(self) -> Gallery:
         """The gallery."""
         return self._stored.gallery
+
+    @property
+    def directory(self) -> Path | None:
+        """Directory of the gallery; None if it is in memory."""
+        return self._directory
+
+    @property
+    def generation(self) -> int:
+        """Number of changes of the gallery on disk."""
+        return self._stored.generation
 
     @property
     def union(self) -> ClassUnion:
@@ -95,22 +111,32 @@ class ObjectGallery:
         Raises:
             InputError: it cannot be read, or has another embedding; the gallery in memory stays.
         """
-        stamp = None if self._directory is None else gallery_stamp(self._directory)
-        if self._directory is None or stamp == self._stamp:
+        if self._directory is None or gallery_stamp(self._directory) == self._stored.stamp:
             return False
         self._set(load_gallery(self._directory, self.embedding.fingerprint, self._stored))
-        self._stamp = stamp
         return True
 
     def _change(self, change: Callable[[Gallery], Gallery], embedding: str | None = None) -> None:
         if self._directory is None:
             self._stored = dataclasses.replace(self._stored, gallery=change(self.gallery))
         else:
-            self._set(update_gallery(self._directory, change, embedding, self._stored))
-            self._stamp = gallery_stamp(self._directory)
+            self._set(update_gallery(self._directory, change, embedding, self._stored, self.lock_seconds))
 
     def _set(self, stored: StoredGallery) -> None:
         self._stored = dataclasses.replace(stored, gallery=dataclasses.replace(stored.gallery, search=self._search))
+
+    def check_writable(self) -> None:
+        """Raise InputError unless changes can be written to the directory, which is created if it is missing."""
+        if self._directory is None:
+            return
+        try:
+            self._directory.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=self._directory):
+                pass
+        except OSError as error:
+            raise InputError(
+                f"gallery: {self._directory} cannot be written ({error.strerror}); choose another directory (--gallery)"
+            ) from None
 
     def check(self, name: str, *, extend: bool = False, replace: bool = False) -> None:
         """Raise InputError if `enroll` would refuse the name; a check before views are rendered or embedded."""
@@ -127,7 +153,7 @@ class ObjectGallery:
                     gallery = dataclasses.replace(gallery, hidden=(*gallery.hidden, name))
                 elif not extend:
                     raise InputError(
-                        f"name: {name!r} is a trained class; add views to it (--extend) or replace it (--replace)"
+                        f"name: {name!r} is a trained class; add views to it (extend) or replace it (replace)"
                     )
         return gallery
 
@@ -139,7 +165,6 @@ class ObjectGallery:
         *,
         extend: bool = False,
         replace: bool = False,
-        pack: Callable[[Sequence[PreparedInstance]], PointClouds] | None = None,
     ) -> None:
         """Enroll an object from prepared views.
 
@@ -149,7 +174,6 @@ class ObjectGallery:
             source: "frames", or "mesh" for views that get no augmented copies.
             extend: add the views to those of an object with this name.
             replace: discard the views, and the output of the classifiers, of an object with this name.
-            pack: see `enrollment.embed_views`.
 
         Raises:
             InputError: a view cannot be used, or the name exists and neither `extend` nor `replace` is given. Nothing
@@ -157,7 +181,7 @@ class ObjectGallery:
             OSError: the gallery cannot be written; it is as before.
         """
         self.check(name, extend=extend, replace=replace)
-        self.add({name: enrolled_views(self.embedding, views, source, pack)}, extend=extend, replace=replace)
+        self.add({name: enrolled_views(self.embedding, views, source)}, extend=extend, replace=replace)
 
     def add(self, objects: Mapping[str, GalleryObject], *, extend: bool = False, replace: bool = False) -> None:
         """Add embedded objects in one change; the arguments and errors are those of `enroll`."""
@@ -181,6 +205,18 @@ class ObjectGallery:
             return gallery.without(name, hide=name in self._trained and name not in gallery.hidden)
 
         self._change(change, self.embedding.fingerprint)
+
+    def undo(self, generation: int) -> None:
+        """Take back the last change of a gallery on disk; `generation` is the one after that change.
+
+        Raises:
+            InputError: the gallery is in memory, or as `store.undo_change`.
+            OSError: the gallery cannot be written; it is as before.
+        """
+        if self._directory is None:
+            raise InputError("undo needs a gallery on disk; open one")
+        fingerprint = self.embedding.fingerprint
+        self._set(undo_change(self._directory, generation, fingerprint, self._stored, self.lock_seconds))
 
     def _reembedded(self, gallery: Gallery) -> Gallery:
         embedding = self.embedding

@@ -2,10 +2,11 @@
 
 GALLERY/index.json                      format, generation, fingerprint of the embedding, hidden classes, and for each
                                         object its name, file, number of views, source and date
+GALLERY/previous.json                   index.json before the last change, so that it can be taken back
 GALLERY/objects/<SHA-256>.safetensors   embeddings and compact clouds of one object
 
 A writer holds the lock, writes the files of new objects and then replaces index.json: the gallery on disk is always the
-one before or the one after a change. Files that no index names are removed by the next writer.
+one before or the one after a change. Files that index.json does not name are removed by the next writer.
 """
 
 import contextlib
@@ -27,7 +28,18 @@ from thor2_jax.files import atomic_write, content_digest, write_text
 from thor2_jax.gallery.clouds import CompactClouds
 from thor2_jax.gallery.gallery import Gallery, GalleryObject, check_name
 
-__all__ = ["GALLERY_DIRECTORY", "INDEX_FILE", "StoredGallery", "update_gallery", "load_gallery", "gallery_stamp"]
+__all__ = [
+    "GALLERY_DIRECTORY",
+    "INDEX_FILE",
+    "LOCK_SECONDS",
+    "GalleryBusyError",
+    "GalleryError",
+    "StoredGallery",
+    "gallery_stamp",
+    "load_gallery",
+    "undo_change",
+    "update_gallery",
+]
 
 GALLERY_FORMAT = 1
 """Version of the layout above."""
@@ -37,8 +49,18 @@ GALLERY_DIRECTORY = "gallery"
 
 INDEX_FILE = "index.json"
 
+PREVIOUS_FILE = "previous.json"
+
 LOCK_SECONDS = 20.0
 """Time that a writer waits for another one; a change takes milliseconds."""
+
+
+class GalleryError(InputError):
+    """A gallery on disk cannot be used: it is damaged or has another embedding. The message names its file."""
+
+
+class GalleryBusyError(GalleryError):
+    """Another process is writing to the gallery."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -49,18 +71,20 @@ class StoredGallery:
         gallery: the content.
         files: object -> name of its file.
         generation: number of changes so far.
+        stamp: `gallery_stamp` of this state; None if the gallery is not on disk.
     """
 
     gallery: Gallery
     files: dict[str, str]
     generation: int
+    stamp: tuple[int, int, int] | None = None
 
 
 def gallery_stamp(directory: Path) -> tuple[int, int, int] | None:
     """Return a value that differs after every change of the gallery in a directory; None if there is no gallery."""
     try:
         status = (directory / INDEX_FILE).stat()
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         return None
     return status.st_mtime_ns, status.st_ino, status.st_size
 
@@ -74,20 +98,21 @@ def load_gallery(directory: Path, embedding: str | None = None, known: StoredGal
         known: an earlier state, whose objects are not read again.
 
     Raises:
-        InputError: a file is missing or damaged, or the gallery has another embedding. The message names the file.
+        GalleryError: a file is missing or damaged, or the gallery has another embedding. The message names the file.
     """
     for _ in range(3):
-        index = _read_index(directory)
+        stamp = gallery_stamp(directory)  # of this index or of an earlier one
+        index = _read_index(directory / INDEX_FILE)
         if index is None:
             return StoredGallery(Gallery(embedding or ""), {}, 0)
         if embedding is not None and index["embedding"] != embedding:
-            raise InputError(
+            raise GalleryError(
                 f"gallery: {directory} was enrolled with the embedding {index['embedding'][:8]}, and the run has "
                 f"{embedding[:8]}; embed its views again with `thor2 objects --reembed`"
             )
         with contextlib.suppress(_Replaced):
-            return _load_objects(directory, index, known)
-    raise InputError(
+            return dataclasses.replace(_load_objects(directory, index, known), stamp=stamp)
+    raise GalleryError(
         f"gallery: {directory / INDEX_FILE} names files that do not exist; restore the directory from a copy"
     )
 
@@ -96,8 +121,7 @@ class _Replaced(Exception):
     """A file that the index names is missing: a writer replaced it after the index was read, or it was deleted."""
 
 
-def _read_index(directory: Path) -> dict[str, Any] | None:
-    path = directory / INDEX_FILE
+def _read_index(path: Path) -> dict[str, Any] | None:
     try:
         index = json.loads(path.read_bytes())
         fields = {"format": int, "generation": int, "embedding": str, "objects": list, "hidden": list}
@@ -112,14 +136,14 @@ def _read_index(directory: Path) -> dict[str, Any] | None:
     except FileNotFoundError:
         return None
     except OSError as error:
-        raise InputError(f"gallery: {path} cannot be read ({error.strerror}); check the permissions") from None
+        raise GalleryError(f"gallery: {path} cannot be read ({error.strerror}); check the permissions") from None
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         reason = " ".join(str(error).split())
-        raise InputError(
+        raise GalleryError(
             f"gallery: {path} is damaged ({reason}); restore it from a copy, or delete the gallery"
         ) from None
     if index["format"] != GALLERY_FORMAT:
-        raise InputError(f"gallery: {path} has format {index['format']}; expected {GALLERY_FORMAT}")
+        raise GalleryError(f"gallery: {path} has format {index['format']}; expected {GALLERY_FORMAT}")
     return dict(index)
 
 
@@ -131,7 +155,7 @@ def _load_objects(directory: Path, index: dict[str, Any], known: StoredGallery |
         objects[entry["name"]] = dataclasses.replace(views, source=str(entry["source"]), date=str(entry["date"]))
     sizes = {views.embeddings.shape[1] for views in objects.values()}
     if len(sizes) > 1:
-        raise InputError(f"gallery: {directory} has embeddings of {sorted(sizes)} numbers; expected one size")
+        raise GalleryError(f"gallery: {directory} has embeddings of {sorted(sizes)} numbers; expected one size")
     gallery = Gallery(index["embedding"], objects, tuple(map(str, index["hidden"])))
     return StoredGallery(gallery, {entry["name"]: entry["file"] for entry in index["objects"]}, index["generation"])
 
@@ -153,27 +177,27 @@ def _read_object(path: Path) -> GalleryObject:
     except FileNotFoundError:
         raise _Replaced from None
     except OSError as error:
-        raise InputError(f"gallery: {path} cannot be read ({error.strerror}); check the permissions") from None
+        raise GalleryError(f"gallery: {path} cannot be read ({error.strerror}); check the permissions") from None
     if content_digest([content]) != path.stem:
-        raise InputError(f"gallery: {path} is damaged; restore it from a copy, or delete the gallery")
+        raise GalleryError(f"gallery: {path} is damaged; restore it from a copy, or delete the gallery")
     try:
         arrays = safetensors.numpy.load(content)
         embeddings = arrays.pop("embeddings")
         return GalleryObject(embeddings, CompactClouds(**arrays), "", "")
     except (safetensors.SafetensorError, KeyError, TypeError, ValueError) as error:
-        raise InputError(f"gallery: {path} is no object of a gallery ({error})") from None
+        raise GalleryError(f"gallery: {path} is no object of a gallery ({error})") from None
 
 
 @contextlib.contextmanager
-def _locked(directory: Path) -> Iterator[None]:
+def _locked(directory: Path, seconds: float) -> Iterator[None]:
     directory.mkdir(parents=True, exist_ok=True)
     # A soft lock would outlive a killed process.
-    lock = filelock.FileLock(directory / ".lock", timeout=LOCK_SECONDS, fallback_to_soft=False)
+    lock = filelock.FileLock(directory / ".lock", timeout=seconds, fallback_to_soft=False)
     try:
         lock.acquire()
     except filelock.Timeout:
-        raise InputError(
-            f"gallery: another process has been writing to {directory} for {LOCK_SECONDS:g} s; try again when it ends"
+        raise GalleryBusyError(
+            f"gallery: another process has been writing to {directory} for {seconds:.2g} s; try again when it ends"
         ) from None
     try:
         yield
@@ -186,6 +210,7 @@ def update_gallery(
     change: Callable[[Gallery], Gallery],
     embedding: str | None = None,
     known: StoredGallery | None = None,
+    lock_seconds: float | None = None,
 ) -> StoredGallery:
     """Change a gallery on disk; another writer's change is never lost.
 
@@ -194,15 +219,17 @@ def update_gallery(
         change: function of the gallery on disk that returns the new one. Whatever it raises leaves the disk as it was.
         embedding: fingerprint that the gallery must have; None accepts any.
         known: an earlier state, whose objects are not read again.
+        lock_seconds: time to wait for another writer; by default `LOCK_SECONDS`.
 
     Returns:
         The gallery after the change.
 
     Raises:
-        InputError: the gallery cannot be read, or another process holds the lock.
+        GalleryError: the gallery cannot be read.
+        GalleryBusyError: another process holds the lock.
         OSError: a file cannot be written; the gallery is as before.
     """
-    with _locked(directory):
+    with _locked(directory, LOCK_SECONDS if lock_seconds is None else lock_seconds):
         stored = load_gallery(directory, embedding, known)
         gallery = change(stored.gallery)
         (directory / "objects").mkdir(exist_ok=True)
@@ -220,13 +247,56 @@ def update_gallery(
                 if not path.exists():
                     written.append(path)
                     _write_durably(path, content)
-            index = _index(gallery, files, stored.generation + 1)
-            write_text(directory / INDEX_FILE, json.dumps(index, indent=1, ensure_ascii=False) + "\n")
+            changed = StoredGallery(gallery, files, stored.generation + 1)
+            write_text(directory / INDEX_FILE, _index_content(changed))
         except BaseException:
             for path in written:
                 path.unlink(missing_ok=True)
             raise
-        return StoredGallery(gallery, files, stored.generation + 1)
+        with contextlib.suppress(OSError):  # The change is made; it only cannot be taken back.
+            write_text(directory / PREVIOUS_FILE, _index_content(stored))
+        return dataclasses.replace(changed, stamp=gallery_stamp(directory))
+
+
+def undo_change(
+    directory: Path,
+    generation: int,
+    embedding: str | None = None,
+    known: StoredGallery | None = None,
+    lock_seconds: float | None = None,
+) -> StoredGallery:
+    """Take back the last change of a gallery on disk. That is a change, too: taking it back restores the first one.
+
+    Args:
+        directory: directory of the gallery.
+        generation: generation of the gallery after the change that is taken back.
+        embedding: see `update_gallery`.
+        known: see `update_gallery`.
+        lock_seconds: see `update_gallery`.
+
+    Returns:
+        The gallery as it was before that change, with a new generation.
+
+    Raises:
+        InputError: the gallery has been changed since, or the state before the change is not known.
+        GalleryError: see `update_gallery`.
+        OSError: see `update_gallery`.
+    """
+
+    def previous(gallery: Gallery) -> Gallery:
+        current, index = _read_index(directory / INDEX_FILE), None
+        with contextlib.suppress(GalleryError):
+            index = _read_index(directory / PREVIOUS_FILE)
+        last = 0 if current is None else current["generation"]
+        if last != generation:
+            raise InputError(f"generation is {generation}; expected {last}: the gallery has been changed since")
+        if index is None or index["generation"] != generation - 1 or index["embedding"] != gallery.embedding:
+            raise InputError(f"generation is {generation}, and the gallery before it is not known; forget the object")
+        with contextlib.suppress(_Replaced):
+            return _load_objects(directory, index, known).gallery
+        raise InputError(f"generation is {generation}, and files of the gallery before it are missing")
+
+    return update_gallery(directory, previous, embedding, known, lock_seconds)
 
 
 def _same_arrays(views: GalleryObject, other: GalleryObject) -> bool:
@@ -240,15 +310,16 @@ def _write_durably(path: Path, content: bytes) -> None:
         os.fsync(file.fileno())  # the index must not reach the disk before the files that it names
 
 
-def _index(gallery: Gallery, files: dict[str, str], generation: int) -> dict[str, Any]:
-    return {
+def _index_content(stored: StoredGallery) -> str:
+    gallery = stored.gallery
+    index = {
         "format": GALLERY_FORMAT,
-        "generation": generation,
+        "generation": stored.generation,
         "embedding": gallery.embedding,
         "objects": [
             {
                 "name": name,
-                "file": files[name],
+                "file": stored.files[name],
                 "views": len(views.clouds),
                 "source": views.source,
                 "date": views.date,
@@ -257,6 +328,7 @@ def _index(gallery: Gallery, files: dict[str, str], generation: int) -> dict[str
         ],
         "hidden": list(gallery.hidden),
     }
+    return json.dumps(index, indent=1, ensure_ascii=False) + "\n"
 
 
 def _remove_orphans(directory: Path, used: set[str]) -> None:
@@ -264,5 +336,6 @@ def _remove_orphans(directory: Path, used: set[str]) -> None:
     for path in (directory / "objects").iterdir():
         if path.name.removesuffix(".safetensors") not in used:
             path.unlink(missing_ok=True)
-    for path in directory.glob(".index.*"):
-        path.unlink(missing_ok=True)
+    for name in (INDEX_FILE, PREVIOUS_FILE):
+        for path in directory.glob(f".{Path(name).stem}.*"):
+            path.unlink(missing_ok=True)

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.config import DescriptorConfig
+from thor2_jax.gallery.objects import ObjectGallery
 from thor2_jax.recognition.answers import Recognition
 from thor2_jax.recognition.prepared_instance import PreparedInstance
 from thor2_jax.service.engine import CloudResult
@@ -16,12 +17,13 @@ from thor2_jax.service.schemas import (
     ExplainedFrame,
     ExplainedInstance,
     InstanceAnswer,
+    ObjectAnswer,
     SliceDetails,
     StripColors,
 )
 from thor2_jax.service.settings import MAX_EXPLAINED
 
-__all__ = ["explained_frame", "instance_answer"]
+__all__ = ["explained_frame", "instance_answer", "object_answers"]
 
 MAX_SHOWN_POINTS = 1000
 """Number of points of a cloud in an explanation."""
@@ -45,6 +47,24 @@ def instance_answer(recognition: Recognition) -> InstanceAnswer:
         kept_by_fallback=recognition.kept_by_fallback,
         unrecognized=recognition.reason,
     )
+
+
+def object_answers(objects: ObjectGallery) -> list[ObjectAnswer]:
+    """Return the JSON records of all objects that may be answered."""
+    union, enrolled = objects.union, objects.gallery.objects
+    answers = []
+    for name, is_trained in zip(union.names, union.has_output, strict=True):
+        views = enrolled.get(name)
+        answers.append(
+            ObjectAnswer(
+                name=name,
+                trained=bool(is_trained),
+                views=0 if views is None else len(views.clouds),
+                source=None if views is None else views.source,
+                date=None if views is None else views.date,
+            )
+        )
+    return answers
 
 
 def explained_frame(

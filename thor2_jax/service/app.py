@@ -19,7 +19,7 @@ from starlette.requests import ClientDisconnect
 
 from thor2_jax.config import DESCRIPTOR_VERSION
 from thor2_jax.service import schemas
-from thor2_jax.service.answers import instance_answer
+from thor2_jax.service.answers import instance_answer, object_answers
 from thor2_jax.service.engine import CloudResult
 from thor2_jax.service.metrics import RequestCounter
 from thor2_jax.service.page_files import PageFiles
@@ -27,12 +27,14 @@ from thor2_jax.service.pipeline import Service
 from thor2_jax.service.problem import Problem, RequestError, error_responses
 from thor2_jax.service.schemas import NPZ
 from thor2_jax.service.settings import Settings
+from thor2_jax.service.teaching import gallery_errors, generation_number, parse_enrolment
 from thor2_jax.service.uploads import read_body, read_form
 
 __all__ = ["create_app"]
 
 FRAME_FIELDS = ("color", "depth", "labels", "intrinsics")
 FRAME_ERRORS = error_responses(400, 408, 413, 415, 422, 429, 503, 504)
+GALLERY_ERRORS = error_responses(429, 500, 503, 504, 507)
 
 
 def create_app(settings: Settings, workers: int = 1) -> FastAPI:
@@ -74,6 +76,11 @@ def create_app(settings: Settings, workers: int = 1) -> FastAPI:
     )
     _add_inference_routes(authenticated, service)
     _add_model_routes(authenticated, service)
+    _add_object_routes(authenticated, service)
+    if settings.teach:
+        _add_teaching_routes(authenticated, service)
+    else:
+        _add_refusals_to_teach(authenticated)
     app.include_router(authenticated)
     app.router.default = PageFiles()
     app.add_exception_handler(RequestError, _on_request_error)
@@ -182,6 +189,7 @@ def _add_model_routes(routes: APIRouter, service: Service) -> None:
     @routes.get("/v1/model")
     async def model() -> schemas.ModelAnswer:
         """Return the classes and the configuration of the model."""
+        service.engine.refresh()
         run = service.engine.run
         return schemas.ModelAnswer(
             classes=list(service.engine.classes),
@@ -189,6 +197,7 @@ def _add_model_routes(routes: APIRouter, service: Service) -> None:
             descriptor_version=DESCRIPTOR_VERSION,
             descriptor=pydantic_core.to_jsonable_python(run.config),
             color_network=run.network.fingerprint,
+            teaches=service.settings.teach,
         )
 
     @routes.get("/v1/colornet")
@@ -204,6 +213,66 @@ def _add_model_routes(routes: APIRouter, service: Service) -> None:
     async def metrics() -> Response:
         """Return the metrics in the Prometheus text format."""
         return Response(service.metrics.text(), media_type="text/plain; version=0.0.4; charset=utf-8")
+
+
+def _add_object_routes(routes: APIRouter, service: Service) -> None:
+    @routes.get("/v1/objects", responses=error_responses(500))
+    async def objects() -> schemas.ObjectsAnswer:
+        """Return the objects that may be answered, with their views."""
+        with gallery_errors(service.engine.objects.directory, 500, "gallery"):
+            service.engine.objects.refresh()
+        known = service.engine.objects
+        return schemas.ObjectsAnswer(objects=object_answers(known), generation=known.generation)
+
+
+def _add_teaching_routes(routes: APIRouter, service: Service) -> None:
+    @routes.post(
+        "/v1/objects",
+        responses=FRAME_ERRORS | GALLERY_ERRORS | error_responses(409),
+        openapi_extra={"requestBody": schemas.ENROLMENT_FORM},
+    )
+    async def enroll(request: Request) -> schemas.EnrolmentAnswer:
+        """Enroll an object from one instance of a frame; all processes recognize it from now on.
+
+        A name that exists needs extend or replace.
+        """
+        async with service.admit() as admitted:
+            with admitted.stage("upload"):
+                fields = await read_form(request, (*FRAME_FIELDS, "name", "instance"), ("extend", "replace"))
+            enrolment = parse_enrolment(fields)
+            known = await service.enroll({name: fields[name] for name in FRAME_FIELDS}, enrolment, admitted)
+        (enrolled,) = [answer for answer in object_answers(known) if answer.name == enrolment.name]
+        return schemas.EnrolmentAnswer(**dict(enrolled), generation=known.generation, timings=admitted.milliseconds())
+
+    @routes.post(
+        "/v1/objects/undo",
+        responses=GALLERY_ERRORS | error_responses(400, 408, 409, 413, 415, 422),
+        openapi_extra={"requestBody": schemas.UNDO_FORM},
+    )
+    async def undo(request: Request) -> schemas.ChangeAnswer:
+        """Take back the last change of the gallery, unless another one was made since."""
+        async with service.admit() as admitted:
+            with admitted.stage("upload"):
+                generation = generation_number(await read_form(request, ("generation",)))
+            known = await service.undo(generation, admitted)
+        return schemas.ChangeAnswer(generation=known.generation)
+
+    @routes.delete("/v1/objects/{name:path}", responses=GALLERY_ERRORS | error_responses(404))
+    async def forget(name: str) -> schemas.ChangeAnswer:
+        """Forget an object: its views are removed, and a trained class is never answered again."""
+        async with service.admit() as admitted:
+            with admitted.stage("upload"):
+                pass  # There is no body; a late answer gets status 504.
+            known = await service.forget(name, admitted)
+        return schemas.ChangeAnswer(generation=known.generation)
+
+
+def _add_refusals_to_teach(routes: APIRouter) -> None:
+    @routes.post("/v1/objects", include_in_schema=False)
+    @routes.post("/v1/objects/undo", include_in_schema=False)
+    @routes.delete("/v1/objects/{name:path}", include_in_schema=False)
+    async def refuse() -> None:
+        raise RequestError(403, None, "The service does not teach; start it with `thor2 serve --teach`.")
 
 
 def _token_check(token: str) -> Callable[..., Any]:

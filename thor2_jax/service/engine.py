@@ -1,6 +1,7 @@
 """The compiled model: descriptors and class probabilities for batches of a few sizes, all compiled before serving."""
 
 import dataclasses
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,6 +13,11 @@ from thor2_jax.capacity import BATCH_BUCKETS, POINT_BUCKETS, batch_bucket, point
 from thor2_jax.descriptor.describe import describe_strips, strips
 from thor2_jax.descriptor.view_normalization import align
 from thor2_jax.errors import InputError
+from thor2_jax.gallery.clouds import CompactClouds
+from thor2_jax.gallery.enrollment import enrolled_object
+from thor2_jax.gallery.gallery import GalleryObject
+from thor2_jax.gallery.objects import ObjectGallery
+from thor2_jax.gallery.store import INDEX_FILE
 from thor2_jax.recognition.answers import Recognition
 from thor2_jax.recognition.classifier import Feature
 from thor2_jax.recognition.fusion import fuse, fused_probabilities, with_temperature
@@ -20,6 +26,8 @@ from thor2_jax.recognizer import THOR2, Recognizer
 from thor2_jax.service.settings import Settings
 
 __all__ = ["CloudResult", "InferenceEngine"]
+
+log = logging.getLogger(__name__)
 
 MIN_POINTS_BUCKET, MIN_BATCH_BUCKET = 2048, 8
 """Smallest shape of a batch. Smaller shapes run hardly faster, and each shape takes seconds to compile."""
@@ -36,7 +44,7 @@ class CloudResult:
         probabilities: classifier -> [C] float32.
         aligned: [N, 3] float32, the aligned cloud in scaled units, with padding.
         strip_colors: [S, J, R] float32, strip colour vectors.
-        enrolled: [K, D] float32, embeddings for the gallery; None if the classifiers alone answer.
+        embedding: [K, D] float32, embeddings for the gallery in K orientations; None if the classifiers alone answer.
     """
 
     images: NDArray[np.float32]
@@ -45,7 +53,7 @@ class CloudResult:
     probabilities: dict[Feature, NDArray[np.float32]]
     aligned: NDArray[np.float32]
     strip_colors: NDArray[np.float32]
-    enrolled: NDArray[np.float32] | None = None
+    embedding: NDArray[np.float32] | None = None
 
 
 class InferenceEngine:
@@ -59,7 +67,7 @@ class InferenceEngine:
         """
         if settings.cache is not None:
             _enable_compilation_cache(settings.cache)
-        self._recognizer = Recognizer.load(settings.model, settings.unknown_below)
+        self._recognizer = _load(settings)
         run = self._recognizer.run
         self._classifiers = THOR2 if run.classifiers else ()
         missing = [name for name in self._classifiers if name not in run.classifiers]
@@ -71,13 +79,44 @@ class InferenceEngine:
         # The closed form computes the same pairs as gudhi without a host callback.
         self.run = dataclasses.replace(run, config=dataclasses.replace(run.config, homology="closed_form"))
         self._recognizer.run = self.run
-        self._embeds = self._recognizer.answers_by() != "classifiers"
+        # A service that teaches compiles the embedding before the first object is enrolled.
+        self._embeds = settings.teach or self._uses_gallery
+        self._last_error = ""
         self.max_batch = settings.max_batch
+
+    @property
+    def _uses_gallery(self) -> bool:
+        return self._recognizer.answers_by() != "classifiers"
 
     @property
     def classes(self) -> tuple[str, ...]:
         """All names that may be answered."""
         return self._recognizer.classes
+
+    @property
+    def objects(self) -> ObjectGallery:
+        """The enrolled objects. Change a copy of them in another thread, and call `refresh` in this one."""
+        return self._recognizer.objects
+
+    def refresh(self) -> None:
+        """Read the gallery again if a process has changed it; if it cannot be read, the one in memory stays.
+
+        The gallery is not read again if it was empty at the start and the service does not teach: clouds are not
+        embedded then.
+        """
+        if not self._embeds:
+            return
+        try:
+            self.objects.refresh()
+            self._last_error = ""
+        except (InputError, OSError) as error:
+            if str(error) != self._last_error:
+                log.error("%s", error)
+            self._last_error = str(error)
+
+    def enrolled_object(self, clouds: CompactClouds, results: Sequence[CloudResult]) -> GalleryObject:
+        """Return an object to enroll from its clouds and the results of `enrollment.views_to_embed`."""
+        return enrolled_object(np.array([result.embedding for result in results]), clouds, "frames")
 
     @property
     def batch_shapes(self) -> list[tuple[int, int]]:
@@ -100,7 +139,7 @@ class InferenceEngine:
         cloud_strips = strips(aligned, self.run.network, self.run.config)
         descriptors = describe_strips(cloud_strips, self.run.network, self.run.config)
         probabilities = self._recognizer.probabilities(descriptors, self._classifiers)
-        enrolled = np.asarray(self._recognizer.objects.embed(clouds)) if self._embeds else None
+        embedded = np.asarray(self.objects.embed(clouds)) if self._embeds else None
         arrays = (
             descriptors.images,
             descriptors.embeddings,
@@ -117,7 +156,7 @@ class InferenceEngine:
                 {name: p[k] for name, p in probabilities.items()},
                 points[k],
                 colors[k],
-                None if enrolled is None else enrolled[k],
+                None if embedded is None else embedded[k],
             )
             for k in range(len(instances))
         ]
@@ -128,17 +167,18 @@ class InferenceEngine:
         probabilities = {
             name: np.reshape([r.probabilities[name] for r in results], shape) for name in self._classifiers
         }
-        enrolled = [r.enrolled for r in results if r.enrolled is not None]
-        embeddings = np.array(enrolled, np.float32) if self._embeds else None
+        embeddings = np.array([r.embedding for r in results], np.float32) if self._uses_gallery else None
         return self._recognizer.recognitions(instances, probabilities, [r.overflow for r in results], embeddings)
 
     def calibrated_confidences(self, results: Sequence[CloudResult]) -> list[float | None]:
         """Return the confidence of each cloud's most probable class after temperature scaling of both classifiers.
 
-        None without temperatures, which training fits on a held-out set (`thor2 train --folds`), and with a gallery.
+        None without temperatures, which training fits on a held-out set (`thor2 train --folds`), with a gallery, and
+        with forgotten classes.
         """
         temperatures = self.run.record.get("temperatures", {})
-        if not results or self._embeds or not set(THOR2) <= set(temperatures):
+        is_changed = self._uses_gallery or self.objects.gallery.hidden
+        if not results or is_changed or not set(THOR2) <= set(temperatures):
             return [None] * len(results)
         probabilities = {name: np.stack([r.probabilities[name] for r in results]) for name in THOR2}
         index = fuse(probabilities).class_index
@@ -146,6 +186,23 @@ class InferenceEngine:
             {name: with_temperature(p, temperatures[name]) for name, p in probabilities.items()}
         )
         return [float(p) for p in calibrated[np.arange(len(results)), index]]
+
+
+def _load(settings: Settings) -> Recognizer:
+    """Load the recognizer of a service.
+
+    Raises:
+        InputError: as `Recognizer.load`, or a gallery that is given does not exist and the service does not teach.
+    """
+    directory = settings.gallery
+    if directory is not None and not settings.teach and not (directory / INDEX_FILE).is_file():
+        raise InputError(f"gallery: {directory} has no {INDEX_FILE}; expected the directory of a gallery")
+    recognizer = Recognizer.load(settings.model, settings.unknown_below, gallery=directory)
+    if settings.teach:
+        recognizer.objects.check_writable()
+        if recognizer.run.record.get("answer_by") == "classifiers":  # They would never answer by an enrolled object.
+            recognizer = Recognizer.load(settings.model, settings.unknown_below, gallery=directory, answer_by="both")
+    return recognizer
 
 
 def _enable_compilation_cache(directory: Path) -> None:

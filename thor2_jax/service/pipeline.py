@@ -2,25 +2,40 @@
 
 import asyncio
 import contextlib
+import copy
 import logging
 import threading
 import time
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 
+from thor2_jax.errors import InputError
+from thor2_jax.gallery.clouds import CompactClouds
+from thor2_jax.gallery.enrollment import views_to_embed
+from thor2_jax.gallery.objects import ObjectGallery
 from thor2_jax.recognition.answers import Recognition
 from thor2_jax.recognition.prepared_instance import PreparedInstance
 from thor2_jax.service.answers import explained_frame
 from thor2_jax.service.batching import Batcher
 from thor2_jax.service.engine import CloudResult, InferenceEngine
 from thor2_jax.service.metrics import CompilationCounter, Metrics
-from thor2_jax.service.preparation import PreparationPool, PreparedRequest, prepare_clouds, prepare_frame
+from thor2_jax.service.preparation import (
+    PreparationPool,
+    PreparedRequest,
+    prepare_clouds,
+    prepare_frame,
+    prepare_view,
+)
 from thor2_jax.service.problem import RequestError, deadline_exceeded
 from thor2_jax.service.schemas import ExplainedFrame
 from thor2_jax.service.settings import Settings
+from thor2_jax.service.teaching import Enrolment, gallery_errors
 
 __all__ = ["AdmittedRequest", "Service"]
 
 log = logging.getLogger(__name__)
+
+LOCK_SHARE = 0.8
+"""Share of the time left to a request for which it waits for another writer, so that it learns the reason."""
 
 
 class AdmittedRequest:
@@ -153,11 +168,13 @@ class Service:
     async def recognize(self, files: dict[str, bytes], request: AdmittedRequest) -> list[Recognition]:
         """Recognize the frame in `files` (the arguments of `decoding.decode_frame`). Raises RequestError."""
         prepared, results = await self._infer_frame(files, False, request)
+        self.engine.refresh()
         return self.engine.recognize(prepared.instances, results)
 
     async def explain(self, files: dict[str, bytes], request: AdmittedRequest) -> ExplainedFrame:
         """Recognize a frame and return the evidence as well. Raises RequestError."""
         prepared, results = await self._infer_frame(files, True, request)
+        self.engine.refresh()
         recognitions = self.engine.recognize(prepared.instances, results)
         confidences = self.engine.calibrated_confidences(results)
         config = self.engine.run.config
@@ -169,6 +186,59 @@ class Service:
         """Describe the clouds of an npz or JSON body. Raises RequestError."""
         future = self._pool.submit(request.deadline, prepare_clouds, content, is_npz)
         return await self._infer(await asyncio.wrap_future(future), request)
+
+    async def enroll(self, files: dict[str, bytes], enrolment: Enrolment, request: AdmittedRequest) -> ObjectGallery:
+        """Enroll an object from one instance of the frame in `files`, and return the gallery with it.
+
+        The view and its augmented copies are embedded in batches, as the instances of frames are.
+
+        Raises:
+            RequestError: 409 if the name exists and neither `extend` nor `replace` is true, or as `gallery_errors` and
+                `prepare_view`. Nothing is enrolled.
+        """
+        name, flags = enrolment.name, {"extend": enrolment.extend, "replace": enrolment.replace}
+        with gallery_errors(self.engine.objects.directory, 409, "name"):
+            self.engine.objects.refresh()
+            self.engine.objects.check(name, **flags)
+        sigma_s = self.engine.run.config.sigma_s
+        future = self._pool.submit(request.deadline, prepare_view, files, sigma_s, enrolment.instance)
+        prepared = await asyncio.wrap_future(future)
+        try:
+            clouds = CompactClouds.of(prepared.instances)
+        except InputError as error:
+            message = str(error).replace("views[0]", f"instance {enrolment.instance}")
+            raise RequestError(422, "instance", f"{message}.") from None
+        views = await asyncio.to_thread(views_to_embed, clouds, "frames")
+        results = await self._infer(PreparedRequest(views, prepared.seconds), request)
+        added = {name: self.engine.enrolled_object(clouds, results)}
+        return await self._change(lambda objects: objects.add(added, **flags), 409, "name", request)
+
+    async def forget(self, name: str, request: AdmittedRequest) -> ObjectGallery:
+        """Forget an object, and return the gallery without it.
+
+        Raises:
+            RequestError: 404 if no object has this name, or as `gallery_errors`.
+        """
+        return await self._change(lambda objects: objects.forget(name), 404, "name", request)
+
+    async def undo(self, generation: int, request: AdmittedRequest) -> ObjectGallery:
+        """Take back the last change of the gallery, the one that gave it this generation, and return the gallery.
+
+        Raises:
+            RequestError: 409 if the gallery has been changed since, or as `gallery_errors`.
+        """
+        return await self._change(lambda objects: objects.undo(generation), 409, "generation", request)
+
+    async def _change(
+        self, change: Callable[[ObjectGallery], None], refused: int, field: str, request: AdmittedRequest
+    ) -> ObjectGallery:
+        """Change the gallery on disk in another thread, then read it again in this one, as other processes do."""
+        copied = copy.copy(self.engine.objects)
+        copied.lock_seconds = max(0.0, LOCK_SHARE * (request.deadline - time.monotonic()))
+        with request.stage("gallery"), gallery_errors(copied.directory, refused, field):
+            await asyncio.to_thread(change, copied)
+        self.engine.refresh()
+        return copied
 
     async def _infer_frame(
         self, files: dict[str, bytes], with_label_map: bool, request: AdmittedRequest

@@ -19,13 +19,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
+from thor2_jax.recognition.frames import RGBDFrame
 from thor2_jax.recognition.prepared_instance import PreparedInstance, prepare_instance
 from thor2_jax.service.decoding import decode_frame, decode_json_clouds, decode_npz_clouds
 from thor2_jax.service.problem import RequestError, deadline_exceeded
 from thor2_jax.service.schemas import LabelMap
 from thor2_jax.service.settings import MAX_LABEL_RUNS
 
-__all__ = ["PreparationPool", "PreparedRequest", "prepare_clouds", "prepare_frame"]
+__all__ = ["PreparationPool", "PreparedRequest", "prepare_clouds", "prepare_frame", "prepare_view"]
 
 MIN_SECONDS = 1.0
 """Minimum time that a process has for a request, so that only exceptionally slow requests are interrupted."""
@@ -51,14 +52,37 @@ def prepare_frame(files: dict[str, bytes], sigma_s: float, with_label_map: bool)
     start = time.perf_counter()
     frame = decode_frame(**files)
     decoded = time.perf_counter()
+    instances = _prepare_instances(frame, frame.instances, sigma_s)
+    label_map = _encode_label_map(frame.label_image) if with_label_map else None
+    return PreparedRequest(instances, {"decode": decoded - start, "clouds": time.perf_counter() - decoded}, label_map)
+
+
+def prepare_view(files: dict[str, bytes], sigma_s: float, label: int) -> PreparedRequest:
+    """Decode a frame and compute the cloud of one instance, which is to be enrolled.
+
+    Raises:
+        RequestError: 422 if there is no such instance or it has too few points, or as `prepare_frame`.
+    """
+    start = time.perf_counter()
+    frame = decode_frame(**files)
+    decoded = time.perf_counter()
+    if label not in frame.instances:
+        first = ", ".join(map(str, frame.instances[:10])) or "none"
+        more = " ..." if len(frame.instances) > 10 else ""
+        raise RequestError(422, "instance", f"instance is {label}; expected a number of labels: {first}{more}.")
+    (view,) = _prepare_instances(frame, [label], sigma_s)
+    if view.reason is not None:
+        raise RequestError(422, "instance", f"instance {label} cannot be enrolled: {view.reason}.")
+    return PreparedRequest([view], {"decode": decoded - start, "clouds": time.perf_counter() - decoded})
+
+
+def _prepare_instances(frame: RGBDFrame, labels: Sequence[int], sigma_s: float) -> list[PreparedInstance]:
     try:
-        instances = [prepare_instance(frame, label, sigma_s) for label in frame.instances]
+        return [prepare_instance(frame, label, sigma_s) for label in labels]
     except InputError:  # The images and the intrinsics are valid, but their combination exceeds the voxel grid.
         raise RequestError(
             422, "intrinsics", "intrinsics place the points of an instance too far apart; check fx, fy and depth_scale."
         ) from None
-    label_map = _encode_label_map(frame.label_image) if with_label_map else None
-    return PreparedRequest(instances, {"decode": decoded - start, "clouds": time.perf_counter() - decoded}, label_map)
 
 
 def _encode_label_map(labels: NDArray[Any]) -> LabelMap:

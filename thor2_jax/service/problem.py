@@ -10,14 +10,18 @@ __all__ = ["FieldError", "Problem", "RequestError", "deadline_exceeded", "error_
 _DESCRIPTIONS = {
     400: "The body cannot be parsed.",
     401: "The bearer token is missing or invalid.",
+    403: "The service does not teach.",
+    404: "No object has this name.",
     408: "The body did not arrive before the deadline.",
+    409: "The change conflicts with the gallery: the name exists, or another change was made since.",
     413: "The body is too large.",
     415: "The content type of the body is not supported.",
     422: "A field is missing, damaged, too large, or inconsistent with another field.",
     429: "The queue is full; repeat the request after the number of seconds in Retry-After.",
-    500: "Internal error of the service.",
-    503: "The service is starting or stopping.",
+    500: "Internal error of the service, or a damaged gallery.",
+    503: "The service is starting or stopping, or another process is writing to the gallery.",
     504: "The deadline of the request was exceeded.",
+    507: "The gallery cannot be written, for example on a full disk; it is as before.",
 }
 
 

@@ -10,13 +10,17 @@ from thor2_jax.service.settings import MAX_CLOUD_COORDINATE, MAX_CLOUDS, MAX_EXP
 __all__ = [
     "CLOUDS_BODY",
     "FRAME_FORM",
+    "ENROLMENT_FORM",
     "NPZ",
+    "UNDO_FORM",
     "Candidate",
     "CloudsBody",
+    "ChangeAnswer",
     "ColorNetworkAnswer",
     "DescribeAnswer",
     "DescriptorAnswer",
     "Details",
+    "EnrolmentAnswer",
     "ExplainedFrame",
     "ExplainedInstance",
     "FrameAnswer",
@@ -24,6 +28,8 @@ __all__ = [
     "InstanceAnswer",
     "LabelMap",
     "ModelAnswer",
+    "ObjectAnswer",
+    "ObjectsAnswer",
     "Readiness",
     "SliceDetails",
     "StripColors",
@@ -169,6 +175,36 @@ class ModelAnswer(BaseModel):
     descriptor_version: int
     descriptor: dict[str, Any] = Field(description="Configuration of the descriptor.")
     color_network: str = Field(description="Fingerprint of the colour network.")
+    teaches: bool = Field(description="Whether objects can be enrolled and forgotten.")
+
+
+class ObjectAnswer(BaseModel):
+    """An object that may be answered."""
+
+    name: str
+    trained: bool = Field(description="Whether the classifiers have an output for it.")
+    views: int = Field(description="Number of enrolled views.")
+    source: str | None = Field(description="Source of the views: frames, mesh, or mesh and frames; null without views.")
+    date: str | None = Field(description="Date of the last enrolment, ISO 8601; null without views.")
+
+
+class ObjectsAnswer(BaseModel):
+    """All objects that may be answered: trained classes, without forgotten ones, and enrolled objects."""
+
+    objects: list[ObjectAnswer]
+    generation: int = Field(description="Number of changes of the gallery.")
+
+
+class ChangeAnswer(BaseModel):
+    """A change of the gallery."""
+
+    generation: int = Field(description="Number of changes of the gallery; POST /v1/objects/undo takes this one back.")
+
+
+class EnrolmentAnswer(ObjectAnswer, ChangeAnswer):
+    """The object after its enrolment."""
+
+    timings: Milliseconds = Field(description="Milliseconds per stage: upload, decode, clouds, device, gallery, total.")
 
 
 class ColorNetworkAnswer(BaseModel):
@@ -225,6 +261,30 @@ FRAME_FORM: dict[str, Any] = {
     },
 }
 """OpenAPI schema of the body of /v1/recognize. `uploads` parses the form, since FastAPI writes large files to disk."""
+
+
+def _form(required: dict[str, Any], optional: dict[str, Any]) -> dict[str, Any]:
+    schema = {"type": "object", "required": list(required), "properties": required | optional}
+    return {"required": True, "content": {"multipart/form-data": {"schema": schema}}}
+
+
+ENROLMENT_FORM = _form(
+    {
+        **FRAME_FORM["content"]["multipart/form-data"]["schema"]["properties"],
+        "name": {"type": "string", "minLength": 1, "maxLength": 200, "description": "Name of the object."},
+        "instance": {"type": "integer", "minimum": 0, "description": "Number of the object in the label image."},
+    },
+    {
+        "extend": {"type": "boolean", "description": "Add the view to those of an object that exists."},
+        "replace": {"type": "boolean", "description": "Discard the views of an object that exists."},
+    },
+)
+"""OpenAPI schema of the body of POST /v1/objects."""
+
+UNDO_FORM = _form(
+    {"generation": {"type": "integer", "minimum": 0, "description": "Generation in the answer of the change."}}, {}
+)
+"""OpenAPI schema of the body of POST /v1/objects/undo."""
 
 
 def _clouds_body() -> dict[str, Any]:

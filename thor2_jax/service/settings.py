@@ -57,6 +57,8 @@ class Settings:
         processes: number of processes that decode images and compute clouds.
         unknown_below: confidence below which an object is unknown, as in `Recognizer`.
         cache: directory of compiled programs, which a later start reuses; None disables the cache.
+        gallery: directory of the enrolled objects; None is `gallery` in the run directory.
+        teach: callers may enroll and forget objects.
 
     Raises:
         InputError: a value is out of range.
@@ -71,6 +73,8 @@ class Settings:
     processes: int = 2
     unknown_below: float = 0.0
     cache: Path | None = None
+    gallery: Path | None = None
+    teach: bool = False
 
     def __post_init__(self) -> None:
         for name in ("queue", "deadline", "processes"):

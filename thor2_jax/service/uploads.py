@@ -30,8 +30,8 @@ async def read_body(request: Request) -> bytes:
     return b"".join([data async for data in _limited_stream(request)])
 
 
-async def read_form(request: Request, names: tuple[str, ...]) -> dict[str, bytes]:
-    """Return the fields `names` of a multipart form; other fields are ignored.
+async def read_form(request: Request, names: tuple[str, ...], optional: tuple[str, ...] = ()) -> dict[str, bytes]:
+    """Return the fields `names` of a multipart form, and those of `optional` that it has; other fields are ignored.
 
     Raises:
         RequestError: 413 if the body is larger than `MAX_BODY`, 415 for another content type or charset, 400 if the
@@ -53,8 +53,10 @@ async def read_form(request: Request, names: tuple[str, ...]) -> dict[str, bytes
         raise RequestError(400, "body", error.message) from None
     try:
         fields = {}
-        for name in names:
+        for name in (*names, *optional):
             values = form.getlist(name)
+            if not values and name in optional:
+                continue
             if len(values) != 1:
                 raise RequestError(422, name, f"{name} is {'given more than once' if values else 'missing'}.")
             fields[name] = await values[0].read() if isinstance(values[0], UploadFile) else values[0].encode()

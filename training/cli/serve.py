@@ -23,6 +23,10 @@ def serve(
     cache: Annotated[
         Path | None, typer.Option(help="Directory for compiled programs, so that the next start is faster.")
     ] = None,
+    gallery: Annotated[
+        Path | None, typer.Option(help="Directory of the enrolled objects. Default: gallery in the run directory.")
+    ] = None,
+    teach: Annotated[bool, typer.Option("--teach", help="Let callers enroll and forget objects.")] = False,
     token: Annotated[
         str | None, typer.Option(envvar="THOR2_TOKEN", help="Bearer token that clients must send.")
     ] = None,
@@ -39,6 +43,15 @@ def serve(
     from thor2_jax.service.settings import Settings
 
     settings = Settings(
-        model, token, queue, deadline, max_batch, processes=processes, unknown_below=unknown_below, cache=cache
+        model,
+        token,
+        queue,
+        deadline,
+        max_batch,
+        processes=processes,
+        unknown_below=unknown_below,
+        cache=cache,
+        gallery=gallery,
+        teach=teach,
     )
     serve_forever(settings, host, port, workers)

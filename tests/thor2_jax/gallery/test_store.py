@@ -16,7 +16,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.gallery import store
 from thor2_jax.gallery.clouds import CompactClouds
 from thor2_jax.gallery.gallery import Gallery, GalleryObject
-from thor2_jax.gallery.store import gallery_stamp, load_gallery, update_gallery
+from thor2_jax.gallery.store import gallery_stamp, load_gallery, undo_change, update_gallery
 from thor2_jax.recognition.prepared_instance import PreparedInstance
 
 FINGERPRINT = "f" * 64
@@ -81,7 +81,45 @@ def test_forgetting_restores_the_gallery_and_removes_the_file(directory: Path) -
     update_gallery(directory, lambda gallery: gallery, FINGERPRINT)
     after = content(directory)
     assert after.keys() == before.keys()
-    assert all(after[name] == before[name] for name in before if name != "index.json")
+    assert all(after[name] == before[name] for name in before if not name.endswith(".json"))
+
+
+def test_undo_restores_the_gallery_and_its_files(directory: Path) -> None:
+    before = load_gallery(directory)
+    changed = update_gallery(directory, add("mug", 5, replace=True), FINGERPRINT)
+    undone = undo_change(directory, changed.generation, FINGERPRINT, changed)
+    again = load_gallery(directory)
+    assert undone.generation == again.generation == changed.generation + 1
+    assert undone.files == again.files == before.files and undone.stamp == gallery_stamp(directory)
+    np.testing.assert_array_equal(again.gallery.objects["mug"].embeddings, enrolled(0).embeddings)
+    undo_change(directory, undone.generation)  # restores the change
+    assert load_gallery(directory).files == changed.files
+
+
+def test_undo_of_the_first_change_empties_the_gallery(tmp_path: Path) -> None:
+    changed = update_gallery(tmp_path, add("mug", 0), FINGERPRINT)
+    assert undo_change(tmp_path, changed.generation, FINGERPRINT).gallery.names == ()
+    assert update_gallery(tmp_path, add("mug", 0), FINGERPRINT).gallery.names == ("mug",)
+
+
+UNDO_FAULTS: dict[str, Callable[[Path], object]] = {
+    "changed since": lambda path: update_gallery(path, add("new", 5), FINGERPRINT),
+    "no former index": lambda path: (path / "previous.json").unlink(),
+    "damaged former index": lambda path: (path / "previous.json").write_text("{"),
+    "older former index": lambda path: edit(path / "previous.json", generation=0),
+    "missing files": lambda path: edit(
+        path / "previous.json", objects=[{"name": "a", "file": 64 * "0", "source": "", "date": ""}]
+    ),
+}
+
+
+@pytest.mark.parametrize("fault", UNDO_FAULTS)
+def test_undo_refuses_in_one_line_and_changes_nothing(fault: str, directory: Path) -> None:
+    UNDO_FAULTS[fault](directory)
+    before = content(directory)
+    with pytest.raises(InputError, match="generation is 2") as caught:
+        undo_change(directory, 2, FINGERPRINT)
+    assert "\n" not in str(caught.value) and content(directory) == before
 
 
 def test_a_known_state_is_not_read_again(directory: Path) -> None:
@@ -131,17 +169,18 @@ def test_a_gallery_of_another_embedding_is_refused(directory: Path) -> None:
 DAMAGES: dict[str, Callable[[Path], object]] = {
     "cut index": lambda path: (path / "index.json").write_text('{"format": 1'),
     "a list": lambda path: (path / "index.json").write_text("[]"),
-    "other format": lambda path: edit(path, format=2),
-    "no objects": lambda path: edit(path, objects=[{}]),
-    "other path": lambda path: edit(path, objects=[{"name": "a", "file": "../../x", "source": "", "date": ""}]),
+    "other format": lambda path: edit(path / "index.json", format=2),
+    "no objects": lambda path: edit(path / "index.json", objects=[{}]),
+    "other path": lambda path: edit(
+        path / "index.json", objects=[{"name": "a", "file": "../../x", "source": "", "date": ""}]
+    ),
     "missing file": lambda path: next((path / "objects").iterdir()).unlink(),
     "cut file": lambda path: cut(next((path / "objects").iterdir())),
 }
 
 
 def edit(path: Path, **changes: object) -> None:
-    index = json.loads((path / "index.json").read_text())
-    (path / "index.json").write_text(json.dumps({**index, **changes}))
+    path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
 
 
 def cut(file: Path) -> None:

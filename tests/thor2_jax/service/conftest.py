@@ -12,10 +12,12 @@ from pathlib import Path
 import httpx
 import numpy as np
 import pytest
-from helpers import encode_image, untrained_run
+from helpers import SMALL_CONFIG, encode_image, untrained_run
 
 import thor2_jax as thor2
+from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
 from thor2_jax.recognition.run_directory import save_run
+from thor2_jax.recognizer import EMBEDDING_FILE
 
 Files = dict[str, bytes]
 SAMPLE_INDEX = Path(thor2.__file__).parent / "service" / "page" / "samples" / "index.json"
@@ -33,6 +35,15 @@ def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     run = untrained_run(CLASSES, config=thor2.DescriptorConfig(), record={"meshes": "/a/local/path"})
     folder = tmp_path_factory.mktemp("service") / "run"
     save_run(run, folder)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def teaching_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run with two classes and a small embedding, which compiles quickly."""
+    folder = tmp_path_factory.mktemp("teaching") / "run"
+    save_run(untrained_run(("a", "b"), ("tops", "tops2")), folder)
+    Embedding.create(SMALL_CONFIG, sizes=EmbeddingSizes(4, (16,), 8, 4)).save(folder / EMBEDDING_FILE)
     return folder
 
 
@@ -102,8 +113,8 @@ class Server:
 def start_server(run_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., Server]]:
     folder, started = tmp_path_factory.mktemp("servers"), []
 
-    def start(*options: str) -> Server:
-        started.append(Server(run_dir, folder / f"{len(started)}.log", folder / "cache", *options))
+    def start(*options: str, run: Path = run_dir) -> Server:
+        started.append(Server(run, folder / f"{len(started)}.log", folder / "cache", *options))
         return started[-1]
 
     yield start
@@ -116,6 +127,15 @@ def start_server(run_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Ite
 @pytest.fixture(scope="session")
 def server(start_server: Callable[..., Server]) -> Server:
     return start_server()
+
+
+@pytest.fixture(scope="session")
+def teaching_server(
+    start_server: Callable[..., Server], teaching_run: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Server:
+    """`thor2 serve --teach` with a gallery outside of the run directory."""
+    gallery = tmp_path_factory.mktemp("taught") / "gallery"
+    return start_server("--teach", "--gallery", str(gallery), "--processes", "1", run=teaching_run)
 
 
 @pytest.fixture

@@ -173,6 +173,7 @@ OPERATIONS = {
     "/v1/explain": "POST",
     "/v1/describe": "POST",
     "/v1/model": "GET",
+    "/v1/objects": "GET",
     "/v1/colornet": "GET",
     "/metrics": "GET",
     "/healthz": "GET",

@@ -1,0 +1,427 @@
+"""Enrolling and forgetting objects over HTTP: changes, undo, several processes, and bad input."""
+
+import asyncio
+import contextlib
+import json
+import re
+import shutil
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import filelock
+import httpx
+import numpy as np
+import pytest
+import uvicorn
+from fastapi import FastAPI
+from helpers import encode_image
+
+import thor2_jax as thor2
+from thor2_jax.client import Client, ServiceError
+from thor2_jax.errors import InputError
+from thor2_jax.gallery import store
+from thor2_jax.service.app import create_app
+from thor2_jax.service.engine import InferenceEngine
+from thor2_jax.service.settings import Settings
+
+Files = dict[str, bytes]
+
+
+@pytest.fixture(scope="module")
+def gallery(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("teaching") / "gallery"
+
+
+@pytest.fixture(scope="module")
+def app(teaching_run: Path, gallery: Path) -> FastAPI:
+    settings = Settings(teaching_run, max_batch=8, processes=1, gallery=gallery, teach=True, deadline=20)
+    return create_app(settings)
+
+
+@contextlib.contextmanager
+def serving(app: FastAPI) -> Iterator[str]:
+    """Serve in a thread of this process, so that tests can replace functions; yield the URL."""
+    server = uvicorn.Server(uvicorn.Config(app, port=0, log_config=None, ws="none"))
+    thread = threading.Thread(target=server.run)
+    thread.start()
+    try:
+        while not server.started:
+            assert thread.is_alive()
+            time.sleep(0.01)
+        yield f"http://127.0.0.1:{server.servers[0].sockets[0].getsockname()[1]}"
+    finally:
+        server.should_exit = True
+        thread.join()
+
+
+@pytest.fixture(scope="module")
+def started(app: FastAPI) -> Iterator[str]:
+    with serving(app) as url:
+        app.state.service.wait_until_ready()
+        yield url
+
+
+@pytest.fixture
+def http(started: str, gallery: Path, files: Files) -> Iterator[httpx.Client]:
+    """The service with an empty gallery; it still answers after the test."""
+    with httpx.Client(base_url=started, timeout=60) as client:
+        yield client
+        shutil.rmtree(gallery)
+        assert len(recognized(client, files)) == 4 and known(client) == {}
+
+
+def enroll(http: httpx.Client, files: Files, name: str, instance: object = 200, **flags: object) -> httpx.Response:
+    return http.post("/v1/objects", files=files, data={"name": name, "instance": str(instance), **flags})
+
+
+def known(http: httpx.Client) -> dict[str, int]:
+    """Return the enrolled objects and the number of their views."""
+    return {each["name"]: each["views"] for each in http.get("/v1/objects").json()["objects"] if each["views"]}
+
+
+def recognized(http: httpx.Client, files: Files) -> list[str | None]:
+    return [one["name"] for one in http.post("/v1/recognize", files=files).json()["instances"]]
+
+
+def state(http: httpx.Client, files: Files) -> tuple[Any, Any]:
+    """Return the list of objects and the answers for a frame."""
+    listed, answer = http.get("/v1/objects").json(), http.post("/v1/recognize", files=files).json()
+    return listed["objects"], answer["instances"]
+
+
+def compilations(http: httpx.Client) -> float:
+    match = re.search(r"^thor2_compilations_after_warm_up_total (.*)$", http.get("/metrics").text, re.M)
+    assert match is not None
+    return float(match[1])
+
+
+def content(directory: Path) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(directory)): path.read_bytes()
+        for path in directory.rglob("*")
+        if path.is_file() and path.name != ".lock"
+    }
+
+
+def test_the_next_frame_knows_an_enrolled_object(http: httpx.Client, files: Files) -> None:
+    before = http.post("/v1/recognize", files=files).json()["instances"]
+    answer = enroll(http, files, "tall")
+    assert answer.status_code == 200, answer.text
+    record = answer.json()
+    assert (record["name"], record["trained"], record["views"], record["source"]) == ("tall", False, 1, "frames")
+    assert record["generation"] == 1 and {"upload", "decode", "device", "gallery"} <= record["timings"].keys()
+    assert recognized(http, files)[3] == "tall"
+    listed = http.get("/v1/objects").json()
+    assert [each["name"] for each in listed["objects"]] == ["a", "b", "tall"] and listed["generation"] == 1
+    assert [each["trained"] for each in listed["objects"]] == [True, True, False]
+    assert listed["objects"][2] == {key: record[key] for key in ("name", "trained", "views", "source", "date")}
+    assert http.get("/v1/model").json()["classes"] == ["a", "b", "tall"]
+    assert http.get("/v1/model").json()["teaches"] is True
+    assert enroll(http, files, "wide", 7).status_code == 200
+    explained = http.post("/v1/explain", files=files).json()["instances"]
+    assert [one["name"] for one in explained] == recognized(http, files) and explained[2]["name"] == "wide"
+    for name in ("wide", "tall"):
+        assert http.delete(f"/v1/objects/{name}").status_code == 200
+    assert http.post("/v1/recognize", files=files).json()["instances"] == before
+    assert compilations(http) == 0
+
+
+def test_the_service_embeds_as_the_library(http: httpx.Client, files: Files, frame: Any, teaching_run: Path) -> None:
+    enroll(http, files, "tall")
+    expected = thor2.Recognizer.load(teaching_run, gallery=teaching_run / "none")
+    expected.enroll("tall", [(frame, 200)])
+    answers = http.post("/v1/recognize", files=files).json()["instances"]
+    for answer, other in zip(answers, expected.recognize(frame), strict=True):
+        assert answer["name"] == other.name and answer["confidence"] == pytest.approx(other.confidence, abs=5e-3)
+
+
+def test_extend_and_replace(http: httpx.Client, files: Files) -> None:
+    enroll(http, files, "tall")
+    refused = enroll(http, files, "tall", 7)
+    assert refused.status_code == 409 and refused.json()["field"] == "name" and "extend" in refused.json()["message"]
+    assert known(http) == {"tall": 1}
+    assert enroll(http, files, "tall", 7, extend="true").json()["views"] == 2
+    assert known(http) == {"tall": 2}
+    assert enroll(http, files, "tall", 7, replace="true").json()["views"] == 1
+    # A trained class needs one of them, too.
+    assert enroll(http, files, "a").status_code == 409
+    assert enroll(http, files, "a", replace="true").json()["trained"] is False
+    assert enroll(http, files, "b", extend="true").json()["trained"] is True
+
+
+def test_undo_takes_back_each_kind_of_change(http: httpx.Client, files: Files) -> None:
+    enroll(http, files, "tall")
+    changes: dict[str, Callable[[], httpx.Response]] = {
+        "new": lambda: enroll(http, files, "wide", 7),
+        "extend": lambda: enroll(http, files, "tall", 7, extend="true"),
+        "replace": lambda: enroll(http, files, "tall", 7, replace="true"),
+        "extend a trained class": lambda: enroll(http, files, "a", 7, extend="true"),
+        "replace a trained class": lambda: enroll(http, files, "a", 7, replace="true"),
+        "forget": lambda: http.delete("/v1/objects/tall"),
+        "forget a trained class": lambda: http.delete("/v1/objects/a"),
+    }
+    for kind, change in changes.items():
+        before = state(http, files)
+        generation = change().json()["generation"]
+        assert state(http, files) != before, kind
+        undone = http.post("/v1/objects/undo", files={"generation": str(generation).encode()})
+        assert undone.status_code == 200 and undone.json()["generation"] == generation + 1, undone.text
+        assert state(http, files) == before, kind
+
+
+def test_undo_refuses_after_another_change(http: httpx.Client, files: Files) -> None:
+    generation = enroll(http, files, "tall").json()["generation"]
+    enroll(http, files, "wide", 7)
+    for number in (generation, 0, 999):
+        refused = http.post("/v1/objects/undo", data={"generation": number}, files={"x": b""})
+        assert refused.status_code == 409 and refused.json()["field"] == "generation"
+    assert known(http) == {"tall": 1, "wide": 1}
+
+
+def test_another_process_sees_a_change_and_is_seen(
+    http: httpx.Client, files: Files, frame: Any, teaching_run: Path, gallery: Path
+) -> None:
+    other = InferenceEngine(Settings(teaching_run, max_batch=8, gallery=gallery, teach=True))
+    enroll(http, files, "tall")
+    other.refresh()
+    assert other.classes == ("a", "b", "tall")
+    library = thor2.Recognizer.load(teaching_run, gallery=gallery)
+    library.enroll("wide", [(frame, 7)])
+    assert recognized(http, files)[2:] == ["wide", "tall"]
+    library.forget("tall")
+    assert known(http) == {"wide": 1}
+
+
+def call(app: FastAPI, method: str, path: str, **options: Any) -> httpx.Response:
+    """Send a request to an application that is not started."""
+
+    async def send() -> httpx.Response:
+        async with httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://x") as client:
+            return await client.request(method, path, **options)
+
+    return asyncio.run(send())
+
+
+CHANGES = [("POST", "/v1/objects"), ("DELETE", "/v1/objects/a"), ("POST", "/v1/objects/undo")]
+
+
+def test_without_teach_the_service_refuses_changes(teaching_run: Path) -> None:
+    app = create_app(Settings(teaching_run))
+    for method, path in CHANGES:
+        answer = call(app, method, path)
+        assert answer.status_code == 403 and "--teach" in answer.json()["message"]
+    listed = call(app, "GET", "/v1/objects").json()["objects"]
+    assert [(each["name"], each["views"], each["date"]) for each in listed] == [("a", 0, None), ("b", 0, None)]
+    assert call(app, "GET", "/v1/model").json()["teaches"] is False
+    assert "/v1/objects/undo" not in call(app, "GET", "/openapi.json").json()["paths"]
+
+
+def test_the_token_protects_the_gallery(teaching_run: Path, tmp_path: Path) -> None:
+    app = create_app(Settings(teaching_run, token="secret", gallery=tmp_path / "gallery", teach=True))
+    for method, path in [*CHANGES, ("GET", "/v1/objects")]:
+        assert call(app, method, path).status_code == 401
+    assert call(app, "GET", "/v1/objects", headers={"Authorization": "Bearer secret"}).status_code == 200
+
+
+def test_unusable_galleries_are_refused_at_the_start(teaching_run: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="gallery: .*index.json"):
+        InferenceEngine(Settings(teaching_run, gallery=tmp_path / "none"))
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match="gallery: .*cannot be written"):
+        InferenceEngine(Settings(teaching_run, gallery=tmp_path / "file" / "gallery", teach=True))
+
+
+BAD_FIELDS: dict[str, tuple[dict[str, Any], str]] = {
+    "empty name": ({"name": ""}, "name"),
+    "blank name": ({"name": "  "}, "name"),
+    "control characters": ({"name": "mug\x1b[31m\n"}, "name"),
+    "changes the direction": ({"name": "mug\u202egpj"}, "name"),
+    "long name": ({"name": "m" * 201}, "name"),
+    "very long name": ({"name": "m" * 100_000}, "name"),
+    "no number": ({"instance": "three"}, "instance"),
+    "negative number": ({"instance": "-3"}, "instance"),
+    "background": ({"instance": "0"}, "instance"),
+    "no such instance": ({"instance": "9"}, "instance"),
+    "huge number": ({"instance": "9" * 30}, "instance"),
+    "too few points": ({"instance": "5"}, "instance"),
+    "no flag": ({"extend": "maybe"}, "extend"),
+    "both flags": ({"extend": "true", "replace": "true"}, "replace"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_FIELDS)
+def test_bad_fields_are_refused_in_one_line(case: str, http: httpx.Client, files: Files, gallery: Path) -> None:
+    enroll(http, files, "tall")
+    before = content(gallery)
+    change, field = BAD_FIELDS[case]
+    answer = http.post("/v1/objects", files=files, data={"name": "new", "instance": "200", **change})
+    check_refused(answer, 422, field)
+    assert content(gallery) == before and known(http) == {"tall": 1}
+
+
+def check_refused(answer: httpx.Response, status: int, field: str | None) -> None:
+    assert answer.status_code == status, answer.text
+    problem = answer.json()
+    assert problem["field"] == field and len(problem["message"]) < 500, problem
+    for internal in ("\n", "\x1b", "Traceback", "/tmp", ".py"):
+        assert internal not in problem["message"]
+
+
+def test_bad_requests_are_refused(http: httpx.Client, files: Files) -> None:
+    without = {name: content for name, content in files.items() if name != "depth"}
+    check_refused(enroll(http, without, "tall"), 422, "depth")
+    check_refused(enroll(http, files | {"color": b"damaged"}, "tall"), 422, "color")
+    check_refused(http.post("/v1/objects", files=files), 422, "name")
+    check_refused(http.post("/v1/objects", json={"name": "tall"}), 415, "body")
+    check_refused(http.post("/v1/objects", files=files | {"name": b"\xff\xfe", "instance": b"200"}), 422, "name")
+    far = {"fx": 600.0, "fy": 600.0, "cx": 159.5, "cy": 119.5, "depth_scale": 1000 / 2.6}
+    camera = json.dumps({**far, "fx": 60.0, "fy": 60.0}).encode()
+    huge = files | {"intrinsics": camera, "labels": encode_image(np.full((240, 320), 200, np.uint8))}
+    assert enroll(http, huge, "huge").json()["field"] in ("instance", "intrinsics")
+    for name in ("missing", "a/b", "..", "%00", "", "m" * 3000):
+        assert http.delete(f"/v1/objects/{name}").status_code in (404, 405)
+    for value in ("", "x", "-1", "1e9", "9" * 40):
+        check_refused(http.post("/v1/objects/undo", files={"generation": value.encode()}), 422, "generation")
+    assert known(http) == {}
+
+
+def test_a_full_disk_leaves_the_gallery(
+    http: httpx.Client, files: Files, gallery: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    generation = enroll(http, files, "tall").json()["generation"]
+    before = content(gallery)
+
+    def fail(*_: object) -> None:
+        raise OSError(28, "No space left on device", "/tmp/secret")
+
+    for step in ("_write_durably", "write_text"):
+        with monkeypatch.context() as patch:
+            patch.setattr(store, step, fail)
+            check_refused(enroll(http, files, "wide", 7), 507, None)
+            if step == "write_text":
+                check_refused(http.delete("/v1/objects/tall"), 507, None)
+                check_refused(http.post("/v1/objects/undo", files={"generation": str(generation).encode()}), 507, None)
+        assert content(gallery) == before and known(http) == {"tall": 1}
+    assert enroll(http, files, "wide", 7).status_code == 200
+
+
+def test_a_damaged_gallery_stops_changes_but_not_recognition(
+    http: httpx.Client, files: Files, gallery: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    enroll(http, files, "tall")
+    index = gallery / "index.json"
+    good = index.read_bytes()
+    for bad in (
+        b"{",
+        good.replace(b'"embedding": "', b'"embedding": "0'),
+        good.replace(b'"format": 1', b'"format": 9'),
+    ):
+        index.write_bytes(bad)
+        for answer in (
+            enroll(http, files, "wide", 7),
+            http.delete("/v1/objects/tall"),
+            http.get("/v1/objects"),
+        ):
+            check_refused(answer, 500, answer.json()["field"])
+            assert answer.json()["message"].startswith("gallery: ")
+        assert index.read_bytes() == bad and recognized(http, files)[3] == "tall"
+        assert http.get("/v1/model").json()["classes"] == ["a", "b", "tall"]
+    assert str(gallery) in caplog.text
+    index.write_bytes(good)
+    assert known(http) == {"tall": 1} and enroll(http, files, "wide", 7).status_code == 200
+
+
+def test_a_change_waits_for_another_writer(
+    http: httpx.Client, files: Files, gallery: Path, app: FastAPI, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    enroll(http, files, "tall")
+    lock = filelock.FileLock(gallery / ".lock", thread_local=False, fallback_to_soft=False)
+    with lock:
+        timer = threading.Timer(0.5, lock.release, [True])
+        timer.start()
+        answer = enroll(http, files, "wide", 7)
+        timer.join()
+    assert answer.status_code == 200 and answer.json()["timings"]["gallery"] > 100
+    service = app.state.service
+    monkeypatch.setattr(service, "settings", Settings(service.settings.model, deadline=2.0, teach=True))
+    before = content(gallery)
+    with lock:
+        start = time.monotonic()
+        refused = enroll(http, files, "other")
+        assert time.monotonic() - start < 2 and refused.headers["retry-after"] == "1"
+        check_refused(refused, 503, None)
+        assert recognized(http, files)[2:] == ["wide", "tall"]
+    assert content(gallery) == before and enroll(http, files, "other").status_code == 200
+
+
+def test_two_clients_at_once_lose_no_change(http: httpx.Client, files: Files) -> None:
+    answers: list[int] = []
+
+    def teach(prefix: str) -> None:
+        for number in range(5):
+            answers.append(enroll(http, files, f"{prefix}{number}", 7).status_code)
+
+    threads = [threading.Thread(target=teach, args=[prefix]) for prefix in "xy"]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert answers == [200] * 10 and len(known(http)) == 10
+
+
+def test_a_run_that_answers_by_classifiers_answers_by_both(teaching_run: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(teaching_run, run)
+    description = json.loads((run / "run.json").read_text())
+    description["record"]["answer_by"] = "classifiers"
+    (run / "run.json").write_text(json.dumps(description))
+    engine = InferenceEngine(Settings(run, teach=True))
+    library = thor2.Recognizer.load(run)
+    assert library.answers_by() == "classifiers"
+    assert engine._recognizer._answer_by == "both"
+
+
+def test_the_client_teaches(http: httpx.Client, files: Files) -> None:
+    client = Client(str(http.base_url))
+    record = client.enroll("client/tall ü", **files, instance=200)
+    assert record["views"] == 1 and client.objects()[-1]["name"] == "client/tall ü"
+    with pytest.raises(ServiceError, match="extend") as error:
+        client.enroll("client/tall ü", **files, instance=7)
+    assert (error.value.status, error.value.field) == (409, "name")
+    extended = client.enroll("client/tall ü", **files, instance=7, extend=True)
+    assert extended["views"] == 2
+    client.undo(extended["generation"])
+    assert client.objects()[-1]["views"] == 1
+    generation = client.forget("client/tall ü")
+    assert client.undo(generation) == generation + 1
+    client.forget("client/tall ü")
+    with pytest.raises(ServiceError) as missing:
+        client.forget("client/tall ü")
+    assert missing.value.status == 404
+
+
+@pytest.mark.slow
+def test_all_workers_know_an_object_within_a_second(
+    start_server: Callable[..., Any], teaching_run: Path, files: Files, tmp_path: Path
+) -> None:
+    options = ("--teach", "--gallery", str(tmp_path / "gallery"), "--workers", "2", "--processes", "1")
+    server = start_server(*options, run=teaching_run)
+    until = time.monotonic() + 240
+    while server.log.read_text().count("ready:") < 2:
+        assert time.monotonic() < until
+        time.sleep(0.1)
+    with httpx.Client(base_url=server.url, timeout=60) as client:
+        for round_ in range(3):
+            assert enroll(client, files, f"tall{round_}").status_code == 200
+            end = time.monotonic() + 1
+            while time.monotonic() < end:  # Each request is a new connection, which any worker may accept.
+                names = [
+                    one["name"] for one in httpx.post(f"{server.url}/v1/recognize", files=files).json()["instances"]
+                ]
+                assert names[3] is not None and names[3].startswith("tall")
+                classes = httpx.get(f"{server.url}/v1/model").json()["classes"]
+                assert f"tall{round_}" in classes
+        assert "thor2_compilations_after_warm_up_total 0.0" in client.get("/metrics").text

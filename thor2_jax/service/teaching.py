@@ -1,0 +1,110 @@
+"""Requests that enroll and forget objects: their fields, and the errors of the gallery as error responses."""
+
+import contextlib
+import dataclasses
+import logging
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+from thor2_jax.errors import InputError
+from thor2_jax.gallery.gallery import check_name
+from thor2_jax.gallery.store import GalleryBusyError, GalleryError
+from thor2_jax.service.problem import RequestError
+
+__all__ = ["Enrolment", "gallery_errors", "generation_number", "parse_enrolment"]
+
+log = logging.getLogger(__name__)
+
+MAX_NAME_BYTES = 1000
+"""Length in bytes up to which a name is checked, and named in an error."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Enrolment:
+    """What a request enrolls.
+
+    Attributes:
+        name: name of the object.
+        instance: its number in the label image.
+        extend: add the view to those of an object with this name.
+        replace: discard the views of an object with this name.
+    """
+
+    name: str
+    instance: int
+    extend: bool
+    replace: bool
+
+
+def parse_enrolment(fields: dict[str, bytes]) -> Enrolment:
+    """Return the enrolment of the form fields name, instance, extend and replace; the last two may be absent.
+
+    Raises:
+        RequestError: 422, with the errors of all fields.
+    """
+    errors: list[RequestError] = []
+
+    def error(field: str, message: str) -> None:
+        errors.append(RequestError(422, field, message))
+
+    name = fields["name"]
+    text = ""
+    if len(name) > MAX_NAME_BYTES:
+        error("name", f"name has {len(name)} bytes; expected a printable text of 1 to 200 characters.")
+    else:
+        try:
+            text = check_name(name.decode())
+        except UnicodeDecodeError:
+            error("name", "name is not valid UTF-8; expected a printable text of 1 to 200 characters.")
+        except InputError as problem:
+            error("name", f"{problem}.")
+    instance = 0
+    if re.fullmatch(rb"[0-9]{1,10}", fields["instance"]):
+        instance = int(fields["instance"])
+    else:
+        error("instance", "instance is not a number; expected the object's number in the label image.")
+    flags = {}
+    for field in ("extend", "replace"):
+        value = fields.get(field, b"false").lower()
+        if value not in (b"true", b"1", b"false", b"0"):
+            error(field, f"{field} must be true or false.")
+        flags[field] = value in (b"true", b"1")
+    if all(flags.values()):
+        error("replace", "extend and replace are both true; choose one.")
+    if errors:
+        raise RequestError.merge(errors)
+    return Enrolment(text, instance, flags["extend"], flags["replace"])
+
+
+def generation_number(fields: dict[str, bytes]) -> int:
+    """Return the form field generation. Raises RequestError (422)."""
+    if not re.fullmatch(rb"[0-9]{1,18}", fields["generation"]):
+        raise RequestError(422, "generation", "generation is not a number; expected that of the change's answer.")
+    return int(fields["generation"])
+
+
+@contextlib.contextmanager
+def gallery_errors(directory: Path | None, refused: int, field: str) -> Iterator[None]:
+    """Turn the errors of a gallery into error responses; they do not say where it lies.
+
+    Args:
+        directory: directory of the gallery.
+        refused: status for a change that the gallery refuses.
+        field: field of the request that is then concerned.
+
+    Raises:
+        RequestError: 500 for a gallery that cannot be read, 503 while another process writes to it, 507 if it cannot be
+            written, `refused` for other errors. The gallery is as before.
+    """
+    try:
+        yield
+    except (GalleryError, OSError) as error:
+        log.error("%s", error)
+        if isinstance(error, OSError):
+            message = f"The gallery cannot be written ({error.strerror}); it is as before."
+            raise RequestError(507, None, message) from None
+        message = str(error).replace(f"{directory}/", "").replace(str(directory), "the directory")
+        raise RequestError(503 if isinstance(error, GalleryBusyError) else 500, None, f"{message}.") from None
+    except InputError as error:
+        raise RequestError(refused, field, f"{error}.") from None
