@@ -5,6 +5,7 @@ enroll_objects(Path("run"), {"mug": mesh_views(Path("mug.glb"))}, "mesh")
 
 import contextlib
 import dataclasses
+import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError, with_context
 from thor2_jax.gallery.enrollment import enrolled_views, instance_view
+from thor2_jax.gallery.gallery import GalleryObject
 from thor2_jax.gallery.objects import ObjectGallery
 from thor2_jax.gallery.store import GALLERY_DIRECTORY
 from thor2_jax.recognition.prepared_instance import PreparedInstance
@@ -148,7 +150,7 @@ def enroll_objects(
     Raises:
         InputError: the run directory cannot be read, a view cannot be used, or a name exists and neither `extend` nor
             `replace` is given. Nothing is enrolled.
-        OSError: a file cannot be written; the gallery is as before.
+        OSError: a file cannot be written; the gallery is as before, and no run directory is created.
     """
     is_new = not model.exists() or (model.is_dir() and not any(model.iterdir()))
     objects = ObjectGallery(()) if is_new else Recognizer.load(model).objects
@@ -165,7 +167,19 @@ def enroll_objects(
             added[each] = enrolled_views(objects.embedding, found, source)
         report("enroll", len(views), len(views), "")
     if is_new:
-        save_run(TrainedRun(config, objects.embedding.network, (), {}, {}), model)
-        objects.open(model / GALLERY_DIRECTORY)
-    objects.add(added, extend=extend, replace=replace)
+        _create_run(model, objects, added)
+    else:
+        objects.add(added, extend=extend, replace=replace)
     return {each: len(objects.gallery.objects[each].clouds) for each in views}
+
+
+def _create_run(model: Path, objects: ObjectGallery, added: Mapping[str, GalleryObject]) -> None:
+    """Write a run directory of enrolled objects only. It appears under its name when it is complete."""
+    model = model.resolve()
+    model.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f".{model.name}.", dir=model.parent) as unfinished:
+        run = Path(unfinished) / "run"
+        save_run(TrainedRun(objects.embedding.config, objects.embedding.network, (), {}, {}), run)
+        objects.open(run / GALLERY_DIRECTORY)
+        objects.add(added)
+        run.rename(model)

@@ -13,6 +13,7 @@ from PIL import Image
 
 from thor2_jax.gallery import embedding as embeddings
 from thor2_jax.gallery import objects as gallery_objects
+from thor2_jax.gallery import store
 from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
 from thor2_jax.recognition.run_directory import load_run, save_run
 from thor2_jax.recognizer import Recognizer
@@ -210,3 +211,26 @@ def test_too_few_points_are_refused(tmp_path: Path, capsys: pytest.CaptureFixtur
     for given in (["--frames", frame], ["new", *one_frame(frame, 1)]):
         assert "points" in error_of(capsys, "enroll", *given, "--model", tmp_path / "run")
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("step", ["_write_durably", "write_text"])
+@pytest.mark.parametrize("exists", [False, True])
+def test_a_full_disk_leaves_no_run_behind(
+    step: str,
+    exists: bool,
+    frames: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def fail(*_: object) -> None:
+        raise OSError(28, "No space left on device", "index.json")
+
+    model = tmp_path / "run"
+    if exists:
+        model.mkdir()
+    before = sorted(tmp_path.iterdir())
+    monkeypatch.setattr(store, step, fail)
+    assert run_thor2("enroll", "--frames", frames, "--model", model) != 0
+    assert "No space left" in capsys.readouterr().err
+    assert sorted(tmp_path.iterdir()) == before and (not exists or not any(model.iterdir()))
