@@ -1,0 +1,287 @@
+"""Accuracy under simulated cameras: `python -m benchmarks.cameras --model RUN... --frames DIR... --out FILE.json`.
+
+Every frame is recognized as it is and as ten simulated cameras see it (`benchmarks.simulated_cameras`): those on which
+settings may be chosen, or those for the final report. For one or several runs on the same classes, the file has the
+mean and the standard deviation over the runs of
+
+accuracy              mean over placements, all together and by group (directory) of frames
+accuracy_of_instances
+steadiness            share of neighbouring frames with the most frequent answer of their placement
+calibration_error     expected calibration error on known objects
+auroc                 known against unknown objects, by the confidence
+unknown_named         share of unknown objects that are named where 95 % of the correct answers are kept
+
+on the original frames, for each camera, and for all cameras together. Labelled objects that the runs do not know are
+unknown objects, except those with a name of --ignore, which are left out. Placements are those of the original frames;
+each camera has its own. --picture draws the first frame, or without --frames a scene of built-in objects, as all
+twenty cameras see it.
+"""
+
+import argparse
+import dataclasses
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from fnmatch import fnmatch
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from benchmarks.simulated_cameras import CHOOSE, REPORT, SimulatedCamera, through_camera
+from thor2_jax.errors import InputError
+from thor2_jax.files import atomic_write, write_text
+from thor2_jax.recognition.frames import RGBDFrame
+from thor2_jax.recognition.fusion import DEFAULT_RULE
+from thor2_jax.recognition.overlay import COLORS, Annotation, draw_instances
+from training.evaluation.accuracy import summarize_rows
+from training.evaluation.answering import answer_frames
+from training.evaluation.answers import EvaluatedRun, FrameAnswers, InstancePrediction
+from training.evaluation.confidence import auroc, expected_calibration_error, unknown_named
+from training.evaluation.fusion import Rule, main_fusion
+from training.evaluation.placements import find_placements, placement_accuracy, steadiness
+from training.evaluation.results import COVERAGE, fuse_answers
+from training.evaluation.runs import Run, load_runs
+from training.objects.builtin_objects import builtin_objects
+from training.readers.frames import FrameFolder
+from training.readers.labelled import LabelledFrame, sequence_of
+from training.rendering.scenes import compose_scene
+
+CAMERAS: dict[str, tuple[SimulatedCamera, ...]] = {"choose": CHOOSE, "report": REPORT, "none": ()}
+
+ORIGINAL, ALL = "original", "all cameras"
+"""Names of the frames as they are, and of all cameras together."""
+
+LOOK_ALIKES = (
+    *("banana", "bowl", "apple", "lemon", "orange", "peach", "pear"),
+    *("scissors_*", "marker_*", "pen_*", "spoon_*", "fork_*", "knife*", "plate_*", "cup_*"),
+)
+"""Objects of HOTS that look like a class of YCB."""
+
+SCENE = 5
+"""Seed of the scene of built-in objects."""
+
+Progress = Callable[[str, int, int], None]
+"""Called with a camera's name, frames done and the number of frames."""
+
+
+def labelled_frames(directories: Sequence[Path], ignore: Sequence[str] = ()) -> list[LabelledFrame]:
+    """Read frames, of which those in one directory are a group and a video.
+
+    Args:
+        directories: directories of frames, or of single frames, whose group is their parent directory.
+        ignore: patterns of object names that are left out.
+
+    Returns:
+        Frames with identifiers GROUP/FRAME.
+
+    Raises:
+        InputError: a frame cannot be read, or two directories have one name.
+    """
+    frames: dict[str, LabelledFrame] = {}
+    for directory in directories:
+        folder = Path(directory).resolve()
+        group = folder.parent if (folder / "labels.json").is_file() else folder
+        for item in FrameFolder(folder):
+            identifier = f"{group.name}/{item.identifier}"
+            if identifier in frames:
+                raise InputError(f"frames: {identifier} is given twice; give every frame once")
+            truth = {k: name for k, name in item.truth.items() if not any(fnmatch(name, each) for each in ignore)}
+            frames[identifier] = dataclasses.replace(item, identifier=identifier, truth=truth)
+    return list(frames.values())
+
+
+def answers_by_camera(
+    runs: Sequence[Run],
+    frames: Sequence[LabelledFrame],
+    cameras: Sequence[SimulatedCamera],
+    progress: Progress = lambda camera, done, total: None,
+) -> dict[str, list[FrameAnswers]]:
+    """Return `ORIGINAL` or a camera's name -> the answers; every frame is described once for all runs."""
+
+    def seen(camera: SimulatedCamera | None) -> Iterator[LabelledFrame]:
+        for item in frames:
+            yield item if camera is None else dataclasses.replace(item, frame=through_camera(item.frame, camera))
+
+    answers: dict[str, list[FrameAnswers]] = {}
+    for camera in (None, *cameras):
+        name = ORIGINAL if camera is None else camera.name
+        answers[name] = []
+        for _, of_frame in answer_frames(runs, seen(camera)):
+            answers[name].append(of_frame)
+            progress(name, len(answers[name]), len(frames))
+    return answers
+
+
+def measure(
+    runs: Sequence[EvaluatedRun],
+    answers: Mapping[str, Sequence[FrameAnswers]],
+    title: str | None = None,
+    rule: Rule = DEFAULT_RULE,
+) -> dict[str, dict[str, Any]]:
+    """Return `ORIGINAL`, a camera's name or `ALL` -> metric -> `RunStatistics` as a JSON table; "groups" holds several.
+
+    Args:
+        runs: the runs that gave the answers.
+        answers: from `answers_by_camera`.
+        title: fusion of the classifiers, see `fusions`; by default the one that the first run answers by.
+        rule: rule of the fusion.
+
+    Raises:
+        InputError: no instance is of a class of the runs.
+    """
+    placements = find_placements(answers[ORIGINAL])
+    parts = {name: [(name, frames)] for name, frames in answers.items()}
+    cameras = [(name, frames) for name, frames in answers.items() if name != ORIGINAL]
+    if cameras:
+        parts[ALL] = cameras
+    return {name: _measure(runs, part, placements, title, rule) for name, part in parts.items()}
+
+
+def _measure(
+    runs: Sequence[EvaluatedRun],
+    cameras: Sequence[tuple[str, Sequence[FrameAnswers]]],
+    placements: Sequence[NDArray[np.intp]],
+    title: str | None,
+    rule: Rule,
+) -> dict[str, Any]:
+    """Return the metrics of the answers of some cameras together."""
+    classes = runs[0].classes
+    n_placements = 1 + max((int(numbers.max()) for numbers in placements if len(numbers)), default=0)
+    known: list[InstancePrediction] = []
+    unknown: list[InstancePrediction] = []
+    placement: list[int] = []
+    group: list[str] = []
+    for index, (_, frames) in enumerate(cameras):
+        for frame, numbers in zip(frames, placements, strict=True):
+            for instance, number in zip(frame.instances, numbers, strict=True):
+                if instance.truth not in classes:
+                    unknown.append(instance)
+                    continue
+                known.append(instance)
+                placement.append(index * n_placements + int(number))
+                group.append(sequence_of(frame.frame))
+    if not known:
+        raise InputError(f"frames: no instance is of a class of the runs, which know {', '.join(classes[:5])}, ...")
+    fused, others = fuse_answers(known, runs, rule), fuse_answers(unknown, runs, rule)
+    chosen = title or main_fusion(fused, runs[0].answer_by)
+    if chosen not in fused:
+        raise InputError(f"fusion: the runs have no {chosen}; expected one of {', '.join(fused)}")
+    described = np.array([instance.probabilities is not None for instance in known])
+    truth = np.array([classes.index(instance.truth) for instance in known])
+    numbers, groups = np.array(placement), np.array(group)
+    rows, by_group = [], []
+    for run, predictions in fused[chosen].items():
+        answer = np.full(len(known), -1)
+        answer[described] = predictions.class_index
+        correct = answer == truth
+        confidence = np.minimum(predictions.confidence, 1)
+        of_unknown = np.minimum(others[chosen][run].confidence, 1)
+        right = correct[described]
+        every = np.concatenate([confidence, of_unknown])
+        rows.append(
+            {
+                "accuracy": placement_accuracy(numbers, correct),
+                "accuracy_of_instances": float(correct.mean()),
+                "steadiness": steadiness(numbers, answer),
+                "calibration_error": expected_calibration_error(confidence, right),
+                "auroc": auroc(every, np.arange(len(every)) < len(confidence)),
+                "unknown_named": float(unknown_named(confidence[right], of_unknown, COVERAGE)),
+            }
+        )
+        by_group.append(
+            {
+                each: placement_accuracy(numbers[groups == each], correct[groups == each])
+                for each in dict.fromkeys(group)
+            }
+        )
+    return {
+        **summarize_rows(rows),
+        "groups": summarize_rows(by_group),
+        "instances": len(known),
+        "placements": len(np.unique(numbers)),
+        "unknown_instances": len(unknown),
+    }
+
+
+def draw_cameras(frame: RGBDFrame, path: Path) -> None:
+    """Draw a labelled frame as all cameras see it (JPEG): black in masks has no depth, what is in no mask is dimmed."""
+    figure = Figure(figsize=(15, 9.6), layout="constrained")
+    for axes, camera in zip(figure.subplots(4, 5).flat, (*CHOOSE, *REPORT), strict=True):
+        seen = through_camera(frame, camera)
+        color = np.where(seen.labels[..., None] > 0, seen.color, seen.color // 2)
+        color[(seen.labels > 0) & (seen.depth == 0)] = 0
+        outlines = [Annotation(label, COLORS[k % len(COLORS)], "") for k, label in enumerate(seen.instances)]
+        axes.imshow(np.asarray(draw_instances(color, seen.labels, outlines)))
+        rows, columns = np.nonzero(frame.labels)
+        axes.set(xlim=(columns.min() - 30, columns.max() + 30), ylim=(rows.max() + 30, rows.min() - 30))
+        axes.set_title(f"{camera.name} ({'choose' if camera in CHOOSE else 'report'})", fontsize=11)
+        axes.set_axis_off()
+    FigureCanvasAgg(figure)
+    with atomic_write(path) as temporary:
+        figure.savefig(temporary, dpi=100, format="jpeg", pil_kwargs={"quality": 80})
+
+
+def show(results: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return the metrics as a table of text."""
+    metrics = "accuracy", "accuracy_of_instances", "steadiness", "calibration_error", "auroc", "unknown_named"
+    lines = [" " * 20 + "".join(f"{name:>23s}" for name in metrics)]
+    for name, values in results.items():
+        cells = [values[metric] for metric in metrics]
+        lines.append(f"{name:20s}" + "".join(f"{mean_and_deviation(cell):>23s}" for cell in cells))
+    return "\n".join(lines)
+
+
+def mean_and_deviation(statistics: Mapping[str, Any]) -> str:
+    """Return a mean, with the standard deviation if there are several runs."""
+    if statistics["mean"] is None:
+        return "-"
+    return f"{statistics['mean']:.3f}" + ("" if statistics["std"] is None else f" +- {statistics['std']:.3f}")
+
+
+def print_progress(camera: str, done: int, total: int) -> None:
+    """Print a line when all frames of a camera are answered."""
+    if done == total:
+        print(f"{camera}: {total} frames", flush=True)
+
+
+def main() -> None:
+    """Measure the runs, print the table and write the file."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--model", type=Path, nargs="+", default=[], metavar="RUN")
+    parser.add_argument("--frames", type=Path, nargs="+", default=[], metavar="DIR")
+    parser.add_argument("--cameras", choices=list(CAMERAS), default="choose")
+    parser.add_argument("--ignore", nargs="*", default=LOOK_ALIKES, metavar="PATTERN", help="names to leave out")
+    parser.add_argument("--fusion", metavar="TITLE", help="such as CE+TOPS+TOPS2; default: what the run answers by")
+    parser.add_argument("--out", type=Path, metavar="FILE.json")
+    parser.add_argument("--picture", type=Path, metavar="FILE.jpg")
+    options = parser.parse_args()
+    measured = options.model, options.frames, options.out
+    if not all(measured) and (options.model or options.out or not options.picture):
+        parser.error("give --model, --frames and --out, or --picture")
+    try:
+        frames = labelled_frames(options.frames, options.ignore)
+        if options.picture:
+            scene = frames[0] if frames else compose_scene(builtin_objects(), np.random.default_rng(SCENE), 6)
+            draw_cameras(scene.frame, options.picture)
+        if options.model:
+            runs = load_runs(options.model)
+            answers = answers_by_camera(runs, frames, CAMERAS[options.cameras], print_progress)
+            results = measure(runs, answers, options.fusion)
+            print(show(results))
+            report = {
+                "runs": [run.name for run in runs],
+                "frames": [str(path) for path in options.frames],
+                "ignored": list(options.ignore),
+                "cameras": options.cameras,
+                "results": results,
+            }
+            write_text(options.out, json.dumps(report, indent=1) + "\n")
+    except (InputError, OSError) as error:
+        parser.error(str(error))
+
+
+if __name__ == "__main__":
+    main()

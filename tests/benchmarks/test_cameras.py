@@ -1,0 +1,157 @@
+"""The benchmark of simulated cameras: its frames, its metrics by hand, and the command with an untrained run."""
+
+import json
+import sys
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from helpers import encode_image, untrained_run
+
+from benchmarks import cameras
+from benchmarks.simulated_cameras import CHOOSE
+from thor2_jax.errors import InputError
+from thor2_jax.recognition.run_directory import save_run
+from training.evaluation.answers import FrameAnswers, InstancePrediction
+
+CLASSES = ("bowl", "can", "mug")
+
+
+class ToyRun(NamedTuple):
+    name: str
+    predictors: tuple[str, ...] = ("tops",)
+    classes: tuple[str, ...] = CLASSES
+    answer_by: str = "classifiers"
+    temperatures: dict[str, float] = {}
+    threshold: float = 0.0
+
+
+def write_frame(folder: Path, names: dict[int, str], seed: int = 0) -> Path:
+    """Write a frame of blocks on a table, a block for each name."""
+    folder.mkdir(parents=True)
+    rng = np.random.default_rng(seed)
+    labels, depth = np.zeros((48, 64), np.uint8), np.full((48, 64), 900, np.uint16)
+    for k, label in enumerate(names):
+        labels[8:40, 4 + 20 * k : 18 + 20 * k] = label
+    depth[labels > 0] = rng.integers(780, 800, (labels > 0).sum())
+    for name, image in (
+        ("color", rng.integers(0, 256, (48, 64, 3), dtype=np.uint8)),
+        ("depth", depth),
+        ("mask", labels),
+    ):
+        (folder / f"{name}.png").write_bytes(encode_image(image))
+    (folder / "intrinsics.json").write_text('{"fx": 150, "fy": 150, "cx": 32, "cy": 24}')
+    (folder / "labels.json").write_text(json.dumps({"labels": names}))
+    return folder
+
+
+def test_groups_are_directories_of_frames(tmp_path: Path) -> None:
+    for k in range(2):
+        write_frame(tmp_path / "video" / f"{k}", {1: "mug", 2: "banana"})
+        write_frame(tmp_path / "hots" / f"mix_{k}", {1: "pen_red", 3: "book"})
+    given = [tmp_path / "video", tmp_path / "hots" / "mix_1", tmp_path / "hots" / "mix_0"]
+    frames = cameras.labelled_frames(given, cameras.LOOK_ALIKES)
+    assert [(item.identifier, dict(item.truth)) for item in frames] == [
+        ("video/0", {1: "mug"}),
+        ("video/1", {1: "mug"}),
+        ("hots/mix_1", {3: "book"}),
+        ("hots/mix_0", {3: "book"}),
+    ]
+    with pytest.raises(InputError, match="video/1"):
+        cameras.labelled_frames([tmp_path / "video", tmp_path / "video" / "1"])
+
+
+def answer(truth: str, name: str | None, confidence: float = 0.6) -> InstancePrediction:
+    """Return an unmoved instance; a name of None has not been described."""
+    if name is None:
+        return InstancePrediction(1, truth, reason="too few points", position=(0.0, 0.0, 1.0))
+    row = np.full(3, (1 - confidence) / 2, np.float32)
+    row[CLASSES.index(name)] = confidence
+    return InstancePrediction(1, truth, False, None, row[None], (0.0, 0.0, 1.0))
+
+
+def test_metrics_match_hand_calculation() -> None:
+    """A mug in a video of three frames, a can, a dragon; under the camera, one answer is lost and one is new."""
+
+    def frames(mug: list[str | None], can: str, dragon: float) -> list[FrameAnswers]:
+        video = [FrameAnswers(f"v/{k}", {}, 1.0, [answer("mug", name, 0.7)]) for k, name in enumerate(mug)]
+        can_frame = FrameAnswers("w/0", {}, 1.0, [answer("can", can, 0.9)])
+        return [*video, can_frame, FrameAnswers("u/0", {}, 1.0, [answer("dragon", "can", dragon)])]
+
+    answers = {
+        "original": frames(["mug", "mug", "bowl"], "can", 0.8),
+        "a": frames(["mug", None, "mug"], "can", 0.6),
+        "b": frames(["can", "bowl", "bowl"], "mug", 0.65),
+    }
+    results = cameras.measure([ToyRun("x")], answers)
+    assert list(results) == ["original", "a", "b", "all cameras"]
+
+    def mean(name: str, metric: str) -> float:
+        return results[name][metric]["mean"]
+
+    assert [mean(name, "accuracy") for name in results] == pytest.approx([(2 / 3 + 1) / 2, (2 / 3 + 1) / 2, 0, 5 / 12])
+    assert [mean(name, "accuracy_of_instances") for name in results] == pytest.approx([3 / 4, 3 / 4, 0, 3 / 8])
+    assert [mean(name, "steadiness") for name in results] == pytest.approx([2 / 3] * 4)
+    assert mean("original", "auroc") == pytest.approx(1 / 4) and mean("a", "auroc") == 1
+    assert mean("all cameras", "auroc") == 1 and mean("original", "unknown_named") == 1
+    assert mean("a", "unknown_named") == 0 and mean("b", "unknown_named") is None
+    assert mean("original", "calibration_error") == pytest.approx((3 * abs(2 / 3 - 0.7) + 0.1) / 4, abs=1e-6)
+    assert {name: value["mean"] for name, value in results["a"]["groups"].items()} == {
+        "v": pytest.approx(2 / 3),
+        "w": 1,
+    }
+    assert [results[name]["placements"] for name in results] == [2, 2, 2, 4]
+    assert results["all cameras"]["unknown_instances"] == 2
+    table = cameras.show(results).splitlines()
+    assert table[1].split()[:2] == ["original", "0.833"] and table[3].split()[-1] == "-"
+
+
+def test_several_runs_have_a_deviation() -> None:
+    """The second run answers "can" to the mug."""
+    rows = np.array([[0.1, 0.2, 0.7], [0.1, 0.7, 0.2]], np.float32)
+    frame = FrameAnswers("v/0", {}, 1.0, [InstancePrediction(1, "mug", probabilities=rows)])
+    results = cameras.measure([ToyRun("x"), ToyRun("y")], {"original": [frame]})
+    assert results["original"]["accuracy"] == {"mean": 0.5, "std": pytest.approx(np.sqrt(0.5)), "runs": 2}
+    assert results["original"]["steadiness"]["runs"] == 0
+    assert "0.500 +- 0.707" in cameras.show(results)
+    with pytest.raises(InputError, match="TOPS2"):
+        cameras.measure([ToyRun("x"), ToyRun("y")], {"original": [frame]}, "TOPS2")
+    with pytest.raises(InputError, match="frames"):
+        cameras.measure([ToyRun("x")], {"original": [FrameAnswers("f", {}, 1.0, [])]})
+
+
+def run_command(monkeypatch: pytest.MonkeyPatch, *arguments: Any) -> None:
+    monkeypatch.setattr(sys, "argv", ["cameras", *map(str, arguments)])
+    cameras.main()
+
+
+def test_command_writes_all_cameras(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for k in range(2):
+        write_frame(tmp_path / "video" / f"{k}", {1: "mug", 2: "can", 5: "dragon"}, seed=k)
+    for seed in range(2):
+        save_run(untrained_run(CLASSES, ("tops",), seed=seed), tmp_path / f"run{seed}")
+    out, picture = tmp_path / "out.json", tmp_path / "cameras.jpg"
+    runs = [tmp_path / "run0", tmp_path / "run1"]
+    run_command(monkeypatch, "--model", *runs, "--frames", tmp_path / "video", "--out", out, "--picture", picture)
+    report = json.loads(out.read_text())
+    results = report["results"]
+    assert list(results) == ["original", *(camera.name for camera in CHOOSE), "all cameras"]
+    assert report["runs"] == ["run0", "run1"] and results["original"]["accuracy"]["runs"] == 2
+    assert (results["original"]["instances"], results["all cameras"]["instances"]) == (4, 40)
+    assert (results["original"]["placements"], results["all cameras"]["placements"]) == (2, 20)
+    assert picture.read_bytes()[:3] == b"\xff\xd8\xff" and "worn: 2 frames" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "arguments", [[], ["--model", "x"], ["--frames", "x"], ["--model", "x", "--frames", "y", "--out", "z"]]
+)
+def test_bad_arguments_are_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], arguments: list[str], tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit):
+        run_command(monkeypatch, *arguments)
+    assert "error: " in capsys.readouterr().err.splitlines()[-1] and list(tmp_path.iterdir()) == []
