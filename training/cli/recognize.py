@@ -1,42 +1,129 @@
-"""`thor2 recognize`: recognize the instances of one frame."""
+"""`thor2 recognize`: recognize the instances of frames."""
 
+import json
+import sys
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.table import Table
 
+from thor2_jax.errors import InputError
 from thor2_jax.printable import escape_characters
 from training.cli.app import ModelOption, UnknownOption, app, console
+
+if TYPE_CHECKING:
+    from thor2_jax.recognition.answers import Recognition
+    from training.readers.frame_files import FrameSource
+
+MAX_LISTED = 5
+"""Failed frames that the last line lists."""
 
 
 @app.command()
 def recognize(
     model: ModelOption,
-    color: Annotated[Path, typer.Option(help="Color image, PNG or JPEG.")],
-    depth: Annotated[Path, typer.Option(help="Depth image, 16-bit PNG.")],
-    labels: Annotated[Path, typer.Option(help="Instance labels, PNG; 0 is background.")],
-    intrinsics: Annotated[Path, typer.Option(help="JSON with fx, fy, cx, cy (pixels) and optionally depth_scale.")],
+    frames: Annotated[
+        list[Path] | None,
+        typer.Argument(metavar="[FRAME]...", help="Folders of frames, or frames: color, depth, mask, intrinsics."),
+    ] = None,
+    color: Annotated[Path | None, typer.Option(help="Color image, PNG or JPEG, in place of FRAME.")] = None,
+    depth: Annotated[Path | None, typer.Option(help="Depth image: 16-bit PNG, float TIFF, NPY or EXR.")] = None,
+    labels: Annotated[Path | None, typer.Option(help="Instance labels, PNG; 0 is background.")] = None,
+    intrinsics: Annotated[
+        Path | None, typer.Option(help="fx, fy, cx, cy in JSON, ROS camera_info, K, BOP, RealSense or Open3D.")
+    ] = None,
+    depth_scale: Annotated[
+        float | None, typer.Option(help="Depth units per metre. Default: that of the intrinsics, or 1000.")
+    ] = None,
     unknown_below: UnknownOption = 0.0,
     answer_by: Annotated[
         str | None, typer.Option(help="classifiers, gallery or both. Default: what the run has.")
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="Directory for recognition.json and overlay.png.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Directory for recognition.json and overlay.png, of each FRAME in OUT/<frame>.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one line of JSON for each frame.")] = False,
+    coco: Annotated[Path | None, typer.Option(metavar="FILE", help="Write COCO results (JSON with masks).")] = None,
+    bop: Annotated[Path | None, typer.Option(metavar="FILE", help="Write BOP results (CSV, without poses).")] = None,
+    names: Annotated[
+        Path | None, typer.Option(help="YAML or JSON table for --coco and --bop: number -> name of the object.")
+    ] = None,
 ) -> None:
-    """Recognize every instance of one RGB-D frame."""
+    """Recognize every instance of RGB-D frames.
+
+    A frame that cannot be recognized does not stop the others; the command then ends with exit code 2.
+    """
     from thor2_jax.capacity import BATCH_BUCKETS
     from thor2_jax.files import check_output_directory, remove_leftovers
-    from thor2_jax.recognition.frames import read_frame
     from thor2_jax.recognition.result_files import RESULT_FILES, write_recognitions
     from thor2_jax.recognizer import Recognizer
+    from training.frame_recognition import ResultTables, recognize_frames
+    from training.readers.bop import read_object_names
 
+    if names is not None and coco is None and bop is None:
+        raise InputError(f"names is {names}; it belongs to --coco and --bop")
+    files = {"color": color, "depth": depth, "labels": labels, "intrinsics": intrinsics}
     if out is not None:
-        check_output_directory(out, resumable=RESULT_FILES)
+        made = {s.name.split("/")[0] for s in _sources(frames, files, depth_scale)} if frames else RESULT_FILES
+        check_output_directory(out, resumable=made)
         remove_leftovers(out)
-    frame = read_frame(color=color, depth=depth, labels=labels, intrinsics=intrinsics)
+    sources = _sources(frames, files, depth_scale)
+    numbers = None if names is None else read_object_names(names)
     recognizer = Recognizer.load(model, unknown_below, answer_by=answer_by)
     recognizer.chunk = BATCH_BUCKETS[-1]
-    recognitions = recognizer.recognize(frame)
+    tables = ResultTables([source.name for source in sources], recognizer.classes, numbers)
+    failed = []
+    for answer in recognize_frames(recognizer, sources):
+        if answer.error is not None or answer.frame is None:
+            failed.append(answer.name)
+            if not frames:
+                raise InputError(str(answer.error))
+            print(f"failed: {answer.name}: {answer.error}", file=sys.stderr)
+        if as_json:
+            print(json.dumps(answer.as_json()), flush=True)
+        if answer.frame is None:
+            continue
+        if not as_json:
+            _print_table(answer.name if frames else None, answer.recognitions)
+        tables.add(answer)
+        if out is not None:
+            write_recognitions(out / answer.name if frames else out, answer.frame, answer.recognitions)
+    tables.write(coco, bop)
+    if not as_json:
+        for written in filter(None, (out, coco, bop)):
+            console.print(f"written to {written}")
+    if tables.n_without_number and (coco or bop):
+        print(f"{tables.n_without_number} instances have a name that {names} does not number", file=sys.stderr)
+    if failed:
+        listed = ", ".join(failed[:MAX_LISTED]) + (", ..." if len(failed) > MAX_LISTED else "")
+        raise InputError(f"{len(failed)} of {len(sources)} frames could not be recognized: {listed}; see above")
+
+
+def _sources(
+    frames: list[Path] | None, files: dict[str, Path | None], depth_scale: float | None
+) -> list["FrameSource"]:
+    """Return the frames that are given as folders, or the one that is given by its files."""
+    import functools
+
+    from training.readers.frame_files import FrameFiles, FrameSource, find_frames
+
+    given = [name for name, path in files.items() if path is not None]
+    if bool(frames) == bool(given):
+        raise InputError("give either FRAME... or --color, --depth, --labels and --intrinsics")
+    if frames:
+        return find_frames(frames, depth_scale)
+    missing = [name for name in files if files[name] is None]
+    if missing:
+        raise InputError(f"{', '.join(f'--{name}' for name in missing)} is missing; one frame needs {', '.join(files)}")
+    color, depth, labels, intrinsics = files.values()
+    assert color and depth and labels and intrinsics
+    one = FrameFiles(color, depth, labels, intrinsics)
+    return [FrameSource(color.stem, functools.partial(one.read, depth_scale))]
+
+
+def _print_table(frame: str | None, recognitions: Sequence["Recognition"]) -> None:
     table = Table("label", "name", "confidence", "classifier", "occluded", "points", "overflow", "note")
     for r in recognitions:
         confidence = "" if r.confidence is None else f"{r.confidence:.3f}"
@@ -45,7 +132,6 @@ def recognize(
         occluded = "yes" if r.occluded else "no"
         row = (str(r.label), name, confidence, r.classifier or "", occluded, str(r.points_used), str(r.overflow), note)
         table.add_row(*row)
+    if frame is not None:
+        console.print(f"{escape_characters(frame)}:")
     console.print(table)
-    if out is not None:
-        write_recognitions(out, frame, recognitions)
-        console.print(f"written to {out}")

@@ -18,7 +18,7 @@ from thor2_jax.recognition.frames import Intrinsics, RGBDFrame, read_color, read
 from thor2_jax.tables import read_table
 from training.readers.labelled import LabelledFrame, LabelledFrames
 
-__all__ = ["BOP", "SMALLEST_VISIBLE"]
+__all__ = ["BOP", "SMALLEST_VISIBLE", "read_object_names"]
 
 SMALLEST_VISIBLE = 0.1
 """Least visible fraction of an instance that is scored, as in BOP's own evaluation."""
@@ -57,7 +57,7 @@ class BOP(LabelledFrames):
         # Frames are read scene by scene, so the tables of one scene are kept.
         self._scene = functools.lru_cache(maxsize=1)(_Scene)
         self._names_file = names
-        self._names = None if names is None else _names(Path(names))
+        self._names = None if names is None else read_object_names(Path(names))
 
     def __getitem__(self, number: int) -> LabelledFrame:
         """Read a frame; also raises InputError for an image or object that a table lacks."""
@@ -129,7 +129,13 @@ def _images(folder: Path) -> list[Path]:
     return sorted(files, key=lambda f: int(f.stem))
 
 
-def _names(path: Path) -> dict[int, str]:
+def read_object_names(path: Path) -> dict[int, str]:
+    """Read a YAML or JSON table obj_id -> name.
+
+    Raises:
+        InputError: the table is damaged or has other entries; names the file.
+        OSError: the file cannot be opened.
+    """
     names: dict[int, str] = {}
     for obj_id, name in read_table(path).items():
         # In JSON the keys are text.

@@ -1,16 +1,18 @@
-"""Labelled frames, one directory each: color.png, depth.png, mask.png, intrinsics.json, labels.json."""
+"""Labelled frames, one directory each: color.png, depth.png, mask.png, intrinsics.json, labels.json.
 
+The images and the intrinsics may have the other names of `frame_files.FILE_NAMES`.
+"""
+
+import dataclasses
 import json
 from collections.abc import Iterable
 from pathlib import Path
 
 from thor2_jax.errors import InputError, with_context
-from thor2_jax.recognition.frames import read_frame
+from training.readers.frame_files import FILE_NAMES, frame_files
 from training.readers.labelled import LabelledFrame, LabelledFrames
 
 __all__ = ["FrameFolder"]
-
-FILES = ("color.png", "depth.png", "mask.png", "intrinsics.json", "labels.json")
 
 
 class FrameFolder(LabelledFrames):
@@ -37,8 +39,8 @@ class FrameFolder(LabelledFrames):
         """Read a frame."""
         folder = self._folders[number]
         with with_context(folder.name):
-            color, depth, mask, intrinsics, labels = self.files(number)
-            frame = read_frame(color=color, depth=depth, labels=mask, intrinsics=intrinsics)
+            mask, labels = self.files(number)[2:5:2]
+            frame = dataclasses.replace(frame_files(folder), labels=mask).read()
             truth = _truth(labels)
             if truth and set(truth).isdisjoint(frame.instances):
                 raise InputError(
@@ -49,7 +51,10 @@ class FrameFolder(LabelledFrames):
 
     def files(self, number: int) -> list[Path]:
         """Return the files of a frame."""
-        return [self._folders[number] / name for name in FILES]
+        folder = self._folders[number]
+        files = frame_files(folder)
+        mask = files.labels or folder / FILE_NAMES["labels"][0]
+        return [files.color, files.depth, mask, files.intrinsics, folder / "labels.json"]
 
 
 def _listed(labels: Iterable[int]) -> str:

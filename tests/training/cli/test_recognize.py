@@ -1,0 +1,165 @@
+"""`thor2 recognize` with several frames, other formats and other outputs; the run's weights are random."""
+
+import csv
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers import encode_image, run_thor2, untrained_run
+from PIL import Image
+
+from thor2_jax.config import DescriptorConfig
+from thor2_jax.recognition.run_directory import save_run
+
+CAMERA = {"fx": 120.0, "fy": 120.0, "cx": 60.0, "cy": 45.0}
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    directory = tmp_path_factory.mktemp("run")
+    config = DescriptorConfig(homology="closed_form")
+    save_run(untrained_run(("bowl", "mug", "plate"), config=config), directory)
+    return directory
+
+
+def write_frame(folder: Path, seed: int = 0) -> Path:
+    """Write a frame with the instances 1 and 4."""
+    rng = np.random.default_rng(seed)
+    labels = np.zeros((90, 120), np.uint8)
+    labels[10:50, 10:50], labels[30:80, 60:110] = 1, 4
+    depth = np.full(labels.shape, 900, np.uint16)
+    depth[labels > 0] = 700 + rng.integers(0, 30, (labels > 0).sum())
+    folder.mkdir(parents=True)
+    (folder / "color.png").write_bytes(encode_image(rng.integers(0, 256, (90, 120, 3), dtype=np.uint8)))
+    (folder / "depth.png").write_bytes(encode_image(depth))
+    (folder / "mask.png").write_bytes(encode_image(labels))
+    (folder / "intrinsics.json").write_text(json.dumps(CAMERA))
+    return folder
+
+
+def files_of(folder: Path, **changes: object) -> list[object]:
+    files = {
+        "color": folder / "color.png",
+        "depth": folder / "depth.png",
+        "labels": folder / "mask.png",
+        "intrinsics": folder / "intrinsics.json",
+    }
+    return [part for name, value in {**files, **changes}.items() for part in (f"--{name}", value)]
+
+
+def lines_of(text: str) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in text.splitlines()]
+
+
+def test_json_of_one_frame(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    folder = write_frame(tmp_path / "one")
+    assert run_thor2("recognize", "--model", model, *files_of(folder), "--json", "--out", tmp_path / "out") == 0
+    (answer,) = lines_of(capfd.readouterr().out)
+    assert [one["label"] for one in answer["instances"]] == [1, 4]
+    assert all(one["name"] in ("bowl", "mug", "plate") for one in answer["instances"])
+    assert answer["instances"] == json.loads((tmp_path / "out" / "recognition.json").read_text())
+    assert run_thor2("recognize", "--model", model, *files_of(folder), "--json", "--unknown-below", 1) == 0
+    (answer,) = lines_of(capfd.readouterr().out)
+    assert [one["name"] for one in answer["instances"]] == [None, None]
+
+
+def test_other_formats_give_the_same_answers(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    folder = write_frame(tmp_path / "one")
+    matrix = np.array([[120, 0, 60], [0, 120, 45], [0, 0, 1.0]])
+    np.savetxt(tmp_path / "K.txt", matrix)
+    (tmp_path / "camera_info.yaml").write_text(
+        f"image_width: 120\nimage_height: 90\ncamera_matrix: {{data: {matrix.ravel().tolist()}}}\n"
+    )
+    units = np.asarray(Image.open(folder / "depth.png"))
+    np.save(tmp_path / "metres.npy", units / np.float32(1000))
+    (tmp_path / "tenths.png").write_bytes(encode_image((units * 10).astype(np.uint16)))
+    answers = []
+    for changes, options in (
+        ({}, []),
+        ({"intrinsics": tmp_path / "K.txt"}, []),
+        ({"intrinsics": tmp_path / "camera_info.yaml", "depth": tmp_path / "metres.npy"}, []),
+        ({"depth": tmp_path / "tenths.png"}, ["--depth-scale", 10_000]),
+    ):
+        assert run_thor2("recognize", "--model", model, *files_of(folder, **changes), *options, "--json") == 0
+        answers += [line["instances"] for line in lines_of(capfd.readouterr().out)]
+    for other in answers[1:]:
+        for one, expected in zip(other, answers[0], strict=True):
+            assert one["name"] == expected["name"] and one["points_used"] == expected["points_used"]
+            assert one["confidence"] == pytest.approx(expected["confidence"], abs=1e-4)
+
+
+def test_one_failing_frame_does_not_lose_the_others(
+    model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    for number in range(1, 5):
+        write_frame(tmp_path / "frames" / f"00000{number}", number)
+    (tmp_path / "frames" / "000002" / "depth.png").write_bytes(b"damaged")
+    (tmp_path / "frames" / "000003" / "intrinsics.json").unlink()
+    outputs = ("--out", tmp_path / "out", "--coco", tmp_path / "coco.json", "--bop", tmp_path / "bop.csv")
+    command = ("recognize", "--model", model, tmp_path / "frames", "--json", *outputs)
+    for _ in range(2):  # it may be repeated
+        assert run_thor2(*command) == 2
+        out, err = capfd.readouterr()
+        answers = {line["frame"]: line for line in lines_of(out)}
+        assert list(answers) == ["000001", "000002", "000003", "000004"]
+        assert "depth" in answers["000002"]["error"] and "intrinsics.json" in answers["000003"]["error"]
+        assert all([one["label"] for one in answers[n]["instances"]] == [1, 4] for n in ("000001", "000004"))
+        assert "2 of 4 frames" in err and "000002, 000003" in err
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["000001", "000004"]
+    coco = json.loads((tmp_path / "coco.json").read_text())
+    assert sorted((entry["image_id"], entry["bbox"]) for entry in coco) == [
+        (image, box) for image in (1, 4) for box in ([10, 10, 40, 40], [60, 30, 50, 50])
+    ]
+    with (tmp_path / "bop.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    assert [(row["scene_id"], row["im_id"]) for row in rows] == [("1", "1")] * 2 + [("1", "4")] * 2
+    numbers = {"bowl": 1, "mug": 2, "plate": 3}
+    names = [one["name"] for n in ("000001", "000004") for one in answers[n]["instances"]]
+    assert [int(row["obj_id"]) for row in rows] == [numbers[name] for name in names]
+
+
+def test_several_folders_and_tables(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    one, two = write_frame(tmp_path / "one"), write_frame(tmp_path / "more" / "deep" / "two", 1)
+    shutil.move(two / "mask.png", two / "labels.png")
+    (tmp_path / "names.json").write_text(json.dumps({"14": "mug"}))
+    outputs = ("--coco", tmp_path / "coco.json", "--names", tmp_path / "names.json", "--out", tmp_path / "out")
+    assert run_thor2("recognize", "--model", model, one, tmp_path / "more", *outputs) == 0
+    out, err = capfd.readouterr()
+    assert out.index("one:") < out.index("deep/two:") and out.count("confidence") == 2
+    assert (tmp_path / "out" / "deep" / "two" / "overlay.png").is_file()
+    results = [tmp_path / "out" / name / "recognition.json" for name in ("one", "deep/two")]
+    answers = [{"instances": json.loads(path.read_text())} for path in results]
+    coco = json.loads((tmp_path / "coco.json").read_text())
+    names = [one["name"] for line in answers for one in line["instances"]]
+    assert [entry["category_id"] for entry in coco] == [14] * names.count("mug")
+    others = len(names) - names.count("mug")
+    assert (f"{others} instances have a name" in err) == (others > 0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ([], "give either"),
+        (["{frames}", "--color", "{frames}/one/color.png"], "give either"),
+        (["--color", "{frames}/one/color.png"], "--depth, --labels, --intrinsics is missing"),
+        (["{frames}/absent"], "not a directory"),
+        (["{empty}"], "has no color.png"),
+        (["{frames}", "{frames}"], "two frames are called one"),
+        (["{frames}", "--names", "{frames}/names.json"], "it belongs to --coco"),
+        (["{frames}", "--coco", "{empty}", "--names", "{frames}/one/intrinsics.json"], "expected an obj_id"),
+        (["{frames}", "--out", "{frames}"], "expected a new or empty directory"),
+    ],
+)
+def test_invalid_arguments(
+    model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], arguments: list[str], expected: str
+) -> None:
+    (tmp_path / "empty").mkdir()
+    write_frame(tmp_path / "frames" / "one")
+    (tmp_path / "frames" / "names.json").write_text("{}")
+    given = [text.format(frames=tmp_path / "frames", empty=tmp_path / "empty") for text in arguments]
+    assert run_thor2("recognize", "--model", model, *given) == 2
+    err = capfd.readouterr().err
+    assert expected in err and err.startswith("error: ") and err.count("\n") == 1

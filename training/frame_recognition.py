@@ -1,0 +1,114 @@
+"""Recognition of several frames, one after the other, and the files with all answers.
+
+for answer in recognize_frames(recognizer, find_frames([Path("frames")])):
+    print(answer.name, answer.error or answer.recognitions)
+"""
+
+import dataclasses
+import json
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from thor2_jax.errors import InputError
+from thor2_jax.files import write_text
+from thor2_jax.recognition.answers import Recognition
+from thor2_jax.recognition.frames import RGBDFrame
+from thor2_jax.recognition.result_files import (
+    BOP_HEADER,
+    bop_lines,
+    category_numbers,
+    coco_results,
+    image_numbers,
+    instances_as_json,
+)
+from thor2_jax.recognizer import Recognizer
+from training.readers.frame_files import FrameSource
+
+__all__ = ["FrameAnswer", "ResultTables", "recognize_frames"]
+
+
+@dataclasses.dataclass(frozen=True)
+class FrameAnswer:
+    """The answers for a frame, or why there are none.
+
+    Attributes:
+        name: name of the frame.
+        frame: the frame; None if it could not be read.
+        recognitions: one answer for each instance.
+        seconds: time for recognition, without reading the files.
+        error: why the frame could not be recognized; None if it was.
+    """
+
+    name: str
+    frame: RGBDFrame | None = None
+    recognitions: Sequence[Recognition] = ()
+    seconds: float = 0.0
+    error: str | None = None
+
+    def as_json(self) -> dict[str, Any]:
+        """Return {"frame", "instances"}, or {"frame", "error"}."""
+        if self.error is not None:
+            return {"frame": self.name, "error": self.error}
+        return {"frame": self.name, "instances": instances_as_json(self.recognitions)}
+
+
+def recognize_frames(recognizer: Recognizer, sources: Iterable[FrameSource]) -> Iterator[FrameAnswer]:
+    """Read and recognize frames; one that fails has an `error` and does not stop the others."""
+    for source in sources:
+        try:
+            frame = source.read()
+            start = time.perf_counter()
+            recognitions = recognizer.recognize(frame)
+        except InputError as error:
+            yield FrameAnswer(source.name, error=str(error))
+        except OSError as error:
+            yield FrameAnswer(source.name, error=f"{error.filename}: {error.strerror or error}")
+        else:
+            yield FrameAnswer(source.name, frame, recognitions, time.perf_counter() - start)
+
+
+class ResultTables:
+    """The COCO and BOP results of all frames, filled frame by frame and written at the end.
+
+    Attributes:
+        n_without_number: named instances whose class has no number; they are in neither file.
+    """
+
+    def __init__(self, frames: Sequence[str], classes: Sequence[str], names: Mapping[int, str] | None = None) -> None:
+        """Number the frames and the classes.
+
+        Args:
+            frames: names of all frames, see `image_numbers`.
+            classes: names of all objects.
+            names: number -> name, see `category_numbers`.
+        """
+        self._categories = category_numbers(classes, names)
+        self._images = dict(zip(frames, image_numbers(frames), strict=True))
+        scenes = {scene for scene, _ in self._images.values()}
+        # COCO has no scenes: images of several scenes are counted from 1.
+        numbers = [image for _, image in self._images.values()] if len(scenes) == 1 else range(1, len(frames) + 1)
+        self._coco_images = dict(zip(frames, numbers, strict=True))
+        self._coco: list[dict[str, Any]] = []
+        self._bop: list[str] = []
+        self.n_without_number = 0
+
+    def add(self, answer: FrameAnswer) -> None:
+        """Add the answers of a frame."""
+        if answer.frame is None:
+            return
+        named = [r.name for r in answer.recognitions if r.name is not None]
+        self.n_without_number += sum(name not in self._categories for name in named)
+        image = self._coco_images[answer.name]
+        self._coco += coco_results(answer.name, image, answer.frame, answer.recognitions, self._categories)
+        self._bop += bop_lines(
+            *self._images[answer.name], answer.frame, answer.recognitions, self._categories, answer.seconds
+        )
+
+    def write(self, coco: Path | None = None, bop: Path | None = None) -> None:
+        """Write the files that are wanted: COCO results in JSON, BOP results in CSV; raises OSError."""
+        if coco is not None:
+            write_text(coco, json.dumps(self._coco) + "\n")
+        if bop is not None:
+            write_text(bop, "\n".join([BOP_HEADER, *self._bop]) + "\n")
