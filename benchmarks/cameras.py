@@ -38,7 +38,7 @@ from thor2_jax.recognition.fusion import DEFAULT_RULE
 from thor2_jax.recognition.overlay import COLORS, Annotation, draw_instances
 from training.evaluation.accuracy import summarize_rows
 from training.evaluation.answering import answer_frames
-from training.evaluation.answers import EvaluatedRun, FrameAnswers, InstancePrediction
+from training.evaluation.answers import EvaluatedRun, FrameAnswers
 from training.evaluation.confidence import auroc, expected_calibration_error, unknown_named
 from training.evaluation.fusion import Rule, main_fusion
 from training.evaluation.placements import find_placements, placement_accuracy, steadiness
@@ -54,6 +54,9 @@ CAMERAS: dict[str, tuple[SimulatedCamera, ...]] = {"choose": CHOOSE, "report": R
 ORIGINAL, ALL = "original", "all cameras"
 """Names of the frames as they are, and of all cameras together."""
 
+METRICS = "accuracy", "accuracy_of_instances", "steadiness", "calibration_error", "auroc", "unknown_named"
+"""Metrics of the table."""
+
 LOOK_ALIKES = (
     *("banana", "bowl", "apple", "lemon", "orange", "peach", "pear"),
     *("scissors_*", "marker_*", "pen_*", "spoon_*", "fork_*", "knife*", "plate_*", "cup_*"),
@@ -62,6 +65,9 @@ LOOK_ALIKES = (
 
 SCENE = 5
 """Seed of the scene of built-in objects."""
+
+RunResults = dict[str, dict[str, float]]
+"""Results of a run: frames or camera -> metric -> value; NaN where there is none."""
 
 Progress = Callable[[str, int, int], None]
 """Called with a camera's name, frames done and the number of frames."""
@@ -120,8 +126,11 @@ def measure(
     answers: Mapping[str, Sequence[FrameAnswers]],
     title: str | None = None,
     rule: Rule = DEFAULT_RULE,
-) -> dict[str, dict[str, Any]]:
-    """Return `ORIGINAL`, a camera's name or `ALL` -> metric -> `RunStatistics` as a JSON table; "groups" holds several.
+) -> list[RunResults]:
+    """Return the results of every run: `ORIGINAL`, a camera's name or `ALL` -> metric -> value.
+
+    The metrics are those of the module's docstring; "accuracy in GROUP" is the accuracy in a group of frames.
+    "instances", "placements" and "unknown_instances" are counts.
 
     Args:
         runs: the runs that gave the answers.
@@ -130,80 +139,76 @@ def measure(
         rule: rule of the fusion.
 
     Raises:
-        InputError: no instance is of a class of the runs.
+        InputError: no instance is of a class of the runs, or they have no such fusion.
     """
     placements = find_placements(answers[ORIGINAL])
-    parts = {name: [(name, frames)] for name, frames in answers.items()}
-    cameras = [(name, frames) for name, frames in answers.items() if name != ORIGINAL]
+    parts = {name: [frames] for name, frames in answers.items()}
+    cameras = [frames for name, frames in answers.items() if name != ORIGINAL]
     if cameras:
         parts[ALL] = cameras
-    return {name: _measure(runs, part, placements, title, rule) for name, part in parts.items()}
+    by_part = {name: _measure(runs, part, placements, title, rule) for name, part in parts.items()}
+    return [{name: results[index] for name, results in by_part.items()} for index in range(len(runs))]
 
 
 def _measure(
     runs: Sequence[EvaluatedRun],
-    cameras: Sequence[tuple[str, Sequence[FrameAnswers]]],
+    cameras: Sequence[Sequence[FrameAnswers]],
     placements: Sequence[NDArray[np.intp]],
     title: str | None,
     rule: Rule,
-) -> dict[str, Any]:
-    """Return the metrics of the answers of some cameras together."""
+) -> list[dict[str, float]]:
+    """Return the metrics of each run on the answers of some cameras together."""
     classes = runs[0].classes
-    n_placements = 1 + max((int(numbers.max()) for numbers in placements if len(numbers)), default=0)
-    known: list[InstancePrediction] = []
-    unknown: list[InstancePrediction] = []
-    placement: list[int] = []
-    group: list[str] = []
-    for index, (_, frames) in enumerate(cameras):
-        for frame, numbers in zip(frames, placements, strict=True):
-            for instance, number in zip(frame.instances, numbers, strict=True):
-                if instance.truth not in classes:
-                    unknown.append(instance)
-                    continue
-                known.append(instance)
-                placement.append(index * n_placements + int(number))
-                group.append(sequence_of(frame.frame))
+    labelled = [
+        (instance, sequence_of(frame.frame), (index, int(number)))
+        for index, frames in enumerate(cameras)
+        for frame, numbers in zip(frames, placements, strict=True)
+        for instance, number in zip(frame.instances, numbers, strict=True)
+    ]
+    known = [each for each in labelled if each[0].truth in classes]
+    unknown = [instance for instance, _, _ in labelled if instance.truth not in classes]
     if not known:
         raise InputError(f"frames: no instance is of a class of the runs, which know {', '.join(classes[:5])}, ...")
-    fused, others = fuse_answers(known, runs, rule), fuse_answers(unknown, runs, rule)
+    instances = [instance for instance, _, _ in known]
+    fused, others = fuse_answers(instances, runs, rule), fuse_answers(unknown, runs, rule)
     chosen = title or main_fusion(fused, runs[0].answer_by)
-    if chosen not in fused:
-        raise InputError(f"fusion: the runs have no {chosen}; expected one of {', '.join(fused)}")
-    described = np.array([instance.probabilities is not None for instance in known])
-    truth = np.array([classes.index(instance.truth) for instance in known])
-    numbers, groups = np.array(placement), np.array(group)
-    rows, by_group = [], []
+    if len(fused.get(chosen, ())) < len(runs):
+        raise InputError(f"fusion is {chosen}; expected one that all runs have, of {', '.join(fused)}")
+    described = np.array([instance.probabilities is not None for instance in instances])
+    truth = np.array([classes.index(instance.truth) for instance in instances])
+    group = np.array([name for _, name, _ in known])
+    placement = np.unique([pair for _, _, pair in known], axis=0, return_inverse=True)[1].ravel()
+    results = []
     for run, predictions in fused[chosen].items():
         answer = np.full(len(known), -1)
         answer[described] = predictions.class_index
         correct = answer == truth
         confidence = np.minimum(predictions.confidence, 1)
         of_unknown = np.minimum(others[chosen][run].confidence, 1)
-        right = correct[described]
         every = np.concatenate([confidence, of_unknown])
-        rows.append(
+        results.append(
             {
-                "accuracy": placement_accuracy(numbers, correct),
+                "accuracy": placement_accuracy(placement, correct),
                 "accuracy_of_instances": float(correct.mean()),
-                "steadiness": steadiness(numbers, answer),
-                "calibration_error": expected_calibration_error(confidence, right),
+                "steadiness": steadiness(placement, answer),
+                "calibration_error": expected_calibration_error(confidence, correct[described]),
                 "auroc": auroc(every, np.arange(len(every)) < len(confidence)),
-                "unknown_named": float(unknown_named(confidence[right], of_unknown, COVERAGE)),
+                "unknown_named": float(unknown_named(confidence[correct[described]], of_unknown, COVERAGE)),
+                **{
+                    f"accuracy in {name}": placement_accuracy(placement[group == name], correct[group == name])
+                    for name in np.unique(group).tolist()
+                },
+                "instances": len(known),
+                "placements": len(np.unique(placement)),
+                "unknown_instances": len(unknown),
             }
         )
-        by_group.append(
-            {
-                each: placement_accuracy(numbers[groups == each], correct[groups == each])
-                for each in dict.fromkeys(group)
-            }
-        )
-    return {
-        **summarize_rows(rows),
-        "groups": summarize_rows(by_group),
-        "instances": len(known),
-        "placements": len(np.unique(numbers)),
-        "unknown_instances": len(unknown),
-    }
+    return results
+
+
+def summarize(results: Sequence[RunResults]) -> dict[str, dict[str, Any]]:
+    """Return `RunStatistics` over the runs, as JSON tables, in place of the values of `measure`."""
+    return {name: summarize_rows([of_run[name] for of_run in results]) for name in results[0]}
 
 
 def draw_cameras(frame: RGBDFrame, path: Path) -> None:
@@ -226,10 +231,9 @@ def draw_cameras(frame: RGBDFrame, path: Path) -> None:
 
 def show(results: Mapping[str, Mapping[str, Any]]) -> str:
     """Return the metrics as a table of text."""
-    metrics = "accuracy", "accuracy_of_instances", "steadiness", "calibration_error", "auroc", "unknown_named"
-    lines = [" " * 20 + "".join(f"{name:>23s}" for name in metrics)]
+    lines = [" " * 20 + "".join(f"{name:>23s}" for name in METRICS)]
     for name, values in results.items():
-        cells = [values[metric] for metric in metrics]
+        cells = [values[metric] for metric in METRICS]
         lines.append(f"{name:20s}" + "".join(f"{mean_and_deviation(cell):>23s}" for cell in cells))
     return "\n".join(lines)
 
@@ -269,7 +273,7 @@ def main() -> None:
         if options.model:
             runs = load_runs(options.model)
             answers = answers_by_camera(runs, frames, CAMERAS[options.cameras], print_progress)
-            results = measure(runs, answers, options.fusion)
+            results = summarize(measure(runs, answers, options.fusion))
             print(show(results))
             report = {
                 "runs": [run.name for run in runs],
