@@ -30,14 +30,20 @@ def render(
     sensor: Annotated[bool, typer.Option("--sensor", help="Augment: noise and faults of the depth sensor.")] = False,
     occlusion: Annotated[bool, typer.Option("--occlusion", help="Augment: another object in front.")] = False,
     segmentation: Annotated[bool, typer.Option("--segmentation", help="Augment: inexact masks.")] = False,
+    registration: Annotated[
+        bool, typer.Option("--registration", help="Augment: colour that is blurred and shifted against depth.")
+    ] = False,
+    base: Annotated[bool, typer.Option("--base", help="Augment: masks without the lowest centimetre.")] = False,
     copies: Annotated[int, typer.Option(help="Augmented copies of each view, if there are augmentations.")] = 2,
     seed: Annotated[int, typer.Option(help="Seed for the augmentations.")] = 0,
     quiet: QuietOption = False,
 ) -> None:
     """Render views of meshes to a dataset for `train --dataset`. An interrupted rendering resumes."""
     from training.augmentation.augmentations import Augmentations
+    from training.augmentation.base import Base
     from training.augmentation.illumination import Illumination
     from training.augmentation.occlusion import Occlusion
+    from training.augmentation.registration import Registration
     from training.augmentation.segmentation import Segmentation
     from training.augmentation.sensor import Sensor
     from training.objects.meshes import find_meshes, read_names
@@ -51,6 +57,8 @@ def render(
         sensor=Sensor() if sensor else None,
         occlusion=Occlusion() if occlusion else None,
         segmentation=Segmentation() if segmentation else None,
+        registration=Registration() if registration else None,
+        base=Base() if base else None,
         copies=copies,
     )
     paths = find_meshes(meshes, read_names(names) if names else None)

@@ -1,0 +1,305 @@
+"""What helps on other cameras: `python -m benchmarks.levers --meshes DIR --frames DIR... --out OUT`.
+
+For each lever, a row of `LEVERS`, recognizers are trained with several seeds by `thor2 train` on views that
+`thor2 render` has rendered once, and evaluated as `benchmarks.cameras` does. Levers that differ in recognition only
+share their trainings. Results are in
+
+OUT/views/*, OUT/runs/*/seed-N    views and trained runs
+OUT/cells/LEVER/seed-N.json       results of one run
+OUT/levers.json, OUT/levers.md    mean and standard deviation of each lever; written again after each lever
+
+The command resumes when it is given again: finished views, runs and cells are kept, and more levers or seeds may be
+asked for. A cell of a lever whose row has changed since is computed again.
+
+Not among the levers is the relaxed descriptor: training with it takes several times as long.
+"""
+
+import argparse
+import dataclasses
+import json
+import math
+import shlex
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from benchmarks.cameras import (
+    ALL,
+    CAMERAS,
+    LOOK_ALIKES,
+    ORIGINAL,
+    RunResults,
+    answers_by_camera,
+    labelled_frames,
+    mean_and_deviation,
+    measure,
+    summarize,
+)
+from thor2_jax.errors import InputError
+from thor2_jax.files import write_text
+from thor2_jax.recognition.fusion import DEFAULT_RULE
+from training.enrollment import mesh_views
+from training.evaluation.fusion import BOTH, GALLERY, Rule
+from training.evaluation.runs import Run, load_runs
+from training.objects.meshes import find_meshes, read_names
+from training.readers.labelled import LabelledFrame
+from training.storage.jobs import check_same_job
+
+AUGMENTATIONS = "--illumination --occlusion --sensor --segmentation"
+"""The augmentations of the default protocol."""
+
+RENDER = f"--azimuth-step 20 --polar-step 15 {AUGMENTATIONS}"
+"""Default options of all renderings, as in the default protocol."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Lever:
+    """A change of training or recognition; by default it changes nothing.
+
+    Attributes:
+        name: name in the table.
+        render: further options of `thor2 render`.
+        train: further options of `thor2 train`.
+        describe: constants of the descriptor that recognition uses in place of the run's, see `DescriptorConfig`.
+        fusion: column of an evaluation that answers, see `fusions`. With "gallery" or "both", the meshes are enrolled.
+        rule: rule of the fusion.
+    """
+
+    name: str
+    render: str = ""
+    train: str = ""
+    describe: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    fusion: str = "THOR2"
+    rule: Rule = DEFAULT_RULE
+
+    @property
+    def views(self) -> str:
+        """Directory name of its views."""
+        return _slug(self.render)
+
+    @property
+    def training(self) -> str:
+        """Directory name of its runs."""
+        return _slug(f"{self.render} {self.train}")
+
+    @property
+    def enrolls(self) -> bool:
+        """Whether the meshes are enrolled in its recognizer."""
+        return self.fusion in (GALLERY, BOTH)
+
+
+LEVERS = (
+    Lever("default"),
+    Lever('fusion rule "max"', rule="max"),
+    Lever('fusion rule "mean"', rule="mean"),
+    Lever("CE, TOPS and TOPS2", fusion="CE+TOPS+TOPS2"),
+    Lever("gallery", fusion=GALLERY),
+    Lever("classifiers and gallery", fusion=BOTH),
+    Lever("registration and base in training", render="--registration --base"),
+)
+"""The table's rows."""
+
+COLUMNS = {
+    "real frames": (ORIGINAL, "accuracy"),
+    "simulated cameras": (ALL, "accuracy"),
+    "steady, real": (ORIGINAL, "steadiness"),
+    "steady, simulated": (ALL, "steadiness"),
+    "AUROC, real": (ORIGINAL, "auroc"),
+    "AUROC, simulated": (ALL, "auroc"),
+    "unknown named, real": (ORIGINAL, "unknown_named"),
+    "unknown named, simulated": (ALL, "unknown_named"),
+    "calibration error": (ORIGINAL, "calibration_error"),
+}
+"""Column of the table -> frames and metric."""
+
+
+def _slug(options: str) -> str:
+    """Return options as a directory name."""
+    words = shlex.split(options)
+    return (
+        "_".join("".join(c if c.isalnum() or c in "-." else "-" for c in word.strip("-")) for word in words)
+        or "default"
+    )
+
+
+class Table:
+    """The cells of the table in a directory, and what is needed to compute them.
+
+    Attributes:
+        out: directory of the table.
+        options: command line.
+        frames: the labelled frames.
+    """
+
+    def __init__(self, options: argparse.Namespace) -> None:
+        """Read the frames, and check that the directory is new or of the same job.
+
+        Raises:
+            InputError: the directory is of another job, or a frame or a mesh table cannot be read.
+            OSError: a file cannot be read or written.
+        """
+        self.out: Path = options.out
+        self.options = options
+        self.meshes = find_meshes(options.meshes, read_names(options.names) if options.names else None)
+        self.frames: list[LabelledFrame] = labelled_frames(options.frames, options.ignore)
+        job = {
+            "meshes": {name: str(path.resolve()) for name, path in self.meshes.items()},
+            "frames": [item.identifier for item in self.frames],
+            "ignore": list(options.ignore),
+            "cameras": options.cameras,
+            "render": options.render,
+            "train": options.train,
+        }
+        file = self.out / "job.json"
+        if file.is_file():
+            check_same_job(self.out, json.loads(file.read_bytes()), job)
+        self.out.mkdir(parents=True, exist_ok=True)
+        write_text(file, json.dumps(job, indent=1) + "\n")
+
+    def cell(self, lever: Lever, seed: int) -> RunResults | None:
+        """Return the results of a lever with a seed; None if they are still to be computed."""
+        file = self._cell_file(lever, seed)
+        if not file.is_file():
+            return None
+        stored = json.loads(file.read_bytes())
+        if stored["lever"] != json.loads(json.dumps(dataclasses.asdict(lever))):
+            return None
+        return {
+            name: {metric: math.nan if value is None else value for metric, value in values.items()}
+            for name, values in stored["results"].items()
+        }
+
+    def _cell_file(self, lever: Lever, seed: int) -> Path:
+        return self.out / "cells" / _slug(shlex.quote(lever.name)) / f"seed-{seed}.json"
+
+    def train(self, lever: Lever, seed: int) -> Path:
+        """Render the views and train a run, unless both are finished, and return the run directory."""
+        source = ["--meshes", str(self.options.meshes)]
+        if self.options.names:
+            source += ["--names", str(self.options.names)]
+        views, run = self.out / "views" / lever.views, self.out / "runs" / lever.training / f"seed-{seed}"
+        workers = ["--workers", str(self.options.workers)]
+        _thor2("render", *source, "--out", views, *workers, *shlex.split(f"{self.options.render} {lever.render}"))
+        training = shlex.split(f"{self.options.train} {lever.train}")
+        _thor2("train", "--dataset", views, "--out", run, "--seed", seed, *training)
+        return run
+
+    def _load(self, lever: Lever, directories: Sequence[Path]) -> list[Run]:
+        """Load runs and change them as the lever does."""
+        runs = load_runs(directories)
+        for run in runs:
+            recognizer = run.recognizer
+            config = dataclasses.replace(recognizer.run.config, **lever.describe)
+            recognizer.run = dataclasses.replace(recognizer.run, config=config)
+            if lever.enrolls:
+                recognizer.objects.open(self.out / "galleries" / recognizer.objects.embedding.fingerprint[:12])
+                for name, path in self.meshes.items():
+                    if name in run.classes and name not in recognizer.gallery.objects:
+                        recognizer.objects.enroll(name, mesh_views(path), "mesh", extend=True)
+        return runs
+
+    def compute(self, levers: Sequence[Lever], seeds: Sequence[int]) -> None:
+        """Compute the missing cells of levers that differ in the fusion only, with one evaluation."""
+        missing = [seed for seed in seeds if any(self.cell(lever, seed) is None for lever in levers)]
+        if not missing:
+            return
+        directories = []
+        for seed in missing:
+            _report(f"{levers[0].name}: training with seed {seed}")
+            directories.append(self.train(levers[0], seed))
+        runs = self._load(levers[0], directories)
+
+        def progress(camera: str, done: int, total: int) -> None:
+            if done == total:
+                _report(f"{', '.join(lever.name for lever in levers)}: {camera}")
+
+        answers = answers_by_camera(runs, self.frames, CAMERAS[self.options.cameras], progress)
+        for lever in levers:
+            for seed, results in zip(missing, measure(runs, answers, lever.fusion, lever.rule), strict=True):
+                self._write_cell(lever, seed, results)
+
+    def _write_cell(self, lever: Lever, seed: int, results: RunResults) -> None:
+        file = self._cell_file(lever, seed)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        plain = {
+            name: {metric: None if math.isnan(value) else value for metric, value in values.items()}
+            for name, values in results.items()
+        }
+        write_text(file, json.dumps({"lever": dataclasses.asdict(lever), "results": plain}, indent=1) + "\n")
+
+    def write(self, levers: Sequence[Lever], seeds: Sequence[int]) -> str:
+        """Write mean and standard deviation of the levers whose cells are complete, and return the table."""
+        report = {}
+        lines = ["| lever | runs | " + " | ".join(COLUMNS) + " |", "|---" * (len(COLUMNS) + 2) + "|"]
+        for lever in levers:
+            cells = [results for seed in seeds if (results := self.cell(lever, seed)) is not None]
+            if len(cells) < len(seeds):
+                continue
+            summary = report[lever.name] = summarize(cells)
+            values = [
+                mean_and_deviation(summary[part][metric]).replace("+-", "±") if part in summary else "-"
+                for part, metric in COLUMNS.values()
+            ]
+            lines.append(f"| {lever.name} | {len(cells)} | " + " | ".join(values) + " |")
+        table = "\n".join(lines) + "\n"
+        write_text(self.out / "levers.json", json.dumps(report, indent=1) + "\n")
+        write_text(self.out / "levers.md", table)
+        return table
+
+
+def _thor2(*arguments: object) -> None:
+    command = [sys.executable, "-m", "training.cli", *map(str, arguments), "--quiet"]
+    if subprocess.run(command, stdout=subprocess.DEVNULL, check=False).returncode:
+        raise InputError(f"the command failed: {shlex.join(command)}")
+
+
+def _report(text: str) -> None:
+    print(f"{time.strftime('%H:%M:%S')} {text}", flush=True)
+
+
+def grouped(levers: Sequence[Lever]) -> list[list[Lever]]:
+    """Return levers that share trainings, descriptors and galleries together, in the order of the first ones."""
+    groups: dict[tuple[Any, ...], list[Lever]] = {}
+    for lever in levers:
+        key = lever.training, json.dumps(dict(lever.describe), sort_keys=True), lever.enrolls
+        groups.setdefault(key, []).append(lever)
+    return list(groups.values())
+
+
+def main() -> None:
+    """Compute the missing cells and write the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--meshes", type=Path, required=True, metavar="DIR", help="as for thor2 render")
+    parser.add_argument("--names", type=Path, metavar="FILE", help="as for thor2 render")
+    parser.add_argument("--frames", type=Path, nargs="+", required=True, metavar="DIR")
+    parser.add_argument("--out", type=Path, required=True, metavar="OUT")
+    parser.add_argument("--seeds", type=int, default=3, help="number of trainings (%(default)s)")
+    parser.add_argument("--levers", nargs="+", metavar="NAME", help=f"of: {', '.join(lever.name for lever in LEVERS)}")
+    parser.add_argument("--cameras", choices=list(CAMERAS), default="choose")
+    parser.add_argument("--ignore", nargs="*", default=LOOK_ALIKES, metavar="PATTERN", help="names to leave out")
+    parser.add_argument("--render", default=RENDER, metavar="OPTIONS", help='of all renderings ("%(default)s")')
+    parser.add_argument("--train", default="", metavar="OPTIONS", help="of all trainings")
+    parser.add_argument("--workers", type=int, default=2, help="rendering processes")
+    options = parser.parse_args()
+    by_name = {lever.name: lever for lever in LEVERS}
+    unknown = [name for name in options.levers or () if name not in by_name]
+    if unknown:
+        parser.error(f"levers: {unknown[0]!r} is none of {', '.join(by_name)}")
+    if options.seeds < 1:
+        parser.error(f"seeds is {options.seeds}; expected at least 1")
+    levers = [by_name[name] for name in options.levers or by_name]
+    seeds = range(options.seeds)
+    try:
+        table = Table(options)
+        for group in grouped(levers):
+            table.compute(group, seeds)
+            print(table.write(LEVERS, seeds), flush=True)
+    except (InputError, OSError) as error:
+        parser.error(str(error))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,121 @@
+"""The table of levers: its rows, its groups, and a tiny table of built-in objects that is interrupted and resumes."""
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from benchmarks import levers
+from benchmarks.levers import LEVERS, Lever
+from training.evaluation.fusion import RULES
+from training.objects.builtin_objects import builtin_objects
+from training.rendering.scenes import compose_scene
+
+NAMES = ("soup_can_red", "cereal_box_blue")
+
+
+def test_levers_share_what_only_fusion_tells_apart() -> None:
+    rows = [
+        Lever("a"),
+        Lever("b", train="--epochs 2"),
+        Lever("c", rule="max"),
+        Lever("d", describe={"n_slices": 5}),
+        Lever("e", fusion="gallery"),
+        Lever("f", fusion="both"),
+        Lever("g", render="--base", rule="mean"),
+        Lever("h", train="--epochs 2", fusion="CE"),
+    ]
+    groups = [[lever.name for lever in group] for group in levers.grouped(rows)]
+    assert groups == [["a", "c"], ["b", "h"], ["d"], ["e", "f"], ["g"]]
+    assert (
+        Lever("x").training == "default" and Lever("x", train="--epochs 2", render="--base").training == "base_epochs_2"
+    )
+
+
+def test_rows_of_the_table_differ() -> None:
+    assert len({lever.name for lever in LEVERS}) == len(LEVERS)
+    rows = [(lever.training, json.dumps(dict(lever.describe)), lever.fusion, lever.rule) for lever in LEVERS]
+    assert len(set(rows)) == len(rows) and {lever.rule for lever in LEVERS} <= set(RULES)
+
+
+def run_command(monkeypatch: pytest.MonkeyPatch, *arguments: Any) -> None:
+    monkeypatch.setattr(sys, "argv", ["levers", *map(str, arguments)])
+    levers.main()
+
+
+@pytest.mark.parametrize("arguments", [["--levers", "none"], ["--seeds", "0"], []])
+def test_bad_arguments_write_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], arguments: list[str]
+) -> None:
+    """Without arguments, the directory of meshes is what is missing."""
+    given = "--meshes", tmp_path / "absent", "--frames", tmp_path, "--out", tmp_path / "out"
+    with pytest.raises(SystemExit):
+        run_command(monkeypatch, *given, *arguments)
+    assert "error: " in capsys.readouterr().err.splitlines()[-1] and list(tmp_path.iterdir()) == []
+
+
+@pytest.fixture
+def given(tmp_path: Path) -> list[Any]:
+    """Return options with the meshes and two frames of two built-in objects, and a training of a few seconds."""
+    import trimesh
+
+    objects = builtin_objects()
+    meshes, frames = tmp_path / "meshes", tmp_path / "frames"
+    meshes.mkdir()
+    for name in NAMES:
+        mesh = objects[name]
+        colors = mesh.colors_at(np.arange(len(mesh.faces)), np.full((len(mesh.faces), 2), 1 / 3, np.float32))
+        corners = mesh.vertices[mesh.faces].reshape(-1, 3)
+        faces = np.arange(len(corners)).reshape(-1, 3)
+        plain = trimesh.Trimesh(corners, faces, vertex_colors=np.repeat(colors, 3, axis=0), process=False)
+        plain.export(meshes / f"{name}.ply")
+    for seed in range(2):
+        shown = (*NAMES, "mug_white")
+        scene = compose_scene({name: objects[name] for name in shown}, np.random.default_rng(seed), n_objects=3)
+        folder = frames / f"{seed}"
+        folder.mkdir(parents=True)
+        for name, image in (("color", scene.frame.color), ("depth", scene.frame.depth), ("mask", scene.frame.labels)):
+            Image.fromarray(np.asarray(image)).save(folder / f"{name}.png")
+        k = scene.frame.intrinsics
+        (folder / "intrinsics.json").write_text(json.dumps({"fx": k.fx, "fy": k.fy, "cx": k.cx, "cy": k.cy}))
+        (folder / "labels.json").write_text(json.dumps({"labels": {str(i): n for i, n in scene.truth.items()}}))
+    tiny = (
+        "--render=--azimuth-step 90 --polar-step 90 --registration --base --copies 1",
+        "--train=--epochs 1 --batch-size 8 --classifiers tops,tops2",
+        *("--workers", 1),
+    )
+    return ["--meshes", meshes, "--frames", frames, *tiny, "--cameras", "none"]
+
+
+@pytest.mark.slow
+def test_a_small_table_resumes(tmp_path: Path, given: list[Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    out = tmp_path / "out"
+    rows = "default", 'fusion rule "max"'
+    run_command(monkeypatch, *given, "--out", out, "--seeds", 1, "--levers", *rows)
+    first = {path: path.stat().st_mtime_ns for path in out.rglob("seed-0.json")}
+    assert len(first) == 2 and [path.name for path in (out / "runs").iterdir()] == ["default"]
+
+    trained: list[Any] = []
+    train = levers.Table.train
+    monkeypatch.setattr(levers.Table, "train", lambda *a: trained.append(a[1:]) or train(*a))
+    run_command(monkeypatch, *given, "--out", out, "--seeds", 2, "--levers", *rows)
+    run_command(monkeypatch, *given, "--out", out, "--seeds", 1, "--levers", "gallery")
+    assert [(lever.name, seed) for lever, seed in trained] == [("default", 1), ("gallery", 0)]
+    assert sorted(path.name for path in (out / "runs" / "default").iterdir()) == ["seed-0", "seed-1"]
+    assert all(path.stat().st_mtime_ns == time for path, time in first.items())
+    report = json.loads((out / "levers.json").read_text())
+    assert list(report) == [*rows, "gallery"]
+    cells = [json.loads((out / "cells" / "default" / f"seed-{k}.json").read_text())["results"] for k in range(1)]
+    assert cells[0]["original"]["instances"] == 4 and cells[0]["original"]["unknown_instances"] == 2
+    assert report["default"]["original"]["accuracy"]["mean"] == cells[0]["original"]["accuracy"]
+    run_command(monkeypatch, *given, "--out", out, "--seeds", 2, "--levers", *rows)
+    report = json.loads((out / "levers.json").read_text())
+    assert list(report) == list(rows) and report["default"]["original"]["accuracy"]["runs"] == 2
+    assert len((out / "levers.md").read_text().splitlines()) == 2 + 2 and len(trained) == 2
+
+    with pytest.raises(SystemExit):
+        run_command(monkeypatch, *given, "--out", out, "--ignore", "mug*")
