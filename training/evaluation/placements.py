@@ -89,10 +89,10 @@ def steadiness(placement: ArrayLike, answer: ArrayLike) -> float:
     Returns:
         The share; NaN if no placement has two instances.
     """
-    placements, answers = np.asarray(placement), np.asarray(answer)
-    sizes, agreeing = 0, 0
-    for number, size in zip(*np.unique(placements, return_counts=True), strict=True):
-        if size > 1:
-            sizes += size
-            agreeing += np.unique(answers[placements == number], return_counts=True)[1].max()
-    return agreeing / sizes if sizes else float("nan")
+    numbers = np.unique(np.asarray(placement), return_inverse=True)[1]
+    sizes = np.bincount(numbers)
+    pairs, counts = np.unique(np.stack([numbers, np.asarray(answer, np.intp)]), axis=1, return_counts=True)
+    agreeing = np.zeros_like(sizes)
+    np.maximum.at(agreeing, pairs[0], counts)
+    several = sizes > 1
+    return float(agreeing[several].sum() / sizes[several].sum()) if several.any() else float("nan")

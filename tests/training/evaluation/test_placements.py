@@ -81,7 +81,8 @@ def test_accuracy_and_steadiness_by_hand() -> None:
     assert placement_accuracy(placement, correct) == pytest.approx((0.25 + 1 + 0) / 3)
     answers = [3, 0, 2, 0, 2, 1, 2, 5]
     assert steadiness(placement, answers) == pytest.approx((3 + 2) / (4 + 3))
-    assert math.isnan(steadiness([1, 2], [0, 0])) and math.isnan(placement_accuracy([], []))
+    assert math.isnan(steadiness([1, 2], [0, 0])) and math.isnan(steadiness([], []))
+    assert math.isnan(placement_accuracy([], []))
 
 
 class Unable(UntaughtRecognizer):
