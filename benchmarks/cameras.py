@@ -10,6 +10,7 @@ steadiness            share of neighbouring frames with the most frequent answer
 calibration_error     expected calibration error on known objects
 auroc                 known against unknown objects, by the confidence
 unknown_named         share of unknown objects that are named where 95 % of the correct answers are kept
+kept_at_threshold, unknown_named_at_threshold    the two shares at the threshold that the run stores
 
 on the original frames, for each camera, and for all cameras together. Labelled objects that the runs do not know are
 unknown objects, except those with a name of --ignore, which are left out. Placements are those of the original frames;
@@ -194,6 +195,7 @@ def _measure(
                 "calibration_error": expected_calibration_error(confidence, correct[described]),
                 "auroc": auroc(every, np.arange(len(every)) < len(confidence)),
                 "unknown_named": float(unknown_named(confidence[correct[described]], of_unknown, COVERAGE)),
+                **at_threshold(runs[run].threshold, confidence, correct[described], of_unknown),
                 **{
                     f"accuracy in {name}": placement_accuracy(placement[group == name], correct[group == name])
                     for name in np.unique(group).tolist()
@@ -204,6 +206,17 @@ def _measure(
             }
         )
     return results
+
+
+def at_threshold(
+    threshold: float, confidence: NDArray[np.floating], correct: NDArray[np.bool_], of_unknown: NDArray[np.floating]
+) -> dict[str, float]:
+    """Return the shares of correct answers and of unknown objects that keep a name; NaN without a threshold."""
+    kept, named = (
+        float((values >= threshold).mean()) if threshold and len(values) else np.nan
+        for values in (confidence[correct], of_unknown)
+    )
+    return {"threshold": threshold or np.nan, "kept_at_threshold": kept, "unknown_named_at_threshold": named}
 
 
 def summarize(results: Sequence[RunResults]) -> dict[str, dict[str, Any]]:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 
-from thor2_jax.recognition.frames import Intrinsics, RGBDFrame, backproject
+from thor2_jax.recognition.frames import RGBDFrame, backproject
 from training.augmentation.illumination import LUMA
 from training.augmentation.sensor import axial_deviation
 
@@ -147,9 +147,8 @@ def through_camera(frame: RGBDFrame, camera: SimulatedCamera) -> RGBDFrame:
     rng = np.random.default_rng([zlib.crc32(camera.name.encode()), zlib.crc32(np.ascontiguousarray(frame.depth))])
     color = _color(frame.color, camera, rng)
     depth = _depth(frame.depth_m, camera, rng)
-    k = frame.intrinsics
     labels = None if frame.labels is None else _labels(frame, frame.labels, camera, rng)
-    return RGBDFrame(color, depth, labels, Intrinsics(k.fx, k.fy, k.cx, k.cy))
+    return RGBDFrame(color, depth, labels, dataclasses.replace(frame.intrinsics, depth_scale=1000.0))
 
 
 def _color(color: NDArray[np.uint8], camera: SimulatedCamera, rng: np.random.Generator) -> NDArray[np.uint8]:

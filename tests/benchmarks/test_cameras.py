@@ -100,6 +100,10 @@ def test_metrics_match_hand_calculation() -> None:
     assert mean("a", "accuracy in v") == pytest.approx(2 / 3) and mean("a", "accuracy in w") == 1
     assert [mean(name, "placements") for name in results] == [2, 2, 2, 4]
     assert mean("all cameras", "unknown_instances") == 2
+    assert results["a"]["threshold"]["runs"] == results["a"]["kept_at_threshold"]["runs"] == 0
+    (of_run,) = cameras.measure([ToyRun("x", threshold=0.75)], answers)
+    assert of_run["original"]["kept_at_threshold"] == pytest.approx(1 / 3)
+    assert [of_run[name]["unknown_named_at_threshold"] for name in ("original", "a")] == [1, 0]
     table = cameras.show(results).splitlines()
     assert table[1].split()[:2] == ["original", "0.833"] and table[3].split()[-1] == "-"
 
