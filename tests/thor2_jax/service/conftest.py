@@ -1,23 +1,31 @@
-"""A run with random weights, a frame, and a running service that most tests share."""
+"""Runs with random weights, a frame, running services that tests share, and their page in headless Chromium."""
 
 import json
 import re
+import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import httpx
 import numpy as np
 import pytest
+import uvicorn
+from fastapi import FastAPI
 from helpers import SMALL_CONFIG, encode_image, untrained_run
+from playwright.sync_api import Browser, Page, Route, expect, sync_playwright
 
 import thor2_jax as thor2
 from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
 from thor2_jax.recognition.run_directory import save_run
 from thor2_jax.recognizer import EMBEDDING_FILE
+from thor2_jax.service.app import create_app
+from thor2_jax.service.settings import Settings
 
 Files = dict[str, bytes]
 SAMPLE_INDEX = Path(thor2.__file__).parent / "service" / "page" / "samples" / "index.json"
@@ -130,15 +138,72 @@ def server(start_server: Callable[..., Server]) -> Server:
 
 
 @pytest.fixture(scope="session")
-def teaching_server(
-    start_server: Callable[..., Server], teaching_run: Path, tmp_path_factory: pytest.TempPathFactory
-) -> Server:
-    """`thor2 serve --teach` with a gallery outside of the run directory."""
-    gallery = tmp_path_factory.mktemp("taught") / "gallery"
-    return start_server("--teach", "--gallery", str(gallery), "--processes", "1", run=teaching_run)
+def teaching_gallery(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("teaching") / "gallery"
+
+
+@pytest.fixture(scope="session")
+def teaching_app(teaching_run: Path, teaching_gallery: Path) -> FastAPI:
+    """A service that teaches, with a gallery outside of the run directory."""
+    settings = Settings(teaching_run, max_batch=8, processes=1, gallery=teaching_gallery, teach=True, deadline=20)
+    return create_app(settings)
+
+
+@pytest.fixture(scope="session")
+def teaching_url(teaching_app: FastAPI) -> Iterator[str]:
+    """Serve it in a thread of this process, so that tests can replace functions; yield the URL."""
+    server = uvicorn.Server(uvicorn.Config(teaching_app, port=0, log_config=None, ws="none"))
+    thread = threading.Thread(target=server.run)
+    thread.start()
+    try:
+        while not server.started:
+            assert thread.is_alive()
+            time.sleep(0.01)
+        teaching_app.state.service.wait_until_ready()
+        yield f"http://127.0.0.1:{server.servers[0].sockets[0].getsockname()[1]}"
+    finally:
+        server.should_exit = True
+        thread.join()
 
 
 @pytest.fixture
 def http(server: Server) -> Iterator[httpx.Client]:
     with httpx.Client(base_url=server.url, timeout=60) as client:
         yield client
+
+
+@pytest.fixture(scope="module")  # While it is open, other tests cannot call asyncio.run.
+def browser() -> Iterator[Browser]:
+    chromium = shutil.which("chromium")
+    if chromium is None:
+        pytest.skip("chromium is not installed (apt-get install chromium)")
+    with sync_playwright() as playwright:
+        yield playwright.chromium.launch(executable_path=chromium)
+
+
+@pytest.fixture
+def open_page(browser: Browser, request: pytest.FixtureRequest) -> Iterator[Callable[..., Page]]:
+    """Open the page in a new profile; afterwards, check that no other server was contacted and no script failed."""
+    contexts, sources, urls, errors = [], [], [], []
+
+    def open_one(route: Callable[[Route], None] | None = None, samples: int = 4, url: str = "", **options: Any) -> Page:
+        url = url or request.getfixturevalue("server").url
+        sources.append(f"{url}/")
+        contexts.append(browser.new_context(**options))
+        page = contexts[-1].new_page()
+        page.set_default_timeout(15_000)
+        page.on("request", lambda request: urls.append(request.url))
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        # Error statuses also appear in the console; tests check how the page shows them.
+        page.on("console", lambda line: errors.append(line.text) if "status of" not in line.text else None)
+        if route is not None:
+            page.route("**/v1/**", route)
+        page.goto(url)
+        expect(page.locator("#samples button")).to_have_count(samples)
+        return page
+
+    yield open_one
+    for context in contexts:
+        context.close()
+    assert urls and all(url.startswith(tuple(sources)) for url in urls)
+    assert errors == []

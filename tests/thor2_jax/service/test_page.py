@@ -2,57 +2,21 @@
 
 import io
 import json
-import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import httpx
 import numpy as np
 import pytest
+from page_actions import FIELDS, upload
 from PIL import Image
-from playwright.sync_api import Browser, Locator, Page, Route, expect, sync_playwright
+from playwright.sync_api import Locator, Page, Route, expect
 
 import thor2_jax
 
 Files = dict[str, bytes]
 SAMPLES = Path(thor2_jax.__file__).parent / "service" / "page" / "samples"
-FIELDS = {"color": "image/png", "depth": "image/png", "labels": "image/png", "intrinsics": "application/json"}
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    chromium = shutil.which("chromium")
-    if chromium is None:
-        pytest.skip("chromium is not installed (apt-get install chromium)")
-    with sync_playwright() as playwright:
-        yield playwright.chromium.launch(executable_path=chromium)
-
-
-@pytest.fixture
-def open_page(browser: Browser, server: Any) -> Iterator[Callable[..., Page]]:
-    """Open the page in a new profile; afterwards, check that no other server was contacted and no script failed."""
-    contexts, urls, errors = [], [], []
-
-    def open_one(route: Callable[[Route], None] | None = None, samples: int = 4, **options: Any) -> Page:
-        contexts.append(browser.new_context(**options))
-        page = contexts[-1].new_page()
-        page.set_default_timeout(15_000)
-        page.on("request", lambda request: urls.append(request.url))
-        page.on("pageerror", lambda error: errors.append(str(error)))
-        # Error statuses also appear in the console; tests check how the page shows them.
-        page.on("console", lambda line: errors.append(line.text) if "status of" not in line.text else None)
-        if route is not None:
-            page.route("**/v1/**", route)
-        page.goto(server.url)
-        expect(page.locator("#samples button")).to_have_count(samples)
-        return page
-
-    yield open_one
-    for context in contexts:
-        context.close()
-    assert urls and all(url.startswith(f"{server.url}/") for url in urls)
-    assert errors == []
 
 
 def choose_sample(page: Page) -> np.ndarray:
@@ -61,15 +25,6 @@ def choose_sample(page: Page) -> np.ndarray:
     expect(page.locator("#objects button").first).to_be_visible()
     folder = json.loads((SAMPLES / "index.json").read_text())[0]["folder"]
     return np.asarray(Image.open(SAMPLES / folder / "labels.png"))
-
-
-def upload(page: Page, files: Files, color_name: str = "color.png") -> None:
-    if not page.locator("#upload-form").is_visible():
-        page.get_by_text("Upload your own frame").click()
-    for field, kind in FIELDS.items():
-        name = color_name if field == "color" else field
-        page.locator(f"#{field}").set_input_files({"name": name, "mimeType": kind, "buffer": files[field]})
-    page.get_by_role("button", name="Recognize", exact=True).click()
 
 
 def changed_answers(change: Callable[[Any], None]) -> Callable[[Route], None]:
@@ -551,6 +506,8 @@ def test_text_contrast_in_both_color_schemes(open_page: Callable[..., Page], sch
     for ink, ground in [
         *pairs,
         ("accent", "card"),
+        ("accent", "chosen"),
+        ("error", "chosen"),
         ("on-accent", "accent"),
         ("error", "card"),
         ("error", "error-well"),

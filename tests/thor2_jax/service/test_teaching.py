@@ -1,7 +1,6 @@
 """Enrolling and forgetting objects over HTTP: changes, undo, several processes, and bad input."""
 
 import asyncio
-import contextlib
 import json
 import re
 import shutil
@@ -15,7 +14,6 @@ import filelock
 import httpx
 import numpy as np
 import pytest
-import uvicorn
 from fastapi import FastAPI
 from helpers import encode_image
 
@@ -30,44 +28,16 @@ from thor2_jax.service.settings import Settings
 Files = dict[str, bytes]
 
 
-@pytest.fixture(scope="module")
-def gallery(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("teaching") / "gallery"
-
-
-@pytest.fixture(scope="module")
-def app(teaching_run: Path, gallery: Path) -> FastAPI:
-    settings = Settings(teaching_run, max_batch=8, processes=1, gallery=gallery, teach=True, deadline=20)
-    return create_app(settings)
-
-
-@contextlib.contextmanager
-def serving(app: FastAPI) -> Iterator[str]:
-    """Serve in a thread of this process, so that tests can replace functions; yield the URL."""
-    server = uvicorn.Server(uvicorn.Config(app, port=0, log_config=None, ws="none"))
-    thread = threading.Thread(target=server.run)
-    thread.start()
-    try:
-        while not server.started:
-            assert thread.is_alive()
-            time.sleep(0.01)
-        yield f"http://127.0.0.1:{server.servers[0].sockets[0].getsockname()[1]}"
-    finally:
-        server.should_exit = True
-        thread.join()
-
-
-@pytest.fixture(scope="module")
-def started(app: FastAPI) -> Iterator[str]:
-    with serving(app) as url:
-        app.state.service.wait_until_ready()
-        yield url
+@pytest.fixture
+def gallery(teaching_gallery: Path) -> Path:
+    return teaching_gallery
 
 
 @pytest.fixture
-def http(started: str, gallery: Path, files: Files) -> Iterator[httpx.Client]:
+def http(teaching_url: str, gallery: Path, files: Files) -> Iterator[httpx.Client]:
     """The service with an empty gallery; it still answers after the test."""
-    with httpx.Client(base_url=started, timeout=60) as client:
+    shutil.rmtree(gallery, ignore_errors=True)
+    with httpx.Client(base_url=teaching_url, timeout=60) as client:
         yield client
         shutil.rmtree(gallery)
         assert len(recognized(client, files)) == 4 and known(client) == {}
@@ -335,7 +305,7 @@ def test_a_damaged_gallery_stops_changes_but_not_recognition(
 
 
 def test_a_change_waits_for_another_writer(
-    http: httpx.Client, files: Files, gallery: Path, app: FastAPI, monkeypatch: pytest.MonkeyPatch
+    http: httpx.Client, files: Files, gallery: Path, teaching_app: FastAPI, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     enroll(http, files, "tall")
     lock = filelock.FileLock(gallery / ".lock", thread_local=False, fallback_to_soft=False)
@@ -345,7 +315,7 @@ def test_a_change_waits_for_another_writer(
         answer = enroll(http, files, "wide", 7)
         timer.join()
     assert answer.status_code == 200 and answer.json()["timings"]["gallery"] > 100
-    service = app.state.service
+    service = teaching_app.state.service
     monkeypatch.setattr(service, "settings", Settings(service.settings.model, deadline=2.0, teach=True))
     before = content(gallery)
     with lock:

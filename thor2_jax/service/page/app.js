@@ -4,6 +4,7 @@ import { showDetails } from "./details.js";
 import { breakable, confidenceOf, element, percent, rgb } from "./drawing.js";
 import { instanceColors, Overlay, textColor } from "./overlay.js";
 import * as service from "./service.js";
+import { canBeNamed, connectNaming, showNaming } from "./teaching.js";
 
 const FIELDS = ["color", "depth", "labels", "intrinsics"];
 const RETRY_MS = 1000;
@@ -12,7 +13,7 @@ const pause = (milliseconds) => new Promise((resolve) => setTimeout(resolve, mil
 
 const overlay = new Overlay(byId("overlay"), (label) => select(label, true));
 let loaded = null; // The model and the mean colours of its colour regions.
-let frame = null; // The answer that is shown.
+let frame = null; // The answer that is shown, with the arguments of `recognize` that lead to it.
 let currentRequest = new AbortController();
 
 function setStatus(text, busy = false) {
@@ -68,7 +69,8 @@ async function whenStarted(request, signal) {
   }
 }
 
-async function recognize(title, fileSource, fields) {
+/** Recognize a frame and show it, with the object `selected` if it is given. */
+async function recognize(title, fileSource, fields, selected) {
   currentRequest.abort();
   const { signal } = (currentRequest = new AbortController());
   clearProblems();
@@ -79,7 +81,7 @@ async function recognize(title, fileSource, fields) {
     const files = await fileSource();
     const answer = await whenStarted(() => service.explain(files, signal), signal);
     const bitmap = await createImageBitmap(files.color, { imageOrientation: "none" });
-    if (!signal.aborted) show(title, answer, bitmap);
+    if (!signal.aborted) show({ ...answer, title, files, fields }, bitmap, selected);
   } catch (problem) {
     if (signal.aborted) return;
     hideResult();
@@ -95,9 +97,9 @@ function hideResult() {
   byId("chooser").classList.remove("compact");
 }
 
-function show(title, answer, bitmap) {
+function show(answer, bitmap, selected) {
   frame = answer;
-  const { instances, timings } = answer;
+  const { title, instances, timings } = answer;
   const named = instances.filter(({ name }) => name !== null);
   const count = `${instances.length} ${instances.length === 1 ? "object" : "objects"}`;
   const unknown = instances.length - named.length;
@@ -111,7 +113,7 @@ function show(title, answer, bitmap) {
   byId("objects").replaceChildren(...instances.map((instance, k) => element("li", {}, objectButton(instance, colors[k]))));
   const stages = Object.entries(timings).map(([stage, ms]) => `${stage}\u00a0${ms.toFixed(ms < 10 ? 1 : 0)}\u00a0ms`);
   byId("timings").textContent = stages.join(" · ");
-  const first = named[0] ?? instances[0];
+  const first = instances.find(({ label }) => label === selected) ?? named[0] ?? instances[0];
   overlay.show(bitmap, instances, answer.label_map, first?.label);
   if (first) select(first.label);
   scrollTo({ top: 0 });
@@ -120,17 +122,24 @@ function show(title, answer, bitmap) {
 
 function objectButton(instance, color) {
   const { label, name, occluded, unrecognized } = instance;
-  const facts = unrecognized ?? (occluded ? "partly occluded" : "");
+  const invites = name === null && loaded.model.teaches && canBeNamed(instance);
+  const facts = invites ? "Name this object" : unrecognized ?? (occluded ? "partly occluded" : "");
   const swatch = element("span", { className: "swatch" }, label);
   swatch.style.background = rgb(color);
   swatch.style.color = textColor(color);
   const button = element(
     "button",
-    { type: "button", onclick: () => select(label, true) },
+    {
+      type: "button",
+      onclick: () => {
+        select(label, true);
+        if (invites) byId("name").focus();
+      },
+    },
     swatch,
     element("span", { className: "name" }, ...breakable(name ?? "unknown object")),
     element("span", { className: "confidence" }, name === null ? "" : percent(confidenceOf(instance))),
-    element("span", { className: "facts hint" }, facts),
+    element("span", { className: invites ? "facts invitation" : "facts hint" }, facts),
   );
   button.dataset.label = label;
   return button;
@@ -141,7 +150,9 @@ function select(label, byUser = false) {
     button.setAttribute("aria-pressed", button.dataset.label === String(label));
   }
   overlay.select(label);
-  showDetails(frame.instances.find((instance) => instance.label === label), loaded.model, loaded.regions);
+  const instance = frame.instances.find((one) => one.label === label);
+  showDetails(instance, loaded.model, loaded.regions);
+  showNaming(instance, loaded.model);
   if (byUser && byId("details-title").getBoundingClientRect().bottom > innerHeight) byId("details").scrollIntoView();
 }
 
@@ -152,7 +163,7 @@ async function load() {
       const [model, network] = await Promise.all([service.model(), service.colornet()]);
       byId("token-section").hidden = true;
       showClasses(model.classes);
-      await showSamples(model.classes);
+      await showSamples(model);
       return { model, regions: network.mean_rgb };
     } catch (problem) {
       if (![0, 502, 503, 504].includes(problem.status)) throw problem;
@@ -167,9 +178,10 @@ function showClasses(classes) {
   byId("model").hidden = false;
 }
 
-/** Offer the sample frames all of whose objects the model knows. */
-async function showSamples(classes) {
-  const samples = (await service.samples()).filter(({ objects }) => objects.every((name) => classes.includes(name)));
+/** Offer the sample frames all of whose objects the model knows or can be taught. */
+async function showSamples({ classes, teaches }) {
+  const isKnown = (name) => teaches || classes.includes(name);
+  const samples = (await service.samples()).filter(({ objects }) => objects.every(isKnown));
   const buttons = samples.map(({ folder, title }) => {
     const picture = element("img", { src: `samples/${folder}/color.jpg`, alt: "", loading: "lazy" });
     const button = element("button", { type: "button" }, picture, element("span", {}, title));
@@ -216,6 +228,19 @@ byId("token-form").addEventListener("submit", async (event) => {
     showProblem(problem);
   }
 });
+
+connectNaming(
+  () => frame.files,
+  async (files) => {
+    loaded.model = await service.model();
+    showClasses(loaded.model.classes);
+    if (frame?.files === files) {
+      const selected = Number(byId("naming").dataset.label);
+      await recognize(frame.title, async () => files, frame.fields, selected);
+    }
+  },
+  showProblem,
+);
 
 async function watchReady() {
   const setState = (name, text) => {

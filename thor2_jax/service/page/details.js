@@ -3,7 +3,7 @@
 import { breakable, element, keepDrawn, percent, rgb, themed } from "./drawing.js";
 
 const byId = (id) => document.getElementById(id);
-const TITLES = { tops: "TOPS: shape", tops2: "TOPS2: shape and colour" };
+const TITLES = { tops: "TOPS: shape", tops2: "TOPS2: shape and colour", gallery: "Gallery: enrolled views" };
 
 /** Fill the section. `regions` are the mean colours of the colour regions. */
 export function showDetails(instance, model, regions) {
@@ -18,8 +18,9 @@ export function showDetails(instance, model, regions) {
   byId("cloud").setAttribute("aria-label", `Point cloud of ${name ?? "the object"}, side view, with slices from bottom to top.`);
   const { sigma_1: thickness, sigma_s: perMetre } = model.descriptor;
   byId("cloud-hint").textContent = `Aligned and cut into slices of ${+((100 * thickness) / perMetre).toFixed(1)} cm.`;
-  byId("classifiers").replaceChildren(...Object.keys(instance.top).map((classifier) => topFive(instance, classifier)));
-  byId("confidence-help").textContent = confidenceHelp(details.calibrated_confidence);
+  const sources = Object.keys(instance.top).filter((source) => instance.top[source].length);
+  byId("classifiers").replaceChildren(...sources.map((source) => topFive(instance, source, sources.length > 1)));
+  byId("confidence-help").textContent = confidenceHelp(details.calibrated_confidence, sources);
   showSlices(details, model, regions);
 }
 
@@ -36,7 +37,12 @@ function facts({ label, confidence, occluded, points_used, overflow, kept_by_fal
   ].join(" · ");
 }
 
-function confidenceHelp(calibrated) {
+function confidenceHelp(calibrated, sources) {
+  if (!sources.length) return "No object is enrolled.";
+  const gallery = "The score of the gallery is about 1 amid the enrolled views of an object and about 0 far from all of them. ";
+  if (sources.length === 1 && sources[0] === "gallery") return `${gallery}It is the confidence; it is not calibrated.`;
+  const both = "An object without training takes this score as its confidence, a trained class the geometric mean of its probabilities, and of its score if it has views, too. ";
+  if (sources.includes("gallery")) return `${gallery}${both}The confidence is not calibrated.`;
   const fusion = "The named class has the highest geometric mean of both probabilities; normalized, it is the confidence. ";
   if (calibrated !== null) return `${fusion}The calibrated confidence (temperature scaling on a held-out set) estimates the accuracy of such answers.`;
   return `${fusion}It is not calibrated, since the model was trained without a held-out set: expect fewer correct answers than it suggests.`;
@@ -47,7 +53,7 @@ function reason({ unrecognized, details }) {
   return details === null ? "Details are limited to the first objects of a frame." : "";
 }
 
-function topFive(instance, classifier) {
+function topFive(instance, classifier, isCompared) {
   const rows = instance.top[classifier].flatMap(({ name, probability }) => {
     const bar = element("div");
     bar.style.setProperty("--share", `${100 * probability}%`);
@@ -59,7 +65,7 @@ function topFive(instance, classifier) {
     ];
   });
   const title = element("h3", {}, TITLES[classifier] ?? classifier.toUpperCase());
-  const isHigher = instance.classifier === classifier;
+  const isHigher = isCompared && instance.classifier === classifier;
   if (isHigher) title.append(element("span", { className: "badge" }, "higher probability"));
   return element("div", { className: isHigher ? "higher" : "" }, title, element("table", {}, element("tbody", {}, ...rows)));
 }

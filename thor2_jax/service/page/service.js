@@ -52,8 +52,16 @@ export async function sampleFiles(folder) {
   return Object.fromEntries(await Promise.all(Object.entries(names).map(load)));
 }
 
-export function explain(files, signal) {
+function form(parts) {
   const body = new FormData();
-  for (const [part, file] of Object.entries(files)) body.append(part, file);
-  return json("v1/explain", { method: "POST", body, signal });
+  for (const [part, value] of Object.entries(parts)) body.append(part, value);
+  return body;
 }
+
+export const explain = (files, signal) => json("v1/explain", { method: "POST", body: form(files), signal });
+
+/** Enroll one object of a frame; a name that is known gets another view. */
+export const enroll = (files, instance, name) =>
+  json("v1/objects", { method: "POST", body: form({ ...files, instance, name, extend: "true" }) });
+
+export const undo = (generation) => json("v1/objects/undo", { method: "POST", body: form({ generation }) });

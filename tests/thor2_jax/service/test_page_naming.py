@@ -1,0 +1,156 @@
+"""Naming objects on the web page of a service that teaches."""
+
+from collections.abc import Callable, Iterator
+
+import httpx
+import pytest
+from page_actions import upload
+from playwright.sync_api import Page, Route, expect
+
+Open = Callable[..., Page]
+Files = dict[str, bytes]
+
+
+@pytest.fixture
+def open_teaching(open_page: Open, teaching_url: str) -> Iterator[Open]:
+    """Open the page of a service that has no objects enrolled; afterwards, forget what was enrolled."""
+    yield lambda *arguments, **options: open_page(*arguments, url=teaching_url, **options)
+    for each in httpx.get(f"{teaching_url}/v1/objects").json()["objects"]:
+        if not each["trained"]:
+            httpx.delete(f"{teaching_url}/v1/objects/{each['name']}")
+
+
+def without_trained_classes(route: Route) -> None:
+    """Answer that objects of trained classes, whose weights are random, are unknown."""
+    if "explain" not in route.request.url:
+        route.continue_()
+        return
+    response = route.fetch()
+    answer = response.json()
+    for one in answer["instances"]:
+        if one["name"] in ("a", "b"):
+            one.update(name=None, unrecognized="unknown: a confidence of 0.100, below 0.5")
+    route.fulfill(response=response, json=answer)
+
+
+def recognize(page: Page, files: Files) -> None:
+    upload(page, files)
+    expect(page.locator("#objects button")).to_have_count(4)
+
+
+def name_object(page: Page, label: int, name: str) -> None:
+    page.locator(f'#objects button[data-label="{label}"]').click()
+    page.locator("#name").fill(name)
+    page.get_by_role("button", name="Save name").click()
+
+
+def test_a_named_object_is_known_until_undo(open_teaching: Open, files: Files, teaching_url: str) -> None:
+    page = open_teaching(without_trained_classes, viewport={"width": 1280, "height": 900})
+    recognize(page, files)
+    invitations = page.locator("#objects .facts").filter(has_text="Name this object")
+    expect(invitations).to_have_count(3)  # The fourth has too few points.
+    page.locator('#objects button[data-label="200"]').click()
+    expect(page.get_by_label("Name this object")).to_be_focused()
+    page.keyboard.type("blue teapot")
+    page.keyboard.press("Enter")
+
+    chosen = page.locator('#objects button[aria-pressed="true"]')
+    expect(chosen.locator(".name")).to_have_text("blue teapot")
+    expect(chosen).to_have_attribute("data-label", "200")
+    expect(page.locator("#details-title")).to_have_text("blue teapot")
+    expect(page.locator("#notice-text")).to_contain_text("“blue teapot” is enrolled")
+    expect(page.locator("#name-label")).to_have_text("Correct the name")
+    expect(page.locator("#classes li").last).to_have_text("blue teapot")
+    listed = httpx.get(f"{teaching_url}/v1/objects").json()["objects"]
+    assert [(each["name"], each["views"]) for each in listed][2:] == [("blue teapot", 1)]
+
+    page.get_by_role("button", name="Undo").click()
+    expect(page.locator("#notice-text")).to_contain_text("taken back")
+    expect(page.get_by_role("button", name="Undo")).to_be_hidden()
+    expect(invitations).to_have_count(3)
+    expect(page.locator("#classes li")).to_have_count(2)
+
+
+def test_the_next_frame_knows_a_named_object(open_teaching: Open, files: Files) -> None:
+    page = open_teaching(without_trained_classes)
+    recognize(page, files)
+    name_object(page, 200, "teapot")
+    expect(page.locator("#notice-text")).to_be_visible()
+    second = open_teaching(without_trained_classes)
+    recognize(second, files)
+    expect(second.locator('#objects button[data-label="200"] .name')).to_have_text("teapot")
+    expect(second.locator("#notice")).to_be_hidden()
+
+
+def test_a_known_name_gets_another_view(open_teaching: Open, files: Files, teaching_url: str) -> None:
+    page = open_teaching()
+    recognize(page, files)
+    name_object(page, 200, "teapot")
+    expect(page.locator("#notice-text")).to_contain_text("is enrolled")
+    name_object(page, 7, "teapot")
+    expect(page.locator("#notice-text")).to_contain_text("“teapot” has 2 views")
+    page.get_by_role("button", name="Undo").click()
+    expect(page.locator("#notice-text")).to_contain_text("taken back")
+    listed = httpx.get(f"{teaching_url}/v1/objects").json()["objects"]
+    assert [each["views"] for each in listed if each["name"] == "teapot"] == [1]
+
+
+def test_undo_after_another_change_is_refused(open_teaching: Open, files: Files, teaching_url: str) -> None:
+    page = open_teaching()
+    recognize(page, files)
+    name_object(page, 200, "teapot")
+    expect(page.locator("#notice-text")).to_contain_text("is enrolled")
+    httpx.delete(f"{teaching_url}/v1/objects/teapot")
+    page.get_by_role("button", name="Undo").click()
+    expect(page.locator("#notice-text")).to_contain_text("Another change")
+    expect(page.get_by_role("button", name="Undo")).to_be_hidden()
+
+
+def test_problems_of_a_name_appear_beside_it(open_teaching: Open, files: Files) -> None:
+    page = open_teaching()
+    recognize(page, files)
+    for name, message in (("  ", "Enter a name."), ("mug\u202egpj", "printable")):
+        name_object(page, 200, name)
+        expect(page.locator("#name-error")).to_contain_text(message)
+        expect(page.locator("#name")).to_have_attribute("aria-invalid", "true")
+        expect(page.locator("#name")).to_be_focused()
+        expect(page.locator("#notice")).to_be_hidden()
+    name_object(page, 200, "mug")
+    expect(page.locator("#notice-text")).to_contain_text("“mug” is enrolled")
+    expect(page.locator("#name-error")).to_be_empty()
+
+
+def test_errors_of_the_gallery_are_shown(open_teaching: Open, files: Files) -> None:
+    def full(route: Route) -> None:
+        if route.request.url.endswith("/v1/objects"):
+            route.fulfill(
+                status=507, json={"field": None, "message": "The gallery cannot be written; it is as before."}
+            )
+        else:
+            route.continue_()
+
+    page = open_teaching(full)
+    recognize(page, files)
+    name_object(page, 200, "mug")
+    expect(page.locator("#name-error")).to_have_text("The gallery cannot be written; it is as before.")
+    expect(page.locator("#objects button").first).to_be_visible()
+
+
+def test_a_service_that_does_not_teach_has_no_form(open_page: Open, files: Files) -> None:
+    page = open_page()
+    recognize(page, files)
+    expect(page.locator("#details-title")).to_be_visible()
+    expect(page.locator("#naming")).to_be_hidden()
+    expect(page.locator("#objects")).not_to_contain_text("Name this object")
+
+
+@pytest.mark.parametrize("width", [360, 1280])
+def test_the_form_fits_the_page(open_teaching: Open, files: Files, width: int) -> None:
+    page = open_teaching(without_trained_classes, viewport={"width": width, "height": 740})
+    recognize(page, files)
+    name_object(page, 200, "an_object_with_a_long_name_that_has_no_spaces_and_does_not_end_soon_" + "x" * 60)
+    expect(page.locator("#notice-text")).to_be_visible()
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    for selector in ("#name", "#naming button", "#undo", "#notice"):
+        box = page.locator(selector).bounding_box()
+        assert box is not None and box["x"] >= 0 and box["x"] + box["width"] <= width and box["height"] >= 24

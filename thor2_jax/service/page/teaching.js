@@ -1,0 +1,88 @@
+// Naming of objects: the form in the details, and the notice that takes a name back.
+
+import { element } from "./drawing.js";
+import * as service from "./service.js";
+
+const byId = (id) => document.getElementById(id);
+
+/** Return whether an object can be named: its cloud was described, whether it is known or not. */
+export const canBeNamed = ({ name, unrecognized }) => name !== null || unrecognized.startsWith("unknown");
+
+function markName(message) {
+  byId("name-error").textContent = message;
+  if (message) byId("name").setAttribute("aria-invalid", "true");
+  else byId("name").removeAttribute("aria-invalid");
+}
+
+/** Show the form for an object if the service teaches. */
+export function showNaming(instance, { teaches, classes }) {
+  byId("naming").hidden = !teaches || !canBeNamed(instance);
+  byId("naming").dataset.label = instance.label;
+  byId("name-label").textContent = instance.name === null ? "Name this object" : "Correct the name";
+  byId("name").value = "";
+  byId("known-names").replaceChildren(...classes.map((value) => element("option", { value })));
+  markName("");
+}
+
+function showNotice(text, generation = null) {
+  byId("notice").hidden = false;
+  byId("notice-text").textContent = text;
+  byId("undo").hidden = generation === null;
+  byId("undo").dataset.generation = generation;
+}
+
+/**
+ * Connect the form and the notice.
+ *
+ * `shownFiles()` returns the files of the frame that is shown, `changed(files)` is called after each change with the
+ * files in which an object was named or taken back, and `failed(problem)` with a problem that belongs to no field.
+ */
+export function connectNaming(shownFiles, changed, failed) {
+  let files = null;
+
+  async function whileBusy(action) {
+    const setBusy = (isBusy) => [byId("save-name"), byId("undo")].forEach((button) => (button.disabled = isBusy));
+    setBusy(true);
+    try {
+      await action();
+    } finally {
+      setBusy(false);
+    }
+  }
+
+  byId("naming").addEventListener("submit", (event) => {
+    event.preventDefault();
+    const name = byId("name").value.trim();
+    markName(name ? "" : "Enter a name.");
+    if (!name) return byId("name").focus();
+    whileBusy(async () => {
+      files = shownFiles();
+      let answer;
+      try {
+        answer = await service.enroll(files, byId("naming").dataset.label, name);
+      } catch (problem) {
+        if (problem.status === 401 || !(problem instanceof service.Problem)) return failed(problem);
+        markName(problem.message);
+        return byId("name").focus();
+      }
+      const { name: enrolled, views, generation } = answer;
+      showNotice(views === 1 ? `“${enrolled}” is enrolled.` : `“${enrolled}” has ${views} views now.`, generation);
+      byId("notice").dataset.name = enrolled;
+      await changed(files);
+    });
+  });
+
+  byId("undo").addEventListener("click", () => {
+    whileBusy(async () => {
+      try {
+        await service.undo(byId("undo").dataset.generation);
+      } catch (problem) {
+        // Only the last change can be taken back.
+        if (problem.status === 409) return showNotice("Another change was made since; forget the object instead.");
+        return failed(problem);
+      }
+      showNotice(`The name “${byId("notice").dataset.name}” is taken back.`);
+      await changed(files);
+    });
+  });
+}
