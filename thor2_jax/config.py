@@ -12,12 +12,19 @@ from typing import Any, Literal
 
 from thor2_jax.errors import InputError
 
-__all__ = ["DESCRIPTOR_VERSION", "DescriptorConfig", "Relaxation"]
+__all__ = ["DESCRIPTOR_VERSION", "ORIENTATION_COUNTS", "DescriptorConfig", "Relaxation"]
 
 DESCRIPTOR_VERSION = 1
 """Version of the descriptor's values, stored in every run directory; a run of another version is rejected."""
 
-_CHOICES = {"homology": ("gudhi", "closed_form"), "convention": ("paper", "released")}
+ORIENTATION_COUNTS = (1, 2, 4)
+"""Numbers of candidate orientations of a cloud; 1 is the paper's."""
+
+_CHOICES = {
+    "homology": ("gudhi", "closed_form"),
+    "convention": ("paper", "released"),
+    "orientations": ORIENTATION_COUNTS,
+}
 
 
 def _is_finite(value: object) -> bool:
@@ -73,6 +80,8 @@ class DescriptorConfig:
         image_variance: variance of the Gaussian at each point of a diagram.
         persistence_weight: exponent n of the weight persistence**n of a point in an image; 1 in the paper.
         relaxation: temperatures of soft slices, strips, extremes and colours; None for the paper's hard descriptor.
+        orientations: candidate orientations K of a cloud that recognition describes and fuses, one of
+            `ORIENTATION_COUNTS` (see `descriptor.orientations`); `describe` returns the first one only.
 
     Raises:
         InputError: a value is out of range; the message names the field and the value.
@@ -90,6 +99,7 @@ class DescriptorConfig:
     image_variance: float = 0.00025
     persistence_weight: float = 1.0
     relaxation: Relaxation | None = None
+    orientations: int = 1
 
     def __post_init__(self) -> None:
         for name, allowed in _CHOICES.items():

@@ -5,8 +5,9 @@
 >>> [(r.label, r.name, r.confidence) for r in recognizer.recognize(frame)]          # doctest: +SKIP
 [(1, 'mug', 0.98), (2, 'bowl', 0.71)]
 
-Each instance of the frame is prepared on the host (`prepare_instance`), described (`describe`), classified by the MLPs
-of the run and named by the fusion of their probabilities (`fuse`). A gallery recognizes objects without training:
+Each instance of the frame is prepared on the host (`prepare_instance`), described in its candidate orientations
+(`describe_orientations`), classified by the networks of the run and named by the fusion of their probabilities
+(`fuse`). A gallery recognizes objects without training:
 
 >>> recognizer.enroll("teapot", [frame])                                            # doctest: +SKIP
 >>> recognizer.forget("teapot")                                                     # doctest: +SKIP
@@ -21,23 +22,24 @@ from typing import Any, Literal, TypeVar
 import jax
 import numpy as np
 from flax import nnx
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from thor2_jax.capacity import BATCH_BUCKETS, POINT_BUCKETS, batch_bucket, point_bucket
-from thor2_jax.descriptor.describe import describe
+from thor2_jax.descriptor.orientations import OrientedDescriptors, describe_orientations
 from thor2_jax.errors import InputError, with_context
 from thor2_jax.gallery.embedding import Embedding
 from thor2_jax.gallery.enrollment import instance_view
 from thor2_jax.gallery.gallery import Gallery
 from thor2_jax.gallery.objects import ObjectGallery
 from thor2_jax.gallery.store import GALLERY_DIRECTORY
-from thor2_jax.recognition.answers import MAX_OVERFLOW, DescribedFrame, Recognition, concatenate_padded
-from thor2_jax.recognition.classifier import MLP, Feature, check_features, class_probabilities
+from thor2_jax.recognition.answers import MAX_OVERFLOW, DescribedFrame, Evidence, Recognition, concatenate_padded
+from thor2_jax.recognition.classifier import EMBEDDING, MLP, Feature, feature_of
+from thor2_jax.recognition.confidence import Calibration
 from thor2_jax.recognition.frames import RGBDFrame
 from thor2_jax.recognition.fusion import DEFAULT_RULE, FUSION_RULES, FusionRule, fused_probabilities
 from thor2_jax.recognition.prepared_instance import PreparedInstance, pack_instances, prepare_instance
 from thor2_jax.recognition.run_directory import TrainedRun, load_run
-from thor2_jax.types import Descriptors
+from thor2_jax.types import PointClouds
 
 __all__ = [
     "ANSWER_SOURCES",
@@ -71,6 +73,7 @@ class Recognizer:
         objects: the enrolled objects, on disk after `load`.
         unknown_below: least confidence of an answer with a name.
         rule: fusion rule of the classifiers.
+        calibration: turns fused probabilities into confidences; None in runs without one.
         chunk: instances described and classified in one call. While the device computes a chunk, the host prepares the
             next. For a single frame, one large chunk starts sooner, since fewer functions are compiled.
 
@@ -81,7 +84,7 @@ class Recognizer:
     def __init__(
         self,
         run: TrainedRun,
-        unknown_below: float = 0.0,
+        unknown_below: float | None = None,
         rule: FusionRule = DEFAULT_RULE,
         *,
         embedding: Embedding | None = None,
@@ -92,10 +95,11 @@ class Recognizer:
 
         Args:
             run: the trained run.
-            unknown_below: least confidence, from 0 to 1, of an answer with a name. An object of no trained class tends
-                to get less. The report of `thor2 evaluate` has the threshold that keeps 95 % of the answers.
+            unknown_below: least confidence, from 0 to 1, of an answer with a name. By default the run's own threshold,
+                which keeps 95 % of the correct answers on held-out views; 0 in runs without one.
             rule: fusion rule, see `fusion`; the paper's is "max".
-            embedding: embedding of the gallery; by default the packaged one.
+            embedding: embedding of the gallery, by default the packaged one. One that was fitted on the run's classes
+                is also a classifier.
             answer_by: what answers, see `answers_by`; by default what the run's record stores.
             search: search in the gallery, "exact" or "usearch" (extra `index`), see `Gallery`.
 
@@ -104,6 +108,9 @@ class Recognizer:
         """
         if rule not in FUSION_RULES:
             raise InputError(f"rule is {rule!r}; expected one of {', '.join(FUSION_RULES)}")
+        self.calibration = Calibration.of_record(run.record)
+        if unknown_below is None:
+            unknown_below = self.calibration.unknown_below if self.calibration else 0.0
         if not 0 <= unknown_below <= 1:
             raise InputError(f"unknown_below is {unknown_below}; expected a confidence from 0 to 1")
         self.run = run
@@ -113,12 +120,14 @@ class Recognizer:
         self.objects = ObjectGallery(run.classes, embedding, search)
         self._answer_by = _check_answer_by(answer_by)
         self._classify = {name: _compiled(name, model) for name, model in run.classifiers.items()}
+        if embedding is not None and embedding.classes == run.classes and run.classifiers:
+            self._classify[EMBEDDING] = embedding.class_probabilities
 
     @classmethod
     def load(
         cls,
         run_dir: str | Path,
-        unknown_below: float = 0.0,
+        unknown_below: float | None = None,
         rule: FusionRule = DEFAULT_RULE,
         *,
         gallery: str | Path | None = None,
@@ -223,15 +232,11 @@ class Recognizer:
             InputError: a number below 1 or past the largest bucket.
         """
         points = [n for n in POINT_BUCKETS if n <= point_bucket(max_points)]
-        rows = [b for b in BATCH_BUCKETS if b <= batch_bucket(max_instances)]
-        shapes = [(b, n) for n in points for b in rows if b <= self.chunk]
-        described = [describe(pack_instances([], b, n), self.run.network, self.run.config) for b, n in shapes]
-        if self.answers_by() != "classifiers":
-            for b, n in shapes:
-                self.objects.embed(pack_instances([], b, n))
-        for b in rows:
-            self.probabilities(concatenate_padded(described[:1], b))
-        return len(shapes) + len(rows)
+        rows = [b for b in BATCH_BUCKETS if b <= min(batch_bucket(max_instances), self.chunk)]
+        shapes = [(b, n) for n in points for b in rows]
+        for b, n in shapes:
+            self._evidence(pack_instances([], b, n), self.default_classifiers, self.answers_by() != "classifiers")
+        return len(shapes)
 
     def describe(self, frame: RGBDFrame) -> DescribedFrame:
         """Prepare and describe the instances of a frame, of which there may be more than the largest batch bucket."""
@@ -261,25 +266,61 @@ class Recognizer:
             results.append(compute(chunk))
         return instances, results
 
-    def _describe_chunk(self, instances: Sequence[PreparedInstance]) -> Descriptors:
-        return describe(pack_instances(instances, _padded_rows(len(instances))), self.run.network, self.run.config)
+    def _describe_chunk(self, instances: Sequence[PreparedInstance]) -> OrientedDescriptors:
+        return describe_orientations(
+            pack_instances(instances, _padded_rows(len(instances))), self.run.network, self.run.config
+        )
+
+    @property
+    def classifiers(self) -> tuple[str, ...]:
+        """Names of the classifiers: those of the run, and "embedding" if its embedding knows the classes."""
+        return tuple(self._classify)
+
+    @property
+    def default_classifiers(self) -> tuple[str, ...]:
+        """The classifiers that are fused by default: the paper's two, and the embedding where it is a classifier."""
+        default = tuple(name for name in (*THOR2, EMBEDDING) if name in self._classify)
+        return default or self.classifiers
 
     def probabilities(
-        self, descriptors: Descriptors, classifiers: Sequence[Feature] | None = None
-    ) -> dict[Feature, NDArray[np.float32]]:
-        """Return classifier -> class probabilities [B, C], of all classifiers or of those named."""
-        names = self._classify if classifiers is None else classifiers
-        computing = {name: self._classify[name](descriptors) for name in names}
+        self, oriented: OrientedDescriptors, classifiers: Sequence[str] | None = None
+    ) -> dict[str, NDArray[np.float32]]:
+        """Return classifier -> class probabilities [B, C], of all classifiers or of those named.
+
+        Those of the embedding sum to the probability that an object is one of the classes.
+        """
+        names = self.classifiers if classifiers is None else classifiers
+        computing = {name: self._classify[name](oriented) for name in names}
         return {name: np.asarray(values) for name, values in computing.items()}
 
+    def evidence(
+        self, oriented: OrientedDescriptors, classifiers: Sequence[str], clouds: PointClouds | None = None
+    ) -> Evidence:
+        """Return what clouds are recognized by, as arrays on the device.
+
+        Args:
+            oriented: descriptors of the clouds.
+            classifiers: classifiers to evaluate; none if the gallery alone answers.
+            clouds: [B, N] the clouds in metres, to embed them for the gallery; None if the classifiers alone answer.
+        """
+        probabilities = {name: self._classify[name](oriented) for name in classifiers}
+        if clouds is None:
+            return Evidence(oriented.first.overflow, probabilities)
+        embeddings, weights = self.objects.embed(clouds, oriented, self.run.config)
+        return Evidence(oriented.first.overflow, probabilities, embeddings, weights)
+
+    def _evidence(self, clouds: PointClouds, classifiers: Sequence[str], embed: bool) -> Evidence:
+        oriented = describe_orientations(clouds, self.run.network, self.run.config)
+        return self.evidence(oriented, classifiers, clouds if embed else None)
+
     def recognize(
-        self, frame: RGBDFrame, classifiers: Sequence[Feature] = THOR2, answer_by: str | None = None
+        self, frame: RGBDFrame, classifiers: Sequence[str] | None = None, answer_by: str | None = None
     ) -> list[Recognition]:
         """Recognize every instance of a frame; the answers are in the order of the label numbers.
 
         Args:
             frame: color, depth, labels and intrinsics.
-            classifiers: the classifiers that are fused; by default the paper's two.
+            classifiers: the classifiers that are fused, see `default_classifiers`; the paper's are `THOR2`.
             answer_by: what answers, see `answers_by`.
 
         Raises:
@@ -287,67 +328,63 @@ class Recognizer:
                 `reason` of its answer says why.
         """
         source = self.answers_by(answer_by)
-        names = check_features(classifiers, "classifiers") if source != "gallery" else ()
-        missing = [name for name in names if name not in self._classify]
-        if missing:
-            raise InputError(f"classifiers: the run has no {', '.join(missing)}, only {', '.join(self._classify)}")
+        names = self._check_classifiers(classifiers) if source != "gallery" else ()
 
-        def compute(instances: Sequence[PreparedInstance]) -> tuple[Any, dict[Feature, Any], dict[str, Any]]:
+        def compute(instances: Sequence[PreparedInstance]) -> Evidence:
             clouds = pack_instances(instances, _padded_rows(len(instances)))
-            descriptors = describe(clouds, self.run.network, self.run.config)
-            embeddings = {} if source == "classifiers" else {"gallery": self.objects.embed(clouds)}
-            return descriptors.overflow, {name: self._classify[name](descriptors) for name in names}, embeddings
+            return self._evidence(clouds, names, source != "classifiers")
 
         instances, chunks = self._by_chunks(frame, compute)
         n_usable = sum(instance.reason is None for instance in instances)
-        overflow, probabilities, embeddings = concatenate_padded(chunks, _padded_rows(n_usable))
-        return self.recognitions(instances, probabilities, overflow, embeddings.get("gallery"))
+        return self.recognitions(instances, concatenate_padded(chunks, n_usable))
+
+    def _check_classifiers(self, classifiers: Sequence[str] | None) -> tuple[str, ...]:
+        names = self.default_classifiers if classifiers is None else classifiers
+        if not isinstance(names, (list, tuple)) or not names or not set(names) <= set(self.classifiers):
+            raise InputError(f"classifiers is {names!r}; expected one or more of {', '.join(self.classifiers)}")
+        return tuple(dict.fromkeys(names))
 
     def gallery_scores(self, described: DescribedFrame) -> NDArray[np.float32]:
         """Return the scores [B, n_objects] of the gallery, one row for each row of the descriptors."""
-        usable = described.usable
-        chunks = [usable[start : start + self.chunk] for start in range(0, len(usable), self.chunk)]
-        embeddings = [self.objects.embed(pack_instances(chunk, _padded_rows(len(chunk)))) for chunk in chunks]
         scores = np.zeros((len(described.descriptors.overflow), len(self.gallery.names)), np.float32)
-        if chunks:
-            scores[: len(usable)] = self.gallery.scores(concatenate_padded(embeddings, len(scores))[: len(usable)])
+        if described.usable:
+            embedded = self.objects.embed(described.packed, described.oriented, self.run.config)
+            scores[:] = self.gallery.scores(*embedded)
         return scores
 
-    def recognitions(
-        self,
-        instances: Sequence[PreparedInstance],
-        probabilities: Mapping[Feature, NDArray[np.float32]],
-        overflow: ArrayLike,
-        embeddings: NDArray[np.float32] | None = None,
-    ) -> list[Recognition]:
+    def recognitions(self, instances: Sequence[PreparedInstance], evidence: Evidence) -> list[Recognition]:
         """Fuse the classifiers and the gallery and return the answer for each instance of a frame.
 
         Args:
-            instances: all of them; the usable ones are the first rows of the other arguments, in order.
-            probabilities: classifier -> class probabilities [B, C]; empty if the gallery alone answers.
-            overflow: [B] int, of the descriptors.
-            embeddings: [B, K, D] from `ObjectGallery.embed`; None if the classifiers alone answer.
+            instances: all of them; the usable ones are the first rows of the evidence, in order.
+            evidence: what they are recognized by.
         """
-        overflows = np.asarray(overflow)
         n_usable = sum(instance.reason is None for instance in instances)
-        scores = None if embeddings is None else self.gallery.scores(np.asarray(embeddings)[:n_usable])
-        values = self.combined({name: p[:n_usable] for name, p in probabilities.items()}, scores)
+        evidence = jax.tree.map(lambda a: np.asarray(a)[:n_usable], evidence)
+        embedded = evidence.embeddings, evidence.weights
+        scores = None if evidence.embeddings is None else self.gallery.scores(*embedded)
+        values = self.combined(evidence.probabilities, scores)
         union = self.objects.union
-        by_source: dict[str, NDArray[Any]] = {
-            name: union.of_classifiers(np.asarray(p)[:n_usable]) for name, p in probabilities.items()
-        }
+        by_source = {name: union.of_classifiers(p) for name, p in evidence.probabilities.items()}
         if scores is not None:
             by_source["gallery"] = union.of_gallery(scores)
         rows = iter(range(n_usable))
         return [
-            self._recognition(instance, next(rows), values, by_source, overflows)
+            self._recognition(instance, next(rows), values, by_source, evidence.overflow)
             if instance.reason is None
             else Recognition(instance.label, reason=instance.reason)
             for instance in instances
         ]
 
+    def fused(self, probabilities: Mapping[str, NDArray[np.float32]]) -> NDArray[np.floating[Any]]:
+        """Return the fused class probabilities [B, C], calibrated where the run is and the embedding is among them."""
+        fused = fused_probabilities(probabilities, self.rule)
+        if self.calibration is None or EMBEDDING not in probabilities:
+            return fused
+        return self.calibration.calibrated(fused, probabilities[EMBEDDING])
+
     def combined(
-        self, probabilities: Mapping[Feature, NDArray[np.float32]], scores: NDArray[np.float32] | None
+        self, probabilities: Mapping[str, NDArray[np.float32]], scores: NDArray[np.float32] | None
     ) -> NDArray[np.floating[Any]]:
         """Return the values [B, n] of all `classes`, whose largest one is the answer and its confidence.
 
@@ -356,10 +393,10 @@ class Recognizer:
             scores: [B, n_objects] of the gallery; None if the classifiers alone answer.
         """
         if scores is None:
-            return self.objects.union.of_classifiers(fused_probabilities(probabilities, self.rule))
+            return self.objects.union.of_classifiers(self.fused(probabilities))
         if not probabilities:
             return self.objects.union.of_gallery(scores)
-        return self.objects.union.combine(fused_probabilities(probabilities, self.rule), scores)
+        return self.objects.union.combine(self.fused(probabilities), scores)
 
     def _recognition(
         self,
@@ -416,13 +453,16 @@ def _padded_rows(n: int) -> int:
     return n if n == whole > 0 else whole + batch_bucket(max(n - whole, 1))
 
 
-def _compiled(name: Feature, model: MLP) -> Callable[[Descriptors], jax.Array]:
+def _compiled(name: Feature, model: MLP) -> Callable[[OrientedDescriptors], jax.Array]:
+    """Return the compiled function from descriptors in K orientations to class probabilities [B, C]."""
     graph, state = nnx.split(model)
     # As a flat list: JAX would take an nnx state apart, in Python, at every call.
     leaves, structure = jax.tree.flatten(state)
 
     @jax.jit
-    def forward(leaves: list[jax.Array], descriptors: Descriptors) -> jax.Array:
-        return class_probabilities(nnx.merge(graph, jax.tree.unflatten(structure, leaves)), descriptors, name)
+    def forward(leaves: list[jax.Array], oriented: OrientedDescriptors) -> jax.Array:
+        logits = nnx.merge(graph, jax.tree.unflatten(structure, leaves))(feature_of(oriented.flat[0], name))
+        each = jax.nn.log_softmax(logits).reshape(*oriented.weights.shape, -1)
+        return jax.nn.softmax((oriented.weights[..., None] * each).sum(axis=1))
 
-    return lambda descriptors: forward(leaves, descriptors)
+    return lambda oriented: forward(leaves, oriented)

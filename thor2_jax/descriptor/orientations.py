@@ -1,7 +1,8 @@
 """Candidate orientations: the frames of axes that the view normalization chooses between by small differences.
 
-A view's end with more points, and the longer of two nearly equal sides, may differ from those of the next view. Scores
-that are averaged over both choices do not depend on them.
+A view's end with more points, and the longer of two nearly equal sides, may differ from those of the next view.
+Recognition describes and classifies K orientations of each cloud and fuses the answers, so that they do not depend on
+these choices. K = 1 is the paper.
 """
 
 import dataclasses
@@ -11,18 +12,48 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from thor2_jax.config import DescriptorConfig
-from thor2_jax.descriptor.view_normalization import Normalization, boxed, oriented, place_aligned
+from colornet import ColorNetwork
+from thor2_jax.config import ORIENTATION_COUNTS, DescriptorConfig
+from thor2_jax.descriptor.cloud_statistics import cloud_statistics, side_lengths
+from thor2_jax.descriptor.describe import describe_strips, strips
+from thor2_jax.descriptor.view_normalization import Normalization, align, boxed, oriented, place_aligned
 from thor2_jax.errors import InputError
-from thor2_jax.types import PointClouds
+from thor2_jax.types import Descriptors, PointClouds, Strips
 
-__all__ = ["ORIENTATION_COUNTS", "candidate_orientations"]
-
-ORIENTATION_COUNTS = (1, 2, 4)
-"""Numbers of candidate orientations; 1 is the paper's."""
+__all__ = ["OrientedDescriptors", "candidate_orientations", "describe_orientations", "orient_descriptors"]
 
 NEARLY_EQUAL = 0.85
 """Least ratio of the second side of the box to the first at which the two are also swapped."""
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class OrientedDescriptors:
+    """The descriptors of B clouds in K candidate orientations.
+
+    Attributes:
+        each: descriptors, fields [B, K, ...].
+        statistics: [B, K, 12 + R] float32, from `cloud_statistics`.
+        weights: [B, K] float32, weight of each orientation in the fused answer; they sum to 1.
+    """
+
+    each: Descriptors
+    statistics: jax.Array
+    weights: jax.Array
+
+    @property
+    def first(self) -> Descriptors:
+        """The descriptors [B, ...] of the paper's orientation."""
+        first: Descriptors = jax.tree.map(lambda a: a[:, 0], self.each)
+        return first
+
+    @property
+    def flat(self) -> tuple[Descriptors, jax.Array]:
+        """The descriptors [B * K, ...] and statistics [B * K, 12 + R]; those of a cloud are consecutive."""
+        flat: tuple[Descriptors, jax.Array] = jax.tree.map(
+            lambda a: a.reshape(-1, *a.shape[2:]), (self.each, self.statistics)
+        )
+        return flat
 
 
 def _swapped(normalization: Normalization) -> Normalization:
@@ -35,30 +66,33 @@ def _swapped(normalization: Normalization) -> Normalization:
 
 
 @partial(jax.jit, static_argnums=(1, 2))
-def _orientations(clouds: PointClouds, config: DescriptorConfig, count: int) -> PointClouds:
+def _orientations(clouds: PointClouds, config: DescriptorConfig, count: int) -> tuple[PointClouds, jax.Array]:
     half_turn = jnp.diag(jnp.array([-1, -1, 1], jnp.float32))
 
-    def one(cloud: PointClouds) -> tuple[jax.Array, jax.Array]:
+    def one(cloud: PointClouds) -> tuple[jax.Array, jax.Array, jax.Array]:
         normalization = boxed(cloud, np.float32(config.sigma_s))
-        rotations = []
-        for box in (normalization, _swapped(normalization)):
-            rotation = oriented(box)
+        rotations, weights = [], []
+        for box in (normalization, _swapped(normalization))[: max(count // 2, 1)]:
+            rotation, end_is_occluded = oriented(box)
             rotations += [rotation, half_turn @ rotation]
-        placed = [place_aligned(rotation, normalization, np.float32(config.alpha)) for rotation in rotations[:count]]
+            weights += [jnp.ones(()), jnp.where(end_is_occluded, 0.0, 1.0)]
+        placed = [place_aligned(rotation, normalization, np.float32(config.alpha)) for rotation in rotations]
         points, cameras = zip(*placed, strict=True)
-        return jnp.stack(points)[:, : len(cloud.mask)], jnp.stack(cameras)
+        return jnp.stack(points)[:, : len(cloud.mask)], jnp.stack(cameras), jnp.stack(weights)
 
-    points, cameras = jax.vmap(one)(clouds)
+    points, cameras, weights = jax.vmap(one)(clouds)
     repeated = jax.tree.map(lambda array: jnp.repeat(array, count, axis=0), clouds)
     flat = (array.reshape(-1, *array.shape[2:]) for array in (points, cameras))
-    return dataclasses.replace(repeated, **dict(zip(("points", "camera"), flat, strict=True)))
+    aligned = dataclasses.replace(repeated, **dict(zip(("points", "camera"), flat, strict=True)))
+    return aligned, weights / weights.sum(axis=1, keepdims=True)
 
 
-def candidate_orientations(clouds: PointClouds, config: DescriptorConfig, count: int) -> PointClouds:
-    """Return `count` aligned versions of each cloud, the one of `align` first.
+def candidate_orientations(clouds: PointClouds, config: DescriptorConfig, count: int) -> tuple[PointClouds, jax.Array]:
+    """Return `count` aligned versions of each cloud, the one of `align` first, and their weights.
 
     With 2, the other one is turned by half a turn about z before the turn by alpha. With 4, both are repeated with the
-    first two sides of the box swapped if they are nearly equal, and unchanged otherwise.
+    first two sides of the box swapped if they are nearly equal, and unchanged otherwise. A half turn has no weight
+    where the occlusion boundary decides which end comes first; all other weights of a cloud are equal.
 
     Args:
         clouds: [B, N] clouds in metres.
@@ -66,11 +100,47 @@ def candidate_orientations(clouds: PointClouds, config: DescriptorConfig, count:
         count: one of `ORIENTATION_COUNTS`. Static.
 
     Returns:
-        [B * count, N] aligned clouds in scaled units; those of a cloud are consecutive.
+        [B * count, N] aligned clouds in scaled units, those of a cloud consecutive, and weights [B, count], which sum
+        to 1 for each cloud.
 
     Raises:
         InputError: `count` is another number.
     """
     if count not in ORIENTATION_COUNTS:
         raise InputError(f"count is {count!r}; expected one of {', '.join(map(str, ORIENTATION_COUNTS))}")
+    if count == 1:
+        return align(clouds, config), jnp.ones((len(clouds.mask), 1))
     return _orientations(clouds, config, count)
+
+
+def orient_descriptors(
+    aligned: PointClouds, weights: jax.Array, strips: Strips, network: ColorNetwork, config: DescriptorConfig
+) -> OrientedDescriptors:
+    """Return the descriptors of the orientations of clouds.
+
+    Args:
+        aligned: [B * K, N] clouds, from `candidate_orientations`.
+        weights: [B, K] float32, likewise.
+        strips: their strips.
+        network: colour network.
+        config: static.
+    """
+    sides = side_lengths(aligned, config.alpha)
+    values = describe_strips(strips, network, config), cloud_statistics(sides, aligned, strips)
+    each, statistics = jax.tree.map(lambda a: a.reshape(*weights.shape, *a.shape[1:]), values)
+    return OrientedDescriptors(each, statistics, weights)
+
+
+def describe_orientations(
+    clouds: PointClouds, network: ColorNetwork, config: DescriptorConfig, count: int | None = None
+) -> OrientedDescriptors:
+    """Return the descriptors of the candidate orientations of clouds.
+
+    Args:
+        clouds: [B, N] clouds in metres.
+        network: colour network.
+        config: static.
+        count: number of orientations K; by default `config.orientations`. Static.
+    """
+    aligned, weights = candidate_orientations(clouds, config, config.orientations if count is None else count)
+    return orient_descriptors(aligned, weights, strips(aligned, network, config), network, config)

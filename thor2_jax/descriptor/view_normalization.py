@@ -85,8 +85,11 @@ def boxed(cloud: PointClouds, sigma_s: ArrayLike) -> Normalization:
     return Normalization(axes, low, high, centred, mask, boundary, camera)
 
 
-def oriented(normalization: Normalization) -> jax.Array:
-    """Return the rotation [3, 3] of the view normalization: the axes of the box with their signs."""
+def oriented(normalization: Normalization) -> tuple[jax.Array, jax.Array]:
+    """Return the rotation [3, 3] of the view normalization, and whether an occluded end decided its half turn about z.
+
+    The rows of the rotation are the axes of the box with their signs.
+    """
     axes, low, high = normalization.axes, normalization.low, normalization.high
     middle = (low + high) / 2
 
@@ -107,12 +110,12 @@ def oriented(normalization: Normalization) -> jax.Array:
     x_sign = jnp.where(first_end > last_end, -x_sign, x_sign)
 
     x, z = axes[0] * x_sign, axes[2] * z_sign
-    return jax.lax.stop_gradient(jnp.stack([x, jnp.cross(z, x), z]))
+    return jax.lax.stop_gradient(jnp.stack([x, jnp.cross(z, x), z])), first_end != last_end
 
 
 def _normalize_one(cloud: PointClouds, sigma_s: ArrayLike) -> PointClouds:
     normalization = boxed(cloud, sigma_s)
-    points, camera = _place(oriented(normalization), normalization.points, normalization.mask, normalization.camera)
+    points, camera = _place(oriented(normalization)[0], normalization.points, normalization.mask, normalization.camera)
     return dataclasses.replace(cloud, points=points.T[: len(cloud.mask)], camera=camera)
 
 
@@ -190,7 +193,7 @@ def place_aligned(rotation: jax.Array, normalization: Normalization, alpha: Arra
 def _align(clouds: PointClouds, sigma_s: ArrayLike, alpha: ArrayLike) -> tuple[jax.Array, jax.Array]:
     def one(cloud: PointClouds) -> tuple[jax.Array, jax.Array]:
         normalization = boxed(cloud, sigma_s)
-        points, camera = place_aligned(oriented(normalization), normalization, alpha)
+        points, camera = place_aligned(oriented(normalization)[0], normalization, alpha)
         return points[: len(cloud.mask)], camera  # the other fields would be copied
 
     return jax.vmap(one)(clouds)

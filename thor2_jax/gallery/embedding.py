@@ -24,8 +24,8 @@ from flax import nnx
 import colornet
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig, Relaxation
 from thor2_jax.descriptor.chunking import map_chunks
-from thor2_jax.descriptor.describe import describe_strips, strips
-from thor2_jax.descriptor.view_normalization import align
+from thor2_jax.descriptor.cloud_statistics import N_SCALARS
+from thor2_jax.descriptor.orientations import OrientedDescriptors, describe_orientations
 from thor2_jax.errors import InputError
 from thor2_jax.files import atomic_write, content_digest
 from thor2_jax.recognition.weights import model_arrays, model_from_arrays
@@ -36,7 +36,7 @@ __all__ = [
     "Embedding",
     "EmbeddingNetwork",
     "EmbeddingSizes",
-    "cloud_statistics",
+    "class_cosines",
     "load_default",
 ]
 
@@ -45,9 +45,6 @@ EMBEDDING_FORMAT = 1
 
 MAX_EMBEDDING_SIZE = 256
 """Largest length of an embedding."""
-
-N_SCALARS = 12
-"""Statistics of a cloud before its colour histogram."""
 
 _METADATA = "embedding"
 # safetensors writes several metadata keys in a random order, and equal embeddings shall have equal bytes.
@@ -83,35 +80,6 @@ def _unit(x: jax.Array) -> jax.Array:
     return x * jax.lax.rsqrt(jnp.maximum(jnp.square(x).sum(axis=-1, keepdims=True), 1e-12))
 
 
-def cloud_statistics(extents: jax.Array, colors: jax.Array, mask: jax.Array, region_mass: jax.Array) -> jax.Array:
-    """Return the statistics of clouds that the network reads beside the descriptor, all of order 1.
-
-    Args:
-        extents: [B, 3] side lengths of the bounding box, longest first, scaled units.
-        colors: [B, N, 3] sRGB in [0, 1].
-        mask: [B, N] bool.
-        region_mass: [B, R] points in each colour region.
-
-    Returns:
-        [B, 12 + R] float32: extents, size of the box, number of points, mean and standard deviation of the colours,
-        ratio of the two longest extents, and the square root of the colour histogram, which has unit length.
-    """
-    count = mask.sum(axis=1, keepdims=True, dtype=jnp.float32)
-    weight = mask[..., None] / jnp.maximum(count, 1)[..., None]
-    mean = (colors * weight).sum(axis=1)
-    deviation = jnp.sqrt(jnp.maximum((jnp.square(colors) * weight).sum(axis=1) - jnp.square(mean), 0))
-    scalars = [
-        2 * extents,
-        3 * jnp.cbrt(extents.prod(axis=1, keepdims=True)),
-        jnp.sqrt(count) / 20,
-        mean,
-        deviation,
-        extents[:, 1:2] / jnp.maximum(extents[:, :1], 1e-6),
-    ]
-    histogram = region_mass / jnp.maximum(region_mass.sum(axis=1, keepdims=True), 1e-6)
-    return jnp.concatenate([*scalars, jnp.sqrt(histogram)], axis=1)
-
-
 class EmbeddingNetwork(nnx.Module):
     """Network of an embedding: one linear layer on each strip position of each slice, then fully connected layers.
 
@@ -120,9 +88,23 @@ class EmbeddingNetwork(nnx.Module):
     """
 
     def __init__(
-        self, config: DescriptorConfig, n_regions: int, sizes: EmbeddingSizes = EmbeddingSizes(), *, rngs: nnx.Rngs
+        self,
+        config: DescriptorConfig,
+        n_regions: int,
+        sizes: EmbeddingSizes = EmbeddingSizes(),
+        n_proxies: int = 0,
+        *,
+        rngs: nnx.Rngs,
     ) -> None:
-        """Initialize the weights; the colour basis is zero and the blocks have equal weights."""
+        """Initialize the weights; the colour basis is zero and the blocks have equal weights.
+
+        Args:
+            config: descriptor.
+            n_regions: number of colour regions.
+            sizes: sizes of the layers.
+            n_proxies: number of proxies, which classify; none by default.
+            rngs: generators of the weights and the dropout.
+        """
         self.positions = max(config.image_size, config.n_strips)
         n_cells = config.n_slices * self.positions
         widths = (n_cells * sizes.cell + N_SCALARS + n_regions, *sizes.hidden)
@@ -140,6 +122,9 @@ class EmbeddingNetwork(nnx.Module):
         n_colors = config.n_slices * n_regions * config.n_strips
         self.color_basis = nnx.BatchStat(jnp.zeros((n_colors, sizes.color)))
         self.block_weights = nnx.BatchStat(jnp.ones(3))
+        if n_proxies:
+            self.proxies = nnx.Param(jax.random.normal(rngs.params(), (sizes.learned, n_proxies)))
+            self.log_scale = nnx.Param(jnp.log(16.0))
 
     def learned(
         self, descriptors: Descriptors, statistics: jax.Array, *, train: bool = False, rngs: nnx.Rngs | None = None
@@ -164,6 +149,11 @@ class EmbeddingNetwork(nnx.Module):
             x = self.dropout(x, deterministic=not train, rngs=rngs)
         return _unit(self.head(x))
 
+    def class_logits(self, descriptors: Descriptors, statistics: jax.Array) -> jax.Array:
+        """Return one logit for each proxy [B, n_proxies]; the arguments are those of `learned`."""
+        cosines = class_cosines(self.learned(descriptors, statistics), self.proxies[...])
+        return jnp.exp(self.log_scale[...]) * cosines
+
     def __call__(self, descriptors: Descriptors, statistics: jax.Array) -> jax.Array:
         """Return the embeddings [B, D], of unit length; the arguments are those of `learned`."""
         histogram = statistics[:, N_SCALARS:]
@@ -173,42 +163,35 @@ class EmbeddingNetwork(nnx.Module):
         return _unit(jnp.concatenate([w * block for w, block in zip(weights, blocks, strict=True)], axis=1))
 
 
+def class_cosines(learned: jax.Array, proxies: jax.Array) -> jax.Array:
+    """Return the cosines [B, n] of unit vectors [B, learned] with proxies [learned, n]."""
+    return learned @ (proxies / jnp.linalg.norm(proxies, axis=0))
+
+
 def color_features(embeddings: jax.Array) -> jax.Array:
     """Return the square roots of colour embeddings [B, S, R, J], flat and of unit length."""
     return _unit(jnp.sqrt(jnp.maximum(embeddings, 0)).reshape(len(embeddings), -1))
 
 
-def _extents(aligned: PointClouds, alpha: float) -> jax.Array:
-    """Return the side lengths [B, 3] of the clouds' boxes before the turn by alpha, longest first."""
-    c, s = np.float32(np.cos(alpha)), np.float32(np.sin(alpha))
-    x, y, z = jnp.moveaxis(aligned.points, -1, 0)
-    sides = []
-    for values in (c * x + s * z, y, c * z - s * x):
-        high = jnp.where(aligned.mask, values, -jnp.inf).max(axis=1)
-        sides.append(high - jnp.where(aligned.mask, values, jnp.inf).min(axis=1))
-    extents = jnp.stack(sides, axis=1)
-    return -jnp.sort(-jnp.where(jnp.isfinite(extents), extents, 0), axis=1)
+@functools.partial(jax.jit, static_argnums=0)
+def _embed_oriented(graph: Any, state: Any, oriented: OrientedDescriptors) -> jax.Array:
+    embeddings = nnx.merge(graph, state)(*oriented.flat)
+    return embeddings.reshape(*oriented.weights.shape, -1)
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1, 2, 3))
-def _embed(
-    graph: Any,
-    config: DescriptorConfig,
-    network: colornet.ColorNetwork,
-    are_aligned: bool,
-    state: Any,
-    clouds: PointClouds,
+@functools.partial(jax.jit, static_argnums=(0, 1, 2))
+def _embed_clouds(
+    graph: Any, config: DescriptorConfig, network: colornet.ColorNetwork, state: Any, clouds: PointClouds
 ) -> jax.Array:
     model = nnx.merge(graph, state)
+    return map_chunks(lambda chunk: model(*describe_orientations(chunk, network, config, 1).flat), clouds)
 
-    def embed(clouds: PointClouds) -> jax.Array:
-        aligned = clouds if are_aligned else align(clouds, config)
-        occupied = strips(aligned, network, config)
-        mass = occupied.color.sum(axis=(1, 2))
-        statistics = cloud_statistics(_extents(aligned, config.alpha), aligned.colors, aligned.mask, mass)
-        return model(describe_strips(occupied, network, config), statistics)
 
-    return map_chunks(embed, clouds)
+@functools.partial(jax.jit, static_argnums=0)
+def _classify(graph: Any, state: Any, oriented: OrientedDescriptors) -> jax.Array:
+    logits = nnx.merge(graph, state).class_logits(*oriented.flat)
+    each = jax.nn.log_softmax(logits).reshape(*oriented.weights.shape, -1)
+    return jax.nn.softmax((oriented.weights[..., None] * each).sum(axis=1))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -220,12 +203,16 @@ class Embedding:
         network: the colour network.
         sizes: sizes of the network.
         model: the network of the embedding. Do not change it: compiled functions and `fingerprint` keep its arrays.
+        classes: classes that the network also recognizes by its first proxies; none in the packaged embedding.
+        distractors: number of further proxies, of objects that are none of the classes.
     """
 
     config: DescriptorConfig
     network: colornet.ColorNetwork
     sizes: EmbeddingSizes
     model: EmbeddingNetwork
+    classes: tuple[str, ...] = ()
+    distractors: int = 0
 
     @classmethod
     def create(
@@ -234,6 +221,8 @@ class Embedding:
         network: colornet.ColorNetwork | None = None,
         sizes: EmbeddingSizes | None = None,
         seed: int = 0,
+        classes: tuple[str, ...] = (),
+        distractors: int = 0,
     ) -> "Embedding":
         """Return an embedding with random weights.
 
@@ -242,6 +231,8 @@ class Embedding:
             network: by default the packaged colour network.
             sizes: of the network.
             seed: seed for the weights.
+            classes: names of the classes that the network also recognizes.
+            distractors: number of objects that are none of the classes.
 
         Raises:
             InputError: the embedding would have more than `MAX_EMBEDDING_SIZE` numbers, or more colour components than
@@ -252,7 +243,9 @@ class Embedding:
         size = sizes.learned + sizes.color + network.n_regions
         if size > MAX_EMBEDDING_SIZE:
             raise InputError(f"sizes give embeddings of {size} numbers; expected at most {MAX_EMBEDDING_SIZE}")
-        return cls(config, network, sizes, EmbeddingNetwork(config, network.n_regions, sizes, rngs=nnx.Rngs(seed)))
+        n_proxies = len(classes) + distractors
+        model = EmbeddingNetwork(config, network.n_regions, sizes, n_proxies, rngs=nnx.Rngs(seed))
+        return cls(config, network, sizes, model, classes, distractors)
 
     @property
     def size(self) -> int:
@@ -270,15 +263,22 @@ class Embedding:
 
         Each shape [B, N] of the batch compiles once for all embeddings of the same sizes and descriptor.
         """
-        return self._embed(clouds, are_aligned=False)
-
-    def embed_aligned(self, aligned: PointClouds) -> jax.Array:
-        """Return the embeddings of clouds that are already aligned, for example to candidate orientations."""
-        return self._embed(aligned, are_aligned=True)
-
-    def _embed(self, clouds: PointClouds, are_aligned: bool) -> jax.Array:
         graph, state = self._split
-        return _embed(graph, self.config, self.network, are_aligned, state, clouds)
+        return _embed_clouds(graph, self.config, self.network, state, clouds)
+
+    def embed_oriented(self, oriented: OrientedDescriptors) -> jax.Array:
+        """Return the embeddings [B, K, D] of clouds that are described in K orientations, by this descriptor."""
+        return _embed_oriented(*self._split, oriented)
+
+    def class_probabilities(self, oriented: OrientedDescriptors) -> jax.Array:
+        """Return the probabilities [B, C] of the classes; what they lack to 1 is that of the distractors.
+
+        They are the geometric mean over the orientations, by their weights.
+
+        Args:
+            oriented: clouds in K orientations, described by this embedding's descriptor.
+        """
+        return _classify(*self._split, oriented)[:, : len(self.classes)]
 
     @functools.cached_property
     def _content(self) -> bytes:
@@ -288,6 +288,8 @@ class Embedding:
             "descriptor_config": dataclasses.asdict(self.config),
             "color_network": self.network.fingerprint,
             "sizes": dataclasses.asdict(self.sizes),
+            "classes": list(self.classes),
+            "distractors": self.distractors,
         }
         arrays = {name: array.astype(np.float16) for name, array in model_arrays(self.model).items()}
         return safetensors.numpy.save(arrays, {_METADATA: json.dumps(about, sort_keys=True)})
@@ -332,12 +334,13 @@ class Embedding:
                 **about["descriptor_config"], relaxation=None if relaxation is None else Relaxation(**relaxation)
             )
             sizes = EmbeddingSizes(**{**about["sizes"], "hidden": tuple(about["sizes"]["hidden"])})
-            model = model_from_arrays(lambda: cls.create(config, network, sizes).model, arrays)
+            classes, distractors = tuple(map(str, about.get("classes", ()))), int(about.get("distractors", 0))
+            model = model_from_arrays(lambda: cls.create(config, network, sizes, 0, classes, distractors).model, arrays)
         except InputError as error:
             raise InputError(f"embedding: {path}: {error}") from None
         except (OSError, safetensors.SafetensorError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise InputError(f"embedding: {path} is missing or damaged ({type(error).__name__}: {error})") from None
-        return cls(config, network, sizes, model)
+        return cls(config, network, sizes, model, classes, distractors)
 
 
 @functools.cache

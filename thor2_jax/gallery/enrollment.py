@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.capacity import point_bucket
-from thor2_jax.descriptor.orientations import candidate_orientations
+from thor2_jax.descriptor.orientations import describe_orientations
 from thor2_jax.errors import InputError
 from thor2_jax.gallery.augment import augmented_copies
 from thor2_jax.gallery.clouds import CompactClouds
@@ -38,8 +38,7 @@ ROWS = 4
 
 def embed_orientations(embedding: Embedding, clouds: PointClouds, count: int = ORIENTATIONS) -> Any:
     """Return the embeddings [B, count, D] of candidate orientations of clouds in metres."""
-    flat = embedding.embed_aligned(candidate_orientations(clouds, embedding.config, count))
-    return flat.reshape(-1, count, flat.shape[-1])
+    return embedding.embed_oriented(describe_orientations(clouds, embedding.network, embedding.config, count))
 
 
 def instance_view(frame: RGBDFrame, label: int | None, sigma_s: float) -> PreparedInstance:

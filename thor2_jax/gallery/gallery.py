@@ -144,27 +144,30 @@ class Gallery:
     def _search(self) -> ViewSearch:
         return IndexSearch(self._embeddings) if self.search == "usearch" else ExactSearch(self._embeddings)
 
-    def scores(self, embeddings: ArrayLike) -> NDArray[np.float32]:
+    def scores(self, embeddings: ArrayLike, weights: ArrayLike | None = None) -> NDArray[np.float32]:
         """Return the scores [B, n_objects] of each object, from 0 to 1, in the order of `names`.
 
         Args:
             embeddings: [B, D] of unit length, or [B, K, D] for K candidate orientations, whose scores are averaged.
+            weights: [B, K] weights of the orientations, which sum to 1; equal by default.
         """
         queries = np.asarray(embeddings, np.float32)
         if not self.objects or not len(queries):
             return np.zeros((len(queries), len(self.objects)), np.float32)
         if queries.ndim == 3:
-            each = self.scores(queries.reshape(-1, queries.shape[-1]))
-            return each.reshape(*queries.shape[:2], -1).mean(axis=1)
+            each = self.scores(queries.reshape(-1, queries.shape[-1])).reshape(*queries.shape[:2], -1)
+            if weights is None:
+                return each.mean(axis=1)
+            return np.einsum("bkn,bk->bn", each, np.asarray(weights, np.float32))
         similarity, index = self._search.nearest(queries, NEAREST)
         views, owners = self._embeddings[index].astype(np.float32), self._object_of_view[index]
         # Objects of many views are regularized more, so that they do not outweigh those of few.
         ridge = RIDGE * self._counts[owners] / self._counts[self._object_of_view].mean()
         kernel = np.exp(GAMMA * (views @ views.transpose(0, 2, 1) - 1)).astype(np.float64)
         kernel[:, np.arange(kernel.shape[1]), np.arange(kernel.shape[1])] += ridge
-        weights = np.linalg.solve(kernel, np.exp(GAMMA * (similarity.astype(np.float64) - 1))[..., None])[..., 0]
+        duals = np.linalg.solve(kernel, np.exp(GAMMA * (similarity.astype(np.float64) - 1))[..., None])[..., 0]
         scores = np.zeros((len(queries), len(self.objects)))
-        np.add.at(scores, (np.arange(len(queries))[:, None], owners), weights)
+        np.add.at(scores, (np.arange(len(queries))[:, None], owners), duals)
         return scores.clip(0, 1).astype(np.float32)
 
 

@@ -8,10 +8,12 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from thor2_jax.config import DescriptorConfig
+from thor2_jax.descriptor.orientations import OrientedDescriptors, describe_orientations
 from thor2_jax.errors import InputError
 from thor2_jax.gallery.clouds import CompactClouds
 from thor2_jax.gallery.embedding import Embedding, load_default
-from thor2_jax.gallery.enrollment import embed_orientations, embed_views, enrolled_views
+from thor2_jax.gallery.enrollment import embed_views, enrolled_views
 from thor2_jax.gallery.gallery import Gallery, GalleryObject
 from thor2_jax.gallery.store import StoredGallery, gallery_stamp, load_gallery, undo_change, update_gallery
 from thor2_jax.gallery.union import ClassUnion
@@ -100,10 +102,20 @@ class ObjectGallery:
             self._union = gallery, union
         return union
 
-    def embed(self, clouds: PointClouds) -> jax.Array:
-        """Return the embeddings [B, K, D] of clouds in metres in K orientations, for `Gallery.scores`."""
-        embeddings: jax.Array = embed_orientations(self.embedding, clouds)
-        return embeddings
+    def embed(
+        self, clouds: PointClouds, oriented: OrientedDescriptors, config: DescriptorConfig
+    ) -> tuple[jax.Array, jax.Array]:
+        """Return the embeddings [B, K, D] of clouds in K orientations and their weights [B, K], for `Gallery.scores`.
+
+        Args:
+            clouds: [B, N] in metres.
+            oriented: their descriptors, which are reused if the embedding reads the same ones.
+            config: descriptor of `oriented`.
+        """
+        ours = self.embedding.config
+        if dataclasses.replace(config, homology=ours.homology, orientations=ours.orientations) != ours:
+            oriented = describe_orientations(clouds, self.embedding.network, ours, config.orientations)
+        return self.embedding.embed_oriented(oriented), oriented.weights
 
     def refresh(self) -> bool:
         """Read the gallery again if it has changed on disk, and return whether it has.

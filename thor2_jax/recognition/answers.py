@@ -1,17 +1,18 @@
 """Records of recognition: the described instances of a frame, and the answers for them."""
 
 import dataclasses
-from collections.abc import Sequence
-from typing import Any, TypeVar
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import numpy as np
 from numpy.typing import NDArray
 
+from thor2_jax.descriptor.orientations import OrientedDescriptors
 from thor2_jax.recognition.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.types import Descriptors, PointClouds
 
-__all__ = ["MAX_OVERFLOW", "DescribedFrame", "Recognition", "concatenate_padded"]
+__all__ = ["MAX_OVERFLOW", "DescribedFrame", "Evidence", "Recognition", "concatenate_padded"]
 
 MAX_OVERFLOW = 0.5
 """Largest overflow of an answer with a name, as a fraction of the points: beyond it, too little is described."""
@@ -28,9 +29,11 @@ class Recognition:
         name: the object's name. None if the instance could not be described (fewer points than
             `instance_clouds.MIN_POINTS`), if more than half of its points overflow (`MAX_OVERFLOW`), or if its
             confidence is below the recognizer's `unknown_below`: an unknown object.
-        confidence: fused probability of the most probable class, or the score of the gallery, also of an unknown
-            object; None if the instance could not be described.
-        classifier: the classifier that gives this class the largest probability ("tops" or "tops2"), or "gallery".
+        confidence: estimated probability that the name is correct, from 0 to 1, also of an unknown object (see
+            `recognition.confidence`); without a calibration, the fused probability of the most probable class or the
+            score of the gallery. None if the instance could not be described.
+        classifier: the classifier that gives this class the largest probability ("tops", "tops2" or "embedding"), or
+            "gallery".
         top: classifier or "gallery" -> its five most probable (name, probability) pairs.
         occluded: another instance hides a part of it, or the image border cuts it.
         overflow: points and persistence pairs outside the descriptor's grid, see `Descriptors`.
@@ -51,17 +54,40 @@ class Recognition:
     reason: str | None = None
 
 
+class Evidence(NamedTuple):
+    """What instances are recognized by, one row for each.
+
+    Attributes:
+        overflow: [B] int, of the descriptors in the paper's orientation.
+        probabilities: classifier -> class probabilities [B, C], fused over the orientations; empty if the gallery alone
+            answers.
+        embeddings: [B, K, D] float32, embeddings for the gallery; None if the classifiers alone answer.
+        weights: [B, K] float32, weights of their orientations; None likewise.
+    """
+
+    overflow: Any
+    probabilities: Mapping[str, Any]
+    embeddings: Any = None
+    weights: Any = None
+
+
 @dataclasses.dataclass(frozen=True)
 class DescribedFrame:
     """The instances of a frame and the descriptors of those that can be used.
 
     Attributes:
         instances: every instance, in the order of the label numbers.
-        descriptors: NumPy arrays with one row for each of `usable`, padded to a batch bucket.
+        oriented: descriptors in all orientations, as NumPy arrays with one row for each of `usable`, padded to a batch
+            bucket.
     """
 
     instances: Sequence[PreparedInstance]
-    descriptors: Descriptors
+    oriented: OrientedDescriptors
+
+    @property
+    def descriptors(self) -> Descriptors:
+        """The descriptors in the paper's orientation."""
+        return self.oriented.first
 
     @property
     def usable(self) -> list[PreparedInstance]:

@@ -11,6 +11,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.types import Descriptors
 
 __all__ = [
+    "EMBEDDING",
     "FEATURES",
     "HIDDEN",
     "Feature",
@@ -24,8 +25,10 @@ Feature = Literal["ce", "tops", "tops2"]
 FEATURES: tuple[Feature, ...] = ("ce", "tops", "tops2")
 """Descriptors that a classifier can be trained on: colour embeddings, TOPS, TOPS2."""
 
-HIDDEN = (512, 256, 128, 64)
+EMBEDDING = "embedding"
+"""Name of the classifier of a run that is its embedding's network, beside the MLPs."""
 
+HIDDEN = (512, 256, 128, 64)
 
 SPARSE_BATCH = 16
 """Largest batch whose first layer uses `_sparse_matmul`: up to it, a classifier takes as long as reading its weights,

@@ -20,8 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import softmax
 
-from thor2_jax.recognition.classifier import Feature
-
 __all__ = ["DEFAULT_RULE", "FUSION_RULES", "Fused", "FusionRule", "fuse", "fused_probabilities", "with_temperature"]
 
 FusionRule = Literal["max", "mean", "log-mean"]
@@ -57,7 +55,7 @@ def with_temperature(probabilities: NDArray[np.floating[Any]], temperature: floa
 
 
 def fused_probabilities(
-    probabilities: Mapping[Feature, NDArray[np.floating[Any]]], rule: FusionRule = DEFAULT_RULE
+    probabilities: Mapping[str, NDArray[np.floating[Any]]], rule: FusionRule = DEFAULT_RULE
 ) -> NDArray[np.floating[Any]]:
     """Return the fused class probabilities [B, C]; the arguments are those of `fuse`."""
     stacked = np.stack([probabilities[name] for name in probabilities])  # [M, B, C]
@@ -69,7 +67,7 @@ def fused_probabilities(
     return np.asarray(fused / fused.sum(axis=1, keepdims=True))
 
 
-def fuse(probabilities: Mapping[Feature, NDArray[np.floating[Any]]], rule: FusionRule = DEFAULT_RULE) -> Fused:
+def fuse(probabilities: Mapping[str, NDArray[np.floating[Any]]], rule: FusionRule = DEFAULT_RULE) -> Fused:
     """Fuse the class probabilities of several classifiers.
 
     Args:
