@@ -62,6 +62,9 @@ THOR2: tuple[Feature, ...] = ("tops", "tops2")
 CHUNK = 4
 """Default of `Recognizer.chunk`."""
 
+Classify = Callable[[OrientedDescriptors], jax.Array]
+"""A classifier: from the descriptors of clouds to class probabilities [B, C]."""
+
 T = TypeVar("T")
 
 
@@ -119,7 +122,7 @@ class Recognizer:
         self.rule: FusionRule = rule
         self.objects = ObjectGallery(run.classes, embedding, search)
         self._answer_by = _check_answer_by(answer_by)
-        self._classify = {name: _compiled(name, model) for name, model in run.classifiers.items()}
+        self._classify: dict[str, Classify] = {name: _compiled(name, m) for name, m in run.classifiers.items()}
         if embedding is not None and embedding.classes == run.classes and run.classifiers:
             self._classify[EMBEDDING] = embedding.class_probabilities
 
@@ -453,7 +456,7 @@ def _padded_rows(n: int) -> int:
     return n if n == whole > 0 else whole + batch_bucket(max(n - whole, 1))
 
 
-def _compiled(name: Feature, model: MLP) -> Callable[[OrientedDescriptors], jax.Array]:
+def _compiled(name: Feature, model: MLP) -> Classify:
     """Return the compiled function from descriptors in K orientations to class probabilities [B, C]."""
     graph, state = nnx.split(model)
     # As a flat list: JAX would take an nnx state apart, in Python, at every call.

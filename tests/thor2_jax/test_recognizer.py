@@ -64,7 +64,7 @@ def test_every_instance_is_answered_in_the_order_of_labels(recognizer: Recognize
 
 def test_fusion_is_the_mean_log_probability(recognizer: Recognizer) -> None:
     described = recognizer.describe(tilted(patches()))
-    probabilities = recognizer.probabilities(described.descriptors, ("tops", "tops2"))
+    probabilities = recognizer.probabilities(described.oriented, ("tops", "tops2"))
     recognized = [answer for answer in recognizer.recognize(tilted(patches())) if answer.reason is None]
     assert len(recognized) == 3
     for row, answer in enumerate(recognized):
@@ -124,7 +124,7 @@ def test_no_names_with_absurd_intrinsics(recognizer: Recognizer, change: dict[st
 def test_probabilities_are_the_classifiers_on_the_descriptors(recognizer: Recognizer, run: TrainedRun) -> None:
     """Against the same layers in NumPy, float64."""
     described = recognizer.describe(tilted(patches()))
-    for name, probabilities in recognizer.probabilities(described.descriptors).items():
+    for name, probabilities in recognizer.probabilities(described.oriented).items():
         model = run.classifiers[name]
         x = np.asarray(feature_of(described.descriptors, name), np.float64) * np.asarray(model.input_scale[...])
         for layer, norm in zip(model.layers, model.norms, strict=True):

@@ -41,7 +41,7 @@ def cloud_statistics(sides: jax.Array, clouds: PointClouds, strips: Strips) -> j
         colours, ratio of the two longest sides, and the square root of the colour histogram, which has unit length.
     """
     count = clouds.mask.sum(axis=1, keepdims=True, dtype=jnp.float32)
-    weight = clouds.mask[..., None] / jnp.maximum(count, 1)[..., None]
+    weight = clouds.mask[..., None].astype(jnp.float32) / jnp.maximum(count, 1)[..., None]
     mean = (clouds.colors * weight).sum(axis=1)
     deviation = jnp.sqrt(jnp.maximum((jnp.square(clouds.colors) * weight).sum(axis=1) - jnp.square(mean), 0))
     scalars = [

@@ -13,7 +13,7 @@ from thor2_jax.descriptor.orientations import OrientedDescriptors, describe_orie
 from thor2_jax.errors import InputError
 from thor2_jax.gallery.clouds import CompactClouds
 from thor2_jax.gallery.embedding import Embedding, load_default
-from thor2_jax.gallery.enrollment import embed_views, enrolled_views
+from thor2_jax.gallery.enrollment import ORIENTATIONS, embed_views, enrolled_views
 from thor2_jax.gallery.gallery import Gallery, GalleryObject
 from thor2_jax.gallery.store import StoredGallery, gallery_stamp, load_gallery, undo_change, update_gallery
 from thor2_jax.gallery.union import ClassUnion
@@ -112,9 +112,10 @@ class ObjectGallery:
             oriented: their descriptors, which are reused if the embedding reads the same ones.
             config: descriptor of `oriented`.
         """
-        ours = self.embedding.config
-        if dataclasses.replace(config, homology=ours.homology, orientations=ours.orientations) != ours:
-            oriented = describe_orientations(clouds, self.embedding.network, ours, config.orientations)
+        ours, count = self.embedding.config, max(config.orientations, ORIENTATIONS)
+        is_ours = dataclasses.replace(config, homology=ours.homology, orientations=ours.orientations) == ours
+        if not is_ours or oriented.weights.shape[1] != count:
+            oriented = describe_orientations(clouds, self.embedding.network, ours, count)
         return self.embedding.embed_oriented(oriented), oriented.weights
 
     def refresh(self) -> bool:

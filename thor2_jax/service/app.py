@@ -287,7 +287,8 @@ def _token_check(token: str) -> Callable[..., Any]:
 
 def _encode_json(results: Sequence[CloudResult], timings: dict[str, float]) -> bytes:
     descriptors = [
-        {"images": r.images.tolist(), "embeddings": r.embeddings.tolist(), "overflow": r.overflow} for r in results
+        {"images": r.images.tolist(), "embeddings": r.embeddings.tolist(), "overflow": int(r.evidence.overflow)}
+        for r in results
     ]
     return pydantic_core.to_json({"descriptors": descriptors, "timings": timings})
 
@@ -298,7 +299,7 @@ def _encode_npz(results: Sequence[CloudResult]) -> bytes:
         stream,
         images=np.stack([r.images for r in results]),
         embeddings=np.stack([r.embeddings for r in results]),
-        overflow=np.array([r.overflow for r in results], np.int32),
+        overflow=np.array([r.evidence.overflow for r in results], np.int32),
     )
     return stream.getvalue()
 

@@ -10,16 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.capacity import BATCH_BUCKETS, POINT_BUCKETS, batch_bucket, point_bucket
-from thor2_jax.descriptor.describe import describe_strips, strips
-from thor2_jax.descriptor.view_normalization import align
+from thor2_jax.descriptor.describe import strips
+from thor2_jax.descriptor.orientations import candidate_orientations, orient_descriptors
 from thor2_jax.errors import InputError
 from thor2_jax.gallery.clouds import CompactClouds
-from thor2_jax.gallery.enrollment import enrolled_object
+from thor2_jax.gallery.enrollment import ORIENTATIONS, enrolled_object
 from thor2_jax.gallery.gallery import GalleryObject
 from thor2_jax.gallery.objects import ObjectGallery
 from thor2_jax.gallery.store import INDEX_FILE
-from thor2_jax.recognition.answers import Recognition
-from thor2_jax.recognition.classifier import Feature
+from thor2_jax.recognition.answers import Evidence, Recognition
 from thor2_jax.recognition.fusion import fuse, fused_probabilities, with_temperature
 from thor2_jax.recognition.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.recognizer import THOR2, Recognizer
@@ -40,20 +39,16 @@ class CloudResult:
     Attributes:
         images: [S, P, P] float32, persistence images.
         embeddings: [S, R, J] float32, colour embeddings.
-        overflow: number of points and persistence pairs outside the descriptor's grid.
-        probabilities: classifier -> [C] float32.
         aligned: [N, 3] float32, the aligned cloud in scaled units, with padding.
         strip_colors: [S, J, R] float32, strip colour vectors.
-        embedding: [K, D] float32, embeddings for the gallery in K orientations; None if the classifiers alone answer.
+        evidence: what the cloud is recognized by, fields without the axis of the batch.
     """
 
     images: NDArray[np.float32]
     embeddings: NDArray[np.float32]
-    overflow: int
-    probabilities: dict[Feature, NDArray[np.float32]]
     aligned: NDArray[np.float32]
     strip_colors: NDArray[np.float32]
-    embedding: NDArray[np.float32] | None = None
+    evidence: Evidence
 
 
 class InferenceEngine:
@@ -69,13 +64,13 @@ class InferenceEngine:
             _enable_compilation_cache(settings.cache)
         self._recognizer = _load(settings)
         run = self._recognizer.run
-        self._classifiers = THOR2 if run.classifiers else ()
-        missing = [name for name in self._classifiers if name not in run.classifiers]
+        missing = [name for name in THOR2 if run.classifiers and name not in run.classifiers]
         if missing:
             raise InputError(
                 f"model: {settings.model} has no classifier {', '.join(missing)}; "
                 f"serving needs {' and '.join(THOR2)}: train the run with them"
             )
+        self._classifiers = self._recognizer.default_classifiers
         # The closed form computes the same pairs as gudhi without a host callback.
         self.run = dataclasses.replace(run, config=dataclasses.replace(run.config, homology="closed_form"))
         self._recognizer.run = self.run
@@ -116,7 +111,8 @@ class InferenceEngine:
 
     def enrolled_object(self, clouds: CompactClouds, results: Sequence[CloudResult]) -> GalleryObject:
         """Return an object to enroll from its clouds and the results of `enrollment.views_to_embed`."""
-        return enrolled_object(np.array([result.embedding for result in results]), clouds, "frames")
+        embeddings = np.array([result.evidence.embeddings[:ORIENTATIONS] for result in results])
+        return enrolled_object(embeddings, clouds, "frames")
 
     @property
     def batch_shapes(self) -> list[tuple[int, int]]:
@@ -135,40 +131,32 @@ class InferenceEngine:
 
     def _infer(self, instances: Sequence[PreparedInstance], n_clouds: int, n_points: int) -> list[CloudResult]:
         clouds = pack_instances(instances, n_clouds, n_points)
-        aligned = align(clouds, self.run.config)
-        cloud_strips = strips(aligned, self.run.network, self.run.config)
-        descriptors = describe_strips(cloud_strips, self.run.network, self.run.config)
-        probabilities = self._recognizer.probabilities(descriptors, self._classifiers)
-        embedded = np.asarray(self.objects.embed(clouds)) if self._embeds else None
-        arrays = (
-            descriptors.images,
-            descriptors.embeddings,
-            descriptors.overflow,
-            aligned.points,
-            cloud_strips.color,
-        )
-        images, embeddings, overflow, points, colors = (np.asarray(a) for a in arrays)
+        network, config = self.run.network, self.run.config
+        aligned, weights = candidate_orientations(clouds, config, config.orientations)
+        cloud_strips = strips(aligned, network, config)
+        oriented = orient_descriptors(aligned, weights, cloud_strips, network, config)
+        evidence = self._recognizer.evidence(oriented, self._classifiers, clouds if self._embeds else None)
+        first = slice(None, None, config.orientations)
+        computed = oriented.first, aligned.points[first], cloud_strips.color[first], evidence
+        descriptors, points, colors, evidence = jax.tree.map(np.asarray, computed)
         return [
             CloudResult(
-                images[k],
-                embeddings[k],
-                int(overflow[k]),
-                {name: p[k] for name, p in probabilities.items()},
+                descriptors.images[k],
+                descriptors.embeddings[k],
                 points[k],
                 colors[k],
-                None if embedded is None else embedded[k],
+                jax.tree.map(lambda a, k=k: a[k], evidence),
             )
             for k in range(len(instances))
         ]
 
     def recognize(self, instances: Sequence[PreparedInstance], results: Sequence[CloudResult]) -> list[Recognition]:
         """Return a recognition per instance of a frame; `results` are those of the usable instances, in order."""
-        shape = len(results), len(self.run.classes)
-        probabilities = {
-            name: np.reshape([r.probabilities[name] for r in results], shape) for name in self._classifiers
-        }
-        embeddings = np.array([r.embedding for r in results], np.float32) if self._uses_gallery else None
-        return self._recognizer.recognitions(instances, probabilities, [r.overflow for r in results], embeddings)
+        if not results:
+            nothing = {name: np.zeros((0, len(self.run.classes)), np.float32) for name in self._classifiers}
+            return self._recognizer.recognitions(instances, Evidence(np.zeros(0, int), nothing))
+        evidence = jax.tree.map(lambda *rows: np.stack(rows), *[result.evidence for result in results])
+        return self._recognizer.recognitions(instances, evidence)
 
     def calibrated_confidences(self, results: Sequence[CloudResult]) -> list[float | None]:
         """Return the confidence of each cloud's most probable class after temperature scaling of both classifiers.
@@ -180,7 +168,9 @@ class InferenceEngine:
         is_changed = self._uses_gallery or self.objects.gallery.hidden
         if not results or is_changed or not set(THOR2) <= set(temperatures):
             return [None] * len(results)
-        probabilities = {name: np.stack([r.probabilities[name] for r in results]) for name in THOR2}
+        probabilities: dict[str, NDArray[np.float32]] = {
+            name: np.stack([r.evidence.probabilities[name] for r in results]) for name in THOR2
+        }
         index = fuse(probabilities).class_index
         calibrated = fused_probabilities(
             {name: with_temperature(p, temperatures[name]) for name, p in probabilities.items()}

@@ -55,7 +55,7 @@ class Settings:
         max_batch: maximum batch size, one of `capacity.BATCH_BUCKETS`.
         window: seconds for which a batch waits for the instances of requests in progress.
         processes: number of processes that decode images and compute clouds.
-        unknown_below: confidence below which an object is unknown, as in `Recognizer`.
+        unknown_below: confidence below which an object is unknown, as in `Recognizer`; None is the run's own.
         cache: directory of compiled programs, which a later start reuses; None disables the cache.
         gallery: directory of the enrolled objects; None is `gallery` in the run directory.
         teach: callers may enroll and forget objects.
@@ -71,7 +71,7 @@ class Settings:
     max_batch: int = 32
     window: float = 0.01
     processes: int = 2
-    unknown_below: float = 0.0
+    unknown_below: float | None = None
     cache: Path | None = None
     gallery: Path | None = None
     teach: bool = False

@@ -26,8 +26,11 @@ app = typer.Typer(
 console = Console(width=None if sys.stdout.isatty() else 160, markup=False, emoji=False)
 
 UnknownOption = Annotated[
-    float,
-    typer.Option("--unknown-below", help="Instances with a lower confidence are unknown objects (0 to 1)."),
+    float | None,
+    typer.Option(
+        "--unknown-below",
+        help="Instances with a lower confidence are unknown objects (0 to 1). Default: the model's own.",
+    ),
 ]
 ModelOption = Annotated[Path, typer.Option("--model", help="Run directory of a trained model.")]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress.")]

@@ -37,7 +37,7 @@ def recognize(
     depth_scale: Annotated[
         float | None, typer.Option(help="Depth units per metre. Default: that of the intrinsics, or 1000.")
     ] = None,
-    unknown_below: UnknownOption = 0.0,
+    unknown_below: UnknownOption = None,
     answer_by: Annotated[
         str | None, typer.Option(help="classifiers, gallery or both. Default: what the run has.")
     ] = None,

@@ -19,7 +19,7 @@ def serve(
     queue: Annotated[int, typer.Option(min=1, help="Requests per worker at a time; others get status 429.")] = 32,
     deadline: Annotated[float, typer.Option(help="Seconds per request before it gets status 504.")] = 5.0,
     max_batch: Annotated[int, typer.Option(help="Largest number of clouds in a device batch.")] = 32,
-    unknown_below: UnknownOption = 0.0,
+    unknown_below: UnknownOption = None,
     cache: Annotated[
         Path | None, typer.Option(help="Directory for compiled programs, so that the next start is faster.")
     ] = None,

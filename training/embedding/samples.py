@@ -15,9 +15,9 @@ from scipy.spatial.transform import Rotation
 
 from colornet import ColorNetwork
 from thor2_jax.config import DescriptorConfig
+from thor2_jax.descriptor.cloud_statistics import cloud_statistics
 from thor2_jax.descriptor.describe import strips
 from thor2_jax.descriptor.view_normalization import turn, view_normalize
-from thor2_jax.gallery.embedding import cloud_statistics
 from thor2_jax.types import Cloud, PointClouds
 from training.views.normalized_views import padded_batches
 
@@ -151,8 +151,7 @@ def sample_clouds(
         for _ in range(copies):
             axes, mirrored = _random_axes(np.asarray(extents), rng), rng.random(CLOUDS_PER_BATCH) < 0.5
             occupied = strips(turn(_reoriented(normal, axes, mirrored), config), network, config)
-            mass = occupied.color.sum(axis=(1, 2))
-            statistics = np.asarray(cloud_statistics(extents, normal.colors, normal.mask, mass))[:count]
+            statistics = np.asarray(cloud_statistics(extents, normal, occupied))[:count]
             sample, strip = np.nonzero(np.asarray(occupied.occupied)[:count].reshape(count, -1))
             length = np.asarray(occupied.high - occupied.low).reshape(CLOUDS_PER_BATCH, -1)
             color = np.asarray(occupied.color).reshape(*length.shape, -1)

@@ -2,23 +2,26 @@
 
 import itertools
 from collections.abc import Iterable, Mapping
-from typing import Any, Literal, cast
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from thor2_jax.recognition.classifier import FEATURES, Feature
+from thor2_jax.recognition.classifier import FEATURES
 from thor2_jax.recognition.fusion import FUSION_RULES, FusionRule, fuse, with_temperature
 from training.baselines.names import TITLES
 
-__all__ = ["BOTH", "GALLERY", "RULES", "Rule", "fuse_by", "fusions", "main_fusion"]
+__all__ = ["ALL_CLASSIFIERS", "BOTH", "EMBEDDED", "GALLERY", "RULES", "Rule", "fuse_by", "fusions", "main_fusion"]
 
 Rule = FusionRule | Literal["calibrated"]
 RULES: tuple[Rule, ...] = (*FUSION_RULES, "calibrated")
 """The rules of `fuse`, and "calibrated": the rule "max" on temperature-scaled probabilities."""
 
-GALLERY, BOTH = "gallery", "both"
-"""Columns of the gallery alone and of THOR2 combined with it, which no rule fuses with others."""
+EMBEDDED, ALL_CLASSIFIERS, GALLERY, BOTH = "embedding", "THOR2+embedding", "gallery", "both"
+"""Columns of the embedding alone, of its fusion with THOR2, of the gallery alone, and of all combined. The recognizer
+computes them, and no rule fuses them with others."""
+
+WHOLE = (EMBEDDED, ALL_CLASSIFIERS, GALLERY, BOTH)
 
 
 def fusions(available: Iterable[str]) -> dict[str, tuple[str, ...]]:
@@ -31,7 +34,7 @@ def fusions(available: Iterable[str]) -> dict[str, tuple[str, ...]]:
     groups = [group for size in range(1, len(features) + 1) for group in itertools.combinations(features, size)]
     baselines: dict[str, tuple[str, ...]] = {title: (name,) for name, title in TITLES.items() if name in names}
     classifiers = {"THOR2" if group == ("tops", "tops2") else "+".join(group).upper(): group for group in groups}
-    return baselines | classifiers | {name: (name,) for name in (GALLERY, BOTH) if name in names}
+    return baselines | classifiers | {name: (name,) for name in WHOLE if name in names}
 
 
 def main_fusion(titles: Iterable[str], answer_by: str = "classifiers") -> str:
@@ -39,12 +42,14 @@ def main_fusion(titles: Iterable[str], answer_by: str = "classifiers") -> str:
 
     Args:
         titles: the columns, at least one.
-        answer_by: "classifiers" (THOR2 if it is among the titles, otherwise the last one), "gallery" or "both".
+        answer_by: "classifiers" (with the embedding if it is among them, else THOR2, else the last title), "gallery" or
+            "both".
     """
     titles = list(titles)
-    if answer_by in titles:
-        return answer_by
-    return "THOR2" if "THOR2" in titles else [title for title in titles if title not in (GALLERY, BOTH)][-1]
+    for title in (answer_by, ALL_CLASSIFIERS, "THOR2"):
+        if title in titles:
+            return title
+    return [title for title in titles if title not in WHOLE][-1]
 
 
 def fuse_by(
@@ -57,12 +62,12 @@ def fuse_by(
         probabilities: [B, C] class probabilities of each classifier.
         temperatures: temperature of each classifier; needed for "calibrated".
     """
-    if set(probabilities) <= {GALLERY, BOTH}:
+    if set(probabilities) <= set(WHOLE):
         (values,) = probabilities.values()  # scores, which need not sum to 1
         return values.argmax(axis=1), values.max(axis=1)
     if rule == "calibrated":
         assert temperatures is not None
         probabilities = {name: with_temperature(values, temperatures[name]) for name, values in probabilities.items()}
         rule = "max"
-    fused = fuse(cast(Mapping[Feature, NDArray[np.floating[Any]]], probabilities), rule)
+    fused = fuse(probabilities, rule)
     return fused.class_index, fused.confidence

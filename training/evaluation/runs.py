@@ -16,12 +16,13 @@ from thor2_jax.errors import InputError
 from thor2_jax.files import content_digest, json_digest
 from thor2_jax.gallery.store import GALLERY_DIRECTORY, INDEX_FILE
 from thor2_jax.recognition.answers import DescribedFrame
+from thor2_jax.recognition.classifier import EMBEDDING
 from thor2_jax.recognition.run_directory import RUN_FILE
-from thor2_jax.recognizer import EMBEDDING_FILE, THOR2, Recognizer
+from thor2_jax.recognizer import EMBEDDING_FILE, Recognizer
 from training.baselines.baseline import Baseline, BaselineInputs
 from training.baselines.files import baseline_file
 from training.baselines.load import load_baselines
-from training.evaluation.fusion import BOTH, GALLERY
+from training.evaluation.fusion import ALL_CLASSIFIERS, BOTH, EMBEDDED, GALLERY
 from training.fitting.run_directories import find_run_directories
 from training.readers.labelled import path_ends, sequence_of
 
@@ -53,11 +54,14 @@ class Run:
 
     @property
     def predictors(self) -> tuple[str, ...]:
-        """Names of the classifiers and baselines; "gallery" and "both" if objects are enrolled."""
-        classifiers = self.recognizer.run.classifiers
-        if not self.recognizer.objects.gallery.objects:
-            return (*classifiers, *self.baselines)
-        return (*classifiers, *self.baselines, GALLERY, *([BOTH] if set(THOR2) <= set(classifiers) else []))
+        """Names of the classifiers and baselines; with an embedding or enrolled objects, their columns too."""
+        recognizer = self.recognizer
+        names = (*recognizer.run.classifiers, *self.baselines)
+        if EMBEDDING in recognizer.classifiers:
+            names += EMBEDDED, ALL_CLASSIFIERS
+        if recognizer.objects.gallery.objects:
+            names += (GALLERY, BOTH) if recognizer.run.classifiers else (GALLERY,)
+        return names
 
     @property
     def answer_by(self) -> str:
@@ -79,8 +83,11 @@ class Run:
             described: the described frame.
             inputs: inputs of the baselines; None if no run has any.
         """
-        by_classifiers = self.recognizer.probabilities(described.descriptors)
-        values = {str(name): p for name, p in by_classifiers.items()}
+        by_classifiers = self.recognizer.probabilities(described.oriented)
+        default = {name: by_classifiers[name] for name in self.recognizer.default_classifiers}
+        values = dict(by_classifiers)
+        if ALL_CLASSIFIERS in self.predictors:
+            values[ALL_CLASSIFIERS] = np.asarray(self.recognizer.fused(default), np.float32)
         if inputs is not None:
             values |= {name: baseline.probabilities(inputs) for name, baseline in self.baselines.items()}
         union = self.recognizer.objects.union
@@ -89,7 +96,7 @@ class Run:
             scores = self.recognizer.gallery_scores(described)
             values[GALLERY] = union.of_gallery(scores)
         if BOTH in self.predictors:
-            values[BOTH] = self.recognizer.combined({name: by_classifiers[name] for name in THOR2}, scores)
+            values[BOTH] = self.recognizer.combined(default, scores)
         return values
 
 

@@ -1,11 +1,15 @@
 """Candidate orientations: their order, their geometry and their number."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import colornet
 import thor2_jax as thor2
-from thor2_jax.descriptor.orientations import ORIENTATION_COUNTS, candidate_orientations
+from thor2_jax.config import ORIENTATION_COUNTS
+from thor2_jax.descriptor.orientations import candidate_orientations, describe_orientations
 
 CONFIG = thor2.DescriptorConfig(homology="closed_form")
 
@@ -30,7 +34,7 @@ LONG, SQUARE = (0.2, 0.1, 0.06), (0.12, 0.115, 0.06)
 @pytest.mark.parametrize("count", ORIENTATION_COUNTS)
 def test_the_first_orientation_is_that_of_align(count: int) -> None:
     batch = clouds(LONG, SQUARE, LONG)
-    oriented, expected = candidate_orientations(batch, CONFIG, count), thor2.align(batch, CONFIG)
+    (oriented, _), expected = candidate_orientations(batch, CONFIG, count), thor2.align(batch, CONFIG)
     assert oriented.points.shape == (3 * count, *batch.points.shape[1:])
     np.testing.assert_allclose(oriented.points[::count], expected.points, atol=1e-6)
     np.testing.assert_allclose(oriented.camera[::count], expected.camera, atol=1e-6)
@@ -40,14 +44,14 @@ def test_the_first_orientation_is_that_of_align(count: int) -> None:
 
 def test_the_second_orientation_is_a_half_turn_about_z() -> None:
     batch = clouds(LONG, SQUARE)
-    turned = candidate_orientations(batch, CONFIG, 2)
+    turned, _ = candidate_orientations(batch, CONFIG, 2)
     mirrored = thor2.turn(thor2.mirror(thor2.view_normalize(batch, CONFIG), "xy"), CONFIG)
     points = np.asarray(turned.points)[1::2]
     np.testing.assert_allclose(points, mirrored.points, atol=2e-6)
 
 
 def test_sides_are_swapped_only_if_nearly_equal() -> None:
-    oriented = candidate_orientations(clouds(LONG, SQUARE), CONFIG, 4)
+    oriented, _ = candidate_orientations(clouds(LONG, SQUARE), CONFIG, 4)
     points = np.asarray(oriented.points).reshape(2, 4, -1, 3)
     mask = np.asarray(oriented.mask).reshape(2, 4, -1)
     width = [np.ptp(points[cloud, k][mask[cloud, k]][:, 1]) for cloud in range(2) for k in (0, 2)]
@@ -58,7 +62,7 @@ def test_sides_are_swapped_only_if_nearly_equal() -> None:
 
 def test_an_empty_cloud_stays_empty() -> None:
     empty = thor2.PointClouds.pack([(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))])
-    oriented = candidate_orientations(empty, CONFIG, 4)
+    oriented, _ = candidate_orientations(empty, CONFIG, 4)
     assert not oriented.mask.any() and bool(jnp.isfinite(oriented.points).all())
 
 
@@ -66,3 +70,22 @@ def test_an_empty_cloud_stays_empty() -> None:
 def test_other_counts_are_refused(count: int) -> None:
     with pytest.raises(thor2.InputError, match=f"count is {count}"):
         candidate_orientations(clouds(LONG), CONFIG, count)
+
+
+def test_an_occluded_end_decides_the_half_turn() -> None:
+    batch = clouds(LONG, SQUARE)
+    x = np.asarray(thor2.view_normalize(batch, CONFIG).points)[0, :, 0]
+    boundary = np.zeros(batch.mask.shape, bool)
+    boundary[0] = np.asarray(batch.mask)[0] & (x > x.max() - 0.01)
+    _, weights = candidate_orientations(dataclasses.replace(batch, boundary=jnp.asarray(boundary)), CONFIG, 4)
+    np.testing.assert_allclose(weights, [[0.5, 0, 0.5, 0], [0.25, 0.25, 0.25, 0.25]])
+
+
+def test_descriptors_of_orientations_are_those_of_their_clouds() -> None:
+    network, batch = colornet.load_default(), clouds(LONG, SQUARE)
+    described = describe_orientations(batch, network, CONFIG, 4)
+    aligned, _ = candidate_orientations(batch, CONFIG, 4)
+    expected = thor2.describe_aligned(aligned, network, CONFIG)
+    np.testing.assert_array_equal(described.flat[0].tops2, expected.tops2)
+    np.testing.assert_allclose(described.first.tops2, thor2.describe(batch, network, CONFIG).tops2, atol=1e-4)
+    assert described.statistics.shape[:2] == described.weights.shape == (2, 4)

@@ -8,10 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import safetensors.numpy
+import scipy.special
 from helpers import SMALL_CONFIG
 
 import thor2_jax as thor2
-from thor2_jax.gallery.embedding import N_SCALARS, Embedding, EmbeddingSizes, cloud_statistics, load_default
+from thor2_jax.descriptor.orientations import describe_orientations
+from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes, load_default
 
 SIZES = EmbeddingSizes(cell=4, hidden=(16, 16), learned=8, color=6)
 
@@ -47,9 +49,24 @@ def test_embeddings_have_unit_length(embedding: Embedding, clouds: thor2.PointCl
     assert (values[0] @ values[1]) < 1 - 1e-4
 
 
-def test_aligned_clouds_give_the_same_embedding(embedding: Embedding, clouds: thor2.PointClouds) -> None:
-    aligned = thor2.align(clouds, embedding.config)
-    np.testing.assert_allclose(embedding.embed_aligned(aligned), embedding.embed(clouds), atol=1e-5)
+def test_described_clouds_give_the_same_embedding(embedding: Embedding, clouds: thor2.PointClouds) -> None:
+    oriented = describe_orientations(clouds, embedding.network, embedding.config, 2)
+    np.testing.assert_allclose(embedding.embed_oriented(oriented)[:, 0], embedding.embed(clouds), atol=1e-5)
+
+
+def test_class_probabilities_are_means_over_orientations(clouds: thor2.PointClouds) -> None:
+    embedding = Embedding.create(sizes=SIZES, classes=("a", "b"), distractors=3)
+    oriented = describe_orientations(clouds, embedding.network, embedding.config, 4)
+    weights = np.array([[1, 0, 0, 0], [0.25] * 4, [0, 0, 0.5, 0.5]], np.float32)
+    learned = embedding.embed_oriented(oriented)[..., : SIZES.learned]
+    actual = embedding.class_probabilities(dataclasses.replace(oriented, weights=jnp.asarray(weights)))
+    state = embedding._split[1]
+    unit = np.asarray(learned, np.float64)
+    unit /= np.linalg.norm(unit, axis=-1, keepdims=True)
+    proxies = np.asarray(state["proxies"][...], np.float64)
+    logits = np.exp(float(state["log_scale"][...])) * unit @ (proxies / np.linalg.norm(proxies, axis=0))
+    mean = np.einsum("bk,bkc->bc", weights, scipy.special.log_softmax(logits, axis=-1))
+    np.testing.assert_allclose(actual, scipy.special.softmax(mean, axis=1)[:, :2], atol=1e-4)
 
 
 def test_padding_and_batch_do_not_matter(embedding: Embedding) -> None:
@@ -67,15 +84,6 @@ def test_large_batches_are_computed_in_chunks(embedding: Embedding) -> None:
 def test_an_empty_cloud_has_a_finite_embedding(embedding: Embedding) -> None:
     empty = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
     assert np.isfinite(embedding.embed(thor2.PointClouds.pack([empty, box_cloud(0)]))).all()
-
-
-def test_statistics_of_a_cloud() -> None:
-    colors = jnp.asarray([[[0.0, 0.5, 1.0], [1.0, 0.5, 1.0], [9.0, 9.0, 9.0]]])
-    mask = jnp.asarray([[True, True, False]])
-    values = cloud_statistics(jnp.asarray([[0.5, 0.25, 0.125]]), colors, mask, jnp.asarray([[3.0, 1.0]]))[0]
-    expected = [1, 0.5, 0.25, 0.75, np.sqrt(2) / 20, 0.5, 0.5, 1, 0.5, 0, 0, 0.5, np.sqrt(0.75), 0.5]
-    np.testing.assert_allclose(values, expected, atol=1e-6)
-    assert len(expected) == N_SCALARS + 2
 
 
 def test_block_weights_are_the_shares_of_the_similarity(clouds: thor2.PointClouds) -> None:

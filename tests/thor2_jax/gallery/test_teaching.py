@@ -189,8 +189,9 @@ def test_another_embedding_embeds_the_views_again(embedding: Embedding, tmp_path
 
 def test_embeddings_of_a_query_have_one_row_per_orientation(embedding: Embedding) -> None:
     recognizer = thor2.Recognizer(untrained_run((), ()), embedding=embedding)
-    packed = recognizer.describe(CLUTTER).packed
-    assert recognizer.objects.embed(packed).shape == (4, ORIENTATIONS, embedding.size)
+    described = recognizer.describe(CLUTTER)
+    embeddings, weights = recognizer.objects.embed(described.packed, described.oriented, recognizer.run.config)
+    assert embeddings.shape == (4, ORIENTATIONS, embedding.size) and weights.shape == (4, ORIENTATIONS)
 
 
 def test_combined_values_of_classes_and_objects() -> None:

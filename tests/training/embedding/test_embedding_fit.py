@@ -12,6 +12,8 @@ from helpers import SMALL_CONFIG
 
 import colornet
 import thor2_jax as thor2
+from thor2_jax.descriptor.describe import strips
+from thor2_jax.descriptor.orientations import orient_descriptors
 from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
 from training.embedding import fit, samples, sampling
 from training.embedding.build import main
@@ -74,11 +76,18 @@ def test_unturned_samples_have_the_descriptor_of_their_cloud(monkeypatch: pytest
     batch = Samples(start=start, shape=(2, 5), **fields).take(np.arange(len(rendered)))
     embedding = Embedding.create(SMALL_CONFIG, sizes=SIZES)
     clouds = thor2.PointClouds.pack([rendered[k][1] for k in order])
-    expected = {mirror: embedding.embed_aligned(aligned(clouds, mirror)) for mirror in ("", "x")}
+    expected = {mirror: embedded(embedding, aligned(clouds, mirror)) for mirror in ("", "x")}
     descriptors = fit._descriptors(jnp.asarray(batch.length), jnp.asarray(batch.color), NETWORK, embedding.config)
     actual = whole_embedding(nnx.merge(*embedding._split), descriptors, batch.statistics)
     similarity = [np.asarray((actual * values).sum(axis=1)) for values in expected.values()]
     np.testing.assert_allclose(np.max(similarity, axis=0), 1, atol=1e-3)
+
+
+def embedded(embedding: Embedding, aligned: thor2.PointClouds) -> np.ndarray:
+    described = strips(aligned, NETWORK, embedding.config)
+    weights = jnp.ones((len(aligned.mask), 1))
+    oriented = orient_descriptors(aligned, weights, described, NETWORK, embedding.config)
+    return np.asarray(embedding.embed_oriented(oriented))[:, 0]
 
 
 def aligned(clouds: thor2.PointClouds, mirror: str) -> thor2.PointClouds:

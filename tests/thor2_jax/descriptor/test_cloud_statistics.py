@@ -1,0 +1,34 @@
+"""Statistics of clouds, compared with NumPy."""
+
+import jax.numpy as jnp
+import numpy as np
+
+import colornet
+import thor2_jax as thor2
+from thor2_jax.descriptor.cloud_statistics import N_SCALARS, cloud_statistics, side_lengths
+from thor2_jax.descriptor.describe import strips
+
+CONFIG = thor2.DescriptorConfig(homology="closed_form")
+
+
+def test_statistics_of_a_cloud() -> None:
+    rng = np.random.default_rng(0)
+    points, colors = rng.random((300, 3)) * (0.2, 0.1, 0.05), rng.integers(0, 256, (300, 3), np.uint8)
+    clouds = thor2.PointClouds.pack([(points.astype(np.float32), colors)])
+    aligned, network = thor2.align(clouds, CONFIG), colornet.load_default()
+    described = strips(aligned, network, CONFIG)
+    values = np.asarray(cloud_statistics(jnp.asarray([[0.5, 0.25, 0.125]]), aligned, described))[0]
+    scalars = [1, 0.5, 0.25, 0.75, np.sqrt(300) / 20, *colors.mean(axis=0) / 255, *colors.std(axis=0) / 255, 0.5]
+    region_points = np.asarray(described.color).sum(axis=(0, 1, 2))
+    expected = [*scalars, *np.sqrt(region_points / region_points.sum())]
+    assert len(scalars) == N_SCALARS
+    np.testing.assert_allclose(values, expected, atol=1e-4)
+
+
+def test_side_lengths_are_those_before_the_turn() -> None:
+    rng = np.random.default_rng(1)
+    points = rng.random((300, 3)) * (0.2, 0.1, 0.05)
+    clouds = thor2.PointClouds.pack([(points.astype(np.float32), np.zeros((300, 3), np.uint8))])
+    normal = np.asarray(thor2.view_normalize(clouds, CONFIG).points)[0]
+    sides = side_lengths(thor2.align(clouds, CONFIG), CONFIG.alpha)[0]
+    np.testing.assert_allclose(sides, np.sort(np.ptp(normal, axis=0))[::-1], atol=1e-4)
