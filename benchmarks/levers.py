@@ -22,7 +22,7 @@ import shlex
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -63,16 +63,17 @@ class Lever:
         name: name in the table.
         render: further options of `thor2 render`.
         train: further options of `thor2 train`.
-        describe: constants of the descriptor that recognition uses in place of the run's, see `DescriptorConfig`.
-        fusion: column of an evaluation that answers, see `fusions`. With "gallery" or "both", the meshes are enrolled.
+        orientations: candidate orientations of a cloud in recognition; None for those of the run.
+        fusion: column of an evaluation that answers, see `fusions`; None for the one that the run answers by. With
+            "gallery" or "both", the meshes are enrolled.
         rule: rule of the fusion.
     """
 
     name: str
     render: str = ""
     train: str = ""
-    describe: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    fusion: str = "THOR2"
+    orientations: int | None = 1
+    fusion: str | None = "THOR2"
     rule: Rule = DEFAULT_RULE
 
     @property
@@ -93,6 +94,8 @@ class Lever:
 
 LEVERS = (
     Lever("default"),
+    Lever("2 orientations in recognition", orientations=2),
+    Lever("4 orientations in recognition", orientations=4),
     Lever('fusion rule "max"', rule="max"),
     Lever('fusion rule "mean"', rule="mean"),
     Lever("CE, TOPS and TOPS2", fusion="CE+TOPS+TOPS2"),
@@ -192,8 +195,9 @@ class Table:
         runs = load_runs(directories)
         for run in runs:
             recognizer = run.recognizer
-            config = dataclasses.replace(recognizer.run.config, **lever.describe)
-            recognizer.run = dataclasses.replace(recognizer.run, config=config)
+            if lever.orientations is not None:
+                config = dataclasses.replace(recognizer.run.config, orientations=lever.orientations)
+                recognizer.run = dataclasses.replace(recognizer.run, config=config)
             if lever.enrolls:
                 recognizer.objects.open(self.out / "galleries" / recognizer.objects.embedding.fingerprint[:12])
                 for name, path in self.meshes.items():
@@ -264,7 +268,7 @@ def grouped(levers: Sequence[Lever]) -> list[list[Lever]]:
     """Return levers that share trainings, descriptors and galleries together, in the order of the first ones."""
     groups: dict[tuple[Any, ...], list[Lever]] = {}
     for lever in levers:
-        key = lever.training, json.dumps(dict(lever.describe), sort_keys=True), lever.enrolls
+        key = lever.training, lever.orientations, lever.enrolls
         groups.setdefault(key, []).append(lever)
     return list(groups.values())
 

@@ -55,6 +55,14 @@ class UntaughtRecognizer:
     def objects(self) -> ObjectGallery:
         return ObjectGallery(tuple(self.run.classes))
 
+    @property
+    def classifiers(self) -> tuple[str, ...]:
+        return tuple(self.run.classifiers)
+
+    @property
+    def default_classifiers(self) -> tuple[str, ...]:
+        return self.classifiers
+
     def answers_by(self) -> str:
         return "classifiers"
 

@@ -23,7 +23,7 @@ def test_levers_share_what_only_fusion_tells_apart() -> None:
         Lever("a"),
         Lever("b", train="--epochs 2"),
         Lever("c", rule="max"),
-        Lever("d", describe={"n_slices": 5}),
+        Lever("d", orientations=4),
         Lever("e", fusion="gallery"),
         Lever("f", fusion="both"),
         Lever("g", render="--base", rule="mean"),
@@ -38,7 +38,7 @@ def test_levers_share_what_only_fusion_tells_apart() -> None:
 
 def test_rows_of_the_table_differ() -> None:
     assert len({lever.name for lever in LEVERS}) == len(LEVERS)
-    rows = [(lever.training, json.dumps(dict(lever.describe)), lever.fusion, lever.rule) for lever in LEVERS]
+    rows = [(lever.training, lever.orientations, lever.fusion, lever.rule) for lever in LEVERS]
     assert len(set(rows)) == len(rows) and {lever.rule for lever in LEVERS} <= set(RULES)
 
 

@@ -29,9 +29,9 @@ class ToyRecognizer(UntaughtRecognizer):
 
     def describe(self, frame: Any) -> Any:
         usable = [instance for instance in self.instances if instance.reason is None]
-        return SimpleNamespace(instances=self.instances, usable=usable, descriptors=None)
+        return SimpleNamespace(instances=self.instances, usable=usable, oriented=None)
 
-    def probabilities(self, descriptors: Any) -> dict[str, np.ndarray]:
+    def probabilities(self, oriented: Any) -> dict[str, np.ndarray]:
         return self.table
 
 

@@ -70,10 +70,10 @@ class ToyRecognizer(UntaughtRecognizer):
         with self.log.open("a") as file:
             file.write(f"{number}\n")
         instances = [SimpleNamespace(label=label, reason=None, occluded=False) for label in frame.instances]
-        return SimpleNamespace(instances=instances, usable=instances, descriptors=number)
+        return SimpleNamespace(instances=instances, usable=instances, oriented=number)
 
-    def probabilities(self, descriptors: int) -> dict[str, np.ndarray]:
-        rng = np.random.default_rng([self.seed, descriptors])
+    def probabilities(self, oriented: int) -> dict[str, np.ndarray]:
+        rng = np.random.default_rng([self.seed, oriented])
         return {name: rng.dirichlet(np.ones(3), 4).astype(np.float32) for name in self.run.classifiers}
 
 

@@ -96,11 +96,11 @@ class Unable(UntaughtRecognizer):
         class Described:
             instances: list[Any] = []
             usable: list[Any] = []
-            descriptors = None
+            oriented = None
 
         return Described()
 
-    def probabilities(self, descriptors: Any) -> dict[str, np.ndarray]:
+    def probabilities(self, oriented: Any) -> dict[str, np.ndarray]:
         return {"tops": np.zeros((0, 1), np.float32)}
 
 

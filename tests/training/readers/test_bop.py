@@ -374,7 +374,7 @@ class LabelIsClass(UntaughtRecognizer):
             SimpleNamespace(label=k, reason="too few points" if k == last else None, occluded=False)
             for k in frame.instances
         ]
-        return SimpleNamespace(instances=instances, usable=instances[:-1], descriptors=range(len(instances) - 1))
+        return SimpleNamespace(instances=instances, usable=instances[:-1], oriented=range(len(instances) - 1))
 
     def probabilities(self, usable: range) -> dict[str, np.ndarray]:
         return {"tops": np.array([[0.9, 0.1] if k == 0 else [0.2, 0.8] for k in usable]).reshape(-1, 2)}

@@ -344,7 +344,7 @@ class NamesInOrder(UntaughtRecognizer):
 
     def describe(self, frame: Any) -> Any:
         instances = [SimpleNamespace(label=label, reason=None, occluded=False) for label in frame.instances]
-        return SimpleNamespace(instances=instances, usable=instances, descriptors=instances)
+        return SimpleNamespace(instances=instances, usable=instances, oriented=instances)
 
     def probabilities(self, clouds: Sequence[Any]) -> dict[str, np.ndarray]:
         return {"tops": np.array([[0.9, 0.1] if k == 0 else [0.2, 0.8] for k in range(len(clouds))]).reshape(-1, 2)}
