@@ -1,0 +1,83 @@
+"""Edges of a depth image: steps, where one surface ends before another, and folds, where two surfaces meet at a dent.
+
+Both are found by extrapolation. In inverse depth a plane is linear, so the value two pixels after an edge is compared
+with that extrapolated from two and six pixels before it, and the other way round. At a step the two differences have
+opposite signs; at a fold both are positive, since both surfaces bend towards the camera.
+"""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from thor2_jax.segmentation.pixels import Mask, components, nearest_known
+from thor2_jax.segmentation.planes import DepthImage
+
+__all__ = ["STRIDE", "depth_edges"]
+
+STRIDE = 2
+"""Every second pixel of every second row is used."""
+
+STEP = (0.006, 0.010)
+"""Least step: the first in metres, plus the second times the squared depth in metres."""
+
+NARROW = 0.4
+"""Least share of a step between the two neighbours of a pixel."""
+
+LEAST_EDGE = 8
+"""Smaller connected groups of step pixels are noise."""
+
+GAP = 2.0
+"""Steepest slope of a surface across a gap without depth. Shadows of the projector beside a step are narrower."""
+
+BEND = 0.8
+"""Least change of slope at a fold."""
+
+NEAR, FAR = 2, 6
+"""Pixels between an edge and the values that are extrapolated."""
+
+
+def depth_edges(depth: DepthImage) -> tuple[Mask, Mask]:
+    """Return the steps and the folds of a depth image.
+
+    Returns:
+        Steps and folds, [ceil(H / 2), ceil(W / 2)] each.
+    """
+    known = depth.valid[::STRIDE, ::STRIDE]
+    if not known.any():
+        return np.zeros(known.shape, bool), np.zeros(known.shape, bool)
+    inverse = depth.inverse[::STRIDE, ::STRIDE].ravel()[nearest_known(known)]
+    inverse = np.asarray(cv2.medianBlur(inverse, 5))
+    unknown = np.ascontiguousarray(~known).view(np.uint8)
+    gap = np.asarray(cv2.dilate(cv2.distanceTransform(unknown, cv2.DIST_L2, 3), np.ones((3, 3), np.uint8)))
+    z = 1 / inverse
+    z2 = z * z
+    pixel = np.float32(STRIDE * depth.pixel_size)
+    least = STEP[0] + STEP[1] * z2
+    least_step = least + (2 * GAP * pixel) * gap * z
+    least_fold = least + (2 * NEAR * BEND * pixel) * z + gap
+    steps, folds = np.zeros(z.shape, bool), np.zeros(z.shape, bool)
+    for along_rows in (True, False):
+        before, after, difference = (_filter(inverse, kernel, along_rows) * z2 for kernel in _kernels())
+        smaller = np.minimum(np.abs(before), np.abs(after))
+        opposite = (before > 0) != (after > 0)
+        steps |= (smaller > least_step) & opposite & (np.abs(difference) > NARROW * least_step)
+        folds |= np.minimum(before, after) > least_fold
+    numbers, sizes = components(steps, connectivity=8)
+    return (sizes >= LEAST_EDGE)[numbers], folds
+
+
+def _kernels() -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """Return kernels: the value after a pixel minus its extrapolation, the same from the other side, a difference."""
+    forward = np.zeros(2 * FAR + 1, np.float32)
+    slope = 2 * NEAR / (FAR - NEAR)
+    forward[FAR + NEAR] = 1
+    forward[FAR - NEAR] = -1 - slope
+    forward[0] = slope
+    return forward, forward[::-1].copy(), np.array([-1, 0, 1], np.float32)
+
+
+def _filter(image: NDArray[np.float32], kernel: NDArray[np.float32], along_rows: bool) -> NDArray[np.float32]:
+    """Correlate with a kernel along rows or columns, averaged over three pixels across."""
+    average = np.full(3, 1 / 3, np.float32)
+    kernels = (kernel, average) if along_rows else (average, kernel)
+    return np.asarray(cv2.sepFilter2D(image, cv2.CV_32F, *kernels))

@@ -1,0 +1,193 @@
+"""What stands or lies on a plane: evidence from the height over the plane and from the colour beside the plane's."""
+
+import dataclasses
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from thor2_jax.segmentation.pixels import Mask, components, grow, open_round, pixel_mask, shrink
+from thor2_jax.segmentation.planes import DepthImage, Plane
+
+__all__ = ["FLAT", "UNIT", "Evidence", "find_foreground"]
+
+HEIGHT = (0.006, 0.005)
+"""Least height of a thing over its plane: the first in metres, plus the second times the squared depth in metres."""
+
+FLAT = 0.03
+"""Height, metres, below which depth at the border of a thing is not trusted where the colour is the plane's."""
+
+COARSE = 4
+"""Pixels of the image in a pixel of the coarse image of the plane's colour, in each direction."""
+
+WINDOW = 25
+"""Coarse pixels, in each direction, that the colour of the plane is averaged over."""
+
+SHIFT = 12
+"""Distance, coarse pixels, of the neighbouring windows, of which the most similar one counts at borders of colours."""
+
+OUTLIER = 30.0
+"""Least difference of a coarse pixel that is no part of the plane, sum over the channels."""
+
+LEAST_PLANE = 0.04
+"""Least share of a window that the plane fills, or the plane's colour is unknown there."""
+
+DIFFERENCE = 22.0
+"""Least colour difference, in levels of 8 bits, between a thing and the plane."""
+
+NOISE = 3.0
+"""Least colour difference between a thing and the plane, as a multiple of the mean difference of the plane's pixels."""
+
+DARKER, LIGHTER = 0.35, 0.5
+"""Weights of differences in brightness: shadows and highlights are less of a sign than another hue."""
+
+UNIT = 40
+"""`Evidence.contrast` of a pixel with the least colour difference of a thing; 8 bits end at about six times as much."""
+
+SMOOTH = 0.3
+"""Largest change of contrast, in units, between neighbours in a smooth part of the plane, such as a soft shadow."""
+
+LARGEST_SMOOTH = 3
+"""Largest contrast, in units, of a soft shadow or a highlight."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Evidence:
+    """What height and colour say of each pixel; every field is an image [H, W].
+
+    Attributes:
+        heights: float32, metres over the support; 0 where depth is missing.
+        high: pixels that are above a plane.
+        contrast: uint8, colour difference to the support, `UNIT` where it is just noticeable.
+        colored: pixels on the support, or without depth before it, whose colour is not the support's.
+        plain: pixels whose colour is the support's, including soft shadows and highlights.
+        region: pixels in the convex hull of the support.
+    """
+
+    heights: NDArray[np.float32]
+    high: Mask
+    contrast: NDArray[np.uint8]
+    colored: Mask
+    plain: Mask
+    region: Mask
+
+
+def find_foreground(color: NDArray[np.uint8], depth: DepthImage, planes: list[Plane]) -> Evidence:
+    """Return the evidence for things on the planes, of which the first is the support.
+
+    Args:
+        color: [H, W, 3] uint8, sRGB, a little blurred.
+        depth: the depth image.
+        planes: at least one plane.
+    """
+    least = HEIGHT[1] * depth.z2
+    least += HEIGHT[0]
+    heights = planes[0].heights(depth)
+    on_support = (np.abs(heights) <= least) & depth.valid
+    high = (heights > least) & depth.valid
+    for plane in planes[1:]:
+        others = plane.heights(depth)
+        high = (high & (np.abs(others) > least)) | ((others > least) & ~on_support & depth.valid)
+    contrast, known = _color_contrast(color, on_support)
+    region = shrink(planes[0].region(depth.z.shape), 5)
+    low = ((heights < FLAT + 0.02) | ~depth.valid) & region & known
+    gradient = np.asarray(cv2.morphologyEx(contrast, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)))
+    smooth = pixel_mask(cv2.erode((low & (gradient < SMOOTH * UNIT)).view(np.uint8), np.ones((2, 2), np.uint8)))
+    plain = _plain_parts(smooth, (contrast < UNIT) & on_support) & (contrast < LARGEST_SMOOTH * UNIT)
+    beside = on_support | (~depth.valid & region)
+    colored = open_round(beside & known & (contrast > UNIT) & ~plain)
+    return Evidence(heights, open_round(high), contrast, colored, plain, region)
+
+
+def _plain_parts(smooth: Mask, like_plane: Mask) -> Mask:
+    """Return the smooth parts of the image of which most pixels have the plane's colour, grown by a pixel.
+
+    Shadows and highlights are connected to the plane without an edge; things are not.
+    """
+    numbers, sizes = components(smooth)
+    plain = np.bincount(numbers[like_plane], minlength=len(sizes)) > 0.5 * sizes
+    plain[0] = False
+    return grow(plain[numbers], 3)
+
+
+def _color_contrast(color: NDArray[np.uint8], plane: Mask) -> tuple[NDArray[np.uint8], Mask]:
+    """Compare each pixel with the pixels of the plane around it.
+
+    Returns:
+        `Evidence.contrast`, and the pixels around which there is enough of the plane.
+    """
+    height, width = plane.shape
+    around, window_share, share = _plane_color(color, plane)
+    length = np.sqrt((around * around).sum(axis=2)) + 1e-3
+    direction = cv2.resize(around / length[..., None], (width, height), interpolation=cv2.INTER_LINEAR)
+    reference = cv2.resize(length, (width, height), interpolation=cv2.INTER_LINEAR)
+    pixels = color.astype(np.float32)
+    # A shadow changes the length of a colour, not its direction.
+    ones = np.ones((1, 3), np.float32)
+    along = np.asarray(cv2.transform(cv2.multiply(pixels, direction), ones))
+    across = np.asarray(cv2.transform(cv2.multiply(pixels, pixels), ones))
+    across -= along * along
+    brightness = along - reference
+    brightness *= np.where(brightness < 0, np.float32(DARKER), np.float32(LIGHTER))
+    brightness *= brightness
+    across += brightness
+    difference = np.sqrt(np.maximum(across, 0, out=across), out=across)
+    size = (share.shape[1], share.shape[0])
+    noise = cv2.resize(np.minimum(difference, 60) * plane, size, interpolation=cv2.INTER_AREA)
+    noise = np.asarray(cv2.blur(noise * (share > 0), (WINDOW, WINDOW))) / (window_share + 1e-4)
+    least = np.maximum(DIFFERENCE, NOISE * noise)
+    scale = cv2.resize((UNIT / least).astype(np.float32), (width, height), interpolation=cv2.INTER_NEAREST)
+    contrast = np.asarray(cv2.multiply(difference, scale, dtype=cv2.CV_8U), np.uint8)
+    known = cv2.resize(
+        (window_share > LEAST_PLANE).view(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST
+    )
+    return contrast, pixel_mask(known)
+
+
+def _plane_color(
+    color: NDArray[np.uint8], plane: Mask
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """Return, for coarse pixels [h, w]: the colour [h, w, 3] of the plane around, and the share of the plane.
+
+    The first share is that of the window, the second that of the pixel itself.
+    """
+    height, width = plane.shape
+    size, window = (-(-width // COARSE), -(-height // COARSE)), (WINDOW, WINDOW)
+    shown = np.asarray(cv2.resize(color, size, interpolation=cv2.INTER_AREA)).astype(np.float32)
+    masked = cv2.bitwise_and(color, color, mask=plane.view(np.uint8))
+    total = np.asarray(cv2.resize(masked, size, interpolation=cv2.INTER_AREA)).astype(np.float32)
+    share = np.asarray(cv2.resize(plane.astype(np.float32), size, interpolation=cv2.INTER_AREA))
+    own = total / np.maximum(share, 0.05)[..., None]
+    for _ in range(2):  # leave out what has another colour than most of the window
+        mean = np.asarray(cv2.blur(total, window)) / (np.asarray(cv2.blur(share, window))[..., None] + 1e-4)
+        off = _channel_sum(own, mean)
+        full = share > 0.5
+        typical = float(np.median(off[full])) if full.any() else 0.0
+        kept = off < max(OUTLIER, 3 * typical)
+        share, total = share * kept, total * kept[..., None]
+    window_share = np.asarray(cv2.blur(share, window))
+    mean = np.asarray(cv2.blur(total, window)) / (window_share[..., None] + 1e-4)
+    mean[window_share < LEAST_PLANE] = 0
+    return np.asarray(cv2.blur(_most_similar_window(shown, mean), (3, 3))), window_share, share
+
+
+def _most_similar_window(shown: NDArray[np.float32], mean: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return for each coarse pixel the mean of the window, its own or a neighbouring one, that is most like it.
+
+    At the border of two materials, a window holds both.
+    """
+    height, width = shown.shape[:2]
+    padded = np.asarray(cv2.copyMakeBorder(mean, SHIFT, SHIFT, SHIFT, SHIFT, cv2.BORDER_REPLICATE))
+    nearest, least = mean.copy(), _channel_sum(shown, mean)
+    for down in (0, SHIFT, 2 * SHIFT):
+        for right in (0, SHIFT, 2 * SHIFT):
+            other = padded[down : down + height, right : right + width]
+            off = _channel_sum(shown, other)
+            nearer = off < least
+            np.copyto(least, off, where=nearer)
+            np.copyto(nearest, other, where=nearer[..., None])
+    return nearest
+
+
+def _channel_sum(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:
+    return np.asarray(cv2.transform(cv2.absdiff(a, b), np.ones((1, 3), np.float32)))

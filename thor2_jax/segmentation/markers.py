@@ -1,0 +1,112 @@
+"""Pieces by watershed: sure pixels of things and of the background flood what is between them along colour edges.
+
+Depth is not trusted beside its edges and where it is missing; there, the colour image decides.
+"""
+
+import dataclasses
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from thor2_jax.segmentation.foreground import FLAT, UNIT, Evidence
+from thor2_jax.segmentation.pixels import Mask, close, components, grow, resize_mask, shrink
+from thor2_jax.segmentation.planes import DepthImage
+
+__all__ = ["Pieces", "flood"]
+
+LEAST_MARKER = 40
+"""Least pixels of a marker."""
+
+RIM = 7
+"""Width, pixels, of the square within which depth is not trusted at the border of a thing."""
+
+CLEAR = 0.6
+"""Largest contrast, in units, of a pixel that is clearly the plane's."""
+
+BLEEDING = 13
+"""Width, pixels, of the square within which depth of a thing may reach over the plane."""
+
+OUTSIDE = 41
+"""Width, pixels, of the square within which things may reach over pixels without depth beyond the plane."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Pieces:
+    """Parts of the foreground.
+
+    Attributes:
+        labels: [H, W] int32; 0 is background.
+        colored: [n] for each label whether the part was found by its colour alone.
+    """
+
+    labels: NDArray[np.int32]
+    colored: NDArray[np.bool_]
+
+
+def flood(color: NDArray[np.uint8], depth: DepthImage, evidence: Evidence, steps: Mask, folds: Mask) -> Pieces:
+    """Return the pieces between edges.
+
+    Args:
+        color: [H, W, 3] uint8, a little blurred.
+        depth: the depth image.
+        evidence: what height and colour say.
+        steps: [H, W], of depth.
+        folds: [H, W], of depth.
+    """
+    high = evidence.high | (close(evidence.high, 9) & ~depth.valid)
+    like_plane = evidence.plain & (evidence.contrast < CLEAR * UNIT) & (evidence.heights < FLAT)
+    like_plane &= ~shrink(high, BLEEDING)
+    body = high & ~like_plane
+    markers, n_bodies = _body_markers(body, steps | folds)
+    body_numbers, body_sizes = components(body)
+    marked = np.zeros(len(body_sizes), bool)
+    marked[body_numbers[markers > 0]] = True
+    alone = ~marked & (body_sizes >= LEAST_MARKER)  # bodies that are all rim
+    rank = np.cumsum(alone) * alone
+    markers += np.where(rank > 0, rank + n_bodies, 0).astype(np.int32)[body_numbers]
+    n_bodies += int(alone.sum())
+    body = (marked | alone)[body_numbers]
+    colored = close(evidence.colored | (high & ~like_plane & ~body & (evidence.contrast > UNIT)), 3)
+    near = grow(body, 9)
+    numbers, n_colored = _colored_markers(colored & ~near, near, depth.valid)
+    markers = np.where(numbers > 0, numbers + n_bodies, markers)
+    unknown = (near & ~like_plane) | colored | _unknown_without_depth(depth, evidence, body, near | colored, like_plane)
+    markers += 1  # the background is 1, and 0 is flooded
+    markers[(markers == 1) & unknown] = 0
+    flooded = np.asarray(cv2.watershed(color, markers))
+    # Between two pieces, OpenCV leaves a line, which goes to the higher number: to a thing, not to the background.
+    line = flooded < 0
+    grown = np.asarray(cv2.dilate(flooded.astype(np.float32), np.ones((3, 3), np.uint8))).astype(np.int32)
+    labels = np.maximum(np.where(line, grown, flooded) - 1, 0)
+    return Pieces(labels, np.arange(1 + n_bodies + n_colored) > n_bodies)
+
+
+def _body_markers(body: Mask, edges: Mask) -> tuple[NDArray[np.int32], int]:
+    """Return the numbers [H, W] of the inner parts of bodies between edges, and how many there are."""
+    numbers, sizes = components(shrink(body, RIM) & ~edges)
+    kept = sizes >= LEAST_MARKER
+    return (np.cumsum(kept) * kept).astype(np.int32)[numbers], int(kept.sum())
+
+
+def _colored_markers(colored: Mask, near: Mask, valid: Mask) -> tuple[NDArray[np.int32], int]:
+    """Return the numbers [H, W] of things that are found by their colour, and how many there are.
+
+    What is beside a body and has no depth is left to the flood.
+    """
+    numbers, sizes = components(colored, connectivity=8)
+    n_valid = np.bincount(numbers[valid], minlength=len(sizes))
+    beside = np.zeros(len(sizes), bool)
+    beside[numbers[grow(near, 3)]] = True
+    kept = (sizes >= LEAST_MARKER) & (~beside | (n_valid > 0.5 * sizes))
+    return (np.cumsum(kept) * kept).astype(np.int32)[numbers], int(kept.sum())
+
+
+def _unknown_without_depth(
+    depth: DepthImage, evidence: Evidence, body: Mask, things: Mask, like_plane: Mask
+) -> Mask:
+    """Return pixels without depth that may belong to a thing."""
+    wide = resize_mask(grow(body[::4, ::4], OUTSIDE // 4), body.shape)
+    beside = grow(things, 9) & ~like_plane
+    colored = (evidence.contrast > UNIT) & ~evidence.plain & evidence.region
+    return ~depth.valid & ((~evidence.region & wide) | beside | colored)

@@ -1,0 +1,194 @@
+"""Pieces that belong together: neighbours without an edge of depth between them, and both sides of hollow things."""
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thor2_jax.segmentation.foreground import Evidence
+from thor2_jax.segmentation.markers import Pieces
+from thor2_jax.segmentation.pixels import Mask, grow
+from thor2_jax.segmentation.planes import DepthImage
+
+__all__ = ["merge_pieces"]
+
+LEAST_CONTACT = 0.12
+"""Least share of the border of the smaller piece that two pieces of one thing have in common."""
+
+EDGE = 0.5
+"""Least share of a common border that is a step, for two things."""
+
+FOLD = 0.6
+"""Least share of a common border that is a step or a fold, for two things of different colours."""
+
+CONTRAST = 60.0
+"""Least colour difference across a fold between two things, sum over the channels."""
+
+PART = 90.0
+"""Largest colour difference between a body and a part of it that was found by its colour."""
+
+TALL, LOW = 0.035, 0.02
+"""Heights, metres: a tall piece reaches the first; between pieces that stay below the second, depth has no steps."""
+
+HOLLOW_COLOR = 120.0
+"""Largest difference of the mean colours of the two sides of a hollow thing, sum over the channels."""
+
+SAME_HEIGHT = 0.015
+"""Largest difference of the heights, metres, of the two sides of a hollow thing."""
+
+BEFORE, AFTER = 3, 4
+"""Pixels beside a border at which the two pieces are compared."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Borders:
+    """Pixels of the borders between pieces [P], and pairs of neighbouring pieces [N], the smaller number first.
+
+    Attributes:
+        first: piece of each border pixel.
+        second: the other one.
+        height: height of the second piece beside each border pixel; 0 if missing.
+        pair: pair of each border pixel.
+        pairs: [N, 2] the pieces of each pair.
+        length: [N] border pixels.
+        step: [N] share of them at a step.
+        fold: [N] share of them at a step or a fold.
+        contrast: [N] mean colour difference across, sum over the channels.
+        behind: [N] share of them where the second piece is farther than the first, less where it is nearer.
+        perimeter: border pixels of each piece.
+    """
+
+    first: NDArray[np.int32]
+    second: NDArray[np.int32]
+    height: NDArray[np.float32]
+    pairs: NDArray[np.int64]
+    length: NDArray[np.intp]
+    step: NDArray[np.float64]
+    fold: NDArray[np.float64]
+    contrast: NDArray[np.float64]
+    behind: NDArray[np.float64]
+    perimeter: NDArray[np.float64]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Shapes:
+    """Statistics of pieces [n], of every second pixel in each direction: which are tall or low, and mean colours."""
+
+    tall: NDArray[np.bool_]
+    low: NDArray[np.bool_]
+    color: NDArray[np.float64]
+
+
+def merge_pieces(
+    pieces: Pieces, color: NDArray[np.uint8], depth: DepthImage, evidence: Evidence, steps: Mask, folds: Mask
+) -> NDArray[np.int32]:
+    """Return the labels [H, W] of pieces after merging, not consecutive; arguments as of `flood`."""
+    labels = pieces.labels
+    n = len(pieces.colored)
+    borders = _find_borders(labels, n, color, depth, evidence, steps, folds)
+    shapes = _measure(labels, n, color, evidence)
+    parent = list(range(n))
+
+    def root(piece: int) -> int:
+        while parent[piece] != piece:
+            piece = parent[piece]
+        return piece
+
+    for k, (a, b) in enumerate(borders.pairs.tolist()):
+        if a == 0:
+            continue
+        if _belong_together(k, a, b, borders, shapes, pieces.colored) or (
+            shapes.tall[a] and shapes.tall[b] and _is_hollow(k, a, b, borders, shapes, labels, evidence)
+        ):
+            parent[max(root(a), root(b))] = min(root(a), root(b))
+    return np.array([root(piece) for piece in range(n)], np.int32)[labels]
+
+
+def _belong_together(
+    k: int, a: int, b: int, borders: _Borders, shapes: _Shapes, colored: NDArray[np.bool_]
+) -> bool:
+    if colored[a] != colored[b] and (shapes.tall[a] or shapes.tall[b]):
+        return bool(borders.contrast[k] < PART)
+    if shapes.low[a] and shapes.low[b]:
+        return True
+    if borders.length[k] < LEAST_CONTACT * min(borders.perimeter[a], borders.perimeter[b]):
+        return False
+    return bool(borders.step[k] < EDGE and not (borders.fold[k] > FOLD and borders.contrast[k] > CONTRAST))
+
+
+def _is_hollow(
+    k: int, a: int, b: int, borders: _Borders, shapes: _Shapes, labels: NDArray[np.int32], evidence: Evidence
+) -> bool:
+    """Return whether one piece is the inner side of the other, as in a mug.
+
+    It lies behind, has about its colour, width and height, and meets the background at its upper rim only.
+    """
+    if abs(borders.behind[k]) < 0.2 or np.abs(shapes.color[a] - shapes.color[b]).sum() > HOLLOW_COLOR:
+        return False
+    inner, outer = (b, a) if borders.behind[k] > 0 else (a, b)
+    inner_height, inner_width = _size(inner, labels, evidence)
+    outer_height, outer_width = _size(outer, labels, evidence)
+    rim = borders.height[(borders.first == 0) & (borders.second == inner) & (borders.height != 0)]
+    return bool(
+        abs(inner_height - outer_height) < SAME_HEIGHT
+        and borders.length[k] > 0.6 * inner_width
+        and inner_width > 0.6 * outer_width
+        and len(rim) > 0
+        and np.percentile(rim, 20) > 0.7 * inner_height
+    )
+
+
+def _size(piece: int, labels: NDArray[np.int32], evidence: Evidence) -> tuple[float, int]:
+    """Return the height, metres, and the width, pixels, of a piece."""
+    rows, columns = np.nonzero(labels[::2, ::2] == piece)
+    if len(rows) == 0:
+        return 0.0, 0
+    heights = evidence.heights[::2, ::2][rows, columns]
+    return float(np.percentile(heights, 97)), 2 * int(np.ptp(columns) + 1)
+
+
+def _measure(labels: NDArray[np.int32], n: int, color: NDArray[np.uint8], evidence: Evidence) -> _Shapes:
+    every = labels[::2, ::2].ravel()
+    things = np.flatnonzero(every)
+    every = every[things]
+    heights = evidence.heights[::2, ::2].ravel()[things]
+    pixels = color[::2, ::2].reshape(-1, 3)[things]
+    size = np.maximum(np.bincount(every, minlength=n), 1)
+    tall = np.bincount(every[heights > TALL], minlength=n) > 0.1 * size
+    low = np.bincount(every[heights > LOW], minlength=n) < 0.1 * size
+    mean = np.stack([np.bincount(every, pixels[:, c], minlength=n) / size for c in range(3)], axis=1)
+    return _Shapes(tall, low, mean)
+
+
+def _find_borders(
+    labels: NDArray[np.int32],
+    n: int,
+    color: NDArray[np.uint8],
+    depth: DepthImage,
+    evidence: Evidence,
+    steps: Mask,
+    folds: Mask,
+) -> _Borders:
+    flat, pixels = labels.ravel(), color.reshape(-1, 3)
+    z, heights = depth.z.ravel(), evidence.heights.ravel()
+    near_step = grow(steps, 7)
+    near_edge = (near_step | grow(folds, 5)).ravel()
+    near_step = near_step.ravel()
+    parts = []
+    for step in (1, labels.shape[1]):
+        here = np.flatnonzero(flat[:-step] != flat[step:])
+        a, b = flat[here], flat[here + step]
+        swap = a > b
+        before, after = np.maximum(here - BEFORE * step, 0), np.minimum(here + AFTER * step, flat.size - 1)
+        difference = np.abs(pixels[before].astype(np.int16) - pixels[after]).sum(axis=1)
+        at_a, at_b = np.where(swap, after, before), np.where(swap, before, after)
+        behind = np.where((z[at_a] > 0) & (z[at_b] > 0), np.sign(z[at_b] - z[at_a]), 0)
+        a, b = np.minimum(a, b), np.maximum(a, b)
+        parts.append((a, b, heights[at_b], near_step[here], near_edge[here], difference, behind))
+    a, b, height, at_step, at_edge, difference, behind = (np.concatenate(values) for values in zip(*parts, strict=True))
+    keys, pair = np.unique(a.astype(np.int64) * n + b, return_inverse=True)
+    length = np.bincount(pair, minlength=len(keys))
+    pairs = np.stack(np.divmod(keys, n), axis=1)
+    perimeter = np.bincount(pairs.ravel(), np.repeat(length, 2), minlength=n)
+    means = (np.bincount(pair, values, minlength=len(keys)) / length for values in (at_step, at_edge, difference, behind))
+    return _Borders(a, b, height, pairs, length, *means, perimeter)

@@ -1,0 +1,69 @@
+"""Operations on images of pixels, with the types of NumPy; masks are boolean images [H, W]."""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Mask", "close", "components", "grow", "nearest_known", "open_round", "pixel_mask", "resize_mask", "shrink"]
+
+Mask = NDArray[np.bool_]
+
+
+def _bytes(mask: Mask) -> NDArray[np.uint8]:
+    return np.ascontiguousarray(mask).view(np.uint8)
+
+
+def pixel_mask(image: object) -> Mask:
+    """Return an image of zeros and ones of OpenCV as a mask."""
+    return np.asarray(image, np.uint8).view(np.bool_)
+
+
+def grow(mask: Mask, size: int) -> Mask:
+    """Return the pixels with a pixel of the mask in the square of `size` pixels around them."""
+    return pixel_mask(cv2.dilate(_bytes(mask), np.ones((size, size), np.uint8)))
+
+
+def shrink(mask: Mask, size: int) -> Mask:
+    """Return the pixels whose square of `size` pixels lies in the mask; pixels outside the image do not count."""
+    return pixel_mask(cv2.erode(_bytes(mask), np.ones((size, size), np.uint8)))
+
+
+def open_round(mask: Mask) -> Mask:
+    """Return the mask without what a cross of three pixels does not fit in."""
+    return pixel_mask(cv2.morphologyEx(_bytes(mask), cv2.MORPH_OPEN, _cross()))
+
+
+def close(mask: Mask, size: int) -> Mask:
+    """Return the mask with gaps of less than `size` pixels closed."""
+    return pixel_mask(cv2.morphologyEx(_bytes(mask), cv2.MORPH_CLOSE, np.ones((size, size), np.uint8)))
+
+
+def resize_mask(mask: Mask, shape: tuple[int, ...]) -> Mask:
+    """Return the mask in another size [H, W], by the nearest pixel."""
+    return pixel_mask(cv2.resize(_bytes(mask), (shape[1], shape[0]), interpolation=cv2.INTER_NEAREST))
+
+
+def components(mask: Mask, connectivity: int = 4) -> tuple[NDArray[np.int32], NDArray[np.intp]]:
+    """Return the numbers [H, W] of the connected components, 0 outside the mask, and their sizes in pixels.
+
+    The size with the number 0 is 0.
+    """
+    count, numbers = cv2.connectedComponents(_bytes(mask), connectivity=connectivity)
+    numbers = np.asarray(numbers, np.int32)
+    sizes = np.bincount(numbers.ravel(), minlength=count)
+    sizes[0] = 0
+    return numbers, sizes
+
+
+def nearest_known(known: Mask) -> NDArray[np.intp]:
+    """Return the flat index [H, W] of the nearest pixel of a mask, which has at least one."""
+    unknown = _bytes(~known)
+    _, numbers = cv2.distanceTransformWithLabels(unknown, cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL)
+    numbers = np.asarray(numbers)
+    index = np.zeros(int(numbers.max()) + 1, np.intp)
+    index[numbers[known]] = np.flatnonzero(known.ravel())
+    return index[numbers]
+
+
+def _cross() -> NDArray[np.uint8]:
+    return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3)), np.uint8)

@@ -1,0 +1,208 @@
+"""Dominant planes of a depth image: the table, and a floor or a wall behind it.
+
+A plane is linear in inverse depth, 1 / z = a x + b y + c for the ray (x, y, 1) of a pixel, and the error of a
+structured-light or stereo camera has about the same size everywhere in 1 / z. Planes are therefore found, refined and
+subtracted there. The refinement has second-order terms, which absorb the distortion of the depth sensor.
+"""
+
+import dataclasses
+import math
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from thor2_jax.recognition.frames import Intrinsics
+from thor2_jax.segmentation.pixels import Mask, pixel_mask
+
+__all__ = ["DepthImage", "Plane", "dominant_planes"]
+
+NEAREST, FARTHEST = 0.26, 2.5
+"""Range of depth, metres, that the recognizer reads."""
+
+MAX_PLANES = 4
+HYPOTHESES = 200
+SCORED_POINTS = 1000
+"""Points that the hypotheses of a plane are scored on."""
+
+REFINED_POINTS = 5000
+"""Points that a plane is refined on."""
+
+LEAST_POINTS = 50
+TOLERANCE = (0.003, 0.004)
+"""Largest distance of an inlier: the first in metres, plus the second times the squared depth in metres."""
+
+LEAST_SHARE = 0.05
+"""Least share of the points that lie on a dominant plane."""
+
+LEAST_SHARE_OF_LARGEST = 0.2
+LEAST_EXTENT = 0.23
+"""Least extent, metres, across the longest direction of a dominant plane after the largest: sides of boxes have less."""
+
+LEAST_FILLING = 0.3
+"""Least share of the hull of such a plane that its inliers fill: tops of several things in one plane fill less."""
+
+LEAST_SHARE_OF_SUPPORT = 0.08
+
+
+class DepthImage:
+    """The usable part of a depth image.
+
+    Attributes:
+        z: [H, W] float32, metres; 0 where depth is missing or outside `NEAREST` to `FARTHEST`.
+        z2: [H, W] float32, squares of `z`.
+        inverse: [H, W] float32, 1 / z; 0 where `z` is.
+        valid: [H, W], where `z` is not 0.
+        x: [W] float32, of the rays (x, y, 1) of the pixels.
+        y: [H] float32.
+        pixel_size: width of a pixel at a depth of one metre, metres.
+    """
+
+    def __init__(self, depth_m: NDArray[np.float32], intrinsics: Intrinsics) -> None:
+        """Prepare `depth_m` [H, W], metres, of a camera."""
+        self.valid: Mask = (depth_m >= NEAREST) & (depth_m <= FARTHEST)
+        self.z = depth_m * self.valid
+        self.z2 = self.z * self.z
+        self.inverse = np.zeros_like(self.z)
+        np.divide(1, self.z, out=self.inverse, where=self.valid)
+        height, width = self.z.shape
+        self.x = ((np.arange(width) - intrinsics.cx) / intrinsics.fx).astype(np.float32)
+        self.y = ((np.arange(height) - intrinsics.cy) / intrinsics.fy).astype(np.float32)
+        self.pixel_size = 2 / (intrinsics.fx + intrinsics.fy)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Plane:
+    """A dominant plane.
+
+    Attributes:
+        coefficients: [6], of 1 / z = a x + b y + c + d x^2 + e x y + f y^2.
+        hull: [n, 2] int32, columns and rows of the convex hull of its inliers.
+        share: share of the points that lie on the plane.
+        distance: median depth of its inliers, metres.
+    """
+
+    coefficients: NDArray[np.float64]
+    hull: NDArray[np.int32]
+    share: float
+    distance: float
+
+    def heights(self, depth: DepthImage) -> NDArray[np.float32]:
+        """Return the distance [H, W] of each point to the plane, metres, positive towards the camera; 0 if missing."""
+        a, b, c, d, e, f = (float(value) for value in self.coefficients)
+        x, y = depth.x, depth.y[:, None]
+        heights = (np.float32(e) * y + np.float32(a)) * x
+        heights += d * x * x
+        heights += b * y + f * y * y + c
+        np.subtract(depth.inverse, heights, out=heights)
+        heights *= depth.z
+        # z times the difference in 1 / z, divided by the length of (a, b, c), is the distance to the plane.
+        heights *= np.float32(1 / math.hypot(a, b, c))
+        return heights
+
+    def region(self, shape: tuple[int, ...]) -> Mask:
+        """Return which pixels [H, W] lie in the hull."""
+        return pixel_mask(cv2.fillConvexPoly(np.zeros(shape, np.uint8), self.hull, 1))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Points:
+    """Points of a grid of pixels, `step` pixels apart.
+
+    They have positions [N], terms [N, 6] of the coefficients, inverse depth [N] and tolerance [N].
+    """
+
+    step: int
+    columns: NDArray[np.intp]
+    rows: NDArray[np.intp]
+    terms: NDArray[np.float64]
+    inverse: NDArray[np.float64]
+    tolerance: NDArray[np.float64]
+
+
+def dominant_planes(depth: DepthImage) -> list[Plane]:
+    """Find up to `MAX_PLANES` planes by RANSAC; equal depth has equal planes.
+
+    Returns:
+        The planes, the likely support of the objects first: the nearest plane of some size.
+    """
+    points = _grid_points(depth)
+    total = len(points.inverse)
+    left = np.arange(total)
+    rng = np.random.default_rng(0)
+    planes: list[Plane] = []
+    for _ in range(2 * MAX_PLANES):
+        if len(left) < max(LEAST_POINTS, LEAST_SHARE * total) or len(planes) == MAX_PLANES:
+            break
+        hypothesis = _best_hypothesis(points, left, rng)
+        if hypothesis is None:
+            break
+        inliers, coefficients = _refine(hypothesis, points, left)
+        share = len(inliers) / total
+        if share < (LEAST_SHARE if planes else LEAST_SHARE_OF_LARGEST):
+            break
+        pixels = np.stack([points.columns[inliers], points.rows[inliers]], axis=1).astype(np.int32)
+        hull = np.asarray(cv2.convexHull(pixels), np.int32)[:, 0]
+        filling = len(inliers) * points.step**2 / max(cv2.contourArea(hull), 1.0)
+        if not planes or (filling >= LEAST_FILLING and _least_extent(points, inliers) >= LEAST_EXTENT):
+            planes.append(Plane(coefficients, hull, share, float(1 / np.median(points.inverse[inliers]))))
+        near = np.abs(points.terms[left] @ coefficients - points.inverse[left]) < 2 * points.tolerance[left]
+        left = left[~near]
+    support = min((p for p in planes if p.share >= LEAST_SHARE_OF_SUPPORT), key=lambda p: p.distance, default=None)
+    return sorted(planes, key=lambda p: p is not support)
+
+
+def _grid_points(depth: DepthImage) -> _Points:
+    height, width = depth.z.shape
+    step = max(1, round(math.sqrt(height * width / REFINED_POINTS)))
+    rows = np.arange((height - 1) % step // 2, height, step)
+    columns = np.arange((width - 1) % step // 2, width, step)
+    inverse = depth.inverse[np.ix_(rows, columns)].astype(np.float64)
+    row, column = np.nonzero(inverse)
+    w = inverse[row, column]
+    x, y = depth.x[columns[column]].astype(np.float64), depth.y[rows[row]].astype(np.float64)
+    terms = np.stack([x, y, np.ones_like(x), x * x, x * y, y * y], axis=1)
+    return _Points(step, columns[column], rows[row], terms, w, TOLERANCE[0] * w * w + TOLERANCE[1])
+
+
+def _best_hypothesis(
+    points: _Points, left: NDArray[np.intp], rng: np.random.Generator
+) -> NDArray[np.float64] | None:
+    """Return the plane [3] through three random points of `left` that is near the most of them."""
+    triples = left[rng.integers(0, len(left), (HYPOTHESES, 3))]
+    matrices = points.terms[triples, :3]
+    usable = np.abs(np.linalg.det(matrices)) > 1e-4
+    if not usable.any():
+        return None
+    planes = np.linalg.solve(matrices[usable], points.inverse[triples[usable]][..., None])[..., 0]
+    scored = left[:: max(1, len(left) // SCORED_POINTS)]
+    x, y = points.terms[scored, 0], points.terms[scored, 1]
+    # Not a matrix product, for which threads would be started.
+    misses = planes[:, :1] * x
+    misses += planes[:, 1:2] * y
+    misses += planes[:, 2:]
+    misses -= points.inverse[scored]
+    return planes[int((np.abs(misses, out=misses) < points.tolerance[scored]).sum(axis=1).argmax())]
+
+
+def _refine(
+    hypothesis: NDArray[np.float64], points: _Points, left: NDArray[np.intp]
+) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    """Return the inliers of `left` and the coefficients [6] that fit them by least squares."""
+    coefficients = np.concatenate([hypothesis, np.zeros(3)])
+    terms, inverse, tolerance = points.terms[left], points.inverse[left], points.tolerance[left]
+    near = np.ones(len(left), bool)
+    for n_terms in (3, 3, 3, 6, 6):
+        near = np.abs(terms @ coefficients - inverse) < tolerance
+        if near.sum() < LEAST_POINTS // 2:
+            break
+        matrix = terms[near, :n_terms]
+        fitted = np.linalg.solve(matrix.T @ matrix + 1e-9 * np.eye(n_terms), matrix.T @ inverse[near])
+        coefficients = np.concatenate([fitted, np.zeros(6 - n_terms)])
+    return left[near], coefficients
+
+
+def _least_extent(points: _Points, inliers: NDArray[np.intp]) -> float:
+    """Return the extent, metres, of a flat set of points across its longest direction, as of a uniform rectangle."""
+    positions = points.terms[inliers, :3] / points.inverse[inliers, None]
+    return float(np.sqrt(12 * max(np.linalg.eigvalsh(np.cov(positions.T))[1], 0.0)))

@@ -1,0 +1,117 @@
+"""Segmentation of things on a table, or another plane, without learned weights.
+
+labels = segment_table(frame)          # [H, W] int32, 0 is background
+
+Dominant planes are found and removed; what rises above them, or lies on one and has another colour, is grouped into
+pieces, which are divided at depth steps, folds and colour edges.
+"""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from thor2_jax.recognition.frames import Intrinsics, RGBDFrame
+from thor2_jax.segmentation.depth_edges import depth_edges
+from thor2_jax.segmentation.foreground import find_foreground
+from thor2_jax.segmentation.markers import flood
+from thor2_jax.segmentation.merging import merge_pieces
+from thor2_jax.segmentation.pixels import Mask, components, grow, resize_mask
+from thor2_jax.segmentation.planes import DepthImage, Plane, dominant_planes
+
+__all__ = ["segment_table"]
+
+WORKING_SIZE = 640
+"""Larger side, pixels, of the images that are segmented; larger images are subsampled."""
+
+LEAST_PIXELS = 60
+LEAST_AREA, LARGEST_AREA = 2e-4, 0.15
+"""Area of a thing, square metres."""
+
+LARGEST_SHARE = 0.25
+"""Largest share of the image that a thing fills."""
+
+LEAST_SUPPORT = 0.3
+"""Least share of the pixels of a thing that lie in the hull of a plane."""
+
+HOLE = 0.3
+"""Largest hole in a thing, as a share of it, that is filled, for instance the handle of scissors."""
+
+
+def segment_table(frame: RGBDFrame) -> NDArray[np.int32]:
+    """Segment what stands or lies on the dominant planes of a frame; its labels are not read.
+
+    Args:
+        frame: colour, depth and intrinsics.
+
+    Returns:
+        Labels [H, W]: 0 is background, and the things are numbered from 1 without a gap in the order of their first
+        pixels. Without a dominant plane, everything is background. Equal frames get equal labels.
+    """
+    stride = max(1, round(max(frame.depth.shape) / WORKING_SIZE))
+    color = np.ascontiguousarray(frame.color[::stride, ::stride])
+    depth = DepthImage(np.ascontiguousarray(frame.depth_m[::stride, ::stride]), _subsampled(frame.intrinsics, stride))
+    labels = _segment(color, depth)
+    if stride > 1:
+        labels = labels.repeat(stride, axis=0).repeat(stride, axis=1)
+    height, width = frame.depth.shape
+    return labels[:height, :width]
+
+
+def _subsampled(camera: Intrinsics, stride: int) -> Intrinsics:
+    values = (camera.fx, camera.fy, camera.cx, camera.cy)
+    return Intrinsics(*(value / stride for value in values))
+
+
+def _segment(color: NDArray[np.uint8], depth: DepthImage) -> NDArray[np.int32]:
+    planes = dominant_planes(depth)
+    if not planes:
+        return np.zeros(depth.z.shape, np.int32)
+    color = np.asarray(cv2.GaussianBlur(color, (3, 3), 0), np.uint8)
+    evidence = find_foreground(color, depth, planes)
+    steps, folds = (resize_mask(edges, depth.z.shape) for edges in depth_edges(depth))
+    steps = grow(steps, 3)
+    pieces = flood(color, depth, evidence, steps, folds)
+    labels = merge_pieces(pieces, color, depth, evidence, steps, folds)
+    return _cleaned(labels, depth, planes)
+
+
+def _cleaned(labels: NDArray[np.int32], depth: DepthImage, planes: list[Plane]) -> NDArray[np.int32]:
+    """Return the things among the pieces, without holes and numbered from 1."""
+    region = np.zeros(labels.shape, bool)
+    for plane in planes:
+        region |= plane.region(labels.shape)
+    region = grow(region, 9)
+    cleaned = np.zeros_like(labels)
+    count = 0
+    for label, place in enumerate(ndimage.find_objects(labels), start=1):
+        if place is None:
+            continue
+        mask = _largest_part(labels[place] == label)
+        if _is_thing(mask, depth.z[place], depth, region[place], labels.size):
+            count += 1
+            free = (labels[place] == label) | (labels[place] == 0)
+            cleaned[place][_without_holes(mask) & free] = count
+    return cleaned
+
+
+def _is_thing(mask: Mask, z: NDArray[np.float32], depth: DepthImage, region: Mask, n_pixels: int) -> bool:
+    size = int(mask.sum())
+    if not LEAST_PIXELS <= size <= LARGEST_SHARE * n_pixels or region[mask].mean() < LEAST_SUPPORT:
+        return False
+    z = z[mask]
+    z = z[z > 0]
+    distance = float(np.median(z)) if len(z) else 1.0
+    return LEAST_AREA <= size * (distance * depth.pixel_size) ** 2 <= LARGEST_AREA
+
+
+def _largest_part(mask: Mask) -> Mask:
+    numbers, sizes = components(mask, connectivity=8)
+    return numbers == sizes.argmax() if len(sizes) > 2 else mask
+
+
+def _without_holes(mask: Mask) -> Mask:
+    numbers, sizes = components(np.pad(~mask, 1, constant_values=True))
+    sizes[1] = 0  # the outside has the first pixel
+    filled = (sizes > 0) & (sizes < HOLE * mask.sum())
+    return mask | filled[numbers[1:-1, 1:-1]] if filled.any() else mask
