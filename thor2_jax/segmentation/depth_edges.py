@@ -12,10 +12,7 @@ from numpy.typing import NDArray
 from thor2_jax.segmentation.pixels import Mask, components, nearest_known
 from thor2_jax.segmentation.planes import DepthImage
 
-__all__ = ["STRIDE", "depth_edges"]
-
-STRIDE = 2
-"""Every second pixel of every second row is used."""
+__all__ = ["depth_edges"]
 
 STEP = (0.006, 0.010)
 """Least step: the first in metres, plus the second times the squared depth in metres."""
@@ -40,18 +37,18 @@ def depth_edges(depth: DepthImage) -> tuple[Mask, Mask]:
     """Return the steps and the folds of a depth image.
 
     Returns:
-        Steps and folds, [ceil(H / 2), ceil(W / 2)] each.
+        Steps and folds, [H, W] each.
     """
-    known = depth.valid[::STRIDE, ::STRIDE]
+    known = depth.valid
     if not known.any():
         return np.zeros(known.shape, bool), np.zeros(known.shape, bool)
-    inverse = depth.inverse[::STRIDE, ::STRIDE].ravel()[nearest_known(known)]
+    inverse = depth.inverse.ravel()[nearest_known(known)]
     inverse = np.asarray(cv2.medianBlur(inverse, 5))
-    unknown = np.ascontiguousarray(~known).view(np.uint8)
+    unknown = (~known).view(np.uint8)
     gap = np.asarray(cv2.dilate(cv2.distanceTransform(unknown, cv2.DIST_L2, 3), np.ones((3, 3), np.uint8)))
     z = 1 / inverse
     z2 = z * z
-    pixel = np.float32(STRIDE * depth.pixel_size)
+    pixel = np.float32(depth.pixel_size)
     least = STEP[0] + STEP[1] * z2
     least_step = least + (2 * GAP * pixel) * gap * z
     least_fold = least + (2 * NEAR * BEND * pixel) * z + gap

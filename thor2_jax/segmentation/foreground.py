@@ -17,7 +17,7 @@ HEIGHT = (0.006, 0.005)
 FLAT = 0.03
 """Height, metres, below which depth at the border of a thing is not trusted where the colour is the plane's."""
 
-COARSE = 4
+COARSE = 2
 """Pixels of the image in a pixel of the coarse image of the plane's colour, in each direction."""
 
 WINDOW = 25
@@ -89,7 +89,7 @@ def find_foreground(color: NDArray[np.uint8], depth: DepthImage, planes: list[Pl
         others = plane.heights(depth)
         high = (high & (np.abs(others) > least)) | ((others > least) & ~on_support & depth.valid)
     contrast, known = _color_contrast(color, on_support)
-    region = shrink(planes[0].region(depth.z.shape), 5)
+    region = shrink(planes[0].region(depth.z.shape), 3)
     low = ((heights < FLAT + 0.02) | ~depth.valid) & region & known
     gradient = np.asarray(cv2.morphologyEx(contrast, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)))
     smooth = pixel_mask(cv2.erode((low & (gradient < SMOOTH * UNIT)).view(np.uint8), np.ones((2, 2), np.uint8)))

@@ -5,29 +5,28 @@ Depth is not trusted beside its edges and where it is missing; there, the colour
 
 import dataclasses
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.segmentation.foreground import FLAT, UNIT, Evidence
-from thor2_jax.segmentation.pixels import Mask, close, components, grow, resize_mask, shrink
+from thor2_jax.segmentation.pixels import Mask, close, components, grow, shrink, watershed
 from thor2_jax.segmentation.planes import DepthImage
 
 __all__ = ["Pieces", "flood"]
 
-LEAST_MARKER = 40
+LEAST_MARKER = 10
 """Least pixels of a marker."""
 
-RIM = 7
+RIM = 3
 """Width, pixels, of the square within which depth is not trusted at the border of a thing."""
 
 CLEAR = 0.6
 """Largest contrast, in units, of a pixel that is clearly the plane's."""
 
-BLEEDING = 13
+BLEEDING = 7
 """Width, pixels, of the square within which depth of a thing may reach over the plane."""
 
-OUTSIDE = 41
+OUTSIDE = 21
 """Width, pixels, of the square within which things may reach over pixels without depth beyond the plane."""
 
 
@@ -54,7 +53,7 @@ def flood(color: NDArray[np.uint8], depth: DepthImage, evidence: Evidence, steps
         steps: [H, W], of depth.
         folds: [H, W], of depth.
     """
-    high = evidence.high | (close(evidence.high, 9) & ~depth.valid)
+    high = evidence.high | (close(evidence.high, 5) & ~depth.valid)
     like_plane = evidence.plain & (evidence.contrast < CLEAR * UNIT) & (evidence.heights < FLAT)
     like_plane &= ~shrink(high, BLEEDING)
     body = high & ~like_plane
@@ -68,17 +67,13 @@ def flood(color: NDArray[np.uint8], depth: DepthImage, evidence: Evidence, steps
     n_bodies += int(alone.sum())
     body = (marked | alone)[body_numbers]
     colored = close(evidence.colored | (high & ~like_plane & ~body & (evidence.contrast > UNIT)), 3)
-    near = grow(body, 9)
+    near = grow(body, 5)
     numbers, n_colored = _colored_markers(colored & ~near, near, depth.valid)
     markers = np.where(numbers > 0, numbers + n_bodies, markers)
     unknown = (near & ~like_plane) | colored | _unknown_without_depth(depth, evidence, body, near | colored, like_plane)
     markers += 1  # the background is 1, and 0 is flooded
     markers[(markers == 1) & unknown] = 0
-    flooded = np.asarray(cv2.watershed(color, markers))
-    # Between two pieces, OpenCV leaves a line, which goes to the higher number: to a thing, not to the background.
-    line = flooded < 0
-    grown = np.asarray(cv2.dilate(flooded.astype(np.float32), np.ones((3, 3), np.uint8))).astype(np.int32)
-    labels = np.maximum(np.where(line, grown, flooded) - 1, 0)
+    labels = watershed(color, markers) - 1
     return Pieces(labels, np.arange(1 + n_bodies + n_colored) > n_bodies)
 
 
@@ -106,7 +101,7 @@ def _unknown_without_depth(
     depth: DepthImage, evidence: Evidence, body: Mask, things: Mask, like_plane: Mask
 ) -> Mask:
     """Return pixels without depth that may belong to a thing."""
-    wide = resize_mask(grow(body[::4, ::4], OUTSIDE // 4), body.shape)
-    beside = grow(things, 9) & ~like_plane
+    wide = grow(body, OUTSIDE)
+    beside = grow(things, 5) & ~like_plane
     colored = (evidence.contrast > UNIT) & ~evidence.plain & evidence.region
     return ~depth.valid & ((~evidence.region & wide) | beside | colored)

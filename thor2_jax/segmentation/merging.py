@@ -36,7 +36,7 @@ HOLLOW_COLOR = 120.0
 SAME_HEIGHT = 0.015
 """Largest difference of the heights, metres, of the two sides of a hollow thing."""
 
-BEFORE, AFTER = 3, 4
+BEFORE, AFTER = 2, 2
 """Pixels beside a border at which the two pieces are compared."""
 
 
@@ -171,8 +171,8 @@ def _find_borders(
 ) -> _Borders:
     flat, pixels = labels.ravel(), color.reshape(-1, 3)
     z, heights = depth.z.ravel(), evidence.heights.ravel()
-    near_step = grow(steps, 7)
-    near_edge = (near_step | grow(folds, 5)).ravel()
+    near_step = grow(steps, 5)
+    near_edge = (near_step | grow(folds, 3)).ravel()
     near_step = near_step.ravel()
     parts = []
     for step in (1, labels.shape[1]):

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Mask", "close", "components", "grow", "nearest_known", "open_round", "pixel_mask", "resize_mask", "shrink"]
+__all__ = ["Mask", "close", "components", "grow", "local_extremes", "nearest_known", "open_round", "pixel_mask", "shrink", "watershed"]
 
 Mask = NDArray[np.bool_]
 
@@ -38,11 +38,6 @@ def close(mask: Mask, size: int) -> Mask:
     return pixel_mask(cv2.morphologyEx(_bytes(mask), cv2.MORPH_CLOSE, np.ones((size, size), np.uint8)))
 
 
-def resize_mask(mask: Mask, shape: tuple[int, ...]) -> Mask:
-    """Return the mask in another size [H, W], by the nearest pixel."""
-    return pixel_mask(cv2.resize(_bytes(mask), (shape[1], shape[0]), interpolation=cv2.INTER_NEAREST))
-
-
 def components(mask: Mask, connectivity: int = 4) -> tuple[NDArray[np.int32], NDArray[np.intp]]:
     """Return the numbers [H, W] of the connected components, 0 outside the mask, and their sizes in pixels.
 
@@ -63,6 +58,27 @@ def nearest_known(known: Mask) -> NDArray[np.intp]:
     index = np.zeros(int(numbers.max()) + 1, np.intp)
     index[numbers[known]] = np.flatnonzero(known.ravel())
     return index[numbers]
+
+
+def local_extremes(labels: NDArray[np.int32], size: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return the largest and the smallest label [H, W] in the square of `size` pixels around each pixel."""
+    image, square = labels.astype(np.float32), np.ones((size, size), np.uint8)
+    return np.asarray(cv2.dilate(image, square)), np.asarray(cv2.erode(image, square))
+
+
+def watershed(color: NDArray[np.uint8], markers: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Flood pixels with the marker 0 from the others, which are positive, along the edges of a colour image.
+
+    Args:
+        color: [H, W, 3] uint8.
+        markers: [H, W] int32.
+
+    Returns:
+        Markers [H, W] without 0. The line that OpenCV leaves between two regions goes to the higher number.
+    """
+    flooded = np.asarray(cv2.watershed(color, markers.copy()), np.int32)
+    largest = np.asarray(cv2.dilate(flooded.astype(np.float32), np.ones((3, 3), np.uint8)))
+    return np.where(flooded <= 0, np.maximum(largest, 1).astype(np.int32), flooded)
 
 
 def _cross() -> NDArray[np.uint8]:
