@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from thor2_jax.recognition.answers import Recognition
     from thor2_jax.recognition.frames import Intrinsics, RGBDFrame, read_frame
     from thor2_jax.recognizer import Recognizer
+    from thor2_jax.segmentation.segmenters import segment, segmented
     from thor2_jax.types import Descriptors, Diagrams, PointClouds, Strips
 else:
     _MODULES = {
@@ -26,10 +27,11 @@ else:
         "recognition.frames": ("Intrinsics", "RGBDFrame", "read_frame"),
         "recognition.answers": ("Recognition",),
         "recognizer": ("Recognizer",),
+        "segmentation.segmenters": ("segment", "segmented"),
         "types": ("Descriptors", "Diagrams", "PointClouds", "Strips"),
     }
     _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
-    _SUBMODULES = ("capacity", "client", "descriptor", "export", "recognition", "testing", *_MODULES)
+    _SUBMODULES = ("capacity", "client", "descriptor", "export", "recognition", "segmentation", "testing", *_MODULES)
 
     def __getattr__(name: str) -> Any:
         if name in _MODULE_OF:
@@ -68,6 +70,8 @@ __all__ = [
     "diagrams",
     "mirror",
     "read_frame",
+    "segment",
+    "segmented",
     "strips",
     "turn",
     "view_normalize",

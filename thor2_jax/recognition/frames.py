@@ -106,7 +106,7 @@ class RGBDFrame:
             InputError: the frame has no labels.
         """
         if self.labels is None:
-            raise InputError("labels is None; expected an image of instance numbers: give labels, or segment the frame")
+            raise InputError("labels is None; expected labels; give them, or segment the frame (--segment table)")
         return self.labels
 
     @cached_property

@@ -26,7 +26,7 @@ LEAST_EDGE = 8
 GAP = 2.0
 """Steepest slope of a surface across a gap without depth. Shadows of the projector beside a step are narrower."""
 
-BEND = 0.8
+BEND = 0.5
 """Least change of slope at a fold."""
 
 NEAR, FAR = 2, 6
@@ -51,7 +51,7 @@ def depth_edges(depth: DepthImage) -> tuple[Mask, Mask]:
     pixel = np.float32(depth.pixel_size)
     least = STEP[0] + STEP[1] * z2
     least_step = least + (2 * GAP * pixel) * gap * z
-    least_fold = least + (2 * NEAR * BEND * pixel) * z + gap
+    least_fold = 0.5 * least + (NEAR * BEND * pixel) * z + gap
     steps, folds = np.zeros(z.shape, bool), np.zeros(z.shape, bool)
     for along_rows in (True, False):
         before, after, difference = (_filter(inverse, kernel, along_rows) * z2 for kernel in _kernels())

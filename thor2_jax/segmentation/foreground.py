@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from thor2_jax.segmentation.pixels import Mask, components, grow, open_round, pixel_mask, shrink
+from thor2_jax.segmentation.pixels import Mask, components, float_image, grow, open_round, pixel_mask, shrink
 from thor2_jax.segmentation.planes import DepthImage, Plane
 
 __all__ = ["FLAT", "UNIT", "Evidence", "find_foreground"]
@@ -35,7 +35,7 @@ LEAST_PLANE = 0.04
 DIFFERENCE = 22.0
 """Least colour difference, in levels of 8 bits, between a thing and the plane."""
 
-NOISE = 3.0
+NOISE = 4.0
 """Least colour difference between a thing and the plane, as a multiple of the mean difference of the plane's pixels."""
 
 DARKER, LIGHTER = 0.35, 0.5
@@ -44,7 +44,7 @@ DARKER, LIGHTER = 0.35, 0.5
 UNIT = 40
 """`Evidence.contrast` of a pixel with the least colour difference of a thing; 8 bits end at about six times as much."""
 
-SMOOTH = 0.3
+SMOOTH = 0.5
 """Largest change of contrast, in units, between neighbours in a smooth part of the plane, such as a soft shadow."""
 
 LARGEST_SMOOTH = 3
@@ -88,6 +88,7 @@ def find_foreground(color: NDArray[np.uint8], depth: DepthImage, planes: list[Pl
     for plane in planes[1:]:
         others = plane.heights(depth)
         high = (high & (np.abs(others) > least)) | ((others > least) & ~on_support & depth.valid)
+        on_support &= np.abs(heights) <= np.abs(others)
     contrast, known = _color_contrast(color, on_support)
     region = shrink(planes[0].region(depth.z.shape), 3)
     low = ((heights < FLAT + 0.02) | ~depth.valid) & region & known
@@ -119,13 +120,13 @@ def _color_contrast(color: NDArray[np.uint8], plane: Mask) -> tuple[NDArray[np.u
     height, width = plane.shape
     around, window_share, share = _plane_color(color, plane)
     length = np.sqrt((around * around).sum(axis=2)) + 1e-3
-    direction = cv2.resize(around / length[..., None], (width, height), interpolation=cv2.INTER_LINEAR)
-    reference = cv2.resize(length, (width, height), interpolation=cv2.INTER_LINEAR)
+    direction = float_image(cv2.resize(around / length[..., None], (width, height), interpolation=cv2.INTER_LINEAR))
+    reference = float_image(cv2.resize(length, (width, height), interpolation=cv2.INTER_LINEAR))
     pixels = color.astype(np.float32)
     # A shadow changes the length of a colour, not its direction.
     ones = np.ones((1, 3), np.float32)
-    along = np.asarray(cv2.transform(cv2.multiply(pixels, direction), ones))
-    across = np.asarray(cv2.transform(cv2.multiply(pixels, pixels), ones))
+    along = float_image(cv2.transform(cv2.multiply(pixels, direction), ones))
+    across = float_image(cv2.transform(cv2.multiply(pixels, pixels), ones))
     across -= along * along
     brightness = along - reference
     brightness *= np.where(brightness < 0, np.float32(DARKER), np.float32(LIGHTER))
@@ -134,13 +135,11 @@ def _color_contrast(color: NDArray[np.uint8], plane: Mask) -> tuple[NDArray[np.u
     difference = np.sqrt(np.maximum(across, 0, out=across), out=across)
     size = (share.shape[1], share.shape[0])
     noise = cv2.resize(np.minimum(difference, 60) * plane, size, interpolation=cv2.INTER_AREA)
-    noise = np.asarray(cv2.blur(noise * (share > 0), (WINDOW, WINDOW))) / (window_share + 1e-4)
+    noise = float_image(cv2.blur(noise * (share > 0), (WINDOW, WINDOW))) / (window_share + 1e-4)
     least = np.maximum(DIFFERENCE, NOISE * noise)
     scale = cv2.resize((UNIT / least).astype(np.float32), (width, height), interpolation=cv2.INTER_NEAREST)
     contrast = np.asarray(cv2.multiply(difference, scale, dtype=cv2.CV_8U), np.uint8)
-    known = cv2.resize(
-        (window_share > LEAST_PLANE).view(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST
-    )
+    known = cv2.resize((window_share > LEAST_PLANE).view(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
     return contrast, pixel_mask(known)
 
 
@@ -152,23 +151,28 @@ def _plane_color(
     The first share is that of the window, the second that of the pixel itself.
     """
     height, width = plane.shape
-    size, window = (-(-width // COARSE), -(-height // COARSE)), (WINDOW, WINDOW)
-    shown = np.asarray(cv2.resize(color, size, interpolation=cv2.INTER_AREA)).astype(np.float32)
+    size = (-(-width // COARSE), -(-height // COARSE))
+    shown = float_image(cv2.resize(color, size, interpolation=cv2.INTER_AREA))
     masked = cv2.bitwise_and(color, color, mask=plane.view(np.uint8))
-    total = np.asarray(cv2.resize(masked, size, interpolation=cv2.INTER_AREA)).astype(np.float32)
-    share = np.asarray(cv2.resize(plane.astype(np.float32), size, interpolation=cv2.INTER_AREA))
-    own = total / np.maximum(share, 0.05)[..., None]
+    total = float_image(cv2.resize(masked, size, interpolation=cv2.INTER_AREA))
+    share = float_image(cv2.resize(plane.astype(np.float32), size, interpolation=cv2.INTER_AREA))
+    own = float_image(total / np.maximum(share, 0.05)[..., None])
     for _ in range(2):  # leave out what has another colour than most of the window
-        mean = np.asarray(cv2.blur(total, window)) / (np.asarray(cv2.blur(share, window))[..., None] + 1e-4)
+        mean = _window_mean(total, share)
         off = _channel_sum(own, mean)
         full = share > 0.5
         typical = float(np.median(off[full])) if full.any() else 0.0
         kept = off < max(OUTLIER, 3 * typical)
         share, total = share * kept, total * kept[..., None]
-    window_share = np.asarray(cv2.blur(share, window))
-    mean = np.asarray(cv2.blur(total, window)) / (window_share[..., None] + 1e-4)
+    window_share = float_image(cv2.blur(share, (WINDOW, WINDOW)))
+    mean = _window_mean(total, share)
     mean[window_share < LEAST_PLANE] = 0
-    return np.asarray(cv2.blur(_most_similar_window(shown, mean), (3, 3))), window_share, share
+    return float_image(cv2.blur(_most_similar_window(shown, mean), (3, 3))), window_share, share
+
+
+def _window_mean(total: NDArray[np.float32], share: NDArray[np.float32]) -> NDArray[np.float32]:
+    window = (WINDOW, WINDOW)
+    return float_image(cv2.blur(total, window)) / (float_image(cv2.blur(share, window))[..., None] + np.float32(1e-4))
 
 
 def _most_similar_window(shown: NDArray[np.float32], mean: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -177,7 +181,7 @@ def _most_similar_window(shown: NDArray[np.float32], mean: NDArray[np.float32]) 
     At the border of two materials, a window holds both.
     """
     height, width = shown.shape[:2]
-    padded = np.asarray(cv2.copyMakeBorder(mean, SHIFT, SHIFT, SHIFT, SHIFT, cv2.BORDER_REPLICATE))
+    padded = float_image(cv2.copyMakeBorder(mean, SHIFT, SHIFT, SHIFT, SHIFT, cv2.BORDER_REPLICATE))
     nearest, least = mean.copy(), _channel_sum(shown, mean)
     for down in (0, SHIFT, 2 * SHIFT):
         for right in (0, SHIFT, 2 * SHIFT):
@@ -190,4 +194,4 @@ def _most_similar_window(shown: NDArray[np.float32], mean: NDArray[np.float32]) 
 
 
 def _channel_sum(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:
-    return np.asarray(cv2.transform(cv2.absdiff(a, b), np.ones((1, 3), np.float32)))
+    return float_image(cv2.transform(cv2.absdiff(a, b), np.ones((1, 3), np.float32)))

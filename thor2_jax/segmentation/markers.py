@@ -57,7 +57,7 @@ def flood(color: NDArray[np.uint8], depth: DepthImage, evidence: Evidence, steps
     like_plane = evidence.plain & (evidence.contrast < CLEAR * UNIT) & (evidence.heights < FLAT)
     like_plane &= ~shrink(high, BLEEDING)
     body = high & ~like_plane
-    markers, n_bodies = _body_markers(body, steps | folds)
+    markers, n_bodies = _body_markers(body, steps | grow(folds, 3) | (grow(folds, 5) & grow(steps, 3)))
     body_numbers, body_sizes = components(body)
     marked = np.zeros(len(body_sizes), bool)
     marked[body_numbers[markers > 0]] = True
@@ -97,9 +97,7 @@ def _colored_markers(colored: Mask, near: Mask, valid: Mask) -> tuple[NDArray[np
     return (np.cumsum(kept) * kept).astype(np.int32)[numbers], int(kept.sum())
 
 
-def _unknown_without_depth(
-    depth: DepthImage, evidence: Evidence, body: Mask, things: Mask, like_plane: Mask
-) -> Mask:
+def _unknown_without_depth(depth: DepthImage, evidence: Evidence, body: Mask, things: Mask, like_plane: Mask) -> Mask:
     """Return pixels without depth that may belong to a thing."""
     wide = grow(body, OUTSIDE)
     beside = grow(things, 5) & ~like_plane

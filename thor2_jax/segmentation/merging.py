@@ -44,18 +44,19 @@ BEFORE, AFTER = 2, 2
 class _Borders:
     """Pixels of the borders between pieces [P], and pairs of neighbouring pieces [N], the smaller number first.
 
+    The background is a piece, too.
+
     Attributes:
-        first: piece of each border pixel.
-        second: the other one.
-        height: height of the second piece beside each border pixel; 0 if missing.
-        pair: pair of each border pixel.
+        first: [P] one piece at each border pixel.
+        second: [P] the other one.
+        height: [P] height of the second piece beside the pixel, metres; 0 if missing.
         pairs: [N, 2] the pieces of each pair.
         length: [N] border pixels.
         step: [N] share of them at a step.
         fold: [N] share of them at a step or a fold.
         contrast: [N] mean colour difference across, sum over the channels.
         behind: [N] share of them where the second piece is farther than the first, less where it is nearer.
-        perimeter: border pixels of each piece.
+        perimeter: [n] border pixels of each piece.
     """
 
     first: NDArray[np.int32]
@@ -67,7 +68,7 @@ class _Borders:
     fold: NDArray[np.float64]
     contrast: NDArray[np.float64]
     behind: NDArray[np.float64]
-    perimeter: NDArray[np.float64]
+    perimeter: NDArray[np.intp]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -104,9 +105,7 @@ def merge_pieces(
     return np.array([root(piece) for piece in range(n)], np.int32)[labels]
 
 
-def _belong_together(
-    k: int, a: int, b: int, borders: _Borders, shapes: _Shapes, colored: NDArray[np.bool_]
-) -> bool:
+def _belong_together(k: int, a: int, b: int, borders: _Borders, shapes: _Shapes, colored: NDArray[np.bool_]) -> bool:
     if colored[a] != colored[b] and (shapes.tall[a] or shapes.tall[b]):
         return bool(borders.contrast[k] < PART)
     if shapes.low[a] and shapes.low[b]:
@@ -123,7 +122,7 @@ def _is_hollow(
 
     It lies behind, has about its colour, width and height, and meets the background at its upper rim only.
     """
-    if abs(borders.behind[k]) < 0.2 or np.abs(shapes.color[a] - shapes.color[b]).sum() > HOLLOW_COLOR:
+    if abs(borders.behind[k]) < 0.1 or np.abs(shapes.color[a] - shapes.color[b]).sum() > HOLLOW_COLOR:
         return False
     inner, outer = (b, a) if borders.behind[k] > 0 else (a, b)
     inner_height, inner_width = _size(inner, labels, evidence)
@@ -189,6 +188,8 @@ def _find_borders(
     keys, pair = np.unique(a.astype(np.int64) * n + b, return_inverse=True)
     length = np.bincount(pair, minlength=len(keys))
     pairs = np.stack(np.divmod(keys, n), axis=1)
-    perimeter = np.bincount(pairs.ravel(), np.repeat(length, 2), minlength=n)
-    means = (np.bincount(pair, values, minlength=len(keys)) / length for values in (at_step, at_edge, difference, behind))
-    return _Borders(a, b, height, pairs, length, *means, perimeter)
+    perimeter = np.bincount(pairs.ravel(), np.repeat(length, 2), minlength=n).astype(np.intp)
+    step_share, edge_share, contrast, behind = (
+        np.bincount(pair, values, minlength=len(keys)) / length for values in (at_step, at_edge, difference, behind)
+    )
+    return _Borders(a, b, height, pairs, length, step_share, edge_share, contrast, behind, perimeter)

@@ -4,7 +4,19 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Mask", "close", "components", "grow", "local_extremes", "nearest_known", "open_round", "pixel_mask", "shrink", "watershed"]
+__all__ = [
+    "Mask",
+    "close",
+    "components",
+    "float_image",
+    "grow",
+    "local_extremes",
+    "nearest_known",
+    "open_round",
+    "pixel_mask",
+    "shrink",
+    "watershed",
+]
 
 Mask = NDArray[np.bool_]
 
@@ -16,6 +28,11 @@ def _bytes(mask: Mask) -> NDArray[np.uint8]:
 def pixel_mask(image: object) -> Mask:
     """Return an image of zeros and ones of OpenCV as a mask."""
     return np.asarray(image, np.uint8).view(np.bool_)
+
+
+def float_image(image: object) -> NDArray[np.float32]:
+    """Return an image of floats of OpenCV as an array."""
+    return np.asarray(image, np.float32)
 
 
 def grow(mask: Mask, size: int) -> Mask:
@@ -44,10 +61,10 @@ def components(mask: Mask, connectivity: int = 4) -> tuple[NDArray[np.int32], ND
     The size with the number 0 is 0.
     """
     count, numbers = cv2.connectedComponents(_bytes(mask), connectivity=connectivity)
-    numbers = np.asarray(numbers, np.int32)
-    sizes = np.bincount(numbers.ravel(), minlength=count)
+    numbered = np.asarray(numbers, np.int32)
+    sizes = np.bincount(numbered.ravel(), minlength=count)
     sizes[0] = 0
-    return numbers, sizes
+    return numbered, sizes
 
 
 def nearest_known(known: Mask) -> NDArray[np.intp]:
@@ -63,7 +80,7 @@ def nearest_known(known: Mask) -> NDArray[np.intp]:
 def local_extremes(labels: NDArray[np.int32], size: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return the largest and the smallest label [H, W] in the square of `size` pixels around each pixel."""
     image, square = labels.astype(np.float32), np.ones((size, size), np.uint8)
-    return np.asarray(cv2.dilate(image, square)), np.asarray(cv2.erode(image, square))
+    return float_image(cv2.dilate(image, square)), float_image(cv2.erode(image, square))
 
 
 def watershed(color: NDArray[np.uint8], markers: NDArray[np.int32]) -> NDArray[np.int32]:
@@ -77,8 +94,17 @@ def watershed(color: NDArray[np.uint8], markers: NDArray[np.int32]) -> NDArray[n
         Markers [H, W] without 0. The line that OpenCV leaves between two regions goes to the higher number.
     """
     flooded = np.asarray(cv2.watershed(color, markers.copy()), np.int32)
-    largest = np.asarray(cv2.dilate(flooded.astype(np.float32), np.ones((3, 3), np.uint8)))
-    return np.where(flooded <= 0, np.maximum(largest, 1).astype(np.int32), flooded)
+    row, column = np.nonzero(flooded <= 0)
+    largest = np.ones(len(row), np.int32)
+    for down in (-1, 0, 1):
+        for right in (-1, 0, 1):
+            beside = flooded.take(
+                np.clip(row + down, 0, flooded.shape[0] - 1) * flooded.shape[1]
+                + np.clip(column + right, 0, flooded.shape[1] - 1)
+            )
+            np.maximum(largest, beside, out=largest)
+    flooded[row, column] = largest
+    return flooded
 
 
 def _cross() -> NDArray[np.uint8]:

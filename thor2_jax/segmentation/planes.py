@@ -12,13 +12,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from thor2_jax.recognition.frames import Intrinsics
+from thor2_jax.recognition.frames import MAX_DEPTH, MIN_DEPTH, Intrinsics
 from thor2_jax.segmentation.pixels import Mask, pixel_mask
 
 __all__ = ["DepthImage", "Plane", "dominant_planes"]
-
-NEAREST, FARTHEST = 0.26, 2.5
-"""Range of depth, metres, that the recognizer reads."""
 
 MAX_PLANES = 4
 HYPOTHESES = 200
@@ -35,12 +32,12 @@ TOLERANCE = (0.003, 0.004)
 LEAST_SHARE = 0.05
 """Least share of the points that lie on a dominant plane."""
 
-LEAST_SHARE_OF_LARGEST = 0.2
+LEAST_SHARE_OF_LARGEST, LEAST_EXTENT_OF_LARGEST = 0.2, 0.15
 LEAST_EXTENT = 0.23
-"""Least extent, metres, across the longest direction of a dominant plane after the largest: sides of boxes have less."""
+"""Least extent, metres, across the longest direction of a plane after the largest; sides of boxes have less."""
 
-LEAST_FILLING = 0.3
-"""Least share of the hull of such a plane that its inliers fill: tops of several things in one plane fill less."""
+LEAST_FILLING = 0.25
+"""Least share of the hull of a plane that its inliers fill: tops of several things in one plane fill less."""
 
 LEAST_SHARE_OF_SUPPORT = 0.08
 
@@ -49,7 +46,7 @@ class DepthImage:
     """The usable part of a depth image.
 
     Attributes:
-        z: [H, W] float32, metres; 0 where depth is missing or outside `NEAREST` to `FARTHEST`.
+        z: [H, W] float32, metres; 0 where depth is missing or outside `MIN_DEPTH` to `MAX_DEPTH`.
         z2: [H, W] float32, squares of `z`.
         inverse: [H, W] float32, 1 / z; 0 where `z` is.
         valid: [H, W], where `z` is not 0.
@@ -60,7 +57,7 @@ class DepthImage:
 
     def __init__(self, depth_m: NDArray[np.float32], intrinsics: Intrinsics) -> None:
         """Prepare `depth_m` [H, W], metres, of a camera."""
-        self.valid: Mask = (depth_m >= NEAREST) & (depth_m <= FARTHEST)
+        self.valid: Mask = (depth_m >= MIN_DEPTH) & (depth_m <= MAX_DEPTH)
         self.z = depth_m * self.valid
         self.z2 = self.z * self.z
         self.inverse = np.zeros_like(self.z)
@@ -144,7 +141,8 @@ def dominant_planes(depth: DepthImage) -> list[Plane]:
         pixels = np.stack([points.columns[inliers], points.rows[inliers]], axis=1).astype(np.int32)
         hull = np.asarray(cv2.convexHull(pixels), np.int32)[:, 0]
         filling = len(inliers) * points.step**2 / max(cv2.contourArea(hull), 1.0)
-        if not planes or (filling >= LEAST_FILLING and _least_extent(points, inliers) >= LEAST_EXTENT):
+        extent = _least_extent(points, inliers)
+        if filling >= LEAST_FILLING and extent >= (LEAST_EXTENT if planes else LEAST_EXTENT_OF_LARGEST):
             planes.append(Plane(coefficients, hull, share, float(1 / np.median(points.inverse[inliers]))))
         near = np.abs(points.terms[left] @ coefficients - points.inverse[left]) < 2 * points.tolerance[left]
         left = left[~near]
@@ -165,9 +163,7 @@ def _grid_points(depth: DepthImage) -> _Points:
     return _Points(step, columns[column], rows[row], terms, w, TOLERANCE[0] * w * w + TOLERANCE[1])
 
 
-def _best_hypothesis(
-    points: _Points, left: NDArray[np.intp], rng: np.random.Generator
-) -> NDArray[np.float64] | None:
+def _best_hypothesis(points: _Points, left: NDArray[np.intp], rng: np.random.Generator) -> NDArray[np.float64] | None:
     """Return the plane [3] through three random points of `left` that is near the most of them."""
     triples = left[rng.integers(0, len(left), (HYPOTHESES, 3))]
     matrices = points.terms[triples, :3]

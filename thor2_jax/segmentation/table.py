@@ -25,6 +25,8 @@ WORKING_SIZE = 320
 """Larger side, pixels, of the images that are segmented; larger images are subsampled by a whole number."""
 
 BAND = 3
+"""Width, working pixels, of the square around a border within which it is moved to an edge of colour."""
+
 LEAST_PIXELS = 20
 LEAST_AREA, LARGEST_AREA = 2e-4, 0.15
 """Area of a thing, square metres."""
@@ -58,8 +60,8 @@ def segment_table(frame: RGBDFrame) -> NDArray[np.int32]:
 
 
 def _subsampled(camera: Intrinsics, stride: int) -> Intrinsics:
-    values = (camera.fx, camera.fy, camera.cx, camera.cy)
-    return Intrinsics(*(value / stride for value in values))
+    """Return the camera of every `stride`-th pixel; the planes' second-order terms absorb lens distortion."""
+    return Intrinsics(camera.fx / stride, camera.fy / stride, camera.cx / stride, camera.cy / stride)
 
 
 def _segment(color: NDArray[np.uint8], depth: DepthImage) -> NDArray[np.int32]:

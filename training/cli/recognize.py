@@ -31,6 +31,9 @@ def recognize(
     color: Annotated[Path | None, typer.Option(help="Color image, PNG or JPEG, in place of FRAME.")] = None,
     depth: Annotated[Path | None, typer.Option(help="Depth image: 16-bit PNG, float TIFF, NPY or EXR.")] = None,
     labels: Annotated[Path | None, typer.Option(help="Instance labels, PNG; 0 is background.")] = None,
+    segment: Annotated[
+        str | None, typer.Option(help="Segment the frames instead of reading labels: table, or another segmenter.")
+    ] = None,
     intrinsics: Annotated[
         Path | None, typer.Option(help="fx, fy, cx, cy in JSON, ROS camera_info, K, BOP, RealSense or Open3D.")
     ] = None,
@@ -64,12 +67,14 @@ def recognize(
 
     if names is not None and coco is None and bop is None:
         raise InputError(f"names is {names}; it belongs to --coco and --bop")
+    if segment is not None and labels is not None:
+        raise InputError(f"labels is {labels} and segment is {segment}; give one of them")
     files = {"color": color, "depth": depth, "labels": labels, "intrinsics": intrinsics}
     if out is not None:
-        made = {s.name.split("/")[0] for s in _sources(frames, files, depth_scale)} if frames else RESULT_FILES
+        made = {s.name.split("/")[0] for s in _sources(frames, files, depth_scale, segment)} if frames else RESULT_FILES
         check_output_directory(out, resumable=made)
         remove_leftovers(out)
-    sources = _sources(frames, files, depth_scale)
+    sources = _sources(frames, files, depth_scale, segment)
     numbers = None if names is None else read_object_names(names)
     recognizer = Recognizer.load(model, unknown_below, answer_by=answer_by)
     recognizer.chunk = BATCH_BUCKETS[-1]
@@ -102,25 +107,34 @@ def recognize(
 
 
 def _sources(
-    frames: list[Path] | None, files: dict[str, Path | None], depth_scale: float | None
+    frames: list[Path] | None, files: dict[str, Path | None], depth_scale: float | None, segment: str | None
 ) -> list["FrameSource"]:
     """Return the frames that are given as folders, or the one that is given by its files."""
     import functools
 
-    from training.readers.frame_files import FrameFiles, FrameSource, find_frames
+    from thor2_jax.segmentation.segmenters import load_segmenter
+    from training.readers.frame_files import FrameFiles, FrameSource, find_frames, segmented_source
 
     given = [name for name, path in files.items() if path is not None]
     if bool(frames) == bool(given):
         raise InputError("give either FRAME... or --color, --depth, --labels and --intrinsics")
     if frames:
-        return find_frames(frames, depth_scale)
-    missing = [name for name in files if files[name] is None]
-    if missing:
-        raise InputError(f"{', '.join(f'--{name}' for name in missing)} is missing; one frame needs {', '.join(files)}")
-    color, depth, labels, intrinsics = files.values()
-    assert color and depth and labels and intrinsics
-    one = FrameFiles(color, depth, labels, intrinsics)
-    return [FrameSource(color.stem, functools.partial(one.read, depth_scale))]
+        sources = find_frames(frames, depth_scale)
+    else:
+        missing = [name for name in files if files[name] is None and (name != "labels" or segment is None)]
+        if missing:
+            raise InputError(
+                f"{', '.join(f'--{name}' for name in missing)} is missing; one frame needs {', '.join(files)}, or "
+                "--segment in place of labels"
+            )
+        color, depth, labels, intrinsics = files.values()
+        assert color and depth and intrinsics
+        one = FrameFiles(color, depth, labels, intrinsics)
+        sources = [FrameSource(color.stem, functools.partial(one.read, depth_scale))]
+    if segment is None:
+        return sources
+    segmenter = load_segmenter(segment)
+    return [segmented_source(source, segmenter) for source in sources]
 
 
 def _print_table(frame: str | None, recognitions: Sequence["Recognition"]) -> None:

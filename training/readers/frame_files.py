@@ -7,9 +7,10 @@ from pathlib import Path
 
 from thor2_jax.errors import InputError
 from thor2_jax.recognition.frames import RGBDFrame, read_frame
+from thor2_jax.segmentation.segmenters import Segmenter, segmented
 from training.readers.bop import BOP
 
-__all__ = ["FILE_NAMES", "FrameFiles", "FrameSource", "find_frames", "frame_files"]
+__all__ = ["FILE_NAMES", "FrameFiles", "FrameSource", "find_frames", "frame_files", "segmented_source"]
 
 FILE_NAMES = {
     "color": ("color.png", "color.jpg", "color.jpeg", "rgb.png", "rgb.jpg"),
@@ -120,6 +121,11 @@ def find_frames(paths: Sequence[Path], depth_scale: float | None = None) -> list
     if repeated:
         raise InputError(f"frames: two frames are called {repeated[0]}; give each folder once, or one that holds both")
     return sources
+
+
+def segmented_source(source: FrameSource, segmenter: Segmenter) -> FrameSource:
+    """Return a frame that is segmented when it is read; labels that it has are replaced."""
+    return FrameSource(source.name, lambda: segmented(source.read(), segmenter))
 
 
 def _read_bop(dataset: BOP, number: int) -> RGBDFrame:

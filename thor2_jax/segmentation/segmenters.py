@@ -1,0 +1,112 @@
+"""Segmenters by name: the built-in one, and those that other packages offer as entry points.
+
+labels = segment(frame)                      # [H, W] integers, by the built-in segmenter "table"
+recognizer.recognize(segmented(frame, "sam"))
+
+A segmenter is a function from a frame, whose labels are None, to labels [H, W]: integers, 0 is background. A package
+offers one under a name in the entry point group `ENTRY_POINTS`, see docs/segmentation.md.
+"""
+
+import dataclasses
+import importlib
+from collections.abc import Callable
+from importlib.metadata import entry_points
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thor2_jax.errors import InputError
+from thor2_jax.recognition.frames import RGBDFrame
+
+__all__ = ["ENTRY_POINTS", "TABLE", "Segmenter", "load_segmenter", "segment", "segmented", "segmenter_names"]
+
+Segmenter = Callable[[RGBDFrame], NDArray[Any]]
+"""A function from a frame to labels [H, W]."""
+
+ENTRY_POINTS = "thor2_jax.segmenters"
+"""Entry point group of segmenters."""
+
+TABLE = "table"
+"""Name of the built-in segmenter, `table.segment_table`, which needs OpenCV (extra `segment`)."""
+
+
+def segmenter_names() -> list[str]:
+    """Return the names of all installed segmenters, the built-in one first."""
+    return [TABLE, *sorted({point.name for point in entry_points(group=ENTRY_POINTS)} - {TABLE})]
+
+
+def load_segmenter(name: str) -> Segmenter:
+    """Return the segmenter of this name.
+
+    Raises:
+        InputError: no segmenter has this name, or its package cannot be imported.
+    """
+    if name == TABLE:
+        try:
+            return importlib.import_module("thor2_jax.segmentation.table").segment_table
+        except ImportError as error:
+            raise InputError(
+                f'segmenter is {name!r}, which needs OpenCV ({error}); install "thor2-jax[segment]"'
+            ) from None
+    points = list(entry_points(group=ENTRY_POINTS, name=name))
+    if not points:
+        raise InputError(
+            f"segmenter is {name!r}; expected one of {', '.join(segmenter_names())}, or install a package that offers "
+            f"it in the entry point group {ENTRY_POINTS}"
+        )
+    # The package is not ours: importing it may raise anything.
+    try:
+        segmenter = points[0].load()
+    except Exception as error:
+        raise InputError(
+            f"segmenter is {name!r}; {points[0].value} cannot be imported ({_reason(error)}); check its package"
+        ) from None
+    if not callable(segmenter):
+        raise InputError(
+            f"segmenter is {name!r}; {points[0].value} is a {type(segmenter).__name__}; expected a function"
+        )
+    return segmenter
+
+
+def segment(frame: RGBDFrame, segmenter: str | Segmenter = TABLE) -> NDArray[Any]:
+    """Segment a frame; labels that it has are not passed on.
+
+    Args:
+        frame: colour, depth and intrinsics.
+        segmenter: name of a segmenter, or a segmenter.
+
+    Returns:
+        Labels [H, W], integers; 0 is background.
+
+    Raises:
+        InputError: the segmenter is unknown, raises an exception, or returns no labels of the size of the frame.
+    """
+    function = load_segmenter(segmenter) if isinstance(segmenter, str) else segmenter
+    name = segmenter if isinstance(segmenter, str) else getattr(segmenter, "__name__", type(segmenter).__name__)
+    try:
+        labels = function(dataclasses.replace(frame, labels=None))
+    except InputError:
+        raise
+    except Exception as error:
+        raise InputError(f"segmenter {name} failed on the frame ({_reason(error)}); check its package") from error
+    expected = f"expected integers of shape {frame.depth.shape} (rows, columns), 0 for the background"
+    if not isinstance(labels, np.ndarray):
+        raise InputError(f"segmenter {name} returned a {type(labels).__name__}; {expected}, as a NumPy array")
+    if labels.shape != frame.depth.shape or labels.dtype.kind not in "ui":
+        raise InputError(
+            f"segmenter {name} returned labels of shape {labels.shape} and type {labels.dtype}; {expected}"
+        )
+    if labels.min() < 0:
+        raise InputError(f"segmenter {name} returned the label {labels.min()}; {expected}")
+    return labels
+
+
+def segmented(frame: RGBDFrame, segmenter: str | Segmenter = TABLE) -> RGBDFrame:
+    """Return the frame with the labels of a segmenter; arguments and exceptions as `segment`."""
+    return dataclasses.replace(frame, labels=segment(frame, segmenter))
+
+
+def _reason(error: Exception) -> str:
+    message = " ".join(str(error).split())
+    return f"{type(error).__name__}: {message}" if message else type(error).__name__
