@@ -339,7 +339,7 @@ class Recognizer:
 
         instances, chunks = self._by_chunks(frame, compute)
         n_usable = sum(instance.reason is None for instance in instances)
-        return self.recognitions(instances, concatenate_padded(chunks, n_usable))
+        return self.recognitions(instances, concatenate_padded(chunks, _padded_rows(n_usable)))
 
     def _check_classifiers(self, classifiers: Sequence[str] | None) -> tuple[str, ...]:
         names = self.default_classifiers if classifiers is None else classifiers

@@ -153,9 +153,13 @@ class InferenceEngine:
     def recognize(self, instances: Sequence[PreparedInstance], results: Sequence[CloudResult]) -> list[Recognition]:
         """Return a recognition per instance of a frame; `results` are those of the usable instances, in order."""
         if not results:
-            nothing = {name: np.zeros((0, len(self.run.classes)), np.float32) for name in self._classifiers}
-            return self._recognizer.recognitions(instances, Evidence(np.zeros(0, int), nothing))
+            return [Recognition(instance.label, reason=instance.reason) for instance in instances]
         evidence = jax.tree.map(lambda *rows: np.stack(rows), *[result.evidence for result in results])
+        source = self._recognizer.answers_by()  # A change of the gallery may change it.
+        if source == "classifiers":
+            evidence = evidence._replace(embeddings=None, weights=None)
+        elif source == "gallery":
+            evidence = evidence._replace(probabilities={})
         return self._recognizer.recognitions(instances, evidence)
 
     def calibrated_confidences(self, results: Sequence[CloudResult]) -> list[float | None]:

@@ -14,9 +14,14 @@ from thor2_jax.service.engine import InferenceEngine
 from thor2_jax.service.settings import Settings
 
 
-@pytest.mark.parametrize("trained", [(), ("a", "b")], ids=["gallery", "both"])
-def test_the_engine_answers_as_the_recognizer(trained: tuple[str, ...], frame: thor2.RGBDFrame, tmp_path: Path) -> None:
-    save_run(untrained_run(trained, ("tops", "tops2") if trained else ()), tmp_path / "run")
+@pytest.mark.parametrize(
+    ("trained", "answer_by"), [((), None), (("a", "b"), None), (("a", "b"), "gallery"), (("a", "b"), "classifiers")]
+)
+def test_the_engine_answers_as_the_recognizer(
+    trained: tuple[str, ...], answer_by: str | None, frame: thor2.RGBDFrame, tmp_path: Path
+) -> None:
+    record: dict[str, object] = {} if answer_by is None else {"answer_by": answer_by}
+    save_run(untrained_run(trained, ("tops", "tops2") if trained else (), record=record), tmp_path / "run")
     Embedding.create(SMALL_CONFIG, sizes=EmbeddingSizes(4, (16,), 8, 4)).save(tmp_path / "run" / EMBEDDING_FILE)
     recognizer = thor2.Recognizer.load(tmp_path / "run")
     recognizer.enroll("tall", [(frame, 200)])
@@ -29,6 +34,7 @@ def test_the_engine_answers_as_the_recognizer(trained: tuple[str, ...], frame: t
     for answer, expected in zip(answers, recognizer.recognize(frame), strict=True):
         assert (answer.label, answer.name, answer.reason) == (expected.label, expected.name, expected.reason)
         assert answer.confidence == pytest.approx(expected.confidence, abs=1e-4)
+        assert answer.classifier == expected.classifier and answer.top.keys() == expected.top.keys()
     assert engine.calibrated_confidences(results) == [None] * 3
     unusable = [instance for instance in instances if instance.reason is not None]
     assert [answer.name for answer in engine.recognize(unusable, [])] == [None]

@@ -78,6 +78,7 @@ def content(directory: Path) -> dict[str, bytes]:
 
 def test_the_next_frame_knows_an_enrolled_object(http: httpx.Client, files: Files) -> None:
     before = http.post("/v1/recognize", files=files).json()["instances"]
+    assert list(before[3]["top"]) == ["tops", "tops2"]
     answer = enroll(http, files, "tall")
     assert answer.status_code == 200, answer.text
     record = answer.json()
