@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from thor2_jax.errors import InputError
 from thor2_jax.gallery.clouds import CompactClouds
-from thor2_jax.gallery.search import ExactSearch, IndexSearch, ViewSearch
+from thor2_jax.gallery.search import ExactSearch, IndexSearch, ViewSearch, one_blas_thread
 
 __all__ = ["Gallery", "GalleryObject"]
 
@@ -163,9 +163,10 @@ class Gallery:
         views, owners = self._embeddings[index].astype(np.float32), self._object_of_view[index]
         # Objects of many views are regularized more, so that they do not outweigh those of few.
         ridge = RIDGE * self._counts[owners] / self._counts[self._object_of_view].mean()
-        kernel = np.exp(GAMMA * (views @ views.transpose(0, 2, 1) - 1)).astype(np.float64)
-        kernel[:, np.arange(kernel.shape[1]), np.arange(kernel.shape[1])] += ridge
-        duals = np.linalg.solve(kernel, np.exp(GAMMA * (similarity.astype(np.float64) - 1))[..., None])[..., 0]
+        with one_blas_thread():
+            kernel = np.exp(GAMMA * (views @ views.transpose(0, 2, 1) - 1)).astype(np.float64)
+            kernel[:, np.arange(kernel.shape[1]), np.arange(kernel.shape[1])] += ridge
+            duals = np.linalg.solve(kernel, np.exp(GAMMA * (similarity.astype(np.float64) - 1))[..., None])[..., 0]
         scores = np.zeros((len(queries), len(self.objects)))
         np.add.at(scores, (np.arange(len(queries))[:, None], owners), duals)
         return scores.clip(0, 1).astype(np.float32)

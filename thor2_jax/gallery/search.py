@@ -5,21 +5,39 @@
 array([[1, 0]])
 """
 
+import contextlib
+import functools
 import importlib
 from typing import Any, Protocol
 
 import numpy as np
+import threadpoolctl
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
 
-__all__ = ["ExactSearch", "IndexSearch", "ViewSearch"]
+__all__ = ["ExactSearch", "IndexSearch", "ViewSearch", "one_blas_thread"]
 
 CHUNK = 2**14
 """Views per matrix product: 16 MB as float32 at 256 numbers each."""
 
 FAST_VIEWS = 2**17
 """Largest number of views that are also kept as float32 (134 MB): their conversion takes half of a query."""
+
+
+@functools.cache
+def _thread_pools() -> Any:
+    return threadpoolctl.ThreadpoolController()
+
+
+def one_blas_thread() -> contextlib.AbstractContextManager[Any]:
+    """Limit NumPy's linear algebra to one thread in the context.
+
+    Small products gain nothing from several threads, which on a busy machine wait for one another: a query that takes
+    10 ms then takes up to seconds.
+    """
+    limited: contextlib.AbstractContextManager[Any] = _thread_pools().limit(limits=1, user_api="blas")
+    return limited
 
 
 class ViewSearch(Protocol):
@@ -43,6 +61,12 @@ class ExactSearch:
 
     def nearest(self, queries: NDArray[np.float32], count: int) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
         """See `ViewSearch.nearest`; views of equal similarity are in the order of their indices."""
+        if len(self._embeddings) <= FAST_VIEWS:
+            with one_blas_thread():
+                return self._nearest(queries, count)
+        return self._nearest(queries, count)
+
+    def _nearest(self, queries: NDArray[np.float32], count: int) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
         similarity: NDArray[np.float32] = np.zeros((len(queries), 0), np.float32)
         index: NDArray[np.intp] = np.zeros((len(queries), 0), np.intp)
         for start in range(0, len(self._embeddings), CHUNK):

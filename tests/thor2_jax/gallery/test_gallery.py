@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+import threadpoolctl
 
 from thor2_jax.errors import InputError
 from thor2_jax.gallery.clouds import CompactClouds
@@ -50,6 +51,16 @@ def test_the_nearest_object_scores_highest(gallery: Gallery) -> None:
 def test_an_unknown_object_scores_low(gallery: Gallery) -> None:
     known, unknown = views_around(0, 5, seed=1), views_around(9, 5, seed=1)
     assert gallery.scores(unknown).max() < gallery.scores(known).max(axis=1).min() / 2
+
+
+def test_scores_use_one_thread_of_linear_algebra(gallery: Gallery, monkeypatch: pytest.MonkeyPatch) -> None:
+    def threads() -> set[int]:
+        return {pool["num_threads"] for pool in threadpoolctl.threadpool_info() if pool["user_api"] == "blas"}
+
+    before, inside, solve = threads(), [], np.linalg.solve
+    monkeypatch.setattr(np.linalg, "solve", lambda a, b: inside.append(threads()) or solve(a, b))
+    gallery.scores(views_around(0, 5, seed=1))
+    assert inside == [{1}] and threads() == before
 
 
 def test_scores_of_orientations_are_averaged(gallery: Gallery) -> None:
