@@ -42,17 +42,14 @@ from thor2_jax.errors import InputError
 from thor2_jax.files import write_text
 from thor2_jax.recognition.fusion import DEFAULT_RULE
 from training.enrollment import mesh_views
-from training.evaluation.fusion import BOTH, GALLERY, Rule
+from training.evaluation.fusion import ALL_CLASSIFIERS, BOTH, EMBEDDED, GALLERY, Rule
 from training.evaluation.runs import Run, load_runs
 from training.objects.meshes import find_meshes, read_names
 from training.readers.labelled import LabelledFrame
 from training.storage.jobs import check_same_job
 
-AUGMENTATIONS = "--illumination --occlusion --sensor --segmentation"
-"""The augmentations of the default protocol."""
-
-RENDER = f"--azimuth-step 20 --polar-step 15 {AUGMENTATIONS}"
-"""Default options of all renderings, as in the default protocol."""
+RENDER = "--azimuth-step 20 --polar-step 15 --illumination --occlusion --sensor --segmentation"
+"""Default options of all renderings: the cameras and the first four augmentations of the default protocol."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,18 +89,29 @@ class Lever:
         return self.fusion in (GALLERY, BOTH)
 
 
+PLAIN = "--orientation-copies 0 --embedding 0"
+ORIENTED = "--orientation-copies 2 --embedding 0"
+DISTRACTED = "--orientation-copies 2 --embedding 600"
+"""Options of trainings without orientation copies and embedding, with the copies, and with both."""
+
 LEVERS = (
-    Lever("default"),
-    Lever("2 orientations in recognition", orientations=2),
-    Lever("4 orientations in recognition", orientations=4),
-    Lever('fusion rule "max"', rule="max"),
-    Lever('fusion rule "mean"', rule="mean"),
-    Lever("CE, TOPS and TOPS2", fusion="CE+TOPS+TOPS2"),
-    Lever("gallery", fusion=GALLERY),
-    Lever("classifiers and gallery", fusion=BOTH),
-    Lever("registration and base in training", render="--registration --base"),
+    Lever("default", train=PLAIN),
+    Lever("2 orientations in recognition", train=PLAIN, orientations=2),
+    Lever("4 orientations in recognition", train=PLAIN, orientations=4),
+    Lever("orientation copies in training", train=ORIENTED),
+    Lever("orientation copies, 4 orientations", train=ORIENTED, orientations=4),
+    Lever("embedding fitted on distractors, alone", train=DISTRACTED, orientations=4, fusion=EMBEDDED),
+    Lever("with THOR2", train=DISTRACTED, orientations=4, fusion=ALL_CLASSIFIERS),
+    Lever('fusion rule "max"', train=PLAIN, rule="max"),
+    Lever('fusion rule "mean"', train=PLAIN, rule="mean"),
+    Lever("CE, TOPS and TOPS2", train=PLAIN, fusion="CE+TOPS+TOPS2"),
+    Lever("gallery", train=PLAIN, fusion=GALLERY),
+    Lever("classifiers and gallery", train=PLAIN, fusion=BOTH),
+    Lever("registration and base in training", render="--registration --base", train=PLAIN),
+    Lever("total", render="--registration --base", orientations=None, fusion=None),
 )
-"""The table's rows."""
+"""The table's rows. The default is that of versions without orientation copies and distractors; "total" is what
+`thor2 train` and recognition do by default now."""
 
 COLUMNS = {
     "real frames": (ORIGINAL, "accuracy"),

@@ -85,7 +85,7 @@ def given(tmp_path: Path) -> list[Any]:
         (folder / "labels.json").write_text(json.dumps({"labels": {str(i): n for i, n in scene.truth.items()}}))
     tiny = (
         "--render=--azimuth-step 90 --polar-step 90 --registration --base --copies 1",
-        "--train=--epochs 1 --batch-size 8 --classifiers tops,tops2",
+        "--train=--epochs 1 --batch-size 8 --classifiers tops,tops2 --embedding 0",
         *("--workers", 1),
     )
     return ["--meshes", meshes, "--frames", frames, *tiny, "--cameras", "none"]
@@ -95,6 +95,8 @@ def given(tmp_path: Path) -> list[Any]:
 def test_a_small_table_resumes(tmp_path: Path, given: list[Any], monkeypatch: pytest.MonkeyPatch) -> None:
     out = tmp_path / "out"
     rows = "default", 'fusion rule "max"'
+    small = Lever(rows[0]), Lever(rows[1], rule="max"), Lever("gallery", fusion="gallery")
+    monkeypatch.setattr(levers, "LEVERS", small)
     run_command(monkeypatch, *given, "--out", out, "--seeds", 1, "--levers", *rows)
     first = {path: path.stat().st_mtime_ns for path in out.rglob("seed-0.json")}
     assert len(first) == 2 and [path.name for path in (out / "runs").iterdir()] == ["default"]
