@@ -66,7 +66,7 @@ def test_a_new_arrangement_has_new_placements(n_unmoved: int, expected: list[int
     assert numbers(video([before, after])) == [[0, 1, 2, 3], expected]
 
 
-def test_instances_without_position_or_with_another_name_start_anew() -> None:
+def test_instances_without_position_or_renamed_start_anew() -> None:
     frames: list[Objects] = [
         {k: (f"object {k}", (0.1 * k, 0, 1)) for k in range(4)},
         {0: ("object 0", None), **{k: (f"object {k}", (0.1 * k, 0, 1)) for k in range(1, 4)}},
