@@ -20,7 +20,7 @@ LEAST_MARKER = 10
 RIM = 3
 """Width, pixels, of the square within which depth is not trusted at the border of a thing."""
 
-CLEAR = 0.6
+CLEAR = 0.3
 """Largest contrast, in units, of a pixel that is clearly the plane's."""
 
 BLEEDING = 7
@@ -70,7 +70,7 @@ def flood(color: NDArray[np.uint8], depth: DepthImage, evidence: Evidence, steps
     near = grow(body, 5)
     numbers, n_colored = _colored_markers(colored & ~near, near, depth.valid)
     markers = np.where(numbers > 0, numbers + n_bodies, markers)
-    unknown = (near & ~like_plane) | colored | _unknown_without_depth(depth, evidence, body, near | colored, like_plane)
+    unknown = (near & ~(like_plane & ~evidence.high)) | colored | _unknown_without_depth(depth, evidence, body, near | colored, like_plane)
     markers += 1  # the background is 1, and 0 is flooded
     markers[(markers == 1) & unknown] = 0
     labels = watershed(color, markers) - 1
