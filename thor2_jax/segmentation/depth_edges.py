@@ -26,7 +26,7 @@ LEAST_EDGE = 8
 GAP = 2.0
 """Steepest slope of a surface across a gap without depth. Shadows of the projector beside a step are narrower."""
 
-BEND = 0.5
+BEND = 0.4
 """Least change of slope at a fold."""
 
 NEAR, FAR = 2, 6

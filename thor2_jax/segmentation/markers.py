@@ -5,11 +5,12 @@ Depth is not trusted beside its edges and where it is missing; there, the colour
 
 import dataclasses
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.segmentation.foreground import FLAT, UNIT, Evidence
-from thor2_jax.segmentation.pixels import Mask, close, components, grow, shrink, watershed
+from thor2_jax.segmentation.pixels import Mask, close, components, grow, nearest_known, shrink, watershed
 from thor2_jax.segmentation.planes import DepthImage
 
 __all__ = ["Pieces", "flood"]
@@ -19,6 +20,9 @@ LEAST_MARKER = 10
 
 RIM = 3
 """Width, pixels, of the square within which depth is not trusted at the border of a thing."""
+
+NECK = 4.0
+"""Half the width, pixels, of a neck that divides a body."""
 
 CLEAR = 0.3
 """Largest contrast, in units, of a pixel that is clearly the plane's."""
@@ -70,7 +74,11 @@ def flood(color: NDArray[np.uint8], depth: DepthImage, evidence: Evidence, steps
     near = grow(body, 5)
     numbers, n_colored = _colored_markers(colored & ~near, near, depth.valid)
     markers = np.where(numbers > 0, numbers + n_bodies, markers)
-    unknown = (near & ~(like_plane & ~evidence.high)) | colored | _unknown_without_depth(depth, evidence, body, near | colored, like_plane)
+    unknown = (
+        (near & ~(like_plane & ~evidence.high))
+        | colored
+        | _unknown_without_depth(depth, evidence, body, near | colored, like_plane)
+    )
     markers += 1  # the background is 1, and 0 is flooded
     markers[(markers == 1) & unknown] = 0
     labels = watershed(color, markers) - 1
@@ -78,10 +86,25 @@ def flood(color: NDArray[np.uint8], depth: DepthImage, evidence: Evidence, steps
 
 
 def _body_markers(body: Mask, edges: Mask) -> tuple[NDArray[np.int32], int]:
-    """Return the numbers [H, W] of the inner parts of bodies between edges, and how many there are."""
+    """Return the numbers [H, W] of the inner parts of bodies between edges, and how many there are.
+
+    Edges have gaps, so parts are also divided at necks. `merge_pieces` undoes what was no edge.
+    """
     numbers, sizes = components(shrink(body, RIM) & ~edges)
-    kept = sizes >= LEAST_MARKER
-    return (np.cumsum(kept) * kept).astype(np.int32)[numbers], int(kept.sum())
+    room = np.asarray(cv2.distanceTransform((numbers > 0).view(np.uint8), cv2.DIST_L2, 3))
+    parts, part_sizes = components((room > NECK) & (sizes >= LEAST_MARKER)[numbers])
+    part_sizes[part_sizes < LEAST_MARKER] = 0
+    whole = sizes >= LEAST_MARKER
+    whole[numbers[part_sizes[parts] > 0]] = False
+    kept = part_sizes > 0
+    markers = (np.cumsum(kept) * kept).astype(np.int32)[parts]
+    n_parts = int(kept.sum())
+    if n_parts > 0:  # the rest of a divided component goes to its nearest part
+        nearest = nearest_known(markers > 0)
+        same = (numbers.ravel()[nearest] == numbers) & (numbers > 0)
+        markers = np.where(same, markers.ravel()[nearest], 0)
+    markers += np.where(whole, np.cumsum(whole) + n_parts, 0).astype(np.int32)[numbers]
+    return markers, n_parts + int(whole.sum())
 
 
 def _colored_markers(colored: Mask, near: Mask, valid: Mask) -> tuple[NDArray[np.int32], int]:
