@@ -163,3 +163,57 @@ def test_invalid_arguments(
     assert run_thor2("recognize", "--model", model, *given) == 2
     err = capfd.readouterr().err
     assert expected in err and err.startswith("error: ") and err.count("\n") == 1
+
+
+def write_table_frame(folder: Path) -> Path:
+    """Write a frame without labels: two boxes on a table that is seen from straight above."""
+    color, depth = np.full((240, 320, 3), (150, 120, 90), np.uint8), np.full((240, 320), 900, np.uint16)
+    for columns, shade in ((slice(60, 110), (190, 30, 40)), (slice(180, 250), (30, 60, 190))):
+        color[80:150, columns], depth[80:150, columns] = shade, 800
+    folder.mkdir(parents=True)
+    (folder / "color.png").write_bytes(encode_image(color))
+    (folder / "depth.png").write_bytes(encode_image(depth))
+    (folder / "intrinsics.json").write_text(json.dumps({"fx": 290.0, "fy": 290.0, "cx": 160.0, "cy": 120.0}))
+    return folder
+
+
+def test_frames_without_labels_are_segmented(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    folder = write_table_frame(tmp_path / "frames" / "a")
+    files = files_of(folder)
+    del files[files.index("--labels") : files.index("--labels") + 2]
+    for given in (files, [tmp_path / "frames"]):
+        assert run_thor2("recognize", "--model", model, *given, "--segment", "table", "--json") == 0
+        (answer,) = lines_of(capfd.readouterr().out)
+        assert [one["label"] for one in answer["instances"]] == [1, 2]
+    assert run_thor2("recognize", "--model", model, *files) == 2
+    assert "--segment" in capfd.readouterr().err
+    assert run_thor2("recognize", "--model", model, tmp_path / "frames") == 2
+    assert "--segment" in capfd.readouterr().err
+
+
+def test_labels_are_replaced_where_a_folder_is_segmented(
+    model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    folder = write_table_frame(tmp_path / "one")
+    (folder / "mask.png").write_bytes(encode_image(np.full((240, 320), 9, np.uint8)))
+    assert run_thor2("recognize", "--model", model, folder, "--segment", "table", "--json") == 0
+    (answer,) = lines_of(capfd.readouterr().out)
+    assert [one["label"] for one in answer["instances"]] == [1, 2]
+
+
+def test_labels_and_segment_together(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    folder = write_frame(tmp_path / "one")
+    assert (
+        run_thor2("recognize", "--model", model, *files_of(folder), "--segment", "table", "--out", tmp_path / "o") == 2
+    )
+    error = capfd.readouterr().err
+    assert error.startswith("error: labels is ") and error.count("\n") == 1
+    assert not (tmp_path / "o").exists()
+
+
+def test_an_unknown_segmenter(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    folder = write_frame(tmp_path / "one")
+    assert run_thor2("recognize", "--model", model, folder, "--segment", "sam", "--out", tmp_path / "o") == 2
+    error = capfd.readouterr().err
+    assert error.startswith("error: segmenter is 'sam'") and error.count("\n") == 1
+    assert not (tmp_path / "o").exists()

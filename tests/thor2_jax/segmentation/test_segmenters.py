@@ -1,0 +1,111 @@
+"""Segmenters by name: the built-in one, entry points of other packages, and what they may do wrong."""
+
+import sys
+from collections.abc import Callable
+from importlib.metadata import EntryPoint
+from typing import Any
+
+import numpy as np
+import pytest
+
+import thor2_jax as thor2
+from thor2_jax.errors import InputError
+from thor2_jax.recognition.frames import RGBDFrame
+from thor2_jax.segmentation import segmenters
+from thor2_jax.segmentation.segmenters import ENTRY_POINTS, load_segmenter, segment, segmented, segmenter_names
+from thor2_jax.segmentation.table import segment_table
+
+FRAME = RGBDFrame(
+    np.zeros((6, 8, 3), np.uint8), np.full((6, 8), 800, np.uint16), np.ones((6, 8), np.uint8), np.eye(3) * [50, 50, 1]
+)
+
+
+def halves(frame: RGBDFrame) -> np.ndarray[Any, Any]:
+    assert frame.labels is None
+    labels = np.zeros(frame.depth.shape, np.uint16)
+    labels[:, 4:] = 1
+    return labels
+
+
+@pytest.fixture
+def offer(monkeypatch: pytest.MonkeyPatch) -> Callable[[str, str], None]:
+    """Return a function that offers an entry point of the group for the duration of a test."""
+    points: list[EntryPoint] = []
+
+    def entry_points(group: str, name: str | None = None) -> list[EntryPoint]:
+        assert group == ENTRY_POINTS
+        return [point for point in points if name in (None, point.name)]
+
+    monkeypatch.setattr(segmenters, "entry_points", entry_points)
+    monkeypatch.setitem(sys.modules, "wrapper", sys.modules[__name__])
+    return lambda name, value: points.append(EntryPoint(name, value, ENTRY_POINTS))
+
+
+def test_the_table_segmenter_is_built_in() -> None:
+    assert segmenter_names()[0] == "table" and load_segmenter("table") is segment_table
+    np.testing.assert_array_equal(thor2.segment(FRAME), segment_table(FRAME))
+
+
+def test_a_segmenter_of_another_package(offer: Callable[[str, str], None]) -> None:
+    offer("halves", "wrapper:halves")
+    assert segmenter_names() == ["table", "halves"]
+    np.testing.assert_array_equal(
+        segment(FRAME, "halves"), halves(RGBDFrame(FRAME.color, FRAME.depth, None, FRAME.intrinsics))
+    )
+    assert thor2.segmented(FRAME, "halves").instances == (1,)
+    assert FRAME.labels is not None and FRAME.labels.all()
+
+
+def test_a_segmenter_may_be_a_function() -> None:
+    assert segmented(FRAME, halves).labels is not None
+
+
+def test_an_unknown_segmenter(offer: Callable[[str, str], None]) -> None:
+    offer("halves", "wrapper:halves")
+    with pytest.raises(InputError, match=r"^segmenter is 'sam'; expected one of table, halves, .*" + ENTRY_POINTS):
+        segment(FRAME, "sam")
+
+
+@pytest.mark.parametrize("value", ["no_such_package_anywhere:f", "wrapper:no_such_function", "wrapper:FRAME"])
+def test_an_entry_point_that_is_no_function(offer: Callable[[str, str], None], value: str) -> None:
+    offer("broken", value)
+    with pytest.raises(InputError, match=rf"^segmenter is 'broken'; {value} "):
+        load_segmenter("broken")
+
+
+def test_the_table_segmenter_without_opencv(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in [
+        name for name in sys.modules if name.startswith("thor2_jax.segmentation.") and "segmenters" not in name
+    ]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    with pytest.raises(InputError, match=r"^segmenter is 'table', which needs OpenCV .*\[segment\]"):
+        load_segmenter("table")
+
+
+@pytest.mark.parametrize(
+    ("result", "message"),
+    [
+        (None, "returned a NoneType"),
+        ([[0, 1]], "returned a list"),
+        (np.zeros((6, 7), int), r"shape \(6, 7\)"),
+        (np.zeros((1, 6, 8), int), r"shape \(1, 6, 8\)"),
+        (np.zeros((6, 8)), "type float64"),
+        (np.zeros((6, 8), bool), "type bool"),
+        (np.full((6, 8), -1), "label -1"),
+    ],
+)
+def test_labels_that_are_not_labels(result: Any, message: str) -> None:
+    with pytest.raises(InputError, match=rf"^segmenter <lambda> returned .*{message.removeprefix('returned ')}"):
+        segment(FRAME, lambda frame: result)
+
+
+def test_a_segmenter_that_raises() -> None:
+    def failing(frame: RGBDFrame) -> np.ndarray[Any, Any]:
+        raise RuntimeError("no weights\nin this folder")
+
+    with pytest.raises(
+        InputError, match=r"^segmenter failing failed .*RuntimeError: no weights in this folder.*;"
+    ) as caught:
+        segment(FRAME, failing)
+    assert "\n" not in str(caught.value)
