@@ -102,7 +102,7 @@ def gallery_errors(directory: Path | None, refused: int, field: str) -> Iterator
     except (GalleryError, OSError) as error:
         log.error("%s", error)
         if isinstance(error, OSError):
-            message = f"The gallery cannot be written ({error.strerror}); it is as before."
+            message = f"The gallery cannot be read or written ({error.strerror}); it is as before."
             raise RequestError(507, None, message) from None
         message = str(error).replace(f"{directory}/", "").replace(str(directory), "the directory")
         raise RequestError(503 if isinstance(error, GalleryBusyError) else 500, None, f"{message}.") from None

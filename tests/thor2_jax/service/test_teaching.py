@@ -12,10 +12,15 @@ from typing import Any
 
 import filelock
 import httpx
+import hypothesis
 import numpy as np
 import pytest
+import schemathesis
 from fastapi import FastAPI
 from helpers import encode_image
+from hypothesis import HealthCheck
+from schemathesis.checks import not_a_server_error
+from schemathesis.specs.openapi.checks import response_schema_conformance, status_code_conformance
 
 import thor2_jax as thor2
 from thor2_jax.client import Client, ServiceError
@@ -39,7 +44,7 @@ def http(teaching_url: str, gallery: Path, files: Files) -> Iterator[httpx.Clien
     shutil.rmtree(gallery, ignore_errors=True)
     with httpx.Client(base_url=teaching_url, timeout=60) as client:
         yield client
-        shutil.rmtree(gallery)
+        shutil.rmtree(gallery, ignore_errors=True)
         assert len(recognized(client, files)) == 4 and known(client) == {}
 
 
@@ -79,6 +84,7 @@ def content(directory: Path) -> dict[str, bytes]:
 def test_the_next_frame_knows_an_enrolled_object(http: httpx.Client, files: Files) -> None:
     before = http.post("/v1/recognize", files=files).json()["instances"]
     assert list(before[3]["top"]) == ["tops", "tops2"]
+    compiled = compilations(http)  # by other tests in this process
     answer = enroll(http, files, "tall")
     assert answer.status_code == 200, answer.text
     record = answer.json()
@@ -97,9 +103,10 @@ def test_the_next_frame_knows_an_enrolled_object(http: httpx.Client, files: File
     for name in ("wide", "tall"):
         assert http.delete(f"/v1/objects/{name}").status_code == 200
     assert http.post("/v1/recognize", files=files).json()["instances"] == before
-    assert compilations(http) == 0
+    assert compilations(http) == compiled
 
 
+@pytest.mark.slow
 def test_the_service_embeds_as_the_library(http: httpx.Client, files: Files, frame: Any, teaching_run: Path) -> None:
     enroll(http, files, "tall")
     expected = thor2.Recognizer.load(teaching_run, gallery=teaching_run / "none")
@@ -343,6 +350,20 @@ def test_two_clients_at_once_lose_no_change(http: httpx.Client, files: Files) ->
     assert answers == [200] * 10 and len(known(http)) == 10
 
 
+@pytest.mark.parametrize(
+    ("method", "path"), [("POST", "/v1/objects"), ("DELETE", "/v1/objects/{name}"), ("POST", "/v1/objects/undo")]
+)
+def test_openapi_requests_conform(method: str, path: str, http: httpx.Client) -> None:
+    document = schemathesis.openapi.from_url(f"{http.base_url}/openapi.json")
+
+    @hypothesis.settings(max_examples=25, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+    @hypothesis.given(case=document[path][method].as_strategy())
+    def call(case: schemathesis.Case) -> None:
+        case.call_and_validate(checks=[not_a_server_error, status_code_conformance, response_schema_conformance])
+
+    call()
+
+
 def test_a_run_that_answers_by_classifiers_answers_by_both(teaching_run: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     shutil.copytree(teaching_run, run)
@@ -385,14 +406,12 @@ def test_all_workers_know_an_object_within_a_second(
         assert time.monotonic() < until
         time.sleep(0.1)
     with httpx.Client(base_url=server.url, timeout=60) as client:
-        for round_ in range(3):
-            assert enroll(client, files, f"tall{round_}").status_code == 200
-            end = time.monotonic() + 1
+        for name in ("tall", "high"):
+            assert enroll(client, files, name).status_code == 200
+            end = time.monotonic() + 2
             while time.monotonic() < end:  # Each request is a new connection, which any worker may accept.
-                names = [
-                    one["name"] for one in httpx.post(f"{server.url}/v1/recognize", files=files).json()["instances"]
-                ]
-                assert names[3] is not None and names[3].startswith("tall")
-                classes = httpx.get(f"{server.url}/v1/model").json()["classes"]
-                assert f"tall{round_}" in classes
+                answer = httpx.post(f"{server.url}/v1/recognize", files=files, timeout=60).json()
+                assert answer["instances"][3]["name"] == name
+                assert httpx.get(f"{server.url}/v1/model", timeout=60).json()["classes"] == ["a", "b", name]
+            assert client.delete(f"/v1/objects/{name}").status_code == 200
         assert "thor2_compilations_after_warm_up_total 0.0" in client.get("/metrics").text
