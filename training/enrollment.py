@@ -50,8 +50,8 @@ def _evenly_spread(count: int) -> NDArray[np.float64]:
     return np.stack([index * golden_angle % (2 * np.pi), np.arccos(1 - (2 * index + 1) / count)], axis=1)
 
 
-def mesh_views(mesh: Path | TexturedMesh) -> list[PreparedInstance]:
-    """Render a mesh from all sides.
+def mesh_views(mesh: Path | TexturedMesh, mesh_scale: float = 1.0) -> list[PreparedInstance]:
+    """Render a mesh from all sides; `mesh_scale` converts the unit of a file to metres.
 
     Raises:
         InputError: the mesh cannot be read, is too large or too small to be in metres, or has no usable view.
@@ -59,7 +59,11 @@ def mesh_views(mesh: Path | TexturedMesh) -> list[PreparedInstance]:
     """
     name = mesh.name if isinstance(mesh, Path) else "mesh"
     task = ViewTask(
-        name, load_mesh(mesh) if isinstance(mesh, Path) else mesh, _evenly_spread(MESH_VIEWS), 0, AUGMENTATIONS
+        name,
+        load_mesh(mesh, mesh_scale) if isinstance(mesh, Path) else mesh,
+        _evenly_spread(MESH_VIEWS),
+        0,
+        AUGMENTATIONS,
     )
     views = [
         PreparedInstance(number, cloud.xyz, cloud.rgb, np.zeros(len(cloud.xyz), bool))

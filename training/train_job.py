@@ -19,7 +19,8 @@ from training.fitting.checkpoints import CHECKPOINTS
 from training.fitting.job import VIEWS, check_out, check_trained, finished_record, is_finished, train_run
 from training.fitting.options import Progress
 from training.fitting.protocol import DEFAULT, PAPER, Protocol
-from training.objects.meshes import find_meshes, read_names
+from training.objects.mesh import TexturedMesh
+from training.objects.meshes import find_meshes, read_names, scaled_meshes
 from training.storage.jobs import check_same_job
 from training.storage.workers import local_workers
 from training.views.dataset import ViewDataset
@@ -50,6 +51,7 @@ class TrainJob:
         leave_out: objects to train without.
         sequences: table of sequence -> its objects; one run is trained for each sequence.
         workers: rendering processes.
+        mesh_scale: factor from the unit of the meshes to metres.
     """
 
     out: Path
@@ -63,6 +65,7 @@ class TrainJob:
     leave_out: Sequence[str] = ()
     sequences: Path | None = None
     workers: int = 1
+    mesh_scale: float = 1.0
 
 
 def run_train_job(job: TrainJob, display: Display) -> dict[Path, list[TrainedRun]]:
@@ -157,9 +160,9 @@ def _remove(directory: Path) -> None:
     shutil.rmtree(directory.rename(leftover))
 
 
-def _find_meshes(job: TrainJob) -> dict[str, Path]:
+def _find_meshes(job: TrainJob) -> dict[str, Path | TexturedMesh]:
     assert job.meshes is not None
-    return find_meshes(job.meshes, read_names(job.names) if job.names else None)
+    return scaled_meshes(find_meshes(job.meshes, read_names(job.names) if job.names else None), job.mesh_scale)
 
 
 def _open_views(job: TrainJob, display: Display) -> ViewSource:

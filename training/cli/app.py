@@ -15,7 +15,17 @@ from thor2_jax.errors import InputError
 from thor2_jax.printable import escape_characters
 from training.cli.compilation_cache import enable_compilation_cache
 
-__all__ = ["ModelOption", "QuietOption", "UnknownOption", "app", "console", "main", "show_help", "split_names"]
+__all__ = [
+    "MeshScaleOption",
+    "ModelOption",
+    "QuietOption",
+    "UnknownOption",
+    "app",
+    "console",
+    "main",
+    "show_help",
+    "split_names",
+]
 
 app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -33,6 +43,9 @@ UnknownOption = Annotated[
     ),
 ]
 ModelOption = Annotated[Path, typer.Option("--model", help="Run directory of a trained model.")]
+MeshScaleOption = Annotated[
+    float, typer.Option("--mesh-scale", help="Factor from the unit of the meshes to metres; 0.001 for millimetres.")
+]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress.")]
 
 

@@ -9,7 +9,7 @@ import typer
 from typer.core import TyperCommand
 
 from thor2_jax.errors import InputError
-from training.cli.app import QuietOption, app, console
+from training.cli.app import MeshScaleOption, QuietOption, app, console
 from training.cli.progress import show_progress
 
 if TYPE_CHECKING:
@@ -45,6 +45,7 @@ def enroll(
     labels: Annotated[Path | None, typer.Option(help="Instance labels, PNG; 0 is background.")] = None,
     intrinsics: Annotated[Path | None, typer.Option(help="JSON with fx, fy, cx, cy and depth_scale.")] = None,
     instance: Annotated[int | None, typer.Option(help="Label number of the object in this frame.")] = None,
+    mesh_scale: MeshScaleOption = 1.0,
     extend: Annotated[bool, typer.Option("--extend", help="Add views to an object that exists.")] = False,
     replace: Annotated[bool, typer.Option("--replace", help="Discard the views of an object that exists.")] = False,
     quiet: QuietOption = False,
@@ -59,12 +60,14 @@ def enroll(
 
     images = {"color": color, "depth": depth, "labels": labels, "intrinsics": intrinsics, "instance": instance}
     _check_sources(name, mesh, frames, label_name, images)
+    if mesh is None and mesh_scale != 1:
+        raise InputError(f"mesh_scale is {mesh_scale:g}; it belongs to --mesh")
     skipped: list[str] = []
 
     def read(sigma_s: float) -> Mapping[str, Sequence["PreparedInstance"]]:
         if mesh is not None:
             assert name is not None
-            return {name: mesh_views(mesh)}
+            return {name: mesh_views(mesh, mesh_scale)}
         if frames:
             views, unusable = labelled_views(frames, sigma_s, label_name or name)
             skipped.extend(f"skipped: {each.reason}" for each in unusable)

@@ -65,7 +65,8 @@ def ocid(
     dataset: DatasetArgument,
     model: ModelsOption,
     names: Annotated[
-        Path, typer.Option(help="YAML or JSON table: sequence -> object names in the order of their placement.")
+        Path,
+        typer.Option(help="Table: sequence -> object names in order of placement; or a table of OCID-VLG."),
     ],
     runs: MoreModels = None,
     per_sequence: Annotated[

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 import typer
 
 from thor2_jax.errors import InputError
-from training.cli.app import QuietOption, app, console
+from training.cli.app import MeshScaleOption, QuietOption, app, console
 from training.cli.progress import show_progress
 
 
@@ -36,6 +36,7 @@ def render(
     base: Annotated[bool, typer.Option("--base", help="Augment: masks without the lowest centimetre.")] = False,
     copies: Annotated[int, typer.Option(help="Augmented copies of each view, if there are augmentations.")] = 2,
     seed: Annotated[int, typer.Option(help="Seed for the augmentations.")] = 0,
+    mesh_scale: MeshScaleOption = 1.0,
     quiet: QuietOption = False,
 ) -> None:
     """Render views of meshes to a dataset for `train --dataset`. An interrupted rendering resumes."""
@@ -46,7 +47,7 @@ def render(
     from training.augmentation.registration import Registration
     from training.augmentation.segmentation import Segmentation
     from training.augmentation.sensor import Sensor
-    from training.objects.meshes import find_meshes, read_names
+    from training.objects.meshes import find_meshes, read_names, scaled_meshes
     from training.storage.workers import local_workers, ray_workers
     from training.views.render_job import render_dataset
 
@@ -61,11 +62,11 @@ def render(
         base=Base() if base else None,
         copies=copies,
     )
-    paths = find_meshes(meshes, read_names(names) if names else None)
+    sources = scaled_meshes(find_meshes(meshes, read_names(names) if names else None), mesh_scale)
     pool = local_workers(workers) if engine == "local" else ray_workers(workers, address)
     with show_progress(quiet) as progress:
         dataset = render_dataset(
-            paths,
+            sources,
             out,
             azimuth_step,
             polar_step,

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from thor2_jax.errors import InputError
-from training.cli.app import QuietOption, app, console, split_names
+from training.cli.app import MeshScaleOption, QuietOption, app, console, split_names
 from training.cli.progress import show_progress
 
 
@@ -51,6 +51,7 @@ def train(
             help="Also fit an embedding, on the meshes and N procedural objects, in place of the packaged one.",
         ),
     ] = 0,
+    mesh_scale: MeshScaleOption = 1.0,
     workers: Annotated[int, typer.Option(min=1, help="Rendering processes.")] = 2,
     coordinator: Annotated[
         str | None, typer.Option(help="HOST:PORT of process 0, for training with several processes.")
@@ -76,6 +77,8 @@ def train(
     for option, value in (("names", names), ("azimuth-step", azimuth_step), ("polar-step", polar_step)):
         if dataset is not None and value is not None:
             raise InputError(f"{option} is {value}; expected only with --meshes: the views of a --dataset are rendered")
+    if dataset is not None and mesh_scale != 1:
+        raise InputError(f"mesh-scale is {mesh_scale:g}; expected only with --meshes: the views are rendered")
     if coordinator is None and (processes, process) != (1, 0):
         raise InputError(f"processes is {processes} and process {process}; several processes need --coordinator")
     if process >= processes:
@@ -91,7 +94,7 @@ def train(
     from thor2_jax.recognizer import EMBEDDING_FILE
     from training.embedding.build import build_embedding
     from training.fitting.protocol import DEFAULT, PAPER
-    from training.objects.meshes import find_meshes, read_names
+    from training.objects.meshes import find_meshes, read_names, scaled_meshes
     from training.train_job import TrainJob, run_train_job
 
     job = TrainJob(
@@ -108,10 +111,11 @@ def train(
         leave_out=split_names(leave_out),
         sequences=sequences,
         workers=workers,
+        mesh_scale=mesh_scale,
     )
     trained = run_train_job(job, functools.partial(show_progress, quiet))
     if embedding and meshes is not None and not (out / EMBEDDING_FILE).is_file():
-        paths = find_meshes(meshes, read_names(names) if names else None)
+        paths = scaled_meshes(find_meshes(meshes, read_names(names) if names else None), mesh_scale)
         with show_progress(quiet) as progress:
             build_embedding(
                 out / EMBEDDING_FILE,

@@ -19,6 +19,7 @@ from thor2_jax.gallery.embedding import Embedding
 from training.embedding.fit import EmbeddingFit, fit_embedding
 from training.embedding.sampling import ObjectSource, build_samples
 from training.fitting.options import Progress
+from training.objects.mesh import TexturedMesh
 from training.objects.meshes import find_meshes
 from training.storage.workers import local_workers
 
@@ -36,7 +37,7 @@ def build_embedding(
     objects: int = OBJECTS,
     views: int = VIEWS,
     epochs: int = EPOCHS,
-    meshes: Sequence[Path] = (),
+    meshes: Sequence[Path | TexturedMesh] = (),
     workers: int = 2,
     progress: Progress = lambda stage, done, total, note: None,
 ) -> Embedding:
@@ -47,7 +48,7 @@ def build_embedding(
         objects: number of procedural objects.
         views: views of each procedural object; a mesh has `MESH_WEIGHT` times as many.
         epochs: passes over the samples.
-        meshes: files of other objects.
+        meshes: other objects, or their files.
         workers: rendering processes; they do not affect the result.
         progress: called with (stage, done, total, note).
 

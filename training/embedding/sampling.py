@@ -29,6 +29,7 @@ from training.augmentation.registration import Registration
 from training.augmentation.segmentation import Segmentation
 from training.augmentation.sensor import Sensor
 from training.embedding.samples import Samples, concatenate_fields, sample_clouds
+from training.objects.mesh import TexturedMesh
 from training.objects.meshes import load_mesh
 from training.objects.procedural import procedural_object
 from training.rendering.camera import Camera
@@ -63,7 +64,7 @@ CAMERA = Camera.from_field_of_view(540, 405, 40.0)
 FROM_ABOVE = 0.7
 """Share of views whose camera looks down on the object or is slightly below its middle, as on a table."""
 
-ObjectSource = int | Path
+ObjectSource = int | Path | TexturedMesh
 """The seed of a procedural object, or a mesh file."""
 
 
@@ -87,6 +88,12 @@ def _random_angles(rng: np.random.Generator) -> tuple[float, float]:
     return rng.uniform(0, 2 * np.pi), float(np.arccos(rng.uniform(low, high)))
 
 
+def _mesh(source: ObjectSource) -> TexturedMesh:
+    if isinstance(source, TexturedMesh):
+        return source
+    return load_mesh(source) if isinstance(source, Path) else procedural_object(source)
+
+
 def render_clouds(task: ViewTask) -> list[tuple[int, Cloud]]:
     """Return the object's index and the cloud of the views that have at least `MIN_VIEW_POINTS` points.
 
@@ -95,7 +102,7 @@ def render_clouds(task: ViewTask) -> list[tuple[int, Cloud]]:
     """
     clouds = []
     for index, source in task.sources.items():
-        mesh = load_mesh(source) if isinstance(source, Path) else procedural_object(source)
+        mesh = _mesh(source)
         caster = RayCaster([mesh])
         rng = np.random.default_rng([task.seed, index])
         for _ in range(task.views):

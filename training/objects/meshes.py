@@ -15,7 +15,16 @@ from thor2_jax.recognition.frames import MAX_IMAGE_PIXELS
 from thor2_jax.tables import parse_json, parse_yaml
 from training.objects.mesh import TexturedMesh, merge_meshes
 
-__all__ = ["MESH_SUFFIXES", "find_meshes", "load_mesh", "read_names"]
+__all__ = [
+    "MAX_SIDE",
+    "MESH_SUFFIXES",
+    "MIN_SIDE",
+    "find_meshes",
+    "load_mesh",
+    "longest_side",
+    "read_names",
+    "scaled_meshes",
+]
 
 MESH_SUFFIXES = (".glb", ".obj", ".ply")
 
@@ -76,10 +85,10 @@ def _part(geometry: trimesh.Trimesh) -> TexturedMesh:
 
 
 def _check(mesh: TexturedMesh) -> None:
-    """Check the shapes, values and size of a parsed mesh.
+    """Check the shapes and values of a parsed mesh.
 
     Raises:
-        InputError: The mesh is inconsistent, or not of an object's size.
+        InputError: The mesh is inconsistent.
     """
     vertices, faces, n = mesh.vertices, mesh.faces, len(mesh.faces)
     shapes: list[tuple[str, NDArray[Any] | None, tuple[int, ...]]] = [
@@ -96,11 +105,20 @@ def _check(mesh: TexturedMesh) -> None:
         raise InputError(f"{(~np.isfinite(vertices)).any(axis=1).sum()} vertices are not finite")
     if mesh.uv is not None and not (np.abs(mesh.uv) <= MAX_TEXTURE_COORDINATE).all():
         raise InputError(f"texture coordinates are not finite, or beyond {MAX_TEXTURE_COORDINATE}")
-    longest = float(np.ptp(vertices[np.unique(faces)], axis=0).max())
+
+
+def _longest(mesh: TexturedMesh) -> float:
+    return float(np.ptp(mesh.vertices[np.unique(mesh.faces)], axis=0).max())
+
+
+def _check_size(mesh: TexturedMesh) -> None:
+    """Raise InputError unless the mesh has an object's size in metres."""
+    longest = _longest(mesh)
     if not MIN_SIDE <= longest <= MAX_SIDE:
         unit = " (is it in millimetres?)" if longest > MAX_SIDE else ""
         raise InputError(
-            f"longest side {longest:g}{unit}; expected {MIN_SIDE:g} to {MAX_SIDE:g} metres; scale the mesh"
+            f"longest side {longest:g}{unit}; expected {MIN_SIDE:g} to {MAX_SIDE:g} metres; scale the mesh, for "
+            "instance by --mesh-scale 0.001"
         )
 
 
@@ -124,16 +142,43 @@ def _check_obj_references(path: Path) -> None:
                 raise InputError(f"its texture {image!r} is missing")
 
 
-def load_mesh(path: str | Path) -> TexturedMesh:
+def load_mesh(path: str | Path, scale: float = 1.0) -> TexturedMesh:
     """Read a GLB, OBJ or PLY file with a texture, vertex colours, face colours or plain material colours.
 
     Colours are taken as stored, as sRGB; a base colour factor multiplies its texture, or stands alone without one.
 
+    Args:
+        path: the file.
+        scale: factor that converts its unit to metres; .001 for millimetres.
+
     Raises:
         InputError: The file is missing, unreadable or of another format, has no faces or colours, has vertices or
-            texture coordinates that are not finite or too large, or is not of an object's size in metres.
+            texture coordinates that are not finite or too large, or is not of an object's size in metres; or `scale` is
+            not a positive number.
     """
-    path = Path(path)
+    if not 0 < scale < np.inf:
+        raise InputError(f"mesh_scale is {scale:g}; expected a positive number, such as 0.001 for millimetres")
+    mesh = _parsed(Path(path))
+    if scale != 1:
+        mesh = mesh.transformed(np.diag([scale, scale, scale, 1.0]))
+    try:
+        _check_size(mesh)
+    except InputError as error:
+        raise InputError(f"mesh {path}: {error}") from None
+    return mesh
+
+
+def longest_side(path: str | Path) -> float:
+    """Return the longest side of the bounding box of a mesh in the file's unit; raises InputError as `load_mesh`."""
+    return _longest(_parsed(Path(path)))
+
+
+def scaled_meshes(meshes: Mapping[str, Path], scale: float) -> dict[str, Path | TexturedMesh]:
+    """Return object name -> mesh file, or, if the unit is not metres, mesh; raises InputError as `load_mesh`."""
+    return {name: path if scale == 1 else load_mesh(path, scale) for name, path in meshes.items()}
+
+
+def _parsed(path: Path) -> TexturedMesh:
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise InputError(f"mesh {path}: the extension must be one of {', '.join(MESH_SUFFIXES)}")
     if not path.is_file():

@@ -7,20 +7,25 @@ YAML or JSON file does: sequence -> names in the order in which the objects were
     seq36: [mug, bowl, banana]                      # of both cameras
     table/top/mixed/seq21: [bowl, tomato_soup]      # the sequence's folder, or the end of its path
 
+The tables of OCID-VLG (Tziafas et al., 2023) name objects too: a JSON list of {"image_filename": "sequence,image",
+"answer": label, "target": name, ...}. With such a table, the frames that it lists are read, and labels that it does not
+name are not scored.
+
 The dataset has no intrinsics. They are fitted to each frame's organized point cloud, whose points lie on the rays of
 their pixels.
 """
 
 import itertools
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError, with_context
 from thor2_jax.recognition.frames import Intrinsics, RGBDFrame, read_color, read_depth, read_labels
-from thor2_jax.tables import read_table
+from thor2_jax.tables import parse_json, read_table
 from training.readers.labelled import LabelledFrame, LabelledFrames, path_ends
 from training.readers.pcd import read_organized_points
 
@@ -51,7 +56,8 @@ class OCID(LabelledFrames):
             names: YAML or JSON file, see the module.
 
         Raises:
-            InputError: There are no frames, or `names` is damaged or lacks sequences, which the message lists.
+            InputError: There are no frames, or `names` is damaged, lacks sequences, which the message lists, or is a
+                table of OCID-VLG that lists none of the frames.
             OSError: `names` cannot be opened.
         """
         path = Path(path)
@@ -65,7 +71,16 @@ class OCID(LabelledFrames):
                 self._images += [(sequence, image) for image in sorted((folder / "rgb").glob("*.png"))]
         if not self._images:
             raise InputError(f"dataset: {path} has no {{table,floor}}/{{bottom,top}}/<type>/<sequence>/rgb/*.png")
-        self._names = _names(Path(names), dict.fromkeys(sequence for sequence, _ in self._images))
+        value = _read_names(Path(names))
+        self._is_complete = not isinstance(value, list)
+        if isinstance(value, list):
+            by_sequence, listed = _names_of_vlg(Path(names), value)
+            self._images = [(s, image) for s, image in self._images if _find(s, listed, image.stem) is not None]
+            if not self._images:
+                raise InputError(f"{names} lists no frame of {path}; expected image_filename <sequence>,<image>")
+        else:
+            by_sequence = _names_in_order(Path(names), value, dict.fromkeys(s for s, _ in self._images))
+        self._names = by_sequence
         self.identifiers = ["/".join((*sequence, image.stem)) for sequence, image in self._images]
 
     def __getitem__(self, number: int) -> LabelledFrame:
@@ -73,7 +88,8 @@ class OCID(LabelledFrames):
         sequence, _ = self._images[number]
         place, camera, kind, _ = sequence
         with with_context(self.identifiers[number]):
-            frame, truth = _read(self.files(number), _FIRST_OBJECT[place], self._names[sequence])
+            names = next(self._names[end] for end in path_ends("/".join(sequence)) if end in self._names)
+            frame, truth = _read(self.files(number), _FIRST_OBJECT[place], names, self._is_complete)
         attributes = {"place": place, "camera": _CAMERAS[camera], "type": kind}
         return LabelledFrame(self.identifiers[number], frame, truth, attributes)
 
@@ -85,10 +101,22 @@ class OCID(LabelledFrames):
         return [image, folder / "depth" / image.name, folder / "label" / image.name, cloud]
 
 
-def _names(path: Path, sequences: Iterable[_Sequence]) -> dict[_Sequence, list[str]]:
-    """Return the object names of each sequence, whose key is the longest end of its path in the table."""
-    table = read_table(path)
-    named: dict[_Sequence, list[str]] = {}
+def _read_names(path: Path) -> dict[Any, Any] | list[Any]:
+    """Return the value of a table of names: a list if it is one of OCID-VLG."""
+    if path.suffix.lower() != ".json":
+        return read_table(path)
+    try:
+        value = parse_json(path.read_bytes())
+    except ValueError as error:
+        raise InputError(f"{path} is damaged ({error})") from None
+    if not isinstance(value, (dict, list)):
+        raise InputError(f"{path} holds a {type(value).__name__}; expected a table, or a list of OCID-VLG")
+    return value
+
+
+def _names_in_order(path: Path, table: Mapping[Any, Any], sequences: Iterable[_Sequence]) -> dict[str, dict[int, str]]:
+    """Return label -> name of each sequence, whose key is the longest end of its path in the table."""
+    named: dict[str, dict[int, str]] = {}
     lacking = []
     for sequence in sequences:
         key = next((end for end in path_ends("/".join(sequence)) if end in table), None)
@@ -98,14 +126,50 @@ def _names(path: Path, sequences: Iterable[_Sequence]) -> dict[_Sequence, list[s
         names = table[key]
         if not isinstance(names, list) or not all(isinstance(name, str) and name for name in names):
             raise InputError(f"{path}: {key} is {names!r}; expected a list of names")
-        named[sequence] = names
+        named["/".join(sequence)] = dict(enumerate(names, start=_FIRST_OBJECT[sequence[0]]))
     if lacking:
         raise InputError(f"{path} lacks the sequences {', '.join(lacking)}")
     return named
 
 
-def _read(files: Iterable[Path], first_object: int, names: list[str]) -> tuple[RGBDFrame, dict[int, str]]:
-    """Read a frame and the names of its labels."""
+def _names_of_vlg(path: Path, items: Sequence[Any]) -> tuple[dict[str, dict[int, str]], dict[str, set[str]]]:
+    """Return, of a table of OCID-VLG, sequence -> label -> name, and sequence -> stems of its images.
+
+    Labels number the objects of a sequence in the order of their placement, so its images share the names.
+    """
+    names: dict[str, dict[int, str]] = {}
+    images: dict[str, set[str]] = {}
+    for position, item in enumerate(items):
+        try:
+            file, answer, target = item["image_filename"], item["answer"], item["target"]
+            folder, image = file.split(",")
+            label = int(answer)
+            if isinstance(answer, (bool, float)) or not isinstance(target, str) or not target:
+                raise ValueError
+        except (TypeError, KeyError, ValueError, AttributeError):
+            raise InputError(
+                f"{path}: item {position} is {str(item)[:200]}; expected image_filename <sequence>,<image>, answer "
+                "<label> and target <name>"
+            ) from None
+        sequence = "/".join(folder.strip().strip("/").split("/")[-4:])
+        known = names.setdefault(sequence, {}).setdefault(label, target)
+        if known != target:
+            raise InputError(
+                f"{path}: label {label} of {sequence} has the names {known!r} and {target!r}; expected one"
+            )
+        images.setdefault(sequence, set()).add(Path(image.strip()).stem)
+    return names, images
+
+
+def _find(sequence: _Sequence, images: Mapping[str, set[str]], stem: str) -> str | None:
+    """Return the end of a sequence's path under which an image is listed."""
+    return next((end for end in path_ends("/".join(sequence)) if stem in images.get(end, ())), None)
+
+
+def _read(
+    files: Iterable[Path], first_object: int, names: Mapping[int, str], is_complete: bool
+) -> tuple[RGBDFrame, dict[int, str]]:
+    """Read a frame and the names of its labels; with `is_complete`, each must have one."""
     image, depth_file, label_file, cloud_file = files
     color = read_color(image)
     labels = read_labels(label_file)
@@ -116,13 +180,13 @@ def _read(files: Iterable[Path], first_object: int, names: list[str]) -> tuple[R
         intrinsics = fit_intrinsics(points)
     depth = read_depth(depth_file)
     frame = RGBDFrame(color, depth, labels * (labels >= first_object), intrinsics)
-    unnamed = [label for label in frame.instances if label - first_object >= len(names)]
-    if unnamed:
+    unnamed = [label for label in frame.instances if label not in names]
+    if unnamed and is_complete:
         raise InputError(
             f"{label_file} has the label {unnamed[0]}; the sequence has {len(names)} names, for the labels from "
             f"{first_object} on"
         )
-    return frame, {label: names[label - first_object] for label in frame.instances}
+    return frame, {label: names[label] for label in frame.instances if label in names}
 
 
 def fit_intrinsics(points: NDArray[np.float64]) -> Intrinsics:

@@ -204,6 +204,8 @@ def test_options_without_effect_are_refused(meshes: Path, tmp_path: Path, run: R
         ("names", (*dataset, "--names", tmp_path / "names.json")),
         ("azimuth-step", (*dataset, "--azimuth-step", 20)),
         ("polar-step", (*dataset, "--polar-step", 20)),
+        ("mesh-scale", (*dataset, "--mesh-scale", 0.001)),
+        ("mesh_scale", ("--meshes", meshes, "--mesh-scale", 0)),
         ("processes", (*dataset, "--processes", 2)),
         ("process", (*dataset, "--process", 1)),
         ("embedding", (*dataset, "--embedding", 9)),

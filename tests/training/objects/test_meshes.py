@@ -11,7 +11,7 @@ from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
 from thor2_jax.errors import InputError
 from training.objects.mesh import TexturedMesh, merge_meshes
-from training.objects.meshes import find_meshes, load_mesh, read_names
+from training.objects.meshes import find_meshes, load_mesh, longest_side, read_names, scaled_meshes
 
 QUAD = np.array([[0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0], [0, 0.1, 0]])
 QUAD_FACES = np.array([[0, 1, 2], [0, 2, 3]])
@@ -309,3 +309,32 @@ def test_scans_against_trimesh(shared: Path) -> None:
         vertex_colors = np.asarray(reference.visual.to_color().vertex_colors)[:, :3].astype(int)
         at_corner = mesh.colors_at(np.arange(len(mesh.faces)), np.zeros((len(mesh.faces), 2))).astype(int)
         assert np.median(np.abs(at_corner - vertex_colors[reference.faces[:, 0]])) <= 2
+
+
+# Units
+
+
+def test_meshes_in_other_units(tmp_path: Path) -> None:
+    metres = trimesh.creation.box((0.2, 0.1, 0.05))
+    metres.visual = trimesh.visual.ColorVisuals(metres, vertex_colors=np.full((8, 4), 200, np.uint8))
+    metres.export(tmp_path / "box.glb")
+    millimetres = metres.copy()
+    millimetres.apply_scale(1000)
+    millimetres.export(tmp_path / "large.glb")
+    expected, scaled = load_mesh(tmp_path / "box.glb"), load_mesh(tmp_path / "large.glb", 0.001)
+    np.testing.assert_allclose(scaled.vertices, expected.vertices, atol=1e-6)
+    np.testing.assert_array_equal(scaled.corner_colors, expected.corner_colors)
+    assert longest_side(tmp_path / "large.glb") == pytest.approx(200)
+    with pytest.raises(InputError, match=r"large\.glb: longest side 200 .*--mesh-scale 0\.001"):
+        load_mesh(tmp_path / "large.glb")
+    paths = {"box": tmp_path / "box.glb"}
+    assert scaled_meshes(paths, 1.0) == paths
+    doubled = scaled_meshes(paths, 2.0)["box"]
+    assert isinstance(doubled, TexturedMesh)
+    np.testing.assert_allclose(doubled.vertices, 2 * expected.vertices)
+
+
+@pytest.mark.parametrize("scale", [0.0, -1.0, float("nan"), float("inf")])
+def test_invalid_scales_of_meshes(tmp_path: Path, scale: float) -> None:
+    with pytest.raises(InputError, match="^mesh_scale is "):
+        load_mesh(tmp_path / "box.glb", scale)

@@ -212,6 +212,53 @@ def test_labels_without_a_name(tmp_path: Path) -> None:
     assert str(folder / "label" / f"{STEM}.png") in message and "label 5;" in message
 
 
+# Names of OCID-VLG
+
+
+def vlg_item(label: int | str, name: str, sequence: str, stem: str = STEM) -> dict[str, Any]:
+    return {"image_filename": f"{sequence},{stem}.png", "answer": label, "target": name, "question": "Pick it."}
+
+
+@pytest.mark.parametrize("sequence", ["YCB10/table/bottom/curved/seq36", "table/bottom/curved/seq36", "seq36"])
+def test_names_of_vlg(tmp_path: Path, sequence: str) -> None:
+    """Names hold for all images of a sequence; labels without a name are not scored; unlisted frames are left out."""
+    write_frame(tmp_path)
+    write_frame(tmp_path, stem="later")
+    write_frame(tmp_path, stem="unlisted")
+    write_frame(tmp_path, "floor/top/mixed/seq08")
+    items = [vlg_item(3, "mug", sequence), vlg_item(3, "mug", sequence), vlg_item("5", "bowl_1", sequence, "later")]
+    names = tmp_path / "test.json"
+    names.write_text(json.dumps(items))
+    dataset = OCID(tmp_path, names)
+    assert dataset.identifiers == [f"table/bottom/curved/seq36/{stem}" for stem in ("later", STEM)]
+    for item in dataset:
+        assert item.frame.instances == (3, 4, 5)
+        assert dict(item.truth) == {3: "mug", 5: "bowl_1"}
+
+
+@pytest.mark.parametrize(
+    ("items", "expected"),
+    [
+        ([], "lists no frame"),
+        ([vlg_item(3, "mug", "seq99")], "lists no frame"),
+        ([{"image_filename": "seq36,a.png", "answer": 3}], "item 0 is"),
+        ([vlg_item(3, "mug", "seq36"), vlg_item(3, "", "seq36")], "item 1 is"),
+        ([{**vlg_item(3, "mug", "seq36"), "answer": "mug"}], "item 0 is"),
+        ([{**vlg_item(3, "mug", "seq36"), "answer": True}], "item 0 is"),
+        ([{**vlg_item(3, "mug", "seq36"), "image_filename": "seq36"}], "item 0 is"),
+        ([7], "item 0 is 7"),
+        ([vlg_item(3, "mug", "seq36"), vlg_item(3, "bowl", "seq36")], "the names 'mug' and 'bowl'"),
+    ],
+)
+def test_invalid_names_of_vlg(tmp_path: Path, items: Any, expected: str) -> None:
+    write_frame(tmp_path)
+    names = tmp_path / "names.json"
+    names.write_text(json.dumps(items))
+    with pytest.raises(InputError) as caught:
+        OCID(tmp_path, names)
+    assert expected in str(caught.value) and str(names) in str(caught.value)
+
+
 # Files
 
 

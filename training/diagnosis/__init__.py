@@ -1,0 +1,1 @@
+"""Diagnosis of set-ups: what is likely wrong with the files of a frame."""

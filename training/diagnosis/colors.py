@@ -1,0 +1,130 @@
+"""Checks of colour: light and cast in the image alone, the order of the channels with a trained recognizer.
+
+One frame does not show whether red and blue are exchanged: apples may be blue. A recognizer knows its objects, so it is
+surer of their names in the right order.
+"""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from thor2_jax.recognition.frames import RGBDFrame
+from thor2_jax.recognizer import Recognizer
+from training.diagnosis.findings import Diagnosis
+
+__all__ = ["check_channel_order", "check_light"]
+
+MIN_BRIGHTNESS = 22.0
+"""Least mean value of the pixels of the instances, of 255."""
+
+MAX_SATURATED = 0.5
+"""Largest share of the pixels of the instances with a channel at its maximum."""
+
+MAX_CAST = 2.2
+"""Largest ratio of the contrasts of two channels (generalized mean of order 4), which are equal in white light."""
+
+MIN_LOGIT_GAIN = 0.2
+"""How much surer, in mean log-odds, a recognizer must be with exchanged channels."""
+
+MIN_CONFIDENCE_GAIN = 0.2
+"""How much surer, in mean confidence, a recognizer must be with other light."""
+
+MAX_LOGIT = 7.0
+
+MIN_OBJECTS = 2
+"""Least number of objects for a verdict on the order of the channels."""
+
+LIGHTS = {
+    "half as bright": (0.5, 0.5, 0.5),
+    "twice as bright": (2.0, 2.0, 2.0),
+    "warmer": (1.5, 1.0, 0.6),
+    "cooler": (0.6, 1.0, 1.5),
+    "greener": (0.7, 1.3, 0.7),
+    "less green": (1.4, 0.7, 1.4),
+}
+"""Factors of red, green and blue that are tried."""
+
+
+def check_light(diagnosis: Diagnosis, color: NDArray[np.uint8], labels: NDArray[Any] | None) -> bool:
+    """Check the light in a colour image [H, W, 3]; return whether nothing was found."""
+    n_before = len(diagnosis.findings)
+    pixels = color[labels != 0] if labels is not None and (labels != 0).any() else color.reshape(-1, 3)
+    brightness, saturated = float(pixels.mean()), float((pixels.max(axis=1) == 255).mean())
+    contrasts = [_contrast(color[..., channel]) for channel in range(3)]
+    if (pixels.max(axis=1) == pixels.min(axis=1)).mean() > 0.98:
+        diagnosis.add(
+            "color-gray",
+            "The colour image is grey, with red, green and blue equal: perhaps it is the infrared image.",
+            "Record the colour stream; without colours, only the shape is recognized.",
+        )
+    elif brightness < MIN_BRIGHTNESS:
+        diagnosis.add(
+            "color-dark",
+            f"The colours are far from those of training: the mean value of the pixels is {brightness:.0f} of 255.",
+            "Raise the exposure or the light. Images of more than 8 bits must be scaled to 0 to 255.",
+        )
+    elif saturated > MAX_SATURATED:
+        diagnosis.add(
+            "color-bright",
+            f"The colours are far from those of training: {saturated:.0%} of the pixels are overexposed.",
+            "Lower the exposure or the gain of the camera.",
+        )
+    elif max(contrasts) > MAX_CAST * min(contrasts):
+        strongest, weakest = (("red", "green", "blue")[each(contrasts)] for each in (np.argmax, np.argmin))
+        diagnosis.add(
+            "color-cast",
+            f"The colours are far from those of training: {strongest} has "
+            f"{max(contrasts) / max(min(contrasts), 1e-9):.1f} times the contrast of {weakest}, a strong colour cast.",
+            "Set the white balance of the camera.",
+        )
+    return len(diagnosis.findings) == n_before
+
+
+def _contrast(channel: NDArray[np.uint8]) -> float:
+    values = channel.astype(np.float64)
+    gradient = np.hypot(ndimage.gaussian_filter(values, 1, (0, 1)), ndimage.gaussian_filter(values, 1, (1, 0)))
+    return float(np.mean(gradient**4) ** 0.25)
+
+
+def check_channel_order(diagnosis: Diagnosis, frame: RGBDFrame, recognizer: Recognizer) -> None:
+    """Check the order of the channels and the light of a frame by how sure a recognizer is of its objects."""
+
+    def confidences(color: NDArray[np.uint8]) -> NDArray[np.float64]:
+        answers = recognizer.recognize(dataclasses.replace(frame, color=color))
+        return np.array([answer.confidence for answer in answers if answer.confidence is not None])
+
+    given, exchanged = confidences(frame.color), confidences(np.ascontiguousarray(frame.color[..., ::-1]))
+    if len(given) < MIN_OBJECTS or not recognizer.classes:
+        diagnosis.notes.append(
+            f"order of the colour channels: not checked, since {len(given)} objects could be described; it takes "
+            f"{MIN_OBJECTS} that the model knows"
+        )
+        return
+    lights = {name: confidences(_lit(frame.color, factors)) for name, factors in LIGHTS.items()}
+    best = max(lights, key=lambda name: float(lights[name].mean()))
+    if _logit(exchanged) - _logit(given) > MIN_LOGIT_GAIN and exchanged.mean() > lights[best].mean():
+        diagnosis.add(
+            "bgr",
+            f"With red and blue exchanged, the model is surer of the {len(given)} objects (mean confidence "
+            f"{exchanged.mean():.2f} in place of {given.mean():.2f}): the colour image is BGR, not RGB.",
+            "Store RGB; OpenCV's imread and cvtColor give BGR, imwrite expects it.",
+        )
+    elif lights[best].mean() - given.mean() > MIN_CONFIDENCE_GAIN:
+        diagnosis.add(
+            "color-light",
+            f"The colours are far from those of training: if they were {best}, the model would be surer of the objects "
+            f"(mean confidence {lights[best].mean():.2f} in place of {given.mean():.2f}).",
+            "Set the exposure and the white balance of the camera.",
+        )
+
+
+def _lit(color: NDArray[np.uint8], factors: tuple[float, float, float]) -> NDArray[np.uint8]:
+    return np.clip(np.rint(color * np.array(factors)), 0, 255).astype(np.uint8)
+
+
+def _logit(confidence: NDArray[np.float64]) -> float:
+    clipped = np.clip(confidence, 1e-9, 1 - 1e-9)
+    return float(np.clip(np.log(clipped / (1 - clipped)), -MAX_LOGIT, MAX_LOGIT).mean())

@@ -1,0 +1,151 @@
+"""Checks of depth: its unit, its range, and how much of it there is."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thor2_jax.recognition.frames import MAX_DEPTH, MIN_DEPTH, RGBDFrame, pixel_rays
+from training.diagnosis.findings import Diagnosis
+
+__all__ = ["check_depth", "instance_extents"]
+
+MIN_VALID_INSTANCES = 0.3
+"""Least share of the pixels of instances that have depth."""
+
+MIN_VALID_IMAGE = 0.15
+"""Least share of the pixels of the whole image that have depth, if there are no labels."""
+
+MIN_IN_RANGE = 0.5
+"""Least share of the pixels with depth that lie within `MIN_DEPTH` and `MAX_DEPTH`."""
+
+MIN_EXTENT, MAX_EXTENT = 0.02, 0.45
+"""Range of the median longest side of the objects of a frame, metres, if no meshes are given."""
+
+EXTENT_MARGIN = 2.0
+"""How much smaller or larger than all meshes the median object may be."""
+
+MIN_ROOM, MAX_ROOM = 0.12, 8.0
+"""Range of median depths that need no other unit, metres, if there are no labels to measure."""
+
+DEPTH_SCALES = (1000.0, 10_000.0, 5000.0, 4000.0, 100.0, 1.0)
+"""Depth scales in use, the most frequent one first."""
+
+MIN_PIXELS = 50
+"""Least number of pixels with depth of an instance that is measured."""
+
+
+def instance_extents(frame: RGBDFrame) -> list[float]:
+    """Return the longest side of the visible part of each instance, metres.
+
+    Sides run from the 2nd to the 98th percentile along the principal axes of the points whose depth is within a quarter
+    of the median. Instances with few pixels are left out.
+    """
+    extents = []
+    depths = frame.depth_m.ravel()
+    for pixels in frame.instance_pixels.values():
+        depth = depths[pixels]
+        median = np.median(depth[depth > 0]) if (depth > 0).any() else 0
+        chosen = (depth > 0) & (np.abs(depth - median) < 0.25 * median)
+        if chosen.sum() < MIN_PIXELS:
+            continue
+        rays = pixel_rays(pixels[chosen], frame.depth.shape[1], frame.intrinsics)
+        points = rays * depth[chosen, None]
+        axes = np.linalg.eigh(np.cov(points.T))[1]
+        extents.append(float(np.ptp(np.percentile(points @ axes, (2, 98), axis=0), axis=0).max()))
+    return extents
+
+
+def check_depth(
+    diagnosis: Diagnosis, frame: RGBDFrame, mesh_sides: Sequence[float] = (), *, trust_camera: bool = True
+) -> None:
+    """Check the depth of a frame with or without labels.
+
+    Args:
+        diagnosis: receives the findings.
+        frame: the frame.
+        mesh_sides: longest sides of the meshes, metres, which the objects are compared with.
+        trust_camera: whether the intrinsics are right, so that extents mean something.
+    """
+    labelled = None if frame.labels is None or not (frame.labels != 0).any() else frame.labels != 0
+    depth = frame.depth_m if labelled is None else frame.depth_m[labelled]
+    valid = depth[depth > 0]
+    where = "the image" if labelled is None else "the instances"
+    least = MIN_VALID_IMAGE if labelled is None else MIN_VALID_INSTANCES
+    if valid.size < least * depth.size:
+        diagnosis.add(
+            "depth-missing",
+            f"Only {valid.size / depth.size:.0%} of the pixels of {where} have depth.",
+            "Glass, mirrors and shiny metal give no depth; move closer, avoid sunlight, and check that the depth file "
+            "belongs to this frame.",
+        )
+    if not valid.size:
+        return
+    if _check_unit(diagnosis, frame, valid, labelled is not None and trust_camera, mesh_sides):
+        return
+    in_range = float(((valid >= MIN_DEPTH) & (valid <= MAX_DEPTH)).mean())
+    if in_range < MIN_IN_RANGE:
+        diagnosis.add(
+            "distance",
+            f"{1 - in_range:.0%} of the depth of {where} lies outside {MIN_DEPTH} to {MAX_DEPTH} m (median "
+            f"{np.median(valid):.2f} m) and is not used.",
+            "Bring the camera to 0.5 to 1.5 m from the objects; if it is there already, depth_scale is wrong.",
+        )
+
+
+def _check_unit(
+    diagnosis: Diagnosis, frame: RGBDFrame, valid: NDArray[Any], with_extents: bool, mesh_sides: Sequence[float]
+) -> bool:
+    """Check the unit of depth; return whether it is likely wrong."""
+    median = float(np.median(valid))
+    extents = instance_extents(frame) if with_extents else []
+    extent = float(np.median(extents)) if extents else None
+    low, high = MIN_EXTENT, MAX_EXTENT
+    if mesh_sides:
+        low, high = min(mesh_sides) / EXTENT_MARGIN, max(mesh_sides) * EXTENT_MARGIN
+    if extent is not None:
+        if low <= extent <= high:
+            return False
+        measured = f"The objects would measure {_length(extent)} (median of their longest sides) at a distance of "
+        measured += f"{_length(median)}"
+        measured += (
+            f"; the meshes measure {_length(min(mesh_sides))} to {_length(max(mesh_sides))}" if mesh_sides else ""
+        )
+    else:
+        if MIN_ROOM <= median <= MAX_ROOM:
+            return False
+        measured = f"The median depth would be {_length(median)}"
+
+    def is_plausible(factor: float) -> bool:
+        fits = extent is None or low <= extent * factor <= high
+        return fits and MIN_DEPTH <= median * factor <= MAX_DEPTH
+
+    scale = frame.intrinsics.depth_scale
+    if frame.depth.dtype.kind == "f":
+        found = next((each for each in DEPTH_SCALES if is_plausible(1 / each)), None)
+        advice = "Floating-point depth must be in metres."
+        if found is not None:
+            advice += f" Divide it by {found:g}: the median would be {_length(median / found)}."
+    else:
+        found = next((each for each in DEPTH_SCALES if is_plausible(scale / each)), None)
+        advice = "Set depth_scale to the number of depth units per metre (1000 for millimetres)."
+        if found is not None:
+            advice = f"With depth_scale {found:g} (units per metre) the median distance would be "
+            advice += f"{_length(median * scale / found)}: set it in the intrinsics or by --depth-scale."
+    if found is None and MIN_DEPTH <= median <= MAX_DEPTH:
+        advice += " If the distance is right, the focal length or the labels are wrong."
+    if extent is not None and len(frame.instances) == 1 and extent > high and MIN_DEPTH <= median <= MAX_DEPTH:
+        diagnosis.add(
+            "labels-foreground",
+            f"{measured}: the only number of the label image seems to cover several objects.",
+            "Give each object a number of its own. If it is one object, the unit of depth is wrong: " + advice,
+        )
+        return True
+    used = "" if frame.depth.dtype.kind == "f" else f" with depth_scale {scale:g}"
+    diagnosis.add("depth-unit", f"{measured}{used}: the unit of depth is likely wrong.", advice)
+    return True
+
+
+def _length(metres: float) -> str:
+    return f"{1000 * metres:.3g} mm" if metres < 0.01 else f"{metres:.3g} m"

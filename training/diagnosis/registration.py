@@ -1,0 +1,215 @@
+"""Whether edges of depth, or of labels, lie on edges of colour.
+
+The fields of oriented edges are correlated over all shifts up to `MAX_SHIFT` pixels. Orientations are doubled angles:
+an edge from dark to bright equals one from bright to dark, and random edges cancel. In registered frames the peak lies
+within three pixels of no shift and stands many standard deviations above the rest.
+"""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft, ndimage
+
+from training.diagnosis.findings import Diagnosis
+
+__all__ = ["Alignment", "align_edges", "check_labels_alignment", "check_registration"]
+
+MAX_SHIFT = 48
+"""Largest shift that is searched, pixels of an image of 640 columns."""
+
+MAX_REGISTERED = 8.0
+"""Largest shift of a registered frame, pixels of an image of 640 columns. Some cameras shift by a few pixels."""
+
+MIN_EDGES = 150
+"""Least number of pixels on edges for a verdict."""
+
+MIN_PEAK = 6.0
+"""Least height of a peak, in standard deviations of the correlation elsewhere."""
+
+MIN_NEAR = 4.0
+"""Least height without a shift, in the same unit, of a frame that may be registered."""
+
+MIN_GAIN = 1.25
+"""How much higher than without a shift or a transformation a peak must be."""
+
+WIDTH = 640
+
+FLIPS = {"mirrored": (slice(None), slice(None, None, -1)), "upside down": (slice(None, None, -1), slice(None))}
+SCALES = (0.75, 0.8, 0.85, 0.9, 1.1, 1.15, 1.2, 1.25, 1.35)
+
+Field = NDArray[np.complex128]
+
+
+@dataclasses.dataclass(frozen=True)
+class Alignment:
+    """The best shift of an edge field onto another one.
+
+    Attributes:
+        right: columns by which the first must be moved.
+        down: rows by which the first must be moved.
+        peak: mean correlation at this shift; 1 is perfect.
+        near: largest mean correlation at shifts up to `MAX_REGISTERED`.
+        height: `peak` in standard deviations of the correlation at other shifts.
+        near_height: `near` in the same unit.
+        n_edges: pixels on edges of the first field.
+    """
+
+    right: int
+    down: int
+    peak: float
+    near: float
+    height: float
+    near_height: float
+    n_edges: int
+
+    @property
+    def distance(self) -> float:
+        """Length of the shift, pixels."""
+        return float(np.hypot(self.right, self.down))
+
+
+def _gradient(image: NDArray[Any], sigma: float) -> Field:
+    return ndimage.gaussian_filter(image, sigma, (0, 1)) + 1j * ndimage.gaussian_filter(image, sigma, (1, 0))
+
+
+def _double_angle(gradient: Field) -> Field:
+    return (gradient / np.maximum(np.abs(gradient), 1e-9)) ** 2
+
+
+def color_edges(color: NDArray[np.uint8]) -> Field:
+    """Return the oriented edges of a colour image, weighted by their contrast to the surroundings."""
+    gradients = np.stack([_gradient(color[..., channel].astype(np.float64), 1.0) for channel in range(3)])
+    strongest = np.take_along_axis(gradients, np.abs(gradients).argmax(axis=0)[None], axis=0)[0]
+    size = np.abs(strongest)
+    usual = ndimage.uniform_filter(size, 41) + 1
+    return np.where(size > usual, size / (size + usual), 0) * _double_angle(strongest)
+
+
+def depth_edges(depth_m: NDArray[np.floating[Any]]) -> Field:
+    """Return the oriented steps of a depth image, on the side that is nearer to the camera."""
+    is_valid = depth_m > 0
+    if not is_valid.any():
+        return np.zeros(depth_m.shape, np.complex128)
+    nearest = ndimage.distance_transform_edt(~is_valid, return_distances=False, return_indices=True)
+    filled = depth_m[tuple(nearest)].astype(np.float64)
+    # Steps are relative, so that a wrong unit of depth changes nothing.
+    filled /= np.median(filled)
+    low, high = ndimage.minimum_filter(filled, 3), ndimage.maximum_filter(filled, 3)
+    is_edge = is_valid & (high - low > 0.025 * np.maximum(low, 1)) & (filled <= low + 0.0125)
+    return is_edge * _double_angle(_gradient(np.minimum(filled, 5), 1.5))
+
+
+def label_edges(labels: NDArray[Any]) -> Field:
+    """Return the oriented borders of the instances, on their inner side."""
+    is_object = (labels != 0).astype(np.float64)
+    is_edge = (ndimage.minimum_filter(is_object, 3) != is_object) & (is_object > 0)
+    return is_edge * _double_angle(_gradient(is_object, 1.5))
+
+
+def _spectrum(fixed: Field) -> Field:
+    """Return the Fourier transform of edges [H, W] with a margin of `MAX_SHIFT`, at an efficient size."""
+    shape = [fft.next_fast_len(n + 2 * MAX_SHIFT) for n in fixed.shape]
+    return fft.fft2(np.pad(fixed, MAX_SHIFT).astype(np.complex64), shape)
+
+
+def align_edges(moved: Field, fixed: Field) -> Alignment:
+    """Return the best shift of the edges `moved` [H, W] onto the edges `fixed` [H, W]."""
+    return _align(moved, _spectrum(fixed))
+
+
+def _align(moved: Field, spectrum: Field) -> Alignment:
+    n_edges = int(np.count_nonzero(moved))
+    reach = MAX_SHIFT
+    product = spectrum * np.conj(fft.fft2(moved.astype(np.complex64), spectrum.shape))
+    correlation = fft.ifft2(product)[: 2 * reach + 1, : 2 * reach + 1].real / max(n_edges, 1)
+    correlation = ndimage.gaussian_filter(correlation, 1)
+    down, right = (int(k) - reach for k in np.unravel_index(correlation.argmax(), correlation.shape))
+    rows, columns = np.mgrid[-reach : reach + 1, -reach : reach + 1]
+    elsewhere = correlation[np.hypot(rows - down, columns - right) > 12]
+    near, peak = float(correlation[np.hypot(rows, columns) <= MAX_REGISTERED].max()), float(correlation.max())
+    spread = max(float(elsewhere.std()), 1e-9)
+    return Alignment(right, down, peak, near, peak / spread, near / spread, n_edges)
+
+
+def _resized(image: NDArray[Any]) -> NDArray[Any]:
+    """Return an image with about `WIDTH` columns, by taking every n-th pixel."""
+    step = max(round(image.shape[1] / WIDTH), 1)
+    return image[::step, ::step]
+
+
+def _zoomed(image: NDArray[Any], factor: float) -> NDArray[Any]:
+    """Return an image enlarged about its centre, of the same size; 0 outside."""
+    height, width = image.shape
+    rows, columns = (np.rint((np.arange(n) - (n - 1) / 2) / factor + (n - 1) / 2).astype(int) for n in (height, width))
+    inside = ((rows >= 0) & (rows < height))[:, None] & ((columns >= 0) & (columns < width))
+    return np.where(inside, image[np.clip(rows, 0, height - 1)][:, np.clip(columns, 0, width - 1)], 0)
+
+
+def check_registration(diagnosis: Diagnosis, color: NDArray[np.uint8], depth_m: NDArray[np.floating[Any]]) -> None:
+    """Check whether depth [H, W] is registered to colour [H, W, 3]."""
+    step = max(round(color.shape[1] / WIDTH), 1)
+    color, depth_m = _resized(color), _resized(depth_m)
+    spectrum = _spectrum(color_edges(color))
+    plain = _align(depth_edges(depth_m), spectrum)
+    if plain.n_edges < MIN_EDGES:
+        diagnosis.notes.append("registration of colour and depth: not checked, since depth has too few edges")
+        return
+    if plain.distance <= MAX_REGISTERED and plain.height >= MIN_PEAK:
+        return
+    advice = "Use the depth image that the camera's driver aligns to the colour image (align_depth, registered depth)."
+    candidates = {name: depth_m[flip] for name, flip in FLIPS.items()}
+    candidates["rotated by 180 degrees"] = depth_m[::-1, ::-1]
+    candidates |= {f"enlarged by a factor of {1 / scale:.2f}": _zoomed(depth_m, scale) for scale in SCALES}
+    found = {name: _align(depth_edges(each), spectrum) for name, each in candidates.items()}
+
+    def weighted_peak(name: str) -> float:
+        return found[name].peak * min(1, found[name].n_edges / plain.n_edges)
+
+    name = max(found, key=weighted_peak)
+    best = found[name]
+    if best.height >= MIN_PEAK and weighted_peak(name) >= MIN_GAIN * plain.peak:
+        shift = f", and {_shift(best, step)}" if best.distance > MAX_REGISTERED else ""
+        diagnosis.add(
+            "registration",
+            f"The depth image is {name} compared with the colour image{shift}: they are not registered.",
+            advice,
+        )
+    elif plain.height >= MIN_PEAK and plain.peak >= MIN_GAIN * plain.near:
+        diagnosis.add(
+            "registration",
+            f"The edges of the depth image lie on those of the colour image only if depth is {_shift(plain, step)}: "
+            "they are not registered.",
+            advice,
+        )
+    elif plain.near_height < MIN_NEAR:
+        diagnosis.add(
+            "registration",
+            "The edges of the depth image lie on those of the colour image at no shift: they are not registered, or "
+            "belong to different frames.",
+            advice,
+        )
+
+
+def check_labels_alignment(diagnosis: Diagnosis, color: NDArray[np.uint8], labels: NDArray[Any]) -> None:
+    """Check whether the borders of the instances [H, W] lie on edges of colour [H, W, 3]."""
+    step = max(round(color.shape[1] / WIDTH), 1)
+    alignment = align_edges(label_edges(_resized(labels)), color_edges(_resized(color)))
+    if alignment.n_edges < MIN_EDGES or alignment.height < MIN_PEAK:
+        return
+    if alignment.distance > MAX_REGISTERED and alignment.peak >= MIN_GAIN * alignment.near:
+        diagnosis.add(
+            "labels-shifted",
+            "The borders of the instances lie on edges of the colour image only if labels is "
+            f"{_shift(alignment, step)}.",
+            "Check that the label image belongs to this frame and was made from this colour image.",
+        )
+
+
+def _shift(alignment: Alignment, step: int) -> str:
+    parts = []
+    for pixels, positive, negative in ((alignment.right, "right", "left"), (alignment.down, "down", "up")):
+        if pixels:
+            parts.append(f"{abs(pixels) * step} pixels {positive if pixels > 0 else negative}")
+    return "moved " + " and ".join(parts)

@@ -1,0 +1,122 @@
+"""The diagnosis of a whole set-up: the files of a frame, a model and meshes.
+
+for finding in diagnose(FrameFiles(color, depth, labels, intrinsics)).findings:
+    print(finding.message, finding.advice)
+"""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from thor2_jax.errors import InputError
+from thor2_jax.recognition.frames import Intrinsics, RGBDFrame, frame_intrinsics, read_color, read_depth, read_labels
+from thor2_jax.recognizer import Recognizer
+from training.diagnosis.camera import check_camera
+from training.diagnosis.colors import check_channel_order, check_light
+from training.diagnosis.depth import check_depth
+from training.diagnosis.findings import Diagnosis
+from training.diagnosis.labels import check_labels
+from training.diagnosis.meshes import check_meshes
+from training.diagnosis.registration import check_labels_alignment, check_registration
+from training.readers.frame_files import FrameFiles
+
+__all__ = ["diagnose"]
+
+T = TypeVar("T")
+
+
+def diagnose(
+    files: FrameFiles,
+    *,
+    depth_scale: float | None = None,
+    recognizer: Recognizer | None = None,
+    meshes: Sequence[Path] = (),
+    mesh_scale: float = 1.0,
+) -> Diagnosis:
+    """Diagnose the set-up that a frame was recorded with.
+
+    Args:
+        files: the files of a frame, with or without labels.
+        depth_scale: depth units per metre, in place of the one in the intrinsics.
+        recognizer: a trained recognizer, which is needed to check the order of the colour channels.
+        meshes: mesh files of the objects.
+        mesh_scale: factor that converts the meshes to metres.
+
+    Raises:
+        InputError: a file is missing.
+        OSError: a file cannot be opened.
+    """
+    missing = [
+        path for path in (files.color, files.depth, files.labels, files.intrinsics) if path and not path.exists()
+    ]
+    if missing:
+        raise InputError(f"{missing[0]} is missing; expected the files of a frame")
+    diagnosis = Diagnosis()
+    sides = check_meshes(diagnosis, meshes, mesh_scale)
+    color = _read(diagnosis, "color", lambda: read_color(files.color))
+    depth = _read(diagnosis, "depth", lambda: read_depth(files.depth))
+    labels = _read(diagnosis, "labels", lambda: None if files.labels is None else read_labels(files.labels))
+    camera = _read(diagnosis, "intrinsics", lambda: frame_intrinsics(files.intrinsics, files.color, depth_scale))
+    shape = next((image.shape[:2] for image in (color, depth, labels) if image is not None), None)
+    for name, image in (("depth", depth), ("labels", labels)):
+        if color is not None and image is not None and image.shape != color.shape[:2]:
+            diagnosis.add(
+                "size",
+                f"{name} has {image.shape[1]} x {image.shape[0]} pixels, but color has {color.shape[1]} x "
+                f"{color.shape[0]}.",
+                "Colour, depth and labels must have the same size, pixel for pixel: use the depth image that the "
+                "driver aligns to colour.",
+            )
+    if depth is not None and color is not None and depth.shape != color.shape[:2]:
+        depth = None
+    if labels is not None and color is not None and labels.shape != color.shape[:2]:
+        labels = None
+    camera_is_right = camera is not None and shape is not None and check_camera(diagnosis, camera, shape[1], shape[0])
+    if labels is not None and not check_labels(diagnosis, labels):
+        labels = None
+    elif files.labels is None:
+        diagnosis.notes.append("labels: none are given, so the sizes of the objects were not checked")
+    light_is_right = color is not None and check_light(diagnosis, color, labels)
+    if color is not None and labels is not None:
+        check_labels_alignment(diagnosis, color, labels)
+    if depth is None or camera is None:
+        return diagnosis
+    frame = _frame(np.zeros((*depth.shape, 3), np.uint8) if color is None else color, depth, labels, camera)
+    n_findings = len(diagnosis.findings)
+    if color is not None:
+        check_registration(diagnosis, color, frame.depth_m)
+    # Without registration the labels are of other pixels.
+    check_depth(diagnosis, frame, sides, trust_camera=camera_is_right and len(diagnosis.findings) == n_findings)
+    depth_is_right = len(diagnosis.findings) == n_findings and camera_is_right
+    _check_order(diagnosis, frame, recognizer, light_is_right and depth_is_right and color is not None)
+    return diagnosis
+
+
+def _check_order(diagnosis: Diagnosis, frame: RGBDFrame, recognizer: Recognizer | None, is_sound: bool) -> None:
+    """Check the order of the channels, or note why it is not checked."""
+    subject = "order of the colour channels (RGB or BGR): not checked"
+    if recognizer is None:
+        diagnosis.notes.append(f"{subject}; one frame does not show it, a model that knows the objects does (--model)")
+    elif frame.labels is None:
+        diagnosis.notes.append(f"{subject}, since there are no labels")
+    elif not is_sound:
+        diagnosis.notes.append(f"{subject} until the other findings are resolved")
+    else:
+        check_channel_order(diagnosis, frame, recognizer)
+
+
+def _read(diagnosis: Diagnosis, name: str, read: Callable[[], T]) -> T | None:
+    """Read a file; one of the wrong kind is a finding."""
+    try:
+        return read()
+    except InputError as error:
+        diagnosis.add(f"unreadable-{name}", f"{name} cannot be used: {error}.", "Formats: docs/frames.md.")
+        return None
+
+
+def _frame(color: np.ndarray, depth: np.ndarray, labels: np.ndarray | None, camera: Intrinsics) -> RGBDFrame:
+    """Return a frame; the camera's image size is a finding of its own."""
+    pinhole = Intrinsics(camera.fx, camera.fy, camera.cx, camera.cy, camera.depth_scale)
+    return RGBDFrame(color, depth, labels, pinhole)
