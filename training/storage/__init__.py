@@ -1,1 +1,1 @@
-"""Files and processes: locks, tables, worker pools."""
+"""Files and processes: locks, jobs, worker pools."""
