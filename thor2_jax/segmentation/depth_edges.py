@@ -46,15 +46,14 @@ def depth_edges(depth: DepthImage) -> tuple[Mask, Mask]:
     inverse = np.asarray(cv2.medianBlur(inverse, 5))
     unknown = (~known).view(np.uint8)
     gap = np.asarray(cv2.dilate(cv2.distanceTransform(unknown, cv2.DIST_L2, 3), np.ones((3, 3), np.uint8)))
-    z = 1 / inverse
-    z2 = z * z
+    # Metres are differences of inverse depth times the squared depth.
     pixel = np.float32(depth.pixel_size)
-    least = STEP[0] + STEP[1] * z2
-    least_step = least + (2 * GAP * pixel) * gap * z
-    least_fold = 0.5 * least + (NEAR * BEND * pixel) * z + gap
-    steps, folds = np.zeros(z.shape, bool), np.zeros(z.shape, bool)
+    least = STEP[0] * inverse * inverse + STEP[1]
+    least_step = least + (2 * GAP * pixel) * gap * inverse
+    least_fold = 0.5 * least + (NEAR * BEND * pixel) * inverse + gap
+    steps, folds = np.zeros(known.shape, bool), np.zeros(known.shape, bool)
     for along_rows in (True, False):
-        before, after, difference = (_filter(inverse, kernel, along_rows) * z2 for kernel in _kernels())
+        before, after, difference = (_filter(inverse, kernel, along_rows) for kernel in _kernels())
         smaller = np.minimum(np.abs(before), np.abs(after))
         opposite = (before > 0) != (after > 0)
         steps |= (smaller > least_step) & opposite & (np.abs(difference) > NARROW * least_step)

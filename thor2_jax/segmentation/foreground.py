@@ -183,8 +183,8 @@ def _most_similar_window(shown: NDArray[np.float32], mean: NDArray[np.float32]) 
     height, width = shown.shape[:2]
     padded = float_image(cv2.copyMakeBorder(mean, SHIFT, SHIFT, SHIFT, SHIFT, cv2.BORDER_REPLICATE))
     nearest, least = mean.copy(), _channel_sum(shown, mean)
-    for down in (0, SHIFT, 2 * SHIFT):
-        for right in (0, SHIFT, 2 * SHIFT):
+    for down in (0, 2 * SHIFT):
+        for right in (0, 2 * SHIFT):
             other = padded[down : down + height, right : right + width]
             off = _channel_sum(shown, other)
             nearer = off < least

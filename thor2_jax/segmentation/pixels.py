@@ -94,16 +94,12 @@ def watershed(color: NDArray[np.uint8], markers: NDArray[np.int32]) -> NDArray[n
         Markers [H, W] without 0. The line that OpenCV leaves between two regions goes to the higher number.
     """
     flooded = np.asarray(cv2.watershed(color, markers.copy()), np.int32)
-    row, column = np.nonzero(flooded <= 0)
-    largest = np.ones(len(row), np.int32)
-    for down in (-1, 0, 1):
-        for right in (-1, 0, 1):
-            beside = flooded.take(
-                np.clip(row + down, 0, flooded.shape[0] - 1) * flooded.shape[1]
-                + np.clip(column + right, 0, flooded.shape[1] - 1)
-            )
-            np.maximum(largest, beside, out=largest)
-    flooded[row, column] = largest
+    line = np.flatnonzero(flooded <= 0)
+    largest = np.ones(len(line), np.int32)
+    width = flooded.shape[1]
+    for beside in (-width - 1, -width, -width + 1, -1, 1, width - 1, width, width + 1):
+        np.maximum(largest, flooded.take(line + beside, mode="clip"), out=largest)
+    flooded.put(line, largest)
     return flooded
 
 

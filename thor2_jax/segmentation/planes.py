@@ -18,11 +18,11 @@ from thor2_jax.segmentation.pixels import Mask, pixel_mask
 __all__ = ["DepthImage", "Plane", "dominant_planes"]
 
 MAX_PLANES = 4
-HYPOTHESES = 200
-SCORED_POINTS = 1000
+HYPOTHESES = 150
+SCORED_POINTS = 500
 """Points that the hypotheses of a plane are scored on."""
 
-REFINED_POINTS = 5000
+REFINED_POINTS = 3000
 """Points that a plane is refined on."""
 
 LEAST_POINTS = 50
@@ -172,13 +172,18 @@ def _best_hypothesis(points: _Points, left: NDArray[np.intp], rng: np.random.Gen
         return None
     planes = np.linalg.solve(matrices[usable], points.inverse[triples[usable]][..., None])[..., 0]
     scored = left[:: max(1, len(left) // SCORED_POINTS)]
-    x, y = points.terms[scored, 0], points.terms[scored, 1]
+    x, y, inverse, tolerance = (
+        values[scored].astype(np.float32)
+        for values in (points.terms[:, 0], points.terms[:, 1], points.inverse, points.tolerance)
+    )
     # Not a matrix product, for which threads would be started.
-    misses = planes[:, :1] * x
-    misses += planes[:, 1:2] * y
-    misses += planes[:, 2:]
-    misses -= points.inverse[scored]
-    return planes[int((np.abs(misses, out=misses) < points.tolerance[scored]).sum(axis=1).argmax())]
+    single = planes.astype(np.float32)
+    misses = single[:, :1] * x
+    misses += single[:, 1:2] * y
+    misses += single[:, 2:]
+    misses -= inverse
+    near = np.abs(misses, out=misses) < tolerance
+    return planes[int(np.count_nonzero(near, axis=1).argmax())]
 
 
 def _refine(
