@@ -27,7 +27,7 @@ from thor2_jax.service.pipeline import Service
 from thor2_jax.service.problem import Problem, RequestError, error_responses
 from thor2_jax.service.schemas import NPZ
 from thor2_jax.service.settings import Settings
-from thor2_jax.service.teaching import gallery_errors, generation_number, parse_enrolment
+from thor2_jax.service.teaching import check_same_site, gallery_errors, generation_number, parse_enrolment
 from thor2_jax.service.uploads import read_body, read_form
 
 __all__ = ["create_app"]
@@ -225,7 +225,9 @@ def _add_object_routes(routes: APIRouter, service: Service) -> None:
         return schemas.ObjectsAnswer(objects=object_answers(known), generation=known.generation)
 
 
-def _add_teaching_routes(routes: APIRouter, service: Service) -> None:
+def _add_teaching_routes(authenticated: APIRouter, service: Service) -> None:
+    routes = APIRouter(dependencies=[Depends(check_same_site)], responses=error_responses(403))
+
     @routes.post(
         "/v1/objects",
         responses=FRAME_ERRORS | GALLERY_ERRORS | error_responses(409),
@@ -265,6 +267,8 @@ def _add_teaching_routes(routes: APIRouter, service: Service) -> None:
                 pass  # There is no body; a late answer gets status 504.
             known = await service.forget(name, admitted)
         return schemas.ChangeAnswer(generation=known.generation)
+
+    authenticated.include_router(routes)
 
 
 def _add_refusals_to_teach(routes: APIRouter) -> None:

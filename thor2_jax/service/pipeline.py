@@ -81,6 +81,7 @@ class Service:
         self.progress = ""
         self._compilations = CompilationCounter(self.metrics.compilations)
         self._in_progress = self._accepted = self._finished = 0
+        self._gallery_lock = asyncio.Lock()  # Changes that wait for another process occupy one thread only.
 
     def start(self) -> None:
         """Start processes and threads. `state` becomes "ready" when all batch shapes are compiled."""
@@ -233,10 +234,12 @@ class Service:
         self, change: Callable[[ObjectGallery], None], refused: int, field: str, request: AdmittedRequest
     ) -> ObjectGallery:
         """Change the gallery on disk in another thread, then read it again in this one, as other processes do."""
-        copied = copy.copy(self.engine.objects)
-        copied.lock_seconds = max(0.0, LOCK_SHARE * (request.deadline - time.monotonic()))
-        with request.stage("gallery"), gallery_errors(copied.directory, refused, field):
-            await asyncio.to_thread(change, copied)
+        with request.stage("gallery"):
+            async with self._gallery_lock:
+                copied = copy.copy(self.engine.objects)
+                copied.lock_seconds = max(0.0, LOCK_SHARE * (request.deadline - time.monotonic()))
+                with gallery_errors(copied.directory, refused, field):
+                    await asyncio.to_thread(change, copied)
         self.engine.refresh()
         return copied
 

@@ -10,7 +10,7 @@ __all__ = ["FieldError", "Problem", "RequestError", "deadline_exceeded", "error_
 _DESCRIPTIONS = {
     400: "The body cannot be parsed.",
     401: "The bearer token is missing or invalid.",
-    403: "The service does not teach.",
+    403: "The request comes from a web page of another site.",
     404: "No object has this name.",
     408: "The body did not arrive before the deadline.",
     409: "The change conflicts with the gallery: the name exists, or another change was made since.",

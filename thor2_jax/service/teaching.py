@@ -7,12 +7,14 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
+from fastapi import Request
+
 from thor2_jax.errors import InputError
 from thor2_jax.gallery.gallery import check_name
 from thor2_jax.gallery.store import GalleryBusyError, GalleryError
 from thor2_jax.service.problem import RequestError
 
-__all__ = ["Enrolment", "gallery_errors", "generation_number", "parse_enrolment"]
+__all__ = ["Enrolment", "check_same_site", "gallery_errors", "generation_number", "parse_enrolment"]
 
 log = logging.getLogger(__name__)
 
@@ -82,6 +84,17 @@ def generation_number(fields: dict[str, bytes]) -> int:
     if not re.fullmatch(rb"[0-9]{1,18}", fields["generation"]):
         raise RequestError(422, "generation", "generation is not a number; expected that of the change's answer.")
     return int(fields["generation"])
+
+
+async def check_same_site(request: Request) -> None:
+    """Raise RequestError (403) if a web page of another site sends the request, as browsers let any page do."""
+    site, origin = request.headers.get("sec-fetch-site"), request.headers.get("origin")
+    if site is not None:  # Browsers send it to https and to localhost.
+        is_foreign = site not in ("same-origin", "none")
+    else:
+        is_foreign = origin is not None and origin.partition("://")[2] != request.headers.get("host")
+    if is_foreign:
+        raise RequestError(403, "Origin", "The request comes from a web page of another site.")
 
 
 @contextlib.contextmanager

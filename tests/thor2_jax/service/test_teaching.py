@@ -335,6 +335,28 @@ def test_a_change_waits_for_another_writer(
     assert content(gallery) == before and enroll(http, files, "other").status_code == 200
 
 
+@pytest.mark.parametrize(
+    ("headers", "status"),
+    [
+        ({"Sec-Fetch-Site": "cross-site"}, 403),
+        ({"Sec-Fetch-Site": "same-site"}, 403),
+        ({"Origin": "http://other.example"}, 403),
+        ({"Origin": "null"}, 403),
+        ({"Sec-Fetch-Site": "same-origin", "Origin": "https://behind.a.proxy"}, 200),
+        ({"Sec-Fetch-Site": "none"}, 200),
+        ({"Origin": "http://HOST"}, 200),
+    ],
+)
+def test_pages_of_other_sites_cannot_teach(
+    headers: dict[str, str], status: int, http: httpx.Client, files: Files
+) -> None:
+    sent = {name: value.replace("HOST", http.base_url.netloc.decode()) for name, value in headers.items()}
+    answer = http.post("/v1/objects", files=files, data={"name": "tall", "instance": "200"}, headers=sent)
+    assert answer.status_code == status and known(http) == ({"tall": 1} if status == 200 else {})
+    for method, path in CHANGES[1:]:
+        assert (http.request(method, path, headers=sent).status_code == 403) == (status == 403)
+
+
 def test_two_clients_at_once_lose_no_change(http: httpx.Client, files: Files) -> None:
     answers: list[int] = []
 

@@ -78,7 +78,7 @@ export function connectNaming(shownFiles, changed, failed) {
         await service.undo(byId("undo").dataset.generation);
       } catch (problem) {
         // Only the last change can be taken back.
-        if (problem.status === 409) return showNotice("Another change was made since; forget the object instead.");
+        if (problem.status === 409) return showNotice("Another change was made since, so this one stays.");
         return failed(problem);
       }
       showNotice(`The name “${byId("notice").dataset.name}” is taken back.`);
