@@ -20,7 +20,7 @@ __all__ = ["check_channel_order", "check_light"]
 MIN_BRIGHTNESS = 22.0
 """Least mean value of the pixels of the instances, of 255."""
 
-MAX_SATURATED = 0.5
+MAX_SATURATED = 0.65
 """Largest share of the pixels of the instances with a channel at its maximum."""
 
 MAX_CAST = 2.2

@@ -25,6 +25,9 @@ MAX_REGISTERED = 8.0
 MIN_EDGES = 150
 """Least number of pixels on edges for a verdict."""
 
+MIN_EDGES_UNRELATED = 250
+"""Least number for the verdict that no shift fits: a box seen from above has one or two straight steps."""
+
 MIN_PEAK = 6.0
 """Least height of a peak, in standard deviations of the correlation elsewhere."""
 
@@ -183,7 +186,7 @@ def check_registration(diagnosis: Diagnosis, color: NDArray[np.uint8], depth_m: 
             "they are not registered.",
             advice,
         )
-    elif plain.near_height < MIN_NEAR:
+    elif plain.near_height < MIN_NEAR and plain.n_edges >= MIN_EDGES_UNRELATED:
         diagnosis.add(
             "registration",
             "The edges of the depth image lie on those of the colour image at no shift: they are not registered, or "
