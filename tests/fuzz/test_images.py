@@ -1,5 +1,6 @@
 """Damaged frames: PNG and JPEG images, intrinsics."""
 
+import io
 import json
 import struct
 import zlib
@@ -24,12 +25,22 @@ SHAPE = (24, 17)
 
 COLOR = RNG.integers(0, 256, (*SHAPE, 3), dtype=np.uint8)
 PALETTE = Image.fromarray(RNG.integers(0, 4, SHAPE, dtype=np.uint8)).convert("P")
+
+
+def npy_file(array: np.ndarray) -> bytes:
+    stream = io.BytesIO()
+    np.save(stream, array)
+    return stream.getvalue()
+
+
 FILES: dict[str, tuple[Callable[[Path], Any], bytes]] = {
     "color.png": (read_color, encode_image(COLOR, "PNG")),
     "alpha.png": (read_color, encode_image(np.dstack([COLOR, COLOR[..., 0]]), "PNG")),
     "color.jpg": (read_color, encode_image(COLOR, "JPEG")),
     "depth.png": (read_depth, encode_image(RNG.integers(0, 2**16, SHAPE).astype(np.uint16), "PNG")),
     "depth.tiff": (read_depth, encode_image(RNG.integers(0, 2**16, SHAPE).astype(np.uint16), "TIFF")),
+    "metres.tiff": (read_depth, encode_image(RNG.random(SHAPE, dtype=np.float32), "TIFF")),
+    "depth.npy": (read_depth, npy_file(RNG.random(SHAPE, dtype=np.float32))),
     "labels.png": (read_labels, encode_image(RNG.integers(0, 9, SHAPE, dtype=np.uint8), "PNG")),
 }
 
@@ -51,7 +62,7 @@ def test_images(name: str, data: st.DataObject, attempt: Any, tmp_path: Path) ->
     path.write_bytes(data.draw(damaged(content)))
     image = attempt(lambda: read(path))
     if image is not None:
-        assert image.ndim in (2, 3) and image.dtype.kind == "u" and image.size > 0
+        assert image.ndim in (2, 3) and image.dtype.kind in "uf" and image.size > 0
 
 
 @pytest.mark.parametrize("name", [name for name in FILES if name.endswith("png")])
@@ -105,10 +116,26 @@ def test_other_kinds_of_images_are_refused(tmp_path: Path) -> None:
 INTRINSICS = json.dumps({"fx": 600.5, "fy": 601.0, "cx": 320, "cy": 240.25, "depth_scale": 1000.0}).encode()
 
 
-@given(content=damaged(INTRINSICS))
-def test_intrinsics(content: bytes, attempt: Any, tmp_path: Path) -> None:
-    path = tmp_path / "k.json"
-    path.write_bytes(content)
+CAMERA_INFO = b"""\
+image_width: 640
+image_height: 480
+camera_matrix: {rows: 3, cols: 3, data: [600.5, 0, 320, 0, 601.0, 240.25, 0, 0, 1]}
+distortion_model: plumb_bob
+distortion_coefficients: {rows: 1, cols: 5, data: [0.1, -0.2, 0.001, 0, 0]}
+"""
+CAMERAS = {
+    "json": INTRINSICS,
+    "yaml": CAMERA_INFO,
+    "txt": b"600.5 0 320\n0 601 240.25\n0 0 1\n",
+    "npy": npy_file(np.array([[600.5, 0, 320], [0, 601, 240.25], [0, 0, 1]])),
+}
+
+
+@pytest.mark.parametrize("kind", CAMERAS)
+@given(data=st.data())
+def test_intrinsics(kind: str, data: st.DataObject, attempt: Any, tmp_path: Path) -> None:
+    path = tmp_path / f"k.{kind}"
+    path.write_bytes(data.draw(damaged(CAMERAS[kind])))
     intrinsics = attempt(lambda: read_intrinsics(path))
     if intrinsics is not None:
         assert (

@@ -41,9 +41,11 @@ def enroll(
     ] = None,
     label_name: Annotated[str | None, typer.Option(help="Name of the object in labels.json. Default: NAME.")] = None,
     color: Annotated[Path | None, typer.Option(help="Color image of one frame, PNG or JPEG.")] = None,
-    depth: Annotated[Path | None, typer.Option(help="Depth image, 16-bit PNG.")] = None,
+    depth: Annotated[Path | None, typer.Option(help="Depth image: 16-bit PNG, float TIFF, NPY or EXR.")] = None,
     labels: Annotated[Path | None, typer.Option(help="Instance labels, PNG; 0 is background.")] = None,
-    intrinsics: Annotated[Path | None, typer.Option(help="JSON with fx, fy, cx, cy and depth_scale.")] = None,
+    intrinsics: Annotated[
+        Path | None, typer.Option(help="fx, fy, cx, cy in JSON, ROS camera_info, K, BOP, RealSense or Open3D.")
+    ] = None,
     instance: Annotated[int | None, typer.Option(help="Label number of the object in this frame.")] = None,
     mesh_scale: MeshScaleOption = 1.0,
     extend: Annotated[bool, typer.Option("--extend", help="Add views to an object that exists.")] = False,
