@@ -13,7 +13,7 @@ import pytest
 import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.describe import strips
-from thor2_jax.recognition.answers import DescribedFrame
+from thor2_jax.recognition.answers import DescribedFrame, Evidence
 from thor2_jax.service.answers import explained_frame
 from thor2_jax.service.engine import CloudResult, InferenceEngine
 from thor2_jax.service.preparation import PreparedRequest, prepare_frame
@@ -88,7 +88,7 @@ def test_calibrated_confidence_uses_the_temperatures(run_dir: Path) -> None:
     shape = len(engine.run.classes)
     probabilities = {name: rng.dirichlet(np.full(shape, 0.1)).astype(np.float32) for name in ("tops", "tops2")}
     empty = np.zeros(0, np.float32)
-    result = CloudResult(empty, empty, 0, probabilities, empty, empty)
+    result = CloudResult(empty, empty, empty, empty, Evidence(0, probabilities))
     assert engine.calibrated_confidences([result]) == [None] and engine.calibrated_confidences([]) == []
     engine.run.record["temperatures"] = {"tops": 2.0, "tops2": 3.0}
     (confidence,) = engine.calibrated_confidences([result])
@@ -121,10 +121,9 @@ def explained(instance: Any, count: int, config: thor2.DescriptorConfig, z: np.n
     result = CloudResult(
         np.zeros((7, 32, 32), np.float32),
         np.zeros((7, 22, 31), np.float32),
-        0,
-        {},
         np.column_stack([z, z, z]).astype(np.float32),
         np.zeros((7, 31, 22), np.float32),
+        Evidence(0, {}),
     )
     empty = LabelMap(width=1, height=1, labels=[0], lengths=[1])
     instances = [dataclasses.replace(instance, label=k) for k in range(count)]
