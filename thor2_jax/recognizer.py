@@ -38,12 +38,11 @@ from thor2_jax.recognition.confidence import Calibration
 from thor2_jax.recognition.frames import RGBDFrame
 from thor2_jax.recognition.fusion import DEFAULT_RULE, FUSION_RULES, FusionRule, fused_probabilities
 from thor2_jax.recognition.prepared_instance import PreparedInstance, pack_instances, prepare_instance
-from thor2_jax.recognition.run_directory import TrainedRun, load_run
+from thor2_jax.recognition.run_directory import EMBEDDING_FILE, TrainedRun, load_run
 from thor2_jax.types import PointClouds
 
 __all__ = [
     "ANSWER_SOURCES",
-    "EMBEDDING_FILE",
     "THOR2",
     "AnswerBy",
     "Recognizer",
@@ -52,9 +51,6 @@ __all__ = [
 AnswerBy = Literal["classifiers", "gallery", "both"]
 ANSWER_SOURCES: tuple[AnswerBy, ...] = ("classifiers", "gallery", "both")
 """What a recognizer may answer by."""
-
-EMBEDDING_FILE = "embedding.safetensors"
-"""Embedding of a run directory, in place of the packaged one."""
 
 THOR2: tuple[Feature, ...] = ("tops", "tops2")
 """The two classifiers whose fusion is THOR2."""

@@ -23,7 +23,6 @@ from training.evaluation.answers import FrameAnswers
 from training.evaluation.results import compute_results, fuse_answers
 from training.evaluation.runs import Run, load_runs
 from training.fitting.job import VIEWS, is_finished, train_run
-from training.fitting.options import Progress
 from training.fitting.protocol import DEFAULT
 from training.objects.builtin_objects import builtin_objects
 from training.objects.mesh import TexturedMesh
@@ -34,6 +33,7 @@ from training.reports.html import Picture, Section, write_page
 from training.reports.object_plots import draw_descriptor, draw_objects
 from training.reports.plots import draw_accuracy, draw_confusion, draw_curves
 from training.storage.jobs import check_same_job
+from training.storage.progress import Progress
 from training.views.mesh_views import view_cloud
 from training.views.render_job import render_dataset
 
@@ -134,7 +134,16 @@ def _train(objects: Mapping[str, TexturedMesh], out: Path, seed: int, progress: 
             seed=seed,
         )
         options = dataclasses.replace(PROTOCOL.fit, seed=seed)
-        (run,) = train_run(dataset, out, ("ce", "tops", "tops2"), options, progress, mirrors=PROTOCOL.mirrors)
+        (run,) = train_run(
+            dataset,
+            out,
+            ("ce", "tops", "tops2"),
+            options,
+            progress,
+            mirrors=PROTOCOL.mirrors,
+            orientations=PROTOCOL.orientation_copies,
+            config=PROTOCOL.config,
+        )
     shutil.rmtree(out / VIEWS, ignore_errors=True)
     return run
 

@@ -25,10 +25,10 @@ from training.augmentation.illumination import Illumination
 from training.augmentation.occlusion import Occlusion
 from training.augmentation.segmentation import Segmentation
 from training.augmentation.sensor import Sensor
-from training.fitting.options import Progress
 from training.objects.mesh import TexturedMesh
 from training.objects.meshes import load_mesh
 from training.readers.frames import FrameFolder
+from training.storage.progress import Progress
 from training.views.mesh_views import ViewTask, render_task
 
 __all__ = ["SkippedInstance", "enroll_objects", "labelled_views", "mesh_views"]

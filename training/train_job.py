@@ -6,6 +6,7 @@ import shutil
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
+from typing import Any
 
 import jax
 
@@ -15,13 +16,14 @@ from thor2_jax.recognition.classifier import check_features
 from thor2_jax.recognition.run_directory import TrainedRun
 from training.baselines.job import train_baselines
 from training.baselines.names import check_baselines
+from training.embedding.run_embedding import Distractors
 from training.fitting.checkpoints import CHECKPOINTS
 from training.fitting.job import VIEWS, check_out, check_trained, finished_record, is_finished, train_run
-from training.fitting.options import Progress
 from training.fitting.protocol import DEFAULT, PAPER, Protocol
 from training.objects.mesh import TexturedMesh
 from training.objects.meshes import find_meshes, read_names, scaled_meshes
 from training.storage.jobs import check_same_job
+from training.storage.progress import Progress
 from training.storage.workers import local_workers
 from training.views.dataset import ViewDataset
 from training.views.left_out import WithoutClasses
@@ -50,6 +52,7 @@ class TrainJob:
         baselines: any of "thor", "forest", "pointnet".
         leave_out: objects to train without.
         sequences: table of sequence -> its objects; one run is trained for each sequence.
+        distractors: other objects that the embedding of the run is fitted on, too; None fits no embedding.
         workers: rendering processes.
         mesh_scale: factor from the unit of the meshes to metres.
     """
@@ -64,6 +67,7 @@ class TrainJob:
     baselines: Sequence[str] = ()
     leave_out: Sequence[str] = ()
     sequences: Path | None = None
+    distractors: Distractors | None = None
     workers: int = 1
     mesh_scale: float = 1.0
 
@@ -99,14 +103,14 @@ def run_train_job(job: TrainJob, display: Display) -> dict[Path, list[TrainedRun
         if not is_finished(directory):
             check_out(directory)
         elif not baselines or job.sequences is not None:
-            check_trained(views.digest, directory, features, protocol.fit, job.folds, protocol.mirrors)
+            check_trained(views.digest, directory, features, protocol.fit, job.folds, **_samples(job))
     runs: dict[Path, list[TrainedRun]] = {}
     for directory, views in sources.items():
         runs[directory] = []
         with display() as progress:
             if not is_finished(directory):
                 runs[directory] = train_run(
-                    views, directory, features, protocol.fit, progress, folds=job.folds, mirrors=protocol.mirrors
+                    views, directory, features, protocol.fit, progress, folds=job.folds, **_samples(job)
                 )
             if baselines and jax.process_index() == 0:
                 train_baselines(directory, views, baselines, progress)
@@ -115,14 +119,26 @@ def run_train_job(job: TrainJob, display: Display) -> dict[Path, list[TrainedRun
     return runs
 
 
+def _samples(job: TrainJob) -> Any:
+    """Return the arguments of `train_run` that determine the samples and the descriptor."""
+    protocol = job.protocol
+    return {
+        "mirrors": protocol.mirrors,
+        "config": protocol.config,
+        "orientations": protocol.orientation_copies,
+        "distractors": job.distractors,
+    }
+
+
 def _check_batch_size(protocol: Protocol, source: ViewSource) -> None:
     """Raise InputError if a batch is larger than all samples; the defaults are reduced to their number instead."""
     size, n_views = protocol.fit.batch_size, sum(shard.views for shard in source.shards)
-    n_samples = n_views * len(protocol.mirrors)
+    per_view = len(protocol.mirrors) + protocol.orientation_copies
+    n_samples = n_views * per_view
     if size > n_samples and size not in (DEFAULT.fit.batch_size, PAPER.fit.batch_size):
         raise InputError(
-            f"batch_size is {size}; expected at most {n_samples}, the number of samples ({n_views} views in "
-            f"{len(protocol.mirrors)} mirrors)"
+            f"batch_size is {size}; expected at most {n_samples}, the number of samples ({n_views} views, "
+            f"{per_view} samples of each)"
         )
 
 
@@ -144,7 +160,7 @@ def _check_finished_views(job: TrainJob) -> None:
     )
     if job.baselines:
         return
-    check_trained(stored["digest"], job.out, job.classifiers, protocol.fit, job.folds, protocol.mirrors)
+    check_trained(stored["digest"], job.out, job.classifiers, protocol.fit, job.folds, **_samples(job))
     remove_leftovers(job.out)
     for name in (VIEWS, CHECKPOINTS):
         shutil.rmtree(job.out / f".{name}", ignore_errors=True)

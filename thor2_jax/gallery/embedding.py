@@ -247,6 +247,12 @@ class Embedding:
         model = EmbeddingNetwork(config, network.n_regions, sizes, n_proxies, rngs=nnx.Rngs(seed))
         return cls(config, network, sizes, model, classes, distractors)
 
+    def without_proxies(self) -> "Embedding":
+        """Return the same embedding without classes and distractors."""
+        arrays = model_arrays(self.model)
+        model = model_from_arrays(lambda: Embedding.create(self.config, self.network, self.sizes).model, arrays)
+        return Embedding(self.config, self.network, self.sizes, model)
+
     @property
     def size(self) -> int:
         """Length D of an embedding."""

@@ -37,12 +37,15 @@ from thor2_jax.recognition.classifier import MLP, Feature, check_features
 from thor2_jax.recognition.orbax_weights import load_orbax_classifier
 from thor2_jax.recognition.weights import model_arrays, model_from_arrays
 
-__all__ = ["RUN_FILE", "TrainedRun", "input_size", "load_run", "save_run", "weights_file"]
+__all__ = ["EMBEDDING_FILE", "RUN_FILE", "TrainedRun", "input_size", "load_run", "save_run", "weights_file"]
 
 RUN_FORMAT = 2
 """Version of the layout above. Format 1 has Orbax checkpoints (RUN/weights/NAME/) and is still read."""
 
 RUN_FILE = "run.json"
+
+EMBEDDING_FILE = "embedding.safetensors"
+"""Embedding of a run directory, in place of the packaged one."""
 
 
 @dataclasses.dataclass(frozen=True)

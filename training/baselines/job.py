@@ -14,9 +14,10 @@ from training.baselines.fit_pointnet import fit_pointnet
 from training.baselines.fit_thor import fit_thor
 from training.baselines.names import BASELINES, check_baselines
 from training.baselines.task import FitTask, FittedBaseline
-from training.fitting.options import FitOptions, Progress
+from training.fitting.options import FitOptions
 from training.fitting.run_directories import find_run_directories
 from training.fitting.temperature import fit_temperature
+from training.storage.progress import Progress
 from training.views.normalized_views import ViewSource
 
 __all__ = ["train_baselines"]

@@ -2,7 +2,7 @@
 
 import functools
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -44,13 +44,16 @@ def train(
         typer.Option(help="YAML or JSON table: sequence -> its objects. One run per sequence, in OUT/<sequence>."),
     ] = None,
     embedding: Annotated[
-        int,
+        int | None,
         typer.Option(
             min=0,
             metavar="N",
-            help="Also fit an embedding, on the meshes and N procedural objects, in place of the packaged one.",
+            help="Fit the run's embedding on N procedural distractors and the views; 0 fits none. (600; paper: 0)",
         ),
-    ] = 0,
+    ] = None,
+    distractors: Annotated[
+        Path | None, typer.Option(help="Directory of meshes of objects that are none of the classes.")
+    ] = None,
     mesh_scale: MeshScaleOption = 1.0,
     workers: Annotated[int, typer.Option(min=1, help="Rendering processes.")] = 2,
     coordinator: Annotated[
@@ -68,7 +71,8 @@ def train(
 
     With --baselines, a finished run gets the baselines that it lacks. With --sequences, one run is trained for each
     sequence, on its objects only (see `thor2 evaluate ocid --per-sequence`); finished runs must have the same options.
-    With --embedding, objects are enrolled in the run with an embedding of its own; 400 procedural objects are enough.
+    The embedding is a classifier beside the others, and objects are enrolled in the run with it. It is also fitted on
+    distractors, objects that are none of the classes, so that the model recognizes what it does not know.
     """
     import jax
 
@@ -83,18 +87,13 @@ def train(
         raise InputError(f"processes is {processes} and process {process}; several processes need --coordinator")
     if process >= processes:
         raise InputError(f"process is {process}; expected less than --processes, which is {processes}")
-    if embedding and (meshes is None or folds > 1):
-        raise InputError(f"embedding is {embedding}; it requires --meshes and excludes --folds")
     if sequences is not None and (dataset is None or leave_out):
         raise InputError(f"sequences is {sequences}; it requires --dataset and excludes --leave-out")
     if coordinator is not None:
         if meshes is not None:
             raise InputError("coordinator: several processes need a --dataset that all of them can read, not --meshes")
         jax.distributed.initialize(coordinator, processes, process)
-    from thor2_jax.recognizer import EMBEDDING_FILE
-    from training.embedding.build import build_embedding
     from training.fitting.protocol import DEFAULT, PAPER
-    from training.objects.meshes import find_meshes, read_names, scaled_meshes
     from training.train_job import TrainJob, run_train_job
 
     job = TrainJob(
@@ -110,20 +109,11 @@ def train(
         baselines=split_names(baselines),
         leave_out=split_names(leave_out),
         sequences=sequences,
+        distractors=_distractors(0 if paper and embedding is None else embedding, distractors, workers),
         workers=workers,
         mesh_scale=mesh_scale,
     )
     trained = run_train_job(job, functools.partial(show_progress, quiet))
-    if embedding and meshes is not None and not (out / EMBEDDING_FILE).is_file():
-        paths = scaled_meshes(find_meshes(meshes, read_names(names) if names else None), mesh_scale)
-        with show_progress(quiet) as progress:
-            build_embedding(
-                out / EMBEDDING_FILE,
-                embedding,
-                meshes=[path for name, path in paths.items() if name not in job.leave_out],
-                workers=workers,
-                progress=progress,
-            )
     for directory, runs in trained.items():
         if not runs:
             console.print(f"finished already: nothing was trained; the run is in {directory}")
@@ -132,3 +122,16 @@ def train(
             for name, accuracy in run.record["held_out_accuracy"].items():
                 console.print(f"fold {run.record['fold']}: {name} has a held-out accuracy of {accuracy:.3f}")
         console.print(f"run written to {directory}")
+
+
+def _distractors(procedural: int | None, meshes: Path | None, workers: int) -> Any:
+    """Return the distractors of the options; None fits no embedding."""
+    from training.embedding.run_embedding import Distractors
+    from training.objects.meshes import find_meshes
+
+    if procedural == 0 and meshes is None:
+        return None
+    found = {} if meshes is None else find_meshes(meshes)
+    if procedural is None:
+        return Distractors(meshes=found, workers=workers)
+    return Distractors(procedural, found, workers=workers)

@@ -18,9 +18,9 @@ from thor2_jax.errors import InputError
 from thor2_jax.gallery.embedding import Embedding
 from training.embedding.fit import EmbeddingFit, fit_embedding
 from training.embedding.sampling import ObjectSource, build_samples
-from training.fitting.options import Progress
 from training.objects.mesh import TexturedMesh
 from training.objects.meshes import find_meshes
+from training.storage.progress import Progress
 from training.storage.workers import local_workers
 
 __all__ = ["build_embedding", "main"]

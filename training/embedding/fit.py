@@ -2,7 +2,7 @@
 
 The loss is the cross-entropy of the scaled cosines between a view and all proxies, less a margin for the view's own
 (Movshovitz-Attias et al., "No Fuss Distance Metric Learning Using Proxies", ICCV 2017; Wang et al., "CosFace", CVPR
-2018). The proxies are discarded; on a new object, views are compared with views.
+2018). On a new object, views are compared with views; the proxies of a run's classes also classify.
 """
 
 import dataclasses
@@ -21,11 +21,11 @@ from colornet import ColorNetwork
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.describe import describe_strips
 from thor2_jax.errors import InputError
-from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes, color_features
+from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes, class_cosines, color_features
 from thor2_jax.types import Descriptors, Strips
 from training.embedding.samples import Batch, Samples
 
-__all__ = ["EmbeddingFit", "fit_embedding"]
+__all__ = ["EmbeddingFit", "batch_descriptors", "fit_embedding"]
 
 BASIS_SAMPLES = 2048
 """Samples whose colour embeddings determine the principal components."""
@@ -59,7 +59,10 @@ class EmbeddingFit:
             )
 
 
-def _descriptors(length: jax.Array, color: jax.Array, network: ColorNetwork, config: DescriptorConfig) -> Descriptors:
+def batch_descriptors(
+    length: jax.Array, color: jax.Array, network: ColorNetwork, config: DescriptorConfig
+) -> Descriptors:
+    """Return the descriptors of the strips of a batch; `length` and `color` are fields of `Batch`."""
     length = length.astype(jnp.float32)
     strips = Strips(
         low=jnp.zeros_like(length),
@@ -73,7 +76,7 @@ def _descriptors(length: jax.Array, color: jax.Array, network: ColorNetwork, con
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
 def _color_features(network: ColorNetwork, config: DescriptorConfig, batch: Batch) -> jax.Array:
-    return color_features(_descriptors(batch.length, batch.color, network, config).embeddings)
+    return color_features(batch_descriptors(batch.length, batch.color, network, config).embeddings)
 
 
 def _color_basis(
@@ -103,15 +106,14 @@ def _step(
     """Make one step and return the next state and the loss before it."""
     parameters, rest, moments, key = state
     key, dropout = jax.random.split(key)
-    descriptors = _descriptors(batch.length, batch.color, network, config)
+    descriptors = batch_descriptors(batch.length, batch.color, network, config)
 
     def loss_of(parameters: Any) -> Any:
-        model = nnx.merge(graph, parameters["model"], rest, copy=True)
+        model = nnx.merge(graph, parameters, rest, copy=True)
         learned = model.learned(descriptors, batch.statistics, train=True, rngs=nnx.Rngs(dropout=dropout))
-        proxies = parameters["proxies"]
-        cosine = learned @ (proxies / jnp.linalg.norm(proxies, axis=0))
-        own = jax.nn.one_hot(batch.label, cosine.shape[1])
-        logits = jnp.exp(parameters["log_scale"]) * (cosine - margin * own)
+        cosines = class_cosines(learned, model.proxies[...])
+        own = jax.nn.one_hot(batch.label, cosines.shape[1])
+        logits = jnp.exp(model.log_scale[...]) * (cosines - margin * own)
         loss = optax.softmax_cross_entropy_with_integer_labels(logits, batch.label).mean()
         return loss, nnx.state(model, nnx.Not(nnx.Param))
 
@@ -127,6 +129,7 @@ def fit_embedding(
     options: EmbeddingFit,
     sizes: EmbeddingSizes | None = None,
     progress: Callable[[int, int, float], object] = lambda epoch, epochs, loss: None,
+    classes: tuple[str, ...] = (),
 ) -> Embedding:
     """Fit an embedding; on the same machine, equal arguments give equal weights.
 
@@ -137,6 +140,8 @@ def fit_embedding(
         options: of the fit.
         sizes: of the network.
         progress: called after each epoch with (epochs done, number of epochs, mean loss).
+        classes: names of the first objects, which the embedding also recognizes: their proxies, and those of the other
+            objects as distractors, are kept. None by default: the proxies are discarded.
 
     Raises:
         InputError: there are fewer samples than in a batch, or the loss is not finite.
@@ -144,21 +149,15 @@ def fit_embedding(
     n_steps = len(samples) // options.batch_size
     if n_steps < 1:
         raise InputError(f"there are {len(samples)} samples; expected at least {options.batch_size}; add views")
-    embedding = Embedding.create(config, network, sizes, options.seed)
+    n_objects = int(samples.label.max()) + 1
+    embedding = Embedding.create(config, network, sizes, options.seed, classes, n_objects - len(classes))
     config = embedding.config
     basis = _color_basis(samples, network, config, embedding.sizes.color, options.batch_size)
     embedding.model.color_basis[...] = jnp.asarray(basis)
     split: Any = nnx.split(embedding.model, nnx.Param, ...)
     graph, parameters, rest = split
-    key, proxy_key = jax.random.split(jax.random.key(options.seed))
-    n_objects = int(samples.label.max()) + 1
-    parameters = {
-        "model": parameters,
-        "proxies": jax.random.normal(proxy_key, (embedding.sizes.learned, n_objects)),
-        "log_scale": jnp.log(16.0),
-    }
     optimizer = _adamw(options.rate, n_steps * options.epochs)
-    state = parameters, rest, optimizer.init(parameters), key
+    state = parameters, rest, optimizer.init(parameters), jax.random.key(options.seed)
     for epoch in range(options.epochs):
         order = np.random.default_rng([options.seed, epoch]).permutation(len(samples))
         total = jnp.zeros(())
@@ -169,5 +168,5 @@ def fit_embedding(
         if not np.isfinite(mean):
             raise InputError(f"the loss is {mean} in epoch {epoch + 1}; expected a finite one; lower the rate")
         progress(epoch + 1, options.epochs, mean)
-    model = nnx.merge(graph, state[0]["model"], state[1])
-    return dataclasses.replace(embedding, model=model)
+    fitted = dataclasses.replace(embedding, model=nnx.merge(graph, state[0], state[1]))
+    return fitted if classes else fitted.without_proxies()

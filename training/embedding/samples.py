@@ -4,14 +4,12 @@ A sample stores its occupied strips, a tenth of all, and the statistics of its c
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from colornet import ColorNetwork
 from thor2_jax.config import DescriptorConfig
@@ -19,17 +17,12 @@ from thor2_jax.descriptor.cloud_statistics import cloud_statistics
 from thor2_jax.descriptor.describe import strips
 from thor2_jax.descriptor.view_normalization import turn, view_normalize
 from thor2_jax.types import Cloud, PointClouds
-from training.views.normalized_views import padded_batches
+from training.augmentation.orientation import reorient
+from training.views.normalized_views import NormalizedViews, padded_batches
 
-__all__ = ["Batch", "Samples", "concatenate_fields", "sample_clouds"]
+__all__ = ["Batch", "Samples", "concatenate_fields", "joined_samples", "sample_clouds", "sample_views"]
 
 CLOUDS_PER_BATCH = 64
-
-NEARLY_EQUAL = 0.85
-"""Least ratio of two neighbouring sides of a box at which they are swapped in half of the samples."""
-
-MAX_ROTATION = 10.0
-"""Largest random rotation of a normalized cloud, degrees."""
 
 
 class Batch(NamedTuple):
@@ -73,11 +66,27 @@ class Samples:
     def __len__(self) -> int:
         return len(self.label)
 
+    def _entries(self, rows: NDArray[np.integer[Any]]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the number of strips of each of the samples, and the indices of all their strips."""
+        counts = self.start[rows + 1] - self.start[rows]
+        return counts, np.arange(counts.sum()) + np.repeat(self.start[rows] - np.cumsum(counts) + counts, counts)
+
+    def fields(self, rows: NDArray[np.integer[Any]]) -> dict[str, NDArray[Any]]:
+        """Return the fields of the samples with the given indices, as `sample_clouds` returns them."""
+        counts, entry = self._entries(rows)
+        return {
+            "strips": counts,
+            "strip": self.strip[entry],
+            "length": self.length[entry],
+            "color": self.color[entry],
+            "statistics": self.statistics[rows],
+            "label": self.label[rows],
+        }
+
     def take(self, rows: NDArray[np.integer[Any]]) -> Batch:
         """Return the samples with the given indices."""
-        counts = self.start[rows + 1] - self.start[rows]
+        counts, entry = self._entries(rows)
         sample = np.repeat(np.arange(len(rows)), counts)
-        entry = np.arange(counts.sum()) + np.repeat(self.start[rows] - np.cumsum(counts) + counts, counts)
         strip = self.strip[entry]
         n_strips = self.shape[0] * self.shape[1]
         length = np.zeros((len(rows), n_strips), np.float16)
@@ -85,38 +94,6 @@ class Samples:
         length[sample, strip], color[sample, strip] = self.length[entry], self.color[entry]
         grid = len(rows), *self.shape
         return Batch(length.reshape(grid), color.reshape(*grid, -1), self.statistics[rows], self.label[rows])
-
-
-@jax.jit
-def _reoriented(normal: PointClouds, axes: jax.Array, mirrored: jax.Array) -> PointClouds:
-    """Rotate normalized clouds to axes [B, 3, 3], then mirror some [B] in x; the camera stays on the side of -z."""
-
-    def one(cloud: PointClouds, axes: jax.Array, mirrored: jax.Array) -> PointClouds:
-        inside = cloud.mask[:, None]
-        middle = cloud.points.max(axis=0) / 2
-        points, camera = (jnp.matmul(a - middle, axes.T) for a in (cloud.points, cloud.camera))
-        low = jnp.where(inside, points, jnp.inf).min(axis=0)
-        high = jnp.where(inside, points, -jnp.inf).max(axis=0)
-        signs = jnp.stack([mirrored, jnp.zeros_like(mirrored), camera[2] > (low[2] + high[2]) / 2])
-        corner = jnp.where(signs, high, low)
-        corner = jnp.where(jnp.isfinite(corner), corner, 0)
-        sign = jnp.where(signs, -1, 1)
-        points = jnp.where(inside, sign * (points - corner), 0)
-        return dataclasses.replace(cloud, points=points, camera=sign * (camera - corner))
-
-    return jax.vmap(one)(normal, axes, mirrored)
-
-
-def _random_axes(extents: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:
-    """Return axes [B, 3, 3]: some nearly equal sides [B, 3] swapped, then a small rotation about a random axis."""
-    sides, axes = extents.copy(), np.tile(np.eye(3), (len(extents), 1, 1))
-    for order, (i, j) in (([1, 0, 2], (0, 1)), ([0, 2, 1], (1, 2))):
-        swap = (sides[:, j] > NEARLY_EQUAL * sides[:, i]) & (rng.random(len(sides)) < 0.5)
-        sides[swap], axes[swap] = sides[swap][:, order], axes[swap][:, order]
-    direction = rng.standard_normal((len(extents), 3))
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    angle = np.radians(rng.uniform(0, MAX_ROTATION, (len(extents), 1)))
-    return np.asarray(Rotation.from_rotvec(angle * direction).as_matrix() @ axes, np.float32)
 
 
 def sample_clouds(
@@ -139,19 +116,50 @@ def sample_clouds(
     """
     # Clouds of one size share a batch, so that little of it is padding.
     order = sorted(range(len(clouds)), key=lambda k: len(clouds[k][0]))
+    batches = padded_batches([clouds[k] for k in order], CLOUDS_PER_BATCH)
+    normal = ((count, view_normalize(batch, config)) for count, batch in batches)
+    return _sample_normal(normal, np.array([labels[k] for k in order], np.int32), network, config, copies, rng)
+
+
+def sample_views(
+    views: NormalizedViews,
+    rows: NDArray[np.bool_],
+    network: ColorNetwork,
+    config: DescriptorConfig,
+    copies: int,
+    rng: np.random.Generator,
+) -> dict[str, NDArray[Any]]:
+    """Return the fields of samples of normalized views of one object, each in `copies` random orientations.
+
+    Args:
+        views: the views.
+        rows: [V], views to sample, at least one.
+        network: colour network.
+        config: descriptor. Static.
+        copies: samples of each view.
+        rng: generator of the orientations.
+    """
+    clouds = [cloud for cloud, chosen in zip(views.clouds(), rows, strict=True) if chosen]
+    labels = np.full(len(clouds), views.label, np.int32)
+    return _sample_normal(padded_batches(clouds, CLOUDS_PER_BATCH), labels, network, config, copies, rng)
+
+
+def _sample_normal(
+    batches: Iterable[tuple[int, PointClouds]],
+    labels: NDArray[np.int32],
+    network: ColorNetwork,
+    config: DescriptorConfig,
+    copies: int,
+    rng: np.random.Generator,
+) -> dict[str, NDArray[Any]]:
+    """Return the fields of samples of batches of normalized clouds; `labels` are those of all clouds."""
     chunks: list[dict[str, NDArray[Any]]] = []
-    for first, (count, batch) in zip(
-        range(0, len(order), CLOUDS_PER_BATCH),
-        padded_batches([clouds[k] for k in order], CLOUDS_PER_BATCH),
-        strict=True,
-    ):
-        normal = view_normalize(batch, config)
-        extents = jnp.max(normal.points, axis=1)
-        label = np.array([labels[k] for k in order[first : first + count]], np.int32)
+    done = 0
+    for count, normal in batches:
+        sides = jnp.max(normal.points, axis=1)
         for _ in range(copies):
-            axes, mirrored = _random_axes(np.asarray(extents), rng), rng.random(CLOUDS_PER_BATCH) < 0.5
-            occupied = strips(turn(_reoriented(normal, axes, mirrored), config), network, config)
-            statistics = np.asarray(cloud_statistics(extents, normal, occupied))[:count]
+            occupied = strips(turn(reorient(normal, rng), config), network, config)
+            statistics = np.asarray(cloud_statistics(sides, normal, occupied))[:count]
             sample, strip = np.nonzero(np.asarray(occupied.occupied)[:count].reshape(count, -1))
             length = np.asarray(occupied.high - occupied.low).reshape(CLOUDS_PER_BATCH, -1)
             color = np.asarray(occupied.color).reshape(*length.shape, -1)
@@ -162,12 +170,20 @@ def sample_clouds(
                     "length": length[sample, strip].astype(np.float16),
                     "color": color[sample, strip].astype(np.float16),
                     "statistics": statistics,
-                    "label": label,
+                    "label": labels[done : done + count],
                 }
             )
+        done += count
     return concatenate_fields(chunks)
 
 
 def concatenate_fields(chunks: Sequence[Mapping[str, NDArray[Any]]]) -> dict[str, NDArray[Any]]:
     """Concatenate the fields of samples."""
     return {name: np.concatenate([chunk[name] for chunk in chunks]) for name in chunks[0]}
+
+
+def joined_samples(chunks: Sequence[Mapping[str, NDArray[Any]]], config: DescriptorConfig) -> Samples:
+    """Return the samples of the fields that `sample_clouds` and `sample_views` return."""
+    fields = concatenate_fields(chunks)
+    start = np.concatenate([[0], np.cumsum(fields.pop("strips"), dtype=np.int64)])
+    return Samples(start=start, shape=(config.n_slices, config.n_strips), **fields)

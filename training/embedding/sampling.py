@@ -28,7 +28,7 @@ from training.augmentation.occlusion import Occlusion
 from training.augmentation.registration import Registration
 from training.augmentation.segmentation import Segmentation
 from training.augmentation.sensor import Sensor
-from training.embedding.samples import Samples, concatenate_fields, sample_clouds
+from training.embedding.samples import Samples, joined_samples, sample_clouds
 from training.objects.mesh import TexturedMesh
 from training.objects.meshes import load_mesh
 from training.objects.procedural import procedural_object
@@ -175,9 +175,7 @@ def build_samples(
                     arrays = sample_clouds(clouds, labels, network, config, copies, rng)
                     temporary.write_bytes(safetensors.numpy.save(arrays))
                 progress(min(first + OBJECTS_PER_SHARD, len(sources)), len(sources))
-        fields = concatenate_fields([safetensors.numpy.load_file(file) for file in files.values()])
-    start = np.concatenate([[0], np.cumsum(fields.pop("strips"), dtype=np.int64)])
-    return Samples(start=start, shape=(config.n_slices, config.n_strips), **fields)
+        return joined_samples([safetensors.numpy.load_file(file) for file in files.values()], config)
 
 
 def _begin(directory: Path, job: Mapping[str, Any]) -> None:

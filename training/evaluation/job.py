@@ -20,9 +20,9 @@ from training.evaluation.frame_pictures import FramePictures
 from training.evaluation.page import write_report_page
 from training.evaluation.results import compute_results
 from training.evaluation.runs import Run
-from training.fitting.options import Progress
 from training.readers.labelled import LabelledFrames
 from training.storage.locks import locked
+from training.storage.progress import Progress
 
 __all__ = ["evaluate_dataset"]
 

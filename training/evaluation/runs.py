@@ -17,8 +17,8 @@ from thor2_jax.files import content_digest, json_digest
 from thor2_jax.gallery.store import GALLERY_DIRECTORY, INDEX_FILE
 from thor2_jax.recognition.answers import DescribedFrame
 from thor2_jax.recognition.classifier import EMBEDDING
-from thor2_jax.recognition.run_directory import RUN_FILE
-from thor2_jax.recognizer import EMBEDDING_FILE, Recognizer
+from thor2_jax.recognition.run_directory import EMBEDDING_FILE, RUN_FILE
+from thor2_jax.recognizer import Recognizer
 from training.baselines.baseline import Baseline, BaselineInputs
 from training.baselines.files import baseline_file
 from training.baselines.load import load_baselines

@@ -1,6 +1,7 @@
 """Train a run directory: samples, one classifier per feature and fold, metrics, curves and the record.
 
 RUN/run.json, network.npz, weights/   the trained model (`run_directory`); with several folds, RUN/fold-0/run.json, ...
+RUN/embedding.safetensors             with distractors: the embedding, which is also a classifier
 RUN/metrics.jsonl                     one line per epoch, classifier and fold
 RUN/curves.png                        plots of the metrics
 RUN/checkpoints/                      until the training is finished: its job record and checkpoints
@@ -27,19 +28,24 @@ from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
 from thor2_jax.descriptor.sharding import batch_mesh
 from thor2_jax.errors import InputError
 from thor2_jax.files import check_output_directory, remove_leftovers, write_text
+from thor2_jax.gallery.embedding import Embedding
 from thor2_jax.recognition.classifier import MLP, Feature, check_features
-from thor2_jax.recognition.run_directory import RUN_FILE, TrainedRun, load_run, save_run
+from thor2_jax.recognition.confidence import Calibration
+from thor2_jax.recognition.run_directory import EMBEDDING_FILE, RUN_FILE, TrainedRun, load_run, save_run
+from training.embedding.run_embedding import Distractors, fit_run_embedding
 from training.fitting.calibration import temperatures
 from training.fitting.checkpoints import CHECKPOINTS, Checkpoints
+from training.fitting.confidence import fit_calibration
 from training.fitting.fit import check_batch_size, fit
 from training.fitting.folds import fold_of_views
 from training.fitting.metrics_log import append_metrics, discard_later_epochs, read_metrics
-from training.fitting.options import EpochMetrics, FitOptions, Progress
+from training.fitting.options import EpochMetrics, FitOptions
 from training.fitting.samples import MIRRORS, Samples, build_samples
 from training.fitting.steps import FitContext
 from training.reports.plots import draw_curves
 from training.storage.jobs import check_same_job
 from training.storage.locks import locked
+from training.storage.progress import Progress
 from training.views.normalized_views import ViewSource
 
 __all__ = ["VIEWS", "check_out", "check_trained", "finished_record", "is_finished", "train_run"]
@@ -47,6 +53,9 @@ __all__ = ["VIEWS", "check_out", "check_trained", "finished_record", "is_finishe
 VIEWS = "views"
 BEGUN = "begun.json"
 METRICS = "metrics.jsonl"
+HELD_OUT = 12
+"""One view of so many is held out to calibrate the confidence of a run without folds."""
+
 CURVES = "curves.png"
 
 CONFIG = DescriptorConfig(homology="closed_form")
@@ -64,8 +73,11 @@ def _job_record(
     network: colornet.ColorNetwork,
     folds: int,
     mirrors: Sequence[str],
+    orientations: int,
+    distractors: Distractors | None,
 ) -> dict[str, Any]:
-    return {
+    added = {} if distractors is None else {"distractors": distractors.record}
+    return added | {
         "descriptor_version": DESCRIPTOR_VERSION,
         "descriptor_config": dataclasses.asdict(config),
         "color_network": network.fingerprint,
@@ -73,6 +85,7 @@ def _job_record(
         "classifiers": list(features),
         "folds": folds,
         "mirrors": list(mirrors),
+        "orientation_copies": orientations,
         "epochs": options.epochs,
         "learning_rates": list(options.learning_rates),
         "batch_size": options.batch_size,
@@ -93,6 +106,8 @@ class _Training:
         network: colour network.
         folds: number of folds.
         mirrors: in which each view is used.
+        orientations: samples of each view in random orientations.
+        distractors: other objects that an embedding is fitted on, too; None fits no embedding.
     """
 
     source: ViewSource
@@ -103,12 +118,22 @@ class _Training:
     network: colornet.ColorNetwork
     folds: int
     mirrors: tuple[str, ...]
+    orientations: int = 0
+    distractors: Distractors | None = None
 
     @property
     def record(self) -> dict[str, Any]:
         """Everything that determines the trained run, as JSON holds it."""
         return _job_record(
-            self.source.digest, self.features, self.options, self.config, self.network, self.folds, self.mirrors
+            self.source.digest,
+            self.features,
+            self.options,
+            self.config,
+            self.network,
+            self.folds,
+            self.mirrors,
+            self.orientations,
+            self.distractors,
         )
 
     def check_begun(self) -> None:
@@ -146,6 +171,9 @@ def check_trained(
     options: FitOptions,
     folds: int = 1,
     mirrors: Sequence[str] = MIRRORS,
+    config: DescriptorConfig | None = None,
+    orientations: int = 0,
+    distractors: Distractors | None = None,
 ) -> None:
     """Raise if a finished run differs from what `train_run` trains for the same arguments.
 
@@ -156,14 +184,21 @@ def check_trained(
         options: fit options.
         folds: number of folds.
         mirrors: mirrors in which each view is used.
+        config: descriptor, see `train_run`.
+        orientations: see `train_run`.
+        distractors: see `train_run`.
 
     Raises:
         InputError: The run was trained with another value, which is named, or cannot be read.
     """
     names = check_features(features, "classifiers")
-    requested = _job_record(digest, names, options, CONFIG, colornet.load_default(), folds, mirrors)
+    network = colornet.load_default()
+    requested = _job_record(
+        digest, names, options, config or CONFIG, network, folds, mirrors, orientations, distractors
+    )
     record = finished_record(out)
-    stored = {**record, "dataset": record["dataset"]["digest"]}
+    stored = {"orientation_copies": 0, **record, "dataset": record["dataset"]["digest"]}
+    stored["descriptor_config"] = {"orientations": 1, **record["descriptor_config"]}  # version 0.1.0 has neither
     check_same_job(out, {name: stored.get(name) for name in requested}, requested)
 
 
@@ -191,6 +226,8 @@ def train_run(
     config: DescriptorConfig | None = None,
     folds: int = 1,
     mirrors: Sequence[str] = MIRRORS,
+    orientations: int = 0,
+    distractors: Distractors | None = None,
 ) -> list[TrainedRun]:
     """Train one classifier per feature and fold and write the run directory or directories; resume if interrupted.
 
@@ -206,6 +243,9 @@ def train_run(
         config: descriptor; by default the paper's, with diagrams in closed form.
         folds: with more than one, one model per fold (`out`/fold-0, ...), with the fold as its held-out set.
         mirrors: mirrors in which each view is used.
+        orientations: further samples of each view, in random orientations.
+        distractors: fit an embedding on the views and on these objects, and calibrate the confidence; without folds,
+            one view of `HELD_OUT` is held out for it. None fits none.
 
     Returns:
         The run of each fold, as read back.
@@ -219,7 +259,11 @@ def train_run(
     names = check_features(features, "classifiers")
     network = colornet.load_default()
     out = Path(out).absolute()
-    training = _Training(source, out, names, options, config or CONFIG, network, folds, tuple(mirrors))
+    if distractors is not None:
+        distractors.check(source.classes)
+    training = _Training(
+        source, out, names, options, config or CONFIG, network, folds, tuple(mirrors), orientations, distractors
+    )
     check_out(out)
     training.check_begun()
     check_batch_size(options.batch_size, batch_mesh())
@@ -228,7 +272,9 @@ def train_run(
         if first and resumed:
             locks.enter_context(locked(out / CHECKPOINTS))
         samples = _describe_views(training, progress)
-        fold_of = fold_of_views(samples.label, samples.view, samples.classes, folds, options.seed)
+        is_held_out = folds > 1 or distractors is not None
+        parts = folds if folds > 1 else HELD_OUT if distractors else 1
+        fold_of = fold_of_views(samples.label, samples.view, samples.classes, parts, options.seed)
         _wait_for_all("checked")
         if first:
             if not resumed:
@@ -240,7 +286,7 @@ def train_run(
             remove_leftovers(out)
         _wait_for_all("begun")
         runs = [
-            _train_fold(training, samples, fold, fold_of == fold if folds > 1 else None, progress)
+            _train_fold(training, samples, fold, fold_of == fold if is_held_out else None, progress)
             for fold in range(folds)
         ]
         _wait_for_all("trained")
@@ -258,7 +304,15 @@ def _describe_views(training: _Training, progress: Progress) -> Samples:
         done += count
         progress("describe", done, total, "views")
 
-    return build_samples(training.source, training.network, training.config, advance, training.mirrors)
+    return build_samples(
+        training.source,
+        training.network,
+        training.config,
+        advance,
+        training.mirrors,
+        training.orientations,
+        training.options.seed,
+    )
 
 
 def _train_fold(
@@ -271,6 +325,8 @@ def _train_fold(
         classifiers, best_epochs = _fit_classifiers(training, samples, fold, held_out, progress)
         calibrated = temperatures(classifiers, samples, held_out, network, config)
         if jax.process_index() == 0:
+            run = TrainedRun(config, network, samples.classes, classifiers, {})
+            embedding, calibration = _fit_embedding(training, samples, fold, held_out, run, progress)
             rows = read_metrics(out / METRICS)
             draw_curves(
                 {name: [row for row in rows if row["classifier"] == name] for name in training.features}, out / CURVES
@@ -278,8 +334,14 @@ def _train_fold(
             record = training.record | {"dataset": training.source.record, "samples": len(samples), "fold": fold}
             record |= _outcome([row for row in rows if row["fold"] == fold], best_epochs)
             record["temperatures"] = calibrated
-            run = TrainedRun(config, network, samples.classes, classifiers, record)
-            _publish(run, out / CHECKPOINTS / f"fold-{fold}" / "run", directory)
+            if calibration is not None:
+                record["calibration"] = dataclasses.asdict(calibration)
+            _publish(
+                dataclasses.replace(run, record=record),
+                embedding,
+                out / CHECKPOINTS / f"fold-{fold}" / "run",
+                directory,
+            )
         _wait_for_all("published")
     return load_run(directory)
 
@@ -315,6 +377,33 @@ def _fit_classifiers(
     return classifiers, best_epochs
 
 
+def _fit_embedding(
+    training: _Training,
+    samples: Samples,
+    fold: int,
+    held_out: NDArray[np.bool_] | None,
+    run: TrainedRun,
+    progress: Progress,
+) -> tuple[Embedding | None, Calibration | None]:
+    """Fit the embedding of a fold and calibrate the confidence on its held-out set; None and None without distractors.
+
+    An interrupted fit starts again, on the samples of the distractors that are on disk.
+    """
+    if training.distractors is None or held_out is None:
+        return None, None
+    embedding, kept = fit_run_embedding(
+        training.source,
+        {label: np.unique(samples.view[held_out & (samples.label == label)]) for label in np.unique(samples.label)},
+        training.distractors,
+        training.out / CHECKPOINTS / "distractors",
+        training.network,
+        training.config,
+        training.options.seed,
+        progress if training.folds == 1 else lambda stage, *values: progress(f"fold {fold}: {stage}", *values),
+    )
+    return embedding, fit_calibration(run, embedding, kept)
+
+
 def _outcome(rows: Sequence[Mapping[str, Any]], best_epochs: Mapping[Feature, int]) -> dict[str, Any]:
     """Return the results of a fold for its record: curves, the epochs kept and the held-out accuracy."""
     curves: dict[str, list[dict[str, Any]]] = {name: [] for name in best_epochs}
@@ -327,11 +416,13 @@ def _outcome(rows: Sequence[Mapping[str, Any]], best_epochs: Mapping[Feature, in
     return {"kept_epochs": dict(best_epochs), "held_out_accuracy": held_out, "curves": curves}
 
 
-def _publish(run: TrainedRun, complete: Path, directory: Path) -> None:
+def _publish(run: TrainedRun, embedding: Embedding | None, complete: Path, directory: Path) -> None:
     """Write a run to `complete` and move its files into `directory`; run.json is moved last."""
     shutil.rmtree(complete, ignore_errors=True)  # left by a process that was killed just here
     save_run(run, complete)
     directory.mkdir(exist_ok=True)
     shutil.rmtree(directory / "weights", ignore_errors=True)
+    if embedding is not None:
+        embedding.save(directory / EMBEDDING_FILE)
     for name in ("weights", "network.npz", RUN_FILE):
         (complete / name).rename(directory / name)

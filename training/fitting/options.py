@@ -1,15 +1,11 @@
-"""Options of a fit, metrics of an epoch and the progress callback."""
+"""Options of a fit, and metrics of an epoch."""
 
 import dataclasses
 import math
-from collections.abc import Callable
 
 from thor2_jax.errors import InputError
 
-__all__ = ["EpochMetrics", "FitOptions", "Progress"]
-
-Progress = Callable[[str, int, int, str], object]
-"""Called with (stage, done, total, note)."""
+__all__ = ["EpochMetrics", "FitOptions"]
 
 MAX_SEED = 2**31 - 1
 """Largest seed that fits into 32 signed bits, as JAX requires."""

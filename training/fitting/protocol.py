@@ -3,13 +3,11 @@
 import dataclasses
 from typing import Any
 
+from thor2_jax.config import DescriptorConfig
 from training.augmentation.augmentations import Augmentations
-from training.augmentation.illumination import Illumination
-from training.augmentation.occlusion import Occlusion
-from training.augmentation.segmentation import Segmentation
-from training.augmentation.sensor import Sensor
+from training.embedding.sampling import AUGMENTATIONS
 from training.fitting.options import FitOptions
-from training.fitting.samples import MIRRORS, PAPER_MIRRORS
+from training.fitting.samples import PAPER_MIRRORS
 
 __all__ = ["DEFAULT", "PAPER", "Protocol"]
 
@@ -23,6 +21,8 @@ class Protocol:
         polar_step: degrees between cameras from pole to pole.
         augmentations: augmented copies of each view; None adds none.
         mirrors: mirrors in which each view is used.
+        orientation_copies: further samples of each view, in random orientations.
+        config: descriptor, with the number of candidate orientations in recognition.
         fit: fit options of every classifier.
     """
 
@@ -30,6 +30,8 @@ class Protocol:
     polar_step: float
     augmentations: Augmentations | None
     mirrors: tuple[str, ...]
+    orientation_copies: int
+    config: DescriptorConfig
     fit: FitOptions
 
     def replace(
@@ -55,17 +57,21 @@ class Protocol:
 DEFAULT = Protocol(
     azimuth_step=20.0,
     polar_step=15.0,
-    augmentations=Augmentations(Illumination(), Sensor(), Occlusion(), Segmentation()),
-    mirrors=MIRRORS,
+    augmentations=AUGMENTATIONS,
+    mirrors=("",),
+    orientation_copies=2,
+    config=DescriptorConfig(homology="closed_form", orientations=4),
     fit=FitOptions(epochs=24, batch_size=256),
 )
-"""Fewer views than the paper's, each with two augmented copies (light, sensor, occlusion and segmentation)."""
+"""Fewer views than the paper's, each with two augmented copies and in two more orientations."""
 
 PAPER = Protocol(
     azimuth_step=5.0,
     polar_step=5.0,
     augmentations=None,
     mirrors=PAPER_MIRRORS,
+    orientation_copies=0,
+    config=DescriptorConfig(homology="closed_form"),
     fit=FitOptions(epochs=100, batch_size=128),
 )
 """The paper's protocol (section "Training"): 72 x 37 views per object, four mirrors, 100 epochs."""

@@ -10,6 +10,7 @@ each set of colour regions. This takes some hundred bytes instead of the 48 kB o
 
 import dataclasses
 import functools
+import itertools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -25,6 +26,7 @@ from thor2_jax.descriptor.describe import strips_by_sets
 from thor2_jax.descriptor.view_normalization import mirror, turn
 from thor2_jax.errors import InputError
 from thor2_jax.types import Strips
+from training.augmentation.orientation import reorient
 from training.views.normalized_views import ViewSource, padded_batches
 
 __all__ = ["MIRRORS", "PAPER_MIRRORS", "Batch", "Samples", "build_samples", "expand"]
@@ -131,6 +133,8 @@ def build_samples(
     config: DescriptorConfig,
     progress: Callable[[int], object] = lambda n: None,
     mirrors: Sequence[str] = MIRRORS,
+    orientations: int = 0,
+    seed: int = 0,
 ) -> Samples:
     """Mirror every view and keep its strips; reads one shard of views at a time.
 
@@ -140,6 +144,8 @@ def build_samples(
         config: descriptor. Static.
         progress: called with the number of views done since the last call.
         mirrors: axes of each mirror, such as "xy"; one sample each.
+        orientations: further samples of each view, in random orientations.
+        seed: seed for the orientations.
 
     Raises:
         InputError: There are fewer than two classes, a class has no views, or the source is unreadable.
@@ -154,11 +160,12 @@ def build_samples(
     counting = RegionSets(sets.of_color, jnp.eye(len(sets.weights)))
     chunks: list[dict[str, NDArray[Any]]] = []
     for index, shard in enumerate(source.shards):
-        views = source.read(index)
+        views, rng = source.read(index), np.random.default_rng([seed, index])
         done = 0
         for count, normal in padded_batches(views.clouds(), VIEWS_PER_BATCH):
-            for axes in mirrors:
-                strips = strips_by_sets(turn(mirror(normal, axes), config), counting, config)
+            copies = (mirror(normal, axes) for axes in mirrors)
+            for copy in itertools.chain(copies, (reorient(normal, rng) for _ in range(orientations))):
+                strips = strips_by_sets(turn(copy, config), counting, config)
                 compact = _compact(jax.tree.map(lambda a: np.asarray(a)[:count], strips))  # noqa: B023
                 compact["label"] = np.full(count, shard.label, np.int32)
                 chunks.append(compact | {"view": views.view[done : done + count]})

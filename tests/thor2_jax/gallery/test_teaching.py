@@ -14,8 +14,7 @@ from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
 from thor2_jax.gallery.enrollment import ORIENTATIONS, instance_view
 from thor2_jax.gallery.objects import ObjectGallery
 from thor2_jax.gallery.union import ClassUnion
-from thor2_jax.recognition.run_directory import TrainedRun, load_run, save_run
-from thor2_jax.recognizer import EMBEDDING_FILE
+from thor2_jax.recognition.run_directory import EMBEDDING_FILE, TrainedRun, load_run, save_run
 
 INTRINSICS = thor2.Intrinsics(600.0, 600.0, 159.5, 119.5)
 SIZES = EmbeddingSizes(4, (16,), 8, 4)

@@ -22,8 +22,7 @@ from playwright.sync_api import Browser, Page, Route, expect, sync_playwright
 
 import thor2_jax as thor2
 from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
-from thor2_jax.recognition.run_directory import save_run
-from thor2_jax.recognizer import EMBEDDING_FILE
+from thor2_jax.recognition.run_directory import EMBEDDING_FILE, save_run
 from thor2_jax.service.app import create_app
 from thor2_jax.service.settings import Settings
 

@@ -8,8 +8,7 @@ from helpers import SMALL_CONFIG, untrained_run
 import thor2_jax as thor2
 from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
 from thor2_jax.recognition.prepared_instance import prepare_instance
-from thor2_jax.recognition.run_directory import save_run
-from thor2_jax.recognizer import EMBEDDING_FILE
+from thor2_jax.recognition.run_directory import EMBEDDING_FILE, save_run
 from thor2_jax.service.engine import InferenceEngine
 from thor2_jax.service.settings import Settings
 

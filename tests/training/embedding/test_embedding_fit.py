@@ -77,7 +77,7 @@ def test_unturned_samples_have_the_descriptor_of_their_cloud(monkeypatch: pytest
     embedding = Embedding.create(SMALL_CONFIG, sizes=SIZES)
     clouds = thor2.PointClouds.pack([rendered[k][1] for k in order])
     expected = {mirror: embedded(embedding, aligned(clouds, mirror)) for mirror in ("", "x")}
-    descriptors = fit._descriptors(jnp.asarray(batch.length), jnp.asarray(batch.color), NETWORK, embedding.config)
+    descriptors = fit.batch_descriptors(jnp.asarray(batch.length), jnp.asarray(batch.color), NETWORK, embedding.config)
     actual = whole_embedding(nnx.merge(*embedding._split), descriptors, batch.statistics)
     similarity = [np.asarray((actual * values).sum(axis=1)) for values in expected.values()]
     np.testing.assert_allclose(np.max(similarity, axis=0), 1, atol=1e-3)
@@ -134,7 +134,7 @@ def test_views_of_one_object_become_more_similar(views: Samples) -> None:
     assert losses[11][:2] == (12, 12) and losses[11][2] < 0.5 * losses[0][2]
     assert fitted.fingerprint == again.fingerprint
     batch = views.take(np.arange(len(views)))
-    descriptors = fit._descriptors(jnp.asarray(batch.length), jnp.asarray(batch.color), NETWORK, fitted.config)
+    descriptors = fit.batch_descriptors(jnp.asarray(batch.length), jnp.asarray(batch.color), NETWORK, fitted.config)
     same = batch.label[:, None] == batch.label
     gaps = []
     for embedding in (Embedding.create(SMALL_CONFIG, sizes=SIZES), fitted):
