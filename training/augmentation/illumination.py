@@ -48,12 +48,12 @@ class Illumination:
         InputError: A value is outside its limits.
     """
 
-    gamma: Range = (0.7, 1.4)
-    gain: Range = (0.4, 1.6)
-    cast: float = 0.1
+    gamma: Range = (0.6, 1.6)
+    gain: Range = (0.4, 1.7)
+    cast: float = 0.15
     shading: Range = (0.0, 1.0)
-    saturation: Range = (0.5, 1.6)
-    veil: Range = (0.0, 0.08)
+    saturation: Range = (0.4, 1.7)
+    veil: Range = (0.0, 0.12)
     noise: Range = (0.0, 0.02)
 
     def __post_init__(self) -> None:

@@ -35,7 +35,7 @@ class Sensor:
     """
 
     distance: Range = (0.6, 1.2)
-    axial: Range = (0.3, 1.0)
+    axial: Range = (0.3, 1.5)
     lateral: float = 0.8
     grazing: float = 78.0
     missing: float = 0.3

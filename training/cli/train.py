@@ -51,6 +51,9 @@ def train(
             help="Fit the run's embedding on N procedural distractors and the views; 0 fits none. (600; paper: 0)",
         ),
     ] = None,
+    orientation_copies: Annotated[
+        int | None, typer.Option(min=0, help="Further samples of each view, in random orientations. (2; paper: 0)")
+    ] = None,
     distractors: Annotated[
         Path | None, typer.Option(help="Directory of meshes of objects that are none of the classes.")
     ] = None,
@@ -99,7 +102,12 @@ def train(
     job = TrainJob(
         out=out,
         protocol=(PAPER if paper else DEFAULT).replace(
-            azimuth_step=azimuth_step, polar_step=polar_step, epochs=epochs, batch_size=batch_size, seed=seed
+            azimuth_step=azimuth_step,
+            polar_step=polar_step,
+            epochs=epochs,
+            batch_size=batch_size,
+            seed=seed,
+            orientation_copies=orientation_copies,
         ),
         meshes=meshes,
         dataset=dataset,

@@ -47,9 +47,9 @@ OBJECTS_PER_SHARD = 32
 JOB = "job.json"
 
 AUGMENTATIONS = Augmentations(
-    illumination=Illumination(gamma=(0.6, 1.6), gain=(0.4, 1.7), cast=0.15, saturation=(0.4, 1.7), veil=(0.0, 0.12)),
-    sensor=Sensor(axial=(0.3, 1.5)),
-    occlusion=Occlusion(none=0.45),
+    illumination=Illumination(),
+    sensor=Sensor(),
+    occlusion=Occlusion(),
     segmentation=Segmentation(),
     registration=Registration(),
     base=Base(),

@@ -273,7 +273,7 @@ def train_run(
             locks.enter_context(locked(out / CHECKPOINTS))
         samples = _describe_views(training, progress)
         is_held_out = folds > 1 or distractors is not None
-        parts = folds if folds > 1 else HELD_OUT if distractors else 1
+        parts = folds if folds > 1 or distractors is None else _held_out_parts(samples)
         fold_of = fold_of_views(samples.label, samples.view, samples.classes, parts, options.seed)
         _wait_for_all("checked")
         if first:
@@ -294,6 +294,12 @@ def train_run(
             # Renamed first: whenever the process is killed, the run is either interrupted or finished.
             shutil.rmtree((out / CHECKPOINTS).rename(out / f".{CHECKPOINTS}"))
         return runs
+
+
+def _held_out_parts(samples: Samples) -> int:
+    """Return the number of parts of the views of which one is held out; fewer if a class has few views."""
+    fewest = min(len(np.unique(samples.view[samples.label == label])) for label in range(len(samples.classes)))
+    return max(2, min(HELD_OUT, fewest))
 
 
 def _describe_views(training: _Training, progress: Progress) -> Samples:

@@ -41,13 +41,18 @@ class Protocol:
         epochs: int | None = None,
         batch_size: int | None = None,
         seed: int | None = None,
+        orientation_copies: int | None = None,
     ) -> "Protocol":
         """Return the protocol with the given values; None keeps the protocol's own.
 
         Raises:
             InputError: A value of the fit is invalid.
         """
-        steps = {"azimuth_step": azimuth_step, "polar_step": polar_step}
+        steps = {
+            "azimuth_step": azimuth_step,
+            "polar_step": polar_step,
+            "orientation_copies": orientation_copies,
+        }
         fit: dict[str, Any] = {"epochs": epochs, "batch_size": batch_size, "seed": seed}
         given: dict[str, Any] = {name: value for name, value in steps.items() if value is not None}
         given["fit"] = dataclasses.replace(self.fit, **{n: v for n, v in fit.items() if v is not None})

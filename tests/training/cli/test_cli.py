@@ -76,7 +76,7 @@ def model(meshes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the run directory of a model of three objects, trained for six epochs."""
     out = tmp_path_factory.mktemp("model") / "run"
     steps = ("--azimuth-step", 60, "--polar-step", 45, "--workers", 1)
-    options = ("--epochs", 6, "--batch-size", 16, "--classifiers", "tops,tops2,ce")
+    options = ("--epochs", 6, "--batch-size", 16, "--classifiers", "tops,tops2,ce", "--embedding", 0)
     assert run_thor2("train", "--meshes", meshes, "--out", out, *steps, *options) == 0
     return out
 
@@ -208,7 +208,8 @@ def test_options_without_effect_are_refused(meshes: Path, tmp_path: Path, run: R
         ("mesh_scale", ("--meshes", meshes, "--mesh-scale", 0)),
         ("processes", (*dataset, "--processes", 2)),
         ("process", (*dataset, "--process", 1)),
-        ("embedding", (*dataset, "--embedding", 9)),
+        ("distractors", (*dataset, "--embedding", 9)),
+        ("distractors", ("--meshes", meshes, "--distractors", meshes)),
         ("process", (*dataset, "--coordinator", "localhost:1", "--processes", 2, "--process", 2)),
         ("azimuth_step", ("--meshes", meshes, "--azimuth-step", 1e-9)),
     )
@@ -223,8 +224,8 @@ def test_options_without_effect_are_refused(meshes: Path, tmp_path: Path, run: R
 def test_train_on_rendered_dataset_equals_train_on_meshes(meshes: Path, model: Path, tmp_path: Path) -> None:
     """Views written by `render` and read back train the same model as views rendered by `train`."""
     steps = ("--azimuth-step", 60, "--polar-step", 45, "--workers", 1)
-    options = ("--epochs", 6, "--batch-size", 16, "--classifiers", "tops,tops2,ce")
-    augmentations = ("--illumination", "--sensor", "--occlusion", "--segmentation")
+    options = ("--epochs", 6, "--batch-size", 16, "--classifiers", "tops,tops2,ce", "--embedding", 0)
+    augmentations = ("--illumination", "--sensor", "--occlusion", "--segmentation", "--registration", "--base")
     assert run_thor2("render", "--meshes", meshes, "--out", tmp_path / "views", *steps, *augmentations) == 0
     assert run_thor2("train", "--dataset", tmp_path / "views", "--out", tmp_path / "run", *options) == 0
     assert not (model / "views").exists()
@@ -233,21 +234,31 @@ def test_train_on_rendered_dataset_equals_train_on_meshes(meshes: Path, model: P
 
 
 @pytest.mark.slow
-def test_train_with_an_embedding_of_its_own(meshes: Path, tmp_path: Path, run: Run) -> None:
-    steps = ("--azimuth-step", 90, "--polar-step", 90, "--workers", 1, "--epochs", 1, "--classifiers", "tops")
-    command = ("train", "--meshes", meshes, "--out", tmp_path / "run", *steps, "--embedding", 8)
+def test_train_with_distractors(meshes: Path, images: Path, tmp_path: Path, run: Run) -> None:
+    steps = ("--azimuth-step", 60, "--polar-step", 45, "--workers", 1, "--epochs", 4, "--classifiers", "tops,tops2")
+    out = tmp_path / "run"
+    command = ("train", "--meshes", meshes, "--out", out, *steps, "--embedding", 30)
     assert run(*command)[0] == 0
-    file = tmp_path / "run" / "embedding.safetensors"
-    content = file.read_bytes()
-    assert Embedding.load(file).fingerprint != load_default().fingerprint
-    assert Recognizer.load(tmp_path / "run").objects.embedding.fingerprint == Embedding.load(file).fingerprint
-    assert run(*command)[0] == 0 and file.read_bytes() == content
-    assert not list(tmp_path.glob("run/*.samples"))
+    content = (out / "embedding.safetensors").read_bytes()
+    embedding, recognizer = Embedding.load(out / "embedding.safetensors"), Recognizer.load(out)
+    assert embedding.classes == recognizer.run.classes and embedding.distractors == 27
+    assert recognizer.objects.embedding.fingerprint == embedding.fingerprint != load_default().fingerprint
+    assert recognizer.default_classifiers == ("tops", "tops2", "embedding")
+    record = recognizer.run.record
+    assert record["distractors"]["procedural"] == 30 and record["orientation_copies"] == 2
+    assert 0 < recognizer.unknown_below == record["calibration"]["unknown_below"] < 1
+    assert Recognizer.load(out, 0.25).unknown_below == 0.25
+    assert run("recognize", "--model", out, *recognize(images), "--out", tmp_path / "answer")[0] == 0
+    answers = json.loads((tmp_path / "answer" / "result.json").read_text())["instances"]
+    assert {"tops", "tops2", "embedding"} == set(answers[0]["top"])
+    assert run(*command)[0] == 0 and (out / "embedding.safetensors").read_bytes() == content
+    code, _, err = run(*command, "--orientation-copies", 1)
+    assert code == 2 and "orientation_copies" in one_line(err)
 
 
 def test_train_by_folds(meshes: Path, tmp_path: Path, run: Run) -> None:
     steps = ("--azimuth-step", 90, "--polar-step", 45, "--workers", 1)
-    options = ("--epochs", 1, "--batch-size", 16, "--classifiers", "ce", "--folds", 2)
+    options = ("--epochs", 1, "--batch-size", 16, "--classifiers", "ce", "--folds", 2, "--embedding", 0)
     arguments = ("train", "--meshes", meshes, "--out", tmp_path / "run", *steps, *options)
     code, out, _ = run(*arguments)
     assert code == 0 and "fold 0: ce" in out and "fold 1: ce" in out
@@ -260,7 +271,7 @@ def test_train_by_folds(meshes: Path, tmp_path: Path, run: Run) -> None:
     (tmp_path / "run" / ".curves.12345678.png").touch()
     code, out, _ = run(*arguments)
     assert code == 0 and "nothing was trained" in out
-    code, _, err = run("train", "--dataset", tmp_path / "run" / "views", "--out", tmp_path / "run")
+    code, _, err = run("train", "--dataset", tmp_path / "run" / "views", "--out", tmp_path / "run", "--embedding", 0)
     assert code == 2 and "manifest.json" in one_line(err)
     for change in (("--epochs", 2), ("--seed", 1), ("--polar-step", 90), ("--leave-out", NAMES[0])):
         code, _, err = run(*arguments, *change)
@@ -268,7 +279,7 @@ def test_train_by_folds(meshes: Path, tmp_path: Path, run: Run) -> None:
     assert {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()} == before
     # A training that is killed at the very end leaves its own views.
     shutil.rmtree(tmp_path / "run" / "views")
-    switches = ("--illumination", "--sensor", "--occlusion", "--segmentation")
+    switches = ("--illumination", "--sensor", "--occlusion", "--segmentation", "--registration", "--base")
     assert run("render", "--meshes", meshes, "--out", tmp_path / "run" / "views", *steps, *switches)[0] == 0
     assert run(*arguments)[0] == 0
     assert not [path for path in (tmp_path / "run").iterdir() if path.name[0] == "." or path.name == "views"]
@@ -280,7 +291,7 @@ def test_train_by_sequences(meshes: Path, tmp_path: Path, run: Run) -> None:
     table, out = tmp_path / "table.yaml", tmp_path / "runs"
     steps = ("--azimuth-step", 90, "--polar-step", 45, "--workers", 1)
     assert run_thor2("render", "--meshes", meshes, "--out", tmp_path / "views", *steps) == 0
-    options = ("--sequences", table, "--epochs", 1, "--batch-size", 16, "--classifiers", "ce")
+    options = ("--sequences", table, "--epochs", 1, "--batch-size", 16, "--classifiers", "ce", "--embedding", 0)
     arguments = ("train", "--dataset", tmp_path / "views", "--out", out, *options)
     table.write_text(json.dumps({"table/a": [soup, mug]}))
     assert run(*arguments)[0] == 0
@@ -436,20 +447,21 @@ def test_invalid_training_input_is_refused(meshes: Path, tmp_path: Path, run: Ru
     code, _, err = run("train", "--meshes", meshes, "--out", out, *coarse, "--batch-size", 100_000)
     assert code == 2 and "batch_size is 100000" in one_line(err)
     assert [p.name for p in out.iterdir()] == ["views"]
-    assert run("train", "--meshes", meshes, "--out", out, *coarse, "--epochs", 1, "--classifiers", "ce")[0] == 0
+    last = ("--epochs", 1, "--classifiers", "ce", "--embedding", 0)
+    assert run("train", "--meshes", meshes, "--out", out, *coarse, *last)[0] == 0
 
 
 def test_paper_protocol(meshes: Path, tmp_path: Path) -> None:
     """The paper's protocol uses plain views in four mirrors; options replace values of the protocol."""
     options = ("--azimuth-step", 90, "--polar-step", 45, "--workers", 1, "--epochs", 1, "--classifiers", "ce")
-    for name, paper in (("paper", ["--paper"]), ("default", [])):
+    for name, paper in (("paper", ["--paper"]), ("default", ["--embedding", 0])):
         assert run_thor2("train", "--meshes", meshes, "--out", tmp_path / name, *options, *paper) == 0
     of = {name: json.loads((tmp_path / name / "run.json").read_text())["record"] for name in ("paper", "default")}
     assert of["paper"]["samples"] == 4 * of["paper"]["dataset"]["views"] == 4 * 3 * 4 * 5
     assert of["paper"]["batch_size"] == 128 and of["default"]["batch_size"] > 100
     # Augmented copies with too few points are left out.
-    assert 2 * 3 * 4 * 5 < of["default"]["samples"] / 2 <= 3 * 3 * 4 * 5
-    assert of["default"]["samples"] == 2 * of["default"]["dataset"]["views"]
+    assert 2 * 3 * 4 * 5 < of["default"]["samples"] / 3 <= 3 * 3 * 4 * 5
+    assert of["default"]["samples"] == 3 * of["default"]["dataset"]["views"]
 
 
 def test_missing_evaluation_datasets_are_refused(model: Path, tmp_path: Path, run: Run) -> None:
