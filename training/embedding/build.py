@@ -18,7 +18,6 @@ from thor2_jax.errors import InputError
 from thor2_jax.gallery.embedding import Embedding
 from training.embedding.fit import EmbeddingFit, fit_embedding
 from training.embedding.sampling import ObjectSource, build_samples
-from training.objects.mesh import TexturedMesh
 from training.objects.meshes import find_meshes
 from training.storage.progress import Progress
 from training.storage.workers import local_workers
@@ -37,7 +36,7 @@ def build_embedding(
     objects: int = OBJECTS,
     views: int = VIEWS,
     epochs: int = EPOCHS,
-    meshes: Sequence[Path | TexturedMesh] = (),
+    meshes: Sequence[Path] = (),
     workers: int = 2,
     progress: Progress = lambda stage, done, total, note: None,
 ) -> Embedding:

@@ -64,7 +64,7 @@ CAMERA = Camera.from_field_of_view(540, 405, 40.0)
 FROM_ABOVE = 0.7
 """Share of views whose camera looks down on the object or is slightly below its middle, as on a table."""
 
-ObjectSource = int | Path | TexturedMesh
+ObjectSource = int | Path
 """The seed of a procedural object, or a mesh file."""
 
 
@@ -89,8 +89,6 @@ def _random_angles(rng: np.random.Generator) -> tuple[float, float]:
 
 
 def _mesh(source: ObjectSource) -> TexturedMesh:
-    if isinstance(source, TexturedMesh):
-        return source
     return load_mesh(source) if isinstance(source, Path) else procedural_object(source)
 
 

@@ -7,7 +7,7 @@ from thor2_jax.config import DescriptorConfig
 from training.augmentation.augmentations import Augmentations
 from training.embedding.sampling import AUGMENTATIONS
 from training.fitting.options import FitOptions
-from training.fitting.samples import PAPER_MIRRORS
+from training.fitting.samples import MIRRORS, PAPER_MIRRORS
 
 __all__ = ["DEFAULT", "PAPER", "Protocol"]
 
@@ -45,6 +45,8 @@ class Protocol:
     ) -> "Protocol":
         """Return the protocol with the given values; None keeps the protocol's own.
 
+        Without copies in other orientations, views are also used in a mirror.
+
         Raises:
             InputError: A value of the fit is invalid.
         """
@@ -55,6 +57,8 @@ class Protocol:
         }
         fit: dict[str, Any] = {"epochs": epochs, "batch_size": batch_size, "seed": seed}
         given: dict[str, Any] = {name: value for name, value in steps.items() if value is not None}
+        if orientation_copies == 0 and self.orientation_copies:
+            given["mirrors"] = MIRRORS
         given["fit"] = dataclasses.replace(self.fit, **{n: v for n, v in fit.items() if v is not None})
         return dataclasses.replace(self, **given)
 
