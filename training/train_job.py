@@ -187,6 +187,8 @@ def _open_views(job: TrainJob, display: Display) -> ViewSource:
         assert job.dataset is not None
         return ViewDataset.open(job.dataset)
     meshes, protocol = _find_meshes(job), job.protocol
+    if job.distractors is not None:
+        job.distractors.check([name for name in meshes if name not in job.leave_out])
     with display() as progress:
         return render_dataset(
             meshes,
