@@ -23,6 +23,12 @@ COARSE = 2
 WINDOW = 25
 """Coarse pixels, in each direction, that the colour of the plane is averaged over."""
 
+WIDE_WINDOW = 75
+"""The same where the window holds too little of the plane: inside large things."""
+
+WINDOWS_OF_OUTLIERS = (51, WINDOW)
+"""Windows of whose mean colour the plane's pixels are, one after the other; large flat things fill the small one."""
+
 SHIFT = 12
 """Distance, coarse pixels, of the neighbouring windows, of which the most similar one counts at borders of colours."""
 
@@ -58,7 +64,7 @@ class Evidence:
     Attributes:
         heights: float32, metres over the support; 0 where depth is missing.
         high: pixels that are above a plane.
-        contrast: uint8, colour difference to the support, `UNIT` where it is just noticeable.
+        contrast: uint8, colour difference to the support, `UNIT` where it is just noticeable; 0 far from the support.
         colored: pixels on the support, or without depth before it, whose colour is not the support's.
         plain: pixels whose colour is the support's, including soft shadows and highlights.
         region: pixels in the convex hull of the support.
@@ -89,8 +95,10 @@ def find_foreground(color: NDArray[np.uint8], depth: DepthImage, planes: list[Pl
         others = plane.heights(depth)
         high = (high & (np.abs(others) > least)) | ((others > least) & ~on_support & depth.valid)
         on_support &= np.abs(heights) <= np.abs(others)
-    contrast, known = _color_contrast(color, on_support)
+    contrast, near, known = _color_contrast(color, on_support)
     region = shrink(planes[0].region(depth.z.shape), 3)
+    known = near | (known & depth.valid & region)  # far from the plane, missing depth is rarely a thing on it
+    contrast = contrast * known
     low = ((heights < FLAT + 0.02) | ~depth.valid) & region & known
     gradient = np.asarray(cv2.morphologyEx(contrast, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)))
     smooth = pixel_mask(cv2.erode((low & (gradient < SMOOTH * UNIT)).view(np.uint8), np.ones((2, 2), np.uint8)))
@@ -111,14 +119,14 @@ def _plain_parts(smooth: Mask, like_plane: Mask) -> Mask:
     return grow(plain[numbers], 3)
 
 
-def _color_contrast(color: NDArray[np.uint8], plane: Mask) -> tuple[NDArray[np.uint8], Mask]:
+def _color_contrast(color: NDArray[np.uint8], plane: Mask) -> tuple[NDArray[np.uint8], Mask, Mask]:
     """Compare each pixel with the pixels of the plane around it.
 
     Returns:
-        `Evidence.contrast`, and the pixels around which there is enough of the plane.
+        `Evidence.contrast`, and the pixels with enough of the plane in their window, and in their wide window.
     """
     height, width = plane.shape
-    around, window_share, share = _plane_color(color, plane)
+    around, near, window_share, share = _plane_color(color, plane)
     length = np.sqrt((around * around).sum(axis=2)) + 1e-3
     direction = float_image(cv2.resize(around / length[..., None], (width, height), interpolation=cv2.INTER_LINEAR))
     reference = float_image(cv2.resize(length, (width, height), interpolation=cv2.INTER_LINEAR))
@@ -139,16 +147,20 @@ def _color_contrast(color: NDArray[np.uint8], plane: Mask) -> tuple[NDArray[np.u
     least = np.maximum(DIFFERENCE, NOISE * noise)
     scale = cv2.resize((UNIT / least).astype(np.float32), (width, height), interpolation=cv2.INTER_NEAREST)
     contrast = np.asarray(cv2.multiply(difference, scale, dtype=cv2.CV_8U), np.uint8)
-    known = cv2.resize((window_share > LEAST_PLANE).view(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
-    return contrast, pixel_mask(known)
+    known = [
+        pixel_mask(cv2.resize(mask.view(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST))
+        for mask in (near, window_share > LEAST_PLANE)
+    ]
+    return contrast, known[0], known[1]
 
 
 def _plane_color(
     color: NDArray[np.uint8], plane: Mask
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+) -> tuple[NDArray[np.float32], Mask, NDArray[np.float32], NDArray[np.float32]]:
     """Return, for coarse pixels [h, w]: the colour [h, w, 3] of the plane around, and the share of the plane.
 
-    The first share is that of the window, the second that of the pixel itself.
+    The mask has the pixels with enough of the plane in their window; elsewhere, the wide window is used. The first share
+    is that of the window, the second that of the pixel itself.
     """
     height, width = plane.shape
     size = (-(-width // COARSE), -(-height // COARSE))
@@ -157,22 +169,24 @@ def _plane_color(
     total = float_image(cv2.resize(masked, size, interpolation=cv2.INTER_AREA))
     share = float_image(cv2.resize(plane.astype(np.float32), size, interpolation=cv2.INTER_AREA))
     own = float_image(total / np.maximum(share, 0.05)[..., None])
-    for _ in range(2):  # leave out what has another colour than most of the window
-        mean = _window_mean(total, share)
+    for window in WINDOWS_OF_OUTLIERS:  # leave out what has another colour than most of the window
+        mean = _window_mean(total, share, window)
         off = _channel_sum(own, mean)
         full = share > 0.5
         typical = float(np.median(off[full])) if full.any() else 0.0
         kept = off < max(OUTLIER, 3 * typical)
         share, total = share * kept, total * kept[..., None]
     window_share = float_image(cv2.blur(share, (WINDOW, WINDOW)))
-    mean = _window_mean(total, share)
-    mean[window_share < LEAST_PLANE] = 0
-    return float_image(cv2.blur(_most_similar_window(shown, mean), (3, 3))), window_share, share
+    mean = _window_mean(total, share, WINDOW)
+    far = window_share < LEAST_PLANE  # inside large things
+    mean[far] = _window_mean(total, share, WIDE_WINDOW)[far]
+    window_share[far] = cv2.blur(share, (WIDE_WINDOW, WIDE_WINDOW))[far]
+    return float_image(cv2.blur(_most_similar_window(shown, mean), (3, 3))), ~far, window_share, share
 
 
-def _window_mean(total: NDArray[np.float32], share: NDArray[np.float32]) -> NDArray[np.float32]:
-    window = (WINDOW, WINDOW)
-    return float_image(cv2.blur(total, window)) / (float_image(cv2.blur(share, window))[..., None] + np.float32(1e-4))
+def _window_mean(total: NDArray[np.float32], share: NDArray[np.float32], window: int) -> NDArray[np.float32]:
+    size = (window, window)
+    return float_image(cv2.blur(total, size)) / (float_image(cv2.blur(share, size))[..., None] + np.float32(1e-4))
 
 
 def _most_similar_window(shown: NDArray[np.float32], mean: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -39,6 +39,9 @@ LEAST_EXTENT = 0.23
 LEAST_FILLING = 0.25
 """Least share of the hull of a plane that its inliers fill: tops of several things in one plane fill less."""
 
+PARALLEL, LARGEST_THING = 0.97, 0.15
+"""Least cosine between the normals of a plane and of the tops of things on it, and their largest height, metres."""
+
 LEAST_SHARE_OF_SUPPORT = 0.08
 
 
@@ -142,12 +145,22 @@ def dominant_planes(depth: DepthImage) -> list[Plane]:
         hull = np.asarray(cv2.convexHull(pixels), np.int32)[:, 0]
         filling = len(inliers) * points.step**2 / max(cv2.contourArea(hull), 1.0)
         extent = _least_extent(points, inliers)
-        if filling >= LEAST_FILLING and extent >= (LEAST_EXTENT if planes else LEAST_EXTENT_OF_LARGEST):
+        tops = any(_is_just_above(plane.coefficients, coefficients) for plane in planes)
+        if not tops and filling >= LEAST_FILLING and extent >= (LEAST_EXTENT if planes else LEAST_EXTENT_OF_LARGEST):
             planes.append(Plane(coefficients, hull, share, float(1 / np.median(points.inverse[inliers]))))
         near = np.abs(points.terms[left] @ coefficients - points.inverse[left]) < 2 * points.tolerance[left]
         left = left[~near]
     support = min((p for p in planes if p.share >= LEAST_SHARE_OF_SUPPORT), key=lambda p: p.distance, default=None)
     return sorted(planes, key=lambda p: p is not support)
+
+
+def _is_just_above(plane: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
+    """Return whether another plane is parallel to a plane and a little nearer to the camera: the tops of things."""
+    normals = np.stack([plane[:3], other[:3]])
+    lengths = np.linalg.norm(normals, axis=1)
+    parallel = normals[0] @ normals[1] > PARALLEL * lengths.prod()
+    # The distance of a plane from the camera is 1 / |(a, b, c)|.
+    return bool(parallel and 0 < 1 / lengths[0] - 1 / lengths[1] < LARGEST_THING)
 
 
 def _grid_points(depth: DepthImage) -> _Points:

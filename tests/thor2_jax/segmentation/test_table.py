@@ -48,6 +48,22 @@ def test_flat_strips_are_found_by_their_color() -> None:
     assert (best_overlaps(labels, frame.label_image) > 0.7).all()
 
 
+@pytest.mark.parametrize("height", [0.004, 0.02])
+def test_books_whose_tops_lie_in_one_plane(height: float) -> None:
+    """Their tops are no table, and those that are lower than the noise are larger than the window of the colour."""
+    books = [
+        Box(-0.25, 0.1, (0.08, 0.11), height, BLUE),
+        Box(0.0, 0.1, (0.07, 0.1), height, (235, 235, 235)),
+        Box(0.25, 0.05, (0.08, 0.11), height, YELLOW),
+        Box(-0.15, -0.2, (0.1, 0.1), height, (225, 220, 215)),
+        Box(0.1, -0.2, (0.09, 0.09), height, (30, 30, 30)),
+    ]
+    frame = render(books, 45, distance=1.1)
+    labels = segment_table(frame)
+    assert labels.max() == 5
+    assert (best_overlaps(labels, frame.label_image) > 0.85).all()
+
+
 def test_a_soft_shadow_is_not_a_thing() -> None:
     frame = render(APART[:1])
     row, column = np.mgrid[0:240, 0:320]
