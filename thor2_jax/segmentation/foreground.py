@@ -159,8 +159,8 @@ def _plane_color(
 ) -> tuple[NDArray[np.float32], Mask, NDArray[np.float32], NDArray[np.float32]]:
     """Return, for coarse pixels [h, w]: the colour [h, w, 3] of the plane around, and the share of the plane.
 
-    The mask has the pixels with enough of the plane in their window; elsewhere, the wide window is used. The first share
-    is that of the window, the second that of the pixel itself.
+    The mask has the pixels with enough of the plane in their window; elsewhere, the wide window is used. The first
+    share is that of the window, the second that of the pixel itself.
     """
     height, width = plane.shape
     size = (-(-width // COARSE), -(-height // COARSE))
