@@ -249,7 +249,7 @@ def test_train_with_distractors(meshes: Path, images: Path, tmp_path: Path, run:
     assert 0 < recognizer.unknown_below == record["calibration"]["unknown_below"] < 1
     assert Recognizer.load(out, 0.25).unknown_below == 0.25
     assert run("recognize", "--model", out, *recognize(images), "--out", tmp_path / "answer")[0] == 0
-    answers = json.loads((tmp_path / "answer" / "recognition.json").read_text())["instances"]
+    answers = json.loads((tmp_path / "answer" / "recognition.json").read_text())
     assert {"tops", "tops2", "embedding"} == set(answers[0]["top"])
     assert run(*command)[0] == 0 and (out / "embedding.safetensors").read_bytes() == content
     code, _, err = run(*command, "--orientation-copies", 1)
