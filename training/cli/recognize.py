@@ -70,11 +70,10 @@ def recognize(
     if segment is not None and labels is not None:
         raise InputError(f"labels is {labels} and segment is {segment}; give one of them")
     files = {"color": color, "depth": depth, "labels": labels, "intrinsics": intrinsics}
-    if out is not None:
-        made = {s.name.split("/")[0] for s in _sources(frames, files, depth_scale, segment)} if frames else RESULT_FILES
-        check_output_directory(out, resumable=made)
-        remove_leftovers(out)
     sources = _sources(frames, files, depth_scale, segment)
+    if out is not None:
+        check_output_directory(out, resumable={s.name.split("/")[0] for s in sources} if frames else RESULT_FILES)
+        remove_leftovers(out)
     numbers = None if names is None else read_object_names(names)
     recognizer = Recognizer.load(model, unknown_below, answer_by=answer_by)
     recognizer.chunk = BATCH_BUCKETS[-1]

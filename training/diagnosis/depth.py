@@ -1,5 +1,6 @@
 """Checks of depth: its unit, its range, and how much of it there is."""
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -28,6 +29,9 @@ EXTENT_MARGIN = 2.0
 
 MIN_ROOM, MAX_ROOM = 0.12, 8.0
 """Range of median depths that need no other unit, metres, if there are no labels to measure."""
+
+USUAL_EXTENT, USUAL_DISTANCE = 0.15, 0.8
+"""Longest side and distance of most objects, metres; they choose among the depth scales that are possible."""
 
 DEPTH_SCALES = (1000.0, 10_000.0, 5000.0, 4000.0, 100.0, 1.0)
 """Depth scales in use, the most frequent one first."""
@@ -108,27 +112,31 @@ def _check_unit(
         if low <= extent <= high:
             return False
         measured = f"The objects would measure {_length(extent)} (median of their longest sides) at a distance of "
-        measured += f"{_length(median)}"
-        measured += (
-            f"; the meshes measure {_length(min(mesh_sides))} to {_length(max(mesh_sides))}" if mesh_sides else ""
-        )
+        measured += f"{_length(median)}{_unit_used(frame)}"
+        if mesh_sides:
+            measured += f"; the meshes measure {_length(min(mesh_sides))} to {_length(max(mesh_sides))}"
     else:
         if MIN_ROOM <= median <= MAX_ROOM:
             return False
-        measured = f"The median depth would be {_length(median)}"
+        measured = f"The median depth would be {_length(median)}{_unit_used(frame)}"
+    usual = float(np.median(mesh_sides)) if mesh_sides else USUAL_EXTENT
 
-    def is_plausible(factor: float) -> bool:
+    def misfit(factor: float) -> float:
+        """Return how badly depth times a factor fits, or infinity."""
         fits = extent is None or low <= extent * factor <= high
-        return fits and MIN_DEPTH <= median * factor <= MAX_DEPTH
+        if not fits or not MIN_DEPTH <= median * factor <= MAX_DEPTH:
+            return math.inf
+        distance = abs(math.log(median * factor / USUAL_DISTANCE))
+        return distance if extent is None else distance + abs(math.log(extent * factor / usual))
 
-    scale = frame.intrinsics.depth_scale
+    scale = 1.0 if frame.depth.dtype.kind == "f" else frame.intrinsics.depth_scale
+    best = min(DEPTH_SCALES, key=lambda each: misfit(scale / each))
+    found = best if misfit(scale / best) < math.inf else None
     if frame.depth.dtype.kind == "f":
-        found = next((each for each in DEPTH_SCALES if is_plausible(1 / each)), None)
         advice = "Floating-point depth must be in metres."
         if found is not None:
             advice += f" Divide it by {found:g}: the median would be {_length(median / found)}."
     else:
-        found = next((each for each in DEPTH_SCALES if is_plausible(scale / each)), None)
         advice = "Set depth_scale to the number of depth units per metre (1000 for millimetres)."
         if found is not None:
             advice = f"With depth_scale {found:g} (units per metre) the median distance would be "
@@ -142,9 +150,12 @@ def _check_unit(
             "Give each object a number of its own. If it is one object, the unit of depth is wrong: " + advice,
         )
         return True
-    used = "" if frame.depth.dtype.kind == "f" else f" with depth_scale {scale:g}"
-    diagnosis.add("depth-unit", f"{measured}{used}: the unit of depth is likely wrong.", advice)
+    diagnosis.add("depth-unit", f"{measured}: the unit of depth is likely wrong.", advice)
     return True
+
+
+def _unit_used(frame: RGBDFrame) -> str:
+    return "" if frame.depth.dtype.kind == "f" else f" with depth_scale {frame.intrinsics.depth_scale:g}"
 
 
 def _length(metres: float) -> str:
