@@ -27,11 +27,14 @@ CONTRAST = 45.0
 PART = 90.0
 """Largest colour difference between a body and a part of it that was found by its colour."""
 
+ENCLOSED = 0.7
+"""Least share of the border of a piece, all along another one, that is a part of the other one."""
+
 TALL, LOW = 0.035, 0.02
 """Heights, metres: a tall piece reaches the first; between pieces that stay below the second, depth has no steps."""
 
-HOLLOW_COLOR = 120.0
-"""Largest difference of the mean colours of the two sides of a hollow thing, sum over the channels."""
+SAME_HUE = 0.25
+"""Largest distance of the mean colours, as unit vectors, of the two sides of a hollow thing; their light differs."""
 
 SAME_HEIGHT = 0.015
 """Largest difference of the heights, metres, of the two sides of a hollow thing."""
@@ -106,6 +109,8 @@ def merge_pieces(
 
 
 def _belong_together(k: int, a: int, b: int, borders: _Borders, shapes: _Shapes, colored: NDArray[np.bool_]) -> bool:
+    if _is_enclosed(k, a, b, borders):
+        return True
     if colored[a] != colored[b] and (shapes.tall[a] or shapes.tall[b]):
         return bool(borders.contrast[k] < PART)
     if shapes.low[a] and shapes.low[b]:
@@ -115,14 +120,23 @@ def _belong_together(k: int, a: int, b: int, borders: _Borders, shapes: _Shapes,
     return bool(borders.step[k] < EDGE and not (borders.fold[k] > FOLD and borders.contrast[k] > CONTRAST))
 
 
+def _is_enclosed(k: int, a: int, b: int, borders: _Borders) -> bool:
+    """Return whether one piece surrounds the other, which is not nearer to the camera: the bottom of a bowl."""
+    for inner, nearer in ((a, borders.behind[k]), (b, -borders.behind[k])):
+        if borders.length[k] > ENCLOSED * borders.perimeter[inner] and nearer < 0.1:
+            return True
+    return False
+
+
 def _is_hollow(
     k: int, a: int, b: int, borders: _Borders, shapes: _Shapes, labels: NDArray[np.int32], evidence: Evidence
 ) -> bool:
     """Return whether one piece is the inner side of the other, as in a mug.
 
-    It lies behind, has about its colour, width and height, and meets the background at its upper rim only.
+    It lies behind, has about its hue, width and height, and meets the background at its upper rim only.
     """
-    if abs(borders.behind[k]) < 0.1 or np.abs(shapes.color[a] - shapes.color[b]).sum() > HOLLOW_COLOR:
+    hues = shapes.color[[a, b]] / (np.linalg.norm(shapes.color[[a, b]], axis=1, keepdims=True) + 1)
+    if abs(borders.behind[k]) < 0.1 or np.linalg.norm(hues[0] - hues[1]) > SAME_HUE:
         return False
     inner, outer = (b, a) if borders.behind[k] > 0 else (a, b)
     inner_height, inner_width = _size(inner, labels, evidence)
