@@ -195,7 +195,7 @@ def _measure(
                 "calibration_error": expected_calibration_error(confidence, correct[described]),
                 "auroc": auroc(every, np.arange(len(every)) < len(confidence)),
                 "unknown_named": float(unknown_named(confidence[correct[described]], of_unknown, COVERAGE)),
-                **at_threshold(runs[run].threshold, confidence, correct[described], of_unknown),
+                **at_threshold(float(np.median(runs[run].thresholds)), confidence, correct[described], of_unknown),
                 **{
                     f"accuracy in {name}": placement_accuracy(placement[group == name], correct[group == name])
                     for name in np.unique(group).tolist()

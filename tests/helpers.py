@@ -49,7 +49,7 @@ class UntaughtRecognizer:
     """Base of toy recognizers: no object is enrolled."""
 
     run: Any
-    unknown_below = 0.0
+    unknown_below: float | None = None
 
     @property
     def objects(self) -> ObjectGallery:
@@ -65,6 +65,9 @@ class UntaughtRecognizer:
 
     def answers_by(self) -> str:
         return "classifiers"
+
+    def thresholds(self) -> np.ndarray:
+        return np.full(len(self.run.classes), self.unknown_below or 0.0)
 
 
 def aligned_cloud(

@@ -70,7 +70,7 @@ class Recognizer:
     Attributes:
         run: the trained run.
         objects: the enrolled objects, on disk after `load`.
-        unknown_below: least confidence of an answer with a name.
+        unknown_below: least confidence of an answer with any name; None for those of `thresholds`.
         rule: fusion rule of the classifiers.
         calibration: turns fused probabilities into confidences; None in runs without one.
         chunk: instances described and classified in one call. While the device computes a chunk, the host prepares the
@@ -94,8 +94,7 @@ class Recognizer:
 
         Args:
             run: the trained run.
-            unknown_below: least confidence, from 0 to 1, of an answer with a name. By default the run's own threshold,
-                which keeps 95 % of the correct answers on held-out views; 0 in runs without one.
+            unknown_below: least confidence, from 0 to 1, of an answer with a name; by default see `thresholds`.
             rule: fusion rule, see `fusion`; the paper's is "max".
             embedding: embedding of the gallery, by default the packaged one. One that was fitted on the run's classes
                 is also a classifier.
@@ -108,9 +107,7 @@ class Recognizer:
         if rule not in FUSION_RULES:
             raise InputError(f"rule is {rule!r}; expected one of {', '.join(FUSION_RULES)}")
         self.calibration = Calibration.of_record(run.record)
-        if unknown_below is None:
-            unknown_below = self.calibration.unknown_below if self.calibration else 0.0
-        if not 0 <= unknown_below <= 1:
+        if unknown_below is not None and not 0 <= unknown_below <= 1:
             raise InputError(f"unknown_below is {unknown_below}; expected a confidence from 0 to 1")
         self.run = run
         self.unknown_below = unknown_below
@@ -176,6 +173,24 @@ class Recognizer:
         if not self.gallery.objects:
             return "classifiers"
         return wanted or "both"
+
+    def thresholds(self, answer_by: str | None = None) -> NDArray[np.float64]:
+        """Return the least confidence [n] of an answer with each name of `classes`; with `unknown_below`, it is that.
+
+        By default 95 % of the correct answers reach it. That of a class with an output of the classifiers is the run's
+        own, measured on held-out views, or 0 in runs without one. That of other objects, and of all where the gallery
+        alone answers, depends on the number of their views, see `Gallery.unknown_below`.
+
+        Args:
+            answer_by: what answers, see `answers_by`.
+        """
+        if self.unknown_below is not None:
+            return np.full(len(self.classes), self.unknown_below)
+        union = self.objects.union
+        thresholds = union.of_gallery(self.gallery.unknown_below[None])[0]
+        if self.answers_by(answer_by) == "gallery":
+            return thresholds
+        return np.where(union.has_output, self.calibration.unknown_below if self.calibration else 0.0, thresholds)
 
     def enroll(
         self,
@@ -363,13 +378,14 @@ class Recognizer:
         embedded = evidence.embeddings, evidence.weights
         scores = None if evidence.embeddings is None else self.gallery.scores(*embedded)
         values = self.combined(evidence.probabilities, scores)
+        thresholds = self.thresholds("both" if evidence.probabilities else "gallery")
         union = self.objects.union
         by_source = {name: union.of_classifiers(p) for name, p in evidence.probabilities.items()}
         if scores is not None:
             by_source["gallery"] = union.of_gallery(scores)
         rows = iter(range(n_usable))
         return [
-            self._recognition(instance, next(rows), values, by_source, evidence.overflow)
+            self._recognition(instance, next(rows), values, thresholds, by_source, evidence.overflow)
             if instance.reason is None
             else Recognition(instance.label, reason=instance.reason)
             for instance in instances
@@ -402,6 +418,7 @@ class Recognizer:
         instance: PreparedInstance,
         row: int,
         values: NDArray[np.floating[Any]],
+        thresholds: NDArray[np.float64],
         by_source: Mapping[str, NDArray[Any]],
         overflows: NDArray[Any],
     ) -> Recognition:
@@ -416,8 +433,8 @@ class Recognizer:
             )
         elif not names:
             reason = "unknown: no object is enrolled"
-        elif confidence < self.unknown_below:
-            reason = f"unknown: a confidence of {confidence:.3f}, below {self.unknown_below:g}"
+        elif confidence < thresholds[best]:
+            reason = f"unknown: a confidence of {confidence:.3f}, below {thresholds[best]:g}"
         return Recognition(
             label=instance.label,
             name=names[best] if reason is None else None,

@@ -24,7 +24,7 @@ class ToyRun(NamedTuple):
     classes: tuple[str, ...] = CLASSES
     answer_by: str = "classifiers"
     temperatures: dict[str, float] = {}
-    threshold: float = 0.0
+    thresholds: np.ndarray = np.zeros(3)  # noqa: RUF012
 
 
 def write_frame(folder: Path, names: dict[int, str], seed: int = 0) -> Path:
@@ -101,7 +101,7 @@ def test_metrics_match_hand_calculation() -> None:
     assert [mean(name, "placements") for name in results] == [2, 2, 2, 4]
     assert mean("all cameras", "unknown_instances") == 2
     assert results["a"]["threshold"]["runs"] == results["a"]["kept_at_threshold"]["runs"] == 0
-    (of_run,) = cameras.measure([ToyRun("x", threshold=0.75)], answers)
+    (of_run,) = cameras.measure([ToyRun("x", thresholds=np.full(3, 0.75))], answers)
     assert of_run["original"]["kept_at_threshold"] == pytest.approx(1 / 3)
     assert [of_run[name]["unknown_named_at_threshold"] for name in ("original", "a")] == [1, 0]
     table = cameras.show(results).splitlines()

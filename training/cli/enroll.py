@@ -55,7 +55,8 @@ def enroll(
     """Enroll an object from a mesh, from labelled frames, or from one frame; it is recognized at once.
 
     Without NAME, every labelled object of the frames is enrolled. A frame is a folder with color.png, depth.png,
-    mask.png, intrinsics.json and labels.json.
+    mask.png, intrinsics.json and labels.json. The confidence below which an object is unknown depends on its number of
+    views; see --unknown-below of `thor2 recognize`.
     """
     from thor2_jax.gallery.enrollment import instance_view
     from training.enrollment import enroll_objects, labelled_views, mesh_views

@@ -45,8 +45,8 @@ class EvaluatedRun(Protocol):
         """Temperatures of the calibrated classifiers and baselines."""
 
     @property
-    def threshold(self) -> float:
-        """Confidence below which the recognizer answers that an object is unknown; 0 if it names every object."""
+    def thresholds(self) -> NDArray[np.float64]:
+        """[C] confidence below which an object of each class is unknown; 0 if it is always named."""
 
 
 def all_predictors(runs: Sequence[EvaluatedRun]) -> tuple[tuple[int, str], ...]:

@@ -196,7 +196,8 @@ def _unknown_sections(report: Mapping[str, Any], out: Path) -> list[Section]:
         "object is unknown. "
     )
     text += (
-        "The threshold is the one that the models store."
+        "The threshold is the one that the models store. Enrolled objects have their own ones, by their numbers of "
+        "views; the median is shown."
         if shares["threshold"]["runs"]
         else "These models store no threshold."
     )

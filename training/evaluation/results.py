@@ -168,7 +168,10 @@ def _scores(
         "placements": _placements(by_rule[DEFAULT_RULE], placement, truth, described),
         "main": main,
         "rejection": summarize_rows(
-            [_rejection(by_run[run], truth, described, unknown_predictions[run], runs[run].threshold) for run in by_run]
+            [
+                _rejection(by_run[run], truth, described, unknown_predictions[run], runs[run].thresholds)
+                for run in by_run
+            ]
         ),
         "known_unknown": _known_unknown([(by_run[run], unknown_predictions[run]) for run in by_run], truth[described]),
         "reliability": _reliability(predictions, truth[described]),
@@ -270,20 +273,20 @@ def _rejection(
     truth: NDArray[np.intp],
     described: NDArray[np.bool_],
     unknown: Predictions,
-    threshold: float,
+    thresholds: NDArray[np.float64],
 ) -> dict[str, float]:
-    """Return shares of the known and the unknown objects without rejection and at the run's threshold."""
+    """Return shares of the known and the unknown objects without rejection and at the run's thresholds [C]."""
     correct = np.zeros(len(truth), bool)
     correct[described] = known.class_index == truth[described]
     named = described.copy()
-    named[described] = known.confidence >= threshold
+    named[described] = known.confidence >= thresholds[known.class_index]
     return {
-        "threshold": threshold or np.nan,
+        "threshold": float(np.median(thresholds)) or np.nan,
         "accuracy": float(correct.mean()),
         "incorrect": float((described & ~correct).mean()),
         "accuracy_at_threshold": float((correct & named).mean()),
         "incorrect_at_threshold": float((named & ~correct).mean()),
-        "unknown_named_at_threshold": float((unknown.confidence >= threshold).mean())
+        "unknown_named_at_threshold": float((unknown.confidence >= thresholds[unknown.class_index]).mean())
         if len(unknown.confidence)
         else np.nan,
     }

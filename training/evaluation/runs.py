@@ -69,9 +69,9 @@ class Run:
         return self.recognizer.answers_by()
 
     @property
-    def threshold(self) -> float:
-        """Confidence below which the recognizer answers that an object is unknown; 0 if it names every object."""
-        return self.recognizer.unknown_below
+    def thresholds(self) -> NDArray[np.float64]:
+        """[C] confidence below which an object of each class is unknown; 0 if it is always named."""
+        return self.recognizer.thresholds()
 
     def probabilities(
         self, frame: str, described: DescribedFrame, inputs: BaselineInputs | None
@@ -166,9 +166,9 @@ class SequenceRun(Run):
         return tuple(sorted({name for run in self.of_sequence.values() for name in run.classes}))
 
     @property
-    def threshold(self) -> float:
+    def thresholds(self) -> NDArray[np.float64]:
         """0: the runs of the sequences have different thresholds."""
-        return 0.0
+        return np.zeros(len(self.classes))
 
     def probabilities(
         self, frame: str, described: DescribedFrame, inputs: BaselineInputs | None

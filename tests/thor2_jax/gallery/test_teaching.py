@@ -97,6 +97,43 @@ def test_the_record_and_the_argument_choose_what_answers(run: TrainedRun, embedd
         thor2.Recognizer(run, answer_by="all")  # type: ignore[arg-type]
 
 
+CALIBRATION = {"bias": 0.0, "answer": 1.0, "known": 1.0, "unknown_below": 0.625}
+
+
+def test_the_default_thresholds_of_each_source(run: TrainedRun, embedding: Embedding) -> None:
+    """A trained class has the run's threshold, an object that of its views; brick has two, and book one."""
+    calibrated = taught(dataclasses.replace(run, record={"calibration": CALIBRATION}), embedding)
+    calibrated.enroll("b", [frame(RED)], extend=True)
+    calibrated.enroll("c", [frame(RED)], replace=True)
+    assert calibrated.classes == ("a", "b", "brick", "book", "c")
+    assert calibrated.thresholds().tolist() == [0.625, 0.625, 0.227, 0.17, 0.17]
+    assert calibrated.thresholds("gallery")[1:].tolist() == [0.17, 0.227, 0.17, 0.17]
+    assert taught(run, embedding).thresholds().tolist() == [0, 0, 0, 0.227, 0.17]
+    explicit = taught(run, embedding, unknown_below=0.25)
+    assert explicit.thresholds().tolist() == explicit.thresholds("gallery").tolist() == [0.25] * 5
+    assert thor2.Recognizer(run).thresholds().tolist() == [0, 0, 0]
+
+
+@pytest.mark.parametrize(
+    "score, names", [(0.16, [None, None]), (0.18, [None, "book"]), (0.22, [None, "book"]), (0.23, ["brick", "book"])]
+)
+def test_a_gallery_alone_rejects_unknown_objects(
+    score: float, names: list[str | None], embedding: Embedding, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Scores as given: the brick has two views and is named from .227, the book has one and is named from .17."""
+    instance = instance_view(CLUTTER, 1, 2.5)
+    for unknown_below, expected in ((None, names), (0.0, ["brick", "book"])):
+        recognizer = taught(untrained_run((), ()), embedding, unknown_below=unknown_below)
+        described = recognizer.describe(CLUTTER)
+        evidence = recognizer.evidence(described.oriented, (), described.packed)
+        for column, name in enumerate(expected):
+            values = np.eye(2, dtype=np.float32)[[column]] * score
+            monkeypatch.setattr(recognizer, "combined", lambda *_, values=values: values)
+            (answer,) = recognizer.recognitions([instance], evidence)
+            assert answer.name == name and (answer.reason is None) == (name is not None)
+            assert answer.reason is None or answer.reason.startswith("unknown: ")
+
+
 def test_a_forgotten_class_is_never_answered(run: TrainedRun, embedding: Embedding) -> None:
     recognizer = thor2.Recognizer(run, embedding=embedding)
     first = {answer.name for answer in recognizer.recognize(CLUTTER)}

@@ -246,8 +246,9 @@ def test_train_with_distractors(meshes: Path, images: Path, tmp_path: Path, run:
     assert recognizer.default_classifiers == ("tops", "tops2", "embedding")
     record = recognizer.run.record
     assert record["distractors"]["procedural"] == 30 and record["orientation_copies"] == 2
-    assert 0 < recognizer.unknown_below == record["calibration"]["unknown_below"] < 1
-    assert Recognizer.load(out, 0.25).unknown_below == 0.25
+    own = record["calibration"]["unknown_below"]
+    assert set(recognizer.thresholds()) == {own} and 0 < own < 1
+    assert set(Recognizer.load(out, 0.25).thresholds()) == {0.25}
     assert run("recognize", "--model", out, *recognize(images), "--out", tmp_path / "answer")[0] == 0
     answers = json.loads((tmp_path / "answer" / "recognition.json").read_text())
     assert {"tops", "tops2", "embedding"} == set(answers[0]["top"])

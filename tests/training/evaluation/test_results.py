@@ -24,7 +24,7 @@ class ToyRun(NamedTuple):
     classes: tuple[str, ...] = CLASSES
     temperatures: Mapping[str, float] = {}
     answer_by: str = "classifiers"
-    threshold: float = 0.0
+    thresholds: np.ndarray = np.zeros(3)  # noqa: RUF012
 
 
 RUNS = [ToyRun("a", ("tops", "tops2")), ToyRun("b", ("ce", "tops", "tops2"))]
@@ -209,7 +209,7 @@ def sure_of(name: str, confidence: float) -> np.ndarray:
 
 
 def test_rejection_and_placements_match_hand_calculation() -> None:
-    """A mug in four frames, correct in two; a can in one; three dragons. The threshold 0.75 rejects the less sure."""
+    """A mug in four frames, correct in two; a can in one; three dragons. The thresholds reject the less sure."""
     answers = [("mug", 0.9), ("mug", 0.7), ("can", 0.8), ("bowl", 0.6)]
     dragons: list[tuple[str, float]] = [("mug", 0.8), ("can", 0.65), ("can", 0.5)]
     frames = [
@@ -219,7 +219,9 @@ def test_rejection_and_placements_match_hand_calculation() -> None:
     frames.append(FrameAnswers("g", {}, 1.0, [InstancePrediction(1, "can", False, None, sure_of("can", 0.95))]))
     frames += [FrameAnswers("h", {}, 1.0, [InstancePrediction(1, "dragon", False, None, sure_of(*d))]) for d in dragons]
     frames.append(FrameAnswers("i", {}, 1.0, [InstancePrediction(1, "can", reason="too few points")]))
-    report = compute_results("frames", [ToyRun("a", ("tops", "tops2"), threshold=0.75)], frames)
+    report = compute_results(
+        "frames", [ToyRun("a", ("tops", "tops2"), thresholds=np.array([0.61, 0.75, 0.75]))], frames
+    )
     placements = report["placements"]
     assert placements["count"] == 3
     assert placements["accuracy"]["THOR2"]["mean"] == pytest.approx((2 / 4 + 1 + 0) / 3)
