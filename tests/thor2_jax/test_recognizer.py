@@ -8,6 +8,7 @@ import pytest
 from helpers import untrained_run
 
 import thor2_jax as thor2
+from thor2_jax.recognition.answers import Evidence
 from thor2_jax.recognition.classifier import feature_of
 from thor2_jax.recognition.prepared_instance import PreparedInstance
 from thor2_jax.recognition.run_directory import TrainedRun
@@ -108,7 +109,7 @@ def test_half_of_the_points_may_overflow_with_a_name(recognizer: Recognizer) -> 
     colors, boundary = np.zeros((100, 3), np.uint8), np.zeros(100, bool)
     instance = PreparedInstance(1, np.zeros((100, 3), np.float32), colors, boundary)
     probabilities = {name: np.full((2, 4), [0.7, 0.1, 0.1, 0.1], np.float32) for name in THOR2}
-    named, refused = recognizer.recognitions([instance, instance], probabilities, np.array([50, 51]))
+    named, refused = recognizer.recognitions([instance, instance], Evidence(np.array([50, 51]), probabilities))
     assert named.name == "a" and named.reason is None and named.overflow == 50
     assert refused.name is None and refused.overflow == 51 and refused.confidence == named.confidence
     assert refused.reason is not None and "overflow" in refused.reason
@@ -192,9 +193,9 @@ def test_more_instances_than_the_largest_batch(recognizer: Recognizer) -> None:
 
 def test_a_missing_classifier_is_named(run: TrainedRun) -> None:
     shape_only = Recognizer(dataclasses.replace(run, classifiers={"tops": run.classifiers["tops"]}))
-    with pytest.raises(thor2.InputError, match="no tops2"):
-        shape_only.recognize(tilted(patches()))
-    answers = shape_only.recognize(tilted(patches()), classifiers=("tops",))
+    with pytest.raises(thor2.InputError, match="'tops2'.*expected one or more of tops$"):
+        shape_only.recognize(tilted(patches()), classifiers=THOR2)
+    answers = shape_only.recognize(tilted(patches()))
     assert {a.classifier for a in answers if a.reason is None} == {"tops"}
     with pytest.raises(thor2.InputError, match="shape"):
         shape_only.recognize(tilted(patches()), classifiers=("shape",))  # type: ignore[arg-type]
@@ -211,7 +212,7 @@ def test_nothing_compiles_after_warm_up(run: TrainedRun) -> None:
     fresh = Recognizer(run)
     jax.monitoring.register_event_duration_secs_listener(listen)
     try:
-        assert fresh.warm_up(max_points=1000, max_instances=5) == 2 * 3 + 4
+        assert fresh.warm_up(max_points=1000, max_instances=5) == 2 * 3
         assert compiled
         compiled.clear()
         for count in range(1, 6):
