@@ -24,14 +24,15 @@ MAX_ODDS = 8.0
 
 
 def answer_features(fused: Probabilities, embedding: Probabilities) -> NDArray[np.float64]:
-    """Return the features [B, 2] of a calibration: the log-odds of the answer, and of being a trained class.
+    """Return the features [B, 2] of a calibration: the log-odds of the answer, fused and by the embedding alone.
 
     Args:
         fused: [B, C] fused class probabilities.
         embedding: [B, C] class probabilities of the embedding; what they lack to 1 is that of the distractors.
     """
-    odds = [logit(fused.max(axis=1).astype(np.float64)), logit(embedding.sum(axis=1, dtype=np.float64).clip(0, 1))]
-    return np.stack(odds, axis=1).clip(-MAX_ODDS, MAX_ODDS)
+    answer = fused.argmax(axis=1)[:, None]
+    values = [np.take_along_axis(p, answer, axis=1)[:, 0].astype(np.float64) for p in (fused, embedding)]
+    return logit(np.stack(values, axis=1).clip(0, 1)).clip(-MAX_ODDS, MAX_ODDS)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,8 +41,8 @@ class Calibration:
 
     Attributes:
         bias: log-odds of a correct answer where both features are 0.
-        answer: factor of the answer's log-odds.
-        known: factor of the log-odds of being a trained class.
+        answer: factor of the fused log-odds of the answer.
+        known: factor of the embedding's log-odds of the answer, against all other classes and the distractors.
         unknown_below: confidence that 95 % of the correct held-out answers reach.
 
     Raises:

@@ -50,7 +50,7 @@ class Distractors:
     procedural: int = 600
     meshes: Mapping[str, Path] = dataclasses.field(default_factory=dict)
     views: int = 16
-    epochs: int = 16
+    epochs: int = 20
     workers: int = 1
 
     def __post_init__(self) -> None:

@@ -34,7 +34,7 @@ from training.objects.meshes import load_mesh
 from training.objects.procedural import procedural_object
 from training.rendering.camera import Camera
 from training.rendering.ray_caster import RayCaster, render_view
-from training.rendering.view_sphere import camera_pose
+from training.rendering.view_sphere import camera_pose, random_angles
 from training.storage.jobs import check_same_job
 from training.storage.locks import locked
 from training.storage.workers import IN_PROCESS, WorkerPool
@@ -61,9 +61,6 @@ UNCHANGED = 0.2
 CAMERA = Camera.from_field_of_view(540, 405, 40.0)
 """Half the pixels of the training camera: still two for each voxel of a cloud."""
 
-FROM_ABOVE = 0.7
-"""Share of views whose camera looks down on the object or is slightly below its middle, as on a table."""
-
 ObjectSource = int | Path
 """The seed of a procedural object, or a mesh file."""
 
@@ -83,11 +80,6 @@ class ViewTask:
     seed: int
 
 
-def _random_angles(rng: np.random.Generator) -> tuple[float, float]:
-    low, high = (-0.15, 0.97) if rng.random() < FROM_ABOVE else (-1.0, 1.0)
-    return rng.uniform(0, 2 * np.pi), float(np.arccos(rng.uniform(low, high)))
-
-
 def _mesh(source: ObjectSource) -> TexturedMesh:
     return load_mesh(source) if isinstance(source, Path) else procedural_object(source)
 
@@ -104,7 +96,7 @@ def render_clouds(task: ViewTask) -> list[tuple[int, Cloud]]:
         caster = RayCaster([mesh])
         rng = np.random.default_rng([task.seed, index])
         for _ in range(task.views):
-            view = render_view(caster, camera_pose(*_random_angles(rng), mesh.centre), CAMERA)
+            view = render_view(caster, camera_pose(*random_angles(rng), mesh.centre), CAMERA)
             cloud = cloud_of(view if rng.random() < UNCHANGED else augment(view, AUGMENTATIONS, rng))
             if len(cloud[0]) >= MIN_VIEW_POINTS:
                 clouds.append((index, cloud))

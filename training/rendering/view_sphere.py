@@ -12,10 +12,13 @@ from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
 
-__all__ = ["DISTANCE", "camera_pose", "view_angles"]
+__all__ = ["DISTANCE", "camera_pose", "random_angles", "view_angles"]
 
 DISTANCE = 1.5
 """Distance between the camera and the centre of the object's bounding box, metres."""
+
+FROM_ABOVE = 0.7
+"""Share of random views from above or from slightly below the middle of the object."""
 
 MAX_VIEWS = 10**6
 """Largest number of views of an object: 375 times the paper's."""
@@ -50,6 +53,12 @@ def view_angles(azimuth_step: float = 5.0, polar_step: float = 5.0) -> NDArray[n
     azimuths = np.arange(n) * (2 * np.pi / n)
     polars = np.linspace(0, np.pi, n_polar)
     return np.stack([np.tile(azimuths, len(polars)), np.repeat(polars, n)], axis=1)
+
+
+def random_angles(rng: np.random.Generator) -> tuple[float, float]:
+    """Return the azimuth and polar angle of a random view, in radians; most look down on the object, as on a table."""
+    low, high = (-0.15, 0.97) if rng.random() < FROM_ABOVE else (-1.0, 1.0)
+    return rng.uniform(0, 2 * np.pi), float(np.arccos(rng.uniform(low, high)))
 
 
 def camera_pose(

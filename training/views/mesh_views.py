@@ -27,7 +27,7 @@ from training.objects.mesh import TexturedMesh
 from training.objects.meshes import load_mesh
 from training.rendering.camera import TRAINING_CAMERA, Camera, RenderedView
 from training.rendering.ray_caster import RayCaster, render_view
-from training.rendering.view_sphere import camera_pose, view_angles
+from training.rendering.view_sphere import camera_pose, random_angles, view_angles
 from training.storage.workers import local_workers
 
 __all__ = [
@@ -102,7 +102,7 @@ class ViewTask:
         mesh: metres, z up.
         angles: [n, 2] azimuth and polar angle in radians.
         first: index of the first view among all views of the object.
-        augmentations: adds augmented copies of each view; None adds none.
+        augmentations: adds augmented views from random cameras, `copies` for each view; None adds none.
         seed: seed for the augmentations.
     """
 
@@ -120,7 +120,7 @@ class ViewCloud:
 
     Attributes:
         view: index of the view among all views of the object.
-        copy: 0 is the view as rendered, others are augmented copies.
+        copy: 0 is the view as rendered, others are augmented views from random cameras.
         xyz: [n, 3] float32, metres, camera frame.
         rgb: [n, 3] uint8.
     """
@@ -149,7 +149,8 @@ def _all_clouds(task: ViewTask) -> Iterator[ViewCloud]:
         for copy in range(1, clouds_per_view(task.augmentations)):
             assert task.augmentations is not None
             rng = np.random.default_rng([task.seed, name, number, copy])
-            yield ViewCloud(number, copy, *cloud_of(augment(view, task.augmentations, rng)))
+            other = render_view(caster, camera_pose(*random_angles(rng), centre))
+            yield ViewCloud(number, copy, *cloud_of(augment(other, task.augmentations, rng)))
 
 
 def render_task(task: ViewTask) -> list[ViewCloud]:
