@@ -176,16 +176,19 @@ def dataset_job(
     angles = view_angles(azimuth_step, polar_step)
     objects = _objects(meshes, angles)
     plan = _Plan(angles, clouds_per_view(augmentations), tuple(entry["name"] for entry in objects))
+    camera = TRAINING_CAMERA
+    # Without the fields that this camera has no value for: datasets of version 0.1.0 do not have them.
+    intrinsics = {name: value for name, value in dataclasses.asdict(camera.intrinsics).items() if value}
     return {
         "descriptor_version": DESCRIPTOR_VERSION,
         "sigma_s": SIGMA_S,
         "voxel": DESCRIPTOR_VOXEL,
         "step": COORDINATE_STEP,
         "min_points": MIN_VIEW_POINTS,
-        "camera": {**dataclasses.asdict(TRAINING_CAMERA), "distance": DISTANCE},
+        "camera": {"width": camera.width, "height": camera.height, "intrinsics": intrinsics, "distance": DISTANCE},
         "azimuth_step": float(azimuth_step),
         "polar_step": float(polar_step),
-        "variations": {"seed": seed, **augmentations.record()} if augmentations else None,
+        "variations": {"seed": seed, "cameras": "random", **augmentations.record()} if augmentations else None,
         "objects": objects,
         "shards": len(plan.shards),
     }

@@ -88,7 +88,7 @@ def test_the_record_is_json() -> None:
     record = Augmentations(illumination=Illumination(), copies=3).record()
     assert record == json.loads(json.dumps(record))
     assert set(record) == {*AUGMENTATIONS, "copies"}
-    assert record["sensor"] is None and record["copies"] == 3 and record["illumination"]["gain"] == [0.4, 1.6]
+    assert record["sensor"] is None and record["copies"] == 3 and record["illumination"]["gain"] == [0.4, 1.7]
     assert Augmentations(**AUGMENTATIONS).record() == ALL.record() != record
     assert hash(Augmentations(**AUGMENTATIONS)) == hash(ALL)
 

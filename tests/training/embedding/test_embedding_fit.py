@@ -15,7 +15,8 @@ import thor2_jax as thor2
 from thor2_jax.descriptor.describe import strips
 from thor2_jax.descriptor.orientations import orient_descriptors
 from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
-from training.embedding import fit, samples, sampling
+from training.augmentation import orientation
+from training.embedding import fit, sampling
 from training.embedding.build import main
 from training.embedding.fit import EmbeddingFit, fit_embedding
 from training.embedding.samples import Samples, sample_clouds
@@ -67,7 +68,9 @@ def test_a_repeated_object_has_one_label(tmp_path: Path) -> None:
 
 
 def test_unturned_samples_have_the_descriptor_of_their_cloud(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(samples, "_random_axes", lambda sides, rng: np.tile(np.eye(3, dtype=np.float32), (64, 1, 1)))
+    monkeypatch.setattr(
+        orientation, "_random_axes", lambda sides, rng: np.tile(np.eye(3, dtype=np.float32), (64, 1, 1))
+    )
     rendered = render_clouds(ViewTask({0: 0, 1: 10}, 3, 0))
     order = np.argsort([len(cloud[0]) for _, cloud in rendered], kind="stable")
     rng = np.random.default_rng(0)
@@ -92,14 +95,6 @@ def embedded(embedding: Embedding, aligned: thor2.PointClouds) -> np.ndarray:
 
 def aligned(clouds: thor2.PointClouds, mirror: str) -> thor2.PointClouds:
     return thor2.turn(thor2.mirror(thor2.view_normalize(clouds, SMALL_CONFIG), mirror), SMALL_CONFIG)
-
-
-def test_random_axes_are_rotations_with_nearly_equal_sides_swapped() -> None:
-    sides = np.array([[1, 0.9, 0.2]] * 400 + [[1, 0.5, 0.2]] * 400, np.float32)
-    axes = samples._random_axes(sides, np.random.default_rng(0))
-    np.testing.assert_allclose(axes @ np.swapaxes(axes, 1, 2), np.tile(np.eye(3), (800, 1, 1)), atol=1e-5)
-    along_x = axes[:, 0, 0] > np.cos(np.radians(10.1))
-    assert 0.4 < along_x[:400].mean() < 0.6 and along_x[400:].all()
 
 
 def test_an_interrupted_sampling_resumes(

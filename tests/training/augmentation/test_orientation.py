@@ -1,0 +1,30 @@
+"""Augmentation of orientation: the axes, and what a reoriented cloud keeps."""
+
+import numpy as np
+
+import thor2_jax as thor2
+from training.augmentation.orientation import _random_axes, reorient
+
+CONFIG = thor2.DescriptorConfig(homology="closed_form")
+
+
+def test_random_axes_are_rotations_with_nearly_equal_sides_swapped() -> None:
+    sides = np.array([[1, 0.9, 0.2]] * 400 + [[1, 0.5, 0.2]] * 400, np.float32)
+    axes = _random_axes(sides, np.random.default_rng(0))
+    np.testing.assert_allclose(axes @ np.swapaxes(axes, 1, 2), np.tile(np.eye(3), (800, 1, 1)), atol=1e-5)
+    along_x = axes[:, 0, 0] > np.cos(np.radians(10.1))
+    assert 0.4 < along_x[:400].mean() < 0.6 and along_x[400:].all()
+
+
+def test_reoriented_clouds_are_rigid_and_in_the_first_octant() -> None:
+    rng = np.random.default_rng(3)
+    points = (rng.random((200, 3)) * (0.2, 0.19, 0.1)).astype(np.float32)
+    clouds = thor2.PointClouds.pack([(points, rng.integers(0, 256, (200, 3), np.uint8))] * 8)
+    normal = thor2.view_normalize(clouds, CONFIG)
+    turned = reorient(normal, rng)
+    assert len({np.asarray(cloud).tobytes() for cloud in turned.points}) == 8
+    for cloud, before in zip(np.asarray(turned.points), np.asarray(normal.points), strict=True):
+        np.testing.assert_allclose(cloud[:200].min(axis=0), 0, atol=1e-5)
+        distances = [np.linalg.norm(a[:100] - a[100:200], axis=1) for a in (cloud, before)]
+        np.testing.assert_allclose(*distances, atol=1e-4)
+    np.testing.assert_array_equal(turned.colors, normal.colors)
