@@ -1,6 +1,7 @@
 """Helpers of several test files: untrained runs, small clouds and images, the command line, programs, HTML pages."""
 
 import io
+import json
 import os
 import socket
 import struct
@@ -189,3 +190,24 @@ def full_image(view: RenderedView, camera: Camera) -> tuple[NDArray[np.uint8], N
     depth = np.zeros((camera.height, camera.width), np.uint16)
     color[rows, columns], depth[rows, columns] = view.color, view.depth
     return color, depth
+
+
+FRAME_COLORS = {"brick": (220, 30, 30), "book": (30, 40, 220), "leaf": (60, 200, 60)}
+
+
+def write_frame(directory: Path, objects: dict[int, str], seed: int = 0) -> Path:
+    """Write a labelled frame with a rectangle for each object; each name has its colour and size."""
+    rng = np.random.default_rng(seed)
+    color = rng.integers(100, 120, (240, 320, 3), np.uint8)
+    mask = np.zeros((240, 320), np.uint8)
+    for place, (label, name) in enumerate(objects.items()):
+        window = slice(30, 140 if name == "brick" else 90), slice(20 + 100 * place, 100 + 100 * place)
+        mask[window] = label
+        color[window] = np.clip(np.array(FRAME_COLORS[name]) + rng.integers(-9, 10, (*mask[window].shape, 3)), 0, 255)
+    depth = np.broadcast_to(600 + np.arange(320) // 2, (240, 320)).astype(np.uint16)
+    directory.mkdir(parents=True)
+    for name, image in (("color", color), ("depth", depth), ("mask", mask)):
+        Image.fromarray(image).save(directory / f"{name}.png")
+    (directory / "intrinsics.json").write_text('{"fx": 600, "fy": 600, "cx": 159.5, "cy": 119.5}')
+    (directory / "labels.json").write_text(json.dumps({"labels": {str(k): name for k, name in objects.items()}}))
+    return directory

@@ -76,7 +76,7 @@ def mesh_views(mesh: Path | TexturedMesh, mesh_scale: float = 1.0) -> list[Prepa
 
 @dataclasses.dataclass(frozen=True)
 class SkippedInstance:
-    """A labelled instance that cannot be enrolled.
+    """A labelled instance that cannot be used.
 
     Attributes:
         frame: identifier of its frame.
@@ -118,7 +118,7 @@ def labelled_views(
     empty = [name for name, found in views.items() if not found]
     if empty:
         reason = next(instance.reason for instance in skipped if instance.name == empty[0])
-        raise InputError(f"frames: {empty[0]!r} has no view that can be enrolled ({reason})")
+        raise InputError(f"frames: {empty[0]!r} has no usable view ({reason})")
     if not views:
         shown = ", ".join(map(str, directories))
         wanted = "an object" if label_name is None else repr(label_name)

@@ -1,22 +1,24 @@
-"""The job of `thor2 train`: render or open the views, train the runs, train their baselines."""
+"""The job of `thor2 train`: render or open the views, join labelled instances, train the runs and their baselines."""
 
 import contextlib
 import dataclasses
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 
 from thor2_jax.errors import InputError
 from thor2_jax.files import remove_leftovers
 from thor2_jax.recognition.classifier import check_features
+from thor2_jax.recognition.prepared_instance import PreparedInstance
 from thor2_jax.recognition.run_directory import TrainedRun
 from training.baselines.job import train_baselines
 from training.baselines.names import check_baselines
 from training.embedding.run_embedding import Distractors
+from training.enrollment import SkippedInstance, labelled_views
 from training.fitting.checkpoints import CHECKPOINTS
 from training.fitting.job import VIEWS, check_out, check_trained, finished_record, is_finished, train_run
 from training.fitting.protocol import DEFAULT, PAPER, Protocol
@@ -26,6 +28,7 @@ from training.storage.jobs import check_same_job
 from training.storage.progress import Progress
 from training.storage.workers import local_workers
 from training.views.dataset import ViewDataset
+from training.views.labelled_views import WithLabelledViews, digest_of_instances
 from training.views.left_out import WithoutClasses
 from training.views.normalized_views import ViewSource
 from training.views.render_job import dataset_job, render_dataset
@@ -33,19 +36,33 @@ from training.views.sequences import sequence_sources
 
 __all__ = ["TrainJob", "run_train_job"]
 
+
+class LabelledInstances(NamedTuple):
+    """The instances of labelled frames.
+
+    Attributes:
+        views: object -> its usable instances.
+        skipped: the others.
+    """
+
+    views: Mapping[str, Sequence[PreparedInstance]]
+    skipped: Sequence[SkippedInstance]
+
+
 Display = Callable[[], AbstractContextManager[Progress]]
 """Opens a progress display, such as `training.cli.progress.show_progress`."""
 
 
 @dataclasses.dataclass(frozen=True)
 class TrainJob:
-    """What to train, and on which views; exactly one of `meshes` and `dataset` is given.
+    """What to train, and on which views: at most one of `meshes` and `dataset` is given, `frames`, or both.
 
     Attributes:
         out: run directory, or with `sequences` the directory of the run directories.
         protocol: camera steps, augmentations, mirrors and fit options.
         meshes: directory of meshes; their views are rendered for this run and removed afterwards.
         dataset: directory written by `thor2 render`.
+        frames: folders of labelled frames, see `FrameFolder`, whose instances are views of their classes, too.
         names: table of object name -> mesh in `meshes`; None uses all meshes.
         classifiers: any of "tops", "tops2", "ce".
         folds: number of folds; with more than one, each gets a model and is its held-out set.
@@ -61,6 +78,7 @@ class TrainJob:
     protocol: Protocol
     meshes: Path | None = None
     dataset: Path | None = None
+    frames: Sequence[Path] = ()
     names: Path | None = None
     classifiers: Sequence[str] = ("tops", "tops2", "ce")
     folds: int = 1
@@ -84,14 +102,15 @@ def run_train_job(job: TrainJob, display: Display) -> dict[Path, list[TrainedRun
     """
     baselines = check_baselines(job.baselines)
     features = check_features(job.classifiers, "classifiers")
+    labelled = _read_frames(job, baselines)
     if job.sequences is None:
         if not is_finished(job.out):
             check_out(job.out)
         elif job.meshes is not None:
-            _check_finished_views(job)
+            _check_finished_views(job, labelled)
             if not baselines:
                 return {job.out: []}
-    source = _open_views(job, display)
+    source = _open_views(job, labelled, display)
     if job.leave_out:
         source = WithoutClasses(source, job.leave_out)
     sources = {job.out: source}
@@ -142,7 +161,7 @@ def _check_batch_size(protocol: Protocol, source: ViewSource) -> None:
         )
 
 
-def _check_finished_views(job: TrainJob) -> None:
+def _check_finished_views(job: TrainJob, labelled: LabelledInstances | None) -> None:
     """Raise InputError if a finished run is of another job; without baselines, remove what a killed process left.
 
     Views of this job are removed, other ones stay: another training may read them.
@@ -153,10 +172,15 @@ def _check_finished_views(job: TrainJob) -> None:
         _find_meshes(job), protocol.azimuth_step, protocol.polar_step, protocol.augmentations, protocol.fit.seed
     )
     stored = record["dataset"]
+    frames = digest_of_instances(labelled.views) if labelled else None
     check_same_job(
         job.out,
-        {"dataset": stored.get("job"), "leave_out": stored.get("classes_left_out", [])},
-        {"dataset": requested, "leave_out": left_out},
+        {
+            "dataset": stored.get("job"),
+            "frames": stored.get("frames", {}).get("digest"),
+            "leave_out": stored.get("classes_left_out", []),
+        },
+        {"dataset": requested, "frames": frames, "leave_out": left_out},
     )
     if job.baselines:
         return
@@ -181,14 +205,72 @@ def _find_meshes(job: TrainJob) -> dict[str, Path | TexturedMesh]:
     return scaled_meshes(find_meshes(job.meshes, read_names(job.names) if job.names else None), job.mesh_scale)
 
 
-def _open_views(job: TrainJob, display: Display) -> ViewSource:
-    """Open the dataset, or render the meshes to `out`/views."""
-    if job.meshes is None:
-        assert job.dataset is not None
-        return ViewDataset.open(job.dataset)
-    meshes, protocol = _find_meshes(job), job.protocol
+def _read_frames(job: TrainJob, baselines: Sequence[str]) -> LabelledInstances | None:
+    """Return the instances of the labelled frames; None if the job has no frames.
+
+    Raises:
+        InputError: a frame cannot be read, or has no usable instance of an object; or the job cannot use frames.
+    """
+    if not job.frames:
+        if job.meshes is None and job.dataset is None:
+            raise InputError("meshes, dataset and frames are missing; expected one of them")
+        return None
+    if job.sequences is not None:
+        raise InputError(
+            f"sequences is {job.sequences}; expected none with frames: the frames of each have other objects"
+        )
+    if "thor" in baselines:
+        raise InputError("baselines: thor needs the camera angles of all views, and frames have none; leave out thor")
+    return LabelledInstances(*labelled_views(job.frames, job.protocol.config.sigma_s))
+
+
+def _check_names(job: TrainJob, names: Sequence[str], labelled: LabelledInstances | None) -> None:
+    """Raise InputError if the classes cannot be trained, before views are rendered.
+
+    Args:
+        job: the job.
+        names: classes of the meshes or of the dataset.
+        labelled: instances of the frames.
+    """
+    classes = [
+        name for name in dict.fromkeys([*names, *(labelled.views if labelled else ())]) if name not in job.leave_out
+    ]
     if job.distractors is not None:
-        job.distractors.check([name for name in meshes if name not in job.leave_out])
+        job.distractors.check(classes)
+    if labelled is None:
+        return
+    folded: dict[str, str] = {}
+    for name in classes:
+        other = folded.setdefault(name.casefold(), name)
+        if other != name:
+            raise InputError(
+                f"frames: the names {other!r} and {name!r} differ only by case; expected one name of an object"
+            )
+        if name not in names and len(labelled.views[name]) < 2:
+            raise InputError(
+                f"frames: {name!r} has one usable instance; expected at least two: label it in another frame, "
+                "or leave it out (leave_out)"
+            )
+    if len(classes) < 2:
+        raise InputError(f"frames: the objects are {', '.join(classes) or 'none'}; expected at least two to tell apart")
+
+
+def _open_views(job: TrainJob, labelled: LabelledInstances | None, display: Display) -> ViewSource:
+    """Open the dataset, or render the meshes to `out`/views; add the labelled instances."""
+    meshes = {} if job.meshes is None else _find_meshes(job)
+    source: ViewSource | None = None if job.dataset is None else ViewDataset.open(job.dataset)
+    _check_names(job, source.classes if source else list(meshes), labelled)
+    if meshes:
+        source = _render(job, meshes, display)
+    if labelled is not None:
+        reasons = [instance.reason for instance in labelled.skipped]
+        source = WithLabelledViews(labelled.views, job.protocol.config, source, reasons)
+    assert source is not None
+    return source
+
+
+def _render(job: TrainJob, meshes: Mapping[str, Path | TexturedMesh], display: Display) -> ViewDataset:
+    protocol = job.protocol
     with display() as progress:
         return render_dataset(
             meshes,

@@ -58,7 +58,7 @@ def instance_view(frame: RGBDFrame, label: int | None, sigma_s: float) -> Prepar
         raise InputError(f"instance is {label}; expected one of {', '.join(map(str, frame.instances)) or 'none'}")
     view = prepare_instance(frame, frame.instances[0] if label is None else label, sigma_s)
     if view.reason is not None:
-        raise InputError(f"instance {view.label} cannot be enrolled: {view.reason}")
+        raise InputError(f"instance {view.label} cannot be used: {view.reason}")
     return view
 
 

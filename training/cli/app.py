@@ -5,10 +5,11 @@ Invalid input ends a command with one line on standard error and exit code 2.
 
 import sys
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import Annotated, Any, NoReturn
 
 import typer
 from rich.console import Console
+from typer.core import TyperCommand
 
 from thor2_jax import __version__
 from thor2_jax.errors import InputError
@@ -16,6 +17,7 @@ from thor2_jax.printable import escape_characters
 from training.cli.compilation_cache import enable_compilation_cache
 
 __all__ = [
+    "ManyFrames",
     "MeshScaleOption",
     "ModelOption",
     "QuietOption",
@@ -48,6 +50,22 @@ MeshScaleOption = Annotated[
     float, typer.Option("--mesh-scale", help="Factor from the unit of the meshes to metres; 0.001 for millimetres.")
 ]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress.")]
+
+
+class ManyFrames(TyperCommand):
+    """A command whose option --frames takes all values up to the next option."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse the arguments, with --frames before each value that follows it."""
+        expanded: list[str] = []
+        taking = False
+        for argument in args:
+            if argument.startswith("-") and argument != "-":
+                taking = argument == "--frames"
+                expanded += [] if taking else [argument]
+            else:
+                expanded += ["--frames", argument] if taking else [argument]
+        return super().parse_args(ctx, expanded)
 
 
 def show_help(context: typer.Context) -> None:

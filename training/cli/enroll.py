@@ -6,32 +6,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from typer.core import TyperCommand
 
 from thor2_jax.errors import InputError
-from training.cli.app import MeshScaleOption, QuietOption, app, console
+from training.cli.app import ManyFrames, MeshScaleOption, QuietOption, app, console
 from training.cli.progress import show_progress
 
 if TYPE_CHECKING:
     from thor2_jax.recognition.prepared_instance import PreparedInstance
 
 
-class _ManyFrames(TyperCommand):
-    """A command whose option --frames takes all values up to the next option."""
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        expanded: list[str] = []
-        taking = False
-        for argument in args:
-            if argument.startswith("-") and argument != "-":
-                taking = argument == "--frames"
-                expanded += [] if taking else [argument]
-            else:
-                expanded += ["--frames", argument] if taking else [argument]
-        return super().parse_args(ctx, expanded)
-
-
-@app.command(cls=_ManyFrames)
+@app.command(cls=ManyFrames)
 def enroll(
     model: Annotated[Path, typer.Option("--model", help="Run directory; created if it does not exist.")],
     name: Annotated[str | None, typer.Argument(help="Name of the object. Default: every labelled object.")] = None,

@@ -7,16 +7,20 @@ from typing import Annotated, Any
 import typer
 
 from thor2_jax.errors import InputError
-from training.cli.app import MeshScaleOption, QuietOption, app, console, split_names
+from training.cli.app import ManyFrames, MeshScaleOption, QuietOption, app, console, split_names
 from training.cli.progress import show_progress
 
 
-@app.command()
+@app.command(cls=ManyFrames)
 def train(
     out: Annotated[Path, typer.Option(help="Run directory: new, or begun by this command.")],
     meshes: Annotated[Path | None, typer.Option(help="Directory of meshes (GLB, OBJ, PLY) to render.")] = None,
     dataset: Annotated[
         Path | None, typer.Option(help="Directory written by `thor2 render`, instead of --meshes.")
+    ] = None,
+    frames: Annotated[
+        list[Path] | None,
+        typer.Option(metavar="DIR...", help="Folders of labelled frames, whose instances are views, too."),
     ] = None,
     names: Annotated[
         Path | None, typer.Option(help="JSON or YAML table: object name -> mesh. Default: all meshes.")
@@ -72,6 +76,9 @@ def train(
     sensor errors and inexact masks. A --dataset has the copies that it was rendered with. --paper trains as the paper
     does: more views, no augmented copies, four mirrors of each view and more epochs.
 
+    With --frames, labelled real instances are views of their objects, too, each with augmented copies. Objects may have
+    a mesh, frames or both. A frame is a folder with color.png, depth.png, mask.png, intrinsics.json and labels.json.
+
     With --baselines, a finished run gets the baselines that it lacks. With --sequences, one run is trained for each
     sequence, on its objects only (see `thor2 evaluate ocid --per-sequence`); finished runs must have the same options.
     The embedding is a classifier beside the others, and objects are enrolled in the run with it. It is also fitted on
@@ -79,13 +86,13 @@ def train(
     """
     import jax
 
-    if (meshes is None) == (dataset is None):
-        raise InputError("give exactly one of --meshes and --dataset")
+    if (meshes is None) == (dataset is None) and (meshes is not None or not frames):
+        raise InputError("give one of --meshes and --dataset, --frames, or both")
     for option, value in (("names", names), ("azimuth-step", azimuth_step), ("polar-step", polar_step)):
-        if dataset is not None and value is not None:
-            raise InputError(f"{option} is {value}; expected only with --meshes: the views of a --dataset are rendered")
-    if dataset is not None and mesh_scale != 1:
-        raise InputError(f"mesh-scale is {mesh_scale:g}; expected only with --meshes: the views are rendered")
+        if meshes is None and value is not None:
+            raise InputError(f"{option} is {value}; expected only with --meshes: other views are not rendered")
+    if meshes is None and mesh_scale != 1:
+        raise InputError(f"mesh-scale is {mesh_scale:g}; expected only with --meshes: other views are not rendered")
     if coordinator is None and (processes, process) != (1, 0):
         raise InputError(f"processes is {processes} and process {process}; several processes need --coordinator")
     if process >= processes:
@@ -93,8 +100,10 @@ def train(
     if sequences is not None and (dataset is None or leave_out):
         raise InputError(f"sequences is {sequences}; it requires --dataset and excludes --leave-out")
     if coordinator is not None:
-        if meshes is not None:
-            raise InputError("coordinator: several processes need a --dataset that all of them can read, not --meshes")
+        if meshes is not None or frames:
+            raise InputError(
+                "coordinator: several processes need a --dataset that all of them can read, not --meshes or --frames"
+            )
         jax.distributed.initialize(coordinator, processes, process)
     from training.fitting.protocol import DEFAULT, PAPER
     from training.train_job import TrainJob, run_train_job
@@ -111,6 +120,7 @@ def train(
         ),
         meshes=meshes,
         dataset=dataset,
+        frames=frames or (),
         names=names,
         classifiers=split_names(classifiers),
         folds=folds,
@@ -126,6 +136,8 @@ def train(
         if not runs:
             console.print(f"finished already: nothing was trained; the run is in {directory}")
             continue
+        for reason in runs[0].record["dataset"].get("frames", {}).get("skipped", []):
+            console.print(f"skipped: {reason}")
         for run in runs:
             for name, accuracy in run.record["held_out_accuracy"].items():
                 console.print(f"fold {run.record['fold']}: {name} has a held-out accuracy of {accuracy:.3f}")

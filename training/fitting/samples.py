@@ -151,7 +151,7 @@ def build_samples(
         InputError: There are fewer than two classes, a class has no views, or the source is unreadable.
     """
     if len(source.classes) < 2:
-        raise InputError(f"there are views of {len(source.classes)} classes; expected at least two; add meshes")
+        raise InputError(f"there are views of {len(source.classes)} classes; expected at least two; add objects")
     for label, name in enumerate(source.classes):
         if not any(shard.label == label and shard.views for shard in source.shards):
             raise InputError(f"class {name!r} has no views; render more views or leave it out")

@@ -32,8 +32,15 @@ CLOUDS_PER_BATCH = 64
 """Batch size of the normalization."""
 
 
-def padded_batches(clouds: Sequence[Cloud], size: int) -> Iterator[tuple[int, PointClouds]]:
+def padded_batches(
+    clouds: Sequence[Cloud], size: int, boundary: Sequence[NDArray[np.bool_]] | None = None
+) -> Iterator[tuple[int, PointClouds]]:
     """Yield clouds in batches of `size`; the last batch is filled up with empty clouds.
+
+    Args:
+        clouds: the clouds.
+        size: clouds in a batch.
+        boundary: for each cloud [n] bool, the points on the occlusion boundary; None if there are none.
 
     Yields:
         The number of given clouds in the batch, and the batch, padded to the bucket of its largest cloud.
@@ -44,7 +51,9 @@ def padded_batches(clouds: Sequence[Cloud], size: int) -> Iterator[tuple[int, Po
     empty: Cloud = (np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
     for start in range(0, len(clouds), size):
         chunk = list(clouds[start : start + size])
-        yield len(chunk), PointClouds.pack(chunk + [empty] * (size - len(chunk)))
+        padding = size - len(chunk)
+        marks = None if boundary is None else [*boundary[start : start + size], *[None] * padding]
+        yield len(chunk), PointClouds.pack(chunk + [empty] * padding, boundary=marks)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,7 +110,12 @@ class ViewSource(Protocol):
 
 
 def normalize_views(
-    clouds: Sequence[Cloud], label: int, view: Sequence[int], copy: Sequence[int], config: DescriptorConfig
+    clouds: Sequence[Cloud],
+    label: int,
+    view: Sequence[int],
+    copy: Sequence[int],
+    config: DescriptorConfig,
+    boundary: Sequence[NDArray[np.bool_]] | None = None,
 ) -> NormalizedViews:
     """Normalize views of one object; the same clouds in the same order give the same bits.
 
@@ -111,6 +125,7 @@ def normalize_views(
         view: index of each view among all views of the object.
         copy: 0 for a view as rendered, others for augmented copies.
         config: only `sigma_s` is used.
+        boundary: points on the occlusion boundary, see `padded_batches`.
 
     Raises:
         InputError: A cloud has more points than the largest bucket, or is longer than `MAX_VIEW_LENGTH`.
@@ -118,15 +133,15 @@ def normalize_views(
     xyz = [np.zeros((0, 3), np.float32)]
     # Always on the CPU: an accelerator rounds differently, and rendering should not occupy its memory.
     with jax.default_device(jax.local_devices(backend="cpu")[0]):
-        for count, batch in padded_batches(clouds, CLOUDS_PER_BATCH):
+        for count, batch in padded_batches(clouds, CLOUDS_PER_BATCH, boundary):
             normal = view_normalize(batch, config)
             padded, mask = np.asarray(normal.points)[:count], np.asarray(normal.mask)[:count]
             xyz.append(np.rint(padded[mask] / np.float32(COORDINATE_STEP)) * np.float32(COORDINATE_STEP))
     points = np.concatenate(xyz)
     if not (points <= MAX_VIEW_LENGTH).all():
         raise InputError(
-            f"a view is {points.max():.3g} scaled units long; at most {MAX_VIEW_LENGTH:.3g} can be stored; scale the "
-            "mesh to metres"
+            f"a view is {points.max():.3g} scaled units long; at most {MAX_VIEW_LENGTH:.3g} can be stored; check the "
+            "unit of the mesh, or the mask and the depth scale of the frame"
         )
     return NormalizedViews(
         xyz=points,

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from helpers import SMALL_CONFIG, run_thor2, untrained_run
+from helpers import SMALL_CONFIG, run_thor2, untrained_run, write_frame
 from PIL import Image
 
 from thor2_jax.gallery import embedding as embeddings
@@ -19,8 +19,6 @@ from thor2_jax.recognition.run_directory import load_run, save_run
 from thor2_jax.recognizer import Recognizer
 from training import enrollment
 
-COLORS = {"brick": (220, 30, 30), "book": (30, 40, 220), "leaf": (60, 200, 60)}
-
 
 @pytest.fixture(autouse=True)
 def small_embedding(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -29,24 +27,6 @@ def small_embedding(monkeypatch: pytest.MonkeyPatch) -> None:
     for module in (embeddings, gallery_objects):
         monkeypatch.setattr(module, "load_default", lambda: small)
     monkeypatch.setattr(enrollment, "MESH_VIEWS", 3)
-
-
-def write_frame(directory: Path, objects: dict[int, str], seed: int = 0) -> Path:
-    """A frame with a rectangle for each object."""
-    rng = np.random.default_rng(seed)
-    color = rng.integers(100, 120, (240, 320, 3), np.uint8)
-    mask = np.zeros((240, 320), np.uint8)
-    for place, (label, name) in enumerate(objects.items()):
-        window = slice(30, 140 if name == "brick" else 90), slice(20 + 100 * place, 100 + 100 * place)
-        mask[window] = label
-        color[window] = np.clip(np.array(COLORS[name]) + rng.integers(-9, 10, (*mask[window].shape, 3)), 0, 255)
-    depth = np.broadcast_to(600 + np.arange(320) // 2, (240, 320)).astype(np.uint16)
-    directory.mkdir(parents=True)
-    for name, image in (("color", color), ("depth", depth), ("mask", mask)):
-        Image.fromarray(image).save(directory / f"{name}.png")
-    (directory / "intrinsics.json").write_text('{"fx": 600, "fy": 600, "cx": 159.5, "cy": 119.5}')
-    (directory / "labels.json").write_text(json.dumps({"labels": {str(k): name for k, name in objects.items()}}))
-    return directory
 
 
 @pytest.fixture

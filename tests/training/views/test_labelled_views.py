@@ -1,0 +1,101 @@
+"""Labelled instances as views, against the normalization that recognition computes."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from thor2_jax.config import DescriptorConfig
+from thor2_jax.descriptor.view_normalization import view_normalize
+from thor2_jax.errors import InputError
+from thor2_jax.gallery.augment import augmented_view
+from thor2_jax.recognition.prepared_instance import PreparedInstance, pack_instances
+from training.views import labelled_views
+from training.views.labelled_views import FIRST_VIEW, WithLabelledViews
+from training.views.left_out import WithoutClasses
+from training.views.memory_views import MemoryViews
+from training.views.normalized_views import COORDINATE_STEP
+
+CONFIG = DescriptorConfig(homology="closed_form")
+
+
+def instance(seed: int, n: int = 50) -> PreparedInstance:
+    """Return a cloud in a box; the left end is occluded in every second one."""
+    rng = np.random.default_rng(seed)
+    points = (rng.random((n, 3)) * (0.2, 0.1, 0.05) + (0.1, -0.3, 0.6)).astype(np.float32)
+    boundary = (points[:, 0] < 0.13) & bool(seed % 2)
+    return PreparedInstance(1, points, rng.integers(0, 256, (n, 3), np.uint8), boundary, bool(seed % 2))
+
+
+def rendered(bowls: int = 30, mugs: int = 3) -> MemoryViews:
+    clouds = [(view.points, view.colors) for view in map(instance, range(bowls + mugs))]
+    return MemoryViews({"bowl": clouds[:bowls], "mug": clouds[bowls:]}, CONFIG)
+
+
+def test_labelled_instances_join_the_rendered_views() -> None:
+    """The largest class has 30 clouds: 4 mugs get 30 // 4 - 1 copies, 40 pens none, and 2 boxes the most of 8."""
+    instances = {"mug": 4, "pen": 40, "box": 2}
+    views = {name: [instance(100 + k) for k in range(n)] for name, n in instances.items()}
+    source = WithLabelledViews(views, CONFIG, rendered(), ["too few points"])
+    assert source.classes == ("bowl", "mug", "pen", "box")
+    shards = [(shard.label, shard.views) for shard in source.shards]
+    assert shards == [(0, 30), (1, 3), (1, 4 * 7), (2, 40), (3, 2 * 9)]
+    assert source.record == {
+        "digest": source.digest,
+        "views": 30 + 3 + 28 + 40 + 18,
+        "frames": {
+            "digest": labelled_views.digest_of_instances(views),
+            "instances": instances,
+            "copies": {"mug": 6, "pen": 0, "box": 8},
+            "skipped": ["too few points"],
+        },
+    }
+    mugs = source.read(2)
+    assert (mugs.label, len(mugs)) == (1, 28)
+    assert mugs.view.tolist() == [FIRST_VIEW + k for k in range(4) for _ in range(7)]
+    assert mugs.copy.tolist() == list(range(7)) * 4
+    np.testing.assert_array_equal(source.read(1).xyz, rendered().read(1).xyz)
+    only = WithoutClasses(source, ["bowl", "pen"])
+    assert [only.read(k).label for k in range(3)] == [0, 0, 1] and only.read(1).view.tolist() == mugs.view.tolist()
+
+
+def test_instances_are_normalized_as_recognition_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Clouds with an occlusion boundary may take another half turn than the same points without one."""
+    monkeypatch.setattr(labelled_views, "CLOUDS", 12)
+    views = [instance(seed, 40 + seed) for seed in range(6)]
+    source = WithLabelledViews({"mug": views}, CONFIG)
+    assert source.classes == ("mug",) and [shard.views for shard in source.shards] == [12]
+    flat = [each for view in views for each in (view, augmented_view(view, 0))]
+    normal = view_normalize(pack_instances(flat, len(flat)), CONFIG)
+    expected = np.asarray(normal.points)[np.asarray(normal.mask)]
+    read = source.read(0)
+    assert read.counts.tolist() == [len(each.points) for each in flat]
+    np.testing.assert_allclose(read.xyz, expected, atol=COORDINATE_STEP / 2 + 1e-6)
+    np.testing.assert_array_equal(read.rgb, np.concatenate([each.colors for each in flat]))
+    bare = [dataclasses.replace(view, boundary=np.zeros_like(view.boundary)) for view in views]
+    assert np.abs(WithLabelledViews({"mug": bare}, CONFIG).read(0).xyz - read.xyz).max() > 0.01
+
+
+def test_the_digest_depends_on_everything_that_is_read() -> None:
+    def digest(*seeds: int, name: str = "mug", bowls: int = 30, **changes: np.ndarray) -> str:
+        views = [dataclasses.replace(instance(seed), **changes) for seed in seeds]
+        return WithLabelledViews({name: views}, CONFIG, rendered(bowls) if bowls else None).digest
+
+    colors, boundary = np.zeros((50, 3), np.uint8), np.ones(50, bool)
+    digests = [
+        digest(1, 2),
+        digest(2, 1),
+        digest(1),
+        digest(1, 2, name="cup"),
+        digest(1, 2, bowls=29),
+        digest(1, 2, bowls=0),
+        digest(1, 2, colors=colors),
+        digest(1, 2, boundary=boundary),
+    ]
+    assert len(set(digests)) == len(digests) and digest(1, 2) == digests[0]
+
+
+def test_an_instance_that_is_too_long_is_refused() -> None:
+    long = dataclasses.replace(instance(0), points=instance(0).points * np.float32(20))
+    with pytest.raises(InputError, match="frames: 'mug': .*depth scale"):
+        WithLabelledViews({"mug": [long]}, CONFIG).read(0)
