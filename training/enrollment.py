@@ -134,6 +134,7 @@ def enroll_objects(
     name: str | None = None,
     extend: bool = False,
     replace: bool = False,
+    gallery: Path | None = None,
     progress: Callable[[], contextlib.AbstractContextManager[Progress]] = lambda: contextlib.nullcontext(_show_nothing),
 ) -> dict[str, int]:
     """Enroll objects in the gallery of a run directory, in one change; one that does not exist is created.
@@ -145,6 +146,7 @@ def enroll_objects(
         name: the name that `read` will return, if there is one: it is checked before anything is read.
         extend: add the views to those of objects that exist.
         replace: discard the views of objects that exist.
+        gallery: directory of the gallery, of a run directory that exists; by default `gallery` in the run directory.
         progress: function that shows the progress of embedding, like `show_progress` of the command line; its context
             is called with ("enroll", objects done, number of objects, name).
 
@@ -157,7 +159,9 @@ def enroll_objects(
         OSError: a file cannot be written; the gallery is as before, and no run directory is created.
     """
     is_new = not model.exists() or (model.is_dir() and not any(model.iterdir()))
-    objects = ObjectGallery(()) if is_new else Recognizer.load(model).objects
+    if is_new and gallery is not None:
+        raise InputError(f"gallery is {gallery}, and {model} is no run directory; expected one, or leave out gallery")
+    objects = ObjectGallery(()) if is_new else Recognizer.load(model, gallery=gallery).objects
     config = objects.embedding.config if is_new else load_run(model).config
     if name is not None:
         objects.check(name, extend=extend, replace=replace)

@@ -17,6 +17,7 @@ from thor2_jax.printable import escape_characters
 from training.cli.compilation_cache import enable_compilation_cache
 
 __all__ = [
+    "GalleryOption",
     "ManyFrames",
     "MeshScaleOption",
     "ModelOption",
@@ -46,6 +47,9 @@ UnknownOption = Annotated[
     ),
 ]
 ModelOption = Annotated[Path, typer.Option("--model", help="Run directory of a trained model.")]
+GalleryOption = Annotated[
+    Path | None, typer.Option("--gallery", help="Directory of the gallery. Default: gallery in the run directory.")
+]
 MeshScaleOption = Annotated[
     float, typer.Option("--mesh-scale", help="Factor from the unit of the meshes to metres; 0.001 for millimetres.")
 ]

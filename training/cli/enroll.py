@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from thor2_jax.errors import InputError
-from training.cli.app import ManyFrames, MeshScaleOption, QuietOption, app, console
+from training.cli.app import GalleryOption, ManyFrames, MeshScaleOption, QuietOption, app, console
 from training.cli.progress import show_progress
 
 if TYPE_CHECKING:
@@ -34,6 +34,7 @@ def enroll(
     mesh_scale: MeshScaleOption = 1.0,
     extend: Annotated[bool, typer.Option("--extend", help="Add views to an object that exists.")] = False,
     replace: Annotated[bool, typer.Option("--replace", help="Discard the views of an object that exists.")] = False,
+    gallery: GalleryOption = None,
     quiet: QuietOption = False,
 ) -> None:
     """Enroll an object from a mesh, from labelled frames, or from one frame; it is recognized at once.
@@ -67,13 +68,20 @@ def enroll(
 
     source = "frames" if mesh is None else "mesh"
     counts = enroll_objects(
-        model, read, source, name=name, extend=extend, replace=replace, progress=partial(show_progress, quiet)
+        model,
+        read,
+        source,
+        name=name,
+        extend=extend,
+        replace=replace,
+        gallery=gallery,
+        progress=partial(show_progress, quiet),
     )
     for line in skipped:
         console.print(line)
     for each, count in counts.items():
         console.print(f"{each}: {count} views")
-    console.print(f"enrolled in {model}")
+    console.print(f"enrolled in {gallery or model}")
 
 
 def _check_sources(

@@ -5,21 +5,26 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
+from thor2_jax.errors import InputError
 from thor2_jax.printable import escape_characters
-from training.cli.app import ModelOption, app, console
+from training.cli.app import GalleryOption, ModelOption, app, console
 
 
 @app.command()
 def objects(
     model: ModelOption,
+    gallery: GalleryOption = None,
     reembed: Annotated[
         bool, typer.Option("--reembed", help="Embed all enrolled views again, after a change of the embedding.")
     ] = False,
 ) -> None:
     """List the trained classes and the enrolled objects: number of views, source and date of enrolment."""
+    from thor2_jax.gallery.store import INDEX_FILE
     from thor2_jax.recognizer import Recognizer
 
-    recognizer = Recognizer.load(model, reembed=reembed)
+    if gallery is not None and not (gallery / INDEX_FILE).is_file():
+        raise InputError(f"gallery: {gallery} has no {INDEX_FILE}; expected the directory of a gallery")
+    recognizer = Recognizer.load(model, gallery=gallery, reembed=reembed)
     table = Table("name", "views", "source", "enrolled")
     enrolled = recognizer.gallery.objects
     for name in recognizer.classes:

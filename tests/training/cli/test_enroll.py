@@ -150,6 +150,24 @@ def test_forgetting_an_object(model: Path, frames: Path, capsys: pytest.CaptureF
     assert "'new'" in error_of(capsys, "forget", "new", "--model", model)
 
 
+def test_a_gallery_outside_the_run_directory(
+    model: Path, frames: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The run directory does not change, and each gallery has its own objects."""
+    before, other = files(model), ("--gallery", tmp_path / "other")
+    assert "index.json" in error_of(capsys, "objects", "--model", model, *other)
+    assert "run directory" in error_of(capsys, "enroll", "--frames", frames, "--model", tmp_path / "none", *other)
+    assert not (tmp_path / "none").exists() and not (tmp_path / "other").exists()
+    for name, label in (("new", 1), ("old", 5)):
+        assert run_thor2("enroll", name, "--model", model, *one_frame(frames / "000", label), *other) == 0
+    assert run_thor2("forget", "old", "--model", model, *other) == 0
+    capsys.readouterr()
+    assert run_thor2("objects", "--model", model, *other) == 0
+    lines = capsys.readouterr().out
+    assert "new" in lines and "old" not in lines and "brick" not in lines
+    assert files(model) == before and Recognizer.load(model, gallery=tmp_path / "other").classes == ("new",)
+
+
 def in_millimetres(tmp_path: Path) -> Path:
     box = trimesh.creation.box((100, 200, 150))
     box.visual.vertex_colors = [[200, 100, 50, 255]] * len(box.vertices)
