@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from thor2_jax.recognition.frames import Intrinsics, RGBDFrame, read_frame
     from thor2_jax.recognizer import Recognizer
     from thor2_jax.segmentation.segmenters import segment, segmented
+    from thor2_jax.transformers import Tops2Transformer, TopsTransformer
     from thor2_jax.types import Descriptors, Diagrams, PointClouds, Strips
 else:
     _MODULES = {
@@ -28,6 +29,7 @@ else:
         "recognition.answers": ("Recognition",),
         "recognizer": ("Recognizer",),
         "segmentation.segmenters": ("segment", "segmented"),
+        "transformers": ("Tops2Transformer", "TopsTransformer"),
         "types": ("Descriptors", "Diagrams", "PointClouds", "Strips"),
     }
     _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
@@ -63,6 +65,8 @@ __all__ = [
     "Recognizer",
     "Relaxation",
     "Strips",
+    "Tops2Transformer",
+    "TopsTransformer",
     "align",
     "describe",
     "describe_aligned",

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from thor2_jax.capacity import POINT_BUCKETS, point_bucket
 from thor2_jax.errors import InputError
 
-__all__ = ["Cloud", "Descriptors", "Diagrams", "PointClouds", "Strips"]
+__all__ = ["Cloud", "Descriptors", "Diagrams", "PointClouds", "Strips", "as_array", "check_cloud"]
 
 Cloud = tuple[NDArray[np.float32], NDArray[np.uint8]]
 """One point cloud of any size: xyz [n, 3] and sRGB [n, 3]."""
@@ -69,7 +69,7 @@ class PointClouds:
         """
         if len(clouds) == 0:
             raise InputError("clouds is empty; expected at least one pair (xyz, rgb)")
-        arrays = [_check_cloud(pair, f"clouds[{i}]") for i, pair in enumerate(clouds)]
+        arrays = [check_cloud(pair, f"clouds[{i}]") for i, pair in enumerate(clouds)]
         sizes = [len(xyz) for xyz, _ in arrays]
         n = _padded_size(sizes, capacity)
         points = np.zeros((len(arrays), n, 3), np.float32)
@@ -123,10 +123,24 @@ def _as_float32(values: NDArray[Any]) -> NDArray[np.float32]:
         return values.astype(np.float32)
 
 
-def _check_cloud(pair: tuple[ArrayLike, ArrayLike], name: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def as_array(values: ArrayLike, name: str) -> NDArray[Any]:
+    """Return `values` as an array; rows of different lengths raise InputError."""
+    try:
+        return np.asarray(values)
+    except ValueError:
+        raise InputError(f"{name} has rows of different lengths; expected an array [n, 3]") from None
+
+
+def check_cloud(pair: tuple[ArrayLike, ArrayLike], name: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return a cloud's xyz [n, 3], metres, and rgb [n, 3] in [0, 1]; `name` stands for the cloud in messages.
+
+    Raises:
+        InputError: the cloud is not a pair, or has a wrong shape or type, coordinates that are not finite in float32,
+            or colours out of range.
+    """
     if not isinstance(pair, tuple | list) or len(pair) != 2:
         raise InputError(f"{name} is a {type(pair).__name__}; expected a pair (xyz, rgb)")
-    points, colors = np.asarray(pair[0]), np.asarray(pair[1])
+    points, colors = as_array(pair[0], f"{name}: xyz"), as_array(pair[1], f"{name}: rgb")
     if points.ndim != 2 or points.shape[1] != 3 or not np.issubdtype(points.dtype, np.floating):
         raise InputError(f"{name}: xyz is {points.dtype} {list(points.shape)}; expected floating [n, 3], in metres")
     if colors.shape != points.shape:

@@ -1,0 +1,68 @@
+"""The Python code of docs/library.md runs, section by section."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers import untrained_run
+
+import thor2_jax as thor2
+from thor2_jax.recognition.run_directory import save_run
+
+TEXT = (Path(__file__).parents[2] / "docs" / "library.md").read_text()
+
+
+def code_of(section: str) -> list[str]:
+    """Return the Python blocks between the heading `section` and the next heading."""
+    content = re.split(r"^#+ ", TEXT.split(f"# {section}\n", 1)[1], maxsplit=1, flags=re.MULTILINE)[0]
+    return re.findall(r"^```python\n(.*?)^```$", content, re.DOTALL | re.MULTILINE)
+
+
+def run_section(section: str, **names: Any) -> dict[str, Any]:
+    """Execute the code of a section, in which `names` are defined, and return all names."""
+    for block in code_of(section):
+        exec(compile(block, f"docs/library.md: {section}", "exec"), names)
+    return names
+
+
+def random_cloud(seed: int, size: tuple[float, float, float] = (0.2, 0.1, 0.05)) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return rng.random((400, 3)) * size, rng.integers(0, 256, (400, 3), np.uint8)
+
+
+SECTIONS = {"Descriptors as a library": 1, "scikit-learn": 2, "Recognizers": 1}
+"""Sections with code, and their numbers of blocks; each has a test below."""
+
+
+def test_every_block_belongs_to_a_tested_section() -> None:
+    assert {section: len(code_of(section)) for section in SECTIONS} == SECTIONS
+    assert sum(SECTIONS.values()) == TEXT.count("```python\n") == TEXT.count("```") / 2
+
+
+def test_descriptors() -> None:
+    xyz, rgb = random_cloud(0)
+    result = run_section("Descriptors as a library", xyz=xyz, rgb=rgb)["descriptors"]
+    assert result.tops.shape == (1, 7168) and result.tops2.shape == (1, 11942) and result.overflow.shape == (1,)
+
+
+def test_scikit_learn() -> None:
+    clouds = [random_cloud(i, (0.2, 0.1, 0.05) if i % 2 else (0.05, 0.05, 0.05)) for i in range(8)]
+    names = run_section("scikit-learn", clouds=clouds, labels=["cube", "brick"] * 4)
+    assert names["search"].predict(clouds[:2]).tolist() == ["cube", "brick"]
+    assert names["frame"].shape == (8, 7168)
+
+
+@pytest.mark.slow
+def test_recognizers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    save_run(untrained_run(["mug", "bowl"]), "run")
+    labels = np.zeros((480, 640), np.uint8)
+    labels[200:280, 300:380] = 3
+    depth = np.full(labels.shape, 1000, np.uint16)
+    depth[labels == 3] = 800
+    color = np.random.default_rng(0).integers(0, 256, (480, 640, 3), np.uint8)
+    frame = thor2.RGBDFrame(color, depth, labels, thor2.Intrinsics(fx=600, fy=600, cx=320, cy=240, depth_scale=1000))
+    run_section("Recognizers", frame=frame, thor2=thor2)
+    assert (tmp_path / "run" / "gallery").is_dir()

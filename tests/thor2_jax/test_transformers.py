@@ -1,0 +1,199 @@
+"""The scikit-learn transformers: values of `describe`, scikit-learn's own checks, pipelines, grid search, bad input."""
+
+import dataclasses
+import pickle
+import re
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from helpers import SMALL_CONFIG
+from sklearn.base import clone
+from sklearn.linear_model import LogisticRegression
+from sklearn.model_selection import GridSearchCV
+from sklearn.pipeline import Pipeline
+from sklearn.preprocessing import StandardScaler
+from sklearn.utils import estimator_checks
+
+import colornet
+import thor2_jax as thor2
+from thor2_jax.capacity import BATCH_BUCKETS
+from training.objects.builtin_objects import builtin_objects
+
+NETWORK = colornet.load_default()
+TRANSFORMERS = (thor2.TopsTransformer, thor2.Tops2Transformer)
+
+
+def random_clouds(count: int, seed: int = 0) -> list[tuple[np.ndarray, np.ndarray]]:
+    rng = np.random.default_rng(seed)
+    sizes = rng.integers(1, 300, count)
+    return [(rng.random((n, 3)) * (0.2, 0.1, 0.05), rng.integers(0, 256, (n, 3), np.uint8)) for n in sizes]
+
+
+def described(clouds: list[Any], config: thor2.DescriptorConfig = SMALL_CONFIG) -> thor2.Descriptors:
+    return thor2.describe(thor2.PointClouds.pack(clouds), NETWORK, config)
+
+
+# The other checks of `check_estimator` fit estimators to matrices of numbers [samples, features], which are no clouds;
+# `check_estimator` itself leaves all checks out for estimators whose input is no matrix.
+@pytest.mark.parametrize("transformer", TRANSFORMERS)
+@pytest.mark.parametrize(
+    "check",
+    [
+        "check_do_not_raise_errors_in_init_or_set_params",
+        "check_estimator_cloneable",
+        "check_estimator_repr",
+        "check_estimator_tags_renamed",
+        "check_get_params_invariance",
+        "check_mixin_order",
+        "check_no_attributes_set_in_init",
+        "check_parameters_default_constructible",
+        "check_set_params",
+        "check_valid_tag_types",
+    ],
+)
+def test_checks_of_scikit_learn(check: str, transformer: Any) -> None:
+    getattr(estimator_checks, check)(transformer.__name__, transformer())
+
+
+@pytest.mark.parametrize("count", [1, 3, 5])
+def test_values_are_those_of_describe(count: int) -> None:
+    clouds = random_clouds(count)
+    expected = described(clouds)
+    for transformer, values in zip(TRANSFORMERS, (expected.tops, expected.tops2), strict=True):
+        rows = transformer(config=SMALL_CONFIG).fit_transform(clouds)
+        assert isinstance(rows, np.ndarray) and rows.dtype == np.float32
+        np.testing.assert_allclose(rows, values, atol=1e-6)
+
+
+def test_defaults_are_those_of_the_paper() -> None:
+    clouds = random_clouds(2)
+    expected = described(clouds, thor2.DescriptorConfig(homology="closed_form"))
+    np.testing.assert_allclose(thor2.TopsTransformer().transform(clouds), expected.tops, atol=1e-6)
+    np.testing.assert_allclose(thor2.Tops2Transformer().transform(clouds), expected.tops2, atol=1e-6)
+
+
+def test_more_clouds_than_the_largest_batch() -> None:
+    one = random_clouds(3)
+    clouds = one * 86
+    assert len(clouds) > BATCH_BUCKETS[-1]
+    rows = thor2.Tops2Transformer(config=SMALL_CONFIG).transform(clouds)
+    np.testing.assert_allclose(rows, np.tile(described(one).tops2, (86, 1)), atol=1e-6)
+
+
+def test_shape_needs_no_colors() -> None:
+    clouds = random_clouds(3)
+    transformer = thor2.TopsTransformer(config=SMALL_CONFIG)
+    expected = transformer.transform(clouds)
+    np.testing.assert_array_equal(transformer.transform([xyz for xyz, _ in clouds]), expected)
+    same_size = np.stack([clouds[0][0]] * 2)
+    np.testing.assert_allclose(transformer.transform(same_size), expected[[0, 0]], atol=1e-6)
+
+
+def test_another_network() -> None:
+    network = dataclasses.replace(NETWORK, similarity=np.eye(NETWORK.n_regions))
+    clouds = random_clouds(2)
+    expected = thor2.describe(thor2.PointClouds.pack(clouds), network, SMALL_CONFIG).tops2
+    transformer = thor2.Tops2Transformer(config=SMALL_CONFIG, network=network)
+    np.testing.assert_allclose(transformer.transform(clouds), expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("transformer", TRANSFORMERS)
+def test_names_follow_the_layout(transformer: Any) -> None:
+    images = np.zeros((1, 2, 8, 8), object)
+    colors = np.zeros((1, 2, NETWORK.n_regions, 5), object)
+    for s, b, p in np.ndindex(2, 8, 8):
+        images[0, s, b, p] = f"slice{s}_birth{b}_persistence{p}"
+    for s, r, j in np.ndindex(2, NETWORK.n_regions, 5):
+        colors[0, s, r, j] = f"slice{s}_region{r}_strip{j}"
+    blocks = [images.reshape(2, -1)] + [colors.reshape(2, -1)] * (transformer is thor2.Tops2Transformer)
+    names = transformer(config=SMALL_CONFIG).get_feature_names_out()
+    assert list(names) == list(np.concatenate(blocks, axis=1).reshape(-1))
+
+
+@pytest.mark.parametrize("transformer", TRANSFORMERS)
+def test_data_frames(transformer: Any) -> None:
+    clouds = random_clouds(3)
+    plain = transformer(config=SMALL_CONFIG)
+    frame = clone(plain).set_output(transform="pandas").fit_transform(clouds)
+    assert isinstance(frame, pd.DataFrame) and list(frame.columns) == list(plain.get_feature_names_out())
+    np.testing.assert_array_equal(frame.to_numpy(), plain.transform(clouds))
+
+
+@pytest.mark.parametrize("transformer", TRANSFORMERS)
+def test_clones_and_pickles_give_equal_values(transformer: Any) -> None:
+    clouds = random_clouds(2)
+    original = transformer(config=SMALL_CONFIG, capacity=1024).fit(clouds)
+    expected = original.transform(clouds)
+    for copy in (clone(original), pickle.loads(pickle.dumps(original))):
+        assert copy.get_params() == original.get_params()
+        np.testing.assert_array_equal(copy.transform(clouds), expected)
+    changed = clone(original).set_params(config=dataclasses.replace(SMALL_CONFIG, n_slices=1))
+    assert changed.transform(clouds).shape[1] == expected.shape[1] // 2
+
+
+def test_grid_search_finds_that_colors_tell_mugs_apart() -> None:
+    rng = np.random.default_rng(0)
+    objects, labels, clouds = builtin_objects(), ["mug_blue", "mug_white"] * 8, []
+    for name in labels:
+        mesh, face = objects[name], rng.integers(len(objects[name].faces), size=400)
+        weights = rng.dirichlet((1, 1, 1), 400)
+        xyz = np.einsum("nk,nkd->nd", weights, mesh.vertices[mesh.faces[face]]) + (0, 0, 0.8)
+        clouds.append((xyz, mesh.colors_at(face, weights)))
+    pipeline = Pipeline(
+        [("describe", thor2.TopsTransformer()), ("scale", StandardScaler()), ("classify", LogisticRegression())]
+    )
+    wide = dataclasses.replace(SMALL_CONFIG, sigma_1=0.2, sigma_2=0.1)  # covers a mug
+    describe = [transformer(config=wide) for transformer in TRANSFORMERS]
+    search = GridSearchCV(pipeline, {"describe": describe, "classify__C": [0.1, 1]}, cv=2).fit(clouds[:10], labels[:10])
+    assert len(search.cv_results_["params"]) == 4
+    assert isinstance(search.best_params_["describe"], thor2.Tops2Transformer) and search.best_score_ == 1
+    assert search.score(clouds[10:], labels[10:]) == 1
+    finer = [wide, dataclasses.replace(wide, image_variance=0.001)]
+    search = GridSearchCV(search.best_estimator_, {"describe__config": finer}, cv=2).fit(clouds[:10], labels[:10])
+    assert search.best_params_["describe__config"] in finer
+
+
+XYZ, RGB = np.zeros((3, 3)), np.zeros((3, 3), np.uint8)
+INVALID = {
+    "X is a int": 7,
+    "X is a str": "cloud",
+    "X is a dict": {"a": (XYZ, RGB)},
+    "X is empty": [],
+    "X[1] is a int": [(XYZ, RGB), 7],
+    "X[1]: xyz[2] is [nan, nan, nan]": [(XYZ, RGB), (np.array([[0.0] * 3] * 2 + [[np.nan] * 3]), RGB)],
+    "X[0]: xyz is float64 [3, 2]": [(XYZ[:, :2], RGB)],
+    "X[0]: xyz has rows of different lengths": [([[0.0, 1.0, 2.0], [0.0]], RGB)],
+    "X[0]: rgb is [2, 3]": [(XYZ, RGB[:2])],
+    "X[0]: rgb[0] is [2.0, 2.0, 2.0]": [(XYZ, np.full((3, 3), 2.0))],
+    "X[1] has 8193 points": [(XYZ, RGB), (np.zeros((8193, 3)), np.zeros((8193, 3)))],
+}
+
+
+@pytest.mark.parametrize("message", INVALID)
+def test_bad_input_is_one_line(message: str) -> None:
+    for method in ("fit", "transform"):
+        with pytest.raises(thor2.InputError, match=re.escape(message)) as error:
+            getattr(thor2.Tops2Transformer(config=SMALL_CONFIG), method)(INVALID[message])
+        assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("cloud", [7, "cloud", np.zeros(3), [[0.0, 1.0, 2.0], [0.0], [1.0]], np.full((2, 3), np.inf)])
+def test_bad_shapes_are_one_line(cloud: Any) -> None:
+    with pytest.raises(thor2.InputError, match=r"^X\[1\]: xyz[^\n]*$"):
+        thor2.TopsTransformer(config=SMALL_CONFIG).transform([XYZ, cloud])
+
+
+@pytest.mark.parametrize(
+    "parameters", [{"config": "paper"}, {"capacity": 0}, {"capacity": 2.5}, {"network": 3}, {"capacity": 2}]
+)
+def test_bad_parameters_are_named(parameters: dict[str, Any]) -> None:
+    transformer = thor2.Tops2Transformer(**parameters)
+    with pytest.raises(thor2.InputError, match="capacity" if parameters == {"capacity": 2} else next(iter(parameters))):
+        transformer.fit([(XYZ, RGB)])
+
+
+def test_empty_clouds_are_rows_of_zeros() -> None:
+    rows = thor2.TopsTransformer(config=SMALL_CONFIG).transform([np.zeros((0, 3)), random_clouds(1)[0]])
+    assert not rows[0].any() and rows[1].any()
