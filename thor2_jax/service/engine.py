@@ -165,11 +165,11 @@ class InferenceEngine:
     def calibrated_confidences(self, results: Sequence[CloudResult]) -> list[float | None]:
         """Return the confidence of each cloud's most probable class after temperature scaling of both classifiers.
 
-        None without temperatures, which training fits on a held-out set (`thor2 train --folds`), with a gallery, and
-        with forgotten classes.
+        None without temperatures, which training fits on a held-out set (`thor2 train --folds`), where the confidence
+        itself is calibrated, with a gallery, and with forgotten classes.
         """
         temperatures = self.run.record.get("temperatures", {})
-        is_changed = self._uses_gallery or self.objects.gallery.hidden
+        is_changed = self._uses_gallery or self.objects.gallery.hidden or self._recognizer.calibration
         if not results or is_changed or not set(THOR2) <= set(temperatures):
             return [None] * len(results)
         probabilities: dict[str, NDArray[np.float32]] = {
