@@ -292,7 +292,7 @@ class Recognizer:
 
     @property
     def default_classifiers(self) -> tuple[str, ...]:
-        """The classifiers that are fused by default: the paper's two, and the embedding where it is a classifier."""
+        """The classifiers that answer by default: the paper's two, and the embedding, which gives the confidence."""
         default = tuple(name for name in (*THOR2, EMBEDDING) if name in self._classify)
         return default or self.classifiers
 
@@ -392,8 +392,13 @@ class Recognizer:
         ]
 
     def fused(self, probabilities: Mapping[str, NDArray[np.float32]]) -> NDArray[np.floating[Any]]:
-        """Return the fused class probabilities [B, C], calibrated where the run is and the embedding is among them."""
-        fused = fused_probabilities(probabilities, self.rule)
+        """Return the fused class probabilities [B, C] of the classifiers.
+
+        The embedding is not fused with others. Where the run is calibrated, it scales their fused probabilities, so
+        that the largest one is the confidence.
+        """
+        others = {name: values for name, values in probabilities.items() if name != EMBEDDING}
+        fused = fused_probabilities(others or probabilities, self.rule)
         if self.calibration is None or EMBEDDING not in probabilities:
             return fused
         return self.calibration.calibrated(fused, probabilities[EMBEDDING])

@@ -18,8 +18,8 @@ RULES: tuple[Rule, ...] = (*FUSION_RULES, "calibrated")
 """The rules of `fuse`, and "calibrated": the rule "max" on temperature-scaled probabilities."""
 
 EMBEDDED, ALL_CLASSIFIERS, GALLERY, BOTH = "embedding", "THOR2+embedding", "gallery", "both"
-"""Columns of the embedding alone, of its fusion with THOR2, of the gallery alone, and of all combined. The recognizer
-computes them, and no rule fuses them with others."""
+"""Columns of the embedding alone, of THOR2 with the confidence that the embedding gives, of the gallery alone, and of
+all combined. The recognizer computes them, and no rule fuses them with others."""
 
 WHOLE = (EMBEDDED, ALL_CLASSIFIERS, GALLERY, BOTH)
 

@@ -9,7 +9,6 @@ from thor2_jax.descriptor.orientations import OrientedDescriptors
 from thor2_jax.gallery.embedding import Embedding
 from thor2_jax.recognition.classifier import EMBEDDING
 from thor2_jax.recognition.confidence import Calibration, answer_features
-from thor2_jax.recognition.fusion import fused_probabilities
 from thor2_jax.recognition.run_directory import TrainedRun
 from thor2_jax.recognizer import Recognizer
 from training.embedding.fit import batch_descriptors
@@ -43,7 +42,7 @@ def fit_calibration(run: TrainedRun, embedding: Embedding, held_out: Samples) ->
         oriented = OrientedDescriptors(each, statistics, jnp.ones((BATCH, 1)))
         chunks.append(recognizer.probabilities(oriented, recognizer.default_classifiers))
     probabilities = {name: np.concatenate([c[name] for c in chunks])[: len(rows)] for name in chunks[0]}
-    fused = fused_probabilities(probabilities, recognizer.rule)
+    fused = recognizer.fused(probabilities)  # not calibrated yet
     features = answer_features(fused, probabilities[EMBEDDING])
     correct, known = fused.argmax(axis=1) == held_out.label, held_out.label < len(run.classes)
     if correct.all() or not correct.any():

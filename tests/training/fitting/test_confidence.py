@@ -1,0 +1,58 @@
+"""Fit of the confidence on a held-out set with known and unknown objects."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from helpers import SMALL_CONFIG, untrained_run
+
+import colornet
+import thor2_jax as thor2
+from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
+from training.embedding.samples import Samples, joined_samples, sample_clouds
+from training.fitting import confidence
+from training.fitting.confidence import fit_calibration
+
+NETWORK = colornet.load_default()
+
+
+@pytest.fixture(scope="module")
+def held_out() -> Samples:
+    rng = np.random.default_rng(0)
+    clouds = [
+        ((rng.random((200, 3)) * (0.2, 0.1, 0.05)).astype(np.float32), rng.integers(0, 256, (200, 3), np.uint8))
+        for _ in range(40)
+    ]
+    labels = [k % 4 for k in range(40)]
+    return joined_samples([sample_clouds(clouds, labels, NETWORK, SMALL_CONFIG, 1, rng)], SMALL_CONFIG)
+
+
+def test_confidence_separates_and_keeps_its_share(held_out: Samples, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Known objects (labels 0 and 1) with high odds, unknown ones with low odds; a tenth of the known are wrong."""
+    run = untrained_run(("a", "b"), ("tops", "tops2"), SMALL_CONFIG)
+    sizes = EmbeddingSizes(cell=4, hidden=(8,), learned=4, color=2)
+    embedding = Embedding.create(SMALL_CONFIG, NETWORK, sizes, classes=("a", "b"), distractors=2)
+    known = held_out.label < 2
+    right = np.where(known, held_out.label, 0)
+    rng = np.random.default_rng(1)
+    top = np.where(known, rng.uniform(0.8, 0.99, 40), rng.uniform(0.5, 0.9, 40))
+    answer = np.where(known & (np.arange(40) % 10 == 1), 1 - right, right)
+    fused = np.stack([np.where(answer == k, top, 1 - top) for k in (0, 1)], axis=1)
+    embedded = fused * np.where(known, 0.9, 0.1)[:, None]
+    values = {"tops": fused, "tops2": fused, "embedding": embedded}
+    monkeypatch.setattr(
+        thor2.Recognizer, "probabilities", lambda *a: {k: np.resize(v, (128, 2)) for k, v in values.items()}
+    )
+    fitted = fit_calibration(run, embedding, held_out)
+    assert fitted is not None and fitted.known > 0
+    scores, correct = fitted.confidence(fused, embedded), answer == held_out.label
+    assert np.median(scores[known]) > 0.5 > np.median(scores[~known])
+    assert fitted.unknown_below == pytest.approx(np.quantile(scores[correct], 1 - confidence.KEPT))
+
+
+def test_without_correct_answers_there_is_no_confidence(held_out: Samples) -> None:
+    run = untrained_run(("a", "b"), ("tops", "tops2"), SMALL_CONFIG)
+    sizes = EmbeddingSizes(cell=4, hidden=(8,), learned=4, color=2)
+    embedding = Embedding.create(SMALL_CONFIG, NETWORK, sizes, classes=("a", "b"), distractors=2)
+    unknown = dataclasses.replace(held_out, label=held_out.label + 2)
+    assert fit_calibration(run, embedding, unknown) is None
