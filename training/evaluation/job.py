@@ -19,7 +19,7 @@ from training.evaluation.answers import AnswerFile, all_predictors
 from training.evaluation.frame_pictures import FramePictures
 from training.evaluation.page import write_report_page
 from training.evaluation.results import compute_results
-from training.evaluation.runs import Run
+from training.evaluation.runs import Run, SequenceRun
 from training.readers.labelled import LabelledFrames
 from training.storage.locks import locked
 from training.storage.progress import Progress
@@ -85,7 +85,9 @@ def _evaluate(
     for answers in file.frames:
         pictures.restore(answers)
     _answer_rest(runs, frames, file, pictures, progress)
-    report = {"dataset": description, "digests": digests, **compute_results(dataset["kind"], runs, file.frames)}
+    own_objects = isinstance(runs[0], SequenceRun)
+    results = compute_results(dataset["kind"], runs, file.frames, own_objects)
+    report = {"dataset": description, "digests": digests, **results}
     if not report["instances"]["scored"]:
         raise InputError(
             f"model: no instance of the dataset is of a class of the runs; the dataset has "

@@ -9,12 +9,12 @@ import numpy as np
 from training.baselines.names import TITLES
 from training.evaluation.frame_pictures import FramePictures
 from training.evaluation.fusion import RULES
-from training.evaluation.published import Published, published, published_seconds
+from training.evaluation.published import published_seconds
 from training.evaluation.results import COVERAGE
 from training.reports.html import Picture, Section, Table, write_page
 from training.reports.plots import draw_accuracy, draw_confusion, draw_known_unknown, draw_reliability
 
-__all__ = ["accuracy_table", "write_report_page"]
+__all__ = ["accuracy_table", "comparison_table", "comparison_title", "write_report_page"]
 
 NO_VALUE = {"mean": None, "std": None}
 
@@ -32,27 +32,64 @@ def _mean_std(statistics: Mapping[str, Any]) -> str:
     return f"{statistics['mean']:.3f}" + ("" if statistics["std"] is None else f" ±\u00a0{statistics['std']:.3f}")
 
 
-def accuracy_table(table: Mapping[str, Any], titles: Sequence[str], methods: Sequence[str] = ()) -> Table:
+def _percent(statistics: Mapping[str, Any]) -> str:
+    """Return `_mean_std` in percent, with two decimals as in the publications."""
+    if statistics["mean"] is None:
+        return "–"
+    std = statistics["std"]
+    return f"{100 * statistics['mean']:.2f}" + ("" if std is None else f" ±\u00a0{100 * std:.2f}")
+
+
+def accuracy_table(table: Mapping[str, Any], titles: Sequence[str]) -> Table:
     """Return header and rows of an accuracy table of `compute_results`.
 
     Args:
         table: an entry of `report["accuracy"][rule]`.
         titles: fusions to show.
-        methods: published methods to show beside them, where a cell of the table has their values.
     """
-    methods = [method for method in methods if any(method in cell["published"] for cell in table["cells"])]
-    header = [", ".join(table["by"]), "instances", *titles, *(f"{method}, published" for method in methods)]
+    header = [", ".join(table["by"]), "instances", *titles]
     rows = []
     for cell in table["cells"]:
-        others = [cell["published"].get(method) for method in methods]
         rows.append(
             [
                 ", ".join(cell["where"].values()) or "all",
                 f"{cell['instances']:,}",
                 *(_mean_std(cell["accuracy"][title]) for title in titles),
-                *("–" if value is None else f"{value:.3f}" for value in others),
             ]
         )
+    return header, rows
+
+
+def comparison_title(table: Mapping[str, Any]) -> str:
+    """Return the heading of a published table, an entry of `report["published_tables"]`."""
+    number = "" if table["number"] is None else f" table {table['number']}"
+    return f"Published{number}: {table['title']}"
+
+
+def comparison_table(table: Mapping[str, Any], main: str) -> Table:
+    """Return header and rows of a published table beside the measured accuracies, in percent.
+
+    Each published method has its measured column before it, where there is one; the column `main` is always shown.
+
+    Args:
+        table: an entry of `report["published_tables"]`.
+        main: title of the column that the recognizer answers by.
+    """
+    methods = list(dict.fromkeys(method for cell in table["cells"] for method in cell["published"]))
+    columns: list[tuple[str, str]] = [] if main in table["ours"].values() else [("accuracy", main)]
+    for method in methods:
+        if method in table["ours"]:
+            columns.append(("accuracy", table["ours"][method]))
+        columns.append(("published", method))
+    header = ["", "instances", *(f"{name}, published" if key == "published" else name for key, name in columns)]
+    rows = [
+        [
+            ", ".join(cell["where"].values()) or "all",
+            f"{cell['instances']:,}",
+            *(_percent(cell[key].get(name, NO_VALUE)) for key, name in columns),
+        ]
+        for cell in table["cells"]
+    ]
     return header, rows
 
 
@@ -71,6 +108,7 @@ def write_report_page(report: Mapping[str, Any], pictures: FramePictures, out: P
     if report["fusions"]:
         sections += [
             *_accuracy_sections(report, out),
+            *_published_sections(report),
             _fusion_section(report),
             *_placement_sections(report),
             _confidence_section(report, out),
@@ -91,19 +129,28 @@ def _relative(path: Path, out: Path) -> str:
 
 
 def _accuracy_sections(report: Mapping[str, Any], out: Path) -> list[Section]:
-    known = published(report["dataset"]["kind"])
-    methods = known.methods if known else ()
     first, *tables = report["accuracy"][report["rule"]]
-    table = accuracy_table(first, report["fusions"], methods)
-    sections = [Section("Accuracy", _accuracy_text(report, known), table)]
+    table = accuracy_table(first, report["fusions"])
+    sections = [Section("Accuracy", _accuracy_text(report), table)]
     for number, each in enumerate(tables):
         heading = f"Accuracy by {' and '.join(each['by'])}"
         chart = _bar_chart(each, report["fusions"], heading, out / f"accuracy-{number}.png")
-        sections.append(Section(heading, "", accuracy_table(each, report["fusions"], methods), chart))
+        sections.append(Section(heading, "", accuracy_table(each, report["fusions"]), chart))
     return sections
 
 
-def _accuracy_text(report: Mapping[str, Any], known: Published | None) -> str:
+def _published_sections(report: Mapping[str, Any]) -> list[Section]:
+    return [
+        Section(
+            comparison_title(table),
+            " ".join([f"In percent. Source: {table['source']}.", *table["notes"], *table["differences"]]),
+            comparison_table(table, report["main"]),
+        )
+        for table in report["published_tables"]
+    ]
+
+
+def _accuracy_text(report: Mapping[str, Any]) -> str:
     text = (
         "Fraction of the instances that are recognized correctly; an instance that could not be described counts as "
         "incorrect. CE uses colour only, TOPS shape only, TOPS2 both. THOR2 is the fusion of TOPS and TOPS2; a plus "
@@ -117,11 +164,6 @@ def _accuracy_text(report: Mapping[str, Any], known: Published | None) -> str:
         )
     if len(report["runs"]) > 1:
         text += f"Values are the mean and the sample standard deviation over {len(report['runs'])} models. "
-    if known:
-        text += (
-            f"Published values: {known.source}. They refer to {known.concerns}, and compare only on the same frames. "
-            f"Values that were not found: {known.missing}."
-        )
     return text
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from thor2_jax.recognition.fusion import DEFAULT_RULE
 from training.evaluation.accuracy import attribute_tables, group_by_attributes, summarize_rows, summarize_runs
 from training.evaluation.answers import EvaluatedRun, FrameAnswers, InstancePrediction, all_predictors
+from training.evaluation.comparison import EvaluationConditions, compare_with_published
 from training.evaluation.confidence import (
     accuracy_at_coverage,
     auroc,
@@ -20,7 +21,7 @@ from training.evaluation.confidence import (
 )
 from training.evaluation.fusion import RULES, Rule, fuse_by, fusions, main_fusion
 from training.evaluation.placements import find_placements, placement_accuracy, steadiness
-from training.evaluation.published import published
+from training.evaluation.published import published_means
 from training.readers.labelled import sequence_of
 
 __all__ = ["COVERAGE", "Predictions", "compute_results", "fuse_answers", "incorrect_answers"]
@@ -84,13 +85,16 @@ def incorrect_answers(
                 yield instance, classes[index], float(confidence)
 
 
-def compute_results(kind: str, runs: Sequence[EvaluatedRun], frames: Sequence[FrameAnswers]) -> dict[str, Any]:
+def compute_results(
+    kind: str, runs: Sequence[EvaluatedRun], frames: Sequence[FrameAnswers], own_objects: bool = False
+) -> dict[str, Any]:
     """Return accuracy, confidence metrics, confusions and speed.
 
     Args:
         kind: kind of dataset ("uwis", "ocid", "bop", "frames"); selects the tables and the published values.
         runs: evaluated runs, which share their classes.
         frames: the answers.
+        own_objects: whether a frame's classes are the objects of its sequence; selects the published values.
     """
     classes = runs[0].classes
     labelled = [(instance, _attributes(kind, frame)) for frame in frames for instance in frame.instances]
@@ -111,8 +115,10 @@ def compute_results(kind: str, runs: Sequence[EvaluatedRun], frames: Sequence[Fr
         "speed": _speed([frame.seconds for frame in frames]),
         "fusions": [],
         "worst": [],
+        "published_tables": [],
     }
-    return results | _scores(kind, runs, known, placement, unknown) if known else results
+    conditions = EvaluationConditions(own_objects, len(runs), len(frames), DEFAULT_RULE)
+    return results | _scores(kind, runs, known, placement, unknown, conditions) if known else results
 
 
 def _attributes(kind: str, frame: FrameAnswers) -> dict[str, str]:
@@ -136,6 +142,7 @@ def _scores(
     known: Sequence[tuple[InstancePrediction, Mapping[str, str]]],
     placement: NDArray[np.intp],
     unknown: Sequence[InstancePrediction],
+    conditions: EvaluationConditions,
 ) -> dict[str, Any]:
     """Return the part of the results that needs instances of the runs' classes."""
     classes = runs[0].classes
@@ -150,13 +157,17 @@ def _scores(
     predictions = list(by_run.values())
     unknown_predictions = fuse_answers(unknown, runs, DEFAULT_RULE)[main]
     confusion = _confusion(predictions, truth, described, len(classes))
+    correct = {rule: _correct(fused, truth, described) for rule, fused in by_rule.items()}
     rules: dict[str, Rule] = {"confidence": DEFAULT_RULE, "calibrated_confidence": "calibrated"}
     return {
         "fusions": list(by_rule[DEFAULT_RULE]),
         "accuracy": {
-            rule: [_accuracy(kind, names, attributes, _correct(fused, truth, described)) for names in tables]
-            for rule, fused in by_rule.items()
+            rule: [_accuracy(kind, names, attributes, correct[rule], conditions.own_objects) for names in tables]
+            for rule in by_rule
         },
+        "published_tables": compare_with_published(
+            kind, conditions, attributes, [i.truth for i in instances], correct[conditions.rule]
+        ),
         "temperatures": {
             name: summarize_runs([run.temperatures[name] for run in runs if name in run.temperatures])
             for name in dict.fromkeys(name for _, name in all_predictors(runs))
@@ -199,14 +210,14 @@ def _accuracy(
     names: Sequence[str],
     attributes: Sequence[Mapping[str, str]],
     correct: Mapping[str, Sequence[NDArray[np.bool_]]],
+    own_objects: bool,
 ) -> dict[str, Any]:
     """Return the accuracy of each fusion by the named attributes, with published values of the same cells."""
-    known = published(kind)
     cells = []
     for values, rows in group_by_attributes(attributes, names).items():
         where = dict(zip(names, values, strict=True))
         accuracy = {title: summarize_runs([marks[rows].mean() for marks in each]) for title, each in correct.items()}
-        others = known.cell(where) if known else {}
+        others = published_means(kind, where, own_objects)
         cells.append({"where": where, "instances": len(rows), "accuracy": accuracy, "published": others})
     return {"by": list(names), "cells": cells}
 

@@ -172,6 +172,23 @@ def test_page_for_datasets_of_any_size(tmp_path: Path, n: int) -> None:
             assert max(image.size) <= 2000
 
 
+def test_page_shows_published_tables(tmp_path: Path) -> None:
+    """The toys have no environment, so only rows on the whole dataset match: of tables 4, 7, 9 and of THOR's paper."""
+    report = evaluate_dataset(
+        toys(tmp_path / "log"), ToyDataset(2), {"kind": "uwis", "path": "toys"}, tmp_path / "report"
+    )
+    assert [table["number"] for table in report["published_tables"]] == [4, 7, 9, None]
+    page = ParsedPage((tmp_path / "report" / "report.html").read_text())
+    assert page.open == []
+    headings = [text for text in page.text if text.startswith("Published")]
+    assert [heading.split(":")[0] for heading in headings] == [
+        *(f"Published table {n}" for n in (4, 7, 9)),
+        "Published",
+    ]
+    assert {"THOR2, published", "62.58 ±\u00a00.36", "CE+TOPS, published", "57.68 ±\u00a00.25"} <= set(page.text)
+    assert any("2408.01579" in text and "8,456 frames" in text for text in page.text)
+
+
 def evaluate_empty_frame(tmp_path: Path, name: str) -> Path:
     """Evaluate a frame without pixels of its only object, which has this name."""
     frame = thor2.RGBDFrame(

@@ -10,7 +10,6 @@ from sklearn.metrics import confusion_matrix
 from training.evaluation.accuracy import attribute_tables, group_by_attributes, summarize_runs
 from training.evaluation.answers import FrameAnswers, InstancePrediction
 from training.evaluation.fusion import fuse_by, fusions, main_fusion
-from training.evaluation.published import published, published_seconds
 from training.evaluation.results import compute_results, incorrect_answers
 
 CLASSES = ("bowl", "can", "mug")
@@ -284,19 +283,7 @@ def test_ocid_has_a_table_by_sequence() -> None:
     answer = InstancePrediction(1, "mug", probabilities=np.eye(3, dtype=np.float32)[:2])
     names = ["table/bottom/mixed/seq1", "table/bottom/mixed/seq2"]
     frames = [FrameAnswers(f"{name}/{k}", {"camera": "lower"}, 1.0, [answer]) for name in names for k in range(2)]
-    tables = compute_results("ocid", RUNS[:1], frames)["accuracy"]["max"]
+    tables = compute_results("ocid", RUNS[:1], frames, own_objects=True)["accuracy"]["max"]
     assert tables[-1]["by"] == ["sequence"]
     assert [cell["where"]["sequence"] for cell in tables[-1]["cells"]] == names
     assert tables[1]["cells"][0]["published"]["SimpleView"] == pytest.approx(0.6254)
-
-
-def test_published_values_have_a_source() -> None:
-    for kind in ("uwis", "ocid"):
-        values = published(kind)
-        assert values is not None and "2305.03815" in values.source and values.missing
-        assert values.cell({"environment": "moon"}) == {}
-    uwis = published("uwis")
-    assert uwis is not None and uwis.cell({})["THOR (MLP)"] == pytest.approx(0.5222)
-    assert uwis.cell({"environment": "lounge", "occlusion": "high"}) == {"THOR (MLP)": pytest.approx(0.5188)}
-    assert published("frames") is None
-    assert all(seconds > 0 for seconds in published_seconds().values())

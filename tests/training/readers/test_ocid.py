@@ -423,7 +423,9 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     monkeypatch.setattr("training.evaluation.runs.load_runs", lambda paths: [EvaluatedRun("run", "0", NamesInOrder())])
     options = ("--model", tmp_path / "run", "--names", names)
     assert run_thor2("evaluate", "ocid", tmp_path, *options, "--out", tmp_path / "report") == 0
-    assert "2 instances scored" in capsys.readouterr().out
+    output = capsys.readouterr().out
+    assert "2 instances scored" in output
+    assert "Published table 3" in output and "Published table 1" not in output
     report = json.loads((tmp_path / "report" / "report.json").read_text())
     assert report["instances"]["scored"] == 2 and sum(report["instances"]["no_class"].values()) == 1
     page = (tmp_path / "report" / "report.html").read_text()
@@ -457,6 +459,9 @@ def test_each_sequence_has_its_own_run(
     assert f"error: model: {models} has no run for table/top/mixed/seq08; " in capsys.readouterr().err
     (models / "table/top/mixed/seq08").mkdir(parents=True)
     assert run_thor2("evaluate", "ocid", tmp_path, *options, "--out", tmp_path / "report") == 0
+    output = capsys.readouterr().out
+    assert [number for number in range(1, 10) if f"Published table {number}:" in output] == [1, 2, 8]
+    assert "63.33 ±\u00a00.98" in output  # THOR2 in S-36, lower camera
     report = json.loads((tmp_path / "report" / "report.json").read_text())
     assert report["runs"] == ["runs/*"] and report["classes"] == ["apple", "banana", "bowl", "mug"]
     by = {tuple(table["by"]): table["cells"] for table in report["accuracy"]["max"]}

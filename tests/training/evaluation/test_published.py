@@ -1,0 +1,175 @@
+"""The published tables, and reports that show them beside measured accuracies."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from training.evaluation.answers import FrameAnswers, InstancePrediction
+from training.evaluation.comparison import EvaluationConditions, compare_with_published
+from training.evaluation.page import comparison_table, comparison_title
+from training.evaluation.published import (
+    PublishedTable,
+    published_attributes,
+    published_means,
+    published_seconds,
+    published_tables,
+)
+from training.evaluation.results import compute_results
+from training.readers.uwis import NOT_SCORED
+
+CONDITIONS = EvaluationConditions(own_objects=True, models=2, frames=10, rule="log-mean")
+
+
+def thor2_tables() -> list[PublishedTable]:
+    tables = [table for kind in ("uwis", "ocid") for table in published_tables(kind) if "2408.01579" in table.source]
+    return sorted(tables, key=lambda table: table.number or 0)
+
+
+def test_every_figure_equals_the_transcription(shared: Path) -> None:
+    """The transcription of all tables of the paper beside the checkout has the same tables, rows and figures."""
+    source = json.loads((shared / "published" / "thor2_tables.json").read_text())
+    tables = thor2_tables()
+    assert [table.number for table in tables] == list(range(1, len(source["tables"]) + 1))
+    for table, (name, cells) in zip(tables, source["tables"].items(), strict=True):
+        ours = [(cell.where, {m: [f.mean, f.std] for m, f in cell.figures.items()}) for cell in table.cells]
+        assert ours == [(cell["where"], cell["accuracy"]) for cell in cells], name
+        assert table.title.startswith("OCID" if name.startswith("ocid") else "UW-IS Occluded")
+
+
+def test_published_figures_are_complete_and_consistent() -> None:
+    """Figures known by heart, in every table a standard deviation, and one figure for each method and condition."""
+    tables = thor2_tables()
+    assert [len(table.cells) for table in tables] == [25, 25, 25, 7, 6, 4, 7, 6, 7]
+    figures = [figure for table in tables for cell in table.cells for figure in cell.figures.values()]
+    assert all(0 <= f.mean <= 100 and f.std is not None and 0 <= f.std < 10 for f in figures)
+    assert len(figures) == 5 * (75 + 17) + 7 * 7 + 5 * 6 + 4 * 7
+    assert published_means("uwis", {}, own_objects=False)["THOR2"] == pytest.approx(0.6258)
+    own, every = (published_means("ocid", {"camera": "lower"}, own) for own in (True, False))
+    assert (own["THOR2"], every["THOR2"]) == (pytest.approx(0.7507), pytest.approx(0.5996))
+    seen: dict[Any, float] = {}
+    for table in (*published_tables("uwis"), *published_tables("ocid")):
+        for cell in table.cells:
+            for method, figure in cell.figures.items():
+                key = (table.title[:4], table.own_objects, *sorted(cell.where.items()), method)
+                assert seen.setdefault(key, figure.mean) == figure.mean, key
+
+
+def test_the_slip_is_kept_and_noted() -> None:
+    upper = thor2_tables()[1]
+    assert "slip" in " ".join(upper.notes)
+    *sequences, total = upper.cells
+    assert all(cell.figures["RCFusion"] == cell.figures["ViT-CNN"] for cell in sequences)
+    assert total.figures["RCFusion"] != total.figures["ViT-CNN"]
+
+
+def test_other_datasets_have_no_published_tables() -> None:
+    assert published_tables("frames") == () and published_means("bop", {}, own_objects=False) == {}
+    assert published_means("uwis", {"environment": "moon"}, own_objects=False) == {}
+    assert all(seconds > 0 for seconds in published_seconds().values())
+
+
+def test_attributes_have_the_names_of_the_paper() -> None:
+    assert published_attributes("uwis", {"light": "1"}) == {"light": "bright"}
+    assert published_attributes("uwis", {"light": "2", "occlusion": "low"}) == {"light": "dim", "occlusion": "low"}
+    assert published_attributes("frames", {"light": "2"}) == {"light": "2"}
+    sequence = {"camera": "lower", "sequence": "table/bottom/curved/seq05"}
+    assert published_attributes("ocid", sequence) == {"camera": "lower", "sequence": "S-05"}
+
+
+def test_measured_values_stand_beside_the_published_ones() -> None:
+    """Four instances in two sequences, two runs: means and deviations by hand, rows without instances are left out."""
+    where = {"camera": "lower", "place": "table", "type": "curved", "sequence": "table/bottom/curved/seq25"}
+    other = {**where, "place": "floor", "type": "mixed", "sequence": "floor/bottom/mixed/seq08"}
+    marks = [np.array([1, 1, 0, 0], bool), np.array([1, 0, 0, 1], bool)]
+    correct = {"THOR2": marks, "PointNet": marks}
+    own = compare_with_published("ocid", CONDITIONS, [where, where, where, other], ["a", "b", "a", "c"], correct)
+    assert [table["number"] for table in own] == [1, 8, None]
+    cells = {cell["where"].get("sequence"): cell for cell in own[0]["cells"]}
+    assert list(cells) == ["S-25", "S-08", None]
+    assert [cell["instances"] for cell in cells.values()] == [3, 1, 4]
+    assert cells["S-25"]["accuracy"]["THOR2"] == {
+        "mean": pytest.approx(1 / 2), "std": pytest.approx(np.std([2 / 3, 1 / 3], ddof=1)), "runs": 2,
+    }  # fmt: skip
+    assert cells["S-08"]["published"]["THOR"] == {"mean": pytest.approx(0.4343), "std": pytest.approx(0.013)}
+    assert own[0]["ours"] == {"THOR2": "THOR2"} and own[1]["ours"] == {"THOR2, synthetic": "THOR2"}
+    text = " ".join(own[0]["differences"])
+    assert all(
+        part in text for part in ("OCID", " 10 ", "3 objects", "22 of", "25 rows", "2 models", "5 models", "max")
+    )
+
+    every = EvaluationConditions(own_objects=False, models=1, frames=10, rule="max")
+    (table,) = compare_with_published("ocid", every, [where] * 4, ["a"] * 4, correct)
+    assert table["number"] == 3
+    assert "26 objects" in " ".join(table["differences"]) and "rule" not in " ".join(table["differences"])
+
+
+def test_tables_without_an_instance_are_left_out() -> None:
+    upper = {"camera": "upper", "place": "table", "type": "curved", "sequence": "seq99"}
+    correct = {"THOR2": [np.ones(1, bool)]}
+    tables = compare_with_published("ocid", CONDITIONS, [upper], ["a"], correct)
+    assert [table["number"] for table in tables] == [2, 8]
+    assert [len(table["cells"]) for table in tables] == [1, 2]
+    assert compare_with_published("frames", CONDITIONS, [upper], ["a"], correct) == []
+
+
+def test_scored_objects_are_counted_as_in_the_paper() -> None:
+    """UW-IS Occluded has 20 objects, of which the paper does not score three."""
+    assert {table.objects for table in published_tables("uwis")} == {20 - len(NOT_SCORED)}
+    attributes = {"environment": "lounge", "occlusion": "none", "category": "food", "light": "1"}
+    names = [f"object {k}" for k in range(17)]
+    correct = {"TOPS": [np.ones(17, bool)]}
+    tables = compare_with_published("uwis", CONDITIONS, [attributes] * 17, names, correct)
+    assert [table["number"] for table in tables] == [4, 5, 6, 7, 9, None]
+    assert not any("objects" in sentence for table in tables for sentence in table["differences"])
+    assert tables[3]["ours"] == {"TOPS": "TOPS"}
+
+
+def test_comparison_table_pairs_columns_and_prints_percent() -> None:
+    attributes = {"environment": "lounge", "light": "2"}
+    correct = {"THOR2": [np.ones(8, bool), np.arange(8) < 7], "THOR": [np.zeros(8, bool)] * 2}
+    *_, light = (
+        table
+        for table in compare_with_published("uwis", CONDITIONS, [attributes] * 8, ["a"] * 8, correct)
+        if table["number"] == 6
+    )
+    assert comparison_title(light).startswith("Published table 6: ") and "assumed" in " ".join(light["notes"])
+    header, (row,) = comparison_table(light, "THOR2")
+    assert dict(zip(header, row, strict=True)) == {
+        "": "lounge, dim",
+        "instances": "8",
+        "RCFusion, published": "21.81 ±\u00a01.45",
+        "ViT-CNN, published": "11.29 ±\u00a00.28",
+        "RGB-D ViT, published": "44.80 ±\u00a01.70",
+        "THOR": "0.00 ±\u00a00.00",
+        "THOR, published": "57.64 ±\u00a00.39",
+        "THOR2": "93.75 ±\u00a08.84",
+        "THOR2, published": "63.95 ±\u00a00.51",
+    }
+    assert comparison_table(light, "gallery")[0][2] == "gallery"
+    assert comparison_table(light, "gallery")[1][0][2] == "–"
+
+
+class ToyRun:
+    """The attributes of a run that the results use."""
+
+    name, predictors, classes, temperatures, answer_by = "a", ("tops", "tops2"), ("bowl", "mug"), {}, "classifiers"
+    thresholds = np.zeros(2)
+
+
+def test_report_has_the_tables_of_its_protocol() -> None:
+    answer = InstancePrediction(1, "mug", probabilities=np.eye(2, dtype=np.float32))
+    attributes = {"camera": "lower", "place": "table", "type": "mixed"}
+    frames = [FrameAnswers("table/bottom/mixed/seq21/0", attributes, 1.0, [answer])]
+    numbers = {}
+    for own in (True, False):
+        report = compute_results("ocid", [ToyRun()], frames, own_objects=own)  # type: ignore[list-item]
+        numbers[own] = [table["number"] for table in report["published_tables"]]
+        assert json.loads(json.dumps(report))["published_tables"] == report["published_tables"]
+        lower = next(table for table in report["accuracy"]["max"] if table["by"] == ["camera"])["cells"][0]
+        assert lower["published"]["THOR2"] == pytest.approx(0.7507 if own else 0.5996)
+    assert numbers == {True: [1, 8, None], False: [3]}
+    assert compute_results("frames", [ToyRun()], frames)["published_tables"] == []  # type: ignore[list-item]
+    assert compute_results("ocid", [ToyRun()], frames[:0])["published_tables"] == []  # type: ignore[list-item]

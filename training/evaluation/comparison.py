@@ -1,0 +1,124 @@
+"""Measured accuracies beside the published tables, and the differences between the data of both."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from training.evaluation.accuracy import summarize_runs
+from training.evaluation.published import (
+    PublishedFigure,
+    PublishedTable,
+    published_attributes,
+    published_dataset,
+    published_tables,
+)
+
+__all__ = ["EvaluationConditions", "compare_with_published"]
+
+_OURS = {"THOR2, synthetic": "THOR2", "THOR (MLP)": "THOR"}
+"""Published methods whose name differs from the title of the measured column."""
+
+_PAPER_RULE = "max"
+
+
+@dataclasses.dataclass(frozen=True)
+class EvaluationConditions:
+    """What an evaluation must state beside published figures.
+
+    Attributes:
+        own_objects: whether the classes are the objects of the frame's own sequence.
+        models: number of trained models.
+        frames: number of frames.
+        rule: fusion rule of the measured accuracies.
+    """
+
+    own_objects: bool
+    models: int
+    frames: int
+    rule: str
+
+
+def compare_with_published(
+    kind: str,
+    conditions: EvaluationConditions,
+    attributes: Sequence[Mapping[str, str]],
+    objects: Sequence[str],
+    correct: Mapping[str, Sequence[NDArray[np.bool_]]],
+) -> list[dict[str, Any]]:
+    """Return the published tables that the evaluation has instances for, each with the measured accuracies.
+
+    Args:
+        kind: kind of dataset ("uwis", "ocid", ...).
+        conditions: conditions of the evaluation.
+        attributes: [N] attributes of the scored instances.
+        objects: [N] names of their objects.
+        correct: column title -> for each run, [N] whether the instance is recognized correctly.
+
+    Returns:
+        JSON tables with "number", "title", "source", "notes", "differences" (sentences), "ours" (published method ->
+        title of the measured column, where there is one) and "cells". A cell has "where", "instances", "published"
+        (method -> mean and standard deviation, from 0 to 1) and "accuracy" (title -> `RunStatistics`). Rows without an
+        instance are left out.
+    """
+    values = [published_attributes(kind, each) for each in attributes]
+    comparisons = []
+    for table in published_tables(kind):
+        if not table.is_comparable(conditions.own_objects):
+            continue
+        cells, shown = [], np.zeros(len(values), bool)
+        for cell in table.cells:
+            rows = np.array([cell.where.items() <= each.items() for each in values], bool)
+            if rows.any():
+                shown |= rows
+                published = {method: _fractions(figure) for method, figure in cell.figures.items()}
+                accuracy = {t: summarize_runs([marks[rows].mean() for marks in each]) for t, each in correct.items()}
+                counts = {"instances": int(rows.sum())}
+                cells.append({"where": dict(cell.where), **counts, "published": published, "accuracy": accuracy})
+        if cells:
+            n_objects = len({name for name, is_shown in zip(objects, shown, strict=True) if is_shown})
+            comparisons.append(
+                {
+                    "number": table.number,
+                    "title": table.title,
+                    "source": table.source,
+                    "notes": list(table.notes),
+                    "differences": _differences(kind, table, conditions, n_objects, len(cells)),
+                    "ours": {m: _OURS.get(m, m) for m in table.methods if _OURS.get(m, m) in correct},
+                    "cells": cells,
+                }
+            )
+    return comparisons
+
+
+def _fractions(figure: PublishedFigure) -> dict[str, float | None]:
+    return {"mean": figure.mean / 100, "std": None if figure.std is None else figure.std / 100}
+
+
+def _differences(
+    kind: str, table: PublishedTable, conditions: EvaluationConditions, n_objects: int, n_rows: int
+) -> list[str]:
+    """Return one sentence for each known difference between the data of the table and of the evaluation."""
+    data = published_dataset(kind)
+    size = f" ({data.frames:,} frames, {data.instances:,} instances)" if data.frames and data.instances else ""
+    sentences = [
+        f"The published figures concern {data.concerns}{size}; here {conditions.frames:,} frames are evaluated."
+    ]
+    if table.objects is None:
+        sentences.append(f"Here {n_objects} objects are scored.")
+    elif table.objects != n_objects:
+        sentences.append(f"The publication scores {table.objects} objects, this evaluation {n_objects}.")
+    if n_rows < len(table.cells):
+        sentences.append(f"{len(table.cells) - n_rows} of the table's {len(table.cells)} rows have no instance here.")
+    models = "models of its own" if table.models is None else f"{table.models} models"
+    sentences.append(
+        f"The publication uses {models}; here {conditions.models} "
+        f"{'model is' if conditions.models == 1 else 'models are'} evaluated, trained on other views and folds."
+    )
+    if conditions.rule != _PAPER_RULE:
+        sentences.append(
+            f"The publication fuses classifiers by the rule {_PAPER_RULE}, this table by {conditions.rule}."
+        )
+    return sentences
