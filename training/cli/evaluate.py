@@ -126,7 +126,7 @@ def _evaluate(
 
 
 def _print_report(report: Mapping[str, Any]) -> None:
-    from training.evaluation.page import accuracy_table, comparison_table, comparison_title
+    from training.evaluation.page import accuracy_table, comparison_table, comparison_text, comparison_title
 
     counts, speed = report["instances"], report["speed"]
     if report["fusions"]:
@@ -141,11 +141,11 @@ def _print_report(report: Mapping[str, Any]) -> None:
         console.print(shown)
         for table in report["published_tables"]:
             header, rows = comparison_table(table, report["main"])
-            shown = Table(*header, title=f"{comparison_title(table)} (percent)")
+            shown = Table(*header, title=comparison_title(table))
             for row in rows:
                 shown.add_row(*row)
             console.print(shown)
-            console.print(" ".join([*table["notes"], *table["differences"]]))
+            console.print(comparison_text(table))
     console.print(
         f"{counts['scored']} instances scored, {sum(counts['not_described'].values())} of them could not be described "
         f"(counted as incorrect); {sum(counts['no_class'].values())} are of no class of the runs"

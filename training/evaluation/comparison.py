@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from training.evaluation.accuracy import summarize_runs
+from training.evaluation.fusion import Rule
 from training.evaluation.published import (
     PublishedFigure,
     PublishedTable,
@@ -21,7 +22,8 @@ __all__ = ["EvaluationConditions", "compare_with_published"]
 _OURS = {"THOR2, synthetic": "THOR2", "THOR (MLP)": "THOR"}
 """Published methods whose name differs from the title of the measured column."""
 
-_PAPER_RULE = "max"
+_PAPER_RULE: Rule = "max"
+"""Fusion rule of the THOR2 paper."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,7 +40,7 @@ class EvaluationConditions:
     own_objects: bool
     models: int
     frames: int
-    rule: str
+    rule: Rule
 
 
 def compare_with_published(
@@ -107,7 +109,7 @@ def _differences(
         f"The published figures concern {data.concerns}{size}; here {conditions.frames:,} frames are evaluated."
     ]
     if table.objects is None:
-        sentences.append(f"Here {n_objects} objects are scored.")
+        sentences.append(f"Number of objects that are scored here: {n_objects}.")
     elif table.objects != n_objects:
         sentences.append(f"The publication scores {table.objects} objects, this evaluation {n_objects}.")
     if n_rows < len(table.cells):
@@ -117,7 +119,8 @@ def _differences(
         f"The publication uses {models}; here {conditions.models} "
         f"{'model is' if conditions.models == 1 else 'models are'} evaluated, trained on other views and folds."
     )
-    if conditions.rule != _PAPER_RULE:
+    fuses = any("THOR2" in method for method in table.methods)
+    if fuses and conditions.rule != _PAPER_RULE:
         sentences.append(
             f"The publication fuses classifiers by the rule {_PAPER_RULE}, this table by {conditions.rule}."
         )

@@ -14,7 +14,7 @@ from training.evaluation.results import COVERAGE
 from training.reports.html import Picture, Section, Table, write_page
 from training.reports.plots import draw_accuracy, draw_confusion, draw_known_unknown, draw_reliability
 
-__all__ = ["accuracy_table", "comparison_table", "comparison_title", "write_report_page"]
+__all__ = ["accuracy_table", "comparison_table", "comparison_text", "comparison_title", "write_report_page"]
 
 NO_VALUE = {"mean": None, "std": None}
 
@@ -64,6 +64,11 @@ def comparison_title(table: Mapping[str, Any]) -> str:
     """Return the heading of a published table, an entry of `report["published_tables"]`."""
     number = "" if table["number"] is None else f" table {table['number']}"
     return f"Published{number}: {table['title']}"
+
+
+def comparison_text(table: Mapping[str, Any]) -> str:
+    """Return the source of a published table, its notes, and where the data differ."""
+    return " ".join([f"In percent. Source: {table['source']}.", *table["notes"], *table["differences"]])
 
 
 def comparison_table(table: Mapping[str, Any], main: str) -> Table:
@@ -143,7 +148,7 @@ def _published_sections(report: Mapping[str, Any]) -> list[Section]:
     return [
         Section(
             comparison_title(table),
-            " ".join([f"In percent. Source: {table['source']}.", *table["notes"], *table["differences"]]),
+            comparison_text(table),
             comparison_table(table, report["main"]),
         )
         for table in report["published_tables"]
