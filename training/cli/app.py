@@ -43,7 +43,7 @@ UnknownOption = Annotated[
     typer.Option(
         "--unknown-below",
         help="Instances with a lower confidence are unknown objects (0 to 1). Default: the model's own for trained "
-        "classes; for enrolled objects, 0.17 with one view to 0.35 with 20.",
+        "classes; for enrolled objects, 0.26 with one view to 0.37 with 10.",
     ),
 ]
 ModelOption = Annotated[Path, typer.Option("--model", help="Run directory of a trained model.")]

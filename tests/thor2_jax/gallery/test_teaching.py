@@ -106,21 +106,21 @@ def test_the_default_thresholds_of_each_source(run: TrainedRun, embedding: Embed
     calibrated.enroll("b", [frame(RED)], extend=True)
     calibrated.enroll("c", [frame(RED)], replace=True)
     assert calibrated.classes == ("a", "b", "brick", "book", "c")
-    assert calibrated.thresholds().tolist() == [0.625, 0.625, 0.227, 0.17, 0.17]
-    assert calibrated.thresholds("gallery")[1:].tolist() == [0.17, 0.227, 0.17, 0.17]
-    assert taught(run, embedding).thresholds().tolist() == [0, 0, 0, 0.227, 0.17]
+    assert calibrated.thresholds().tolist() == [0.625, 0.625, 0.292, 0.26, 0.26]
+    assert calibrated.thresholds("gallery")[1:].tolist() == [0.26, 0.292, 0.26, 0.26]
+    assert taught(run, embedding).thresholds().tolist() == [0, 0, 0, 0.292, 0.26]
     explicit = taught(run, embedding, unknown_below=0.25)
     assert explicit.thresholds().tolist() == explicit.thresholds("gallery").tolist() == [0.25] * 5
     assert thor2.Recognizer(run).thresholds().tolist() == [0, 0, 0]
 
 
 @pytest.mark.parametrize(
-    "score, names", [(0.16, [None, None]), (0.18, [None, "book"]), (0.22, [None, "book"]), (0.23, ["brick", "book"])]
+    "score, names", [(0.25, [None, None]), (0.27, [None, "book"]), (0.29, [None, "book"]), (0.3, ["brick", "book"])]
 )
 def test_a_gallery_alone_rejects_unknown_objects(
     score: float, names: list[str | None], embedding: Embedding, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Scores as given: the brick has two views and is named from .227, the book has one and is named from .17."""
+    """Scores as given: the brick has two views and is named from .292, the book has one and is named from .26."""
     instance = instance_view(CLUTTER, 1, 2.5)
     for unknown_below, expected in ((None, names), (0.0, ["brick", "book"])):
         recognizer = taught(untrained_run((), ()), embedding, unknown_below=unknown_below)
