@@ -91,7 +91,7 @@ class Lever:
 
 PLAIN = "--orientation-copies 0 --embedding 0"
 ORIENTED = "--orientation-copies 2 --embedding 0"
-DISTRACTED = "--orientation-copies 2 --embedding 600"
+DISTRACTED = "--orientation-copies 2 --embedding 1500"
 """Options of trainings without orientation copies and embedding, with the copies, and with both."""
 
 LEVERS = (

@@ -78,16 +78,22 @@ def _describe_strips(strips: Strips, parameters: Parameters, config: DescriptorC
     )
 
 
-def strips(aligned: PointClouds, network: ColorNetwork, config: DescriptorConfig) -> Strips:
+def strips(aligned: PointClouds, network: ColorNetwork, config: DescriptorConfig, copies: int = 1) -> Strips:
     """Return the extremes and the colour vector of every strip: all that descriptors need, at a fraction of their size.
 
     Args:
         aligned: clouds in scaled units, as `align` returns them.
         network: the colour network, of which only the regions are used.
         config: static.
+        copies: number of consecutive clouds that are orientations of one cloud: their colours are equal, and are looked
+            up once.
     """
     _check_batch(aligned)
-    return strips_by_sets(aligned, _region_sets(network), config)
+    sets = _region_sets(network)
+    if copies == 1:
+        return strips_by_sets(aligned, sets, config)
+    region_set = _color_sets(aligned.colors[::copies], sets)
+    return _strips_of(aligned, jnp.repeat(region_set, copies, axis=0), sets, config)
 
 
 def describe_strips(

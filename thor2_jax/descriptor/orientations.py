@@ -125,10 +125,12 @@ def orient_descriptors(
         network: colour network.
         config: static.
     """
-    sides = side_lengths(aligned, config.alpha)
-    values = describe_strips(strips, network, config), cloud_statistics(sides, aligned, strips)
-    each, statistics = jax.tree.map(lambda a: a.reshape(*weights.shape, *a.shape[1:]), values)
-    return OrientedDescriptors(each, statistics, weights)
+    shape = weights.shape
+    each = jax.tree.map(lambda a: a.reshape(*shape, *a.shape[1:]), describe_strips(strips, network, config))
+    # The side lengths and the colours of all orientations are equal.
+    first, first_strips = jax.tree.map(lambda a: a[:: shape[1]], (aligned, strips))
+    statistics = cloud_statistics(side_lengths(first, config.alpha), first, first_strips)
+    return OrientedDescriptors(each, jnp.repeat(statistics[:, None], shape[1], axis=1), weights)
 
 
 def describe_orientations(
@@ -142,5 +144,6 @@ def describe_orientations(
         config: static.
         count: number of orientations K; by default `config.orientations`. Static.
     """
-    aligned, weights = candidate_orientations(clouds, config, config.orientations if count is None else count)
-    return orient_descriptors(aligned, weights, strips(aligned, network, config), network, config)
+    count = config.orientations if count is None else count
+    aligned, weights = candidate_orientations(clouds, config, count)
+    return orient_descriptors(aligned, weights, strips(aligned, network, config, count), network, config)

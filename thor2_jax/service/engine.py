@@ -133,7 +133,7 @@ class InferenceEngine:
         clouds = pack_instances(instances, n_clouds, n_points)
         network, config = self.run.network, self.run.config
         aligned, weights = candidate_orientations(clouds, config, config.orientations)
-        cloud_strips = strips(aligned, network, config)
+        cloud_strips = strips(aligned, network, config, config.orientations)
         oriented = orient_descriptors(aligned, weights, cloud_strips, network, config)
         evidence = self._recognizer.evidence(oriented, self._classifiers, clouds if self._embeds else None)
         first = slice(None, None, config.orientations)

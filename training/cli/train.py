@@ -52,7 +52,7 @@ def train(
         typer.Option(
             min=0,
             metavar="N",
-            help="Fit the run's embedding on N procedural distractors and the views; 0 fits none. (600; paper: 0)",
+            help="Fit the run's embedding on N procedural distractors and the views; 0 fits none. (1500; paper: 0)",
         ),
     ] = None,
     orientation_copies: Annotated[

@@ -47,10 +47,10 @@ class Distractors:
         InputError: there are fewer than ten distractors, or a number is out of range.
     """
 
-    procedural: int = 600
+    procedural: int = 1500
     meshes: Mapping[str, Path] = dataclasses.field(default_factory=dict)
-    views: int = 16
-    epochs: int = 20
+    views: int = 8
+    epochs: int = 10
     workers: int = 1
 
     def __post_init__(self) -> None:
