@@ -33,7 +33,17 @@ else:
         "types": ("Descriptors", "Diagrams", "PointClouds", "Strips"),
     }
     _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
-    _SUBMODULES = ("capacity", "client", "descriptor", "export", "recognition", "segmentation", "testing", *_MODULES)
+    _SUBMODULES = (
+        "capacity",
+        "client",
+        "descriptor",
+        "export",
+        "persistence",
+        "recognition",
+        "segmentation",
+        "testing",
+        *_MODULES,
+    )
 
     def __getattr__(name: str) -> Any:
         if name in _MODULE_OF:

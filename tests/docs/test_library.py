@@ -32,7 +32,7 @@ def random_cloud(seed: int, size: tuple[float, float, float] = (0.2, 0.1, 0.05))
     return rng.random((400, 3)) * size, rng.integers(0, 256, (400, 3), np.uint8)
 
 
-SECTIONS = {"Descriptors as a library": 1, "scikit-learn": 2, "Recognizers": 1}
+SECTIONS = {"Descriptors as a library": 1, "scikit-learn": 2, "Persistence of functions on lines": 4, "Recognizers": 1}
 """Sections with code, and their numbers of blocks; each has a test below."""
 
 
@@ -47,11 +47,20 @@ def test_descriptors() -> None:
     assert result.tops.shape == (1, 7168) and result.tops2.shape == (1, 11942) and result.overflow.shape == (1,)
 
 
+@pytest.mark.slow
 def test_scikit_learn() -> None:
     clouds = [random_cloud(i, (0.2, 0.1, 0.05) if i % 2 else (0.05, 0.05, 0.05)) for i in range(8)]
     names = run_section("scikit-learn", clouds=clouds, labels=["cube", "brick"] * 4)
     assert names["search"].predict(clouds[:2]).tolist() == ["cube", "brick"]
     assert names["frame"].shape == (8, 7168)
+
+
+def test_persistence() -> None:
+    names = run_section("Persistence of functions on lines")
+    assert names["images"].shape == (2, 16, 16) and len(names["pairs"]) == int(names["diagrams"].mask[0].sum()) > 0
+    shallow, noisy, smooth = names["shallow"], names["noisy"], names["smooth"]
+    assert shallow(smooth) < 0.2 * shallow(noisy)
+    assert float(smooth.min()) == pytest.approx(float(noisy.min()), abs=0.01)
 
 
 @pytest.mark.slow

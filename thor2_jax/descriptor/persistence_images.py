@@ -9,17 +9,16 @@ from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.slicing import strip_births
 from thor2_jax.types import Diagrams
 
-__all__ = ["count_past_window", "persistence_images"]
+__all__ = ["count_past_window", "cumulative_at_edges", "persistence_images", "persistence_power"]
 
 
-def _at_edges(centres: jax.Array, variance: ArrayLike, config: DescriptorConfig) -> jax.Array:
-    """Return 2 CDF - 1 of the normal distributions at `centres` [..., J] at the pixel edges, [..., P + 1, J]."""
-    edges = (jnp.arange(config.image_size + 1, dtype=centres.dtype) - 1) * config.sigma_2
+def cumulative_at_edges(centres: jax.Array, variance: ArrayLike, edges: jax.Array) -> jax.Array:
+    """Return 2 CDF - 1 of the normal distributions at `centres` [..., J] at `edges` [P + 1], [..., P + 1, J]."""
     # `ndtr` costs four times as much, for digits of far tails that an image does not need.
     return erf((edges[:, None] - centres[..., None, :]) * jax.lax.rsqrt(2 * variance))
 
 
-def _weight(persistence: jax.Array, exponent: ArrayLike) -> jax.Array:
+def persistence_power(persistence: jax.Array, exponent: ArrayLike) -> jax.Array:
     """Return persistence**exponent: 0 at 0, with a finite gradient for any exponent; exactly `persistence` for 1."""
     return persistence * jnp.exp((exponent - 1) * jnp.log(jnp.where(persistence > 0, persistence, 1)))
 
@@ -52,9 +51,12 @@ def persistence_images(
     persistence = jnp.pad(persistence, [(0, 0)] * (persistence.ndim - 1) + [(0, padding)])
     births = jnp.pad(births, (0, padding))
     variance = config.image_variance if variance is None else variance
-    weight = _weight(persistence, config.persistence_weight if persistence_weight is None else persistence_weight)
-    by_persistence = _at_edges(persistence, variance, config) * weight[..., None, :]
-    by_birth = jnp.diff(_at_edges(births, variance, config), axis=-2)
+    weight = persistence_power(
+        persistence, config.persistence_weight if persistence_weight is None else persistence_weight
+    )
+    edges = (jnp.arange(config.image_size + 1, dtype=births.dtype) - 1) * config.sigma_2
+    by_persistence = cumulative_at_edges(persistence, variance, edges) * weight[..., None, :]
+    by_birth = jnp.diff(cumulative_at_edges(births, variance, edges), axis=-2)
     # Differences along persistence come after the product: before it, XLA evaluates each edge's `erf` twice.
     images = jnp.diff(jnp.matmul(by_persistence, by_birth.T, precision=jax.lax.Precision.HIGHEST), axis=-2) / 4
     return jnp.swapaxes(images, -1, -2)

@@ -1,0 +1,221 @@
+"""Diagrams of functions on lines against gudhi, images against persim, gradients against differences of both."""
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import gudhi
+import jax
+import jax.numpy as jnp
+import numpy as np
+import persim
+import pytest
+
+import thor2_jax as thor2
+from thor2_jax import persistence
+
+
+@pytest.fixture
+def x64() -> Iterator[None]:
+    with jax.enable_x64(True):
+        yield
+
+
+def gudhi_pairs(heights: np.ndarray, edges: np.ndarray | None = None) -> np.ndarray:
+    """Return the finite pairs of positive persistence of one line, [k, 2] sorted."""
+    tree = gudhi.SimplexTree()
+    for i, height in enumerate(heights):
+        if np.isfinite(height):
+            tree.insert([i], float(height))
+    for i in range(len(heights) - 1):
+        height = max(heights[i], heights[i + 1], -np.inf if edges is None else edges[i])
+        if np.isfinite([heights[i], heights[i + 1], height]).all():
+            tree.insert([i, i + 1], float(height))
+    pairs = [p for dimension, p in tree.persistence() if dimension == 0 and math.isfinite(p[1])]
+    return np.array(sorted(pairs)).reshape(-1, 2)
+
+
+def pairs_of(diagrams: thor2.Diagrams) -> np.ndarray:
+    return np.array(sorted(zip(diagrams.births[diagrams.mask], diagrams.deaths[diagrams.mask], strict=True))).reshape(
+        -1, 2
+    )
+
+
+def assert_as_gudhi(heights: np.ndarray, edges: np.ndarray | None = None) -> None:
+    """Compare a batch [B, N] line by line."""
+    diagrams = persistence.sublevel_diagrams(heights, edges)
+    assert diagrams.births.shape == diagrams.deaths.shape == diagrams.mask.shape == heights.shape
+    assert diagrams.births.dtype == diagrams.deaths.dtype == heights.dtype
+    for b in range(len(heights)):
+        one = jax.tree.map(lambda a: np.asarray(a[b]), diagrams)  # noqa: B023  used at once
+        np.testing.assert_array_equal(
+            pairs_of(one), gudhi_pairs(heights[b], None if edges is None else edges[b]), strict=False
+        )
+        assert not one.births[~one.mask].any() and not one.deaths[~one.mask].any()
+        np.testing.assert_array_equal(one.births[one.mask], heights[b][one.mask])
+
+
+@pytest.mark.parametrize("n", [1, 2, 9, 100])
+def test_random_heights(n: int) -> None:
+    rng = np.random.default_rng(n)
+    assert_as_gudhi(rng.normal(size=(20, n)).astype(np.float32))
+
+
+def test_equal_heights() -> None:
+    rng = np.random.default_rng(0)
+    heights = rng.integers(0, 3, (200, 9)).astype(np.float32)
+    assert_as_gudhi(heights)
+    assert_as_gudhi(heights, rng.integers(0, 5, (200, 8)).astype(np.float32))
+
+
+def test_heights_of_edges() -> None:
+    rng = np.random.default_rng(0)
+    heights = rng.normal(size=(200, 9)).astype(np.float32)
+    assert_as_gudhi(heights, (rng.normal(size=(200, 8)) + 1).astype(np.float32))
+
+
+def test_absent_vertices_and_edges() -> None:
+    rng = np.random.default_rng(0)
+    heights = rng.normal(size=(30, 17)).astype(np.float32)
+    edges = (rng.normal(size=(30, 16)) + 1).astype(np.float32)
+    heights[rng.random(heights.shape) < 0.2] = np.nan
+    edges[rng.random(edges.shape) < 0.2] = np.nan
+    expected = np.where(np.isnan(heights), np.inf, heights), np.where(np.isnan(edges), np.inf, edges)
+    for values, gaps in ((expected[0], None), expected):
+        first = persistence.sublevel_diagrams(heights, None if gaps is None else edges)
+        assert_as_gudhi(values, gaps)
+        for a, b in zip(
+            jax.tree.leaves(first), jax.tree.leaves(persistence.sublevel_diagrams(values, gaps)), strict=True
+        ):
+            np.testing.assert_array_equal(a, b)
+    short = np.where(np.arange(17) < 9, expected[0], np.inf)
+    assert_as_gudhi(short)
+    assert len(gudhi_pairs(short[0])) == len(gudhi_pairs(expected[0][0, :9]))
+
+
+def test_strips_of_a_slice_are_paths_of_two_vertices() -> None:
+    rng = np.random.default_rng(0)
+    births = np.repeat(np.arange(31) * 0.025, 2).astype(np.float32)
+    edges = np.full(61, np.inf, np.float32)
+    edges[::2] = births[::2] + rng.random(31).astype(np.float32)
+    diagrams = persistence.sublevel_diagrams(births, edges)
+    np.testing.assert_array_equal(pairs_of(diagrams), np.stack([births[::2], edges[::2]], axis=1))
+
+
+@pytest.mark.parametrize("shape", [(0,), (1,), (0, 5), (4, 5, 9)])
+def test_leading_axes_and_vmap(shape: tuple[int, ...]) -> None:
+    heights = np.random.default_rng(0).normal(size=shape).astype(np.float32)
+    diagrams = persistence.sublevel_diagrams(heights)
+    assert diagrams.mask.shape == diagrams.births.shape == shape
+    if len(shape) == 3:
+        nested = jax.vmap(jax.vmap(persistence.sublevel_diagrams))(heights)
+        for a, b in zip(jax.tree.leaves(diagrams), jax.tree.leaves(nested), strict=True):
+            np.testing.assert_array_equal(a, b)
+        assert diagrams.mask.any()
+
+
+IMAGE: dict[str, Any] = {"birth_range": (-2.0, 2.0), "persistence_range": (0.0, 3.0), "pixels": (8, 6)}
+
+
+def persim_image(pairs: np.ndarray, variance: float, exponent: float) -> np.ndarray:
+    """Return the image of `IMAGE`; `sigma` of persim is a variance."""
+    imager = persim.PersistenceImager(
+        birth_range=IMAGE["birth_range"],
+        pers_range=IMAGE["persistence_range"],
+        pixel_size=0.5,
+        weight="persistence",
+        weight_params={"n": exponent},
+        kernel_params={"sigma": [[variance, 0.0], [0.0, variance]]},
+    )
+    return np.asarray(imager.transform(pairs, skew=True))
+
+
+@pytest.mark.parametrize(("variance", "exponent"), [(0.05, 1.0), (0.3, 2.0), (0.01, 0.5)])
+def test_images_against_persim(variance: float, exponent: float) -> None:
+    heights = np.random.default_rng(1).normal(size=(3, 40)).astype(np.float32)
+    images = persistence.images(persistence.sublevel_diagrams(heights), **IMAGE, variance=variance, exponent=exponent)
+    assert images.shape == (3, 8, 6) and images.dtype == np.float32
+    for image, line in zip(images, heights, strict=True):
+        np.testing.assert_allclose(image, persim_image(gudhi_pairs(line), variance, exponent), atol=2e-6)
+
+
+def test_the_image_of_no_pairs_is_zero_with_zero_gradients() -> None:
+    def total(heights: jax.Array) -> jax.Array:
+        return persistence.images(persistence.sublevel_diagrams(heights), **IMAGE, variance=0.1).sum()
+
+    for heights in (jnp.arange(5.0), jnp.full(5, jnp.nan), jnp.zeros(5)):
+        value, gradient = jax.value_and_grad(total)(heights)
+        assert value == 0 and not gradient.any()
+
+
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("with_edges", [False, True])
+def test_gradients_against_differences_of_gudhi_and_persim(with_edges: bool) -> None:
+    rng = np.random.default_rng(2)
+    heights, edges = rng.normal(size=12), rng.normal(size=11) + 1.5
+    probe = rng.random(IMAGE["pixels"])
+
+    def expected(values: np.ndarray) -> float:
+        pairs = gudhi_pairs(values[:12], values[12:] if with_edges else None)
+        return float((persim_image(pairs, 0.1, 1.0) * probe).sum())
+
+    def actual(values: jax.Array) -> jax.Array:
+        diagrams = persistence.sublevel_diagrams(values[:12], values[12:] if with_edges else None)
+        return (persistence.images(diagrams, **IMAGE, variance=0.1) * probe).sum()
+
+    values = np.concatenate([heights, edges])
+    assert len(gudhi_pairs(heights, edges if with_edges else None)) >= 3
+    np.testing.assert_allclose(actual(jnp.asarray(values)), expected(values), rtol=1e-9)
+    steps = np.eye(len(values)) * 1e-5
+    differences = [(expected(values + step) - expected(values - step)) / 2e-5 for step in steps]
+    gradient = jax.jit(jax.grad(actual))(jnp.asarray(values))
+    assert gradient.dtype == np.float64
+    np.testing.assert_allclose(gradient, differences, rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.usefixtures("x64")
+def test_gradients_of_variance_and_exponent() -> None:
+    heights = np.random.default_rng(3).normal(size=30)
+    pairs = gudhi_pairs(heights)
+
+    def actual(variance: jax.Array, exponent: jax.Array) -> jax.Array:
+        diagrams = persistence.sublevel_diagrams(heights)
+        return persistence.images(diagrams, **IMAGE, variance=variance, exponent=exponent)[3, 1]
+
+    gradient = jax.grad(actual, argnums=(0, 1))(0.1, 1.5)
+    step = 1e-5
+    by_variance = (persim_image(pairs, 0.1 + step, 1.5) - persim_image(pairs, 0.1 - step, 1.5)) / (2 * step)
+    by_exponent = (persim_image(pairs, 0.1, 1.5 + step) - persim_image(pairs, 0.1, 1.5 - step)) / (2 * step)
+    np.testing.assert_allclose(gradient, (by_variance[3, 1], by_exponent[3, 1]), rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("heights", "edges", "name"),
+    [
+        (np.zeros(3, np.int32), None, "heights"),
+        (np.float32(1), None, "heights"),
+        (np.zeros(3, np.float32), np.zeros(3, np.float32), "edges"),
+        (np.zeros((2, 3), np.float32), np.zeros(2, np.float32), "edges"),
+        (np.zeros(3, np.float32), np.zeros(2, np.int32), "edges"),
+    ],
+)
+def test_bad_heights_and_edges(heights: Any, edges: Any, name: str) -> None:
+    with pytest.raises(thor2.InputError, match=f"^{name} is [^\n]*$"):
+        persistence.sublevel_diagrams(heights, edges)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"birth_range": (1.0, 1.0)},
+        {"persistence_range": (0.0, math.inf)},
+        {"pixels": (8, 0)},
+        {"pixels": (8,)},
+        {"variance": 0},
+        {"exponent": -1.0},
+    ],
+)
+def test_bad_images(change: dict[str, Any]) -> None:
+    diagrams = persistence.sublevel_diagrams(np.zeros(3, np.float32))
+    with pytest.raises(thor2.InputError, match=f"^{next(iter(change))} is [^\n]*$"):
+        persistence.images(diagrams, **({**IMAGE, "variance": 0.1} | change))

@@ -1,0 +1,203 @@
+"""Sublevel-set persistence (H0) of functions on lines, and persistence images, for batches in JAX.
+
+A function on a line is a row of heights, with or without heights of the edges between neighbours: a signal, a profile,
+or any filtration on a path. All arrays have fixed shapes, so that diagrams and images can be computed under `jax.jit`
+and `jax.vmap` on any device, and have gradients.
+
+>>> heights = jax.numpy.array([0.0, 2.0, 1.0, 3.0])  # the minimum at 1 merges with the one at 0 over 2
+>>> diagrams = sublevel_diagrams(heights)
+>>> diagrams.births[diagrams.mask], diagrams.deaths[diagrams.mask]
+(Array([1.], dtype=float32), Array([2.], dtype=float32))
+>>> images(diagrams, birth_range=(0, 3), persistence_range=(0, 3), pixels=(8, 8), variance=0.1).shape
+(8, 8)
+
+This is no library for simplicial complexes: there are no triangles, no cycles (H1 and above), no Rips or alpha
+complexes, and no distances between diagrams. Use GUDHI for these.
+"""
+
+import math
+
+import jax
+import jax.numpy as jnp
+from jax.typing import ArrayLike
+
+from thor2_jax.descriptor.persistence_images import cumulative_at_edges, persistence_power
+from thor2_jax.errors import InputError
+from thor2_jax.types import Diagrams
+
+__all__ = ["Diagrams", "images", "sublevel_diagrams"]
+
+_Ranges = tuple[jax.Array, jax.Array, jax.Array]
+"""For the range of vertices and edges behind each vertex: lowest vertex, highest edge and its index, each [N]."""
+
+_Walk = tuple[jax.Array, jax.Array, jax.Array]
+"""For the walk from each vertex: the vertex reached so far, the highest edge on the way and its index, each [N]."""
+
+
+def sublevel_diagrams(heights: ArrayLike, edges: ArrayLike | None = None) -> Diagrams:
+    """Return the finite H0 pairs of functions on lines, by the height at which components of sublevel sets merge.
+
+    A component is born at its lowest vertex and dies at the edge over which it reaches a lower one (the elder rule; of
+    equal heights, the first is the older one). The component of the lowest vertex of a line never dies; it has no pair,
+    and its birth is the minimum of the heights. For superlevel sets, negate the heights and the result.
+
+    Pairs are found by binary search in tables of ranges, in O(N log N) operations and memory and log2(N) steps for each
+    line. Gradients reach the height of the vertex and of the edge of each pair, hence, without `edges`, that of the
+    higher vertex of the edge. They exist where no two heights are equal.
+
+    Args:
+        heights: [..., N] floating, one height for each vertex. A vertex of height NaN or infinity is absent and its
+            neighbours are not connected, so that lines of different lengths are padded with either.
+        edges: [..., N - 1] floating, height of the edge between vertices i and i + 1; by default that of the higher
+            vertex. A lower edge is raised to it, since an edge cannot come before its vertices; at NaN or infinity,
+            the line is cut.
+
+    Returns:
+        Diagrams with fields [..., N] of the type of `heights`. Pair i is born at vertex i. The mask is True for pairs
+        of positive persistence, at most (N + 1) // 2; elsewhere births and deaths are 0.
+
+    Raises:
+        InputError: `heights` or `edges` is not floating, or has another shape.
+    """
+    heights = jnp.asarray(heights)
+    if heights.ndim == 0 or not jnp.issubdtype(heights.dtype, jnp.floating):
+        raise InputError(f"heights is {heights.dtype} {list(heights.shape)}; expected floating [..., N]")
+    if edges is not None:
+        edges = jnp.asarray(edges)
+        shape = (*heights.shape[:-1], max(heights.shape[-1] - 1, 0))
+        if edges.shape != shape or not jnp.issubdtype(edges.dtype, jnp.floating):
+            raise InputError(
+                f"edges is {edges.dtype} {list(edges.shape)}; expected floating {list(shape)}, one for each pair of "
+                f"neighbours in heights {list(heights.shape)}"
+            )
+    return _sublevel_diagrams(heights, edges)
+
+
+@jax.jit
+def _sublevel_diagrams(heights: jax.Array, edges: jax.Array | None) -> Diagrams:
+    heights = _nan_as_infinity(heights)
+    left, right = heights[..., :-1], heights[..., 1:]
+    lowest = jnp.where(left >= right, left, right)
+    if edges is None:
+        edges = lowest
+    else:
+        edges = _nan_as_infinity(edges.astype(heights.dtype))
+        edges = jnp.where(edges > lowest, edges, lowest)
+    if edges.size == 0:
+        return Diagrams(jnp.zeros_like(heights), jnp.zeros_like(heights), jnp.zeros(heights.shape, bool))
+    index = jnp.vectorize(_death_edges, signature="(n),(m)->(n)")(*jax.lax.stop_gradient((heights, edges)))
+    deaths = jnp.take_along_axis(edges, jnp.maximum(index, 0), axis=-1)
+    mask = (index >= 0) & jnp.isfinite(heights) & (deaths > heights)
+    return Diagrams(births=jnp.where(mask, heights, 0), deaths=jnp.where(mask, deaths, 0), mask=mask)
+
+
+def _nan_as_infinity(values: jax.Array) -> jax.Array:
+    return jnp.where(jnp.isnan(values), jnp.inf, values)
+
+
+def _death_edges(heights: jax.Array, edges: jax.Array) -> jax.Array:
+    """Return the edge at which the component born at each vertex dies, [N] int32; -1 if it never does.
+
+    A component reaches a lower vertex on the side whose highest edge on the way there is lower.
+    """
+    right, right_index = _edges_to_lower(heights, edges, or_equal=False)
+    left, left_index = _edges_to_lower(heights[::-1], edges[::-1], or_equal=True)
+    left, left_index = left[::-1], len(edges) - 1 - left_index[::-1]
+    never = jnp.isinf(jnp.minimum(left, right))
+    return jnp.where(never, -1, jnp.where(right < left, right_index, left_index))
+
+
+def _edges_to_lower(heights: jax.Array, edges: jax.Array, or_equal: bool) -> tuple[jax.Array, jax.Array]:
+    """Return the highest edge between each vertex and the next lower one to its right: its height and index, [N].
+
+    The height is infinite if no vertex there is lower (or equal, with `or_equal`).
+    """
+    vertices = jnp.arange(len(heights), dtype=jnp.int32)
+    # Behind the last vertex stands one that is lower than all, over an edge that is never reached.
+    low = jnp.append(heights[1:], -jnp.inf)  # lowest of the vertices i + 1 .. i + 2^k, for k = 0
+    high, at = jnp.append(edges, jnp.inf), vertices  # highest of the edges i .. i + 2^k - 1, and its index
+
+    def double(ranges: _Ranges, width: jax.Array) -> tuple[_Ranges, _Ranges]:
+        low, high, at = ranges
+        second = vertices + width
+        inside, second = second < len(heights), jnp.minimum(second, len(heights) - 1)
+        second_high = jnp.where(inside, high[second], jnp.inf)
+        doubled = (
+            jnp.minimum(low, jnp.where(inside, low[second], -jnp.inf)),
+            jnp.maximum(high, second_high),
+            jnp.where(second_high > high, at[second], at),
+        )
+        return doubled, ranges
+
+    def walk(state: _Walk, ranges: tuple[_Ranges, jax.Array]) -> tuple[_Walk, None]:
+        (low, high, at), width = ranges
+        position = state[0]
+        passed = (low[position] > heights) if or_equal else (low[position] >= heights)
+        return (jnp.where(passed, position + width, position), *_higher(state, high, at, passed)), None
+
+    widths = jnp.array([2**k for k in range((len(heights) - 1).bit_length())], jnp.int32)
+    _, tables = jax.lax.scan(double, (low, high, at), widths)
+    start = vertices, jnp.full_like(heights, -jnp.inf), vertices
+    state, _ = jax.lax.scan(walk, start, (tables, widths), reverse=True)
+    return _higher(state, high, at, jnp.ones_like(vertices, bool))
+
+
+def _higher(state: _Walk, high: jax.Array, at: jax.Array, passed: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return the highest edge on each walk, with those of the next range if it is passed: height and index."""
+    position, highest, index = state
+    higher = passed & (high[position] > highest)
+    return jnp.where(higher, high[position], highest), jnp.where(higher, at[position], index)
+
+
+def images(
+    diagrams: Diagrams,
+    *,
+    birth_range: tuple[float, float],
+    persistence_range: tuple[float, float],
+    pixels: tuple[int, int],
+    variance: ArrayLike,
+    exponent: ArrayLike = 1.0,
+) -> jax.Array:
+    """Return persistence images: the sum over pairs of persistence**n times a Gaussian, integrated over each pixel.
+
+    These are the images of Adams et al. (2017). Pairs outside the ranges contribute what of their Gaussian is inside.
+    Gradients reach the diagrams, `variance` and `exponent`.
+
+    Args:
+        diagrams: fields [..., N], of `sublevel_diagrams` or of any other source; births, deaths and the mask.
+        birth_range: least and greatest birth of the image. Static, as are the next two.
+        persistence_range: least and greatest persistence of the image.
+        pixels: number of pixels P along births, and Q along persistence.
+        variance: [], variance of the Gaussian, positive (persim calls it `sigma`).
+        exponent: [], exponent n of the weight, positive.
+
+    Returns:
+        [..., P, Q] of the type of the births, axes birth and persistence. The image of an empty diagram is zero.
+
+    Raises:
+        InputError: a range is not two finite increasing numbers, `pixels` is not two positive integers, or `variance`
+            or `exponent` is a number that is not positive.
+    """
+    for name, bounds in (("birth_range", birth_range), ("persistence_range", persistence_range)):
+        if len(bounds) != 2 or not all(map(math.isfinite, bounds)) or not bounds[0] < bounds[1]:
+            raise InputError(f"{name} is {bounds}; expected two finite numbers, the smaller one first")
+    if len(pixels) != 2 or not all(isinstance(n, int) and n > 0 for n in pixels):
+        raise InputError(f"pixels is {pixels}; expected two positive integers")
+    for name, value in (("variance", variance), ("exponent", exponent)):
+        if isinstance(value, int | float) and not (value > 0 and math.isfinite(value)):
+            raise InputError(f"{name} is {value}; expected a positive number")
+    ends = (birth_range, pixels[0]), (persistence_range, pixels[1])
+    dtype = diagrams.births.dtype
+    return _images(diagrams, *(jnp.linspace(*bounds, n + 1, dtype=dtype) for bounds, n in ends), variance, exponent)
+
+
+@jax.jit
+def _images(
+    diagrams: Diagrams, birth_edges: jax.Array, persistence_edges: jax.Array, variance: ArrayLike, exponent: ArrayLike
+) -> jax.Array:
+    births = jnp.where(diagrams.mask, diagrams.births, 0)
+    persistence = jnp.where(diagrams.mask, diagrams.deaths - diagrams.births, 0)
+    by_birth = jnp.diff(cumulative_at_edges(births, variance, birth_edges), axis=-2)
+    by_persistence = jnp.diff(cumulative_at_edges(persistence, variance, persistence_edges), axis=-2)
+    weighted = by_persistence * persistence_power(persistence, exponent)[..., None, :]
+    return jnp.matmul(by_birth, jnp.swapaxes(weighted, -1, -2), precision=jax.lax.Precision.HIGHEST) / 4
