@@ -17,9 +17,9 @@ import jax.export
 import jax.numpy as jnp
 
 from thor2_jax.capacity import BATCH_BUCKETS, POINT_BUCKETS
-from thor2_jax.descriptor.describe import describe
+from thor2_jax.descriptor.orientations import describe_orientations
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.classifier import class_probabilities
+from thor2_jax.recognition.classifier import oriented_probabilities
 from thor2_jax.recognition.run_directory import TrainedRun
 from thor2_jax.types import PointClouds
 
@@ -56,10 +56,10 @@ def export_recognizer(run: TrainedRun, n_points: int, n_clouds: int, platforms: 
     config = dataclasses.replace(run.config, homology="closed_form")
 
     def recognize(*fields: jax.Array) -> dict[str, jax.Array]:
-        descriptors = describe(PointClouds(*fields), run.network, config)
+        oriented = describe_orientations(PointClouds(*fields), run.network, config)
         return {
-            "overflow": descriptors.overflow,
-            **{name: class_probabilities(model, descriptors, name) for name, model in run.classifiers.items()},
+            "overflow": oriented.first.overflow,
+            **{name: oriented_probabilities(model, oriented, name) for name, model in run.classifiers.items()},
         }
 
     shape = jax.ShapeDtypeStruct

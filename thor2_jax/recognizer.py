@@ -33,7 +33,7 @@ from thor2_jax.gallery.gallery import Gallery
 from thor2_jax.gallery.objects import ObjectGallery
 from thor2_jax.gallery.store import GALLERY_DIRECTORY
 from thor2_jax.recognition.answers import MAX_OVERFLOW, DescribedFrame, Evidence, Recognition, concatenate_padded
-from thor2_jax.recognition.classifier import EMBEDDING, MLP, Feature, feature_of
+from thor2_jax.recognition.classifier import EMBEDDING, MLP, Feature, oriented_probabilities
 from thor2_jax.recognition.confidence import Calibration
 from thor2_jax.recognition.frames import RGBDFrame
 from thor2_jax.recognition.fusion import DEFAULT_RULE, FUSION_RULES, FusionRule, fused_probabilities
@@ -482,8 +482,6 @@ def _compiled(name: Feature, model: MLP) -> Classify:
 
     @jax.jit
     def forward(leaves: list[jax.Array], oriented: OrientedDescriptors) -> jax.Array:
-        logits = nnx.merge(graph, jax.tree.unflatten(structure, leaves))(feature_of(oriented.flat[0], name))
-        each = jax.nn.log_softmax(logits).reshape(*oriented.weights.shape, -1)
-        return jax.nn.softmax((oriented.weights[..., None] * each).sum(axis=1))
+        return oriented_probabilities(nnx.merge(graph, jax.tree.unflatten(structure, leaves)), oriented, name)
 
     return lambda oriented: forward(leaves, oriented)

@@ -9,6 +9,7 @@ import pytest
 from helpers import untrained_run
 
 import thor2_jax as thor2
+from thor2_jax.descriptor.orientations import describe_orientations
 from thor2_jax.export import export_recognizer
 from thor2_jax.recognition.classifier import FEATURES
 from thor2_jax.recognition.run_directory import TrainedRun
@@ -50,8 +51,8 @@ def test_an_exported_recognizer_runs_without_this_package(run: TrainedRun, tmp_p
     outputs = np.load(tmp_path / "outputs.npz")
     assert set(outputs) == {*FEATURES, "overflow"}
 
-    described = thor2.describe(packed, run.network, CONFIG)  # gudhi: the other backend
-    np.testing.assert_array_equal(outputs["overflow"], described.overflow)
+    described = describe_orientations(packed, run.network, CONFIG)  # gudhi: the other backend
+    np.testing.assert_array_equal(outputs["overflow"], described.first.overflow)
     expected = thor2.Recognizer(run).probabilities(described)
     for name in FEATURES:
         np.testing.assert_allclose(outputs[name], expected[name], rtol=0, atol=1e-6)

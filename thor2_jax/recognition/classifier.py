@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
+from thor2_jax.descriptor.orientations import OrientedDescriptors
 from thor2_jax.errors import InputError
 from thor2_jax.types import Descriptors
 
@@ -19,6 +20,7 @@ __all__ = [
     "check_features",
     "class_probabilities",
     "feature_of",
+    "oriented_probabilities",
 ]
 
 Feature = Literal["ce", "tops", "tops2"]
@@ -113,3 +115,12 @@ class MLP(nnx.Module):
 def class_probabilities(model: MLP, descriptors: Descriptors, name: Feature) -> jax.Array:
     """Return the class probabilities [B, n_classes] of a trained classifier that reads the descriptor `name`."""
     return jax.nn.softmax(model(feature_of(descriptors, name)))
+
+
+def oriented_probabilities(model: MLP, oriented: OrientedDescriptors, name: Feature) -> jax.Array:
+    """Return the class probabilities [B, n_classes] of clouds that are described in K orientations.
+
+    They are the geometric mean over the orientations, by their weights, normalized to sum to 1.
+    """
+    each = jax.nn.log_softmax(model(feature_of(oriented.flat[0], name))).reshape(*oriented.weights.shape, -1)
+    return jax.nn.softmax((oriented.weights[..., None] * each).sum(axis=1))

@@ -19,6 +19,7 @@ from flax import nnx
 
 import colornet
 import thor2_jax as thor2
+from thor2_jax.descriptor.orientations import OrientedDescriptors
 from thor2_jax.recognition.classifier import FEATURES, MLP
 from thor2_jax.recognition.run_directory import TrainedRun, input_size, load_run, save_run
 from thor2_jax.recognition.weights import model_arrays
@@ -64,9 +65,10 @@ def test_saving_and_loading_round_trips(saved: Path) -> None:
     assert loaded.network.fingerprint == run.network.fingerprint
     assert tuple(loaded.classifiers) == ("ce", "tops")
     rng = np.random.default_rng(0)
-    images, color = rng.random((1, 2, 8, 8), np.float32), rng.random((1, 2, 22, 5), np.float32)
-    descriptors = thor2.Descriptors(jnp.asarray(images), jnp.asarray(color), jnp.zeros(1, jnp.int32))
-    before, after = Recognizer(run).probabilities(descriptors), Recognizer.load(saved).probabilities(descriptors)
+    images, color = rng.random((1, 1, 2, 8, 8), np.float32), rng.random((1, 1, 2, 22, 5), np.float32)
+    descriptors = thor2.Descriptors(jnp.asarray(images), jnp.asarray(color), jnp.zeros((1, 1), jnp.int32))
+    oriented = OrientedDescriptors(descriptors, jnp.zeros((1, 1, 34)), jnp.ones((1, 1)))
+    before, after = Recognizer(run).probabilities(oriented), Recognizer.load(saved).probabilities(oriented)
     for name in run.classifiers:
         assert before[name].shape == (1, 3)
         np.testing.assert_array_equal(before[name], after[name])
