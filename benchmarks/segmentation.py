@@ -98,15 +98,15 @@ def measure(items: Sequence[LabelledFrame], segmenter: Any, recognizer: Recogniz
                 row["correct"] = with_truth.get(row["label"]) == row["name"]
                 row["correct_piece"] = with_pieces.get(row["piece"]) == row["name"]
         rows += of_frame
-    found = np.array([row["iou"] > FOUND for row in rows])
+    is_found = np.array([row["iou"] > FOUND for row in rows])
     thick = np.array([not row["name"].startswith(THIN) for row in rows])
     elapsed, processor = np.median(times, axis=0) * 1000
     report: dict[str, Any] = {
         "frames": len(items),
         "instances": len(rows),
-        "found": float(found.mean()),
+        "found": float(is_found.mean()),
         "thick": int(thick.sum()),
-        "thick found": float(found[thick].mean()),
+        "thick found": float(is_found[thick].mean()),
         "over-segmented": float(np.mean([row["over"] for row in rows])),
         "under-segmented": float(np.mean([row["under"] for row in rows])),
         "pieces on the background in a frame": extra / len(items),
@@ -117,8 +117,8 @@ def measure(items: Sequence[LabelledFrame], segmenter: Any, recognizer: Recogniz
         correct = np.array([row["correct"] for row in rows])
         correct_piece = np.array([row["correct_piece"] for row in rows])
         report["accuracy, true masks"] = float(correct.mean())
-        report["accuracy of the found, true masks"] = float(correct[found].mean())
-        report["accuracy of the found, segmented"] = float(correct_piece[found].mean())
+        report["accuracy of the found, true masks"] = float(correct[is_found].mean())
+        report["accuracy of the found, segmented"] = float(correct_piece[is_found].mean())
     return report
 
 

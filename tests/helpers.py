@@ -24,6 +24,7 @@ import thor2_jax as thor2
 from thor2_jax.gallery.objects import ObjectGallery
 from thor2_jax.recognition.classifier import FEATURES, MLP
 from thor2_jax.recognition.run_directory import TrainedRun, input_size
+from training.objects.builtin_objects import builtin_objects
 from training.rendering.camera import Camera, RenderedView
 
 SMALL_CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=2, n_strips=5, image_size=8)
@@ -210,4 +211,31 @@ def write_frame(directory: Path, objects: dict[int, str], seed: int = 0) -> Path
         Image.fromarray(image).save(directory / f"{name}.png")
     (directory / "intrinsics.json").write_text('{"fx": 600, "fy": 600, "cx": 159.5, "cy": 119.5}')
     (directory / "labels.json").write_text(json.dumps({"labels": {str(k): name for k, name in objects.items()}}))
+    return directory
+
+
+def frame_options(folder: Path, **changes: object) -> list[object]:
+    """Return the options of `thor2 recognize` that name the files of a frame, with some changed."""
+    files = {
+        "color": folder / "color.png",
+        "depth": folder / "depth.png",
+        "labels": folder / "mask.png",
+        "intrinsics": folder / "intrinsics.json",
+    }
+    return [part for name, value in {**files, **changes}.items() for part in (f"--{name}", value)]
+
+
+def write_meshes(directory: Path, names: Sequence[str]) -> Path:
+    """Write built-in objects to PLY files with vertex colours."""
+    import trimesh
+
+    directory.mkdir(exist_ok=True)
+    objects = builtin_objects()
+    for name in names:
+        mesh = objects[name]
+        colors = mesh.colors_at(np.arange(len(mesh.faces)), np.full((len(mesh.faces), 2), 1 / 3, np.float32))
+        corners = mesh.vertices[mesh.faces].reshape(-1, 3)
+        faces = np.arange(len(corners)).reshape(-1, 3)
+        plain = trimesh.Trimesh(corners, faces, vertex_colors=np.repeat(colors, 3, axis=0), process=False)
+        plain.export(directory / f"{name}.ply")
     return directory

@@ -58,7 +58,7 @@ def export_recognizer(run: TrainedRun, n_points: int, n_clouds: int, platforms: 
     def recognize(*fields: jax.Array) -> dict[str, jax.Array]:
         oriented = describe_orientations(PointClouds(*fields), run.network, config)
         return {
-            "overflow": oriented.first.overflow,
+            "overflow": oriented.overflow,
             **{name: oriented_probabilities(model, oriented, name) for name, model in run.classifiers.items()},
         }
 

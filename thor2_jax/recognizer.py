@@ -319,9 +319,9 @@ class Recognizer:
         """
         probabilities = {name: self._classify[name](oriented) for name in classifiers}
         if clouds is None:
-            return Evidence(oriented.first.overflow, probabilities)
+            return Evidence(oriented.overflow, probabilities)
         embeddings, weights = self.objects.embed(clouds, oriented, self.run.config)
-        return Evidence(oriented.first.overflow, probabilities, embeddings, weights)
+        return Evidence(oriented.overflow, probabilities, embeddings, weights)
 
     def _evidence(self, clouds: PointClouds, classifiers: Sequence[str], embed: bool) -> Evidence:
         oriented = describe_orientations(clouds, self.run.network, self.run.config)
@@ -360,7 +360,7 @@ class Recognizer:
 
     def gallery_scores(self, described: DescribedFrame) -> NDArray[np.float32]:
         """Return the scores [B, n_objects] of the gallery, one row for each row of the descriptors."""
-        scores = np.zeros((len(described.descriptors.overflow), len(self.gallery.names)), np.float32)
+        scores = np.zeros((len(described.oriented.weights), len(self.gallery.names)), np.float32)
         if described.usable:
             embedded = self.objects.embed(described.packed, described.oriented, self.run.config)
             scores[:] = self.gallery.scores(*embedded)

@@ -115,7 +115,7 @@ def labelled_views(
                         views[name].append(instance_view(item.frame, label, sigma_s))
                 except InputError as error:
                     skipped.append(SkippedInstance(item.identifier, name, str(error)))
-    empty = [name for name, found in views.items() if not found]
+    empty = [name for name, of_object in views.items() if not of_object]
     if empty:
         reason = next(instance.reason for instance in skipped if instance.name == empty[0])
         raise InputError(f"frames: {empty[0]!r} has no usable view ({reason})")
@@ -170,9 +170,9 @@ def enroll_objects(
         objects.check(each, extend=extend, replace=replace)
     added = {}
     with progress() as report:
-        for number, (each, found) in enumerate(views.items()):
+        for number, (each, of_object) in enumerate(views.items()):
             report("enroll", number, len(views), each)
-            added[each] = enrolled_views(objects.embedding, found, source)
+            added[each] = enrolled_views(objects.embedding, of_object, source)
         report("enroll", len(views), len(views), "")
     if is_new:
         _create_run(model, objects, added)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers import write_meshes
 from PIL import Image
 
 from benchmarks import levers
@@ -61,18 +62,8 @@ def test_bad_arguments_write_nothing(
 @pytest.fixture
 def given(tmp_path: Path) -> list[Any]:
     """Return options with the meshes and two frames of two built-in objects, and a training of a few seconds."""
-    import trimesh
-
     objects = builtin_objects()
-    meshes, frames = tmp_path / "meshes", tmp_path / "frames"
-    meshes.mkdir()
-    for name in NAMES:
-        mesh = objects[name]
-        colors = mesh.colors_at(np.arange(len(mesh.faces)), np.full((len(mesh.faces), 2), 1 / 3, np.float32))
-        corners = mesh.vertices[mesh.faces].reshape(-1, 3)
-        faces = np.arange(len(corners)).reshape(-1, 3)
-        plain = trimesh.Trimesh(corners, faces, vertex_colors=np.repeat(colors, 3, axis=0), process=False)
-        plain.export(meshes / f"{name}.ply")
+    meshes, frames = write_meshes(tmp_path / "meshes", NAMES), tmp_path / "frames"
     for seed in range(2):
         shown = (*NAMES, "mug_white")
         scene = compose_scene({name: objects[name] for name in shown}, np.random.default_rng(seed), n_objects=3)

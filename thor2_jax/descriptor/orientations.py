@@ -20,10 +20,16 @@ from thor2_jax.descriptor.view_normalization import Normalization, align, boxed,
 from thor2_jax.errors import InputError
 from thor2_jax.types import Descriptors, PointClouds, Strips
 
-__all__ = ["OrientedDescriptors", "candidate_orientations", "describe_orientations", "orient_descriptors"]
+__all__ = [
+    "NEARLY_EQUAL",
+    "OrientedDescriptors",
+    "candidate_orientations",
+    "describe_orientations",
+    "orient_descriptors",
+]
 
 NEARLY_EQUAL = 0.85
-"""Least ratio of the second side of the box to the first at which the two are also swapped."""
+"""Least ratio of a side of the box to the next longer one at which the two may be swapped."""
 
 
 @jax.tree_util.register_dataclass
@@ -46,6 +52,19 @@ class OrientedDescriptors:
         """The descriptors [B, ...] of the paper's orientation."""
         first: Descriptors = jax.tree.map(lambda a: a[:, 0], self.each)
         return first
+
+    @property
+    def overflow(self) -> jax.Array:
+        """The overflow [B] of the descriptors in the paper's orientation."""
+        return self.each.overflow[:, 0]
+
+    def fuse(self, logits: jax.Array) -> jax.Array:
+        """Return class probabilities [B, n] from the logits [B * K, n] of `flat`.
+
+        They are the geometric mean over the orientations, by their weights, normalized to sum to 1.
+        """
+        each = jax.nn.log_softmax(logits).reshape(*self.weights.shape, -1)
+        return jax.nn.softmax((self.weights[..., None] * each).sum(axis=1))
 
     @property
     def flat(self) -> tuple[Descriptors, jax.Array]:
@@ -72,7 +91,7 @@ def _orientations(clouds: PointClouds, config: DescriptorConfig, count: int) -> 
     def one(cloud: PointClouds) -> tuple[jax.Array, jax.Array, jax.Array]:
         normalization = boxed(cloud, np.float32(config.sigma_s))
         rotations, weights = [], []
-        for box in (normalization, _swapped(normalization))[: max(count // 2, 1)]:
+        for box in (normalization, _swapped(normalization))[: count // 2]:
             rotation, end_is_occluded = oriented(box)
             rotations += [rotation, half_turn @ rotation]
             weights += [jnp.ones(()), jnp.where(end_is_occluded, 0.0, 1.0)]

@@ -189,9 +189,7 @@ def _embed_clouds(
 
 @functools.partial(jax.jit, static_argnums=0)
 def _classify(graph: Any, state: Any, oriented: OrientedDescriptors) -> jax.Array:
-    logits = nnx.merge(graph, state).class_logits(*oriented.flat)
-    each = jax.nn.log_softmax(logits).reshape(*oriented.weights.shape, -1)
-    return jax.nn.softmax((oriented.weights[..., None] * each).sum(axis=1))
+    return oriented.fuse(nnx.merge(graph, state).class_logits(*oriented.flat))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -97,7 +97,7 @@ class DescribedFrame:
     @property
     def packed(self) -> PointClouds:
         """The described clouds in metres, padded as `descriptors` are."""
-        return pack_instances(self.usable, len(self.descriptors.overflow))
+        return pack_instances(self.usable, len(self.oriented.weights))
 
 
 def concatenate_padded(batches: Sequence[T], n_rows: int) -> T:

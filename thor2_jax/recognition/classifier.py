@@ -28,7 +28,7 @@ FEATURES: tuple[Feature, ...] = ("ce", "tops", "tops2")
 """Descriptors that a classifier can be trained on: colour embeddings, TOPS, TOPS2."""
 
 EMBEDDING = "embedding"
-"""Name of the classifier of a run that is its embedding's network, beside the MLPs."""
+"""Name of the class probabilities that the embedding of a run gives, beside those of the MLPs."""
 
 HIDDEN = (512, 256, 128, 64)
 
@@ -118,9 +118,5 @@ def class_probabilities(model: MLP, descriptors: Descriptors, name: Feature) -> 
 
 
 def oriented_probabilities(model: MLP, oriented: OrientedDescriptors, name: Feature) -> jax.Array:
-    """Return the class probabilities [B, n_classes] of clouds that are described in K orientations.
-
-    They are the geometric mean over the orientations, by their weights, normalized to sum to 1.
-    """
-    each = jax.nn.log_softmax(model(feature_of(oriented.flat[0], name))).reshape(*oriented.weights.shape, -1)
-    return jax.nn.softmax((oriented.weights[..., None] * each).sum(axis=1))
+    """Return the class probabilities [B, n_classes] of clouds that are described in K orientations."""
+    return oriented.fuse(model(feature_of(oriented.flat[0], name)))

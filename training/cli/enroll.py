@@ -59,7 +59,7 @@ def enroll(
         if frames:
             views, unusable = labelled_views(frames, sigma_s, label_name or name)
             skipped.extend(f"skipped: {each.reason}" for each in unusable)
-            return views if name is None else {name: [view for found in views.values() for view in found]}
+            return views if name is None else {name: [view for each in views.values() for view in each]}
         from thor2_jax.recognition.frames import read_frame
 
         assert name is not None and color and depth and labels and intrinsics and instance is not None

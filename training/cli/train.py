@@ -81,8 +81,8 @@ def train(
 
     With --baselines, a finished run gets the baselines that it lacks. With --sequences, one run is trained for each
     sequence, on its objects only (see `thor2 evaluate ocid --per-sequence`); finished runs must have the same options.
-    The embedding is a classifier beside the others, and objects are enrolled in the run with it. It is also fitted on
-    distractors, objects that are none of the classes, so that the model recognizes what it does not know.
+    The embedding gives the confidence of an answer, and objects are enrolled in the run with it. It is also fitted on
+    distractors, objects that are none of the classes, so that unknown objects get a low confidence.
     """
     import jax
 
@@ -151,7 +151,7 @@ def _distractors(procedural: int | None, meshes: Path | None, workers: int) -> A
 
     if procedural == 0 and meshes is None:
         return None
-    found = {} if meshes is None else find_meshes(meshes)
+    paths = {} if meshes is None else find_meshes(meshes)
     if procedural is None:
-        return Distractors(meshes=found, workers=workers)
-    return Distractors(procedural, found, workers=workers)
+        return Distractors(meshes=paths, workers=workers)
+    return Distractors(procedural, paths, workers=workers)

@@ -131,17 +131,17 @@ def _check_unit(
 
     scale = 1.0 if frame.depth.dtype.kind == "f" else frame.intrinsics.depth_scale
     best = min(DEPTH_SCALES, key=lambda each: misfit(scale / each))
-    found = best if misfit(scale / best) < math.inf else None
+    likely = best if misfit(scale / best) < math.inf else None
     if frame.depth.dtype.kind == "f":
         advice = "Floating-point depth must be in metres."
-        if found is not None:
-            advice += f" Divide it by {found:g}: the median would be {_length(median / found)}."
+        if likely is not None:
+            advice += f" Divide it by {likely:g}: the median would be {_length(median / likely)}."
     else:
         advice = "Set depth_scale to the number of depth units per metre (1000 for millimetres)."
-        if found is not None:
-            advice = f"With depth_scale {found:g} (units per metre) the median distance would be "
-            advice += f"{_length(median * scale / found)}: set it in the intrinsics or by --depth-scale."
-    if found is None and MIN_DEPTH <= median <= MAX_DEPTH:
+        if likely is not None:
+            advice = f"With depth_scale {likely:g} (units per metre) the median distance would be "
+            advice += f"{_length(median * scale / likely)}: set it in the intrinsics or by --depth-scale."
+    if likely is None and MIN_DEPTH <= median <= MAX_DEPTH:
         advice += " If the distance is right, the focal length or the labels are wrong."
     if extent is not None and len(frame.instances) == 1 and extent > high and MIN_DEPTH <= median <= MAX_DEPTH:
         diagnosis.add(

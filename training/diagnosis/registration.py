@@ -165,13 +165,13 @@ def check_registration(diagnosis: Diagnosis, color: NDArray[np.uint8], depth_m: 
     candidates = {name: depth_m[flip] for name, flip in FLIPS.items()}
     candidates["rotated by 180 degrees"] = depth_m[::-1, ::-1]
     candidates |= {f"enlarged by a factor of {1 / scale:.2f}": _zoomed(depth_m, scale) for scale in SCALES}
-    found = {name: _align(depth_edges(each), spectrum) for name, each in candidates.items()}
+    alignments = {name: _align(depth_edges(each), spectrum) for name, each in candidates.items()}
 
     def weighted_peak(name: str) -> float:
-        return found[name].peak * min(1, found[name].n_edges / plain.n_edges)
+        return alignments[name].peak * min(1, alignments[name].n_edges / plain.n_edges)
 
-    name = max(found, key=weighted_peak)
-    best = found[name]
+    name = max(alignments, key=weighted_peak)
+    best = alignments[name]
     if best.height >= MIN_PEAK and weighted_peak(name) >= MIN_GAIN * plain.peak:
         shift = f", and {_shift(best, step)}" if best.distance > MAX_REGISTERED else ""
         diagnosis.add(

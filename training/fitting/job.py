@@ -65,41 +65,11 @@ CURVE = ("epoch", "loss", "accuracy", "held_out_accuracy")
 """Metrics of an epoch that the record keeps: those that a repeated training reproduces."""
 
 
-def _job_record(
-    digest: str,
-    features: Sequence[Feature],
-    options: FitOptions,
-    config: DescriptorConfig,
-    network: colornet.ColorNetwork,
-    folds: int,
-    mirrors: Sequence[str],
-    orientations: int,
-    distractors: Distractors | None,
-) -> dict[str, Any]:
-    added = {} if distractors is None else {"distractors": distractors.record}
-    return added | {
-        "descriptor_version": DESCRIPTOR_VERSION,
-        "descriptor_config": dataclasses.asdict(config),
-        "color_network": network.fingerprint,
-        "dataset": digest,
-        "classifiers": list(features),
-        "folds": folds,
-        "mirrors": list(mirrors),
-        "orientation_copies": orientations,
-        "epochs": options.epochs,
-        "learning_rates": list(options.learning_rates),
-        "batch_size": options.batch_size,
-        "seed": options.seed,
-    }
-
-
 @dataclasses.dataclass(frozen=True)
-class _Training:
-    """The job of one run directory; see `train_run` for the fields.
+class _Settings:
+    """Everything beside the views that determines a trained run; see `train_run` for the fields.
 
     Attributes:
-        source: labelled views.
-        out: absolute path of the run directory.
         features: what the classifiers read.
         options: of every fit.
         config: descriptor.
@@ -110,31 +80,45 @@ class _Training:
         distractors: other objects that an embedding is fitted on, too; None fits no embedding.
     """
 
-    source: ViewSource
-    out: Path
     features: tuple[Feature, ...]
     options: FitOptions
     config: DescriptorConfig
     network: colornet.ColorNetwork
     folds: int
-    mirrors: tuple[str, ...]
-    orientations: int = 0
-    distractors: Distractors | None = None
+    mirrors: Sequence[str]
+    orientations: int
+    distractors: Distractors | None
 
-    @property
-    def record(self) -> dict[str, Any]:
-        """Everything that determines the trained run, as JSON holds it."""
-        return _job_record(
-            self.source.digest,
-            self.features,
-            self.options,
-            self.config,
-            self.network,
-            self.folds,
-            self.mirrors,
-            self.orientations,
-            self.distractors,
-        )
+    def record(self, digest: str) -> dict[str, Any]:
+        """Return everything that determines the run as JSON holds it; `digest` is that of the labelled views."""
+        added = {} if self.distractors is None else {"distractors": self.distractors.record}
+        return added | {
+            "descriptor_version": DESCRIPTOR_VERSION,
+            "descriptor_config": dataclasses.asdict(self.config),
+            "color_network": self.network.fingerprint,
+            "dataset": digest,
+            "classifiers": list(self.features),
+            "folds": self.folds,
+            "mirrors": list(self.mirrors),
+            "orientation_copies": self.orientations,
+            "epochs": self.options.epochs,
+            "learning_rates": list(self.options.learning_rates),
+            "batch_size": self.options.batch_size,
+            "seed": self.options.seed,
+        }
+
+
+@dataclasses.dataclass(frozen=True)
+class _Training(_Settings):
+    """The job of one run directory.
+
+    Attributes:
+        source: labelled views.
+        out: absolute path of the run directory.
+    """
+
+    source: ViewSource
+    out: Path
 
     def check_begun(self) -> None:
         """Raise InputError if `out` holds an interrupted training of another job."""
@@ -144,13 +128,13 @@ class _Training:
                 begun = dict(json.loads(path.read_bytes()))
             except (OSError, ValueError, TypeError, RecursionError) as error:
                 raise InputError(f"out: {path} cannot be read ({error}); delete {path.parent} to start anew") from None
-            check_same_job(self.out, begun, self.record)
+            check_same_job(self.out, begun, self.record(self.source.digest))
 
     def begin(self) -> None:
         """Write the job record unless the training is resumed."""
         path = self.out / CHECKPOINTS / BEGUN
         if not path.is_file():
-            write_text(path, json.dumps(self.record, indent=1) + "\n")
+            write_text(path, json.dumps(self.record(self.source.digest), indent=1) + "\n")
 
 
 def check_out(out: str | Path) -> None:
@@ -193,9 +177,8 @@ def check_trained(
     """
     names = check_features(features, "classifiers")
     network = colornet.load_default()
-    requested = _job_record(
-        digest, names, options, config or CONFIG, network, folds, mirrors, orientations, distractors
-    )
+    settings = _Settings(names, options, config or CONFIG, network, folds, mirrors, orientations, distractors)
+    requested = settings.record(digest)
     record = finished_record(out)
     stored = {"orientation_copies": 0, **record, "dataset": record["dataset"]["digest"]}
     stored["descriptor_config"] = {"orientations": 1, **record["descriptor_config"]}  # version 0.1.0 has neither
@@ -262,7 +245,7 @@ def train_run(
     if distractors is not None:
         distractors.check(source.classes)
     training = _Training(
-        source, out, names, options, config or CONFIG, network, folds, tuple(mirrors), orientations, distractors
+        names, options, config or CONFIG, network, folds, tuple(mirrors), orientations, distractors, source, out
     )
     check_out(out)
     training.check_begun()
@@ -337,7 +320,8 @@ def _train_fold(
             draw_curves(
                 {name: [row for row in rows if row["classifier"] == name] for name in training.features}, out / CURVES
             )
-            record = training.record | {"dataset": training.source.record, "samples": len(samples), "fold": fold}
+            record = training.record(training.source.digest)
+            record |= {"dataset": training.source.record, "samples": len(samples), "fold": fold}
             record |= _outcome([row for row in rows if row["fold"] == fold], best_epochs)
             record["temperatures"] = calibrated
             if calibration is not None:

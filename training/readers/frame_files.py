@@ -103,19 +103,19 @@ def find_frames(paths: Sequence[Path], depth_scale: float | None = None) -> list
             raise InputError(f"frames: {path} is not a directory; expected a folder of frames")
         if any(path.glob("scene_camera.json")) or any(path.glob("*/scene_camera.json")):
             dataset = BOP(path)
-            found = [
+            of_path = [
                 FrameSource(name, functools.partial(_read_bop, dataset, k))
                 for k, name in enumerate(dataset.identifiers)
             ]
         else:
             colors = [file for name in FILE_NAMES["color"] for file in path.rglob(name)]
-            found = [
+            of_path = [
                 FrameSource(_name(folder, path), functools.partial(frame_files(folder).read, depth_scale))
                 for folder in sorted({file.parent for file in colors})
             ]
-        if not found:
+        if not of_path:
             raise InputError(f"frames: {path} has no {' or '.join(FILE_NAMES['color'])}; expected a folder of frames")
-        sources += found
+        sources += of_path
     names = [source.name for source in sources]
     repeated = sorted({name for name in names if names.count(name) > 1}) if len(set(names)) < len(names) else []
     if repeated:

@@ -69,15 +69,15 @@ def test_pycocotools_loads_the_results(tmp_path: Path) -> None:
     }
     dataset.createIndex()
     loaded = dataset.loadRes(str(tmp_path / "results.json"))
-    found = {entry["category_id"]: entry for entry in loaded.loadAnns(loaded.getAnnIds())}
-    assert set(found) == {1, 2}
+    annotations = {entry["category_id"]: entry for entry in loaded.loadAnns(loaded.getAnnIds())}
+    assert set(annotations) == {1, 2}
     for category, label, score in ((2, 1, 0.75), (1, 2, 0.5)):
         mask = scene.label_image == label
-        entry = found[category]
+        entry = annotations[category]
         np.testing.assert_array_equal(loaded.annToMask(entry).astype(bool), mask)
         assert entry["score"] == score and entry["area"] == mask.sum() and entry["image_id"] == 7
         np.testing.assert_array_equal(entry["bbox"], coco_mask.toBbox(entry["segmentation"]))
-    assert found[2]["bbox"] == [10, 5, 20, 15]
+    assert annotations[2]["bbox"] == [10, 5, 20, 15]
 
 
 def test_bop_lines() -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import run_thor2
+from helpers import frame_options, run_thor2, write_meshes
 from PIL import Image
 
 from thor2_jax.gallery.embedding import Embedding, load_default
@@ -24,18 +24,7 @@ NAMES = ("soup_can_red", "cereal_box_blue", "mug_white")
 @pytest.fixture(scope="module")
 def meshes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a directory of three PLY files with vertex colours."""
-    import trimesh
-
-    folder = tmp_path_factory.mktemp("meshes")
-    objects = builtin_objects()
-    for name in NAMES:
-        mesh = objects[name]
-        colors = mesh.colors_at(np.arange(len(mesh.faces)), np.full((len(mesh.faces), 2), 1 / 3, np.float32))
-        corners = mesh.vertices[mesh.faces].reshape(-1, 3)
-        faces = np.arange(len(corners)).reshape(-1, 3)
-        plain = trimesh.Trimesh(corners, faces, vertex_colors=np.repeat(colors, 3, axis=0), process=False)
-        plain.export(folder / f"{name}.ply")
-    return folder
+    return write_meshes(tmp_path_factory.mktemp("meshes"), NAMES)
 
 
 @pytest.fixture(scope="module")
@@ -81,16 +70,6 @@ def model(meshes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def recognize(images: Path, **changes: Path) -> list[object]:
-    files = {
-        "color": images / "color.png",
-        "depth": images / "depth.png",
-        "labels": images / "mask.png",
-        "intrinsics": images / "intrinsics.json",
-    }
-    return [part for name, path in {**files, **changes}.items() for part in (f"--{name}", path)]
-
-
 def one_line(err: str) -> str:
     lines = [line for line in err.splitlines() if line.startswith("error:")]
     assert len(lines) == 1, err
@@ -108,7 +87,7 @@ def test_files_of_a_run_directory(model: Path) -> None:
 
 
 def test_recognize(model: Path, images: Path, scene: Scene, tmp_path: Path, run: Run) -> None:
-    code, out, _ = run("recognize", "--model", model, *recognize(images), "--out", tmp_path / "answer")
+    code, out, _ = run("recognize", "--model", model, *frame_options(images), "--out", tmp_path / "answer")
     assert code == 0
     answers = json.loads((tmp_path / "answer" / "recognition.json").read_text())
     assert [a["label"] for a in answers] == list(scene.frame.instances)
@@ -118,9 +97,9 @@ def test_recognize(model: Path, images: Path, scene: Scene, tmp_path: Path, run:
 
 
 def test_unknown_below_makes_objects_unknown(model: Path, images: Path, run: Run) -> None:
-    code, out, _ = run("recognize", "--model", model, *recognize(images), "--unknown-below", 1)
+    code, out, _ = run("recognize", "--model", model, *frame_options(images), "--unknown-below", 1)
     assert code == 0 and "unrecognized" in out and "unknown" in out
-    code, _, err = run("recognize", "--model", model, *recognize(images), "--unknown-below", 1.5)
+    code, _, err = run("recognize", "--model", model, *frame_options(images), "--unknown-below", 1.5)
     assert code == 2 and "unknown_below is 1.5" in one_line(err)
 
 
@@ -132,7 +111,7 @@ def test_evaluate_frames(model: Path, images: Path, scene: Scene, tmp_path: Path
     code, out, _ = run(*command)
     assert code == 0 and "THOR2" in out and "a second" in out
     report = json.loads((tmp_path / "report" / "report.json").read_text())
-    run("recognize", "--model", model, *recognize(images), "--out", tmp_path / "answer")
+    run("recognize", "--model", model, *frame_options(images), "--out", tmp_path / "answer")
     answers = json.loads((tmp_path / "answer" / "recognition.json").read_text())
     expected = np.mean([a["name"] == scene.truth[a["label"]] for a in answers])
     whole = report["accuracy"][report["rule"]][0]["cells"][0]
@@ -173,8 +152,8 @@ def test_any_name_of_an_object(model: Path, images: Path, scene: Scene, tmp_path
     shutil.copytree(images, tmp_path / "frames" / "one")
     truth = {label: renamed[name] for label, name in scene.truth.items()}
     (tmp_path / "frames" / "one" / "labels.json").write_text(json.dumps({"labels": truth}))
-    _, expected, _ = run("recognize", "--model", model, *recognize(images))
-    code, out, _ = run("recognize", "--model", tmp_path / "run", *recognize(images), "--out", tmp_path / "answer")
+    _, expected, _ = run("recognize", "--model", model, *frame_options(images))
+    code, out, _ = run("recognize", "--model", tmp_path / "run", *frame_options(images), "--out", tmp_path / "answer")
     assert code == 0 and all((name in expected) == (shown[name] in out) for name in NAMES)
     assert "\x1b" not in out and "\u202e" not in out
     code, _, _ = run(
@@ -188,7 +167,7 @@ def test_output_is_checked_before_the_work(meshes: Path, images: Path, tmp_path:
     absent = tmp_path / "absent"
     for out in (Path("/proc/no/directory"), images / "color.png" / "run"):
         for command in (
-            ("recognize", "--model", absent, *recognize(absent)),
+            ("recognize", "--model", absent, *frame_options(absent)),
             ("train", "--meshes", absent),
             ("train", "--dataset", absent),
             ("render", "--meshes", meshes),
@@ -249,7 +228,7 @@ def test_train_with_distractors(meshes: Path, images: Path, tmp_path: Path, run:
     own = record["calibration"]["unknown_below"]
     assert set(recognizer.thresholds()) == {own} and 0 < own < 1
     assert set(Recognizer.load(out, 0.25).thresholds()) == {0.25}
-    assert run("recognize", "--model", out, *recognize(images), "--out", tmp_path / "answer")[0] == 0
+    assert run("recognize", "--model", out, *frame_options(images), "--out", tmp_path / "answer")[0] == 0
     answers = json.loads((tmp_path / "answer" / "recognition.json").read_text())
     assert {"tops", "tops2", "embedding"} == set(answers[0]["top"])
     assert run(*command)[0] == 0 and (out / "embedding.safetensors").read_bytes() == content
@@ -333,7 +312,7 @@ def test_one_invalid_instance_leaves_the_others_recognized(
     labels = scene.frame.labels.astype(np.uint8)
     labels[0, :5] = 9
     Image.fromarray(labels).save(tmp_path / "labels.png")
-    changed = recognize(images, labels=tmp_path / "labels.png")
+    changed = frame_options(images, labels=tmp_path / "labels.png")
     code, out, _ = run("recognize", "--model", model, *changed, "--out", tmp_path / "answer")
     assert code == 0 and "unrecognized" in out
     answers = {a["label"]: a for a in json.loads((tmp_path / "answer" / "recognition.json").read_text())}
@@ -379,7 +358,7 @@ def invalid_inputs(folder: Path, source: Path) -> dict[str, tuple[str, Path, str
 
 def test_invalid_images_are_refused(model: Path, images: Path, tmp_path: Path, run: Run) -> None:
     for case, (argument, path, expected) in invalid_inputs(tmp_path, images).items():
-        changed = recognize(images, **{argument: path})
+        changed = frame_options(images, **{argument: path})
         code, _, err = run("recognize", "--model", model, *changed, "--out", tmp_path / "answer")
         assert code == 2, case
         assert expected in one_line(err), case
@@ -406,7 +385,7 @@ def test_invalid_models_are_refused(model: Path, images: Path, tmp_path: Path, r
         damaged_copy("weights", lambda f: (f / "weights" / "tops.safetensors").unlink()): "tops",
     }
     for path, expected in cases.items():
-        code, _, err = run("recognize", "--model", path, *recognize(images))
+        code, _, err = run("recognize", "--model", path, *frame_options(images))
         assert code == 2, path
         assert expected in one_line(err), path
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import encode_image, run_thor2, untrained_run
+from helpers import encode_image, frame_options, run_thor2, untrained_run
 from PIL import Image
 
 from thor2_jax.config import DescriptorConfig
@@ -40,28 +40,18 @@ def write_frame(folder: Path, seed: int = 0) -> Path:
     return folder
 
 
-def files_of(folder: Path, **changes: object) -> list[object]:
-    files = {
-        "color": folder / "color.png",
-        "depth": folder / "depth.png",
-        "labels": folder / "mask.png",
-        "intrinsics": folder / "intrinsics.json",
-    }
-    return [part for name, value in {**files, **changes}.items() for part in (f"--{name}", value)]
-
-
 def lines_of(text: str) -> list[dict[str, Any]]:
     return [json.loads(line) for line in text.splitlines()]
 
 
 def test_json_of_one_frame(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     folder = write_frame(tmp_path / "one")
-    assert run_thor2("recognize", "--model", model, *files_of(folder), "--json", "--out", tmp_path / "out") == 0
+    assert run_thor2("recognize", "--model", model, *frame_options(folder), "--json", "--out", tmp_path / "out") == 0
     (answer,) = lines_of(capfd.readouterr().out)
     assert [one["label"] for one in answer["instances"]] == [1, 4]
     assert all(one["name"] in ("bowl", "mug", "plate") for one in answer["instances"])
     assert answer["instances"] == json.loads((tmp_path / "out" / "recognition.json").read_text())
-    assert run_thor2("recognize", "--model", model, *files_of(folder), "--json", "--unknown-below", 1) == 0
+    assert run_thor2("recognize", "--model", model, *frame_options(folder), "--json", "--unknown-below", 1) == 0
     (answer,) = lines_of(capfd.readouterr().out)
     assert [one["name"] for one in answer["instances"]] == [None, None]
 
@@ -83,7 +73,7 @@ def test_other_formats_give_the_same_answers(model: Path, tmp_path: Path, capfd:
         ({"intrinsics": tmp_path / "camera_info.yaml", "depth": tmp_path / "metres.npy"}, []),
         ({"depth": tmp_path / "tenths.png"}, ["--depth-scale", 10_000]),
     ):
-        assert run_thor2("recognize", "--model", model, *files_of(folder, **changes), *options, "--json") == 0
+        assert run_thor2("recognize", "--model", model, *frame_options(folder, **changes), *options, "--json") == 0
         answers += [line["instances"] for line in lines_of(capfd.readouterr().out)]
     for other in answers[1:]:
         for one, expected in zip(other, answers[0], strict=True):
@@ -179,7 +169,7 @@ def write_table_frame(folder: Path) -> Path:
 
 def test_frames_without_labels_are_segmented(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     folder = write_table_frame(tmp_path / "frames" / "a")
-    files = files_of(folder)
+    files = frame_options(folder)
     del files[files.index("--labels") : files.index("--labels") + 2]
     for given in (files, [tmp_path / "frames"]):
         assert run_thor2("recognize", "--model", model, *given, "--segment", "table", "--json") == 0
@@ -204,7 +194,8 @@ def test_labels_are_replaced_where_a_folder_is_segmented(
 def test_labels_and_segment_together(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     folder = write_frame(tmp_path / "one")
     assert (
-        run_thor2("recognize", "--model", model, *files_of(folder), "--segment", "table", "--out", tmp_path / "o") == 2
+        run_thor2("recognize", "--model", model, *frame_options(folder), "--segment", "table", "--out", tmp_path / "o")
+        == 2
     )
     error = capfd.readouterr().err
     assert error.startswith("error: labels is ") and error.count("\n") == 1

@@ -185,8 +185,8 @@ def blobs(n: int) -> np.ndarray:
 )
 def test_labels(frame: RGBDFrame, make: Callable[[np.ndarray], np.ndarray], expected: list[str]) -> None:
     labels = make(frame.label_image)
-    found = codes(lambda diagnosis: check_labels(diagnosis, labels))
-    assert found == expected or (make is interpolated and found == ["labels-many"])
+    actual = codes(lambda diagnosis: check_labels(diagnosis, labels))
+    assert actual == expected or (make is interpolated and actual == ["labels-many"])
 
 
 def test_a_mask_of_touching_objects(frame: RGBDFrame) -> None:
@@ -337,10 +337,10 @@ def copy_of(folder: Path, **contents: bytes) -> FrameFiles:
 def test_files_of_the_wrong_kind_are_findings(tmp_path: Path) -> None:
     original = frame_files(SAMPLES / "crockery").read()
     photo = encode_image(original.color)
-    found = {f.code for f in diagnose(copy_of(tmp_path, labels=photo, intrinsics=b"{}")).findings}
-    assert found == {"unreadable-labels", "unreadable-intrinsics"}
-    found = {f.code for f in diagnose(copy_of(tmp_path, color=b"", depth=photo)).findings}
-    assert found == {"unreadable-color", "unreadable-depth"}
+    actual = {f.code for f in diagnose(copy_of(tmp_path, labels=photo, intrinsics=b"{}")).findings}
+    assert actual == {"unreadable-labels", "unreadable-intrinsics"}
+    actual = {f.code for f in diagnose(copy_of(tmp_path, color=b"", depth=photo)).findings}
+    assert actual == {"unreadable-color", "unreadable-depth"}
     half = encode_image(np.ascontiguousarray(original.depth[::2, ::2]))
     assert "size" in {f.code for f in diagnose(copy_of(tmp_path, depth=half)).findings}
 
