@@ -11,7 +11,18 @@ from thor2_jax.recognition.classifier import FEATURES
 from thor2_jax.recognition.fusion import FUSION_RULES, FusionRule, fuse, with_temperature
 from training.baselines.names import TITLES
 
-__all__ = ["ALL_CLASSIFIERS", "BOTH", "EMBEDDED", "GALLERY", "RULES", "Rule", "fuse_by", "fusions", "main_fusion"]
+__all__ = [
+    "ALL_CLASSIFIERS",
+    "BOTH",
+    "EMBEDDED",
+    "GALLERY",
+    "WHOLE",
+    "RULES",
+    "Rule",
+    "fuse_by",
+    "fusions",
+    "main_fusion",
+]
 
 Rule = FusionRule | Literal["calibrated"]
 RULES: tuple[Rule, ...] = (*FUSION_RULES, "calibrated")
@@ -22,6 +33,7 @@ EMBEDDED, ALL_CLASSIFIERS, GALLERY, BOTH = "embedding", "THOR2+embedding", "gall
 all combined. The recognizer computes them, and no rule fuses them with others."""
 
 WHOLE = (EMBEDDED, ALL_CLASSIFIERS, GALLERY, BOTH)
+"""All columns that no rule fuses."""
 
 
 def fusions(available: Iterable[str]) -> dict[str, tuple[str, ...]]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from training.baselines.names import TITLES
 from training.evaluation.frame_pictures import FramePictures
-from training.evaluation.fusion import RULES
+from training.evaluation.fusion import ALL_CLASSIFIERS, RULES, WHOLE
 from training.evaluation.published import published_seconds
 from training.evaluation.results import COVERAGE
 from training.reports.html import Picture, Section, Table, write_page
@@ -161,6 +161,11 @@ def _accuracy_text(report: Mapping[str, Any]) -> str:
         "incorrect. CE uses colour only, TOPS shape only, TOPS2 both. THOR2 is the fusion of TOPS and TOPS2; a plus "
         f"sign marks other fusions. The fusion rule is {report['rule']}; other rules are compared below. "
     )
+    if ALL_CLASSIFIERS in report["fusions"]:
+        text += (
+            f"{ALL_CLASSIFIERS} has the names of THOR2 with the confidence that the embedding gives; here, answers "
+            "below the threshold keep their names. "
+        )
     if not set(report["fusions"]).isdisjoint(TITLES.values()):
         text += (
             "Baselines, trained on the same views and evaluated on the same instances: THOR, the predecessor, "
@@ -184,7 +189,7 @@ def _bar_chart(table: Mapping[str, Any], titles: Sequence[str], caption: str, pa
 
 def _fusion_section(report: Mapping[str, Any]) -> Section:
     cells = {rule: report["accuracy"][rule][0]["cells"][0]["accuracy"] for rule in RULES}
-    titles = [title for title in report["fusions"] if "+" in title or title == "THOR2"]
+    titles = [title for title in report["fusions"] if ("+" in title or title == "THOR2") and title not in WHOLE]
     rows = [[title, *(_mean_std(cells[rule].get(title, NO_VALUE)) for rule in RULES)] for title in titles]
     text = (
         'Accuracy on all instances by fusion rule. With "max", the paper\'s rule, the classifier with the higher top-1 '
