@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
@@ -16,11 +17,12 @@ from colornet.files import atomic_write
 from colornet.lab import MEAN_WHITE, to_lab
 from colornet.network import ColorNetwork
 
-__all__ = ["draw_network", "draw_similarity"]
+__all__ = ["draw_network", "draw_similarity", "plot_network"]
 
 _DPI = 150
 _TEXT_COLOR = "#222222"
 _EDGE_COLOR = "#8a8a8a"
+_PALE_EDGE_COLOR = "#dcdcdc"
 _LEGEND_STYLE: dict[str, Any] = {"loc": "upper left", "frameon": False, "alignment": "left", "title_fontsize": 11}
 
 
@@ -35,24 +37,7 @@ def draw_network(network: ColorNetwork, path: str | Path) -> None:
     """
     figure = Figure(figsize=(9.6, 9.0))
     axes = figure.add_axes((0.08, 0.07, 0.72, 0.88))
-    a, b = to_lab(network.mean_rgb, MEAN_WHITE)[:, 1:].T
-    for (i, j), weight, cyclic in zip(network.edges, network.edge_weights, network.cyclic, strict=True):
-        style = "--" if cyclic else "-"
-        line: dict[str, Any] = {"linestyle": style, "linewidth": _width(weight), "solid_capstyle": "butt"}
-        axes.plot(a[[i, j]], b[[i, j]], color=_EDGE_COLOR, zorder=1, **line)
-    axes.scatter(
-        a, b, s=_area(network.member_counts), c=network.mean_rgb / 255, edgecolors=_TEXT_COLOR, linewidths=0.8, zorder=2
-    )
-    for r, (x, y) in enumerate(zip(a, b, strict=True)):
-        text_color = _contrasting(network.mean_rgb[r])
-        axes.text(x, y, str(r), color=text_color, ha="center", va="center", fontsize=9, fontweight="bold", zorder=3)
-
-    axes.set_aspect("equal")
-    axes.margins(0.08)
-    axes.set_axisbelow(True)
-    axes.grid(color="#ececec")
-    axes.set_xlabel("a*  (green to red)")
-    axes.set_ylabel("b*  (blue to yellow)")
+    plot_network(axes, network)
     axes.set_title(f"Colour network: {network.n_regions} regions, {len(network.edges)} edges")
     sizes = [_legend_disc(count) for count in (100, 5_000, 20_000)]
     figure.legend(
@@ -67,6 +52,42 @@ def draw_network(network: ColorNetwork, path: str | Path) -> None:
     lines.append(Line2D([], [], color=_EDGE_COLOR, linewidth=_width(50), linestyle="--", label="across the\nhue seam"))
     figure.legend(handles=lines, title="edge: HyAB", labelspacing=1.0, **_LEGEND_STYLE, bbox_to_anchor=(0.815, 0.66))
     _save(figure, path)
+
+
+def plot_network(axes: Axes, network: ColorNetwork, weights: NDArray[np.float64] | None = None) -> None:
+    """Draw the network on the a*-b* plane on matplotlib axes, as `draw_network` does.
+
+    Args:
+        axes: matplotlib axes.
+        network: the colour network.
+        weights: [R] points in each region, at least 0. If given, the areas of the discs grow with them, and regions
+            without points, and their edges, are pale.
+    """
+    a, b = to_lab(network.mean_rgb, MEAN_WHITE)[:, 1:].T
+    used = np.ones(network.n_regions, bool) if weights is None else weights > 0
+    share = None if weights is None else weights / max(float(weights.sum()), 1e-12)
+    area = _area(network.member_counts) if share is None else 190 + 2500 * share
+    for (i, j), weight, cyclic in zip(network.edges, network.edge_weights, network.cyclic, strict=True):
+        style = "--" if cyclic else "-"
+        line: dict[str, Any] = {"linestyle": style, "linewidth": _width(weight), "solid_capstyle": "butt"}
+        axes.plot(
+            a[[i, j]], b[[i, j]], color=_EDGE_COLOR if used[i] and used[j] else _PALE_EDGE_COLOR, zorder=1, **line
+        )
+    # Pale regions are opaque, so that no edge is seen through them.
+    faces = np.where(used[:, None], network.mean_rgb / 255, 0.75 + 0.25 * network.mean_rgb / 255)
+    outlines = [_TEXT_COLOR if one else _PALE_EDGE_COLOR for one in used]
+    # The smallest discs last, in front of larger ones.
+    for r in np.argsort(-area):
+        axes.scatter(a[r], b[r], s=area[r], color=faces[r], edgecolors=outlines[r], linewidths=0.8, zorder=2)
+        text_color = _contrasting(255 * faces[r]) if used[r] else "#8a8a8a"
+        label: dict[str, Any] = {"ha": "center", "va": "center", "fontweight": "bold" if used[r] else "normal"}
+        axes.text(a[r], b[r], str(r), color=text_color, fontsize=9, zorder=3, **label)
+    axes.set_aspect("equal")
+    axes.margins(0.08)
+    axes.set_axisbelow(True)
+    axes.grid(color="#ececec")
+    axes.set_xlabel("a*  (green to red)")
+    axes.set_ylabel("b*  (blue to yellow)")
 
 
 def draw_similarity(network: ColorNetwork, path: str | Path) -> None:

@@ -39,6 +39,7 @@ else:
         "descriptor",
         "export",
         "persistence",
+        "plot",
         "recognition",
         "segmentation",
         "testing",

@@ -90,6 +90,11 @@ class PointClouds:
         fields: Any = points, colors, mask, position, on_boundary
         return cls(*(fields if on_host else jax.device_put(fields)))
 
+    def unpack(self) -> list[tuple[NDArray[np.float32], NDArray[np.float32]]]:
+        """Return the clouds without padding: pairs of points [n, 3], in their unit, and sRGB [n, 3] in [0, 1]."""
+        points, colors, mask = (np.asarray(array) for array in (self.points, self.colors, self.mask))
+        return [(xyz[real], rgb[real]) for xyz, rgb, real in zip(points, colors, mask, strict=True)]
+
 
 def _padded_size(sizes: list[int], capacity: int | None) -> int:
     largest = max(sizes)

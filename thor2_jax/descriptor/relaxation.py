@@ -81,6 +81,7 @@ def relaxed_strips(
     sets: RegionSets,
     config: DescriptorConfig,
     overflow: jax.Array,
+    point_weights: jax.Array | None = None,
 ) -> Strips:
     """Return the soft extremes and the colour vector of every strip of one aligned cloud (no batch axis).
 
@@ -96,6 +97,8 @@ def relaxed_strips(
         sets: region sets of the colour network.
         config: its `relaxation` gives the temperatures. Static.
         overflow: [] int32, returned unchanged.
+        point_weights: [N] float32 from 0 to 1, by which each point counts; a point of weight 0 is left out. By default
+            all points count fully. Their gradients attribute an answer to points (`explanation.attributions`).
 
     Returns:
         Strips; a strip is occupied if any point has a positive weight in it.
@@ -111,6 +114,8 @@ def relaxed_strips(
     @jax.checkpoint
     def one_slice(log_weight: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
         weight = jnp.where(counted, jnp.exp(log_weight[:, None] + log_strip), 0)
+        if point_weights is not None:
+            weight = weight * point_weights[:, None]
         square = weight**2
         mean = (square * y[:, None]).sum(axis=0) / (square.sum(axis=0) + _WEIGHT_FLOOR**2)
         above = weight * (y[:, None] - mean)

@@ -9,14 +9,15 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from colornet import ColorNetwork
+from thor2_jax import plot
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.describe import describe_strips, strips
 from thor2_jax.descriptor.view_normalization import align
+from thor2_jax.plot import name_style, plain_text, save_figure
 from thor2_jax.types import PointClouds
 from training.objects.mesh import TexturedMesh
 from training.rendering.ray_caster import RayCaster, render_view
 from training.rendering.view_sphere import camera_pose
-from training.reports.plots import name_style, plain_text, save_figure
 
 __all__ = ["draw_descriptor", "draw_objects"]
 
@@ -69,46 +70,25 @@ def draw_descriptor(
     images = np.asarray(describe_strips(cut, network, config).images[0])
     color = np.asarray(cut.color)[0]
     used = max(1, int(np.flatnonzero(color.sum(axis=(1, 2)) > 0).max(initial=-1)) + 1)
-    window = (-config.sigma_2, config.window) * 2
     most_points = max(1.0, float(color.sum(axis=2).max()))
 
     figure = Figure(figsize=(1.9 * (used + 2.2), 6.2), layout="constrained")
     grid = figure.add_gridspec(2, used + 1, width_ratios=[2.2, *[1] * used], height_ratios=[1.2, 1])
-    _draw_side_view(figure.add_subplot(grid[:, 0]), aligned, np.arange(used + 1) * config.sigma_1, name)
+    side = figure.add_subplot(grid[:, 0])
+    plot.slices(side, *aligned.unpack()[0], config, size=3)
+    side.set_title(plain_text(f"{name}: {int(aligned.mask.sum())} points"), fontsize=10, **name_style())
     for i in range(used):
         upper, lower = figure.add_subplot(grid[0, i + 1]), figure.add_subplot(grid[1, i + 1])
-        upper.imshow(images[i].T, origin="lower", extent=window, cmap="magma", vmin=0, vmax=images.max() or 1.0)
+        plot.persistence_image(upper, images[i], config, largest=images.max())
         upper.set_title(f"slice {i}", fontsize=10)
         upper.set_xlabel("birth", fontsize=9)
-        _draw_color_vectors(lower, color[i], network)
+        plot.color_vectors(lower, color[i], network)
         lower.set_ylim(0, most_points)
         lower.set_xlabel("strip", fontsize=9)
         if i == 0:
             upper.set_ylabel("persistence", fontsize=9)
             lower.set_ylabel("points by colour region", fontsize=9)
         else:
-            upper.set_yticklabels([])
+            upper.set(yticklabels=[], ylabel="")
             lower.set_yticklabels([])
     save_figure(figure, path)
-
-
-def _draw_side_view(axes: Any, aligned: PointClouds, levels: NDArray[np.floating[Any]], name: str) -> None:
-    mask = np.asarray(aligned.mask[0])
-    points, colors = np.asarray(aligned.points[0])[mask], np.asarray(aligned.colors[0])[mask]
-    axes.scatter(points[:, 0], points[:, 2], c=colors, s=3)
-    for level in levels:
-        axes.axhline(level, color="#888888", linewidth=0.7)
-    axes.set_aspect("equal")
-    axes.set_xlabel("x (scaled units)")
-    axes.set_ylabel("z (scaled units), lines between slices")
-    axes.set_title(plain_text(f"{name}: {len(points)} points"), fontsize=10, **name_style())
-
-
-def _draw_color_vectors(axes: Any, color: NDArray[np.floating[Any]], network: ColorNetwork) -> None:
-    """Draw the colour vectors [J, R] of a slice as stacked bars, the largest regions at the bottom."""
-    low = np.zeros(len(color))
-    for region in np.argsort(-color.sum(axis=0)):
-        if color[:, region].any():
-            axes.bar(np.arange(len(low)), color[:, region], 1.0, bottom=low, color=network.mean_rgb[region] / 255)
-            low += color[:, region]
-    axes.set_xlim(-0.5, len(low) - 0.5)

@@ -1,18 +1,15 @@
 """Plots of trainings and evaluations (matplotlib, PNG)."""
 
-import functools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.font_manager import fontManager, get_font
 from numpy.typing import NDArray
 
-from thor2_jax.files import atomic_write
-from thor2_jax.printable import escape_characters
+from thor2_jax import plot
+from thor2_jax.plot import PALETTE, name_style, plain_text, save_figure
 
 __all__ = [
     "draw_accuracy",
@@ -20,49 +17,7 @@ __all__ = [
     "draw_curves",
     "draw_known_unknown",
     "draw_reliability",
-    "name_style",
-    "plain_text",
-    "save_figure",
 ]
-
-_DPI = 130
-_COLORS = ("#56b4e9", "#e69f00", "#009e73", "#222222", "#cc79a7", "#0072b2", "#d55e00", "#f0e442")
-"""The palette of Okabe and Ito, which is safe for colour-blind readers."""
-
-
-def save_figure(figure: Figure, path: str | Path) -> None:
-    """Write a figure as PNG, atomically.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
-    FigureCanvasAgg(figure)
-    with atomic_write(path) as temporary:
-        figure.savefig(temporary, dpi=_DPI, format="png")
-
-
-_FONTS = ("DejaVu Sans", "Noto Sans CJK SC", "Noto Sans CJK JP", "WenQuanYi Zen Hei", "Arial Unicode MS", "Noto Emoji")
-"""Fonts for names, those that are installed; matplotlib has the first one."""
-
-
-@functools.cache
-def _installed_fonts() -> tuple[list[str], frozenset[int]]:
-    """Return the installed fonts of _FONTS and the characters that they have."""
-    files = {font.name: font.fname for font in fontManager.ttflist if font.name in _FONTS}
-    characters = frozenset(code for file in files.values() for code in get_font(file).get_charmap())
-    return [name for name in _FONTS if name in files], characters
-
-
-def plain_text(name: str) -> str:
-    """Return a name as matplotlib draws it character by character: no mathtext, and escapes for missing characters."""
-    _, characters = _installed_fonts()
-    shown = escape_characters(name, lambda c: c == "\n" or (c.isprintable() and ord(c) in characters))
-    return shown.replace("$", r"\$")
-
-
-def name_style() -> dict[str, Any]:
-    """Return the properties of a text that holds names."""
-    return {"fontfamily": _installed_fonts()[0]}
 
 
 def draw_accuracy(
@@ -86,7 +41,7 @@ def draw_accuracy(
     for k, name in enumerate(names):
         places = np.arange(len(accuracy)) + (k - (len(names) - 1) / 2) * width
         heights = [values[k] for values in accuracy.values()]
-        bars = axes.bar(places, heights, width * 0.92, label=name, color=_COLORS[k % len(_COLORS)])
+        bars = axes.bar(places, heights, width * 0.92, label=name, color=PALETTE[k % len(PALETTE)])
         axes.bar_label(bars, fmt="%.2f", fontsize=8, padding=2 if crowded else 1, rotation=90 if crowded else 0)
     ticks = [plain_text(f"{subset}\n{counts[subset]} instances") for subset in accuracy]
     axes.set_xticks(range(len(accuracy)), ticks, **name_style())
@@ -111,21 +66,11 @@ def draw_confusion(counts: NDArray[np.integer[Any]], classes: Sequence[str], nam
     Raises:
         OSError: the file cannot be written.
     """
-    columns = [*map(plain_text, classes), "none"]
-    if not counts[:, -1].any():
-        columns, counts = columns[:-1], counts[:, :-1]
-    share = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
-    side = 2.2 + 0.36 * len(columns)
+    side = 2.2 + 0.36 * (len(classes) + bool(counts[:, -1].any()))
     figure = Figure(figsize=(side, side), layout="constrained")
     axes = figure.add_subplot()
-    axes.imshow(share, cmap="Blues", vmin=0, vmax=1)
-    for i, j in zip(*np.nonzero(counts), strict=True):
-        ink = "white" if share[i, j] > 0.5 else "black"
-        axes.text(j, i, str(counts[i, j]), ha="center", va="center", fontsize=8, color=ink)
-    axes.set_xticks(range(len(columns)), columns, rotation=90, fontsize=8, **name_style())
-    axes.set_yticks(range(len(classes)), columns[: len(classes)], fontsize=8, **name_style())
+    plot.confusion(axes, counts, classes)
     axes.set_xlabel(f"recognized by {name} as")
-    axes.set_ylabel("object")
     save_figure(figure, path)
 
 
@@ -140,19 +85,10 @@ def draw_reliability(bins: Mapping[str, Sequence[Any]], name: str, path: str | P
     Raises:
         OSError: the file cannot be written.
     """
-    count = np.array(bins["answers"])
-    edges = np.linspace(0, 1, len(count) + 1)
-    accuracy = np.array([np.nan if value is None else value for value in bins["accuracy"]])
     figure = Figure(figsize=(5.2, 5.5), layout="constrained")
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[3, 1])
-    upper.bar(edges[:-1], accuracy, 1 / len(count), align="edge", color=_COLORS[0], edgecolor="white")
-    upper.plot([0, 1], [0, 1], color="#222222", linewidth=1, linestyle="--", label="perfect calibration")
-    upper.set(xlim=(0, 1), ylim=(0, 1), ylabel="accuracy")
-    upper.legend(frameon=False, loc="upper left")
-    lower.bar(edges[:-1], count, 1 / len(count), align="edge", color="#888888", edgecolor="white")
-    lower.set(xlabel=f"confidence of {name}", ylabel="answers")
-    for axes in (upper, lower):
-        axes.spines[["top", "right"]].set_visible(False)
+    plot.reliability(upper, bins, counts=lower)
+    lower.set_xlabel(f"confidence of {name}")
     save_figure(figure, path)
 
 
@@ -172,10 +108,10 @@ def draw_known_unknown(
     """
     figure = Figure(figsize=(5.2, 4.2), layout="constrained")
     axes = figure.add_subplot()
-    axes.step(curve["kept"], curve["named"], where="pre", color=_COLORS[5])
+    axes.step(curve["kept"], curve["named"], where="pre", color=PALETTE[5])
     axes.plot([0, 1], [0, 1], color="#222222", linewidth=1, linestyle="--", label="confidence tells nothing")
     kept, named = marked
-    axes.plot([kept], [named], "o", color=_COLORS[6], label=f"{named:.0%} named where {kept:.0%} are kept")
+    axes.plot([kept], [named], "o", color=PALETTE[6], label=f"{named:.0%} named where {kept:.0%} are kept")
     axes.set(xlim=(0, 1.01), ylim=(0, 1.02))
     axes.set_xlabel(f"correct answers of {name} kept")
     axes.set_ylabel("unknown objects named")
@@ -202,7 +138,7 @@ def draw_curves(curves: Mapping[str, Sequence[Mapping[str, Any]]], path: str | P
         folds = sorted({record.get("fold", 0) for record in records})
         for fold in folds or [0]:
             rows = [record for record in records if record.get("fold", 0) == fold]
-            style: dict[str, Any] = {"color": _COLORS[k % len(_COLORS)], "linewidth": 1.5 if len(folds) < 2 else 0.8}
+            style: dict[str, Any] = {"color": PALETTE[k % len(PALETTE)], "linewidth": 1.5 if len(folds) < 2 else 0.8}
             if len(rows) < 30:
                 style |= {"marker": "o", "markersize": 3}
             epochs = [record["epoch"] for record in rows]
