@@ -300,6 +300,8 @@ def color_vectors(ax: Axes, matrix: ArrayLike, network: ColorNetwork) -> None:
             ax.bar(np.arange(len(low)), color[:, region], 1.0, bottom=low, color=network.mean_rgb[region] / 255)
             low += color[:, region]
     ax.set_xlim(-0.5, len(low) - 0.5)
+    ax.set_xlabel("strip")
+    ax.set_ylabel("points by colour region")
 
 
 def color_matrix(
@@ -334,7 +336,7 @@ def color_matrix(
     if len(rows):
         ax.imshow(cells, aspect="auto", interpolation="nearest")
     for row, region in enumerate(rows):
-        swatch = {
+        swatch: dict[str, Any] = {
             "transform": ax.get_yaxis_transform(),
             "clip_on": False,
             "markersize": 7,
@@ -342,7 +344,7 @@ def color_matrix(
         }
         ax.plot([-0.02], [row], "s", color=network.mean_rgb[region] / 255, markeredgewidth=0.5, **swatch)
     ax.set_yticks(range(len(rows)), [str(region) for region in rows], fontsize=7)
-    ax.tick_params(axis="y", length=0, pad=8)
+    ax.tick_params(axis="y", length=0, pad=12)
     ax.set_xlim(-0.5, len(color) - 0.5)
     ax.set_xlabel("strip")
     ax.set_ylabel("colour region")

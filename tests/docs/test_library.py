@@ -32,7 +32,13 @@ def random_cloud(seed: int, size: tuple[float, float, float] = (0.2, 0.1, 0.05))
     return rng.random((400, 3)) * size, rng.integers(0, 256, (400, 3), np.uint8)
 
 
-SECTIONS = {"Descriptors as a library": 1, "scikit-learn": 2, "Persistence of functions on lines": 4, "Recognizers": 1}
+SECTIONS = {
+    "Descriptors as a library": 1,
+    "scikit-learn": 2,
+    "Persistence of functions on lines": 4,
+    "Plots": 1,
+    "Recognizers": 1,
+}
 """Sections with code, and their numbers of blocks; each has a test below."""
 
 
@@ -45,6 +51,14 @@ def test_descriptors() -> None:
     xyz, rgb = random_cloud(0)
     result = run_section("Descriptors as a library", xyz=xyz, rgb=rgb)["descriptors"]
     assert result.tops.shape == (1, 7168) and result.tops2.shape == (1, 11942) and result.overflow.shape == (1,)
+
+
+def test_plots(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    names = run_section("Descriptors as a library", xyz=random_cloud(0)[0], rgb=random_cloud(0)[1])
+    names = run_section("Plots", **names)
+    assert all(axes.collections for axes in names["figure"].axes)
+    names["plt"].close(names["figure"])
 
 
 @pytest.mark.slow

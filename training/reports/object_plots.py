@@ -81,14 +81,9 @@ def draw_descriptor(
         upper, lower = figure.add_subplot(grid[0, i + 1]), figure.add_subplot(grid[1, i + 1])
         plot.persistence_image(upper, images[i], config, largest=images.max())
         upper.set_title(f"slice {i}", fontsize=10)
-        upper.set_xlabel("birth", fontsize=9)
         plot.color_vectors(lower, color[i], network)
         lower.set_ylim(0, most_points)
-        lower.set_xlabel("strip", fontsize=9)
-        if i == 0:
-            upper.set_ylabel("persistence", fontsize=9)
-            lower.set_ylabel("points by colour region", fontsize=9)
-        else:
-            upper.set(yticklabels=[], ylabel="")
-            lower.set_yticklabels([])
+        if i > 0:
+            for axes in (upper, lower):
+                axes.set(yticklabels=[], ylabel="")
     save_figure(figure, path)
