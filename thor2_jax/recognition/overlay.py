@@ -23,7 +23,7 @@ from thor2_jax.printable import escape_characters
 if TYPE_CHECKING:
     from thor2_jax.recognition.answers import Recognition
 
-__all__ = ["COLORS", "UNRECOGNIZED", "Annotation", "Paint", "draw_instances", "draw_overlay"]
+__all__ = ["COLORS", "UNRECOGNIZED", "Annotation", "Paint", "annotate", "draw_instances", "draw_overlay"]
 
 Paint = tuple[int, int, int]
 """An sRGB colour, 0 to 255."""
@@ -110,12 +110,17 @@ def draw_overlay(
     for answer in answers:
         if answer.label == 0 or not (labels == answer.label).any():
             raise InputError(f"answers: label {answer.label} is no instance of labels")
+    picture = annotate(color, labels, answers)
+    with atomic_write(path) as temporary:
+        picture.save(temporary, format="PNG")
+
+
+def annotate(color: NDArray[np.uint8], labels: NDArray[Any], answers: Sequence[Recognition]) -> Image.Image:
+    """Return the picture that `draw_overlay` writes, of valid arguments."""
     annotations = [
         Annotation(answer.label, paint, _text(answer)) for answer, paint in zip(answers, _paints(answers), strict=True)
     ]
-    picture = draw_instances(color, labels, annotations)
-    with atomic_write(path) as temporary:
-        picture.save(temporary, format="PNG")
+    return draw_instances(color, labels, annotations)
 
 
 def draw_instances(color: NDArray[np.uint8], labels: NDArray[Any], annotations: Sequence[Annotation]) -> Image.Image:

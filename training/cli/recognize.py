@@ -11,11 +11,16 @@ from rich.table import Table
 
 from thor2_jax.errors import InputError
 from thor2_jax.printable import escape_characters
+from thor2_jax.recordings.topics import Topics
 from training.cli.app import ModelOption, UnknownOption, app, console
+from training.cli.recognize_bag import BagOptions, recognize_bag
 
 if TYPE_CHECKING:
     from thor2_jax.recognition.answers import Recognition
     from training.readers.frame_files import FrameSource
+
+RECORDINGS = "Recordings"
+"""Panel of the options of recordings in the help."""
 
 MAX_LISTED = 5
 """Failed frames that the last line lists."""
@@ -53,6 +58,30 @@ def recognize(
     names: Annotated[
         Path | None, typer.Option(help="YAML or JSON table for --coco and --bop: number -> name of the object.")
     ] = None,
+    bag: Annotated[
+        Path | None,
+        typer.Option(rich_help_panel=RECORDINGS, help="ROS 1 bag, ROS 2 bag or MCAP, in place of FRAME (extra bags)."),
+    ] = None,
+    color_topic: Annotated[
+        str | None, typer.Option(rich_help_panel=RECORDINGS, help="Colour images. Default: the topic that has them.")
+    ] = None,
+    depth_topic: Annotated[
+        str | None, typer.Option(rich_help_panel=RECORDINGS, help="Depth that is aligned to colour. Default: likewise.")
+    ] = None,
+    camera_topic: Annotated[
+        str | None,
+        typer.Option(rich_help_panel=RECORDINGS, help="camera_info of the colour camera. Default: likewise."),
+    ] = None,
+    max_gap: Annotated[
+        float, typer.Option(rich_help_panel=RECORDINGS, help="Longest time between colour and depth, seconds.")
+    ] = 0.03,
+    every: Annotated[
+        int, typer.Option(min=1, rich_help_panel=RECORDINGS, help="Recognize the first of so many frames.")
+    ] = 1,
+    out_bag: Annotated[
+        Path | None,
+        typer.Option(rich_help_panel=RECORDINGS, help="Write detections: MCAP (.mcap), or directory of a ROS 2 bag."),
+    ] = None,
 ) -> None:
     """Recognize every instance of RGB-D frames.
 
@@ -65,6 +94,19 @@ def recognize(
     from training.frame_recognition import ResultTables, recognize_frames
     from training.readers.bop import read_object_names
 
+    if bag is not None:
+        refused = {"FRAME": frames, "color": color, "depth": depth, "labels": labels, "coco": coco, "bop": bop}
+        given = [name for name, value in {**refused, "names": names}.items() if value]
+        if given:
+            raise InputError(f"{given[0]} is {refused.get(given[0], names)} and bag is {bag}; give one of them")
+        topics = Topics(color_topic, depth_topic, camera_topic)
+        options = BagOptions(bag, topics, intrinsics, depth_scale, max_gap, every, segment, out, out_bag)
+        recognize_bag(options, model, unknown_below, answer_by)
+        return
+    of_bags = {"color_topic": color_topic, "depth_topic": depth_topic, "camera_topic": camera_topic, "out_bag": out_bag}
+    for name, value in of_bags.items():
+        if value is not None:
+            raise InputError(f"{name} is {value}; it belongs to --bag")
     if names is not None and coco is None and bop is None:
         raise InputError(f"names is {names}; it belongs to --coco and --bop")
     if segment is not None and labels is not None:

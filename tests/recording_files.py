@@ -1,0 +1,134 @@
+"""Recordings that tests write: ROS 1 bags, ROS 2 bags and MCAP files of RGB-D frames."""
+
+import contextlib
+import io
+import struct
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
+from rosbags.typesys import Stores, get_typestore
+
+import thor2_jax as thor2
+
+TYPES = {1: get_typestore(Stores.ROS1_NOETIC), 2: get_typestore(Stores.ROS2_HUMBLE)}
+COLOR, DEPTH, CAMERA = (
+    "/camera/color/image_raw",
+    "/camera/aligned_depth_to_color/image_raw",
+    "/camera/color/camera_info",
+)
+START = 1_700_000_000 * 10**9
+PERIOD = 33_333_333
+
+
+def header(stamp: int, frame_id: str = "camera_color_optical_frame", ros: int = 2) -> Any:
+    types = TYPES[ros].types
+    time = types["builtin_interfaces/msg/Time"](stamp // 10**9, stamp % 10**9)
+    fields = {"stamp": time, "frame_id": frame_id, **({"seq": 0} if ros == 1 else {})}
+    return types["std_msgs/msg/Header"](**fields)
+
+
+def image(pixels: np.ndarray, encoding: str, stamp: int = START, ros: int = 2, padding: int = 0, **more: Any) -> Any:
+    """Return an Image with `padding` unused bytes behind each row."""
+    rows = np.ascontiguousarray(pixels).reshape(len(pixels), -1).view(np.uint8)
+    data = np.pad(rows, ((0, 0), (0, padding)))
+    return TYPES[ros].types["sensor_msgs/msg/Image"](
+        header=header(stamp, ros=ros, **more),
+        height=pixels.shape[0],
+        width=pixels.shape[1],
+        encoding=encoding,
+        is_bigendian=int(pixels.dtype.byteorder == ">"),
+        step=data.shape[1],
+        data=data.ravel(),
+    )
+
+
+def compressed(content: bytes, described: str, stamp: int = START, ros: int = 2) -> Any:
+    return TYPES[ros].types["sensor_msgs/msg/CompressedImage"](
+        header=header(stamp, ros=ros), format=described, data=np.frombuffer(content, np.uint8)
+    )
+
+
+def encoded(pixels: np.ndarray, kind: str, **options: Any) -> bytes:
+    stream = io.BytesIO()
+    Image.fromarray(pixels).save(stream, kind, **options)
+    return stream.getvalue()
+
+
+def compressed_depth(depth: np.ndarray, stamp: int = START, ros: int = 2) -> Any:
+    """Return depth as compressed_depth_image_transport writes it: a header of 12 bytes, then a PNG."""
+    content = struct.pack("<iff", 0, 0.0, 0.0) + encoded(depth, "PNG")
+    return compressed(content, "16UC1; compressedDepth png", stamp, ros)
+
+
+def camera_info(camera: thor2.Intrinsics, size: tuple[int, int], stamp: int = START, ros: int = 2) -> Any:
+    matrix = np.array([camera.fx, 0, camera.cx, 0, camera.fy, camera.cy, 0, 0, 1.0])
+    projection = np.zeros((3, 4))
+    projection[:, :3] = matrix.reshape(3, 3)
+    types = TYPES[ros].types
+    region = types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
+    arrays = {"d": np.zeros(5), "k": matrix, "r": np.eye(3).ravel(), "p": projection.ravel()}
+    return types["sensor_msgs/msg/CameraInfo"](
+        header=header(stamp, ros=ros),
+        height=size[0],
+        width=size[1],
+        distortion_model="plumb_bob",
+        **{name.upper() if ros == 1 else name: value for name, value in arrays.items()},
+        binning_x=0,
+        binning_y=0,
+        roi=region,
+    )
+
+
+@contextlib.contextmanager
+def bag_writer(path: Path) -> Iterator[Any]:
+    """Yield a function (topic, message, time of arrival) that writes to a bag of the kind that the suffix says."""
+    ros = 1 if path.suffix == ".bag" else 2
+    types, connections = TYPES[ros], {}
+    folder = path.with_suffix(".folder") if path.suffix == ".mcap" else path
+    plugin = StoragePlugin.MCAP if path.suffix == ".mcap" else StoragePlugin.SQLITE3
+    with Writer1(path) if ros == 1 else Writer2(folder, version=8, storage_plugin=plugin) as writer:
+
+        def write(topic: str, message: Any, arrival: int) -> None:
+            kind = message.__msgtype__
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=types)
+            serialize = types.serialize_ros1 if ros == 1 else types.serialize_cdr
+            writer.write(connections[topic], arrival, serialize(message, kind))
+
+        yield write
+    if path.suffix == ".mcap":
+        next(folder.glob("*.mcap")).rename(path)
+
+
+def write_recording(
+    path: Path, frames: Sequence[thor2.RGBDFrame], *, is_compressed: bool = False, gap: int = 4_000_000
+) -> Path:
+    """Write a recording of frames at 30 Hz, whose depth is taken `gap` nanoseconds after colour."""
+    ros = 1 if path.suffix == ".bag" else 2
+    with bag_writer(path) as write:
+        for number, frame in enumerate(frames):
+            stamp = START + number * PERIOD
+            if is_compressed:
+                jpeg = encoded(frame.color, "JPEG", quality=95)
+                write(f"{COLOR}/compressed", compressed(jpeg, "rgb8; jpeg compressed bgr8", stamp, ros), stamp)
+                write(f"{DEPTH}/compressedDepth", compressed_depth(frame.depth, stamp + gap, ros), stamp + gap)
+            else:
+                write(COLOR, image(frame.color, "rgb8", stamp, ros), stamp)
+                write(DEPTH, image(frame.depth, "16UC1", stamp + gap, ros), stamp + gap)
+            write(CAMERA, camera_info(frame.intrinsics, frame.depth.shape, stamp, ros), stamp)
+    return path
+
+
+def table_frame(shift: int = 0) -> thor2.RGBDFrame:
+    """Return a frame without labels: two boxes on a table that is seen from straight above."""
+    color, depth = np.full((240, 320, 3), (150, 120, 90), np.uint8), np.full((240, 320), 900, np.uint16)
+    for left, right, shade in ((60, 110, (190, 30, 40)), (180, 250, (30, 60, 190))):
+        color[80:150, left + shift : right + shift] = shade
+        depth[80:150, left + shift : right + shift] = 800
+    return thor2.RGBDFrame(color, depth, None, thor2.Intrinsics(290.0, 290.0, 160.0, 120.0))

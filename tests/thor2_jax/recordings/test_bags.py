@@ -1,0 +1,169 @@
+"""Recordings of ROS 1, ROS 2 and MCAP."""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from recording_files import (
+    CAMERA,
+    COLOR,
+    DEPTH,
+    START,
+    bag_writer,
+    camera_info,
+    image,
+    table_frame,
+    write_recording,
+)
+
+import thor2_jax as thor2
+from thor2_jax.errors import InputError
+from thor2_jax.recordings.bags import Bag
+from thor2_jax.recordings.topics import Topics, choose_topics
+
+FRAMES = [table_frame(shift) for shift in (0, 3, 6)]
+NAMES = ("a.bag", "folder", "a.mcap")
+
+
+@pytest.mark.parametrize("is_compressed", [False, True])
+@pytest.mark.parametrize("name", NAMES)
+def test_frames_of_recordings(tmp_path: Path, name: str, is_compressed: bool) -> None:
+    path = write_recording(tmp_path / name, FRAMES, is_compressed=is_compressed)
+    with Bag(path) as bag:
+        recorded = list(bag.frames())
+        assert bag.notes == [] and bag.frame_id == "camera_color_optical_frame"
+    assert [one.name for one in recorded] == ["1700000000.000000000", "1700000000.033333333", "1700000000.066666666"]
+    assert all(one.gap == 4_000_000 for one in recorded)
+    for one, expected in zip(recorded, FRAMES, strict=True):
+        frame = one.read()
+        assert frame.labels is None and frame.intrinsics.fx == 290 and frame.intrinsics.width == 320
+        np.testing.assert_array_equal(frame.depth, expected.depth)
+        difference = np.abs(frame.color.astype(int) - expected.color)
+        assert difference.mean() < 2 if is_compressed else difference.max() == 0
+
+
+def test_a_single_database_file(tmp_path: Path) -> None:
+    path = write_recording(tmp_path / "folder", FRAMES)
+    with Bag(next(path.glob("*.db3"))) as bag:
+        assert len(list(bag.frames())) == 3
+
+
+def test_the_file_of_intrinsics_replaces_the_topic(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with bag_writer(path) as write:
+        write(COLOR, image(FRAMES[0].color, "rgb8"), START)
+        write(DEPTH, image(FRAMES[0].depth, "16UC1"), START)
+    with pytest.raises(InputError, match="camera_topic"), Bag(path):
+        pass
+    with Bag(path, intrinsics=thor2.Intrinsics(300, 300, 160, 120), depth_scale=5000) as bag:
+        (recorded,) = bag.frames()
+        assert recorded.read().intrinsics == thor2.Intrinsics(300, 300, 160, 120, 5000)
+
+
+def test_rectified_images_have_the_camera_of_the_projection(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    info = camera_info(FRAMES[0].intrinsics, (240, 320))
+    info.d[:] = 0.1, 0, 0, 0, 0
+    info.p[0] = 280.0
+    with bag_writer(path) as write:
+        for topic in ("/cam/image_rect_color", "/cam/image_raw"):
+            write(topic, image(FRAMES[0].color, "bgr8"), START)
+        write("/cam/depth_registered/image", image(FRAMES[0].depth, "16UC1"), START)
+        write("/cam/camera_info", info, START)
+    with Bag(path, Topics(color="/cam/image_rect_color")) as bag:
+        assert bag.intrinsics is not None and (bag.intrinsics.fx, bag.intrinsics.distortion) == (280.0, ())
+    with Bag(path, Topics(color="cam/image_raw")) as bag:
+        assert bag.intrinsics is not None and (bag.intrinsics.fx, bag.intrinsics.distortion[0]) == (290.0, 0.1)
+    with pytest.raises(InputError, match="color_topic is not given"), Bag(path):
+        pass
+
+
+def test_depth_that_is_not_aligned(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with bag_writer(path) as write:
+        write(COLOR, image(FRAMES[0].color, "rgb8"), START)
+        write("/camera/depth/image_rect_raw", image(FRAMES[0].depth[::2, ::2], "16UC1", frame_id="depth"), START)
+        write(CAMERA, camera_info(FRAMES[0].intrinsics, (240, 320)), START)
+    with Bag(path) as bag:
+        assert len(bag.notes) == 1 and "aligned" in bag.notes[0]
+        (recorded,) = bag.frames()
+        with pytest.raises(InputError, match="160 x 120 pixels and color 320 x 240"):
+            recorded.read()
+
+
+def test_streams_out_of_step(tmp_path: Path) -> None:
+    path = write_recording(tmp_path / "a.bag", FRAMES, gap=5 * 10**9)
+    with Bag(path) as bag, pytest.raises(InputError, match=r"at least 4\.93 s apart"):
+        list(bag.frames())
+    with Bag(path, max_gap=6) as bag:
+        assert len(list(bag.frames())) == 3
+
+
+def test_headers_without_a_stamp(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with bag_writer(path) as write:
+        write(COLOR, image(FRAMES[0].color, "rgb8", 0), START)
+        write(DEPTH, image(FRAMES[0].depth, "16UC1", 0), START + 10**6)
+        write(CAMERA, camera_info(FRAMES[0].intrinsics, (240, 320), 0), START)
+    with Bag(path) as bag:
+        (recorded,) = bag.frames()
+    assert (recorded.stamp, recorded.gap) == (START, 10**6)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("kept", [0, 5, 0.3, 0.9, 1])
+def test_damaged_recordings(tmp_path: Path, name: str, kept: float) -> None:
+    path = write_recording(tmp_path / name, FRAMES)
+    file = next(path.glob("*.db3")) if path.is_dir() else path
+    content = bytearray(file.read_bytes())
+    if kept == 1:  # bytes in the middle
+        content[len(content) // 3 : len(content) // 3 + 2000] = bytes(2000)
+    file.write_bytes(content if kept == 1 else content[: int(kept * len(content)) if kept < 1 else int(kept)])
+    try:
+        with Bag(path) as bag:
+            for recorded in bag.frames():
+                recorded.read()
+    except InputError as error:
+        assert str(path) in str(error) and "\n" not in str(error)
+    else:
+        assert kept == 1, "a truncated recording was read without an error"
+
+
+@pytest.mark.parametrize(
+    ("write", "message"),
+    [
+        (lambda path: None, "No such file"),
+        (lambda path: path.mkdir(), "metadata.yaml"),
+        (lambda path: path.write_bytes(b"#ROSBAG V2.0\n"), "damaged or of another format"),
+    ],
+)
+def test_no_recording(tmp_path: Path, write: Any, message: str) -> None:
+    write(tmp_path / "x.bag")
+    with pytest.raises((InputError, OSError), match=message), Bag(tmp_path / "x.bag"):
+        pass
+
+
+def test_without_rosbags(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
+    with pytest.raises(InputError, match=r"thor2-jax\[bags\]"), Bag(tmp_path):
+        pass
+
+
+def test_choice_of_topics() -> None:
+    kinds = {"/c": "color", "/c/compressed": "color", "/d": "depth", "/aligned/d": "depth", "/camera_info": "camera"}
+    types = dict.fromkeys([*kinds, "/empty"], "sensor_msgs/msg/Image")
+    assert choose_topics(Topics(), kinds, types) == Topics("/c", "/aligned/d", "/camera_info")
+    assert choose_topics(Topics(), kinds, types, needs_camera=False) == Topics("/c", "/aligned/d")
+    assert choose_topics(Topics("/c/compressed", "d"), kinds, types).depth == "/d"
+    for wanted, message in (
+        (Topics("/x"), "expected one of"),
+        (Topics("/d"), "expected 8-bit colour"),
+        (Topics("/empty"), "without messages"),
+        (Topics(camera="/c"), "CameraInfo"),
+    ):
+        with pytest.raises(InputError, match=message):
+            choose_topics(wanted, kinds, types)
+    with pytest.raises(InputError, match="no topic holds"):
+        choose_topics(Topics(), {}, {})

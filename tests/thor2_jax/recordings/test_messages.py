@@ -1,0 +1,103 @@
+"""Images in ROS messages to arrays."""
+
+import struct
+from typing import Any
+
+import numpy as np
+import pytest
+from recording_files import camera_info, compressed, compressed_depth, encoded, image
+
+import thor2_jax as thor2
+from thor2_jax.errors import InputError
+from thor2_jax.recordings.messages import color_image, depth_image, image_kind
+
+RNG = np.random.default_rng(0)
+COLOR = RNG.integers(0, 256, (5, 7, 3), dtype=np.uint8)
+DEPTH = RNG.integers(0, 3000, (5, 7), dtype=np.uint16)
+
+
+@pytest.mark.parametrize("padding", [0, 3])
+@pytest.mark.parametrize("encoding", ["rgb8", "bgr8", "rgba8", "bgra8", "8UC3", "RGB8"])
+@pytest.mark.parametrize("ros", [1, 2])
+def test_colour_encodings(encoding: str, padding: int, ros: int) -> None:
+    pixels = COLOR if encoding.lower().startswith("rgb") else COLOR[..., ::-1]
+    if "a" in encoding:
+        pixels = np.dstack([pixels, np.full((5, 7), 9, np.uint8)])
+    message = image(pixels, encoding, ros=ros, padding=padding)
+    assert image_kind(message) == "color"
+    np.testing.assert_array_equal(color_image(message), COLOR)
+
+
+@pytest.mark.parametrize(
+    ("pixels", "encoding"),
+    [
+        (DEPTH, "16UC1"),
+        (DEPTH.astype(">u2"), "mono16"),
+        ((DEPTH / 1000).astype(np.float32), "32FC1"),
+        ((DEPTH / 1000).astype(">f4"), "32FC1"),
+    ],
+)
+def test_depth_encodings(pixels: np.ndarray, encoding: str) -> None:
+    message = image(pixels, encoding, padding=2)
+    assert image_kind(message) == "depth"
+    read = depth_image(message)
+    np.testing.assert_array_equal(read, pixels)
+    assert read.dtype == pixels.dtype.newbyteorder("=")
+
+
+def test_compressed_images() -> None:
+    png = compressed(encoded(COLOR, "PNG"), "bgr8; png compressed bgr8")
+    np.testing.assert_array_equal(color_image(png), COLOR)
+    smooth = np.broadcast_to(np.array([200, 60, 20], np.uint8), (16, 16, 3))
+    jpeg = compressed(encoded(smooth, "JPEG", quality=95), "jpeg")
+    assert np.abs(color_image(jpeg).astype(int) - smooth).max() < 6
+    depth = compressed_depth(DEPTH)
+    np.testing.assert_array_equal(depth_image(depth), DEPTH)
+    plain = compressed(encoded(DEPTH, "PNG"), "png")
+    np.testing.assert_array_equal(depth_image(plain), DEPTH)
+    assert [image_kind(one) for one in (png, jpeg, depth, plain)] == ["color", "color", "depth", "depth"]
+
+
+def test_compressed_float_depth() -> None:
+    metres = np.linspace(0.3, 2.5, 35, dtype=np.float32).reshape(5, 7)
+    # compressed_depth_image_transport: depth_quantization 100, depth_max 10.
+    scale, offset = 100 * 101.0, 1 - 100 * 101.0 / 10
+    quantized = np.round(scale / metres + offset).astype(np.uint16)
+    quantized[0, 0] = 0
+    content = struct.pack("<iff", 0, scale, offset) + encoded(quantized, "PNG")
+    read = depth_image(compressed(content, "32FC1; compressedDepth png"))
+    assert read[0, 0] == 0
+    np.testing.assert_allclose(read.ravel()[1:], metres.ravel()[1:], rtol=2e-4)
+
+
+@pytest.mark.parametrize(
+    ("read", "message"),
+    [
+        (color_image, image(DEPTH.astype(np.uint8), "mono8")),
+        (color_image, image(COLOR, "bayer_rggb8")),
+        (depth_image, image(COLOR, "rgb8")),
+        (color_image, compressed(encoded(COLOR, "PNG")[:40], "png")),
+        (color_image, compressed(encoded(DEPTH, "PNG"), "png")),
+        (depth_image, compressed(encoded(COLOR, "PNG"), "16UC1; png compressed")),
+        (depth_image, compressed(b"123", "16UC1; compressedDepth png")),
+        (depth_image, compressed(b"0" * 99, "16UC1; compressedDepth rvl")),
+    ],
+)
+def test_other_images_are_refused(read: Any, message: Any) -> None:
+    with pytest.raises(InputError, match="expected"):
+        read(message)
+
+
+@pytest.mark.parametrize("change", [{"step": 4}, {"height": 50}, {"width": 0}])
+def test_sizes_that_do_not_fit(change: dict[str, int]) -> None:
+    message = image(COLOR, "rgb8")
+    for name, value in change.items():
+        object.__setattr__(message, name, value)
+    with pytest.raises(InputError, match="expected"):
+        color_image(message)
+
+
+@pytest.mark.parametrize("ros", [1, 2])
+def test_camera_info_gives_intrinsics(ros: int) -> None:
+    camera = thor2.Intrinsics(600.0, 610.0, 320.0, 240.0, width=640, height=480)
+    assert thor2.Intrinsics.of(camera_info(camera, (480, 640), ros=ros)) == camera

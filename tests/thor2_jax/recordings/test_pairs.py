@@ -1,0 +1,55 @@
+"""Pairs of colour and depth images by the nearest time stamp."""
+
+import numpy as np
+import pytest
+
+from thor2_jax.recordings.pairs import LONGEST_WAIT, PairCounts, StampedImage, nearest_pairs
+
+MS = 10**6
+
+
+def pairs_of(images: list[StampedImage], tolerance: int) -> tuple[list[tuple[int, int]], PairCounts]:
+    counts = PairCounts()
+    pairs = [(pair.color.stamp, pair.depth.stamp) for pair in nearest_pairs(images, tolerance, counts)]
+    return pairs, counts
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_pairs_equal_those_of_all_pairs(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    images, stamps = [], {}
+    for is_color, period in ((True, 33), (False, int(rng.integers(15, 120)))):
+        steps = rng.uniform(0.5, 1.5, 60) * period * MS
+        stamps[is_color] = [int(stamp) for stamp in np.cumsum(steps)]
+        late = int(rng.integers(0, 300)) * MS
+        images += [StampedImage(is_color, stamp, stamp + late, None) for stamp in stamps[is_color]]
+    images.sort(key=lambda image: image.arrival)
+    tolerance = 15 * MS
+    expected = []
+    for color in stamps[True]:
+        nearest = min(stamps[False], key=lambda depth: abs(depth - color))
+        if abs(nearest - color) <= tolerance:
+            expected.append((color, nearest))
+    pairs, counts = pairs_of(images, tolerance)
+    assert pairs == expected
+    assert (counts.color, counts.depth, counts.pairs) == (60, 60, len(expected))
+
+
+def test_streams_with_other_clocks_are_not_paired() -> None:
+    hour = 3600 * 10**9
+    for shift in (hour, -hour):
+        images = [
+            StampedImage(is_color, k * 33 * MS + (0 if is_color else shift), k * 33 * MS, None)
+            for k in range(200)
+            for is_color in (True, False)
+        ]
+        pairs, counts = pairs_of(images, 30 * MS)
+        assert pairs == [] and counts.color == counts.depth == 200
+        assert counts.smallest_gap is not None and abs(counts.smallest_gap - hour) < 2 * LONGEST_WAIT + 7 * 10**9
+
+
+@pytest.mark.parametrize("is_color", [True, False])
+def test_a_single_stream(is_color: bool) -> None:
+    pairs, counts = pairs_of([StampedImage(is_color, k, k, None) for k in range(3)], MS)
+    assert pairs == [] and counts.smallest_gap is None
+    assert pairs_of([], MS)[0] == []

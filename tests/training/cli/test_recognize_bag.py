@@ -1,0 +1,178 @@
+"""`thor2 recognize --bag`, end to end; the run's weights are random."""
+
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers import run_thor2, untrained_run
+from PIL import Image
+from recording_files import COLOR, PERIOD, START, bag_writer, image, table_frame, write_recording
+from rosbags.highlevel import AnyReader
+
+from thor2_jax.config import DescriptorConfig
+from thor2_jax.recognition.frames import read_frame
+from thor2_jax.recognition.run_directory import save_run
+from thor2_jax.segmentation.segmenters import segment
+
+FRAMES = [table_frame(shift) for shift in (0, 3, 6)]
+REAL = Path(__file__).parents[4] / "shared" / "data" / "frames" / "ycbv_real_0000"
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    directory = tmp_path_factory.mktemp("run")
+    config = DescriptorConfig(homology="closed_form")
+    save_run(untrained_run(("bowl", "mug", "plate"), config=config), directory)
+    return directory
+
+
+def lines_of(text: str) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in text.splitlines()]
+
+
+def messages_of(path: Path) -> dict[str, list[tuple[int, Any]]]:
+    """Return topic -> (time, message) of a recording, read with the definitions that it holds."""
+    found: dict[str, list[tuple[int, Any]]] = {}
+    with AnyReader([path]) as reader:
+        for connection, time, content in reader.messages():
+            found.setdefault(connection.topic, []).append((time, reader.deserialize(content, connection.msgtype)))
+    return found
+
+
+@pytest.mark.parametrize(("name", "out"), [("a.bag", "out.mcap"), ("folder", "out"), ("a.mcap", "out.mcap")])
+def test_detections_are_read_back(
+    model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], name: str, out: str
+) -> None:
+    path = write_recording(tmp_path / name, FRAMES, is_compressed=name == "a.mcap")
+    assert run_thor2("recognize", "--model", model, "--bag", path, "--out-bag", tmp_path / out) == 0
+    lines = lines_of(capfd.readouterr().out)
+    assert [line["frame"] for line in lines] == [f"1700000000.{k * PERIOD:09d}" for k in range(3)]
+    messages = messages_of(tmp_path / out)
+    assert set(messages) == {"/thor2/detections", "/thor2/overlay/compressed"}
+    for k, (line, (time, array)) in enumerate(zip(lines, messages["/thor2/detections"], strict=True)):
+        assert time == START + k * PERIOD == array.header.stamp.sec * 10**9 + array.header.stamp.nanosec
+        assert array.header.frame_id == "camera_color_optical_frame"
+        boxes = []
+        for one, detection in zip(line["instances"], array.detections, strict=True):
+            (result,) = detection.results
+            assert result.hypothesis.class_id == one["name"] and result.hypothesis.score == one["confidence"]
+            position = result.pose.pose.position
+            assert [position.x, position.y, position.z] == one["position"]
+            box = detection.bbox
+            corner = box.center.position.x - (box.size_x - 1) / 2, box.center.position.y - (box.size_y - 1) / 2
+            assert [*corner, box.size_x, box.size_y] == one["box"]
+            boxes.append((detection.id, one["box"]))
+        shift = 3 * k
+        expected = [("1", [60 + shift, 80, 50, 70]), ("2", [180 + shift, 80, 70, 70])]
+        assert [label for label, _ in boxes] == ["1", "2"]
+        np.testing.assert_allclose([box for _, box in boxes], [box for _, box in expected], atol=2)
+        assert line["instances"][0]["position"][2] == pytest.approx(0.8, abs=0.01)
+    _, overlay = messages["/thor2/overlay/compressed"][0]
+    assert Image.open(io.BytesIO(overlay.data.tobytes())).size == (320, 240)
+    assert not [one for one in tmp_path.iterdir() if one.name.startswith(".")]
+
+
+def test_every_second_frame_and_pictures(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    path = write_recording(tmp_path / "a.mcap", FRAMES)
+    command = ("recognize", "--model", model, "--bag", path, "--every", 2, "--out", tmp_path / "out")
+    assert run_thor2(*command, "--unknown-below", 1) == 0
+    lines = lines_of(capfd.readouterr().out)
+    assert [line["frame"] for line in lines] == ["1700000000.000000000", "1700000000.066666666"]
+    assert all(one["name"] is None for line in lines for one in line["instances"])
+    assert sorted(one.name for one in (tmp_path / "out").iterdir()) == [line["frame"] for line in lines]
+
+
+def test_a_frame_that_fails_does_not_stop_the_others(
+    model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "a.mcap"
+    with bag_writer(path) as write:
+        for k, pixels in enumerate((FRAMES[0].color, FRAMES[0].color[:100], FRAMES[0].color)):
+            write(COLOR, image(pixels, "rgb8", START + k * PERIOD), START + k * PERIOD)
+            write("/depth", image(FRAMES[0].depth, "16UC1", START + k * PERIOD), START + k * PERIOD)
+    (tmp_path / "K.txt").write_text("290 0 160 0 290 120 0 0 1")
+    command = ("recognize", "--model", model, "--bag", path, "--intrinsics", tmp_path / "K.txt")
+    assert run_thor2(*command, "--out-bag", tmp_path / "out.mcap") == 2
+    out, err = capfd.readouterr()
+    assert ["error" in line for line in lines_of(out)] == [False, True, False]
+    assert err.splitlines()[-1].startswith("error: 1 of 3 frames") and "failed: 1700000000.033333333" in err
+    assert len(messages_of(tmp_path / "out.mcap")["/thor2/detections"]) == 2
+
+
+def test_what_was_done_before_the_damage_is_kept(
+    model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write_recording(tmp_path / "a.mcap", FRAMES)
+    messages = AnyReader.messages
+
+    def damaged(self: AnyReader, connections: Any = ()) -> Any:
+        for number, message in enumerate(messages(self, connections)):
+            if number == 5:
+                raise AssertionError("bad record")
+            yield message
+
+    monkeypatch.setattr(AnyReader, "messages", damaged)
+    assert run_thor2("recognize", "--model", model, "--bag", path, "--out-bag", tmp_path / "out.mcap") == 2
+    out, err = capfd.readouterr()
+    monkeypatch.undo()
+    assert len(lines_of(out)) == 2
+    assert "bad record" in err and f"2 frames were recognized before and are in {tmp_path / 'out.mcap'}" in err
+    assert len(messages_of(tmp_path / "out.mcap")["/thor2/detections"]) == 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["--color", "c.png"], "color is c.png and bag is"),
+        (["--coco", "c.json"], "coco is c.json and bag is"),
+        (["--out-bag", "{there}/a.bag"], "expected an MCAP file"),
+        (["--out-bag", "{there}"], "which exists"),
+        (["--out-bag", "{there}/none/a.mcap"], "No such file"),
+        (["--color-topic", "/x"], "color_topic is /x"),
+        (["--max-gap", "0"], "max_gap is 0"),
+        (["--max-gap", "0.001", "--out-bag", "{there}/out"], "expected at most 0.001 s"),
+        (["--segment", "sam"], "segmenter is 'sam'"),
+    ],
+)
+def test_invalid_arguments(
+    model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], arguments: list[str], expected: str
+) -> None:
+    path = write_recording(tmp_path / "in.mcap", FRAMES[:1])
+    given = [text.format(there=tmp_path) for text in arguments]
+    before = sorted(tmp_path.iterdir())
+    assert run_thor2("recognize", "--model", model, "--bag", path, *given) == 2
+    out, err = capfd.readouterr()
+    assert out == "" and expected in err and err.startswith("error: ") and err.count("\n") == 1
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_options_of_bags_need_a_bag(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    assert run_thor2("recognize", "--model", model, tmp_path, "--depth-topic", "/d") == 2
+    assert "depth_topic is /d; it belongs to --bag" in capfd.readouterr().err
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason="no real frames beside the repository (shared/data/frames)")
+@pytest.mark.parametrize("name", ["a.bag", "folder", "a.mcap"])
+def test_recordings_of_real_frames(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], name: str) -> None:
+    folders = sorted(one for one in REAL.iterdir() if one.is_dir())[:2]
+    files = [
+        dict(color=one / "color.png", depth=one / "depth.png", intrinsics=one / "intrinsics.json") for one in folders
+    ]
+    frames = [read_frame(**one) for one in files]
+    path = write_recording(tmp_path / name, frames)
+    assert run_thor2("recognize", "--model", model, "--bag", path, "--out-bag", tmp_path / "out.mcap") == 0
+    from_bag = [line["instances"] for line in lines_of(capfd.readouterr().out)]
+    assert run_thor2("recognize", "--model", model, *folders, "--segment", "table", "--json") == 0
+    from_files = [line["instances"] for line in lines_of(capfd.readouterr().out)]
+    assert [[one["label"] for one in answer] for answer in from_bag] == [
+        sorted(set(np.unique(segment(frame)).tolist()) - {0}) for frame in frames
+    ]
+    places = ("box", "position")
+    assert [[{k: v for k, v in one.items() if k not in places} for one in line] for line in from_bag] == from_files
+    arrays = messages_of(tmp_path / "out.mcap")["/thor2/detections"]
+    assert [[d.results[0].hypothesis.class_id for d in array.detections] for _, array in arrays] == [
+        [one["name"] or "" for one in answer] for answer in from_bag
+    ]

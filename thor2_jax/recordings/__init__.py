@@ -1,0 +1,1 @@
+"""Recordings and live cameras: frames from bags and RealSense cameras, and files with the detections in them."""

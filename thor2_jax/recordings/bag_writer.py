@@ -1,0 +1,160 @@
+"""Bags with the detections of a recording, for ROS 2, RViz and Foxglove (extra `bags`).
+
+with DetectionBag(Path("answers.mcap")) as bag:
+    bag.write(frame, detections, stamp=stamp, frame_id="camera_color_optical_frame")
+"""
+
+import io
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from thor2_jax.errors import InputError
+from thor2_jax.files import errors_name
+from thor2_jax.recognition.frames import RGBDFrame
+from thor2_jax.recognition.overlay import annotate
+from thor2_jax.recordings.detections import Detection, detection_array, ros_time
+
+__all__ = ["DETECTIONS_TOPIC", "OVERLAY_TOPIC", "VISION_MSGS", "DetectionBag", "detection_types"]
+
+DETECTIONS_TOPIC = "/thor2/detections"
+OVERLAY_TOPIC = "/thor2/overlay/compressed"
+
+DETECTION_ARRAY = "vision_msgs/msg/Detection2DArray"
+COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
+
+VISION_MSGS = {
+    "Point2D": "float64 x\nfloat64 y",
+    "Pose2D": "vision_msgs/Point2D position\nfloat64 theta",
+    "BoundingBox2D": "vision_msgs/Pose2D center\nfloat64 size_x\nfloat64 size_y",
+    "ObjectHypothesis": "string class_id\nfloat64 score",
+    "ObjectHypothesisWithPose": ("vision_msgs/ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose"),
+    "Detection2D": (
+        "std_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\nvision_msgs/BoundingBox2D bbox\n"
+        "string id"
+    ),
+    "Detection2DArray": "std_msgs/Header header\nvision_msgs/Detection2D[] detections",
+}
+"""Definitions of the messages of vision_msgs 4 (ROS 2 Humble and later) that rosbags does not ship."""
+
+_JPEG_QUALITY = 85
+
+
+def detection_types() -> Any:
+    """Return a typestore of rosbags for ROS 2 Humble with the messages of `VISION_MSGS`.
+
+    Raises:
+        ImportError: rosbags is not installed.
+    """
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    typestore = get_typestore(Stores.ROS2_HUMBLE)
+    for name, definition in VISION_MSGS.items():
+        typestore.register(get_types_from_msg(definition, f"vision_msgs/msg/{name}"))
+    return typestore
+
+
+class DetectionBag:
+    """A ROS 2 bag or an MCAP file that is being written.
+
+    It holds `vision_msgs/Detection2DArray` in the topic `/thor2/detections` and, as JPEG, the colour images with
+    outlines and names in `/thor2/overlay/compressed`. It appears when the context ends, also with an exception, if at
+    least one frame was written.
+
+    Attributes:
+        path: the MCAP file (.mcap), or the directory of the ROS 2 bag.
+        n_frames: frames written.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Check that `path` can be written.
+
+        Raises:
+            InputError: it exists or names a ROS 1 bag, or the package rosbags is missing.
+            OSError: its folder does not exist.
+        """
+        if path.suffix == ".bag":
+            raise InputError(
+                f"out_bag is {path}; expected an MCAP file (.mcap) or a directory for a ROS 2 bag: detections of ROS 1 "
+                "have no names"
+            )
+        if path.exists() or path.is_symlink():
+            raise InputError(f"out_bag is {path}, which exists; choose another name")
+        if not path.absolute().parent.is_dir():
+            raise FileNotFoundError(2, "No such file or directory", str(path.parent))
+        try:
+            self._types = detection_types()
+        except ImportError as error:
+            raise InputError(f'out_bag is {path}, which needs rosbags ({error}); install "thor2-jax[bags]"') from None
+        self.path, self.n_frames = path, 0
+
+    def __enter__(self) -> "DetectionBag":
+        """Create a temporary bag beside `path`."""
+        from rosbags.rosbag2 import StoragePlugin, Writer
+
+        self._folder = Path(tempfile.mkdtemp(prefix=f".{self.path.name}.", dir=self.path.absolute().parent))
+        plugin = StoragePlugin.MCAP if self.path.suffix == ".mcap" else StoragePlugin.SQLITE3
+        # ROS 2 names the files of a bag by its directory.
+        self._bag = self._folder / self.path.stem
+        self._writer = Writer(self._bag, version=8, storage_plugin=plugin)
+        self._writer.open()
+        add = self._writer.add_connection
+        self._detections = add(DETECTIONS_TOPIC, DETECTION_ARRAY, typestore=self._types)
+        self._overlays = add(OVERLAY_TOPIC, COMPRESSED_IMAGE, typestore=self._types)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the bag and move it to `path`, or remove it if it is empty."""
+        try:
+            with errors_name(self.path):
+                self._writer.close()
+                if self.n_frames:
+                    is_file = self.path.suffix == ".mcap"
+                    os.replace(next(self._bag.glob("*.mcap")) if is_file else self._bag, self.path)
+        finally:
+            shutil.rmtree(self._folder, ignore_errors=True)
+
+    def write(self, frame: RGBDFrame, detections: Sequence[Detection], *, stamp: int, frame_id: str = "") -> None:
+        """Write the detections of a frame; arguments as `detection_array`."""
+        picture = io.BytesIO()
+        annotate(frame.color, frame.label_image, [one.recognition for one in detections]).save(
+            picture, "JPEG", quality=_JPEG_QUALITY
+        )
+        overlay = {
+            "header": {"stamp": ros_time(stamp), "frame_id": frame_id},
+            "format": "rgb8; jpeg compressed bgr8",
+            "data": np.frombuffer(picture.getvalue(), np.uint8),
+        }
+        array = detection_array(detections, stamp=stamp, frame_id=frame_id)
+        for connection, kind, fields in (
+            (self._detections, DETECTION_ARRAY, array),
+            (self._overlays, COMPRESSED_IMAGE, overlay),
+        ):
+            content = self._types.serialize_cdr(_message(self._types, kind, fields), kind)
+            with errors_name(self.path):
+                self._writer.write(connection, stamp, content)
+        self.n_frames += 1
+
+
+def _message(types: Any, kind: str, fields: Any) -> Any:
+    """Return a message of rosbags with the values of nested mappings and lists."""
+    from rosbags.interfaces import Nodetype
+
+    def convert(description: Any, value: Any) -> Any:
+        node, details = description
+        if node == Nodetype.NAME:
+            return _message(types, details, value)
+        if node == Nodetype.BASE or isinstance(value, np.ndarray):
+            return value
+        (element, name), _ = details
+        if element == Nodetype.NAME:
+            return [_message(types, name, one) for one in value]
+        return np.asarray(value, dtype=name[0])
+
+    cls: Callable[..., Any] = types.types[kind]
+    return cls(**{name: convert(description, fields[name]) for name, description in types.fielddefs[kind][1]})

@@ -1,0 +1,212 @@
+"""Recordings of ROS 1, ROS 2 and MCAP: frames of nearest colour and depth images (extra `bags`).
+
+with Bag("table.mcap") as bag:
+    for recorded in bag.frames():
+        frame = segmented(recorded.read())
+"""
+
+import contextlib
+import dataclasses
+import functools
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from thor2_jax.errors import InputError, with_context
+from thor2_jax.recognition.frames import RGBDFrame
+from thor2_jax.recognition.intrinsics import Intrinsics
+from thor2_jax.recordings.messages import color_image, depth_image, image_kind, stamp_of
+from thor2_jax.recordings.pairs import ImagePair, PairCounts, StampedImage, nearest_pairs
+from thor2_jax.recordings.recorded_frames import RecordedFrame, stamp_name
+from thor2_jax.recordings.topics import CAMERA_TYPE, IMAGE_TYPES, Topics, choose_topics
+
+__all__ = ["DEFAULT_MAX_GAP", "Bag"]
+
+DEFAULT_MAX_GAP = 0.03
+"""Default of the largest time between the images of a pair, seconds: about a period at 30 frames a second."""
+
+_ADVICE = {
+    ".bag": "repair it: rosbag reindex",
+    ".mcap": "repair it: mcap recover",
+    ".db3": "repair it: ros2 bag reindex",
+}
+
+
+class Bag:
+    """A recording, open while its context is entered.
+
+    Attributes:
+        path: the file, or the directory of a ROS 2 bag.
+        topics: the topics that are read.
+        intrinsics: the colour camera.
+        frame_id: coordinate frame of the colour images.
+        counts: images and pairs so far.
+        notes: what is likely wrong with the recording, without being an error.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        topics: Topics | None = None,
+        *,
+        intrinsics: Intrinsics | None = None,
+        depth_scale: float | None = None,
+        max_gap: float = DEFAULT_MAX_GAP,
+    ) -> None:
+        """Describe what is read; nothing is opened yet.
+
+        Args:
+            path: a ROS 1 bag (.bag), a ROS 2 bag (its directory, or a .db3 file) or an MCAP file.
+            topics: names of topics; by default they are chosen by what they hold.
+            intrinsics: the colour camera, in place of the recorded one.
+            depth_scale: depth units per metre, in place of ROS's 1000.
+            max_gap: largest time between the two images of a frame, seconds.
+
+        Raises:
+            InputError: `max_gap` is no positive number.
+        """
+        if not 0 < max_gap < float("inf"):
+            raise InputError(f"max_gap is {max_gap}; expected a positive number of seconds")
+        self.path = Path(path)
+        self.intrinsics: Intrinsics | None = intrinsics
+        self._wanted, self._depth_scale, self._max_gap = topics or Topics(), depth_scale, max_gap
+        self.topics, self.frame_id, self.counts = Topics(), "", PairCounts()
+        self.notes: list[str] = []
+        self._reader: Any = None
+
+    def __enter__(self) -> "Bag":
+        """Open the recording, choose its topics and read the camera.
+
+        Raises:
+            InputError: the package rosbags is missing, the recording is damaged or of another format, or it lacks a
+                topic.
+            OSError: it cannot be opened.
+        """
+        try:
+            from rosbags.highlevel import AnyReader
+            from rosbags.typesys import Stores, get_typestore
+        except ImportError as error:
+            raise InputError(f'bag is {self.path}, which needs rosbags ({error}); install "thor2-jax[bags]"') from None
+        if not self.path.exists():
+            raise FileNotFoundError(2, "No such file or directory", str(self.path))
+        if self.path.is_dir() and not (self.path / "metadata.yaml").is_file():
+            raise InputError(
+                f"bag: {self.path} has no metadata.yaml; expected a ROS 2 bag; repair it: ros2 bag reindex"
+            )
+        with self._damage_named():
+            # ROS 2 before Iron stores no message definitions; those of images have not changed.
+            self._reader = AnyReader([self.path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+            self._reader.open()
+        try:
+            self._choose()
+        except BaseException:
+            self.__exit__()
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the recording."""
+        if self._reader is not None and self._reader.stack is not None:
+            self._reader.close()
+        self._reader = None
+
+    def frames(self) -> Iterator[RecordedFrame]:
+        """Yield the frames in the order of their time stamps.
+
+        Raises:
+            InputError: the recording is damaged from here on, or no two images are near enough in time.
+        """
+        tolerance = round(self._max_gap * 1e9)
+        for pair in nearest_pairs(self._images(), tolerance, self.counts):
+            gap = pair.depth.stamp - pair.color.stamp
+            read = functools.partial(self._read, pair)
+            yield RecordedFrame(stamp_name(pair.color.stamp), read, pair.color.stamp, gap, self.frame_id)
+        if self.counts.pairs == 0:
+            smallest = self.counts.smallest_gap
+            apart = "" if smallest is None else f", at least {smallest / 1e9:.3g} s apart"
+            raise InputError(
+                f"bag: {self.path}: {self.counts.color} images of {self.topics.color} and {self.counts.depth} of "
+                f"{self.topics.depth}{apart}; expected at most {self._max_gap:g} s; check the clocks of the streams, "
+                "or raise max_gap"
+            )
+
+    def _read(self, pair: ImagePair) -> RGBDFrame:
+        color, depth = color_image(pair.color.message), depth_image(pair.depth.message)
+        if color.shape[:2] != depth.shape:
+            raise InputError(
+                f"depth has {depth.shape[1]} x {depth.shape[0]} pixels and color {color.shape[1]} x {color.shape[0]}; "
+                f"expected depth that is aligned to color; {self.topics.depth} is not: record or choose the aligned one"
+            )
+        assert self.intrinsics is not None
+        return RGBDFrame(color, depth, None, self.intrinsics)
+
+    def _images(self) -> Iterator[StampedImage]:
+        wanted = [c for c in self._reader.connections if c.topic in (self.topics.color, self.topics.depth)]
+        messages = self._reader.messages(wanted)
+        while True:
+            with self._damage_named():
+                item = next(messages, None)
+                if item is None:
+                    return
+                connection, arrival, content = item
+                message = self._reader.deserialize(content, connection.msgtype)
+                image = StampedImage(
+                    connection.topic == self.topics.color, stamp_of(message) or arrival, arrival, message
+                )
+            yield image
+
+    def _choose(self) -> None:
+        """Choose the topics by their first messages, and read the camera."""
+        types = {connection.topic: connection.msgtype for connection in self._reader.connections}
+        first = {topic: self._first(topic) for topic, kind in types.items() if kind in (*IMAGE_TYPES, CAMERA_TYPE)}
+        first = {topic: message for topic, message in first.items() if message is not None}
+        kinds = {t: "camera" if types[t] == CAMERA_TYPE else image_kind(message) for t, message in first.items()}
+        with with_context(f"bag: {self.path}"):
+            self.topics = choose_topics(self._wanted, kinds, types, needs_camera=self.intrinsics is None)
+            if self.intrinsics is None:
+                with with_context(str(self.topics.camera)):
+                    self.intrinsics = _camera(first[self.topics.camera], str(self.topics.color))
+        if self._depth_scale is not None:
+            self.intrinsics = dataclasses.replace(self.intrinsics, depth_scale=self._depth_scale)
+        color, depth = (first[topic].header.frame_id for topic in (self.topics.color, self.topics.depth))
+        self.frame_id = str(color)
+        if color != depth:
+            self.notes.append(
+                f"depth ({self.topics.depth}) is in the coordinate frame {depth} and color in {color}: it is probably "
+                "not aligned to color"
+            )
+
+    def _first(self, topic: str) -> Any:
+        """Return the first message of a topic; None if there is none."""
+        connections = [connection for connection in self._reader.connections if connection.topic == topic]
+        with self._damage_named():
+            for connection, _, content in self._reader.messages(connections):
+                return self._reader.deserialize(content, connection.msgtype)
+        return None
+
+    @contextlib.contextmanager
+    def _damage_named(self) -> Iterator[None]:
+        """Turn what rosbags and its decompressors raise on damaged files, dozens of kinds, into an InputError."""
+        try:
+            yield
+        except (OSError, InputError):
+            raise
+        except Exception as error:
+            reason = " ".join(str(error).split()).rstrip(".") or type(error).__name__
+            after = f" after {self.counts.color} colour images" if self.counts.color else ""
+            raise InputError(
+                f"bag: {self.path} is damaged or of another format{after} ({reason}); expected a ROS 1 bag (.bag), a "
+                f"ROS 2 bag (directory, .db3) or MCAP of ROS 2; "
+                f"{_ADVICE.get(self.path.suffix, 'repair it: ros2 bag reindex')} {self.path.name}"
+            ) from None
+
+
+def _camera(message: Any, color_topic: str) -> Intrinsics:
+    """Return the intrinsics of a CameraInfo: of rectified images P without distortion, of others K."""
+    projection = np.asarray(getattr(message, "P", getattr(message, "p", ())), dtype=np.float64)
+    if "image_rect" in color_topic and projection.size == 12 and projection[0] > 0:
+        matrix = projection.reshape(3, 4)[:, :3]
+        return Intrinsics.of_matrix(matrix, width=int(message.width), height=int(message.height))
+    return Intrinsics.of(message)

@@ -1,0 +1,144 @@
+"""Images in ROS messages: sensor_msgs/Image and CompressedImage to arrays.
+
+The functions read attributes only, so messages of ROS 1, ROS 2 (rclpy) and rosbags are the same to them.
+"""
+
+import io
+import struct
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from thor2_jax.errors import InputError
+from thor2_jax.recognition.image_files import MAX_IMAGE_PIXELS
+
+__all__ = ["color_image", "depth_image", "image_kind", "stamp_of"]
+
+_COLOR_CHANNELS: dict[str, tuple[int, tuple[int, int, int]]] = {
+    "rgb8": (3, (0, 1, 2)),
+    "bgr8": (3, (2, 1, 0)),
+    "8uc3": (3, (2, 1, 0)),  # as cv_bridge reads it
+    "rgba8": (4, (0, 1, 2)),
+    "bgra8": (4, (2, 1, 0)),
+    "8uc4": (4, (2, 1, 0)),
+}
+"""Encoding in lower case -> number of channels, and those of red, green and blue."""
+
+_DEPTH_TYPES: dict[str, np.dtype[Any]] = {
+    "16uc1": np.dtype(np.uint16),
+    "mono16": np.dtype(np.uint16),
+    "32fc1": np.dtype(np.float32),
+}
+"""Encoding in lower case -> type of a pixel: millimetres as integers, metres as floats (REP 118)."""
+
+_DEPTH_HEADER = struct.Struct("<iff")
+"""Header of compressedDepth: format, and the two numbers of the quantization of inverse depth."""
+
+
+def stamp_of(message: Any) -> int:
+    """Return the time stamp of a message's header, nanoseconds; 0 if it was not set."""
+    stamp = message.header.stamp
+    return int(stamp.sec) * 10**9 + int(stamp.nanosec)
+
+
+def image_kind(message: Any) -> str:
+    """Return "color" or "depth", what `color_image` or `depth_image` reads, or "other"."""
+    if not hasattr(message, "format"):
+        encoding = message.encoding.lower()
+        return "color" if encoding in _COLOR_CHANNELS else "depth" if encoding in _DEPTH_TYPES else "other"
+    encoding, _, transport = message.format.lower().partition(";")
+    if "compresseddepth" in transport:
+        return "depth"
+    if encoding.strip() in _DEPTH_TYPES:
+        return "depth"
+    try:
+        with Image.open(io.BytesIO(bytes(message.data)), formats=("PNG", "JPEG")) as image:
+            return "color" if image.mode in ("RGB", "RGBA") else "depth" if image.mode.startswith("I") else "other"
+    except Exception:  # Decoders raise many kinds of exception on damaged images.
+        return "other"
+
+
+def color_image(message: Any) -> NDArray[np.uint8]:
+    """Return the colour image [H, W, 3] uint8 sRGB of an Image or a CompressedImage.
+
+    Raises:
+        InputError: the encoding is none of rgb8, bgr8, rgba8, bgra8, JPEG and PNG, or the data is damaged.
+    """
+    if hasattr(message, "format"):
+        pixels = _decoded(bytes(message.data), message.format)
+        if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] not in (3, 4):
+            raise InputError(f"color: a compressed image has the format {message.format!r}; expected 8-bit RGB")
+        return np.ascontiguousarray(pixels[..., :3])
+    if message.encoding.lower() not in _COLOR_CHANNELS:
+        raise InputError(
+            f"color: an image has the encoding {message.encoding!r}; expected rgb8, bgr8, rgba8, bgra8 or a compressed "
+            "image"
+        )
+    channels, order = _COLOR_CHANNELS[message.encoding.lower()]
+    pixels = _rows(message, np.dtype(np.uint8), channels)
+    return np.ascontiguousarray(pixels.reshape(message.height, message.width, channels)[..., order])
+
+
+def depth_image(message: Any) -> NDArray[Any]:
+    """Return the depth image [H, W] of an Image or a CompressedImage.
+
+    Returns:
+        uint16 in depth units (millimetres in ROS) or float32 in metres, as `RGBDFrame.depth`.
+
+    Raises:
+        InputError: the encoding is none of 16UC1, mono16, 32FC1 and PNG in `compressedDepth`, or the data is damaged.
+    """
+    if hasattr(message, "format"):
+        return _compressed_depth(bytes(message.data), message.format)
+    dtype = _DEPTH_TYPES.get(message.encoding.lower())
+    if dtype is None:
+        raise InputError(f"depth: an image has the encoding {message.encoding!r}; expected 16UC1, mono16 or 32FC1")
+    return _rows(message, dtype, 1)
+
+
+def _rows(message: Any, dtype: np.dtype[Any], channels: int) -> NDArray[Any]:
+    """Return the pixels [H, W * channels] of an Image, without the padding of its rows."""
+    data = np.frombuffer(message.data, np.uint8)
+    height, step, used = int(message.height), int(message.step), int(message.width) * channels * dtype.itemsize
+    if height * used == 0 or step < used or len(data) < height * step:
+        raise InputError(
+            f"an image has {len(data)} bytes in rows of {step}; expected {message.width} x {message.height} pixels of "
+            f"{message.encoding}"
+        )
+    rows = np.ascontiguousarray(data[: height * step].reshape(height, step)[:, :used])
+    return rows.view(dtype.newbyteorder(">" if message.is_bigendian else "<")).astype(dtype, copy=False)
+
+
+def _decoded(content: bytes, described: str) -> NDArray[Any]:
+    """Return the pixels of a PNG or JPEG whose content is not trusted."""
+    try:
+        with Image.open(io.BytesIO(content), formats=("PNG", "JPEG")) as image:
+            if image.width * image.height > MAX_IMAGE_PIXELS:
+                raise ValueError(f"{image.width} x {image.height} pixels; expected at most {MAX_IMAGE_PIXELS}")
+            return np.asarray(image)
+    except Exception as error:  # Decoders raise many kinds of exception on damaged images.
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise InputError(f"a compressed image ({described}) is damaged ({reason}); expected PNG or JPEG") from None
+
+
+def _compressed_depth(content: bytes, described: str) -> NDArray[Any]:
+    encoding, _, transport = described.lower().partition(";")
+    if "compresseddepth" not in transport:
+        return _as_depth(_decoded(content, described), described)
+    if "rvl" in transport or len(content) < _DEPTH_HEADER.size:
+        raise InputError(f"depth: a compressed image has the format {described!r}; expected compressedDepth png")
+    _, scale, offset = _DEPTH_HEADER.unpack_from(content)
+    pixels = _as_depth(_decoded(content[_DEPTH_HEADER.size :], described), described)
+    if encoding.strip() != "32fc1":
+        return pixels
+    # compressed_depth_image_transport quantizes inverse depth: depth = scale / (value - offset).
+    with np.errstate(divide="ignore"):
+        return np.where(pixels > 0, scale / (pixels - np.float32(offset)), 0).astype(np.float32)
+
+
+def _as_depth(pixels: NDArray[Any], described: str) -> NDArray[np.uint16]:
+    if pixels.ndim != 2 or pixels.dtype == np.uint8 or not np.issubdtype(pixels.dtype, np.integer):
+        raise InputError(f"depth: a compressed image has the format {described!r}; expected 16-bit PNG")
+    return pixels.astype(np.uint16)

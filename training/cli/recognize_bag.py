@@ -1,0 +1,108 @@
+"""`thor2 recognize --bag`: recognize the frames of a recording."""
+
+import contextlib
+import dataclasses
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from thor2_jax.errors import InputError
+from thor2_jax.recordings.topics import Topics
+
+if TYPE_CHECKING:
+    from thor2_jax.recordings.bag_writer import DetectionBag
+    from thor2_jax.recordings.recorded_frames import RecordedFrame
+    from training.frame_recognition import FrameAnswer
+
+__all__ = ["BagOptions", "recognize_bag"]
+
+
+@dataclasses.dataclass(frozen=True)
+class BagOptions:
+    """The options of `thor2 recognize` that belong to a recording."""
+
+    bag: Path
+    topics: Topics
+    intrinsics: Path | None
+    depth_scale: float | None
+    max_gap: float
+    every: int
+    segment: str | None
+    out: Path | None
+    out_bag: Path | None
+
+
+def recognize_bag(options: BagOptions, model: Path, unknown_below: float | None, answer_by: str | None) -> None:
+    """Recognize the frames of a recording: a line of JSON for each, and the outputs that are wanted.
+
+    Raises:
+        InputError: the recording cannot be read from here on, and what was written so far; or frames failed.
+    """
+    from thor2_jax.capacity import BATCH_BUCKETS
+    from thor2_jax.files import check_output_directory
+    from thor2_jax.recognition.frames import read_intrinsics
+    from thor2_jax.recognizer import Recognizer
+    from thor2_jax.recordings.bag_writer import DetectionBag
+    from thor2_jax.recordings.bags import Bag
+    from thor2_jax.segmentation.segmenters import TABLE, load_segmenter
+    from training.bag_recognition import recognize_recorded
+
+    segmenter = load_segmenter(options.segment or TABLE)
+    intrinsics = None if options.intrinsics is None else read_intrinsics(options.intrinsics)
+    bag = Bag(
+        options.bag,
+        options.topics,
+        intrinsics=intrinsics,
+        depth_scale=options.depth_scale,
+        max_gap=options.max_gap,
+    )
+    out_bag = None if options.out_bag is None else DetectionBag(options.out_bag)
+    if options.out is not None:
+        check_output_directory(options.out)
+    n_answers, failed, damage = 0, [], None
+    with bag:
+        for note in bag.notes:
+            print(f"note: {note}", file=sys.stderr)
+        recognizer = Recognizer.load(model, unknown_below, answer_by=answer_by)
+        recognizer.chunk = BATCH_BUCKETS[-1]
+        with out_bag or contextlib.nullcontext():
+            try:
+                for recorded, answer in recognize_recorded(recognizer, bag.frames(), segmenter, options.every):
+                    n_answers += answer.error is None
+                    if answer.error is not None:
+                        failed.append(recorded.name)
+                        print(f"failed: {answer.name}: {answer.error}", file=sys.stderr)
+                    _write(recorded, answer, options.out, out_bag)
+            except InputError as error:
+                damage = str(error)
+    written = [str(path) for path in (options.out, options.out_bag) if path is not None and n_answers]
+    if damage is not None:
+        kept = f"; {n_answers} frames were recognized before" + (f" and are in {', '.join(written)}" if written else "")
+        raise InputError(damage + (kept if n_answers else ""))
+    unpaired = bag.counts.color - bag.counts.pairs
+    if unpaired:
+        print(
+            f"{unpaired} of {bag.counts.color} images of {bag.topics.color} have no depth within {options.max_gap:g} s",
+            file=sys.stderr,
+        )
+    for path in written:
+        print(f"written to {path}", file=sys.stderr)
+    if failed:
+        raise InputError(f"{len(failed)} of {n_answers + len(failed)} frames could not be recognized; see above")
+
+
+def _write(recorded: "RecordedFrame", answer: "FrameAnswer", out: Path | None, out_bag: "DetectionBag | None") -> None:
+    from thor2_jax.recognition.result_files import write_recognitions
+    from thor2_jax.recordings.detections import detections_as_json, detections_of
+
+    line = {"frame": recorded.name, "depth_gap": recorded.gap / 1e9}
+    if answer.frame is None:
+        print(json.dumps({**line, "error": answer.error}), flush=True)
+        return
+    detections = detections_of(answer.frame, answer.recognitions)
+    print(json.dumps({**line, "instances": detections_as_json(detections)}), flush=True)
+    if out is not None:
+        write_recognitions(out / recorded.name, answer.frame, answer.recognitions)
+    if out_bag is not None:
+        out_bag.write(answer.frame, detections, stamp=recorded.stamp, frame_id=recorded.frame_id)
