@@ -6,7 +6,7 @@ COPY constraints.txt pyproject.toml README.md LICENSE ./
 COPY colornet colornet
 COPY thor2_jax thor2_jax
 COPY training training
-RUN pip install --no-cache-dir -c constraints.txt '.[serve]' \
+RUN pip install --no-cache-dir -c constraints.txt '.[serve,segment]' \
     && useradd --system --uid 10001 --no-create-home thor2
 
 USER thor2

@@ -6,10 +6,10 @@ FIELDS = {"color": "image/png", "depth": "image/png", "labels": "image/png", "in
 
 
 def upload(page: Page, files: dict[str, bytes], color_name: str = "color.png") -> None:
-    """Upload a frame and have it recognized."""
+    """Upload a frame, which may lack labels, and have it recognized."""
     if not page.locator("#upload-form").is_visible():
         page.get_by_text("Upload your own frame").click()
-    for field, kind in FIELDS.items():
+    for field, content in files.items():
         name = color_name if field == "color" else field
-        page.locator(f"#{field}").set_input_files({"name": name, "mimeType": kind, "buffer": files[field]})
+        page.locator(f"#{field}").set_input_files({"name": name, "mimeType": FIELDS[field], "buffer": content})
     page.get_by_role("button", name="Recognize", exact=True).click()

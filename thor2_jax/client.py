@@ -5,6 +5,11 @@
 >>> client.recognize(**frame)                                                       # doctest: +SKIP
 [Recognition(label=1, name='mug', confidence=0.98, ...)]
 
+The service segments a frame without labels (`thor2 serve --segment`); `recognize_frame` returns its labels, too:
+
+>>> del frame["labels"]                                                             # doctest: +SKIP
+>>> recognitions, labels = client.recognize_frame(**frame)                          # doctest: +SKIP
+
 A service that teaches (`thor2 serve --teach`) enrolls and forgets objects:
 
 >>> client.enroll("teapot", **frame, instance=3)["views"]                           # doctest: +SKIP
@@ -24,6 +29,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from thor2_jax.errors import InputError
 from thor2_jax.recognition.answers import Recognition
@@ -66,23 +72,46 @@ class Client:
         self._url, self._token, self._timeout = url.rstrip("/"), token, timeout
 
     def recognize(
-        self, *, color: str | Path | bytes, depth: str | Path | bytes, labels: str | Path | bytes, intrinsics: Any
+        self,
+        *,
+        color: str | Path | bytes,
+        depth: str | Path | bytes,
+        labels: str | Path | bytes | NDArray[Any] | None = None,
+        intrinsics: Any,
     ) -> list[Recognition]:
         """Recognize every instance of a frame, in the order of the labels.
 
         Args:
             color: 8-bit PNG or JPEG, as a path or the content of the file.
             depth: 16-bit PNG.
-            labels: PNG of instance numbers.
+            labels: PNG of instance numbers, or an array [H, W] of them up to 65,535; None lets the service segment the
+                frame.
             intrinsics: JSON file, or a mapping with fx, fy, cx, cy and optionally depth_scale.
 
         Raises:
+            InputError: `labels` is an array of another kind.
             ServiceError: the service returned an error.
             OSError: a file cannot be read, or the service cannot be reached.
         """
+        return self.recognize_frame(color=color, depth=depth, labels=labels, intrinsics=intrinsics)[0]
+
+    def recognize_frame(
+        self,
+        *,
+        color: str | Path | bytes,
+        depth: str | Path | bytes,
+        labels: str | Path | bytes | NDArray[Any] | None = None,
+        intrinsics: Any,
+    ) -> tuple[list[Recognition], NDArray[np.int32] | None]:
+        """Recognize a frame, and return its recognitions and the labels [H, W] that the service made.
+
+        The labels are None if the request had labels. The service halves their size, as often as needed, if a segmenter
+        returns more than 50,000 runs of equal labels. Arguments and exceptions as `recognize`.
+        """
         files = _frame_files(color, depth, labels, intrinsics)
         answer = json.loads(self._request("/v1/recognize", *multipart(files)))
-        return [_recognition(instance) for instance in answer["instances"]]
+        label_map = answer.get("label_map")  # Services of version 0.1.0 have none.
+        return [_recognition(instance) for instance in answer["instances"]], label_map and _label_image(label_map)
 
     def describe(self, clouds: Sequence[tuple[Any, Any]]) -> dict[str, NDArray[Any]]:
         """Compute the descriptors of clouds, pairs (xyz [n, 3] in metres, rgb [n, 3] uint8).
@@ -122,7 +151,7 @@ class Client:
         *,
         color: str | Path | bytes,
         depth: str | Path | bytes,
-        labels: str | Path | bytes,
+        labels: str | Path | bytes | NDArray[Any],
         intrinsics: Any,
         instance: int,
         extend: bool = False,
@@ -144,6 +173,7 @@ class Client:
             The record of the object, as in `objects`, with the generation of the gallery, for `undo`, and timings.
 
         Raises:
+            InputError: as `recognize`.
             ServiceError: as `describe`; status 409 if the name exists and neither `extend` nor `replace` is given.
             OSError: as `recognize`.
         """
@@ -190,9 +220,14 @@ class Client:
 
 
 def _frame_files(
-    color: str | Path | bytes, depth: str | Path | bytes, labels: str | Path | bytes, intrinsics: Any
+    color: str | Path | bytes,
+    depth: str | Path | bytes,
+    labels: str | Path | bytes | NDArray[Any] | None,
+    intrinsics: Any,
 ) -> dict[str, bytes]:
-    files = {name: _read(file) for name, file in (("color", color), ("depth", depth), ("labels", labels))}
+    files = {"color": _read(color), "depth": _read(depth)}
+    if labels is not None:
+        files["labels"] = _encode_labels(labels) if isinstance(labels, np.ndarray) else _read(labels)
     files["intrinsics"] = (
         json.dumps(dict(intrinsics)).encode() if isinstance(intrinsics, Mapping) else _read(intrinsics)
     )
@@ -201,6 +236,26 @@ def _frame_files(
 
 def _read(file: str | Path | bytes) -> bytes:
     return file if isinstance(file, bytes) else Path(file).read_bytes()
+
+
+def _encode_labels(labels: NDArray[Any]) -> bytes:
+    if (
+        labels.ndim != 2
+        or labels.dtype.kind not in "ui"
+        or not labels.size
+        or not 0 <= labels.min() <= labels.max() < 2**16
+    ):
+        raise InputError(
+            f"labels has shape {labels.shape} and type {labels.dtype}; expected integers [H, W] from 0 to 65535"
+        )
+    stream = io.BytesIO()
+    Image.fromarray(labels.astype(np.uint16)).save(stream, "PNG")
+    return stream.getvalue()
+
+
+def _label_image(label_map: Mapping[str, Any]) -> NDArray[np.int32]:
+    flat = np.repeat(np.array(label_map["labels"], np.int32), label_map["lengths"])
+    return flat.reshape(label_map["height"], label_map["width"])
 
 
 def _service_error(error: urllib.error.HTTPError) -> ServiceError:

@@ -32,7 +32,8 @@ from thor2_jax.service.uploads import read_body, read_form
 
 __all__ = ["create_app"]
 
-FRAME_FIELDS = ("color", "depth", "labels", "intrinsics")
+LABELLED_FRAME = ("color", "depth", "labels", "intrinsics")
+FRAME, OPTIONAL = ("color", "depth", "intrinsics"), ("labels",)
 FRAME_ERRORS = error_responses(400, 408, 413, 415, 422, 429, 503, 504)
 GALLERY_ERRORS = error_responses(429, 500, 503, 504, 507)
 
@@ -133,13 +134,15 @@ def _health_routes(service: Service, workers: int) -> APIRouter:
 def _add_inference_routes(routes: APIRouter, service: Service) -> None:
     @routes.post("/v1/recognize", responses=FRAME_ERRORS, openapi_extra={"requestBody": schemas.FRAME_FORM})
     async def recognize(request: Request) -> schemas.FrameAnswer:
-        """Recognize every instance of a frame."""
+        """Recognize every instance of a frame; one without labels is segmented."""
         async with service.admit() as admitted:
             with admitted.stage("upload"):
-                files = await read_form(request, FRAME_FIELDS)
-            recognitions = await service.recognize(files, admitted)
+                files = await read_form(request, FRAME, OPTIONAL)
+            recognitions, label_map = await service.recognize(files, admitted)
         return schemas.FrameAnswer(
-            instances=[instance_answer(recognition) for recognition in recognitions], timings=admitted.milliseconds()
+            instances=[instance_answer(recognition) for recognition in recognitions],
+            label_map=label_map,
+            timings=admitted.milliseconds(),
         )
 
     @routes.post(
@@ -152,7 +155,7 @@ def _add_inference_routes(routes: APIRouter, service: Service) -> None:
         """Recognize every instance of a frame and return the evidence: clouds, persistence images and colours."""
         async with service.admit() as admitted:
             with admitted.stage("upload"):
-                files = await read_form(request, FRAME_FIELDS)
+                files = await read_form(request, FRAME, OPTIONAL)
             answer = await service.explain(files, admitted)
             content = await run_in_threadpool(answer.model_dump_json)
         return Response(content, media_type="application/json")
@@ -198,6 +201,7 @@ def _add_model_routes(routes: APIRouter, service: Service) -> None:
             descriptor=pydantic_core.to_jsonable_python(run.config),
             color_network=run.network.fingerprint,
             teaches=service.settings.teach,
+            segmenter=service.settings.segmenter,
         )
 
     @routes.get("/v1/colornet")
@@ -240,9 +244,9 @@ def _add_teaching_routes(authenticated: APIRouter, service: Service) -> None:
         """
         async with service.admit() as admitted:
             with admitted.stage("upload"):
-                fields = await read_form(request, (*FRAME_FIELDS, "name", "instance"), ("extend", "replace"))
+                fields = await read_form(request, (*LABELLED_FRAME, "name", "instance"), ("extend", "replace"))
             enrolment = parse_enrolment(fields)
-            known = await service.enroll({name: fields[name] for name in FRAME_FIELDS}, enrolment, admitted)
+            known = await service.enroll({name: fields[name] for name in LABELLED_FRAME}, enrolment, admitted)
         (enrolled,) = [answer for answer in object_answers(known) if answer.name == enrolment.name]
         return schemas.EnrolmentAnswer(**dict(enrolled), generation=known.generation, timings=admitted.milliseconds())
 

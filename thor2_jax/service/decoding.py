@@ -28,14 +28,16 @@ from thor2_jax.service.settings import (
     MAX_UPLOAD_PIXELS,
 )
 
-__all__ = ["CloudArrays", "decode_frame", "decode_json_clouds", "decode_npz_clouds"]
+__all__ = ["CloudArrays", "check_instances", "decode_frame", "decode_json_clouds", "decode_npz_clouds"]
 
 CloudArrays = list[tuple[NDArray[np.float32], NDArray[np.uint8]]]
 """Points [n, 3] in metres and sRGB colours [n, 3] of each cloud."""
 
 
-def decode_frame(color: bytes, depth: bytes, labels: bytes, intrinsics: bytes) -> RGBDFrame:
+def decode_frame(color: bytes, depth: bytes, intrinsics: bytes, labels: bytes | None = None) -> RGBDFrame:
     """Decode a frame from the contents of its files (formats of `frames.read_frame`; depth and labels only as PNG).
+
+    Without `labels`, the frame has none.
 
     Raises:
         RequestError: 413 or 422, with the errors of all fields.
@@ -43,7 +45,9 @@ def decode_frame(color: bytes, depth: bytes, labels: bytes, intrinsics: bytes) -
     decoders: dict[str, Callable[[], Any]] = {
         "color": lambda: _decode_image("color", color, ("PNG", "JPEG"), ("RGB", "RGBA")),
         "depth": lambda: _decode_image("depth", depth, ("PNG",), ("I;16",)),
-        "labels": lambda: _decode_image("labels", labels, ("PNG",), ("L", "P", "I;16", "I")),
+        "labels": lambda: (
+            None if labels is None else _decode_image("labels", labels, ("PNG",), ("L", "P", "I;16", "I"))
+        ),
         "intrinsics": lambda: _decode_intrinsics(intrinsics),
     }
     fields, errors = {}, []
@@ -58,11 +62,17 @@ def decode_frame(color: bytes, depth: bytes, labels: bytes, intrinsics: bytes) -
         frame = RGBDFrame(**fields | {"color": np.ascontiguousarray(fields["color"][..., :3])})
     except InputError as error:
         raise RequestError(422, str(error).split(maxsplit=1)[0], f"{error}.") from None
+    if labels is not None:
+        check_instances(frame)
+    return frame
+
+
+def check_instances(frame: RGBDFrame) -> None:
+    """Raise RequestError (422) if the labels of a frame have more than `MAX_INSTANCES` instances."""
     if len(frame.instances) > MAX_INSTANCES:
         raise RequestError(
             422, "labels", f"labels has {len(frame.instances)} instances; expected at most {MAX_INSTANCES}."
         )
-    return frame
 
 
 def _decode_intrinsics(content: bytes) -> Intrinsics:

@@ -26,7 +26,7 @@ from thor2_jax.service.preparation import (
     prepare_view,
 )
 from thor2_jax.service.problem import RequestError, deadline_exceeded
-from thor2_jax.service.schemas import ExplainedFrame
+from thor2_jax.service.schemas import ExplainedFrame, LabelMap
 from thor2_jax.service.settings import Settings
 from thor2_jax.service.teaching import Enrolment, gallery_errors
 
@@ -85,7 +85,7 @@ class Service:
 
     def start(self) -> None:
         """Start processes and threads. `state` becomes "ready" when all batch shapes are compiled."""
-        self._pool = PreparationPool(self.settings.processes)
+        self._pool = PreparationPool(self.settings.processes, self.settings.segmenter)
         self._batcher = Batcher(
             self._process_batch, lambda: self._in_progress, self.settings.max_batch, self.settings.window
         )
@@ -166,11 +166,20 @@ class Service:
             for name, seconds in request.seconds.items():
                 self.metrics.stages.labels(name).observe(seconds)
 
-    async def recognize(self, files: dict[str, bytes], request: AdmittedRequest) -> list[Recognition]:
-        """Recognize the frame in `files` (the arguments of `decoding.decode_frame`). Raises RequestError."""
+    async def recognize(
+        self, files: dict[str, bytes], request: AdmittedRequest
+    ) -> tuple[list[Recognition], LabelMap | None]:
+        """Recognize the frame in `files` (the arguments of `decoding.decode_frame`).
+
+        Returns:
+            One recognition per instance, and the labels of a frame that was segmented here, otherwise None.
+
+        Raises:
+            RequestError: as `preparation.prepare_frame`.
+        """
         prepared, results = await self._infer_frame(files, False, request)
         self.engine.refresh()
-        return self.engine.recognize(prepared.instances, results)
+        return self.engine.recognize(prepared.instances, results), prepared.label_map
 
     async def explain(self, files: dict[str, bytes], request: AdmittedRequest) -> ExplainedFrame:
         """Recognize a frame and return the evidence as well. Raises RequestError."""
@@ -247,7 +256,8 @@ class Service:
         self, files: dict[str, bytes], with_label_map: bool, request: AdmittedRequest
     ) -> tuple[PreparedRequest, list[CloudResult]]:
         sigma_s = self.engine.run.config.sigma_s
-        future = self._pool.submit(request.deadline, prepare_frame, files, sigma_s, with_label_map)
+        arguments = files, sigma_s, with_label_map, self.settings.segmenter
+        future = self._pool.submit(request.deadline, prepare_frame, *arguments)
         prepared = await asyncio.wrap_future(future)
         return prepared, await self._infer(prepared, request)
 

@@ -4,7 +4,9 @@ This is most of the work of a frame and holds the interpreter lock, so threads w
 exceeds its deadline or crashes is replaced.
 """
 
+import contextlib
 import dataclasses
+import functools
 import multiprocessing
 import queue
 import signal
@@ -19,9 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.frames import RGBDFrame
+from thor2_jax.recognition.frames import Intrinsics, RGBDFrame
 from thor2_jax.recognition.prepared_instance import PreparedInstance, prepare_instance
-from thor2_jax.service.decoding import decode_frame, decode_json_clouds, decode_npz_clouds
+from thor2_jax.segmentation.segmenters import load_segmenter, segmented
+from thor2_jax.service.decoding import check_instances, decode_frame, decode_json_clouds, decode_npz_clouds
 from thor2_jax.service.problem import RequestError, deadline_exceeded
 from thor2_jax.service.schemas import LabelMap
 from thor2_jax.service.settings import MAX_LABEL_RUNS
@@ -39,7 +42,7 @@ class PreparedRequest:
     Attributes:
         instances: its instances, in the order of their labels.
         seconds: stage -> duration.
-        label_map: the label image of the frame, if requested.
+        label_map: the label image of the frame, if requested, and if the frame was segmented here.
     """
 
     instances: list[PreparedInstance]
@@ -47,14 +50,55 @@ class PreparedRequest:
     label_map: LabelMap | None = None
 
 
-def prepare_frame(files: dict[str, bytes], sigma_s: float, with_label_map: bool) -> PreparedRequest:
-    """Decode a frame and compute the clouds of its instances. Raises RequestError."""
+def prepare_frame(
+    files: dict[str, bytes], sigma_s: float, with_label_map: bool, segmenter: str | None
+) -> PreparedRequest:
+    """Decode a frame, segment it if it has no labels, and compute the clouds of its instances.
+
+    Raises:
+        RequestError: 422 if there are no labels and no segmenter, 500 if the segmenter fails, or as `decode_frame`.
+    """
     start = time.perf_counter()
     frame = decode_frame(**files)
-    decoded = time.perf_counter()
+    ready = time.perf_counter()
+    seconds = {"decode": ready - start}
+    if frame.labels is None:
+        frame = _segmented(frame, segmenter)
+        with_label_map = True
+        seconds["segment"] = time.perf_counter() - ready
+        ready += seconds["segment"]
     instances = _prepare_instances(frame, frame.instances, sigma_s)
     label_map = _encode_label_map(frame.label_image) if with_label_map else None
-    return PreparedRequest(instances, {"decode": decoded - start, "clouds": time.perf_counter() - decoded}, label_map)
+    seconds["clouds"] = time.perf_counter() - ready
+    return PreparedRequest(instances, seconds, label_map)
+
+
+_segmenter = functools.cache(load_segmenter)
+"""The segmenter of a name; it is loaded once in each process."""
+
+
+def _segmented(frame: RGBDFrame, name: str | None) -> RGBDFrame:
+    if name is None:
+        raise RequestError(422, "labels", "labels is missing; this service has no segmenter (thor2 serve --segment).")
+    try:
+        frame = segmented(frame, _segmenter(name))
+    except InputError as error:
+        raise RequestError(500, "labels", f"{error}, or send labels.") from None
+    except SystemExit:
+        message = f"segmenter {name} ended the process on the frame; check its package, or send labels."
+        raise RequestError(500, "labels", message) from None
+    check_instances(frame)
+    return frame
+
+
+def _warm_up(name: str) -> None:
+    """Load a segmenter and segment a small frame: a segmenter may load weights at its first frame.
+
+    If that fails, requests report the reason.
+    """
+    blank = RGBDFrame(np.zeros((48, 64, 3), np.uint8), np.zeros((48, 64), np.uint16), None, Intrinsics(60, 60, 32, 24))
+    with contextlib.suppress(InputError, SystemExit):
+        segmented(blank, _segmenter(name))
 
 
 def prepare_view(files: dict[str, bytes], sigma_s: float, label: int) -> PreparedRequest:
@@ -108,10 +152,12 @@ def prepare_clouds(content: bytes, is_npz: bool) -> PreparedRequest:
     return PreparedRequest(instances, {"decode": time.perf_counter() - start})
 
 
-def _run_process(pipe: Connection) -> None:
+def _run_process(pipe: Connection, segmenter: str | None) -> None:
     """Receive functions with their arguments, and send back (result, None) or (None, error)."""
     for number in (signal.SIGINT, signal.SIGTERM):  # A terminal signals all processes; the service stops this one.
         signal.signal(number, signal.SIG_IGN)
+    if segmenter is not None:
+        _warm_up(segmenter)
     pipe.send("ready")
     while True:
         try:
@@ -132,9 +178,9 @@ def _run_process(pipe: Connection) -> None:
 
 
 class _PreparationProcess:
-    def __init__(self, context: Any) -> None:
+    def __init__(self, context: Any, segmenter: str | None) -> None:
         self.pipe, child_pipe = context.Pipe()
-        self.process = context.Process(target=_run_process, args=(child_pipe,), daemon=True)
+        self.process = context.Process(target=_run_process, args=(child_pipe, segmenter), daemon=True)
         self.process.start()
         child_pipe.close()
         self.pipe.recv()
@@ -148,15 +194,16 @@ class _PreparationProcess:
 class PreparationPool:
     """A fixed number of processes, each with a thread that waits for it."""
 
-    def __init__(self, count: int) -> None:
-        """Start `count` processes."""
+    def __init__(self, count: int, segmenter: str | None = None) -> None:
+        """Start `count` processes, each of which loads the segmenter of this name."""
+        self._segmenter = segmenter
         # The fork server has imported this module and has no threads: a replacement process starts at once.
         self._context = multiprocessing.get_context("forkserver")
         self._context.set_forkserver_preload([__name__])
         self._threads = ThreadPoolExecutor(count, thread_name_prefix="prepare")
         self._idle: queue.SimpleQueue[_PreparationProcess] = queue.SimpleQueue()
         for _ in range(count):
-            self._idle.put(_PreparationProcess(self._context))
+            self._idle.put(_PreparationProcess(self._context, segmenter))
 
     def submit(
         self, deadline: float, function: Callable[..., PreparedRequest], *arguments: Any
@@ -194,7 +241,7 @@ class PreparationPool:
 
     def _replace(self, process: _PreparationProcess) -> _PreparationProcess:
         process.stop()
-        return _PreparationProcess(self._context)
+        return _PreparationProcess(self._context, self._segmenter)
 
     def close(self) -> None:
         """Wait for submitted calls, then stop the processes."""

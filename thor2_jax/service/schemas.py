@@ -38,6 +38,8 @@ __all__ = [
 NPZ = "application/octet-stream"
 """Content type of npz files."""
 
+FRAME_STAGES = "Milliseconds per stage: upload, decode, segment (without labels), clouds, device, total."
+
 Milliseconds = dict[str, float]
 Coordinate = Annotated[float, Field(ge=-MAX_CLOUD_COORDINATE, le=MAX_CLOUD_COORDINATE, allow_inf_nan=False)]
 Channel = Annotated[int, Field(ge=0, le=255)]
@@ -75,7 +77,10 @@ class FrameAnswer(BaseModel):
     """All instances of a frame, in the order of their labels."""
 
     instances: list[InstanceAnswer]
-    timings: Milliseconds = Field(description="Milliseconds per stage: upload, decode, clouds, device, total.")
+    label_map: "LabelMap | None" = Field(
+        default=None, description="Labels of a frame that was segmented; null if the request had labels."
+    )
+    timings: Milliseconds = Field(description=FRAME_STAGES)
 
 
 class StripColors(BaseModel):
@@ -130,7 +135,7 @@ class ExplainedFrame(BaseModel):
 
     instances: list[ExplainedInstance]
     label_map: LabelMap
-    timings: Milliseconds = Field(description="Milliseconds per stage: upload, decode, clouds, device, total.")
+    timings: Milliseconds = Field(description=FRAME_STAGES)
 
 
 class CloudBody(BaseModel):
@@ -176,6 +181,7 @@ class ModelAnswer(BaseModel):
     descriptor: dict[str, Any] = Field(description="Configuration of the descriptor.")
     color_network: str = Field(description="Fingerprint of the colour network.")
     teaches: bool = Field(description="Whether objects can be enrolled and forgotten.")
+    segmenter: str | None = Field(description="Segmenter of frames without labels; null if they are refused.")
 
 
 class ObjectAnswer(BaseModel):
@@ -238,7 +244,7 @@ FRAME_FORM: dict[str, Any] = {
         "multipart/form-data": {
             "schema": {
                 "type": "object",
-                "required": ["color", "depth", "labels", "intrinsics"],
+                "required": ["color", "depth", "intrinsics"],
                 "properties": {
                     "color": {"type": "string", "format": "binary", "description": "8-bit RGB, PNG or JPEG."},
                     "depth": {
@@ -249,7 +255,8 @@ FRAME_FORM: dict[str, Any] = {
                     "labels": {
                         "type": "string",
                         "format": "binary",
-                        "description": "One-channel or indexed PNG of instance numbers; 0 is background.",
+                        "description": "One-channel or indexed PNG of instance numbers; 0 is background. "
+                        "Without it, the frame is segmented.",
                     },
                     "intrinsics": {
                         "type": "string",

@@ -1,10 +1,12 @@
 """Settings of the service, and the limits of a request."""
 
 import dataclasses
+import importlib.util
 from pathlib import Path
 
 from thor2_jax.capacity import BATCH_BUCKETS
 from thor2_jax.errors import InputError
+from thor2_jax.segmentation.segmenters import TABLE, load_segmenter
 
 __all__ = [
     "MAX_BODY",
@@ -16,6 +18,7 @@ __all__ = [
     "MAX_INTRINSICS_BYTES",
     "MAX_LABEL_RUNS",
     "Settings",
+    "default_segmenter",
 ]
 
 MAX_CLOUD_COORDINATE = 100.0
@@ -43,6 +46,11 @@ MAX_INTRINSICS_BYTES = 4096
 """Maximum size of the intrinsics file."""
 
 
+def default_segmenter() -> str | None:
+    """Return the segmenter of a service for which none is chosen: the built-in one where OpenCV is installed."""
+    return TABLE if importlib.util.find_spec("cv2") else None
+
+
 @dataclasses.dataclass(frozen=True)
 class Settings:
     """Settings of one process of the service.
@@ -59,9 +67,11 @@ class Settings:
         cache: directory of compiled programs, which a later start reuses; None disables the cache.
         gallery: directory of the enrolled objects; None is `gallery` in the run directory.
         teach: callers may enroll and forget objects.
+        segmenter: name of the segmenter of frames without labels, see `segmentation.segmenters`; None refuses
+            them. Default: that of `default_segmenter`.
 
     Raises:
-        InputError: a value is out of range.
+        InputError: a value is out of range, or the segmenter cannot be loaded.
     """
 
     model: Path
@@ -75,6 +85,7 @@ class Settings:
     cache: Path | None = None
     gallery: Path | None = None
     teach: bool = False
+    segmenter: str | None = dataclasses.field(default_factory=default_segmenter)
 
     def __post_init__(self) -> None:
         for name in ("queue", "deadline", "processes"):
@@ -82,6 +93,8 @@ class Settings:
                 raise InputError(f"{name} is {getattr(self, name)}; expected a positive number")
         if self.cache is not None and self.cache.exists() and not self.cache.is_dir():
             raise InputError(f"cache is {self.cache}, a file; expected a directory, which may be new")
+        if self.segmenter is not None:
+            load_segmenter(self.segmenter)  # Its errors are reported here once, not by every process.
         if self.max_batch not in BATCH_BUCKETS:
             raise InputError(f"max_batch is {self.max_batch}; expected one of {', '.join(map(str, BATCH_BUCKETS))}")
         if self.token is not None and not (self.token and self.token.isascii() and self.token.isprintable()):

@@ -27,6 +27,10 @@ def serve(
         Path | None, typer.Option(help="Directory of the enrolled objects. Default: gallery in the run directory.")
     ] = None,
     teach: Annotated[bool, typer.Option("--teach", help="Let callers enroll and forget objects.")] = False,
+    segment: Annotated[
+        str | None,
+        typer.Option(help="Segmenter of frames without labels, or none. Default: table, if OpenCV is installed."),
+    ] = None,
     token: Annotated[
         str | None, typer.Option(envvar="THOR2_TOKEN", help="Bearer token that clients must send.")
     ] = None,
@@ -40,7 +44,7 @@ def serve(
         raise InputError(
             f"{error.name} is not installed; install it: pip install -c constraints.txt '.[serve]'"
         ) from None
-    from thor2_jax.service.settings import Settings
+    from thor2_jax.service.settings import Settings, default_segmenter
 
     settings = Settings(
         model,
@@ -53,5 +57,6 @@ def serve(
         cache=cache,
         gallery=gallery,
         teach=teach,
+        segmenter=default_segmenter() if segment is None else segment if segment != "none" else None,
     )
     serve_forever(settings, host, port, workers)

@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 import trimesh
+from segmentation_scenes import best_overlaps, camera_pose
 
 from thor2_jax.recognition.frames import Intrinsics, RGBDFrame
 from thor2_jax.segmentation.table import segment_table
-
-from .scenes import best_overlaps, camera_pose
 
 WHITE, RED = (225, 225, 220), (170, 60, 50)
 LIGHT = np.array([0.3, -0.2, 0.93])

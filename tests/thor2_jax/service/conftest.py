@@ -19,6 +19,7 @@ import uvicorn
 from fastapi import FastAPI
 from helpers import SMALL_CONFIG, encode_image, untrained_run
 from playwright.sync_api import Browser, Page, Route, expect, sync_playwright
+from segmentation_scenes import Box, render
 
 import thor2_jax as thor2
 from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
@@ -77,6 +78,25 @@ def frame() -> thor2.RGBDFrame:
 def files(frame: thor2.RGBDFrame) -> Files:
     images = {name: encode_image(getattr(frame, name)) for name in ("color", "depth", "labels")}
     return {**images, "intrinsics": json.dumps(CAMERA).encode()}
+
+
+@pytest.fixture(scope="session")
+def scene() -> thor2.RGBDFrame:
+    """Three boxes apart on a table."""
+    boxes = [
+        Box(-0.2, 0.05, (0.04, 0.06), 0.12, (190, 30, 40)),
+        Box(0.0, -0.1, (0.05, 0.03), 0.06, (30, 60, 190)),
+        Box(0.2, 0.1, (0.03, 0.03), 0.15, (30, 150, 60)),
+    ]
+    return render(boxes)
+
+
+@pytest.fixture(scope="session")
+def unlabelled(scene: thor2.RGBDFrame) -> Files:
+    """The files of the scene, without labels."""
+    intrinsics = {name: getattr(scene.intrinsics, name) for name in ("fx", "fy", "cx", "cy")}
+    images = {name: encode_image(getattr(scene, name)) for name in ("color", "depth")}
+    return {**images, "intrinsics": json.dumps(intrinsics).encode()}
 
 
 class Server:

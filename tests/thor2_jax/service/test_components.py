@@ -226,9 +226,9 @@ def test_progress_of_the_warm_up_is_reported(
 def test_full_queue_is_429_and_deadline_504(
     app: FastAPI, files: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    async def slow(*_: Any) -> list[Any]:
+    async def slow(*_: Any) -> tuple[list[Any], None]:
         await asyncio.sleep(0.2)
-        return []
+        return [], None
 
     monkeypatch.setattr(app.state.service, "state", "ready")
     monkeypatch.setattr(app.state.service, "recognize", slow)
@@ -271,9 +271,9 @@ def test_large_files_stay_in_memory(app: FastAPI, files: dict[str, bytes], monke
 
     received: list[dict[str, bytes]] = []
 
-    async def recognize(files: dict[str, bytes], _: Any) -> list[Any]:
+    async def recognize(files: dict[str, bytes], _: Any) -> tuple[list[Any], None]:
         received.append(files)
-        return []
+        return [], None
 
     monkeypatch.setattr(tempfile.SpooledTemporaryFile, "rollover", roll)
     monkeypatch.setattr(app.state.service, "state", "ready")

@@ -162,7 +162,7 @@ def test_errors_appear_beside_their_fields(open_page: Callable[..., Page], http:
     page = open_page()
     page.get_by_text("Upload your own frame").click()
     page.get_by_role("button", name="Recognize", exact=True).click()
-    for field in FIELDS:
+    for field in FIELDS.keys() - {"labels"}:  # A frame without labels is segmented.
         expect(page.locator(f"#{field}-error")).to_have_text("Choose a file.")
     expect(page.locator("#color")).to_be_focused()
 

@@ -2,6 +2,8 @@
 
 import { showDetails } from "./details.js";
 import { breakable, confidenceOf, element, percent, rgb } from "./drawing.js";
+import { decoded, labelImage } from "./label_image.js";
+import { MaskTools } from "./masks.js";
 import { instanceColors, Overlay, textColor } from "./overlay.js";
 import * as service from "./service.js";
 import { canBeNamed, connectNaming, showNaming } from "./teaching.js";
@@ -11,7 +13,8 @@ const RETRY_MS = 1000;
 const byId = (id) => document.getElementById(id);
 const pause = (milliseconds) => new Promise((resolve) => setTimeout(resolve, milliseconds));
 
-const overlay = new Overlay(byId("overlay"), (label) => select(label, true));
+const overlay = new Overlay(byId("overlay"), (click) => choose(click));
+const maskTools = new MaskTools(overlay, changeMasks, undoMasks);
 let loaded = null; // The model and the mean colours of its colour regions.
 let frame = null; // The answer that is shown, with the arguments of `recognize` that lead to it.
 let currentRequest = new AbortController();
@@ -69,8 +72,12 @@ async function whenStarted(request, signal) {
   }
 }
 
-/** Recognize a frame and show it, with the object `selected` if it is given. */
-async function recognize(title, fileSource, fields, selected) {
+/**
+ * Recognize a frame and show it, with the object `selected` if it is given.
+ *
+ * `history` has the label images before each correction of masks; null if the masks came with the frame.
+ */
+async function recognize(title, fileSource, fields, selected, history = null) {
   currentRequest.abort();
   const { signal } = (currentRequest = new AbortController());
   clearProblems();
@@ -78,10 +85,16 @@ async function recognize(title, fileSource, fields, selected) {
   byId("result").setAttribute("aria-busy", "true");
   try {
     loaded ??= await load();
-    const files = await fileSource();
+    let files = await fileSource();
     const answer = await whenStarted(() => service.explain(files, signal), signal);
     const bitmap = await createImageBitmap(files.color, { imageOrientation: "none" });
-    if (!signal.aborted) show({ ...answer, title, files, fields }, bitmap, selected);
+    const { width, height } = answer.label_map;
+    if (!files.labels && width === bitmap.width) {
+      // All further requests have these labels, for instance to name an object.
+      files = { ...files, labels: await labelImage(decoded(answer.label_map), width, height) };
+      history = [];
+    }
+    if (!signal.aborted) show({ ...answer, title, files, fields, history }, bitmap, selected);
   } catch (problem) {
     if (signal.aborted) return;
     hideResult();
@@ -99,11 +112,12 @@ function hideResult() {
 
 function show(answer, bitmap, selected) {
   frame = answer;
-  const { title, instances, timings } = answer;
+  const { title, instances, timings, history } = answer;
   const named = instances.filter(({ name }) => name !== null);
   const count = `${instances.length} ${instances.length === 1 ? "object" : "objects"}`;
   const unknown = instances.length - named.length;
-  if (!instances.length) setStatus(`${title}: no objects: the label image is 0 everywhere.`);
+  const empty = history ? "there are no masks" : "the label image is 0 everywhere";
+  if (!instances.length) setStatus(`${title}: no objects: ${empty}.`);
   else setStatus(`${title}: ${count}${unknown ? `, ${unknown} of them unknown` : ""}.`);
   byId("chooser").classList.add("compact");
   byId("upload").open = false;
@@ -115,6 +129,8 @@ function show(answer, bitmap, selected) {
   byId("timings").textContent = stages.join(" · ");
   const first = instances.find(({ label }) => label === selected) ?? named[0] ?? instances[0];
   overlay.show(bitmap, instances, answer.label_map, first?.label);
+  if (history) maskTools.show(loaded.model.segmenter, history.length > 0);
+  else maskTools.hide();
   if (first) select(first.label);
   scrollTo({ top: 0 });
   if (byId("overlay").getBoundingClientRect().bottom > innerHeight) byId("status").scrollIntoView();
@@ -132,8 +148,7 @@ function objectButton(instance, color) {
     {
       type: "button",
       onclick: () => {
-        select(label, true);
-        if (invites) byId("name").focus();
+        if (choose({ label }) && invites) byId("name").focus();
       },
     },
     swatch,
@@ -145,6 +160,26 @@ function objectButton(instance, color) {
   return button;
 }
 
+/** Use a click on an object for the masks, or select it; return whether it was selected. */
+function choose(click) {
+  if (maskTools.takes(click) || !click.label) return false;
+  select(click.label, true);
+  return true;
+}
+
+async function changeMasks(map, selected) {
+  const { title, files, fields, history } = frame;
+  const { width, height } = frame.label_map;
+  const labels = await labelImage(map, width, height);
+  await recognize(title, async () => ({ ...files, labels }), fields, selected, [...history, files.labels]);
+}
+
+function undoMasks() {
+  const { title, files, fields, history } = frame;
+  const corrected = { ...files, labels: history.at(-1) };
+  return recognize(title, async () => corrected, fields, overlay.selected, history.slice(0, -1));
+}
+
 function select(label, byUser = false) {
   for (const button of byId("objects").querySelectorAll("button")) {
     button.setAttribute("aria-pressed", button.dataset.label === String(label));
@@ -153,7 +188,8 @@ function select(label, byUser = false) {
   const instance = frame.instances.find((one) => one.label === label);
   showDetails(instance, loaded.model, loaded.regions);
   showNaming(instance, loaded.model);
-  if (byUser && byId("details-title").getBoundingClientRect().bottom > innerHeight) byId("details").scrollIntoView();
+  // While masks are corrected, the image stays in view.
+  if (byUser && !frame.history && byId("details-title").getBoundingClientRect().bottom > innerHeight) byId("details").scrollIntoView();
 }
 
 /** Load the model, and try again while the service cannot be reached. */
@@ -163,6 +199,7 @@ async function load() {
       const [model, network] = await Promise.all([service.model(), service.colornet()]);
       byId("token-section").hidden = true;
       showClasses(model.classes);
+      if (model.segmenter === null) byId("labels-hint").textContent = "PNG of instance numbers.";
       await showSamples(model);
       return { model, regions: network.mean_rgb };
     } catch (problem) {
@@ -207,7 +244,9 @@ byId("upload-form").addEventListener("submit", (event) => {
   event.preventDefault();
   clearProblems();
   const files = Object.fromEntries(FIELDS.map((name) => [name, byId(name).files[0]]));
-  const missing = FIELDS.filter((name) => !files[name]);
+  const isOptional = (name) => name === "labels" && loaded?.model.segmenter !== null;
+  const missing = FIELDS.filter((name) => !files[name] && !isOptional(name));
+  if (!files.labels) delete files.labels;
   if (missing.length) {
     missing.forEach((name) => markField(name, "Choose a file."));
     byId(missing[0]).focus();
@@ -236,7 +275,7 @@ connectNaming(
     showClasses(loaded.model.classes);
     if (frame?.files === files) {
       const selected = Number(byId("naming").dataset.label);
-      await recognize(frame.title, async () => files, frame.fields, selected);
+      await recognize(frame.title, async () => files, frame.fields, selected, frame.history);
     }
   },
   showProblem,

@@ -1,6 +1,7 @@
 // The colour image with the outlines and names of its objects, and the object at a position.
 
 import { confidenceOf, keepDrawn, percent, rgb } from "./drawing.js";
+import { decoded } from "./label_image.js";
 
 // Five colours of Okabe and Ito, as in the images of the command line, and eleven more that differ from them.
 const COLORS = [
@@ -28,17 +29,21 @@ export function instanceColors(instances) {
 export const textColor = ([red, green, blue]) => (0.299 * red + 0.587 * green + 0.114 * blue > 100 ? "#000" : "#fff");
 
 export class Overlay {
-  /** Draw on `canvas`; `onSelect(label)` is called when an object is clicked. */
-  constructor(canvas, onSelect) {
-    this.canvas = canvas;
-    this.regions = null;
-    this.tags = [];
-    canvas.addEventListener("click", (event) => {
-      const label = this.labelAt(event.offsetX, event.offsetY);
-      if (label !== 0) onSelect(label);
+  /**
+   * Draw on `canvas`; `onClick({ label, x, y })` is called with the object, or 0, and the position in pixels of the
+   * label map that are clicked.
+   */
+  constructor(canvas, onClick) {
+    Object.assign(this, { canvas, regions: null, tags: [], marked: null, takesPoints: false });
+    canvas.addEventListener("click", ({ offsetX, offsetY }) => {
+      if (!this.regions) return;
+      const x = (offsetX * this.regions.width) / canvas.clientWidth;
+      const y = (offsetY * this.regions.height) / canvas.clientHeight;
+      onClick({ label: this.labelAt(offsetX, offsetY), x, y });
     });
     canvas.addEventListener("pointermove", (event) => {
-      canvas.style.cursor = this.labelAt(event.offsetX, event.offsetY) ? "pointer" : "default";
+      const isObject = this.labelAt(event.offsetX, event.offsetY);
+      canvas.style.cursor = this.takesPoints ? "crosshair" : isObject ? "pointer" : "default";
     });
   }
 
@@ -52,6 +57,13 @@ export class Overlay {
 
   select(label) {
     this.selected = label;
+    this.redraw();
+  }
+
+  /** Mark a position, in pixels of the label map; null marks none. */
+  mark(position) {
+    if (this.marked === position) return;
+    this.marked = position;
     this.redraw();
   }
 
@@ -105,6 +117,17 @@ export class Overlay {
     }
     this.placeTags(context, width, height);
     for (const tag of this.tags) this.paintTag(context, tag);
+    if (this.marked) this.paintMark(context, this.marked[0] * across, this.marked[1] * down);
+  }
+
+  paintMark(context, x, y) {
+    context.beginPath();
+    context.arc(x, y, 5, 0, 2 * Math.PI);
+    context.fillStyle = "#fff";
+    context.fill();
+    context.strokeStyle = "#000";
+    context.lineWidth = 2;
+    context.stroke();
   }
 
   isSelected(k) {
@@ -212,14 +235,12 @@ function overlap(a, b) {
 
 /** Decoded label map: area, outline and bounding box of each label, in pixels of the map. */
 class Regions {
-  constructor({ width, height, labels, lengths }) {
-    Object.assign(this, { width, height });
-    this.map = new Int32Array(width * height);
-    this.byLabel = new Map();
+  constructor(labelMap) {
+    const { width, height, labels, lengths } = labelMap;
+    Object.assign(this, { width, height, map: decoded(labelMap), byLabel: new Map() });
     let start = 0;
     labels.forEach((label, k) => {
       const end = start + lengths[k];
-      this.map.fill(label, start, end);
       if (label !== 0) this.addRun(label, start, end);
       start = end;
     });

@@ -1,0 +1,154 @@
+"""Frames without labels: the service segments them, and says what is wrong with a segmenter."""
+
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+
+import thor2_jax as thor2
+from thor2_jax.client import Client
+from thor2_jax.errors import InputError
+from thor2_jax.segmentation.table import segment_table
+from thor2_jax.service.preparation import PreparationPool, prepare_frame
+from thor2_jax.service.problem import RequestError
+from thor2_jax.service.settings import Settings
+
+Files = dict[str, bytes]
+
+WRAPPER = """
+import numpy as np
+
+def halves(frame):
+    labels = np.zeros(frame.depth.shape, np.uint8)
+    labels[:, frame.depth.shape[1] // 2:] = 7
+    return labels
+
+def failing(frame):
+    raise RuntimeError("no weights\\nin this folder")
+
+def leaving(frame):
+    raise SystemExit(3)
+
+def many(frame):
+    return np.arange(frame.depth.size).reshape(frame.depth.shape)
+"""
+
+
+@pytest.fixture
+def wrapper(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Install a package with segmenters."""
+    (tmp_path / "wrapper_package.py").write_text(WRAPPER)
+    record = tmp_path / "wrapper_package-1.dist-info"
+    record.mkdir()
+    (record / "METADATA").write_text("Metadata-Version: 2.1\nName: wrapper-package\nVersion: 1\n")
+    names = "".join(f"{name} = wrapper_package:{name}\n" for name in ("halves", "failing", "leaving", "many"))
+    (record / "entry_points.txt").write_text(f"[thor2_jax.segmenters]\n{names}")
+    monkeypatch.syspath_prepend(tmp_path)
+
+
+@pytest.fixture
+def segment_by(wrapper: None) -> Iterator[Callable[[str, Files], Any]]:
+    """Return a function that prepares a frame in the process of a pool with a segmenter."""
+    pools: dict[str, PreparationPool] = {}
+
+    def prepare(name: str, files: Files) -> Any:
+        if name not in pools:
+            pools[name] = PreparationPool(1, name)
+        return pools[name].submit(time.monotonic() + 60, prepare_frame, files, 2.5, False, name).result(60)
+
+    yield prepare
+    for pool in pools.values():
+        pool.close()
+
+
+def test_a_frame_without_labels_is_segmented(server: Any, scene: thor2.RGBDFrame, unlabelled: Files) -> None:
+    client = Client(server.url)
+    recognitions, labels = client.recognize_frame(**unlabelled)
+    np.testing.assert_array_equal(labels, segment_table(scene))
+    assert [r.label for r in recognitions] == [1, 2, 3]
+    assert [r.points_used > 100 for r in recognitions] == [True] * 3
+    again, none = client.recognize_frame(**unlabelled, labels=labels)
+    assert none is None
+    assert [(r.name, r.confidence) for r in again] == [(r.name, r.confidence) for r in recognitions]
+    assert [r.label for r in client.recognize(**unlabelled)] == [1, 2, 3]
+
+
+def test_answers_have_labels_only_where_none_were_sent(http: httpx.Client, unlabelled: Files, files: Files) -> None:
+    answer = http.post("/v1/recognize", files=unlabelled).json()
+    assert answer["label_map"]["width"] == 320 and answer["timings"]["segment"] > 0
+    answer = http.post("/v1/recognize", files=files).json()
+    assert answer["label_map"] is None and "segment" not in answer["timings"]
+    explained = http.post("/v1/explain", files=unlabelled).json()
+    assert len(explained["instances"]) == 3 and set(explained["label_map"]["labels"]) == {0, 1, 2, 3}
+    assert http.get("/v1/model").json()["segmenter"] == "table"
+
+
+def test_errors_of_other_fields_do_not_need_labels(http: httpx.Client, unlabelled: Files) -> None:
+    for field in unlabelled:
+        answer = http.post("/v1/recognize", files=unlabelled | {field: b"damaged"})
+        assert (answer.status_code, answer.json()["field"]) == (422, field)
+    for change in ({"fx": 1e-9}, {"cx": 1e8}, {"fx": 1e300, "fy": 1e300}):
+        camera = json.loads(unlabelled["intrinsics"]) | change
+        answer = http.post("/v1/recognize", files=unlabelled | {"intrinsics": json.dumps(camera).encode()})
+        assert answer.status_code == 200 or answer.json()["field"] == "intrinsics"
+
+
+def test_frames_without_labels_can_be_refused(unlabelled: Files) -> None:
+    with pytest.raises(RequestError, match="labels is missing") as caught:
+        prepare_frame(unlabelled, 2.5, False, None)
+    assert (caught.value.status, caught.value.field) == (422, "labels")
+
+
+def test_a_segmenter_of_another_package(
+    segment_by: Callable[[str, Files], Any], unlabelled: Files, files: Files
+) -> None:
+    prepared = segment_by("halves", unlabelled)
+    assert [instance.label for instance in prepared.instances] == [7]
+    assert prepared.label_map.labels == [0, 7] * 240 and prepared.label_map.lengths == [160] * 480
+    assert [instance.label for instance in segment_by("halves", files).instances] == [3, 5, 7, 200]
+
+
+@pytest.mark.parametrize(
+    ("name", "status", "words"),
+    [
+        ("failing", 500, "segmenter failing failed .*RuntimeError: no weights in this folder"),
+        ("leaving", 500, "segmenter leaving ended the process"),
+        ("many", 422, "labels has 76799 instances"),
+    ],
+)
+def test_a_segmenter_that_fails_ends_one_request(
+    segment_by: Callable[[str, Files], Any], unlabelled: Files, files: Files, name: str, status: int, words: str
+) -> None:
+    for _ in range(2):
+        with pytest.raises(RequestError, match=words) as caught:
+            segment_by(name, unlabelled)
+        assert (caught.value.status, caught.value.field) == (status, "labels")
+    assert len(segment_by(name, files).instances) == 4
+
+
+def test_a_segmenter_that_cannot_be_loaded_is_reported_at_the_start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(InputError, match="segmenter is 'sam'; expected one of table"):
+        Settings(tmp_path, segmenter="sam")
+    monkeypatch.setitem(sys.modules, "thor2_jax.segmentation.table", None)
+    with pytest.raises(InputError, match=r"OpenCV.*\[segment\]"):
+        Settings(tmp_path, segmenter="table")
+
+
+def test_the_default_segmenter_needs_opencv(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert Settings(tmp_path).segmenter == "table"
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    assert Settings(tmp_path).segmenter is None
+
+
+@pytest.mark.parametrize("labels", [np.zeros((2, 2)), np.zeros(4, int), np.full((2, 2), -1), np.full((2, 2), 2**16)])
+def test_client_refuses_arrays_that_are_no_labels(labels: np.ndarray) -> None:
+    with pytest.raises(InputError, match=r"labels has .* from 0 to 65535"):
+        Client("http://127.0.0.1:1").recognize(color=b"", depth=b"", labels=labels, intrinsics=b"")
