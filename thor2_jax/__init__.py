@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from thor2_jax.recognition.frames import Intrinsics, RGBDFrame, read_frame
     from thor2_jax.recognizer import Recognizer
     from thor2_jax.segmentation.segmenters import segment, segmented
+    from thor2_jax.tracking.tracker import TrackedRecognition, Tracker
     from thor2_jax.transformers import Tops2Transformer, TopsTransformer
     from thor2_jax.types import Descriptors, Diagrams, PointClouds, Strips
 else:
@@ -29,6 +30,7 @@ else:
         "recognition.answers": ("Recognition",),
         "recognizer": ("Recognizer",),
         "segmentation.segmenters": ("segment", "segmented"),
+        "tracking.tracker": ("TrackedRecognition", "Tracker"),
         "transformers": ("Tops2Transformer", "TopsTransformer"),
         "types": ("Descriptors", "Diagrams", "PointClouds", "Strips"),
     }
@@ -43,6 +45,7 @@ else:
         "recognition",
         "segmentation",
         "testing",
+        "tracking",
         *_MODULES,
     )
 
@@ -78,6 +81,8 @@ __all__ = [
     "Strips",
     "Tops2Transformer",
     "TopsTransformer",
+    "TrackedRecognition",
+    "Tracker",
     "align",
     "describe",
     "describe_aligned",

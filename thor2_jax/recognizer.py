@@ -12,7 +12,8 @@ Each instance of the frame is prepared on the host (`prepare_instance`), describ
 >>> recognizer.enroll("teapot", [frame])                                            # doctest: +SKIP
 >>> recognizer.forget("teapot")                                                     # doctest: +SKIP
 
-Its scores name an instance alone, or combined with the classifiers (`ClassUnion.combine`).
+Its scores name an instance alone, or combined with the classifiers (`ClassUnion.combine`). The answers of several
+frames are fused by a `Tracker` (`Recognizer.track`).
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -39,6 +40,7 @@ from thor2_jax.recognition.frames import RGBDFrame
 from thor2_jax.recognition.fusion import DEFAULT_RULE, FUSION_RULES, FusionRule, fused_probabilities
 from thor2_jax.recognition.prepared_instance import PreparedInstance, pack_instances, prepare_instance
 from thor2_jax.recognition.run_directory import EMBEDDING_FILE, TrainedRun, load_run
+from thor2_jax.tracking.tracker import Tracker
 from thor2_jax.types import PointClouds
 
 __all__ = [
@@ -341,6 +343,19 @@ class Recognizer:
             InputError: a classifier that the run does not have. An instance that cannot be described is no error: the
                 `reason` of its answer says why.
         """
+        return self.recognitions(*self.frame_evidence(frame, classifiers, answer_by))
+
+    def track(self) -> Tracker:
+        """Return a tracker, which follows the objects of successive frames and fuses the answers for each of them."""
+        return Tracker(self)
+
+    def frame_evidence(
+        self, frame: RGBDFrame, classifiers: Sequence[str] | None = None, answer_by: str | None = None
+    ) -> tuple[list[PreparedInstance], Evidence]:
+        """Return the instances of a frame and what the usable ones, the first rows in their order, are recognized by.
+
+        The arguments are those of `recognize`.
+        """
         source = self.answers_by(answer_by)
         names = self._check_classifiers(classifiers) if source != "gallery" else ()
 
@@ -350,7 +365,7 @@ class Recognizer:
 
         instances, chunks = self._by_chunks(frame, compute)
         n_usable = sum(instance.reason is None for instance in instances)
-        return self.recognitions(instances, concatenate_padded(chunks, _padded_rows(n_usable)))
+        return instances, concatenate_padded(chunks, _padded_rows(n_usable))
 
     def _check_classifiers(self, classifiers: Sequence[str] | None) -> tuple[str, ...]:
         names = self.default_classifiers if classifiers is None else classifiers
@@ -376,7 +391,7 @@ class Recognizer:
         n_usable = sum(instance.reason is None for instance in instances)
         evidence = jax.tree.map(lambda a: np.asarray(a)[:n_usable], evidence)
         embedded = evidence.embeddings, evidence.weights
-        scores = None if evidence.embeddings is None else self.gallery.scores(*embedded)
+        scores = evidence.scores if evidence.embeddings is None else self.gallery.scores(*embedded)
         values = self.combined(evidence.probabilities, scores)
         thresholds = self.thresholds("both" if evidence.probabilities else "gallery")
         union = self.objects.union

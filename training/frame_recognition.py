@@ -11,7 +11,9 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from thor2_jax.errors import InputError
+from numpy.typing import NDArray
+
+from thor2_jax.errors import InputError, with_context
 from thor2_jax.files import write_text
 from thor2_jax.recognition.answers import Recognition
 from thor2_jax.recognition.frames import RGBDFrame
@@ -24,9 +26,10 @@ from thor2_jax.recognition.result_files import (
     instances_as_json,
 )
 from thor2_jax.recognizer import Recognizer
+from thor2_jax.tracking.tracker import TrackedRecognition
 from training.readers.frame_files import FrameSource
 
-__all__ = ["FrameAnswer", "ResultTables", "recognize_frames"]
+__all__ = ["FrameAnswer", "ResultTables", "recognize_frames", "track_frames"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,6 +70,39 @@ def recognize_frames(recognizer: Recognizer, sources: Iterable[FrameSource]) -> 
             yield FrameAnswer(source.name, error=f"{error.filename}: {error.strerror or error}")
         else:
             yield FrameAnswer(source.name, frame, recognitions, time.perf_counter() - start)
+
+
+def track_frames(
+    recognizer: Recognizer, sources: Sequence[FrameSource], poses: Sequence[NDArray[Any]] | None = None
+) -> Iterator[FrameAnswer]:
+    """Read and recognize the frames of one camera as a sequence; the answers are fused over all frames.
+
+    The recognitions are `TrackedRecognition`s. Every instance of a track has the name and the confidence that the track
+    has at its end.
+
+    Args:
+        recognizer: the recognizer.
+        sources: the frames, in the order in which they were taken.
+        poses: pose of the camera for each frame, see `thor2_jax.tracking.poses`.
+
+    Raises:
+        InputError: a frame cannot be read, has another size than the first one, or a pose is not a rigid motion. The
+            message names the frame.
+        OSError: a file cannot be opened.
+    """
+    tracker = recognizer.track()
+    answered: list[tuple[list[TrackedRecognition], float]] = []
+    last: dict[int | None, TrackedRecognition] = {}
+    for number, source in enumerate(sources):
+        with with_context(source.name):
+            frame, start = source.read(), time.perf_counter()
+            recognitions = tracker.update(frame, None if poses is None else poses[number])
+        answered.append((recognitions, time.perf_counter() - start))
+        last.update({each.track: each for each in recognitions})
+    for source, (recognitions, seconds) in zip(sources, answered, strict=True):
+        final = [each if each.track is None else each.renamed(last[each.track]) for each in recognitions]
+        # The frame is read again, since a long sequence of images does not fit into memory.
+        yield FrameAnswer(source.name, source.read(), final, seconds)
 
 
 class ResultTables:

@@ -63,12 +63,14 @@ class Evidence(NamedTuple):
             answers.
         embeddings: [B, K, D] float32, embeddings for the gallery; None if the classifiers alone answer.
         weights: [B, K] float32, weights of their orientations; None likewise.
+        scores: [B, n_objects] scores of the gallery, of evidence that is fused over frames, in place of embeddings.
     """
 
     overflow: Any
     probabilities: Mapping[str, Any]
     embeddings: Any = None
     weights: Any = None
+    scores: Any = None
 
 
 @dataclasses.dataclass(frozen=True)

@@ -49,6 +49,12 @@ def recognize(
     answer_by: Annotated[
         str | None, typer.Option(help="classifiers, gallery or both. Default: what the run has.")
     ] = None,
+    track: Annotated[
+        bool, typer.Option("--track", help="The frames are a sequence: follow the objects and fuse their answers.")
+    ] = False,
+    poses: Annotated[
+        Path | None, typer.Option(help="JSON of camera poses for --track: frame -> 4 x 4 matrix, camera to world.")
+    ] = None,
     out: Annotated[
         Path | None, typer.Option(help="Directory for recognition.json and overlay.png, of each FRAME in OUT/<frame>.")
     ] = None,
@@ -85,14 +91,16 @@ def recognize(
 ) -> None:
     """Recognize every instance of RGB-D frames.
 
-    A frame that cannot be recognized does not stop the others; the command then ends with exit code 2.
+    A frame that cannot be recognized does not stop the others; the command then ends with exit code 2. With --track,
+    the frames of one camera are a sequence in the order of their names: an object has one name in all of them.
     """
     from thor2_jax.capacity import BATCH_BUCKETS
     from thor2_jax.files import check_output_directory, remove_leftovers
     from thor2_jax.recognition.result_files import RESULT_FILES, write_recognitions
     from thor2_jax.recognizer import Recognizer
-    from training.frame_recognition import ResultTables, recognize_frames
+    from training.frame_recognition import ResultTables, recognize_frames, track_frames
     from training.readers.bop import read_object_names
+    from training.readers.poses import read_poses
 
     if bag is not None:
         refused = {"FRAME": frames, "color": color, "depth": depth, "labels": labels, "coco": coco, "bop": bop}
@@ -111,8 +119,11 @@ def recognize(
         raise InputError(f"names is {names}; it belongs to --coco and --bop")
     if segment is not None and labels is not None:
         raise InputError(f"labels is {labels} and segment is {segment}; give one of them")
+    if poses is not None and not track:
+        raise InputError(f"poses is {poses}; it belongs to --track")
     files = {"color": color, "depth": depth, "labels": labels, "intrinsics": intrinsics}
     sources = _sources(frames, files, depth_scale, segment)
+    of_frames = None if poses is None else read_poses(poses, [source.name for source in sources])
     if out is not None:
         check_output_directory(out, resumable={s.name.split("/")[0] for s in sources} if frames else RESULT_FILES)
         remove_leftovers(out)
@@ -121,7 +132,8 @@ def recognize(
     recognizer.chunk = BATCH_BUCKETS[-1]
     tables = ResultTables([source.name for source in sources], recognizer.classes, numbers)
     failed = []
-    for answer in recognize_frames(recognizer, sources):
+    answers = track_frames(recognizer, sources, of_frames) if track else recognize_frames(recognizer, sources)
+    for answer in answers:
         if answer.error is not None or answer.frame is None:
             failed.append(answer.name)
             if not frames:
@@ -179,14 +191,17 @@ def _sources(
 
 
 def _print_table(frame: str | None, recognitions: Sequence["Recognition"]) -> None:
-    table = Table("label", "name", "confidence", "classifier", "occluded", "points", "overflow", "note")
+    tracked = any(hasattr(r, "track") for r in recognitions)
+    table = Table(
+        *["track"] * tracked, "label", "name", "confidence", "classifier", "occluded", "points", "overflow", "note"
+    )
     for r in recognitions:
         confidence = "" if r.confidence is None else f"{r.confidence:.3f}"
         note = r.reason or ("outlier filter relaxed" if r.kept_by_fallback else "")
         name = escape_characters(r.name or "unrecognized")
         occluded = "yes" if r.occluded else "no"
         row = (str(r.label), name, confidence, r.classifier or "", occluded, str(r.points_used), str(r.overflow), note)
-        table.add_row(*row)
+        table.add_row(*[str(getattr(r, "track", "") or "")] * tracked, *row)
     if frame is not None:
         console.print(f"{escape_characters(frame)}:")
     console.print(table)

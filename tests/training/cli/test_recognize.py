@@ -208,3 +208,44 @@ def test_an_unknown_segmenter(model: Path, tmp_path: Path, capfd: pytest.Capture
     error = capfd.readouterr().err
     assert error.startswith("error: segmenter is 'sam'") and error.count("\n") == 1
     assert not (tmp_path / "o").exists()
+
+
+def test_track_gives_an_object_one_name(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    frames = [write_frame(tmp_path / "video" / f"{number}", number) for number in range(3)]
+    poses = tmp_path / "poses.json"
+    poses.write_text(json.dumps({frame.name: np.eye(4).tolist() for frame in frames}))
+    command = ("recognize", "--model", model, tmp_path / "video", "--track", "--poses", poses)
+    assert run_thor2(*command, "--json", "--out", tmp_path / "out") == 0
+    answers = lines_of(capfd.readouterr().out)
+    assert [answer["frame"] for answer in answers] == ["0", "1", "2"]
+    assert [[one["track"] for one in answer["instances"]] for answer in answers] == [[1, 2]] * 3
+    for index in range(2):
+        assert len({(a["instances"][index]["name"], a["instances"][index]["confidence"]) for a in answers}) == 1
+        assert [a["instances"][index]["frames"] for a in answers] == [3, 3, 3]
+    assert (tmp_path / "out" / "2" / "overlay.png").is_file()
+    assert run_thor2(*command) == 0
+    assert "track" in capfd.readouterr().out
+
+
+def test_bad_sequences_write_nothing(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    frames = [write_frame(tmp_path / "video" / f"{number}", number) for number in range(2)]
+    poses, out = tmp_path / "poses.json", tmp_path / "out"
+    command = ("recognize", "--model", model, tmp_path / "video", "--out", out)
+    cases: list[tuple[object, str]] = [
+        ("[", "poses.json is invalid"),
+        ([np.eye(4).tolist()], "1 poses for 2 frames"),
+        ({"0": np.eye(4).tolist()}, "no pose of frame 1"),
+        ([np.eye(4).tolist(), (2 * np.eye(4)).tolist()], "frame 1 is not a rigid motion"),
+    ]
+    for content, message in cases:
+        poses.write_text(content if isinstance(content, str) else json.dumps(content))
+        assert run_thor2(*command, "--track", "--poses", poses) == 2
+        assert message in capfd.readouterr().err
+    assert run_thor2(*command, "--poses", poses) == 2
+    assert "--track" in capfd.readouterr().err
+    for name in ("color.png", "depth.png", "mask.png"):
+        Image.open(frames[1] / name).crop((0, 0, 100, 90)).save(frames[1] / name)
+    assert run_thor2(*command, "--track") == 2
+    error = capfd.readouterr().err
+    assert "1: frame has 100 x 90 pixels" in error and error.count("\n") == 1
+    assert not out.exists()

@@ -1,0 +1,72 @@
+"""Matching of clouds by their overlap, and camera poses."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from thor2_jax.errors import InputError
+from thor2_jax.tracking.matching import MIN_OVERLAP, VOXELS, match, occupied_voxels, overlap
+from thor2_jax.tracking.poses import check_pose, transform
+
+
+def patch(x: float, y: float = 0.0, size: float = 0.08, step: float = 0.004) -> np.ndarray:
+    """Return a square of points at depth 0.7 m, with a corner at (x, y)."""
+    grid = np.mgrid[0:size:step, 0:size:step].reshape(2, -1).T
+    return np.column_stack([grid + (x, y), np.full(len(grid), 0.7)]).astype(np.float32)
+
+
+def test_overlap_is_the_share_of_common_voxels() -> None:
+    first, second = patch(0.0), patch(0.03, 0.012, 0.05)
+    shares = []
+    for size in VOXELS:
+        a, b = ({tuple(v) for v in np.floor(p / size).astype(int).tolist()} for p in (first, second))
+        shares.append(len(a & b) / min(len(a), len(b)))
+    assert overlap(occupied_voxels(first), occupied_voxels(second)) == pytest.approx(np.mean(shares))
+    assert overlap(occupied_voxels(first), occupied_voxels(first + 1)) == 0
+    assert overlap(occupied_voxels(first), occupied_voxels(first[:0])) == 0
+
+
+def test_a_match_has_the_largest_total_overlap() -> None:
+    rng = np.random.default_rng(0)
+    first = [occupied_voxels(patch(*rng.uniform(0, 0.2, 2))) for _ in range(4)]
+    second = [occupied_voxels(patch(*rng.uniform(0, 0.2, 2))) for _ in range(5)]
+
+    def total(pairs: list[tuple[int, int]]) -> float:
+        values = [overlap(first[i], second[j]) for i, j in pairs]
+        return sum(value for value in values if value >= MIN_OVERLAP)
+
+    best = max(total(list(enumerate(order))) for order in itertools.permutations(range(5), 4))
+    pairs = match(first, second)
+    assert total(pairs) == pytest.approx(best) and best > 0.5
+    assert len({i for i, _ in pairs}) == len({j for _, j in pairs}) == len(pairs)
+
+
+def test_objects_that_moved_a_little_keep_their_match() -> None:
+    before, after = [patch(x) for x in (0.0, 0.1, 0.2)], [patch(x + 0.02) for x in (0.2, 0.0, 0.1, 0.6)]
+    pairs = match([occupied_voxels(p) for p in before], [occupied_voxels(p) for p in after])
+    assert sorted(pairs) == [(0, 1), (1, 2), (2, 0)]
+    assert match([], [occupied_voxels(before[0])]) == match([occupied_voxels(before[0])], []) == []
+
+
+def test_poses_move_points() -> None:
+    pose = np.array([[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]])
+    np.testing.assert_allclose(transform(check_pose(pose), np.array([[1.0, 0, 0], [0, 1, 5]])), [[1, 3, 3], [0, 2, 8]])
+
+
+@pytest.mark.parametrize(
+    "pose",
+    [
+        np.eye(3),
+        "x",
+        np.full((4, 4), np.nan),
+        np.diag([2.0, 2, 2, 1]),
+        np.diag([1.0, 1, -1, 1]),
+        np.eye(4) + np.eye(4, k=-3) * 0.5,
+        [[1, 0.1, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]],
+    ],
+)
+def test_a_pose_that_is_no_rigid_motion_is_refused(pose: object) -> None:
+    with pytest.raises(InputError, match="camera_pose") as error:
+        check_pose(pose, "camera_pose")  # type: ignore[arg-type]
+    assert "\n" not in str(error.value)

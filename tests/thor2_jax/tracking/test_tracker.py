@@ -1,0 +1,128 @@
+"""Trackers with a toy recognizer that reads an instance's probabilities from its colour."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from helpers import untrained_run
+
+import thor2_jax as thor2
+from thor2_jax.gallery.gallery import Gallery
+from thor2_jax.recognition.answers import Evidence, Recognition
+from thor2_jax.recognition.prepared_instance import PreparedInstance
+from thor2_jax.recognizer import Recognizer
+from thor2_jax.tracking.fusion import FusedEvidence
+from thor2_jax.tracking.tracker import Tracker
+
+CAMERA = thor2.Intrinsics(600.0, 600.0, 79.5, 59.5)
+RUN = untrained_run(("a", "b", "c"))
+
+
+class ToyRecognizer:
+    """Answers by the mean colour of an instance, whose channels are class probabilities in 1/255."""
+
+    def __init__(self) -> None:
+        self._recognizer = Recognizer(RUN)
+        self.gallery: Gallery = self._recognizer.gallery
+
+    def frame_evidence(self, frame: thor2.RGBDFrame) -> tuple[list[PreparedInstance], Evidence]:
+        described = self._recognizer.describe(frame)
+        p = np.array([each.colors.mean(axis=0) / 255 for each in described.usable])
+        return list(described.instances), Evidence(np.zeros(len(p), int), {"tops": p, "tops2": p})
+
+    def recognitions(self, instances: Sequence[PreparedInstance], evidence: Evidence) -> list[Recognition]:
+        return self._recognizer.recognitions(instances, evidence)
+
+
+def frame(boxes: dict[int, tuple[int, int, tuple[int, int, int]]], size: int = 40) -> thor2.RGBDFrame:
+    """Return a frame with squares: label -> row, column, colour."""
+    color, labels = np.zeros((120, 160, 3), np.uint8), np.zeros((120, 160), np.uint8)
+    depth = np.full((120, 160), 900, np.uint16)
+    for label, (row, column, rgb) in boxes.items():
+        here = slice(row, row + size), slice(column, column + size)
+        color[here], labels[here], depth[here] = rgb, label, 700
+    return thor2.RGBDFrame(color, depth, labels, CAMERA)
+
+
+SURE_A, UNSURE_B = (230, 15, 10), (100, 125, 30)
+
+
+def test_a_track_keeps_its_number_and_fuses_the_answers() -> None:
+    tracker = Tracker(ToyRecognizer())
+    first = tracker.update(frame({1: (10, 10, SURE_A), 2: (60, 100, (10, 10, 235))}))
+    second = tracker.update(frame({7: (62, 98, (10, 10, 235)), 9: (12, 12, UNSURE_B)}))
+    assert [(r.label, r.track, r.name, r.frames) for r in first] == [(1, 1, "a", 1), (2, 2, "c", 1)]
+    assert [(r.label, r.track, r.name, r.frames) for r in second] == [(7, 2, "c", 2), (9, 1, "a", 2)]
+    logs = np.log(np.array([SURE_A, UNSURE_B]) / 255)
+    weights = np.array([0.5 ** (1 / 30), 1])
+    mean = np.exp((weights[:, None] * logs).sum(axis=0) / weights.sum())
+    assert second[1].confidence == pytest.approx(mean[0] / mean.sum(), abs=2e-3)
+    assert [track.name for track in tracker.tracks()] == ["a", "c"]
+
+
+def test_the_first_answer_is_that_of_the_frame_alone() -> None:
+    rng = np.random.default_rng(0)
+    recognizer = Recognizer(RUN)
+    image = frame({1: (10, 10, SURE_A), 2: (60, 100, UNSURE_B)})
+    image = dataclasses.replace(image, color=rng.integers(0, 256, image.color.shape, dtype=np.uint8))
+    alone, tracked = recognizer.recognize(image), recognizer.track().update(image)
+    for one, other in zip(alone, tracked, strict=True):
+        assert (one.label, one.name, one.points_used) == (other.label, other.name, other.points_used)
+        assert one.confidence == pytest.approx(other.confidence, abs=1e-5)
+
+
+def test_poses_match_objects_of_a_camera_that_moved() -> None:
+    moved = np.eye(4)
+    moved[0, 3] = 0.09  # 77 pixels at a depth of 0.7 m
+    boxes = frame({1: (10, 110, SURE_A)}), frame({1: (10, 33, SURE_A)})
+    with_poses, without = Tracker(ToyRecognizer()), Tracker(ToyRecognizer())
+    assert [with_poses.update(f, p)[0].track for f, p in zip(boxes, (np.eye(4), moved), strict=True)] == [1, 1]
+    assert [without.update(f)[0].track for f in boxes] == [1, 2]
+
+
+def test_a_track_ends_when_its_object_is_gone() -> None:
+    tracker = Tracker(ToyRecognizer())
+    empty, full = frame({}), frame({1: (10, 10, SURE_A)})
+    assert tracker.update(empty) == [] and tracker.tracks() == []
+    assert tracker.update(full)[0].track == 1
+    for _ in range(9):
+        tracker.update(empty)
+    assert tracker.update(full)[0].track == 1
+    for _ in range(10):
+        tracker.update(empty)
+    assert tracker.update(full)[0].track == 2
+
+
+def test_an_instance_that_cannot_be_used_has_no_track() -> None:
+    answers = Tracker(ToyRecognizer()).update(frame({3: (5, 5, SURE_A)}, size=3))
+    assert [(r.label, r.track, r.name) for r in answers] == [(3, None, None)] and answers[0].reason
+
+
+def test_frames_and_poses_that_do_not_belong_together_are_refused() -> None:
+    tracker = Tracker(ToyRecognizer())
+    image = frame({1: (10, 10, SURE_A)})
+    tracker.update(image)
+    small = thor2.RGBDFrame(image.color[:100], image.depth[:100], image.labels[:100], CAMERA)
+    with pytest.raises(thor2.InputError, match="160 x 100 pixels; expected 160 x 120"):
+        tracker.update(small)
+    with pytest.raises(thor2.InputError, match="pose is given"):
+        tracker.update(image, np.eye(4))
+    with pytest.raises(thor2.InputError, match="rigid"):
+        tracker.update(image, 2 * np.eye(4))
+    assert tracker.update(image)[0].frames == 2
+
+
+def test_fused_evidence_is_a_weighted_mean() -> None:
+    evidence = FusedEvidence()
+    views = np.array([[0.5, 0.3], [0.2, 0.6]])  # what is missing to 1 belongs to no class
+    evidence.add(3.0, {"embedding": views[0]}, {"mug": 0.9})
+    evidence.add(1.0, {"embedding": views[1]}, {"mug": 0.1})
+    probabilities, scores = evidence.fused()
+    decayed = 3 * 0.5 ** (1 / 30)
+    logs = np.log(np.column_stack([views, 1 - views.sum(axis=1)]))
+    expected = np.exp((decayed * logs[0] + logs[1]) / (decayed + 1))
+    np.testing.assert_allclose(probabilities["embedding"], (expected / expected.sum())[:2], rtol=1e-9)
+    assert scores == {"mug": pytest.approx((decayed * 0.9 + 0.1) / (decayed + 1))}
+    evidence.add(1.0, {"embedding": views[1]}, {"mug": 0.2, "bowl": 0.7})  # an object was enrolled
+    assert evidence.fused()[1] == pytest.approx({"mug": 0.2, "bowl": 0.7})

@@ -1,0 +1,54 @@
+"""Which clouds of two frames show the same object: those that overlap most in space.
+
+The overlap of two clouds is the share of the smaller one's voxels that the other one occupies too, averaged over
+`VOXELS`. Small voxels tell neighbouring objects apart; large ones allow for the motion between two frames.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+
+__all__ = ["MIN_OVERLAP", "OccupiedVoxels", "match", "occupied_voxels", "overlap"]
+
+VOXELS = (0.01, 0.02, 0.04)
+"""Voxel sides, metres."""
+
+MIN_OVERLAP = 0.2
+"""Least overlap of two clouds of one object."""
+
+_OFFSET = 2**20
+"""Half the number of voxels along each axis that get a number of their own."""
+
+OccupiedVoxels = tuple[NDArray[np.int64], ...]
+"""Numbers of the voxels that a cloud occupies, in increasing order, for each of `VOXELS`."""
+
+
+def occupied_voxels(points: NDArray[np.floating]) -> OccupiedVoxels:
+    """Return the voxels that points [n, 3] in metres occupy, for each of `VOXELS`."""
+    numbers = []
+    for size in VOXELS:
+        x, y, z = np.floor(points / size).astype(np.int64).T + _OFFSET
+        numbers.append(np.unique((x * 2 * _OFFSET + y) * 2 * _OFFSET + z))
+    return tuple(numbers)
+
+
+def overlap(first: OccupiedVoxels, second: OccupiedVoxels) -> float:
+    """Return the overlap of two clouds, from 0 to 1."""
+    shares = [
+        len(np.intersect1d(a, b, assume_unique=True)) / max(min(len(a), len(b)), 1)
+        for a, b in zip(first, second, strict=True)
+    ]
+    return float(np.mean(shares))
+
+
+def match(first: Sequence[OccupiedVoxels], second: Sequence[OccupiedVoxels]) -> list[tuple[int, int]]:
+    """Return pairs of indices, one of each sequence, with the largest total overlap; each index occurs at most once.
+
+    Pairs with an overlap below `MIN_OVERLAP` are left out.
+    """
+    overlaps = np.array([[overlap(a, b) for b in second] for a in first]).reshape(len(first), len(second))
+    overlaps[overlaps < MIN_OVERLAP] = 0
+    rows, columns = linear_sum_assignment(overlaps, maximize=True)
+    return [(int(i), int(j)) for i, j in zip(rows, columns, strict=True) if overlaps[i, j] > 0]

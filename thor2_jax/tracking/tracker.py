@@ -1,0 +1,184 @@
+"""Tracker: the instances of successive frames are matched in space, and each object gets one fused answer.
+
+>>> tracker = recognizer.track()                                                    # doctest: +SKIP
+>>> for frame in frames:                                                            # doctest: +SKIP
+...     for answer in tracker.update(frame):
+...         print(answer.track, answer.name, answer.confidence)
+>>> [(track.track, track.name, track.frames) for track in tracker.tracks()]        # doctest: +SKIP
+[(1, 'mug', 5), (2, 'bowl', 4)]
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, Protocol, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from thor2_jax.errors import InputError
+from thor2_jax.gallery.gallery import Gallery
+from thor2_jax.recognition.answers import MAX_OVERFLOW, Evidence, Recognition
+from thor2_jax.recognition.frames import RGBDFrame
+from thor2_jax.recognition.prepared_instance import PreparedInstance
+from thor2_jax.tracking.fusion import FusedEvidence, view_weight
+from thor2_jax.tracking.matching import OccupiedVoxels, match, occupied_voxels
+from thor2_jax.tracking.poses import check_pose, transform
+
+__all__ = ["TrackedRecognition", "Tracker"]
+
+MAX_MISSED = 10
+"""Frames without a view of an object after which its track ends."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TrackedRecognition(Recognition):
+    """The answer for one instance of a frame, fused over the frames of its track.
+
+    Attributes:
+        track: number of the track, from 1; None if the instance could not be described.
+        frames: number of frames in which the object was seen so far.
+    """
+
+    track: int | None = None
+    frames: int = 0
+
+    def renamed(self, other: Self) -> Self:
+        """Return this answer with the name, the confidence and the number of frames of another one of its track."""
+        changed = ("name", "confidence", "classifier", "top", "reason", "frames")
+        return dataclasses.replace(self, **{name: getattr(other, name) for name in changed})
+
+
+class FrameRecognizer(Protocol):
+    """What a tracker needs of a recognizer, see `Recognizer`."""
+
+    @property
+    def gallery(self) -> Gallery: ...
+
+    def frame_evidence(self, frame: RGBDFrame) -> tuple[list[PreparedInstance], Evidence]: ...
+
+    def recognitions(self, instances: Sequence[PreparedInstance], evidence: Evidence) -> list[Recognition]: ...
+
+
+@dataclasses.dataclass
+class _Track:
+    """An object that is followed.
+
+    Attributes:
+        number: from 1, in the order of appearance.
+        voxels: those of its last view.
+        instance: its last view.
+        overflow: points of that view outside the descriptor's grid.
+        seen: number of the frame of its last view.
+        frames: number of views.
+        evidence: what it is recognized by.
+    """
+
+    number: int
+    voxels: OccupiedVoxels
+    instance: PreparedInstance
+    overflow: int
+    seen: int
+    frames: int = 0
+    evidence: FusedEvidence = dataclasses.field(default_factory=FusedEvidence)
+
+
+class Tracker:
+    """The objects of a sequence of frames of one camera.
+
+    Without poses, clouds are compared in camera coordinates: the camera may move by a few centimetres between frames.
+    """
+
+    def __init__(self, recognizer: FrameRecognizer) -> None:
+        """Start without tracks; `Recognizer.track` calls this."""
+        self._recognizer = recognizer
+        self._tracks: list[_Track] = []
+        self._frame = 0
+        self._size: tuple[int, ...] = ()
+        self._has_poses = False
+        self._last_number = 0
+
+    def update(self, frame: RGBDFrame, pose: ArrayLike | None = None) -> list[TrackedRecognition]:
+        """Recognize the next frame and return its answers, fused with the earlier ones, in the order of the labels.
+
+        Args:
+            frame: of the size of the first frame.
+            pose: [4, 4] the camera's pose, see `check_pose`; for all frames or for none.
+
+        Raises:
+            InputError: the frame has another size than the first one, the pose is not a rigid motion, or it is missing
+                although the first frame had one, or the other way round. The tracks stay as they are.
+        """
+        world = None if pose is None else check_pose(pose)
+        if self._frame and frame.depth.shape != self._size:
+            (height, width), (rows, columns) = frame.depth.shape, self._size
+            raise InputError(
+                f"frame has {width} x {height} pixels; expected {columns} x {rows}, as the first frame of the tracker; "
+                "track the frames of another camera apart"
+            )
+        if self._frame and (world is not None) != self._has_poses:
+            given, expected = ("given", "none") if world is not None else ("None", "a pose")
+            raise InputError(f"pose is {given}; expected {expected}, as for the first frame: give all poses or none")
+        instances, evidence = self._recognizer.frame_evidence(frame)
+        self._size, self._has_poses = frame.depth.shape, world is not None
+        self._frame += 1
+        self._tracks = [track for track in self._tracks if self._frame - track.seen <= MAX_MISSED]
+        usable = [instance for instance in instances if instance.reason is None]
+        self._extend(usable, evidence, world)
+        by_label = {track.instance.label: track for track in self._tracks if track.seen == self._frame}
+        answers = iter(self._answers([by_label[instance.label] for instance in usable]))
+        return [
+            next(answers) if instance.reason is None else TrackedRecognition(instance.label, reason=instance.reason)
+            for instance in instances
+        ]
+
+    def tracks(self) -> list[TrackedRecognition]:
+        """Return the answers for all objects that are followed, with the label of their last view."""
+        return self._answers(self._tracks)
+
+    def _extend(
+        self, usable: Sequence[PreparedInstance], evidence: Evidence, world: NDArray[np.float64] | None
+    ) -> None:
+        """Add every instance to its track, or start a track with it."""
+        points = [each.points if world is None else transform(world, each.points) for each in usable]
+        voxels = [occupied_voxels(cloud) for cloud in points]
+        matched = {j: self._tracks[i] for i, j in match([track.voxels for track in self._tracks], voxels)}
+        scores = self._scores(evidence, len(usable))
+        for row, instance in enumerate(usable):
+            overflow = int(evidence.overflow[row])
+            track = matched.get(row)
+            if track is None:
+                self._last_number += 1
+                track = _Track(self._last_number, voxels[row], instance, overflow, self._frame)
+                self._tracks.append(track)
+            track.voxels, track.instance, track.overflow = voxels[row], instance, overflow
+            track.seen, track.frames = self._frame, track.frames + 1
+            weight = view_weight(instance) if overflow <= MAX_OVERFLOW * len(instance.points) else 0.0
+            probabilities = {name: np.asarray(values)[row] for name, values in evidence.probabilities.items()}
+            track.evidence.add(weight, probabilities, None if scores is None else scores[row])
+
+    def _scores(self, evidence: Evidence, count: int) -> list[dict[str, float]] | None:
+        """Return the scores of the gallery of each instance, by name; None if the classifiers alone answer."""
+        if evidence.embeddings is None:
+            return None
+        gallery = self._recognizer.gallery
+        scores = gallery.scores(np.asarray(evidence.embeddings)[:count], np.asarray(evidence.weights)[:count])
+        return [dict(zip(gallery.names, row.tolist(), strict=True)) for row in scores]
+
+    def _answers(self, tracks: Sequence[_Track]) -> list[TrackedRecognition]:
+        if not tracks:
+            return []
+        fused = [track.evidence.fused() for track in tracks]
+        probabilities = {name: np.stack([each[0][name] for each in fused]) for name in fused[0][0]}
+        scores = None
+        if fused[0][1] is not None:
+            scores = np.array([[each[1].get(name, 0.0) for name in self._recognizer.gallery.names] for each in fused])
+        evidence = Evidence(np.array([track.overflow for track in tracks]), probabilities, scores=scores)
+        answers = self._recognizer.recognitions([track.instance for track in tracks], evidence)
+        return [
+            TrackedRecognition(**_fields(answer), track=track.number, frames=track.frames)
+            for track, answer in zip(tracks, answers, strict=True)
+        ]
+
+
+def _fields(answer: Recognition) -> dict[str, Any]:
+    return {field.name: getattr(answer, field.name) for field in dataclasses.fields(answer)}
