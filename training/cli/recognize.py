@@ -104,9 +104,10 @@ def recognize(
 
     if bag is not None:
         refused = {"FRAME": frames, "color": color, "depth": depth, "labels": labels, "coco": coco, "bop": bop}
-        given = [name for name, value in {**refused, "names": names}.items() if value]
+        refused |= {"names": names, "poses": poses, "track": track or None}
+        given = [name for name, value in refused.items() if value]
         if given:
-            raise InputError(f"{given[0]} is {refused.get(given[0], names)} and bag is {bag}; give one of them")
+            raise InputError(f"{given[0]} is {refused[given[0]]} and bag is {bag}; give one of them")
         topics = Topics(color_topic, depth_topic, camera_topic)
         options = BagOptions(bag, topics, intrinsics, depth_scale, max_gap, every, segment, out, out_bag)
         recognize_bag(options, model, unknown_below, answer_by)
