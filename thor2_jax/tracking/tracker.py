@@ -171,7 +171,8 @@ class Tracker:
         probabilities = {name: np.stack([each[0][name] for each in fused]) for name in fused[0][0]}
         scores = None
         if fused[0][1] is not None:
-            scores = np.array([[each[1].get(name, 0.0) for name in self._recognizer.gallery.names] for each in fused])
+            names = self._recognizer.gallery.names
+            scores = np.array([[(each or {}).get(name, 0.0) for name in names] for _, each in fused])
         evidence = Evidence(np.array([track.overflow for track in tracks]), probabilities, scores=scores)
         answers = self._recognizer.recognitions([track.instance for track in tracks], evidence)
         return [

@@ -103,8 +103,8 @@ def recognize(
     from training.readers.poses import read_poses
 
     if bag is not None:
-        refused = {"FRAME": frames, "color": color, "depth": depth, "labels": labels, "coco": coco, "bop": bop}
-        refused |= {"names": names, "poses": poses, "track": track or None}
+        refused: dict[str, object] = {"FRAME": frames, "color": color, "depth": depth, "labels": labels, "names": names}
+        refused |= {"coco": coco, "bop": bop, "poses": poses, "track": track}
         given = [name for name, value in refused.items() if value]
         if given:
             raise InputError(f"{given[0]} is {refused[given[0]]} and bag is {bag}; give one of them")
