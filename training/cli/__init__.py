@@ -5,7 +5,20 @@ import os
 # XLA reports the features it expects of cached programs as errors. The variable is read when JAX is imported.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
-from training.cli import colornet, demo, doctor, enroll, evaluate, forget, objects, recognize, render, serve, train  # noqa: E402
+from training.cli import (
+    colornet,
+    demo,
+    doctor,
+    enroll,
+    evaluate,
+    forget,
+    objects,
+    recognize,
+    render,
+    serve,
+    train,
+    watch,
+)  # noqa: E402
 from training.cli.app import app, main  # noqa: E402
 
 __all__ = [
@@ -22,4 +35,5 @@ __all__ = [
     "render",
     "serve",
     "train",
+    "watch",
 ]

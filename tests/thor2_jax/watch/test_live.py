@@ -1,0 +1,225 @@
+"""The live view: pacing, messages, server and page, with a recognizer that knows its answers."""
+
+import base64
+import functools
+import http.client
+import io
+import json
+import shutil
+import threading
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from playwright.sync_api import Browser, expect, sync_playwright
+from recording_files import table_frame
+
+import thor2_jax as thor2
+from thor2_jax.errors import InputError
+from thor2_jax.recognition.answers import Recognition
+from thor2_jax.recordings.recorded_frames import RecordedFrame
+from thor2_jax.segmentation.table import segment_table
+from thor2_jax.watch.broadcast import Broadcast
+from thor2_jax.watch.live import LONGEST_PAUSE, LiveView, paced
+from thor2_jax.watch.server import serve_live
+
+SECOND = 10**9
+
+
+def recorded(seconds: float, read: Any = table_frame) -> RecordedFrame:
+    return RecordedFrame(f"{seconds:.3f}", read, round(seconds * SECOND))
+
+
+def recognize(frame: thor2.RGBDFrame) -> list[Recognition]:
+    """Name the first instance `<b>mug</b>`; the others are unknown."""
+    names = {frame.instances[0]: "<b>mug</b>"}
+    return [
+        Recognition(label, names.get(label), 0.9, reason=None if label in names else "unknown: it is")
+        for label in frame.instances
+    ]
+
+
+def fail() -> thor2.RGBDFrame:
+    raise InputError("depth is missing")
+
+
+class Clock:
+    """A clock that stands still, but for sleeping and for `work` seconds after each frame."""
+
+    def __init__(self, work: Sequence[float]) -> None:
+        self.now, self.work = 0.0, iter(work)
+
+    def sleep(self, seconds: float) -> None:
+        self.now += seconds
+
+    def times(self, stamps: Sequence[float]) -> list[tuple[float, float]]:
+        """Return time stamp and time at which it was shown, of each frame that was."""
+        shown = []
+        for frame in paced(map(recorded, stamps), lambda: self.now, self.sleep):
+            shown.append((frame.stamp / SECOND, self.now))
+            self.now += next(self.work, 0.0)
+        return shown
+
+
+def test_recordings_play_at_their_speed() -> None:
+    stamps = [100 + k / 10 for k in range(10)]
+    assert Clock([]).times(stamps) == [pytest.approx((stamp, stamp - 100)) for stamp in stamps]
+    shown = Clock([0.25] * 10).times(stamps)
+    assert [stamp for stamp, _ in shown] == pytest.approx([100, 100.3, 100.6, 100.9])
+    assert all(time == pytest.approx(stamp - 100) for stamp, time in shown)
+
+
+def test_a_long_first_frame_loses_no_others() -> None:
+    stamps = [100 + k / 10 for k in range(10)]
+    shown = Clock([LONGEST_PAUSE + 5, 0.25]).times(stamps)
+    assert [stamp for stamp, _ in shown] == pytest.approx([100, 100.1, *stamps[4:]])
+
+
+def test_gaps_and_clocks_that_go_back() -> None:
+    shown = Clock([]).times([100, 100.1, 500, 500.1, 3, 3.1])
+    assert [time for _, time in shown] == pytest.approx([0, 0.1, 0.1, 0.2, 0.2, 0.3])
+
+
+def test_messages_of_a_view() -> None:
+    broadcast = Broadcast()
+    view = LiveView(recognize, segment_table, broadcast)
+
+    def message() -> dict[str, Any]:
+        latest = broadcast.wait(0, 0)
+        assert latest is not None
+        return json.loads(latest[1])
+
+    assert message()["state"] == "waiting" and "image" not in message()
+    view.show(recorded(1))
+    one = message()
+    assert (one["state"], one["number"], one["frame"], one["fps"], one["error"]) == ("live", 1, "1.000", None, None)
+    assert [(o["label"], o["name"], o["track"]) for o in one["objects"]] == [(1, "<b>mug</b>", None), (2, None, None)]
+    assert one["objects"][0]["position"][2] == pytest.approx(0.8, abs=0.01)
+    picture = np.asarray(Image.open(io.BytesIO(base64.b64decode(one["image"]))))
+    assert picture.shape == (240, 320, 3)
+    for k, (row, column) in enumerate([(115, 60), (115, 180)]):  # left edges of the boxes
+        paint = [int(one["objects"][k]["color"][i : i + 2], 16) for i in (1, 3, 5)]
+        near = picture[row, column - 3 : column + 4].astype(int)
+        assert np.abs(near - paint).sum(axis=1).min() < 180  # without a line, at least 260
+    view.show(recorded(2, fail))
+    failed = message()
+    assert failed["error"] == "depth is missing" and failed["objects"] == [] and failed["number"] == 1
+    assert failed["image"] == one["image"] and failed["fps"] > 0
+    view.publish_state("ended", "no more")
+    assert message()["state"] == "ended" and message()["message"] == "no more" and "image" in message()
+
+
+def test_labels_of_a_frame_are_kept_and_tracks_give_colours() -> None:
+    frame = table_frame()
+    labels = np.zeros((240, 320), np.uint8)
+    labels[80:150, 60:110], labels[80:150, 180:250] = 7, 3
+
+    class Tracked(Recognition):
+        track, frames = 2, 5
+
+    broadcast = Broadcast()
+    view = LiveView(lambda f: [Tracked(label, f"name {label}") for label in f.instances], segment_table, broadcast)
+    view.show(recorded(1, functools.partial(thor2.RGBDFrame, frame.color, frame.depth, labels, frame.intrinsics)))
+    latest = broadcast.wait(0, 0)
+    assert latest is not None
+    objects = json.loads(latest[1])["objects"]
+    assert sorted(one["name"] for one in objects) == ["name 3", "name 7"]
+    assert {(one["color"], one["frames"]) for one in objects} == {("#f0e442", 5)}
+
+
+def test_slow_readers_get_the_latest_message() -> None:
+    broadcast = Broadcast()
+    assert broadcast.wait(0, 0) is None
+    for k in range(5):
+        broadcast.publish(str(k))
+    assert broadcast.wait(0, 0) == (5, "4") and broadcast.wait(5, 0) is None
+    threading.Timer(0.05, broadcast.publish, ["late"]).start()
+    assert broadcast.wait(5, 5) == (6, "late")
+
+
+def get(url: str, path: str, host: str | None = None) -> tuple[int, dict[str, str], bytes]:
+    connection = http.client.HTTPConnection(url.removeprefix("http://"), timeout=10)
+    connection.request("GET", path, headers={"Host": host} if host else {})
+    response = connection.getresponse()
+    content = response.read() if path != "/events" else response.fp.readline()
+    connection.close()
+    response.close()
+    return response.status, dict(response.getheaders()), content
+
+
+def test_server_serves_its_files_and_events_only() -> None:
+    broadcast = Broadcast()
+    broadcast.publish('{"a": 1}')
+    with serve_live(broadcast, port=0) as url:
+        for path in ("/", "/watch.js", "/watch.css", "/style.css", "/icon.svg"):
+            status, headers, content = get(url, path)
+            assert status == 200 and content and "default-src 'none'" in headers["Content-Security-Policy"]
+        assert get(url, "/events")[2] == b'data: {"a": 1}\n'
+        for path in ("/server.py", "/../server.py", "//etc/passwd", "/page/index.html"):
+            assert get(url, path)[0] == 404
+        assert get(url, "/", "attacker.example:80")[0] == 403
+        assert get(url, "/", "localhost:80")[0] == 200
+        with pytest.raises(InputError, match="port is"), serve_live(broadcast, port=int(url.rpartition(":")[2])):
+            pass
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    chromium = shutil.which("chromium")
+    if chromium is None:
+        pytest.skip("chromium is not installed (apt-get install chromium)")
+    with sync_playwright() as playwright:
+        yield playwright.chromium.launch(executable_path=chromium)
+
+
+@pytest.mark.parametrize("width", [1280, 390])
+def test_page_shows_frames_and_states(browser: Browser, width: int) -> None:
+    broadcast, errors = Broadcast(), []
+    view = LiveView(recognize, segment_table, broadcast)
+    context = browser.new_context(viewport={"width": width, "height": 800})
+    page = context.new_page()
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.on("console", lambda line: errors.append(line.text))
+    with serve_live(broadcast, port=0) as url:
+        page.goto(url)
+        expect(page.locator("#ready")).to_have_text("Waiting")
+        expect(page.locator("#message")).to_contain_text("compiled")
+        for k in range(3):
+            view.show(recorded(1_700_000_000.5 + k))
+        expect(page.locator("#ready")).to_have_text("Live")
+        expect(page.locator("#number")).to_have_text("3")
+        expect(page.locator("#frame")).to_have_text("1700000002.500")
+        expect(page.locator("#objects .name")).to_have_text(["<b>mug</b>", "unknown"])
+        expect(page.locator("#objects .confidence")).to_have_text(["90 %", "90 %"])
+        assert page.locator("#picture").evaluate("image => image.decode().then(() => image.naturalWidth)") == 320
+        assert float(page.locator("#fps").inner_text()) > 0
+        assert page.evaluate("document.documentElement.scrollWidth") == width
+        view.show(recorded(2, fail))
+        expect(page.locator("#problem")).to_have_text("depth is missing")
+        expect(page.locator("#none")).to_be_visible()
+        view.publish_state("failed", "the camera was unplugged")
+        expect(page.locator("#ready")).to_have_text("Stopped")
+        expect(page.locator("#problem")).to_have_text("the camera was unplugged")
+        assert errors == []
+    context.close()
+
+
+def test_page_says_that_the_server_is_gone(browser: Browser) -> None:
+    broadcast = Broadcast()
+    LiveView(recognize, segment_table, broadcast).show(recorded(1))
+    context = browser.new_context()
+    page = context.new_page()
+    with serve_live(broadcast, port=0) as url:
+        page.goto(url)
+        expect(page.locator("#ready")).to_have_text("Live")
+    expect(page.locator("#ready")).to_have_text("Disconnected")
+    expect(page.locator("#picture")).to_be_visible()
+    context.close()
+
+
+def test_files_of_the_page_are_in_the_package() -> None:
+    page = Path(thor2.__file__).parent / "watch" / "page"
+    assert {one.name for one in page.iterdir()} == {"index.html", "watch.css", "watch.js"}

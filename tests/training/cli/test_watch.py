@@ -1,0 +1,146 @@
+"""`thor2 watch`; the run's weights are random."""
+
+import json
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+import urllib.request
+from pathlib import Path
+from typing import Any
+
+import pytest
+from helpers import encode_image, run_thor2, untrained_run
+from recording_files import table_frame, write_recording
+
+from thor2_jax.config import DescriptorConfig
+from thor2_jax.recognition.run_directory import save_run
+from thor2_jax.watch.broadcast import Broadcast
+
+FRAMES = [table_frame(shift) for shift in (0, 3, 6)]
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    directory = tmp_path_factory.mktemp("run")
+    config = DescriptorConfig(homology="closed_form")
+    save_run(untrained_run(("bowl", "mug", "plate"), config=config), directory)
+    return directory
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Two frames without labels and one that is damaged."""
+    for k, frame in enumerate(FRAMES):
+        one = tmp_path / "frames" / f"{k}"
+        one.mkdir(parents=True)
+        (one / "color.png").write_bytes(encode_image(frame.color))
+        (one / "depth.png").write_bytes(encode_image(frame.depth) if k < 2 else b"damaged")
+        (one / "intrinsics.json").write_text(json.dumps({"fx": 290.0, "fy": 290.0, "cx": 160.0, "cy": 120.0}))
+    return tmp_path / "frames"
+
+
+@pytest.fixture
+def messages(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
+    """Return the messages that are published; the command is interrupted when it waits for Ctrl-C."""
+    published: list[dict[str, Any]] = []
+    publish = Broadcast.publish
+
+    def record(self: Broadcast, text: str) -> None:
+        published.append(json.loads(text))
+        publish(self, text)
+        if published[-1]["state"] == "ended":
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(Broadcast, "publish", record)
+    monkeypatch.setattr("training.cli.watch.NOTICE_SECONDS", 0.0)
+    return published
+
+
+def test_frames_of_a_folder(
+    model: Path, folder: Path, messages: list[dict[str, Any]], capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert run_thor2("watch", "--model", model, "--folder", folder, "--port", 0) == 0
+    assert "watch at http://127.0.0.1:" in capfd.readouterr().err
+    assert [one["state"] for one in messages] == ["waiting", "live", "live", "live", "ended"]
+    assert [one.get("frame") for one in messages] == [None, "0", "1", "2", "2"]
+    assert [len(one["objects"]) for one in messages[1:4]] == [2, 2, 0] and "depth" in messages[3]["error"]
+    assert messages[-1]["number"] == 2
+
+
+def test_a_damaged_recording_ends_with_its_line(
+    model: Path, tmp_path: Path, messages: list[dict[str, Any]], capfd: pytest.CaptureFixture[str]
+) -> None:
+    path = write_recording(tmp_path / "a.mcap", FRAMES, gap=5 * 10**9)
+    assert run_thor2("watch", "--model", model, "--bag", path, "--port", 0) == 2
+    error = capfd.readouterr().err.splitlines()[-1]
+    assert error.startswith("error: bag: ") and "expected at most" in error
+    assert messages[-1]["state"] == "failed" and "expected at most" in messages[-1]["message"]
+    path.write_bytes(path.read_bytes()[:1000])
+    assert run_thor2("watch", "--model", model, "--bag", path, "--port", 0) == 2
+    assert "mcap recover" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ([], "no source is given"),
+        (["--bag", "a.bag", "--realsense"], "--bag and --realsense is given"),
+        (["--folder", "a", "--color-topic", "/c"], "belong to --bag"),
+        (["--folder", "{none}"], "not a directory"),
+        (["--bag", "{none}"], "No such file"),
+        (["--folder", "a", "--segment", "sam"], "segmenter is 'sam'"),
+    ],
+)
+def test_invalid_arguments(
+    model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], arguments: list[str], expected: str
+) -> None:
+    given = [text.format(none=tmp_path / "none") for text in arguments]
+    assert run_thor2("watch", "--model", model, *given) == 2
+    err = capfd.readouterr().err
+    assert expected in err and err.startswith("error: ") and err.count("\n") == 1
+
+
+def test_realsense_without_its_package(
+    model: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pyrealsense2", None)
+    assert run_thor2("watch", "--model", model, "--realsense") == 2
+    err = capfd.readouterr().err
+    assert err.startswith("error: realsense needs pyrealsense2") and err.count("\n") == 1
+
+
+@pytest.mark.slow
+def test_a_recording_in_its_own_process(model: Path, tmp_path: Path) -> None:
+    path = write_recording(tmp_path / "a.bag", FRAMES * 4)
+    command = [sys.executable, "-m", "training.cli", "watch", "--model", str(model), "--bag", str(path), "--port", "0"]
+    process = subprocess.Popen(command, cwd=Path(__file__).parents[3], stderr=subprocess.PIPE, text=True)
+    timer = threading.Timer(120, process.kill)
+    timer.start()
+    try:
+        assert process.stderr is not None
+        first = process.stderr.readline()
+        match = re.search(r"http://127\.0\.0\.1:\d+", first)
+        assert match is not None, first + process.stderr.read()
+        states: dict[str, dict[str, Any]] = {}
+        with urllib.request.urlopen(f"{match[0]}/events", timeout=60) as events:
+            for line in events:
+                if line.startswith(b"data: "):
+                    message = json.loads(line[6:])
+                    states[message["state"]] = message
+                    if message["state"] == "ended":
+                        break
+        assert set(states) >= {"waiting", "ended"} and states["ended"]["number"] >= 1
+        assert [one["label"] for one in states["ended"]["objects"]] in ([1, 2], [2, 1])
+        time.sleep(0.2)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(30) == 0
+        assert "were recognized" in process.stderr.read()
+    finally:
+        timer.cancel()
+        process.kill()
+        process.wait()
+        if process.stderr is not None:
+            process.stderr.close()

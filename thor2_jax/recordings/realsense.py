@@ -1,0 +1,126 @@
+"""Frames of a RealSense camera (extra `realsense`).
+
+with RealSenseCamera() as camera:
+    for recorded in camera.frames():
+        frame = segmented(recorded.read())
+"""
+
+import functools
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from thor2_jax.errors import InputError
+from thor2_jax.recognition.frames import RGBDFrame
+from thor2_jax.recognition.intrinsics import Intrinsics
+from thor2_jax.recordings.recorded_frames import RecordedFrame, stamp_name
+
+__all__ = ["RealSenseCamera"]
+
+WIDTH, HEIGHT, RATE = 640, 480, 30
+"""Size of both images and frames per second; every RealSense camera with colour has them."""
+
+
+class RealSenseCamera:
+    """A camera that is open while its context is entered; depth is aligned to colour."""
+
+    def __init__(self, source: Any = None, timeout: float = 5.0) -> None:
+        """Describe the camera; nothing is opened yet.
+
+        Args:
+            source: what frames are taken from, with `wait_for_frames(milliseconds)`: a started pipeline or a syncer of
+                pyrealsense2. By default a pipeline of the first connected camera.
+            timeout: seconds without a frame after which the camera counts as unplugged.
+        """
+        self._source, self._timeout = source, timeout
+        self._pipeline: Any = None
+        self._align: Any = None
+
+    def __enter__(self) -> "RealSenseCamera":
+        """Start the camera.
+
+        Raises:
+            InputError: the package pyrealsense2 is missing, or no camera is connected.
+        """
+        try:
+            import pyrealsense2 as rs
+        except ImportError as error:
+            raise InputError(
+                f'realsense needs pyrealsense2 ({error}); install "thor2-jax[realsense]" and the system library '
+                "libusb-1.0-0"
+            ) from None
+        self._align = rs.align(rs.stream.color)
+        if self._source is None:
+            config = rs.config()
+            config.enable_stream(rs.stream.color, WIDTH, HEIGHT, rs.format.rgb8, RATE)
+            config.enable_stream(rs.stream.depth, WIDTH, HEIGHT, rs.format.z16, RATE)
+            pipeline = rs.pipeline()
+            try:
+                if not len(rs.context().query_devices()):  # `start` would wait for one
+                    raise RuntimeError("no device connected")
+                pipeline.start(config)
+            except RuntimeError as error:
+                raise InputError(
+                    f"realsense: no camera can be started ({error}); expected a RealSense camera with colour and "
+                    f"depth of {WIDTH} x {HEIGHT} at {RATE} Hz; check the cable, and that no other program uses it"
+                ) from None
+            self._source = self._pipeline = pipeline
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Stop the camera."""
+        if self._pipeline is not None:
+            pipeline, self._pipeline = self._pipeline, None
+            try:
+                pipeline.stop()
+            except RuntimeError:  # It is unplugged.
+                pass
+
+    def frames(self) -> Iterator[RecordedFrame]:
+        """Yield the newest frame, again and again.
+
+        Raises:
+            InputError: no frame arrives in time.
+        """
+        n_frames = 0
+        while True:
+            try:
+                color, depth = self._next()
+            except RuntimeError as error:
+                reason = " ".join(str(error).split()).rstrip(".")
+                raise InputError(
+                    f"realsense: no frame for {self._timeout:g} s after {n_frames} frames ({reason}); the camera was "
+                    "unplugged or has stopped; check the cable"
+                ) from None
+            n_frames += 1
+            stamp = round(color.get_timestamp() * 1e6)
+            gap = round(depth.get_timestamp() * 1e6) - stamp
+            # The camera reuses the memory of its images.
+            pixels, units = np.array(color.get_data(), np.uint8), np.array(depth.get_data(), np.uint16)
+            intrinsics = _intrinsics(color, depth)
+            yield RecordedFrame(
+                stamp_name(stamp), functools.partial(RGBDFrame, pixels, units, None, intrinsics), stamp, gap
+            )
+
+    def _next(self) -> tuple[Any, Any]:
+        """Return the next colour frame and the depth frame that is aligned to it; raises RuntimeError."""
+        milliseconds = int(1000 * self._timeout)
+        for _ in range(max(int(self._timeout * RATE), 10)):
+            frames = self._source.wait_for_frames(milliseconds)
+            if frames.get_color_frame() and frames.get_depth_frame():
+                aligned = self._align.process(frames)
+                return aligned.get_color_frame(), aligned.get_depth_frame()
+        raise RuntimeError("colour and depth do not arrive together")
+
+
+def _intrinsics(color: Any, depth: Any) -> Intrinsics:
+    camera = color.get_profile().as_video_stream_profile().get_intrinsics()
+    return Intrinsics.of(
+        {
+            **{name: getattr(camera, name) for name in ("fx", "fy", "ppx", "ppy", "width", "height")},
+            "model": str(camera.model),
+            "coeffs": list(camera.coeffs),
+            "depth_scale": round(float(depth.get_units()), 9),
+        }
+    )

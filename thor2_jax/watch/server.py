@@ -1,0 +1,130 @@
+"""The local web server of a live view: the page, and its messages as server-sent events.
+
+with serve_live(broadcast, port=0) as url:
+    ...
+"""
+
+import contextlib
+import socket
+import threading
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+from thor2_jax.errors import InputError
+from thor2_jax.watch.broadcast import Broadcast
+
+__all__ = ["serve_live"]
+
+_PAGE = Path(__file__).parent / "page"
+_SERVICE_PAGE = Path(__file__).parents[1] / "service" / "page"
+
+_FILES = {
+    "/": (_PAGE / "index.html", "text/html; charset=utf-8"),
+    "/watch.js": (_PAGE / "watch.js", "text/javascript; charset=utf-8"),
+    "/watch.css": (_PAGE / "watch.css", "text/css; charset=utf-8"),
+    "/style.css": (_SERVICE_PAGE / "style.css", "text/css; charset=utf-8"),
+    "/icon.svg": (_SERVICE_PAGE / "icon.svg", "image/svg+xml"),
+}
+"""Path -> file and content type."""
+
+_HEADERS = {
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "
+    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cache-Control": "no-store",
+}
+
+_LOOPBACK = ("localhost", "127.0.0.1", "[::1]", "::1")
+
+KEEP_ALIVE = 2.0
+"""Seconds without a message after which a comment is sent, so that a closed connection is noticed."""
+
+
+class _Server(ThreadingHTTPServer):
+    daemon_threads = True
+    block_on_close = False
+
+    def __init__(self, address: tuple[str, int], broadcast: Broadcast) -> None:
+        self.address_family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
+        self.broadcast, self.is_stopping = broadcast, threading.Event()
+        super().__init__(address, _Handler)
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Ignore what goes wrong with a single connection: the browser has closed it."""
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server: _Server
+    timeout = 30
+
+    def do_GET(self) -> None:
+        """Answer with a file, or with the messages of the live view."""
+        host = self.headers.get("Host", "").rpartition(":")[0] or self.headers.get("Host", "")
+        if self.server.server_address[0] in _LOOPBACK and host not in _LOOPBACK:
+            self.send_error(403)  # A page of another site that has given its own name this address.
+        elif self.path == "/events":
+            self._send_events()
+        elif self.path in _FILES:
+            file, kind = _FILES[self.path]
+            content = file.read_bytes()
+            self._start(kind)
+            self.send_header("Content-Length", str(len(content)))
+            self.end_headers()
+            self.wfile.write(content)
+        else:
+            self.send_error(404)
+
+    def _start(self, kind: str) -> None:
+        self.send_response(200)
+        self.send_header("Content-Type", kind)
+        for name, value in _HEADERS.items():
+            self.send_header(name, value)
+
+    def _send_events(self) -> None:
+        self._start("text/event-stream")
+        self.end_headers()
+        number = 0
+        while not self.server.is_stopping.is_set():
+            message = self.server.broadcast.wait(number, KEEP_ALIVE)
+            if message is None:
+                self.wfile.write(b":\n\n")
+            else:
+                number, text = message
+                self.wfile.write(f"data: {text}\n\n".encode())
+            self.wfile.flush()
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """Log nothing: a page makes one request for each file."""
+
+
+@contextlib.contextmanager
+def serve_live(broadcast: Broadcast, host: str = "127.0.0.1", port: int = 8090) -> Iterator[str]:
+    """Serve a live view in threads of this process; yield its address.
+
+    Args:
+        broadcast: the messages.
+        host: address to listen on.
+        port: port to listen on; 0 chooses a free one.
+
+    Raises:
+        InputError: the address cannot be used.
+    """
+    try:
+        server = _Server((host, port), broadcast)
+    except (OSError, OverflowError) as error:
+        raise InputError(
+            f"port is {port} and host {host}, which cannot be used ({error}); choose another one"
+        ) from None
+    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.1}, daemon=True)
+    thread.start()
+    shown = f"[{host}]" if ":" in host else host
+    try:
+        yield f"http://{shown}:{server.server_address[1]}"
+    finally:
+        server.is_stopping.set()
+        server.shutdown()
+        thread.join()
+        server.server_close()

@@ -1,0 +1,116 @@
+"""`thor2 watch`: a live page with the recognized objects of a recording, a folder or a camera."""
+
+import contextlib
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from thor2_jax.errors import InputError
+from thor2_jax.recordings.topics import Topics
+from training.cli.app import ModelOption, UnknownOption, app
+
+if TYPE_CHECKING:
+    from thor2_jax.recordings.recorded_frames import RecordedFrame
+
+NOTICE_SECONDS = 1.0
+"""Time that pages have to show an error before the server ends."""
+
+
+@app.command()
+def watch(
+    model: ModelOption,
+    bag: Annotated[Path | None, typer.Option(help="ROS 1 bag, ROS 2 bag or MCAP (extra bags).")] = None,
+    folder: Annotated[Path | None, typer.Option(help="Folder of frames.")] = None,
+    realsense: Annotated[bool, typer.Option("--realsense", help="A RealSense camera (extra realsense).")] = False,
+    segment: Annotated[
+        str | None, typer.Option(help="Segmenter. Default: table; in folders, for frames without labels.")
+    ] = None,
+    color_topic: Annotated[str | None, typer.Option(help="Colour images of the bag.")] = None,
+    depth_topic: Annotated[str | None, typer.Option(help="Aligned depth images of the bag.")] = None,
+    camera_topic: Annotated[str | None, typer.Option(help="camera_info of the bag.")] = None,
+    unknown_below: UnknownOption = None,
+    answer_by: Annotated[str | None, typer.Option(help="classifiers, gallery or both.")] = None,
+    host: Annotated[str, typer.Option(help="Address to listen on; 0.0.0.0 for other machines.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port; 0 selects a free one.")] = 8090,
+) -> None:
+    """Show the recognized objects of a recording or a camera on a live page, until Ctrl-C.
+
+    A bag plays at the speed at which it was recorded; frames for which there is no time are left out. All frames of a
+    folder are shown.
+    """
+    from thor2_jax.capacity import BATCH_BUCKETS
+    from thor2_jax.recognizer import Recognizer
+    from thor2_jax.segmentation.segmenters import TABLE, load_segmenter
+    from thor2_jax.watch.broadcast import Broadcast
+    from thor2_jax.watch.live import LiveView
+    from thor2_jax.watch.server import serve_live
+
+    sources = {"--bag": bag, "--folder": folder, "--realsense": realsense or None}
+    given = [name for name, value in sources.items() if value is not None]
+    if len(given) != 1:
+        raise InputError(f"{' and '.join(given) or 'no source'} is given; expected one of {', '.join(sources)}")
+    topics = Topics(color_topic, depth_topic, camera_topic)
+    if bag is None and topics != Topics():
+        raise InputError("color_topic, depth_topic and camera_topic belong to --bag")
+    segmenter = load_segmenter(segment or TABLE)
+    with contextlib.ExitStack() as stack:
+        frames = _frames(stack, bag, folder, topics, segment)
+        recognizer = Recognizer.load(model, unknown_below, answer_by=answer_by)
+        recognizer.chunk = BATCH_BUCKETS[-1]
+        broadcast = Broadcast()
+        print(f"watch at {stack.enter_context(serve_live(broadcast, host, port))}", file=sys.stderr, flush=True)
+        view = LiveView(recognizer.recognize, segmenter, broadcast)
+        with contextlib.suppress(KeyboardInterrupt):
+            try:
+                for recorded in frames:
+                    view.show(recorded)
+            except (InputError, OSError) as error:
+                view.publish_state("failed", str(error))
+                time.sleep(NOTICE_SECONDS)
+                raise
+            view.publish_state("ended", f"There are no more frames; {view.n_frames} were recognized.")
+            print(f"no more frames, {view.n_frames} were recognized; Ctrl-C ends", file=sys.stderr, flush=True)
+            threading.Event().wait()
+
+
+def _frames(
+    stack: contextlib.ExitStack, bag: Path | None, folder: Path | None, topics: Topics, segment: str | None
+) -> Iterator["RecordedFrame"]:
+    """Open the source and return its frames."""
+    from thor2_jax.recordings.bags import Bag
+    from thor2_jax.recordings.realsense import RealSenseCamera
+    from thor2_jax.watch.live import paced
+
+    if folder is not None:
+        return _folder_frames(folder, relabel=segment is not None)
+    if bag is None:
+        return stack.enter_context(RealSenseCamera()).frames()
+    opened = stack.enter_context(Bag(bag, topics))
+    for note in opened.notes:
+        print(f"note: {note}", file=sys.stderr)
+    return paced(opened.frames())
+
+
+def _folder_frames(folder: Path, relabel: bool) -> Iterator["RecordedFrame"]:
+    """Return the frames of a folder; with `relabel`, without their labels."""
+    import dataclasses
+    import functools
+
+    from thor2_jax.recognition.frames import RGBDFrame
+    from thor2_jax.recordings.recorded_frames import RecordedFrame
+    from training.readers.frame_files import FrameSource, find_frames
+
+    def read(source: FrameSource) -> RGBDFrame:
+        try:
+            frame = source.read()
+        except OSError as error:
+            raise InputError(f"{error.filename}: {error.strerror or error}") from None
+        return dataclasses.replace(frame, labels=None) if relabel else frame
+
+    sources = find_frames([folder])
+    return (RecordedFrame(source.name, functools.partial(read, source), k) for k, source in enumerate(sources))
