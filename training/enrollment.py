@@ -17,6 +17,7 @@ from thor2_jax.gallery.enrollment import enrolled_views, instance_view
 from thor2_jax.gallery.gallery import GalleryObject
 from thor2_jax.gallery.objects import ObjectGallery
 from thor2_jax.gallery.store import GALLERY_DIRECTORY
+from thor2_jax.recognition.frames import RGBDFrame
 from thor2_jax.recognition.prepared_instance import PreparedInstance
 from thor2_jax.recognition.run_directory import TrainedRun, load_run, save_run
 from thor2_jax.recognizer import Recognizer
@@ -90,7 +91,10 @@ class SkippedInstance:
 
 
 def labelled_views(
-    directories: Sequence[Path], sigma_s: float, label_name: str | None = None
+    directories: Sequence[Path],
+    sigma_s: float,
+    label_name: str | None = None,
+    on_view: Callable[[RGBDFrame, int, str], object] = lambda frame, label, name: None,
 ) -> tuple[dict[str, list[PreparedInstance]], list[SkippedInstance]]:
     """Return object -> its views in folders of labelled frames, and the instances that cannot be used.
 
@@ -98,6 +102,7 @@ def labelled_views(
         directories: folders of frames, or single frames, see `FrameFolder`.
         sigma_s: scaled units per metre, see `DescriptorConfig`.
         label_name: only the object that labels.json gives this name.
+        on_view: called with the frame, the label and the object of each usable instance, in the order of the views.
 
     Raises:
         InputError: a folder or a frame cannot be read, or an object has no usable view.
@@ -113,6 +118,7 @@ def labelled_views(
                 try:
                     with with_context(item.identifier):
                         views[name].append(instance_view(item.frame, label, sigma_s))
+                        on_view(item.frame, label, name)
                 except InputError as error:
                     skipped.append(SkippedInstance(item.identifier, name, str(error)))
     empty = [name for name, of_object in views.items() if not of_object]

@@ -13,10 +13,12 @@ import jax
 from thor2_jax.errors import InputError
 from thor2_jax.files import remove_leftovers
 from thor2_jax.recognition.classifier import check_features
+from thor2_jax.recognition.frames import RGBDFrame
 from thor2_jax.recognition.prepared_instance import PreparedInstance
 from thor2_jax.recognition.run_directory import TrainedRun
 from training.baselines.job import train_baselines
-from training.baselines.names import check_baselines
+from training.baselines.names import check_baselines, crop_size
+from training.baselines.pretrained import pretrained_files, weights_file
 from training.embedding.run_embedding import Distractors
 from training.enrollment import SkippedInstance, labelled_views
 from training.fitting.checkpoints import CHECKPOINTS
@@ -27,12 +29,15 @@ from training.objects.meshes import find_meshes, read_names, scaled_meshes
 from training.storage.jobs import check_same_job
 from training.storage.progress import Progress
 from training.storage.workers import local_workers
+from training.views.crop_job import render_crops
+from training.views.crops import rgbd_crop
 from training.views.dataset import ViewDataset
 from training.views.labelled_views import WithLabelledViews, digest_of_instances
 from training.views.left_out import WithoutClasses
 from training.views.normalized_views import ViewSource
 from training.views.render_job import dataset_job, render_dataset
 from training.views.sequences import sequence_sources
+from training.views.view_crops import QuantizedCrop, quantized
 
 __all__ = ["TrainJob", "run_train_job"]
 
@@ -43,10 +48,12 @@ class LabelledInstances(NamedTuple):
     Attributes:
         views: object -> its usable instances.
         skipped: the others.
+        crops: object -> the crops of its usable instances; None if no baseline reads them.
     """
 
     views: Mapping[str, Sequence[PreparedInstance]]
     skipped: Sequence[SkippedInstance]
+    crops: Mapping[str, Sequence[QuantizedCrop]] | None
 
 
 Display = Callable[[], AbstractContextManager[Progress]]
@@ -66,7 +73,8 @@ class TrainJob:
         names: table of object name -> mesh in `meshes`; None uses all meshes.
         classifiers: any of "tops", "tops2", "ce".
         folds: number of folds; with more than one, each gets a model and is its held-out set.
-        baselines: any of "thor", "forest", "pointnet".
+        baselines: any of `BASELINES`.
+        weights: directory of pretrained weights for the image networks; None trains them from scratch.
         leave_out: objects to train without.
         sequences: table of sequence -> its objects; one run is trained for each sequence.
         distractors: other objects that the embedding of the run is fitted on, too; None fits no embedding.
@@ -83,6 +91,7 @@ class TrainJob:
     classifiers: Sequence[str] = ("tops", "tops2", "ce")
     folds: int = 1
     baselines: Sequence[str] = ()
+    weights: Path | None = None
     leave_out: Sequence[str] = ()
     sequences: Path | None = None
     distractors: Distractors | None = None
@@ -101,6 +110,7 @@ def run_train_job(job: TrainJob, display: Display) -> dict[Path, list[TrainedRun
         OSError: A file cannot be written.
     """
     baselines = check_baselines(job.baselines)
+    _check_weights(job, baselines)
     features = check_features(job.classifiers, "classifiers")
     labelled = _read_frames(job, baselines)
     if job.sequences is None:
@@ -132,10 +142,21 @@ def run_train_job(job: TrainJob, display: Display) -> dict[Path, list[TrainedRun
                     views, directory, features, protocol.fit, progress, folds=job.folds, **_samples(job)
                 )
             if baselines and jax.process_index() == 0:
-                train_baselines(directory, views, baselines, progress)
+                train_baselines(directory, views, baselines, progress, weights=job.weights)
     if job.meshes is not None and jax.process_index() == 0:
         _remove(job.out / VIEWS)
     return runs
+
+
+def _check_weights(job: TrainJob, baselines: Sequence[str]) -> None:
+    """Raise InputError if files of pretrained weights are missing or read by none of the baselines."""
+    if job.weights is None:
+        return
+    files = {name: pretrained_files(name) for name in baselines}
+    if not any(files.values()):
+        raise InputError(f"weights is {job.weights}, but none of the baselines reads pretrained weights; leave it out")
+    for name in dict.fromkeys(file for each in files.values() for file in each):
+        weights_file(job.weights, name)
 
 
 def _samples(job: TrainJob) -> Any:
@@ -221,7 +242,15 @@ def _read_frames(job: TrainJob, baselines: Sequence[str]) -> LabelledInstances |
         )
     if "thor" in baselines:
         raise InputError("baselines: thor needs the camera angles of all views, and frames have none; leave out thor")
-    return LabelledInstances(*labelled_views(job.frames, job.protocol.config.sigma_s))
+    size = crop_size(baselines, job.weights is not None)
+    crops: dict[str, list[QuantizedCrop]] = {}
+
+    def crop(frame: RGBDFrame, label: int, name: str) -> None:
+        if size is not None:
+            crops.setdefault(name, []).append(quantized(rgbd_crop(frame, label, size)))
+
+    views, skipped = labelled_views(job.frames, job.protocol.config.sigma_s, on_view=crop)
+    return LabelledInstances(views, skipped, crops if size is not None else None)
 
 
 def _check_names(job: TrainJob, names: Sequence[str], labelled: LabelledInstances | None) -> None:
@@ -264,21 +293,33 @@ def _open_views(job: TrainJob, labelled: LabelledInstances | None, display: Disp
         source = _render(job, meshes, display)
     if labelled is not None:
         reasons = [instance.reason for instance in labelled.skipped]
-        source = WithLabelledViews(labelled.views, job.protocol.config, source, reasons)
+        source = WithLabelledViews(labelled.views, job.protocol.config, source, reasons, labelled.crops)
     assert source is not None
     return source
 
 
 def _render(job: TrainJob, meshes: Mapping[str, Path | TexturedMesh], display: Display) -> ViewDataset:
     protocol = job.protocol
+    workers, size = local_workers(job.workers), crop_size(job.baselines, job.weights is not None)
     with display() as progress:
-        return render_dataset(
+        dataset = render_dataset(
             meshes,
             job.out / VIEWS,
             protocol.azimuth_step,
             protocol.polar_step,
-            local_workers(job.workers),
+            workers,
             lambda done, total: progress("render", done, total, ""),
             protocol.augmentations,
             protocol.fit.seed,
         )
+        if size is not None:
+            render_crops(
+                meshes,
+                dataset,
+                size,
+                workers,
+                lambda done, total: progress("render crops", done, total, ""),
+                protocol.augmentations,
+                protocol.fit.seed,
+            )
+    return dataset

@@ -1,7 +1,7 @@
 """Files of trained baselines, RUN/baselines/NAME.safetensors.
 
 The metadata entry "about" is JSON: the format, the classes, the temperature (null without a held-out set), the training
-time in seconds, and a digest of these entries and the arrays.
+time in seconds, the files of pretrained weights if there were any, and a digest of these entries and the arrays.
 """
 
 import dataclasses
@@ -36,11 +36,13 @@ class StoredBaseline:
         arrays: learned arrays by name.
         temperature: temperature fitted on the held-out set; None without one.
         seconds: training time.
+        weights: files of pretrained weights it was fitted from -> SHA-256; empty if it was trained from scratch.
     """
 
     arrays: Mapping[str, NDArray[Any]]
     temperature: float | None
     seconds: float
+    weights: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
 
 def _digest(arrays: Mapping[str, NDArray[Any]], about: Mapping[str, Any]) -> str:
@@ -56,12 +58,14 @@ def write_baseline(path: Path, stored: StoredBaseline, classes: Sequence[str]) -
     Raises:
         OSError: if the file cannot be written.
     """
-    about = {
+    about: dict[str, Any] = {
         "format": BASELINE_FORMAT,
         "classes": list(classes),
         "temperature": stored.temperature,
         "seconds": round(stored.seconds, 1),
     }
+    if stored.weights:
+        about["weights"] = dict(stored.weights)
     about["digest"] = _digest(stored.arrays, about)
     arrays = {name: np.ascontiguousarray(array) for name, array in stored.arrays.items()}
     path.parent.mkdir(exist_ok=True)
@@ -91,7 +95,7 @@ def read_baseline(path: Path, classes: Sequence[str]) -> StoredBaseline:
             raise ValueError("its digest does not match")
         if about["classes"] != list(classes):
             raise InputError(f"model: {path} has other classes than its run; train the baseline again")
-        return StoredBaseline(arrays, about["temperature"], about["seconds"])
+        return StoredBaseline(arrays, about["temperature"], about["seconds"], about.get("weights", {}))
     except InputError:
         raise
     except (OSError, ValueError, KeyError, TypeError, safetensors.SafetensorError) as error:

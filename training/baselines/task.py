@@ -1,8 +1,9 @@
 """Records that go into and come out of the fit of a baseline."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -30,6 +31,8 @@ class FitTask:
         folds: number of folds that the views are split into.
         fold: index of the held-out fold; nothing is held out if `folds` is 1.
         scratch: directory for checkpoints, so that an interrupted fit can resume.
+        run: directory of the run.
+        weights: directory of pretrained weights; None trains networks from scratch.
         progress: called with (stage, done, total, note).
     """
 
@@ -40,6 +43,8 @@ class FitTask:
     folds: int
     fold: int
     scratch: Path
+    run: Path
+    weights: Path | None
     progress: Callable[[str, int, int, str], object]
 
     def held_out(self, label: NDArray[np.integer[Any]], view: NDArray[np.integer[Any]]) -> NDArray[np.bool_]:
@@ -56,8 +61,10 @@ class FittedBaseline(NamedTuple):
         model: the baseline.
         probabilities: [H, C] class probabilities.
         truth: [H] class indices.
+        weights: files of pretrained weights it was fitted from -> SHA-256.
     """
 
     model: Baseline
     probabilities: NDArray[np.float32]
     truth: NDArray[np.integer[Any]]
+    weights: Mapping[str, str] = MappingProxyType({})

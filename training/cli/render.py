@@ -36,10 +36,18 @@ def render(
     base: Annotated[bool, typer.Option("--base", help="Augment: masks without the lowest centimetre.")] = False,
     copies: Annotated[int, typer.Option(help="Augmented copies of each view, if there are augmentations.")] = 2,
     seed: Annotated[int, typer.Option(help="Seed for the augmentations.")] = 0,
+    crops: Annotated[
+        int | None, typer.Option(metavar="PIXELS", help="Also write crops of this size, for image networks.")
+    ] = None,
     mesh_scale: MeshScaleOption = 1.0,
     quiet: QuietOption = False,
 ) -> None:
-    """Render views of meshes to a dataset for `train --dataset`. An interrupted rendering resumes."""
+    """Render views of meshes to a dataset for `train --dataset`. An interrupted rendering resumes.
+
+    With --crops, the views are rendered once more, also for a finished dataset, and their crops of colour and surface
+    normals are written to OUT/crops: the networks among the baselines of `train` are trained on them (224 pixels, their
+    small variants 96).
+    """
     from training.augmentation.augmentations import Augmentations
     from training.augmentation.base import Base
     from training.augmentation.illumination import Illumination
@@ -49,10 +57,13 @@ def render(
     from training.augmentation.sensor import Sensor
     from training.objects.meshes import find_meshes, read_names, scaled_meshes
     from training.storage.workers import local_workers, ray_workers
+    from training.views.crop_job import render_crops
     from training.views.render_job import render_dataset
 
     if address is not None and engine != "ray":
         raise InputError(f"address is {address}; it is only used with --engine ray")
+    if crops is not None and crops < 1:
+        raise InputError(f"crops is {crops}; expected at least 1 pixel")
     augmentations = Augmentations(
         illumination=Illumination() if illumination else None,
         sensor=Sensor() if sensor else None,
@@ -75,6 +86,16 @@ def render(
             augmentations or None,
             seed,
         )
+        if crops is not None:
+            render_crops(
+                sources,
+                dataset,
+                crops,
+                pool,
+                lambda done, total: progress("render crops", done, total, ""),
+                augmentations or None,
+                seed,
+            )
     console.print(
         f"{len(dataset)} views of {len(dataset.classes)} objects ({dataset.manifest.left_out} left out) in {out}"
     )

@@ -40,8 +40,16 @@ def train(
     seed: Annotated[int, typer.Option(help="Seed for augmentations, weights, sample order and dropout.")] = 0,
     folds: Annotated[int, typer.Option(min=1, help="More than 1: one model per fold, which is its held-out set.")] = 1,
     baselines: Annotated[
-        str, typer.Option(help="Comma-separated baselines to train too: thor, forest, pointnet.")
+        str,
+        typer.Option(
+            help="Comma-separated baselines to train too: thor, forest, pointnet; rcfusion, vit-cnn, rgbd-vit, each "
+            "also with -small; templates."
+        ),
     ] = "",
+    weights: Annotated[
+        Path | None,
+        typer.Option(help="Directory of pretrained weights (safetensors) for the networks. Default: from scratch."),
+    ] = None,
     leave_out: Annotated[str, typer.Option(help="Comma-separated objects to train without.")] = "",
     sequences: Annotated[
         Path | None,
@@ -79,10 +87,13 @@ def train(
     With --frames, labelled real instances are views of their objects, too, each with augmented copies. Objects may have
     a mesh, frames or both. A frame is a folder with color.png, depth.png, mask.png, intrinsics.json and labels.json.
 
-    With --baselines, a finished run gets the baselines that it lacks. With --sequences, one run is trained for each
-    sequence, on its objects only (see `thor2 evaluate ocid --per-sequence`); finished runs must have the same options.
-    The embedding gives the confidence of an answer, and objects are enrolled in the run with it. It is also fitted on
-    distractors, objects that are none of the classes, so that unknown objects get a low confidence.
+    With --baselines, a finished run gets the baselines that it lacks. The image networks among them read crops (see
+    `thor2 render --crops`) and are trained from scratch or from --weights.
+
+    With --sequences, one run is trained for each sequence, on its objects only (see `thor2 evaluate ocid
+    --per-sequence`); finished runs must have the same options. The embedding gives the confidence of an answer, and
+    objects are enrolled in the run with it. It is also fitted on distractors, objects that are none of the classes, so
+    that unknown objects get a low confidence.
     """
     import jax
 
@@ -125,6 +136,7 @@ def train(
         classifiers=split_names(classifiers),
         folds=folds,
         baselines=split_names(baselines),
+        weights=weights,
         leave_out=split_names(leave_out),
         sequences=sequences,
         distractors=_distractors(0 if paper and embedding is None else embedding, distractors, workers),

@@ -37,7 +37,8 @@ def answer_frames(runs: Sequence[Run], frames: Iterable[LabelledFrame]) -> Itera
 def _answer(runs: Sequence[Run], item: LabelledFrame) -> list[InstancePrediction]:
     recognizer = runs[0].recognizer
     described = recognizer.describe(item.frame)
-    inputs = baseline_inputs(described, recognizer.run.config) if any(run.baselines for run in runs) else None
+    baselines = any(run.baselines for run in runs)
+    inputs = baseline_inputs(described, recognizer.run.config, item.frame) if baselines else None
     values = [run.probabilities(item.identifier, described, inputs) for run in runs]
     table = np.stack([values[index][name] for index, name in all_predictors(runs)], axis=1)  # [B, M, C]
     rows = {instance.label: row for row, instance in enumerate(described.usable)}

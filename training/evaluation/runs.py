@@ -39,6 +39,7 @@ class Run:
         recognizer: recognizer with the run's classifiers.
         baselines: baselines in the run directory.
         temperatures: temperatures of the classifiers and baselines that were calibrated on a held-out set.
+        weights: the files of pretrained weights that each baseline was fitted from; empty without any.
     """
 
     name: str
@@ -46,6 +47,7 @@ class Run:
     recognizer: Recognizer
     baselines: Mapping[str, Baseline] = dataclasses.field(default_factory=dict)
     temperatures: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    weights: Mapping[str, Sequence[str]] = dataclasses.field(default_factory=dict)
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -227,15 +229,17 @@ def load_sequence_runs(directory: Path, frames: Iterable[str]) -> list[SequenceR
         runs_of_fold = {sequence: runs[fold] for sequence, runs in of_sequence.items()}
         digest = json_digest({sequence: run.digest for sequence, run in runs_of_fold.items()})
         name = f"{directory.absolute().name}/*" + (f"/fold-{fold}" if len(first) > 1 else "")
-        result.append(SequenceRun(name, digest, run.recognizer, run.baselines, of_sequence=runs_of_fold))
+        result.append(
+            SequenceRun(name, digest, run.recognizer, run.baselines, weights=run.weights, of_sequence=runs_of_fold)
+        )
     return result
 
 
 def _load(directory: Path) -> Run:
     recognizer = Recognizer.load(directory)
-    baselines, temperatures = load_baselines(directory, recognizer.run)
-    temperatures |= recognizer.run.record.get("temperatures", {})
-    return Run(_name(directory), _digest(directory), recognizer, baselines, temperatures)
+    baselines = load_baselines(directory, recognizer.run)
+    temperatures = baselines.temperatures | recognizer.run.record.get("temperatures", {})
+    return Run(_name(directory), _digest(directory), recognizer, baselines.models, temperatures, baselines.weights)
 
 
 def _name(directory: Path) -> str:

@@ -33,6 +33,7 @@ from thor2_jax.config import DESCRIPTOR_VERSION
 from thor2_jax.errors import InputError
 from thor2_jax.files import write_text
 from training.views.normalized_views import COORDINATE_STEP, NormalizedViews
+from training.views.view_crops import ViewCrops, read_crops
 
 __all__ = ["MANIFEST", "Manifest", "NormalizedViews", "Shard", "ViewDataset", "encode"]
 
@@ -250,3 +251,15 @@ class ViewDataset:
         """
         shard = self.shards[index]
         return _decode(shard.content(self.directory), shard.label)
+
+    def read_crops(self, index: int, size: int) -> ViewCrops:
+        """Read the crops of a shard's views, in their order.
+
+        Args:
+            index: index of the shard.
+            size: side of the crops, pixels; larger stored ones are reduced.
+
+        Raises:
+            InputError: The dataset has no crops or smaller ones, or a file is missing or damaged.
+        """
+        return read_crops(self.directory, self.digest, self.shards[index].file, size)

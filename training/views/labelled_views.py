@@ -11,11 +11,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from thor2_jax.config import DescriptorConfig
-from thor2_jax.errors import with_context
+from thor2_jax.errors import InputError, with_context
 from thor2_jax.files import content_digest
 from thor2_jax.gallery.augment import augmented_view
 from thor2_jax.recognition.prepared_instance import PreparedInstance
 from training.views.normalized_views import NormalizedViews, ViewSource, normalize_views
+from training.views.view_crops import QuantizedCrop, ViewCrops, repeated, stacked
 
 __all__ = ["MAX_COPIES", "WithLabelledViews", "digest_of_instances"]
 
@@ -54,6 +55,7 @@ class WithLabelledViews:
         config: DescriptorConfig,
         rendered: ViewSource | None = None,
         skipped: Sequence[str] = (),
+        crops: Mapping[str, Sequence[QuantizedCrop]] | None = None,
     ) -> None:
         """Keep the instances; nothing is computed yet.
 
@@ -63,8 +65,10 @@ class WithLabelledViews:
             config: descriptor; only `sigma_s` is used.
             rendered: other views; None if there are none.
             skipped: why further instances could not be used, for the record.
+            crops: class -> the crops of its instances, of one size; None if nothing reads them.
         """
         self._rendered, self._views, self._config, self._skipped = rendered, dict(views), config, list(skipped)
+        self._crops = crops
         self.classes = tuple(dict.fromkeys([*(rendered.classes if rendered else ()), *views]))
         shards = list(rendered.shards) if rendered else []
         clouds = [0] * len(self.classes)
@@ -126,3 +130,18 @@ class WithLabelledViews:
                 self._config,
                 [view.boundary for view in flat],
             )
+
+    def read_crops(self, index: int, size: int) -> ViewCrops:
+        """Read the crops of a shard of the rendered views, or repeat those of a class's instances for their copies.
+
+        Raises:
+            InputError: what the source of the rendered views raises, or there are no crops of the instances.
+        """
+        if index < self._first:
+            assert self._rendered is not None
+            return self._rendered.read_crops(index, size)
+        if self._crops is None:
+            raise InputError("frames: the instances were read without crops; expected crops for image networks")
+        name = list(self._views)[index - self._first]
+        crops = self._crops[name]
+        return repeated(stacked(crops, len(crops[0][0])).reduced(size), 1 + self._copies(name))

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 from thor2_jax.errors import InputError
 from training.views.normalized_views import NormalizedViews, ViewSource
+from training.views.view_crops import ViewCrops
 
 __all__ = ["WithoutClasses"]
 
@@ -56,3 +57,7 @@ class WithoutClasses:
         """Read the views of a shard; raises what the source raises."""
         shard = self.shards[index]
         return dataclasses.replace(self._source.read(shard.source_index), label=shard.label)
+
+    def read_crops(self, index: int, size: int) -> ViewCrops:
+        """Read the crops of a shard; raises what the source raises."""
+        return self._source.read_crops(self.shards[index].source_index, size)

@@ -9,9 +9,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from thor2_jax.config import DescriptorConfig
+from thor2_jax.errors import InputError
 from thor2_jax.files import content_digest
 from thor2_jax.types import Cloud
 from training.views.normalized_views import NormalizedViews, normalize_views
+from training.views.view_crops import ViewCrops
 
 __all__ = ["MemoryViews"]
 
@@ -55,3 +57,7 @@ class MemoryViews:
         """
         clouds = self._clouds[index]
         return normalize_views(clouds, index, range(len(clouds)), [0] * len(clouds), self._config)
+
+    def read_crops(self, index: int, size: int) -> ViewCrops:
+        """Raise InputError: clouds in memory have no images."""
+        raise InputError("dataset: clouds in memory have no crops; give a rendered dataset with --dataset")

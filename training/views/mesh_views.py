@@ -35,6 +35,7 @@ __all__ = [
     "RenderProgress",
     "ViewCloud",
     "ViewTask",
+    "all_views",
     "checked_meshes",
     "clouds_per_view",
     "cloud_of",
@@ -141,16 +142,20 @@ def _seed_of(name: str) -> int:
     return int.from_bytes(hashlib.sha256(name.encode(errors="surrogatepass")).digest()[:8], "little")
 
 
-def _all_clouds(task: ViewTask) -> Iterator[ViewCloud]:
+def all_views(task: ViewTask) -> Iterator[tuple[int, int, RenderedView]]:
+    """Yield the number of each view of a task, the number of the copy and the image, ordered by view and copy."""
     caster, centre, name = RayCaster([task.mesh]), task.mesh.centre, _seed_of(task.name)
     for number, (azimuth, polar) in enumerate(task.angles.tolist(), task.first):
-        view = render_view(caster, camera_pose(azimuth, polar, centre))
-        yield ViewCloud(number, 0, *cloud_of(view))
+        yield number, 0, render_view(caster, camera_pose(azimuth, polar, centre))
         for copy in range(1, clouds_per_view(task.augmentations)):
             assert task.augmentations is not None
             rng = np.random.default_rng([task.seed, name, number, copy])
             other = render_view(caster, camera_pose(*random_angles(rng), centre))
-            yield ViewCloud(number, copy, *cloud_of(augment(other, task.augmentations, rng)))
+            yield number, copy, augment(other, task.augmentations, rng)
+
+
+def _all_clouds(task: ViewTask) -> Iterator[ViewCloud]:
+    return (ViewCloud(number, copy, *cloud_of(view)) for number, copy, view in all_views(task))
 
 
 def render_task(task: ViewTask) -> list[ViewCloud]:

@@ -12,6 +12,7 @@ from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.view_normalization import view_normalize
 from thor2_jax.errors import InputError
 from thor2_jax.types import Cloud, PointClouds
+from training.views.view_crops import ViewCrops
 
 __all__ = [
     "MAX_VIEW_LENGTH",
@@ -107,6 +108,13 @@ class ViewSource(Protocol):
 
     def read(self, index: int) -> NormalizedViews:
         """Read the views of a shard."""
+
+    def read_crops(self, index: int, size: int) -> ViewCrops:
+        """Read the crops of the views of a shard, in their order, with sides of `size` pixels.
+
+        Raises:
+            InputError: There are no crops, or smaller ones.
+        """
 
 
 def normalize_views(

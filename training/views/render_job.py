@@ -41,7 +41,7 @@ from training.views.mesh_views import (
 )
 from training.views.normalized_views import COORDINATE_STEP, MAX_VIEW_LENGTH, normalize_views
 
-__all__ = ["dataset_job", "render_dataset"]
+__all__ = ["ShardPlan", "dataset_job", "render_dataset"]
 
 CLOUDS_PER_SHARD = 256
 """Clouds per shard, rounded down to whole views: a few megabytes, about a second of rendering."""
@@ -126,7 +126,7 @@ def _store(path: Path, label: int, planned: int, rendered: Sequence[ViewCloud]) 
 
 
 @dataclasses.dataclass(frozen=True)
-class _Plan:
+class ShardPlan:
     """Which views each shard of a dataset holds.
 
     Attributes:
@@ -175,7 +175,7 @@ def dataset_job(
         raise InputError(f"seed is {seed}; it must be at least 0")
     angles = view_angles(azimuth_step, polar_step)
     objects = _objects(meshes, angles)
-    plan = _Plan(angles, clouds_per_view(augmentations), tuple(entry["name"] for entry in objects))
+    plan = ShardPlan(angles, clouds_per_view(augmentations), tuple(entry["name"] for entry in objects))
     camera = TRAINING_CAMERA
     # Without the fields that this camera has no value for: datasets of version 0.1.0 do not have them.
     intrinsics = {name: value for name, value in dataclasses.asdict(camera.intrinsics).items() if value}
@@ -229,7 +229,7 @@ def render_dataset(
     check_output_directory(out, MANIFEST)
     job = dataset_job(meshes, azimuth_step, polar_step, augmentations, seed)
     angles = view_angles(azimuth_step, polar_step)
-    plan = _Plan(angles, clouds_per_view(augmentations), tuple(entry["name"] for entry in job["objects"]))
+    plan = ShardPlan(angles, clouds_per_view(augmentations), tuple(entry["name"] for entry in job["objects"]))
     with locked(out):
         done = {shard.file: shard for shard in _begin(out, job).shards}
         progress(_clouds(done), plan.clouds)

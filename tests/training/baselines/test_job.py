@@ -23,7 +23,7 @@ from training.baselines import job
 from training.baselines.baseline import baseline_inputs
 from training.baselines.job import train_baselines
 from training.baselines.load import load_baselines
-from training.baselines.names import BASELINES, check_baselines
+from training.baselines.names import CLOUD_BASELINES, check_baselines
 from training.cli import app
 from training.evaluation.runs import load_runs
 from training.fitting.folds import fold_of_views
@@ -91,8 +91,8 @@ def test_all_baselines_learn_and_are_calibrated(trained: Path) -> None:
     ]  # fmt: skip
     (run,) = load_runs([trained])
     assert run.predictors == ("tops", "thor", "forest", "pointnet")
-    assert set(run.temperatures) == {"tops", *BASELINES} and run.temperatures["tops"] == 1.5
-    inputs = baseline_inputs(described(5), CONFIG)
+    assert set(run.temperatures) == {"tops", *CLOUD_BASELINES} and run.temperatures["tops"] == 1.5
+    inputs = baseline_inputs(described(5), CONFIG, None)
     for name, model in run.baselines.items():
         probabilities = model.probabilities(inputs)
         np.testing.assert_allclose(probabilities.sum(axis=1), 1, atol=1e-5)
@@ -101,7 +101,7 @@ def test_all_baselines_learn_and_are_calibrated(trained: Path) -> None:
 
 def test_existing_baselines_are_not_trained_again(trained: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = {path: path.read_bytes() for path in (trained / "baselines").iterdir()}
-    monkeypatch.setattr(job, "_FIT", dict.fromkeys(BASELINES, lambda task: pytest.fail("trained again")))
+    monkeypatch.setattr(job, "_FIT", dict.fromkeys(CLOUD_BASELINES, lambda task: pytest.fail("trained again")))
     train_baselines(trained, SOURCE)
     assert before == {path: path.read_bytes() for path in (trained / "baselines").iterdir()}
 
@@ -128,8 +128,8 @@ def test_held_out_set_is_that_of_the_run(tmp_path: Path, monkeypatch: pytest.Mon
 def test_no_held_out_set_gives_no_temperatures(tmp_path: Path) -> None:
     folder = write_run(tmp_path / "run", 1, 0)
     train_baselines(folder, SOURCE, ["forest"])
-    models, temperatures = load_baselines(folder, load_run(folder))
-    assert list(models) == ["forest"] and temperatures == {}
+    loaded = load_baselines(folder, load_run(folder))
+    assert list(loaded.models) == ["forest"] and loaded.temperatures == {}
 
 
 def test_invalid_arguments_are_refused(trained: Path, tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from scipy.ndimage import generic_filter
 
 import thor2_jax as thor2
 from thor2_jax.errors import InputError
-from training.baselines.crops import CROP_SIZE, fill_depth, rgbd_crop, surface_normals
+from training.views.crops import CROP_SIZE, fill_depth, rgbd_crop, surface_normals
 
 CAMERA = thor2.Intrinsics(100.0, 110.0, 31.5, 23.5)
 

@@ -1,0 +1,89 @@
+"""The backbones against outputs of torch and timm for the same random weights (tests/golden/make_networks.py)."""
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+from safetensors.numpy import save_file
+
+from training.baselines.networks.densenet import DENSENET_161, DenseNet
+from training.baselines.networks.rcfusion import GRU
+from training.baselines.networks.resnet import ResNet18
+from training.baselines.networks.vit import VIT_BASE, VIT_DINOV2_SMALL, VIT_TINY, VIT_TINY_4, ViT, ViTConfig
+from training.baselines.networks.weights import load_backbone, resampled_positions, tensor_shapes
+
+GOLDEN = Path(__file__).parents[3] / "golden"
+sys.path.append(str(GOLDEN))
+from network_weights import random_images, random_tensor, random_tensors, sampled  # noqa: E402
+
+OUTPUTS = json.loads((GOLDEN / "networks" / "outputs.json").read_text())["outputs"]
+
+
+def loaded(create: Any, folder: Path) -> Any:
+    """Return a network in evaluation mode with the random weights of its tensors' names, from a file."""
+    model = nnx.eval_shape(create)
+    save_file(random_tensors(tensor_shapes(model)), folder / "weights.safetensors")
+    load_backbone(model, folder / "weights.safetensors")
+    model.eval()
+    return model
+
+
+def assert_golden(name: str, outputs: list[Any]) -> None:
+    expected = np.array(OUTPUTS[name])
+    actual = np.concatenate([sampled(np.asarray(values)) for values in outputs])
+    np.testing.assert_allclose(actual, expected, rtol=2e-3, atol=2e-4 * np.abs(expected).max())
+
+
+def test_resnet_matches_timm(tmp_path: Path) -> None:
+    model = loaded(lambda: ResNet18(rngs=nnx.Rngs(0)), tmp_path)
+    assert_golden("resnet18", nnx.jit(model)(jnp.asarray(random_images("resnet18", 2, 64))))
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "size"),
+    [
+        ("densenet_small", {"growth": 12, "blocks": (2, 4, 4, 2)}, 96),
+        pytest.param("densenet_161", DENSENET_161, 64, marks=pytest.mark.slow),
+    ],
+)
+def test_densenet_matches_timm(tmp_path: Path, name: str, arguments: dict[str, Any], size: int) -> None:
+    model = loaded(lambda: DenseNet(**arguments, rngs=nnx.Rngs(0)), tmp_path)
+    assert_golden(name, [nnx.jit(model)(jnp.asarray(random_images(name, 2, size)))])
+
+
+@pytest.mark.parametrize(
+    ("name", "config", "size"),
+    [
+        ("vit_tiny_4", VIT_TINY_4, 96),
+        pytest.param("vit_tiny", VIT_TINY, 224, marks=pytest.mark.slow),
+        pytest.param("vit_dinov2_small", VIT_DINOV2_SMALL, 224, marks=pytest.mark.slow),
+        pytest.param("vit_base", VIT_BASE, 224, marks=pytest.mark.slow),
+    ],
+)
+def test_vit_matches_timm(tmp_path: Path, name: str, config: ViTConfig, size: int) -> None:
+    model = loaded(lambda: ViT(config, size, rngs=nnx.Rngs(0)), tmp_path)
+    assert_golden(name, [nnx.jit(model)(jnp.asarray(random_images(name, 2, size)))])
+
+
+def test_gru_matches_torch() -> None:
+    model = GRU(10, 7, rngs=nnx.Rngs(0))
+    for layer, kind in ((model.input, "ih"), (model.hidden, "hh")):
+        inputs = 10 if kind == "ih" else 7
+        layer.kernel[...] = jnp.asarray(random_tensor(f"weight_{kind}_l0", (21, inputs)).T)
+        assert layer.bias is not None
+        layer.bias[...] = jnp.asarray(random_tensor(f"bias_{kind}_l0", (21,)))
+    assert_golden("gru", [model(jnp.asarray(random_images("gru", 3, 10)[:, :4, :, 0]))])
+
+
+def test_positions_are_resampled_as_timm_does() -> None:
+    positions = random_tensor("pos_embed", (1, 197, 192))
+    resampled = resampled_positions(positions, (1, 37, 192))
+    assert_golden("positions", [resampled])
+    np.testing.assert_array_equal(resampled[:, 0], positions[:, 0])
+    assert resampled_positions(positions, (1, 37, 384)) is positions
+    assert resampled_positions(positions[:, :190], (1, 37, 192)).shape == (1, 190, 192)

@@ -1,0 +1,260 @@
+"""Image networks and templates: fitting on crops, resuming, pretrained weights, and bad input."""
+
+import dataclasses
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from flax import nnx
+from safetensors.numpy import load_file, save_file
+
+import colornet
+import thor2_jax as thor2
+from thor2_jax.errors import InputError
+from thor2_jax.recognition.classifier import MLP
+from thor2_jax.recognition.run_directory import TrainedRun, load_run, save_run
+from training.baselines import fit_network as module
+from training.baselines.baseline import BaselineInputs
+from training.baselines.files import read_baseline
+from training.baselines.job import train_baselines
+from training.baselines.load import load_baselines
+from training.baselines.names import NETWORKS, crop_size
+from training.baselines.networks.architectures import ARCHITECTURES, Architecture
+from training.baselines.networks.inputs import network_inputs
+from training.baselines.networks.rgbd_vit import RGBDViT
+from training.baselines.networks.vit import VIT_TINY
+from training.baselines.networks.weights import tensor_shapes
+from training.baselines.pretrained import pretrained_files
+from training.baselines.templates import BACKBONES, Templates, create_backbone
+from training.fitting.options import FitOptions
+from training.train_job import TrainJob, run_train_job
+from training.views.memory_views import MemoryViews
+from training.views.view_crops import ViewCrops
+
+CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=1, image_size=8)
+NAMES = ("red", "blue")
+OPTIONS = FitOptions(epochs=3, batch_size=8)
+N_VIEWS = 20
+SMALL = "rgbd-vit-small"
+
+
+def crops_of(label: int, count: int, size: int, seed: int = 0) -> ViewCrops:
+    """Return crops of a red or a blue disc that looks at the camera."""
+    rng = np.random.default_rng((seed, label))
+    rows, columns = np.indices((size, size)) - size / 2
+    disc = np.hypot(rows, columns)[None] < rng.uniform(0.3, 0.5, (count, 1, 1)) * size
+    color = np.where(disc[..., None], np.array([[200, 30, 30], [30, 30, 200]][label]), 0).astype(np.uint8)
+    return ViewCrops(color, np.where(disc[..., None], np.array([0, 0, -127]), 0).astype(np.int8))
+
+
+class Views(MemoryViews):
+    """Views in memory with crops."""
+
+    def read_crops(self, index: int, size: int) -> ViewCrops:
+        return crops_of(index, self.shards[index].views, size)
+
+
+def cloud(seed: int) -> Any:
+    points = np.random.default_rng(seed).random((40, 3)) * 0.1 + [0, 0, 0.5]
+    return points.astype(np.float32), np.full((40, 3), 99, np.uint8)
+
+
+SOURCE = Views({name: [cloud(number) for number in range(N_VIEWS)] for name in NAMES}, CONFIG)
+
+
+def write_run(folder: Path, folds: int = 4) -> Path:
+    record = {
+        "dataset": dict(SOURCE.record), "epochs": 3, "learning_rates": [1e-2, 1e-3], "batch_size": 8, "seed": 0,
+        "folds": folds, "fold": 0, "temperatures": {},
+    }  # fmt: skip
+    network = colornet.load_default()
+    save_run(TrainedRun(CONFIG, network, NAMES, {"tops": MLP(64, 2, rngs=nnx.Rngs(0))}, record), folder)
+    return folder
+
+
+def frame_inputs(seed: int, rows: int = 4) -> BaselineInputs:
+    """Return the inputs of a red and a blue instance, and padding."""
+    packed = thor2.PointClouds.pack([cloud(0)] * rows)
+
+    def crops(size: int) -> ViewCrops:
+        both = [crops_of(label, 1, size, seed) for label in (0, 1)]
+        return ViewCrops(np.concatenate([c.color for c in both]), np.concatenate([c.normals for c in both]))
+
+    return BaselineInputs(packed, np.zeros((rows, 1), np.float32), crops)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick_network() -> Iterator[None]:
+    """Give the small RGB-D ViT one block and images of 32 pixels, to compile and train in seconds."""
+    vit = dataclasses.replace(VIT_TINY, depth=1)
+    architecture = Architecture(partial(RGBDViT, vit=vit, size=32), 32, ARCHITECTURES[SMALL].weights)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(ARCHITECTURES, SMALL, architecture)
+        yield
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = write_run(tmp_path_factory.mktemp("networks") / "run")
+    train_baselines(folder, SOURCE, [SMALL, "templates"], options=OPTIONS)
+    return folder
+
+
+def check_baseline(folder: Path, name: str) -> None:
+    loaded = load_baselines(folder, load_run(folder))
+    probabilities = loaded.models[name].probabilities(frame_inputs(5))
+    np.testing.assert_allclose(probabilities.sum(axis=1), 1, atol=1e-5)
+    assert probabilities[:2].argmax(axis=1).tolist() == [0, 1] and (probabilities[2:] == 0.5).all()
+    assert loaded.weights[name] == [] and loaded.temperatures[name] > 0
+
+
+@pytest.mark.parametrize("name", [SMALL, "templates"])
+def test_network_and_templates_learn(trained: Path, name: str) -> None:
+    check_baseline(trained, name)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["rcfusion-small", "vit-cnn-small"])
+def test_other_networks_learn(tmp_path: Path, name: str) -> None:
+    train_baselines(write_run(tmp_path / "run"), SOURCE, [name], options=dataclasses.replace(OPTIONS, epochs=12))
+    check_baseline(tmp_path / "run", name)
+
+
+def test_interrupted_fit_resumes_to_the_same_weights(
+    trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, steps = write_run(tmp_path / "run"), []
+    step = module._step
+
+    def interrupted(*arguments: Any) -> Any:
+        steps.append(1)
+        if len(steps) == 2:
+            raise KeyboardInterrupt
+        return step(*arguments)
+
+    monkeypatch.setattr(module, "_step", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        train_baselines(folder, SOURCE, [SMALL], options=OPTIONS)
+    assert not list((folder / "baselines").glob("*.safetensors"))
+    train_baselines(folder, SOURCE, [SMALL], options=OPTIONS)
+    assert len(steps) == 4  # one step in each of three epochs, one of them interrupted
+    resumed, expected = (load_file(run / "baselines" / f"{SMALL}.safetensors") for run in (folder, trained))
+    for path in expected:
+        np.testing.assert_allclose(resumed[path], expected[path], rtol=1e-5, atol=1e-6)
+
+
+def write_weights(folder: Path, name: str = SMALL, seed: int = 0) -> Path:
+    """Write the files of weights that a network reads, with random values."""
+    folder.mkdir(exist_ok=True)
+    rng = np.random.default_rng(seed)
+    model: Any = nnx.eval_shape(lambda: ARCHITECTURES[name].build(2, 0))
+    for backbone, file in ARCHITECTURES[name].weights.items():
+        shapes = tensor_shapes(getattr(model, backbone))
+        tensors = {k: (0.05 * rng.standard_normal(s)).astype(np.float32) for k, s in shapes.items()}
+        save_file(tensors, folder / f"{file}.safetensors")
+    return folder
+
+
+def test_pretrained_weights_are_used_and_recorded(tmp_path: Path) -> None:
+    weights = write_weights(tmp_path / "weights")
+    (file,) = pretrained_files(SMALL)
+    folder = write_run(tmp_path / "run", folds=1)
+    options = dataclasses.replace(OPTIONS, epochs=1)
+    train_baselines(folder, SOURCE, [SMALL], options=options, weights=weights)
+    stored = read_baseline(folder / "baselines" / f"{SMALL}.safetensors", NAMES)
+    assert list(stored.weights) == [f"{file}.safetensors"] and stored.temperature is None
+    given = load_file(weights / f"{file}.safetensors")["blocks.0.mlp.fc1.weight"].T
+    moved = stored.arrays["color/blocks/0/mlp/fc1/kernel"] - given
+    assert 0 < np.abs(moved).max() < 1e-3  # a step of the small learning rate away
+    train_baselines(folder, SOURCE, [SMALL], options=options, weights=weights)
+    write_weights(weights, seed=1)
+    with pytest.raises(InputError, match="^weights is .*was trained without these files"):
+        train_baselines(folder, SOURCE, [SMALL], options=options, weights=weights)
+
+
+def test_weights_of_another_architecture_are_refused(tmp_path: Path) -> None:
+    """By the name and the shape of the tensor, in one line, and nothing is left."""
+    weights, folder = write_weights(tmp_path / "weights"), write_run(tmp_path / "run")
+    path = weights / f"{pretrained_files(SMALL)[0]}.safetensors"
+    tensors = load_file(path)
+    cases = [
+        ({**tensors, "norm.weight": np.zeros(384, np.float32)}, r"norm\.weight in .* has the shape \(384,\).*\(192,\)"),
+        (
+            {k: a for k, a in tensors.items() if k != "blocks.0.attn.qkv.weight"},
+            r"no tensor blocks\.0\.attn\.qkv\.weight",
+        ),
+        ({**tensors, "pos_embed": np.zeros((1, 38, 192), np.float32)}, r"pos_embed .* \(1, 38, 192\)"),
+    ]
+    for changed, message in cases:
+        save_file(changed, path)
+        with pytest.raises(InputError, match=f"^weights: .*{message}") as caught:
+            train_baselines(folder, SOURCE, [SMALL], options=OPTIONS, weights=weights)
+        assert "\n" not in str(caught.value)
+    path.write_bytes(b"no tensors")
+    with pytest.raises(InputError, match="^weights: .* cannot be read"):
+        train_baselines(folder, SOURCE, [SMALL], options=OPTIONS, weights=weights)
+    path.unlink()
+    with pytest.raises(InputError, match="^weights: .* does not exist"):
+        train_baselines(folder, SOURCE, [SMALL], options=OPTIONS, weights=weights)
+    assert not list((folder / "baselines").glob("*.safetensors"))
+
+
+def test_command_checks_weights_before_any_work(tmp_path: Path) -> None:
+    def job(**options: Any) -> Any:
+        from training.fitting.protocol import DEFAULT
+
+        return TrainJob(tmp_path / "run", DEFAULT, dataset=tmp_path, weights=tmp_path, **options)
+
+    for names, message in (
+        (["forest"], "none of the baselines"),
+        (["rcfusion"], "resnet18.safetensors does not exist"),
+    ):
+        with pytest.raises(InputError, match=f"^weights.*{message}"):
+            run_train_job(job(baselines=names), lambda: pytest.fail("work began"))
+    assert not (tmp_path / "run").exists()
+
+
+def test_templates_need_a_backbone(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="^baselines: templates needs a backbone"):
+        train_baselines(write_run(tmp_path / "run"), SOURCE, ["templates"])
+
+
+def test_clouds_without_images_are_refused(tmp_path: Path) -> None:
+    source = MemoryViews({name: [cloud(number) for number in range(N_VIEWS)] for name in NAMES}, CONFIG)
+    assert source.digest == SOURCE.digest
+    with pytest.raises(InputError, match="no crops"):
+        train_baselines(write_run(tmp_path / "run"), source, [SMALL], options=OPTIONS)
+    inputs = BaselineInputs(thor2.PointClouds.pack([cloud(0)]), np.zeros((1, 1), np.float32))
+    with pytest.raises(InputError, match="^frame is missing"):
+        inputs.crops(96)
+
+
+def test_nearest_template_has_the_largest_cosine() -> None:
+    """Against the formula, with two classes and features by hand."""
+    features = np.array([[1, 0], [0, 1], [0.6, 0.8]], np.float16)
+    templates = Templates(2, create_backbone(BACKBONES[2]), features, np.array([0, 1, 1], np.int16), 2)
+    similarity = np.array([[0.8, 0.96], [-1.0, -0.6]])
+    expected = np.exp(20 * similarity) / np.exp(20 * similarity).sum(axis=1, keepdims=True)
+    np.testing.assert_allclose(templates.compare(np.array([[0.8, 0.6], [-1, 0]], np.float32)), expected, atol=1e-3)
+
+
+def test_inputs_are_scaled_and_the_background_is_zero() -> None:
+    crops = crops_of(0, 2, 12)
+    color, normals = (np.asarray(values) for values in network_inputs(crops.color, crops.normals))
+    mask = crops.normals.any(axis=-1)
+    assert not color[~mask].any() and not normals[~mask].any()
+    expected = (np.array([200, 30, 30]) / 255 - [0.485, 0.456, 0.406]) / [0.229, 0.224, 0.225]
+    np.testing.assert_allclose(color[mask], np.tile(expected, (mask.sum(), 1)), atol=1e-5)
+    expected = (np.array([0.5, 0.5, 0]) - [0.485, 0.456, 0.406]) / [0.229, 0.224, 0.225]
+    np.testing.assert_allclose(normals[mask], np.tile(expected, (mask.sum(), 1)), atol=1e-5)
+
+
+def test_crop_size_is_that_of_the_largest_reader() -> None:
+    assert crop_size(["forest", "thor"], True) is None
+    assert crop_size([SMALL, "templates"], False) == 96 and crop_size([SMALL, "templates"], True) == 224
+    assert crop_size([SMALL, "rcfusion"], False) == 224
+    others = set(NETWORKS) - {SMALL}
+    assert all(crop_size([name], False) == ARCHITECTURES[name].size for name in others)

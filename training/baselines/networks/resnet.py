@@ -1,0 +1,82 @@
+"""ResNet-18 (He et al., CVPR 2016), with the module names of torchvision and timm."""
+
+import jax
+from flax import nnx
+
+__all__ = ["ResNet18"]
+
+MOMENTUM = 0.9
+"""Of the running statistics of all batch normalizations."""
+
+STAGES = (1, 2, 4, 8)
+"""Channels of the stages, relative to the first one."""
+
+
+def batch_norm(channels: int, rngs: nnx.Rngs) -> nnx.BatchNorm:
+    """Return a batch normalization that trains or evaluates as its model does."""
+    return nnx.BatchNorm(channels, momentum=MOMENTUM, epsilon=1e-5, use_running_average=None, rngs=rngs)
+
+
+def convolution(inputs: int, outputs: int, size: int, stride: int, rngs: nnx.Rngs) -> nnx.Conv:
+    """Return a convolution without bias whose output has 1/stride of the input's height and width, as in PyTorch."""
+    padding = ((size - 1) // 2, (size - 1) // 2)
+    return nnx.Conv(
+        inputs, outputs, (size, size), (stride, stride), padding=(padding, padding), use_bias=False, rngs=rngs
+    )
+
+
+def stem_pool(x: jax.Array) -> jax.Array:
+    """Return the maxima of windows of 3 x 3 pixels at every second pixel."""
+    return nnx.max_pool(x, (3, 3), (2, 2), padding=((1, 1), (1, 1)))
+
+
+class BasicBlock(nnx.Module):
+    """Two convolutions of 3 x 3 pixels and a shortcut."""
+
+    def __init__(self, inputs: int, outputs: int, stride: int, *, rngs: nnx.Rngs) -> None:
+        """Initialize the weights; with another shape of the output, the shortcut is a convolution."""
+        self.conv1 = convolution(inputs, outputs, 3, stride, rngs)
+        self.bn1 = batch_norm(outputs, rngs)
+        self.conv2 = convolution(outputs, outputs, 3, 1, rngs)
+        self.bn2 = batch_norm(outputs, rngs)
+        shortcut = stride != 1 or inputs != outputs
+        self.downsample = nnx.List(
+            [convolution(inputs, outputs, 1, stride, rngs), batch_norm(outputs, rngs)] if shortcut else []
+        )
+
+    def __call__(self, x: jax.Array) -> jax.Array:
+        """Return [B, H/stride, W/stride, outputs] features for [B, H, W, inputs]."""
+        y = self.bn2(self.conv2(nnx.relu(self.bn1(self.conv1(x)))))
+        for layer in self.downsample:
+            x = layer(x)
+        return nnx.relu(x + y)
+
+
+class ResNet18(nnx.Module):
+    """A ResNet-18 without its classifier.
+
+    Attributes:
+        channels: channels of the four stages' features.
+    """
+
+    def __init__(self, width: int = 64, *, rngs: nnx.Rngs) -> None:
+        """Initialize the weights; `width` is the number of channels of the first stage."""
+        self.channels = tuple(width * factor for factor in STAGES)
+        self.conv1 = convolution(3, width, 7, 2, rngs)
+        self.bn1 = batch_norm(width, rngs)
+        inputs = width
+        for number, outputs in enumerate(self.channels, 1):
+            stride = 1 if number == 1 else 2
+            blocks = [BasicBlock(inputs, outputs, stride, rngs=rngs), BasicBlock(outputs, outputs, 1, rngs=rngs)]
+            setattr(self, f"layer{number}", nnx.List(blocks))
+            inputs = outputs
+
+    def __call__(self, x: jax.Array) -> list[jax.Array]:
+        """Return the features of the four stages for images [B, S, S, 3]: S/4 to S/32 pixels."""
+        x = stem_pool(nnx.relu(self.bn1(self.conv1(x))))
+        features = []
+        for number in range(1, len(STAGES) + 1):
+            for block in getattr(self, f"layer{number}"):
+                x = block(x)
+            features.append(x)
+        return features

@@ -1,0 +1,143 @@
+"""Vision transformers (Dosovitskiy et al., ICLR 2021), with the module names of timm; DINOv2's have layer scales."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from flax import nnx
+
+__all__ = ["VIT_BASE", "VIT_DINOV2_SMALL", "VIT_TINY", "VIT_TINY_4", "ViT", "ViTConfig"]
+
+MLP_RATIO = 4
+EPSILON = 1e-6
+TOKEN_DEVIATION = 0.02
+
+
+@dataclasses.dataclass(frozen=True)
+class ViTConfig:
+    """The architecture of a vision transformer.
+
+    Attributes:
+        width: length of a token.
+        depth: number of blocks.
+        heads: attention heads of a block.
+        patch: side of a patch, pixels.
+        layer_scale: whether the blocks scale what they add to the tokens.
+    """
+
+    width: int
+    depth: int
+    heads: int
+    patch: int = 16
+    layer_scale: bool = False
+
+
+VIT_BASE = ViTConfig(768, 12, 12)
+VIT_TINY = ViTConfig(192, 12, 3)
+VIT_TINY_4 = dataclasses.replace(VIT_TINY, depth=4)
+"""The first four blocks of ViT-Ti: a third of the time, with the weights of the public file."""
+VIT_DINOV2_SMALL = ViTConfig(384, 12, 6, patch=14, layer_scale=True)
+
+
+class PatchEmbed(nnx.Module):
+    """Linear embedding of the patches of an image."""
+
+    def __init__(self, config: ViTConfig, *, rngs: nnx.Rngs) -> None:
+        """Initialize the weights."""
+        size = (config.patch, config.patch)
+        self.proj = nnx.Conv(3, config.width, size, size, padding="VALID", rngs=rngs)
+
+    def __call__(self, x: jax.Array) -> jax.Array:
+        """Return tokens [B, (S/patch)^2, width] for images [B, S, S, 3]."""
+        y = self.proj(x)
+        return y.reshape(len(y), -1, y.shape[-1])
+
+
+class Attention(nnx.Module):
+    """Multi-head self-attention."""
+
+    def __init__(self, config: ViTConfig, *, rngs: nnx.Rngs) -> None:
+        """Initialize the weights."""
+        self.heads = config.heads
+        self.qkv = nnx.Linear(config.width, 3 * config.width, rngs=rngs)
+        self.proj = nnx.Linear(config.width, config.width, rngs=rngs)
+
+    def __call__(self, x: jax.Array) -> jax.Array:
+        """Return tokens [B, T, width] for tokens [B, T, width]."""
+        batch, tokens, width = x.shape
+        query, key, value = jnp.moveaxis(self.qkv(x).reshape(batch, tokens, 3, self.heads, width // self.heads), 2, 0)
+        return self.proj(jax.nn.dot_product_attention(query, key, value).reshape(batch, tokens, width))
+
+
+class MLP(nnx.Module):
+    """A hidden layer with GELU."""
+
+    def __init__(self, width: int, *, rngs: nnx.Rngs) -> None:
+        """Initialize the weights."""
+        self.fc1 = nnx.Linear(width, MLP_RATIO * width, rngs=rngs)
+        self.fc2 = nnx.Linear(MLP_RATIO * width, width, rngs=rngs)
+
+    def __call__(self, x: jax.Array) -> jax.Array:
+        """Return [..., width] for [..., width]."""
+        return self.fc2(nnx.gelu(self.fc1(x), approximate=False))
+
+
+class LayerScale(nnx.Module):
+    """A factor for each channel."""
+
+    def __init__(self, width: int) -> None:
+        """Initialize all factors by 1."""
+        self.gamma = nnx.Param(jnp.ones(width))
+
+    def __call__(self, x: jax.Array) -> jax.Array:
+        """Return the scaled [..., width]."""
+        return x * self.gamma[...]
+
+
+class Block(nnx.Module):
+    """Attention and MLP, each after a normalization and added to its input."""
+
+    def __init__(self, config: ViTConfig, *, rngs: nnx.Rngs) -> None:
+        """Initialize the weights."""
+        self.norm1 = nnx.LayerNorm(config.width, epsilon=EPSILON, rngs=rngs)
+        self.attn = Attention(config, rngs=rngs)
+        self.norm2 = nnx.LayerNorm(config.width, epsilon=EPSILON, rngs=rngs)
+        self.mlp = MLP(config.width, rngs=rngs)
+        self.layer_scale = config.layer_scale
+        if config.layer_scale:
+            self.ls1, self.ls2 = LayerScale(config.width), LayerScale(config.width)
+
+    def __call__(self, x: jax.Array) -> jax.Array:
+        """Return tokens [B, T, width] for tokens [B, T, width]."""
+        y = self.attn(self.norm1(x))
+        x = x + (self.ls1(y) if self.layer_scale else y)
+        y = self.mlp(self.norm2(x))
+        return x + (self.ls2(y) if self.layer_scale else y)
+
+
+class ViT(nnx.Module):
+    """A vision transformer without its classifier.
+
+    Attributes:
+        channels: length of the features.
+    """
+
+    def __init__(self, config: ViTConfig, size: int, *, rngs: nnx.Rngs) -> None:
+        """Initialize the weights; `size` is the side of the images in pixels, a multiple of the patch's."""
+        self.channels = config.width
+        tokens = 1 + (size // config.patch) ** 2
+        self.patch_embed = PatchEmbed(config, rngs=rngs)
+        normal = nnx.initializers.normal(TOKEN_DEVIATION)
+        self.cls_token = nnx.Param(normal(rngs.params(), (1, 1, config.width)))
+        self.pos_embed = nnx.Param(normal(rngs.params(), (1, tokens, config.width)))
+        self.blocks = nnx.List([Block(config, rngs=rngs) for _ in range(config.depth)])
+        self.norm = nnx.LayerNorm(config.width, epsilon=EPSILON, rngs=rngs)
+
+    def __call__(self, x: jax.Array) -> jax.Array:
+        """Return [B, channels] features for images [B, S, S, 3]: the normalized class token."""
+        patches = self.patch_embed(x)
+        token = jnp.broadcast_to(self.cls_token[...], (len(x), 1, self.channels))
+        tokens = jnp.concatenate([token, patches], axis=1) + self.pos_embed[...]
+        for block in self.blocks:
+            tokens = block(tokens)
+        return self.norm(tokens[:, 0])
