@@ -1,26 +1,29 @@
 """Recognition of the frames of a recording, one after the other."""
 
-import functools
 import itertools
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator, Sequence
 
+from thor2_jax.errors import InputError
+from thor2_jax.recognition.answers import Recognition
 from thor2_jax.recognition.frames import RGBDFrame
-from thor2_jax.recognizer import Recognizer
 from thor2_jax.recordings.recorded_frames import RecordedFrame
 from thor2_jax.segmentation.segmenters import Segmenter, segmented
-from training.frame_recognition import FrameAnswer, recognize_frames
-from training.readers.frame_files import FrameSource
+from training.frame_recognition import FrameAnswer
 
 __all__ = ["recognize_recorded"]
 
 
 def recognize_recorded(
-    recognizer: Recognizer, frames: Iterator[RecordedFrame], segmenter: Segmenter, every: int = 1
+    recognize: Callable[[RGBDFrame], Sequence[Recognition]],
+    frames: Iterator[RecordedFrame],
+    segmenter: Segmenter,
+    every: int = 1,
 ) -> Iterator[tuple[RecordedFrame, FrameAnswer]]:
     """Segment and recognize recorded frames; one that fails has an `error` and does not stop the others.
 
     Args:
-        recognizer: the recognizer.
+        recognize: `Recognizer.recognize`, or `Tracker.update`.
         frames: the frames, without labels.
         segmenter: gives them labels.
         every: recognize the first of so many frames.
@@ -29,9 +32,11 @@ def recognize_recorded(
         InputError: as `frames`.
     """
     for recorded in itertools.islice(frames, 0, None, every):
-        read = functools.partial(_read_segmented, recorded, segmenter)
-        yield from ((recorded, answer) for answer in recognize_frames(recognizer, [FrameSource(recorded.name, read)]))
-
-
-def _read_segmented(recorded: RecordedFrame, segmenter: Segmenter) -> RGBDFrame:
-    return segmented(recorded.read(), segmenter)
+        try:
+            frame = segmented(recorded.read(), segmenter)
+            start = time.perf_counter()
+            recognitions = recognize(frame)
+        except InputError as error:
+            yield recorded, FrameAnswer(recorded.name, error=str(error))
+        else:
+            yield recorded, FrameAnswer(recorded.name, frame, recognitions, time.perf_counter() - start)

@@ -23,7 +23,16 @@ from thor2_jax.printable import escape_characters
 if TYPE_CHECKING:
     from thor2_jax.recognition.answers import Recognition
 
-__all__ = ["COLORS", "UNRECOGNIZED", "Annotation", "Paint", "annotate", "draw_instances", "draw_overlay"]
+__all__ = [
+    "COLORS",
+    "UNRECOGNIZED",
+    "Annotation",
+    "Paint",
+    "annotate",
+    "answer_paints",
+    "draw_instances",
+    "draw_overlay",
+]
 
 Paint = tuple[int, int, int]
 """An sRGB colour, 0 to 255."""
@@ -118,7 +127,8 @@ def draw_overlay(
 def annotate(color: NDArray[np.uint8], labels: NDArray[Any], answers: Sequence[Recognition]) -> Image.Image:
     """Return the picture that `draw_overlay` writes, of valid arguments."""
     annotations = [
-        Annotation(answer.label, paint, _text(answer)) for answer, paint in zip(answers, _paints(answers), strict=True)
+        Annotation(answer.label, paint, _text(answer))
+        for answer, paint in zip(answers, answer_paints(answers), strict=True)
     ]
     return draw_instances(color, labels, annotations)
 
@@ -148,7 +158,8 @@ def draw_instances(color: NDArray[np.uint8], labels: NDArray[Any], annotations: 
     return picture
 
 
-def _paints(answers: Sequence[Recognition]) -> list[Paint]:
+def answer_paints(answers: Sequence[Recognition]) -> list[Paint]:
+    """Return the colour of each answer: `COLORS` in turn, or `UNRECOGNIZED`."""
     recognized = np.cumsum([answer.name is not None for answer in answers])
     return [
         UNRECOGNIZED if answer.name is None else COLORS[(int(count) - 1) % len(COLORS)]

@@ -71,29 +71,33 @@ def ros_time(stamp: int) -> dict[str, int]:
     return {"sec": stamp // 10**9, "nanosec": stamp % 10**9}
 
 
-def detection_array(
-    detections: Sequence[Detection], *, stamp: int, frame_id: str, ids: Sequence[str] | None = None
-) -> dict[str, Any]:
+def detection_array(detections: Sequence[Detection], *, stamp: int, frame_id: str) -> dict[str, Any]:
     """Return the fields of a vision_msgs/Detection2DArray (version 4, ROS 2), as nested mappings and lists.
 
     The name is `class_id`, empty for an unknown object, and the confidence is `score`. The position is that of the
-    visible points. THOR2 estimates no rotation: that of the pose is the identity.
+    visible points. THOR2 estimates no rotation: that of the pose is the identity. `id` is the number of the track, the
+    same in all frames, or of the label in answers without tracks.
 
     Args:
         detections: of one frame.
         stamp: time of the colour image, nanoseconds.
         frame_id: coordinate frame of the colour camera.
-        ids: `id` of each detection, the same in all frames; by default the label numbers.
     """
     header = {"stamp": ros_time(stamp), "frame_id": frame_id}
-    names = ids if ids is not None else [str(one.recognition.label) for one in detections]
     return {
         "header": header,
         "detections": [
-            {"header": header, "results": [_hypothesis(one)], "bbox": _bounding_box(one.box), "id": name}
-            for one, name in zip(detections, names, strict=True)
+            {"header": header, "results": [_hypothesis(one)], "bbox": _bounding_box(one.box), "id": _identifier(one)}
+            for one in detections
         ],
     }
+
+
+def _identifier(detection: Detection) -> str:
+    if not hasattr(detection.recognition, "track"):
+        return str(detection.recognition.label)
+    track = detection.recognition.track
+    return "" if track is None else str(track)
 
 
 def _hypothesis(detection: Detection) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -17,6 +17,8 @@ from training.cli.recognize_bag import BagOptions, recognize_bag
 
 if TYPE_CHECKING:
     from thor2_jax.recognition.answers import Recognition
+    from thor2_jax.recordings.rerun_file import RerunFile
+    from training.frame_recognition import FrameAnswer
     from training.readers.frame_files import FrameSource
 
 RECORDINGS = "Recordings"
@@ -64,6 +66,9 @@ def recognize(
     names: Annotated[
         Path | None, typer.Option(help="YAML or JSON table for --coco and --bop: number -> name of the object.")
     ] = None,
+    rerun: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write an .rrd file for the Rerun viewer (extra rerun).")
+    ] = None,
     bag: Annotated[
         Path | None,
         typer.Option(rich_help_panel=RECORDINGS, help="ROS 1 bag, ROS 2 bag or MCAP, in place of FRAME (extra bags)."),
@@ -98,18 +103,19 @@ def recognize(
     from thor2_jax.files import check_output_directory, remove_leftovers
     from thor2_jax.recognition.result_files import RESULT_FILES, write_recognitions
     from thor2_jax.recognizer import Recognizer
+    from thor2_jax.recordings.rerun_file import RerunFile
     from training.frame_recognition import ResultTables, recognize_frames, track_frames
     from training.readers.bop import read_object_names
     from training.readers.poses import read_poses
 
     if bag is not None:
         refused: dict[str, object] = {"FRAME": frames, "color": color, "depth": depth, "labels": labels, "names": names}
-        refused |= {"coco": coco, "bop": bop, "poses": poses, "track": track}
+        refused |= {"coco": coco, "bop": bop, "poses": poses}
         given = [name for name, value in refused.items() if value]
         if given:
             raise InputError(f"{given[0]} is {refused[given[0]]} and bag is {bag}; give one of them")
         topics = Topics(color_topic, depth_topic, camera_topic)
-        options = BagOptions(bag, topics, intrinsics, depth_scale, max_gap, every, segment, out, out_bag)
+        options = BagOptions(bag, topics, intrinsics, depth_scale, max_gap, every, segment, track, out, out_bag, rerun)
         recognize_bag(options, model, unknown_below, answer_by)
         return
     of_bags = {"color_topic": color_topic, "depth_topic": depth_topic, "camera_topic": camera_topic, "out_bag": out_bag}
@@ -128,13 +134,14 @@ def recognize(
     if out is not None:
         check_output_directory(out, resumable={s.name.split("/")[0] for s in sources} if frames else RESULT_FILES)
         remove_leftovers(out)
+    rerun_file = None if rerun is None else RerunFile(rerun)
     numbers = None if names is None else read_object_names(names)
     recognizer = Recognizer.load(model, unknown_below, answer_by=answer_by)
     recognizer.chunk = BATCH_BUCKETS[-1]
     tables = ResultTables([source.name for source in sources], recognizer.classes, numbers)
     failed = []
     answers = track_frames(recognizer, sources, of_frames) if track else recognize_frames(recognizer, sources)
-    for answer in answers:
+    for answer in answers if rerun_file is None else _written(answers, rerun_file):
         if answer.error is not None or answer.frame is None:
             failed.append(answer.name)
             if not frames:
@@ -151,7 +158,7 @@ def recognize(
             write_recognitions(out / answer.name if frames else out, answer.frame, answer.recognitions)
     tables.write(coco, bop)
     if not as_json:
-        for written in filter(None, (out, coco, bop)):
+        for written in filter(None, (out, coco, bop, rerun)):
             console.print(f"written to {written}")
     if tables.n_without_number and (coco or bop):
         print(f"{tables.n_without_number} instances have a name that {names} does not number", file=sys.stderr)
@@ -189,6 +196,17 @@ def _sources(
         return sources
     segmenter = load_segmenter(segment)
     return [segmented_source(source, segmenter) for source in sources]
+
+
+def _written(answers: Iterator["FrameAnswer"], file: "RerunFile") -> Iterator["FrameAnswer"]:
+    """Pass answers on, and write each to a file for the Rerun viewer."""
+    from thor2_jax.recordings.detections import detections_of
+
+    with file:
+        for answer in answers:
+            if answer.frame is not None:
+                file.write(answer.frame, detections_of(answer.frame, answer.recognitions), name=answer.name)
+            yield answer
 
 
 def _print_table(frame: str | None, recognitions: Sequence["Recognition"]) -> None:

@@ -13,6 +13,7 @@ from thor2_jax.recordings.topics import Topics
 if TYPE_CHECKING:
     from thor2_jax.recordings.bag_writer import DetectionBag
     from thor2_jax.recordings.recorded_frames import RecordedFrame
+    from thor2_jax.recordings.rerun_file import RerunFile
     from training.frame_recognition import FrameAnswer
 
 __all__ = ["BagOptions", "recognize_bag"]
@@ -29,8 +30,10 @@ class BagOptions:
     max_gap: float
     every: int
     segment: str | None
+    track: bool
     out: Path | None
     out_bag: Path | None
+    rerun: Path | None
 
 
 def recognize_bag(options: BagOptions, model: Path, unknown_below: float | None, answer_by: str | None) -> None:
@@ -45,6 +48,7 @@ def recognize_bag(options: BagOptions, model: Path, unknown_below: float | None,
     from thor2_jax.recognizer import Recognizer
     from thor2_jax.recordings.bag_writer import DetectionBag
     from thor2_jax.recordings.bags import Bag
+    from thor2_jax.recordings.rerun_file import RerunFile
     from thor2_jax.segmentation.segmenters import TABLE, load_segmenter
     from training.bag_recognition import recognize_recorded
 
@@ -58,6 +62,7 @@ def recognize_bag(options: BagOptions, model: Path, unknown_below: float | None,
         max_gap=options.max_gap,
     )
     out_bag = None if options.out_bag is None else DetectionBag(options.out_bag)
+    rerun = None if options.rerun is None else RerunFile(options.rerun)
     if options.out is not None:
         check_output_directory(options.out)
     n_answers, failed, damage = 0, [], None
@@ -66,17 +71,18 @@ def recognize_bag(options: BagOptions, model: Path, unknown_below: float | None,
             print(f"note: {note}", file=sys.stderr)
         recognizer = Recognizer.load(model, unknown_below, answer_by=answer_by)
         recognizer.chunk = BATCH_BUCKETS[-1]
-        with out_bag or contextlib.nullcontext():
+        recognize = recognizer.track().update if options.track else recognizer.recognize
+        with out_bag or contextlib.nullcontext(), rerun or contextlib.nullcontext():
             try:
-                for recorded, answer in recognize_recorded(recognizer, bag.frames(), segmenter, options.every):
+                for recorded, answer in recognize_recorded(recognize, bag.frames(), segmenter, options.every):
                     n_answers += answer.error is None
                     if answer.error is not None:
                         failed.append(recorded.name)
                         print(f"failed: {answer.name}: {answer.error}", file=sys.stderr)
-                    _write(recorded, answer, options.out, out_bag)
+                    _write(recorded, answer, options.out, out_bag, rerun)
             except InputError as error:
                 damage = str(error)
-    written = [str(path) for path in (options.out, options.out_bag) if path is not None and n_answers]
+    written = [str(path) for path in (options.out, options.out_bag, options.rerun) if path is not None and n_answers]
     if damage is not None:
         kept = f"; {n_answers} frames were recognized before" + (f" and are in {', '.join(written)}" if written else "")
         raise InputError(damage + (kept if n_answers else ""))
@@ -92,7 +98,13 @@ def recognize_bag(options: BagOptions, model: Path, unknown_below: float | None,
         raise InputError(f"{len(failed)} of {n_answers + len(failed)} frames could not be recognized; see above")
 
 
-def _write(recorded: "RecordedFrame", answer: "FrameAnswer", out: Path | None, out_bag: "DetectionBag | None") -> None:
+def _write(
+    recorded: "RecordedFrame",
+    answer: "FrameAnswer",
+    out: Path | None,
+    out_bag: "DetectionBag | None",
+    rerun: "RerunFile | None",
+) -> None:
     from thor2_jax.recognition.result_files import write_recognitions
     from thor2_jax.recordings.detections import detections_as_json, detections_of
 
@@ -106,3 +118,5 @@ def _write(recorded: "RecordedFrame", answer: "FrameAnswer", out: Path | None, o
         write_recognitions(out / recorded.name, answer.frame, answer.recognitions)
     if out_bag is not None:
         out_bag.write(answer.frame, detections, stamp=recorded.stamp, frame_id=recorded.frame_id)
+    if rerun is not None:
+        rerun.write(answer.frame, detections, name=recorded.name, stamp=recorded.stamp)

@@ -30,6 +30,9 @@ def watch(
     segment: Annotated[
         str | None, typer.Option(help="Segmenter. Default: table; in folders, for frames without labels.")
     ] = None,
+    track: Annotated[
+        bool, typer.Option("--track/--no-track", help="Follow the objects, and fuse the answers of their frames.")
+    ] = True,
     color_topic: Annotated[str | None, typer.Option(help="Colour images of the bag.")] = None,
     depth_topic: Annotated[str | None, typer.Option(help="Aligned depth images of the bag.")] = None,
     camera_topic: Annotated[str | None, typer.Option(help="camera_info of the bag.")] = None,
@@ -64,7 +67,7 @@ def watch(
         recognizer.chunk = BATCH_BUCKETS[-1]
         broadcast = Broadcast()
         print(f"watch at {stack.enter_context(serve_live(broadcast, host, port))}", file=sys.stderr, flush=True)
-        view = LiveView(recognizer.recognize, segmenter, broadcast)
+        view = LiveView(recognizer.track().update if track else recognizer.recognize, segmenter, broadcast)
         with contextlib.suppress(KeyboardInterrupt):
             try:
                 for recorded in frames:

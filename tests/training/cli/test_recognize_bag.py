@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import run_thor2, untrained_run
+from helpers import encode_image, run_thor2, untrained_run
 from PIL import Image
 from recording_files import COLOR, PERIOD, START, bag_writer, image, table_frame, write_recording
 from rosbags.highlevel import AnyReader
@@ -85,6 +85,33 @@ def test_every_second_frame_and_pictures(model: Path, tmp_path: Path, capfd: pyt
     assert sorted(one.name for one in (tmp_path / "out").iterdir()) == [line["frame"] for line in lines]
 
 
+def test_tracks_are_the_ids_of_detections(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    path = write_recording(tmp_path / "a.mcap", FRAMES)
+    command = ("recognize", "--model", model, "--bag", path, "--track", "--out-bag", tmp_path / "out")
+    assert run_thor2(*command) == 0
+    lines = lines_of(capfd.readouterr().out)
+    assert [[one["track"] for one in line["instances"]] for line in lines] == [[1, 2]] * 3
+    assert [one["frames"] for one in lines[2]["instances"]] == [3, 3]
+    for _, array in messages_of(tmp_path / "out")["/thor2/detections"]:
+        assert [detection.id for detection in array.detections] == ["1", "2"]
+
+
+def test_rerun_files_of_bags_and_folders(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("rerun", reason="rerun-sdk is not installed (pip install rerun-sdk; 660 MB)")
+    path = write_recording(tmp_path / "a.mcap", FRAMES)
+    assert run_thor2("recognize", "--model", model, "--bag", path, "--rerun", tmp_path / "bag.rrd") == 0
+    folder = tmp_path / "frames" / "0"
+    folder.mkdir(parents=True)
+    (folder / "color.png").write_bytes(encode_image(FRAMES[0].color))
+    (folder / "depth.png").write_bytes(encode_image(FRAMES[0].depth))
+    (folder / "intrinsics.json").write_text(json.dumps({"fx": 290.0, "fy": 290.0, "cx": 160.0, "cy": 120.0}))
+    command = ("recognize", "--model", model, tmp_path / "frames", "--segment", "table")
+    assert run_thor2(*command, "--rerun", tmp_path / "folder.rrd") == 0
+    assert f"written to {tmp_path / 'folder.rrd'}" in capfd.readouterr().out
+    for name in ("bag.rrd", "folder.rrd"):
+        assert (tmp_path / name).read_bytes().startswith(b"RRF2")
+
+
 def test_a_frame_that_fails_does_not_stop_the_others(
     model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -135,6 +162,7 @@ def test_what_was_done_before_the_damage_is_kept(
         (["--max-gap", "0"], "max_gap is 0"),
         (["--max-gap", "0.001", "--out-bag", "{there}/out"], "expected at most 0.001 s"),
         (["--segment", "sam"], "segmenter is 'sam'"),
+        (["--rerun", "{there}/a.mcap"], "the suffix .rrd"),
     ],
 )
 def test_invalid_arguments(

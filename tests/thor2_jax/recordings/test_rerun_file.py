@@ -1,0 +1,72 @@
+"""Files for the Rerun viewer, read back with its own reader."""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from recording_files import table_frame
+
+from thor2_jax.errors import InputError
+from thor2_jax.recognition.answers import Recognition
+from thor2_jax.recordings.detections import detections_of
+from thor2_jax.recordings.rerun_file import RerunFile
+from thor2_jax.segmentation.segmenters import segmented
+
+ANSWERS = [Recognition(1, "mug", 0.9), Recognition(2, reason="unknown: 0.1", confidence=0.1)]
+
+
+@pytest.fixture
+def reader() -> Any:
+    """Return the reader of the package rerun-sdk, which is too large for the tests' own environment."""
+    pytest.importorskip("rerun", reason="rerun-sdk is not installed (pip install rerun-sdk; 660 MB)")
+    return pytest.importorskip("rerun.chunk", reason="this version of rerun-sdk has no reader").RrdReader
+
+
+def read(reader: Any, path: Path) -> dict[str, dict[str, list[Any]]]:
+    """Return entity -> column -> values."""
+    columns: dict[str, dict[str, list[Any]]] = {}
+    for chunk in reader(path).stream():
+        for name, values in chunk.to_record_batch().to_pydict().items():
+            columns.setdefault(chunk.entity_path, {}).setdefault(name, []).extend(values)
+    return columns
+
+
+def test_frames_and_detections_are_read_back(reader: Any, tmp_path: Path) -> None:
+    with RerunFile(tmp_path / "a.rrd") as file:
+        for k in range(3):
+            frame = segmented(table_frame(3 * k))
+            file.write(frame, detections_of(frame, ANSWERS), name=f"frame {k}", stamp=1_700_000_000 * 10**9 + k)
+    found = read(reader, tmp_path / "a.rrd")
+    assert {"/camera", "/camera/color", "/camera/depth", "/camera/labels", "/camera/boxes", "/objects"} <= set(found)
+    boxes = found["/camera/boxes"]
+    assert boxes["frame"] == [0, 1, 2]
+    assert [int(time.value) for time in boxes["time"]] == [1_700_000_000 * 10**9 + k for k in range(3)]
+    assert boxes["Boxes2D:labels"] == [["mug 0.90", "unknown 0.10"]] * 3
+    np.testing.assert_allclose(boxes["Boxes2D:centers"][2], [[91, 115], [221, 115]], atol=2)
+    np.testing.assert_allclose(np.array(found["/objects"]["Points3D:positions"])[..., 2], 0.8, atol=0.01)
+    assert found["/camera/name"]["TextDocument:text"] == [["frame 0"], ["frame 1"], ["frame 2"]]
+    assert [one.name for one in tmp_path.iterdir()] == ["a.rrd"]
+
+
+def test_a_frame_without_instances(reader: Any, tmp_path: Path) -> None:
+    with RerunFile(tmp_path / "a.rrd") as file:
+        file.write(segmented(table_frame(), lambda frame: np.zeros(frame.depth.shape, int)), [], name="x")
+    assert "/camera/color" in read(reader, tmp_path / "a.rrd")
+
+
+def test_no_frames_leave_no_file(reader: Any, tmp_path: Path) -> None:
+    with RerunFile(tmp_path / "a.rrd"):
+        pass
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_invalid_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(InputError, match=r"\.rrd"):
+        RerunFile(tmp_path / "a.mcap")
+    with pytest.raises(OSError, match="No such file"):
+        RerunFile(tmp_path / "none" / "a.rrd")
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    with pytest.raises(InputError, match=r"thor2-jax\[rerun\]"):
+        RerunFile(tmp_path / "a.rrd")
