@@ -20,7 +20,15 @@ from thor2_jax.recognition.frames import RGBDFrame
 from thor2_jax.recognition.overlay import annotate
 from thor2_jax.recordings.detections import Detection, detection_array, ros_time
 
-__all__ = ["DETECTIONS_TOPIC", "OVERLAY_TOPIC", "VISION_MSGS", "DetectionBag", "detection_types"]
+__all__ = [
+    "DETECTIONS_TOPIC",
+    "DETECTION_ARRAY",
+    "OVERLAY_TOPIC",
+    "VISION_MSGS",
+    "DetectionBag",
+    "detection_types",
+    "ros_message",
+]
 
 DETECTIONS_TOPIC = "/thor2/detections"
 OVERLAY_TOPIC = "/thor2/overlay/compressed"
@@ -135,25 +143,25 @@ class DetectionBag:
             (self._detections, DETECTION_ARRAY, array),
             (self._overlays, COMPRESSED_IMAGE, overlay),
         ):
-            content = self._types.serialize_cdr(_message(self._types, kind, fields), kind)
+            content = self._types.serialize_cdr(ros_message(self._types, kind, fields), kind)
             with errors_name(self.path):
                 self._writer.write(connection, stamp, content)
         self.n_frames += 1
 
 
-def _message(types: Any, kind: str, fields: Any) -> Any:
+def ros_message(types: Any, kind: str, fields: Any) -> Any:
     """Return a message of rosbags with the values of nested mappings and lists."""
     from rosbags.interfaces import Nodetype
 
     def convert(description: Any, value: Any) -> Any:
         node, details = description
         if node == Nodetype.NAME:
-            return _message(types, details, value)
+            return ros_message(types, details, value)
         if node == Nodetype.BASE or isinstance(value, np.ndarray):
             return value
         (element, name), _ = details
         if element == Nodetype.NAME:
-            return [_message(types, name, one) for one in value]
+            return [ros_message(types, name, one) for one in value]
         return np.asarray(value, dtype=name[0])
 
     cls: Callable[..., Any] = types.types[kind]
