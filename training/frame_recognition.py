@@ -4,7 +4,9 @@ for answer in recognize_frames(recognizer, find_frames([Path("frames")])):
     print(answer.name, answer.error or answer.recognitions)
 """
 
+import contextlib
 import dataclasses
+import functools
 import json
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -13,6 +15,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from thor2_jax.capacity import BATCH_BUCKETS
 from thor2_jax.errors import InputError, with_context
 from thor2_jax.files import write_text
 from thor2_jax.recognition.answers import Recognition
@@ -28,8 +31,19 @@ from thor2_jax.recognition.result_files import (
 from thor2_jax.recognizer import Recognizer
 from thor2_jax.tracking.tracker import TrackedRecognition
 from training.readers.frame_files import FrameSource
+from training.storage.workers import WorkerPool
 
-__all__ = ["FrameAnswer", "ResultTables", "recognize_frames", "track_frames"]
+__all__ = [
+    "FrameAnswer",
+    "RecognizerArguments",
+    "ResultTables",
+    "recognize_frames",
+    "recognize_frames_in_pool",
+    "track_frames",
+]
+
+FRAMES_PER_CHUNK = 4
+"""Frames that a worker recognizes at a time, and that are recognized again if it dies."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,6 +84,44 @@ def recognize_frames(recognizer: Recognizer, sources: Iterable[FrameSource]) -> 
             yield FrameAnswer(source.name, error=f"{error.filename}: {error.strerror or error}")
         else:
             yield FrameAnswer(source.name, frame, recognitions, time.perf_counter() - start)
+
+
+@dataclasses.dataclass(frozen=True)
+class RecognizerArguments:
+    """The arguments of `Recognizer.load`, from which each worker process loads the recognizer."""
+
+    model: Path
+    unknown_below: float | None = None
+    answer_by: str | None = None
+
+    def load(self) -> Recognizer:
+        """Load a recognizer of single frames; raises as `Recognizer.load`."""
+        recognizer = Recognizer.load(self.model, self.unknown_below, answer_by=self.answer_by)
+        recognizer.chunk = BATCH_BUCKETS[-1]
+        return recognizer
+
+
+def recognize_frames_in_pool(
+    arguments: RecognizerArguments, sources: Sequence[FrameSource], pool: WorkerPool
+) -> Iterator[FrameAnswer]:
+    """Return the answers of `recognize_frames`, which worker processes compute in chunks of frames."""
+    starts = range(0, len(sources), FRAMES_PER_CHUNK)
+    chunks = [(arguments, tuple(sources[start : start + FRAMES_PER_CHUNK])) for start in starts]
+    with contextlib.closing(pool(_recognize_chunk, chunks)) as results:
+        for answers in results:
+            yield from answers
+
+
+_loaded = functools.lru_cache(1)(RecognizerArguments.load)
+
+
+def _recognize_chunk(chunk: tuple[RecognizerArguments, tuple[FrameSource, ...]]) -> list[FrameAnswer]:
+    arguments, sources = chunk
+    answers = recognize_frames(_loaded(arguments), sources)
+    return [
+        answer if answer.frame is None else dataclasses.replace(answer, frame=dataclasses.replace(answer.frame))
+        for answer in answers  # without the cached properties of the frames
+    ]
 
 
 def track_frames(

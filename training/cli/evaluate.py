@@ -1,17 +1,21 @@
 """`thor2 evaluate`: measure the accuracy of trained runs, one command per dataset format."""
 
+import functools
 import hashlib
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.table import Table
 
-from thor2_jax.errors import InputError
 from training.cli.app import QuietOption, app, console, show_help
 from training.cli.progress import show_progress
+from training.cli.workers import AddressOption, EngineOption, WorkersOption, worker_pool
+
+if TYPE_CHECKING:
+    from training.storage.workers import WorkerPool
 
 evaluate_app = typer.Typer(
     callback=show_help, invoke_without_command=True, help="Measure the accuracy of trained runs on a labelled dataset."
@@ -38,12 +42,16 @@ def uwis(
     model: ModelsOption,
     runs: MoreModels = None,
     out: ReportOption = None,
+    workers: WorkersOption = 1,
+    engine: EngineOption = "local",
+    address: AddressOption = None,
     quiet: QuietOption = False,
 ) -> None:
     """UW-IS Occluded: <video>/images/<id>_{rgb,depth,labels}.png and <id>_poses.yaml."""
     from training.readers.uwis import UWISOccluded
 
-    _evaluate("uwis", UWISOccluded(dataset), dataset, [*model, *(runs or [])], out, quiet)
+    pool = worker_pool(workers, engine, address)
+    _evaluate("uwis", UWISOccluded(dataset), dataset, [*model, *(runs or [])], out, pool, quiet)
 
 
 @evaluate_app.command()
@@ -52,12 +60,16 @@ def frames(
     model: ModelsOption,
     runs: MoreModels = None,
     out: ReportOption = None,
+    workers: WorkersOption = 1,
+    engine: EngineOption = "local",
+    address: AddressOption = None,
     quiet: QuietOption = False,
 ) -> None:
     """Single frames: <frame>/{color,depth,mask}.png, intrinsics.json, labels.json."""
     from training.readers.frames import FrameFolder
 
-    _evaluate("frames", FrameFolder(dataset), dataset, [*model, *(runs or [])], out, quiet)
+    pool = worker_pool(workers, engine, address)
+    _evaluate("frames", FrameFolder(dataset), dataset, [*model, *(runs or [])], out, pool, quiet)
 
 
 @evaluate_app.command()
@@ -73,12 +85,16 @@ def ocid(
         bool, typer.Option(help="RUN holds one run per sequence, as written by `train --sequences`.")
     ] = False,
     out: ReportOption = None,
+    workers: WorkersOption = 1,
+    engine: EngineOption = "local",
+    address: AddressOption = None,
     quiet: QuietOption = False,
 ) -> None:
     """OCID, subset YCB10: {table,floor}/{bottom,top}/<type>/<sequence>/{rgb,depth,label,pcd}."""
     from training.readers.ocid import OCID
 
-    _evaluate("ocid", OCID(dataset, names), dataset, [*model, *(runs or [])], out, quiet, per_sequence, names)
+    pool = worker_pool(workers, engine, address)
+    _evaluate("ocid", OCID(dataset, names), dataset, [*model, *(runs or [])], out, pool, quiet, per_sequence, names)
 
 
 @evaluate_app.command()
@@ -88,12 +104,16 @@ def bop(
     names: Annotated[Path | None, typer.Option(help="YAML or JSON table: obj_id -> name. Default: obj_000001.")] = None,
     runs: MoreModels = None,
     out: ReportOption = None,
+    workers: WorkersOption = 1,
+    engine: EngineOption = "local",
+    address: AddressOption = None,
     quiet: QuietOption = False,
 ) -> None:
     """BOP format (YCB-Video and others): <scene>/{rgb,depth,mask_visib}, scene_camera.json and scene_gt.json."""
     from training.readers.bop import BOP
 
-    _evaluate("bop", BOP(dataset, names), dataset, [*model, *(runs or [])], out, quiet, names=names)
+    pool = worker_pool(workers, engine, address)
+    _evaluate("bop", BOP(dataset, names), dataset, [*model, *(runs or [])], out, pool, quiet, names=names)
 
 
 def _evaluate(
@@ -102,24 +122,23 @@ def _evaluate(
     dataset: Path,
     models: list[Path],
     out: Path | None,
+    pool: "WorkerPool | None",
     quiet: bool,
     per_sequence: bool = False,
     names: Path | None = None,
 ) -> None:
+    from training.evaluation.answering import RunArguments, answer_frames_in_pool
     from training.evaluation.job import evaluate_dataset
-    from training.evaluation.runs import load_runs, load_sequence_runs
 
-    if per_sequence and len(models) != 1:
-        raise InputError(
-            f"per_sequence: {len(models)} models are given; expected one directory with a run per sequence"
-        )
+    arguments = RunArguments(tuple(models), per_sequence)
     description = {"kind": kind, "path": str(dataset.resolve())}
     if names:
         description["names"] = hashlib.sha256(names.read_bytes()).hexdigest()
     finished = out is not None and (out / "report.json").is_file()
     with tempfile.TemporaryDirectory() as temporary, show_progress(quiet) as progress:
-        runs = load_sequence_runs(models[0], frames.identifiers) if per_sequence else load_runs(models)
-        report = evaluate_dataset(runs, frames, description, out or Path(temporary) / "report", progress)
+        runs = arguments.load(frames)
+        answering = functools.partial(answer_frames_in_pool, arguments, frames, pool) if pool else None
+        report = evaluate_dataset(runs, frames, description, out or Path(temporary) / "report", progress, answering)
     _print_report(report)
     if out is not None:
         console.print(f"report: {out / 'report.html'}{' (was finished: nothing was recomputed)' if finished else ''}")

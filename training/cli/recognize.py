@@ -14,6 +14,7 @@ from thor2_jax.printable import escape_characters
 from thor2_jax.recordings.topics import Topics
 from training.cli.app import ModelOption, UnknownOption, app, console
 from training.cli.recognize_bag import BagOptions, recognize_bag
+from training.cli.workers import AddressOption, EngineOption, WorkersOption, worker_pool
 
 if TYPE_CHECKING:
     from thor2_jax.recognition.answers import Recognition
@@ -54,6 +55,9 @@ def recognize(
     track: Annotated[
         bool, typer.Option("--track", help="The frames are a sequence: follow the objects and fuse their answers.")
     ] = False,
+    workers: WorkersOption = 1,
+    engine: EngineOption = "local",
+    address: AddressOption = None,
     poses: Annotated[
         Path | None, typer.Option(help="JSON of camera poses for --track: frame -> 4 x 4 matrix, camera to world.")
     ] = None,
@@ -99,12 +103,16 @@ def recognize(
     A frame that cannot be recognized does not stop the others; the command then ends with exit code 2. With --track,
     the frames of one camera are a sequence in the order of their names: an object has one name in all of them.
     """
-    from thor2_jax.capacity import BATCH_BUCKETS
     from thor2_jax.files import check_output_directory, remove_leftovers
     from thor2_jax.recognition.result_files import RESULT_FILES, write_recognitions
-    from thor2_jax.recognizer import Recognizer
     from thor2_jax.recordings.rerun_file import RerunFile
-    from training.frame_recognition import ResultTables, recognize_frames, track_frames
+    from training.frame_recognition import (
+        RecognizerArguments,
+        ResultTables,
+        recognize_frames,
+        recognize_frames_in_pool,
+        track_frames,
+    )
     from training.readers.bop import read_object_names
     from training.readers.poses import read_poses
 
@@ -128,6 +136,12 @@ def recognize(
         raise InputError(f"labels is {labels} and segment is {segment}; give one of them")
     if poses is not None and not track:
         raise InputError(f"poses is {poses}; it belongs to --track")
+    pool = worker_pool(workers, engine, address)
+    if pool is not None and (track or not frames):
+        reason = "--track, which takes the frames in turn" if track else "one frame"
+        raise InputError(
+            f"workers is {workers} and engine is {engine}; they are of no use for {reason}: leave them out"
+        )
     files = {"color": color, "depth": depth, "labels": labels, "intrinsics": intrinsics}
     sources = _sources(frames, files, depth_scale, segment)
     of_frames = None if poses is None else read_poses(poses, [source.name for source in sources])
@@ -136,11 +150,14 @@ def recognize(
         remove_leftovers(out)
     rerun_file = None if rerun is None else RerunFile(rerun)
     numbers = None if names is None else read_object_names(names)
-    recognizer = Recognizer.load(model, unknown_below, answer_by=answer_by)
-    recognizer.chunk = BATCH_BUCKETS[-1]
+    arguments = RecognizerArguments(model, unknown_below, answer_by)
+    recognizer = arguments.load()
     tables = ResultTables([source.name for source in sources], recognizer.classes, numbers)
     failed = []
-    answers = track_frames(recognizer, sources, of_frames) if track else recognize_frames(recognizer, sources)
+    if pool is not None:
+        answers = recognize_frames_in_pool(arguments, sources, pool)
+    else:
+        answers = track_frames(recognizer, sources, of_frames) if track else recognize_frames(recognizer, sources)
     for answer in answers if rerun_file is None else _written(answers, rerun_file):
         if answer.error is not None or answer.frame is None:
             failed.append(answer.name)

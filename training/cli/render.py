@@ -1,13 +1,14 @@
 """`thor2 render`: render a dataset of training views."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
 from thor2_jax.errors import InputError
 from training.cli.app import MeshScaleOption, QuietOption, app, console
 from training.cli.progress import show_progress
+from training.cli.workers import AddressOption, EngineOption, WorkersOption, worker_pool
 
 
 @app.command()
@@ -19,13 +20,9 @@ def render(
     ] = None,
     azimuth_step: Annotated[float, typer.Option(help="Degrees between cameras around the object.")] = 5.0,
     polar_step: Annotated[float, typer.Option(help="Degrees between cameras from pole to pole.")] = 5.0,
-    workers: Annotated[int, typer.Option(min=1, help="Rendering processes; with Ray, concurrent tasks.")] = 2,
-    engine: Annotated[
-        Literal["local", "ray"], typer.Option(help="Render on this machine or on a Ray cluster (extra `cluster`).")
-    ] = "local",
-    address: Annotated[
-        str | None, typer.Option(help="Address of the Ray cluster. Default: the one on this machine.")
-    ] = None,
+    workers: WorkersOption = 2,
+    engine: EngineOption = "local",
+    address: AddressOption = None,
     illumination: Annotated[bool, typer.Option("--illumination", help="Augment: light and camera response.")] = False,
     sensor: Annotated[bool, typer.Option("--sensor", help="Augment: noise and faults of the depth sensor.")] = False,
     occlusion: Annotated[bool, typer.Option("--occlusion", help="Augment: another object in front.")] = False,
@@ -56,14 +53,13 @@ def render(
     from training.augmentation.segmentation import Segmentation
     from training.augmentation.sensor import Sensor
     from training.objects.meshes import find_meshes, read_names, scaled_meshes
-    from training.storage.workers import local_workers, ray_workers
+    from training.storage.workers import IN_PROCESS
     from training.views.crop_job import render_crops
     from training.views.render_job import render_dataset
 
-    if address is not None and engine != "ray":
-        raise InputError(f"address is {address}; it is only used with --engine ray")
     if crops is not None and crops < 1:
         raise InputError(f"crops is {crops}; expected at least 1 pixel")
+    pool = worker_pool(workers, engine, address) or IN_PROCESS
     augmentations = Augmentations(
         illumination=Illumination() if illumination else None,
         sensor=Sensor() if sensor else None,
@@ -74,7 +70,6 @@ def render(
         copies=copies,
     )
     sources = scaled_meshes(find_meshes(meshes, read_names(names) if names else None), mesh_scale)
-    pool = local_workers(workers) if engine == "local" else ray_workers(workers, address)
     with show_progress(quiet) as progress:
         dataset = render_dataset(
             sources,

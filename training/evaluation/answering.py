@@ -1,23 +1,33 @@
 """Answering labelled frames with the classifiers and baselines of several runs."""
 
+import contextlib
+import dataclasses
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Generator, Iterable, Sequence
+from pathlib import Path
 
 import numpy as np
 
+from thor2_jax.errors import InputError
 from thor2_jax.recognition.frames import RGBDFrame, pixel_rays
 from training.baselines.baseline import baseline_inputs
 from training.evaluation.answers import FrameAnswers, InstancePrediction, all_predictors
-from training.evaluation.runs import Run
-from training.readers.labelled import LabelledFrame
+from training.evaluation.runs import Run, load_runs, load_sequence_runs
+from training.readers.labelled import LabelledFrame, LabelledFrames
+from training.storage.workers import WorkerPool
 
-__all__ = ["NO_PIXELS", "answer_frames"]
+__all__ = ["NO_PIXELS", "RunArguments", "answer_frames", "answer_frames_in_pool"]
 
 NO_PIXELS = "no pixels in the label image"
 """Why an instance that the labels name could not be described."""
 
+FRAMES_PER_CHUNK = 4
+"""Frames that a worker answers at a time, and that are answered again if it dies."""
 
-def answer_frames(runs: Sequence[Run], frames: Iterable[LabelledFrame]) -> Iterator[tuple[LabelledFrame, FrameAnswers]]:
+
+def answer_frames(
+    runs: Sequence[Run], frames: Iterable[LabelledFrame]
+) -> Generator[tuple[LabelledFrame, FrameAnswers], None, None]:
     """Yield every frame with its answers; a frame is described once for all runs.
 
     Args:
@@ -32,6 +42,76 @@ def answer_frames(runs: Sequence[Run], frames: Iterable[LabelledFrame]) -> Itera
         instances = _answer(runs, item)
         yield item, FrameAnswers(item.identifier, item.attributes, time.perf_counter() - start, instances)
         start = time.perf_counter()
+
+
+@dataclasses.dataclass(frozen=True)
+class RunArguments:
+    """What the runs of an evaluation are loaded from, in this process and in each worker.
+
+    Attributes:
+        models: see `load_runs`; with `per_sequence`, the directory of `load_sequence_runs`.
+        per_sequence: whether there is a run for each sequence.
+    """
+
+    models: tuple[Path, ...]
+    per_sequence: bool = False
+
+    def load(self, frames: LabelledFrames) -> Sequence[Run]:
+        """Load the runs; raises InputError as these functions do, or for several directories of sequences."""
+        if not self.per_sequence:
+            return load_runs(self.models)
+        if len(self.models) != 1:
+            raise InputError(
+                f"per_sequence: {len(self.models)} models are given; expected one directory with a run per sequence"
+            )
+        return load_sequence_runs(self.models[0], frames.identifiers)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Chunk:
+    arguments: RunArguments
+    frames: LabelledFrames
+    numbers: range
+
+
+def answer_frames_in_pool(
+    arguments: RunArguments, frames: LabelledFrames, pool: WorkerPool, numbers: range
+) -> Generator[tuple[LabelledFrame, FrameAnswers], None, None]:
+    """Yield the frames of these numbers with the answers of `answer_frames`, which workers compute in chunks.
+
+    Frames before one that cannot be read are yielded before its error is raised.
+
+    Raises:
+        InputError: as `answer_frames`.
+        OSError: a file cannot be opened, or workers die repeatedly.
+    """
+    chunks = [
+        _Chunk(arguments, frames, numbers[start : start + FRAMES_PER_CHUNK])
+        for start in range(0, len(numbers), FRAMES_PER_CHUNK)
+    ]
+    with contextlib.closing(pool(_answer_chunk, chunks)) as results:
+        for answered, error in results:
+            yield from answered
+            if error is not None:
+                raise error
+
+
+_loaded: dict[RunArguments, Sequence[Run]] = {}
+"""The runs that this worker process has loaded."""
+
+
+def _answer_chunk(chunk: _Chunk) -> tuple[list[tuple[LabelledFrame, FrameAnswers]], Exception | None]:
+    if chunk.arguments not in _loaded:
+        _loaded.clear()
+        _loaded[chunk.arguments] = chunk.arguments.load(chunk.frames)
+    answered = []
+    try:
+        for item, answers in answer_frames(_loaded[chunk.arguments], (chunk.frames[n] for n in chunk.numbers)):
+            frame = dataclasses.replace(item.frame)  # without its cached properties
+            answered.append((dataclasses.replace(item, frame=frame), answers))
+    except (InputError, OSError) as error:
+        return answered, error
+    return answered, None
 
 
 def _answer(runs: Sequence[Run], item: LabelledFrame) -> list[InstancePrediction]:

@@ -4,10 +4,11 @@ REPORT/answers.jsonl               class probabilities of every classifier, writ
 REPORT/report.json, report.html    written last
 """
 
+import contextlib
 import dataclasses
 import json
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,16 +16,19 @@ from thor2_jax.config import DESCRIPTOR_VERSION
 from thor2_jax.errors import InputError
 from thor2_jax.files import check_output_directory, file_digest, remove_leftovers, write_text
 from training.evaluation.answering import NO_PIXELS, answer_frames
-from training.evaluation.answers import AnswerFile, all_predictors
+from training.evaluation.answers import AnswerFile, FrameAnswers, all_predictors
 from training.evaluation.frame_pictures import FramePictures
 from training.evaluation.page import write_report_page
 from training.evaluation.results import compute_results
 from training.evaluation.runs import Run, SequenceRun
-from training.readers.labelled import LabelledFrames
+from training.readers.labelled import LabelledFrame, LabelledFrames
 from training.storage.locks import locked
 from training.storage.progress import Progress
 
-__all__ = ["evaluate_dataset"]
+__all__ = ["Answering", "evaluate_dataset"]
+
+Answering = Callable[[range], Generator[tuple[LabelledFrame, FrameAnswers], None, None]]
+"""Yields the frames of these numbers with their answers, such as `answering.answer_frames_in_pool`."""
 
 ANSWERS = "answers.jsonl"
 
@@ -38,6 +42,7 @@ def evaluate_dataset(
     dataset: Mapping[str, str],
     out: Path,
     progress: Progress = lambda stage, done, total, note: None,
+    answering: Answering | None = None,
 ) -> dict[str, Any]:
     """Evaluate runs on a dataset and write the report. An interrupted evaluation resumes.
 
@@ -49,6 +54,8 @@ def evaluate_dataset(
         dataset: "kind" (uwis, ocid, bop, frames), "path", and all other values that the frames depend on.
         out: directory of the report: new, empty, or of the same evaluation.
         progress: called with ("evaluate", frames done, number of frames, note).
+        answering: answers frames with the same runs, for instance in worker processes; None answers them in this
+            process.
 
     Returns:
         The content of report.json.
@@ -63,11 +70,16 @@ def evaluate_dataset(
     if not out.exists():
         frames[0]  # raises if it cannot be read, before anything is written
     with locked(out):
-        return _evaluate(runs, frames, dataset, out, progress)
+        return _evaluate(runs, frames, dataset, out, progress, answering)
 
 
 def _evaluate(
-    runs: Sequence[Run], frames: LabelledFrames, dataset: Mapping[str, str], out: Path, progress: Progress
+    runs: Sequence[Run],
+    frames: LabelledFrames,
+    dataset: Mapping[str, str],
+    out: Path,
+    progress: Progress,
+    answering: Answering | None,
 ) -> dict[str, Any]:
     description = {**dataset, "frames": len(frames)}
     digests = [run.digest for run in runs]
@@ -84,7 +96,7 @@ def _evaluate(
     pictures = FramePictures(out, runs, len(frames))
     for answers in file.frames:
         pictures.restore(answers)
-    _answer_rest(runs, frames, file, pictures, progress)
+    _answer_rest(answering or _in_process(runs, frames), frames, file, pictures, progress)
     own_objects = isinstance(runs[0], SequenceRun)
     results = compute_results(dataset["kind"], runs, file.frames, own_objects)
     report = {"dataset": description, "digests": digests, **results}
@@ -132,14 +144,18 @@ def _check_unchanged(file: AnswerFile, frames: LabelledFrames, out: Path, progre
         progress("check files", number + 1, len(file.frames), "")
 
 
+def _in_process(runs: Sequence[Run], frames: LabelledFrames) -> Answering:
+    return lambda numbers: answer_frames(runs, (frames[number] for number in numbers))
+
+
 def _answer_rest(
-    runs: Sequence[Run], frames: LabelledFrames, file: AnswerFile, pictures: FramePictures, progress: Progress
+    answering: Answering, frames: LabelledFrames, file: AnswerFile, pictures: FramePictures, progress: Progress
 ) -> None:
     first, start = len(file.frames), time.perf_counter()
     progress("evaluate", first, len(frames), "")
-    rest = (frames[number] for number in range(first, len(frames)))
-    for number, (item, answers) in enumerate(answer_frames(runs, rest), first):
-        pictures.draw(number, item, answers)  # before the frame counts as done
-        file.append(dataclasses.replace(answers, files=_file_digests(frames.files(number))))
-        rate = (number + 1 - first) / (time.perf_counter() - start)
-        progress("evaluate", number + 1, len(frames), f"{rate:.2f} frames/s, {item.identifier}")
+    with contextlib.closing(answering(range(first, len(frames)))) as answered:
+        for number, (item, answers) in enumerate(answered, first):
+            pictures.draw(number, item, answers)  # before the frame counts as done
+            file.append(dataclasses.replace(answers, files=_file_digests(frames.files(number))))
+            rate = (number + 1 - first) / (time.perf_counter() - start)
+            progress("evaluate", number + 1, len(frames), f"{rate:.2f} frames/s, {item.identifier}")

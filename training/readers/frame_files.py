@@ -64,7 +64,7 @@ class FrameSource:
 
     Attributes:
         name: its folder, or scene and image.
-        read: function that returns the frame; raises InputError and OSError.
+        read: function that returns the frame; raises InputError and OSError. Worker processes get it pickled.
     """
 
     name: str
@@ -125,7 +125,11 @@ def find_frames(paths: Sequence[Path], depth_scale: float | None = None) -> list
 
 def segmented_source(source: FrameSource, segmenter: Segmenter) -> FrameSource:
     """Return a frame that is segmented when it is read; labels that it has are replaced."""
-    return FrameSource(source.name, lambda: segmented(source.read(), segmenter))
+    return FrameSource(source.name, functools.partial(_read_segmented, source, segmenter))
+
+
+def _read_segmented(source: FrameSource, segmenter: Segmenter) -> RGBDFrame:
+    return segmented(source.read(), segmenter)
 
 
 def _read_bop(dataset: BOP, number: int) -> RGBDFrame:

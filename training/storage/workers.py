@@ -4,18 +4,20 @@
         for result in results:
             ...
 
-At most `workers` results wait to be read, so memory does not grow with the number of items.
+At most `workers` results wait to be read, so memory does not grow with the number of items. An item whose worker dies
+is given to another one.
 """
 
 import collections
 import importlib
 import multiprocessing
 import os
+import queue
 import signal
 import threading
 import warnings
 from collections.abc import Callable, Generator, Iterable
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from typing import Any, Protocol, TypeVar
 
@@ -26,6 +28,10 @@ __all__ = ["IN_PROCESS", "WorkerPool", "local_workers", "ray_workers"]
 A = TypeVar("A")
 B = TypeVar("B")
 Handle = TypeVar("Handle")
+
+
+ATTEMPTS = 3
+"""Number of workers that may die at the same item before that is an error."""
 
 
 class WorkerPool(Protocol):
@@ -50,6 +56,8 @@ def _map_ordered(
 def _initialize_worker() -> None:
     """Leave Ctrl-C to the parent, and exit when the parent ends: an idle worker would otherwise wait forever."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # JAX would reserve most of an accelerator's memory for one worker; it reads this when it is imported.
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     parent = multiprocessing.parent_process()
     assert parent is not None
 
@@ -65,11 +73,54 @@ def _check_workers(workers: int) -> None:
         raise InputError(f"workers is {workers}; expected at least 1")
 
 
+class _Processes:
+    """Worker processes, each of which is replaced when it dies, and a thread for each that waits for it.
+
+    A single ProcessPoolExecutor with several processes would end all of them when one dies.
+    """
+
+    def __init__(self, count: int) -> None:
+        # JAX starts threads, and a forked child can deadlock on their locks.
+        self._context = multiprocessing.get_context("spawn")
+        self._threads = ThreadPoolExecutor(count)
+        self._idle: queue.SimpleQueue[ProcessPoolExecutor] = queue.SimpleQueue()
+        for _ in range(count):
+            self._idle.put(self._start())
+
+    def _start(self) -> ProcessPoolExecutor:
+        return ProcessPoolExecutor(1, mp_context=self._context, initializer=_initialize_worker)
+
+    def submit(self, function: Callable[[A], B], item: A) -> Future[B]:
+        return self._threads.submit(self._call, function, item)
+
+    def _call(self, function: Callable[[A], B], item: A) -> B:
+        for _ in range(ATTEMPTS):
+            process = self._idle.get()
+            try:
+                return process.submit(function, item).result()
+            except BrokenProcessPool as error:
+                reason = error
+                process.shutdown()
+                process = self._start()
+            finally:
+                self._idle.put(process)
+        raise ChildProcessError(
+            f"{ATTEMPTS} worker processes died at the same item, possibly because memory ran out ({reason})"
+        ) from reason
+
+    def close(self) -> None:
+        """Wait for the calls in progress, drop the others, and end the processes."""
+        self._threads.shutdown(cancel_futures=True)
+        while not self._idle.empty():
+            self._idle.get().shutdown()
+
+
 def local_workers(workers: int = 1) -> WorkerPool:
     """Return a pool of processes on this machine; one worker runs in the calling process.
 
-    With several workers, the calling script needs an `if __name__ == "__main__"` guard. The map raises
-    ChildProcessError if a worker dies, for example because memory ran out.
+    With several workers, the calling script needs an `if __name__ == "__main__"` guard. If a worker dies, only its item
+    is computed again. The map raises ChildProcessError if workers die repeatedly at an item, for example because memory
+    runs out.
 
     Raises:
         InputError: if `workers` is not positive.
@@ -80,17 +131,13 @@ def local_workers(workers: int = 1) -> WorkerPool:
         if workers == 1:
             yield from map(function, items)
             return
-        # JAX starts threads, and a forked child can deadlock on their locks.
-        context = multiprocessing.get_context("spawn")
-        executor = ProcessPoolExecutor(workers, mp_context=context, initializer=_initialize_worker)
+        processes = _Processes(workers)
         try:
             yield from _map_ordered(
-                lambda item: executor.submit(function, item), lambda future: future.result(), items, workers
+                lambda item: processes.submit(function, item), lambda future: future.result(), items, workers
             )
-        except BrokenProcessPool as error:
-            raise ChildProcessError(f"a worker process died, possibly because memory ran out ({error})") from error
         finally:
-            executor.shutdown(cancel_futures=True)
+            processes.close()
 
     return run
 
@@ -118,12 +165,18 @@ def ray_workers(workers: int, address: str | None = None) -> WorkerPool:
             "engine is ray, which is not installed; install it: pip install -c constraints.txt '.[cluster]'"
         ) from None
 
+    def fetch(result: Any) -> Any:
+        try:
+            return ray.get(result)
+        except ray.exceptions.RayTaskError as error:  # Its message is a traceback of the worker.
+            raise error.cause from None
+
     def run(function: Callable[[A], B], items: Iterable[A]) -> Generator[B, None, None]:
         with warnings.catch_warnings():
             # JAX warns about forks; Ray's forks execute another program at once, which is safe.
             warnings.filterwarnings("ignore", r"os\.fork\(\) was called", RuntimeWarning)
             cluster = ray.init(address, log_to_driver=False, logging_level="error")
         with cluster:
-            yield from _map_ordered(ray.remote(function).remote, ray.get, items, workers)
+            yield from _map_ordered(ray.remote(function).remote, fetch, items, workers)
 
     return run

@@ -47,9 +47,23 @@ def test_exceptions_of_the_function_are_raised(workers: int) -> None:
 
 
 @pytest.mark.slow
-def test_a_dead_worker_is_an_error() -> None:
+def test_a_dead_worker_costs_its_item_only(tmp_path: Path) -> None:
+    """The item of the worker that dies is computed again, the other worker goes on, and the dead one is replaced."""
+    logged = f"open({str(tmp_path / 'log')!r}, 'a').write('%s ') and %s"
+    once = f"(__import__('os')._exit(3) if open({str(tmp_path / 'log')!r}).read().count('b') == 1 else 1)"
+    items = [logged % ("a", "__import__('time').sleep(1) or 0"), logged % ("b", once)]
+    items += [logged % (name, "__import__('os').getpid()") for name in "cdef"]
+    with closing(local_workers(2)(eval, items)) as results:
+        first, second, *others = results
+    assert (first, second) == (0, 1) and len(set(others)) <= 2
+    written = (tmp_path / "log").read_text().split()
+    assert sorted(written) == sorted("abbcdef") and written.count("a") == 1
+
+
+@pytest.mark.slow
+def test_an_item_at_which_every_worker_dies_is_an_error() -> None:
     results = local_workers(2)(eval, ["1", "__import__('os')._exit(3)", "2", "3"])
-    with pytest.raises(ChildProcessError), closing(results):
+    with pytest.raises(ChildProcessError, match="3 worker processes"), closing(results):
         list(results)
 
 

@@ -1,0 +1,206 @@
+"""Frames that worker processes recognize and evaluate: equal answers, workers that die, Ray nodes that die."""
+
+import contextlib
+import json
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers import encode_image, run_thor2, untrained_run
+
+import thor2_jax as thor2
+from thor2_jax.errors import InputError
+from thor2_jax.recognition.run_directory import save_run
+from training.evaluation.answering import RunArguments, answer_frames, answer_frames_in_pool
+from training.frame_recognition import (
+    FRAMES_PER_CHUNK,
+    RecognizerArguments,
+    recognize_frames,
+    recognize_frames_in_pool,
+)
+from training.readers.frame_files import find_frames, segmented_source
+from training.readers.frames import FrameFolder
+from training.storage.workers import IN_PROCESS
+
+N_FRAMES = 2 * FRAMES_PER_CHUNK + 1
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    directory = tmp_path_factory.mktemp("run")
+    save_run(untrained_run(("bowl", "mug", "plate"), ("tops", "tops2")), directory)
+    return directory
+
+
+def write_frame(folder: Path, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    labels = np.zeros((90, 120), np.uint8)
+    labels[10:50, 10:50], labels[30:80, 60:110] = 1, 4
+    depth = np.full(labels.shape, 900, np.uint16)
+    depth[labels > 0] = 700 + rng.integers(0, 30, (labels > 0).sum())
+    folder.mkdir(parents=True)
+    (folder / "color.png").write_bytes(encode_image(rng.integers(0, 256, (90, 120, 3), dtype=np.uint8)))
+    (folder / "depth.png").write_bytes(encode_image(depth))
+    (folder / "mask.png").write_bytes(encode_image(labels))
+    (folder / "intrinsics.json").write_text(json.dumps({"fx": 120.0, "fy": 120.0, "cx": 60.0, "cy": 45.0}))
+    (folder / "labels.json").write_text(json.dumps({"labels": {"1": "mug", "4": "bowl"}}))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("frames")
+    for number in range(N_FRAMES):
+        write_frame(folder / f"{number:03d}", number)
+    return folder
+
+
+def halves(frame: thor2.RGBDFrame) -> np.ndarray:
+    return (np.arange(frame.depth.size).reshape(frame.depth.shape) > frame.depth.size // 2).astype(np.uint8)
+
+
+@pytest.mark.parametrize("segments", [False, True])
+def test_chunks_of_frames_have_the_same_answers(model: Path, folder: Path, segments: bool) -> None:
+    arguments = RecognizerArguments(model)
+    sources = find_frames([folder])
+    if segments:
+        sources = [segmented_source(source, halves) for source in sources]
+    expected = list(recognize_frames(arguments.load(), sources))
+    answers = list(recognize_frames_in_pool(arguments, sources, IN_PROCESS))
+    assert [answer.as_json() for answer in answers] == [answer.as_json() for answer in expected]
+    for one, other in zip(answers, expected, strict=True):
+        assert one.frame is not None and other.frame is not None
+        np.testing.assert_array_equal(one.frame.labels, other.frame.labels)
+
+
+def test_answers_before_an_unreadable_frame_are_kept(
+    model: Path, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    frames, arguments = FrameFolder(folder), RunArguments((model,))
+    expected = list(answer_frames(arguments.load(frames), frames))
+    broken, read = FRAMES_PER_CHUNK + 2, FrameFolder.__getitem__
+
+    def damaged(self: FrameFolder, number: int) -> Any:
+        if number == broken:
+            raise InputError("depth: damaged")
+        return read(self, number)
+
+    monkeypatch.setattr(FrameFolder, "__getitem__", damaged)
+    answers = []
+    with pytest.raises(InputError, match="damaged"):
+        for _, answer in answer_frames_in_pool(arguments, frames, IN_PROCESS, range(len(frames))):
+            answers.append(answer)
+    assert [answer.frame for answer in answers] == [f"{number:03d}" for number in range(broken)]
+    for (_, one), other in zip(expected, answers, strict=False):
+        for instance, again in zip(one.instances, other.instances, strict=True):
+            np.testing.assert_array_equal(instance.probabilities, again.probabilities)
+
+
+def test_options_that_have_no_effect_are_refused(model: Path, folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    assert run_thor2("recognize", "--model", model, folder, "--track", "--workers", 2) == 2
+    assert "workers is 2" in capfd.readouterr().err
+    assert run_thor2("recognize", "--model", model, folder, "--address", "head:6379") == 2
+    assert "address is head:6379" in capfd.readouterr().err
+    assert run_thor2("evaluate", "frames", folder, "--model", model, "--address", "head:6379") == 2
+    assert "address is head:6379" in capfd.readouterr().err
+
+
+def without_times(report: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in report.items() if name != "speed"}
+
+
+def results(model: Path, folder: Path, out: Path, *options: object) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Recognize and evaluate the frames, and return the answers and the report without the times."""
+    assert run_thor2("recognize", "--model", model, folder, "--out", out / "answers", *options) == 0
+    assert run_thor2("evaluate", "frames", folder, "--model", model, "--out", out / "report", *options) == 0
+    answers = {path.parent.name: json.loads(path.read_text()) for path in out.glob("answers/*/recognition.json")}
+    assert len(answers) == N_FRAMES
+    return answers, without_times(json.loads((out / "report" / "report.json").read_text()))
+
+
+@pytest.fixture(scope="module")
+def expected(model: Path, folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """The results of one process."""
+    return results(model, folder, tmp_path_factory.mktemp("expected"))
+
+
+@contextlib.contextmanager
+def killing(find: Callable[[], list[int]]) -> Iterator[list[int]]:
+    """Kill the first process that `find` returns, and return it at the end."""
+    killed: list[int] = []
+    done = threading.Event()
+
+    def kill() -> None:
+        while not done.wait(0.02) and not killed:
+            for pid in find()[:1]:
+                with contextlib.suppress(OSError):
+                    os.kill(pid, signal.SIGKILL)
+                    killed.append(pid)
+
+    thread = threading.Thread(target=kill)
+    thread.start()
+    try:
+        yield killed
+    finally:
+        done.set()
+        thread.join()
+
+
+def busy_workers() -> list[int]:
+    """Return the worker processes of this one that have computed for two seconds."""
+    busy = []
+    for pid in [child for task in Path("/proc/self/task").iterdir() for child in children_of_task(task)]:
+        with contextlib.suppress(OSError):
+            if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes():
+                ticks = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+                if int(ticks[11]) + int(ticks[12]) > 2 * os.sysconf("SC_CLK_TCK"):
+                    busy.append(pid)
+    return busy
+
+
+def children_of_task(task: Path) -> list[int]:
+    with contextlib.suppress(OSError):
+        return [int(pid) for pid in (task / "children").read_text().split()]
+    return []
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="looks for processes in /proc")
+def test_two_workers_one_of_which_is_killed(model: Path, folder: Path, tmp_path: Path, expected: Any) -> None:
+    with killing(busy_workers) as killed:
+        assert results(model, folder, tmp_path, "--workers", 2) == expected
+    assert len(killed) == 1
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings(r"ignore:os\.fork\(\) was called:RuntimeWarning")  # Ray's forks execute another program.
+def test_two_ray_nodes_one_of_which_is_killed(
+    model: Path, folder: Path, tmp_path: Path, expected: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("ray", reason="the extra [cluster] is not installed")
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    from ray.cluster_utils import Cluster
+
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
+    try:
+        node = cluster.add_node(num_cpus=1)
+        lost = threading.Event()
+
+        def lose_node() -> None:
+            while not (tmp_path / "answers" / "000").exists():
+                time.sleep(0.02)
+            cluster.remove_node(node, allow_graceful=False)
+            lost.set()
+
+        thread = threading.Thread(target=lose_node)
+        thread.start()
+        found = results(model, folder, tmp_path, "--workers", 2, "--engine", "ray", "--address", cluster.address)
+        thread.join()
+        assert lost.is_set() and found == expected
+    finally:
+        cluster.shutdown()
