@@ -1,8 +1,10 @@
 """Confidence: the estimated probability that an answer is correct, comparable between known and unknown objects.
 
 The fused probability of a class says which of the trained classes is most likely, not whether the object is one of them
-at all. The embedding of a run is also fitted on distractors, objects that are none of the classes. A logistic function
-of both, fitted by `training` on views that no classifier was trained on, is the confidence.
+at all. The embedding of a run is also fitted on distractors, objects that are none of the classes. The confidence is
+the product of two logistic functions, fitted by `training` on views that no network was trained on:
+
+    P(correct) = P(correct | known, fused probability) P(known | the embedding's probability of all classes)
 """
 
 import dataclasses
@@ -24,15 +26,14 @@ MAX_ODDS = 8.0
 
 
 def answer_features(fused: Probabilities, embedding: Probabilities) -> NDArray[np.float64]:
-    """Return the features [B, 2] of a calibration: the log-odds of the answer, fused and by the embedding alone.
+    """Return the features [B, 2] of a calibration: log-odds of the answer, and of being any class by the embedding.
 
     Args:
         fused: [B, C] fused class probabilities.
         embedding: [B, C] class probabilities of the embedding; what they lack to 1 is that of the distractors.
     """
-    answer = fused.argmax(axis=1)[:, None]
-    values = [np.take_along_axis(p, answer, axis=1)[:, 0].astype(np.float64) for p in (fused, embedding)]
-    return logit(np.stack(values, axis=1).clip(0, 1)).clip(-MAX_ODDS, MAX_ODDS)
+    values = [fused.max(axis=1), embedding.sum(axis=1)]
+    return logit(np.stack(values, axis=1).astype(np.float64).clip(0, 1)).clip(-MAX_ODDS, MAX_ODDS)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,24 +41,26 @@ class Calibration:
     """A fitted confidence.
 
     Attributes:
-        bias: log-odds of a correct answer where both features are 0.
-        answer: factor of the fused log-odds of the answer.
-        known: factor of the embedding's log-odds of the answer, against all other classes and the distractors.
+        correct_bias: log-odds of a correct answer, for a known object whose first feature is 0.
+        correct_factor: factor of the first feature, the fused log-odds of the answer.
+        known_bias: log-odds of a known object where the second feature is 0.
+        known_factor: factor of the second feature, the embedding's log-odds of all classes against the distractors.
         unknown_below: confidence that 95 % of the correct held-out answers reach.
 
     Raises:
         InputError: a value is not a finite number, or `unknown_below` is not between 0 and 1.
     """
 
-    bias: float
-    answer: float
-    known: float
+    correct_bias: float
+    correct_factor: float
+    known_bias: float
+    known_factor: float
     unknown_below: float
 
     def __post_init__(self) -> None:
         values = dataclasses.astuple(self)
         if not all(isinstance(value, float) and np.isfinite(value) for value in values):
-            raise InputError(f"calibration is {values}; expected four finite numbers")
+            raise InputError(f"calibration is {values}; expected five finite numbers")
         if not 0 <= self.unknown_below <= 1:
             raise InputError(f"calibration: unknown_below is {self.unknown_below}; expected a confidence from 0 to 1")
 
@@ -74,12 +77,14 @@ class Calibration:
         try:
             return cls(**stored)
         except TypeError:
-            raise InputError(f"calibration is {stored!r}; expected bias, answer, known and unknown_below") from None
+            names = ", ".join(field.name for field in dataclasses.fields(cls))
+            raise InputError(f"calibration is {stored!r}; expected {names}; train the run again") from None
 
     def confidence(self, fused: Probabilities, embedding: Probabilities) -> NDArray[np.float64]:
         """Return the confidence [B] of the most probable class; the arguments are those of `answer_features`."""
-        features = answer_features(fused, embedding)
-        return np.asarray(expit(self.bias + features @ np.array([self.answer, self.known])))
+        answer, known = answer_features(fused, embedding).T
+        correct = expit(self.correct_bias + self.correct_factor * answer)
+        return np.asarray(correct * expit(self.known_bias + self.known_factor * known))
 
     def calibrated(self, fused: Probabilities, embedding: Probabilities) -> Probabilities:
         """Return the class probabilities [B, C], scaled so that the largest one is the confidence."""

@@ -1,8 +1,12 @@
 """Fit the confidence of a run on views and distractors that none of its networks were fitted on."""
 
+import dataclasses
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import NDArray
 from sklearn.linear_model import LogisticRegression
 
 from thor2_jax.descriptor.orientations import OrientedDescriptors
@@ -19,13 +23,16 @@ __all__ = ["KEPT", "fit_calibration"]
 KEPT = 0.95
 """Share of the correct held-out answers whose confidence reaches the threshold of a run."""
 
+KNOWN = 0.9
+"""Share of known objects that the confidence assumes among the instances to recognize."""
+
 BATCH = 128
 
 
 def fit_calibration(run: TrainedRun, embedding: Embedding, held_out: Samples) -> Calibration | None:
-    """Fit the confidence of a run; None if all held-out answers are correct, or none.
+    """Fit the confidence of a run; None if all held-out answers to known objects are correct, or none.
 
-    Known and unknown objects have the same weight in the fit, whatever their numbers.
+    Known and unknown objects are weighted by `KNOWN`, whatever their numbers.
 
     Args:
         run: run with its classifiers, which are fused as recognition does by default.
@@ -45,11 +52,19 @@ def fit_calibration(run: TrainedRun, embedding: Embedding, held_out: Samples) ->
     fused = recognizer.fused(probabilities)  # not calibrated yet
     features = answer_features(fused, probabilities[EMBEDDING])
     correct, known = fused.argmax(axis=1) == held_out.label, held_out.label < len(run.classes)
-    if correct.all() or not correct.any():
+    if known.all() or correct[known].all() or not correct.any():
         return None
-    weights = 1 / np.bincount(known)[known.astype(int)]
-    fit = LogisticRegression().fit(features, correct, sample_weight=weights * len(rows))
-    (answer, of_known), bias = fit.coef_[0].tolist(), float(fit.intercept_[0])
-    calibration = Calibration(bias, answer, of_known, unknown_below=0.0)
+    weights = np.where(known, KNOWN, 1 - KNOWN) / np.bincount(known)[known.astype(int)] * len(rows)
+    calibration = Calibration(
+        *_logistic(features[known, 0], correct[known]), *_logistic(features[:, 1], known, weights), unknown_below=0.0
+    )
     confidence = calibration.confidence(fused, probabilities[EMBEDDING])[correct]
-    return Calibration(bias, answer, of_known, float(np.quantile(confidence, 1 - KEPT)))
+    return dataclasses.replace(calibration, unknown_below=float(np.quantile(confidence, 1 - KEPT)))
+
+
+def _logistic(
+    feature: NDArray[Any], target: NDArray[np.bool_], weights: NDArray[Any] | None = None
+) -> tuple[float, float]:
+    """Return bias and factor of a logistic regression on one feature [N]."""
+    fit = LogisticRegression().fit(feature[:, None], target, sample_weight=weights)
+    return float(fit.intercept_[0]), float(fit.coef_[0, 0])

@@ -13,23 +13,25 @@ from thor2_jax.recognition.confidence import Calibration, answer_features
 
 FUSED = np.array([[0.7, 0.2, 0.1], [0.2, 0.2, 0.6]])
 EMBEDDED = np.array([[0.4, 0.5, 0.0], [0.01, 0.0, 0.001]])
-CALIBRATION = Calibration(-1.0, 0.5, 0.25, 0.3)
+CALIBRATION = Calibration(-1.0, 0.5, 2.0, 0.25, 0.3)
+RECORD = dataclasses.asdict(CALIBRATION)
 
 
-def test_features_are_log_odds_of_the_answer() -> None:
-    expected = np.log([[0.7 / 0.3, 0.4 / 0.6], [0.6 / 0.4, 0.001 / 0.999]])
+def test_features_are_log_odds_of_answer_and_classes() -> None:
+    expected = np.log([[0.7 / 0.3, 0.9 / 0.1], [0.6 / 0.4, 0.011 / 0.989]])
     np.testing.assert_allclose(answer_features(FUSED, EMBEDDED), expected)
 
 
 def test_certain_answers_have_finite_features() -> None:
-    features = answer_features(np.array([[1.0, 0.0]]), np.array([[0.0, 1.0]]))
+    features = answer_features(np.array([[1.0, 0.0]]), np.array([[0.0, 0.0]]))
     np.testing.assert_array_equal(features, [[8, -8]])
 
 
 def test_the_largest_probability_is_the_confidence() -> None:
-    odds = -1 + 0.5 * np.log(0.7 / 0.3) + 0.25 * np.log(0.4 / 0.6)
+    correct = 1 / (1 + np.exp(1 - 0.5 * np.log(0.7 / 0.3)))
+    known = 1 / (1 + np.exp(-2 - 0.25 * np.log(0.9 / 0.1)))
     values = CALIBRATION.calibrated(FUSED, EMBEDDED)
-    np.testing.assert_allclose(values[0], np.array([1, 2 / 7, 1 / 7]) / (1 + np.exp(-odds)))
+    np.testing.assert_allclose(values[0], np.array([1, 2 / 7, 1 / 7]) * correct * known)
     np.testing.assert_array_equal(values.argmax(axis=1), FUSED.argmax(axis=1))
     assert values[1, 2] < values[0, 0]
 
@@ -37,10 +39,10 @@ def test_the_largest_probability_is_the_confidence() -> None:
 @pytest.mark.parametrize(
     "record",
     [
-        {"bias": 0.0},
-        {"bias": 0.0, "answer": 1.0, "known": 1.0, "unknown_below": 2.0},
-        {"bias": float("nan"), "answer": 1.0, "known": 1.0, "unknown_below": 0.5},
-        {"bias": "0", "answer": 1.0, "known": 1.0, "unknown_below": 0.5},
+        {"known_bias": 0.0},
+        RECORD | {"unknown_below": 2.0},
+        RECORD | {"known_bias": float("nan")},
+        RECORD | {"known_bias": "0"},
         [],
     ],
 )
@@ -52,7 +54,7 @@ def test_damaged_records_are_refused(record: Any) -> None:
 
 def test_the_recognizer_uses_the_threshold_of_its_run() -> None:
     run = untrained_run(("a", "b", "c"), ("tops", "tops2"))
-    record = {"calibration": dataclasses.asdict(CALIBRATION)}
+    record = {"calibration": RECORD}
     sizes = EmbeddingSizes(cell=4, hidden=(8,), learned=4, color=2)
     embedding = Embedding.create(run.config, run.network, sizes, classes=run.classes, distractors=2)
     recognizer = thor2.Recognizer(dataclasses.replace(run, record=record), embedding=embedding)

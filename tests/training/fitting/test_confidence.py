@@ -36,7 +36,8 @@ def test_confidence_separates_and_keeps_its_share(held_out: Samples, monkeypatch
     right = np.where(known, held_out.label, 0)
     rng = np.random.default_rng(1)
     top = np.where(known, rng.uniform(0.8, 0.99, 40), rng.uniform(0.5, 0.9, 40))
-    answer = np.where(known & (np.arange(40) % 10 == 1), 1 - right, right)
+    wrong = known & (np.arange(40) % 10 == 1)
+    top, answer = np.where(wrong, 0.55, top), np.where(wrong, 1 - right, right)
     fused = np.stack([np.where(answer == k, top, 1 - top) for k in (0, 1)], axis=1)
     embedded = fused * np.where(known, 0.9, 0.1)[:, None]
     values = {"tops": fused, "tops2": fused, "embedding": embedded}
@@ -44,9 +45,10 @@ def test_confidence_separates_and_keeps_its_share(held_out: Samples, monkeypatch
         thor2.Recognizer, "probabilities", lambda *a: {k: np.resize(v, (128, 2)) for k, v in values.items()}
     )
     fitted = fit_calibration(run, embedding, held_out)
-    assert fitted is not None and fitted.known > 0
+    assert fitted is not None and min(fitted.known_factor, fitted.correct_factor) > 0
     scores, correct = fitted.confidence(fused, embedded), answer == held_out.label
-    assert np.median(scores[known]) > 0.5 > np.median(scores[~known])
+    assert np.min(scores[known & ~wrong]) > 0.7 > np.max(scores[~known])
+    assert np.mean(scores[known]) == pytest.approx(correct[known].mean(), abs=0.05)  # most instances are known
     assert fitted.unknown_below == pytest.approx(np.quantile(scores[correct], 1 - confidence.KEPT))
 
 
