@@ -163,22 +163,24 @@ class InferenceEngine:
         return self._recognizer.recognitions(instances, evidence)
 
     def calibrated_confidences(self, results: Sequence[CloudResult]) -> list[float | None]:
-        """Return the confidence of each cloud's most probable class after temperature scaling of both classifiers.
+        """Return the calibrated confidence of the most probable class of each cloud.
 
-        None without temperatures, which training fits on a held-out set (`thor2 train --folds`), where the confidence
-        itself is calibrated, with a gallery, and with forgotten classes.
+        It is the confidence itself if the run has a calibration, else the confidence after temperature scaling of both
+        classifiers. None without temperatures, which training fits on a held-out set (`thor2 train --folds`), with a
+        gallery, and with forgotten classes.
         """
         temperatures = self.run.record.get("temperatures", {})
-        is_changed = self._uses_gallery or self.objects.gallery.hidden or self._recognizer.calibration
-        if not results or is_changed or not set(THOR2) <= set(temperatures):
+        if not results or self._uses_gallery or self.objects.gallery.hidden:
             return [None] * len(results)
         probabilities: dict[str, NDArray[np.float32]] = {
-            name: np.stack([r.evidence.probabilities[name] for r in results]) for name in THOR2
+            name: np.stack([r.evidence.probabilities[name] for r in results]) for name in self._classifiers
         }
-        index = fuse(probabilities).class_index
-        calibrated = fused_probabilities(
-            {name: with_temperature(p, temperatures[name]) for name, p in probabilities.items()}
-        )
+        if self._recognizer.calibration is not None:
+            return [float(p) for p in self._recognizer.fused(probabilities).max(axis=1)]
+        if not set(THOR2) <= set(temperatures):
+            return [None] * len(results)
+        index = fuse({name: probabilities[name] for name in THOR2}).class_index
+        calibrated = fused_probabilities({n: with_temperature(probabilities[n], temperatures[n]) for n in THOR2})
         return [float(p) for p in calibrated[np.arange(len(results)), index]]
 
 

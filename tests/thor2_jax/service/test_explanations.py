@@ -14,6 +14,7 @@ import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.describe import strips
 from thor2_jax.recognition.answers import DescribedFrame, Evidence
+from thor2_jax.recognition.confidence import Calibration
 from thor2_jax.service.answers import explained_frame
 from thor2_jax.service.engine import CloudResult, InferenceEngine
 from thor2_jax.service.preparation import PreparedRequest, prepare_frame
@@ -95,6 +96,20 @@ def test_calibrated_confidence_uses_the_temperatures(run_dir: Path) -> None:
     logits = np.log(probabilities["tops"]) / 2 + np.log(probabilities["tops2"]) / 3
     expected = np.exp(logits / 2) / np.exp(logits / 2).sum()
     assert confidence == pytest.approx(expected[np.prod(list(probabilities.values()), axis=0).argmax()], rel=1e-4)
+
+
+def test_confidence_of_a_calibrated_run_is_calibrated(run_dir: Path) -> None:
+    engine = InferenceEngine(Settings(run_dir))
+    recognizer = engine._recognizer
+    recognizer.calibration = Calibration(0.0, 1.0, 1.0, 0.5, 0.2)
+    engine._classifiers = (*engine._classifiers, "embedding")
+    probabilities = {
+        name: np.array([0.7, 0.2, 0.1], np.float32)[: len(engine.run.classes)] for name in engine._classifiers
+    }
+    empty = np.zeros(0, np.float32)
+    (confidence,) = engine.calibrated_confidences([CloudResult(empty, empty, empty, empty, Evidence(0, probabilities))])
+    rows = {name: values[None] for name, values in probabilities.items()}
+    assert confidence == pytest.approx(float(recognizer.fused(rows).max()))
 
 
 def test_label_map_decodes_to_the_label_image(answer: Any, frame: thor2.RGBDFrame) -> None:
