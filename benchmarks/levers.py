@@ -48,7 +48,7 @@ from training.objects.meshes import find_meshes, read_names
 from training.readers.labelled import LabelledFrame
 from training.storage.jobs import check_same_job
 
-RENDER = "--azimuth-step 20 --polar-step 15 --illumination --occlusion --sensor --segmentation"
+RENDER = "--azimuth-step 20 --polar-step 15 --copies 2 --illumination --occlusion --sensor --segmentation"
 """Default options of all renderings: the cameras and the first four augmentations of the default protocol."""
 
 
@@ -89,9 +89,9 @@ class Lever:
         return self.fusion in (GALLERY, BOTH)
 
 
-PLAIN = "--orientation-copies 0 --embedding 0"
-ORIENTED = "--orientation-copies 2 --embedding 0"
-DISTRACTED = "--orientation-copies 2 --embedding 1500"
+PLAIN = "--epochs 24 --orientation-copies 0 --embedding 0"
+ORIENTED = "--epochs 24 --orientation-copies 2 --embedding 0"
+DISTRACTED = "--epochs 24 --orientation-copies 2 --embedding 1500"
 """Options of trainings without orientation copies and embedding, with the copies, and with both."""
 
 LEVERS = (
@@ -108,7 +108,8 @@ LEVERS = (
     Lever("gallery", train=PLAIN, fusion=GALLERY),
     Lever("classifiers and gallery", train=PLAIN, fusion=BOTH),
     Lever("registration and base in training", render="--registration --base", train=PLAIN),
-    Lever("total", render="--registration --base", orientations=None, fusion=None),
+    Lever("five copies in fewer epochs", render="--copies 5", train="--epochs 16 --orientation-copies 1 --embedding 0"),
+    Lever("total", render="--registration --base --copies 5", orientations=None, fusion=None),
 )
 """The table's rows. The default is that of versions without orientation copies and distractors; "total" is what
 `thor2 train` and recognition do by default now."""

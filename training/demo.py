@@ -18,6 +18,7 @@ import numpy as np
 from thor2_jax.files import check_output_directory, remove_leftovers, write_text
 from thor2_jax.recognition.overlay import draw_overlay
 from thor2_jax.recognition.run_directory import TrainedRun, load_run
+from training.embedding.sampling import AUGMENTATIONS
 from training.evaluation.answering import answer_frames
 from training.evaluation.answers import FrameAnswers
 from training.evaluation.results import compute_results, fuse_answers
@@ -39,8 +40,13 @@ from training.views.render_job import render_dataset
 
 __all__ = ["DemoSummary", "run_demo"]
 
-PROTOCOL = dataclasses.replace(DEFAULT, fit=dataclasses.replace(DEFAULT.fit, epochs=6))
-"""The default protocol with a quarter of its epochs, so that the demo takes a few minutes."""
+PROTOCOL = dataclasses.replace(
+    DEFAULT,
+    augmentations=dataclasses.replace(AUGMENTATIONS, copies=2),
+    orientation_copies=2,
+    fit=dataclasses.replace(DEFAULT.fit, epochs=6),
+)
+"""The default protocol with fewer augmented copies and epochs, so that the demo takes a few minutes."""
 
 N_SCENES = 40
 LIGHT = 0.4

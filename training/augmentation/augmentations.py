@@ -50,7 +50,7 @@ class Augmentations:
     sensor: Sensor | None = None
     occlusion: Occlusion | None = None
     segmentation: Segmentation | None = None
-    copies: int = 2
+    copies: int = 5
     registration: Registration | None = None
     base: Base | None = None
 

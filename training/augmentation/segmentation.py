@@ -36,7 +36,7 @@ class Segmentation:
         InputError: A value is outside its limits.
     """
 
-    pixels: Range = (-3.0, 3.0)
+    pixels: Range = (-5.0, 4.0)
     tilt: Range = (0.0, 70.0)
     touching: float = 0.7
     gap: Range = (0.0, 0.5)

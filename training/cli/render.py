@@ -31,7 +31,7 @@ def render(
         bool, typer.Option("--registration", help="Augment: colour that is blurred and shifted against depth.")
     ] = False,
     base: Annotated[bool, typer.Option("--base", help="Augment: masks without the lowest centimetre.")] = False,
-    copies: Annotated[int, typer.Option(help="Augmented copies of each view, if there are augmentations.")] = 2,
+    copies: Annotated[int, typer.Option(help="Augmented copies of each view, if there are augmentations.")] = 5,
     seed: Annotated[int, typer.Option(help="Seed for the augmentations.")] = 0,
     crops: Annotated[
         int | None, typer.Option(metavar="PIXELS", help="Also write crops of this size, for image networks.")

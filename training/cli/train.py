@@ -80,9 +80,9 @@ def train(
 ) -> None:
     """Train a recognizer on synthetic views of meshes. An interrupted training resumes.
 
-    With --meshes, each view is used as rendered and in two augmented copies, with other light, partial occlusion, depth
-    sensor errors and inexact masks. A --dataset has the copies that it was rendered with. --paper trains as the paper
-    does: more views, no augmented copies, four mirrors of each view and more epochs.
+    With --meshes, each view is used as rendered and in five augmented copies, with other light, partial occlusion,
+    depth sensor errors and inexact masks. A --dataset has the copies that it was rendered with. --paper trains as the
+    paper does: more views, no augmented copies, four mirrors of each view and more epochs.
 
     With --frames, labelled real instances are views of their objects, too, each with augmented copies. Objects may have
     a mesh, frames or both. A frame is a folder with color.png, depth.png, mask.png, intrinsics.json and labels.json.

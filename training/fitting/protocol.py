@@ -68,11 +68,11 @@ DEFAULT = Protocol(
     polar_step=15.0,
     augmentations=AUGMENTATIONS,
     mirrors=("",),
-    orientation_copies=2,
+    orientation_copies=1,
     config=DescriptorConfig(homology="closed_form", orientations=4),
-    fit=FitOptions(epochs=24, batch_size=256),
+    fit=FitOptions(epochs=16, batch_size=256),
 )
-"""Fewer views than the paper's, each with two augmented copies and in two more orientations."""
+"""Fewer views than the paper's, each with five augmented copies and in one more orientation."""
 
 PAPER = Protocol(
     azimuth_step=5.0,
