@@ -8,15 +8,16 @@ is added, the other one never dies. The finite H0 pairs are therefore (j s2, j s
 this is the closed form.
 """
 
+import importlib
 from typing import Any
 
-import gudhi
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.slicing import strip_births
+from thor2_jax.errors import InputError
 from thor2_jax.types import Diagrams, Strips
 
 __all__ = ["diagrams_of_strips"]
@@ -31,12 +32,16 @@ def diagrams_of_strips(strips: Strips, config: DescriptorConfig) -> Diagrams:
 
     Returns:
         Diagrams with fields [..., S, J]; pair j of a slice is that of strip j.
+
+    Raises:
+        InputError: `homology` is "gudhi", which is not installed.
     """
     births = jnp.broadcast_to(strip_births(config), strips.low.shape)
     edges = births + (strips.high - strips.low)
     if config.homology == "closed_form":
         birth, death, mask = births, edges, strips.occupied
     else:
+        _load_gudhi()
         out = jax.ShapeDtypeStruct(strips.low.shape, jnp.int32)
         values = jax.lax.stop_gradient((births, edges))
         birth_index, death_index = jax.pure_callback(
@@ -47,6 +52,17 @@ def diagrams_of_strips(strips: Strips, config: DescriptorConfig) -> Diagrams:
         birth = jnp.take_along_axis(births, jnp.maximum(birth_index, 0), axis=-1)
         death = jnp.take_along_axis(edges, jnp.maximum(death_index, 0), axis=-1)
     return Diagrams(births=jnp.where(mask, birth, 0), deaths=jnp.where(mask, death, 0), mask=mask)
+
+
+def _load_gudhi() -> Any:
+    # It has no wheels for ARM, where the closed form is used.
+    try:
+        return importlib.import_module("gudhi")
+    except ModuleNotFoundError:
+        raise InputError(
+            'homology is "gudhi", which is not installed; expected DescriptorConfig(homology="closed_form"), which has '
+            "the same pairs, or install gudhi"
+        ) from None
 
 
 def _gudhi_pairs(births: Any, edges: Any, occupied: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -62,7 +78,7 @@ def _gudhi_pairs(births: Any, edges: Any, occupied: Any) -> tuple[np.ndarray, np
         vertex_at = np.broadcast_to(births, shape).reshape(-1)[strip].astype(np.float64)
         edge_at = np.broadcast_to(edges, shape).reshape(-1)[strip].astype(np.float64)
         low = np.arange(len(strip), dtype=np.int32) * 2
-        tree = gudhi.SimplexTree()
+        tree = _load_gudhi().SimplexTree()
         tree.insert_batch(np.concatenate([low, low + 1])[None], np.concatenate([vertex_at, vertex_at]))
         tree.insert_batch(np.stack([low, low + 1]), edge_at)
         tree.compute_persistence(min_persistence=-1)

@@ -72,6 +72,10 @@ class ManyFrames(TyperCommand):
         return super().parse_args(ctx, expanded)
 
 
+TRAINING_PACKAGES = ("colour", "embreex", "gudhi", "kmapper", "matplotlib", "sklearn", "trimesh")
+"""Packages that recognition and the service do not import (docs/install.md)."""
+
+
 def show_help(context: typer.Context) -> None:
     """Print the help of a group of commands if none of them is given."""
     if context.invoked_subcommand is None:
@@ -110,6 +114,11 @@ def main() -> None:
         _exit_with(error.format_message().rstrip(".") + advice)
     except InputError as error:
         _exit_with(str(error))
+    except ModuleNotFoundError as error:
+        package = (error.name or "").partition(".")[0]
+        if package not in TRAINING_PACKAGES:
+            raise
+        _exit_with(f"{package} is not installed; recognition works without it, this does not: see docs/install.md")
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
         _exit_with(f"{where}{error.strerror or error}")

@@ -10,6 +10,7 @@ is given to another one.
 
 import collections
 import importlib
+import inspect
 import multiprocessing
 import os
 import queue
@@ -177,6 +178,8 @@ def ray_workers(workers: int, address: str | None = None) -> WorkerPool:
             warnings.filterwarnings("ignore", r"os\.fork\(\) was called", RuntimeWarning)
             cluster = ray.init(address, log_to_driver=False, logging_level="error")
         with cluster:
-            yield from _map_ordered(ray.remote(function).remote, fetch, items, workers)
+            # Ray takes no other callables, such as partial functions.
+            task = function if inspect.isfunction(function) else lambda item: function(item)
+            yield from _map_ordered(ray.remote(task).remote, fetch, items, workers)
 
     return run

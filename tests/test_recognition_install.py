@@ -1,0 +1,91 @@
+"""The small installation: recognition and the service import none of the packages that only training needs."""
+
+import json
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers import encode_image, untrained_run
+
+import colornet
+import thor2_jax as thor2
+from thor2_jax.config import DescriptorConfig
+from thor2_jax.errors import InputError
+from thor2_jax.recognition.run_directory import save_run
+from training.cli.app import TRAINING_PACKAGES
+
+ROOT = Path(__file__).parents[1]
+DISTRIBUTIONS = {"colour": "colour-science", "sklearn": "scikit-learn"}
+
+PROGRAM = """
+import sys
+for package in {packages!r}:
+    sys.modules[package] = None  # importing it raises ModuleNotFoundError
+import training.cli
+sys.argv = ["thor2", *{arguments!r}]
+{before}
+training.cli.main()
+"""
+
+
+def run_without(*arguments: object, before: str = "") -> subprocess.CompletedProcess[str]:
+    """Run the command line in a process in which the packages of training cannot be imported."""
+    program = PROGRAM.format(packages=TRAINING_PACKAGES, arguments=[*map(str, arguments)], before=before)
+    return subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True)
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    directory = tmp_path_factory.mktemp("run")
+    save_run(untrained_run(("bowl", "mug"), ("tops", "tops2")), directory)
+    return directory
+
+
+def test_recognition_and_the_service_need_no_package_of_training(model: Path, tmp_path: Path) -> None:
+    labels = np.zeros((90, 120), np.uint8)
+    labels[10:50, 10:50] = 1
+    (tmp_path / "color.png").write_bytes(encode_image(np.full((90, 120, 3), 99, np.uint8)))
+    (tmp_path / "depth.png").write_bytes(encode_image(np.full((90, 120), 700, np.uint16)))
+    (tmp_path / "mask.png").write_bytes(encode_image(labels))
+    (tmp_path / "intrinsics.json").write_text(json.dumps({"fx": 120.0, "fy": 120.0, "cx": 60.0, "cy": 45.0}))
+    service = "import thor2_jax.service.server, thor2_jax.client, thor2_jax.segmentation.table, thor2_jax.export"
+    ended = run_without("recognize", "--model", model, tmp_path, "--json", before=service)
+    assert ended.returncode == 0, ended.stderr
+    assert [one["label"] for one in json.loads(ended.stdout)["instances"]] == [1]
+
+
+def test_a_command_that_needs_training_says_so(tmp_path: Path) -> None:
+    (tmp_path / "mesh.ply").touch()
+    ended = run_without("render", "--meshes", tmp_path, "--out", tmp_path / "views")
+    assert ended.returncode == 2 and not (tmp_path / "views").exists()
+    assert re.fullmatch(r"error: (trimesh|embreex) is not installed; .*docs/install.md\n", ended.stderr)
+
+
+def test_gudhi_is_needed_only_where_it_is_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
+    clouds = thor2.PointClouds.pack([(np.ones((9, 3), np.float32), np.zeros((9, 3), np.uint8))])
+    config = DescriptorConfig(homology="gudhi", n_slices=2, n_strips=4, image_size=8)
+    monkeypatch.setitem(sys.modules, "gudhi", None)
+    with pytest.raises(InputError, match="homology is .*closed_form"):
+        thor2.describe(clouds, colornet.load_default(), config)
+
+
+def names(requirements: list[str]) -> dict[str, str]:
+    """Return the name of each distribution -> its requirement without the marker."""
+    plain = [requirement.partition(";")[0].strip() for requirement in requirements]
+    return {re.split(r"[<>=!\[ ]", each)[0].lower(): each for each in plain}
+
+
+def test_requirements_are_those_of_the_project() -> None:
+    lines = (ROOT / "requirements-recognition.txt").read_text().splitlines()
+    listed = names([line for line in lines if line and not line.startswith("#")])
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"]
+    full = names(project["dependencies"])
+    needed = full | names(extras["serve"]) | names(extras["segment"])
+    training = {DISTRIBUTIONS.get(name, name) for name in TRAINING_PACKAGES} | {"optax", "orbax-checkpoint"}
+    assert training <= set(full)
+    assert listed == {name: requirement for name, requirement in needed.items() if name not in training}
