@@ -5,7 +5,10 @@ from collections import deque
 from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple
 
-__all__ = ["ImagePair", "PairCounts", "StampedImage", "nearest_pairs"]
+__all__ = ["DEFAULT_MAX_GAP", "ImagePair", "PairCounts", "StampedImage", "nearest_pairs"]
+
+DEFAULT_MAX_GAP = 0.03
+"""Default of the largest time between the images of a pair, seconds: about a period at 30 frames a second."""
 
 LONGEST_WAIT = 2 * 10**9
 """How much later than the others, in nanoseconds, an image may arrive in the recording to be paired still."""

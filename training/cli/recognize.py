@@ -11,6 +11,7 @@ from rich.table import Table
 
 from thor2_jax.errors import InputError
 from thor2_jax.printable import escape_characters
+from thor2_jax.recordings.pairs import DEFAULT_MAX_GAP
 from thor2_jax.recordings.topics import Topics
 from training.cli.app import ModelOption, UnknownOption, app, console
 from training.cli.recognize_bag import BagOptions, recognize_bag
@@ -89,7 +90,7 @@ def recognize(
     ] = None,
     max_gap: Annotated[
         float, typer.Option(rich_help_panel=RECORDINGS, help="Longest time between colour and depth, seconds.")
-    ] = 0.03,
+    ] = DEFAULT_MAX_GAP,
     every: Annotated[
         int, typer.Option(min=1, rich_help_panel=RECORDINGS, help="Recognize the first of so many frames.")
     ] = 1,
@@ -127,6 +128,7 @@ def recognize(
         recognize_bag(options, model, unknown_below, answer_by)
         return
     of_bags = {"color_topic": color_topic, "depth_topic": depth_topic, "camera_topic": camera_topic, "out_bag": out_bag}
+    of_bags |= {"max_gap": max_gap if max_gap != DEFAULT_MAX_GAP else None, "every": every if every > 1 else None}
     for name, value in of_bags.items():
         if value is not None:
             raise InputError(f"{name} is {value}; it belongs to --bag")
