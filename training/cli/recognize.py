@@ -119,7 +119,8 @@ def recognize(
 
     if bag is not None:
         refused: dict[str, object] = {"FRAME": frames, "color": color, "depth": depth, "labels": labels, "names": names}
-        refused |= {"coco": coco, "bop": bop, "poses": poses}
+        refused |= {"coco": coco, "bop": bop, "poses": poses, "workers": workers if workers > 1 else None}
+        refused["engine"] = engine if engine != "local" else None
         given = [name for name, value in refused.items() if value]
         if given:
             raise InputError(f"{given[0]} is {refused[given[0]]} and bag is {bag}; give one of them")
@@ -127,7 +128,12 @@ def recognize(
         options = BagOptions(bag, topics, intrinsics, depth_scale, max_gap, every, segment, track, out, out_bag, rerun)
         recognize_bag(options, model, unknown_below, answer_by)
         return
-    of_bags = {"color_topic": color_topic, "depth_topic": depth_topic, "camera_topic": camera_topic, "out_bag": out_bag}
+    of_bags: dict[str, object] = {
+        "color_topic": color_topic,
+        "depth_topic": depth_topic,
+        "camera_topic": camera_topic,
+        "out_bag": out_bag,
+    }
     of_bags |= {"max_gap": max_gap if max_gap != DEFAULT_MAX_GAP else None, "every": every if every > 1 else None}
     for name, value in of_bags.items():
         if value is not None:

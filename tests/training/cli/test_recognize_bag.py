@@ -145,6 +145,8 @@ def test_what_was_done_before_the_end_is_kept(model: Path, tmp_path: Path, capfd
     [
         (["--color", "c.png"], "color is c.png and bag is"),
         (["--coco", "c.json"], "coco is c.json and bag is"),
+        (["--workers", "2"], "workers is 2 and bag is"),
+        (["--engine", "ray"], "engine is ray and bag is"),
         (["--out-bag", "{there}/a.bag"], "expected an MCAP file"),
         (["--out-bag", "{there}"], "which exists"),
         (["--out-bag", "{there}/none/a.mcap"], "No such file"),
