@@ -82,7 +82,7 @@ class _State(NamedTuple):
 @partial(jax.jit, static_argnums=0, donate_argnums=1)
 def _step(graph: Any, state: _State, color: Any, normals: Any, label: Any, rate: Any) -> Any:
     def loss_of(params: Any) -> Any:
-        model = nnx.merge(graph, params, state.statistics)
+        model = nnx.merge(graph, params, state.statistics, copy=True)  # batch normalizations change their statistics
         logits = model(*network_inputs(color, normals))
         loss = optax.softmax_cross_entropy_with_integer_labels(logits, label).mean()
         return loss, (nnx.state(model, nnx.BatchStat), (logits.argmax(axis=1) == label).mean())

@@ -18,7 +18,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.files import errors_name, write_text
 from training.storage.jobs import check_same_job
 
-__all__ = ["AnswerFile", "EvaluatedRun", "FrameAnswers", "InstancePrediction", "all_predictors"]
+__all__ = ["AnswerFile", "EvaluatedRun", "FrameAnswers", "InstancePrediction", "all_predictors", "read_answers"]
 
 
 class EvaluatedRun(Protocol):
@@ -143,6 +143,18 @@ class AnswerFile:
         with errors_name(self._path), self._path.open("a", encoding="utf-8") as file:
             file.write(line + "\n")
         self.frames.append(_decode(line))
+
+
+def read_answers(path: Path) -> list[FrameAnswers]:
+    """Read the answers of a finished evaluation.
+
+    Raises:
+        InputError: the file is missing or damaged.
+    """
+    try:
+        return [_decode(line) for line in path.read_bytes().splitlines()[1:]]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{path} cannot be read ({error}); expected the answers of a finished evaluation") from None
 
 
 def _encode(answers: FrameAnswers) -> str:

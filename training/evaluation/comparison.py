@@ -1,7 +1,7 @@
 """Measured accuracies beside the published tables, and the differences between the data of both."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,8 +19,12 @@ from training.evaluation.published import (
 
 __all__ = ["EvaluationConditions", "compare_with_published"]
 
-_OURS = {"THOR2, synthetic": "THOR2", "THOR (MLP)": "THOR"}
+_OURS = {"THOR (MLP)": "THOR"}
 """Published methods whose name differs from the title of the measured column."""
+
+_SYNTHETIC, _REAL, _SMALL = ", synthetic", ", +100 % YCB", "-small"
+"""What the published tables append to the methods that were trained without and with all real images, and what the
+titles of the small networks end with."""
 
 _PAPER_RULE: Rule = "max"
 """Fusion rule of the THOR2 paper."""
@@ -35,12 +39,25 @@ class EvaluationConditions:
         models: number of trained models.
         frames: number of frames.
         rule: fusion rule of the measured accuracies.
+        real_views: whether the models were trained on real views, too.
+        scratch: titles of the image networks that were trained without pretrained weights.
     """
 
     own_objects: bool
     models: int
     frames: int
     rule: Rule
+    real_views: bool = False
+    scratch: Collection[str] = ()
+
+
+def _measured_column(method: str, conditions: EvaluationConditions, titles: Collection[str]) -> str | None:
+    """Return the title of the measured column of a published method, that of a small network if it stands for it."""
+    other, own = (_SYNTHETIC, _REAL) if conditions.real_views else (_REAL, _SYNTHETIC)
+    if method.endswith(other):
+        return None
+    name = method.removesuffix(own)
+    return next((title for title in (_OURS.get(name, name), name + _SMALL) if title in titles), None)
 
 
 def compare_with_published(
@@ -80,6 +97,8 @@ def compare_with_published(
                 counts = {"instances": int(rows.sum())}
                 cells.append({"where": dict(cell.where), **counts, "published": published, "accuracy": accuracy})
         if cells:
+            columns = {method: _measured_column(method, conditions, correct) for method in table.methods}
+            ours = {method: title for method, title in columns.items() if title is not None}
             n_objects = len({name for name, is_shown in zip(objects, shown, strict=True) if is_shown})
             comparisons.append(
                 {
@@ -87,8 +106,11 @@ def compare_with_published(
                     "title": table.title,
                     "source": table.source,
                     "notes": list(table.notes),
-                    "differences": _differences(kind, table, conditions, n_objects, len(cells)),
-                    "ours": {m: _OURS.get(m, m) for m in table.methods if _OURS.get(m, m) in correct},
+                    "differences": [
+                        *_differences(kind, table, conditions, n_objects, len(cells)),
+                        *_network_differences(ours.values(), conditions),
+                    ],
+                    "ours": ours,
                     "cells": cells,
                 }
             )
@@ -97,6 +119,20 @@ def compare_with_published(
 
 def _fractions(figure: PublishedFigure) -> dict[str, float | None]:
     return {"mean": figure.mean / 100, "std": None if figure.std is None else figure.std / 100}
+
+
+def _network_differences(titles: Iterable[str], conditions: EvaluationConditions) -> list[str]:
+    """Return what a reader must know of the measured image networks."""
+    sentences = []
+    for title in dict.fromkeys(titles):
+        if title.endswith(_SMALL):
+            sentences.append(f"{title} is a smaller network than the published one.")
+        if title in conditions.scratch:
+            sentences.append(
+                f"{title} was trained from scratch, without pretrained weights: its accuracy is no claim about the "
+                "published network."
+            )
+    return sentences
 
 
 def _differences(

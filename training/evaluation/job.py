@@ -20,7 +20,7 @@ from training.evaluation.answers import AnswerFile, FrameAnswers, all_predictors
 from training.evaluation.frame_pictures import FramePictures
 from training.evaluation.page import write_report_page
 from training.evaluation.results import compute_results
-from training.evaluation.runs import Run, SequenceRun
+from training.evaluation.runs import Run, SequenceRun, has_real_views, scratch_networks
 from training.readers.labelled import LabelledFrame, LabelledFrames
 from training.storage.locks import locked
 from training.storage.progress import Progress
@@ -98,7 +98,9 @@ def _evaluate(
         pictures.restore(answers)
     _answer_rest(answering or _in_process(runs, frames), frames, file, pictures, progress)
     own_objects = isinstance(runs[0], SequenceRun)
-    results = compute_results(dataset["kind"], runs, file.frames, own_objects)
+    results = compute_results(
+        dataset["kind"], runs, file.frames, own_objects, has_real_views(runs), scratch_networks(runs)
+    )
     report = {"dataset": description, "digests": digests, **results}
     if not report["instances"]["scored"]:
         raise InputError(

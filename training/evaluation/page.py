@@ -170,7 +170,13 @@ def _accuracy_text(report: Mapping[str, Any]) -> str:
         text += (
             "Baselines, trained on the same views and evaluated on the same instances: THOR, the predecessor, "
             "a library of shape classifiers; a random forest on a colour histogram and side "
-            "lengths; a PointNet with colour. "
+            "lengths; a PointNet with colour; RCFusion, ViT-CNN and RGB-D ViT, networks on crops of colour and surface "
+            "normals; templates, the nearest training crop by the features of a frozen backbone. "
+        )
+    if report["scratch"]:
+        text += (
+            f"{', '.join(report['scratch'])}: trained from scratch, without pretrained weights; the accuracy is no "
+            "claim about the published networks. "
         )
     if len(report["runs"]) > 1:
         text += f"Values are the mean and the sample standard deviation over {len(report['runs'])} models. "

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -86,7 +86,12 @@ def incorrect_answers(
 
 
 def compute_results(
-    kind: str, runs: Sequence[EvaluatedRun], frames: Sequence[FrameAnswers], own_objects: bool = False
+    kind: str,
+    runs: Sequence[EvaluatedRun],
+    frames: Sequence[FrameAnswers],
+    own_objects: bool = False,
+    real_views: bool = False,
+    scratch: Collection[str] = (),
 ) -> dict[str, Any]:
     """Return accuracy, confidence metrics, confusions and speed.
 
@@ -95,6 +100,8 @@ def compute_results(
         runs: evaluated runs, which share their classes.
         frames: the answers.
         own_objects: whether a frame's classes are the objects of its sequence; selects the published values.
+        real_views: whether the runs were trained on real views, too; selects the published values.
+        scratch: titles of the image networks that were trained without pretrained weights.
     """
     classes = runs[0].classes
     labelled = [(instance, _attributes(kind, frame)) for frame in frames for instance in frame.instances]
@@ -116,8 +123,9 @@ def compute_results(
         "fusions": [],
         "worst": [],
         "published_tables": [],
+        "scratch": list(scratch),
     }
-    conditions = EvaluationConditions(own_objects, len(runs), len(frames), DEFAULT_RULE)
+    conditions = EvaluationConditions(own_objects, len(runs), len(frames), DEFAULT_RULE, real_views, scratch)
     return results | _scores(kind, runs, known, placement, unknown, conditions) if known else results
 
 

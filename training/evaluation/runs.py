@@ -22,11 +22,12 @@ from thor2_jax.recognizer import Recognizer
 from training.baselines.baseline import Baseline, BaselineInputs
 from training.baselines.files import baseline_file
 from training.baselines.load import load_baselines
+from training.baselines.names import NETWORKS, TITLES
 from training.evaluation.fusion import ALL_CLASSIFIERS, BOTH, EMBEDDED, GALLERY
 from training.fitting.run_directories import find_run_directories
 from training.readers.labelled import path_ends, sequence_of
 
-__all__ = ["Run", "SequenceRun", "load_runs", "load_sequence_runs"]
+__all__ = ["Run", "SequenceRun", "has_real_views", "load_runs", "load_sequence_runs", "scratch_networks"]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -233,6 +234,17 @@ def load_sequence_runs(directory: Path, frames: Iterable[str]) -> list[SequenceR
             SequenceRun(name, digest, run.recognizer, run.baselines, weights=run.weights, of_sequence=runs_of_fold)
         )
     return result
+
+
+def has_real_views(runs: Sequence[Run]) -> bool:
+    """Return whether runs were trained on labelled real instances, too."""
+    return any("frames" in run.recognizer.run.record.get("dataset", {}) for run in runs)
+
+
+def scratch_networks(runs: Sequence[Run]) -> list[str]:
+    """Return the titles of the image networks that were trained without pretrained weights."""
+    names = {name for run in runs for name, files in run.weights.items() if not files}
+    return [TITLES[name] for name in NETWORKS if name in names]
 
 
 def _load(directory: Path) -> Run:

@@ -171,3 +171,23 @@ def test_report_has_the_tables_of_its_protocol() -> None:
     assert numbers == {True: [1, 8, None], False: [3]}
     assert compute_results("frames", [ToyRun()], frames)["published_tables"] == []  # type: ignore[list-item]
     assert compute_results("ocid", [ToyRun()], frames[:0])["published_tables"] == []  # type: ignore[list-item]
+
+
+def test_networks_stand_beside_their_published_figures() -> None:
+    """Small ones too, trained without or with real views, and what was trained from scratch is said."""
+    marks = [np.array([True, False])]
+    attributes = [{"environment": "lounge", "occlusion": "high", "light": "1", "category": "food"}] * 2
+
+    def ours(number: int, real: bool, titles: list[str]) -> tuple[dict[str, str], str]:
+        conditions = EvaluationConditions(False, 1, 1, "max", real, ("RCFusion-small",))
+        correct = dict.fromkeys(titles, marks)
+        tables = compare_with_published("uwis", conditions, attributes, ["a", "b"], correct)
+        (table,) = [table for table in tables if table["number"] == number]
+        return table["ours"], " ".join(table["differences"])
+
+    titles = ["THOR2", "RCFusion-small", "ViT-CNN", "ViT-CNN-small"]
+    columns, text = ours(4, False, titles)
+    assert columns == {"THOR2": "THOR2", "RCFusion": "RCFusion-small", "ViT-CNN": "ViT-CNN"}
+    assert text.count("RCFusion-small") == 2 and "scratch" in text and "ViT-CNN" not in text
+    assert ours(9, False, titles)[0] == {"THOR2, synthetic": "THOR2"}
+    assert ours(9, True, titles)[0] == {"RCFusion, +100 % YCB": "RCFusion-small", "ViT-CNN, +100 % YCB": "ViT-CNN"}

@@ -1,0 +1,232 @@
+"""The paper's whole comparison: `python -m benchmarks.paper --meshes DIR --scenes DIR --frames DIR... --out OUT`.
+
+For each dataset, `thor2 render` renders views and crops, and `thor2 train` trains THOR2 and then each baseline on them,
+in folds; all are evaluated on the same instances. --scenes is a dataset in the layout of UW-IS Occluded, --frames are
+folders of labelled frames; either may be left out. The results are in
+
+OUT/DATASET/views, run, evaluation*    views, trained models, answers and pages of each dataset
+OUT/paper.json, paper.md, paper.png    the tables of the paper beside ours, paired comparisons, time and memory
+
+The command resumes when it is given again with the same options: finished views, models, frames and measurements are
+kept. Networks are trained from scratch without --weights, and the report then makes no claim about the paper's.
+With --real, the labelled frames of these folders join the views, as in the last tables of the paper; THOR is left out
+then, since real frames have no camera angles.
+"""
+
+import argparse
+import json
+import os
+import shlex
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from benchmarks.paper_measurement import Dataset, compare_runs, recognition_seconds
+from benchmarks.paper_report import draw_claims, report_text
+from thor2_jax.errors import InputError
+from thor2_jax.files import file_digest, write_text
+from training.baselines.files import baseline_file
+from training.baselines.names import check_baselines, crop_size
+from training.evaluation.runs import load_runs
+from training.fitting.run_directories import find_run_directories
+from training.objects.meshes import find_meshes, read_names
+from training.readers.frames import FrameFolder
+from training.readers.labelled import LabelledFrames
+from training.readers.uwis import UWISOccluded
+from training.storage.jobs import check_same_job
+
+BASELINES = "thor,forest,pointnet,rcfusion-small,vit-cnn-small,rgbd-vit-small,templates"
+RENDER = "--azimuth-step 20 --polar-step 15 --illumination --occlusion --sensor --segmentation --registration --base"
+"""Views and augmentations of the default protocol."""
+
+THOR2 = "THOR2"
+"""Name of the training of the classifiers of THOR2 among the costs."""
+
+
+class Comparison:
+    """The trainings and evaluations in an output directory.
+
+    Attributes:
+        out: the directory.
+        options: command line.
+        baselines: names of the baselines, in the order of training.
+    """
+
+    def __init__(self, options: argparse.Namespace) -> None:
+        """Read the datasets, and check that the directory is new or of the same job.
+
+        Raises:
+            InputError: the directory is of another job, or a dataset, a table or the meshes cannot be read.
+            OSError: a file cannot be read or written.
+        """
+        self.out: Path = options.out
+        self.options = options
+        names = [name.strip() for name in options.baselines.split(",") if name.strip()]
+        self.baselines = [name for name in check_baselines(names) if not (options.real and name == "thor")]
+        self.datasets = _datasets(options)
+        tables = {"scenes": options.scene_names, "frames": options.frame_names}
+        for name in self.datasets:
+            find_meshes(options.meshes, read_names(tables[name]) if tables[name] else None)
+        weights = sorted(options.weights.glob("*.safetensors")) if options.weights else []
+        job = {
+            "meshes": str(options.meshes.resolve()),
+            "names": {name: str(path) if path else None for name, path in tables.items()},
+            "datasets": {name: list(dataset.parts) for name, dataset in self.datasets.items()},
+            "real": [str(path.resolve()) for path in options.real],
+            "weights": {path.name: file_digest(path) for path in weights},
+            "folds": options.folds,
+            "render": options.render,
+            "train": options.train,
+        }
+        file = self.out / "job.json"
+        if file.is_file():
+            check_same_job(self.out, json.loads(file.read_bytes()), job)
+        self.out.mkdir(parents=True, exist_ok=True)
+        write_text(file, json.dumps(job, indent=1) + "\n")
+
+    def train(self, name: str) -> None:
+        """Render the views of a dataset and train all its models, unless they are finished."""
+        options, directory = self.options, self.out / name
+        views, table = directory / "views", getattr(options, "scene_names" if name == "scenes" else "frame_names")
+        source = ["--meshes", options.meshes, *(["--names", table] if table else [])]
+        size = crop_size(self.baselines, options.weights is not None)
+        crops = [] if size is None else ["--crops", size]
+        self._run(name, "render", "render", *source, "--out", views, *shlex.split(options.render), *crops,
+                  "--workers", options.workers)  # fmt: skip
+        real = ["--frames", *options.real] if options.real else []
+        train = ["train", "--dataset", views, *real, "--out", directory / "run", "--folds", options.folds]
+        train += ["--embedding", 0, *shlex.split(options.train)]
+        self._run(name, THOR2, *train)
+        for baseline in self.baselines:
+            weights = ["--weights", options.weights] if options.weights and _reads_weights(baseline) else []
+            self._run(name, baseline, *train, "--baselines", baseline, *weights)
+
+    def _run(self, dataset: str, method: str, *arguments: object) -> None:
+        """Run a command of `thor2` and store its time and memory, unless that is done."""
+        file = self.out / dataset / "costs.json"
+        costs = json.loads(file.read_bytes()) if file.is_file() else {}
+        if method in costs:
+            return
+        _report(f"{dataset}: {method}")
+        command = [sys.executable, "-m", "training.cli", *map(str, arguments), "--quiet"]
+        start = time.perf_counter()
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+        _, status, usage = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+        if process.returncode:
+            raise InputError(f"the command failed: {shlex.join(command)}")
+        costs[method] = {
+            "seconds": round(time.perf_counter() - start, 1),
+            "processor_seconds": round(usage.ru_utime + usage.ru_stime, 1),
+            "peak_memory_mb": round(usage.ru_maxrss / 1024),
+        }
+        file.parent.mkdir(parents=True, exist_ok=True)
+        write_text(file, json.dumps(costs, indent=1) + "\n")
+
+    def evaluate(self, name: str) -> dict[str, Any]:
+        """Evaluate the models of a dataset and return the results."""
+        directory = self.out / name
+        runs = load_runs([directory / "run"])
+        dataset = self.datasets[name]
+        _report(f"{name}: evaluation")
+        results = compare_runs(dataset, runs, directory)
+        costs = json.loads((directory / "costs.json").read_bytes())
+        timing = directory / "recognition.json"
+        if not timing.is_file():
+            write_text(timing, json.dumps(recognition_seconds(runs[0], dataset), indent=1) + "\n")
+        for method, seconds in json.loads(timing.read_bytes()).items():
+            costs[method]["milliseconds_per_instance"] = 1000 * seconds
+        for baseline in self.baselines:
+            files = [baseline_file(run, baseline) for run in find_run_directories([directory / "run"])]
+            costs[baseline]["file_mb"] = round(sum(file.stat().st_size for file in files) / len(files) / 1e6, 1)
+        return {**results, "costs": costs}
+
+    def write(self, results: dict[str, Any]) -> str:
+        """Write the report and return its text."""
+        options = self.options
+        conditions = {
+            "date": time.strftime("%Y-%m-%d"),
+            "processors": len(os.sched_getaffinity(0)),
+            "note": options.note,
+            "folds": options.folds,
+            "render": options.render,
+            "train": f"--embedding 0 {options.train}".strip(),
+            "pretrained": options.weights is not None,
+            "real": [path.name for path in options.real],
+            "baselines": self.baselines,
+        }
+        report = {"conditions": conditions, "datasets": results}
+        write_text(self.out / "paper.json", json.dumps(report, indent=1) + "\n")
+        draw_claims(report, self.out / "paper.png")
+        text = report_text(report)
+        write_text(self.out / "paper.md", text)
+        return text
+
+
+def _reads_weights(name: str) -> bool:
+    from training.baselines.pretrained import pretrained_files
+
+    return bool(pretrained_files(name))
+
+
+def _datasets(options: argparse.Namespace) -> dict[str, Dataset]:
+    datasets: dict[str, Dataset] = {}
+    if options.scenes:
+        datasets["scenes"] = Dataset("uwis", {options.scenes.name: UWISOccluded(options.scenes)})
+    if options.frames:
+        folders: dict[str, LabelledFrames] = {path.resolve().name: FrameFolder(path) for path in options.frames}
+        if len(folders) < len(options.frames):
+            raise InputError("frames has several directories of one name; expected different names")
+        datasets["frames"] = Dataset("frames", folders)
+    return datasets
+
+
+def _report(text: str) -> None:
+    print(f"{time.strftime('%H:%M:%S')} {text}", flush=True)
+
+
+def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
+    """Return the command line's options."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--meshes", type=Path, required=True, metavar="DIR", help="as for thor2 render")
+    parser.add_argument("--scenes", type=Path, metavar="DIR", help="dataset in the layout of UW-IS Occluded")
+    parser.add_argument("--scene-names", type=Path, metavar="FILE", help="its objects: table of name -> mesh")
+    parser.add_argument("--frames", type=Path, nargs="+", default=[], metavar="DIR", help="folders of labelled frames")
+    parser.add_argument("--frame-names", type=Path, metavar="FILE", help="their objects: table of name -> mesh")
+    parser.add_argument("--real", type=Path, nargs="+", default=[], metavar="DIR", help="labelled frames to train on")
+    parser.add_argument("--out", type=Path, required=True, metavar="OUT")
+    parser.add_argument("--baselines", default=BASELINES, help="comma-separated (%(default)s)")
+    parser.add_argument("--weights", type=Path, metavar="DIR", help="pretrained weights, as for thor2 train")
+    parser.add_argument("--folds", type=int, default=5, help="as for thor2 train (%(default)s)")
+    parser.add_argument("--render", default=RENDER, metavar="OPTIONS", help='of all renderings ("%(default)s")')
+    parser.add_argument("--train", default="", metavar="OPTIONS", help="further options of all trainings")
+    parser.add_argument("--note", default="", metavar="TEXT", help="about the machine, for the report")
+    parser.add_argument("--workers", type=int, default=2, help="rendering processes")
+    options = parser.parse_args(arguments)
+    if not options.scenes and not options.frames:
+        parser.error("scenes and frames are missing; expected at least one of them")
+    if options.folds < 1:
+        parser.error(f"folds is {options.folds}; expected at least 1")
+    return options
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Train and evaluate what is missing and write the report."""
+    options = parse(arguments)
+    try:
+        comparison = Comparison(options)
+        results: dict[str, Any] = {}
+        for name in comparison.datasets:
+            comparison.train(name)  # all before the first evaluation: a process counts its parent's memory, too
+        for name in comparison.datasets:
+            results[name] = comparison.evaluate(name)
+        print(comparison.write(results))
+    except (InputError, OSError) as error:
+        sys.exit(f"error: {error}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,168 @@
+"""What `benchmarks.paper` measures: accuracy by column, paired comparisons of the paper's claims, recognition time."""
+
+import dataclasses
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.paired import paired_difference
+from thor2_jax.recognition.fusion import DEFAULT_RULE
+from training.baselines.baseline import baseline_inputs
+from training.baselines.names import CLOUD_BASELINES, NETWORKS, TITLES
+from training.evaluation.answers import FrameAnswers, read_answers
+from training.evaluation.fusion import Rule
+from training.evaluation.job import ANSWERS, evaluate_dataset
+from training.evaluation.placements import find_placements
+from training.evaluation.results import compute_results, fuse_answers
+from training.evaluation.runs import Run, has_real_views, scratch_networks
+from training.readers.labelled import LabelledFrames
+
+__all__ = ["CLAIMS", "Claim", "Dataset", "compare_runs", "recognition_seconds"]
+
+RULES: tuple[Rule, ...] = (DEFAULT_RULE, "max")
+"""The project's fusion rule and the paper's."""
+
+TIMED_FRAMES = 5
+
+
+class Claim(NamedTuple):
+    """A claim of the paper: THOR2 is more accurate than another column."""
+
+    text: str
+    other: str
+
+
+CLAIMS = (
+    Claim("THOR2 above THOR", "THOR"),
+    Claim("colour helps: THOR2 above TOPS", "TOPS"),
+    Claim("THOR2 above CE + TOPS + TOPS2", "CE+TOPS+TOPS2"),
+    *(Claim(f"THOR2 above {TITLES[name]}", TITLES[name]) for name in (*NETWORKS, "templates", "forest", "pointnet")),
+)
+"""Claims of the paper, and the comparisons with baselines that the paper does not have: templates, forest, PointNet."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Dataset:
+    """Frames that are evaluated together.
+
+    Attributes:
+        kind: kind of dataset, as for `evaluate_dataset`.
+        parts: name -> frames.
+    """
+
+    kind: str
+    parts: Mapping[str, LabelledFrames]
+
+
+def compare_runs(dataset: Dataset, runs: Sequence[Run], directory: Path) -> dict[str, Any]:
+    """Evaluate runs, or resume that, and return accuracies, published tables and claims.
+
+    Args:
+        dataset: the frames.
+        runs: the folds.
+        directory: where the evaluations are written, one directory for each part.
+    """
+    frames: list[FrameAnswers] = []
+    for name, part in dataset.parts.items():
+        out = directory / f"evaluation-{name}"
+        evaluate_dataset(runs, part, {"kind": dataset.kind, "path": name}, out)
+        prefix = f"{name}/" if len(dataset.parts) > 1 else ""
+        frames += [dataclasses.replace(each, frame=prefix + each.frame) for each in read_answers(out / ANSWERS)]
+    report = compute_results(
+        dataset.kind, runs, frames, real_views=has_real_views(runs), scratch=scratch_networks(runs)
+    )
+    return {
+        "objects": len(report["classes"]),
+        "frames": len(frames),
+        "instances": report["instances"],
+        "placements": report["placements"],
+        "fusions": report["fusions"],
+        "main": report["main"],
+        "scratch": report["scratch"],
+        "accuracy": {rule: report["accuracy"][rule] for rule in RULES},
+        "by_part": _accuracy_by_part(dataset, runs, frames),
+        "published_tables": report["published_tables"],
+        "claims": {rule: claims(runs, frames, rule) for rule in RULES},
+    }
+
+
+def _accuracy_by_part(dataset: Dataset, runs: Sequence[Run], frames: Sequence[FrameAnswers]) -> dict[str, Any]:
+    """Return part -> column -> accuracy, mean over the folds, by the default rule."""
+    values: dict[str, Any] = {}
+    for name in dataset.parts if len(dataset.parts) > 1 else ():
+        own = [frame for frame in frames if frame.frame.startswith(f"{name}/")]
+        correct, placement = correct_answers(runs, own, DEFAULT_RULE)
+        values[name] = {
+            "instances": len(placement),
+            "placements": len(np.unique(placement)),
+            "accuracy": {title: float(np.mean(marks)) for title, marks in correct.items()} if len(placement) else {},
+        }
+    return values
+
+
+def correct_answers(
+    runs: Sequence[Run], frames: Sequence[FrameAnswers], rule: Rule
+) -> tuple[dict[str, NDArray[np.bool_]], NDArray[np.intp]]:
+    """Return column -> [F, N] whether each fold is correct on each known instance, and the placements [N]."""
+    classes = runs[0].classes
+    labelled = [instance for frame in frames for instance in frame.instances]
+    known = np.array([instance.truth in classes for instance in labelled], bool)
+    placement = np.concatenate([np.zeros(0, np.intp), *find_placements(frames)])[known]
+    instances = [instance for instance, is_known in zip(labelled, known, strict=True) if is_known]
+    described = np.array([instance.probabilities is not None for instance in instances], bool)
+    truth = np.array([classes.index(instance.truth) for instance in instances], np.intp)
+    correct = {}
+    for title, by_run in fuse_answers(instances, runs, rule).items():
+        marks = np.zeros((len(by_run), len(instances)), bool)
+        for row, predictions in enumerate(by_run.values()):
+            marks[row, described] = predictions.class_index == truth[described]
+        correct[title] = marks
+    return correct, placement
+
+
+def claims(runs: Sequence[Run], frames: Sequence[FrameAnswers], rule: Rule) -> list[dict[str, Any]]:
+    """Return the paired comparisons of THOR2 with the other columns."""
+    correct, placement = correct_answers(runs, frames, rule)
+    found = []
+    for claim in CLAIMS:
+        if "THOR2" in correct and claim.other in correct:
+            difference = paired_difference(correct["THOR2"], correct[claim.other], placement)
+            found.append(
+                {"claim": claim.text, "other": claim.other, **dataclasses.asdict(difference)}
+                | {"verdict": difference.verdict}
+            )
+    return found
+
+
+def recognition_seconds(run: Run, dataset: Dataset) -> dict[str, float]:
+    """Return method -> seconds for an instance, from the frame in memory to the probabilities, after compilation.
+
+    Methods on clouds segment and describe the frame, image networks crop it.
+    """
+    part = next(iter(dataset.parts.values()))
+    frames = [part[number].frame for number in range(min(TIMED_FRAMES, len(part)))]
+    recognizer, config = run.recognizer, run.recognizer.run.config
+    described = [recognizer.describe(frame) for frame in frames]
+    n_instances = sum(len(each.usable) for each in described)
+
+    def timed(function: Callable[[int], object]) -> float:
+        for number in range(len(frames)):
+            function(number)  # compiles
+        start = time.perf_counter()
+        for number in range(len(frames)):
+            function(number)
+        return (time.perf_counter() - start) / max(n_instances, 1)
+
+    describing = timed(lambda number: recognizer.describe(frames[number]))
+    seconds = {"THOR2": describing + timed(lambda number: recognizer.probabilities(described[number].oriented))}
+    for name, model in run.baselines.items():
+
+        def predict(number: int, model: Any = model) -> object:
+            return model.probabilities(baseline_inputs(described[number], config, frames[number]))
+
+        seconds[name] = timed(predict) + (describing if name in CLOUD_BASELINES else 0)
+    return seconds

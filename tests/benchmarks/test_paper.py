@@ -1,0 +1,105 @@
+"""The paper's comparison: bad arguments, and a tiny one with every part that resumes."""
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers import write_meshes
+from PIL import Image
+
+from benchmarks import paper
+from benchmarks.paper_measurement import CLAIMS
+from training.baselines.names import TITLES
+from training.evaluation.fusion import fusions
+from training.objects.builtin_objects import builtin_objects
+from training.rendering.scenes import compose_scene
+
+NAMES = ("soup_can_red", "cereal_box_blue")
+
+
+def test_claims_name_columns() -> None:
+    titles = fusions([*TITLES, "tops", "tops2", "ce"])
+    assert all(claim.other in titles for claim in CLAIMS) and "THOR2" in titles
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "scenes and frames are missing"),
+        (["--frames", "absent", "--folds", "0"], "folds is 0"),
+        (["--frames", "absent"], "absent"),
+        (["--frames", ".", "--baselines", "tree"], "baselines is tree"),
+    ],
+)
+def test_bad_arguments_write_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
+) -> None:
+    with pytest.raises(SystemExit) as caught:
+        paper.main(["--meshes", str(tmp_path), "--out", str(tmp_path / "out"), *arguments])
+    shown = capsys.readouterr().err if caught.value.code == 2 else str(caught.value)
+    assert message in shown and list(tmp_path.iterdir()) == []
+
+
+@pytest.fixture
+def given(tmp_path: Path) -> list[str]:
+    """Return options with two frames of two built-in objects, which also join the views."""
+    objects = builtin_objects()
+    meshes, frames = write_meshes(tmp_path / "meshes", NAMES), tmp_path / "frames"
+    for seed in range(2):
+        scene = compose_scene({name: objects[name] for name in NAMES}, np.random.default_rng(seed), n_objects=2)
+        folder = frames / f"{seed}"
+        folder.mkdir(parents=True)
+        for name, image in (("color", scene.frame.color), ("depth", scene.frame.depth), ("mask", scene.frame.labels)):
+            Image.fromarray(np.asarray(image)).save(folder / f"{name}.png")
+        k = scene.frame.intrinsics
+        (folder / "intrinsics.json").write_text(json.dumps({"fx": k.fx, "fy": k.fy, "cx": k.cx, "cy": k.cy}))
+        (folder / "labels.json").write_text(json.dumps({"labels": {str(i): n for i, n in scene.truth.items()}}))
+    values = {
+        "meshes": meshes, "frames": frames, "real": frames, "baselines": "thor,forest,rgbd-vit-small,templates",
+        "render": "--azimuth-step 90 --polar-step 90", "train": "--epochs 1 --batch-size 8", "folds": 1, "workers": 1,
+    }  # fmt: skip
+    return [f"--{name}={value}" for name, value in values.items()]
+
+
+@pytest.mark.slow
+def test_a_small_comparison_resumes(tmp_path: Path, given: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """A model that is lost is trained again, and nothing else; THOR cannot use real views."""
+    out = tmp_path / "out"
+    paper.main([*given, f"--out={out}"])
+    report: dict[str, Any] = json.loads((out / "paper.json").read_text())
+    results = report["datasets"]["frames"]
+    assert results["instances"]["scored"] == 4 and results["scratch"] == ["RGB-D ViT-small"]
+    assert {"forest", "RGB-D ViT-small", "templates", "THOR2"} <= set(results["fusions"])
+    assert "THOR" not in results["fusions"]
+    others = [claim["other"] for claim in results["claims"]["max"]]
+    assert others == ["TOPS", "CE+TOPS+TOPS2", "RGB-D ViT-small", "templates", "forest"]
+    costs = results["costs"]
+    assert list(costs) == ["render", "THOR2", "forest", "rgbd-vit-small", "templates"]
+    assert all(cost["peak_memory_mb"] > 100 and cost["seconds"] > 0 for cost in costs.values())
+    accuracy = results["accuracy"]["max"][0]["cells"][0]["accuracy"]
+    claim = results["claims"]["max"][0]
+    assert claim["difference"] == pytest.approx(accuracy["THOR2"]["mean"] - accuracy["TOPS"]["mean"])
+    text = (out / "paper.md").read_text()
+    assert "no claim about the published networks" in text and "joined the views: frames" in text
+    assert (out / "paper.png").stat().st_size > 1000
+
+    calls: list[str] = []
+    run = paper.Comparison._run
+    monkeypatch.setattr(paper.Comparison, "_run", lambda *a: calls.append(a[2]) or run(*a))
+    popen = paper.subprocess.Popen
+    commands: list[Any] = []
+    monkeypatch.setattr(paper.subprocess, "Popen", lambda c, **k: commands.append(c) or popen(c, **k))
+    paper.main([*given, f"--out={out}"])
+    assert commands == [] and calls == ["render", "THOR2", "forest", "rgbd-vit-small", "templates"]
+    (out / "frames" / "run" / "baselines" / "forest.safetensors").unlink()
+    stored = json.loads((out / "frames" / "costs.json").read_text())
+    del stored["forest"]
+    (out / "frames" / "costs.json").write_text(json.dumps(stored))
+    shutil.rmtree(out / "frames" / "evaluation-frames")
+    paper.main([*given, f"--out={out}"])
+    assert len(commands) == 1 and "forest" in commands[0]
+    with pytest.raises(SystemExit, match="folds"):
+        paper.main([*given, f"--out={out}", "--folds=2"])
