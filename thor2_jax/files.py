@@ -1,8 +1,10 @@
 """Atomic writes, digests, and the check of output directories."""
 
+import contextlib
 import functools
 import hashlib
 import json
+import shutil
 import tempfile
 from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
@@ -12,6 +14,7 @@ from colornet.files import atomic_write, errors_name, remove_leftovers
 from thor2_jax.errors import InputError
 
 __all__ = [
+    "atomic_directory",
     "atomic_write",
     "check_output_directory",
     "content_digest",
@@ -58,6 +61,36 @@ def check_output_directory(directory: str | Path, marker: str | None = None, res
         raise InputError(
             f"out: {directory} is not a directory that can be written ({error.strerror}); choose another directory"
         ) from None
+
+
+@contextlib.contextmanager
+def atomic_directory(path: str | Path) -> Iterator[Path]:
+    """Yield a temporary directory that takes the place of `path` if the block ends without an error.
+
+    A directory that stands there is replaced. After an error, it stays as it was, and nothing else is left behind.
+
+    Args:
+        path: the directory; its parents are created.
+    """
+    path = Path(path).resolve()
+    created = [parent for parent in path.parents if not parent.exists()]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        unfinished = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
+        try:
+            unfinished.chmod(0o755)
+            yield unfinished
+            if path.is_dir():
+                shutil.rmtree(path)
+            unfinished.rename(path)
+        except BaseException:
+            shutil.rmtree(unfinished, ignore_errors=True)
+            raise
+    except BaseException:
+        for parent in created:
+            with contextlib.suppress(OSError):
+                parent.rmdir()
+        raise
 
 
 def content_digest(parts: Iterable[str | bytes]) -> str:

@@ -129,6 +129,25 @@ def _paint(colors: NDArray[np.float64], values: ArrayLike | None, scale: ScalarM
     return np.asarray((scale or attribution_colors(painted)).to_rgba(painted))
 
 
+def _scatter(
+    ax: Axes,
+    x: NDArray[Any],
+    y: NDArray[Any],
+    nearness: NDArray[Any],
+    paint: NDArray[Any],
+    values: ArrayLike | None,
+    size: float,
+) -> PathCollection:
+    """Draw near points over far ones; with values, large ones over small ones and up to three times as large."""
+    if values is None:
+        order, areas = np.argsort(nearness, kind="stable"), np.full(len(x), size)
+    else:
+        magnitude = np.abs(np.asarray(values, float))
+        order = np.argsort(magnitude, kind="stable")
+        areas = size * (1 + 2 * np.clip(magnitude / attribution_colors(magnitude).norm.vmax, 0, 1))
+    return ax.scatter(x[order], y[order], c=paint[order], s=areas[order], linewidths=0)
+
+
 def cloud(
     ax: Axes,
     points: ArrayLike,
@@ -144,7 +163,7 @@ def cloud(
         ax: matplotlib axes.
         points: [n, 3] metres, camera frame.
         colors: [n, 3] sRGB, uint8 or floating in [0, 1].
-        values: [n] numbers that are drawn instead of the colours, for example attributions.
+        values: [n] numbers that are drawn instead of the colours, for example attributions; large ones over small ones.
         scale: colours of the values; by default `attribution_colors(values)`.
         size: area of a point, points squared.
 
@@ -155,8 +174,7 @@ def cloud(
         InputError: the shapes do not fit.
     """
     xyz, rgb = _check_points(points, colors)
-    order = np.argsort(-xyz[:, 2], kind="stable")
-    drawn = ax.scatter(xyz[order, 0], xyz[order, 1], c=_paint(rgb, values, scale)[order], s=size, linewidths=0)
+    drawn = _scatter(ax, xyz[:, 0], xyz[:, 1], -xyz[:, 2], _paint(rgb, values, scale), values, size)
     ax.set_aspect("equal")
     if not ax.yaxis_inverted():
         ax.invert_yaxis()
@@ -195,8 +213,7 @@ def slices(
         InputError: the shapes do not fit.
     """
     xyz, rgb = _check_points(points, colors)
-    order = np.argsort(xyz[:, 1], kind="stable")
-    drawn = ax.scatter(xyz[order, 0], xyz[order, 2], c=_paint(rgb, values, scale)[order], s=size, linewidths=0)
+    drawn = _scatter(ax, xyz[:, 0], xyz[:, 2], xyz[:, 1], _paint(rgb, values, scale), values, size)
     right, top = xyz[:, [0, 2]].max(axis=0, initial=0)
     used = min(config.n_slices, int(top / config.sigma_1) + 1)
     for level in np.arange(used + 1) * config.sigma_1:

@@ -41,10 +41,13 @@ def test_cloud_is_seen_by_the_camera(ax) -> None:
 
 def test_values_replace_the_colors(ax) -> None:
     values = np.linspace(-1, 1, 300)
-    faces = plot.cloud(ax, POINTS, COLORS, values).get_facecolors()[np.argsort(np.argsort(-POINTS[:, 2]))]
+    drawn = plot.cloud(ax, POINTS, COLORS, values)
+    order = np.argsort(np.abs(values), kind="stable")  # large values are drawn last, and larger
+    np.testing.assert_allclose(drawn.get_offsets(), POINTS[order, :2])
+    np.testing.assert_allclose(np.sort(drawn.get_sizes()), drawn.get_sizes())
+    faces = drawn.get_facecolors()[np.argsort(order)]
     assert faces[0, 2] > faces[0, 0] and faces[-1, 0] > faces[-1, 2]  # blue against, orange for
-    middle = faces[150]
-    assert np.ptp(middle[:3]) < 0.03
+    assert np.ptp(faces[150, :3]) < 0.03
     with pytest.raises(thor2.InputError, match="values"):
         plot.cloud(ax, POINTS, COLORS, values[:-1])
 

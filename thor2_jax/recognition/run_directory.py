@@ -18,8 +18,6 @@ trainings that are equal (see `training.fitting.fit`) give the same bytes in the
 
 import dataclasses
 import json
-import shutil
-import tempfile
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
@@ -32,7 +30,7 @@ from flax import nnx
 import colornet
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig, Relaxation
 from thor2_jax.errors import InputError
-from thor2_jax.files import check_output_directory, content_digest
+from thor2_jax.files import atomic_directory, check_output_directory, content_digest
 from thor2_jax.recognition.classifier import MLP, Feature, check_features
 from thor2_jax.recognition.orbax_weights import load_orbax_classifier
 from thor2_jax.recognition.weights import model_arrays, model_from_arrays
@@ -82,20 +80,13 @@ def save_run(run: TrainedRun, path: str | Path) -> None:
     """
     path = Path(path).resolve()
     check_output_directory(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
-    try:
-        unfinished.chmod(0o755)
+    with atomic_directory(path) as unfinished:
         colornet.save(run.network, unfinished / "network.npz")
         (unfinished / "weights").mkdir()
         contents = {name: safetensors.numpy.save(model_arrays(model)) for name, model in run.classifiers.items()}
         for name, content in contents.items():
             weights_file(unfinished, name).write_bytes(content)
         (unfinished / RUN_FILE).write_text(json.dumps(_description(run, contents), indent=2) + "\n")
-        unfinished.rename(path)
-    except BaseException:
-        shutil.rmtree(unfinished, ignore_errors=True)
-        raise
 
 
 def _description(run: TrainedRun, weights: Mapping[Feature, bytes]) -> dict[str, Any]:

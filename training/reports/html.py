@@ -1,5 +1,6 @@
 """A report as one self-contained HTML page of text, tables and pictures."""
 
+import base64
 import dataclasses
 import html
 from collections.abc import Sequence
@@ -21,12 +22,14 @@ class Picture:
         path: path relative to the page.
         caption: caption and alternative text.
         half: takes half the width of a wide screen.
+        third: takes a third of the width of a wide screen.
         small: takes a fraction of the width, so that many pictures fit side by side.
     """
 
     path: str
     caption: str
     half: bool = False
+    third: bool = False
     small: bool = False
 
 
@@ -53,8 +56,9 @@ th:first-child, td:first-child { text-align: left; }
 .pictures { display: flex; flex-wrap: wrap; gap: 1rem; }
 figure { margin: 0; flex: 1 1 100%; }
 figure.half { flex: 1 1 26rem; max-width: calc(50% - .5rem); }
+figure.third { flex: 0 1 21rem; max-width: calc(33.3% - .7rem); }
 figure.small { flex: 0 1 10rem; max-width: calc(50% - .5rem); }
-@media (max-width: 56rem) { figure.half { max-width: 100%; } }
+@media (max-width: 56rem) { figure.half, figure.third { max-width: 100%; } }
 img { max-width: 100%; height: auto; display: block; }
 figcaption { color: #555; font-size: .9rem; }
 """
@@ -67,34 +71,47 @@ def _table(table: Table) -> str:
     return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
 
 
-def _figure(picture: Picture) -> str:
+def _figure(picture: Picture, embedded_from: Path | None) -> str:
     path, caption = html.escape(picture.path), html.escape(picture.caption)
-    kind = ' class="half"' if picture.half else ' class="small"' if picture.small else ""
+    if embedded_from is not None:
+        content = base64.b64encode((embedded_from / picture.path).read_bytes()).decode()
+        path = f"data:image/{Path(picture.path).suffix[1:]};base64,{content}"
+    width = next((name for name in ("half", "third", "small") if getattr(picture, name)), None)
+    kind = f' class="{width}"' if width else ""
     return f'<figure{kind}><img src="{path}" alt="{caption}"><figcaption>{caption}</figcaption></figure>'
 
 
-def _section(section: Section) -> str:
+def _section(section: Section, embedded_from: Path | None) -> str:
     elements = [f"<h2>{html.escape(section.heading)}</h2>"]
     if section.text:
         elements.append(f"<p>{html.escape(section.text)}</p>")
     if section.table is not None:
         elements.append(_table(section.table))
-    elements.append(f'<div class="pictures">{"".join(map(_figure, section.pictures))}</div>')
+    figures = "".join(_figure(picture, embedded_from) for picture in section.pictures)
+    elements.append(f'<div class="pictures">{figures}</div>')
     return "\n".join(elements)
 
 
-def write_page(path: str | Path, *, title: str, lead: str, sections: Sequence[Section]) -> None:
+def write_page(path: str | Path, *, title: str, lead: str, sections: Sequence[Section], embed: bool = False) -> None:
     """Write the page atomically.
 
+    Args:
+        path: the page.
+        title: title and heading.
+        lead: paragraph below the heading.
+        sections: sections of the page.
+        embed: contain the pictures, which must be PNG files, so that the page can be moved without them.
+
     Raises:
-        OSError: the file cannot be written.
+        OSError: the file cannot be written, or an embedded picture not be read.
     """
+    embedded_from = Path(path).parent if embed else None
     write_text(
         path,
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         f"<title>{html.escape(title)}</title><style>{_STYLE}</style></head><body>\n"
         f'<h1>{html.escape(title)}</h1>\n<p class="lead">{html.escape(lead)}</p>\n'
-        + "\n".join(map(_section, sections))
+        + "\n".join(_section(section, embedded_from) for section in sections)
         + "\n</body></html>\n",
     )

@@ -1,0 +1,183 @@
+"""Smallest changes: how little the colour or the extents of an object would have to change for another answer.
+
+Steps along the gradient of the relaxed descriptor give directions of change; along each of them, the exact descriptor
+gives the smallest change that leads to another answer, in frames that are computed again.
+"""
+
+import dataclasses
+from functools import partial
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from thor2_jax.config import DescriptorConfig, Relaxation
+from thor2_jax.descriptor.describe import strips
+from thor2_jax.descriptor.orientations import candidate_orientations, orient_descriptors
+from thor2_jax.descriptor.view_normalization import boxed, oriented
+from thor2_jax.explanation.class_scores import ClassScores, capacity_of
+from thor2_jax.recognition.prepared_instance import PreparedInstance, pack_instances
+from thor2_jax.types import PointClouds
+
+__all__ = ["CHANGES", "Change", "Kind", "apply_change", "changed_instance", "smallest_change"]
+
+Kind = Literal["color", "extent"]
+CHANGES: tuple[Kind, ...] = ("color", "extent")
+"""Kinds of changes."""
+
+RELAXATION = Relaxation(slice=0.01, strip=0.0025, extremum=0.005, color=4.0)
+"""Wide enough that gradients tell of borders of slices, strips and colour regions at some distance."""
+
+STEPS = 8
+"""Steps along the gradient."""
+
+STEP = {"color": 0.04, "extent": 0.05}
+"""Length of the longest step: of a shift of sRGB in [0, 1], and of logarithms of factors."""
+
+LARGEST = {"color": 0.5, "extent": float(np.log(2))}
+"""Largest change that is tried, in the same units."""
+
+SCALES = 24
+"""Changes that are tried along a direction, equally spaced up to the largest."""
+
+DIRECTIONS = 4
+"""Directions that are tried: those after the first, second, fourth and last step."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Change:
+    """The smallest change of one kind that was found to give another answer.
+
+    Attributes:
+        kind: "color" is a shift of the sRGB colour of all points, "extent" a factor for each side of the box.
+        values: the shift of red, green and blue in units of 255, or the factors of the sides, longest first.
+        size: length of the shift, in units of 255, or the largest change of a side as a fraction of it.
+        answer: the other answer.
+        margin: margin of the first answer after the change.
+    """
+
+    kind: Kind
+    values: tuple[float, float, float]
+    size: float
+    answer: str
+    margin: float
+
+
+@partial(jax.jit, static_argnums=1)
+def _axes(clouds: PointClouds, config: DescriptorConfig) -> jax.Array:
+    """Return the axes [3, 3] of the box of the only cloud of a batch, longest first."""
+    cloud = jax.tree.map(lambda a: a[0], clouds)
+    return oriented(boxed(cloud, np.float32(config.sigma_s)))[0]
+
+
+def _changed(clouds: PointClouds, axes: jax.Array, parameters: jax.Array, kind: Kind) -> PointClouds:
+    if kind == "color":
+        return dataclasses.replace(clouds, colors=jnp.clip(clouds.colors + parameters, 0, 1))
+    count = jnp.maximum(clouds.mask.sum(axis=1), 1)[:, None, None]
+    centre = jnp.where(clouds.mask[..., None], clouds.points, 0).sum(axis=1, keepdims=True) / count
+    stretch = axes.T @ (jnp.exp(parameters)[:, None] * axes)
+    moved = centre + jnp.matmul(clouds.points - centre, stretch.T, precision=jax.lax.Precision.HIGHEST)
+    return dataclasses.replace(clouds, points=jnp.where(clouds.mask[..., None], moved, 0))
+
+
+def changed_instance(
+    instance: PreparedInstance, kind: Kind, parameters: NDArray[np.floating], axes: NDArray[np.floating]
+) -> PreparedInstance:
+    """Return an instance with another colour or other extents.
+
+    Args:
+        instance: the instance.
+        kind: kind of the change.
+        parameters: [3] shift of sRGB in [0, 1], or logarithms of factors along the axes.
+        axes: [3, 3] axes of its box as rows.
+    """
+    if kind == "color":
+        shifted = np.clip(instance.colors / 255 + parameters, 0, 1)
+        return dataclasses.replace(instance, colors=np.rint(255 * shifted).astype(np.uint8))
+    centre = instance.points.mean(axis=0, dtype=np.float64)
+    stretch = axes.T @ (np.exp(parameters)[:, None] * axes)
+    points = centre + (instance.points - centre) @ stretch.T
+    return dataclasses.replace(instance, points=points.astype(np.float32))
+
+
+def apply_change(instance: PreparedInstance, change: Change, config: DescriptorConfig) -> PreparedInstance:
+    """Return an instance after a change that was found for it; `config` is the descriptor's configuration."""
+    values = np.array(change.values)
+    parameters = values / 255 if change.kind == "color" else np.log(values)
+    axes = np.asarray(_axes(pack_instances([instance], 1, capacity_of(instance)), config), np.float64)
+    return changed_instance(instance, change.kind, parameters, axes)
+
+
+def _gradient_directions(
+    scores: ClassScores, clouds: PointClouds, axes: jax.Array, index: int, kind: Kind
+) -> NDArray[np.float64]:
+    """Return directions [d, 3] of unit length that lead towards another answer."""
+    config = dataclasses.replace(scores.config, relaxation=RELAXATION)
+
+    def lead(parameters: jax.Array) -> jax.Array:
+        aligned, weights = candidate_orientations(_changed(clouds, axes, parameters, kind), config, scores.count)
+        cut = strips(aligned, scores.network, config)
+        values = scores.of_descriptors(orient_descriptors(aligned, weights, cut, scores.network, config))[0]
+        return values[index] - jnp.delete(values, index, assume_unique_indices=True).max()
+
+    parameters, path = np.zeros(3), []
+    for _ in range(STEPS):
+        value, gradient = jax.value_and_grad(lead)(jnp.asarray(parameters, jnp.float32))
+        slope = np.asarray(gradient, np.float64)
+        norm = float(np.linalg.norm(slope))
+        if not np.isfinite(norm) or norm == 0:
+            break
+        length = STEP[kind] if value <= 0 else min(STEP[kind], max(float(value) / norm, STEP[kind] / 4))
+        parameters = parameters - length * slope / norm
+        path.append(parameters)
+    chosen = [path[k] for k in sorted({0, 1, 3, len(path) - 1}) if k < len(path)] if path else []
+    return np.array([step / np.linalg.norm(step) for step in chosen if step.any()]).reshape(-1, 3)
+
+
+def smallest_change(scores: ClassScores, instance: PreparedInstance, index: int, kind: Kind) -> Change | None:
+    """Return the smallest change of a kind that gives another answer than the name `index`.
+
+    Args:
+        scores: class scores.
+        instance: an instance whose best score is that of the name.
+        index: number of the name in `scores.names`.
+        kind: kind of the change.
+
+    Returns:
+        The change; None if there is no other name, or none was found up to a shift of 127 of 255, or a factor of 2.
+    """
+    if len(scores.names) < 2:
+        return None
+    clouds = pack_instances([instance], 1, capacity_of(instance))
+    axes = _axes(clouds, scores.config)
+    directions = _gradient_directions(scores, clouds, axes, index, kind)
+    lengths = LARGEST[kind] * np.arange(1, SCALES + 1) / SCALES
+    frame = np.asarray(axes, np.float64)
+
+    def first_change(tried: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float32]] | None:
+        variants = [changed_instance(instance, kind, parameters, frame) for parameters in tried]
+        values = scores.of_instances(variants)
+        other = np.flatnonzero(values.argmax(axis=1) != index)
+        return (tried[other[0]], values[other[0]]) if len(other) else None
+
+    by_length = (lengths[:, None, None] * directions).reshape(-1, 3)
+    found = first_change(by_length)
+    if found is None:
+        return None
+    # Between the last length that was tried and the one that was found.
+    step = lengths[0] / np.linalg.norm(found[0])
+    finer = first_change(found[0] * (1 - step * np.arange(7, 0, -1) / 8)[:, None])
+    parameters, values = finer or found
+    return _record(scores, index, kind, parameters, values)
+
+
+def _record(
+    scores: ClassScores, index: int, kind: Kind, parameters: NDArray[np.float64], values: NDArray[np.float32]
+) -> Change:
+    shown = 255 * parameters if kind == "color" else np.exp(parameters)
+    size = np.linalg.norm(shown) if kind == "color" else np.abs(shown - 1).max()
+    first, second, third = (float(value) for value in shown)
+    margin = float(scores.margin(jnp.asarray(values)[None], index)[0])
+    return Change(kind, (first, second, third), float(size), scores.names[int(values.argmax())], margin)

@@ -1,0 +1,214 @@
+"""Class scores: what an explanation explains, as a differentiable function of descriptors.
+
+The classifiers' answer is explained by its log-odds, that of a gallery by its similarity to the enrolled views. Both
+are fused over the candidate orientations, as recognition fuses them. The embedding of a run, which gives the confidence
+of an answer but does not choose it, is not explained.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from colornet import ColorNetwork
+from thor2_jax.capacity import point_bucket
+from thor2_jax.config import DescriptorConfig
+from thor2_jax.descriptor.describe import strips
+from thor2_jax.descriptor.orientations import (
+    OrientedDescriptors,
+    candidate_orientations,
+    describe_orientations,
+    orient_descriptors,
+)
+from thor2_jax.errors import InputError
+from thor2_jax.gallery.embedding import Embedding
+from thor2_jax.gallery.enrollment import ORIENTATIONS
+from thor2_jax.gallery.gallery import GalleryObject
+from thor2_jax.recognition.classifier import EMBEDDING
+from thor2_jax.recognition.fusion import FusionRule
+from thor2_jax.recognition.prepared_instance import PreparedInstance, pack_instances
+from thor2_jax.recognizer import Recognizer
+from thor2_jax.types import PointClouds
+
+__all__ = ["ClassScores", "OrientedCloud", "Unit", "classifier_scores", "gallery_scores"]
+
+Unit = Literal["log-odds", "similarity"]
+
+ROWS = 8
+"""Variants of a cloud that are described in one call."""
+
+MIN_CAPACITY = 2048
+"""Least padded number of points: smaller clouds are hardly faster, and every further size takes long to compile."""
+
+_TINY = np.finfo(np.float32).tiny
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class OrientedCloud:
+    """A cloud in its candidate orientations, whose frames are held constant.
+
+    Attributes:
+        aligned: [K, N] aligned clouds in scaled units.
+        weights: [K] float32, weights of the orientations.
+    """
+
+    aligned: PointClouds
+    weights: jax.Array
+
+    @property
+    def shown(self) -> int:
+        """The orientation of the greatest weight, the paper's if several have it."""
+        return int(np.asarray(self.weights).argmax())
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ClassScores:
+    """Scores of all names that an instance may have.
+
+    Attributes:
+        names: n names.
+        unit: "log-odds": the scores are fused log-probabilities; "similarity": cosines with the nearest enrolled view.
+        config: descriptor, in closed form.
+        network: colour network of the descriptor.
+        count: number K of candidate orientations.
+        of_descriptors: function of the descriptors of B clouds that returns scores [B, n]; differentiable.
+    """
+
+    names: tuple[str, ...]
+    unit: Unit
+    config: DescriptorConfig
+    network: ColorNetwork
+    count: int
+    of_descriptors: Callable[[OrientedDescriptors], jax.Array]
+
+    def margin(self, scores: jax.Array, index: int) -> jax.Array:
+        """Return the margins [B] of the name `index` from scores [B, n], the quantity that is explained.
+
+        For classifiers it is the log-odds log(p / (1 - p)) of the name, for a gallery the difference to the most
+        similar other object. A single name has a margin of its own score.
+        """
+        own, others = scores[:, index], jnp.delete(scores, index, axis=1, assume_unique_indices=True)
+        if not others.shape[1]:
+            return own
+        return own - (jax.nn.logsumexp(others, axis=1) if self.unit == "log-odds" else others.max(axis=1))
+
+    def orient(self, instance: PreparedInstance) -> OrientedCloud:
+        """Return the aligned clouds of an instance."""
+        aligned, weights = candidate_orientations(
+            pack_instances([instance], 1, capacity_of(instance)), self.config, self.count
+        )
+        return OrientedCloud(aligned, weights[0])
+
+    def of_instances(self, instances: Sequence[PreparedInstance]) -> NDArray[np.float32]:
+        """Return the scores [B, n] of instances, each in its own frames, as recognition computes them."""
+        capacity = max(map(capacity_of, instances), default=MIN_CAPACITY)
+        scores = [np.zeros((0, len(self.names)), np.float32)]
+        for start in range(0, len(instances), ROWS):
+            rows = instances[start : start + ROWS]
+            packed = pack_instances(rows, ROWS, capacity)
+            oriented = describe_orientations(packed, self.network, self.config, self.count)
+            scores.append(np.asarray(self.of_descriptors(oriented))[: len(rows)])
+        return np.concatenate(scores)
+
+    def of_masks(self, cloud: OrientedCloud, masks: NDArray[np.bool_]) -> NDArray[np.float32]:
+        """Return the exact scores [B, n] of parts of a cloud; its frames are those of the whole cloud.
+
+        Args:
+            cloud: the cloud.
+            masks: [B, n] bool, points of each part.
+        """
+        scores = [np.zeros((0, len(self.names)), np.float32)]
+        size = cloud.aligned.mask.shape[1]
+        for start in range(0, len(masks), ROWS):
+            rows = masks[start : start + ROWS]
+            padded = np.zeros((ROWS, size), bool)
+            padded[: len(rows), : rows.shape[1]] = rows
+            repeated = repeat_cloud(cloud.aligned, ROWS)
+            part = dataclasses.replace(repeated, mask=jnp.repeat(jnp.asarray(padded), self.count, axis=0))
+            cut = strips(part, self.network, self.config, ROWS * self.count)
+            oriented = orient_descriptors(part, jnp.tile(cloud.weights, (ROWS, 1)), cut, self.network, self.config)
+            scores.append(np.asarray(self.of_descriptors(oriented))[: len(rows)])
+        return np.concatenate(scores)
+
+
+def capacity_of(instance: PreparedInstance) -> int:
+    """Return the padded number of points of an instance."""
+    return max(point_bucket(len(instance.points)), MIN_CAPACITY)
+
+
+def repeat_cloud(aligned: PointClouds, times: int) -> PointClouds:
+    """Repeat the K orientations of a cloud, [K, N] to [times * K, N]."""
+    repeated: PointClouds = jax.tree.map(lambda a: jnp.tile(a, (times,) + (1,) * (a.ndim - 1)), aligned)
+    return repeated
+
+
+def _checked(config: DescriptorConfig) -> DescriptorConfig:
+    if config.convention != "paper":
+        raise InputError(
+            f"the descriptor's convention is {config.convention!r}; explanations need 'paper', whose slices and strips "
+            "have gradients"
+        )
+    # The closed form computes the same pairs as gudhi without a host callback.
+    return dataclasses.replace(config, homology="closed_form", relaxation=None)
+
+
+def classifier_scores(recognizer: Recognizer) -> ClassScores:
+    """Return the fused log-probabilities of the classifiers, for all classes that are not forgotten.
+
+    Raises:
+        InputError: the run's descriptor has the convention of the released code.
+    """
+    names = tuple(name for name in recognizer.default_classifiers if name != EMBEDDING)
+    classes, hidden = recognizer.run.classes, set(recognizer.gallery.hidden)
+    columns = np.array([k for k, name in enumerate(classes) if name not in hidden], int)
+
+    def of_descriptors(oriented: OrientedDescriptors) -> jax.Array:
+        probabilities = recognizer.evidence(oriented, names).probabilities
+        logs = jnp.stack([jnp.log(jnp.maximum(probabilities[name], _TINY)) for name in names])
+        return _fused_logs(logs, recognizer.rule)[:, columns]
+
+    config = _checked(recognizer.run.config)
+    shown = tuple(classes[k] for k in columns)
+    return ClassScores(shown, "log-odds", config, recognizer.run.network, config.orientations, of_descriptors)
+
+
+def _fused_logs(logs: jax.Array, rule: FusionRule) -> jax.Array:
+    """Return the fused log-probabilities [B, C] of M classifiers [M, B, C], up to a constant in each row."""
+    if rule == "max":
+        best = logs.max(axis=2).argmax(axis=0)
+        return jnp.take_along_axis(logs, best[None, :, None], axis=0)[0]
+    return jax.nn.logsumexp(logs, axis=0) if rule == "mean" else logs.mean(axis=0)
+
+
+def gallery_scores(recognizer: Recognizer) -> ClassScores:
+    """Return the similarity of clouds to the enrolled objects: the cosine with the nearest view of each.
+
+    Raises:
+        InputError: no object is enrolled, or the embedding's descriptor has the convention of the released code.
+    """
+    objects = recognizer.gallery.objects
+    if not objects:
+        raise InputError("no object is enrolled; enroll one, or train a run")
+    embedding = recognizer.objects.embedding
+    of_descriptors = _nearest_cosines(embedding, list(objects.values()))
+    config = _checked(embedding.config)
+    return ClassScores(tuple(objects), "similarity", config, embedding.network, ORIENTATIONS, of_descriptors)
+
+
+def _nearest_cosines(
+    embedding: Embedding, objects: Sequence[GalleryObject]
+) -> Callable[[OrientedDescriptors], jax.Array]:
+    views: Any = jnp.asarray(np.concatenate([one.embeddings for one in objects]), jnp.float32)
+    ends = np.cumsum([len(one.embeddings) for one in objects])
+    starts = ends - [len(one.embeddings) for one in objects]
+
+    def of_descriptors(oriented: OrientedDescriptors) -> jax.Array:
+        cosines = embedding.embed_oriented(oriented) @ views.T
+        nearest = jnp.stack([cosines[..., a:b].max(axis=-1) for a, b in zip(starts, ends, strict=True)], axis=-1)
+        return (oriented.weights[..., None] * nearest).sum(axis=1)
+
+    return of_descriptors

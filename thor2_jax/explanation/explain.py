@@ -1,0 +1,220 @@
+"""The explanation of the answer for one instance of a frame.
+
+>>> explanation = explain(recognizer, frame, 3)                                     # doctest: +SKIP
+>>> explanation.name, explanation.attributions.values.argmax()                      # doctest: +SKIP
+('mug', 1204)
+
+With several candidate orientations, the fused answer is explained, since it is the one that recognition gives. Slices,
+strips, diagrams and colour matrices are those of one orientation, the one of the greatest weight.
+"""
+
+import dataclasses
+from typing import Any
+
+import jax
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from thor2_jax.config import DescriptorConfig
+from thor2_jax.descriptor.describe import describe_strips, strips
+from thor2_jax.descriptor.orientations import describe_orientations
+from thor2_jax.descriptor.persistence import diagrams_of_strips
+from thor2_jax.errors import InputError
+from thor2_jax.explanation.attributions import Attributions, attribute_points
+from thor2_jax.explanation.changes import CHANGES, Change, smallest_change
+from thor2_jax.explanation.class_scores import (
+    ClassScores,
+    OrientedCloud,
+    capacity_of,
+    classifier_scores,
+    gallery_scores,
+)
+from thor2_jax.explanation.leave_out import LeftOut, leave_out
+from thor2_jax.explanation.nearest_views import NearestView, nearest_views
+from thor2_jax.recognition.answers import Recognition
+from thor2_jax.recognition.frames import RGBDFrame, pixel_rays
+from thor2_jax.recognition.prepared_instance import DESCRIPTOR_VOXEL, PreparedInstance, pack_instances, prepare_instance
+from thor2_jax.recognizer import Recognizer
+from thor2_jax.types import Diagrams
+
+__all__ = ["DescribedSlices", "Explanation", "explain", "explain_instance", "pixel_attributions"]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class DescribedSlices:
+    """The descriptor of an instance in the shown orientation.
+
+    Attributes:
+        points: [n, 3] float32, aligned points in scaled units.
+        diagrams: persistence diagrams, fields [S, J].
+        images: [S, P, P] float32, persistence images.
+        colors: [S, J, R] float32, colour matrices.
+    """
+
+    points: NDArray[np.float32]
+    diagrams: Diagrams
+    images: NDArray[np.float32]
+    colors: NDArray[np.float32]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Explanation:
+    """Why an instance has its answer.
+
+    Attributes:
+        recognition: the answer.
+        name: the name that is explained: the most probable one, also of an unknown object.
+        runner_up: the name with the second best score; None if there is no other.
+        scores: what is explained.
+        instance: the cloud, n points.
+        described: its descriptor.
+        attributions: which points decided.
+        left_out: what slices and strips contribute, as the exact check of the attributions.
+        changes: the smallest changes that give another answer, one for each kind for which one was found.
+        nearest: nearest enrolled views; empty without a gallery.
+    """
+
+    recognition: Recognition
+    name: str
+    runner_up: str | None
+    scores: ClassScores
+    instance: PreparedInstance
+    described: DescribedSlices
+    attributions: Attributions
+    left_out: LeftOut
+    changes: tuple[Change, ...]
+    nearest: tuple[NearestView, ...]
+
+    @property
+    def config(self) -> DescriptorConfig:
+        """Configuration of the descriptor."""
+        return self.scores.config
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the explanation as JSON values; lengths are in metres, colours in 0..255."""
+        answer, check, left = self.recognition, self.attributions.faithfulness, self.left_out
+        cells = np.argwhere(np.isfinite(left.strips))
+        return {
+            "label": answer.label,
+            "name": answer.name,
+            "explained_name": self.name,
+            "runner_up": self.runner_up,
+            "confidence": answer.confidence,
+            "reason": answer.reason,
+            "unit": self.scores.unit,
+            "margin": check.margin,
+            "top": {source: [{"name": n, "probability": p} for n, p in best] for source, best in answer.top.items()},
+            "faithfulness": {
+                "loss_without_most_attributed_tenth": check.most_attributed,
+                "mean_loss_without_random_tenth": check.random,
+                "holds": check.holds,
+            },
+            "slices": [
+                {"slice": int(i), "loss": float(left.slices[i])} for i in np.flatnonzero(np.isfinite(left.slices))
+            ],
+            "strips": [{"slice": int(i), "strip": int(j), "loss": float(left.strips[i, j])} for i, j in cells],
+            "agreement": left.agreement,
+            "changes": [dataclasses.asdict(change) for change in self.changes],
+            "nearest": [{"name": v.name, "view": v.number, "similarity": v.similarity} for v in self.nearest],
+            "points": self.instance.points.astype(float).round(5).tolist(),
+            "colors": self.instance.colors.tolist(),
+            "attributions": self.attributions.values.astype(float).round(7).tolist(),
+        }
+
+
+def explain(recognizer: Recognizer, frame: RGBDFrame, label: int) -> Explanation:
+    """Explain the answer for one instance of a frame.
+
+    The first call with a new size of clouds compiles for some seconds; later ones take one to a few seconds.
+
+    Args:
+        recognizer: the recognizer.
+        frame: the frame.
+        label: number of the instance, one of `frame.instances`.
+
+    Raises:
+        InputError: there is no such instance, it cannot be described, no object is known, or the run's descriptor has
+            the convention of the released code.
+    """
+    if label not in frame.instances:
+        raise InputError(f"instance is {label}; expected one of {', '.join(map(str, frame.instances)) or 'none'}")
+    return explain_instance(recognizer, prepare_instance(frame, label, recognizer.run.config.sigma_s))
+
+
+def explain_instance(recognizer: Recognizer, instance: PreparedInstance) -> Explanation:
+    """Explain the answer for a prepared instance; see `explain`."""
+    if instance.reason is not None:
+        raise InputError(f"instance {instance.label} cannot be explained: {instance.reason}")
+    recognition, name = _answer(recognizer, instance)
+    scores = _scores_of(recognizer, name)
+    index = scores.names.index(name)
+    values = scores.of_instances([instance])[0]
+    others = [k for k in np.argsort(-values, kind="stable") if k != index]
+    cloud = scores.orient(instance)
+    attributions = attribute_points(scores, cloud, instance, index)
+    # Where classifiers and gallery answer together, the best score need not be that of the answer.
+    kinds = CHANGES if values.argmax() == index else ()
+    changes = [smallest_change(scores, instance, index, kind) for kind in kinds]
+    return Explanation(
+        recognition=recognition,
+        name=name,
+        runner_up=scores.names[others[0]] if others else None,
+        scores=scores,
+        instance=instance,
+        described=_described(scores, cloud, len(instance.points)),
+        attributions=attributions,
+        left_out=leave_out(scores, cloud, index, attributions.values),
+        changes=tuple(change for change in changes if change is not None),
+        nearest=tuple(nearest_views(recognizer, instance)),
+    )
+
+
+def _answer(recognizer: Recognizer, instance: PreparedInstance) -> tuple[Recognition, str]:
+    """Return the answer of the recognizer and the most probable name."""
+    source = recognizer.answers_by()
+    if not recognizer.classes:
+        raise InputError("no object is known; train a run or enroll an object")
+    clouds = pack_instances([instance], 1, capacity_of(instance))
+    oriented = describe_orientations(clouds, recognizer.run.network, recognizer.run.config)
+    names = recognizer.default_classifiers if source != "gallery" else ()
+    evidence = recognizer.evidence(oriented, names, clouds if source != "classifiers" else None)
+    (recognition,) = recognizer.recognitions([instance], evidence)
+    evidence = jax.tree.map(np.asarray, evidence)
+    gallery = None
+    if evidence.embeddings is not None:
+        gallery = recognizer.gallery.scores(evidence.embeddings, evidence.weights)
+    best = int(recognizer.combined(evidence.probabilities, gallery)[0].argmax())
+    return recognition, recognizer.classes[best]
+
+
+def _scores_of(recognizer: Recognizer, name: str) -> ClassScores:
+    union = recognizer.objects.union
+    has_output = bool(union.has_output[union.names.index(name)])
+    by_classifiers = recognizer.answers_by() != "gallery" and has_output
+    return classifier_scores(recognizer) if by_classifiers else gallery_scores(recognizer)
+
+
+def _described(scores: ClassScores, cloud: OrientedCloud, n: int) -> DescribedSlices:
+    shown = jax.tree.map(lambda a: a[cloud.shown : cloud.shown + 1], cloud.aligned)
+    cut = strips(shown, scores.network, scores.config)
+    diagrams = diagrams_of_strips(cut, scores.config)
+    images = describe_strips(cut, scores.network, scores.config).images
+    first = jax.tree.map(lambda a: np.asarray(a[0]), (shown.points, diagrams, images, cut.color))
+    return DescribedSlices(first[0][:n], *first[1:])
+
+
+def pixel_attributions(explanation: Explanation, frame: RGBDFrame) -> NDArray[np.float32]:
+    """Return the attribution of the nearest point of the cloud for each pixel of the instance, [H, W].
+
+    Pixels of the background are NaN, and pixels whose depth is not in the cloud, for example outliers.
+    """
+    pixels = frame.instance_pixels[explanation.instance.label]
+    depth = frame.depth_m.ravel()[pixels]
+    points = pixel_rays(pixels, frame.depth.shape[1], frame.intrinsics) * depth[:, None]
+    reach = 2 * DESCRIPTOR_VOXEL / explanation.config.sigma_s
+    distance, nearest = KDTree(explanation.instance.points).query(points, distance_upper_bound=reach)
+    near = np.isfinite(distance) & (depth > 0)
+    painted = np.full(frame.depth.size, np.nan, np.float32)
+    painted[pixels[near]] = explanation.attributions.values[nearest[near]]
+    return painted.reshape(frame.depth.shape)

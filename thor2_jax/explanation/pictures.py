@@ -1,0 +1,290 @@
+"""Pictures of an explanation: matplotlib figures with captions, made of the plots of `thor2_jax.plot`."""
+
+import dataclasses
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter, minimum_filter
+
+from thor2_jax import plot
+from thor2_jax.explanation.changes import Change, apply_change
+from thor2_jax.explanation.explain import Explanation, pixel_attributions
+from thor2_jax.plot import name_style, plain_text
+from thor2_jax.recognition.frames import RGBDFrame
+from thor2_jax.recognition.prepared_instance import PreparedInstance
+
+__all__ = ["ExplanationPicture", "change_text", "main_pictures", "pictures"]
+
+_SIZE = (5.2, 4.4)
+"""Inches; with 130 pixels each, a picture is legible on a telephone too."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ExplanationPicture:
+    """A picture of an explanation.
+
+    Attributes:
+        name: name of its file, without ending.
+        section: "decided", "changes", "nearest", "shape", "slices" or "network".
+        title: short title.
+        caption: what it shows, in full sentences.
+        figure: the picture.
+    """
+
+    name: str
+    section: str
+    title: str
+    caption: str
+    figure: Figure
+
+
+def _figure(width: float = _SIZE[0], height: float = _SIZE[1]) -> tuple[Figure, Any]:
+    figure = Figure(figsize=(width, height), layout="constrained")
+    return figure, figure.add_subplot()
+
+
+def main_pictures(explanation: Explanation, frame: RGBDFrame) -> Iterator[ExplanationPicture]:
+    """Yield the pictures that matter most: the points that decided, the smallest changes and the nearest views."""
+    yield _photo(explanation, frame)
+    yield _decided_cloud(explanation)
+    if explanation.changes:
+        yield _changes(explanation)
+    if explanation.nearest:
+        yield _nearest(explanation)
+
+
+def pictures(explanation: Explanation, frame: RGBDFrame) -> Iterator[ExplanationPicture]:
+    """Yield all pictures of an explanation.
+
+    Args:
+        explanation: the explanation.
+        frame: the frame that it was made from.
+    """
+    yield from main_pictures(explanation, frame)
+    yield _decided_slices(explanation)
+    yield _check(explanation)
+    yield _slices(explanation)
+    yield _diagrams(explanation)
+    for number in np.flatnonzero(explanation.described.colors.any(axis=(1, 2))):
+        yield _slice(explanation, int(number))
+    yield _network(explanation)
+
+
+def _color_bar(figure: Figure, axes: Any, explanation: Explanation, below: bool = False) -> None:
+    scale = plot.attribution_colors(explanation.attributions.values)
+    place: dict[str, Any] = {"location": "bottom", "shrink": 0.6, "pad": 0.02} if below else {"shrink": 0.8}
+    bar = figure.colorbar(scale, ax=axes, ticks=[scale.norm.vmin, 0, scale.norm.vmax], **place)
+    bar.set_ticklabels(["against", "neutral", "for"])
+    bar.set_label(plain_text(explanation.name), **name_style())
+
+
+def _spread(values: NDArray[np.float32], size: int) -> NDArray[np.float32]:
+    """Return the value of the largest magnitude within a square of pixels, so that single points are seen."""
+    high, low = maximum_filter(values, size), minimum_filter(values, size)
+    return np.where(high > -low, high, low)
+
+
+def _photo(explanation: Explanation, frame: RGBDFrame) -> ExplanationPicture:
+    mask = frame.label_image == explanation.instance.label
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    margin = 8 + max(int(np.ptp(rows)), int(np.ptp(columns))) // 6
+    window = tuple(slice(max(0, int(s[0]) - margin), int(s[-1]) + margin + 1) for s in (rows, columns))
+    color, painted = frame.color[window], pixel_attributions(explanation, frame)[window]
+    grey = 0.55 * color.mean(axis=2, keepdims=True) / 255 + 0.35
+    shown = np.repeat(grey, 3, axis=2)
+    known = np.isfinite(painted)
+    spread = _spread(np.nan_to_num(painted), max(3, color.shape[1] // 60))
+    shown[known] = plot.attribution_colors(explanation.attributions.values).to_rgba(spread[known])[:, :3]
+    wide = color.shape[1] > 1.5 * color.shape[0]
+    figure = Figure(figsize=(_SIZE[0], 5.4 if wide else 3.8), layout="constrained")
+    first, second = figure.subplots(2, 1) if wide else figure.subplots(1, 2)
+    first.imshow(color)
+    second.imshow(shown)
+    first.set_title("the object", fontsize=10)
+    second.set_title("what decided", fontsize=10)
+    for axes in (first, second):
+        axes.contour(mask[window], [0.5], colors="#ffffff", linewidths=0.8)
+        axes.set_axis_off()
+    _color_bar(figure, [first, second], explanation, below=True)
+    caption = (
+        f"Orange pixels speak for {explanation.name}, blue ones against it, and grey ones hardly matter. Few "
+        "pixels decide where the outline does: the width of each strip hangs on its outermost points."
+    )
+    return ExplanationPicture("photo", "decided", "What decided, on the photo", caption, figure)
+
+
+def _decided_cloud(explanation: Explanation) -> ExplanationPicture:
+    figure, axes = _figure()
+    instance = explanation.instance
+    plot.cloud(axes, instance.points, instance.colors, explanation.attributions.values, size=_point_size(instance))
+    _color_bar(figure, axes, explanation)
+    caption = f"The {len(instance.points)} points of the object as the camera sees them, in the same colours."
+    return ExplanationPicture("cloud", "decided", "What decided, on the points", caption, figure)
+
+
+def _point_size(instance: PreparedInstance) -> float:
+    return float(np.clip(16000 / max(len(instance.points), 1), 4, 25))
+
+
+def _decided_slices(explanation: Explanation) -> ExplanationPicture:
+    figure, axes = _figure()
+    instance, points = explanation.instance, explanation.described.points
+    values, size = explanation.attributions.values, _point_size(instance)
+    plot.slices(axes, points, instance.colors, explanation.config, values, strips=True, size=size)
+    _color_bar(figure, axes, explanation)
+    caption = "The same points, turned as the descriptor sees them, with slices (numbered rows) and strips (columns)."
+    return ExplanationPicture("slices-attributions", "decided", "What decided, in slices and strips", caption, figure)
+
+
+def _check(explanation: Explanation) -> ExplanationPicture:
+    left, config = explanation.left_out, explanation.config
+    predicted = np.full(config.n_slices * config.n_strips, np.nan)
+    cell_of = left.slice_of * config.n_strips + left.strip_of
+    for cell in np.flatnonzero(np.isfinite(left.strips.ravel())):
+        predicted[cell] = explanation.attributions.values[cell_of == cell].sum()
+    used = np.isfinite(left.strips)
+    rows, columns = (int(np.flatnonzero(used.any(axis=axis)).max(initial=0)) + 1 for axis in (1, 0))
+    figure = Figure(figsize=_SIZE, layout="constrained")
+    for axes, values, title in zip(
+        figure.subplots(2, 1, sharex=True),
+        (left.strips, predicted.reshape(left.strips.shape)),
+        ("exact: what the answer loses without the strip", "sum of the attributions of the strip"),
+        strict=True,
+    ):
+        shown = values[:rows, :columns]
+        scale = plot.attribution_colors(shown[np.isfinite(shown)])
+        axes.imshow(np.ma.masked_invalid(shown), origin="lower", aspect="auto", cmap=scale.cmap, norm=scale.norm)
+        figure.colorbar(scale, ax=axes)
+        axes.set_title(title, fontsize=10)
+        axes.set_ylabel("slice")
+        axes.set_yticks(range(rows))
+    axes.set_xlabel("strip")
+    agreement = (
+        ""
+        if left.agreement is None
+        else f" The rank correlation of both is {left.agreement:.2f} (1: the same order, 0: unrelated)."
+    )
+    caption = (
+        f"Above, each strip is left out in turn and the answer is computed again ({_unit(explanation)}). Below, what "
+        f"the attributions predict for it.{agreement}"
+    )
+    return ExplanationPicture("check", "decided", "Exact check: strips left out", caption, figure)
+
+
+def _unit(explanation: Explanation) -> str:
+    return "in log-odds" if explanation.scores.unit == "log-odds" else "in cosine similarity"
+
+
+def change_text(change: Change) -> str:
+    """Return a change in words.
+
+    >>> change_text(Change("extent", (0.9, 1.0, 1.25), 0.25, "bowl", -0.1))
+    'longest side -10 %, middle side +0 %, shortest side +25 %'
+    """
+    if change.kind == "extent":
+        sides = ("longest", "middle", "shortest")
+        parts = [f"{side} side {100 * (factor - 1):+.0f} %" for side, factor in zip(sides, change.values, strict=True)]
+        return ", ".join(parts)
+    names = ("red", "green", "blue")
+    return ", ".join(f"{name} {value:+.0f}" for name, value in zip(names, change.values, strict=True)) + " (of 255)"
+
+
+def _changes(explanation: Explanation) -> ExplanationPicture:
+    shown = [("as it is", explanation.name, explanation.instance)]
+    for change in explanation.changes:
+        title = "other colour" if change.kind == "color" else "other extents"
+        shown.append((title, change.answer, apply_change(explanation.instance, change, explanation.config)))
+    figure = Figure(figsize=(_SIZE[0], 2.6), layout="constrained")
+    all_axes = figure.subplots(1, len(shown), sharex=True, sharey=True)
+    for axes, (title, name, instance) in zip(all_axes, shown, strict=True):
+        points = instance.points - instance.points.mean(axis=0)
+        plot.cloud(axes, points, instance.colors, size=_point_size(instance) / 2)
+        axes.set_title(f"{title}:\n{plain_text(name)}", fontsize=9, **name_style())
+        axes.set_axis_off()
+    texts = [
+        f"{'colour' if c.kind == 'color' else 'extents'}: {change_text(c)} gives {c.answer}"
+        for c in explanation.changes
+    ]
+    caption = (
+        "The smallest changes that were found to give another answer, confirmed by recognizing the changed cloud; "
+        + "; ".join(texts)
+        + "."
+    )
+    return ExplanationPicture("changes", "changes", "Smallest changes that change the answer", caption, figure)
+
+
+def _nearest(explanation: Explanation) -> ExplanationPicture:
+    shown = [("this object", "", explanation.instance)]
+    shown += [(one.name, f"\n{one.similarity:.2f}", one.view) for one in explanation.nearest]
+    columns = 2
+    figure = Figure(figsize=(_SIZE[0], 2.9 * math.ceil(len(shown) / columns)), layout="constrained")
+    grid = figure.subplots(math.ceil(len(shown) / columns), columns, squeeze=False).flat
+    for axes, (title, similarity, instance) in zip(grid, shown, strict=False):
+        plot.cloud(axes, instance.points, instance.colors, size=_point_size(instance) / 2)
+        axes.set_title(plain_text(title + similarity), fontsize=9, **name_style())
+    for axes in figure.axes:
+        axes.set_axis_off()
+    caption = (
+        "The enrolled views that the object resembles most, one for each of the most similar objects, each as its "
+        "camera saw it and at its own scale. Numbers are similarities (1: equal)."
+    )
+    return ExplanationPicture("nearest", "nearest", "Nearest enrolled views", caption, figure)
+
+
+def _slices(explanation: Explanation) -> ExplanationPicture:
+    figure, axes = _figure()
+    instance = explanation.instance
+    size = _point_size(instance)
+    plot.slices(axes, explanation.described.points, instance.colors, explanation.config, strips=True, size=size)
+    config = explanation.config
+    slice_mm, strip_mm = (1000 * width / config.sigma_s for width in (config.sigma_1, config.sigma_2))
+    caption = (
+        "The points seen from the side, after the object was turned so that its longest side rises at 45 degrees. "
+        f"Slices (numbered rows) are {slice_mm:.0f} mm thick, strips (columns) {strip_mm:.0f} mm wide. One scaled unit is "
+        f"{1000 / config.sigma_s:.0f} mm."
+    )
+    return ExplanationPicture("slices", "shape", "The cloud in slices and strips", caption, figure)
+
+
+def _diagrams(explanation: Explanation) -> ExplanationPicture:
+    figure, axes = _figure()
+    plot.persistence_diagram(axes, explanation.described.diagrams, explanation.config)
+    caption = (
+        "Persistence diagrams: one dot for each strip, in the colour of its slice. Its birth is the position of the "
+        "strip; its height above the dashed line, the persistence, is how wide the object is there."
+    )
+    return ExplanationPicture("diagrams", "shape", "Persistence diagrams", caption, figure)
+
+
+def _slice(explanation: Explanation, number: int) -> ExplanationPicture:
+    described, network = explanation.described, explanation.scores.network
+    regions = np.flatnonzero(described.colors.any(axis=(0, 1)))
+    figure = Figure(figsize=(3.6, 6.6), layout="constrained")
+    upper, lower = figure.subplots(2, 1, height_ratios=[1, 1])
+    largest = float(described.images.max())
+    plot.persistence_image(upper, described.images[number], explanation.config, largest=largest)
+    plot.color_matrix(
+        lower, described.colors[number], network, regions=regions.tolist(), largest=float(described.colors.max())
+    )
+    upper.set_title(f"slice {number}: persistence image", fontsize=10)
+    lower.set_title(f"slice {number}: colour matrix", fontsize=10)
+    loss = explanation.left_out.slices[number]
+    caption = f"Slice {number}. Without it, the answer loses {loss:+.2f} ({_unit(explanation)})."
+    return ExplanationPicture(f"slice-{number}", "slices", f"Slice {number}", caption, figure)
+
+
+def _network(explanation: Explanation) -> ExplanationPicture:
+    weights: NDArray[np.float32] = explanation.described.colors.sum(axis=(0, 1))
+    figure, axes = _figure(5.2, 5.0)
+    plot.color_network(axes, explanation.scores.network, weights)
+    order = np.argsort(-weights)[:3]
+    most = ", ".join(f"{k} ({weights[k] / max(float(weights.sum()), 1e-9):.0%})" for k in order if weights[k] > 0)
+    caption = (
+        "The colour network: regions of similar colours, joined where they are neighbours. Discs in full colour are "
+        f"those of this object and grow with its number of points; most are in region {most}. Pale regions are unused."
+    )
+    return ExplanationPicture("network", "network", "The part of the colour network in use", caption, figure)

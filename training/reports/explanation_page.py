@@ -1,0 +1,138 @@
+"""The files of an explanation: a self-contained page, its pictures and JSON."""
+
+import json
+from pathlib import Path
+
+from thor2_jax.explanation.explain import Explanation
+from thor2_jax.explanation.pictures import change_text, pictures
+from thor2_jax.files import atomic_directory, write_text
+from thor2_jax.plot import save_figure
+from thor2_jax.recognition.answers import Recognition
+from thor2_jax.recognition.frames import RGBDFrame
+from training.reports.html import Picture, Section, Table, write_page
+
+__all__ = ["PAGE", "write_explanation"]
+
+PAGE = "explanation.html"
+
+_SOURCES = {
+    "tops": "shape (TOPS)",
+    "tops2": "shape and colour (TOPS2)",
+    "ce": "colour (CE)",
+    "embedding": "embedding",
+    "gallery": "gallery",
+}
+
+_DECIDED = (
+    "Every point of the object has an attribution: about how much the answer would lose without it. {check} Points "
+    "that are left out together can matter more, or less, than the sum of their attributions; the exact check shows "
+    "how well that holds for the strips of this object."
+)
+
+_SHAPE = (
+    "THOR2 turns each object into the same pose, cuts it into slices, and each slice into strips. It then knows how "
+    "wide every strip is (the persistence diagrams and images) and which colours it has (the colour matrices)."
+)
+
+_SLICES = (
+    "A persistence image shows the strips of a slice as spots: to the right the position of the strip (birth), upwards "
+    "how wide the object is there (persistence). A colour matrix shows the same strips from left to right, and in each "
+    "row the points of one colour region, in its mean colour; full colour means many points."
+)
+
+
+def write_explanation(explanation: Explanation, frame: RGBDFrame, name: str, directory: Path) -> None:
+    """Write an explanation to a directory, which appears only when it is complete.
+
+    Args:
+        explanation: the explanation.
+        frame: the frame that it was made from.
+        name: name of the frame.
+        directory: directory; what stands there is replaced.
+
+    Raises:
+        OSError: a file cannot be written; nothing is left behind.
+    """
+    with atomic_directory(directory) as unfinished:
+        sections: dict[str, list[Picture]] = {}
+        for picture in pictures(explanation, frame):
+            save_figure(picture.figure, unfinished / f"{picture.name}.png")
+            is_slice = picture.section == "slices"
+            shown = Picture(f"{picture.name}.png", picture.caption, half=not is_slice, third=is_slice)
+            sections.setdefault(picture.section, []).append(shown)
+        write_text(unfinished / "explanation.json", json.dumps(explanation.as_json()) + "\n")
+        write_page(
+            unfinished / PAGE,
+            title=f"Why {explanation.name}?",
+            lead=_lead(explanation, name),
+            sections=_page_sections(explanation, sections),
+            embed=True,
+        )
+
+
+def _lead(explanation: Explanation, name: str) -> str:
+    answer = explanation.recognition
+    sure = "" if answer.confidence is None else f" with a confidence of {answer.confidence:.0%}"
+    what = f"is recognized as {answer.name}{sure}"
+    if answer.name is None:
+        what = f"has no name ({answer.reason}); the most probable one is {explanation.name}"
+    occluded = " It is partly occluded." if answer.occluded else ""
+    return f"Object {answer.label} in frame {name} {what}.{occluded}"
+
+
+def _page_sections(explanation: Explanation, pictures: dict[str, list[Picture]]) -> list[Section]:
+    check, is_odds = explanation.attributions.faithfulness, explanation.scores.unit == "log-odds"
+    if is_odds:
+        margin = (
+            f"The classifiers' log-odds of {explanation.name} are {check.margin:.1f}. Log-odds compare a name with all "
+            "others together: 0 is even, 2.2 means 90 %, 4.6 means 99 %. The attributions below explain this number."
+        )
+    else:
+        margin = (
+            f"{explanation.name} is {check.margin:.2f} more similar (in cosine) than any other enrolled object. The "
+            "attributions below explain this number."
+        )
+    runner_up = "" if explanation.runner_up is None else f" The next best name is {explanation.runner_up}."
+    comparison = (
+        f"Without the most attributed tenth of the points the answer loses {check.most_attributed:.2f} of its "
+        f"{'log-odds' if is_odds else 'lead'}; without a random tenth, {check.random:.2f} on average."
+    )
+    sections = [
+        Section("The answer", margin + runner_up, _answer_table(explanation.recognition)),
+        Section("What decided", _DECIDED.format(check=comparison), pictures=pictures["decided"]),
+        Section("How little would change the answer", _changes_text(explanation), pictures=pictures.get("changes", ())),
+    ]
+    if "nearest" in pictures:
+        sections.append(Section("What it resembles", pictures=pictures["nearest"]))
+    return [
+        *sections,
+        Section("What the descriptor sees", _SHAPE, pictures=pictures["shape"]),
+        Section("Slice by slice", _SLICES, pictures=pictures.get("slices", ())),
+        Section("Its colours", pictures=pictures["network"]),
+    ]
+
+
+def _changes_text(explanation: Explanation) -> str:
+    if not explanation.changes:
+        return (
+            "No other answer was found: neither for colours shifted by up to half of their range, nor for sides from "
+            "half to twice as long."
+        )
+    kinds = {"color": "A shift of all colours by", "extent": "A change of the box by"}
+    found = [f"{kinds[c.kind]} {change_text(c)} gives {c.answer}." for c in explanation.changes]
+    missing = {"color", "extent"} - {change.kind for change in explanation.changes}
+    if missing == {"color"}:
+        found.append("No shift of the colours by up to half of their range changes the answer.")
+    if missing == {"extent"}:
+        found.append("No change of the sides from half to twice their length changes the answer.")
+    return " ".join(found)
+
+
+def _answer_table(answer: Recognition) -> Table:
+    sources = [source for source in answer.top if answer.top[source]]
+    count = max((len(answer.top[source]) for source in sources), default=0)
+    rows = []
+    for rank in range(count):
+        cells = (answer.top[source][rank : rank + 1] for source in sources)
+        rows.append([str(rank + 1), *(f"{name} {value:.1%}" for cell in cells for name, value in cell)])
+    return (["", *(_SOURCES.get(source, source) for source in sources)], rows)
