@@ -111,8 +111,8 @@ def _photo(explanation: Explanation, frame: RGBDFrame) -> ExplanationPicture:
         axes.set_axis_off()
     _color_bar(figure, [first, second], explanation, below=True)
     caption = (
-        f"Orange pixels speak for {explanation.name}, blue ones against it, and grey ones hardly matter. Few "
-        "pixels decide where the outline does: the width of each strip hangs on its outermost points."
+        f"Orange pixels speak for {explanation.name}, blue ones against it, and grey ones hardly matter. Where "
+        "the outline decides, few pixels do: the width of a strip hangs on its outermost points."
     )
     return ExplanationPicture("photo", "decided", "What decided, on the photo", caption, figure)
 
@@ -205,14 +205,9 @@ def _changes(explanation: Explanation) -> ExplanationPicture:
         plot.cloud(axes, points, instance.colors, size=_point_size(instance) / 2)
         axes.set_title(f"{title}:\n{plain_text(name)}", fontsize=9, **name_style())
         axes.set_axis_off()
-    texts = [
-        f"{'colour' if c.kind == 'color' else 'extents'}: {change_text(c)} gives {c.answer}"
-        for c in explanation.changes
-    ]
     caption = (
-        "The smallest changes that were found to give another answer, confirmed by recognizing the changed cloud; "
-        + "; ".join(texts)
-        + "."
+        "The smallest changes of the object's colour and of its extents that were found to give another answer. Each "
+        "was confirmed by recognizing the changed cloud."
     )
     return ExplanationPicture("changes", "changes", "Smallest changes that change the answer", caption, figure)
 
@@ -244,8 +239,8 @@ def _slices(explanation: Explanation) -> ExplanationPicture:
     slice_mm, strip_mm = (1000 * width / config.sigma_s for width in (config.sigma_1, config.sigma_2))
     caption = (
         "The points seen from the side, after the object was turned so that its longest side rises at 45 degrees. "
-        f"Slices (numbered rows) are {slice_mm:.0f} mm thick, strips (columns) {strip_mm:.0f} mm wide. One scaled unit is "
-        f"{1000 / config.sigma_s:.0f} mm."
+        f"Slices (numbered rows) are {slice_mm:.0f} mm thick, strips (columns) {strip_mm:.0f} mm wide. "
+        f"One scaled unit is {1000 / config.sigma_s:.0f} mm."
     )
     return ExplanationPicture("slices", "shape", "The cloud in slices and strips", caption, figure)
 
@@ -272,8 +267,9 @@ def _slice(explanation: Explanation, number: int) -> ExplanationPicture:
     )
     upper.set_title(f"slice {number}: persistence image", fontsize=10)
     lower.set_title(f"slice {number}: colour matrix", fontsize=10)
-    loss = explanation.left_out.slices[number]
-    caption = f"Slice {number}. Without it, the answer loses {loss:+.2f} ({_unit(explanation)})."
+    loss = float(explanation.left_out.slices[number])
+    caption = f"Slice {number}. Without it, the answer {'loses' if loss > 0 else 'gains'} {abs(loss):.2f}"
+    caption += f" ({_unit(explanation)})."
     return ExplanationPicture(f"slice-{number}", "slices", f"Slice {number}", caption, figure)
 
 

@@ -19,7 +19,7 @@ _SOURCES = {
     "tops": "shape (TOPS)",
     "tops2": "shape and colour (TOPS2)",
     "ce": "colour (CE)",
-    "embedding": "embedding",
+    "embedding": "embedding (gives the confidence)",
     "gallery": "gallery",
 }
 
@@ -72,7 +72,7 @@ def write_explanation(explanation: Explanation, frame: RGBDFrame, name: str, dir
 
 def _lead(explanation: Explanation, name: str) -> str:
     answer = explanation.recognition
-    sure = "" if answer.confidence is None else f" with a confidence of {answer.confidence:.0%}"
+    sure = "" if answer.confidence is None else f" with a confidence of {100 * answer.confidence:.0f} %"
     what = f"is recognized as {answer.name}{sure}"
     if answer.name is None:
         what = f"has no name ({answer.reason}); the most probable one is {explanation.name}"
@@ -129,10 +129,18 @@ def _changes_text(explanation: Explanation) -> str:
 
 
 def _answer_table(answer: Recognition) -> Table:
-    sources = [source for source in answer.top if answer.top[source]]
+    sources = [source for source in _SOURCES if answer.top.get(source)]
     count = max((len(answer.top[source]) for source in sources), default=0)
     rows = []
     for rank in range(count):
         cells = (answer.top[source][rank : rank + 1] for source in sources)
-        rows.append([str(rank + 1), *(f"{name} {value:.1%}" for cell in cells for name, value in cell)])
-    return (["", *(_SOURCES.get(source, source) for source in sources)], rows)
+        texts = [" ".join(f"{name} {_percent(value)}" for name, value in cell) for cell in cells]
+        rows.append([str(rank + 1), *texts])
+    return (["", *(_SOURCES[source] for source in sources)], rows)
+
+
+def _percent(value: float) -> str:
+    """Return a probability; neither 0 % nor 100 % is ever certain."""
+    if value > 0.999:
+        return ">99.9 %"
+    return f"{100 * value:.1f} %" if value >= 0.001 else "<0.1 %"

@@ -1,0 +1,267 @@
+"""Explanations: what they compute against independent computations, and against toys whose answer is known."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import SMALL_CONFIG, untrained_run
+from scipy.special import logit
+
+import colornet
+import thor2_jax as thor2
+from thor2_jax.descriptor.color_membership import region_sets
+from thor2_jax.descriptor.orientations import OrientedDescriptors, describe_orientations, orient_descriptors
+from thor2_jax.descriptor.relaxation import relaxed_strips
+from thor2_jax.explanation import attributions as attributions_module
+from thor2_jax.explanation.attributions import RELAXATION, attribute_points, path_gradients, select_points, tenth_of
+from thor2_jax.explanation.changes import apply_change, changed_instance, smallest_change
+from thor2_jax.explanation.class_scores import ClassScores, classifier_scores, gallery_scores
+from thor2_jax.explanation.explain import Explanation, explain, pixel_attributions
+from thor2_jax.explanation.leave_out import leave_out
+from thor2_jax.recognition.prepared_instance import PreparedInstance, pack_instances, prepare_instance
+from thor2_jax.recognizer import Recognizer
+
+NETWORK = colornet.load_default()
+CLASSES = ("a", "b", "c")
+FOUR = dataclasses.replace(SMALL_CONFIG, orientations=4)
+
+
+@pytest.fixture(scope="module")
+def frame() -> thor2.RGBDFrame:
+    """Two usable instances of a tilted plane, half red and half blue, and one that is too small."""
+    labels = np.zeros((120, 160), np.uint8)
+    labels[10:60, 10:45], labels[10:40, 75:125], labels[100:103, 5:8] = 3, 7, 5
+    depth = np.broadcast_to(600 + np.arange(160) // 2, labels.shape).astype(np.uint16)
+    color = np.zeros((*labels.shape, 3), np.uint8)
+    color[:35], color[35:] = (200, 30, 30), (30, 30, 200)
+    return thor2.RGBDFrame(color, depth, labels, thor2.Intrinsics(300.0, 300.0, 79.5, 59.5))
+
+
+@pytest.fixture(scope="module")
+def recognizer() -> Recognizer:
+    return Recognizer(untrained_run(CLASSES, config=FOUR))
+
+
+@pytest.fixture(scope="module")
+def instance(frame: thor2.RGBDFrame) -> PreparedInstance:
+    return prepare_instance(frame, 3, FOUR.sigma_s)
+
+
+@pytest.fixture(scope="module")
+def explanation(recognizer: Recognizer, frame: thor2.RGBDFrame) -> Explanation:
+    return explain(recognizer, frame, 3)
+
+
+def toy(score: Callable[[OrientedDescriptors], Any], config: thor2.DescriptorConfig = SMALL_CONFIG) -> ClassScores:
+    """Return scores of two names: 0, and a function of the descriptors."""
+
+    def scores(oriented: OrientedDescriptors) -> jax.Array:
+        value = score(oriented)
+        return jnp.stack([jnp.zeros_like(value), value], axis=1)
+
+    return ClassScores(("plain", "special"), "log-odds", config, NETWORK, config.orientations, scores)
+
+
+@pytest.mark.parametrize("rule", ["max", "mean", "log-mean"])
+def test_margin_is_the_log_odds_of_the_answer(rule: str, frame: thor2.RGBDFrame, instance: PreparedInstance) -> None:
+    recognizer = Recognizer(untrained_run(CLASSES, config=FOUR), rule=rule)
+    (answer,) = [one for one in recognizer.recognize(frame) if one.label == 3]
+    scores = classifier_scores(recognizer)
+    values = scores.of_instances([instance])
+    index = CLASSES.index(str(answer.name))
+    assert values[0].argmax() == index
+    assert float(scores.margin(jnp.asarray(values), index)[0]) == pytest.approx(logit(answer.confidence), abs=1e-3)
+
+
+def test_forgotten_classes_have_no_score(instance: PreparedInstance) -> None:
+    recognizer = Recognizer(untrained_run(CLASSES, config=FOUR))
+    whole = classifier_scores(recognizer).of_instances([instance])
+    recognizer.forget("b")
+    scores = classifier_scores(recognizer)
+    assert scores.names == ("a", "c")
+    np.testing.assert_allclose(scores.of_instances([instance]), whole[:, [0, 2]], rtol=1e-5)
+
+
+def test_all_points_have_the_score_of_the_cloud(recognizer: Recognizer, instance: PreparedInstance) -> None:
+    scores = classifier_scores(recognizer)
+    masks = np.ones((9, len(instance.points)), bool)  # more than one batch
+    of_masks = scores.of_masks(scores.orient(instance), masks)
+    np.testing.assert_allclose(of_masks, scores.of_instances([instance] * 9), atol=1e-4)
+
+
+def test_a_left_out_slice_is_an_empty_slice(instance: PreparedInstance) -> None:
+    recognizer = Recognizer(untrained_run(CLASSES, config=SMALL_CONFIG))
+    scores, index = classifier_scores(recognizer), 1
+    cloud = scores.orient(instance)
+    left = leave_out(scores, cloud, index, np.zeros(len(instance.points), np.float32))
+    oriented = describe_orientations(pack_instances([instance], 1), NETWORK, SMALL_CONFIG)
+    margin = lambda o: float(scores.margin(scores.of_descriptors(o), index)[0])  # noqa: E731
+    for number in range(2):
+        blank = lambda a, number=number: a.at[:, :, number].set(0)  # noqa: E731
+        each = dataclasses.replace(
+            oriented.each, images=blank(oriented.each.images), embeddings=blank(oriented.each.embeddings)
+        )
+        expected = margin(oriented) - margin(dataclasses.replace(oriented, each=each))
+        assert left.slices[number] == pytest.approx(expected, abs=1e-3)
+    aligned = np.asarray(thor2.align(pack_instances([instance], 1), SMALL_CONFIG).points[0])[: len(instance.points)]
+    np.testing.assert_array_equal(left.slice_of, np.floor(aligned[:, 2] / 0.1))
+    np.testing.assert_array_equal(left.strip_of, np.floor(aligned[:, 0] / 0.025))
+    assert left.agreement is None  # all attributions are equal
+
+
+def relaxed(scores: ClassScores, instance: PreparedInstance, weight: float) -> float:
+    """Return the relaxed margin of name 1 with a weight for all points."""
+    config = dataclasses.replace(scores.config, relaxation=RELAXATION)
+    cloud = scores.orient(instance)
+    cut = [
+        relaxed_strips(
+            cloud.aligned.points[k].T,
+            cloud.aligned.colors[k],
+            cloud.aligned.mask[k],
+            region_sets(NETWORK),
+            config,
+            jnp.zeros((), jnp.int32),
+            jnp.full(cloud.aligned.mask.shape[1], weight, jnp.float32),
+        )
+        for k in range(scores.count)
+    ]
+    together = jax.tree.map(lambda *a: jnp.stack(a), *cut)
+    oriented = orient_descriptors(cloud.aligned, cloud.weights[None], together, NETWORK, config)
+    return float(scores.margin(scores.of_descriptors(oriented), 1)[0])
+
+
+def test_attributions_are_complete(
+    recognizer: Recognizer, instance: PreparedInstance, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The mean gradient on the path, summed over the points, is the slope of the margin from half to whole weights."""
+    monkeypatch.setattr(attributions_module, "STEPS", 32)
+    scores = classifier_scores(recognizer)
+    gradients = path_gradients(scores, scores.orient(instance), 1)
+    assert gradients.shape[0] == 32 and not gradients[:, len(instance.points) :].any()
+    slope = (relaxed(scores, instance, 1.0) - relaxed(scores, instance, 0.5)) / 0.5
+    assert gradients.mean(axis=0).sum() == pytest.approx(slope, rel=0.1, abs=0.02)
+
+
+def test_weightless_points_are_left_out(instance: PreparedInstance) -> None:
+    config = dataclasses.replace(SMALL_CONFIG, relaxation=RELAXATION)
+    aligned = thor2.align(pack_instances([instance], 1), config)
+    cloud = jax.tree.map(lambda a: a[0], aligned)
+    some = jnp.arange(len(cloud.mask)) % 3 > 0
+    overflow = jnp.zeros((), jnp.int32)
+    arguments = cloud.points.T, cloud.colors
+    sets = region_sets(NETWORK)
+    weighted = relaxed_strips(*arguments, cloud.mask, sets, config, overflow, some.astype(jnp.float32))
+    masked = relaxed_strips(*arguments, cloud.mask & some, sets, config, overflow)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), weighted, masked)
+
+
+def test_points_of_the_decisive_color_are_found(instance: PreparedInstance) -> None:
+    red = np.asarray(NETWORK.membership(np.array([200, 30, 30], np.uint8))) > 0
+    similarity = np.linalg.inv(NETWORK.similarity)
+
+    def redness(oriented: OrientedDescriptors) -> jax.Array:
+        # E = (C Delta)^T: the inverse of Delta gives back the colour vectors.
+        counts = jnp.einsum("bksrj,rq->bq", oriented.each.embeddings, similarity)
+        return counts[:, red].sum(axis=1) / 100
+
+    scores = toy(redness)
+    found = attribute_points(scores, scores.orient(instance), instance, 1)
+    is_red = instance.colors[:, 0] > instance.colors[:, 2]
+    aligned = np.asarray(scores.orient(instance).aligned.points[0])[: len(instance.points)]
+    inside = (aligned[:, 0] < 0.125) & (aligned[:, 2] < 0.2)  # within 5 strips and 2 slices
+    assert found.values[is_red & inside].min() > 5 * np.abs(found.values[~is_red]).max()
+    assert found.faithfulness.holds and found.faithfulness.most_attributed > 0
+
+
+def test_smallest_change_is_smallest_and_confirmed(instance: PreparedInstance) -> None:
+    def width(oriented: OrientedDescriptors) -> jax.Array:
+        return -oriented.each.images.sum(axis=(1, 2, 3, 4))
+
+    raw = toy(width)
+    threshold = -0.75 * float(raw.of_instances([instance])[0, 1])
+    scores = toy(lambda oriented: width(oriented) + threshold)
+    assert scores.of_instances([instance])[0].argmax() == 0
+    change = smallest_change(scores, instance, 0, "extent")
+    assert change is not None and change.answer == "special" and change.margin < 0
+    changed = apply_change(instance, change, SMALL_CONFIG)
+    assert scores.of_instances([changed])[0].argmax() == 1
+    less = dataclasses.replace(change, values=tuple(float(v) ** 0.9 for v in change.values))
+    assert scores.of_instances([apply_change(instance, less, SMALL_CONFIG)])[0].argmax() == 0
+    never = toy(lambda oriented: width(oriented) - 100)
+    assert smallest_change(never, instance, 0, "color") is None
+
+
+def test_changed_extents_keep_the_other_sides(instance: PreparedInstance) -> None:
+    rng = np.random.default_rng(0)
+    axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    changed = changed_instance(instance, "extent", np.log([1.5, 1.0, 0.5]), axes)
+    before, after = (np.ptp(one.points @ axes.T, axis=0) for one in (instance, changed))
+    np.testing.assert_allclose(after / before, [1.5, 1.0, 0.5], rtol=1e-3)
+    shifted = changed_instance(instance, "color", np.array([0.1, 0, -1]), axes)
+    np.testing.assert_allclose(shifted.colors[:, 0], np.minimum(instance.colors[:, 0] + 25.5, 255), atol=0.51)
+    assert not shifted.colors[:, 2].any()
+
+
+def test_explanation_has_its_parts(explanation: Explanation, recognizer: Recognizer, frame: thor2.RGBDFrame) -> None:
+    (answer,) = [one for one in recognizer.recognize(frame) if one.label == 3]
+    assert explanation.name == answer.name and explanation.runner_up in set(CLASSES) - {answer.name}
+    assert explanation.recognition.confidence == pytest.approx(answer.confidence, abs=1e-5)
+    n = len(explanation.instance.points)
+    assert explanation.attributions.values.shape == (n,) and np.isfinite(explanation.attributions.values).all()
+    described = thor2.describe(pack_instances([explanation.instance], 1), NETWORK, SMALL_CONFIG)
+    np.testing.assert_allclose(explanation.described.images, described.images[0], atol=1e-5)
+    record = explanation.as_json()
+    assert len(record["points"]) == len(record["attributions"]) == n
+    assert record["margin"] == pytest.approx(logit(answer.confidence), abs=1e-3)
+    assert record["nearest"] == [] and {strip["slice"] for strip in record["strips"]} <= {0, 1}
+
+
+def test_the_check_removes_the_most_attributed_tenth(explanation: Explanation) -> None:
+    values, check = explanation.attributions.values, explanation.attributions.faithfulness
+    kept = np.ones(len(values), bool)
+    kept[np.argsort(-values, kind="stable")[: tenth_of(len(values))]] = False
+    scores = explanation.scores
+    rest = scores.of_instances([select_points(explanation.instance, kept)])
+    margin = float(scores.margin(jnp.asarray(rest), scores.names.index(explanation.name))[0])
+    assert check.margin - margin == pytest.approx(check.most_attributed, abs=1e-3)
+
+
+def test_pixels_have_the_value_of_their_point(explanation: Explanation, frame: thor2.RGBDFrame) -> None:
+    painted = pixel_attributions(explanation, frame)
+    known = np.isfinite(painted)
+    assert known.sum() > 0.8 * (frame.labels == 3).sum() and not known[frame.labels != 3].any()
+    row, column = np.argwhere(known)[100]
+    depth = frame.depth[row, column] / 1000
+    point = np.array([(column - 79.5) / 300 * depth, (row - 59.5) / 300 * depth, depth])
+    nearest = np.linalg.norm(explanation.instance.points - point, axis=1).argmin()
+    assert painted[row, column] == explanation.attributions.values[nearest]
+
+
+def test_gallery_answers_are_explained(frame: thor2.RGBDFrame) -> None:
+    recognizer = Recognizer(untrained_run((), features=()))
+    recognizer.enroll("red", [(frame, 7)])
+    recognizer.enroll("mixed", [(frame, 3)])
+    explanation = explain(recognizer, frame, 3)
+    assert explanation.name == "mixed" and explanation.scores.unit == "similarity"
+    assert [one.name for one in explanation.nearest] == ["mixed", "red"]
+    nearest = explanation.nearest[0]
+    assert nearest.similarity == pytest.approx(1, abs=0.01) and nearest.number == 0
+    np.testing.assert_allclose(nearest.view.points, explanation.instance.points, atol=1e-4)
+    assert explanation.attributions.faithfulness.margin > 0
+
+
+def test_errors_name_the_argument(recognizer: Recognizer, frame: thor2.RGBDFrame) -> None:
+    for label, match in ((4, "^instance is 4; expected one of 3, 5, 7"), (5, "^instance 5 cannot be explained: ")):
+        with pytest.raises(thor2.InputError, match=match):
+            explain(recognizer, frame, label)
+    with pytest.raises(thor2.InputError, match="no object"):
+        explain(Recognizer(untrained_run((), features=())), frame, 3)
+    with pytest.raises(thor2.InputError, match="no object is enrolled"):
+        gallery_scores(recognizer)
+    released = thor2.DescriptorConfig.released(n_slices=2, n_strips=5, image_size=8)
+    with pytest.raises(thor2.InputError, match="convention"):
+        explain(Recognizer(untrained_run(CLASSES, config=released)), frame, 3)
