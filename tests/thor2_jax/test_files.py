@@ -8,7 +8,14 @@ from pathlib import Path
 import pytest
 
 from thor2_jax.errors import InputError
-from thor2_jax.files import atomic_write, check_output_directory, directory_digest, json_digest, write_text
+from thor2_jax.files import (
+    atomic_directory,
+    atomic_write,
+    check_output_directory,
+    directory_digest,
+    json_digest,
+    write_text,
+)
 
 
 def test_text_is_utf_8_and_readable_by_all(tmp_path: Path) -> None:
@@ -109,3 +116,19 @@ def test_digests_are_those_of_earlier_versions(tmp_path: Path) -> None:
     (tmp_path / "a").write_text("x")
     assert directory_digest(tmp_path, "3 4") == hashlib.sha256(b"3 4" + b"a 1" + b"x").hexdigest()
     assert json_digest({"b": 1, "a": 2}) == hashlib.sha256(b'{"a": 2, "b": 1}').hexdigest()
+
+
+def test_a_directory_appears_when_it_is_complete(tmp_path: Path) -> None:
+    target = tmp_path / "new" / "deeper" / "out"
+    with pytest.raises(KeyError), atomic_directory(target) as unfinished:
+        (unfinished / "half").write_text("x")
+        raise KeyError
+    assert list(tmp_path.iterdir()) == []
+    for content in ("first", "second"):
+        with atomic_directory(target) as unfinished:
+            assert content == "first" or (target / "file").read_text() == "first"
+            (unfinished / "file").write_text(content)
+    assert (target / "file").read_text() == "second"
+    with pytest.raises(KeyError), atomic_directory(target):
+        raise KeyError
+    assert [path.name for path in target.parent.iterdir()] == ["out"] and (target / "file").read_text() == "second"

@@ -17,6 +17,7 @@ from thor2_jax.descriptor.color_membership import region_sets
 from thor2_jax.descriptor.orientations import OrientedDescriptors, describe_orientations, orient_descriptors
 from thor2_jax.descriptor.relaxation import relaxed_strips
 from thor2_jax.explanation import attributions as attributions_module
+from thor2_jax.explanation import class_scores
 from thor2_jax.explanation.attributions import RELAXATION, attribute_points, path_gradients, select_points, tenth_of
 from thor2_jax.explanation.changes import apply_change, changed_instance, smallest_change
 from thor2_jax.explanation.class_scores import ClassScores, classifier_scores, gallery_scores
@@ -64,6 +65,11 @@ def toy(score: Callable[[OrientedDescriptors], Any], config: thor2.DescriptorCon
         return jnp.stack([jnp.zeros_like(value), value], axis=1)
 
     return ClassScores(("plain", "special"), "log-odds", config, NETWORK, config.orientations, scores)
+
+
+@pytest.fixture(autouse=True)
+def small_clouds(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(class_scores, "MIN_CAPACITY", 512)
 
 
 @pytest.mark.parametrize("rule", ["max", "mean", "log-mean"])
@@ -134,6 +140,7 @@ def relaxed(scores: ClassScores, instance: PreparedInstance, weight: float) -> f
     return float(scores.margin(scores.of_descriptors(oriented), 1)[0])
 
 
+@pytest.mark.slow
 def test_attributions_are_complete(
     recognizer: Recognizer, instance: PreparedInstance, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -151,11 +158,15 @@ def test_weightless_points_are_left_out(instance: PreparedInstance) -> None:
     aligned = thor2.align(pack_instances([instance], 1), config)
     cloud = jax.tree.map(lambda a: a[0], aligned)
     some = jnp.arange(len(cloud.mask)) % 3 > 0
-    overflow = jnp.zeros((), jnp.int32)
-    arguments = cloud.points.T, cloud.colors
-    sets = region_sets(NETWORK)
-    weighted = relaxed_strips(*arguments, cloud.mask, sets, config, overflow, some.astype(jnp.float32))
-    masked = relaxed_strips(*arguments, cloud.mask & some, sets, config, overflow)
+    sets, overflow = region_sets(NETWORK), jnp.zeros((), jnp.int32)
+
+    @jax.jit
+    def both(some: jax.Array) -> tuple[thor2.Strips, thor2.Strips]:
+        arguments = cloud.points.T, cloud.colors
+        weighted = relaxed_strips(*arguments, cloud.mask, sets, config, overflow, some.astype(jnp.float32))
+        return weighted, relaxed_strips(*arguments, cloud.mask & some, sets, config, overflow)
+
+    weighted, masked = both(some)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), weighted, masked)
 
 
@@ -177,6 +188,7 @@ def test_points_of_the_decisive_color_are_found(instance: PreparedInstance) -> N
     assert found.faithfulness.holds and found.faithfulness.most_attributed > 0
 
 
+@pytest.mark.slow
 def test_smallest_change_is_smallest_and_confirmed(instance: PreparedInstance) -> None:
     def width(oriented: OrientedDescriptors) -> jax.Array:
         return -oriented.each.images.sum(axis=(1, 2, 3, 4))
@@ -206,6 +218,7 @@ def test_changed_extents_keep_the_other_sides(instance: PreparedInstance) -> Non
     assert not shifted.colors[:, 2].any()
 
 
+@pytest.mark.slow
 def test_explanation_has_its_parts(explanation: Explanation, recognizer: Recognizer, frame: thor2.RGBDFrame) -> None:
     (answer,) = [one for one in recognizer.recognize(frame) if one.label == 3]
     assert explanation.name == answer.name and explanation.runner_up in set(CLASSES) - {answer.name}
@@ -220,6 +233,7 @@ def test_explanation_has_its_parts(explanation: Explanation, recognizer: Recogni
     assert record["nearest"] == [] and {strip["slice"] for strip in record["strips"]} <= {0, 1}
 
 
+@pytest.mark.slow
 def test_the_check_removes_the_most_attributed_tenth(explanation: Explanation) -> None:
     values, check = explanation.attributions.values, explanation.attributions.faithfulness
     kept = np.ones(len(values), bool)
@@ -230,6 +244,7 @@ def test_the_check_removes_the_most_attributed_tenth(explanation: Explanation) -
     assert check.margin - margin == pytest.approx(check.most_attributed, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_pixels_have_the_value_of_their_point(explanation: Explanation, frame: thor2.RGBDFrame) -> None:
     painted = pixel_attributions(explanation, frame)
     known = np.isfinite(painted)
@@ -241,6 +256,7 @@ def test_pixels_have_the_value_of_their_point(explanation: Explanation, frame: t
     assert painted[row, column] == explanation.attributions.values[nearest]
 
 
+@pytest.mark.slow
 def test_gallery_answers_are_explained(frame: thor2.RGBDFrame) -> None:
     recognizer = Recognizer(untrained_run((), features=()))
     recognizer.enroll("red", [(frame, 7)])

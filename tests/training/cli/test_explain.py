@@ -1,0 +1,78 @@
+"""`thor2 explain`: pages that need no other file, and nothing on disk after errors."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from helpers import SMALL_CONFIG, ParsedPage, run_thor2, untrained_run, write_frame
+
+from thor2_jax.explanation import class_scores
+from thor2_jax.recognition.run_directory import save_run
+from training.reports import explanation_page
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    directory = tmp_path_factory.mktemp("run")
+    save_run(untrained_run(("bowl", "mug"), ("tops", "tops2"), config=SMALL_CONFIG), directory)
+    return directory
+
+
+@pytest.fixture(autouse=True)
+def small_clouds(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(class_scores, "MIN_CAPACITY", 512)
+
+
+@pytest.fixture
+def frame(tmp_path: Path) -> Path:
+    return write_frame(tmp_path / "table", {1: "brick", 4: "book"})
+
+
+@pytest.mark.slow
+def test_a_page_for_every_instance(model: Path, frame: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out"
+    assert run_thor2("explain", "--model", model, frame, "--out", out) == 0
+    printed = capfd.readouterr().out.splitlines()
+    assert sorted(path.name for path in (out / "table").iterdir()) == ["1", "4"] and len(printed) == 2
+    for label in (1, 4):
+        directory = out / "table" / str(label)
+        page = ParsedPage((directory / "explanation.html").read_text())
+        assert page.open == [] and "script" not in page.tags
+        assert len(page.pictures) > 6
+        assert all(str(picture["src"]).startswith("data:image/png;base64,") for picture in page.pictures)
+        record = json.loads((directory / "explanation.json").read_text())
+        assert record["label"] == label and record["explained_name"] in ("bowl", "mug")
+        pictures = sorted(path.stem for path in directory.glob("*.png"))
+        assert len(pictures) == len(page.pictures) and {"photo", "cloud", "check", "network"} <= set(pictures)
+        assert not list(directory.glob(".*"))
+
+
+@pytest.mark.slow
+def test_nothing_is_left_after_an_error(
+    model: Path, frame: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: Any, **__: Any) -> None:
+        raise OSError(28, "No space left on device", "explanation.html")
+
+    monkeypatch.setattr(explanation_page, "write_page", fail)
+    assert run_thor2("explain", "--model", model, frame, "--instance", 1, "--out", tmp_path / "deep" / "out") == 2
+    assert not (tmp_path / "deep").exists()
+    assert "No space left" in capfd.readouterr().err
+
+
+def test_wrong_arguments_are_one_line(
+    model: Path, frame: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    for arguments, text in (
+        ((frame, "--instance", 9), "table: instance is 9; expected one of 1, 4"),
+        ((tmp_path / "absent",), "is not a directory"),
+    ):
+        assert run_thor2("explain", "--model", model, *arguments, "--out", out) == 2
+        error = capfd.readouterr().err.strip()
+        assert text in error and "\n" not in error and not out.exists()
+    out.mkdir()
+    (out / "mine.txt").write_text("x")
+    assert run_thor2("explain", "--model", model, frame, "--out", out) == 2
+    assert "mine.txt" in capfd.readouterr().err
