@@ -1,13 +1,18 @@
 """Conversion of recognition results into the JSON records of the API."""
 
+import base64
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.config import DescriptorConfig
+from thor2_jax.explanation.explain import Explanation
+from thor2_jax.explanation.pictures import change_text, main_pictures
 from thor2_jax.gallery.objects import ObjectGallery
+from thor2_jax.plot import png_bytes
 from thor2_jax.recognition.answers import Recognition
+from thor2_jax.recognition.frames import RGBDFrame
 from thor2_jax.recognition.prepared_instance import PreparedInstance
 from thor2_jax.service.engine import CloudResult
 from thor2_jax.service.preparation import PreparedRequest
@@ -20,10 +25,12 @@ from thor2_jax.service.schemas import (
     ObjectAnswer,
     SliceDetails,
     StripColors,
+    WhyAnswer,
+    WhyPicture,
 )
 from thor2_jax.service.settings import MAX_EXPLAINED
 
-__all__ = ["explained_frame", "instance_answer", "object_answers"]
+__all__ = ["explained_frame", "instance_answer", "object_answers", "why_answer"]
 
 MAX_SHOWN_POINTS = 1000
 """Number of points of a cloud in an explanation."""
@@ -46,6 +53,28 @@ def instance_answer(recognition: Recognition) -> InstanceAnswer:
         points_used=recognition.points_used,
         kept_by_fallback=recognition.kept_by_fallback,
         unrecognized=recognition.reason,
+    )
+
+
+def why_answer(explanation: Explanation, frame: RGBDFrame) -> WhyAnswer:
+    """Return the JSON record of an explanation, with its main pictures and without timings."""
+    check = explanation.attributions.faithfulness
+    return WhyAnswer(
+        label=explanation.recognition.label,
+        name=explanation.recognition.name,
+        explained_name=explanation.name,
+        unit=explanation.scores.unit,
+        margin=check.margin,
+        loss_without_most_attributed_tenth=check.most_attributed,
+        mean_loss_without_random_tenth=check.random,
+        changes=[f"{change_text(change)}: {change.answer}" for change in explanation.changes],
+        pictures=[
+            WhyPicture(
+                title=picture.title, caption=picture.caption, png=base64.b64encode(png_bytes(picture.figure)).decode()
+            )
+            for picture in main_pictures(explanation, frame)
+        ],
+        timings={},
     )
 
 

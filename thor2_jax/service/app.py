@@ -27,13 +27,22 @@ from thor2_jax.service.pipeline import Service
 from thor2_jax.service.problem import Problem, RequestError, error_responses
 from thor2_jax.service.schemas import NPZ
 from thor2_jax.service.settings import Settings
-from thor2_jax.service.teaching import check_same_site, gallery_errors, generation_number, parse_enrolment
+from thor2_jax.service.teaching import (
+    check_same_site,
+    gallery_errors,
+    generation_number,
+    instance_number,
+    parse_enrolment,
+)
 from thor2_jax.service.uploads import read_body, read_form
 
 __all__ = ["create_app"]
 
 LABELLED_FRAME = ("color", "depth", "labels", "intrinsics")
 FRAME, OPTIONAL = ("color", "depth", "intrinsics"), ("labels",)
+WHY_SECONDS = 90.0
+"""Least deadline of an explanation, which may have to compile first."""
+
 FRAME_ERRORS = error_responses(400, 408, 413, 415, 422, 429, 503, 504)
 GALLERY_ERRORS = error_responses(429, 500, 503, 504, 507)
 
@@ -159,6 +168,18 @@ def _add_inference_routes(routes: APIRouter, service: Service) -> None:
             answer = await service.explain(files, admitted)
             content = await run_in_threadpool(answer.model_dump_json)
         return Response(content, media_type="application/json")
+
+    @routes.post("/v1/why", responses=FRAME_ERRORS, openapi_extra={"requestBody": schemas.WHY_FORM})
+    async def why(request: Request) -> schemas.WhyAnswer:
+        """Explain the answer for one instance: the points that decided, and the smallest changes that change it.
+
+        The answer may take a minute, since the first explanation of each size of clouds compiles.
+        """
+        async with service.admit(max(service.settings.deadline, WHY_SECONDS)) as admitted:
+            with admitted.stage("upload"):
+                fields = await read_form(request, (*FRAME, *OPTIONAL, "instance"))
+            label = instance_number(fields.pop("instance"))
+            return await service.why(fields, label, admitted)
 
     @routes.post(
         "/v1/describe",

@@ -1,5 +1,6 @@
 """The compiled model: descriptors and class probabilities for batches of a few sizes, all compiled before serving."""
 
+import copy
 import dataclasses
 import logging
 from collections.abc import Sequence
@@ -13,6 +14,7 @@ from thor2_jax.capacity import BATCH_BUCKETS, POINT_BUCKETS, batch_bucket, point
 from thor2_jax.descriptor.describe import strips
 from thor2_jax.descriptor.orientations import candidate_orientations, orient_descriptors
 from thor2_jax.errors import InputError
+from thor2_jax.explanation.explain import Explanation, explain_instance
 from thor2_jax.gallery.clouds import CompactClouds
 from thor2_jax.gallery.enrollment import ORIENTATIONS, enrolled_object
 from thor2_jax.gallery.gallery import GalleryObject
@@ -161,6 +163,12 @@ class InferenceEngine:
         elif source == "gallery":
             evidence = evidence._replace(probabilities={})
         return self._recognizer.recognitions(instances, evidence)
+
+    def explain(self, instance: PreparedInstance) -> Explanation:
+        """Explain the answer for an instance; may be called in another thread. Raises as `explain_instance`."""
+        recognizer = copy.copy(self._recognizer)
+        recognizer.objects = copy.copy(recognizer.objects)  # It stays as it is while the gallery changes.
+        return explain_instance(recognizer, instance)
 
     def calibrated_confidences(self, results: Sequence[CloudResult]) -> list[float | None]:
         """Return the calibrated confidence of the most probable class of each cloud.

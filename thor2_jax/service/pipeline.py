@@ -7,6 +7,7 @@ import logging
 import threading
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 
 from thor2_jax.errors import InputError
 from thor2_jax.gallery.clouds import CompactClouds
@@ -14,7 +15,7 @@ from thor2_jax.gallery.enrollment import views_to_embed
 from thor2_jax.gallery.objects import ObjectGallery
 from thor2_jax.recognition.answers import Recognition
 from thor2_jax.recognition.prepared_instance import PreparedInstance
-from thor2_jax.service.answers import explained_frame
+from thor2_jax.service.answers import explained_frame, why_answer
 from thor2_jax.service.batching import Batcher
 from thor2_jax.service.engine import CloudResult, InferenceEngine
 from thor2_jax.service.metrics import CompilationCounter, Metrics
@@ -26,7 +27,7 @@ from thor2_jax.service.preparation import (
     prepare_view,
 )
 from thor2_jax.service.problem import RequestError, deadline_exceeded
-from thor2_jax.service.schemas import ExplainedFrame, LabelMap
+from thor2_jax.service.schemas import ExplainedFrame, LabelMap, WhyAnswer
 from thor2_jax.service.settings import Settings
 from thor2_jax.service.teaching import Enrolment, gallery_errors
 
@@ -89,6 +90,7 @@ class Service:
         self._batcher = Batcher(
             self._process_batch, lambda: self._in_progress, self.settings.max_batch, self.settings.window
         )
+        self._explainer = ThreadPoolExecutor(1, thread_name_prefix="explain")
         self._warm_up_thread = threading.Thread(target=self._warm_up, name="warm-up")
         self._warm_up_thread.start()
 
@@ -134,12 +136,16 @@ class Service:
         self._warm_up_thread.join()
         self._pool.close()
         self._batcher.close()
+        self._explainer.shutdown(cancel_futures=True)
         self._compilations.stop()
         log.info("stopped: %d requests accepted, %d finished", self._accepted, self._finished)
 
     @contextlib.asynccontextmanager
-    async def admit(self) -> AsyncIterator[AdmittedRequest]:
+    async def admit(self, seconds: float | None = None) -> AsyncIterator[AdmittedRequest]:
         """Admit a request for the duration of the context.
+
+        Args:
+            seconds: time until its deadline; by default that of the settings.
 
         Raises:
             RequestError: 503 if the service is not ready, 429 if the queue is full; at the deadline, 408 if the body
@@ -148,12 +154,13 @@ class Service:
         self.check_ready()
         if self._in_progress >= self.settings.queue:
             raise RequestError(429, None, f"The queue is full: {self.settings.queue} requests are in progress.")
-        request = AdmittedRequest(self.settings.deadline)
+        seconds = self.settings.deadline if seconds is None else seconds
+        request = AdmittedRequest(seconds)
         self._in_progress += 1
         self._accepted += 1
         self.metrics.in_progress.inc()
         try:
-            async with asyncio.timeout(self.settings.deadline):
+            async with asyncio.timeout(seconds):
                 yield request
         except TimeoutError:
             if "upload" in request.seconds:
@@ -163,8 +170,8 @@ class Service:
             self._in_progress -= 1
             self._finished += 1
             self.metrics.in_progress.dec()
-            for name, seconds in request.seconds.items():
-                self.metrics.stages.labels(name).observe(seconds)
+            for name, duration in request.seconds.items():
+                self.metrics.stages.labels(name).observe(duration)
 
     async def recognize(
         self, files: dict[str, bytes], request: AdmittedRequest
@@ -191,6 +198,28 @@ class Service:
         return await asyncio.to_thread(
             explained_frame, prepared, recognitions, results, confidences, config, request.milliseconds()
         )
+
+    async def why(self, files: dict[str, bytes], label: int, request: AdmittedRequest) -> WhyAnswer:
+        """Explain the answer for one instance of a frame, one request after the other.
+
+        Raises:
+            RequestError: as `prepare_view`, or 422 if the run cannot be explained.
+        """
+        arguments = files, self.engine.run.config.sigma_s, label, True
+        prepared = await asyncio.wrap_future(self._pool.submit(request.deadline, prepare_view, *arguments))
+        request.seconds.update(prepared.seconds)
+        self.engine.refresh()
+
+        def explained() -> WhyAnswer:
+            assert prepared.frame is not None
+            return why_answer(self.engine.explain(prepared.instances[0]), prepared.frame)
+
+        with request.stage("explain"):
+            try:
+                answer = await asyncio.wrap_future(self._explainer.submit(explained))
+            except InputError as error:
+                raise RequestError(422, "instance", f"{error}.") from None
+        return answer.model_copy(update={"timings": request.milliseconds()})
 
     async def describe(self, content: bytes, is_npz: bool, request: AdmittedRequest) -> list[CloudResult]:
         """Describe the clouds of an npz or JSON body. Raises RequestError."""

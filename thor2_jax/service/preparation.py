@@ -43,11 +43,13 @@ class PreparedRequest:
         instances: its instances, in the order of their labels.
         seconds: stage -> duration.
         label_map: the label image of the frame, if requested, and if the frame was segmented here.
+        frame: the frame, if it is needed after its instances are prepared.
     """
 
     instances: list[PreparedInstance]
     seconds: dict[str, float]
     label_map: LabelMap | None = None
+    frame: RGBDFrame | None = None
 
 
 def prepare_frame(
@@ -101,8 +103,8 @@ def _warm_up(name: str) -> None:
         segmented(blank, _segmenter(name))
 
 
-def prepare_view(files: dict[str, bytes], sigma_s: float, label: int) -> PreparedRequest:
-    """Decode a frame and compute the cloud of one instance, which is to be enrolled.
+def prepare_view(files: dict[str, bytes], sigma_s: float, label: int, with_frame: bool = False) -> PreparedRequest:
+    """Decode a frame and compute the cloud of one instance, which is to be enrolled or explained.
 
     Raises:
         RequestError: 422 if there is no such instance or it has too few points, or as `prepare_frame`.
@@ -116,8 +118,9 @@ def prepare_view(files: dict[str, bytes], sigma_s: float, label: int) -> Prepare
         raise RequestError(422, "instance", f"instance is {label}; expected a number of labels: {first}{more}.")
     (view,) = _prepare_instances(frame, [label], sigma_s)
     if view.reason is not None:
-        raise RequestError(422, "instance", f"instance {label} cannot be enrolled: {view.reason}.")
-    return PreparedRequest([view], {"decode": decoded - start, "clouds": time.perf_counter() - decoded})
+        raise RequestError(422, "instance", f"instance {label} cannot be used: {view.reason}.")
+    seconds = {"decode": decoded - start, "clouds": time.perf_counter() - decoded}
+    return PreparedRequest([view], seconds, frame=frame if with_frame else None)
 
 
 def _prepare_instances(frame: RGBDFrame, labels: Sequence[int], sigma_s: float) -> list[PreparedInstance]:

@@ -33,6 +33,9 @@ __all__ = [
     "Readiness",
     "SliceDetails",
     "StripColors",
+    "WHY_FORM",
+    "WhyAnswer",
+    "WhyPicture",
 ]
 
 NPZ = "application/octet-stream"
@@ -136,6 +139,31 @@ class ExplainedFrame(BaseModel):
     instances: list[ExplainedInstance]
     label_map: LabelMap
     timings: Milliseconds = Field(description=FRAME_STAGES)
+
+
+class WhyPicture(BaseModel):
+    """A picture of an explanation."""
+
+    title: str
+    caption: str = Field(description="What it shows, in full sentences.")
+    png: str = Field(description="The picture, a PNG file in base64.")
+
+
+class WhyAnswer(BaseModel):
+    """Why an instance has its answer; `thor2 explain` writes more."""
+
+    label: int
+    name: str | None = Field(description="Name of the object; null if it is unknown.")
+    explained_name: str = Field(description="The name that is explained: the most probable one.")
+    unit: str = Field(description="What is explained: log-odds of the classifiers, or similarity to enrolled views.")
+    margin: float = Field(description="The explained number: log-odds, or the lead over the most similar other object.")
+    loss_without_most_attributed_tenth: float = Field(
+        description="What the margin loses without the tenth of the points that speaks most for the name."
+    )
+    mean_loss_without_random_tenth: float = Field(description="The same for random tenths of the points.")
+    changes: list[str] = Field(description="Smallest changes of colour and extents that give another name, in words.")
+    pictures: list[WhyPicture]
+    timings: Milliseconds = Field(description="Milliseconds per stage: upload, decode, clouds, explain, total.")
 
 
 class CloudBody(BaseModel):
@@ -275,11 +303,18 @@ def _form(required: dict[str, Any], optional: dict[str, Any]) -> dict[str, Any]:
     return {"required": True, "content": {"multipart/form-data": {"schema": schema}}}
 
 
+_INSTANCE: dict[str, Any] = {
+    **FRAME_FORM["content"]["multipart/form-data"]["schema"]["properties"],
+    "instance": {"type": "integer", "minimum": 0, "description": "Number of the object in the label image."},
+}
+
+WHY_FORM = _form(_INSTANCE, {})
+"""OpenAPI schema of the body of /v1/why."""
+
 ENROLMENT_FORM = _form(
     {
-        **FRAME_FORM["content"]["multipart/form-data"]["schema"]["properties"],
+        **_INSTANCE,
         "name": {"type": "string", "minLength": 1, "maxLength": 200, "description": "Name of the object."},
-        "instance": {"type": "integer", "minimum": 0, "description": "Number of the object in the label image."},
     },
     {
         "extend": {"type": "boolean", "description": "Add the view to those of an object that exists."},

@@ -14,7 +14,7 @@ from thor2_jax.gallery.gallery import check_name
 from thor2_jax.gallery.store import GalleryBusyError, GalleryError
 from thor2_jax.service.problem import RequestError
 
-__all__ = ["Enrolment", "check_same_site", "gallery_errors", "generation_number", "parse_enrolment"]
+__all__ = ["Enrolment", "check_same_site", "gallery_errors", "generation_number", "instance_number", "parse_enrolment"]
 
 log = logging.getLogger(__name__)
 
@@ -62,10 +62,10 @@ def parse_enrolment(fields: dict[str, bytes]) -> Enrolment:
         except InputError as problem:
             error("name", f"{problem}.")
     instance = 0
-    if re.fullmatch(rb"[0-9]{1,10}", fields["instance"]):
-        instance = int(fields["instance"])
-    else:
-        error("instance", "instance is not a number; expected the object's number in the label image.")
+    try:
+        instance = instance_number(fields["instance"])
+    except RequestError as problem:
+        errors.append(problem)
     flags = {}
     for field in ("extend", "replace"):
         value = fields.get(field, b"false").lower()
@@ -77,6 +77,14 @@ def parse_enrolment(fields: dict[str, bytes]) -> Enrolment:
     if errors:
         raise RequestError.merge(errors)
     return Enrolment(text, instance, flags["extend"], flags["replace"])
+
+
+def instance_number(field: bytes) -> int:
+    """Return the form field instance. Raises RequestError (422)."""
+    if not re.fullmatch(rb"[0-9]{1,10}", field):
+        message = "instance is not a number; expected the object's number in the label image."
+        raise RequestError(422, "instance", message)
+    return int(field)
 
 
 def generation_number(fields: dict[str, bytes]) -> int:

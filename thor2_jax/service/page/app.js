@@ -7,6 +7,7 @@ import { MaskTools } from "./masks.js";
 import { instanceColors, Overlay, textColor } from "./overlay.js";
 import * as service from "./service.js";
 import { canBeNamed, connectNaming, showNaming } from "./teaching.js";
+import { connectWhy, showWhy } from "./why.js";
 
 const FIELDS = ["color", "depth", "labels", "intrinsics"];
 const RETRY_MS = 1000;
@@ -188,6 +189,7 @@ function select(label, byUser = false) {
   const instance = frame.instances.find((one) => one.label === label);
   showDetails(instance, loaded.model, loaded.regions);
   showNaming(instance, loaded.model);
+  showWhy(instance);
   // While masks are corrected, the image stays in view.
   if (byUser && !frame.history && byId("details-title").getBoundingClientRect().bottom > innerHeight) byId("details").scrollIntoView();
 }
@@ -267,6 +269,8 @@ byId("token-form").addEventListener("submit", async (event) => {
     showProblem(problem);
   }
 });
+
+connectWhy(() => frame.files, showProblem);
 
 connectNaming(
   () => frame.files,

@@ -1,0 +1,61 @@
+// Explanation of one object: the pictures of /v1/why.
+
+import { element } from "./drawing.js";
+import * as service from "./service.js";
+
+const byId = (id) => document.getElementById(id);
+let request = new AbortController();
+
+/** Show the button for an object, without the explanation of another one. */
+export function showWhy({ label, details }) {
+  request.abort();
+  byId("why").hidden = details === null;
+  byId("ask-why").disabled = false;
+  byId("ask-why").dataset.label = label;
+  byId("why-status").textContent = "";
+  byId("why-pictures").replaceChildren();
+}
+
+async function canvasOf({ title, caption, png }) {
+  const bytes = Uint8Array.from(atob(png), (character) => character.charCodeAt(0));
+  const bitmap = await createImageBitmap(new Blob([bytes], { type: "image/png" }));
+  const canvas = element("canvas", { width: bitmap.width, height: bitmap.height, role: "img" });
+  canvas.setAttribute("aria-label", `${title}. ${caption}`);
+  canvas.getContext("2d").drawImage(bitmap, 0, 0);
+  const text = element("figcaption", {}, element("h4", {}, title), element("p", { className: "hint" }, caption));
+  return element("figure", {}, text, canvas);
+}
+
+function summary({ name, explained_name, unit, margin, changes, ...answer }) {
+  const [worst, random] = [answer.loss_without_most_attributed_tenth, answer.mean_loss_without_random_tenth];
+  const what = unit === "log-odds" ? "Log-odds (0 is even, 4.6 means 99\u00a0%)" : "Lead in similarity over other objects";
+  const subject = name === null ? `Most probable, though unknown: ${explained_name}. ` : "";
+  const found = changes.length
+    ? `Smallest changes that give another name: ${changes.join("; ")}.`
+    : "No small change of colour or extents gives another name.";
+  const fall = `Without the tenth of the points that speaks most for the name, it falls by ${worst.toFixed(2)}; without a random tenth, by ${random.toFixed(2)}.`;
+  return `${subject}${what}: ${margin.toFixed(1)}. ${fall} ${found}`;
+}
+
+/** Connect the button. `shownFiles()` returns the files of the frame, `failed(problem)` shows other problems. */
+export function connectWhy(shownFiles, failed) {
+  byId("ask-why").addEventListener("click", async () => {
+    const { signal } = (request = new AbortController());
+    byId("ask-why").disabled = true;
+    byId("why-status").textContent = "Computing what decided. The first time, this may take a minute.";
+    try {
+      const answer = await service.why(shownFiles(), byId("ask-why").dataset.label, signal);
+      const figures = await Promise.all(answer.pictures.map(canvasOf));
+      if (signal.aborted) return;
+      byId("why-status").textContent = summary(answer);
+      byId("why-pictures").replaceChildren(...figures);
+    } catch (problem) {
+      if (signal.aborted) return;
+      byId("why-status").textContent = "";
+      if (problem.status === 401 || !(problem instanceof service.Problem)) return failed(problem);
+      byId("why-status").textContent = problem.message;
+    } finally {
+      if (!signal.aborted) byId("ask-why").disabled = false;
+    }
+  });
+}
