@@ -13,6 +13,7 @@ from thor2_jax.errors import InputError
 if TYPE_CHECKING:
     from thor2_jax.descriptor.describe import describe, describe_aligned, describe_strips, diagrams, strips
     from thor2_jax.descriptor.view_normalization import align, mirror, turn, view_normalize
+    from thor2_jax.explanation.explain import Explanation, explain
     from thor2_jax.parameters import Parameters
     from thor2_jax.recognition.answers import Recognition
     from thor2_jax.recognition.frames import Intrinsics, RGBDFrame, read_frame
@@ -25,6 +26,7 @@ else:
     _MODULES = {
         "descriptor.describe": ("describe", "describe_aligned", "describe_strips", "diagrams", "strips"),
         "descriptor.view_normalization": ("align", "mirror", "turn", "view_normalize"),
+        "explanation.explain": ("Explanation", "explain"),
         "parameters": ("Parameters",),
         "recognition.frames": ("Intrinsics", "RGBDFrame", "read_frame"),
         "recognition.answers": ("Recognition",),
@@ -39,6 +41,7 @@ else:
         "capacity",
         "client",
         "descriptor",
+        "explanation",
         "export",
         "persistence",
         "plot",
@@ -70,6 +73,7 @@ __all__ = [
     "DescriptorConfig",
     "Descriptors",
     "Diagrams",
+    "Explanation",
     "InputError",
     "Intrinsics",
     "Parameters",
@@ -88,6 +92,7 @@ __all__ = [
     "describe_aligned",
     "describe_strips",
     "diagrams",
+    "explain",
     "mirror",
     "read_frame",
     "segment",
