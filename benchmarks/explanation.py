@@ -1,8 +1,8 @@
 """Faithfulness of attributions on real frames: `python -m benchmarks.explanation --model RUN DIR...`.
 
-For every instance, the most attributed tenth of the points is removed, and 20 random tenths, and recognition is computed
-again from the reduced cloud. An attribution is faithful if the log-odds of the answer fall by more than in the mean of
-the random tenths. DIRs are folders of frames with label images; names of objects are not read.
+For every instance, the most attributed tenth of the points is removed, and 20 random tenths, and recognition is
+computed again from the reduced cloud. An attribution is faithful if the log-odds of the answer fall by more than in
+the mean of the random tenths. DIRs are folders of frames with label images; names of objects are not read.
 """
 
 import argparse
