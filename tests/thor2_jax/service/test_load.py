@@ -171,6 +171,7 @@ def document(server: Any) -> Any:
 OPERATIONS = {
     "/v1/recognize": "POST",
     "/v1/explain": "POST",
+    "/v1/why": "POST",
     "/v1/describe": "POST",
     "/v1/model": "GET",
     "/v1/objects": "GET",
