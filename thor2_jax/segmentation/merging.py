@@ -15,13 +15,13 @@ __all__ = ["merge_pieces"]
 LEAST_CONTACT = 0.08
 """Least share of the border of the smaller piece that two pieces of one thing have in common."""
 
-EDGE = 0.6
+EDGE = 0.4
 """Least share of a common border that is a step, for two things."""
 
-FOLD = 0.6
+FOLD = 0.4
 """Least share of a common border that is a step or a fold, for two things of different colours."""
 
-CONTRAST = 45.0
+CONTRAST = 25.0
 """Least colour difference across a fold between two things, sum over the channels."""
 
 PART = 90.0

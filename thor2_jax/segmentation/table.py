@@ -27,6 +27,9 @@ WORKING_SIZE = 320
 BAND = 3
 """Width, working pixels, of the square around a border within which it is moved to an edge of colour."""
 
+MARGIN = 4
+"""Working pixels around all things within which their borders are moved; the rest of the image is background."""
+
 LEAST_PIXELS = 20
 LEAST_AREA, LARGEST_AREA = 2e-4, 0.15
 """Area of a thing, square metres."""
@@ -77,10 +80,23 @@ def _segment(color: NDArray[np.uint8], depth: DepthImage) -> NDArray[np.int32]:
 
 def _refined(labels: NDArray[np.int32], color: NDArray[np.uint8], stride: int) -> NDArray[np.int32]:
     """Return labels of the size of the colour image, whose borders run along its edges."""
+    refined = np.zeros(color.shape[:2], np.int32)
+    if not labels.any():
+        return refined
+    rows, columns = (np.flatnonzero(labels.any(axis=axis)) for axis in (1, 0))
+    top, left = max(rows[0] - MARGIN, 0), max(columns[0] - MARGIN, 0)
+    labels = labels[top : rows[-1] + 1 + MARGIN, left : columns[-1] + 1 + MARGIN]
+    here = np.s_[
+        stride * top : stride * (top + labels.shape[0]),
+        stride * left : stride * (left + labels.shape[1]),
+    ]
     known = local_extremes(labels, BAND)
     markers = np.where(known[0] == known[1], labels + 1, 0).astype(np.int32)
-    markers = markers.repeat(stride, axis=0).repeat(stride, axis=1)[: color.shape[0], : color.shape[1]]
-    return watershed(np.asarray(cv2.GaussianBlur(color, (3, 3), 0), np.uint8), np.ascontiguousarray(markers)) - 1
+    height, width = refined[here].shape
+    markers = np.ascontiguousarray(markers.repeat(stride, axis=0).repeat(stride, axis=1)[:height, :width])
+    blurred = np.asarray(cv2.GaussianBlur(np.ascontiguousarray(color[here]), (3, 3), 0), np.uint8)
+    refined[here] = watershed(blurred, markers) - 1
+    return refined
 
 
 def _cleaned(labels: NDArray[np.int32], depth: DepthImage, planes: list[Plane]) -> NDArray[np.int32]:

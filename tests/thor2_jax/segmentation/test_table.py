@@ -7,7 +7,7 @@ import pytest
 from segmentation_scenes import Box, best_overlaps, render
 
 from thor2_jax.recognition.frames import Intrinsics, RGBDFrame
-from thor2_jax.segmentation.table import segment_table
+from thor2_jax.segmentation.table import _refined, segment_table
 
 RED, BLUE, GREEN, YELLOW = (190, 30, 40), (30, 60, 190), (30, 150, 60), (220, 200, 40)
 APART = [
@@ -150,3 +150,14 @@ def test_images_of_few_pixels(size: tuple[int, int]) -> None:
         np.full((*size, 3), 90, np.uint8), np.full(size, 900, np.uint16), None, Intrinsics(500.0, 500.0, 0.0, 0.0)
     )
     assert segment_table(frame).shape == size
+
+
+def test_borders_are_refined_as_in_the_whole_image() -> None:
+    """Only the part of the image around the pieces is flooded; a far piece makes it the whole image."""
+    color = np.random.default_rng(0).integers(0, 256, (96, 128, 3), dtype=np.uint8)
+    labels = np.zeros((48, 64), np.int32)
+    labels[20:30, 12:30] = 1
+    alone = _refined(labels, color, 2)
+    labels[0:4, 0:4], labels[44:48, 60:64] = 2, 3
+    np.testing.assert_array_equal(alone == 1, _refined(labels, color, 2) == 1)
+    assert not _refined(np.zeros_like(labels), color, 2).any()
