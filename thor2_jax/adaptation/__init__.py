@@ -1,0 +1,1 @@
+"""Adaptation to a camera: a colour transform, estimated from frames without labels."""

@@ -1,0 +1,96 @@
+"""A camera's colour transform: gamma, gain, saturation and warmth, which correct colours before recognition."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from thor2_jax.errors import InputError
+from thor2_jax.recognition.prepared_instance import PreparedInstance
+
+__all__ = ["MAX_PARAMETER", "ColorTransform", "transform_colors"]
+
+LUMA = np.array([0.299, 0.587, 0.114], np.float32)
+"""Luma coefficients of red, green and blue (ITU-R BT.601)."""
+
+MAX_PARAMETER = 1.5
+"""Largest absolute value of a parameter: a factor of 4.5 of gamma, gain or saturation."""
+
+
+def transform_colors(parameters: jax.Array, colors: jax.Array) -> jax.Array:
+    """Return transformed colours [..., 3] in [0, 1]; differentiable in both arguments.
+
+    Args:
+        parameters: [4], the fields of `ColorTransform` in their order.
+        colors: [..., 3] sRGB in [0, 1].
+    """
+    gamma, gain, saturation, warmth = parameters
+    positive = colors > 0
+    raised = jnp.where(positive, jnp.where(positive, colors, 1) ** jnp.exp(gamma), 0)
+    values = raised * jnp.exp(gain + warmth * jnp.array([1, 0, -1], jnp.float32))
+    grey = (values * LUMA).sum(axis=-1, keepdims=True)
+    return jnp.clip(grey + jnp.exp(saturation) * (values - grey), 0, 1)
+
+
+@dataclasses.dataclass(frozen=True)
+class ColorTransform:
+    """Colours c in [0, 1] become exp(gain) exp(warmth [1, 0, -1]) c^exp(gamma), then the distance from grey is scaled.
+
+    With all parameters 0, nothing changes.
+
+    Attributes:
+        gamma: logarithm of the exponent.
+        gain: logarithm of the factor of all channels.
+        saturation: logarithm of the factor of a colour's distance from grey.
+        warmth: logarithm of the factor of red, and of one over the factor of blue.
+
+    Raises:
+        InputError: a parameter is not a finite number, or its absolute value is above `MAX_PARAMETER`.
+    """
+
+    gamma: float = 0.0
+    gain: float = 0.0
+    saturation: float = 0.0
+    warmth: float = 0.0
+
+    def __post_init__(self) -> None:
+        values = dataclasses.astuple(self)
+        if not all(isinstance(value, (int, float)) and abs(value) <= MAX_PARAMETER for value in values):
+            raise InputError(
+                f"color_transform is {values}; expected gamma, gain, saturation and warmth from {-MAX_PARAMETER} to "
+                f"{MAX_PARAMETER}: adapt the run again"
+            )
+
+    @classmethod
+    def of_record(cls, record: Mapping[str, Any]) -> "ColorTransform | None":
+        """Return the colour transform in the record of a run; None if it has none.
+
+        Raises:
+            InputError: it is damaged.
+        """
+        stored = record.get("color_transform")
+        if stored is None:
+            return None
+        try:
+            return cls(**stored)
+        except TypeError:
+            raise InputError(
+                f"color_transform is {stored!r}; expected gamma, gain, saturation and warmth: adapt the run again"
+            ) from None
+
+    def __call__(self, colors: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Return the corrected colours of colours [..., 3] uint8 sRGB."""
+        gamma, gain, saturation, warmth = dataclasses.astuple(self)
+        # The channels are powers of 256 values, which a table holds.
+        powers = (np.arange(256) / 255) ** np.exp(gamma)
+        values = powers[colors] * np.exp(gain + warmth * np.array([1, 0, -1]))
+        grey = (values @ LUMA)[..., None]
+        return np.rint(255 * (grey + np.exp(saturation) * (values - grey))).clip(0, 255).astype(np.uint8)
+
+    def corrected(self, instance: PreparedInstance) -> PreparedInstance:
+        """Return an instance with corrected colours."""
+        return dataclasses.replace(instance, colors=self(instance.colors))

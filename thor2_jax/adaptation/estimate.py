@@ -1,0 +1,115 @@
+"""The colour transform of a camera from unlabelled instances: the mean of its posterior.
+
+The prior is a normal distribution around no change; the likelihood of an instance is exp(-entropy of its answer). With
+few instances, or where colours do not matter, the estimate therefore stays near no change.
+"""
+
+import dataclasses
+import itertools
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colornet import ColorNetwork
+from thor2_jax.adaptation.color_transform import ColorTransform
+from thor2_jax.adaptation.objective import Classify, Objective
+from thor2_jax.config import DescriptorConfig
+from thor2_jax.errors import InputError
+from thor2_jax.recognition.prepared_instance import PreparedInstance
+
+__all__ = ["MAX_INSTANCES", "MIN_INSTANCES", "Adaptation", "estimate_transform"]
+
+PRIOR = np.array([0.21, 0.21, 0.21, 0.085])
+"""Standard deviations of gamma, gain, saturation and warmth."""
+
+GRID = np.array(
+    list(
+        itertools.product(
+            (-0.45, -0.22, 0.0, 0.22, 0.45), (-0.28, 0.0, 0.28), (-0.35, 0.0, 0.35), (-0.12, 0.0, 0.12)
+        )
+    )
+)
+"""[135, 4] colour transforms over which the mean is taken."""
+
+MIN_INSTANCES = 10
+"""Fewest instances; with fewer, the prior decides."""
+
+MAX_INSTANCES = 40
+"""Instances that are used at most; more take longer and change little."""
+
+Report = Callable[[int, int], None]
+"""Called with the number of evaluated colour transforms and of all of them."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Adaptation:
+    """An estimated colour transform.
+
+    Attributes:
+        transform: the colour transform.
+        instances: number of instances that it was estimated from.
+        entropy_before: mean entropy of their answers without it, nats.
+        entropy_after: mean entropy with it.
+    """
+
+    transform: ColorTransform
+    instances: int
+    entropy_before: float
+    entropy_after: float
+
+
+def spread(instances: Sequence[PreparedInstance], count: int = MAX_INSTANCES) -> list[PreparedInstance]:
+    """Return at most `count` of the instances, evenly spread."""
+    chosen = np.unique(np.linspace(0, len(instances) - 1, min(count, len(instances))).round().astype(int))
+    return [instances[index] for index in chosen]
+
+
+def estimate_transform(
+    instances: Sequence[PreparedInstance],
+    network: ColorNetwork,
+    config: DescriptorConfig,
+    classify: Classify,
+    report: Report = lambda done, total: None,
+    capacity: int | None = None,
+) -> Adaptation:
+    """Estimate the colour transform with which a recognizer is most certain of its answers.
+
+    Args:
+        instances: unlabelled instances with the camera's colours; those that cannot be used are left out.
+        network: colour network.
+        config: descriptor.
+        classify: what answers, see `objective`.
+        report: function that shows the progress.
+        capacity: see `Objective`.
+
+    Raises:
+        InputError: there are fewer than `MIN_INSTANCES` usable instances.
+    """
+    usable = [instance for instance in instances if instance.reason is None]
+    if len(usable) < MIN_INSTANCES:
+        raise InputError(
+            f"frames have {len(usable)} usable instances; expected at least {MIN_INSTANCES}: give more frames of this "
+            "camera"
+        )
+    chosen = spread(usable)
+    objective = Objective(chosen, network, config, classify, capacity=capacity)
+    totals = np.zeros(len(GRID))
+    for number, parameters in enumerate(GRID):
+        report(number, len(GRID))
+        totals[number] = objective.total(parameters)
+    parameters = posterior_mean(totals)
+    report(len(GRID), len(GRID))
+    return Adaptation(
+        ColorTransform(*parameters.round(4).tolist()),
+        len(chosen),
+        float(objective.total(np.zeros(4)) / len(chosen)),
+        float(objective.total(parameters) / len(chosen)),
+    )
+
+
+def posterior_mean(totals: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return the mean [4] of the posterior from the sums of entropies [135] of the transforms of `GRID`."""
+    negative_log = totals + ((GRID / PRIOR) ** 2).sum(axis=1) / 2
+    weights = np.exp(negative_log.min() - negative_log)
+    return np.asarray(weights @ GRID / weights.sum())

@@ -1,0 +1,176 @@
+"""How uncertain the answers for unlabelled instances are, as a function of the colour transform.
+
+The entropy of an answer is over the classes and over "none of them", whose probability is what the classes lack to 1.
+An unknown object that is surely none of the classes is therefore no reason to change the colours.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from colornet import ColorNetwork
+from thor2_jax.adaptation.color_transform import transform_colors
+from thor2_jax.capacity import point_bucket
+from thor2_jax.config import DescriptorConfig
+from thor2_jax.descriptor.color_membership import RegionSets, color_sets, region_sets
+from thor2_jax.descriptor.describe import strips
+from thor2_jax.descriptor.orientations import OrientedDescriptors, candidate_orientations, orient_descriptors
+from thor2_jax.descriptor.relaxation import soft_regions
+from thor2_jax.descriptor.slicing import slices_and_strips
+from thor2_jax.recognition.prepared_instance import PreparedInstance, pack_instances
+from thor2_jax.types import PointClouds, Strips
+
+__all__ = ["Objective", "entropy"]
+
+ROWS = 8
+"""Instances that are described in one call."""
+
+TEMPERATURE = 2.0
+"""Temperature of the relaxed colour regions, units of HyAB; only gradients need it."""
+
+SMALL_COUNT = 1e-7
+"""Number of points that every colour region of every strip has in addition when gradients are computed."""
+
+Classify = Callable[[OrientedDescriptors], jax.Array]
+"""From the descriptors of B clouds in K orientations to class probabilities [B, C], which may sum to less than 1."""
+
+
+def entropy(probabilities: jax.Array) -> jax.Array:
+    """Return the entropy [B] of probabilities [B, C] and of what they lack to 1, in nats."""
+    rest = jnp.clip(1 - probabilities.sum(axis=-1, keepdims=True), 0, 1)
+    every = jnp.clip(jnp.concatenate([probabilities, rest], axis=-1), 1e-12, 1)
+    return -(every * jnp.log(every)).sum(axis=-1)
+
+
+class _Chunk(NamedTuple):
+    """Instances whose geometry has been described: what does not depend on the colours.
+
+    Attributes:
+        clouds: [B, N].
+        aligned: [B * K, N], their orientations.
+        weights: [B, K].
+        strips: of the orientations; the colour vectors are not used.
+        segment: [B * K, N] int32, number of each point's strip among all strips of all slices; past the last one if
+            the point is in none.
+        usable: [B] float32, 0 for padding.
+    """
+
+    clouds: PointClouds
+    aligned: PointClouds
+    weights: jax.Array
+    strips: Strips
+    segment: jax.Array
+    usable: jax.Array
+
+
+@partial(jax.jit, static_argnums=(3, 4, 5, 6))
+def _entropies(
+    parameters: jax.Array,
+    chunk: _Chunk,
+    sets: RegionSets,
+    network: ColorNetwork,
+    config: DescriptorConfig,
+    classify: Classify,
+    relaxed: bool,
+) -> jax.Array:
+    """Return the entropy of each instance of a chunk [ROWS], 0 for padding."""
+    count = chunk.weights.shape[1]
+    colors = transform_colors(parameters, chunk.clouds.colors)
+    regions = _region_weights(colors, sets, relaxed)
+    shape = chunk.strips.color.shape
+    # A square root has no derivative at 0.
+    vectors = jnp.full((shape[0], shape[1] * shape[2], shape[3]), SMALL_COUNT if relaxed else 0.0)
+    add = jax.vmap(lambda sums, rows, values: sums.at[rows].add(values, mode="drop"))
+    vectors = add(vectors, chunk.segment, jnp.repeat(regions, count, axis=0))
+    described = dataclasses.replace(chunk.strips, color=vectors.reshape(shape))
+    aligned = dataclasses.replace(chunk.aligned, colors=jnp.repeat(colors, count, axis=0))
+    oriented = orient_descriptors(aligned, chunk.weights, described, network, config)
+    return entropy(classify(oriented)) * chunk.usable
+
+
+@partial(jax.jit, static_argnums=(3, 4, 5))
+def _gradient(
+    parameters: jax.Array,
+    chunk: _Chunk,
+    sets: RegionSets,
+    network: ColorNetwork,
+    config: DescriptorConfig,
+    classify: Classify,
+) -> tuple[jax.Array, jax.Array]:
+    """Return the sum of the relaxed entropies of a chunk, and its gradient [4]."""
+    return jax.value_and_grad(lambda p: _entropies(p, chunk, sets, network, config, classify, True).sum())(parameters)
+
+
+def _region_weights(colors: jax.Array, sets: RegionSets, relaxed: bool) -> jax.Array:
+    """Return the weights [B, N, R] of colours in the colour regions."""
+    if relaxed:
+        return jax.vmap(lambda each: soft_regions(each, sets, TEMPERATURE))(colors)
+    return sets.weights[color_sets(colors, sets)]
+
+
+class Objective:
+    """The entropies of instances under colour transforms."""
+
+    def __init__(
+        self,
+        instances: Sequence[PreparedInstance],
+        network: ColorNetwork,
+        config: DescriptorConfig,
+        classify: Classify,
+        orientations: int = 2,
+    ) -> None:
+        """Describe the geometry of the instances.
+
+        Args:
+            instances: usable instances with the camera's colours.
+            network: colour network.
+            config: descriptor.
+            classify: what answers.
+            orientations: candidate orientations K.
+        """
+        self._network = network
+        self._config = dataclasses.replace(config, homology="closed_form", relaxation=None)
+        self._sets = region_sets(network)
+        ordered = sorted(instances, key=lambda each: len(each.points))
+        parts = [ordered[start : start + ROWS] for start in range(0, len(ordered), ROWS)]
+        self._chunks = [self._describe(part, orientations) for part in parts]
+        if self._chunks:
+            # A classifier that prepares its weights at the first call must not do so while JAX traces.
+            first = self._chunks[0]
+            classify(orient_descriptors(first.aligned, first.weights, first.strips, network, self._config))
+        self._static = (network, self._config, classify)
+
+    def _describe(self, instances: Sequence[PreparedInstance], count: int) -> _Chunk:
+        # Rows of padding repeat an instance, since an empty cloud has no gradient.
+        rows = [*instances, *[instances[0]] * (ROWS - len(instances))]
+        clouds = pack_instances(rows, ROWS, point_bucket(max(len(each.points) for each in instances)))
+        aligned, weights = candidate_orientations(clouds, self._config, count)
+        x, _, z = jnp.moveaxis(aligned.points, -1, 0)
+        i, j = jax.vmap(partial(slices_and_strips, config=self._config))(x, z, aligned.mask)
+        slices, of_slice = self._config.n_slices, self._config.n_strips
+        inside = aligned.mask & (i >= 0) & (i < slices) & (j >= 0) & (j < of_slice)
+        segment = jnp.where(inside, i * of_slice + j, slices * of_slice)
+        described = strips(aligned, self._network, self._config, count)
+        usable = jnp.asarray(np.arange(ROWS) < len(instances), jnp.float32)
+        return _Chunk(clouds, aligned, weights, described, segment, usable)
+
+    def total(self, parameters: NDArray[np.floating]) -> float:
+        """Return the sum of the entropies for the parameters [4] of a colour transform, with hard colour regions."""
+        values = [
+            _entropies(jnp.asarray(parameters, jnp.float32), chunk, self._sets, *self._static, False)
+            for chunk in self._chunks
+        ]
+        return float(sum(np.asarray(value).sum() for value in values))
+
+    def gradient(self, parameters: NDArray[np.floating]) -> tuple[float, NDArray[np.float64]]:
+        """Return the sum of the entropies with relaxed colour regions, and its gradient [4]."""
+        values = [
+            _gradient(jnp.asarray(parameters, jnp.float32), chunk, self._sets, *self._static) for chunk in self._chunks
+        ]
+        return float(sum(value for value, _ in values)), np.sum([np.asarray(g, np.float64) for _, g in values], axis=0)
