@@ -11,6 +11,7 @@ from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig, Relaxation
 from thor2_jax.errors import InputError
 
 if TYPE_CHECKING:
+    from thor2_jax.adaptation.color_transform import ColorTransform
     from thor2_jax.descriptor.describe import describe, describe_aligned, describe_strips, diagrams, strips
     from thor2_jax.descriptor.view_normalization import align, mirror, turn, view_normalize
     from thor2_jax.explanation.explain import Explanation, explain
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from thor2_jax.types import Descriptors, Diagrams, PointClouds, Strips
 else:
     _MODULES = {
+        "adaptation.color_transform": ("ColorTransform",),
         "descriptor.describe": ("describe", "describe_aligned", "describe_strips", "diagrams", "strips"),
         "descriptor.view_normalization": ("align", "mirror", "turn", "view_normalize"),
         "explanation.explain": ("Explanation", "explain"),
@@ -38,6 +40,7 @@ else:
     }
     _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
     _SUBMODULES = (
+        "adaptation",
         "capacity",
         "client",
         "descriptor",
@@ -69,6 +72,7 @@ else:
 __version__ = "0.1.0"
 
 __all__ = [
+    "ColorTransform",
     "DESCRIPTOR_VERSION",
     "DescriptorConfig",
     "Descriptors",

@@ -16,7 +16,7 @@ Its scores name an instance alone, or combined with the classifiers (`ClassUnion
 frames are fused by a `Tracker` (`Recognizer.track`).
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -25,7 +25,12 @@ import numpy as np
 from flax import nnx
 from numpy.typing import NDArray
 
+from colornet import ColorNetwork
+from thor2_jax.adaptation.answers import fused_classifier, gallery_classifier
+from thor2_jax.adaptation.color_transform import ColorTransform
+from thor2_jax.adaptation.estimate import Adaptation, Report, estimate_transform
 from thor2_jax.capacity import BATCH_BUCKETS, POINT_BUCKETS, batch_bucket, point_bucket
+from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.orientations import OrientedDescriptors, describe_orientations
 from thor2_jax.errors import InputError, with_context
 from thor2_jax.gallery.embedding import Embedding
@@ -75,6 +80,8 @@ class Recognizer:
         unknown_below: least confidence of an answer with any name; None for those of `thresholds`.
         rule: fusion rule of the classifiers.
         calibration: turns fused probabilities into confidences; None in runs without one.
+        color_transform: corrects the colours of every instance; from the run's record, or estimated by `adapt`. None
+            changes nothing.
         chunk: instances described and classified in one call. While the device computes a chunk, the host prepares the
             next. For a single frame, one large chunk starts sooner, since fewer functions are compiled.
 
@@ -113,6 +120,7 @@ class Recognizer:
             raise InputError(f"unknown_below is {unknown_below}; expected a confidence from 0 to 1")
         self.run = run
         self.unknown_below = unknown_below
+        self.color_transform = ColorTransform.of_record(run.record)
         self.chunk = CHUNK
         self.rule: FusionRule = rule
         self.objects = ObjectGallery(run.classes, embedding, search)
@@ -222,7 +230,7 @@ class Recognizer:
         for number, item in enumerate(frames):
             frame, label = item if isinstance(item, tuple) else (item, None)
             with with_context(f"frames[{number}]"):
-                views.append(instance_view(frame, label, self.run.config.sigma_s))
+                views.append(self.corrected(instance_view(frame, label, self.run.config.sigma_s)))
         self.objects.enroll(name, views, "frames", extend=extend, replace=replace)
 
     def forget(self, name: str) -> None:
@@ -235,6 +243,58 @@ class Recognizer:
             OSError: the gallery cannot be written; it is as before.
         """
         self.objects.forget(name)
+
+    def corrected(self, instance: PreparedInstance) -> PreparedInstance:
+        """Return an instance with the colours that `color_transform` makes of those of the camera."""
+        return instance if self.color_transform is None else self.color_transform.corrected(instance)
+
+    def adapt(self, frames: Iterable[RGBDFrame], report: Report = lambda done, total: None) -> Adaptation:
+        """Estimate the colours of a camera from frames without names, and correct them from now on.
+
+        Objects that this recognizer does not know may be among them.
+
+        Args:
+            frames: frames of one camera, with instance labels.
+            report: function that shows the progress, called with the steps done and their number.
+
+        Returns:
+            The estimate; its `transform` is also the new `color_transform`.
+
+        Raises:
+            InputError: the frames have different sizes, or fewer than `adaptation.estimate.MIN_INSTANCES` usable
+                instances. Nothing changes.
+        """
+        instances: list[PreparedInstance] = []
+        size: tuple[int, ...] = ()
+        for number, frame in enumerate(frames):
+            size = size or frame.depth.shape
+            if frame.depth.shape != size:
+                (height, width), (rows, columns) = frame.depth.shape, size
+                raise InputError(
+                    f"frames[{number}] has {width} x {height} pixels; expected {columns} x {rows}, as the first frame: "
+                    "adapt to one camera at a time"
+                )
+            instances += [prepare_instance(frame, label, self.run.config.sigma_s) for label in frame.instances]
+        adaptation = estimate_transform(instances, *self.adaptation_criterion(), report)
+        self.color_transform = adaptation.transform
+        return adaptation
+
+    def adaptation_criterion(self) -> tuple[ColorNetwork, DescriptorConfig, Classify]:
+        """Return the colour network, the descriptor and the classifier whose certainty `adapt` increases.
+
+        It is the embedding, which also knows what is none of the classes; in runs without one, the fused classifiers;
+        and the gallery if it answers alone.
+        """
+        if self.answers_by() == "gallery":
+            embedding = self.objects.embedding
+            if not self.gallery.objects:
+                raise InputError("model has neither classes nor enrolled objects; enroll some first")
+            return embedding.network, embedding.config, gallery_classifier(self.gallery, embedding)
+        if EMBEDDING in self._classify:
+            classify = self._classify[EMBEDDING]
+        else:
+            classify = fused_classifier([self._classify[name] for name in self.default_classifiers])
+        return self.run.network, self.run.config, classify
 
     def warm_up(self, max_points: int = 2048, max_instances: int = 16) -> int:
         """Compile everything for frames of up to `max_instances` instances with up to `max_points` points each.
@@ -271,7 +331,7 @@ class Recognizer:
         chunk: list[PreparedInstance] = []
         results: list[T] = []
         for label in frame.instances:
-            instance = prepare_instance(frame, label, self.run.config.sigma_s)
+            instance = self.corrected(prepare_instance(frame, label, self.run.config.sigma_s))
             instances.append(instance)
             if instance.reason is None:
                 chunk.append(instance)

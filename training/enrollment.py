@@ -19,7 +19,7 @@ from thor2_jax.gallery.objects import ObjectGallery
 from thor2_jax.gallery.store import GALLERY_DIRECTORY
 from thor2_jax.recognition.frames import RGBDFrame
 from thor2_jax.recognition.prepared_instance import PreparedInstance
-from thor2_jax.recognition.run_directory import TrainedRun, load_run, save_run
+from thor2_jax.recognition.run_directory import TrainedRun, save_run
 from thor2_jax.recognizer import Recognizer
 from training.augmentation.augmentations import Augmentations
 from training.augmentation.illumination import Illumination
@@ -167,11 +167,14 @@ def enroll_objects(
     is_new = not model.exists() or (model.is_dir() and not any(model.iterdir()))
     if is_new and gallery is not None:
         raise InputError(f"gallery is {gallery}, and {model} is no run directory; expected one, or leave out gallery")
-    objects = ObjectGallery(()) if is_new else Recognizer.load(model, gallery=gallery).objects
-    config = objects.embedding.config if is_new else load_run(model).config
+    recognizer = None if is_new else Recognizer.load(model, gallery=gallery)
+    objects = ObjectGallery(()) if recognizer is None else recognizer.objects
+    config = objects.embedding.config if recognizer is None else recognizer.run.config
     if name is not None:
         objects.check(name, extend=extend, replace=replace)
     views = read(config.sigma_s)
+    if recognizer is not None and source == "frames":
+        views = {each: [recognizer.corrected(view) for view in of_object] for each, of_object in views.items()}
     for each in views:
         objects.check(each, extend=extend, replace=replace)
     added = {}

@@ -1,7 +1,7 @@
 """The colour transform of a camera from unlabelled instances: the mean of its posterior.
 
-The prior is a normal distribution around no change; the likelihood of an instance is exp(-entropy of its answer). With
-few instances, or where colours do not matter, the estimate therefore stays near no change.
+The prior is a normal distribution around no change; the likelihood of an instance is exp(-uncertainty of its answer).
+With few instances, or where colours do not matter, the estimate therefore stays near no change.
 """
 
 import dataclasses
@@ -24,11 +24,7 @@ PRIOR = np.array([0.21, 0.21, 0.21, 0.085])
 """Standard deviations of gamma, gain, saturation and warmth."""
 
 GRID = np.array(
-    list(
-        itertools.product(
-            (-0.45, -0.22, 0.0, 0.22, 0.45), (-0.28, 0.0, 0.28), (-0.35, 0.0, 0.35), (-0.12, 0.0, 0.12)
-        )
-    )
+    list(itertools.product((-0.45, -0.22, 0.0, 0.22, 0.45), (-0.28, 0.0, 0.28), (-0.35, 0.0, 0.35), (-0.12, 0.0, 0.12)))
 )
 """[135, 4] colour transforms over which the mean is taken."""
 
@@ -49,14 +45,14 @@ class Adaptation:
     Attributes:
         transform: the colour transform.
         instances: number of instances that it was estimated from.
-        entropy_before: mean entropy of their answers without it, nats.
-        entropy_after: mean entropy with it.
+        uncertainty_before: mean uncertainty of their answers without it, nats, see `objective`.
+        uncertainty_after: mean uncertainty with it.
     """
 
     transform: ColorTransform
     instances: int
-    entropy_before: float
-    entropy_after: float
+    uncertainty_before: float
+    uncertainty_after: float
 
 
 def spread(instances: Sequence[PreparedInstance], count: int = MAX_INSTANCES) -> list[PreparedInstance]:
@@ -109,7 +105,7 @@ def estimate_transform(
 
 
 def posterior_mean(totals: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Return the mean [4] of the posterior from the sums of entropies [135] of the transforms of `GRID`."""
+    """Return the mean [4] of the posterior from the sums of uncertainties [135] of the transforms of `GRID`."""
     negative_log = totals + ((GRID / PRIOR) ** 2).sum(axis=1) / 2
     weights = np.exp(negative_log.min() - negative_log)
     return np.asarray(weights @ GRID / weights.sum())

@@ -1,7 +1,9 @@
 """How uncertain the answers for unlabelled instances are, as a function of the colour transform.
 
 The entropy of an answer is over the classes and over "none of them", whose probability is what the classes lack to 1.
-An unknown object that is surely none of the classes is therefore no reason to change the colours.
+An unknown object that is surely none of the classes is therefore no reason to change the colours. So that it is no way
+out to make all objects unknown, -log of the probability of being known is added, with the weight of that probability
+before any change.
 """
 
 import dataclasses
@@ -37,6 +39,9 @@ TEMPERATURE = 2.0
 SMALL_COUNT = 1e-7
 """Number of points that every colour region of every strip has in addition when gradients are computed."""
 
+MIN_KNOWN = 1e-3
+"""Least probability of being known that is told from 0."""
+
 Classify = Callable[[OrientedDescriptors], jax.Array]
 """From the descriptors of B clouds in K orientations to class probabilities [B, C], which may sum to less than 1."""
 
@@ -59,6 +64,7 @@ class _Chunk(NamedTuple):
         segment: [B * K, N] int32, number of each point's strip among all strips of all slices; past the last one if
             the point is in none.
         usable: [B] float32, 0 for padding.
+        known: [B] float32, probability that an instance is of any of the classes, without a colour transform.
     """
 
     clouds: PointClouds
@@ -67,10 +73,11 @@ class _Chunk(NamedTuple):
     strips: Strips
     segment: jax.Array
     usable: jax.Array
+    known: jax.Array
 
 
 @partial(jax.jit, static_argnums=(3, 4, 5, 6))
-def _entropies(
+def _uncertainties(
     parameters: jax.Array,
     chunk: _Chunk,
     sets: RegionSets,
@@ -79,7 +86,7 @@ def _entropies(
     classify: Classify,
     relaxed: bool,
 ) -> jax.Array:
-    """Return the entropy of each instance of a chunk [ROWS], 0 for padding."""
+    """Return the uncertainty of each instance of a chunk [ROWS], 0 for padding."""
     count = chunk.weights.shape[1]
     colors = transform_colors(parameters, chunk.clouds.colors)
     regions = _region_weights(colors, sets, relaxed)
@@ -91,7 +98,9 @@ def _entropies(
     described = dataclasses.replace(chunk.strips, color=vectors.reshape(shape))
     aligned = dataclasses.replace(chunk.aligned, colors=jnp.repeat(colors, count, axis=0))
     oriented = orient_descriptors(aligned, chunk.weights, described, network, config)
-    return entropy(classify(oriented)) * chunk.usable
+    probabilities = classify(oriented)
+    known = jnp.clip(probabilities.sum(axis=1), MIN_KNOWN, 1)
+    return (entropy(probabilities) - chunk.known * jnp.log(known)) * chunk.usable
 
 
 @partial(jax.jit, static_argnums=(3, 4, 5))
@@ -103,8 +112,10 @@ def _gradient(
     config: DescriptorConfig,
     classify: Classify,
 ) -> tuple[jax.Array, jax.Array]:
-    """Return the sum of the relaxed entropies of a chunk, and its gradient [4]."""
-    return jax.value_and_grad(lambda p: _entropies(p, chunk, sets, network, config, classify, True).sum())(parameters)
+    """Return the sum of the relaxed uncertainties of a chunk, and its gradient [4]."""
+    return jax.value_and_grad(lambda p: _uncertainties(p, chunk, sets, network, config, classify, True).sum())(
+        parameters
+    )
 
 
 def _region_weights(colors: jax.Array, sets: RegionSets, relaxed: bool) -> jax.Array:
@@ -115,7 +126,7 @@ def _region_weights(colors: jax.Array, sets: RegionSets, relaxed: bool) -> jax.A
 
 
 class Objective:
-    """The entropies of instances under colour transforms."""
+    """The uncertainties of instances under colour transforms."""
 
     def __init__(
         self,
@@ -124,6 +135,7 @@ class Objective:
         config: DescriptorConfig,
         classify: Classify,
         orientations: int = 2,
+        capacity: int | None = None,
     ) -> None:
         """Describe the geometry of the instances.
 
@@ -133,23 +145,23 @@ class Objective:
             config: descriptor.
             classify: what answers.
             orientations: candidate orientations K.
+            capacity: N, points in a row, so that only one shape is compiled; larger clouds are left out. By default
+                each chunk has the point bucket of its largest cloud.
         """
-        self._network = network
+        self._network, self._classify = network, classify
         self._config = dataclasses.replace(config, homology="closed_form", relaxation=None)
         self._sets = region_sets(network)
-        ordered = sorted(instances, key=lambda each: len(each.points))
+        self._capacity = capacity
+        fitting = [each for each in instances if capacity is None or len(each.points) <= capacity]
+        ordered = sorted(fitting, key=lambda each: len(each.points))
         parts = [ordered[start : start + ROWS] for start in range(0, len(ordered), ROWS)]
         self._chunks = [self._describe(part, orientations) for part in parts]
-        if self._chunks:
-            # A classifier that prepares its weights at the first call must not do so while JAX traces.
-            first = self._chunks[0]
-            classify(orient_descriptors(first.aligned, first.weights, first.strips, network, self._config))
         self._static = (network, self._config, classify)
 
     def _describe(self, instances: Sequence[PreparedInstance], count: int) -> _Chunk:
         # Rows of padding repeat an instance, since an empty cloud has no gradient.
         rows = [*instances, *[instances[0]] * (ROWS - len(instances))]
-        clouds = pack_instances(rows, ROWS, point_bucket(max(len(each.points) for each in instances)))
+        clouds = pack_instances(rows, ROWS, self._capacity or point_bucket(max(len(each.points) for each in instances)))
         aligned, weights = candidate_orientations(clouds, self._config, count)
         x, _, z = jnp.moveaxis(aligned.points, -1, 0)
         i, j = jax.vmap(partial(slices_and_strips, config=self._config))(x, z, aligned.mask)
@@ -158,18 +170,20 @@ class Objective:
         segment = jnp.where(inside, i * of_slice + j, slices * of_slice)
         described = strips(aligned, self._network, self._config, count)
         usable = jnp.asarray(np.arange(ROWS) < len(instances), jnp.float32)
-        return _Chunk(clouds, aligned, weights, described, segment, usable)
+        # A classifier that prepares its weights at the first call must not do so while JAX traces: it is called here.
+        known = self._classify(orient_descriptors(aligned, weights, described, self._network, self._config)).sum(axis=1)
+        return _Chunk(clouds, aligned, weights, described, segment, usable, jnp.minimum(known, 1))
 
     def total(self, parameters: NDArray[np.floating]) -> float:
-        """Return the sum of the entropies for the parameters [4] of a colour transform, with hard colour regions."""
+        """Return the sum of the uncertainties for parameters [4] of a colour transform, with hard colour regions."""
         values = [
-            _entropies(jnp.asarray(parameters, jnp.float32), chunk, self._sets, *self._static, False)
+            _uncertainties(jnp.asarray(parameters, jnp.float32), chunk, self._sets, *self._static, False)
             for chunk in self._chunks
         ]
         return float(sum(np.asarray(value).sum() for value in values))
 
     def gradient(self, parameters: NDArray[np.floating]) -> tuple[float, NDArray[np.float64]]:
-        """Return the sum of the entropies with relaxed colour regions, and its gradient [4]."""
+        """Return the sum of the uncertainties with relaxed colour regions, and its gradient [4]."""
         values = [
             _gradient(jnp.asarray(parameters, jnp.float32), chunk, self._sets, *self._static) for chunk in self._chunks
         ]

@@ -1,11 +1,13 @@
 """Conversion of recognition results into the JSON records of the API."""
 
 import base64
+import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from thor2_jax.adaptation.estimate import Adaptation
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.explanation.explain import Explanation
 from thor2_jax.explanation.pictures import change_text, main_pictures
@@ -17,6 +19,7 @@ from thor2_jax.recognition.prepared_instance import PreparedInstance
 from thor2_jax.service.engine import CloudResult
 from thor2_jax.service.preparation import PreparedRequest
 from thor2_jax.service.schemas import (
+    AdaptationAnswer,
     Candidate,
     Details,
     ExplainedFrame,
@@ -30,7 +33,7 @@ from thor2_jax.service.schemas import (
 )
 from thor2_jax.service.settings import MAX_EXPLAINED
 
-__all__ = ["explained_frame", "instance_answer", "object_answers", "why_answer"]
+__all__ = ["adaptation_answer", "explained_frame", "instance_answer", "object_answers", "why_answer"]
 
 MAX_SHOWN_POINTS = 1000
 """Number of points of a cloud in an explanation."""
@@ -76,6 +79,13 @@ def why_answer(explanation: Explanation, frame: RGBDFrame) -> WhyAnswer:
         ],
         timings={},
     )
+
+
+def adaptation_answer(adaptation: Adaptation | None) -> AdaptationAnswer | None:
+    """Return the JSON record of an estimate of the camera's colours; None if there is none."""
+    if adaptation is None:
+        return None
+    return AdaptationAnswer(instances=adaptation.instances, **dataclasses.asdict(adaptation.transform))
 
 
 def object_answers(objects: ObjectGallery) -> list[ObjectAnswer]:

@@ -19,7 +19,7 @@ from starlette.requests import ClientDisconnect
 
 from thor2_jax.config import DESCRIPTOR_VERSION
 from thor2_jax.service import schemas
-from thor2_jax.service.answers import instance_answer, object_answers
+from thor2_jax.service.answers import adaptation_answer, instance_answer, object_answers
 from thor2_jax.service.engine import CloudResult
 from thor2_jax.service.metrics import RequestCounter
 from thor2_jax.service.page_files import PageFiles
@@ -151,6 +151,7 @@ def _add_inference_routes(routes: APIRouter, service: Service) -> None:
         return schemas.FrameAnswer(
             instances=[instance_answer(recognition) for recognition in recognitions],
             label_map=label_map,
+            adaptation=adaptation_answer(service.engine.adaptation),
             timings=admitted.milliseconds(),
         )
 

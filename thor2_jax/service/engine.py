@@ -10,6 +10,8 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
+from thor2_jax.adaptation.estimate import Adaptation
+from thor2_jax.adaptation.online import OnlineAdaptation
 from thor2_jax.capacity import BATCH_BUCKETS, POINT_BUCKETS, batch_bucket, point_bucket
 from thor2_jax.descriptor.describe import strips
 from thor2_jax.descriptor.orientations import candidate_orientations, orient_descriptors
@@ -22,6 +24,7 @@ from thor2_jax.gallery.objects import ObjectGallery
 from thor2_jax.gallery.store import INDEX_FILE
 from thor2_jax.recognition.answers import Evidence, Recognition
 from thor2_jax.recognition.fusion import fuse, fused_probabilities, with_temperature
+from thor2_jax.recognition.instance_clouds import MIN_POINTS
 from thor2_jax.recognition.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.recognizer import THOR2, Recognizer
 from thor2_jax.service.settings import Settings
@@ -80,6 +83,30 @@ class InferenceEngine:
         self._embeds = settings.teach or self._uses_gallery
         self._last_error = ""
         self.max_batch = settings.max_batch
+        self._online: OnlineAdaptation | None = None
+        if settings.adapt:
+            if not run.classifiers:
+                raise InputError(f"adapt: {settings.model} has no classifiers; expected a trained run")
+            self._online = OnlineAdaptation(*self._recognizer.adaptation_criterion(), self._set_transform)
+
+    def _set_transform(self, adaptation: Adaptation) -> None:
+        self._recognizer.color_transform = adaptation.transform
+
+    @property
+    def adaptation(self) -> Adaptation | None:
+        """The latest estimate of the camera's colours; None before the first one, or if the service does not adapt."""
+        return None if self._online is None else self._online.latest
+
+    def correct(self, instances: Sequence[PreparedInstance], *, observe: bool) -> list[PreparedInstance]:
+        """Return the instances of a frame with corrected colours.
+
+        Args:
+            instances: with the camera's colours.
+            observe: also estimate the colours of the camera from them, if the service adapts.
+        """
+        if observe and self._online is not None:
+            self._online.observe(instances)
+        return [self._recognizer.corrected(instance) for instance in instances]
 
     @property
     def _uses_gallery(self) -> bool:
@@ -125,6 +152,13 @@ class InferenceEngine:
     def compile(self, n_clouds: int, n_points: int) -> None:
         """Compile the programs for one of `batch_shapes`."""
         self._infer([], n_clouds, n_points)
+
+    def compile_adaptation(self) -> None:
+        """Compile the programs of the adaptation, if the service adapts."""
+        if self._online is not None:
+            points = np.random.default_rng(0).uniform(0, 0.1, (MIN_POINTS, 3)).astype(np.float32)
+            colors = np.zeros((MIN_POINTS, 3), np.uint8)
+            self._online.compile(PreparedInstance(1, points, colors, np.zeros(MIN_POINTS, bool)))
 
     def infer(self, instances: Sequence[PreparedInstance]) -> list[CloudResult]:
         """Describe and classify at most `max_batch` clouds."""

@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import copy
+import dataclasses
 import logging
 import threading
 import time
@@ -103,6 +104,7 @@ class Service:
                 self.progress = f"compiling {k} of {len(shapes)}"
                 log.info("%s: %d clouds of %d points", self.progress, n_clouds, n_points)
                 self.engine.compile(n_clouds, n_points)
+            self.engine.compile_adaptation()
         except Exception:
             log.exception("warm-up failed")
             self.state = "failed"
@@ -243,7 +245,7 @@ class Service:
         future = self._pool.submit(request.deadline, prepare_view, files, sigma_s, enrolment.instance)
         prepared = await asyncio.wrap_future(future)
         try:
-            clouds = CompactClouds.of(prepared.instances)
+            clouds = CompactClouds.of(self.engine.correct(prepared.instances, observe=False))
         except InputError as error:
             message = str(error).replace("views[0]", f"instance {enrolment.instance}")
             raise RequestError(422, "instance", f"{message}.") from None
@@ -288,6 +290,8 @@ class Service:
         arguments = files, sigma_s, with_label_map, self.settings.segmenter
         future = self._pool.submit(request.deadline, prepare_frame, *arguments)
         prepared = await asyncio.wrap_future(future)
+        corrected = self.engine.correct(prepared.instances, observe=True)
+        prepared = dataclasses.replace(prepared, instances=corrected)
         return prepared, await self._infer(prepared, request)
 
     async def _infer(self, prepared: PreparedRequest, request: AdmittedRequest) -> list[CloudResult]:

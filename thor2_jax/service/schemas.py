@@ -8,6 +8,7 @@ from thor2_jax.capacity import POINT_BUCKETS
 from thor2_jax.service.settings import MAX_CLOUD_COORDINATE, MAX_CLOUDS, MAX_EXPLAINED
 
 __all__ = [
+    "AdaptationAnswer",
     "CLOUDS_BODY",
     "FRAME_FORM",
     "ENROLMENT_FORM",
@@ -76,12 +77,25 @@ class InstanceAnswer(BaseModel):
     unrecognized: str | None = Field(description="Reason why the name is null; null if there is a name.")
 
 
+class AdaptationAnswer(BaseModel):
+    """The colours of the camera, as the service corrects them; 0 is no change."""
+
+    instances: int = Field(description="Number of instances of the latest frames that the estimate is from.")
+    gamma: float = Field(description="Logarithm of the exponent.")
+    gain: float = Field(description="Logarithm of the factor of all channels.")
+    saturation: float = Field(description="Logarithm of the factor of the distance from grey.")
+    warmth: float = Field(description="Logarithm of the factor of red, and of one over that of blue.")
+
+
 class FrameAnswer(BaseModel):
     """All instances of a frame, in the order of their labels."""
 
     instances: list[InstanceAnswer]
     label_map: "LabelMap | None" = Field(
         default=None, description="Labels of a frame that was segmented; null if the request had labels."
+    )
+    adaptation: AdaptationAnswer | None = Field(
+        default=None, description="Estimated colours of the camera; null before the first estimate and without --adapt."
     )
     timings: Milliseconds = Field(description=FRAME_STAGES)
 

@@ -67,6 +67,7 @@ class Settings:
         cache: directory of compiled programs, which a later start reuses; None disables the cache.
         gallery: directory of the enrolled objects; None is `gallery` in the run directory.
         teach: callers may enroll and forget objects.
+        adapt: the colours of the camera are estimated from the latest frames, and corrected.
         segmenter: name of the segmenter of frames without labels, see `segmentation.segmenters`; None refuses
             them. Default: that of `default_segmenter`.
 
@@ -85,6 +86,7 @@ class Settings:
     cache: Path | None = None
     gallery: Path | None = None
     teach: bool = False
+    adapt: bool = False
     segmenter: str | None = dataclasses.field(default_factory=default_segmenter)
 
     def __post_init__(self) -> None:

@@ -9,7 +9,7 @@
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Protocol, Self
 
 import numpy as np
@@ -22,6 +22,7 @@ from thor2_jax.recognition.frames import RGBDFrame
 from thor2_jax.recognition.prepared_instance import PreparedInstance
 from thor2_jax.tracking.fusion import FusedEvidence, view_weight
 from thor2_jax.tracking.matching import OccupiedVoxels, match, occupied_voxels
+from thor2_jax.tracking.next_view import NextView, ViewTable, next_view
 from thor2_jax.tracking.poses import check_pose, transform
 
 __all__ = ["TrackedRecognition", "Tracker"]
@@ -58,6 +59,8 @@ class FrameRecognizer(Protocol):
 
     def recognitions(self, instances: Sequence[PreparedInstance], evidence: Evidence) -> list[Recognition]: ...
 
+    def fused(self, probabilities: Mapping[str, NDArray[np.float32]]) -> NDArray[np.floating[Any]]: ...
+
 
 @dataclasses.dataclass
 class _Track:
@@ -69,6 +72,7 @@ class _Track:
         instance: its last view.
         overflow: points of that view outside the descriptor's grid.
         seen: number of the frame of its last view.
+        pose: pose of the camera of that view; None without poses.
         frames: number of views.
         evidence: what it is recognized by.
     """
@@ -78,6 +82,7 @@ class _Track:
     instance: PreparedInstance
     overflow: int
     seen: int
+    pose: NDArray[np.float64] | None
     frames: int = 0
     evidence: FusedEvidence = dataclasses.field(default_factory=FusedEvidence)
 
@@ -135,6 +140,30 @@ class Tracker:
         """Return the answers for all objects that are followed, with the label of their last view."""
         return self._answers(self._tracks)
 
+    def next_view(self, track: int, candidates: Sequence[ArrayLike], table: ViewTable) -> NextView:
+        """Return the camera pose from which an object should be seen next, so that its name becomes certain.
+
+        Args:
+            track: number of its track.
+            candidates: poses [4, 4] that the camera can reach and from which it sees the object.
+            table: training views of the classes.
+
+        Raises:
+            InputError: there is no such track, the frames had no poses, no classifier answers, or as `next_view`.
+        """
+        found = {each.number: each for each in self._tracks}.get(track)
+        if found is None:
+            numbers = ", ".join(str(each.number) for each in self._tracks) or "none"
+            raise InputError(f"track is {track!r}; expected one of {numbers}")
+        probabilities, _ = found.evidence.fused()
+        if found.pose is None or not probabilities:
+            missing = "poses" if found.pose is None else "answers of classifiers"
+            raise InputError(f"track {track} has no {missing}; next_view needs them")
+        fused = self._recognizer.fused({name: p[None].astype(np.float32) for name, p in probabilities.items()})[0]
+        points = found.instance.points
+        centre = transform(found.pose, (points.min(axis=0, keepdims=True) + points.max(axis=0, keepdims=True)) / 2)[0]
+        return next_view(fused, centre, found.pose, candidates, table)
+
     def _extend(
         self, usable: Sequence[PreparedInstance], evidence: Evidence, world: NDArray[np.float64] | None
     ) -> None:
@@ -148,9 +177,9 @@ class Tracker:
             track = matched.get(row)
             if track is None:
                 self._last_number += 1
-                track = _Track(self._last_number, voxels[row], instance, overflow, self._frame)
+                track = _Track(self._last_number, voxels[row], instance, overflow, self._frame, world)
                 self._tracks.append(track)
-            track.voxels, track.instance, track.overflow = voxels[row], instance, overflow
+            track.voxels, track.instance, track.overflow, track.pose = voxels[row], instance, overflow, world
             track.seen, track.frames = self._frame, track.frames + 1
             weight = view_weight(instance) if overflow <= MAX_OVERFLOW * len(instance.points) else 0.0
             probabilities = {name: np.asarray(values)[row] for name, values in evidence.probabilities.items()}

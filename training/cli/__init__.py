@@ -6,6 +6,7 @@ import os
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 from training.cli import (
+    adapt,
     colornet,
     demo,
     doctor,
@@ -23,6 +24,7 @@ from training.cli import (
 from training.cli.app import app, main  # noqa: E402
 
 __all__ = [
+    "adapt",
     "app",
     "colornet",
     "demo",

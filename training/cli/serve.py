@@ -31,6 +31,9 @@ def serve(
         str | None,
         typer.Option(help="Segmenter of frames without labels, or none. Default: table, if OpenCV is installed."),
     ] = None,
+    adapt: Annotated[
+        bool, typer.Option("--adapt", help="Estimate the camera's colours from the latest frames, and correct them.")
+    ] = False,
     token: Annotated[
         str | None, typer.Option(envvar="THOR2_TOKEN", help="Bearer token that clients must send.")
     ] = None,
@@ -57,6 +60,7 @@ def serve(
         cache=cache,
         gallery=gallery,
         teach=teach,
+        adapt=adapt,
         segmenter=default_segmenter() if segment is None else segment if segment != "none" else None,
     )
     serve_forever(settings, host, port, workers)

@@ -150,6 +150,10 @@ def _check_same_descriptor(run: Run, first: Run, directory: Path, first_director
             f"model: {first_directory} and {directory} have different descriptors or colour networks; "
             "evaluate them separately"
         )
+    if run.recognizer.color_transform != first.recognizer.color_transform:
+        raise InputError(
+            f"model: {first_directory} and {directory} are adapted to different cameras; evaluate them separately"
+        )
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

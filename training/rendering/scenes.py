@@ -20,7 +20,7 @@ from training.rendering.camera import Camera
 from training.rendering.ray_caster import RayCaster, pixel_rays, render_view
 from training.rendering.view_sphere import camera_pose
 
-__all__ = ["SCENE_CAMERA", "Scene", "compose_scene"]
+__all__ = ["SCENE_CAMERA", "Scene", "compose_scene", "compose_views"]
 
 SCENE_CAMERA = Camera(640, 480, Intrinsics(615.0, 615.0, 319.5, 239.5))
 """Similar to a small active-stereo camera at VGA resolution, with a horizontal field of view of 55 degrees."""
@@ -237,15 +237,70 @@ def compose_scene(
         if not 0 <= value <= most:
             raise InputError(f"{argument} is {value!r}; it must be 0 to {most:g}")
     names = [list(objects)[k] for k in rng.choice(len(objects), n_objects, replace=False)]
-    azimuth, pitch = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(25, 50))
-    pose = camera_pose(azimuth, np.pi / 2 - pitch, np.array([0, 0, 0.04]), rng.uniform(0.7, 1.1))
+    azimuth, pose = _random_pose(rng)
     towards = np.array([np.cos(azimuth), np.sin(azimuth)])
     meshes = _arrange([objects[name] for name in names], towards, clutter, rng)
+    return _render(names, meshes, pose, camera, noise, light, rng)
 
+
+def compose_views(
+    objects: Mapping[str, TexturedMesh],
+    rng: np.random.Generator,
+    n_objects: int = 5,
+    n_views: int = 4,
+    camera: Camera = SCENE_CAMERA,
+) -> list[tuple[Scene, NDArray[np.float64]]]:
+    """Place random objects on a table and render them from cameras all around it, at equal angles.
+
+    An object has the same label in all views. The first camera is that for which the objects are in line.
+
+    Args:
+        objects: name -> mesh; metres, z up.
+        rng: random number generator.
+        n_objects: number of objects in the scene, each a different one.
+        n_views: number of cameras.
+        camera: camera of the frames.
+
+    Returns:
+        Scene and pose [4, 4] of each camera, from camera to world coordinates, as `compose_scene`.
+
+    Raises:
+        InputError: there are fewer than `n_objects` objects.
+    """
+    if not 1 <= n_objects <= len(objects):
+        raise InputError(f"n_objects is {n_objects!r}; it must be 1 to {len(objects)}, the number of objects")
+    names = [list(objects)[k] for k in rng.choice(len(objects), n_objects, replace=False)]
+    azimuth, _ = _random_pose(rng)
+    meshes = _arrange([objects[name] for name in names], np.array([np.cos(azimuth), np.sin(azimuth)]), 0.85, rng)
+    views = []
+    for turn in np.arange(n_views) * 2 * np.pi / n_views:
+        _, pose = _random_pose(rng, azimuth + turn)
+        views.append((_render(names, meshes, pose, camera, 1.0, 0.08, rng), pose))
+    return views
+
+
+def _random_pose(rng: np.random.Generator, azimuth: float | None = None) -> tuple[float, NDArray[np.float64]]:
+    """Return the azimuth, random by default, and the pose of a camera that looks down on the table."""
+    if azimuth is None:
+        azimuth = rng.uniform(0, 2 * np.pi)
+    pitch = np.radians(rng.uniform(25, 50))
+    return azimuth, camera_pose(azimuth, np.pi / 2 - pitch, np.array([0, 0, 0.04]), rng.uniform(0.7, 1.1))
+
+
+def _render(
+    names: Sequence[str],
+    meshes: Sequence[TexturedMesh],
+    pose: NDArray[np.float64],
+    camera: Camera,
+    noise: float,
+    light: float,
+    rng: np.random.Generator,
+) -> Scene:
+    """Render arranged objects; the last arguments are those of `compose_scene`."""
     rays = pixel_rays(camera.intrinsics, camera.height, camera.width) @ pose[:3, :3].T
     hits = RayCaster([_table(), *meshes]).cast(pose[:3, 3], rays)
     shape = (camera.height, camera.width)
-    labels = hits.mesh.clip(0).astype(np.uint8 if n_objects < 256 else np.uint16).reshape(shape)
+    labels = hits.mesh.clip(0).astype(np.uint8 if len(meshes) < 256 else np.uint16).reshape(shape)
     truth, visible = {}, {}
     for label, (name, mesh) in enumerate(zip(names, meshes, strict=True), 1):
         pixels = int((labels == label).sum())

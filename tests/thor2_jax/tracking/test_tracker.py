@@ -1,7 +1,7 @@
 """Trackers with a toy recognizer that reads an instance's probabilities from its colour."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pytest
@@ -13,7 +13,9 @@ from thor2_jax.recognition.answers import Evidence, Recognition
 from thor2_jax.recognition.prepared_instance import PreparedInstance
 from thor2_jax.recognizer import Recognizer
 from thor2_jax.tracking.fusion import FusedEvidence
+from thor2_jax.tracking.next_view import ViewTable
 from thor2_jax.tracking.tracker import Tracker
+from training.rendering.view_sphere import camera_pose
 
 CAMERA = thor2.Intrinsics(600.0, 600.0, 79.5, 59.5)
 RUN = untrained_run(("a", "b", "c"))
@@ -33,6 +35,9 @@ class ToyRecognizer:
 
     def recognitions(self, instances: Sequence[PreparedInstance], evidence: Evidence) -> list[Recognition]:
         return self._recognizer.recognitions(instances, evidence)
+
+    def fused(self, probabilities: Mapping[str, np.ndarray]) -> np.ndarray:
+        return np.asarray(self._recognizer.fused(probabilities))
 
 
 def frame(boxes: dict[int, tuple[int, int, tuple[int, int, int]]], size: int = 40) -> thor2.RGBDFrame:
@@ -111,6 +116,22 @@ def test_frames_and_poses_that_do_not_belong_together_are_refused() -> None:
     with pytest.raises(thor2.InputError, match="rigid"):
         tracker.update(image, 2 * np.eye(4))
     assert tracker.update(image)[0].frames == 2
+
+
+def test_the_next_view_is_chosen_for_a_track() -> None:
+    cameras = [camera_pose(azimuth, np.pi / 2, np.zeros(3), 0.7) for azimuth in (0.0, 2.0, 4.0)]
+    doubt, sure = np.array([0.48, 0.48, 0.04]), np.array([0.98, 0.01, 0.01])
+    rotations = np.stack([pose[:3, :3] for pose in cameras])
+    table = ViewTable(np.zeros(3, int), rotations, np.stack([doubt, doubt, sure]))
+    tracker = Tracker(ToyRecognizer())
+    tracker.update(frame({1: (40, 60, (122, 122, 10))}), cameras[0])
+    assert tracker.next_view(1, cameras[1:], table).index == 1
+    with pytest.raises(thor2.InputError, match="track is 7; expected one of 1"):
+        tracker.next_view(7, cameras, table)
+    without = Tracker(ToyRecognizer())
+    without.update(frame({1: (40, 60, UNSURE_B)}))
+    with pytest.raises(thor2.InputError, match="no poses"):
+        without.next_view(1, cameras, table)
 
 
 def test_fused_evidence_is_a_weighted_mean() -> None:

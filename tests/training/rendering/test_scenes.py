@@ -9,7 +9,16 @@ from thor2_jax.recognition.frames import Intrinsics, backproject
 from training.objects.builtin_objects import builtin_objects
 from training.objects.mesh import TexturedMesh
 from training.rendering.camera import Camera
-from training.rendering.scenes import MIN_PIXELS, SCENE_CAMERA, Scene, _arrange, _put_down, _sensed_depth, compose_scene
+from training.rendering.scenes import (
+    MIN_PIXELS,
+    SCENE_CAMERA,
+    Scene,
+    _arrange,
+    _put_down,
+    _sensed_depth,
+    compose_scene,
+    compose_views,
+)
 
 OBJECTS = builtin_objects()
 SMALL = Camera(320, 240, Intrinsics(307.5, 307.5, 159.5, 119.5))
@@ -171,3 +180,20 @@ def test_numbers_out_of_range_are_refused(options: dict[str, float], message: st
 def test_all_objects_at_once() -> None:
     scene = compose_scene(OBJECTS, np.random.default_rng(0), n_objects=len(OBJECTS), camera=SMALL)
     assert len(scene.truth) > len(OBJECTS) / 2
+
+
+def test_views_of_a_scene_agree_in_space() -> None:
+    views = compose_views(OBJECTS, np.random.default_rng(2), 4, 3, SMALL)
+    assert len(views) == 3
+    middles: dict[str, list[np.ndarray]] = {}
+    for scene, pose in views:
+        points = backproject(scene.frame.depth_m, scene.frame.intrinsics) @ pose[:3, :3].T + pose[:3, 3]
+        for label, name in scene.truth.items():
+            seen = points[(scene.frame.labels == label) & (scene.frame.depth > 0)]
+            assert seen[:, 2].min() > -0.03
+            if scene.visible[label] > 0.8:
+                middles.setdefault(name, []).append((seen.min(axis=0) + seen.max(axis=0)) / 2)
+    distances = [np.linalg.norm(a - b) for of_object in middles.values() for a in of_object for b in of_object]
+    assert len(distances) > len(middles) and max(distances) < 0.06
+    with pytest.raises(InputError, match="n_objects"):
+        compose_views(OBJECTS, np.random.default_rng(2), 99)

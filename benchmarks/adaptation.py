@@ -1,0 +1,144 @@
+"""What adaptation to a camera gains: `python -m benchmarks.adaptation --model RUN --frames DIR... --out FILE.json`.
+
+The recognizer is adapted on one half of the frames (every second one) as a simulated camera sees them, without labels,
+and tested on the other half, and the other way round. The file has, for the frames as they are and for each camera of
+`benchmarks.simulated_cameras`, the mean over both halves of the accuracy over placements before and after, the
+estimated colour transform, the number of instances that it was estimated from, and seconds. With --unknown, frames of
+objects that the run does not know are added to those for the adaptation, seen by the same camera.
+
+The command resumes: cameras that are in the file are kept.
+"""
+
+import argparse
+import dataclasses
+import json
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.cameras import CAMERAS, LOOK_ALIKES, ORIGINAL, labelled_frames, measure
+from benchmarks.simulated_cameras import SimulatedCamera, through_camera
+from thor2_jax.adaptation.estimate import estimate_transform
+from thor2_jax.errors import InputError
+from thor2_jax.files import write_text
+from thor2_jax.recognition.frames import RGBDFrame
+from thor2_jax.recognition.prepared_instance import prepare_instance
+from training.evaluation.answering import answer_frames
+from training.evaluation.answers import FrameAnswers
+from training.evaluation.runs import Run, load_runs
+from training.readers.labelled import LabelledFrame
+from training.storage.jobs import check_same_job
+
+LOST = 0.05
+"""Least loss of accuracy of a camera that counts as affected."""
+
+
+def seen_by(camera: SimulatedCamera | None, item: LabelledFrame) -> LabelledFrame:
+    """Return a frame as a camera sees it; None changes nothing."""
+    return item if camera is None else dataclasses.replace(item, frame=through_camera(item.frame, camera))
+
+
+def only_labelled(item: LabelledFrame) -> RGBDFrame:
+    """Return the frame without instances that are not scored."""
+    labels = np.where(np.isin(item.frame.label_image, list(item.truth)), item.frame.label_image, 0)
+    return dataclasses.replace(item.frame, labels=labels)
+
+
+def answers_with(run: Run, frames: Sequence[LabelledFrame], transform: Any) -> list[FrameAnswers]:
+    """Return the answers of a run for frames whose colours are corrected by a transform, or by none."""
+    run.recognizer.color_transform = transform
+    return [answers for _, answers in answer_frames([run], frames)]
+
+
+def measure_camera(
+    run: Run,
+    frames: Sequence[LabelledFrame],
+    unknown: Sequence[LabelledFrame],
+    camera: SimulatedCamera | None,
+    count: int,
+) -> dict[str, Any]:
+    """Return the results of one camera, as in the module's docstring."""
+    recognizer, halves = run.recognizer, []
+    for half in range(2):
+        training = [*frames[half::2], *unknown[half::2]]
+        instances = []
+        for item in training:
+            frame = only_labelled(seen_by(camera, item))
+            instances += [prepare_instance(frame, label, recognizer.run.config.sigma_s) for label in frame.instances]
+        usable = [each for each in instances if each.reason is None]
+        chosen = [usable[k] for k in np.random.default_rng(half).permutation(len(usable))[:count]]
+        start = time.perf_counter()
+        adaptation = estimate_transform(chosen, *recognizer.adaptation_criterion())
+        seconds = time.perf_counter() - start
+        test = frames[1 - half :: 2]
+        seen = [seen_by(camera, item) for item in test]
+        answers = {ORIGINAL: answers_with(run, test, None)}
+        answers["before"] = answers[ORIGINAL] if camera is None else answers_with(run, seen, None)
+        answers["after"] = answers_with(run, seen, adaptation.transform)
+        (results,) = measure([run], answers)
+        halves.append(
+            {
+                "before": results["before"]["accuracy"],
+                "after": results["after"]["accuracy"],
+                "placements": results["before"]["placements"],
+                "instances": adaptation.instances,
+                "transform": dataclasses.asdict(adaptation.transform),
+                "seconds": round(seconds, 2),
+            }
+        )
+    before, after = (float(np.mean([half[name] for half in halves])) for name in ("before", "after"))
+    return {"before": before, "after": after, "halves": halves}
+
+
+def summary(cameras: dict[str, Any]) -> dict[str, float]:
+    """Return the mean gain over all cameras and over those that lost at least `LOST`, and the gain on the originals."""
+    changes = {name: row["after"] - row["before"] for name, row in cameras.items()}
+    lost = [name for name, row in cameras.items() if cameras[ORIGINAL]["before"] - row["before"] >= LOST]
+    others = [change for name, change in changes.items() if name != ORIGINAL]
+    return {
+        "original": changes[ORIGINAL],
+        "all cameras": float(np.mean(others)) if others else float("nan"),
+        "affected cameras": float(np.mean([changes[name] for name in lost])) if lost else float("nan"),
+        "number of affected cameras": len(lost),
+        "worst": min(changes.values()),
+    }
+
+
+def main() -> None:
+    """Measure the cameras that are not in the file yet, and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--model", type=Path, required=True, metavar="RUN")
+    parser.add_argument("--frames", type=Path, nargs="+", required=True, metavar="DIR")
+    parser.add_argument("--unknown", type=Path, nargs="*", default=[], metavar="DIR")
+    parser.add_argument("--ignore", nargs="*", default=LOOK_ALIKES, metavar="PATTERN", help="names to leave out")
+    parser.add_argument("--cameras", choices=list(CAMERAS), default="choose")
+    parser.add_argument("--instances", type=int, default=40, help="instances to adapt to, at most (%(default)s)")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE.json")
+    options = parser.parse_args()
+    job = {name: str(value) for name, value in vars(options).items() if name != "out"}
+    try:
+        stored = json.loads(options.out.read_bytes()) if options.out.is_file() else {"job": job, "results": {}}
+        check_same_job(options.out, stored["job"], job)
+        (run,) = load_runs([options.model])
+        frames = labelled_frames(options.frames)
+        unknown = labelled_frames(options.unknown, options.ignore) if options.unknown else []
+        for camera in (None, *CAMERAS[options.cameras]):
+            name = ORIGINAL if camera is None else camera.name
+            if name not in stored["results"]:
+                row = measure_camera(run, frames, unknown, camera, options.instances)
+                stored["results"][name] = row
+                write_text(options.out, json.dumps(stored, indent=1) + "\n")
+            row = stored["results"][name]
+            print(f"{name:20s} {row['before']:.3f} {row['after']:.3f} {row['after'] - row['before']:+.3f}", flush=True)
+        stored["summary"] = summary(stored["results"])
+        write_text(options.out, json.dumps(stored, indent=1) + "\n")
+        print(json.dumps(stored["summary"], indent=1))
+    except (InputError, OSError) as error:
+        parser.error(str(error))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,281 @@
+"""What several frames gain: `python -m benchmarks.tracking --model RUN... --frames DIR... --out FILE.json`.
+
+For each run, every frame is answered alone and by a tracker over it and the four frames before it. The file has the
+steadiness and the accuracy over placements of both, and the placements whose accuracy is lower with tracks.
+
+With --meshes DIR, scenes of these objects are rendered from six cameras around the table as well. For objects that are
+in the first view, and for those that are highly occluded there, the file has the accuracy by the number of views when
+
+fused      the answers for the views are fused (`thor2_jax.tracking.fusion`), the views in the order around the table
+merged     the clouds of the views are merged in space and described as one
+random     fused, the further views in random order
+next_view  fused, each further view chosen by `thor2_jax.tracking.next_view`
+
+and the number of views that each needs for an accuracy of .95. Objects are identified by their labels here.
+
+The command resumes: finished runs and scenes are kept in the file.
+"""
+
+import argparse
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.cameras import labelled_frames
+from thor2_jax.capacity import point_bucket
+from thor2_jax.descriptor.orientations import describe_orientations
+from thor2_jax.errors import InputError
+from thor2_jax.files import write_text
+from thor2_jax.recognition.answers import Evidence, Recognition
+from thor2_jax.recognition.frames import Intrinsics, RGBDFrame
+from thor2_jax.recognition.prepared_instance import (
+    DESCRIPTOR_VOXEL,
+    PreparedInstance,
+    pack_instances,
+    prepare_instance,
+)
+from thor2_jax.recognition.voxel_grid import downsample_to_fit
+from thor2_jax.recognizer import Recognizer
+from thor2_jax.tracking.fusion import FusedEvidence, view_weight
+from thor2_jax.tracking.next_view import ViewTable, next_view
+from thor2_jax.tracking.poses import transform
+from thor2_jax.tracking.tracker import Tracker
+from training.evaluation.placements import placement_accuracy, steadiness
+from training.objects.mesh import TexturedMesh
+from training.objects.meshes import find_meshes, load_mesh, read_names
+from training.readers.labelled import LabelledFrame, sequence_of
+from training.rendering.camera import Camera
+from training.rendering.scenes import Scene, compose_views
+from training.storage.jobs import check_same_job
+from training.view_table import view_table
+
+WINDOW = 5
+"""Frames of a track."""
+
+VIEWS = 6
+"""Cameras around a scene."""
+
+OBJECTS = 6
+"""Objects of a scene."""
+
+CAMERA = Camera(320, 240, Intrinsics(307.5, 307.5, 159.5, 119.5))
+
+TARGET = 0.95
+
+METHODS = ("fused", "merged", "random", "next_view")
+
+Probabilities = Mapping[str, NDArray[np.floating]]
+
+
+class _Cached:
+    """A recognizer that computes the evidence of a frame once."""
+
+    def __init__(self, recognizer: Recognizer) -> None:
+        self._recognizer = recognizer
+        self._evidence: dict[int, tuple[list[PreparedInstance], Evidence]] = {}
+        self.gallery, self.recognitions, self.fused = recognizer.gallery, recognizer.recognitions, recognizer.fused
+
+    def frame_evidence(self, frame: RGBDFrame) -> tuple[list[PreparedInstance], Evidence]:
+        if id(frame) not in self._evidence:
+            self._evidence[id(frame)] = self._recognizer.frame_evidence(frame)
+        return self._evidence[id(frame)]
+
+
+def best_name(answer: Recognition) -> str:
+    """Return the most probable name, also of an answer below the threshold; "" without any."""
+    if answer.name is not None:
+        return answer.name
+    scores: dict[str, float] = {}
+    for name in answer.top:
+        if name != "embedding" or len(answer.top) == 1:
+            for candidate, value in answer.top[name]:
+                scores[candidate] = scores.get(candidate, 0.0) + np.log(max(value, 1e-6)) + 14
+    return max(scores, key=lambda name: scores[name]) if scores else ""
+
+
+def measure_tracks(recognizer: Recognizer, frames: Sequence[LabelledFrame]) -> dict[str, Any]:
+    """Return the results of one run on videos, as in the module's docstring; a placement is an object of a video."""
+    cached = _Cached(recognizer)
+    rows: list[tuple[str, str, str, str]] = []  # placement, truth, alone, tracked
+    for number, item in enumerate(frames):
+        video = [each for each in frames[: number + 1] if sequence_of(each.identifier) == sequence_of(item.identifier)]
+        tracker = Tracker(cached)
+        for each in video[-WINDOW:]:
+            tracked = tracker.update(each.frame)
+        alone = {answer.label: answer for answer in cached.recognitions(*cached.frame_evidence(item.frame))}
+        for answer in tracked:
+            truth = item.truth.get(answer.label)
+            if truth in recognizer.classes:
+                placement = f"{sequence_of(item.identifier)}/{truth}"
+                rows.append((placement, truth, best_name(alone[answer.label]), best_name(answer)))
+    placement = np.unique([row[0] for row in rows], return_inverse=True)[1]
+    results: dict[str, Any] = {"instances": len(rows), "placements": int(placement.max() + 1)}
+    correct = {}
+    for index, name in ((2, "alone"), (3, "tracked")):
+        answers = np.unique([row[index] for row in rows], return_inverse=True)[1]
+        correct[name] = np.array([row[index] == row[1] for row in rows])
+        results[name] = {
+            "accuracy": placement_accuracy(placement, correct[name]),
+            "steadiness": steadiness(placement, answers),
+        }
+    names = np.unique([row[0] for row in rows])
+    results["placements with lower accuracy"] = [
+        str(names[k])
+        for k in range(len(names))
+        if correct["tracked"][placement == k].mean() < correct["alone"][placement == k].mean()
+    ]
+    return results
+
+
+def probabilities_of(recognizer: Recognizer, instances: Sequence[PreparedInstance]) -> list[dict[str, Any]]:
+    """Return classifier -> class probabilities [C] of each instance."""
+    answers: list[dict[str, Any]] = []
+    for start in range(0, len(instances), 16):
+        rows = instances[start : start + 16]
+        clouds = pack_instances(rows, 16, max(2048, point_bucket(max(len(each.points) for each in rows))))
+        oriented = describe_orientations(clouds, recognizer.run.network, recognizer.run.config)
+        values = recognizer.probabilities(oriented, recognizer.default_classifiers)
+        answers += [{name: p[k] for name, p in values.items()} for k in range(len(rows))]
+    return answers
+
+
+def merged(views: Sequence[tuple[PreparedInstance, NDArray[np.float64]]], sigma_s: float) -> PreparedInstance:
+    """Return the clouds of views (instance and pose) as one, in the coordinates of the first camera."""
+    to_first = np.linalg.inv(views[0][1])
+    points = np.concatenate([transform(to_first @ pose, view.points) for view, pose in views])
+    colors = np.concatenate([view.colors for view, _ in views])
+    points, colors = downsample_to_fit(points, colors, DESCRIPTOR_VOXEL / sigma_s)
+    return PreparedInstance(views[0][0].label, points, colors, np.zeros(len(points), bool))
+
+
+def _fuse(recognizer: Recognizer, views: Sequence[tuple[PreparedInstance, Probabilities]]) -> NDArray[np.floating]:
+    """Return the fused class probabilities [C] of views of one object."""
+    evidence = FusedEvidence()
+    for instance, probabilities in views:
+        evidence.add(view_weight(instance), probabilities, None)
+    return recognizer.fused({name: p[None] for name, p in evidence.fused()[0].items()})[0]
+
+
+def measure_scene(
+    recognizer: Recognizer, views: Sequence[tuple[Scene, NDArray[np.float64]]], table: ViewTable, seed: int
+) -> list[dict[str, Any]]:
+    """Return, for each object of the first view, its occlusion there and method -> correct by number of views."""
+    classes, sigma_s = recognizer.run.classes, recognizer.run.config.sigma_s
+    seen: dict[tuple[int, int], PreparedInstance] = {}
+    for number, (scene, _) in enumerate(views):
+        for label in scene.truth:
+            instance = prepare_instance(scene.frame, label, sigma_s)
+            if instance.reason is None:
+                seen[label, number] = instance
+    probabilities = dict(zip(seen, probabilities_of(recognizer, list(seen.values())), strict=True))
+    rows, rng = [], np.random.default_rng(seed)
+    for label, name in views[0][0].truth.items():
+        others = [number for number in range(1, len(views)) if (label, number) in seen]
+        if (label, 0) not in seen or name not in classes:
+            continue
+
+        def answer(order: Sequence[int], label: int = label) -> NDArray[np.floating]:
+            return _fuse(recognizer, [(seen[label, number], probabilities[label, number]) for number in order])
+
+        def chosen(others: Sequence[int] = others, label: int = label) -> list[int]:
+            order, left = [0], list(others)
+            first = seen[label, 0].points
+            centre = transform(views[0][1], (first.min(axis=0) + first.max(axis=0))[None] / 2)[0]
+            while left:
+                poses = [views[number][1] for number in left]
+                best = next_view(answer(order), centre, views[order[-1]][1], poses, table)
+                order.append(left.pop(best.index))
+            return order
+
+        orders = {
+            "fused": [0, *others],
+            "random": [0, *rng.permutation(others).tolist()],
+            "next_view": chosen(),
+        }
+        correct = {
+            method: [classes[int(answer(order[:k]).argmax())] == name for k in range(1, len(order) + 1)]
+            for method, order in orders.items()
+        }
+        clouds = [
+            merged([(seen[label, number], views[number][1]) for number in orders["fused"][:k]], sigma_s)
+            for k in range(2, len(others) + 2)
+        ]
+        of_clouds = [_fuse(recognizer, [(clouds[k], p)]) for k, p in enumerate(probabilities_of(recognizer, clouds))]
+        correct["merged"] = [correct["fused"][0], *[classes[int(p.argmax())] == name for p in of_clouds]]
+        rows.append({"name": name, "occlusion": views[0][0].occlusion(label), "correct": correct})
+    return rows
+
+
+def summarize_scenes(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return method -> accuracy by number of views, and views needed; an object keeps the answer of its last view."""
+    summary: dict[str, Any] = {}
+    for part, chosen in (("all", rows), ("high", [row for row in rows if row["occlusion"] == "high"])):
+        table: dict[str, Any] = {"objects": len(chosen)}
+        for method in METHODS:
+            by_count = [
+                float(np.mean([row["correct"][method][min(k, len(row["correct"][method]) - 1)] for row in chosen]))
+                for k in range(VIEWS)
+                if chosen
+            ]
+            enough = [k + 1 for k, value in enumerate(by_count) if value >= TARGET]
+            table[method] = {"accuracy": np.round(by_count, 3).tolist(), "views needed": enough[0] if enough else None}
+        summary[part] = table
+    return summary
+
+
+def read_meshes(directory: Path, names: Path | None, classes: Sequence[str]) -> dict[str, TexturedMesh]:
+    """Return the meshes of the classes."""
+    found = find_meshes(directory, read_names(names) if names else None)
+    return {name: load_mesh(path) for name, path in found.items() if name in classes}
+
+
+def main() -> None:
+    """Measure the runs and scenes that are not in the file yet, and print the summary."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--model", type=Path, nargs="+", required=True, metavar="RUN")
+    parser.add_argument("--frames", type=Path, nargs="*", default=[], metavar="DIR", help="videos, one for each folder")
+    parser.add_argument("--meshes", type=Path, metavar="DIR", help="meshes of the classes, for rendered scenes")
+    parser.add_argument("--names", type=Path, metavar="FILE", help="as for thor2 render")
+    parser.add_argument("--scenes", type=int, default=40, help="number of scenes, recognized by the first run")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE.json")
+    options = parser.parse_args()
+    job = {"model": list(map(str, options.model)), "frames": list(map(str, options.frames))}
+    try:
+        stored: dict[str, Any] = {"job": job, "tracks": {}, "scenes": {}}
+        if options.out.is_file():
+            stored = json.loads(options.out.read_bytes())
+            check_same_job(options.out, stored["job"], job)
+
+        def write() -> None:
+            write_text(options.out, json.dumps(stored, indent=1) + "\n")
+
+        frames = labelled_frames(options.frames)
+        for path in options.model if frames else []:
+            if str(path) not in stored["tracks"]:
+                stored["tracks"][str(path)] = measure_tracks(Recognizer.load(path), frames)
+                write()
+            print(path, json.dumps(stored["tracks"][str(path)]), flush=True)
+        missing = (
+            [seed for seed in range(options.scenes) if str(seed) not in stored["scenes"]] if options.meshes else []
+        )
+        if missing:
+            recognizer = Recognizer.load(options.model[0])
+            meshes = read_meshes(options.meshes, options.names, recognizer.run.classes)
+            table = view_table(recognizer, meshes)
+            for seed in missing:
+                views = compose_views(meshes, np.random.default_rng(seed), OBJECTS, VIEWS, CAMERA)
+                stored["scenes"][str(seed)] = measure_scene(recognizer, views, table, seed)
+                stored["summary"] = summarize_scenes([row for rows in stored["scenes"].values() for row in rows])
+                write()
+                print(f"scene {seed} of {options.scenes}", flush=True)
+        print(json.dumps(stored.get("summary", {}), indent=1))
+    except (InputError, OSError) as error:
+        parser.error(str(error))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,180 @@
+"""The colour transform of a camera, its estimate, and recognizers that use it."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import untrained_run
+from scipy.stats import entropy as scipy_entropy
+
+import thor2_jax as thor2
+from thor2_jax.adaptation.answers import fused_classifier, gallery_classifier
+from thor2_jax.adaptation.color_transform import ColorTransform, transform_colors
+from thor2_jax.adaptation.estimate import GRID, MIN_INSTANCES, PRIOR, estimate_transform, posterior_mean, spread
+from thor2_jax.adaptation.objective import Objective, entropy
+from thor2_jax.descriptor.orientations import OrientedDescriptors, describe_orientations
+from thor2_jax.recognition.prepared_instance import PreparedInstance, pack_instances
+from thor2_jax.recognizer import Recognizer
+
+RUN = untrained_run(("a", "b", "c"))
+WARM = ColorTransform(gamma=0.2, gain=-0.1, saturation=0.3, warmth=0.1)
+
+
+def instances(count: int = 3, seed: int = 0) -> list[PreparedInstance]:
+    """Return boxes of random sizes and colours."""
+    rng = np.random.default_rng(seed)
+    made = []
+    for label in range(1, count + 1):
+        points = rng.uniform(0, rng.uniform(0.04, 0.15, 3), (200, 3)).astype(np.float32) + np.float32([0, 0, 0.7])
+        colors = (rng.integers(40, 200, 3) + rng.integers(0, 40, (200, 3))).astype(np.uint8)
+        made.append(PreparedInstance(label, points, colors, np.zeros(200, bool)))
+    return made
+
+
+def test_a_transform_of_zeros_changes_no_color() -> None:
+    colors = np.random.default_rng(0).integers(0, 256, (500, 3), dtype=np.uint8)
+    np.testing.assert_array_equal(ColorTransform()(colors), colors)
+
+
+def test_a_transform_follows_its_formula() -> None:
+    colors = np.array([[0, 0, 0], [255, 255, 255], [200, 100, 50], [10, 20, 250]], np.uint8)
+    values = (colors / 255) ** np.exp(0.2) * np.exp(-0.1) * np.exp([0.1, 0, -0.1])
+    grey = values @ [0.299, 0.587, 0.114]
+    expected = (grey[:, None] + np.exp(0.3) * (values - grey[:, None])).clip(0, 1)
+    np.testing.assert_allclose(WARM(colors), 255 * expected, atol=0.51)
+    parameters = jnp.array(dataclasses.astuple(WARM))
+    np.testing.assert_allclose(transform_colors(parameters, jnp.asarray(colors / 255)), expected, atol=1e-5)
+    gradient = jax.jacobian(transform_colors)(parameters, jnp.asarray(colors / 255, jnp.float32))
+    assert np.isfinite(gradient).all() and np.abs(gradient).max() > 0.1
+
+
+@pytest.mark.parametrize("stored", [{"gamma": float("nan")}, {"gain": 9.0}, {"gamma": "x"}, {"hue": 1.0}, [1]])
+def test_a_damaged_transform_is_refused(stored: object) -> None:
+    with pytest.raises(thor2.InputError, match="color_transform"):
+        Recognizer(dataclasses.replace(RUN, record={"color_transform": stored}))
+
+
+def test_entropy_counts_what_the_classes_lack() -> None:
+    p = np.array([[0.2, 0.3, 0.1], [0, 0, 0], [1, 0, 0], [0.5, 0.5, 0]])
+    expected = [scipy_entropy([*row, 1 - sum(row)]) for row in p]
+    np.testing.assert_allclose(entropy(jnp.asarray(p)), expected, atol=1e-5)
+
+
+def test_the_objective_is_the_entropy_of_the_answers() -> None:
+    made = instances(11)  # two chunks, one with padding
+    recognizer = Recognizer(RUN)
+    network, config, classify = recognizer.adaptation_criterion()
+    objective = Objective(made, network, config, classify)
+    for transform in (ColorTransform(), WARM):
+        corrected = [transform.corrected(each) for each in made]
+        oriented = describe_orientations(pack_instances(corrected, 16), network, config, 2)
+        fused = recognizer.fused(recognizer.probabilities(oriented, ("tops", "tops2")))[: len(made)]
+        expected = sum(scipy_entropy(row) for row in fused)
+        # Colours are rounded to 8 bits before a camera's correction, not in between.
+        assert objective.total(np.array(dataclasses.astuple(transform))) == pytest.approx(expected, rel=2e-3)
+
+
+def test_the_gradient_is_that_of_the_relaxed_objective() -> None:
+    network, config, classify = Recognizer(RUN).adaptation_criterion()
+    objective = Objective(instances(2), network, config, classify)
+    at, step = np.array([0.1, -0.1, 0.2, 0.03]), 2e-3
+    value, gradient = objective.gradient(at)
+    numeric = [
+        (objective.gradient(at + step * axis)[0] - objective.gradient(at - step * axis)[0]) / (2 * step)
+        for axis in np.eye(4)
+    ]
+    assert np.isfinite(value) and np.abs(gradient).max() > 1e-3
+    np.testing.assert_allclose(gradient, numeric, rtol=0.1, atol=0.02)
+
+
+def bright_is_known(oriented: OrientedDescriptors) -> jax.Array:
+    """Answer one class, the more surely the closer the mean colour is to light grey."""
+    mean = oriented.statistics[:, 0, 5:8]  # see `cloud_statistics`
+    return jnp.exp(-5 * jnp.square(mean - 0.7).sum(axis=1, keepdims=True))
+
+
+def none_is_known(oriented: OrientedDescriptors) -> jax.Array:
+    return jnp.zeros((len(oriented.weights), 3))
+
+
+def test_dark_cameras_are_brightened_and_unknown_objects_change_nothing() -> None:
+    made = [dataclasses.replace(each, colors=np.full_like(each.colors, 100 + 5 * each.label)) for each in instances(10)]
+    adaptation = estimate_transform(made, RUN.network, RUN.config, bright_is_known)
+    assert adaptation.transform.gain - adaptation.transform.gamma > 0.15
+    assert adaptation.uncertainty_after < adaptation.uncertainty_before and adaptation.instances == 10
+    unchanged = estimate_transform(made, RUN.network, RUN.config, none_is_known).transform
+    np.testing.assert_allclose(dataclasses.astuple(unchanged), 0, atol=1e-6)
+
+
+def test_the_posterior_mean_weighs_evidence_and_prior() -> None:
+    np.testing.assert_allclose(posterior_mean(np.full(len(GRID), 7.0)), 0, atol=1e-12)
+    certain = np.full(len(GRID), 1e4)
+    certain[17] = 0
+    np.testing.assert_allclose(posterior_mean(certain), GRID[17])
+    totals = np.random.default_rng(0).uniform(0, 3, len(GRID))
+    weights = np.exp(-totals) * np.prod(np.exp(-0.5 * (GRID / PRIOR) ** 2), axis=1)
+    np.testing.assert_allclose(posterior_mean(totals), (weights[:, None] * GRID).sum(axis=0) / weights.sum())
+
+
+def test_too_few_instances_are_refused_with_their_number() -> None:
+    unusable = PreparedInstance(1, *(getattr(instances(1)[0], n)[:0] for n in ("points", "colors", "boundary")))
+    few = [*instances(MIN_INSTANCES - 1), dataclasses.replace(unusable, reason="too few points")]
+    with pytest.raises(thor2.InputError, match=f"9 usable instances; expected at least {MIN_INSTANCES}"):
+        estimate_transform(few, RUN.network, RUN.config, none_is_known)
+
+
+def test_instances_are_spread_evenly() -> None:
+    made = instances(7)
+    assert [each.label for each in spread(made, 3)] == [1, 4, 7]
+    assert [each.label for each in spread(made, 40)] == [1, 2, 3, 4, 5, 6, 7]
+
+
+def frame(seed: int, size: tuple[int, int] = (120, 160)) -> thor2.RGBDFrame:
+    """Return a frame of five squares of one colour each."""
+    rng = np.random.default_rng(seed)
+    color, labels = np.zeros((*size, 3), np.uint8), np.zeros(size, np.uint8)
+    depth = np.full(size, 900, np.uint16)
+    for label in range(1, 6):
+        here = slice(10 + 15 * (label % 3), 50 + 15 * (label % 3)), slice(30 * label - 28, 30 * label - 3)
+        color[here], labels[here], depth[here] = rng.integers(0, 256, 3), label, 700
+    return thor2.RGBDFrame(color, depth, labels, thor2.Intrinsics(600.0, 600.0, 79.5, 59.5))
+
+
+def test_an_adapted_recognizer_sees_corrected_colors() -> None:
+    recognizer = Recognizer(RUN)
+    adaptation = recognizer.adapt([frame(seed) for seed in range(2)])
+    assert recognizer.color_transform == adaptation.transform != ColorTransform()
+    image = frame(7)
+    by_hand = dataclasses.replace(image, color=adaptation.transform(image.color))
+    assert recognizer.recognize(image) == Recognizer(RUN).recognize(by_hand)
+    recognizer.enroll("mug", [(image, 2)])
+    stored = next(iter(recognizer.gallery.objects["mug"].clouds.views()))
+    np.testing.assert_array_equal(np.unique(stored.colors, axis=0), [by_hand.color[40, 40]])
+
+
+def test_frames_of_another_size_or_too_few_change_nothing() -> None:
+    recognizer = Recognizer(RUN)
+    with pytest.raises(thor2.InputError, match=r"frames\[1\] has 160 x 110 pixels; expected 160 x 120"):
+        recognizer.adapt([frame(0), frame(1, (110, 160)), frame(2)])
+    with pytest.raises(thor2.InputError, match="5 usable instances"):
+        recognizer.adapt([frame(0)])
+    assert recognizer.color_transform is None
+
+
+def test_gallery_answers_are_its_scores() -> None:
+    recognizer = Recognizer(RUN)
+    for name, seed in (("mug", 0), ("bowl", 1)):
+        recognizer.enroll(name, [(frame(seed), 2), (frame(seed), 3)])
+    embedding = recognizer.objects.embedding
+    oriented = describe_orientations(pack_instances(instances(4), 4), embedding.network, embedding.config, 2)
+    scores = recognizer.gallery.scores(embedding.embed_oriented(oriented), oriented.weights)
+    expected = scores / np.maximum(scores.sum(axis=1, keepdims=True), 1)
+    np.testing.assert_allclose(gallery_classifier(recognizer.gallery, embedding)(oriented), expected, atol=2e-3)
+
+
+def test_fused_answers_are_geometric_means() -> None:
+    p, q = np.array([[0.7, 0.2, 0.1]]), np.array([[0.2, 0.5, 0.3]])
+    fused = fused_classifier([lambda _: jnp.asarray(p), lambda _: jnp.asarray(q)])(None)  # type: ignore[arg-type]
+    np.testing.assert_allclose(fused, np.sqrt(p * q) / np.sqrt(p * q).sum(), rtol=1e-5)

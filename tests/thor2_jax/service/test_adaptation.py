@@ -1,0 +1,56 @@
+"""A service that adapts to its camera, without HTTP."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+
+from thor2_jax.adaptation.online import EVERY, OnlineAdaptation
+from thor2_jax.recognition.prepared_instance import PreparedInstance
+from thor2_jax.service.answers import adaptation_answer
+from thor2_jax.service.engine import InferenceEngine
+from thor2_jax.service.settings import Settings
+
+
+def views(count: int) -> list[PreparedInstance]:
+    rng = np.random.default_rng(count)
+    made = []
+    for label in range(count):
+        points = rng.uniform(0, (0.1, 0.06, 0.04), (100, 3)).astype(np.float32)
+        colors = (rng.integers(20, 200, 3) + rng.integers(0, 40, (100, 3))).astype(np.uint8)
+        made.append(PreparedInstance(label, points, colors, np.zeros(100, bool)))
+    return made
+
+
+def online(engine: InferenceEngine) -> OnlineAdaptation:
+    assert engine._online is not None
+    return engine._online
+
+
+def test_the_service_adapts_after_enough_instances(teaching_run: Path) -> None:
+    engine = InferenceEngine(Settings(teaching_run, adapt=True))
+    engine.compile_adaptation()
+    first, second = views(EVERY - 1), views(3)
+    unusable = dataclasses.replace(first[0], reason="too few points")
+    for frame in (first, [unusable]):
+        corrected = engine.correct(frame, observe=True)
+        assert all(a is b for a, b in zip(corrected, frame, strict=True))
+    engine.correct(second, observe=False)
+    assert engine.adaptation is None and adaptation_answer(None) is None
+    engine.correct(second, observe=True)
+    online(engine).join()
+    adaptation = engine.adaptation
+    assert adaptation is not None and adaptation.instances == EVERY + 2
+    (corrected,) = engine.correct(second[:1], observe=False)
+    np.testing.assert_array_equal(corrected.colors, adaptation.transform(second[0].colors))
+    answer = adaptation_answer(adaptation)
+    assert answer is not None
+    assert answer.model_dump() == {"instances": EVERY + 2, **dataclasses.asdict(adaptation.transform)}
+
+
+def test_a_service_does_not_adapt_by_default(teaching_run: Path) -> None:
+    engine = InferenceEngine(Settings(teaching_run))
+    engine.compile_adaptation()
+    frame = views(2 * EVERY)
+    assert all(a is b for a, b in zip(engine.correct(frame, observe=True), frame, strict=True))
+    assert engine.adaptation is None

@@ -1,0 +1,65 @@
+"""The next view of an object in doubt, on tables of views that are written by hand."""
+
+import numpy as np
+import pytest
+from scipy.stats import entropy
+
+import thor2_jax as thor2
+from thor2_jax.tracking.next_view import ViewTable, next_view
+from training.rendering.view_sphere import camera_pose
+
+AZIMUTHS = np.arange(8) * np.pi / 4
+CENTRE = np.array([0.3, -0.2, 0.1])
+
+
+def poses(centre: np.ndarray = CENTRE, start: float = 0.0) -> list[np.ndarray]:
+    """Return cameras around a point, from the side."""
+    return [camera_pose(start + azimuth, np.pi / 2, centre, 0.8) for azimuth in AZIMUTHS]
+
+
+def table(front: np.ndarray) -> ViewTable:
+    """Return two classes that look alike from everywhere except from one azimuth of each, a third one that does not.
+
+    Views of azimuth 0 are answered by `front`, those of azimuth pi by certainty, all others by doubt.
+    """
+    doubt, sure = np.array([0.48, 0.48, 0.04]), np.eye(3)
+    rows = [(label, azimuth) for label in range(2) for azimuth in range(8)]
+    answers = [front if azimuth == 0 else sure[label] if azimuth == 4 else doubt for label, azimuth in rows]
+    rotations = np.array([poses(np.zeros(3))[azimuth][:3, :3] for _, azimuth in rows])
+    return ViewTable(np.array([label for label, _ in rows]), rotations, np.array(answers))
+
+
+def test_the_view_that_tells_the_classes_apart_is_chosen() -> None:
+    front = np.array([0.3, 0.3, 0.4])
+    for start in (0.0, 1.1):  # the yaw of the object in the world is unknown
+        cameras = poses(start=start)
+        chosen = next_view(front, CENTRE, cameras[0], cameras[1:], table(front))
+        assert chosen.index == 3
+        assert chosen.entropy == pytest.approx(entropy(front))
+        assert chosen.expected.argmin() == 3 and chosen.expected[3] < 0.5 < np.delete(chosen.expected, 3).min()
+
+
+def test_the_expected_entropy_is_a_mean_over_classes() -> None:
+    """With one view of each class, every candidate leads to the answer of that view."""
+    p, answers = np.array([0.6, 0.4]), np.array([[0.9, 0.1], [0.3, 0.7]])
+    rotation = poses(np.zeros(3))[0][:3, :3]
+    views = ViewTable(np.arange(2), np.stack([rotation, rotation]), answers)
+    chosen = next_view(p, CENTRE, poses()[0], poses()[2:4], views)
+    posteriors = p * answers / (p * answers).sum(axis=1, keepdims=True)
+    np.testing.assert_allclose(chosen.expected, p @ [entropy(row) for row in posteriors], rtol=1e-6)
+
+
+def test_without_views_of_the_classes_in_doubt_nothing_is_expected() -> None:
+    views = ViewTable(np.zeros(1, int), np.eye(3)[None], np.array([[0.0, 1.0]]))
+    chosen = next_view([0.0, 1.0], CENTRE, np.eye(4), [np.eye(4)], views)
+    np.testing.assert_allclose(chosen.expected, chosen.entropy)
+
+
+def test_bad_input_of_next_view() -> None:
+    views = table(np.array([0.3, 0.3, 0.4]))
+    with pytest.raises(thor2.InputError, match="candidates is empty"):
+        next_view([0.5, 0.3, 0.2], CENTRE, np.eye(4), [], views)
+    with pytest.raises(thor2.InputError, match=r"candidates\[1\] is not a rigid motion"):
+        next_view([0.5, 0.3, 0.2], CENTRE, np.eye(4), [np.eye(4), 2 * np.eye(4)], views)
+    with pytest.raises(thor2.InputError, match="probabilities"):
+        next_view([0.5, 0.5], CENTRE, np.eye(4), [np.eye(4)], views)

@@ -1,0 +1,102 @@
+"""`thor2 adapt`, and the commands that use the adapted run; the run's weights are random."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers import run_thor2, untrained_run, write_frame
+
+from thor2_jax.errors import InputError
+from thor2_jax.recognition.frames import read_frame
+from thor2_jax.recognition.run_directory import load_run, save_run
+from thor2_jax.recognizer import Recognizer
+from training.evaluation.runs import load_runs
+
+OBJECTS = {1: "brick", 2: "book", 3: "leaf"}
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    directory = tmp_path_factory.mktemp("model") / "run"
+    save_run(untrained_run(tuple(OBJECTS.values())), directory)
+    (directory / "metrics.jsonl").write_text("{}\n")
+    (directory / "checkpoints").mkdir()
+    return directory
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    directory = tmp_path_factory.mktemp("frames")
+    for number in range(4):
+        write_frame(directory / f"{number}", OBJECTS, number)
+        (directory / f"{number}" / "labels.json").unlink()
+    return directory
+
+
+@pytest.fixture(scope="module")
+def adapted(model: Path, video: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("adapted") / "run"
+    assert run_thor2("adapt", "--model", model, video, "--out", out, "--quiet") == 0
+    return out
+
+
+def test_the_copy_differs_in_its_record_only(model: Path, adapted: Path) -> None:
+    transform = Recognizer.load(adapted).color_transform
+    assert transform is not None and transform != type(transform)()
+    before, after = (json.loads((run / "run.json").read_bytes()) for run in (model, adapted))
+    assert after["record"].pop("color_transform") == vars(transform)
+    assert after["record"].pop("adapted_to") == {"instances": 12}
+    assert before == after
+    names = {path.name for path in model.iterdir()}
+    assert {path.name for path in adapted.iterdir()} == names - {"checkpoints"}
+    assert load_run(adapted).classes == load_run(model).classes
+
+
+def test_recognize_corrects_the_colors(
+    model: Path, adapted: Path, video: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    answers = {}
+    for run in (model, adapted):
+        assert run_thor2("recognize", "--model", run, video / "0", "--json") == 0
+        answers[run] = json.loads(capfd.readouterr().out)["instances"]
+    confidences = [[one["confidence"] for one in answers[run]] for run in (model, adapted)]
+    assert np.abs(np.subtract(*confidences)).max() > 1e-4
+
+
+def test_runs_of_different_cameras_are_not_evaluated_together(model: Path, adapted: Path) -> None:
+    with pytest.raises(InputError, match="adapted to different cameras"):
+        load_runs([model, adapted])
+
+
+def test_enrolled_frames_are_corrected(adapted: Path, tmp_path: Path) -> None:
+    folder = write_frame(tmp_path / "labelled", {1: "brick"})
+    files = {"color": "color.png", "depth": "depth.png", "labels": "mask.png", "intrinsics": "intrinsics.json"}
+    frame = read_frame(**{name: folder / file for name, file in files.items()})  # type: ignore[arg-type]
+    gallery = tmp_path / "gallery"
+    assert (
+        run_thor2(
+            "enroll", "mug", "--label-name", "brick", "--model", adapted, "--gallery", gallery, "--frames", folder
+        )
+        == 0
+    )
+    recognizer = Recognizer.load(adapted, gallery=gallery)
+    stored = next(iter(recognizer.gallery.objects["mug"].clouds.views()))
+    assert recognizer.color_transform is not None
+    expected = recognizer.color_transform(frame.color[frame.labels == 1]).mean(axis=0)
+    np.testing.assert_allclose(stored.colors.mean(axis=0), expected, atol=4)
+
+
+def test_bad_input_writes_nothing(model: Path, video: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    few, unlabelled = tmp_path / "few", tmp_path / "unlabelled"
+    write_frame(few, OBJECTS)
+    for number in range(4):
+        (write_frame(unlabelled / f"{number}", OBJECTS, number) / "mask.png").unlink()
+    cases = [((few,), "3 usable instances; expected at least 10"), ((unlabelled,), "0: labels is None")]
+    for arguments, message in cases:
+        assert run_thor2("adapt", "--model", model, *arguments, "--out", tmp_path / "out", "--quiet") == 2
+        error = capfd.readouterr().err
+        assert message in error and error.count("\n") == 1
+    assert run_thor2("adapt", "--model", model, video, "--out", model) == 2
+    assert "already contains" in capfd.readouterr().err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["few", "unlabelled"]

@@ -1,0 +1,53 @@
+"""Answers as differentiable functions of descriptors, whose entropy tells how well colours fit a recognizer."""
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from thor2_jax.adaptation.objective import Classify
+from thor2_jax.descriptor.orientations import OrientedDescriptors
+from thor2_jax.gallery.embedding import Embedding
+from thor2_jax.gallery.gallery import GAMMA, RIDGE, Gallery
+
+__all__ = ["MAX_VIEWS", "fused_classifier", "gallery_classifier"]
+
+MAX_VIEWS = 1024
+"""Views of a gallery that answer at most, evenly spread; the regression is solved for all of them at once."""
+
+
+def fused_classifier(classifiers: Sequence[Classify]) -> Classify:
+    """Return the classifier whose probabilities are the normalized geometric mean of those of others."""
+
+    def classify(oriented: OrientedDescriptors) -> jax.Array:
+        logs = [jnp.log(jnp.maximum(each(oriented), 1e-12)) for each in classifiers]
+        return jax.nn.softmax(sum(logs, jnp.zeros(())) / len(logs))
+
+    return classify
+
+
+def gallery_classifier(gallery: Gallery, embedding: Embedding) -> Classify:
+    """Return the classifier whose probabilities are the scores of a gallery, divided by their sum if it exceeds 1.
+
+    Args:
+        gallery: a gallery with at least one object.
+        embedding: the embedding of its views.
+    """
+    objects = list(gallery.objects.values())
+    counts = np.array([len(each.embeddings) for each in objects])
+    owner = np.repeat(np.arange(len(objects)), counts)
+    kept = np.unique(np.linspace(0, len(owner) - 1, min(len(owner), MAX_VIEWS)).round().astype(int))
+    views = np.concatenate([each.embeddings for each in objects])[kept].astype(np.float64)
+    ridge = RIDGE * counts[owner[kept]] / counts[owner].mean()
+    kernel = np.exp(GAMMA * (views @ views.T - 1)) + np.diag(ridge)
+    duals = jnp.asarray(np.linalg.solve(kernel, np.eye(len(objects))[owner[kept]]), jnp.float32)
+    fixed = jnp.asarray(views, jnp.float32)
+
+    def classify(oriented: OrientedDescriptors) -> jax.Array:
+        embedded = embedding.embed_oriented(oriented)
+        scores = jnp.clip(jnp.exp(GAMMA * (embedded @ fixed.T - 1)) @ duals, 0, 1)
+        mean = (oriented.weights[..., None] * scores).sum(axis=1)
+        return mean / jnp.maximum(mean.sum(axis=1, keepdims=True), 1)
+
+    return classify

@@ -1,0 +1,104 @@
+"""The next view of an object in doubt: the camera pose that is expected to leave the least uncertainty about its name.
+
+Training views of the classes in doubt say what would be seen. For each class and each of its views that is answered as
+the present one is, the motion of the camera leads to another view of that class, whose answer is combined with the
+present one. The expected entropy of the result is the mean over classes and views, by their probability.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from thor2_jax.errors import InputError
+from thor2_jax.tracking.poses import check_pose
+
+__all__ = ["NextView", "ViewTable", "next_view"]
+
+MIN_PROBABILITY = 0.02
+"""Least probability of a class in doubt."""
+
+SHARPNESS = 5.0
+"""A training view is as likely as exp(-SHARPNESS D), where D is the divergence of its answer from the present one."""
+
+TINY = 1e-6
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ViewTable:
+    """Training views of all classes, and how they are answered.
+
+    Attributes:
+        label: [V] class of each view.
+        rotations: [V, 3, 3] rotation of each view's camera, from camera to object axes; the camera looks at the object.
+        probabilities: [V, C] fused class probabilities of each view.
+    """
+
+    label: NDArray[np.intp]
+    rotations: NDArray[np.float64]
+    probabilities: NDArray[np.float64]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class NextView:
+    """The best of several camera poses.
+
+    Attributes:
+        index: its number among the candidates.
+        expected: [n] expected entropy after each candidate, nats.
+        entropy: entropy of the present answer, nats.
+    """
+
+    index: int
+    expected: NDArray[np.float64]
+    entropy: float
+
+
+def next_view(
+    probabilities: ArrayLike, centre: ArrayLike, pose: ArrayLike, candidates: Sequence[ArrayLike], table: ViewTable
+) -> NextView:
+    """Choose the camera pose from which an object in doubt should be seen next.
+
+    Args:
+        probabilities: [C] the object's fused class probabilities.
+        centre: [3] the middle of the object's cloud, world coordinates in metres.
+        pose: [4, 4] the present camera, from camera to world.
+        candidates: poses [4, 4] that the camera can reach; those that look elsewhere should be left out.
+        table: training views.
+
+    Raises:
+        InputError: there is no candidate, a pose is not a rigid motion, or the table has other classes.
+    """
+    p = np.asarray(probabilities, np.float64)
+    if not len(candidates):
+        raise InputError("candidates is empty; expected at least one camera pose")
+    if p.shape != table.probabilities.shape[1:]:
+        raise InputError(f"probabilities has shape {p.shape}; expected {table.probabilities.shape[1:]}, as the table")
+    now = check_pose(pose)
+    poses = [check_pose(each, f"candidates[{k}]") for k, each in enumerate(candidates)]
+    p = np.maximum(p, TINY) / np.maximum(p, TINY).sum()
+    # Directions from the object to the candidates, in the axes of the present camera.
+    towards = (np.array([each[:3, 3] for each in poses]) - np.asarray(centre, np.float64)) @ now[:3, :3]
+    towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), TINY)
+    expected, total = np.zeros(len(poses)), 0.0
+    for index in np.flatnonzero(p >= MIN_PROBABILITY):
+        views = np.flatnonzero(table.label == index)
+        if not len(views):
+            continue
+        answers = np.maximum(table.probabilities[views], TINY)
+        answers /= answers.sum(axis=1, keepdims=True)
+        divergences = (p * np.log(p / answers)).sum(axis=1)
+        likely = np.exp(-SHARPNESS * (divergences - divergences.min()))
+        rotations = table.rotations[views]
+        # The camera looks along its z axis, so that it is seen from the object in the direction -z.
+        seen_from = np.einsum("vij,nj->vni", rotations, towards)
+        nearest = (seen_from @ -rotations[:, :, 2].T).argmax(axis=2)  # [v, n]
+        posterior = p * answers[nearest]
+        posterior /= posterior.sum(axis=2, keepdims=True)
+        entropies = -(posterior * np.log(np.maximum(posterior, 1e-300))).sum(axis=2)
+        expected += p[index] * (likely @ entropies) / likely.sum()
+        total += p[index]
+    entropy = float(-(p * np.log(p)).sum())
+    expected = np.full(len(poses), entropy) if total == 0 else expected / total
+    return NextView(int(expected.argmin()), expected, entropy)

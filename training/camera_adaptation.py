@@ -1,0 +1,73 @@
+"""Run directories that are adapted to a camera: a copy whose record has the camera's colour transform."""
+
+import dataclasses
+import json
+import shutil
+import tempfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from thor2_jax.adaptation.estimate import Adaptation, Report
+from thor2_jax.errors import with_context
+from thor2_jax.files import check_output_directory
+from thor2_jax.recognition.frames import RGBDFrame
+from thor2_jax.recognition.run_directory import RUN_FILE
+from thor2_jax.recognizer import Recognizer
+from training.readers.frame_files import FrameSource
+
+__all__ = ["adapt_run", "write_adapted_run"]
+
+UNFINISHED = ("checkpoints", "views", ".*")
+"""Names in a run directory that are not copied."""
+
+
+def adapt_run(model: Path, sources: Sequence[FrameSource], out: Path, report: Report) -> Adaptation:
+    """Estimate a camera's colour transform and write a run directory that corrects colours by it.
+
+    Args:
+        model: run directory; a colour transform that it has is replaced.
+        sources: frames of the camera, with instance labels.
+        out: new run directory.
+        report: see `Recognizer.adapt`.
+
+    Raises:
+        InputError: the run or a frame cannot be read, `out` is not empty, or as `Recognizer.adapt`. Nothing is written.
+        OSError: a file cannot be read or written. Nothing is written.
+    """
+    check_output_directory(out)
+    recognizer = Recognizer.load(model)
+
+    def frames() -> Iterator[RGBDFrame]:
+        for source in sources:
+            with with_context(source.name):
+                frame = source.read()
+                frame.label_image  # noqa: B018  a frame without labels is named in the error message
+            yield frame
+
+    adaptation = recognizer.adapt(frames(), report)
+    write_adapted_run(model, adaptation, out)
+    return adaptation
+
+
+def write_adapted_run(model: Path, adaptation: Adaptation, out: Path) -> None:
+    """Copy a run directory and store a colour transform in the copy's record.
+
+    The copy appears under its name when it is complete.
+
+    Raises:
+        InputError: `out` is not empty.
+        OSError: a file cannot be read or written; nothing is left behind.
+    """
+    check_output_directory(out)
+    out = out.resolve()
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as unfinished:
+        run = Path(unfinished) / "run"
+        shutil.copytree(model, run, ignore=shutil.ignore_patterns(*UNFINISHED))
+        description = json.loads((run / RUN_FILE).read_bytes())
+        description["record"] |= {
+            "color_transform": dataclasses.asdict(adaptation.transform),
+            "adapted_to": {"instances": adaptation.instances},
+        }
+        (run / RUN_FILE).write_text(json.dumps(description, indent=2) + "\n")
+        run.rename(out)

@@ -1,0 +1,62 @@
+"""Training views of all classes with their answers, from which `next_view` chooses a viewpoint."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from thor2_jax.capacity import point_bucket
+from thor2_jax.descriptor.orientations import describe_orientations
+from thor2_jax.errors import InputError
+from thor2_jax.recognition.prepared_instance import PreparedInstance, pack_instances
+from thor2_jax.recognizer import Recognizer
+from thor2_jax.tracking.next_view import ViewTable
+from training.objects.mesh import TexturedMesh
+from training.rendering.ray_caster import RayCaster, render_view
+from training.rendering.view_sphere import camera_pose
+from training.views.mesh_views import cloud_of
+
+__all__ = ["view_table"]
+
+AZIMUTHS, POLARS = 8, (0.6, 1.2)
+"""Number of azimuths, and polar angles in radians: cameras around a table look down on it."""
+
+ROWS = 16
+"""Views that are described in one call."""
+
+
+def view_table(recognizer: Recognizer, meshes: Mapping[str, TexturedMesh]) -> ViewTable:
+    """Render views of the trained classes from above, all around, and recognize them.
+
+    Args:
+        recognizer: recognizer with classifiers.
+        meshes: name -> mesh, in metres, z up, of at least one class.
+
+    Raises:
+        InputError: no mesh is of a trained class.
+    """
+    classes = recognizer.run.classes
+    labels, rotations, views = [], [], []
+    for name, mesh in meshes.items():
+        if name not in classes:
+            continue
+        caster = RayCaster([mesh])
+        for polar in POLARS:
+            for azimuth in np.arange(AZIMUTHS) * 2 * np.pi / AZIMUTHS:
+                pose = camera_pose(float(azimuth), polar, mesh.centre)
+                xyz, rgb = cloud_of(render_view(caster, pose))
+                views.append(PreparedInstance(len(views), xyz, rgb, np.zeros(len(xyz), bool)))
+                labels.append(classes.index(name))
+                rotations.append(pose[:3, :3])
+    if not views:
+        raise InputError(
+            f"meshes has none of the classes {', '.join(classes[:5])}, ...; expected meshes of the classes"
+        )
+    order = np.argsort([len(view.points) for view in views], kind="stable")
+    answers = np.zeros((len(views), len(classes)))
+    for start in range(0, len(views), ROWS):
+        rows = order[start : start + ROWS]
+        clouds = pack_instances([views[k] for k in rows], ROWS, point_bucket(max(len(views[k].points) for k in rows)))
+        oriented = describe_orientations(clouds, recognizer.run.network, recognizer.run.config)
+        probabilities = recognizer.probabilities(oriented, recognizer.default_classifiers)
+        answers[rows] = recognizer.fused(probabilities)[: len(rows)]
+    return ViewTable(np.array(labels), np.array(rotations), answers)
