@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 
 import numpy as np
+from numpy.typing import NDArray
 
 from thor2_jax.capacity import point_bucket
 from thor2_jax.descriptor.orientations import describe_orientations
@@ -35,7 +36,9 @@ def view_table(recognizer: Recognizer, meshes: Mapping[str, TexturedMesh]) -> Vi
         InputError: no mesh is of a trained class.
     """
     classes = recognizer.run.classes
-    labels, rotations, views = [], [], []
+    labels: list[int] = []
+    rotations: list[NDArray[np.float64]] = []
+    views: list[PreparedInstance] = []
     for name, mesh in meshes.items():
         if name not in classes:
             continue

@@ -139,7 +139,9 @@ def explain(recognizer: Recognizer, frame: RGBDFrame, label: int) -> Explanation
     """
     if label not in frame.instances:
         raise InputError(f"instance is {label}; expected one of {', '.join(map(str, frame.instances)) or 'none'}")
-    return explain_instance(recognizer, prepare_instance(frame, label, recognizer.run.config.sigma_s))
+    return explain_instance(
+        recognizer, recognizer.corrected(prepare_instance(frame, label, recognizer.run.config.sigma_s))
+    )
 
 
 def explain_instance(recognizer: Recognizer, instance: PreparedInstance) -> Explanation:

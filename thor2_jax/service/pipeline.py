@@ -214,7 +214,9 @@ class Service:
 
         def explained() -> WhyAnswer:
             assert prepared.frame is not None
-            return why_answer(self.engine.explain(prepared.instances[0]), prepared.frame)
+            return why_answer(
+                self.engine.explain(self.engine.correct(prepared.instances, observe=False)[0]), prepared.frame
+            )
 
         with request.stage("explain"):
             try:

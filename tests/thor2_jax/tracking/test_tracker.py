@@ -122,7 +122,7 @@ def test_the_next_view_is_chosen_for_a_track() -> None:
     cameras = [camera_pose(azimuth, np.pi / 2, np.zeros(3), 0.7) for azimuth in (0.0, 2.0, 4.0)]
     doubt, sure = np.array([0.48, 0.48, 0.04]), np.array([0.98, 0.01, 0.01])
     rotations = np.stack([pose[:3, :3] for pose in cameras])
-    table = ViewTable(np.zeros(3, int), rotations, np.stack([doubt, doubt, sure]))
+    table = ViewTable(np.zeros(3, int), rotations, np.stack([doubt, [0.05, 0.05, 0.9], sure]))
     tracker = Tracker(ToyRecognizer())
     tracker.update(frame({1: (40, 60, (122, 122, 10))}), cameras[0])
     assert tracker.next_view(1, cameras[1:], table).index == 1
