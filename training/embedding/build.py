@@ -24,7 +24,7 @@ from training.storage.workers import local_workers
 
 __all__ = ["build_embedding", "main"]
 
-OBJECTS, VIEWS, EPOCHS = 3000, 16, 8
+OBJECTS, VIEWS, EPOCHS = 3000, 16, 20
 """Procedural objects, views of each, and passes over their samples, for the packaged embedding."""
 
 MESH_WEIGHT = 6
