@@ -1,8 +1,8 @@
 """Fit the packaged embedding on procedural objects: `python -m training.embedding.build --out FILE`.
 
-The packaged file is the result of the default options. On two cores that other jobs shared, it took 1,050 s: 600 s for
-the views and 450 s for the fit. An interrupted build resumes from the samples in FILE.samples, which are removed at the
-end. `--meshes` adds the objects of a directory.
+The packaged file is the result of the default options. On two cores that other jobs shared, it took 1,280 s: 90 s for
+the views and 1,190 s for the fit. An interrupted build resumes from the samples in FILE.samples, which are removed at
+the end. `--meshes` adds the objects of a directory.
 """
 
 import argparse

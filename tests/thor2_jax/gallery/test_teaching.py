@@ -106,9 +106,9 @@ def test_the_default_thresholds_of_each_source(run: TrainedRun, embedding: Embed
     calibrated.enroll("b", [frame(RED)], extend=True)
     calibrated.enroll("c", [frame(RED)], replace=True)
     assert calibrated.classes == ("a", "b", "brick", "book", "c")
-    assert calibrated.thresholds().tolist() == [0.625, 0.625, 0.292, 0.26, 0.26]
-    assert calibrated.thresholds("gallery")[1:].tolist() == [0.26, 0.292, 0.26, 0.26]
-    assert taught(run, embedding).thresholds().tolist() == [0, 0, 0, 0.292, 0.26]
+    assert calibrated.thresholds().tolist() == [0.625, 0.625, 0.275, 0.25, 0.25]
+    assert calibrated.thresholds("gallery")[1:].tolist() == [0.25, 0.275, 0.25, 0.25]
+    assert taught(run, embedding).thresholds().tolist() == [0, 0, 0, 0.275, 0.25]
     explicit = taught(run, embedding, unknown_below=0.25)
     assert explicit.thresholds().tolist() == explicit.thresholds("gallery").tolist() == [0.25] * 5
     assert thor2.Recognizer(run).thresholds().tolist() == [0, 0, 0]
