@@ -14,6 +14,7 @@ from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
 from thor2_jax.gallery.enrollment import ORIENTATIONS, instance_view
 from thor2_jax.gallery.objects import ObjectGallery
 from thor2_jax.gallery.union import ClassUnion
+from thor2_jax.recognition.confidence import Calibration
 from thor2_jax.recognition.run_directory import EMBEDDING_FILE, TrainedRun, load_run, save_run
 
 INTRINSICS = thor2.Intrinsics(600.0, 600.0, 159.5, 119.5)
@@ -97,7 +98,7 @@ def test_the_record_and_the_argument_choose_what_answers(run: TrainedRun, embedd
         thor2.Recognizer(run, answer_by="all")  # type: ignore[arg-type]
 
 
-CALIBRATION = {"bias": 0.0, "answer": 1.0, "known": 1.0, "unknown_below": 0.625}
+CALIBRATION = dataclasses.asdict(Calibration(0.0, 1.0, 0.0, 1.0, unknown_below=0.625))
 
 
 def test_the_default_thresholds_of_each_source(run: TrainedRun, embedding: Embedding) -> None:
@@ -115,12 +116,12 @@ def test_the_default_thresholds_of_each_source(run: TrainedRun, embedding: Embed
 
 
 @pytest.mark.parametrize(
-    "score, names", [(0.25, [None, None]), (0.27, [None, "book"]), (0.29, [None, "book"]), (0.3, ["brick", "book"])]
+    "score, names", [(0.24, [None, None]), (0.26, [None, "book"]), (0.27, [None, "book"]), (0.28, ["brick", "book"])]
 )
 def test_a_gallery_alone_rejects_unknown_objects(
     score: float, names: list[str | None], embedding: Embedding, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Scores as given: the brick has two views and is named from .292, the book has one and is named from .26."""
+    """Scores as given: the brick has two views and is named from .275, the book has one and is named from .25."""
     instance = instance_view(CLUTTER, 1, 2.5)
     for unknown_below, expected in ((None, names), (0.0, ["brick", "book"])):
         recognizer = taught(untrained_run((), ()), embedding, unknown_below=unknown_below)
