@@ -1,0 +1,179 @@
+"""Downloads of YCB meshes from a local server: resumed, damaged, missing and hostile archives, and no network."""
+
+import io
+import socket
+import tarfile
+from collections.abc import Iterator
+from functools import partial
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from threading import Thread
+
+import numpy as np
+import pytest
+from helpers import run_thor2
+from PIL import Image
+
+from thor2_jax.errors import InputError
+from training.objects.fetch_ycb import fetch_ycb
+from training.objects.meshes import find_meshes, load_mesh
+
+NAME = "003_cracker_box"
+OBJ = b"mtllib textured.mtl\nusemtl m\nv 0 0 0\nv .1 0 0\nv 0 .1 0\nvt 0 0\nvt 1 0\nvt 0 1\nf 1/1 2/2 3/3\n"
+
+
+def archive(files: dict[str, bytes]) -> bytes:
+    stream = io.BytesIO()
+    with tarfile.open(fileobj=stream, mode="w:gz") as content:
+        for name, data in files.items():
+            member = tarfile.TarInfo(name)
+            member.size = len(data)
+            content.addfile(member, io.BytesIO(data))
+    return stream.getvalue()
+
+
+def mesh_files(folder: str = f"{NAME}/google_16k/") -> dict[str, bytes]:
+    texture = io.BytesIO()
+    Image.fromarray(np.random.default_rng(0).integers(0, 256, (64, 64, 3), np.uint8)).save(texture, "PNG")
+    material = b"newmtl m\nmap_Kd texture_map.png\n"
+    files = {"textured.mtl": material, "texture_map.png": texture.getvalue(), "textured.obj": OBJ}
+    return {folder + name: data for name, data in files.items()}
+
+
+class Server:
+    """What the server sends, and the values of Range that it was asked for."""
+
+    def __init__(self) -> None:
+        self.files: dict[str, bytes] = {}
+        self.break_after: int | None = None
+        self.ranges = True
+        self.requests: list[str | None] = []
+        self.url = ""
+
+
+class Handler(BaseHTTPRequestHandler):
+    def __init__(self, server: Server, *arguments: object) -> None:
+        self.state = server
+        super().__init__(*arguments)  # type: ignore[arg-type]
+
+    def log_message(self, *arguments: object) -> None:
+        pass
+
+    def do_GET(self) -> None:
+        requested = self.headers.get("Range")
+        self.state.requests.append(requested)
+        data = self.state.files.get(self.path)
+        if data is None:
+            self.send_error(404)
+            return
+        start = int(requested.removeprefix("bytes=").rstrip("-")) if requested and self.state.ranges else 0
+        if start >= len(data):
+            self.send_error(416)
+            return
+        self.send_response(206 if requested and self.state.ranges else 200)
+        self.send_header("Content-Length", str(len(data) - start))
+        self.end_headers()
+        self.wfile.write(data[start : self.state.break_after])
+
+
+@pytest.fixture
+def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
+    monkeypatch.setenv("no_proxy", "*")
+    state = Server()
+    state.files = {f"/google/{NAME}_google_16k.tgz": archive(mesh_files())}
+    with ThreadingHTTPServer(("127.0.0.1", 0), partial(Handler, state)) as http:
+        state.url = f"http://127.0.0.1:{http.server_port}/google"
+        thread = Thread(target=partial(http.serve_forever, 0.01))
+        thread.start()
+        yield state
+        http.shutdown()
+        thread.join()
+
+
+def test_mesh_is_where_training_finds_it(server: Server, tmp_path: Path) -> None:
+    seen: list[tuple[str, int, int, str]] = []
+    meshes = fetch_ycb([NAME], tmp_path, url=server.url, progress=lambda *values: seen.append(values))
+    assert meshes == find_meshes(tmp_path) == {NAME: tmp_path / NAME / "textured.obj"}
+    assert {path.name: path.read_bytes() for path in (tmp_path / NAME).iterdir()} == mesh_files("")
+    assert load_mesh(meshes[NAME]).textures[0].shape == (64, 64, 3)
+    assert seen[-1][0] == NAME and seen[-1][1] == seen[-1][2] == len(archive(mesh_files())) // 1000
+    fetch_ycb([NAME], tmp_path, url=server.url)
+    assert server.requests == [None]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".lock", NAME]
+
+
+@pytest.mark.parametrize("ranges", [True, False])
+def test_broken_download_resumes(server: Server, tmp_path: Path, ranges: bool) -> None:
+    server.break_after, server.ranges = 5000, ranges
+    with pytest.raises(InputError, match="resumes"):
+        fetch_ycb([NAME], tmp_path, url=server.url)
+    assert not (tmp_path / NAME).exists()
+    server.break_after = None
+    fetch_ycb([NAME], tmp_path, url=server.url)
+    assert server.requests == [None, "bytes=5000-"]
+    assert (tmp_path / NAME / "textured.obj").read_bytes() == OBJ
+
+
+def test_complete_archive_is_not_sent_again(server: Server, tmp_path: Path) -> None:
+    (tmp_path / f".{NAME}.tgz").write_bytes(server.files[f"/google/{NAME}_google_16k.tgz"])
+    fetch_ycb([NAME], tmp_path, url=server.url)
+    assert (tmp_path / NAME / "textured.obj").read_bytes() == OBJ
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        archive(mesh_files())[:5000],
+        archive(mesh_files())[:-4],
+        archive(mesh_files())[:-8] + bytes(8),
+        b"<html>a page</html>",
+        archive({f"{NAME}/google_16k/nontextured.ply": b"ply"}),
+        archive(mesh_files() | {f"{NAME}/google_16k/textured.obj": b"v nonsense"}),
+    ],
+    ids=["half", "without the end", "other checksum", "a page", "no mesh", "damaged mesh"],
+)
+def test_damaged_archives_leave_nothing(server: Server, tmp_path: Path, data: bytes) -> None:
+    server.files = {f"/google/{NAME}_google_16k.tgz": data}
+    with pytest.raises(InputError, match=NAME) as error:
+        fetch_ycb([NAME], tmp_path, url=server.url)
+    assert "\n" not in str(error.value) and ".extracting" not in str(error.value)
+    assert [path.name for path in tmp_path.iterdir()] == [".lock"]
+
+
+def test_archive_writes_only_into_its_folder(server: Server, tmp_path: Path) -> None:
+    evil = {
+        "../../google_16k/evil.txt": b"1",
+        "/google_16k/absolute.txt": b"2",
+        "evil.txt": b"3",
+        "google_16k/..": b"4",
+    }
+    server.files = {f"/google/{NAME}_google_16k.tgz": archive(mesh_files() | evil)}
+    fetch_ycb([NAME], tmp_path / "meshes", url=server.url)
+    names = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.txt")}
+    assert names <= {f"meshes/{NAME}/evil.txt", f"meshes/{NAME}/absolute.txt"}
+    assert [path.name for path in tmp_path.iterdir()] == ["meshes"]
+
+
+@pytest.mark.parametrize("names", [[], ["cracker box"], ["../003_cracker_box"], ["004_sugar_box"]])
+def test_unknown_objects_are_errors(server: Server, tmp_path: Path, names: list[str]) -> None:
+    with pytest.raises(InputError, match="objects"):
+        fetch_ycb(names, tmp_path, url=server.url)
+
+
+def test_foreign_folder_is_not_replaced(server: Server, tmp_path: Path) -> None:
+    (tmp_path / NAME).mkdir()
+    with pytest.raises(InputError, match="out"):
+        fetch_ycb([NAME], tmp_path, url=server.url)
+
+
+def test_command_shows_the_licence(server: Server, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_thor2("fetch", "ycb", "--objects", NAME, "--out", tmp_path, "--url", server.url, "--quiet") == 0
+    assert "CC BY 4.0" in capsys.readouterr().out and (tmp_path / NAME / "textured.obj").is_file()
+
+
+def test_no_network_is_one_line(tmp_path: Path) -> None:
+    with socket.socket() as closed:
+        closed.bind(("127.0.0.1", 0))
+        with pytest.raises(InputError, match="network") as error:
+            fetch_ycb([NAME], tmp_path, url=f"http://127.0.0.1:{closed.getsockname()[1]}")
+    assert "\n" not in str(error.value)

@@ -1,0 +1,36 @@
+"""`thor2 fetch`: download meshes, the only command that downloads anything."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from training.cli.app import QuietOption, app, console, show_help, split_names
+from training.cli.progress import show_progress
+
+fetch_app = typer.Typer(callback=show_help, invoke_without_command=True, help="Download public meshes.")
+app.add_typer(fetch_app, name="fetch")
+
+
+@fetch_app.command()
+def ycb(
+    objects: Annotated[
+        str, typer.Option(help="Comma-separated names as in the set, such as 003_cracker_box,011_banana.")
+    ],
+    out: Annotated[Path, typer.Option(help="Directory for the meshes, one folder for each object.")],
+    url: Annotated[str | None, typer.Option(help="Address of a mirror, the folder that has the archives.")] = None,
+    quiet: QuietOption = False,
+) -> None:
+    """Download scans of the YCB Object and Model Set (CC BY 4.0), about 10 MB for each object.
+
+    An interrupted download resumes, and objects that are there are not downloaded again. `thor2 train --meshes` takes
+    the directory.
+    """
+    from training.objects.fetch_ycb import LICENCE, YCB_URL, fetch_ycb
+
+    console.print(LICENCE, soft_wrap=True)
+    with show_progress(quiet) as progress:
+        meshes = fetch_ycb(split_names(objects), out, url=url or YCB_URL, progress=progress)
+    for name in meshes:
+        console.print(name)
+    console.print(f"{len(meshes)} meshes in {out}")

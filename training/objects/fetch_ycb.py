@@ -1,0 +1,183 @@
+"""Download scanned meshes of the YCB objects; nothing else in this software downloads anything.
+
+The archives are those of the YCB Object and Model Set with 16,000 faces (`google_16k`). The files of an object are
+written to `<directory>/<object>`, where `find_meshes` finds `textured.obj`.
+"""
+
+import gzip
+import http.client
+import re
+import shutil
+import tarfile
+import tempfile
+import urllib.error
+import urllib.request
+import zlib
+from collections.abc import Sequence
+from pathlib import Path, PurePosixPath
+
+from thor2_jax.errors import InputError
+from training.objects.meshes import load_mesh
+from training.storage.locks import locked
+from training.storage.progress import Progress
+
+__all__ = ["LICENCE", "YCB_URL", "fetch_ycb"]
+
+YCB_URL = "http://ycb-benchmarks.s3-website-us-east-1.amazonaws.com/data/google"
+
+LICENCE = (
+    "The scans are those of the YCB Object and Model Set (Calli et al., IEEE Robotics and Automation Magazine 22(3), "
+    "2015), licence CC BY 4.0, https://creativecommons.org/licenses/by/4.0/: whoever shares them, or pictures of them, "
+    "names this source."
+)
+
+NAME = re.compile(r"\d{3}(-[a-z])?_[a-z0-9_-]+")
+MESH_FILE = "textured.obj"
+TIMEOUT = 30.0
+"""Seconds without an answer or a byte after which the server counts as unreachable."""
+
+CHUNK_BYTES = 2**18
+MAX_BYTES = 2**29
+"""Largest archive and largest content of an archive; those of the set have about 10 MB."""
+
+_TEMPORARY = ".extracting-"
+
+
+def fetch_ycb(
+    objects: Sequence[str], directory: str | Path, *, url: str = YCB_URL, progress: Progress | None = None
+) -> dict[str, Path]:
+    """Download the meshes of YCB objects: object name -> mesh file, in the order of `objects`.
+
+    Objects whose mesh is in the directory already are not downloaded again. The download of an archive that was
+    interrupted resumes. An archive that is damaged is removed.
+
+    Args:
+        objects: names as in the set, such as "003_cracker_box".
+        directory: the mesh of an object is `<directory>/<object>/textured.obj`; may contain other objects.
+        url: address of the folder with the archives `<object>_google_16k.tgz`.
+        progress: called with (object, downloaded kB, total kB, "").
+
+    Raises:
+        InputError: A name or the address is invalid, the server has no such object or cannot be reached, an archive or
+            mesh is damaged, or another process writes to the directory.
+        OSError: The directory cannot be written.
+    """
+    if not objects:
+        raise InputError("objects is empty; expected names of YCB objects, such as 003_cracker_box")
+    for name in objects:
+        if not NAME.fullmatch(name):
+            raise InputError(f"objects has {name!r}; expected names of YCB objects, such as 003_cracker_box")
+    if not re.match(r"https?://[^/]", url):
+        raise InputError(f"url is {url!r}; expected an address that begins with http:// or https://")
+    directory = Path(directory)
+    directory.mkdir(parents=True, exist_ok=True)
+    meshes = {}
+    with locked(directory):
+        for leftover in directory.glob(f"{_TEMPORARY}*"):
+            shutil.rmtree(leftover)
+        for name in objects:
+            meshes[name] = directory / name / MESH_FILE
+            if meshes[name].is_file():
+                load_mesh(meshes[name])
+                continue
+            if (directory / name).exists():
+                raise InputError(
+                    f"out: {directory / name} exists without {MESH_FILE}; move it, or choose another directory"
+                )
+            archive = directory / f".{name}.tgz"
+            _download(f"{url.rstrip('/')}/{name}_google_16k.tgz", archive, name, progress)
+            _extract(archive, directory, name)
+    return meshes
+
+
+def _download(address: str, archive: Path, name: str, progress: Progress | None) -> None:
+    """Download to `archive`, from the end of what it contains on."""
+    have = archive.stat().st_size if archive.exists() else 0
+    request = urllib.request.Request(address, headers={"Range": f"bytes={have}-"} if have else {})
+    try:
+        with urllib.request.urlopen(request, timeout=TIMEOUT) as answer:
+            if answer.status != 206:  # the server sends the whole archive
+                have = 0
+            missing = int(answer.headers.get("Content-Length") or 0)
+            _check_bytes(have + missing, archive)
+            with archive.open("ab" if have else "wb") as stream:
+                received = 0
+                while block := answer.read(CHUNK_BYTES):
+                    received += len(block)
+                    _check_bytes(have + received, archive)
+                    stream.write(block)
+                    if progress:
+                        progress(name, (have + received) // 1000, (have + max(missing, received)) // 1000, "kB")
+            if received < missing:
+                raise http.client.IncompleteRead(b"", missing - received)
+    except urllib.error.HTTPError as error:
+        error.close()
+        if error.code == 416:  # nothing is missing; a damaged archive is removed by `_extract`
+            return
+        if error.code in (403, 404):
+            raise InputError(
+                f"objects has {name!r}, but there is no {address}; see the names at ycbbenchmarks.com"
+            ) from None
+        raise InputError(f"url: {address} answers with status {error.code}; try again later, it resumes") from None
+    except http.client.HTTPException as error:
+        raise InputError(
+            f"url: {address} is incomplete ({type(error).__name__}); repeat the command, it resumes"
+        ) from None
+    except urllib.error.URLError as error:
+        raise InputError(f"url: {address} cannot be reached ({error.reason}); {_ADVICE}") from None
+    except (TimeoutError, ConnectionError) as error:
+        raise InputError(f"url: the connection to {address} broke ({error}); {_ADVICE}") from None
+
+
+_ADVICE = "check the network, then repeat the command, it resumes; everything else works without a network"
+
+
+def _check_bytes(size: int, archive: Path) -> None:
+    if size > MAX_BYTES:
+        archive.unlink(missing_ok=True)
+        raise InputError(
+            f"url: {archive.name[1:]} has more than {MAX_BYTES:,} bytes; expected an archive of the YCB set"
+        )
+
+
+def _extract(archive: Path, directory: Path, name: str) -> None:
+    """Move the files of the archive to `directory / name` and remove the archive, also on an error."""
+    try:
+        with tempfile.TemporaryDirectory(prefix=_TEMPORARY, dir=directory) as temporary:
+            folder = Path(temporary) / name
+            folder.mkdir()
+            _extract_files(archive, folder)
+            load_mesh(folder / MESH_FILE)
+            folder.chmod(0o755)
+            folder.rename(directory / name)
+    except (tarfile.TarError, gzip.BadGzipFile, EOFError, zlib.error) as error:
+        raise InputError(f"objects: the archive of {name} is damaged ({error}); repeat the command") from None
+    except InputError as error:
+        reason = str(error).replace(f"{directory}/{_TEMPORARY}", "")
+        raise InputError(
+            f"objects: the archive of {name} has no usable mesh ({reason}); report this to its host"
+        ) from None
+    finally:
+        archive.unlink()
+
+
+def _extract_files(archive: Path, folder: Path) -> None:
+    """Write the regular files in `google_16k` to a folder under their last names; links and other folders are left out.
+
+    The archive is read to its end, so that the checksum of gzip covers all of it.
+    """
+    total = 0
+    with gzip.open(archive) as stream, tarfile.open(fileobj=stream, mode="r:") as content:
+        for member in content:
+            path = PurePosixPath(member.name)
+            total += member.size
+            if total > MAX_BYTES:
+                raise InputError(f"more than {MAX_BYTES:,} bytes")
+            if not member.isfile() or path.parent.name != "google_16k" or path.name.startswith("."):
+                continue
+            source = content.extractfile(member)
+            assert source is not None  # of a regular file
+            with source, (folder / path.name).open("xb") as target:
+                shutil.copyfileobj(source, target)
+        while stream.read(CHUNK_BYTES):
+            pass
