@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.paired import paired_difference
+from thor2_jax.files import json_digest
 from thor2_jax.recognition.fusion import DEFAULT_RULE
 from training.baselines.baseline import baseline_inputs
 from training.baselines.names import CLOUD_BASELINES, NETWORKS, TITLES
@@ -64,11 +65,12 @@ def compare_runs(dataset: Dataset, runs: Sequence[Run], directory: Path) -> dict
     Args:
         dataset: the frames.
         runs: the folds.
-        directory: where the evaluations are written, one directory for each part.
+        directory: where the evaluations are written, one directory for each part and choice of runs and baselines.
     """
+    models = json_digest([run.digest for run in runs])[:8]
     frames: list[FrameAnswers] = []
     for name, part in dataset.parts.items():
-        out = directory / f"evaluation-{name}"
+        out = directory / f"evaluation-{name}-{models}"
         evaluate_dataset(runs, part, {"kind": dataset.kind, "path": name}, out)
         prefix = f"{name}/" if len(dataset.parts) > 1 else ""
         frames += [dataclasses.replace(each, frame=prefix + each.frame) for each in read_answers(out / ANSWERS)]
