@@ -150,6 +150,7 @@ def _scatter(
 ) -> PathCollection:
     """Draw near points over far ones; with values, large ones over small ones and up to three times as large."""
     if values is None:
+        ax.set_facecolor("#e4e4e4")  # White points are seen on it.
         order, areas = np.argsort(nearness, kind="stable"), np.full(len(x), size)
     else:
         magnitude = np.abs(np.asarray(values, float))

@@ -204,7 +204,7 @@ def _changes(explanation: Explanation) -> ExplanationPicture:
         points = instance.points - instance.points.mean(axis=0)
         plot.cloud(axes, points, instance.colors, size=_point_size(instance) / 2)
         axes.set_title(f"{title}:\n{plain_text(name)}", fontsize=9, **name_style())
-        axes.set_axis_off()
+        axes.set(xticks=[], yticks=[], xlabel="", ylabel="")
     caption = (
         "The smallest changes of the object's colour and of its extents that were found to give another answer. Each "
         "was confirmed by recognizing the changed cloud."
@@ -222,7 +222,9 @@ def _nearest(explanation: Explanation) -> ExplanationPicture:
         plot.cloud(axes, instance.points, instance.colors, size=_point_size(instance) / 2)
         axes.set_title(plain_text(title + similarity), fontsize=9, **name_style())
     for axes in figure.axes:
-        axes.set_axis_off()
+        axes.set(xticks=[], yticks=[], xlabel="", ylabel="")
+    for axes in figure.axes[len(shown) :]:
+        axes.set_visible(False)
     caption = (
         "The enrolled views that the object resembles most, one for each of the most similar objects, each as its "
         "camera saw it and at its own scale. Numbers are similarities (1: equal)."
