@@ -72,7 +72,7 @@ class ManyFrames(TyperCommand):
         return super().parse_args(ctx, expanded)
 
 
-TRAINING_PACKAGES = ("colour", "embreex", "gudhi", "kmapper", "matplotlib", "sklearn", "trimesh")
+TRAINING_PACKAGES = ("colour", "embreex", "gudhi", "kmapper", "sklearn")
 """Packages that recognition and the service do not import (docs/install.md)."""
 
 
