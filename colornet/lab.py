@@ -6,7 +6,6 @@ matrix of sRGB is rounded, so that greys have a chroma of up to 0.01 and all the
 that hue from one interval of the cover to the next.
 """
 
-import colour
 import numpy as np
 from numpy.typing import NDArray
 
@@ -29,6 +28,8 @@ def to_lab(rgb: NDArray[np.generic], white: tuple[float, float]) -> NDArray[np.f
     Returns:
         [..., 3] float64: L* in 0..100, a*, b*.
     """
+    import colour  # here, so that plots without a colour network need no colour-science
+
     xyz = colour.sRGB_to_XYZ(np.asarray(rgb, np.float64) / 255.0)
     return np.asarray(colour.XYZ_to_Lab(xyz, np.array(white)), np.float64)
 
