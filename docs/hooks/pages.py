@@ -1,0 +1,123 @@
+"""MkDocs hook: pages generated from the code, and pages of the repository that lie outside of docs/.
+
+The command line comes from the typer application, the HTTP interface from the FastAPI application.
+"""
+
+import json
+import re
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import typer
+from mkdocs.structure.files import File, Files
+
+import colornet
+from thor2_jax.config import DescriptorConfig
+from thor2_jax.recognition.run_directory import TrainedRun, save_run
+from training.cli.app import app
+
+ROOT = Path(__file__).parents[2]
+
+OUTSIDE = ("CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md", "benchmarks/NOTES.md", "examples/ros2/README.md")
+"""Pages outside of docs/; on the site they have the same paths below `repository/`."""
+
+
+def on_files(files: Files, config: Any) -> Files:
+    """Add the generated pages and those outside of docs/."""
+    schema = openapi()
+    pages = {
+        "reference/command-line.md": command_line(),
+        "reference/http.md": http_page(schema),
+        "reference/openapi.json": json.dumps(schema, indent=1),
+        **{f"repository/{name}": (ROOT / name).read_text(encoding="utf-8") for name in OUTSIDE},
+    }
+    for path, content in pages.items():
+        files.append(File.generated(config, path, content=content))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str:
+    """Point links between docs/ and the rest of the repository to the pages of the site."""
+    path = page.file.src_uri
+    if path.startswith("repository/"):
+        above = "../" * (path.count("/") - 1)
+        markdown = markdown.replace(f"]({above}docs/", f"]({above}../")
+        # Other files of the repository are not part of the site.
+        return re.sub(r"\[([^\]]+)\]\((?!https?:)[^)#]+\.(?:py|json|toml|txt)\)", r"\1", markdown)
+    above = "../" * (path.count("/") + 1)
+    for name in OUTSIDE:
+        markdown = markdown.replace(f"]({above}{name}", f"]({above[3:]}repository/{name}")
+    return markdown
+
+
+def command_line() -> str:
+    """Return the page of all commands: usage, description, arguments and options."""
+    lines = ["# Command line", "", "This page is generated from the code; `thor2 COMMAND --help` prints the same."]
+    for path, command in commands():
+        context = typer.Context(command, info_name=path)
+        usage = " ".join(command.collect_usage_pieces(context))
+        lines += ["", f"## {path}", "", f"    {path} {usage}", "", _text(command.help or "")]
+        rows = [_row(parameter, context) for parameter in command.params if parameter.name != "help"]
+        if rows:
+            lines += ["", "| argument or option | default | meaning |", "|---|---|---|", *rows]
+    return "\n".join(lines) + "\n"
+
+
+def commands(group: Any = None, path: str = "thor2") -> list[tuple[str, Any]]:
+    """Return the paths and the command objects of all commands that are not groups."""
+    group = group or typer.main.get_command(app)
+    found: list[tuple[str, Any]] = []
+    for name, command in sorted(group.commands.items()):
+        inner = f"{path} {name}"
+        found += commands(command, inner) if hasattr(command, "commands") else [(inner, command)]
+    return found
+
+
+def _row(parameter: Any, context: Any) -> str:
+    names = ", ".join(f"`{name}`" for name in (*parameter.opts, *parameter.secondary_opts) if name.startswith("-"))
+    shown = names or f"`{parameter.metavar or parameter.name.upper()}`"
+    default = parameter.default
+    unset = (
+        default is None or default == [] or default is False or callable(default) or "Sentinel" in repr(type(default))
+    )
+    value = "required" if parameter.required else "" if unset else f"`{default}`"
+    return f"| {shown} | {value} | {_text(getattr(parameter, 'help', '') or '')} |"
+
+
+def _text(text: str) -> str:
+    return " ".join(text.split()).replace("|", "\\|").replace("<", "&lt;").replace("[", "\\[").replace("*", "\\*")
+
+
+def openapi() -> dict[str, Any]:
+    """Return the OpenAPI description of a service that teaches."""
+    from thor2_jax.service.app import create_app
+    from thor2_jax.service.settings import Settings
+
+    with tempfile.TemporaryDirectory() as directory:
+        run = Path(directory) / "run"
+        save_run(TrainedRun(DescriptorConfig(), colornet.load_default(), (), {}, {}), run)
+        return create_app(Settings(run, teach=True)).openapi()
+
+
+def http_page(schema: dict[str, Any]) -> str:
+    """Return the page of all requests, with their form fields and statuses."""
+    lines = [
+        "# HTTP",
+        "",
+        "The requests of `thor2 serve --teach`, generated from the code. [openapi.json](openapi.json) describes them for "
+        "programs; [the service](../service.md) explains them.",
+    ]
+    for path, methods in sorted(schema["paths"].items()):
+        for method, operation in methods.items():
+            lines += ["", f"## {method.upper()} {path}", "", operation.get("description", operation.get("summary", ""))]
+            content = operation.get("requestBody", {}).get("content", {})
+            for kind, body in content.items():
+                lines += ["", f"Body: `{kind}`", ""]
+                required = body["schema"].get("required", [])
+                for name, field in body["schema"].get("properties", {}).items():
+                    note = " (required)" if name in required else ""
+                    lines.append(f"- `{name}`{note}: {_text(field.get('description', field.get('type', '')))}")
+            lines += ["", "| status | meaning |", "|---|---|"]
+            lines += [f"| {code} | {_text(answer['description'])} |" for code, answer in operation["responses"].items()]
+    return "\n".join(lines) + "\n"
