@@ -105,8 +105,8 @@ def http_page(schema: dict[str, Any]) -> str:
     lines = [
         "# HTTP",
         "",
-        "The requests of `thor2 serve --teach`, generated from the code. [openapi.json](openapi.json) describes them for "
-        "programs; [the service](../service.md) explains them.",
+        "The requests of `thor2 serve --teach`, generated from the code. [openapi.json](openapi.json) describes them "
+        "for programs; [the service](../service.md) explains them.",
     ]
     for path, methods in sorted(schema["paths"].items()):
         for method, operation in methods.items():
