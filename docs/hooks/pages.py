@@ -10,6 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import typer
+from markdown.extensions import Extension
+from markdown.preprocessors import Preprocessor
 from mkdocs.structure.files import File, Files
 
 import colornet
@@ -21,6 +23,31 @@ ROOT = Path(__file__).parents[2]
 
 OUTSIDE = ("CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md", "benchmarks/NOTES.md", "examples/ros2/README.md")
 """Pages outside of docs/; on the site they have the same paths below `repository/`."""
+
+
+class _Examples(Preprocessor):
+    """Fence the examples `>>> ...` of docstrings, which Markdown takes for quotations."""
+
+    def run(self, lines: list[str]) -> list[str]:
+        result, inside = [], False
+        for line in lines:
+            if line.startswith(">>>") and not inside:
+                result, inside = [*result, "```python"], True
+            elif inside and not line.strip():
+                result, inside = [*result, "```"], False
+            result.append(re.sub(r"\s*# doctest: \+SKIP$", "", line) if inside else line)
+        return [*result, "```"] if inside else result
+
+
+class _ExamplesExtension(Extension):
+    def extendMarkdown(self, md: Any) -> None:  # noqa: N802
+        """Register the preprocessor before that of fenced code (25)."""
+        md.preprocessors.register(_Examples(md), "examples", 40)
+
+
+def on_config(config: Any) -> None:
+    """Add the Markdown extension."""
+    config.markdown_extensions.append(_ExamplesExtension())
 
 
 def on_files(files: Files, config: Any) -> Files:

@@ -1,0 +1,61 @@
+"""The Python code of the landing page, the first tutorial and the page on export runs, and the tutorial's command."""
+
+import json
+import re
+import shlex
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+from helpers import run_thor2, untrained_run
+
+import thor2_jax as thor2
+from thor2_jax.recognition.run_directory import save_run
+
+DOCS = Path(__file__).parents[2] / "docs"
+SAMPLES = Path(thor2.__path__[0], "service/page/samples")
+NAMES = ["mug_blue", "mug_white"]
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Change to an empty folder with an untrained run where the demo writes its own."""
+    monkeypatch.chdir(tmp_path)
+    Path("demo-report").mkdir()
+    save_run(untrained_run(NAMES), "demo-report/run")
+    return tmp_path
+
+
+def run_code(page: str, **names: Any) -> dict[str, Any]:
+    blocks = re.findall(r"^```python\n(.*?)^```$", (DOCS / page).read_text(), re.DOTALL | re.MULTILINE)
+    assert len(blocks) == 1
+    exec(compile(blocks[0], page, "exec"), names)
+    return names
+
+
+@pytest.mark.slow
+def test_landing_page(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    names = {"color.jpg": "c.jpg", "depth.png": "d.png", "labels.png": "l.png", "intrinsics.json": "k.json"}
+    for source, target in names.items():
+        shutil.copy(SAMPLES / "breakfast" / source, target)
+    run_code("index.md")
+    assert len(capsys.readouterr().out.splitlines()) == 5
+
+
+@pytest.mark.slow
+def test_export(folder: Path) -> None:
+    run_code("how-to/export.md")
+    assert (folder / "recognizer.export").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_first_tutorial(folder: Path) -> None:
+    text = (DOCS / "tutorials/first-table.md").read_text()
+    (command,) = re.findall(r"thor2 (recognize .*?)^```$", text, re.DOTALL | re.MULTILINE)
+    words = shlex.split(command.replace("$samples", str(SAMPLES)).replace("\\\n", " "))
+    assert run_thor2(*words) == 0
+    answers = json.loads((folder / "answer" / "recognition.json").read_text())
+    names = run_code("tutorials/first-table.md")["names"]
+    assert len(names) == 5 and str(sorted(names)[0]) in json.dumps(answers)
+    assert (folder / "answer" / "overlay.png").is_file()
