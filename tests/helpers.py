@@ -52,6 +52,7 @@ class UntaughtRecognizer:
 
     run: Any
     unknown_below: float | None = None
+    color_transform = None
 
     @property
     def objects(self) -> ObjectGallery:

@@ -1,6 +1,7 @@
 """The colour transform of a camera from unlabelled instances: the mean of its posterior.
 
-The prior is a normal distribution around no change; the likelihood of an instance is exp(-uncertainty of its answer).
+The prior is a normal distribution around no change; the likelihood of an instance is
+exp(-`EVIDENCE` times the uncertainty of its answer).
 With few instances, or where colours do not matter, the estimate therefore stays near no change.
 """
 
@@ -33,6 +34,9 @@ MIN_INSTANCES = 10
 
 MAX_INSTANCES = 40
 """Instances that are used at most; more take longer and change little."""
+
+EVIDENCE = 0.05
+"""Weight of an instance's uncertainty: instances of the same few objects are not independent. Chosen on real frames."""
 
 Report = Callable[[int, int], None]
 """Called with the number of evaluated colour transforms and of all of them."""
@@ -106,6 +110,6 @@ def estimate_transform(
 
 def posterior_mean(totals: NDArray[np.floating]) -> NDArray[np.float64]:
     """Return the mean [4] of the posterior from the sums of uncertainties [135] of the transforms of `GRID`."""
-    negative_log = totals + ((GRID / PRIOR) ** 2).sum(axis=1) / 2
+    negative_log = EVIDENCE * totals + ((GRID / PRIOR) ** 2).sum(axis=1) / 2
     weights = np.exp(negative_log.min() - negative_log)
     return np.asarray(weights @ GRID / weights.sum())

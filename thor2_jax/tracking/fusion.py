@@ -5,7 +5,6 @@ scores. As successive frames are nearly the same, their probabilities are not mu
 a track that always gives the same probabilities has the confidence of one frame.
 """
 
-import dataclasses
 from collections.abc import Mapping
 
 import numpy as np
@@ -33,7 +32,6 @@ def _log_with_rest(probabilities: NDArray[np.floating]) -> NDArray[np.float64]:
     return np.log(np.maximum(np.append(probabilities.astype(np.float64), rest), np.finfo(np.float32).tiny))
 
 
-@dataclasses.dataclass
 class FusedEvidence:
     """The evidence of the views of one object.
 
@@ -44,10 +42,11 @@ class FusedEvidence:
         scores: weighted sum of the gallery's scores, by name of the object; None if the classifiers alone answer.
     """
 
-    weight: float = 0.0
-    logs: dict[str, NDArray[np.float64]] = dataclasses.field(default_factory=dict)
-    score_weight: float = 0.0
-    scores: dict[str, float] | None = None
+    def __init__(self) -> None:
+        self.weight = 0.0
+        self.logs: dict[str, NDArray[np.float64]] = {}
+        self.score_weight = 0.0
+        self.scores: dict[str, float] | None = None
 
     def add(
         self, weight: float, probabilities: Mapping[str, NDArray[np.floating]], scores: Mapping[str, float] | None

@@ -62,7 +62,6 @@ class FrameRecognizer(Protocol):
     def fused(self, probabilities: Mapping[str, NDArray[np.float32]]) -> NDArray[np.floating[Any]]: ...
 
 
-@dataclasses.dataclass
 class _Track:
     """An object that is followed.
 
@@ -77,14 +76,18 @@ class _Track:
         evidence: what it is recognized by.
     """
 
-    number: int
-    voxels: OccupiedVoxels
-    instance: PreparedInstance
-    overflow: int
-    seen: int
-    pose: NDArray[np.float64] | None
-    frames: int = 0
-    evidence: FusedEvidence = dataclasses.field(default_factory=FusedEvidence)
+    def __init__(
+        self,
+        number: int,
+        voxels: OccupiedVoxels,
+        instance: PreparedInstance,
+        overflow: int,
+        seen: int,
+        pose: NDArray[np.float64] | None,
+    ) -> None:
+        self.number, self.voxels, self.instance = number, voxels, instance
+        self.overflow, self.seen, self.pose = overflow, seen, pose
+        self.frames, self.evidence = 0, FusedEvidence()
 
 
 class Tracker:

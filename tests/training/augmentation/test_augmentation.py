@@ -28,7 +28,7 @@ from training.rendering.view_sphere import camera_pose
 from training.views.mesh_views import cloud_of
 
 OBJECTS = builtin_objects()
-ALL = Augmentations(Illumination(), Sensor(), Occlusion(), Segmentation(), 2, Registration(), Base(missing=1))
+ALL = Augmentations(Illumination(), Sensor(), Occlusion(), Segmentation(), 5, Registration(), Base(missing=1))
 AUGMENTATIONS: dict[str, Any] = {
     "illumination": Illumination(),
     "sensor": Sensor(),
@@ -80,7 +80,7 @@ def same(one: RenderedView, other: RenderedView) -> bool:
 
 def test_no_augmentation() -> None:
     off = Augmentations()
-    assert not off and off.copies == 2 and all(Augmentations(**{name: on}) for name, on in AUGMENTATIONS.items())
+    assert not off and off.copies == 5 and all(Augmentations(**{name: on}) for name, on in AUGMENTATIONS.items())
     assert same(augment(MUG, off, np.random.default_rng(0)), MUG)
 
 

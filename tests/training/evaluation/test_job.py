@@ -61,7 +61,7 @@ class ToyRecognizer(UntaughtRecognizer):
 
     def __init__(self, seed: int, log: Path, features: tuple[str, ...], kill_at: int | None = None) -> None:
         self.seed, self.log, self.kill_at = seed, log, kill_at
-        self.run = SimpleNamespace(classes=CLASSES, classifiers=dict.fromkeys(features))
+        self.run = SimpleNamespace(classes=CLASSES, classifiers=dict.fromkeys(features), record={})
 
     def describe(self, frame: Any) -> Any:
         number = int(frame.color[0, 0, 0])

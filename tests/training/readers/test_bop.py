@@ -366,7 +366,7 @@ def test_a_real_frame(shared: Path, tmp_path: Path) -> None:
 class LabelIsClass(UntaughtRecognizer):
     """Stands in for a trained recognizer: instance 1 is a mug, every other a bowl, the last of a frame too small."""
 
-    run = SimpleNamespace(classes=("mug", "bowl"), classifiers={"tops": None})
+    run = SimpleNamespace(classes=("mug", "bowl"), classifiers={"tops": None}, record={})
 
     def describe(self, frame: Any) -> Any:
         last = frame.instances[-1]
@@ -408,7 +408,8 @@ def test_accuracy_by_scene(tmp_path: Path) -> None:
 
 
 def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr("training.evaluation.runs.load_runs", lambda paths: [EvaluatedRun("run", "0", LabelIsClass())])
+    runs = [EvaluatedRun("run", "0", LabelIsClass())]
+    monkeypatch.setattr("training.evaluation.answering.load_runs", lambda paths: runs)
     dataset, model = write_dataset(tmp_path), ("--model", tmp_path / "run")
     options = ("--names", tmp_path / "names.yaml", "--out", tmp_path / "report")
     assert run_thor2("evaluate", "bop", dataset, *model, *options) == 0

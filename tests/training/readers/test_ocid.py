@@ -387,7 +387,7 @@ class NamesInOrder(UntaughtRecognizer):
 
     def __init__(self, classes: tuple[str, ...] = ("mug", "bowl")) -> None:
         network = SimpleNamespace(fingerprint="")
-        self.run = SimpleNamespace(classes=classes, classifiers={"tops": None}, config=None, network=network)
+        self.run = SimpleNamespace(classes=classes, classifiers={"tops": None}, config=None, network=network, record={})
 
     def describe(self, frame: Any) -> Any:
         instances = [SimpleNamespace(label=label, reason=None, occluded=False) for label in frame.instances]
@@ -420,7 +420,8 @@ def test_accuracy_by_condition(tmp_path: Path) -> None:
 def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     write_frame(tmp_path / "YCB10")
     names = write_names(tmp_path)
-    monkeypatch.setattr("training.evaluation.runs.load_runs", lambda paths: [EvaluatedRun("run", "0", NamesInOrder())])
+    runs = [EvaluatedRun("run", "0", NamesInOrder())]
+    monkeypatch.setattr("training.evaluation.answering.load_runs", lambda paths: runs)
     options = ("--model", tmp_path / "run", "--names", names)
     assert run_thor2("evaluate", "ocid", tmp_path, *options, "--out", tmp_path / "report") == 0
     output = capsys.readouterr().out
