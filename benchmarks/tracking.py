@@ -1,7 +1,8 @@
 """What several frames gain: `python -m benchmarks.tracking --model RUN... --frames DIR... --out FILE.json`.
 
-For each run, every frame is answered alone and by a tracker over it and the four frames before it. The file has the
-steadiness and the accuracy over placements of both, and the placements whose accuracy is lower with tracks.
+For each run, every frame from the fifth of a video on is answered alone and by a tracker over it and the four frames
+before it. The file has the steadiness and the accuracy over placements of both, and the placements whose accuracy is
+lower with tracks. Answers are the most probable names, also below the threshold of unknown objects.
 
 With --meshes DIR, scenes of these objects are rendered from six cameras around the table as well. For objects that are
 in the first view, and for those that are highly occluded there, the file has the accuracy by the number of views when
@@ -30,7 +31,7 @@ from thor2_jax.capacity import point_bucket
 from thor2_jax.descriptor.orientations import describe_orientations
 from thor2_jax.errors import InputError
 from thor2_jax.files import write_text
-from thor2_jax.recognition.answers import Evidence, Recognition
+from thor2_jax.recognition.answers import Evidence
 from thor2_jax.recognition.frames import Intrinsics, RGBDFrame
 from thor2_jax.recognition.prepared_instance import (
     DESCRIPTOR_VOXEL,
@@ -85,24 +86,19 @@ class _Cached:
         return self._evidence[id(frame)]
 
 
-def best_name(answer: Recognition) -> str:
-    """Return the most probable name, also of an answer below the threshold; "" without any."""
-    if answer.name is not None:
-        return answer.name
-    scores: dict[str, float] = {}
-    for name in answer.top:
-        if name != "embedding" or len(answer.top) == 1:
-            for candidate, value in answer.top[name]:
-                scores[candidate] = scores.get(candidate, 0.0) + np.log(max(value, 1e-6)) + 14
-    return max(scores, key=lambda name: scores[name]) if scores else ""
-
-
 def measure_tracks(recognizer: Recognizer, frames: Sequence[LabelledFrame]) -> dict[str, Any]:
-    """Return the results of one run on videos, as in the module's docstring; a placement is an object of a video."""
+    """Return the results of one run on videos, as in the module's docstring; a placement is an object of a video.
+
+    Args:
+        recognizer: its `unknown_below` is 0, so that every answer has a name.
+        frames: frames of one or more videos, in order.
+    """
     cached = _Cached(recognizer)
     rows: list[tuple[str, str, str, str]] = []  # placement, truth, alone, tracked
     for number, item in enumerate(frames):
         video = [each for each in frames[: number + 1] if sequence_of(each.identifier) == sequence_of(item.identifier)]
+        if len(video) < WINDOW:
+            continue
         tracker = Tracker(cached)
         for each in video[-WINDOW:]:
             tracked = tracker.update(each.frame)
@@ -111,7 +107,7 @@ def measure_tracks(recognizer: Recognizer, frames: Sequence[LabelledFrame]) -> d
             truth = item.truth.get(answer.label)
             if truth in recognizer.classes:
                 placement = f"{sequence_of(item.identifier)}/{truth}"
-                rows.append((placement, truth, best_name(alone[answer.label]), best_name(answer)))
+                rows.append((placement, truth, alone[answer.label].name or "", answer.name or ""))
     placement = np.unique([row[0] for row in rows], return_inverse=True)[1]
     results: dict[str, Any] = {"instances": len(rows), "placements": int(placement.max() + 1)}
     correct = {}
@@ -256,7 +252,7 @@ def main() -> None:
         frames = labelled_frames(options.frames)
         for path in options.model if frames else []:
             if str(path) not in stored["tracks"]:
-                stored["tracks"][str(path)] = measure_tracks(Recognizer.load(path), frames)
+                stored["tracks"][str(path)] = measure_tracks(Recognizer.load(path, unknown_below=0.0), frames)
                 write()
             print(path, json.dumps(stored["tracks"][str(path)]), flush=True)
         missing = (

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from benchmarks.adaptation import summary
-from benchmarks.tracking import METHODS, VIEWS, best_name, merged, summarize_scenes
-from thor2_jax.recognition.answers import Recognition
+from benchmarks.tracking import METHODS, VIEWS, merged, summarize_scenes
 from thor2_jax.recognition.prepared_instance import PreparedInstance
 from training.rendering.view_sphere import camera_pose
 
@@ -42,10 +41,3 @@ def test_merged_clouds_coincide_in_space() -> None:
     one, both = merged(views[:1], 2.5), merged(views, 2.5)
     assert abs(len(both.points) - len(one.points)) < 0.1 * len(one.points)
     np.testing.assert_allclose(both.points.mean(axis=0), one.points.mean(axis=0), atol=1e-3)
-
-
-def test_the_best_name_ignores_the_threshold() -> None:
-    top = {"tops": [("a", 0.6), ("b", 0.4)], "tops2": [("b", 0.9), ("a", 0.1)], "embedding": [("c", 0.9)]}
-    assert best_name(Recognition(1, None, 0.1, "tops", top, reason="unknown")) == "b"
-    assert best_name(Recognition(1, "a", 0.9, "tops", top)) == "a"
-    assert best_name(Recognition(1)) == ""

@@ -1,4 +1,4 @@
-"""Answers as differentiable functions of descriptors, whose entropy tells how well colours fit a recognizer."""
+"""Answers as compiled functions of descriptors, whose entropy tells how well colours fit a recognizer."""
 
 from collections.abc import Sequence
 

@@ -22,16 +22,14 @@ MAX_PARAMETER = 1.5
 
 
 def transform_colors(parameters: jax.Array, colors: jax.Array) -> jax.Array:
-    """Return transformed colours [..., 3] in [0, 1]; differentiable in both arguments.
+    """Return transformed colours [..., 3] in [0, 1].
 
     Args:
         parameters: [4], the fields of `ColorTransform` in their order.
         colors: [..., 3] sRGB in [0, 1].
     """
     gamma, gain, saturation, warmth = parameters
-    positive = colors > 0
-    raised = jnp.where(positive, jnp.where(positive, colors, 1) ** jnp.exp(gamma), 0)
-    values = raised * jnp.exp(gain + warmth * jnp.array([1, 0, -1], jnp.float32))
+    values = colors ** jnp.exp(gamma) * jnp.exp(gain + warmth * jnp.array([1, 0, -1], jnp.float32))
     grey = (values * LUMA).sum(axis=-1, keepdims=True)
     return jnp.clip(grey + jnp.exp(saturation) * (values - grey), 0, 1)
 

@@ -23,7 +23,6 @@ from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.color_membership import RegionSets, color_sets, region_sets
 from thor2_jax.descriptor.describe import strips
 from thor2_jax.descriptor.orientations import OrientedDescriptors, candidate_orientations, orient_descriptors
-from thor2_jax.descriptor.relaxation import soft_regions
 from thor2_jax.descriptor.slicing import slices_and_strips
 from thor2_jax.recognition.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.types import PointClouds, Strips
@@ -32,12 +31,6 @@ __all__ = ["Objective", "entropy"]
 
 ROWS = 8
 """Instances that are described in one call."""
-
-TEMPERATURE = 2.0
-"""Temperature of the relaxed colour regions, units of HyAB; only gradients need it."""
-
-SMALL_COUNT = 1e-7
-"""Number of points that every colour region of every strip has in addition when gradients are computed."""
 
 MIN_KNOWN = 1e-3
 """Least probability of being known that is told from 0."""
@@ -76,7 +69,7 @@ class _Chunk(NamedTuple):
     known: jax.Array
 
 
-@partial(jax.jit, static_argnums=(3, 4, 5, 6))
+@partial(jax.jit, static_argnums=(3, 4, 5))
 def _uncertainties(
     parameters: jax.Array,
     chunk: _Chunk,
@@ -84,15 +77,13 @@ def _uncertainties(
     network: ColorNetwork,
     config: DescriptorConfig,
     classify: Classify,
-    relaxed: bool,
 ) -> jax.Array:
     """Return the uncertainty of each instance of a chunk [ROWS], 0 for padding."""
     count = chunk.weights.shape[1]
     colors = transform_colors(parameters, chunk.clouds.colors)
-    regions = _region_weights(colors, sets, relaxed)
+    regions = sets.weights[color_sets(colors, sets)]  # [B, N, R]
     shape = chunk.strips.color.shape
-    # A square root has no derivative at 0.
-    vectors = jnp.full((shape[0], shape[1] * shape[2], shape[3]), SMALL_COUNT if relaxed else 0.0)
+    vectors = jnp.zeros((shape[0], shape[1] * shape[2], shape[3]))
     add = jax.vmap(lambda sums, rows, values: sums.at[rows].add(values, mode="drop"))
     vectors = add(vectors, chunk.segment, jnp.repeat(regions, count, axis=0))
     described = dataclasses.replace(chunk.strips, color=vectors.reshape(shape))
@@ -101,28 +92,6 @@ def _uncertainties(
     probabilities = classify(oriented)
     known = jnp.clip(probabilities.sum(axis=1), MIN_KNOWN, 1)
     return (entropy(probabilities) - chunk.known * jnp.log(known)) * chunk.usable
-
-
-@partial(jax.jit, static_argnums=(3, 4, 5))
-def _gradient(
-    parameters: jax.Array,
-    chunk: _Chunk,
-    sets: RegionSets,
-    network: ColorNetwork,
-    config: DescriptorConfig,
-    classify: Classify,
-) -> tuple[jax.Array, jax.Array]:
-    """Return the sum of the relaxed uncertainties of a chunk, and its gradient [4]."""
-    return jax.value_and_grad(lambda p: _uncertainties(p, chunk, sets, network, config, classify, True).sum())(
-        parameters
-    )
-
-
-def _region_weights(colors: jax.Array, sets: RegionSets, relaxed: bool) -> jax.Array:
-    """Return the weights [B, N, R] of colours in the colour regions."""
-    if relaxed:
-        return jax.vmap(lambda each: soft_regions(each, sets, TEMPERATURE))(colors)
-    return sets.weights[color_sets(colors, sets)]
 
 
 class Objective:
@@ -159,9 +128,8 @@ class Objective:
         self._static = (network, self._config, classify)
 
     def _describe(self, instances: Sequence[PreparedInstance], count: int) -> _Chunk:
-        # Rows of padding repeat an instance, since an empty cloud has no gradient.
-        rows = [*instances, *[instances[0]] * (ROWS - len(instances))]
-        clouds = pack_instances(rows, ROWS, self._capacity or point_bucket(max(len(each.points) for each in instances)))
+        capacity = self._capacity or point_bucket(max(len(each.points) for each in instances))
+        clouds = pack_instances(instances, ROWS, capacity)
         aligned, weights = candidate_orientations(clouds, self._config, count)
         x, _, z = jnp.moveaxis(aligned.points, -1, 0)
         i, j = jax.vmap(partial(slices_and_strips, config=self._config))(x, z, aligned.mask)
@@ -175,16 +143,9 @@ class Objective:
         return _Chunk(clouds, aligned, weights, described, segment, usable, jnp.minimum(known, 1))
 
     def total(self, parameters: NDArray[np.floating]) -> float:
-        """Return the sum of the uncertainties for parameters [4] of a colour transform, with hard colour regions."""
+        """Return the sum of the uncertainties for parameters [4] of a colour transform."""
         values = [
-            _uncertainties(jnp.asarray(parameters, jnp.float32), chunk, self._sets, *self._static, False)
+            _uncertainties(jnp.asarray(parameters, jnp.float32), chunk, self._sets, *self._static)
             for chunk in self._chunks
         ]
         return float(sum(np.asarray(value).sum() for value in values))
-
-    def gradient(self, parameters: NDArray[np.floating]) -> tuple[float, NDArray[np.float64]]:
-        """Return the sum of the uncertainties with relaxed colour regions, and its gradient [4]."""
-        values = [
-            _gradient(jnp.asarray(parameters, jnp.float32), chunk, self._sets, *self._static) for chunk in self._chunks
-        ]
-        return float(sum(value for value, _ in values)), np.sum([np.asarray(g, np.float64) for _, g in values], axis=0)

@@ -54,8 +54,6 @@ def test_a_transform_follows_its_formula() -> None:
     np.testing.assert_allclose(WARM(colors), 255 * expected, atol=0.51)
     parameters = jnp.array(dataclasses.astuple(WARM))
     np.testing.assert_allclose(transform_colors(parameters, jnp.asarray(colors / 255)), expected, atol=1e-5)
-    gradient = jax.jacobian(transform_colors)(parameters, jnp.asarray(colors / 255, jnp.float32))
-    assert np.isfinite(gradient).all() and np.abs(gradient).max() > 0.1
 
 
 @pytest.mark.parametrize("stored", [{"gamma": float("nan")}, {"gain": 9.0}, {"gamma": "x"}, {"hue": 1.0}, [1]])
@@ -82,19 +80,6 @@ def test_the_objective_is_the_entropy_of_the_answers() -> None:
         expected = sum(scipy_entropy(row) for row in fused)
         # Colours are rounded to 8 bits before a camera's correction, not in between.
         assert objective.total(np.array(dataclasses.astuple(transform))) == pytest.approx(expected, rel=2e-3)
-
-
-def test_the_gradient_is_that_of_the_relaxed_objective() -> None:
-    network, config, classify = Recognizer(RUN).adaptation_criterion()
-    objective = Objective(instances(2), network, config, classify)
-    at, step = np.array([0.1, -0.1, 0.2, 0.03]), 2e-3
-    value, gradient = objective.gradient(at)
-    numeric = [
-        (objective.gradient(at + step * axis)[0] - objective.gradient(at - step * axis)[0]) / (2 * step)
-        for axis in np.eye(4)
-    ]
-    assert np.isfinite(value) and np.abs(gradient).max() > 1e-3
-    np.testing.assert_allclose(gradient, numeric, rtol=0.1, atol=0.02)
 
 
 def bright_is_known(oriented: OrientedDescriptors) -> jax.Array:
