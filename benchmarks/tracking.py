@@ -4,8 +4,9 @@ For each run, every frame from the fifth of a video on is answered alone and by 
 before it. The file has the steadiness and the accuracy over placements of both, and the placements whose accuracy is
 lower with tracks. Answers are the most probable names, also below the threshold of unknown objects.
 
-With --meshes DIR, scenes of these objects are rendered from six cameras around the table as well. For objects that are
-in the first view, and for those that are highly occluded there, the file has the accuracy by the number of views when
+With --meshes DIR, scenes of these objects are rendered from six cameras as well, all around the table or, with --step,
+so many degrees apart, as a robot may reach them. For objects that are in the first view, and for those that are highly
+occluded there, the file has the accuracy by the number of views when
 
 fused      the answers for the views are fused (`thor2_jax.tracking.fusion`), the views in the order around the table
 merged     the clouds of the views are merged in space and described as one
@@ -237,9 +238,10 @@ def main() -> None:
     parser.add_argument("--meshes", type=Path, metavar="DIR", help="meshes of the classes, for rendered scenes")
     parser.add_argument("--names", type=Path, metavar="FILE", help="as for thor2 render")
     parser.add_argument("--scenes", type=int, default=40, help="number of scenes, recognized by the first run")
+    parser.add_argument("--step", type=float, default=360 / VIEWS, metavar="DEGREES", help="angle between two cameras")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE.json")
     options = parser.parse_args()
-    job = {"model": list(map(str, options.model)), "frames": list(map(str, options.frames))}
+    job = {"model": list(map(str, options.model)), "frames": list(map(str, options.frames)), "step": options.step}
     try:
         stored: dict[str, Any] = {"job": job, "tracks": {}, "scenes": {}}
         if options.out.is_file():
@@ -263,7 +265,8 @@ def main() -> None:
             meshes = read_meshes(options.meshes, options.names, recognizer.run.classes)
             table = view_table(recognizer, meshes)
             for seed in missing:
-                views = compose_views(meshes, np.random.default_rng(seed), OBJECTS, VIEWS, CAMERA)
+                arc = np.radians(VIEWS * options.step)
+                views = compose_views(meshes, np.random.default_rng(seed), OBJECTS, VIEWS, CAMERA, arc)
                 stored["scenes"][str(seed)] = measure_scene(recognizer, views, table, seed)
                 stored["summary"] = summarize_scenes([row for rows in stored["scenes"].values() for row in rows])
                 write()

@@ -249,8 +249,9 @@ def compose_views(
     n_objects: int = 5,
     n_views: int = 4,
     camera: Camera = SCENE_CAMERA,
+    arc: float = 2 * np.pi,
 ) -> list[tuple[Scene, NDArray[np.float64]]]:
-    """Place random objects on a table and render them from cameras all around it, at equal angles.
+    """Place random objects on a table and render them from cameras around it, at equal angles.
 
     An object has the same label in all views. The first camera is that for which the objects are in line.
 
@@ -260,6 +261,7 @@ def compose_views(
         n_objects: number of objects in the scene, each a different one.
         n_views: number of cameras.
         camera: camera of the frames.
+        arc: angle between the first camera and the one that would follow the last, radians; by default all around.
 
     Returns:
         Scene and pose [4, 4] of each camera, from camera to world coordinates, as `compose_scene`.
@@ -273,7 +275,7 @@ def compose_views(
     azimuth, _ = _random_pose(rng)
     meshes = _arrange([objects[name] for name in names], np.array([np.cos(azimuth), np.sin(azimuth)]), 0.85, rng)
     views = []
-    for turn in np.arange(n_views) * 2 * np.pi / n_views:
+    for turn in np.arange(n_views) * arc / n_views:
         _, pose = _random_pose(rng, azimuth + turn)
         views.append((_render(names, meshes, pose, camera, 1.0, 0.08, rng), pose))
     return views
