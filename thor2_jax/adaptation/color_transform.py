@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
 from thor2_jax.recognition.prepared_instance import PreparedInstance
+from thor2_jax.recognition.run_record import stored_value
 
 __all__ = ["MAX_PARAMETER", "ColorTransform", "transform_colors"]
 
@@ -70,15 +71,7 @@ class ColorTransform:
         Raises:
             InputError: it is damaged.
         """
-        stored = record.get("color_transform")
-        if stored is None:
-            return None
-        try:
-            return cls(**stored)
-        except TypeError:
-            raise InputError(
-                f"color_transform is {stored!r}; expected gamma, gain, saturation and warmth: adapt the run again"
-            ) from None
+        return stored_value(cls, "color_transform", record, "adapt the run again")
 
     def __call__(self, colors: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Return the corrected colours of colours [..., 3] uint8 sRGB."""

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.special import expit, logit
 
 from thor2_jax.errors import InputError
+from thor2_jax.recognition.run_record import stored_value
 
 __all__ = ["Calibration", "answer_features"]
 
@@ -71,14 +72,7 @@ class Calibration:
         Raises:
             InputError: it is damaged.
         """
-        stored = record.get("calibration")
-        if stored is None:
-            return None
-        try:
-            return cls(**stored)
-        except TypeError:
-            names = ", ".join(field.name for field in dataclasses.fields(cls))
-            raise InputError(f"calibration is {stored!r}; expected {names}; train the run again") from None
+        return stored_value(cls, "calibration", record, "train the run again")
 
     def confidence(self, fused: Probabilities, embedding: Probabilities) -> NDArray[np.float64]:
         """Return the confidence [B] of the most probable class; the arguments are those of `answer_features`."""
