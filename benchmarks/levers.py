@@ -46,7 +46,7 @@ from training.evaluation.fusion import ALL_CLASSIFIERS, BOTH, EMBEDDED, GALLERY,
 from training.evaluation.runs import Run, load_runs
 from training.objects.meshes import find_meshes, read_names
 from training.readers.labelled import LabelledFrame
-from training.storage.jobs import check_same_job
+from training.storage.jobs import begin_job
 
 RENDER = "--azimuth-step 20 --polar-step 15 --copies 2 --illumination --occlusion --sensor --segmentation"
 """Default options of all renderings: the cameras and the first four augmentations of the default protocol."""
@@ -165,11 +165,7 @@ class Table:
             "render": options.render,
             "train": options.train,
         }
-        file = self.out / "job.json"
-        if file.is_file():
-            check_same_job(self.out, json.loads(file.read_bytes()), job)
-        self.out.mkdir(parents=True, exist_ok=True)
-        write_text(file, json.dumps(job, indent=1) + "\n")
+        begin_job(self.out, job)
 
     def cell(self, lever: Lever, seed: int) -> RunResults | None:
         """Return the results of a lever with a seed; None if they are still to be computed."""

@@ -36,7 +36,7 @@ from training.objects.meshes import find_meshes, read_names
 from training.readers.frames import FrameFolder
 from training.readers.labelled import LabelledFrames
 from training.readers.uwis import UWISOccluded
-from training.storage.jobs import check_same_job
+from training.storage.jobs import begin_job
 
 BASELINES = "thor,forest,pointnet,rcfusion-small,vit-cnn-small,rgbd-vit-small,templates"
 RENDER = "--azimuth-step 20 --polar-step 15 --illumination --occlusion --sensor --segmentation --registration --base"
@@ -81,11 +81,7 @@ class Comparison:
             "render": options.render,
             "train": options.train,
         }
-        file = self.out / "job.json"
-        if file.is_file():
-            check_same_job(self.out, json.loads(file.read_bytes()), job)
-        self.out.mkdir(parents=True, exist_ok=True)
-        write_text(file, json.dumps(job, indent=1) + "\n")
+        begin_job(self.out, job)
 
     def train(self, name: str) -> None:
         """Render the views of a dataset and train all its models, unless they are finished."""

@@ -7,11 +7,9 @@ hold the samples of some objects each, so that an interrupted sampling resumes a
 """
 
 import dataclasses
-import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import safetensors.numpy
@@ -19,7 +17,7 @@ import safetensors.numpy
 from colornet import ColorNetwork
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
 from thor2_jax.errors import InputError
-from thor2_jax.files import atomic_write, write_text
+from thor2_jax.files import atomic_write
 from thor2_jax.types import Cloud
 from training.augmentation.augmentations import Augmentations, augment
 from training.augmentation.base import Base
@@ -35,7 +33,7 @@ from training.objects.procedural import procedural_object
 from training.rendering.camera import Camera
 from training.rendering.ray_caster import RayCaster, render_view
 from training.rendering.view_sphere import camera_pose, random_angles
-from training.storage.jobs import check_same_job
+from training.storage.jobs import begin_job
 from training.storage.locks import locked
 from training.storage.workers import IN_PROCESS, WorkerPool
 from training.views.mesh_views import MIN_VIEW_POINTS, cloud_of
@@ -44,7 +42,6 @@ __all__ = ["AUGMENTATIONS", "ObjectSource", "ViewTask", "build_samples", "render
 
 OBJECTS_PER_SHARD = 32
 
-JOB = "job.json"
 
 AUGMENTATIONS = Augmentations(
     illumination=Illumination(),
@@ -148,7 +145,7 @@ def build_samples(
         "augmentations": AUGMENTATIONS.record(),
     }
     with locked(directory):
-        _begin(directory, job)
+        begin_job(directory, job)
         starts = range(0, len(sources), OBJECTS_PER_SHARD)
         files = {first: directory / f"{first:05d}.safetensors" for first in starts}
         missing = [first for first in starts if not files[first].is_file()]
@@ -166,15 +163,6 @@ def build_samples(
                     temporary.write_bytes(safetensors.numpy.save(arrays))
                 progress(min(first + OBJECTS_PER_SHARD, len(sources)), len(sources))
         return joined_samples([safetensors.numpy.load_file(file) for file in files.values()], config)
-
-
-def _begin(directory: Path, job: Mapping[str, Any]) -> None:
-    """Write the job to a new directory, or check that the directory is of this job."""
-    path = directory / JOB
-    if path.is_file():
-        check_same_job(directory, json.loads(path.read_text()), job)
-    else:
-        write_text(path, json.dumps(job, indent=1) + "\n")
 
 
 def _tasks(sources: Sequence[ObjectSource], starts: Sequence[int], views: int, seed: int) -> Iterator[ViewTask]:

@@ -1,4 +1,4 @@
-"""Comparison of job records: whether an output directory belongs to the job that is requested."""
+"""Job records: whether an output directory belongs to the job that is requested."""
 
 import itertools
 import json
@@ -7,11 +7,33 @@ from pathlib import Path
 from typing import Any
 
 from thor2_jax.errors import InputError
+from thor2_jax.files import write_text
 
-__all__ = ["check_same_job"]
+__all__ = ["begin_job", "check_same_job"]
+
+JOB_FILE = "job.json"
 
 MAX_SHOWN = 100
 """Characters of a value that an error message shows."""
+
+
+def begin_job(directory: Path, job: Mapping[str, Any]) -> None:
+    """Write the record of a job to a directory, or check that the directory is of this job.
+
+    Args:
+        directory: output directory; it is created unless it exists.
+        job: the record, as JSON can hold it.
+
+    Raises:
+        InputError: the directory is of another job.
+        OSError: the record cannot be read or written.
+    """
+    file = directory / JOB_FILE
+    if file.is_file():
+        check_same_job(directory, json.loads(file.read_bytes()), job)
+        return
+    directory.mkdir(parents=True, exist_ok=True)
+    write_text(file, json.dumps(job, indent=1) + "\n")
 
 
 def check_same_job(directory: Path, stored: Mapping[str, Any], requested: Mapping[str, Any]) -> None:

@@ -1,12 +1,13 @@
-"""Comparison of job records."""
+"""Job records."""
 
+import json
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from thor2_jax.errors import InputError
-from training.storage.jobs import check_same_job
+from training.storage.jobs import begin_job, check_same_job
 
 JOB: dict[str, Any] = {"seed": 0, "steps": [5.0, 15.0], "camera": {"width": 800}, "variations": None}
 
@@ -36,3 +37,13 @@ def test_the_first_difference_is_named(changes: dict[str, Any], difference: str)
 def test_a_missing_field_is_a_difference() -> None:
     with pytest.raises(InputError, match="folds 5, not null"):
         check_same_job(Path("run"), JOB | {"folds": 5}, JOB)
+
+
+def test_a_directory_begins_with_one_job(tmp_path: Path) -> None:
+    out = tmp_path / "a" / "b"
+    begin_job(out, JOB)
+    begin_job(out, JOB)
+    assert json.loads((out / "job.json").read_bytes()) == JOB
+    with pytest.raises(InputError, match="seed 0, not 1"):
+        begin_job(out, JOB | {"seed": 1})
+    assert json.loads((out / "job.json").read_bytes()) == JOB
