@@ -8,7 +8,7 @@ import struct
 import subprocess
 import sys
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,7 @@ from thor2_jax.recognition.classifier import FEATURES, MLP
 from thor2_jax.recognition.run_directory import TrainedRun, input_size
 from training.objects.builtin_objects import builtin_objects
 from training.rendering.camera import Camera, RenderedView
+from training.rendering.scenes import compose_scene
 
 SMALL_CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=2, n_strips=5, image_size=8)
 """A descriptor that compiles quickly."""
@@ -127,6 +128,11 @@ def run_thor2(*arguments: object) -> int:
     return 0
 
 
+def json_lines(text: str) -> list[dict[str, Any]]:
+    """Return the values of a JSON Lines text."""
+    return [json.loads(line) for line in text.splitlines()]
+
+
 def free_port() -> int:
     """Return a TCP port that no process listens on."""
     with socket.socket() as free:
@@ -194,6 +200,38 @@ def full_image(view: RenderedView, camera: Camera) -> tuple[NDArray[np.uint8], N
     return color, depth
 
 
+def write_frame_files(folder: Path, frame: thor2.RGBDFrame, names: Mapping[int, str] | None = None) -> Path:
+    """Write a frame as `FrameFolder` reads it: its mask if it has labels, and labels.json if names are given."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "color.png").write_bytes(encode_image(frame.color))
+    (folder / "depth.png").write_bytes(encode_image(frame.depth.astype(np.uint16)))
+    if frame.labels is not None:
+        (folder / "mask.png").write_bytes(encode_image(frame.labels.astype(np.uint8)))
+    k = frame.intrinsics
+    (folder / "intrinsics.json").write_text(json.dumps({"fx": k.fx, "fy": k.fy, "cx": k.cx, "cy": k.cy}))
+    if names is not None:
+        (folder / "labels.json").write_text(json.dumps({"labels": {str(label): name for label, name in names.items()}}))
+    return folder
+
+
+def write_scene(folder: Path, names: Sequence[str], seed: int) -> Path:
+    """Write a labelled frame of built-in objects on a table."""
+    objects = builtin_objects()
+    scene = compose_scene({name: objects[name] for name in names}, np.random.default_rng(seed), n_objects=len(names))
+    return write_frame_files(folder, scene.frame, scene.truth)
+
+
+def small_frame(seed: int = 0) -> thor2.RGBDFrame:
+    """Return a frame of 120 x 90 pixels with the instances 1 and 4, in random colours."""
+    rng = np.random.default_rng(seed)
+    labels = np.zeros((90, 120), np.uint8)
+    labels[10:50, 10:50], labels[30:80, 60:110] = 1, 4
+    depth = np.full(labels.shape, 900, np.uint16)
+    depth[labels > 0] = 700 + rng.integers(0, 30, (labels > 0).sum())
+    color = rng.integers(0, 256, (90, 120, 3), dtype=np.uint8)
+    return thor2.RGBDFrame(color, depth, labels, thor2.Intrinsics(120.0, 120.0, 60.0, 45.0))
+
+
 FRAME_COLORS = {"brick": (220, 30, 30), "book": (30, 40, 220), "leaf": (60, 200, 60)}
 
 
@@ -207,12 +245,8 @@ def write_frame(directory: Path, objects: dict[int, str], seed: int = 0) -> Path
         mask[window] = label
         color[window] = np.clip(np.array(FRAME_COLORS[name]) + rng.integers(-9, 10, (*mask[window].shape, 3)), 0, 255)
     depth = np.broadcast_to(600 + np.arange(320) // 2, (240, 320)).astype(np.uint16)
-    directory.mkdir(parents=True)
-    for name, image in (("color", color), ("depth", depth), ("mask", mask)):
-        Image.fromarray(image).save(directory / f"{name}.png")
-    (directory / "intrinsics.json").write_text('{"fx": 600, "fy": 600, "cx": 159.5, "cy": 119.5}')
-    (directory / "labels.json").write_text(json.dumps({"labels": {str(k): name for k, name in objects.items()}}))
-    return directory
+    frame = thor2.RGBDFrame(color, depth, mask, thor2.Intrinsics(600.0, 600.0, 159.5, 119.5))
+    return write_frame_files(directory, frame, objects)
 
 
 def frame_options(folder: Path, **changes: object) -> list[object]:

@@ -7,8 +7,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from helpers import encode_image, untrained_run
+from helpers import untrained_run, write_frame_files
 
+import thor2_jax as thor2
 from benchmarks import cameras
 from benchmarks.simulated_cameras import CHOOSE
 from thor2_jax.errors import InputError
@@ -29,21 +30,14 @@ class ToyRun(NamedTuple):
 
 def write_frame(folder: Path, names: dict[int, str], seed: int = 0) -> Path:
     """Write a frame of blocks on a table, a block for each name."""
-    folder.mkdir(parents=True)
     rng = np.random.default_rng(seed)
     labels, depth = np.zeros((48, 64), np.uint8), np.full((48, 64), 900, np.uint16)
     for k, label in enumerate(names):
         labels[8:40, 4 + 20 * k : 18 + 20 * k] = label
     depth[labels > 0] = rng.integers(780, 800, (labels > 0).sum())
-    for name, image in (
-        ("color", rng.integers(0, 256, (48, 64, 3), dtype=np.uint8)),
-        ("depth", depth),
-        ("mask", labels),
-    ):
-        (folder / f"{name}.png").write_bytes(encode_image(image))
-    (folder / "intrinsics.json").write_text('{"fx": 150, "fy": 150, "cx": 32, "cy": 24}')
-    (folder / "labels.json").write_text(json.dumps({"labels": names}))
-    return folder
+    color = rng.integers(0, 256, (48, 64, 3), dtype=np.uint8)
+    frame = thor2.RGBDFrame(color, depth, labels, thor2.Intrinsics(150.0, 150.0, 32.0, 24.0))
+    return write_frame_files(folder, frame, names)
 
 
 def test_groups_are_directories_of_frames(tmp_path: Path) -> None:

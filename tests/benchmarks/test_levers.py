@@ -5,16 +5,12 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
-from helpers import write_meshes
-from PIL import Image
+from helpers import write_meshes, write_scene
 
 from benchmarks import levers
 from benchmarks.levers import LEVERS, Lever
 from training.evaluation.fusion import RULES
-from training.objects.builtin_objects import builtin_objects
-from training.rendering.scenes import compose_scene
 
 NAMES = ("soup_can_red", "cereal_box_blue")
 
@@ -62,18 +58,9 @@ def test_bad_arguments_write_nothing(
 @pytest.fixture
 def given(tmp_path: Path) -> list[Any]:
     """Return options with the meshes and two frames of two built-in objects, and a training of a few seconds."""
-    objects = builtin_objects()
     meshes, frames = write_meshes(tmp_path / "meshes", NAMES), tmp_path / "frames"
     for seed in range(2):
-        shown = (*NAMES, "mug_white")
-        scene = compose_scene({name: objects[name] for name in shown}, np.random.default_rng(seed), n_objects=3)
-        folder = frames / f"{seed}"
-        folder.mkdir(parents=True)
-        for name, image in (("color", scene.frame.color), ("depth", scene.frame.depth), ("mask", scene.frame.labels)):
-            Image.fromarray(np.asarray(image)).save(folder / f"{name}.png")
-        k = scene.frame.intrinsics
-        (folder / "intrinsics.json").write_text(json.dumps({"fx": k.fx, "fy": k.fy, "cx": k.cx, "cy": k.cy}))
-        (folder / "labels.json").write_text(json.dumps({"labels": {str(i): n for i, n in scene.truth.items()}}))
+        write_scene(frames / f"{seed}", (*NAMES, "mug_white"), seed)
     tiny = (
         "--render=--azimuth-step 90 --polar-step 90 --registration --base --copies 1",
         "--train=--epochs 1 --batch-size 8 --classifiers tops,tops2 --embedding 0",

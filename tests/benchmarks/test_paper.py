@@ -4,17 +4,13 @@ import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
-from helpers import write_meshes
-from PIL import Image
+from helpers import write_meshes, write_scene
 
 from benchmarks import paper
 from benchmarks.paper_measurement import CLAIMS
 from training.baselines.names import TITLES
 from training.evaluation.fusion import fusions
-from training.objects.builtin_objects import builtin_objects
-from training.rendering.scenes import compose_scene
 
 NAMES = ("soup_can_red", "cereal_box_blue")
 
@@ -45,17 +41,9 @@ def test_bad_arguments_write_nothing(
 @pytest.fixture
 def given(tmp_path: Path) -> list[str]:
     """Return options with two frames of two built-in objects, which also join the views."""
-    objects = builtin_objects()
     meshes, frames = write_meshes(tmp_path / "meshes", NAMES), tmp_path / "frames"
     for seed in range(2):
-        scene = compose_scene({name: objects[name] for name in NAMES}, np.random.default_rng(seed), n_objects=2)
-        folder = frames / f"{seed}"
-        folder.mkdir(parents=True)
-        for name, image in (("color", scene.frame.color), ("depth", scene.frame.depth), ("mask", scene.frame.labels)):
-            Image.fromarray(np.asarray(image)).save(folder / f"{name}.png")
-        k = scene.frame.intrinsics
-        (folder / "intrinsics.json").write_text(json.dumps({"fx": k.fx, "fy": k.fy, "cx": k.cx, "cy": k.cy}))
-        (folder / "labels.json").write_text(json.dumps({"labels": {str(i): n for i, n in scene.truth.items()}}))
+        write_scene(frames / f"{seed}", NAMES, seed)
     values = {
         "meshes": meshes, "frames": frames, "real": frames, "baselines": "thor,forest,rgbd-vit-small,templates",
         "render": "--azimuth-step 90 --polar-step 90", "train": "--epochs 1 --batch-size 8", "folds": 1, "workers": 1,

@@ -5,16 +5,15 @@ import functools
 import http.client
 import io
 import json
-import shutil
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
-from playwright.sync_api import Browser, expect, sync_playwright
+from playwright.sync_api import Browser, expect
 from recording_files import table_frame
 
 import thor2_jax as thor2
@@ -164,15 +163,6 @@ def test_server_serves_its_files_and_events_only() -> None:
         assert get(url, "/", "localhost:80")[0] == 200
         with pytest.raises(InputError, match="port is"), serve_live(broadcast, port=int(url.rpartition(":")[2])):
             pass
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    chromium = shutil.which("chromium")
-    if chromium is None:
-        pytest.skip("chromium is not installed (apt-get install chromium)")
-    with sync_playwright() as playwright:
-        yield playwright.chromium.launch(executable_path=chromium)
 
 
 @pytest.mark.parametrize("width", [1280, 390])

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import frame_options, run_thor2, write_meshes
+from helpers import frame_options, run_thor2, write_frame_files, write_meshes
 from PIL import Image
 
 from thor2_jax.gallery.embedding import Embedding, load_default
@@ -36,16 +36,7 @@ def scene() -> Scene:
 @pytest.fixture(scope="module")
 def images(tmp_path_factory: pytest.TempPathFactory, scene: Scene) -> Path:
     """Return a directory with the files of the scene, as `recognize` and `evaluate frames` read them."""
-    folder = tmp_path_factory.mktemp("frames") / "one"
-    folder.mkdir()
-    frame = scene.frame
-    Image.fromarray(frame.color).save(folder / "color.png")
-    Image.fromarray(frame.depth.astype(np.uint16)).save(folder / "depth.png")
-    Image.fromarray(frame.labels.astype(np.uint8)).save(folder / "mask.png")
-    k = frame.intrinsics
-    (folder / "intrinsics.json").write_text(json.dumps({"fx": k.fx, "fy": k.fy, "cx": k.cx, "cy": k.cy}))
-    (folder / "labels.json").write_text(json.dumps({"labels": {str(i): n for i, n in scene.truth.items()}}))
-    return folder
+    return write_frame_files(tmp_path_factory.mktemp("frames") / "one", scene.frame, scene.truth)
 
 
 @pytest.fixture

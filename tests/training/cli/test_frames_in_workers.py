@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import encode_image, run_thor2, untrained_run
+from helpers import run_thor2, small_frame, untrained_run, write_frame_files
 
 import thor2_jax as thor2
 from thor2_jax.errors import InputError
@@ -38,25 +38,11 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return directory
 
 
-def write_frame(folder: Path, seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    labels = np.zeros((90, 120), np.uint8)
-    labels[10:50, 10:50], labels[30:80, 60:110] = 1, 4
-    depth = np.full(labels.shape, 900, np.uint16)
-    depth[labels > 0] = 700 + rng.integers(0, 30, (labels > 0).sum())
-    folder.mkdir(parents=True)
-    (folder / "color.png").write_bytes(encode_image(rng.integers(0, 256, (90, 120, 3), dtype=np.uint8)))
-    (folder / "depth.png").write_bytes(encode_image(depth))
-    (folder / "mask.png").write_bytes(encode_image(labels))
-    (folder / "intrinsics.json").write_text(json.dumps({"fx": 120.0, "fy": 120.0, "cx": 60.0, "cy": 45.0}))
-    (folder / "labels.json").write_text(json.dumps({"labels": {"1": "mug", "4": "bowl"}}))
-
-
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("frames")
     for number in range(N_FRAMES):
-        write_frame(folder / f"{number:03d}", number)
+        write_frame_files(folder / f"{number:03d}", small_frame(number), {1: "mug", 4: "bowl"})
     return folder
 
 

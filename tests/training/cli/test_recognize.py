@@ -4,60 +4,30 @@ import csv
 import json
 import shutil
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from helpers import encode_image, frame_options, run_thor2, untrained_run
+from helpers import encode_image, frame_options, json_lines, run_thor2, small_frame, write_frame_files
 from PIL import Image
-
-from thor2_jax.config import DescriptorConfig
-from thor2_jax.recognition.run_directory import save_run
+from recording_files import table_frame
 
 CAMERA = {"fx": 120.0, "fy": 120.0, "cx": 60.0, "cy": 45.0}
 
 
-@pytest.fixture(scope="module")
-def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    directory = tmp_path_factory.mktemp("run")
-    config = DescriptorConfig(homology="closed_form")
-    save_run(untrained_run(("bowl", "mug", "plate"), config=config), directory)
-    return directory
-
-
-def write_frame(folder: Path, seed: int = 0) -> Path:
-    """Write a frame with the instances 1 and 4."""
-    rng = np.random.default_rng(seed)
-    labels = np.zeros((90, 120), np.uint8)
-    labels[10:50, 10:50], labels[30:80, 60:110] = 1, 4
-    depth = np.full(labels.shape, 900, np.uint16)
-    depth[labels > 0] = 700 + rng.integers(0, 30, (labels > 0).sum())
-    folder.mkdir(parents=True)
-    (folder / "color.png").write_bytes(encode_image(rng.integers(0, 256, (90, 120, 3), dtype=np.uint8)))
-    (folder / "depth.png").write_bytes(encode_image(depth))
-    (folder / "mask.png").write_bytes(encode_image(labels))
-    (folder / "intrinsics.json").write_text(json.dumps(CAMERA))
-    return folder
-
-
-def lines_of(text: str) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in text.splitlines()]
-
-
 def test_json_of_one_frame(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    folder = write_frame(tmp_path / "one")
+    folder = write_frame_files(tmp_path / "one", small_frame())
     assert run_thor2("recognize", "--model", model, *frame_options(folder), "--json", "--out", tmp_path / "out") == 0
-    (answer,) = lines_of(capfd.readouterr().out)
+    (answer,) = json_lines(capfd.readouterr().out)
     assert [one["label"] for one in answer["instances"]] == [1, 4]
     assert all(one["name"] in ("bowl", "mug", "plate") for one in answer["instances"])
     assert answer["instances"] == json.loads((tmp_path / "out" / "recognition.json").read_text())
     assert run_thor2("recognize", "--model", model, *frame_options(folder), "--json", "--unknown-below", 1) == 0
-    (answer,) = lines_of(capfd.readouterr().out)
+    (answer,) = json_lines(capfd.readouterr().out)
     assert [one["name"] for one in answer["instances"]] == [None, None]
 
 
 def test_other_formats_give_the_same_answers(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    folder = write_frame(tmp_path / "one")
+    folder = write_frame_files(tmp_path / "one", small_frame())
     matrix = np.array([[120, 0, 60], [0, 120, 45], [0, 0, 1.0]])
     np.savetxt(tmp_path / "K.txt", matrix)
     (tmp_path / "camera_info.yaml").write_text(
@@ -74,7 +44,7 @@ def test_other_formats_give_the_same_answers(model: Path, tmp_path: Path, capfd:
         ({"depth": tmp_path / "tenths.png"}, ["--depth-scale", 10_000]),
     ):
         assert run_thor2("recognize", "--model", model, *frame_options(folder, **changes), *options, "--json") == 0
-        answers += [line["instances"] for line in lines_of(capfd.readouterr().out)]
+        answers += [line["instances"] for line in json_lines(capfd.readouterr().out)]
     for other in answers[1:]:
         for one, expected in zip(other, answers[0], strict=True):
             assert one["name"] == expected["name"] and one["points_used"] == expected["points_used"]
@@ -85,7 +55,7 @@ def test_one_failing_frame_does_not_lose_the_others(
     model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     for number in range(1, 5):
-        write_frame(tmp_path / "frames" / f"00000{number}", number)
+        write_frame_files(tmp_path / "frames" / f"00000{number}", small_frame(number))
     (tmp_path / "frames" / "000002" / "depth.png").write_bytes(b"damaged")
     (tmp_path / "frames" / "000003" / "intrinsics.json").unlink()
     outputs = ("--out", tmp_path / "out", "--coco", tmp_path / "coco.json", "--bop", tmp_path / "bop.csv")
@@ -93,7 +63,7 @@ def test_one_failing_frame_does_not_lose_the_others(
     for _ in range(2):  # it may be repeated
         assert run_thor2(*command) == 2
         out, err = capfd.readouterr()
-        answers = {line["frame"]: line for line in lines_of(out)}
+        answers = {line["frame"]: line for line in json_lines(out)}
         assert list(answers) == ["000001", "000002", "000003", "000004"]
         assert "depth" in answers["000002"]["error"] and "intrinsics.json" in answers["000003"]["error"]
         assert all([one["label"] for one in answers[n]["instances"]] == [1, 4] for n in ("000001", "000004"))
@@ -112,7 +82,8 @@ def test_one_failing_frame_does_not_lose_the_others(
 
 
 def test_several_folders_and_tables(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    one, two = write_frame(tmp_path / "one"), write_frame(tmp_path / "more" / "deep" / "two", 1)
+    one = write_frame_files(tmp_path / "one", small_frame())
+    two = write_frame_files(tmp_path / "more" / "deep" / "two", small_frame(1))
     shutil.move(two / "mask.png", two / "labels.png")
     (tmp_path / "names.json").write_text(json.dumps({"14": "mug"}))
     outputs = ("--coco", tmp_path / "coco.json", "--names", tmp_path / "names.json", "--out", tmp_path / "out")
@@ -147,7 +118,7 @@ def test_invalid_arguments(
     model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], arguments: list[str], expected: str
 ) -> None:
     (tmp_path / "empty").mkdir()
-    write_frame(tmp_path / "frames" / "one")
+    write_frame_files(tmp_path / "frames" / "one", small_frame())
     (tmp_path / "frames" / "names.json").write_text("{}")
     given = [text.format(frames=tmp_path / "frames", empty=tmp_path / "empty") for text in arguments]
     assert run_thor2("recognize", "--model", model, *given) == 2
@@ -155,25 +126,13 @@ def test_invalid_arguments(
     assert expected in err and err.startswith("error: ") and err.count("\n") == 1
 
 
-def write_table_frame(folder: Path) -> Path:
-    """Write a frame without labels: two boxes on a table that is seen from straight above."""
-    color, depth = np.full((240, 320, 3), (150, 120, 90), np.uint8), np.full((240, 320), 900, np.uint16)
-    for columns, shade in ((slice(60, 110), (190, 30, 40)), (slice(180, 250), (30, 60, 190))):
-        color[80:150, columns], depth[80:150, columns] = shade, 800
-    folder.mkdir(parents=True)
-    (folder / "color.png").write_bytes(encode_image(color))
-    (folder / "depth.png").write_bytes(encode_image(depth))
-    (folder / "intrinsics.json").write_text(json.dumps({"fx": 290.0, "fy": 290.0, "cx": 160.0, "cy": 120.0}))
-    return folder
-
-
 def test_frames_without_labels_are_segmented(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    folder = write_table_frame(tmp_path / "frames" / "a")
+    folder = write_frame_files(tmp_path / "frames" / "a", table_frame())
     files = frame_options(folder)
     del files[files.index("--labels") : files.index("--labels") + 2]
     for given in (files, [tmp_path / "frames"]):
         assert run_thor2("recognize", "--model", model, *given, "--segment", "table", "--json") == 0
-        (answer,) = lines_of(capfd.readouterr().out)
+        (answer,) = json_lines(capfd.readouterr().out)
         assert [one["label"] for one in answer["instances"]] == [1, 2]
     assert run_thor2("recognize", "--model", model, *files) == 2
     assert "--segment" in capfd.readouterr().err
@@ -184,15 +143,15 @@ def test_frames_without_labels_are_segmented(model: Path, tmp_path: Path, capfd:
 def test_labels_are_replaced_where_a_folder_is_segmented(
     model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    folder = write_table_frame(tmp_path / "one")
+    folder = write_frame_files(tmp_path / "one", table_frame())
     (folder / "mask.png").write_bytes(encode_image(np.full((240, 320), 9, np.uint8)))
     assert run_thor2("recognize", "--model", model, folder, "--segment", "table", "--json") == 0
-    (answer,) = lines_of(capfd.readouterr().out)
+    (answer,) = json_lines(capfd.readouterr().out)
     assert [one["label"] for one in answer["instances"]] == [1, 2]
 
 
 def test_labels_and_segment_together(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    folder = write_frame(tmp_path / "one")
+    folder = write_frame_files(tmp_path / "one", small_frame())
     assert (
         run_thor2("recognize", "--model", model, *frame_options(folder), "--segment", "table", "--out", tmp_path / "o")
         == 2
@@ -203,7 +162,7 @@ def test_labels_and_segment_together(model: Path, tmp_path: Path, capfd: pytest.
 
 
 def test_an_unknown_segmenter(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    folder = write_frame(tmp_path / "one")
+    folder = write_frame_files(tmp_path / "one", small_frame())
     assert run_thor2("recognize", "--model", model, folder, "--segment", "sam", "--out", tmp_path / "o") == 2
     error = capfd.readouterr().err
     assert error.startswith("error: segmenter is 'sam'") and error.count("\n") == 1
@@ -211,12 +170,12 @@ def test_an_unknown_segmenter(model: Path, tmp_path: Path, capfd: pytest.Capture
 
 
 def test_track_gives_an_object_one_name(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    frames = [write_frame(tmp_path / "video" / f"{number}", number) for number in range(3)]
+    frames = [write_frame_files(tmp_path / "video" / f"{number}", small_frame(number)) for number in range(3)]
     poses = tmp_path / "poses.json"
     poses.write_text(json.dumps({frame.name: np.eye(4).tolist() for frame in frames}))
     command = ("recognize", "--model", model, tmp_path / "video", "--track", "--poses", poses)
     assert run_thor2(*command, "--json", "--out", tmp_path / "out") == 0
-    answers = lines_of(capfd.readouterr().out)
+    answers = json_lines(capfd.readouterr().out)
     assert [answer["frame"] for answer in answers] == ["0", "1", "2"]
     assert [[one["track"] for one in answer["instances"]] for answer in answers] == [[1, 2]] * 3
     for index in range(2):
@@ -228,7 +187,7 @@ def test_track_gives_an_object_one_name(model: Path, tmp_path: Path, capfd: pyte
 
 
 def test_bad_sequences_write_nothing(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    frames = [write_frame(tmp_path / "video" / f"{number}", number) for number in range(2)]
+    frames = [write_frame_files(tmp_path / "video" / f"{number}", small_frame(number)) for number in range(2)]
     poses, out = tmp_path / "poses.json", tmp_path / "out"
     command = ("recognize", "--model", model, tmp_path / "video", "--out", out)
     cases: list[tuple[object, str]] = [

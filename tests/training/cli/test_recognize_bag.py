@@ -1,36 +1,21 @@
 """`thor2 recognize --bag`, end to end; the run's weights are random."""
 
 import io
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from helpers import encode_image, run_thor2, untrained_run
+from helpers import json_lines, run_thor2, write_frame_files
 from PIL import Image
 from recording_files import COLOR, PERIOD, START, bag_writer, image, table_frame, write_recording
 from rosbags.highlevel import AnyReader
 
-from thor2_jax.config import DescriptorConfig
 from thor2_jax.recognition.frames import read_frame
-from thor2_jax.recognition.run_directory import save_run
 from thor2_jax.segmentation.segmenters import segment
 
 FRAMES = [table_frame(shift) for shift in (0, 3, 6)]
 REAL = Path(__file__).parents[4] / "shared" / "data" / "frames" / "ycbv_real_0000"
-
-
-@pytest.fixture(scope="module")
-def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    directory = tmp_path_factory.mktemp("run")
-    config = DescriptorConfig(homology="closed_form")
-    save_run(untrained_run(("bowl", "mug", "plate"), config=config), directory)
-    return directory
-
-
-def lines_of(text: str) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in text.splitlines()]
 
 
 def messages_of(path: Path) -> dict[str, list[tuple[int, Any]]]:
@@ -48,7 +33,7 @@ def test_detections_are_read_back(
 ) -> None:
     path = write_recording(tmp_path / name, FRAMES, is_compressed=name == "a.mcap")
     assert run_thor2("recognize", "--model", model, "--bag", path, "--out-bag", tmp_path / out) == 0
-    lines = lines_of(capfd.readouterr().out)
+    lines = json_lines(capfd.readouterr().out)
     assert [line["frame"] for line in lines] == [f"1700000000.{k * PERIOD:09d}" for k in range(3)]
     messages = messages_of(tmp_path / out)
     assert set(messages) == {"/thor2/detections", "/thor2/overlay/compressed"}
@@ -79,7 +64,7 @@ def test_every_second_frame_and_pictures(model: Path, tmp_path: Path, capfd: pyt
     path = write_recording(tmp_path / "a.mcap", FRAMES)
     command = ("recognize", "--model", model, "--bag", path, "--every", 2, "--out", tmp_path / "out")
     assert run_thor2(*command, "--unknown-below", 1) == 0
-    lines = lines_of(capfd.readouterr().out)
+    lines = json_lines(capfd.readouterr().out)
     assert [line["frame"] for line in lines] == ["1700000000.000000000", "1700000000.066666666"]
     assert all(one["name"] is None for line in lines for one in line["instances"])
     assert sorted(one.name for one in (tmp_path / "out").iterdir()) == [line["frame"] for line in lines]
@@ -89,7 +74,7 @@ def test_tracks_are_the_ids_of_detections(model: Path, tmp_path: Path, capfd: py
     path = write_recording(tmp_path / "a.mcap", FRAMES)
     command = ("recognize", "--model", model, "--bag", path, "--track", "--out-bag", tmp_path / "out")
     assert run_thor2(*command) == 0
-    lines = lines_of(capfd.readouterr().out)
+    lines = json_lines(capfd.readouterr().out)
     assert [[one["track"] for one in line["instances"]] for line in lines] == [[1, 2]] * 3
     assert [one["frames"] for one in lines[2]["instances"]] == [3, 3]
     for _, array in messages_of(tmp_path / "out")["/thor2/detections"]:
@@ -100,11 +85,7 @@ def test_rerun_files_of_bags_and_folders(model: Path, tmp_path: Path, capfd: pyt
     pytest.importorskip("rerun", reason="rerun-sdk is not installed (pip install rerun-sdk; 660 MB)")
     path = write_recording(tmp_path / "a.mcap", FRAMES)
     assert run_thor2("recognize", "--model", model, "--bag", path, "--rerun", tmp_path / "bag.rrd") == 0
-    folder = tmp_path / "frames" / "0"
-    folder.mkdir(parents=True)
-    (folder / "color.png").write_bytes(encode_image(FRAMES[0].color))
-    (folder / "depth.png").write_bytes(encode_image(FRAMES[0].depth))
-    (folder / "intrinsics.json").write_text(json.dumps({"fx": 290.0, "fy": 290.0, "cx": 160.0, "cy": 120.0}))
+    write_frame_files(tmp_path / "frames" / "0", FRAMES[0])
     command = ("recognize", "--model", model, tmp_path / "frames", "--segment", "table")
     assert run_thor2(*command, "--rerun", tmp_path / "folder.rrd") == 0
     assert f"written to {tmp_path / 'folder.rrd'}" in capfd.readouterr().out
@@ -124,7 +105,7 @@ def test_a_frame_that_fails_does_not_stop_the_others(
     command = ("recognize", "--model", model, "--bag", path, "--intrinsics", tmp_path / "K.txt")
     assert run_thor2(*command, "--out-bag", tmp_path / "out.mcap") == 2
     out, err = capfd.readouterr()
-    assert ["error" in line for line in lines_of(out)] == [False, True, False]
+    assert ["error" in line for line in json_lines(out)] == [False, True, False]
     assert err.splitlines()[-1].startswith("error: 1 of 3 frames") and "failed: 1700000000.033333333" in err
     assert len(messages_of(tmp_path / "out.mcap")["/thor2/detections"]) == 2
 
@@ -134,7 +115,7 @@ def test_what_was_done_before_the_end_is_kept(model: Path, tmp_path: Path, capfd
     path.write_bytes(path.read_bytes()[: -(10**6)])
     assert run_thor2("recognize", "--model", model, "--bag", path, "--out-bag", tmp_path / "out.mcap") == 2
     out, err = capfd.readouterr()
-    n_frames = len(lines_of(out))
+    n_frames = len(json_lines(out))
     assert 0 < n_frames < 8 and "mcap recover" in err and err.count("\n") == 1
     assert f"{n_frames} frames were recognized before and are in {tmp_path / 'out.mcap'}" in err
     assert len(messages_of(tmp_path / "out.mcap")["/thor2/detections"]) == n_frames
@@ -187,9 +168,9 @@ def test_recordings_of_real_frames(model: Path, tmp_path: Path, capfd: pytest.Ca
     frames = [read_frame(**one) for one in files]
     path = write_recording(tmp_path / name, frames)
     assert run_thor2("recognize", "--model", model, "--bag", path, "--out-bag", tmp_path / "out.mcap") == 0
-    from_bag = [line["instances"] for line in lines_of(capfd.readouterr().out)]
+    from_bag = [line["instances"] for line in json_lines(capfd.readouterr().out)]
     assert run_thor2("recognize", "--model", model, *folders, "--segment", "table", "--json") == 0
-    from_files = [line["instances"] for line in lines_of(capfd.readouterr().out)]
+    from_files = [line["instances"] for line in json_lines(capfd.readouterr().out)]
     assert [[one["label"] for one in answer] for answer in from_bag] == [
         sorted(set(np.unique(segment(frame)).tolist()) - {0}) for frame in frames
     ]

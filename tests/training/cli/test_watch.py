@@ -12,33 +12,20 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers import encode_image, run_thor2, untrained_run
+from helpers import run_thor2, write_frame_files
 from recording_files import table_frame, write_recording
 
-from thor2_jax.config import DescriptorConfig
-from thor2_jax.recognition.run_directory import save_run
 from thor2_jax.watch.broadcast import Broadcast
 
 FRAMES = [table_frame(shift) for shift in (0, 3, 6)]
-
-
-@pytest.fixture(scope="module")
-def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    directory = tmp_path_factory.mktemp("run")
-    config = DescriptorConfig(homology="closed_form")
-    save_run(untrained_run(("bowl", "mug", "plate"), config=config), directory)
-    return directory
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """Two frames without labels and one that is damaged."""
     for k, frame in enumerate(FRAMES):
-        one = tmp_path / "frames" / f"{k}"
-        one.mkdir(parents=True)
-        (one / "color.png").write_bytes(encode_image(frame.color))
-        (one / "depth.png").write_bytes(encode_image(frame.depth) if k < 2 else b"damaged")
-        (one / "intrinsics.json").write_text(json.dumps({"fx": 290.0, "fy": 290.0, "cx": 160.0, "cy": 120.0}))
+        write_frame_files(tmp_path / "frames" / f"{k}", frame)
+    (tmp_path / "frames" / "2" / "depth.png").write_bytes(b"damaged")
     return tmp_path / "frames"
 
 
