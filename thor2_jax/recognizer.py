@@ -16,59 +16,44 @@ Its scores name an instance alone, or combined with the classifiers (`ClassUnion
 frames are fused by a `Tracker` (`Recognizer.track`).
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any
 
 import jax
 import numpy as np
-from flax import nnx
 from numpy.typing import NDArray
 
 from colornet import ColorNetwork
 from thor2_jax.adaptation.answers import fused_classifier, gallery_classifier
 from thor2_jax.adaptation.color_transform import ColorTransform
-from thor2_jax.adaptation.estimate import Adaptation, Report, estimate_transform
+from thor2_jax.adaptation.estimate import Adaptation, Report, camera_instances, estimate_transform
 from thor2_jax.capacity import BATCH_BUCKETS, POINT_BUCKETS, batch_bucket, point_bucket
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.orientations import OrientedDescriptors, describe_orientations
-from thor2_jax.errors import InputError, with_context
+from thor2_jax.errors import InputError
 from thor2_jax.gallery.embedding import Embedding
-from thor2_jax.gallery.enrollment import instance_view
+from thor2_jax.gallery.enrollment import instance_views
 from thor2_jax.gallery.gallery import Gallery
 from thor2_jax.gallery.objects import ObjectGallery
 from thor2_jax.gallery.store import GALLERY_DIRECTORY
-from thor2_jax.recognition.answers import MAX_OVERFLOW, DescribedFrame, Evidence, Recognition, concatenate_padded
-from thor2_jax.recognition.classifier import EMBEDDING, MLP, Feature, oriented_probabilities
+from thor2_jax.recognition.answers import AnswerBy, DescribedFrame, Evidence, Recognition, check_answer_by
+from thor2_jax.recognition.chunks import compute_by_chunks
+from thor2_jax.recognition.classifier import EMBEDDING
 from thor2_jax.recognition.confidence import Calibration
 from thor2_jax.recognition.frames import RGBDFrame
 from thor2_jax.recognition.fusion import DEFAULT_RULE, FUSION_RULES, FusionRule, fused_probabilities
+from thor2_jax.recognition.naming import name_instances
 from thor2_jax.recognition.prepared_instance import PreparedInstance, pack_instances, prepare_instance
+from thor2_jax.recognition.run_classifiers import THOR2, Classifier, RunClassifiers
 from thor2_jax.recognition.run_directory import EMBEDDING_FILE, TrainedRun, load_run
 from thor2_jax.tracking.tracker import Tracker
 from thor2_jax.types import PointClouds
 
-__all__ = [
-    "ANSWER_SOURCES",
-    "THOR2",
-    "AnswerBy",
-    "Recognizer",
-]
-
-AnswerBy = Literal["classifiers", "gallery", "both"]
-ANSWER_SOURCES: tuple[AnswerBy, ...] = ("classifiers", "gallery", "both")
-"""What a recognizer may answer by."""
-
-THOR2: tuple[Feature, ...] = ("tops", "tops2")
-"""The two classifiers whose fusion is THOR2."""
+__all__ = ["THOR2", "AnswerBy", "Recognizer"]
 
 CHUNK = 4
 """Default of `Recognizer.chunk`."""
-
-Classify = Callable[[OrientedDescriptors], jax.Array]
-"""A classifier: from the descriptors of clouds to class probabilities [B, C]."""
-
-T = TypeVar("T")
 
 
 class Recognizer:
@@ -124,10 +109,11 @@ class Recognizer:
         self.chunk = CHUNK
         self.rule: FusionRule = rule
         self.objects = ObjectGallery(run.classes, embedding, search)
-        self._answer_by = _check_answer_by(answer_by)
-        self._classify: dict[str, Classify] = {name: _compiled(name, m) for name, m in run.classifiers.items()}
-        if embedding is not None and embedding.classes == run.classes and run.classifiers:
-            self._classify[EMBEDDING] = embedding.class_probabilities
+        self._answer_by = check_answer_by(answer_by)
+        knows_classes = embedding is not None and embedding.classes == run.classes and bool(run.classifiers)
+        self._classifiers = RunClassifiers.compiled(
+            run.classifiers, embedding.class_probabilities if embedding is not None and knows_classes else None
+        )
 
     @classmethod
     def load(
@@ -177,8 +163,8 @@ class Recognizer:
             answer_by: the wanted source; by default that of the constructor or of the run's record. Without classifiers
                 it is always the gallery, with an empty gallery always the classifiers, and otherwise both by default.
         """
-        wanted = _check_answer_by(answer_by) or self._answer_by or _check_answer_by(self.run.record.get("answer_by"))
-        if not self._classify:
+        wanted = check_answer_by(answer_by) or self._answer_by or check_answer_by(self.run.record.get("answer_by"))
+        if not self._classifiers:
             return "gallery"
         if not self.gallery.objects:
             return "classifiers"
@@ -226,11 +212,7 @@ class Recognizer:
                 and neither `extend` nor `replace` is given. Nothing is enrolled.
             OSError: the gallery cannot be written; it is as before.
         """
-        views = []
-        for number, item in enumerate(frames):
-            frame, label = item if isinstance(item, tuple) else (item, None)
-            with with_context(f"frames[{number}]"):
-                views.append(self.corrected(instance_view(frame, label, self.run.config.sigma_s)))
+        views = [self.corrected(view) for view in instance_views(frames, self.run.config.sigma_s)]
         self.objects.enroll(name, views, "frames", extend=extend, replace=replace)
 
     def forget(self, name: str) -> None:
@@ -264,22 +246,12 @@ class Recognizer:
             InputError: the frames have different sizes, or fewer than `adaptation.estimate.MIN_INSTANCES` usable
                 instances. Nothing changes.
         """
-        instances: list[PreparedInstance] = []
-        size: tuple[int, ...] = ()
-        for number, frame in enumerate(frames):
-            size = size or frame.depth.shape
-            if frame.depth.shape != size:
-                (height, width), (rows, columns) = frame.depth.shape, size
-                raise InputError(
-                    f"frames[{number}] has {width} x {height} pixels; expected {columns} x {rows}, as the first frame: "
-                    "adapt to one camera at a time"
-                )
-            instances += [prepare_instance(frame, label, self.run.config.sigma_s) for label in frame.instances]
+        instances = camera_instances(frames, self.run.config.sigma_s)
         adaptation = estimate_transform(instances, *self.adaptation_criterion(), report)
         self.color_transform = adaptation.transform
         return adaptation
 
-    def adaptation_criterion(self) -> tuple[ColorNetwork, DescriptorConfig, Classify]:
+    def adaptation_criterion(self) -> tuple[ColorNetwork, DescriptorConfig, Classifier]:
         """Return the colour network, the descriptor and the classifier whose certainty `adapt` increases.
 
         It is the embedding, which also knows what is none of the classes; in runs without one, the fused classifiers;
@@ -290,10 +262,9 @@ class Recognizer:
             if not self.gallery.objects:
                 raise InputError("model has neither classes nor enrolled objects; enroll some first")
             return embedding.network, embedding.config, gallery_classifier(self.gallery, embedding)
-        if EMBEDDING in self._classify:
-            classify = self._classify[EMBEDDING]
-        else:
-            classify = fused_classifier([self._classify[name] for name in self.default_classifiers])
+        classify = self._classifiers.get(EMBEDDING) or fused_classifier(
+            [self._classifiers[name] for name in self.default_classifiers]
+        )
         return self.run.network, self.run.config, classify
 
     def warm_up(self, max_points: int = 2048, max_instances: int = 16) -> int:
@@ -316,47 +287,25 @@ class Recognizer:
 
     def describe(self, frame: RGBDFrame) -> DescribedFrame:
         """Prepare and describe the instances of a frame, of which there may be more than the largest batch bucket."""
-        instances, chunks = self._by_chunks(frame, self._describe_chunk)
-        n_usable = sum(instance.reason is None for instance in instances)
-        return DescribedFrame(instances, concatenate_padded(chunks, _padded_rows(n_usable)))
 
-    def _by_chunks(
-        self, frame: RGBDFrame, compute: Callable[[Sequence[PreparedInstance]], T]
-    ) -> tuple[list[PreparedInstance], list[T]]:
-        """Prepare the instances of a frame and call `compute` on each chunk of usable ones, at least once.
+        def compute(clouds: PointClouds) -> OrientedDescriptors:
+            return describe_orientations(clouds, self.run.network, self.run.config)
 
-        JAX dispatches asynchronously: the device computes one chunk while the host prepares the next.
-        """
-        instances: list[PreparedInstance] = []
-        chunk: list[PreparedInstance] = []
-        results: list[T] = []
+        return DescribedFrame(*compute_by_chunks(self._prepared(frame), self.chunk, compute))
+
+    def _prepared(self, frame: RGBDFrame) -> Iterator[PreparedInstance]:
         for label in frame.instances:
-            instance = self.corrected(prepare_instance(frame, label, self.run.config.sigma_s))
-            instances.append(instance)
-            if instance.reason is None:
-                chunk.append(instance)
-                if len(chunk) == self.chunk:
-                    results.append(compute(chunk))
-                    chunk = []
-        if chunk or not results:
-            results.append(compute(chunk))
-        return instances, results
-
-    def _describe_chunk(self, instances: Sequence[PreparedInstance]) -> OrientedDescriptors:
-        return describe_orientations(
-            pack_instances(instances, _padded_rows(len(instances))), self.run.network, self.run.config
-        )
+            yield self.corrected(prepare_instance(frame, label, self.run.config.sigma_s))
 
     @property
     def classifiers(self) -> tuple[str, ...]:
         """Names of the classifiers: those of the run, and "embedding" if its embedding knows the classes."""
-        return tuple(self._classify)
+        return tuple(self._classifiers)
 
     @property
     def default_classifiers(self) -> tuple[str, ...]:
         """The classifiers that answer by default: the paper's two, and the embedding, which gives the confidence."""
-        default = tuple(name for name in (*THOR2, EMBEDDING) if name in self._classify)
-        return default or self.classifiers
+        return self._classifiers.default
 
     def probabilities(
         self, oriented: OrientedDescriptors, classifiers: Sequence[str] | None = None
@@ -366,7 +315,7 @@ class Recognizer:
         Those of the embedding sum to the probability that an object is one of the classes.
         """
         names = self.classifiers if classifiers is None else classifiers
-        computing = {name: self._classify[name](oriented) for name in names}
+        computing = self._classifiers.probabilities(oriented, names)
         return {name: np.asarray(values) for name, values in computing.items()}
 
     def evidence(
@@ -379,7 +328,7 @@ class Recognizer:
             classifiers: classifiers to evaluate; none if the gallery alone answers.
             clouds: [B, N] the clouds in metres, to embed them for the gallery; None if the classifiers alone answer.
         """
-        probabilities = {name: self._classify[name](oriented) for name in classifiers}
+        probabilities = self._classifiers.probabilities(oriented, classifiers)
         if clouds is None:
             return Evidence(oriented.overflow, probabilities)
         embeddings, weights = self.objects.embed(clouds, oriented, self.run.config)
@@ -417,21 +366,12 @@ class Recognizer:
         The arguments are those of `recognize`.
         """
         source = self.answers_by(answer_by)
-        names = self._check_classifiers(classifiers) if source != "gallery" else ()
+        names = self._classifiers.checked(classifiers) if source != "gallery" else ()
 
-        def compute(instances: Sequence[PreparedInstance]) -> Evidence:
-            clouds = pack_instances(instances, _padded_rows(len(instances)))
+        def compute(clouds: PointClouds) -> Evidence:
             return self._evidence(clouds, names, source != "classifiers")
 
-        instances, chunks = self._by_chunks(frame, compute)
-        n_usable = sum(instance.reason is None for instance in instances)
-        return instances, concatenate_padded(chunks, _padded_rows(n_usable))
-
-    def _check_classifiers(self, classifiers: Sequence[str] | None) -> tuple[str, ...]:
-        names = self.default_classifiers if classifiers is None else classifiers
-        if not isinstance(names, (list, tuple)) or not names or not set(names) <= set(self.classifiers):
-            raise InputError(f"classifiers is {names!r}; expected one or more of {', '.join(self.classifiers)}")
-        return tuple(dict.fromkeys(names))
+        return compute_by_chunks(self._prepared(frame), self.chunk, compute)
 
     def gallery_scores(self, described: DescribedFrame) -> NDArray[np.float32]:
         """Return the scores [B, n_objects] of the gallery, one row for each row of the descriptors."""
@@ -458,13 +398,7 @@ class Recognizer:
         by_source = {name: union.of_classifiers(p) for name, p in evidence.probabilities.items()}
         if scores is not None:
             by_source["gallery"] = union.of_gallery(scores)
-        rows = iter(range(n_usable))
-        return [
-            self._recognition(instance, next(rows), values, thresholds, by_source, evidence.overflow)
-            if instance.reason is None
-            else Recognition(instance.label, reason=instance.reason)
-            for instance in instances
-        ]
+        return name_instances(instances, self.classes, values, thresholds, by_source, evidence.overflow)
 
     def fused(self, probabilities: Mapping[str, NDArray[np.float32]]) -> NDArray[np.floating[Any]]:
         """Return the fused class probabilities [B, C] of the classifiers.
@@ -492,71 +426,3 @@ class Recognizer:
         if not probabilities:
             return self.objects.union.of_gallery(scores)
         return self.objects.union.combine(self.fused(probabilities), scores)
-
-    def _recognition(
-        self,
-        instance: PreparedInstance,
-        row: int,
-        values: NDArray[np.floating[Any]],
-        thresholds: NDArray[np.float64],
-        by_source: Mapping[str, NDArray[Any]],
-        overflows: NDArray[Any],
-    ) -> Recognition:
-        names, overflow = self.classes, int(overflows[row])
-        best = int(values[row].argmax()) if names else -1
-        confidence = float(values[row, best]) if names else 0.0
-        reason = None
-        if overflow > MAX_OVERFLOW * len(instance.points):
-            reason = (
-                f"overflow: {overflow} points and pairs of {len(instance.points)} points lie outside the descriptor's "
-                "grid; check the intrinsics and the depth scale"
-            )
-        elif not names:
-            reason = "unknown: no object is enrolled"
-        elif confidence < thresholds[best]:
-            reason = f"unknown: a confidence of {confidence:.3f}, below {thresholds[best]:g}"
-        return Recognition(
-            label=instance.label,
-            name=names[best] if reason is None else None,
-            confidence=confidence,
-            classifier=max(by_source, key=lambda name: by_source[name][row, best]) if names else None,
-            top={name: _top(names, of_source[row]) for name, of_source in by_source.items()},
-            occluded=instance.occluded,
-            overflow=overflow,
-            points_used=len(instance.points),
-            kept_by_fallback=instance.kept_by_fallback,
-            reason=reason,
-        )
-
-
-def _check_answer_by(value: str | None) -> AnswerBy | None:
-    for source in ANSWER_SOURCES:
-        if value == source:
-            return source
-    if value is not None:
-        raise InputError(f"answer_by is {value!r}; expected one of {', '.join(ANSWER_SOURCES)}")
-    return None
-
-
-def _top(names: Sequence[str], values: NDArray[Any], count: int = 5) -> list[tuple[str, float]]:
-    best = np.argsort(-values, kind="stable")[:count]
-    return [(names[i], float(values[i])) for i in best]
-
-
-def _padded_rows(n: int) -> int:
-    """Return the number of rows that `n` instances are padded to: whole largest batches, then a batch bucket."""
-    whole = n // BATCH_BUCKETS[-1] * BATCH_BUCKETS[-1]
-    return n if n == whole > 0 else whole + batch_bucket(max(n - whole, 1))
-
-
-def _compiled(name: Feature, model: MLP) -> Classify:
-    """Return the compiled function from descriptors in K orientations to class probabilities [B, C]."""
-    graph, state = nnx.split(model)
-    # As a flat list: JAX would take an nnx state apart, in Python, at every call.
-    leaves, structure = jax.tree.flatten(state)
-
-    @jax.jit
-    def forward(leaves: list[jax.Array], oriented: OrientedDescriptors) -> jax.Array:
-        return oriented_probabilities(nnx.merge(graph, jax.tree.unflatten(structure, leaves)), oriented, name)
-
-    return lambda oriented: forward(leaves, oriented)

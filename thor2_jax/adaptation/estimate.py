@@ -7,7 +7,7 @@ With few instances, or where colours do not matter, the estimate therefore stays
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +17,10 @@ from thor2_jax.adaptation.color_transform import ColorTransform
 from thor2_jax.adaptation.objective import Classify, Objective
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.prepared_instance import PreparedInstance
+from thor2_jax.recognition.frames import RGBDFrame
+from thor2_jax.recognition.prepared_instance import PreparedInstance, prepare_instance
 
-__all__ = ["MAX_INSTANCES", "MIN_INSTANCES", "Adaptation", "estimate_transform"]
+__all__ = ["MAX_INSTANCES", "MIN_INSTANCES", "Adaptation", "camera_instances", "estimate_transform"]
 
 PRIOR = np.array([0.21, 0.21, 0.21, 0.085])
 """Standard deviations of gamma, gain, saturation and warmth."""
@@ -57,6 +58,30 @@ class Adaptation:
     instances: int
     uncertainty_before: float
     uncertainty_after: float
+
+
+def camera_instances(frames: Iterable[RGBDFrame], sigma_s: float) -> list[PreparedInstance]:
+    """Return the instances of frames of one camera, with the camera's colours.
+
+    Args:
+        frames: frames with instance labels.
+        sigma_s: scaled units per metre, see `DescriptorConfig`.
+
+    Raises:
+        InputError: the frames have different sizes.
+    """
+    instances: list[PreparedInstance] = []
+    size: tuple[int, ...] = ()
+    for number, frame in enumerate(frames):
+        size = size or frame.depth.shape
+        if frame.depth.shape != size:
+            (height, width), (rows, columns) = frame.depth.shape, size
+            raise InputError(
+                f"frames[{number}] has {width} x {height} pixels; expected {columns} x {rows}, as the first frame: "
+                "adapt to one camera at a time"
+            )
+        instances += [prepare_instance(frame, label, sigma_s) for label in frame.instances]
+    return instances
 
 
 def spread(instances: Sequence[PreparedInstance], count: int = MAX_INSTANCES) -> list[PreparedInstance]:

@@ -1,7 +1,7 @@
 """Views of an object, embedded for a gallery, and queries embedded in several orientations."""
 
 import datetime
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from thor2_jax.capacity import point_bucket
 from thor2_jax.descriptor.orientations import describe_orientations
-from thor2_jax.errors import InputError
+from thor2_jax.errors import InputError, with_context
 from thor2_jax.gallery.augment import augmented_copies
 from thor2_jax.gallery.clouds import CompactClouds
 from thor2_jax.gallery.embedding import Embedding
@@ -25,6 +25,7 @@ __all__ = [
     "enrolled_object",
     "enrolled_views",
     "instance_view",
+    "instance_views",
     "views_to_embed",
 ]
 
@@ -60,6 +61,16 @@ def instance_view(frame: RGBDFrame, label: int | None, sigma_s: float) -> Prepar
     if view.reason is not None:
         raise InputError(f"instance {view.label} cannot be used: {view.reason}")
     return view
+
+
+def instance_views(frames: Sequence[RGBDFrame | tuple[RGBDFrame, int]], sigma_s: float) -> list[PreparedInstance]:
+    """Return the views of an object in frames; the arguments and errors are those of `Recognizer.enroll`."""
+    views = []
+    for number, item in enumerate(frames):
+        frame, label = item if isinstance(item, tuple) else (item, None)
+        with with_context(f"frames[{number}]"):
+            views.append(instance_view(frame, label, sigma_s))
+    return views
 
 
 def views_to_embed(clouds: CompactClouds, source: str) -> list[PreparedInstance]:

@@ -1,23 +1,29 @@
-"""Records of recognition: the described instances of a frame, and the answers for them."""
+"""Records of recognition: the described instances of a frame, what they are recognized by, and the answers."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, TypeVar
-
-import jax
-import numpy as np
-from numpy.typing import NDArray
+from typing import Any, Literal, NamedTuple
 
 from thor2_jax.descriptor.orientations import OrientedDescriptors
+from thor2_jax.errors import InputError
 from thor2_jax.recognition.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.types import Descriptors, PointClouds
 
-__all__ = ["MAX_OVERFLOW", "DescribedFrame", "Evidence", "Recognition", "concatenate_padded"]
+__all__ = [
+    "MAX_OVERFLOW",
+    "AnswerBy",
+    "DescribedFrame",
+    "Evidence",
+    "Recognition",
+    "check_answer_by",
+]
+
+AnswerBy = Literal["classifiers", "gallery", "both"]
+_ANSWER_SOURCES: tuple[AnswerBy, ...] = ("classifiers", "gallery", "both")
+"""What a recognizer may answer by."""
 
 MAX_OVERFLOW = 0.5
 """Largest overflow of an answer with a name, as a fraction of the points: beyond it, too little is described."""
-
-T = TypeVar("T")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,12 +108,15 @@ class DescribedFrame:
         return pack_instances(self.usable, len(self.oriented.weights))
 
 
-def concatenate_padded(batches: Sequence[T], n_rows: int) -> T:
-    """Concatenate batches (pytrees of arrays) along the first axis, on the host, with zeros up to `n_rows`."""
+def check_answer_by(value: str | None) -> AnswerBy | None:
+    """Return what answers, or None if it is not given.
 
-    def concatenate(*arrays: jax.Array) -> NDArray[Any]:
-        padding = np.zeros((n_rows - sum(map(len, arrays)), *arrays[0].shape[1:]), arrays[0].dtype)
-        return np.concatenate([*arrays, padding])
-
-    concatenated: T = jax.tree.map(concatenate, *batches)
-    return concatenated
+    Raises:
+        InputError: it is unknown.
+    """
+    for source in _ANSWER_SOURCES:
+        if value == source:
+            return source
+    if value is not None:
+        raise InputError(f"answer_by is {value!r}; expected one of {', '.join(_ANSWER_SOURCES)}")
+    return None
