@@ -171,7 +171,7 @@ DAMAGES: dict[str, tuple[Callable[[SetUp], None], set[str]]] = {
 
 def run(data: Path, recognizer: Recognizer, bases: Sequence[str] = BASES) -> dict[str, Any]:
     """Diagnose all damaged set-ups."""
-    found: dict[str, list[list[str]]] = {name: [] for name in DAMAGES}
+    codes: dict[str, list[list[str]]] = {name: [] for name in DAMAGES}
     for base in bases:
         (source,) = find_frames([data / base])
         for name, (damage, _) in DAMAGES.items():
@@ -180,10 +180,10 @@ def run(data: Path, recognizer: Recognizer, bases: Sequence[str] = BASES) -> dic
             with tempfile.TemporaryDirectory() as folder:
                 files, mesh = setup.write(Path(folder))
                 diagnosis = diagnose(files, recognizer=recognizer, meshes=[mesh])
-            found[name].append([finding.code for finding in diagnosis.findings])
-    right = {name: [bool(DAMAGES[name][1] & set(codes)) for codes in each] for name, each in found.items()}
+            codes[name].append([finding.code for finding in diagnosis.findings])
+    right = {name: [bool(DAMAGES[name][1] & set(codes_of)) for codes_of in each] for name, each in codes.items()}
     return {
-        "damaged": {name: {"right": sum(right[name]), "of": len(bases), "found": found[name]} for name in DAMAGES},
+        "damaged": {name: {"right": sum(right[name]), "of": len(bases), "found": codes[name]} for name in DAMAGES},
         "right_by_frame": {base: sum(each[k] for each in right.values()) for k, base in enumerate(bases)},
     }
 

@@ -30,8 +30,8 @@ def faithfulness_of(scores: ClassScores, directory: Path, sigma_s: float) -> Ite
             instance = prepare_instance(frame, label, sigma_s)
             if instance.reason is None:
                 index = int(scores.of_instances([instance])[0].argmax())
-                found = attribute_points(scores, scores.orient(instance), instance, index)
-                yield source.name, label, found.faithfulness
+                attributions = attribute_points(scores, scores.orient(instance), instance, index)
+                yield source.name, label, attributions.faithfulness
 
 
 def summary(checks: list[Faithfulness]) -> dict[str, float]:

@@ -52,7 +52,7 @@ __all__ = [
 ]
 
 PALETTE = ("#56b4e9", "#e69f00", "#009e73", "#222222", "#cc79a7", "#0072b2", "#d55e00", "#f0e442")
-"""The palette of Okabe and Ito, which people with colour blindness can tell apart."""
+"""The palette of Okabe and Ito, which people with colour blindness can distinguish."""
 
 _DPI = 130
 

@@ -281,7 +281,7 @@ def _check_names(job: TrainJob, names: Sequence[str], labelled: LabelledInstance
                 "or leave it out (leave_out)"
             )
     if len(classes) < 2:
-        raise InputError(f"frames: the objects are {', '.join(classes) or 'none'}; expected at least two to tell apart")
+        raise InputError(f"frames: the objects are {', '.join(classes) or 'none'}; expected at least two")
 
 
 def _open_views(job: TrainJob, labelled: LabelledInstances | None, display: Display) -> ViewSource:

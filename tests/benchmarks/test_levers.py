@@ -15,7 +15,7 @@ from training.evaluation.fusion import RULES
 NAMES = ("soup_can_red", "cereal_box_blue")
 
 
-def test_levers_share_what_only_fusion_tells_apart() -> None:
+def test_levers_that_differ_in_fusion_share_trainings() -> None:
     rows = [
         Lever("a"),
         Lever("b", train="--epochs 2"),

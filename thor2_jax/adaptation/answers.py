@@ -1,4 +1,4 @@
-"""Answers as compiled functions of descriptors, whose entropy tells how well colours fit a recognizer."""
+"""Compiled answers of a recognizer; their entropy measures how well the colours of a camera fit it."""
 
 from collections.abc import Sequence
 

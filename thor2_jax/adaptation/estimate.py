@@ -1,8 +1,8 @@
 """The colour transform of a camera from unlabelled instances: the mean of its posterior.
 
-The prior is a normal distribution around no change; the likelihood of an instance is
-exp(-`EVIDENCE` times the uncertainty of its answer).
-With few instances, or where colours do not matter, the estimate therefore stays near no change.
+The prior is a normal distribution around no change. The likelihood of an instance is exp(-`EVIDENCE` u), where u is the
+uncertainty of its answer (see `objective`). With few instances, or where colours do not matter, the estimate therefore
+stays near no change.
 """
 
 import dataclasses

@@ -1,8 +1,9 @@
 """Attributions: how much each point of a cloud contributes to an answer (Sundararajan et al. 2017).
 
-A point enters the relaxed descriptor with a weight. Integrated gradients average the gradient of the answer's margin
-with respect to the weights, while the weights of all points grow from a part to 1; the frames of the candidate
-orientations are held constant. An attribution is therefore, to first order, what the margin loses with the point.
+Every point has a weight in the relaxed descriptor. The attribution of a point is the gradient of the answer's margin
+with respect to its weight, averaged while the weights of all points increase together to 1 (integrated gradients); the
+frames of the candidate orientations are held constant. To first order, it is the decrease of the margin when the point
+is removed.
 """
 
 import dataclasses

@@ -1,7 +1,7 @@
 """Smallest changes: how little the colour or the extents of an object would have to change for another answer.
 
-Steps along the gradient of the relaxed descriptor give directions of change; along each of them, the exact descriptor
-gives the smallest change that leads to another answer, in frames that are computed again.
+Steps along the gradient of the relaxed descriptor give directions of change. Along each direction, the smallest change
+with another answer is searched for with the exact descriptor, whose frames are computed again for every change.
 """
 
 import dataclasses

@@ -1,4 +1,4 @@
-"""Class scores: what an explanation explains, as a differentiable function of descriptors.
+"""Class scores: the quantity that an explanation explains, as a differentiable function of descriptors.
 
 The classifiers' answer is explained by its log-odds, that of a gallery by its similarity to the enrolled views. Both
 are fused over the candidate orientations, as recognition fuses them. The embedding of a run, which gives the confidence

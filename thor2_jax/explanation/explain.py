@@ -5,7 +5,7 @@
 ('mug', 1204)
 
 With several candidate orientations, the fused answer is explained, since it is the one that recognition gives. Slices,
-strips, diagrams and colour matrices are those of one orientation, the one of the greatest weight.
+strips, diagrams and colour matrices are those of the orientation with the largest weight.
 """
 
 import dataclasses

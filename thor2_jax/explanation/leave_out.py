@@ -1,7 +1,7 @@
-"""Leaving out slices and strips: what the exact margin loses without them, beside what the attributions predict.
+"""Leave-one-out: the decrease of the exact margin without a slice or strip, beside what the attributions predict.
 
-The slices and strips are those of the shown orientation, and their points are missing in all orientations. The frames
-are those of the whole cloud, as for the attributions.
+The points of a slice or strip of the shown orientation are removed in all orientations. The frames remain those of the
+whole cloud, as for the attributions.
 """
 
 import dataclasses

@@ -10,9 +10,7 @@ from numpy.typing import NDArray
 from thor2_jax.errors import InputError
 from thor2_jax.recognition.image_files import MAX_IMAGE_PIXELS, read_image
 
-__all__ = ["DEPTH_SUFFIXES", "read_depth"]
-
-DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".npy", ".exr")
+__all__ = ["read_depth"]
 
 _EXPECTED = "one channel of 16-bit integers (in depth units) or floats (in metres)"
 

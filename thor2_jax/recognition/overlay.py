@@ -39,7 +39,7 @@ Paint = tuple[int, int, int]
 
 COLORS: tuple[Paint, ...] = ((86, 180, 233), (240, 228, 66), (0, 158, 115), (204, 121, 167), (0, 114, 178))
 """Colours of recognized instances, in turn: sky blue, yellow, bluish green, reddish purple and blue of the palette of
-Okabe and Ito, which people with colour blindness can tell apart."""
+Okabe and Ito, which people with colour blindness can distinguish."""
 
 UNRECOGNIZED: Paint = (213, 94, 0)
 """Colour of instances without a name: vermilion of the same palette. Its orange is too close and not used."""

@@ -1,4 +1,4 @@
-"""Recordings of ROS 1, ROS 2 and MCAP: frames of nearest colour and depth images (extra `bags`).
+"""Frames in recordings of ROS 1, ROS 2 and MCAP: colour and depth images nearest in time (extra `bags`).
 
 with Bag("table.mcap") as bag:
     for recorded in bag.frames():

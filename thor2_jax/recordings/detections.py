@@ -1,4 +1,4 @@
-"""Detections: the answers for a frame with the places of the objects, as JSON and as vision_msgs/Detection2DArray.
+"""Detections: the answers for a frame with the positions of the objects, as JSON and as vision_msgs/Detection2DArray.
 
 detections = detections_of(frame, recognizer.recognize(frame))
 detection_array(detections, stamp=stamp, frame_id="camera_color_optical_frame")   # fields of the ROS message

@@ -1,6 +1,6 @@
 """Images in ROS messages: sensor_msgs/Image and CompressedImage to arrays.
 
-The functions read attributes only, so messages of ROS 1, ROS 2 (rclpy) and rosbags are the same to them.
+The functions read attributes only, so they accept messages of ROS 1, ROS 2 (rclpy) and rosbags.
 """
 
 import io

@@ -1,4 +1,4 @@
-"""Choice of the topics of a recording: colour, depth and the camera, by name or by what they hold."""
+"""Choice of the topics of a recording: colour, depth and the camera, by name or by content."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -77,18 +77,20 @@ def _choose(kind: str, wanted: str | None, kinds: Mapping[str, str], types: Mapp
             holds = types[topic] if topic in kinds else f"{types[topic]} without messages"
             raise InputError(f"{option} is {wanted}, which holds {holds}; expected {_expected(kind)}")
         return topic
-    found = [topic for topic, held in kinds.items() if held == kind]
+    candidates = [topic for topic, held in kinds.items() if held == kind]
     if kind == "depth":
-        found = [topic for topic in found if any(word in topic for word in _ALIGNED)] or found
-    found = [topic for topic in found if _uncompressed(topic) == topic or _uncompressed(topic) not in found]
-    if not found:
+        candidates = [topic for topic in candidates if any(word in topic for word in _ALIGNED)] or candidates
+    candidates = [
+        topic for topic in candidates if _uncompressed(topic) == topic or _uncompressed(topic) not in candidates
+    ]
+    if not candidates:
         advice = "; or give the file of the intrinsics" if kind == "camera" else ""
         raise InputError(
             f"{option}: no topic holds {_expected(kind)}; the recording has {_listed(types)}; record one{advice}"
         )
-    if len(found) > 1:
-        raise InputError(f"{option} is not given, and {', '.join(sorted(found))} hold {_expected(kind)}; give one")
-    return found[0]
+    if len(candidates) > 1:
+        raise InputError(f"{option} is not given, and {', '.join(sorted(candidates))} hold {_expected(kind)}; give one")
+    return candidates[0]
 
 
 def _expected(kind: str) -> str:

@@ -1,4 +1,4 @@
-"""MCAP files whose end is missing: their complete records, as a file that rosbags reads.
+"""Truncated MCAP files: their complete records as a file that rosbags can read.
 
 An MCAP file is a sequence of records: a byte for the kind, the length in eight bytes, and the content. Its last record,
 the footer, says where the index lies; without an index, readers scan the records.

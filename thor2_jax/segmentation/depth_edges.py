@@ -1,4 +1,4 @@
-"""Edges of a depth image: steps, where one surface ends before another, and folds, where two surfaces meet at a dent.
+"""Edges of a depth image: steps, where a surface ends in front of another, and folds, where two surfaces form a dent.
 
 Both are found by extrapolation. In inverse depth a plane is linear, so the value two pixels after an edge is compared
 with that extrapolated from two and six pixels before it, and the other way round. At a step the two differences have

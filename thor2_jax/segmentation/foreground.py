@@ -1,4 +1,4 @@
-"""What stands or lies on a plane: evidence from the height over the plane and from the colour beside the plane's."""
+"""Foreground of a plane: what stands or lies on it, by its height over the plane and its difference in colour."""
 
 import dataclasses
 

@@ -1,6 +1,6 @@
-"""Pieces by watershed: sure pixels of things and of the background flood what is between them along colour edges.
+"""Pieces by watershed: regions grow from sure pixels of things and of the background until they meet at colour edges.
 
-Depth is not trusted beside its edges and where it is missing; there, the colour image decides.
+Near depth edges and where depth is missing, the colour image alone decides.
 """
 
 import dataclasses

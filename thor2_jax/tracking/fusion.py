@@ -1,8 +1,8 @@
-"""Fusion of what an object was recognized by in several frames.
+"""Fusion of the evidence for an object over several frames.
 
-Of each classifier, the weighted mean of the log-probabilities is taken; of the gallery, the weighted mean of the
-scores. As successive frames are nearly the same, their probabilities are not multiplied as independent ones would be:
-a track that always gives the same probabilities has the confidence of one frame.
+The log-probabilities of each classifier and the scores of the gallery are averaged, with the weights of the views.
+Successive frames are nearly the same, so their probabilities are not multiplied as those of independent observations
+would be: a track whose frames all have the same probabilities has the confidence of a single frame.
 """
 
 from collections.abc import Mapping

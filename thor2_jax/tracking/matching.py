@@ -1,7 +1,7 @@
-"""Which clouds of two frames show the same object: those that overlap most in space.
+"""Matching of two frames: the clouds that overlap most in space show the same object.
 
-The overlap of two clouds is the share of the smaller one's voxels that the other one occupies too, averaged over
-`VOXELS`. Small voxels tell neighbouring objects apart; large ones allow for the motion between two frames.
+The overlap of two clouds is the share of the smaller one's voxels that the other one also occupies, averaged over the
+voxel sizes `VOXELS`. Small voxels distinguish neighbouring objects; large ones allow for motion between the frames.
 """
 
 from collections.abc import Sequence

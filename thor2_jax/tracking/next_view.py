@@ -1,8 +1,8 @@
-"""The next view of an object in doubt: the camera pose that is expected to leave the least uncertainty about its name.
+"""The next view: the camera pose after which the name of an object is expected to be least uncertain.
 
-Training views of the classes in doubt say what would be seen. For each class and each of its views that is answered as
-the present one is, the motion of the camera leads to another view of that class, whose answer is combined with the
-present one. The expected entropy of the result is the mean over classes and views, by their probability.
+Training views of the plausible classes predict what the camera would see. Each view of a class whose answer is like
+the present one may be the present view; the motion of the camera then leads to another view of that class, whose answer
+is combined with the present one. The expected entropy is the mean over classes and views, by their probability.
 """
 
 import dataclasses

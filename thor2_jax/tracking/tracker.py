@@ -154,18 +154,18 @@ class Tracker:
         Raises:
             InputError: there is no such track, the frames had no poses, no classifier answers, or as `next_view`.
         """
-        found = {each.number: each for each in self._tracks}.get(track)
-        if found is None:
+        followed = {each.number: each for each in self._tracks}.get(track)
+        if followed is None:
             numbers = ", ".join(str(each.number) for each in self._tracks) or "none"
             raise InputError(f"track is {track!r}; expected one of {numbers}")
-        probabilities, _ = found.evidence.fused()
-        if found.pose is None or not probabilities:
-            missing = "poses" if found.pose is None else "answers of classifiers"
+        probabilities, _ = followed.evidence.fused()
+        if followed.pose is None or not probabilities:
+            missing = "poses" if followed.pose is None else "answers of classifiers"
             raise InputError(f"track {track} has no {missing}; next_view needs them")
         fused = self._recognizer.fused({name: p[None].astype(np.float32) for name, p in probabilities.items()})[0]
-        points = found.instance.points
-        centre = transform(found.pose, (points.min(axis=0, keepdims=True) + points.max(axis=0, keepdims=True)) / 2)[0]
-        return next_view(fused, centre, found.pose, candidates, table)
+        points = followed.instance.points
+        centre = (points.min(axis=0, keepdims=True) + points.max(axis=0, keepdims=True)) / 2
+        return next_view(fused, transform(followed.pose, centre)[0], followed.pose, candidates, table)
 
     def _extend(
         self, usable: Sequence[PreparedInstance], evidence: Evidence, world: NDArray[np.float64] | None

@@ -1,6 +1,6 @@
 """The loop of a live view: segment, recognize and draw each frame, and publish it as JSON.
 
-The message has `state` (waiting, live, ended or failed), `message`, and those of the last frame: `frame` (its name),
+A message has `state` (waiting, live, ended or failed), `message`, and the values of the last frame: `frame` (its name),
 `number`, `image` (JPEG in base64), `fps`, `milliseconds` for segmentation and recognition, `error`, and `objects`:
 name, confidence, track, frames, position, color and reason of each.
 """

@@ -2,7 +2,8 @@
 
 The loss is the cross-entropy of the scaled cosines between a view and all proxies, less a margin for the view's own
 (Movshovitz-Attias et al., "No Fuss Distance Metric Learning Using Proxies", ICCV 2017; Wang et al., "CosFace", CVPR
-2018). On a new object, views are compared with views; the proxies of a run's classes also classify.
+2018). Views of a new object are compared with other views, not with proxies. The proxies of a run's classes also serve
+as a classifier.
 """
 
 import dataclasses

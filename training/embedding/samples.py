@@ -1,6 +1,6 @@
 """Samples that an embedding is fitted on: the strips of clouds in random orientations.
 
-A sample stores its occupied strips, a tenth of all, and the statistics of its cloud.
+A sample stores only its occupied strips, about a tenth of all, and the statistics of its cloud.
 """
 
 import dataclasses

@@ -42,7 +42,6 @@ __all__ = ["AUGMENTATIONS", "ObjectSource", "ViewTask", "build_samples", "render
 
 OBJECTS_PER_SHARD = 32
 
-
 AUGMENTATIONS = Augmentations(
     illumination=Illumination(),
     sensor=Sensor(),

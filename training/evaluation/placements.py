@@ -1,7 +1,7 @@
 """Placements: an object that does not move in neighbouring frames of a video is one placement.
 
 Neighbouring frames of a video are nearly equal, so that their answers are not independent. Accuracy is therefore also
-averaged over placements, and the answers within a placement tell how steady a recognizer is.
+averaged over placements, and the answers within a placement show how steady a recognizer is.
 """
 
 from collections.abc import Sequence

@@ -119,13 +119,13 @@ def _changes_text(explanation: Explanation) -> str:
             "half to twice as long."
         )
     kinds = {"color": "A shift of all colours by", "extent": "A change of the box by"}
-    found = [f"{kinds[c.kind]} {change_text(c)} gives {c.answer}." for c in explanation.changes]
+    sentences = [f"{kinds[c.kind]} {change_text(c)} gives {c.answer}." for c in explanation.changes]
     missing = {"color", "extent"} - {change.kind for change in explanation.changes}
     if missing == {"color"}:
-        found.append("No shift of the colours by up to half of their range changes the answer.")
+        sentences.append("No shift of the colours by up to half of their range changes the answer.")
     if missing == {"extent"}:
-        found.append("No change of the sides from half to twice their length changes the answer.")
-    return " ".join(found)
+        sentences.append("No change of the sides from half to twice their length changes the answer.")
+    return " ".join(sentences)
 
 
 def _answer_table(answer: Recognition) -> Table:

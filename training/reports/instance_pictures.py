@@ -16,7 +16,7 @@ __all__ = ["CORRECT", "INCORRECT", "draw_crop", "draw_judged"]
 
 CORRECT, INCORRECT = COLORS[2], UNRECOGNIZED
 """Bluish green and vermilion of the palette of Okabe and Ito, a green and a red that people with colour blindness can
-tell apart."""
+distinguish."""
 
 _LARGEST_WIDTH = 960
 """Pixels; wider frames are drawn smaller."""

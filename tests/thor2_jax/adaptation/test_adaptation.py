@@ -92,7 +92,7 @@ def none_is_known(oriented: OrientedDescriptors) -> jax.Array:
     return jnp.zeros((len(oriented.weights), 3))
 
 
-def test_dark_cameras_are_brightened_and_unknown_objects_change_nothing() -> None:
+def test_dark_cameras_are_brightened_and_unknown_objects_ignored() -> None:
     made = [dataclasses.replace(each, colors=np.full_like(each.colors, 100 + each.label)) for each in instances(40)]
     adaptation = estimate_transform(made, RUN.network, RUN.config, bright_is_known)
     assert adaptation.transform.gain - adaptation.transform.gamma > 0.1

@@ -180,12 +180,12 @@ def test_points_of_the_decisive_color_are_found(instance: PreparedInstance) -> N
         return counts[:, red].sum(axis=1) / 100
 
     scores = toy(redness)
-    found = attribute_points(scores, scores.orient(instance), instance, 1)
+    attributions = attribute_points(scores, scores.orient(instance), instance, 1)
     is_red = instance.colors[:, 0] > instance.colors[:, 2]
     aligned = np.asarray(scores.orient(instance).aligned.points[0])[: len(instance.points)]
     inside = (aligned[:, 0] < 0.125) & (aligned[:, 2] < 0.2)  # within 5 strips and 2 slices
-    assert found.values[is_red & inside].min() > 5 * np.abs(found.values[~is_red]).max()
-    assert found.faithfulness.holds and found.faithfulness.most_attributed > 0
+    assert attributions.values[is_red & inside].min() > 5 * np.abs(attributions.values[~is_red]).max()
+    assert attributions.faithfulness.holds and attributions.faithfulness.most_attributed > 0
 
 
 @pytest.mark.slow

@@ -132,9 +132,7 @@ def test_a_segmenter_that_fails_ends_one_request(
     assert len(segment_by(name, files).instances) == 4
 
 
-def test_a_segmenter_that_cannot_be_loaded_is_reported_at_the_start(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_segmenter_that_cannot_be_loaded_stops_the_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(InputError, match="segmenter is 'sam'; expected one of table"):
         Settings(tmp_path, segmenter="sam")
     monkeypatch.setitem(sys.modules, "thor2_jax.segmentation.table", None)

@@ -49,7 +49,7 @@ def test_the_expected_entropy_is_a_mean_over_classes() -> None:
     np.testing.assert_allclose(chosen.expected, p @ [entropy(row) for row in posteriors], rtol=1e-6)
 
 
-def test_without_views_of_the_classes_in_doubt_nothing_is_expected() -> None:
+def test_without_views_of_plausible_classes_nothing_is_expected() -> None:
     views = ViewTable(np.zeros(1, int), np.eye(3)[None], np.array([[0.0, 1.0]]))
     chosen = next_view([0.0, 1.0], CENTRE, np.eye(4), [np.eye(4)], views)
     np.testing.assert_allclose(chosen.expected, chosen.entropy)

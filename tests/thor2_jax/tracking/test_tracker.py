@@ -104,7 +104,7 @@ def test_an_instance_that_cannot_be_used_has_no_track() -> None:
     assert [(r.label, r.track, r.name) for r in answers] == [(3, None, None)] and answers[0].reason
 
 
-def test_frames_and_poses_that_do_not_belong_together_are_refused() -> None:
+def test_frames_and_poses_of_different_sequences_are_refused() -> None:
     tracker = Tracker(ToyRecognizer())
     image = frame({1: (10, 10, SURE_A)})
     tracker.update(image)

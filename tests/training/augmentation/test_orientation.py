@@ -8,7 +8,7 @@ from training.augmentation.orientation import _random_axes, reorient
 CONFIG = thor2.DescriptorConfig(homology="closed_form")
 
 
-def test_random_axes_are_rotations_with_nearly_equal_sides_swapped() -> None:
+def test_random_axes_are_rotations_that_swap_nearly_equal_sides() -> None:
     sides = np.array([[1, 0.9, 0.2]] * 400 + [[1, 0.5, 0.2]] * 400, np.float32)
     axes = _random_axes(sides, np.random.default_rng(0))
     np.testing.assert_allclose(axes @ np.swapaxes(axes, 1, 2), np.tile(np.eye(3), (800, 1, 1)), atol=1e-5)

@@ -185,8 +185,8 @@ def test_two_ray_nodes_one_of_which_is_killed(
 
         thread = threading.Thread(target=lose_node)
         thread.start()
-        found = results(model, folder, tmp_path, "--workers", 2, "--engine", "ray", "--address", cluster.address)
+        answers = results(model, folder, tmp_path, "--workers", 2, "--engine", "ray", "--address", cluster.address)
         thread.join()
-        assert lost.is_set() and found == expected
+        assert lost.is_set() and answers == expected
     finally:
         cluster.shutdown()

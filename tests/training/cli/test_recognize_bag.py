@@ -20,11 +20,11 @@ REAL = Path(__file__).parents[4] / "shared" / "data" / "frames" / "ycbv_real_000
 
 def messages_of(path: Path) -> dict[str, list[tuple[int, Any]]]:
     """Return topic -> (time, message) of a recording, read with the definitions that it holds."""
-    found: dict[str, list[tuple[int, Any]]] = {}
+    messages: dict[str, list[tuple[int, Any]]] = {}
     with AnyReader([path]) as reader:
         for connection, time, content in reader.messages():
-            found.setdefault(connection.topic, []).append((time, reader.deserialize(content, connection.msgtype)))
-    return found
+            messages.setdefault(connection.topic, []).append((time, reader.deserialize(content, connection.msgtype)))
+    return messages
 
 
 @pytest.mark.parametrize(("name", "out"), [("a.bag", "out.mcap"), ("folder", "out"), ("a.mcap", "out.mcap")])

@@ -48,7 +48,7 @@ def test_exceptions_of_the_function_are_raised(workers: int) -> None:
 
 @pytest.mark.slow
 def test_a_dead_worker_costs_its_item_only(tmp_path: Path) -> None:
-    """The item of the worker that dies is computed again, the other worker goes on, and the dead one is replaced."""
+    """The item of the worker that dies is computed again, the other worker continues, and the dead one is replaced."""
     logged = f"open({str(tmp_path / 'log')!r}, 'a').write('%s ') and %s"
     once = f"(__import__('os')._exit(3) if open({str(tmp_path / 'log')!r}).read().count('b') == 1 else 1)"
     items = [logged % ("a", "__import__('time').sleep(1) or 0"), logged % ("b", once)]
