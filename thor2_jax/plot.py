@@ -9,28 +9,21 @@ Every function draws on the axes `ax` that it is given, which may be part of any
 Lengths are drawn as they are given: metres for clouds as a camera sees them, scaled units for all that is aligned.
 """
 
-import functools
-import io
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import PathCollection
 from matplotlib.colors import LinearSegmentedColormap, Normalize
-from matplotlib.figure import Figure
-from matplotlib.font_manager import fontManager, get_font
 from numpy.typing import ArrayLike, NDArray
 
 from colornet import ColorNetwork
 from colornet.draw import plot_network
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
-from thor2_jax.files import atomic_write
-from thor2_jax.printable import escape_characters
+from thor2_jax.figures import name_style, plain_text
 from thor2_jax.types import Diagrams
 
 __all__ = [
@@ -41,66 +34,17 @@ __all__ = [
     "color_network",
     "color_vectors",
     "confusion",
-    "name_style",
     "persistence_diagram",
     "persistence_image",
-    "plain_text",
-    "png_bytes",
     "reliability",
-    "save_figure",
     "slices",
 ]
 
 PALETTE = ("#56b4e9", "#e69f00", "#009e73", "#222222", "#cc79a7", "#0072b2", "#d55e00", "#f0e442")
 """The palette of Okabe and Ito, which people with colour blindness can distinguish."""
 
-_DPI = 130
-
 _DIVERGING = LinearSegmentedColormap.from_list("attribution", ["#0a4f8f", "#7fb2dd", "#d9d9d9", "#f2a36b", "#b83a00"])
 """Blue for negative, grey for zero, orange for positive values."""
-
-
-def save_figure(figure: Figure, path: str | Path) -> None:
-    """Write a figure as PNG, atomically.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
-    FigureCanvasAgg(figure)
-    with atomic_write(path) as temporary:
-        figure.savefig(temporary, dpi=_DPI, format="png")
-
-
-def png_bytes(figure: Figure) -> bytes:
-    """Return a figure as the content of a PNG file."""
-    FigureCanvasAgg(figure)
-    stream = io.BytesIO()
-    figure.savefig(stream, dpi=_DPI, format="png")
-    return stream.getvalue()
-
-
-_FONTS = ("DejaVu Sans", "Noto Sans CJK SC", "Noto Sans CJK JP", "WenQuanYi Zen Hei", "Arial Unicode MS", "Noto Emoji")
-"""Fonts for names, those that are installed; matplotlib has the first one."""
-
-
-@functools.cache
-def _installed_fonts() -> tuple[list[str], frozenset[int]]:
-    """Return the installed fonts of _FONTS and the characters that they have."""
-    files = {font.name: font.fname for font in fontManager.ttflist if font.name in _FONTS}
-    characters = frozenset(code for file in files.values() for code in get_font(file).get_charmap())
-    return [name for name in _FONTS if name in files], characters
-
-
-def plain_text(name: str) -> str:
-    """Return a name as matplotlib draws it character by character: no mathtext, and escapes for missing characters."""
-    _, characters = _installed_fonts()
-    shown = escape_characters(name, lambda c: c == "\n" or (c.isprintable() and ord(c) in characters))
-    return shown.replace("$", r"\$")
-
-
-def name_style() -> dict[str, Any]:
-    """Return the properties of a text that holds names."""
-    return {"fontfamily": _installed_fonts()[0]}
 
 
 def attribution_colors(values: ArrayLike) -> ScalarMappable:

@@ -13,7 +13,7 @@ from scipy.ndimage import maximum_filter, minimum_filter
 from thor2_jax import plot
 from thor2_jax.explanation.changes import Change, apply_change
 from thor2_jax.explanation.explain import Explanation, pixel_attributions
-from thor2_jax.plot import name_style, plain_text
+from thor2_jax.figures import name_style, plain_text
 from thor2_jax.recognition.frames import RGBDFrame
 from thor2_jax.recognition.prepared_instance import PreparedInstance
 

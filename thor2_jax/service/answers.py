@@ -11,8 +11,8 @@ from thor2_jax.adaptation.estimate import Adaptation
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.explanation.explain import Explanation
 from thor2_jax.explanation.pictures import change_text, main_pictures
+from thor2_jax.figures import png_bytes
 from thor2_jax.gallery.objects import ObjectGallery
-from thor2_jax.plot import png_bytes
 from thor2_jax.recognition.answers import Recognition
 from thor2_jax.recognition.frames import RGBDFrame
 from thor2_jax.recognition.prepared_instance import PreparedInstance

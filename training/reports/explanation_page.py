@@ -5,8 +5,8 @@ from pathlib import Path
 
 from thor2_jax.explanation.explain import Explanation
 from thor2_jax.explanation.pictures import change_text, pictures
+from thor2_jax.figures import save_figure
 from thor2_jax.files import atomic_directory, write_text
-from thor2_jax.plot import save_figure
 from thor2_jax.recognition.answers import Recognition
 from thor2_jax.recognition.frames import RGBDFrame
 from training.reports.html import Picture, Section, Table, write_page

@@ -13,7 +13,7 @@ from thor2_jax import plot
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.describe import describe_strips, strips
 from thor2_jax.descriptor.view_normalization import align
-from thor2_jax.plot import name_style, plain_text, save_figure
+from thor2_jax.figures import name_style, plain_text, save_figure
 from thor2_jax.types import PointClouds
 from training.objects.mesh import TexturedMesh
 from training.rendering.ray_caster import RayCaster, render_view

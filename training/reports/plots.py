@@ -9,7 +9,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from thor2_jax import plot
-from thor2_jax.plot import PALETTE, name_style, plain_text, save_figure
+from thor2_jax.figures import name_style, plain_text, save_figure
+from thor2_jax.plot import PALETTE
 
 __all__ = [
     "draw_accuracy",

@@ -10,7 +10,7 @@ from PIL import Image
 
 import colornet
 import thor2_jax as thor2
-from thor2_jax.plot import plain_text
+from thor2_jax.figures import plain_text
 from training import demo
 from training.fitting.options import FitOptions
 from training.objects.builtin_objects import builtin_objects

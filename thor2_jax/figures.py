@@ -1,0 +1,59 @@
+"""Matplotlib figures as PNG files, and names of objects as texts in them."""
+
+import functools
+import io
+from pathlib import Path
+from typing import Any
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.font_manager import fontManager, get_font
+
+from thor2_jax.files import atomic_write
+from thor2_jax.printable import escape_characters
+
+__all__ = ["name_style", "plain_text", "png_bytes", "save_figure"]
+
+_DPI = 130
+
+_FONTS = ("DejaVu Sans", "Noto Sans CJK SC", "Noto Sans CJK JP", "WenQuanYi Zen Hei", "Arial Unicode MS", "Noto Emoji")
+"""Fonts for names, those that are installed; matplotlib has the first one."""
+
+
+def save_figure(figure: Figure, path: str | Path) -> None:
+    """Write a figure as PNG, atomically.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    FigureCanvasAgg(figure)
+    with atomic_write(path) as temporary:
+        figure.savefig(temporary, dpi=_DPI, format="png")
+
+
+def png_bytes(figure: Figure) -> bytes:
+    """Return a figure as the content of a PNG file."""
+    FigureCanvasAgg(figure)
+    stream = io.BytesIO()
+    figure.savefig(stream, dpi=_DPI, format="png")
+    return stream.getvalue()
+
+
+@functools.cache
+def _installed_fonts() -> tuple[list[str], frozenset[int]]:
+    """Return the installed fonts of _FONTS and the characters that they have."""
+    files = {font.name: font.fname for font in fontManager.ttflist if font.name in _FONTS}
+    characters = frozenset(code for file in files.values() for code in get_font(file).get_charmap())
+    return [name for name in _FONTS if name in files], characters
+
+
+def plain_text(name: str) -> str:
+    """Return a name as matplotlib draws it character by character: no mathtext, and escapes for missing characters."""
+    _, characters = _installed_fonts()
+    shown = escape_characters(name, lambda c: c == "\n" or (c.isprintable() and ord(c) in characters))
+    return shown.replace("$", r"\$")
+
+
+def name_style() -> dict[str, Any]:
+    """Return the properties of a text that holds names."""
+    return {"fontfamily": _installed_fonts()[0]}
