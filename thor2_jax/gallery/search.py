@@ -21,6 +21,12 @@ __all__ = ["ExactSearch", "IndexSearch", "ViewSearch", "one_blas_thread"]
 CHUNK = 2**14
 """Views per matrix product: 16 MB as float32 at 256 numbers each."""
 
+BUILD_CANDIDATES = 64
+"""Candidates for the neighbours of a view while the index is built: half of the default of usearch."""
+
+SEARCH_CANDIDATES = 256
+"""Candidates for the nearest views of a query of the index."""
+
 FAST_VIEWS = 2**17
 """Largest number of views that are also kept as float32 (134 MB): their conversion takes half of a query."""
 
@@ -111,7 +117,13 @@ class IndexSearch:
                 "index is usearch, which is not installed; run pip install -c constraints.txt '.[index]'"
             ) from None
         self._size = len(embeddings)
-        self._index = usearch.Index(ndim=embeddings.shape[1], metric="ip", dtype="f16")
+        self._index = usearch.Index(
+            ndim=embeddings.shape[1],
+            metric="ip",
+            dtype="f16",
+            expansion_add=BUILD_CANDIDATES,
+            expansion_search=SEARCH_CANDIDATES,
+        )
         self._index.add(np.arange(len(embeddings)), embeddings, threads=threads)
 
     def nearest(self, queries: NDArray[np.float32], count: int) -> tuple[NDArray[np.float32], NDArray[np.intp]]:

@@ -69,7 +69,7 @@ DEFAULT = Protocol(
     augmentations=AUGMENTATIONS,
     mirrors=("",),
     orientation_copies=1,
-    config=DescriptorConfig(homology="closed_form", orientations=4),
+    config=DescriptorConfig(homology="closed_form", orientations=2),
     fit=FitOptions(epochs=16, batch_size=256),
 )
 """Fewer views than the paper's, each with five augmented copies and in one more orientation."""

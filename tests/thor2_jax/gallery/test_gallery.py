@@ -9,7 +9,7 @@ import threadpoolctl
 from thor2_jax.errors import InputError
 from thor2_jax.gallery.clouds import CompactClouds
 from thor2_jax.gallery.gallery import Gallery, GalleryObject
-from thor2_jax.gallery.search import CHUNK, ExactSearch
+from thor2_jax.gallery.search import CHUNK, ExactSearch, IndexSearch
 from thor2_jax.recognition.prepared_instance import PreparedInstance
 
 
@@ -166,6 +166,18 @@ def test_the_index_finds_the_same_nearest_views(gallery: Gallery) -> None:
     queries = np.concatenate([views_around(k, 3, seed=2) for k in range(3)]).astype(np.float32)
     indexed = dataclasses.replace(gallery, search="usearch")
     np.testing.assert_allclose(indexed.scores(queries), gallery.scores(queries), atol=0.02)
+
+
+def test_recall_of_the_index() -> None:
+    pytest.importorskip("usearch")
+    rng = np.random.default_rng(0)
+    centers = np.repeat(unit(rng.normal(size=(500, 32))), 10, axis=0)
+    embeddings = unit(centers + 0.6 * unit(rng.normal(size=centers.shape))).astype(np.float16)
+    queries = embeddings[::50].astype(np.float32)
+    _, exact = ExactSearch(embeddings).nearest(queries, 20)
+    similarity, index = IndexSearch(embeddings).nearest(queries, 20)
+    assert np.mean([len(np.intersect1d(*rows)) / 20 for rows in zip(exact, index, strict=True)]) > 0.98
+    np.testing.assert_allclose(similarity, np.einsum("qd,qnd->qn", queries, embeddings[index]), atol=5e-3)
 
 
 def test_an_unknown_search_is_refused() -> None:
