@@ -9,7 +9,7 @@ so many degrees apart, as a robot may reach them. For objects that are in the fi
 occluded there, the file has the accuracy by the number of views when
 
 fused      the answers for the views are fused (`thor2_jax.tracking.fusion`), the views in the order around the table
-merged     the clouds of the views are merged in space and described as one
+merged     fused, and each view is also described as one cloud with those before it (`thor2_jax.tracking.merging`)
 random     fused, the further views in random order
 next_view  fused, each further view chosen by `thor2_jax.tracking.next_view`
 
@@ -34,15 +34,10 @@ from thor2_jax.errors import InputError
 from thor2_jax.files import write_text
 from thor2_jax.recognition.answers import Evidence
 from thor2_jax.recognition.frames import Intrinsics, RGBDFrame
-from thor2_jax.recognition.prepared_instance import (
-    DESCRIPTOR_VOXEL,
-    PreparedInstance,
-    pack_instances,
-    prepare_instance,
-)
-from thor2_jax.recognition.voxel_grid import downsample_to_fit
+from thor2_jax.recognition.prepared_instance import PreparedInstance, pack_instances, prepare_instance
 from thor2_jax.recognizer import Recognizer
 from thor2_jax.tracking.fusion import FusedEvidence, view_weight
+from thor2_jax.tracking.merging import merge_views
 from thor2_jax.tracking.next_view import ViewTable, next_view
 from thor2_jax.tracking.poses import transform
 from thor2_jax.tracking.tracker import Tracker
@@ -79,7 +74,8 @@ class _Cached:
     def __init__(self, recognizer: Recognizer) -> None:
         self._recognizer = recognizer
         self._evidence: dict[int, tuple[list[PreparedInstance], Evidence]] = {}
-        self.gallery, self.recognitions, self.fused = recognizer.gallery, recognizer.recognitions, recognizer.fused
+        self.run, self.gallery, self.fused = recognizer.run, recognizer.gallery, recognizer.fused
+        self.evidence_of, self.recognitions = recognizer.evidence_of, recognizer.recognitions
 
     def frame_evidence(self, frame: RGBDFrame) -> tuple[list[PreparedInstance], Evidence]:
         if id(frame) not in self._evidence:
@@ -140,15 +136,6 @@ def probabilities_of(recognizer: Recognizer, instances: Sequence[PreparedInstanc
     return answers
 
 
-def merged(views: Sequence[tuple[PreparedInstance, NDArray[np.float64]]], sigma_s: float) -> PreparedInstance:
-    """Return the clouds of views (instance and pose) as one, in the coordinates of the first camera."""
-    to_first = np.linalg.inv(views[0][1])
-    points = np.concatenate([transform(to_first @ pose, view.points) for view, pose in views])
-    colors = np.concatenate([view.colors for view, _ in views])
-    points, colors = downsample_to_fit(points, colors, DESCRIPTOR_VOXEL / sigma_s)
-    return PreparedInstance(views[0][0].label, points, colors, np.zeros(len(points), bool))
-
-
 def _fuse(recognizer: Recognizer, views: Sequence[tuple[PreparedInstance, Probabilities]]) -> NDArray[np.floating]:
     """Return the fused class probabilities [C] of views of one object."""
     evidence = FusedEvidence()
@@ -197,12 +184,15 @@ def measure_scene(
             method: [classes[int(answer(order[:k]).argmax())] == name for k in range(1, len(order) + 1)]
             for method, order in orders.items()
         }
-        clouds = [
-            merged([(seen[label, number], views[number][1]) for number in orders["fused"][:k]], sigma_s)
-            for k in range(2, len(others) + 2)
+        posed = [(seen[label, number], views[number][1]) for number in orders["fused"]]
+        clouds = [merge_views(posed[:k], sigma_s) for k in range(2, len(posed) + 1)]
+        of_views = [(seen[label, number], probabilities[label, number]) for number in orders["fused"]]
+        of_clouds = list(zip(clouds, probabilities_of(recognizer, clouds), strict=True))
+        # In the order of a tracker: a view alone, then the cloud of it and those before it.
+        both = [of_views[0], *(each for pair in zip(of_views[1:], of_clouds, strict=True) for each in pair)]
+        correct["merged"] = [
+            classes[int(_fuse(recognizer, both[: 2 * k - 1]).argmax())] == name for k in range(1, len(posed) + 1)
         ]
-        of_clouds = [_fuse(recognizer, [(clouds[k], p)]) for k, p in enumerate(probabilities_of(recognizer, clouds))]
-        correct["merged"] = [correct["fused"][0], *[classes[int(p.argmax())] == name for p in of_clouds]]
         rows.append({"name": name, "occlusion": views[0][0].occlusion(label), "correct": correct})
     return rows
 

@@ -1,12 +1,9 @@
-"""Benchmarks of adaptation and tracks: summaries, merged clouds and answers, on values written by hand."""
+"""Benchmarks of adaptation and tracks: summaries of values written by hand."""
 
-import numpy as np
 import pytest
 
 from benchmarks.adaptation import summary
-from benchmarks.tracking import METHODS, VIEWS, merged, summarize_scenes
-from thor2_jax.recognition.prepared_instance import PreparedInstance
-from training.rendering.view_sphere import camera_pose
+from benchmarks.tracking import METHODS, VIEWS, summarize_scenes
 
 
 def test_affected_cameras_are_those_that_lost_enough() -> None:
@@ -27,17 +24,3 @@ def test_an_object_keeps_the_answer_of_its_last_view() -> None:
     results = summarize_scenes(rows)
     assert results["all"]["fused"] == {"accuracy": [0.5, *[1.0] * (VIEWS - 1)], "views needed": 2}
     assert results["high"]["objects"] == 1 and results["high"]["merged"]["accuracy"][0] == 0
-
-
-def test_merged_clouds_coincide_in_space() -> None:
-    rng = np.random.default_rng(0)
-    world = rng.uniform(-0.05, 0.05, (500, 3))
-    colors = rng.integers(0, 256, (500, 3), dtype=np.uint8)
-    poses = [camera_pose(azimuth, 1.0, np.zeros(3), 0.8) for azimuth in (0.3, 2.0)]
-    views = []
-    for pose in poses:
-        points = ((world - pose[:3, 3]) @ pose[:3, :3]).astype(np.float32)
-        views.append((PreparedInstance(1, points, colors, np.zeros(500, bool)), pose))
-    one, both = merged(views[:1], 2.5), merged(views, 2.5)
-    assert abs(len(both.points) - len(one.points)) < 0.1 * len(one.points)
-    np.testing.assert_allclose(both.points.mean(axis=0), one.points.mean(axis=0), atol=1e-3)

@@ -9,6 +9,7 @@
 """
 
 import dataclasses
+from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol, Self
 
@@ -19,9 +20,11 @@ from thor2_jax.errors import InputError
 from thor2_jax.gallery.gallery import Gallery
 from thor2_jax.recognition.answers import MAX_OVERFLOW, Evidence, Recognition
 from thor2_jax.recognition.frames import RGBDFrame
-from thor2_jax.recognition.prepared_instance import PreparedInstance
+from thor2_jax.recognition.prepared_instance import EMPTY_INSTANCE, PreparedInstance
+from thor2_jax.recognition.run_directory import TrainedRun
 from thor2_jax.tracking.fusion import FusedEvidence, view_weight
 from thor2_jax.tracking.matching import OccupiedVoxels, match, occupied_voxels
+from thor2_jax.tracking.merging import PosedInstance, merge_views
 from thor2_jax.tracking.next_view import NextView, ViewTable, next_view
 from thor2_jax.tracking.poses import check_pose, transform
 
@@ -29,6 +32,9 @@ __all__ = ["TrackedRecognition", "Tracker"]
 
 MAX_MISSED = 10
 """Frames without a view of an object after which its track ends."""
+
+MERGED_VIEWS = 6
+"""Latest views of an object whose clouds are merged; enough to see it from all sides."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,7 +59,12 @@ class FrameRecognizer(Protocol):
     """What a tracker needs of a recognizer, see `Recognizer`."""
 
     @property
+    def run(self) -> TrainedRun: ...
+
+    @property
     def gallery(self) -> Gallery: ...
+
+    def evidence_of(self, instances: Sequence[PreparedInstance]) -> Evidence: ...
 
     def frame_evidence(self, frame: RGBDFrame) -> tuple[list[PreparedInstance], Evidence]: ...
 
@@ -68,32 +79,27 @@ class _Track:
     Attributes:
         number: from 1, in the order of appearance.
         voxels: those of its last view.
-        instance: its last view.
-        overflow: points of that view outside the descriptor's grid.
+        instance: what was described last: its last view, with poses merged with those before it.
+        overflow: points of that cloud outside the descriptor's grid.
         seen: number of the frame of its last view.
-        pose: pose of the camera of that view; None without poses.
+        views: its latest views and the poses of their cameras; empty without poses.
         frames: number of views.
         evidence: what it is recognized by.
     """
 
-    def __init__(
-        self,
-        number: int,
-        voxels: OccupiedVoxels,
-        instance: PreparedInstance,
-        overflow: int,
-        seen: int,
-        pose: NDArray[np.float64] | None,
-    ) -> None:
-        self.number, self.voxels, self.instance = number, voxels, instance
-        self.overflow, self.seen, self.pose = overflow, seen, pose
-        self.frames, self.evidence = 0, FusedEvidence()
+    def __init__(self, number: int) -> None:
+        self.number, self.frames, self.seen, self.overflow = number, 0, 0, 0
+        self.voxels: OccupiedVoxels = ()
+        self.instance = EMPTY_INSTANCE
+        self.views: deque[PosedInstance] = deque(maxlen=MERGED_VIEWS)
+        self.evidence = FusedEvidence()
 
 
 class Tracker:
     """The objects of a sequence of frames of one camera.
 
     Without poses, clouds are compared in camera coordinates: the camera may move by a few centimetres between frames.
+    With poses, each view of an object is described alone and as one cloud with those before it.
     """
 
     def __init__(self, recognizer: FrameRecognizer) -> None:
@@ -159,13 +165,13 @@ class Tracker:
             numbers = ", ".join(str(each.number) for each in self._tracks) or "none"
             raise InputError(f"track is {track!r}; expected one of {numbers}")
         probabilities, _ = followed.evidence.fused()
-        if followed.pose is None or not probabilities:
-            missing = "poses" if followed.pose is None else "answers of classifiers"
+        if not followed.views or not probabilities:
+            missing = "answers of classifiers" if followed.views else "poses"
             raise InputError(f"track {track} has no {missing}; next_view needs them")
         fused = self._recognizer.fused({name: p[None].astype(np.float32) for name, p in probabilities.items()})[0]
-        points = followed.instance.points
+        pose, points = followed.views[-1][1], followed.instance.points
         centre = (points.min(axis=0, keepdims=True) + points.max(axis=0, keepdims=True)) / 2
-        return next_view(fused, transform(followed.pose, centre)[0], followed.pose, candidates, table)
+        return next_view(fused, transform(pose, centre)[0], pose, candidates, table)
 
     def _extend(
         self, usable: Sequence[PreparedInstance], evidence: Evidence, world: NDArray[np.float64] | None
@@ -174,17 +180,31 @@ class Tracker:
         points = [each.points if world is None else transform(world, each.points) for each in usable]
         voxels = [occupied_voxels(cloud) for cloud in points]
         matched = {j: self._tracks[i] for i, j in match([track.voxels for track in self._tracks], voxels)}
-        scores = self._scores(evidence, len(usable))
-        for row, instance in enumerate(usable):
-            overflow = int(evidence.overflow[row])
-            track = matched.get(row)
-            if track is None:
-                self._last_number += 1
-                track = _Track(self._last_number, voxels[row], instance, overflow, self._frame, world)
-                self._tracks.append(track)
-            track.voxels, track.instance, track.overflow, track.pose = voxels[row], instance, overflow, world
+        tracks = [matched.get(row) or self._start_track() for row in range(len(usable))]
+        for track, instance, occupied in zip(tracks, usable, voxels, strict=True):
+            track.voxels, track.instance = occupied, instance
             track.seen, track.frames = self._frame, track.frames + 1
-            weight = view_weight(instance) if overflow <= MAX_OVERFLOW * len(instance.points) else 0.0
+            if world is not None:
+                track.views.append((instance, world))
+        self._add_evidence(tracks, evidence)
+        several = [track for track in tracks if len(track.views) > 1]
+        for track in several:
+            track.instance = merge_views(track.views, self._recognizer.run.config.sigma_s)
+        if several:
+            self._add_evidence(several, self._recognizer.evidence_of([track.instance for track in several]))
+
+    def _start_track(self) -> _Track:
+        self._last_number += 1
+        self._tracks.append(_Track(self._last_number))
+        return self._tracks[-1]
+
+    def _add_evidence(self, tracks: Sequence[_Track], evidence: Evidence) -> None:
+        """Add the rows of the evidence to those of the tracks, weighted by the clouds that were described."""
+        scores = self._scores(evidence, len(tracks))
+        for row, track in enumerate(tracks):
+            track.overflow = int(evidence.overflow[row])
+            fits = track.overflow <= MAX_OVERFLOW * len(track.instance.points)
+            weight = view_weight(track.instance) if fits else 0.0
             probabilities = {name: np.asarray(values)[row] for name, values in evidence.probabilities.items()}
             track.evidence.add(weight, probabilities, None if scores is None else scores[row])
 

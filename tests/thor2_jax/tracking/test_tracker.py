@@ -26,12 +26,18 @@ class ToyRecognizer:
 
     def __init__(self) -> None:
         self._recognizer = Recognizer(RUN)
+        self.run = RUN
         self.gallery: Gallery = self._recognizer.gallery
+        self.described: list[PreparedInstance] = []
 
     def frame_evidence(self, frame: thor2.RGBDFrame) -> tuple[list[PreparedInstance], Evidence]:
         described = self._recognizer.describe(frame)
-        p = np.array([each.colors.mean(axis=0) / 255 for each in described.usable])
-        return list(described.instances), Evidence(np.zeros(len(p), int), {"tops": p, "tops2": p})
+        return list(described.instances), self.evidence_of(described.usable)
+
+    def evidence_of(self, instances: Sequence[PreparedInstance]) -> Evidence:
+        self.described += instances
+        p = np.array([each.colors.mean(axis=0) / 255 for each in instances])
+        return Evidence(np.zeros(len(p), int), {"tops": p, "tops2": p})
 
     def recognitions(self, instances: Sequence[PreparedInstance], evidence: Evidence) -> list[Recognition]:
         return self._recognizer.recognitions(instances, evidence)
@@ -84,6 +90,21 @@ def test_poses_match_objects_of_a_camera_that_moved() -> None:
     with_poses, without = Tracker(ToyRecognizer()), Tracker(ToyRecognizer())
     assert [with_poses.update(f, p)[0].track for f, p in zip(boxes, (np.eye(4), moved), strict=True)] == [1, 1]
     assert [without.update(f)[0].track for f in boxes] == [1, 2]
+
+
+def test_views_with_poses_are_described_as_one_cloud() -> None:
+    moved = np.eye(4)
+    moved[0, 3] = 0.02
+    recognizer = ToyRecognizer()
+    tracker = Tracker(recognizer)
+    tracker.update(frame({1: (10, 60, SURE_A)}), np.eye(4))
+    (answer,) = tracker.update(frame({1: (10, 60, UNSURE_B)}), moved)  # the square now lies 2 cm further right
+    first, second, both = recognizer.described
+    assert np.ptp(second.points[:, 0]) == pytest.approx(np.ptp(first.points[:, 0]), abs=1e-6)
+    assert np.ptp(both.points[:, 0]) == pytest.approx(np.ptp(first.points[:, 0]) + 0.02, abs=0.004)
+    assert both.points[:, 0].max() == pytest.approx(second.points[:, 0].max(), abs=0.004)
+    assert answer.points_used == len(both.points) > len(first.points)
+    assert not both.boundary.any() and answer.frames == 2
 
 
 def test_a_track_ends_when_its_object_is_gone() -> None:
