@@ -365,13 +365,25 @@ class Recognizer:
 
         The arguments are those of `recognize`.
         """
+        return self.evidence_of(self._prepared(frame), classifiers, answer_by)
+
+    def evidence_of(
+        self,
+        instances: Iterable[PreparedInstance],
+        classifiers: Sequence[str] | None = None,
+        answer_by: str | None = None,
+    ) -> tuple[list[PreparedInstance], Evidence]:
+        """Return instances, whose colours are corrected already, and what the usable ones are recognized by.
+
+        The other arguments are those of `recognize`.
+        """
         source = self.answers_by(answer_by)
         names = self._classifiers.checked(classifiers) if source != "gallery" else ()
 
         def compute(clouds: PointClouds) -> Evidence:
             return self._evidence(clouds, names, source != "classifiers")
 
-        return compute_by_chunks(self._prepared(frame), self.chunk, compute)
+        return compute_by_chunks(instances, self.chunk, compute)
 
     def gallery_scores(self, described: DescribedFrame) -> NDArray[np.float32]:
         """Return the scores [B, n_objects] of the gallery, one row for each row of the descriptors."""

@@ -10,7 +10,7 @@
 
 import dataclasses
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Protocol, Self
 
 import numpy as np
@@ -64,7 +64,7 @@ class FrameRecognizer(Protocol):
     @property
     def gallery(self) -> Gallery: ...
 
-    def evidence_of(self, instances: Sequence[PreparedInstance]) -> Evidence: ...
+    def evidence_of(self, instances: Iterable[PreparedInstance]) -> tuple[list[PreparedInstance], Evidence]: ...
 
     def frame_evidence(self, frame: RGBDFrame) -> tuple[list[PreparedInstance], Evidence]: ...
 
@@ -191,7 +191,7 @@ class Tracker:
         for track in several:
             track.instance = merge_views(track.views, self._recognizer.run.config.sigma_s)
         if several:
-            self._add_evidence(several, self._recognizer.evidence_of([track.instance for track in several]))
+            self._add_evidence(several, self._recognizer.evidence_of(track.instance for track in several)[1])
 
     def _start_track(self) -> _Track:
         self._last_number += 1

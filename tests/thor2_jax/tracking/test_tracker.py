@@ -1,7 +1,7 @@
 """Trackers with a toy recognizer that reads an instance's probabilities from its colour."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 import pytest
@@ -32,12 +32,13 @@ class ToyRecognizer:
 
     def frame_evidence(self, frame: thor2.RGBDFrame) -> tuple[list[PreparedInstance], Evidence]:
         described = self._recognizer.describe(frame)
-        return list(described.instances), self.evidence_of(described.usable)
+        return list(described.instances), self.evidence_of(described.usable)[1]
 
-    def evidence_of(self, instances: Sequence[PreparedInstance]) -> Evidence:
-        self.described += instances
-        p = np.array([each.colors.mean(axis=0) / 255 for each in instances])
-        return Evidence(np.zeros(len(p), int), {"tops": p, "tops2": p})
+    def evidence_of(self, instances: Iterable[PreparedInstance]) -> tuple[list[PreparedInstance], Evidence]:
+        usable = list(instances)
+        self.described += usable
+        p = np.array([each.colors.mean(axis=0) / 255 for each in usable])
+        return usable, Evidence(np.zeros(len(p), int), {"tops": p, "tops2": p})
 
     def recognitions(self, instances: Sequence[PreparedInstance], evidence: Evidence) -> list[Recognition]:
         return self._recognizer.recognitions(instances, evidence)
