@@ -43,6 +43,9 @@ LEAST_SUPPORT = 0.3
 HOLE = 0.3
 """Largest hole in a thing, as a share of it, that is filled, for instance the handle of scissors."""
 
+LEAST_INNER = 0.9
+"""Least share of a thing that is left without the rim of half a working pixel; thin things keep their rim."""
+
 
 def segment_table(frame: RGBDFrame) -> NDArray[np.int32]:
     """Segment what stands or lies on the dominant planes of a frame; its labels are not read.
@@ -95,8 +98,20 @@ def _refined(labels: NDArray[np.int32], color: NDArray[np.uint8], stride: int) -
     height, width = refined[here].shape
     markers = np.ascontiguousarray(markers.repeat(stride, axis=0).repeat(stride, axis=1)[:height, :width])
     blurred = np.asarray(cv2.GaussianBlur(np.ascontiguousarray(color[here]), (3, 3), 0), np.uint8)
-    refined[here] = watershed(blurred, markers) - 1
+    refined[here] = _trimmed(watershed(blurred, markers) - 1, 2 * (stride // 2) + 1)
     return refined
+
+
+def _trimmed(labels: NDArray[np.int32], size: int) -> NDArray[np.int32]:
+    """Return labels without the rims of things, where depth belongs to one surface and colour to another.
+
+    A pixel is of the rim if the square of `size` pixels around it has another label.
+    """
+    largest, smallest = local_extremes(labels, size)
+    inner = np.where(largest == smallest, labels, 0)
+    sizes = np.bincount(labels.ravel())
+    thick = np.bincount(inner.ravel(), minlength=len(sizes)) >= LEAST_INNER * sizes
+    return np.where(thick[labels], inner, labels)
 
 
 def _cleaned(labels: NDArray[np.int32], depth: DepthImage, planes: list[Plane]) -> NDArray[np.int32]:

@@ -7,7 +7,7 @@ import pytest
 from segmentation_scenes import Box, best_overlaps, render
 
 from thor2_jax.recognition.frames import Intrinsics, RGBDFrame
-from thor2_jax.segmentation.table import _refined, segment_table
+from thor2_jax.segmentation.table import _refined, _trimmed, segment_table
 
 RED, BLUE, GREEN, YELLOW = (190, 30, 40), (30, 60, 190), (30, 150, 60), (220, 200, 40)
 APART = [
@@ -161,3 +161,17 @@ def test_borders_are_refined_as_in_the_whole_image() -> None:
     labels[0:4, 0:4], labels[44:48, 60:64] = 2, 3
     np.testing.assert_array_equal(alone == 1, _refined(labels, color, 2) == 1)
     assert not _refined(np.zeros_like(labels), color, 2).any()
+
+
+def test_the_rim_of_thick_things_is_trimmed() -> None:
+    labels = np.zeros((80, 120), np.int32)
+    labels[5:65, 10:70] = 1
+    labels[5:65, 70:110] = 2  # beside it
+    labels[70:73, 10:110] = 3  # thin
+    trimmed = _trimmed(labels, 3)
+    expected = np.zeros_like(labels)
+    expected[6:64, 11:69] = 1
+    expected[6:64, 71:109] = 2
+    expected[70:73, 10:110] = 3
+    np.testing.assert_array_equal(trimmed, expected)
+    np.testing.assert_array_equal(_trimmed(labels, 1), labels)
