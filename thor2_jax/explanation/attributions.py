@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from thor2_jax.config import DescriptorConfig, Relaxation
 from thor2_jax.descriptor.color_membership import RegionSets, region_sets
@@ -32,8 +33,13 @@ STEPS = 8
 """Points of the path from half of the weights to all of them."""
 
 PATHS = (8, 3, 1)
-"""Numbers of the last steps that are averaged: from half of the weights, from four fifths, and at the end. The one is
-chosen whose most attributed tenth lowers the exact margin most."""
+"""Numbers of the last steps that are averaged: from half of the weights, from four fifths, and at the end."""
+
+SMOOTHING = (0.0, 0.005, 0.015)
+"""Standard deviations of the Gaussians with which attributions are averaged over neighbouring points, metres. A strip
+depends on its outermost points only, and without them the next ones take their place; smoothed attributions belong to
+patches of the surface. Of all paths and smoothings, those are chosen whose most attributed tenth lowers the exact
+margin most."""
 
 RANDOM_TENTHS = 20
 
@@ -65,11 +71,13 @@ class Attributions:
     Attributes:
         values: [n] float32; the margin lost with each point, to first order. Negative values speak against the answer.
         steps: number of steps of the path that were averaged, one of `PATHS`.
+        smoothing: standard deviation of the average over neighbouring points, metres, one of `SMOOTHING`.
         faithfulness: exact check.
     """
 
     values: NDArray[np.float32]
     steps: int
+    smoothing: float
     faithfulness: Faithfulness
 
 
@@ -121,6 +129,24 @@ def path_gradients(scores: ClassScores, cloud: OrientedCloud, index: int) -> NDA
     return np.asarray(jax.grad(total)(jnp.asarray(weights, jnp.float32)))
 
 
+def smooth(points: NDArray[np.float32], values: NDArray[np.float32], deviation: float) -> NDArray[np.float32]:
+    """Return the averages of the values [m, n] of n points over their neighbours, weighted by a Gaussian of distance.
+
+    Args:
+        points: [n, 3] metres.
+        values: [m, n].
+        deviation: standard deviation of the Gaussian, metres; neighbours are at most two of them away. 0 for no average.
+    """
+    if deviation == 0:
+        return values
+    tree = KDTree(points)
+    near = tree.sparse_distance_matrix(tree, 2 * deviation, output_type="coo_matrix").tocsr()
+    # A distance of 0, to the point itself, is stored too.
+    near.data = np.exp(-np.square(near.data / deviation) / 2)
+    sums = near @ np.vstack([values, np.ones(len(points))]).T
+    return (sums[:, :-1] / sums[:, -1:]).T.astype(np.float32)
+
+
 def attribute_points(
     scores: ClassScores, cloud: OrientedCloud, instance: PreparedInstance, index: int, seed: int = 0
 ) -> Attributions:
@@ -135,7 +161,8 @@ def attribute_points(
     """
     n = len(instance.points)
     gradients = path_gradients(scores, cloud, index)[:, :n]
-    candidates = [gradients[-count:].mean(axis=0) for count in PATHS]
+    averages = np.stack([gradients[-count:].mean(axis=0) for count in PATHS])
+    candidates = np.concatenate([smooth(instance.points, averages, deviation) for deviation in SMOOTHING])
     kept = np.ones((1 + len(candidates) + RANDOM_TENTHS, n), bool)
     for row, values in enumerate(candidates, 1):
         kept[row, np.argsort(-values, kind="stable")[: tenth_of(n)]] = False
@@ -149,6 +176,7 @@ def attribute_points(
     random = float(losses[len(candidates) :].mean())
     return Attributions(
         candidates[best].astype(np.float32),
-        PATHS[best],
+        PATHS[best % len(PATHS)],
+        SMOOTHING[best // len(PATHS)],
         Faithfulness(float(margins[0]), float(losses[best]), random),
     )

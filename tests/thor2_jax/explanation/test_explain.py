@@ -18,7 +18,14 @@ from thor2_jax.descriptor.orientations import OrientedDescriptors, describe_orie
 from thor2_jax.descriptor.relaxation import relaxed_strips
 from thor2_jax.explanation import attributions as attributions_module
 from thor2_jax.explanation import class_scores
-from thor2_jax.explanation.attributions import RELAXATION, attribute_points, path_gradients, select_points, tenth_of
+from thor2_jax.explanation.attributions import (
+    RELAXATION,
+    attribute_points,
+    path_gradients,
+    select_points,
+    smooth,
+    tenth_of,
+)
 from thor2_jax.explanation.changes import apply_change, changed_instance, smallest_change
 from thor2_jax.explanation.class_scores import ClassScores, classifier_scores, gallery_scores
 from thor2_jax.explanation.explain import Explanation, explain, pixel_attributions
@@ -186,6 +193,15 @@ def test_points_of_the_decisive_color_are_found(instance: PreparedInstance) -> N
     inside = (aligned[:, 0] < 0.125) & (aligned[:, 2] < 0.2)  # within 5 strips and 2 slices
     assert attributions.values[is_red & inside].min() > 5 * np.abs(attributions.values[~is_red]).max()
     assert attributions.faithfulness.holds and attributions.faithfulness.most_attributed > 0
+
+
+def test_smoothing_averages_over_neighbours() -> None:
+    rng = np.random.default_rng(0)
+    points, values = (rng.random(shape).astype(np.float32) for shape in ((200, 3), (2, 200)))
+    distances = np.linalg.norm(points[:, None] - points[None], axis=-1)
+    weights = np.exp(-((distances / 0.1) ** 2) / 2) * (distances <= 0.2)
+    np.testing.assert_allclose(smooth(points, values, 0.1), values @ weights / weights.sum(axis=0), rtol=1e-5)
+    np.testing.assert_array_equal(smooth(points, values, 0.0), values)
 
 
 @pytest.mark.slow
