@@ -1,9 +1,11 @@
-"""Draw the pictures of docs/explanation: python docs/hooks/draw_pictures.py (two minutes; the results are committed).
+"""Draw the pictures of docs/explanation: python docs/hooks/draw_pictures.py [FRAMES] (two minutes).
 
-Everything is rendered from the built-in objects; no real data is used.
+The results are committed. They are rendered from the built-in objects. With FRAMES, a directory with the frames `REAL`
+of YCB-Video and PoseCNN, only the pictures of real failures are drawn.
 """
 
 import io
+import sys
 from pathlib import Path
 
 import jax
@@ -23,6 +25,14 @@ from training.views.mesh_views import view_cloud
 
 OUT = Path(__file__).parents[1] / "images" / "explanation"
 CONFIG = thor2.DescriptorConfig()
+
+REAL = {
+    "real-metal": ("ycbv_posecnn_demo/000004", (150, 60, 310, 330), "no depth on the shiny lid"),
+    "real-near": ("ycbv_real_0000/000001", (60, 120, 500, 360), "holes on the box and at the edges"),
+    "real-alike": ("ycbv_posecnn_demo/000003", (120, 210, 330, 260), "two cans with metal lids"),
+    "real-thin": ("ycbv_posecnn_demo/000002", (20, 250, 420, 220), "the scissors hardly rise above the table"),
+}
+"""Picture -> frame, the part that is shown (left, top, width, height in pixels), and the title of its depth."""
 
 
 def save(figure: plt.Figure, name: str) -> None:
@@ -108,8 +118,30 @@ def draw_depths(name: str, frame: RGBDFrame, depths: dict[str, np.ndarray]) -> N
     save(figure, name)
 
 
+def draw_real_failures(frames: Path) -> None:
+    """Draw parts of real frames, in colour and depth."""
+    for name, (path, (left, top, width, height), title) in REAL.items():
+        window = slice(top, top + height), slice(left, left + width)
+        depth = np.asarray(Image.open(frames / path / "depth.png"))[window] / 1000
+        near, far = np.quantile(depth[depth > 0], [0.02, 0.9])
+        colors = plt.get_cmap("viridis_r").copy()
+        colors.set_bad("black")
+        figure, axes = plt.subplots(1, 2, figsize=(8.5, 4.4 * height / width + 0.3), layout="constrained")
+        axes[0].imshow(
+            Image.open(frames / path / "color.png").convert("RGB").crop((left, top, left + width, top + height))
+        )
+        axes[1].imshow(np.where(depth > 0, depth, np.nan), cmap=colors, vmin=near, vmax=far)
+        for ax, text in zip(axes, ("colour", title), strict=True):
+            ax.set_title(text)
+            ax.set_axis_off()
+        save(figure, name)
+
+
 if __name__ == "__main__":
     plt.switch_backend("agg")
     OUT.mkdir(parents=True, exist_ok=True)
-    draw_stages("mug_blue")
-    draw_failures()
+    if len(sys.argv) > 1:
+        draw_real_failures(Path(sys.argv[1]))
+    else:
+        draw_stages("mug_blue")
+        draw_failures()

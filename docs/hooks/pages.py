@@ -1,6 +1,7 @@
-"""MkDocs hook: pages generated from the code, and pages of the repository that lie outside of docs/.
+"""MkDocs hook: pages generated from the code, notebooks, and pages of the repository that lie outside of docs/.
 
-The command line comes from the typer application, the HTTP interface from the FastAPI application.
+The command line comes from the typer application, the HTTP interface from the FastAPI application. The page of a
+notebook has the outputs that are stored in it.
 """
 
 import json
@@ -13,6 +14,7 @@ import typer
 from markdown.extensions import Extension
 from markdown.preprocessors import Preprocessor
 from mkdocs.structure.files import File, Files
+from nbconvert import MarkdownExporter
 
 import colornet
 from thor2_jax.config import DescriptorConfig
@@ -58,6 +60,7 @@ def on_files(files: Files, config: Any) -> Files:
         "reference/http.md": http_page(schema),
         "reference/openapi.json": json.dumps(schema, indent=1),
         **{f"repository/{name}": (ROOT / name).read_text(encoding="utf-8") for name in OUTSIDE},
+        **notebook_pages(),
     }
     for path, content in pages.items():
         files.append(File.generated(config, path, content=content))
@@ -65,7 +68,7 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str:
-    """Point links between docs/ and the rest of the repository to the pages of the site."""
+    """Point links to notebooks, and between docs/ and the rest of the repository, to the pages of the site."""
     path = page.file.src_uri
     if path.startswith("repository/"):
         above = "../" * (path.count("/") - 1)
@@ -73,9 +76,23 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
         # Other files of the repository are not part of the site.
         return re.sub(r"\[([^\]]+)\]\((?!https?:)[^)#]+\.(?:py|json|toml|txt)\)", r"\1", markdown)
     above = "../" * (path.count("/") + 1)
+    markdown = markdown.replace(".ipynb)", ".md)")
     for name in OUTSIDE:
         markdown = markdown.replace(f"]({above}{name}", f"]({above[3:]}repository/{name}")
     return markdown
+
+
+def notebook_pages() -> dict[str, str | bytes]:
+    """Return the pages of the notebooks and the pictures of their outputs: path in the site -> content."""
+    pages: dict[str, str | bytes] = {}
+    for path in sorted((ROOT / "docs").rglob("*.ipynb")):
+        folder = path.parent.relative_to(ROOT / "docs").as_posix()
+        body, resources = MarkdownExporter().from_filename(str(path))
+        body = body.replace("![png](", f"![Output]({path.stem}_")
+        heading, _, rest = body.lstrip().partition("\n")
+        pages[f"{folder}/{path.stem}.md"] = f'{heading}\n\n<a href="{path.name}">This page as a notebook</a>\n{rest}'
+        pages |= {f"{folder}/{path.stem}_{name}": content for name, content in resources["outputs"].items()}
+    return pages
 
 
 def command_line() -> str:

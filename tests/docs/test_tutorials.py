@@ -3,7 +3,6 @@
 import json
 import re
 import shlex
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -36,9 +35,6 @@ def run_code(page: str, **names: Any) -> dict[str, Any]:
 
 @pytest.mark.slow
 def test_landing_page(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    names = {"color.jpg": "c.jpg", "depth.png": "d.png", "labels.png": "l.png", "intrinsics.json": "k.json"}
-    for source, target in names.items():
-        shutil.copy(SAMPLES / "breakfast" / source, target)
     run_code("index.md")
     assert len(capsys.readouterr().out.splitlines()) == 5
 

@@ -135,7 +135,7 @@ def smooth(points: NDArray[np.float32], values: NDArray[np.float32], deviation: 
     Args:
         points: [n, 3] metres.
         values: [m, n].
-        deviation: standard deviation of the Gaussian, metres; neighbours are at most two of them away. 0 for no average.
+        deviation: standard deviation of the Gaussian, metres; neighbours are at most two of them away. 0: no average.
     """
     if deviation == 0:
         return values
