@@ -6,7 +6,6 @@ stays near no change.
 """
 
 import dataclasses
-import itertools
 from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
@@ -22,13 +21,12 @@ from thor2_jax.recognition.prepared_instance import PreparedInstance, prepare_in
 
 __all__ = ["MAX_INSTANCES", "MIN_INSTANCES", "Adaptation", "camera_instances", "estimate_transform"]
 
-PRIOR = np.array([0.21, 0.21, 0.21, 0.085])
-"""Standard deviations of gamma, gain, saturation and warmth."""
+PRIOR = 0.085
+"""Standard deviation of the warmth."""
 
-GRID = np.array(
-    list(itertools.product((-0.45, -0.22, 0.0, 0.22, 0.45), (-0.28, 0.0, 0.28), (-0.35, 0.0, 0.35), (-0.12, 0.0, 0.12)))
-)
-"""[135, 4] colour transforms over which the mean is taken."""
+GRID = np.linspace(-0.36, 0.36, 25)[:, None] * np.array([0.0, 0.0, 0.0, 1.0])
+"""[25, 4] transforms over which the mean is taken. Only their warmth differs: training varies brightness, contrast
+and saturation far more than red against blue, so that a search over all of them changes colours that are right."""
 
 MIN_INSTANCES = 10
 """Fewest instances; with fewer, the prior decides."""
@@ -36,7 +34,7 @@ MIN_INSTANCES = 10
 MAX_INSTANCES = 40
 """Instances that are used at most; more take longer and change little."""
 
-EVIDENCE = 0.05
+EVIDENCE = 0.5
 """Weight of an instance's uncertainty: instances of the same few objects are not independent. Chosen on real frames."""
 
 Report = Callable[[int, int], None]
@@ -134,7 +132,7 @@ def estimate_transform(
 
 
 def posterior_mean(totals: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Return the mean [4] of the posterior from the sums of uncertainties [135] of the transforms of `GRID`."""
-    negative_log = EVIDENCE * totals + ((GRID / PRIOR) ** 2).sum(axis=1) / 2
+    """Return the mean [4] of the posterior from the sums of uncertainties [25] of the transforms of `GRID`."""
+    negative_log = EVIDENCE * totals + (GRID[:, 3] / PRIOR) ** 2 / 2
     weights = np.exp(negative_log.min() - negative_log)
     return np.asarray(weights @ GRID / weights.sum())

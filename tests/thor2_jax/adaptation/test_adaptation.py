@@ -82,20 +82,22 @@ def test_the_objective_is_the_entropy_of_the_answers() -> None:
         assert objective.total(np.array(dataclasses.astuple(transform))) == pytest.approx(expected, rel=2e-3)
 
 
-def bright_is_known(oriented: OrientedDescriptors) -> jax.Array:
-    """Answer one class, the more surely the closer the mean colour is to light grey."""
+def grey_is_known(oriented: OrientedDescriptors) -> jax.Array:
+    """Answer one class, the more surely the closer the mean colour is to grey."""
     mean = oriented.statistics[:, 0, 5:8]  # see `cloud_statistics`
-    return jnp.exp(-5 * jnp.square(mean - 0.7).sum(axis=1, keepdims=True))
+    return jnp.exp(-10 * jnp.square(mean[:, :1] - mean[:, 2:]))
 
 
 def none_is_known(oriented: OrientedDescriptors) -> jax.Array:
     return jnp.zeros((len(oriented.weights), 3))
 
 
-def test_dark_cameras_are_brightened_and_unknown_objects_ignored() -> None:
-    made = [dataclasses.replace(each, colors=np.full_like(each.colors, 100 + each.label)) for each in instances(40)]
-    adaptation = estimate_transform(made, RUN.network, RUN.config, bright_is_known)
-    assert adaptation.transform.gain - adaptation.transform.gamma > 0.1
+def test_warm_colors_are_cooled_and_unknown_objects_change_nothing() -> None:
+    warm = np.array([150, 110, 90], np.uint8)
+    made = [dataclasses.replace(each, colors=np.full_like(each.colors, warm)) for each in instances(40)]
+    adaptation = estimate_transform(made, RUN.network, RUN.config, grey_is_known)
+    assert -0.36 < adaptation.transform.warmth < -0.1
+    assert adaptation.transform == ColorTransform(warmth=adaptation.transform.warmth)
     assert adaptation.uncertainty_after < adaptation.uncertainty_before and adaptation.instances == 40
     unchanged = estimate_transform(made, RUN.network, RUN.config, none_is_known).transform
     np.testing.assert_allclose(dataclasses.astuple(unchanged), 0, atol=1e-6)
@@ -107,7 +109,7 @@ def test_the_posterior_mean_weighs_evidence_and_prior() -> None:
     certain[17] = 0
     np.testing.assert_allclose(posterior_mean(certain), GRID[17])
     totals = np.random.default_rng(0).uniform(0, 3, len(GRID))
-    weights = np.exp(-EVIDENCE * totals) * np.prod(np.exp(-0.5 * (GRID / PRIOR) ** 2), axis=1)
+    weights = np.exp(-EVIDENCE * totals) * np.exp(-0.5 * (GRID[:, 3] / PRIOR) ** 2)
     np.testing.assert_allclose(posterior_mean(totals), (weights[:, None] * GRID).sum(axis=0) / weights.sum())
 
 
