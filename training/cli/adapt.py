@@ -1,6 +1,5 @@
 """`thor2 adapt`: correct the colours of a camera, from frames without names."""
 
-import dataclasses
 from pathlib import Path
 from typing import Annotated
 
@@ -22,9 +21,9 @@ def adapt(
 ) -> None:
     """Adapt a run to a camera: its colours are corrected before recognition.
 
-    The frames need instance masks (or --segment) and no names; unknown objects may be among them. Gamma, gain,
-    saturation and warmth are estimated from at least ten instances, best of many objects: they are those with which the
-    model is most certain of its answers.
+    The frames need instance masks (or --segment) and no names; unknown objects may be among them. The warmth (red
+    against blue) is estimated from at least ten instances, best of many objects: with it, the model is most certain of
+    its answers.
     """
     from thor2_jax.segmentation.segmenters import load_segmenter
     from training.camera_adaptation import adapt_run
@@ -36,8 +35,7 @@ def adapt(
         sources = [segmented_source(source, segmenter) for source in sources]
     with show_progress(quiet) as progress:
         adaptation = adapt_run(model, sources, out, lambda done, total: progress("adapt", done, total, ""))
-    for name, value in dataclasses.asdict(adaptation.transform).items():
-        console.print(f"{name}: {value:+.3f}")
+    console.print(f"warmth: {adaptation.transform.warmth:+.3f}")
     console.print(
         f"{adaptation.instances} instances; mean uncertainty of their answers {adaptation.uncertainty_before:.3f} "
         f"before, {adaptation.uncertainty_after:.3f} after"
