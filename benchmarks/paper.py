@@ -30,6 +30,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.files import file_digest, write_text
 from training.baselines.files import baseline_file
 from training.baselines.names import check_baselines, crop_size
+from training.baselines.pretrained import check_weights, pretrained_files
 from training.evaluation.runs import load_runs
 from training.fitting.run_directories import find_run_directories
 from training.objects.meshes import find_meshes, read_names
@@ -59,7 +60,7 @@ class Comparison:
         """Read the datasets, and check that the directory is new or of the same job.
 
         Raises:
-            InputError: the directory is of another job, or a dataset, a table or the meshes cannot be read.
+            InputError: the directory is of another job, or a dataset, a table, meshes or weights cannot be used.
             OSError: a file cannot be read or written.
         """
         self.out: Path = options.out
@@ -70,6 +71,8 @@ class Comparison:
         tables = {"scenes": options.scene_names, "frames": options.frame_names}
         for name in self.datasets:
             find_meshes(options.meshes, read_names(tables[name]) if tables[name] else None)
+        for name in self.baselines if options.weights else ():
+            check_weights(options.weights, name)
         weights = sorted(options.weights.glob("*.safetensors")) if options.weights else []
         job = {
             "meshes": str(options.meshes.resolve()),
@@ -97,7 +100,7 @@ class Comparison:
         train += ["--embedding", 0, *shlex.split(options.train)]
         self._run(name, THOR2, *train)
         for baseline in self.baselines:
-            weights = ["--weights", options.weights] if options.weights and _reads_weights(baseline) else []
+            weights = ["--weights", options.weights] if options.weights and pretrained_files(baseline) else []
             self._run(name, baseline, *train, "--baselines", baseline, *weights)
 
     def _run(self, dataset: str, method: str, *arguments: object) -> None:
@@ -160,12 +163,6 @@ class Comparison:
         text = report_text(report)
         write_text(self.out / "paper.md", text)
         return text
-
-
-def _reads_weights(name: str) -> bool:
-    from training.baselines.pretrained import pretrained_files
-
-    return bool(pretrained_files(name))
 
 
 def _datasets(options: argparse.Namespace) -> dict[str, Dataset]:

@@ -6,6 +6,7 @@ from typing import Any
 
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from thor2_jax.files import atomic_write
 from thor2_jax.recognition.fusion import DEFAULT_RULE
@@ -117,7 +118,9 @@ def report_text(report: Mapping[str, Any]) -> str:
         f"Measured on {conditions['date']} on {conditions['processors']} processors. {conditions['note']} "
         f"Every method was trained on the same views ({trained}) and evaluated on the same instances. "
         f"Views: `thor2 render {conditions['render']}`. Training: `thor2 train {conditions['train']}`.{real} "
-        "An interval is a 95 % bootstrap interval over placements; McNemar's exact test counts placements. A claim "
+        "A difference is that of the accuracies over all instances. Its interval is a 95 % bootstrap interval that "
+        "resamples placements (an object that does not move is one placement), and McNemar's exact test counts "
+        "placements. A claim "
         "holds where the whole interval is above 0 and does not hold where it is below, if p is below 0.05; otherwise "
         "this data does not decide. Times contain reading the views and compiling; a method on clouds also describes "
         "the frame, a network crops it.\n\n"
@@ -126,10 +129,10 @@ def report_text(report: Mapping[str, Any]) -> str:
 
 
 def draw_claims(report: Mapping[str, Any], path: Path) -> None:
-    """Draw the differences of the default rule with their intervals (PNG); raises OSError."""
+    """Draw the differences of the default rule with their intervals, coloured by verdict (PNG); raises OSError."""
     datasets = report["datasets"]
     n_rows = max(len(results["claims"][DEFAULT_RULE]) for results in datasets.values())
-    figure = Figure(figsize=(6.5 * len(datasets), 0.42 * n_rows + 1.2), layout="constrained")
+    figure = Figure(figsize=(6.5 * len(datasets), 0.42 * n_rows + 1.5), layout="constrained")
     for axes, (name, results) in zip(
         figure.subplots(1, len(datasets), squeeze=False)[0], datasets.items(), strict=True
     ):
@@ -141,8 +144,13 @@ def draw_claims(report: Mapping[str, Any], path: Path) -> None:
         axes.axvline(0, color="black", linewidth=0.8)
         axes.set_yticks(range(len(claims)), [each["claim"] for each in claims])
         axes.invert_yaxis()
-        axes.set_xlabel("accuracy of THOR2 minus the other's, percentage points")
+        axes.set_xlabel("accuracy of THOR2 minus the other's,\npercentage points, with 95 % intervals")
         axes.set_title(f"{NAMES[name]}: {results['instances']['scored']} instances", fontsize=10)
+    verdicts = {claim["verdict"] for each in datasets.values() for claim in each["claims"][DEFAULT_RULE]}
+    handles = [
+        Line2D([], [], color=color, marker="o", label=name) for name, color in COLORS.items() if name in verdicts
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), fontsize=9, frameon=False)
     FigureCanvasAgg(figure)
     with atomic_write(path) as temporary:
         figure.savefig(temporary, dpi=110, format="png")

@@ -18,7 +18,7 @@ from thor2_jax.recognition.prepared_instance import PreparedInstance
 from thor2_jax.recognition.run_directory import TrainedRun
 from training.baselines.job import train_baselines
 from training.baselines.names import check_baselines, crop_size
-from training.baselines.pretrained import pretrained_files, weights_file
+from training.baselines.pretrained import check_weights, pretrained_files
 from training.embedding.run_embedding import Distractors
 from training.enrollment import SkippedInstance, labelled_views
 from training.fitting.checkpoints import CHECKPOINTS
@@ -149,14 +149,13 @@ def run_train_job(job: TrainJob, display: Display) -> dict[Path, list[TrainedRun
 
 
 def _check_weights(job: TrainJob, baselines: Sequence[str]) -> None:
-    """Raise InputError if files of pretrained weights are missing or read by none of the baselines."""
+    """Raise InputError if files of pretrained weights are missing, unfit, or read by none of the baselines."""
     if job.weights is None:
         return
-    files = {name: pretrained_files(name) for name in baselines}
-    if not any(files.values()):
+    if not any(pretrained_files(name) for name in baselines):
         raise InputError(f"weights is {job.weights}, but none of the baselines reads pretrained weights; leave it out")
-    for name in dict.fromkeys(file for each in files.values() for file in each):
-        weights_file(job.weights, name)
+    for name in baselines:
+        check_weights(job.weights, name)
 
 
 def _samples(job: TrainJob) -> Any:

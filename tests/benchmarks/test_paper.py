@@ -4,11 +4,14 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from helpers import write_meshes, write_scene
+from safetensors.numpy import save_file
 
 from benchmarks import paper
 from benchmarks.paper_measurement import CLAIMS
+from benchmarks.paper_report import report_text
 from training.baselines.names import TITLES
 from training.evaluation.fusion import fusions
 
@@ -38,6 +41,48 @@ def test_bad_arguments_write_nothing(
     assert message in shown and list(tmp_path.iterdir()) == []
 
 
+def test_weights_are_checked_before_the_comparison_begins(tmp_path: Path) -> None:
+    write_meshes(tmp_path / "meshes", NAMES)
+    write_scene(tmp_path / "frames" / "0", NAMES, 0)
+    names = ["meshes", "frames", "weights", "out"]
+    options = [*(f"--{name}={tmp_path / name}" for name in names), "--baselines=rcfusion,thor"]
+    with pytest.raises(SystemExit, match=r"^error: weights: .*resnet18\.safetensors does not exist"):
+        paper.main(options)
+    (tmp_path / "weights").mkdir()
+    save_file({"conv1.weight": np.zeros((64, 3, 3, 3), np.float32)}, tmp_path / "weights" / "resnet18.safetensors")
+    with pytest.raises(SystemExit, match=r"^error: weights: .*resnet18\.safetensors has no tensor bn1\.bias"):
+        paper.main(options)
+    assert not (tmp_path / "out").exists()
+
+
+def test_documented_figures_are_those_of_the_results() -> None:
+    """The tables of docs/baselines.md and the stored report have the figures of the stored results."""
+    root = Path(paper.__file__).parents[1]
+    report = json.loads((root / "benchmarks" / "results" / "paper.json").read_text())
+    page = (root / "docs" / "baselines.md").read_text()
+    scenes, frames = report["datasets"]["scenes"], report["datasets"]["frames"]
+
+    def accuracy(title: str) -> str:
+        values = [each["accuracy"]["log-mean"][0]["cells"][0]["accuracy"][title]["mean"] for each in (scenes, frames)]
+        return " | ".join(f"{value:.3f}".lstrip("0") for value in values)
+
+    names = {"THOR2 (TOPS + TOPS2)": "THOR2", "CE + TOPS + TOPS2": "CE+TOPS+TOPS2", "TOPS, shape alone": "TOPS"}
+    names |= {"random forest": "forest"} | {title: title for title in TITLES.values() if title in scenes["fusions"]}
+    for name in names.keys() - {"forest"}:
+        assert f"| {name} | {accuracy(names[name])} |" in page
+    for pair in list(zip(*(each["claims"]["log-mean"] for each in (scenes, frames)), strict=True))[:6]:
+        cells = [
+            f"{100 * c['difference']:+.1f} ({100 * c['low']:+.1f} to {100 * c['high']:+.1f}), {c['verdict']}"
+            for c in pair
+        ]
+        assert f"| {pair[0]['claim']} | {' | '.join(cells)} |" in page
+    text = report_text(report)
+    lines = [line for line in text.splitlines() if line.startswith("| ")]
+    stored = (root / "benchmarks" / "results" / "paper.md").read_text().splitlines()
+    assert lines == [line for line in stored if line.startswith("| ")]
+    assert "RGB-D ViT-small, templates: trained from scratch" in text
+
+
 @pytest.fixture
 def given(tmp_path: Path) -> list[str]:
     """Return options with two frames of two built-in objects, which also join the views."""
@@ -59,7 +104,10 @@ def test_a_small_comparison_resumes(tmp_path: Path, given: list[str], monkeypatc
     report: dict[str, Any] = json.loads((out / "paper.json").read_text())
     results = report["datasets"]["frames"]
     labelled = [len(json.loads(path.read_text())["labels"]) for path in tmp_path.glob("frames/*/labels.json")]
-    assert results["instances"]["scored"] == sum(labelled) > 0 and results["scratch"] == ["RGB-D ViT-small"]
+    assert results["instances"]["scored"] == sum(labelled) > 0 and results["scratch"] == [
+        "RGB-D ViT-small",
+        "templates",
+    ]
     assert {"forest", "RGB-D ViT-small", "templates", "THOR2"} <= set(results["fusions"])
     assert "THOR" not in results["fusions"]
     others = [claim["other"] for claim in results["claims"]["max"]]

@@ -1,5 +1,6 @@
 """Training the baselines of finished runs; each becomes a file in the run directory."""
 
+import contextlib
 import shutil
 import time
 from collections.abc import Callable, Sequence
@@ -118,7 +119,13 @@ def _train(
         weights=weights,
         progress=progress,
     )
-    fitted = _FIT[name](task)
+    try:
+        fitted = _FIT[name](task)
+    except InputError:
+        with contextlib.suppress(OSError):  # they stay with a checkpoint or another baseline
+            scratch.rmdir()
+            file.parent.rmdir()
+        raise
     seconds = time.perf_counter() - start
     temperature = fit_temperature(fitted.probabilities, fitted.truth) if len(fitted.truth) else None
     write_baseline(file, StoredBaseline(fitted.model.arrays(), temperature, seconds, fitted.weights), run.classes)

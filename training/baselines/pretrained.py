@@ -1,13 +1,17 @@
 """The files of pretrained weights that baselines read."""
 
 from pathlib import Path
+from typing import Any
+
+from flax import nnx
 
 from thor2_jax.errors import InputError
 from training.baselines.names import TEMPLATES
 from training.baselines.networks.architectures import ARCHITECTURES
-from training.baselines.templates import DINOV2
+from training.baselines.networks.weights import load_backbone
+from training.baselines.templates import DINOV2, create_backbone
 
-__all__ = ["pretrained_files", "weights_file"]
+__all__ = ["check_weights", "pretrained_files", "weights_file"]
 
 
 def pretrained_files(name: str) -> list[str]:
@@ -27,3 +31,19 @@ def weights_file(directory: Path, name: str) -> Path:
     if not path.is_file():
         raise InputError(f"weights: {path} does not exist; expected it in the directory, see docs/baselines.md")
     return path
+
+
+def check_weights(directory: Path, name: str) -> None:
+    """Read the files of a baseline's pretrained weights, without keeping them.
+
+    Raises:
+        InputError: a file is missing, damaged or of another architecture.
+    """
+    paths = {file: weights_file(directory, file) for file in pretrained_files(name)}
+    if name == TEMPLATES:
+        load_backbone(nnx.eval_shape(lambda: create_backbone(DINOV2)), paths[DINOV2])
+    elif paths:
+        architecture = ARCHITECTURES[name]
+        model: Any = nnx.eval_shape(lambda: architecture.build(2, 0))
+        for backbone, file in architecture.weights.items():
+            load_backbone(getattr(model, backbone), paths[file])

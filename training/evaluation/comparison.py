@@ -40,7 +40,7 @@ class EvaluationConditions:
         frames: number of frames.
         rule: fusion rule of the measured accuracies.
         real_views: whether the models were trained on real views, too.
-        scratch: titles of the image networks that were trained without pretrained weights.
+        scratch: titles of the baselines whose networks were trained without pretrained weights.
     """
 
     own_objects: bool

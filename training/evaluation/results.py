@@ -101,7 +101,7 @@ def compute_results(
         frames: the answers.
         own_objects: whether a frame's classes are the objects of its sequence; selects the published values.
         real_views: whether the runs were trained on real views, too; selects the published values.
-        scratch: titles of the image networks that were trained without pretrained weights.
+        scratch: titles of the baselines whose networks were trained without pretrained weights.
     """
     classes = runs[0].classes
     labelled = [(instance, _attributes(kind, frame)) for frame in frames for instance in frame.instances]

@@ -22,7 +22,7 @@ from thor2_jax.recognizer import Recognizer
 from training.baselines.baseline import Baseline, BaselineInputs
 from training.baselines.files import baseline_file
 from training.baselines.load import load_baselines
-from training.baselines.names import NETWORKS, TITLES
+from training.baselines.names import NETWORKS, TEMPLATES, TITLES
 from training.evaluation.fusion import ALL_CLASSIFIERS, BOTH, EMBEDDED, GALLERY
 from training.fitting.run_directories import find_run_directories
 from training.readers.labelled import path_ends, sequence_of
@@ -246,9 +246,9 @@ def has_real_views(runs: Sequence[Run]) -> bool:
 
 
 def scratch_networks(runs: Sequence[Run]) -> list[str]:
-    """Return the titles of the image networks that were trained without pretrained weights."""
+    """Return the titles of the image networks without pretrained weights, and of templates with such a backbone."""
     names = {name for run in runs for name, files in run.weights.items() if not files}
-    return [TITLES[name] for name in NETWORKS if name in names]
+    return [TITLES[name] for name in (*NETWORKS, TEMPLATES) if name in names]
 
 
 def _load(directory: Path) -> Run:
