@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 import urllib.request
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -30,8 +31,8 @@ def folder(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def messages(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
-    """Return the messages that are published; the command is interrupted when it waits for Ctrl-C."""
+def messages(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[dict[str, Any]]]:
+    """The messages that are published; the command is interrupted when it waits for Ctrl-C."""
     published: list[dict[str, Any]] = []
     publish = Broadcast.publish
 
@@ -43,7 +44,9 @@ def messages(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
 
     monkeypatch.setattr(Broadcast, "publish", record)
     monkeypatch.setattr("training.cli.watch.NOTICE_SECONDS", 0.0)
-    return published
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job starts with it ignored
+    yield published
+    signal.signal(signal.SIGINT, handler)
 
 
 def test_frames_of_a_folder(
