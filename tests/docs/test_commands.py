@@ -1,37 +1,31 @@
 """Every `thor2` command of the documentation is parsed by the command line, and every page is in the navigation."""
 
 import re
-import shlex
-from pathlib import Path
 
 import pytest
 import typer
 import yaml
+from doc_pages import PAGES, ROOT, python_blocks, shell_commands
 
 from training.cli import app
 
-ROOT = Path(__file__).parents[2]
-PAGES = sorted({ROOT / "README.md", *(ROOT / "docs").rglob("*.md")})
 COMMAND = typer.main.get_command(app)
 PLACEHOLDER = "..."
 CHECKED = 60
 """Least number of commands that must be found, so that a change of the pages cannot switch this test off."""
 
 
-def shell_commands(page: Path) -> list[list[str]]:
+def thor2_commands(page: str) -> list[list[str]]:
     """Return the arguments of each `thor2 ...` in the shell blocks of a page."""
-    found = []
-    for block in re.findall(r"^ *```sh\n(.*?)^ *```", page.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE):
-        for line in block.replace("\\\n", " ").splitlines():
-            for part in re.split(r"&&|\|", line):
-                words = shlex.split(part.partition(" >")[0], comments=True)
-                names = [number for number, word in enumerate(words) if word == "thor2" or word.endswith("/thor2")]
-                if names:
-                    found.append(words[names[0] + 1 :])
-    return found
+    arguments = []
+    for words in shell_commands(page):
+        names = [number for number, word in enumerate(words) if word == "thor2" or word.endswith("/thor2")]
+        if names:
+            arguments.append(words[names[0] + 1 :])
+    return arguments
 
 
-COMMANDS = [(page.relative_to(ROOT).as_posix(), words) for page in PAGES for words in shell_commands(page)]
+COMMANDS = [(page, words) for page in PAGES for words in thor2_commands(page)]
 
 
 def parse(words: list[str]) -> None:
@@ -64,8 +58,8 @@ def test_wrong_commands_do_not_parse(words: list[str]) -> None:
 def test_python_blocks_compile() -> None:
     blocks = 0
     for page in PAGES:
-        for block in re.findall(r"^```python\n(.*?)^```$", page.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE):
-            compile(block, str(page), "exec")
+        for block in python_blocks((ROOT / page).read_text(encoding="utf-8")):
+            compile(block, page, "exec")
             blocks += 1
     assert blocks >= 15
 

@@ -1,10 +1,10 @@
 """The Python code of docs/explanations.md runs."""
 
-import re
 from pathlib import Path
 
 import numpy as np
 import pytest
+from doc_pages import python_blocks
 from helpers import SMALL_CONFIG, untrained_run
 
 import thor2_jax as thor2
@@ -24,7 +24,7 @@ def test_the_code_explains_an_instance(monkeypatch: pytest.MonkeyPatch) -> None:
         "recognizer": thor2.Recognizer(untrained_run(("bowl", "mug"), config=SMALL_CONFIG)),
         "frame": thor2.RGBDFrame(color, depth, labels, thor2.Intrinsics(300.0, 300.0, 59.5, 44.5)),
     }
-    (code,) = re.findall(r"^```python\n(.*?)^```$", TEXT, re.DOTALL | re.MULTILINE)
+    (code,) = python_blocks(TEXT)
     exec(compile(code, "docs/explanations.md", "exec"), names)
     assert {names["explanation"].name, names["explanation"].runner_up} == {"bowl", "mug"}
     assert names["picture"].name == "network"

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from doc_pages import python_blocks
 from helpers import untrained_run
 
 import thor2_jax as thor2
@@ -17,7 +18,7 @@ TEXT = (Path(__file__).parents[2] / "docs" / "library.md").read_text()
 def code_of(section: str) -> list[str]:
     """Return the Python blocks between the heading `section` and the next heading."""
     content = re.split(r"^#+ ", TEXT.split(f"# {section}\n", 1)[1], maxsplit=1, flags=re.MULTILINE)[0]
-    return re.findall(r"^```python\n(.*?)^```$", content, re.DOTALL | re.MULTILINE)
+    return python_blocks(content)
 
 
 def run_section(section: str, **names: Any) -> dict[str, Any]:

@@ -5,7 +5,6 @@ replaced by objects of the same interface: what a block calls must exist and tak
 """
 
 import re
-import shlex
 import sys
 import types
 from pathlib import Path
@@ -14,6 +13,7 @@ from unittest.mock import MagicMock, create_autospec
 
 import numpy as np
 import pytest
+from doc_pages import PAGES, ROOT, python_blocks, shell_commands
 from helpers import SMALL_CONFIG, untrained_run, write_frame
 from recording_files import table_frame
 
@@ -23,8 +23,6 @@ from thor2_jax.recognition.frames import backproject
 from thor2_jax.recognition.run_directory import save_run
 from thor2_jax.recordings import realsense
 from thor2_jax.tracking.tracker import Tracker
-
-ROOT = Path(__file__).parents[2]
 
 BLOCKS = {
     "README.md": 1,
@@ -70,17 +68,13 @@ NOT_RUN = {
 
 
 def blocks_of(page: str) -> list[str]:
-    text = (ROOT / page).read_text(encoding="utf-8")
-    return re.findall(r"^```python\n(.*?)^```$", text, re.DOTALL | re.MULTILINE)
+    return python_blocks((ROOT / page).read_text(encoding="utf-8"))
 
 
 def run_block(page: str, number: int = 0, **names: Any) -> dict[str, Any]:
     """Execute a Python block of a page, in which `names` are defined, and return all names."""
     exec(compile(blocks_of(page)[number], page, "exec"), names)
     return names
-
-
-PAGES = ["README.md", *(path.relative_to(ROOT).as_posix() for path in sorted((ROOT / "docs").rglob("*.md")))]
 
 
 def test_every_python_block_is_executed() -> None:
@@ -90,15 +84,11 @@ def test_every_python_block_is_executed() -> None:
 def test_every_command_is_run_or_has_a_reason() -> None:
     first = set()
     for page in PAGES:
-        text = (ROOT / page).read_text(encoding="utf-8")
-        for block in re.findall(r"^ *```sh\n(.*?)^ *```", text, re.DOTALL | re.MULTILINE):
-            for part in re.split(r"&&|\||\n", block.replace("\\\n", " ")):
-                words = shlex.split(part.partition(" >")[0], comments=True)
-                while words and re.match(r"THOR2_\w+=", words[0]):
-                    words = words[words.index(next(word for word in words if word.endswith("thor2"))) :]
-                if words:
-                    name = words[0].replace(".venv/bin/", "")
-                    first.add(words[1] if name == "thor2" else name)
+        for words in shell_commands(page):
+            if re.match(r"THOR2_\w+=", words[0]):
+                words = words[words.index(next(word for word in words if word.endswith("thor2"))) :]
+            name = words[0].replace(".venv/bin/", "")
+            first.add(words[1] if name == "thor2" else name)
     assert first == {*RUN_BY, *NOT_RUN}
     for command, path in RUN_BY.items():
         assert f'"{command}"' in (ROOT / "tests" / path).read_text(encoding="utf-8"), command

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from doc_pages import python_blocks
 from helpers import run_thor2, untrained_run
 
 import thor2_jax as thor2
@@ -27,7 +28,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def run_code(page: str, **names: Any) -> dict[str, Any]:
-    blocks = re.findall(r"^```python\n(.*?)^```$", (DOCS / page).read_text(), re.DOTALL | re.MULTILINE)
+    blocks = python_blocks((DOCS / page).read_text())
     assert len(blocks) == 1
     exec(compile(blocks[0], page, "exec"), names)
     return names

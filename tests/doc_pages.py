@@ -1,0 +1,22 @@
+"""The pages of the documentation, and what is in their blocks of code."""
+
+import re
+import shlex
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+PAGES = ["README.md", *(path.relative_to(ROOT).as_posix() for path in sorted((ROOT / "docs").rglob("*.md")))]
+
+
+def shell_commands(page: str) -> list[list[str]]:
+    """Return the words of each command in the shell blocks of a page, without comments and redirections."""
+    text = (ROOT / page).read_text(encoding="utf-8")
+    blocks = re.findall(r"^ *```sh\n(.*?)^ *```", text, re.DOTALL | re.MULTILINE)
+    parts = [part for block in blocks for part in re.split(r"&&|\||\n", block.replace("\\\n", " "))]
+    commands = [shlex.split(part.partition(" >")[0], comments=True) for part in parts]
+    return [words for words in commands if words]
+
+
+def python_blocks(text: str) -> list[str]:
+    """Return the Python blocks in the text of a page."""
+    return re.findall(r"^```python\n(.*?)^```$", text, re.DOTALL | re.MULTILINE)
