@@ -216,8 +216,8 @@ def summarize_scenes(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 def read_meshes(directory: Path, names: Path | None, classes: Sequence[str]) -> dict[str, TexturedMesh]:
     """Return the meshes of the classes."""
-    found = find_meshes(directory, read_names(names) if names else None)
-    return {name: load_mesh(path) for name, path in found.items() if name in classes}
+    paths = find_meshes(directory, read_names(names) if names else None)
+    return {name: load_mesh(path) for name, path in paths.items() if name in classes}
 
 
 def main() -> None:

@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from thor2_jax.adaptation.objective import Classify
 from thor2_jax.descriptor.orientations import OrientedDescriptors
 from thor2_jax.gallery.embedding import Embedding
 from thor2_jax.gallery.gallery import GAMMA, RIDGE, Gallery
+from thor2_jax.recognition.run_classifiers import Classifier
 
 __all__ = ["MAX_VIEWS", "fused_classifier", "gallery_classifier"]
 
@@ -17,7 +17,7 @@ MAX_VIEWS = 1024
 """Views of a gallery that answer at most, evenly spread; the regression is solved for all of them at once."""
 
 
-def fused_classifier(classifiers: Sequence[Classify]) -> Classify:
+def fused_classifier(classifiers: Sequence[Classifier]) -> Classifier:
     """Return the classifier whose probabilities are the normalized geometric mean of those of others."""
 
     def classify(oriented: OrientedDescriptors) -> jax.Array:
@@ -27,7 +27,7 @@ def fused_classifier(classifiers: Sequence[Classify]) -> Classify:
     return classify
 
 
-def gallery_classifier(gallery: Gallery, embedding: Embedding) -> Classify:
+def gallery_classifier(gallery: Gallery, embedding: Embedding) -> Classifier:
     """Return the classifier whose probabilities are the scores of a gallery, divided by their sum if it exceeds 1.
 
     Args:

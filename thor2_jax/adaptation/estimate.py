@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 
 from colornet import ColorNetwork
 from thor2_jax.adaptation.color_transform import ColorTransform
-from thor2_jax.adaptation.objective import Classify, Objective
+from thor2_jax.adaptation.objective import Objective
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
 from thor2_jax.recognition.frames import RGBDFrame
 from thor2_jax.recognition.prepared_instance import PreparedInstance, prepare_instance
+from thor2_jax.recognition.run_classifiers import Classifier
 
 __all__ = ["MAX_INSTANCES", "MIN_INSTANCES", "Adaptation", "camera_instances", "estimate_transform"]
 
@@ -92,7 +93,7 @@ def estimate_transform(
     instances: Sequence[PreparedInstance],
     network: ColorNetwork,
     config: DescriptorConfig,
-    classify: Classify,
+    classify: Classifier,
     report: Report = lambda done, total: None,
     capacity: int | None = None,
 ) -> Adaptation:

@@ -7,7 +7,7 @@ before any change.
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -22,9 +22,10 @@ from thor2_jax.capacity import point_bucket
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.color_membership import RegionSets, color_sets, region_sets
 from thor2_jax.descriptor.describe import strips
-from thor2_jax.descriptor.orientations import OrientedDescriptors, candidate_orientations, orient_descriptors
+from thor2_jax.descriptor.orientations import candidate_orientations, orient_descriptors
 from thor2_jax.descriptor.slicing import slices_and_strips
 from thor2_jax.recognition.prepared_instance import PreparedInstance, pack_instances
+from thor2_jax.recognition.run_classifiers import Classifier
 from thor2_jax.types import PointClouds, Strips
 
 __all__ = ["Objective", "entropy"]
@@ -33,10 +34,7 @@ ROWS = 8
 """Instances that are described in one call."""
 
 MIN_KNOWN = 1e-3
-"""Least probability of being known that is told from 0."""
-
-Classify = Callable[[OrientedDescriptors], jax.Array]
-"""From the descriptors of B clouds in K orientations to class probabilities [B, C], which may sum to less than 1."""
+"""Smallest probability of being known that is distinguished from 0."""
 
 
 def entropy(probabilities: jax.Array) -> jax.Array:
@@ -76,7 +74,7 @@ def _uncertainties(
     sets: RegionSets,
     network: ColorNetwork,
     config: DescriptorConfig,
-    classify: Classify,
+    classify: Classifier,
 ) -> jax.Array:
     """Return the uncertainty of each instance of a chunk [ROWS], 0 for padding."""
     count = chunk.weights.shape[1]
@@ -102,7 +100,7 @@ class Objective:
         instances: Sequence[PreparedInstance],
         network: ColorNetwork,
         config: DescriptorConfig,
-        classify: Classify,
+        classify: Classifier,
         orientations: int = 2,
         capacity: int | None = None,
     ) -> None:
@@ -125,7 +123,6 @@ class Objective:
         ordered = sorted(fitting, key=lambda each: len(each.points))
         parts = [ordered[start : start + ROWS] for start in range(0, len(ordered), ROWS)]
         self._chunks = [self._describe(part, orientations) for part in parts]
-        self._static = (network, self._config, classify)
 
     def _describe(self, instances: Sequence[PreparedInstance], count: int) -> _Chunk:
         capacity = self._capacity or point_bucket(max(len(each.points) for each in instances))
@@ -145,7 +142,9 @@ class Objective:
     def total(self, parameters: NDArray[np.floating]) -> float:
         """Return the sum of the uncertainties for parameters [4] of a colour transform."""
         values = [
-            _uncertainties(jnp.asarray(parameters, jnp.float32), chunk, self._sets, *self._static)
+            _uncertainties(
+                jnp.asarray(parameters, jnp.float32), chunk, self._sets, self._network, self._config, self._classify
+            )
             for chunk in self._chunks
         ]
         return float(sum(np.asarray(value).sum() for value in values))

@@ -9,9 +9,10 @@ import numpy as np
 
 from colornet import ColorNetwork
 from thor2_jax.adaptation.estimate import MAX_INSTANCES, MIN_INSTANCES, Adaptation, estimate_transform
-from thor2_jax.adaptation.objective import Classify, Objective
+from thor2_jax.adaptation.objective import Objective
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.recognition.prepared_instance import PreparedInstance
+from thor2_jax.recognition.run_classifiers import Classifier
 
 __all__ = ["CAPACITY", "OnlineAdaptation"]
 
@@ -34,7 +35,7 @@ class OnlineAdaptation:
         self,
         network: ColorNetwork,
         config: DescriptorConfig,
-        classify: Classify,
+        classify: Classifier,
         adapted: Callable[[Adaptation], None] = lambda adaptation: None,
     ) -> None:
         """Start without instances; the first arguments are those of `estimate_transform`.

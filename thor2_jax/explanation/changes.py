@@ -42,9 +42,6 @@ LARGEST = {"color": 0.5, "extent": float(np.log(2))}
 SCALES = 24
 """Changes that are tried along a direction, equally spaced up to the largest."""
 
-DIRECTIONS = 4
-"""Directions that are tried: those after the first, second, fourth and last step."""
-
 
 @dataclasses.dataclass(frozen=True)
 class Change:
@@ -163,13 +160,13 @@ def smallest_change(scores: ClassScores, instance: PreparedInstance, index: int,
         return (tried[other[0]], values[other[0]]) if len(other) else None
 
     by_length = (lengths[:, None, None] * directions).reshape(-1, 3)
-    found = first_change(by_length)
-    if found is None:
+    changed = first_change(by_length)
+    if changed is None:
         return None
     # Between the last length that was tried and the one that was found.
-    step = lengths[0] / np.linalg.norm(found[0])
-    finer = first_change(found[0] * (1 - step * np.arange(7, 0, -1) / 8)[:, None])
-    parameters, values = finer or found
+    step = lengths[0] / np.linalg.norm(changed[0])
+    finer = first_change(changed[0] * (1 - step * np.arange(7, 0, -1) / 8)[:, None])
+    parameters, values = finer or changed
     return _record(scores, index, kind, parameters, values)
 
 

@@ -16,7 +16,7 @@ THOR2: tuple[Feature, ...] = ("tops", "tops2")
 """The two classifiers whose fusion is THOR2."""
 
 Classifier = Callable[[OrientedDescriptors], jax.Array]
-"""From the descriptors of B clouds in K orientations to class probabilities [B, C]."""
+"""From the descriptors of B clouds in K orientations to class probabilities [B, C], which may sum to less than 1."""
 
 
 class RunClassifiers(dict[str, Classifier]):

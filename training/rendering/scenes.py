@@ -231,12 +231,10 @@ def compose_scene(
     Raises:
         InputError: A number is out of range, or there are fewer than `n_objects` objects.
     """
-    if not 1 <= n_objects <= len(objects):
-        raise InputError(f"n_objects is {n_objects!r}; it must be 1 to {len(objects)}, the number of objects")
+    names = _choose(objects, n_objects, rng)
     for argument, value, most in (("clutter", clutter, 1.0), ("noise", noise, 10.0), ("light", light, 0.5)):
         if not 0 <= value <= most:
             raise InputError(f"{argument} is {value!r}; it must be 0 to {most:g}")
-    names = [list(objects)[k] for k in rng.choice(len(objects), n_objects, replace=False)]
     azimuth, pose = _random_pose(rng)
     towards = np.array([np.cos(azimuth), np.sin(azimuth)])
     meshes = _arrange([objects[name] for name in names], towards, clutter, rng)
@@ -269,9 +267,7 @@ def compose_views(
     Raises:
         InputError: there are fewer than `n_objects` objects.
     """
-    if not 1 <= n_objects <= len(objects):
-        raise InputError(f"n_objects is {n_objects!r}; it must be 1 to {len(objects)}, the number of objects")
-    names = [list(objects)[k] for k in rng.choice(len(objects), n_objects, replace=False)]
+    names = _choose(objects, n_objects, rng)
     azimuth, _ = _random_pose(rng)
     meshes = _arrange([objects[name] for name in names], np.array([np.cos(azimuth), np.sin(azimuth)]), 0.85, rng)
     views = []
@@ -279,6 +275,13 @@ def compose_views(
         _, pose = _random_pose(rng, azimuth + turn)
         views.append((_render(names, meshes, pose, camera, 1.0, 0.08, rng), pose))
     return views
+
+
+def _choose(objects: Mapping[str, TexturedMesh], count: int, rng: np.random.Generator) -> list[str]:
+    """Return the names of different random objects; raises InputError if there are fewer than `count`."""
+    if not 1 <= count <= len(objects):
+        raise InputError(f"n_objects is {count!r}; it must be 1 to {len(objects)}, the number of objects")
+    return [list(objects)[k] for k in rng.choice(len(objects), count, replace=False)]
 
 
 def _random_pose(rng: np.random.Generator, azimuth: float | None = None) -> tuple[float, NDArray[np.float64]]:
