@@ -4,13 +4,17 @@ import contextlib
 import copy
 import functools
 import logging
+import multiprocessing
 import os
 import signal
 import socket
 import sys
 import tempfile
+import threading
+from multiprocessing.process import BaseProcess
 
 import uvicorn
+from fastapi import FastAPI
 from uvicorn.config import LOGGING_CONFIG
 from uvicorn.supervisors import Multiprocess
 
@@ -40,7 +44,7 @@ def serve(settings: Settings, host: str = "127.0.0.1", port: int = 8080, workers
     log_config = copy.deepcopy(LOGGING_CONFIG)
     log_config["loggers"]["thor2_jax.service"] = {"handlers": ["default"], "level": "INFO", "propagate": False}
     config = uvicorn.Config(
-        functools.partial(create_app, settings, workers),
+        functools.partial(_create_worker, settings, workers),
         factory=True,
         workers=workers,
         http=TimedConnection,
@@ -70,3 +74,16 @@ def serve(settings: Settings, host: str = "127.0.0.1", port: int = 8080, workers
             with tempfile.TemporaryDirectory() as directory:
                 os.environ["PROMETHEUS_MULTIPROC_DIR"] = directory
                 Multiprocess(config, [listener]).run()
+
+
+def _create_worker(settings: Settings, workers: int) -> FastAPI:
+    """Create the application of one process; a worker ends when the process that started it is killed."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        threading.Thread(target=_end_after, args=(parent,), name="parent", daemon=True).start()
+    return create_app(settings, workers)
+
+
+def _end_after(parent: BaseProcess) -> None:
+    parent.join()
+    os.kill(os.getpid(), signal.SIGTERM)
