@@ -21,11 +21,7 @@ from thor2_jax.recognition.frames import RGBDFrame
 from thor2_jax.recognition.prepared_instance import PreparedInstance
 from thor2_jax.recognition.run_directory import TrainedRun, save_run
 from thor2_jax.recognizer import Recognizer
-from training.augmentation.augmentations import Augmentations
-from training.augmentation.illumination import Illumination
-from training.augmentation.occlusion import Occlusion
-from training.augmentation.segmentation import Segmentation
-from training.augmentation.sensor import Sensor
+from training.embedding.sampling import AUGMENTATIONS
 from training.objects.mesh import TexturedMesh
 from training.objects.meshes import load_mesh
 from training.readers.frames import FrameFolder
@@ -36,8 +32,6 @@ __all__ = ["SkippedInstance", "enroll_objects", "labelled_views", "mesh_views"]
 
 MESH_VIEWS = 60
 """Cameras around a mesh; each view is enrolled as rendered and in one augmented copy."""
-
-AUGMENTATIONS = Augmentations(Illumination(), Sensor(), Occlusion(), Segmentation(), copies=1)
 
 
 def _show_nothing(stage: str, done: int, total: int, note: str) -> None:
@@ -64,7 +58,7 @@ def mesh_views(mesh: Path | TexturedMesh, mesh_scale: float = 1.0) -> list[Prepa
         load_mesh(mesh, mesh_scale) if isinstance(mesh, Path) else mesh,
         _evenly_spread(MESH_VIEWS),
         0,
-        AUGMENTATIONS,
+        dataclasses.replace(AUGMENTATIONS, copies=1),
     )
     views = [
         PreparedInstance(number, cloud.xyz, cloud.rgb, np.zeros(len(cloud.xyz), bool))

@@ -1,7 +1,8 @@
 """Augmented copies of enrolled views that need no mesh: light, sensor noise, and masks that are cut.
 
-One to five views of an object show little of what a camera makes of it. The copies are drawn from the cloud itself, so
-that embedding a view again, with another embedding, gives the same copies.
+Views show little of what another camera makes of an object, whether they are one to five frames or clean renderings of
+a mesh. The copies are drawn from the cloud itself, so that embedding a view again, with another embedding, gives the
+same copies.
 """
 
 import zlib
@@ -16,15 +17,24 @@ from thor2_jax.recognition.prepared_instance import PreparedInstance
 __all__ = ["augmented_copies", "augmented_view"]
 
 MAX_COPIES = 8
-"""Copies of a single view; fewer of each where there are more views."""
+"""Copies of a single view from a frame; fewer of each where there are more views."""
+
+MESH_COPIES = 5
+"""Copies of each view that is rendered from a mesh."""
 
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 """Luma coefficients of red, green and blue (ITU-R BT.601)."""
 
 
-def augmented_copies(views: Sequence[PreparedInstance]) -> list[PreparedInstance]:
-    """Return copies of the views of one object: about `MAX_COPIES` in all, none for more than that many views."""
-    copies = MAX_COPIES // max(len(views), 1)
+def augmented_copies(views: Sequence[PreparedInstance], source: str) -> list[PreparedInstance]:
+    """Return copies of the views of one object.
+
+    Args:
+        views: the views.
+        source: "mesh" for `MESH_COPIES` of each view, otherwise about `MAX_COPIES` in all, and none for more than that
+            many views.
+    """
+    copies = MESH_COPIES if source == "mesh" else MAX_COPIES // max(len(views), 1)
     return [augmented_view(view, copy) for view in views for copy in range(copies)]
 
 

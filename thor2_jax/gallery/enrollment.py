@@ -74,9 +74,9 @@ def instance_views(frames: Sequence[RGBDFrame | tuple[RGBDFrame, int]], sigma_s:
 
 
 def views_to_embed(clouds: CompactClouds, source: str) -> list[PreparedInstance]:
-    """Return an object's views as they are embedded: a few that do not come from a mesh get augmented copies."""
+    """Return an object's views and their augmented copies; the arguments are those of `embed_views`."""
     views = list(clouds.views())
-    return views if source == "mesh" else views + augmented_copies(views)
+    return views + augmented_copies(views, source)
 
 
 def embed_views(embedding: Embedding, clouds: CompactClouds, source: str) -> NDArray[np.float16]:

@@ -184,7 +184,7 @@ class ObjectGallery:
         Args:
             name: name of the object.
             views: its views.
-            source: "frames", or "mesh" for views that get no augmented copies.
+            source: "mesh" for views that are rendered from a mesh, or "frames".
             extend: add the views to those of an object with this name.
             replace: discard the views, and the output of the classifiers, of an object with this name.
 

@@ -175,18 +175,19 @@ def test_unusable_views_are_refused_and_nothing_changes(run: TrainedRun, embeddi
     assert recognizer.gallery is before
 
 
-def test_few_views_get_augmented_copies_and_meshes_none(embedding: Embedding) -> None:
+def test_views_get_augmented_copies(embedding: Embedding) -> None:
     recognizer = taught(untrained_run((), ()), embedding)
     views = [instance_view(CLUTTER, label, 2.5) for label in (1, 2)]
-    copies = augmented_copies(views)
-    assert len(copies) == 8 and len(augmented_copies(views * 5)) == 0
-    for copy, again in zip(copies, augmented_copies(views), strict=True):
+    copies = augmented_copies(views, "frames")
+    assert len(copies) == 8 and len(augmented_copies(views * 5, "frames")) == 0
+    assert len(augmented_copies(views * 5, "mesh")) == 50
+    for copy, again in zip(copies, augmented_copies(views, "frames"), strict=True):
         np.testing.assert_array_equal(copy.points, again.points)
         assert len(copy.points) == len(copy.colors) == len(copy.boundary) >= 30
     recognizer.objects.enroll("mesh", views, "mesh")
     recognizer.objects.enroll("frames", views, "frames")
     sizes = {name: len(views.embeddings) for name, views in recognizer.gallery.objects.items()}
-    assert (sizes["mesh"], sizes["frames"]) == (4, 20) and recognizer.gallery.objects["frames"].embeddings.shape[
+    assert (sizes["mesh"], sizes["frames"]) == (24, 20) and recognizer.gallery.objects["frames"].embeddings.shape[
         1
     ] <= 256
 
