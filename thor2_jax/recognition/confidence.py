@@ -1,10 +1,14 @@
 """Confidence: the estimated probability that an answer is correct, comparable between known and unknown objects.
 
 The fused probability of a class says which of the trained classes is most likely, not whether the object is one of them
-at all. The embedding of a run is also fitted on distractors, objects that are none of the classes. The confidence is
-the product of two logistic functions, fitted by `training` on views that no network was trained on:
+at all. The embedding of a run is also fitted on distractors, objects that are none of the classes. The score of an
+answer is the product of two logistic functions,
 
-    P(correct) = P(correct | known, fused probability) P(known | the embedding's probability of all classes)
+    score = P(correct | known, fused probability) P(known | the embedding's probability of all classes)
+
+where known and unknown objects are equally frequent, so that it separates them well. The confidence is a logistic
+function of the log-odds of the score: the share of correct answers to known objects with this score (Platt, 1999). All
+three are fitted by `training` on views that no network was trained on.
 """
 
 import dataclasses
@@ -47,6 +51,8 @@ class Calibration:
         known_bias: log-odds of a known object where the second feature is 0.
         known_factor: factor of the second feature, the embedding's log-odds of all classes against the distractors.
         unknown_below: confidence that 95 % of the correct held-out answers reach.
+        score_bias: log-odds of a correct answer to a known object where the score is one half.
+        score_factor: factor of the log-odds of the score.
 
     Raises:
         InputError: a value is not a finite number, or `unknown_below` is not between 0 and 1.
@@ -57,11 +63,13 @@ class Calibration:
     known_bias: float
     known_factor: float
     unknown_below: float
+    score_bias: float = 0.0
+    score_factor: float = 1.0
 
     def __post_init__(self) -> None:
         values = dataclasses.astuple(self)
         if not all(isinstance(value, float) and np.isfinite(value) for value in values):
-            raise InputError(f"calibration is {values}; expected five finite numbers")
+            raise InputError(f"calibration is {values}; expected finite numbers")
         if not 0 <= self.unknown_below <= 1:
             raise InputError(f"calibration: unknown_below is {self.unknown_below}; expected a confidence from 0 to 1")
 
@@ -74,11 +82,15 @@ class Calibration:
         """
         return stored_value(cls, "calibration", record, "train the run again")
 
-    def confidence(self, fused: Probabilities, embedding: Probabilities) -> NDArray[np.float64]:
-        """Return the confidence [B] of the most probable class; the arguments are those of `answer_features`."""
+    def score(self, fused: Probabilities, embedding: Probabilities) -> NDArray[np.float64]:
+        """Return the score [B] of the most probable class; the arguments are those of `answer_features`."""
         answer, known = answer_features(fused, embedding).T
         correct = expit(self.correct_bias + self.correct_factor * answer)
         return np.asarray(correct * expit(self.known_bias + self.known_factor * known))
+
+    def confidence(self, fused: Probabilities, embedding: Probabilities) -> NDArray[np.float64]:
+        """Return the confidence [B] of the most probable class; the arguments are those of `answer_features`."""
+        return np.asarray(expit(self.score_bias + self.score_factor * logit(self.score(fused, embedding))))
 
     def calibrated(self, fused: Probabilities, embedding: Probabilities) -> Probabilities:
         """Return the class probabilities [B, C], scaled so that the largest one is the confidence."""

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import logit
 from sklearn.linear_model import LogisticRegression
 
 from thor2_jax.descriptor.orientations import OrientedDescriptors
@@ -23,16 +24,13 @@ __all__ = ["KEPT", "fit_calibration"]
 KEPT = 0.95
 """Share of the correct held-out answers whose confidence reaches the threshold of a run."""
 
-KNOWN = 0.9
-"""Share of known objects that the confidence assumes among the instances to recognize."""
-
 BATCH = 128
 
 
 def fit_calibration(run: TrainedRun, embedding: Embedding, held_out: Samples) -> Calibration | None:
     """Fit the confidence of a run; None if all held-out answers to known objects are correct, or none.
 
-    Known and unknown objects are weighted by `KNOWN`, whatever their numbers.
+    Known and unknown objects have equal weights in the score, whatever their numbers.
 
     Args:
         run: run with its classifiers, which are fused as recognition does by default.
@@ -54,10 +52,13 @@ def fit_calibration(run: TrainedRun, embedding: Embedding, held_out: Samples) ->
     correct, known = fused.argmax(axis=1) == held_out.label, held_out.label < len(run.classes)
     if known.all() or correct[known].all() or not correct.any():
         return None
-    weights = np.where(known, KNOWN, 1 - KNOWN) / np.bincount(known)[known.astype(int)] * len(rows)
+    weights = len(rows) / 2 / np.bincount(known)[known.astype(int)]
     calibration = Calibration(
         *_logistic(features[known, 0], correct[known]), *_logistic(features[:, 1], known, weights), unknown_below=0.0
     )
+    score = logit(calibration.score(fused, probabilities[EMBEDDING]))
+    bias, factor = _logistic(score[known], correct[known])
+    calibration = dataclasses.replace(calibration, score_bias=bias, score_factor=factor)
     confidence = calibration.confidence(fused, probabilities[EMBEDDING])[correct]
     return dataclasses.replace(calibration, unknown_below=float(np.quantile(confidence, 1 - KEPT)))
 

@@ -13,7 +13,7 @@ from thor2_jax.recognition.confidence import Calibration, answer_features
 
 FUSED = np.array([[0.7, 0.2, 0.1], [0.2, 0.2, 0.6]])
 EMBEDDED = np.array([[0.4, 0.5, 0.0], [0.01, 0.0, 0.001]])
-CALIBRATION = Calibration(-1.0, 0.5, 2.0, 0.25, 0.3)
+CALIBRATION = Calibration(-1.0, 0.5, 2.0, 0.25, 0.3, 0.6, 1.5)
 RECORD = dataclasses.asdict(CALIBRATION)
 
 
@@ -30,8 +30,10 @@ def test_certain_answers_have_finite_features() -> None:
 def test_the_largest_probability_is_the_confidence() -> None:
     correct = 1 / (1 + np.exp(1 - 0.5 * np.log(0.7 / 0.3)))
     known = 1 / (1 + np.exp(-2 - 0.25 * np.log(0.9 / 0.1)))
+    score = correct * known
+    confidence = 1 / (1 + np.exp(-0.6) * ((1 - score) / score) ** 1.5)
     values = CALIBRATION.calibrated(FUSED, EMBEDDED)
-    np.testing.assert_allclose(values[0], np.array([1, 2 / 7, 1 / 7]) * correct * known)
+    np.testing.assert_allclose(values[0], np.array([1, 2 / 7, 1 / 7]) * confidence)
     np.testing.assert_array_equal(values.argmax(axis=1), FUSED.argmax(axis=1))
     assert values[1, 2] < values[0, 0]
 
