@@ -1,5 +1,7 @@
 """Operations on images of pixels, with the types of NumPy; masks are boolean images [H, W]."""
 
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +12,7 @@ __all__ = [
     "components",
     "float_image",
     "grow",
-    "local_extremes",
+    "is_border",
     "nearest_known",
     "open_round",
     "pixel_mask",
@@ -77,10 +79,12 @@ def nearest_known(known: Mask) -> NDArray[np.intp]:
     return index[numbers]
 
 
-def local_extremes(labels: NDArray[np.int32], size: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return the largest and the smallest label [H, W] in the square of `size` pixels around each pixel."""
-    image, square = labels.astype(np.float32), np.ones((size, size), np.uint8)
-    return float_image(cv2.dilate(image, square)), float_image(cv2.erode(image, square))
+def is_border(labels: NDArray[np.int32], size: int) -> Mask:
+    """Return the pixels with several labels, less than 65,536, in the square of `size` pixels around them."""
+    square = np.ones((size, size), np.uint8)
+    kind: type[np.unsignedinteger[Any]] = np.uint8 if labels.max() < 256 else np.uint16
+    image = labels.astype(kind)
+    return np.asarray(cv2.dilate(image, square) != cv2.erode(image, square))
 
 
 def watershed(color: NDArray[np.uint8], markers: NDArray[np.int32]) -> NDArray[np.int32]:

@@ -16,7 +16,7 @@ from thor2_jax.segmentation.depth_edges import depth_edges
 from thor2_jax.segmentation.foreground import find_foreground
 from thor2_jax.segmentation.markers import flood
 from thor2_jax.segmentation.merging import merge_pieces
-from thor2_jax.segmentation.pixels import Mask, components, grow, local_extremes, watershed
+from thor2_jax.segmentation.pixels import Mask, components, grow, is_border, watershed
 from thor2_jax.segmentation.planes import DepthImage, Plane, dominant_planes
 
 __all__ = ["segment_table"]
@@ -93,10 +93,10 @@ def _refined(labels: NDArray[np.int32], color: NDArray[np.uint8], stride: int) -
         stride * top : stride * (top + labels.shape[0]),
         stride * left : stride * (left + labels.shape[1]),
     ]
-    known = local_extremes(labels, BAND)
-    markers = np.where(known[0] == known[1], labels + 1, 0).astype(np.int32)
+    markers = np.where(is_border(labels, BAND), 0, labels + 1)
     height, width = refined[here].shape
-    markers = np.ascontiguousarray(markers.repeat(stride, axis=0).repeat(stride, axis=1)[:height, :width])
+    scaled = cv2.resize(markers.astype(np.float32), None, fx=stride, fy=stride, interpolation=cv2.INTER_NEAREST)
+    markers = scaled[:height, :width].astype(np.int32)
     blurred = np.asarray(cv2.GaussianBlur(np.ascontiguousarray(color[here]), (3, 3), 0), np.uint8)
     refined[here] = _trimmed(watershed(blurred, markers) - 1, 2 * (stride // 2) + 1)
     return refined
@@ -107,11 +107,13 @@ def _trimmed(labels: NDArray[np.int32], size: int) -> NDArray[np.int32]:
 
     A pixel is of the rim if the square of `size` pixels around it has another label.
     """
-    largest, smallest = local_extremes(labels, size)
-    inner = np.where(largest == smallest, labels, 0)
+    rim = np.flatnonzero(is_border(labels, size))
+    of_rim = labels.take(rim)
     sizes = np.bincount(labels.ravel())
-    thick = np.bincount(inner.ravel(), minlength=len(sizes)) >= LEAST_INNER * sizes
-    return np.where(thick[labels], inner, labels)
+    thick = sizes - np.bincount(of_rim, minlength=len(sizes)) >= LEAST_INNER * sizes
+    trimmed = labels.copy()
+    trimmed.put(rim[thick[of_rim]], 0)
+    return trimmed
 
 
 def _cleaned(labels: NDArray[np.int32], depth: DepthImage, planes: list[Plane]) -> NDArray[np.int32]:
