@@ -31,7 +31,7 @@ from training.views.mesh_views import ViewTask, render_task
 __all__ = ["SkippedInstance", "enroll_objects", "labelled_views", "mesh_views"]
 
 MESH_VIEWS = 60
-"""Cameras around a mesh; each view is enrolled as rendered and in one augmented copy."""
+"""Cameras around a mesh. Each gives two views: the mesh as rendered, and an augmented rendering from another camera."""
 
 
 def _show_nothing(stage: str, done: int, total: int, note: str) -> None:

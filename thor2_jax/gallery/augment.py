@@ -1,8 +1,7 @@
-"""Augmented copies of enrolled views that need no mesh: light, sensor noise, and masks that are cut.
+"""Augmented copies of enrolled views, made from their clouds without rendering: light, sensor noise and cut masks.
 
-Views show little of what another camera makes of an object, whether they are one to five frames or clean renderings of
-a mesh. The copies are drawn from the cloud itself, so that embedding a view again, with another embedding, gives the
-same copies.
+Views, whether a few frames or renderings of a mesh, show little of how another camera sees the object. The copies are
+drawn from the cloud itself, so that each copy of a view is the same in every embedding.
 """
 
 import zlib
@@ -17,10 +16,10 @@ from thor2_jax.recognition.prepared_instance import PreparedInstance
 __all__ = ["augmented_copies", "augmented_view"]
 
 MAX_COPIES = 8
-"""Copies of a single view from a frame; fewer of each where there are more views."""
+"""Copies of all views from frames together."""
 
 MESH_COPIES = 5
-"""Copies of each view that is rendered from a mesh."""
+"""Copies of each view from a mesh, as rendered or augmented."""
 
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 """Luma coefficients of red, green and blue (ITU-R BT.601)."""
@@ -31,10 +30,10 @@ def augmented_copies(views: Sequence[PreparedInstance], source: str) -> list[Pre
 
     Args:
         views: the views.
-        source: "mesh" for `MESH_COPIES` of each view, otherwise about `MAX_COPIES` in all, and none for more than that
-            many views.
+        source: "mesh" or "mesh and frames" for `MESH_COPIES` of each view; with "frames", about `MAX_COPIES` in all,
+            and none for more than that many views.
     """
-    copies = MESH_COPIES if source == "mesh" else MAX_COPIES // max(len(views), 1)
+    copies = MESH_COPIES if source.startswith("mesh") else MAX_COPIES // max(len(views), 1)
     return [augmented_view(view, copy) for view in views for copy in range(copies)]
 
 

@@ -85,7 +85,7 @@ def embed_views(embedding: Embedding, clouds: CompactClouds, source: str) -> NDA
     Args:
         embedding: the embedding.
         clouds: the views.
-        source: "mesh", or where else they come from.
+        source: where they come from, see `augmented_copies`.
     """
     # Views of similar size share a bucket.
     views = sorted(views_to_embed(clouds, source), key=lambda view: point_bucket(len(view.points)))

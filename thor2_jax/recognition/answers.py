@@ -35,9 +35,10 @@ class Recognition:
         name: the object's name. None if the instance could not be described (fewer points than
             `instance_clouds.MIN_POINTS`), if more than half of its points overflow (`MAX_OVERFLOW`), or if its
             confidence is below the recognizer's `unknown_below`: an unknown object.
-        confidence: estimated probability that the name is correct, from 0 to 1, also of an unknown object (see
-            `recognition.confidence`); without a calibration, the fused probability of the most probable class or the
-            score of the gallery. None if the instance could not be described.
+        confidence: from 0 to 1, also of an unknown object: estimated probability that the name of a known object is
+            correct; low for most unknown objects (see `recognition.confidence`). Without a calibration, the fused
+            probability of the most probable class or the score of the gallery. None if the instance could not be
+            described.
         classifier: the classifier that gives this class the largest probability ("tops", "tops2" or "embedding"), or
             "gallery".
         top: classifier or "gallery" -> its five most probable (name, probability) pairs.

@@ -1,4 +1,4 @@
-"""Confidence: the estimated probability that an answer is correct, comparable between known and unknown objects.
+"""Confidence: the estimated probability that the answer to a known object is correct; low for unknown objects.
 
 The fused probability of a class says which of the trained classes is most likely, not whether the object is one of them
 at all. The embedding of a run is also fitted on distractors, objects that are none of the classes. The score of an
@@ -6,9 +6,9 @@ answer is the product of two logistic functions,
 
     score = P(correct | known, fused probability) P(known | the embedding's probability of all classes)
 
-where known and unknown objects are equally frequent, so that it separates them well. The confidence is a logistic
-function of the log-odds of the score: the share of correct answers to known objects with this score (Platt, 1999). All
-three are fitted by `training` on views that no network was trained on.
+The two kinds of objects have equal weights in the fit, so that the score separates them well. The confidence is a third
+logistic function, of the log-odds of the score: the share of correct answers to known objects with this score (Platt,
+1999). All three are fitted by `training` on views that no network was trained on.
 """
 
 import dataclasses

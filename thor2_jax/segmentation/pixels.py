@@ -12,7 +12,7 @@ __all__ = [
     "components",
     "float_image",
     "grow",
-    "is_border",
+    "label_borders",
     "nearest_known",
     "open_round",
     "pixel_mask",
@@ -79,11 +79,11 @@ def nearest_known(known: Mask) -> NDArray[np.intp]:
     return index[numbers]
 
 
-def is_border(labels: NDArray[np.int32], size: int) -> Mask:
-    """Return the pixels with several labels, less than 65,536, in the square of `size` pixels around them."""
+def label_borders(labels: NDArray[np.int32], size: int) -> Mask:
+    """Return the pixels with more than one label in the square of `size` pixels around them; labels are 0 to 65,535."""
     square = np.ones((size, size), np.uint8)
-    kind: type[np.unsignedinteger[Any]] = np.uint8 if labels.max() < 256 else np.uint16
-    image = labels.astype(kind)
+    dtype: type[np.unsignedinteger[Any]] = np.uint8 if labels.max() < 256 else np.uint16  # the former is faster
+    image = labels.astype(dtype)
     return np.asarray(cv2.dilate(image, square) != cv2.erode(image, square))
 
 

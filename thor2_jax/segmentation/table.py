@@ -16,7 +16,7 @@ from thor2_jax.segmentation.depth_edges import depth_edges
 from thor2_jax.segmentation.foreground import find_foreground
 from thor2_jax.segmentation.markers import flood
 from thor2_jax.segmentation.merging import merge_pieces
-from thor2_jax.segmentation.pixels import Mask, components, grow, is_border, watershed
+from thor2_jax.segmentation.pixels import Mask, components, grow, label_borders, watershed
 from thor2_jax.segmentation.planes import DepthImage, Plane, dominant_planes
 
 __all__ = ["segment_table"]
@@ -93,7 +93,7 @@ def _refined(labels: NDArray[np.int32], color: NDArray[np.uint8], stride: int) -
         stride * top : stride * (top + labels.shape[0]),
         stride * left : stride * (left + labels.shape[1]),
     ]
-    markers = np.where(is_border(labels, BAND), 0, labels + 1)
+    markers = np.where(label_borders(labels, BAND), 0, labels + 1)
     height, width = refined[here].shape
     scaled = cv2.resize(markers.astype(np.float32), None, fx=stride, fy=stride, interpolation=cv2.INTER_NEAREST)
     markers = scaled[:height, :width].astype(np.int32)
@@ -107,7 +107,7 @@ def _trimmed(labels: NDArray[np.int32], size: int) -> NDArray[np.int32]:
 
     A pixel is of the rim if the square of `size` pixels around it has another label.
     """
-    rim = np.flatnonzero(is_border(labels, size))
+    rim = np.flatnonzero(label_borders(labels, size))
     of_rim = labels.take(rim)
     sizes = np.bincount(labels.ravel())
     thick = sizes - np.bincount(of_rim, minlength=len(sizes)) >= LEAST_INNER * sizes

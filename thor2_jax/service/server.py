@@ -77,13 +77,14 @@ def serve(settings: Settings, host: str = "127.0.0.1", port: int = 8080, workers
 
 
 def _create_worker(settings: Settings, workers: int) -> FastAPI:
-    """Create the application of one process; a worker ends when the process that started it is killed."""
+    """Create the application of one process; a worker is terminated when its parent has ended, even by SIGKILL."""
     parent = multiprocessing.parent_process()
     if parent is not None:
-        threading.Thread(target=_end_after, args=(parent,), name="parent", daemon=True).start()
+        threading.Thread(target=_terminate_after, args=(parent,), name="parent-watch", daemon=True).start()
     return create_app(settings, workers)
 
 
-def _end_after(parent: BaseProcess) -> None:
+def _terminate_after(parent: BaseProcess) -> None:
+    """Send SIGTERM to this process when its parent has ended; it finishes the accepted requests."""
     parent.join()
     os.kill(os.getpid(), signal.SIGTERM)

@@ -58,7 +58,8 @@ def fit_calibration(run: TrainedRun, embedding: Embedding, held_out: Samples) ->
     )
     score = logit(calibration.score(fused, probabilities[EMBEDDING]))
     bias, factor = _logistic(score[known], correct[known])
-    calibration = dataclasses.replace(calibration, score_bias=bias, score_factor=factor)
+    if factor > 0:  # otherwise the confidence would not grow with the score
+        calibration = dataclasses.replace(calibration, score_bias=bias, score_factor=factor)
     confidence = calibration.confidence(fused, probabilities[EMBEDDING])[correct]
     return dataclasses.replace(calibration, unknown_below=float(np.quantile(confidence, 1 - KEPT)))
 

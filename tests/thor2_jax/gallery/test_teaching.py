@@ -180,7 +180,7 @@ def test_views_get_augmented_copies(embedding: Embedding) -> None:
     views = [instance_view(CLUTTER, label, 2.5) for label in (1, 2)]
     copies = augmented_copies(views, "frames")
     assert len(copies) == 8 and len(augmented_copies(views * 5, "frames")) == 0
-    assert len(augmented_copies(views * 5, "mesh")) == 50
+    assert len(augmented_copies(views * 5, "mesh")) == len(augmented_copies(views * 5, "mesh and frames")) == 50
     for copy, again in zip(copies, augmented_copies(views, "frames"), strict=True):
         np.testing.assert_array_equal(copy.points, again.points)
         assert len(copy.points) == len(copy.colors) == len(copy.boundary) >= 30

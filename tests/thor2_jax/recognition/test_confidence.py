@@ -38,6 +38,13 @@ def test_the_largest_probability_is_the_confidence() -> None:
     assert values[1, 2] < values[0, 0]
 
 
+def test_the_score_of_a_record_without_a_third_function_is_its_confidence() -> None:
+    record = {name: value for name, value in RECORD.items() if not name.startswith("score")}
+    calibration = Calibration.of_record({"calibration": record})
+    assert calibration is not None
+    np.testing.assert_allclose(calibration.confidence(FUSED, EMBEDDED), CALIBRATION.score(FUSED, EMBEDDED))
+
+
 @pytest.mark.parametrize(
     "record",
     [

@@ -131,7 +131,7 @@ def test_workers_share_a_port_and_metrics(start_server: Callable[..., Any], file
 
 
 @pytest.mark.slow
-def test_only_ready_workers_receive_requests(start_server: Callable[..., Any], files: Files) -> None:
+def test_only_ready_workers_answer_and_end_with_their_parent(start_server: Callable[..., Any], files: Files) -> None:
     server = start_server("--workers", "2", "--processes", "1")
 
     def wait_for(condition: Callable[[], bool]) -> None:

@@ -45,7 +45,7 @@ def test_confidence_separates_and_keeps_its_share(held_out: Samples, monkeypatch
         thor2.Recognizer, "probabilities", lambda *a: {k: np.resize(v, (128, 2)) for k, v in values.items()}
     )
     fitted = fit_calibration(run, embedding, held_out)
-    assert fitted is not None and min(fitted.known_factor, fitted.correct_factor) > 0
+    assert fitted is not None and min(fitted.known_factor, fitted.correct_factor, fitted.score_factor) > 0
     scores, correct = fitted.confidence(fused, embedded), answer == held_out.label
     assert np.min(scores[known & ~wrong]) > 0.7 > np.max(scores[~known])
     assert np.mean(scores[known]) == pytest.approx(correct[known].mean(), abs=0.05)  # most instances are known

@@ -49,7 +49,7 @@ function confidenceHelp(calibrated, sources) {
   const both = "An object without training takes this score as its confidence, a trained class the geometric mean of its probabilities, and of its score if it has views, too. ";
   if (sources.includes("gallery")) return `${gallery}${both}The confidence is not calibrated.`;
   const fusion = "The named class has the highest geometric mean of both probabilities; normalized, it is the confidence. ";
-  const known = "The embedding tells the classes from other objects: the less likely it finds all of them together, the lower is the confidence, which estimates the probability that the name is correct.";
+  const known = "The embedding tells the classes from other objects: the less likely it finds all of them together, the lower is the confidence. For objects that the model knows, it estimates the probability that the name is correct.";
   if (sources.includes("embedding")) return `The named class has the highest geometric mean of the other probabilities. ${known}`;
   if (calibrated !== null) return `${fusion}The calibrated confidence (temperature scaling on a held-out set) estimates the accuracy of such answers.`;
   return `${fusion}It is not calibrated, since the model was trained without a held-out set: expect fewer correct answers than it suggests.`;
