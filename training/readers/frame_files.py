@@ -90,7 +90,8 @@ def find_frames(paths: Sequence[Path], depth_scale: float | None = None) -> list
     """Find the frames in folders, in the order of their names.
 
     Args:
-        paths: folders of one frame, folders that hold such folders at any depth, and BOP splits or scenes.
+        paths: folders of one frame, folders that hold such folders at any depth or links to them, and BOP splits or
+            scenes.
         depth_scale: see `read_frame`; BOP scenes have their own.
 
     Raises:
@@ -108,7 +109,9 @@ def find_frames(paths: Sequence[Path], depth_scale: float | None = None) -> list
                 for k, name in enumerate(dataset.identifiers)
             ]
         else:
-            colors = [file for name in FILE_NAMES["color"] for file in path.rglob(name)]
+            # "**" does not follow links to folders, "*" does.
+            patterns = [pattern for name in FILE_NAMES["color"] for pattern in (f"**/{name}", f"*/{name}")]
+            colors = [file for pattern in patterns for file in path.glob(pattern)]
             of_path = [
                 FrameSource(_name(folder, path), functools.partial(frame_files(folder).read, depth_scale))
                 for folder in sorted({file.parent for file in colors})

@@ -46,6 +46,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def test_folders_may_hold_links_to_frames(folder: Path, tmp_path: Path) -> None:
+    for name in ("000", "002"):
+        (tmp_path / name).symlink_to(folder / name, target_is_directory=True)
+    assert [source.name for source in find_frames([tmp_path])] == ["000", "002"]
+
+
 def halves(frame: thor2.RGBDFrame) -> np.ndarray:
     return (np.arange(frame.depth.size).reshape(frame.depth.shape) > frame.depth.size // 2).astype(np.uint8)
 
