@@ -38,7 +38,7 @@ def test_the_largest_probability_is_the_confidence() -> None:
     assert values[1, 2] < values[0, 0]
 
 
-def test_the_score_of_a_record_without_a_third_function_is_its_confidence() -> None:
+def test_records_without_a_third_function_are_read() -> None:
     record = {name: value for name, value in RECORD.items() if not name.startswith("score")}
     calibration = Calibration.of_record({"calibration": record})
     assert calibration is not None
