@@ -83,10 +83,11 @@ class Calibration:
         return stored_value(cls, "calibration", record, "train the run again")
 
     def score(self, fused: Probabilities, embedding: Probabilities) -> NDArray[np.float64]:
-        """Return the score [B] of the most probable class; the arguments are those of `answer_features`."""
+        """Return the score [B] of the most probable class, below 1; the arguments are those of `answer_features`."""
         answer, known = answer_features(fused, embedding).T
         correct = expit(self.correct_bias + self.correct_factor * answer)
-        return np.asarray(correct * expit(self.known_bias + self.known_factor * known))
+        score = correct * expit(self.known_bias + self.known_factor * known)
+        return np.asarray(np.minimum(score, 1 - np.finfo(np.float64).epsneg))  # so that its log-odds are finite
 
     def confidence(self, fused: Probabilities, embedding: Probabilities) -> NDArray[np.float64]:
         """Return the confidence [B] of the most probable class; the arguments are those of `answer_features`."""

@@ -52,10 +52,8 @@ def fit_calibration(run: TrainedRun, embedding: Embedding, held_out: Samples) ->
     correct, known = fused.argmax(axis=1) == held_out.label, held_out.label < len(run.classes)
     if known.all() or correct[known].all() or not correct.any():
         return None
-    weights = len(rows) / 2 / np.bincount(known)[known.astype(int)]
-    calibration = Calibration(
-        *_logistic(features[known, 0], correct[known]), *_logistic(features[:, 1], known, weights), unknown_below=0.0
-    )
+    of_correct, of_known = _logistic(features[known, 0], correct[known]), _logistic(features[:, 1], known, "balanced")
+    calibration = Calibration(*of_correct, *of_known, unknown_below=0.0)
     score = logit(calibration.score(fused, probabilities[EMBEDDING]))
     bias, factor = _logistic(score[known], correct[known])
     if factor > 0:  # otherwise the confidence would not grow with the score
@@ -64,9 +62,7 @@ def fit_calibration(run: TrainedRun, embedding: Embedding, held_out: Samples) ->
     return dataclasses.replace(calibration, unknown_below=float(np.quantile(confidence, 1 - KEPT)))
 
 
-def _logistic(
-    feature: NDArray[Any], target: NDArray[np.bool_], weights: NDArray[Any] | None = None
-) -> tuple[float, float]:
-    """Return bias and factor of a logistic regression on one feature [N]."""
-    fit = LogisticRegression().fit(feature[:, None], target, sample_weight=weights)
+def _logistic(feature: NDArray[Any], target: NDArray[np.bool_], class_weight: str | None = None) -> tuple[float, float]:
+    """Return bias and factor of a logistic regression on one feature [N]; "balanced" weights both targets equally."""
+    fit = LogisticRegression(class_weight=class_weight).fit(feature[:, None], target)
     return float(fit.intercept_[0]), float(fit.coef_[0, 0])

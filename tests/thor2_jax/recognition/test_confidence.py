@@ -38,6 +38,12 @@ def test_the_largest_probability_is_the_confidence() -> None:
     assert values[1, 2] < values[0, 0]
 
 
+def test_the_score_is_below_one() -> None:
+    steep = dataclasses.replace(CALIBRATION, correct_factor=100.0, known_factor=100.0)
+    score = steep.score(np.array([[1.0, 0.0]]), np.array([[1.0, 0.0]]))
+    assert 0.999 < score[0] < 1
+
+
 def test_records_without_a_third_function_are_read() -> None:
     record = {name: value for name, value in RECORD.items() if not name.startswith("score")}
     calibration = Calibration.of_record({"calibration": record})
