@@ -46,8 +46,13 @@ EMBEDDING_FORMAT = 1
 MAX_EMBEDDING_SIZE = 256
 """Largest length of an embedding."""
 
-_METADATA = "embedding"
+_METADATA, _FURTHER = "embedding", "further"
 # safetensors writes several metadata keys in a random order, and equal embeddings shall have equal bytes.
+
+
+def _further(number: int) -> str:
+    """Return the prefix of the names of the arrays of a further network in the file."""
+    return f"{_FURTHER}/{number}/"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -188,8 +193,16 @@ def _embed_clouds(
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _classify(graph: Any, state: Any, oriented: OrientedDescriptors) -> jax.Array:
-    return oriented.fuse(nnx.merge(graph, state).class_logits(*oriented.flat))
+def _classify(graphs: tuple[Any, ...], states: tuple[Any, ...], oriented: OrientedDescriptors) -> jax.Array:
+    models = [nnx.merge(graph, state) for graph, state in zip(graphs, states, strict=True)]
+    each = [jax.nn.log_softmax(model.class_logits(*oriented.flat)) for model in models]
+    return oriented.fuse(jnp.stack(each).mean(axis=0))
+
+
+def _split(model: EmbeddingNetwork) -> tuple[Any, Any]:
+    """Return the graph and the state of a network, with its values as the file stores them."""
+    graph, state = nnx.split(model)
+    return graph, jax.tree.map(lambda a: a.astype(jnp.float16).astype(jnp.float32), state)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -203,6 +216,9 @@ class Embedding:
         model: the network of the embedding. Do not change it: compiled functions and `fingerprint` keep its arrays.
         classes: classes that the network also recognizes by its first proxies; none in the packaged embedding.
         distractors: number of further proxies, of objects that are none of the classes.
+        further: networks that were fitted as `model` was, from other random weights. They classify with it, which
+            tells unknown objects apart more reliably (Lakshminarayanan et al., "Simple and Scalable Predictive
+            Uncertainty Estimation using Deep Ensembles", NeurIPS 2017); they do not embed.
     """
 
     config: DescriptorConfig
@@ -211,6 +227,7 @@ class Embedding:
     model: EmbeddingNetwork
     classes: tuple[str, ...] = ()
     distractors: int = 0
+    further: tuple[EmbeddingNetwork, ...] = ()
 
     @classmethod
     def create(
@@ -257,32 +274,35 @@ class Embedding:
         return self.sizes.learned + self.sizes.color + self.network.n_regions
 
     @functools.cached_property
-    def _split(self) -> tuple[Any, Any]:
-        graph, state = nnx.split(self.model)
-        # The values of the file, so that a stored embedding is the same as the one in memory.
-        return graph, jax.tree.map(lambda a: a.astype(jnp.float16).astype(jnp.float32), state)
+    def _embedder(self) -> tuple[Any, Any]:
+        return _split(self.model)
+
+    @functools.cached_property
+    def _classifiers(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+        graphs, states = zip(self._embedder, *map(_split, self.further), strict=True)
+        return graphs, states
 
     def embed(self, clouds: PointClouds) -> jax.Array:
         """Return the embeddings [B, D] float32 of clouds in metres, each of unit length.
 
         Each shape [B, N] of the batch compiles once for all embeddings of the same sizes and descriptor.
         """
-        graph, state = self._split
+        graph, state = self._embedder
         return _embed_clouds(graph, self.config, self.network, state, clouds)
 
     def embed_oriented(self, oriented: OrientedDescriptors) -> jax.Array:
         """Return the embeddings [B, K, D] of clouds that are described in K orientations, by this descriptor."""
-        return _embed_oriented(*self._split, oriented)
+        return _embed_oriented(*self._embedder, oriented)
 
     def class_probabilities(self, oriented: OrientedDescriptors) -> jax.Array:
         """Return the probabilities [B, C] of the classes; what they lack to 1 is that of the distractors.
 
-        They are the geometric mean over the orientations, by their weights.
+        They are the geometric mean over the networks and over the orientations, by their weights.
 
         Args:
             oriented: clouds in K orientations, described by this embedding's descriptor.
         """
-        return _classify(*self._split, oriented)[:, : len(self.classes)]
+        return _classify(*self._classifiers, oriented)[:, : len(self.classes)]
 
     @functools.cached_property
     def _content(self) -> bytes:
@@ -295,7 +315,10 @@ class Embedding:
             "classes": list(self.classes),
             "distractors": self.distractors,
         }
-        arrays = {name: array.astype(np.float16) for name, array in model_arrays(self.model).items()}
+        arrays = model_arrays(self.model)
+        for number, model in enumerate(self.further):
+            arrays |= {f"{_further(number)}{name}": array for name, array in model_arrays(model).items()}
+        arrays = {name: array.astype(np.float16) for name, array in arrays.items()}
         return safetensors.numpy.save(arrays, {_METADATA: json.dumps(about, sort_keys=True)})
 
     @functools.cached_property
@@ -339,12 +362,20 @@ class Embedding:
             )
             sizes = EmbeddingSizes(**{**about["sizes"], "hidden": tuple(about["sizes"]["hidden"])})
             classes, distractors = tuple(map(str, about.get("classes", ()))), int(about.get("distractors", 0))
-            model = model_from_arrays(lambda: cls.create(config, network, sizes, 0, classes, distractors).model, arrays)
+
+            def model_of(prefix: str, sizes: EmbeddingSizes) -> EmbeddingNetwork:
+                own = {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
+                return model_from_arrays(lambda: cls.create(config, network, sizes, 0, classes, distractors).model, own)
+
+            count = len({name.split("/")[1] for name in arrays if name.startswith(f"{_FURTHER}/")})
+            only_learned = dataclasses.replace(sizes, color=0)
+            model = model_of("", sizes)
+            further = tuple(model_of(_further(number), only_learned) for number in range(count))
         except InputError as error:
             raise InputError(f"embedding: {path}: {error}") from None
         except (OSError, safetensors.SafetensorError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise InputError(f"embedding: {path} is missing or damaged ({type(error).__name__}: {error})") from None
-        return cls(config, network, sizes, model, classes, distractors)
+        return cls(config, network, sizes, model, classes, distractors, further)
 
 
 @functools.cache

@@ -22,7 +22,7 @@ from colornet import ColorNetwork
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.describe import describe_strips
 from thor2_jax.errors import InputError
-from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes, class_cosines, color_features
+from thor2_jax.gallery.embedding import Embedding, EmbeddingNetwork, EmbeddingSizes, class_cosines, color_features
 from thor2_jax.types import Descriptors, Strips
 from training.embedding.samples import Batch, Samples
 
@@ -42,6 +42,8 @@ class EmbeddingFit:
         rate: learning rate of AdamW at the first step; it falls to 0 along a cosine.
         margin: subtracted from the cosine between a view and its own proxy.
         seed: seed for weights, proxies, sample order and dropout.
+        networks: networks that are fitted one after the other, from different weights. The first one embeds, and all
+            classify; an embedding without classes needs no more.
 
     Raises:
         InputError: a value is out of range.
@@ -52,11 +54,13 @@ class EmbeddingFit:
     rate: float = 2e-3
     margin: float = 0.12
     seed: int = 0
+    networks: int = 1
 
     def __post_init__(self) -> None:
-        if min(self.epochs, self.batch_size - 1) < 1 or not (self.rate > 0 and 0 <= self.margin < 1):
+        if min(self.epochs, self.batch_size - 1, self.networks) < 1 or not (self.rate > 0 and 0 <= self.margin < 1):
             raise InputError(
-                f"{self}; expected at least 1 epoch, batches of at least 2, a positive rate and a margin in [0, 1)"
+                f"{self}; expected at least 1 epoch, 1 network, batches of at least 2, a positive rate and a margin "
+                "in [0, 1)"
             )
 
 
@@ -140,22 +144,42 @@ def fit_embedding(
         config: descriptor of the samples.
         options: of the fit.
         sizes: of the network.
-        progress: called after each epoch with (epochs done, number of epochs, mean loss).
+        progress: called after each epoch with (epochs done, epochs of all networks, mean loss).
         classes: names of the first objects, which the embedding also recognizes: their proxies, and those of the other
             objects as distractors, are kept. None by default: the proxies are discarded.
 
     Raises:
         InputError: there are fewer samples than in a batch, or the loss is not finite.
     """
-    n_steps = len(samples) // options.batch_size
-    if n_steps < 1:
+    if len(samples) < options.batch_size:
         raise InputError(f"there are {len(samples)} samples; expected at least {options.batch_size}; add views")
     n_objects = int(samples.label.max()) + 1
+    sizes = sizes or EmbeddingSizes()
     embedding = Embedding.create(config, network, sizes, options.seed, classes, n_objects - len(classes))
-    config = embedding.config
-    basis = _color_basis(samples, network, config, embedding.sizes.color, options.batch_size)
+    basis = _color_basis(samples, network, embedding.config, sizes.color, options.batch_size)
     embedding.model.color_basis[...] = jnp.asarray(basis)
-    split: Any = nnx.split(embedding.model, nnx.Param, ...)
+    models = []
+    for number in range(options.networks):
+        seed, source = options.seed, embedding
+        if number:
+            seed = int(np.random.SeedSequence([options.seed, number]).generate_state(1)[0])
+            only_learned = dataclasses.replace(sizes, color=0)
+            source = Embedding.create(config, network, only_learned, seed, classes, embedding.distractors)
+
+        def of_network(epoch: int, loss: float, before: int = number * options.epochs) -> None:
+            progress(before + epoch, options.networks * options.epochs, loss)
+
+        models.append(_fit_network(source, samples, dataclasses.replace(options, seed=seed), of_network))
+    fitted = dataclasses.replace(embedding, model=models[0], further=tuple(models[1:]))
+    return fitted if classes else fitted.without_proxies()
+
+
+def _fit_network(
+    source: Embedding, samples: Samples, options: EmbeddingFit, progress: Callable[[int, float], object]
+) -> EmbeddingNetwork:
+    """Fit the network of an embedding; `progress` is called after each epoch with (epochs done, mean loss)."""
+    n_steps = len(samples) // options.batch_size
+    split: Any = nnx.split(source.model, nnx.Param, ...)
     graph, parameters, rest = split
     optimizer = _adamw(options.rate, n_steps * options.epochs)
     state = parameters, rest, optimizer.init(parameters), jax.random.key(options.seed)
@@ -163,11 +187,12 @@ def fit_embedding(
         order = np.random.default_rng([options.seed, epoch]).permutation(len(samples))
         total = jnp.zeros(())
         for rows in order[: n_steps * options.batch_size].reshape(n_steps, -1):
-            state, loss = _step(graph, optimizer, options.margin, network, config, state, samples.take(rows))
+            batch = samples.take(rows)
+            state, loss = _step(graph, optimizer, options.margin, source.network, source.config, state, batch)
             total += loss
         mean = float(total) / n_steps
         if not np.isfinite(mean):
             raise InputError(f"the loss is {mean} in epoch {epoch + 1}; expected a finite one; lower the rate")
-        progress(epoch + 1, options.epochs, mean)
-    fitted = dataclasses.replace(embedding, model=nnx.merge(graph, state[0], state[1]))
-    return fitted if classes else fitted.without_proxies()
+        progress(epoch + 1, mean)
+    fitted: EmbeddingNetwork = nnx.merge(graph, state[0], state[1])
+    return fitted

@@ -28,6 +28,9 @@ __all__ = ["Distractors", "fit_run_embedding"]
 COPIES = 2
 """Samples of each view, in random orientations."""
 
+NETWORKS = 3
+"""Networks of an embedding."""
+
 HELD_OUT = 10
 """One distractor of so many is held out."""
 
@@ -148,7 +151,7 @@ def fit_run_embedding(
         joined_samples(fitted, config),
         network,
         config,
-        EmbeddingFit(epochs=distractors.epochs, seed=seed),
+        EmbeddingFit(epochs=distractors.epochs, seed=seed, networks=NETWORKS),
         progress=lambda done, total, loss: progress("fit embedding", done, total, f"loss {loss:.3f}"),
         classes=classes,
     )

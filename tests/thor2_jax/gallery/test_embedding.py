@@ -54,19 +54,42 @@ def test_described_clouds_give_the_same_embedding(embedding: Embedding, clouds: 
     np.testing.assert_allclose(embedding.embed_oriented(oriented)[:, 0], embedding.embed(clouds), atol=1e-5)
 
 
-def test_class_probabilities_are_means_over_orientations(clouds: thor2.PointClouds) -> None:
-    embedding = Embedding.create(sizes=SIZES, classes=("a", "b"), distractors=3)
+def ensemble() -> Embedding:
+    """Two networks of equal sizes, of two classes and three distractors."""
+    first, second = (Embedding.create(sizes=SIZES, seed=seed, classes=("a", "b"), distractors=3) for seed in (0, 1))
+    return dataclasses.replace(first, further=(second.model,))
+
+
+def test_class_probabilities_are_means_over_networks_and_orientations(clouds: thor2.PointClouds) -> None:
+    embedding = ensemble()
     oriented = describe_orientations(clouds, embedding.network, embedding.config, 4)
     weights = np.array([[1, 0, 0, 0], [0.25] * 4, [0, 0, 0.5, 0.5]], np.float32)
-    learned = embedding.embed_oriented(oriented)[..., : SIZES.learned]
     actual = embedding.class_probabilities(dataclasses.replace(oriented, weights=jnp.asarray(weights)))
-    state = embedding._split[1]
-    unit = np.asarray(learned, np.float64)
-    unit /= np.linalg.norm(unit, axis=-1, keepdims=True)
-    proxies = np.asarray(state["proxies"][...], np.float64)
-    logits = np.exp(float(state["log_scale"][...])) * unit @ (proxies / np.linalg.norm(proxies, axis=0))
-    mean = np.einsum("bk,bkc->bc", weights, scipy.special.log_softmax(logits, axis=-1))
-    np.testing.assert_allclose(actual, scipy.special.softmax(mean, axis=1)[:, :2], atol=1e-4)
+    means = []
+    for model in (embedding.model, *embedding.further):
+        one = dataclasses.replace(embedding, model=model, further=())
+        unit = np.asarray(one.embed_oriented(oriented)[..., : SIZES.learned], np.float64)
+        unit /= np.linalg.norm(unit, axis=-1, keepdims=True)
+        proxies = np.asarray(model.proxies[...], np.float16).astype(np.float64)
+        scale = np.exp(np.float16(model.log_scale[...]).astype(np.float64))
+        logits = scale * unit @ (proxies / np.linalg.norm(proxies, axis=0))
+        means.append(np.einsum("bk,bkc->bc", weights, scipy.special.log_softmax(logits, axis=-1)))
+    assert np.abs(means[0] - means[1]).max() > 0.1
+    expected = scipy.special.softmax(np.mean(means, axis=0), axis=1)[:, :2]
+    np.testing.assert_allclose(actual, expected, atol=1e-4)
+
+
+def test_a_file_holds_all_networks(clouds: thor2.PointClouds, tmp_path: Path) -> None:
+    embedding = ensemble()
+    without_color = Embedding.create(sizes=dataclasses.replace(SIZES, color=0), classes=("a", "b"), distractors=3)
+    embedding = dataclasses.replace(embedding, further=(without_color.model, without_color.model))
+    embedding.save(tmp_path / "embedding.safetensors")
+    loaded = Embedding.load(tmp_path / "embedding.safetensors")
+    oriented = describe_orientations(clouds, embedding.network, embedding.config, 2)
+    assert len(loaded.further) == 2 and loaded.fingerprint == embedding.fingerprint
+    assert np.array_equal(loaded.class_probabilities(oriented), embedding.class_probabilities(oriented))
+    assert np.array_equal(loaded.embed(clouds), embedding.embed(clouds))
+    assert not loaded.without_proxies().further
 
 
 def test_padding_and_batch_do_not_matter(embedding: Embedding) -> None:

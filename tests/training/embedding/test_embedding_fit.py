@@ -81,7 +81,7 @@ def test_unturned_samples_have_the_descriptor_of_their_cloud(monkeypatch: pytest
     clouds = thor2.PointClouds.pack([rendered[k][1] for k in order])
     expected = {mirror: embedded(embedding, aligned(clouds, mirror)) for mirror in ("", "x")}
     descriptors = fit.batch_descriptors(jnp.asarray(batch.length), jnp.asarray(batch.color), NETWORK, embedding.config)
-    actual = whole_embedding(nnx.merge(*embedding._split), descriptors, batch.statistics)
+    actual = whole_embedding(nnx.merge(*embedding._embedder), descriptors, batch.statistics)
     similarity = [np.asarray((actual * values).sum(axis=1)) for values in expected.values()]
     np.testing.assert_allclose(np.max(similarity, axis=0), 1, atol=1e-3)
 
@@ -141,7 +141,29 @@ def test_views_of_one_object_become_more_similar(views: Samples) -> None:
     np.testing.assert_allclose(basis.T @ basis, np.eye(10), atol=1e-3)
 
 
-@pytest.mark.parametrize("options", [{"epochs": 0}, {"batch_size": 1}, {"rate": 0.0}, {"margin": 1.0}], ids=str)
+def test_further_networks_classify_and_leave_the_first_as_it_is(views: Samples) -> None:
+    classes, short = ("a", "b"), dataclasses.replace(OPTIONS, epochs=2)
+    done = []
+    one = fit_embedding(views, NETWORK, SMALL_CONFIG, short, SIZES, classes=classes)
+    two = fit_embedding(
+        views,
+        NETWORK,
+        SMALL_CONFIG,
+        dataclasses.replace(short, networks=2),
+        SIZES,
+        lambda *numbers: done.append(numbers[:2]),
+        classes,
+    )
+    assert done == [(1, 4), (2, 4), (3, 4), (4, 4)]
+    (second,) = two.further
+    assert np.array_equal(one.model.proxies[...], two.model.proxies[...])
+    assert second.proxies[...].shape == two.model.proxies[...].shape
+    assert np.abs(second.proxies[...] - two.model.proxies[...]).max() > 0.1
+
+
+@pytest.mark.parametrize(
+    "options", [{"epochs": 0}, {"networks": 0}, {"batch_size": 1}, {"rate": 0.0}, {"margin": 1.0}], ids=str
+)
 def test_options_out_of_range_are_rejected(options: dict[str, float]) -> None:
     with pytest.raises(thor2.InputError, match=next(iter(options))):
         EmbeddingFit(**options)
