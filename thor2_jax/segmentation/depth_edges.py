@@ -42,7 +42,7 @@ def depth_edges(depth: DepthImage) -> tuple[Mask, Mask]:
     known = depth.valid
     if not known.any():
         return np.zeros(known.shape, bool), np.zeros(known.shape, bool)
-    inverse = depth.inverse.ravel()[nearest_known(known)]
+    inverse = depth.inverse[known].take(nearest_known(known))
     inverse = np.asarray(cv2.medianBlur(inverse, 5))
     unknown = (~known).view(np.uint8)
     gap = np.asarray(cv2.dilate(cv2.distanceTransform(unknown, cv2.DIST_L2, 3), np.ones((3, 3), np.uint8)))

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from thor2_jax.segmentation.pixels import Mask, components, float_image, grow, open_round, pixel_mask, shrink
+from thor2_jax.segmentation.pixels import Mask, components, float_image, grow, middle, open_round, pixel_mask, shrink
 from thor2_jax.segmentation.planes import DepthImage, Plane
 
 __all__ = ["FLAT", "UNIT", "Evidence", "find_foreground"]
@@ -127,14 +127,14 @@ def _color_contrast(color: NDArray[np.uint8], plane: Mask) -> tuple[NDArray[np.u
     """
     height, width = plane.shape
     around, near, window_share, share = _plane_color(color, plane)
-    length = np.sqrt((around * around).sum(axis=2)) + 1e-3
+    ones = np.ones((1, 3), np.float32)
+    length = np.sqrt(float_image(cv2.transform(around * around, ones))) + np.float32(1e-3)
     direction = float_image(cv2.resize(around / length[..., None], (width, height), interpolation=cv2.INTER_LINEAR))
     reference = float_image(cv2.resize(length, (width, height), interpolation=cv2.INTER_LINEAR))
-    pixels = color.astype(np.float32)
-    # A shadow changes the length of a colour, not its direction.
-    ones = np.ones((1, 3), np.float32)
-    along = float_image(cv2.transform(cv2.multiply(pixels, direction), ones))
-    across = float_image(cv2.transform(cv2.multiply(pixels, pixels), ones))
+    # A shadow changes the length of a colour, not its direction. The products share memory: new memory costs time.
+    product = cv2.multiply(color, direction, direction, dtype=cv2.CV_32F)
+    along = float_image(cv2.transform(product, ones))
+    across = float_image(cv2.transform(cv2.multiply(color, color, product, dtype=cv2.CV_32F), ones))
     across -= along * along
     brightness = along - reference
     brightness *= np.where(brightness < 0, np.float32(DARKER), np.float32(LIGHTER))
@@ -173,7 +173,7 @@ def _plane_color(
         mean = _window_mean(total, share, window)
         off = _channel_sum(own, mean)
         full = share > 0.5
-        typical = float(np.median(off[full])) if full.any() else 0.0
+        typical = middle(off[full]) if full.any() else 0.0
         kept = off < max(OUTLIER, 3 * typical)
         share, total = share * kept, total * kept[..., None]
     window_share = float_image(cv2.blur(share, (WINDOW, WINDOW)))
@@ -201,9 +201,8 @@ def _most_similar_window(shown: NDArray[np.float32], mean: NDArray[np.float32]) 
         for right in (0, 2 * SHIFT):
             other = padded[down : down + height, right : right + width]
             off = _channel_sum(shown, other)
-            nearer = off < least
-            np.copyto(least, off, where=nearer)
-            np.copyto(nearest, other, where=nearer[..., None])
+            cv2.copyTo(other, (off < least).view(np.uint8), nearest)
+            np.minimum(least, off, out=least)
     return nearest
 
 

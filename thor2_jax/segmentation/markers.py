@@ -100,9 +100,10 @@ def _body_markers(body: Mask, edges: Mask) -> tuple[NDArray[np.int32], int]:
     markers = (np.cumsum(kept) * kept).astype(np.int32)[parts]
     n_parts = int(kept.sum())
     if n_parts > 0:  # the rest of a divided component goes to its nearest part
-        nearest = nearest_known(markers > 0)
-        same = (numbers.ravel()[nearest] == numbers) & (numbers > 0)
-        markers = np.where(same, markers.ravel()[nearest], 0)
+        known = markers > 0
+        nearest = nearest_known(known)
+        same = (numbers[known].take(nearest) == numbers) & (numbers > 0)
+        markers = np.where(same, markers[known].take(nearest), 0)
     markers += np.where(whole, np.cumsum(whole) + n_parts, 0).astype(np.int32)[numbers]
     return markers, n_parts + int(whole.sum())
 

@@ -16,7 +16,7 @@ from thor2_jax.segmentation.depth_edges import depth_edges
 from thor2_jax.segmentation.foreground import find_foreground
 from thor2_jax.segmentation.markers import flood
 from thor2_jax.segmentation.merging import merge_pieces
-from thor2_jax.segmentation.pixels import Mask, components, grow, label_borders, watershed
+from thor2_jax.segmentation.pixels import Mask, components, grow, label_borders, label_sizes, middle, watershed
 from thor2_jax.segmentation.planes import DepthImage, Plane, dominant_planes
 
 __all__ = ["segment_table"]
@@ -95,8 +95,7 @@ def _refined(labels: NDArray[np.int32], color: NDArray[np.uint8], stride: int) -
     ]
     markers = np.where(label_borders(labels, BAND), 0, labels + 1)
     height, width = refined[here].shape
-    scaled = cv2.resize(markers.astype(np.float32), None, fx=stride, fy=stride, interpolation=cv2.INTER_NEAREST)
-    markers = scaled[:height, :width].astype(np.int32)
+    markers = markers.repeat(stride, axis=0).repeat(stride, axis=1)[:height, :width]
     blurred = np.asarray(cv2.GaussianBlur(np.ascontiguousarray(color[here]), (3, 3), 0), np.uint8)
     refined[here] = _trimmed(watershed(blurred, markers) - 1, 2 * (stride // 2) + 1)
     return refined
@@ -109,7 +108,7 @@ def _trimmed(labels: NDArray[np.int32], size: int) -> NDArray[np.int32]:
     """
     rim = np.flatnonzero(label_borders(labels, size))
     of_rim = labels.take(rim)
-    sizes = np.bincount(labels.ravel())
+    sizes = label_sizes(labels, int(labels.max()) + 1)
     thick = sizes - np.bincount(of_rim, minlength=len(sizes)) >= LEAST_INNER * sizes
     trimmed = labels.copy()
     trimmed.put(rim[thick[of_rim]], 0)
@@ -141,7 +140,7 @@ def _is_thing(mask: Mask, z: NDArray[np.float32], depth: DepthImage, region: Mas
         return False
     z = z[mask]
     z = z[z > 0]
-    distance = float(np.median(z)) if len(z) else 1.0
+    distance = middle(z) if len(z) else 1.0
     return LEAST_AREA <= size * (distance * depth.pixel_size) ** 2 <= LARGEST_AREA
 
 
