@@ -1,7 +1,7 @@
 """Large batches on CPUs, computed a chunk of clouds at a time so that intermediate tables stay in the caches.
 
 `map_chunks(function, clouds)` equals `function(clouds)`, the plain version, for any function that treats each cloud by
-itself. On accelerators it is the plain version.
+itself; `map_parts` does, too, with larger parts and less to compile. On accelerators both are the plain version.
 """
 
 from collections.abc import Callable, Sequence
@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from thor2_jax.types import PointClouds
 
-__all__ = ["chunk_size", "map_chunks"]
+__all__ = ["chunk_size", "map_chunks", "map_parts"]
 
 T = TypeVar("T")
 
@@ -24,6 +24,26 @@ MAX_CHUNK_POINTS = 2**17
 
 CHUNKS_PER_STEP = 4
 """Chunks in one step of the loop; XLA can run them concurrently."""
+
+
+MAX_PART_POINTS = 2**19
+"""Largest number of points in a part, padding and all orientations included."""
+
+
+def map_parts(function: Callable[[PointClouds], T], clouds: PointClouds, orientations: int) -> T:
+    """Return `function(clouds)`, computed in parts of the batch, one after the other.
+
+    Args:
+        function: maps clouds [B, N] to arrays [B, ...] and treats each cloud by itself.
+        clouds: [B, N].
+        orientations: number of orientations of each cloud in the tables of the function.
+    """
+    n_clouds, capacity = clouds.mask.shape
+    size = max(1, MAX_PART_POINTS // (max(capacity, 1) * orientations))
+    if jax.default_backend() != "cpu" or n_clouds <= size:
+        return function(clouds)
+    starts = range(0, n_clouds, size)
+    return _concatenate([function(jax.tree.map(lambda a, k=k: a[k : k + size], clouds)) for k in starts])
 
 
 def chunk_size(clouds: PointClouds) -> int:

@@ -14,6 +14,7 @@ import numpy as np
 
 from colornet import ColorNetwork
 from thor2_jax.config import ORIENTATION_COUNTS, DescriptorConfig
+from thor2_jax.descriptor.chunking import map_parts
 from thor2_jax.descriptor.cloud_statistics import cloud_statistics, side_lengths
 from thor2_jax.descriptor.describe import describe_strips, strips
 from thor2_jax.descriptor.view_normalization import Normalization, align, boxed, oriented, place_aligned
@@ -164,5 +165,9 @@ def describe_orientations(
         count: number of orientations K; by default `config.orientations`. Static.
     """
     count = config.orientations if count is None else count
-    aligned, weights = candidate_orientations(clouds, config, count)
-    return orient_descriptors(aligned, weights, strips(aligned, network, config, count), network, config)
+
+    def describe_part(part: PointClouds) -> OrientedDescriptors:
+        aligned, weights = candidate_orientations(part, config, count)
+        return orient_descriptors(aligned, weights, strips(aligned, network, config, count), network, config)
+
+    return map_parts(describe_part, clouds, count)
