@@ -46,7 +46,9 @@ def _check_batch(clouds: PointClouds) -> None:
 
 
 # Compiled apart from `_strips_of`: fused into its scatter, the look-up would be repeated, one number at a time.
-_color_sets = jax.jit(color_sets)
+@partial(jax.jit, static_argnums=2)
+def _color_sets(colors: jax.Array, sets: RegionSets, copies: int) -> jax.Array:
+    return jnp.repeat(color_sets(colors[::copies], sets), copies, axis=0)
 
 
 @partial(jax.jit, static_argnums=3)
@@ -56,9 +58,9 @@ def _strips_of(aligned: PointClouds, region_set: jax.Array, sets: RegionSets, co
     return jax.vmap(one)(planes, aligned.colors, aligned.mask, region_set)
 
 
-def strips_by_sets(aligned: PointClouds, sets: RegionSets, config: DescriptorConfig) -> Strips:
+def strips_by_sets(aligned: PointClouds, sets: RegionSets, config: DescriptorConfig, copies: int = 1) -> Strips:
     """Return `strips` with the given region sets instead of those of a network."""
-    return _strips_of(aligned, _color_sets(aligned.colors, sets), sets, config)
+    return _strips_of(aligned, _color_sets(aligned.colors, sets, copies), sets, config)
 
 
 @partial(jax.jit, static_argnums=1)
@@ -89,11 +91,7 @@ def strips(aligned: PointClouds, network: ColorNetwork, config: DescriptorConfig
             up once.
     """
     _check_batch(aligned)
-    sets = _region_sets(network)
-    if copies == 1:
-        return strips_by_sets(aligned, sets, config)
-    region_set = _color_sets(aligned.colors[::copies], sets)
-    return _strips_of(aligned, jnp.repeat(region_set, copies, axis=0), sets, config)
+    return strips_by_sets(aligned, _region_sets(network), config, copies)
 
 
 def describe_strips(

@@ -145,8 +145,15 @@ def orient_descriptors(
         network: colour network.
         config: static.
     """
+    return _by_cloud(describe_strips(strips, network, config), aligned, weights, strips, config)
+
+
+@partial(jax.jit, static_argnums=4)
+def _by_cloud(
+    descriptors: Descriptors, aligned: PointClouds, weights: jax.Array, strips: Strips, config: DescriptorConfig
+) -> OrientedDescriptors:
     shape = weights.shape
-    each = jax.tree.map(lambda a: a.reshape(*shape, *a.shape[1:]), describe_strips(strips, network, config))
+    each = jax.tree.map(lambda a: a.reshape(*shape, *a.shape[1:]), descriptors)
     # The side lengths and the colours of all orientations are equal.
     first, first_strips = jax.tree.map(lambda a: a[:: shape[1]], (aligned, strips))
     statistics = cloud_statistics(side_lengths(first, config.alpha), first, first_strips)
