@@ -1,7 +1,8 @@
 """Large batches on CPUs, computed a chunk of clouds at a time so that intermediate tables stay in the caches.
 
 `map_chunks(function, clouds)` equals `function(clouds)`, the plain version, for any function that treats each cloud by
-itself; `map_parts` does, too, with larger parts and less to compile. On accelerators both are the plain version.
+itself. `map_large_chunks` does the same outside `jax.jit`, with larger chunks. On accelerators both are the plain
+version.
 """
 
 from collections.abc import Callable, Sequence
@@ -12,7 +13,7 @@ import jax.numpy as jnp
 
 from thor2_jax.types import PointClouds
 
-__all__ = ["chunk_size", "map_chunks", "map_parts"]
+__all__ = ["chunk_size", "map_chunks", "map_large_chunks"]
 
 T = TypeVar("T")
 
@@ -26,24 +27,8 @@ CHUNKS_PER_STEP = 4
 """Chunks in one step of the loop; XLA can run them concurrently."""
 
 
-MAX_PART_POINTS = 2**19
-"""Largest number of points in a part, padding and all orientations included."""
-
-
-def map_parts(function: Callable[[PointClouds], T], clouds: PointClouds, orientations: int) -> T:
-    """Return `function(clouds)`, computed in parts of the batch, one after the other.
-
-    Args:
-        function: maps clouds [B, N] to arrays [B, ...] and treats each cloud by itself.
-        clouds: [B, N].
-        orientations: number of orientations of each cloud in the tables of the function.
-    """
-    n_clouds, capacity = clouds.mask.shape
-    size = max(1, MAX_PART_POINTS // (max(capacity, 1) * orientations))
-    if jax.default_backend() != "cpu" or n_clouds <= size:
-        return function(clouds)
-    starts = range(0, n_clouds, size)
-    return _concatenate([function(jax.tree.map(lambda a, k=k: a[k : k + size], clouds)) for k in starts])
+MAX_LARGE_CHUNK_POINTS = 2**19
+"""Largest number of points in a large chunk, padding and all orientations included."""
 
 
 def chunk_size(clouds: PointClouds) -> int:
@@ -66,8 +51,7 @@ def map_chunks(function: Callable[[PointClouds], T], clouds: PointClouds) -> T:
         return function(clouds)
 
     def step(clouds: PointClouds) -> T:
-        starts = range(0, len(clouds.mask), size)
-        return _concatenate([function(jax.tree.map(lambda a, k=k: a[k : k + size], clouds)) for k in starts])
+        return _map_slices(function, clouds, size)
 
     clouds_per_step = size * CHUNKS_PER_STEP
     if n_clouds <= clouds_per_step:
@@ -81,6 +65,26 @@ def map_chunks(function: Callable[[PointClouds], T], clouds: PointClouds) -> T:
     if rest == 0:
         return results
     return _concatenate([results, step(jax.tree.map(lambda a: a[n_clouds - rest :], clouds))])
+
+
+def map_large_chunks(function: Callable[[PointClouds], T], clouds: PointClouds, orientations: int) -> T:
+    """Return `function(clouds)`, computed for one large chunk after the other.
+
+    Args:
+        function: maps clouds [B, N] to arrays [B, ...] and treats each cloud by itself.
+        clouds: [B, N].
+        orientations: number of orientations in which the function describes each cloud.
+    """
+    n_clouds, capacity = clouds.mask.shape
+    size = max(1, MAX_LARGE_CHUNK_POINTS // (max(capacity, 1) * orientations))
+    if jax.default_backend() != "cpu" or n_clouds <= size:
+        return function(clouds)
+    return _map_slices(function, clouds, size)
+
+
+def _map_slices(function: Callable[[PointClouds], T], clouds: PointClouds, size: int) -> T:
+    starts = range(0, len(clouds.mask), size)
+    return _concatenate([function(jax.tree.map(lambda a, k=k: a[k : k + size], clouds)) for k in starts])
 
 
 def _concatenate(results: Sequence[T]) -> T:

@@ -14,7 +14,7 @@ import numpy as np
 
 from colornet import ColorNetwork
 from thor2_jax.config import ORIENTATION_COUNTS, DescriptorConfig
-from thor2_jax.descriptor.chunking import map_parts
+from thor2_jax.descriptor.chunking import map_large_chunks
 from thor2_jax.descriptor.cloud_statistics import cloud_statistics, side_lengths
 from thor2_jax.descriptor.describe import describe_strips, strips
 from thor2_jax.descriptor.view_normalization import Normalization, align, boxed, oriented, place_aligned
@@ -85,6 +85,11 @@ def _swapped(normalization: Normalization) -> Normalization:
     )
 
 
+def _check_count(count: int) -> None:
+    if count not in ORIENTATION_COUNTS:
+        raise InputError(f"count is {count!r}; expected one of {', '.join(map(str, ORIENTATION_COUNTS))}")
+
+
 @partial(jax.jit, static_argnums=(1, 2))
 def _orientations(clouds: PointClouds, config: DescriptorConfig, count: int) -> tuple[PointClouds, jax.Array]:
     half_turn = jnp.diag(jnp.array([-1, -1, 1], jnp.float32))
@@ -126,8 +131,7 @@ def candidate_orientations(clouds: PointClouds, config: DescriptorConfig, count:
     Raises:
         InputError: `count` is another number.
     """
-    if count not in ORIENTATION_COUNTS:
-        raise InputError(f"count is {count!r}; expected one of {', '.join(map(str, ORIENTATION_COUNTS))}")
+    _check_count(count)
     if count == 1:
         return align(clouds, config), jnp.ones((len(clouds.mask), 1))
     return _orientations(clouds, config, count)
@@ -145,13 +149,14 @@ def orient_descriptors(
         network: colour network.
         config: static.
     """
-    return _by_cloud(describe_strips(strips, network, config), aligned, weights, strips, config)
+    return _group_by_cloud(describe_strips(strips, network, config), aligned, weights, strips, config)
 
 
 @partial(jax.jit, static_argnums=4)
-def _by_cloud(
+def _group_by_cloud(
     descriptors: Descriptors, aligned: PointClouds, weights: jax.Array, strips: Strips, config: DescriptorConfig
 ) -> OrientedDescriptors:
+    """Group the descriptors [B * K, ...] of orientations by cloud, and add the statistics of the clouds."""
     shape = weights.shape
     each = jax.tree.map(lambda a: a.reshape(*shape, *a.shape[1:]), descriptors)
     # The side lengths and the colours of all orientations are equal.
@@ -170,11 +175,15 @@ def describe_orientations(
         network: colour network.
         config: static.
         count: number of orientations K; by default `config.orientations`. Static.
+
+    Raises:
+        InputError: `count` is not one of `ORIENTATION_COUNTS`.
     """
     count = config.orientations if count is None else count
+    _check_count(count)
 
-    def describe_part(part: PointClouds) -> OrientedDescriptors:
-        aligned, weights = candidate_orientations(part, config, count)
+    def describe_chunk(chunk: PointClouds) -> OrientedDescriptors:
+        aligned, weights = candidate_orientations(chunk, config, count)
         return orient_descriptors(aligned, weights, strips(aligned, network, config, count), network, config)
 
-    return map_parts(describe_part, clouds, count)
+    return map_large_chunks(describe_chunk, clouds, count)

@@ -5,7 +5,8 @@
 
 An embedding has three blocks, each of unit length before it is weighted: the output of a trained network on the
 descriptor, the colour embeddings of the strips projected to their principal components, and the colour histogram. The
-last two depend little on what the network was trained on. `training.embedding` fits the network.
+last two depend little on what the network was trained on. The embedding of a run also classifies: by this network and
+further ones, whose class probabilities are averaged. `training.embedding` fits the networks.
 """
 
 import dataclasses
@@ -40,19 +41,19 @@ __all__ = [
     "load_default",
 ]
 
-EMBEDDING_FORMAT = 1
-"""Version of the file: float16 arrays of the network, and JSON metadata."""
+EMBEDDING_FORMAT, FORMAT_WITH_FURTHER = 1, 2
+"""Version of the file: float16 arrays of one network, or of several, and JSON metadata."""
 
 MAX_EMBEDDING_SIZE = 256
 """Largest length of an embedding."""
 
-_METADATA, _FURTHER = "embedding", "further"
+_METADATA = "embedding"
 # safetensors writes several metadata keys in a random order, and equal embeddings shall have equal bytes.
 
 
-def _further(number: int) -> str:
+def _prefix_of_further(number: int) -> str:
     """Return the prefix of the names of the arrays of a further network in the file."""
-    return f"{_FURTHER}/{number}/"
+    return f"further/{number}/"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -195,19 +196,20 @@ def _embed_clouds(
 @functools.partial(jax.jit, static_argnums=0)
 def _classify(graphs: tuple[Any, ...], states: tuple[Any, ...], oriented: OrientedDescriptors) -> jax.Array:
     models = [nnx.merge(graph, state) for graph, state in zip(graphs, states, strict=True)]
-    each = [jax.nn.log_softmax(model.class_logits(*oriented.flat)) for model in models]
-    return oriented.fuse(jnp.stack(each).mean(axis=0))
+    # `fuse` normalizes: the mean logits give the geometric mean of the networks' probabilities.
+    return oriented.fuse(jnp.stack([model.class_logits(*oriented.flat) for model in models]).mean(axis=0))
 
 
 def _split(model: EmbeddingNetwork) -> tuple[Any, Any]:
     """Return the graph and the state of a network, with its values as the file stores them."""
-    graph, state = nnx.split(model)
-    return graph, jax.tree.map(lambda a: a.astype(jnp.float16).astype(jnp.float32), state)
+    with jax.ensure_compile_time_eval():  # the result is kept, also if the first call is inside a compiled function
+        graph, state = nnx.split(model)
+        return graph, jax.tree.map(lambda a: a.astype(jnp.float16).astype(jnp.float32), state)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Embedding:
-    """A network with everything that determines its embeddings.
+    """The networks of an embedding, with everything that determines their results.
 
     Attributes:
         config: constants of the descriptor, which is always computed in closed form.
@@ -215,10 +217,10 @@ class Embedding:
         sizes: sizes of the network.
         model: the network of the embedding. Do not change it: compiled functions and `fingerprint` keep its arrays.
         classes: classes that the network also recognizes by its first proxies; none in the packaged embedding.
-        distractors: number of further proxies, of objects that are none of the classes.
-        further: networks that were fitted as `model` was, from other random weights. They classify with it, which
-            tells unknown objects apart more reliably (Lakshminarayanan et al., "Simple and Scalable Predictive
-            Uncertainty Estimation using Deep Ensembles", NeurIPS 2017); they do not embed.
+        distractors: number of proxies after those of the classes, of objects that are none of them.
+        further: networks from `create_further`, fitted as `model` was from other random weights. `class_probabilities`
+            averages all networks, which separates unknown objects more reliably (Lakshminarayanan et al., "Simple and
+            Scalable Predictive Uncertainty Estimation using Deep Ensembles", NeurIPS 2017). Only `model` embeds.
     """
 
     config: DescriptorConfig
@@ -261,6 +263,12 @@ class Embedding:
         n_proxies = len(classes) + distractors
         model = EmbeddingNetwork(config, network.n_regions, sizes, n_proxies, rngs=nnx.Rngs(seed))
         return cls(config, network, sizes, model, classes, distractors)
+
+    def create_further(self, seed: int = 0) -> EmbeddingNetwork:
+        """Return a network for `further` with random weights; without a colour block, since it does not embed."""
+        sizes = dataclasses.replace(self.sizes, color=0)
+        n_proxies = len(self.classes) + self.distractors
+        return EmbeddingNetwork(self.config, self.network.n_regions, sizes, n_proxies, rngs=nnx.Rngs(seed))
 
     def without_proxies(self) -> "Embedding":
         """Return the same embedding without classes and distractors."""
@@ -307,7 +315,7 @@ class Embedding:
     @functools.cached_property
     def _content(self) -> bytes:
         about = {
-            "format": EMBEDDING_FORMAT,
+            "format": FORMAT_WITH_FURTHER if self.further else EMBEDDING_FORMAT,
             "descriptor_version": DESCRIPTOR_VERSION,
             "descriptor_config": dataclasses.asdict(self.config),
             "color_network": self.network.fingerprint,
@@ -315,9 +323,12 @@ class Embedding:
             "classes": list(self.classes),
             "distractors": self.distractors,
         }
+        if self.further:
+            about["further"] = len(self.further)
         arrays = model_arrays(self.model)
         for number, model in enumerate(self.further):
-            arrays |= {f"{_further(number)}{name}": array for name, array in model_arrays(model).items()}
+            prefix = _prefix_of_further(number)
+            arrays |= {prefix + name: array for name, array in model_arrays(model).items()}
         arrays = {name: array.astype(np.float16) for name, array in arrays.items()}
         return safetensors.numpy.save(arrays, {_METADATA: json.dumps(about, sort_keys=True)})
 
@@ -352,7 +363,9 @@ class Embedding:
             with safetensors.safe_open(path, "numpy") as stored:
                 about = json.loads(stored.metadata()[_METADATA])
                 arrays = {name: stored.get_tensor(name).astype(np.float32) for name in stored.keys()}
-            current = (EMBEDDING_FORMAT, DESCRIPTOR_VERSION, network.fingerprint)
+            count = int(about.get("further", 0))
+            form = FORMAT_WITH_FURTHER if count else EMBEDDING_FORMAT
+            current = (form, DESCRIPTOR_VERSION, network.fingerprint)
             for field, expected in zip(("format", "descriptor_version", "color_network"), current, strict=True):
                 if about[field] != expected:
                     raise InputError(f"{field} is {about[field]!r}; expected {expected!r}; fit the embedding again")
@@ -362,20 +375,17 @@ class Embedding:
             )
             sizes = EmbeddingSizes(**{**about["sizes"], "hidden": tuple(about["sizes"]["hidden"])})
             classes, distractors = tuple(map(str, about.get("classes", ()))), int(about.get("distractors", 0))
-
-            def model_of(prefix: str, sizes: EmbeddingSizes) -> EmbeddingNetwork:
+            model = model_from_arrays(lambda: cls.create(config, network, sizes, 0, classes, distractors).model, arrays)
+            embedding = cls(config, network, sizes, model, classes, distractors)
+            further = []
+            for prefix in map(_prefix_of_further, range(count)):
                 own = {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
-                return model_from_arrays(lambda: cls.create(config, network, sizes, 0, classes, distractors).model, own)
-
-            count = len({name.split("/")[1] for name in arrays if name.startswith(f"{_FURTHER}/")})
-            only_learned = dataclasses.replace(sizes, color=0)
-            model = model_of("", sizes)
-            further = tuple(model_of(_further(number), only_learned) for number in range(count))
+                further.append(model_from_arrays(embedding.create_further, own))
         except InputError as error:
             raise InputError(f"embedding: {path}: {error}") from None
         except (OSError, safetensors.SafetensorError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise InputError(f"embedding: {path} is missing or damaged ({type(error).__name__}: {error})") from None
-        return cls(config, network, sizes, model, classes, distractors, further)
+        return dataclasses.replace(embedding, further=tuple(further))
 
 
 @functools.cache

@@ -14,7 +14,7 @@ from thor2_jax.segmentation.planes import DepthImage
 
 __all__ = ["depth_edges"]
 
-STEP = (0.006, 0.010)
+STEP = (0.006, 0.015)
 """Least step: the first in metres, plus the second times the squared depth in metres."""
 
 NARROW = 0.4

@@ -6,7 +6,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from thor2_jax.segmentation.pixels import Mask, components, float_image, grow, middle, open_round, pixel_mask, shrink
+from thor2_jax.segmentation.pixels import (
+    Mask,
+    components,
+    float_image,
+    grow,
+    median_high,
+    open_round,
+    pixel_mask,
+    shrink,
+)
 from thor2_jax.segmentation.planes import DepthImage, Plane
 
 __all__ = ["FLAT", "UNIT", "Evidence", "find_foreground"]
@@ -173,7 +182,7 @@ def _plane_color(
         mean = _window_mean(total, share, window)
         off = _channel_sum(own, mean)
         full = share > 0.5
-        typical = middle(off[full]) if full.any() else 0.0
+        typical = median_high(off[full]) if full.any() else 0.0
         kept = off < max(OUTLIER, 3 * typical)
         share, total = share * kept, total * kept[..., None]
     window_share = float_image(cv2.blur(share, (WINDOW, WINDOW)))
@@ -201,7 +210,7 @@ def _most_similar_window(shown: NDArray[np.float32], mean: NDArray[np.float32]) 
         for right in (0, 2 * SHIFT):
             other = padded[down : down + height, right : right + width]
             off = _channel_sum(shown, other)
-            cv2.copyTo(other, (off < least).view(np.uint8), nearest)
+            nearest = float_image(cv2.copyTo(other, (off < least).view(np.uint8), nearest))
             np.minimum(least, off, out=least)
     return nearest
 

@@ -21,7 +21,7 @@ LEAST_MARKER = 10
 RIM = 3
 """Width, pixels, of the square within which depth is not trusted at the border of a thing."""
 
-NECK = 3.0
+NECK = 2.4
 """Half the width, pixels, of a neck that divides a body."""
 
 CLEAR = 0.3

@@ -15,7 +15,7 @@ __all__ = ["merge_pieces"]
 LEAST_CONTACT = 0.08
 """Least share of the border of the smaller piece that two pieces of one thing have in common."""
 
-EDGE = 0.4
+EDGE = 0.25
 """Least share of a common border that is a step, for two things."""
 
 FOLD = 0.4

@@ -14,7 +14,7 @@ __all__ = [
     "grow",
     "label_borders",
     "label_sizes",
-    "middle",
+    "median_high",
     "nearest_known",
     "open_round",
     "pixel_mask",
@@ -72,31 +72,31 @@ def components(mask: Mask, connectivity: int = 4) -> tuple[NDArray[np.int32], ND
 
 
 def nearest_known(known: Mask) -> NDArray[np.int32]:
-    """Return which pixel of a mask, which has at least one, is nearest: [H, W], its number in `image[known]`."""
+    """Return the index [H, W] of the nearest pixel of a mask, into `image[known]`; the mask must not be empty."""
     unknown = _bytes(~known)
     _, numbers = cv2.distanceTransformWithLabels(unknown, cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL)
     return np.asarray(numbers, np.int32) - 1  # OpenCV numbers the pixels of the mask from 1 on, row by row
 
 
-def _smallest(labels: NDArray[np.int32], count: int) -> NDArray[Any]:
+def _in_smallest_type(labels: NDArray[np.int32], count: int) -> NDArray[Any]:
     """Return labels from 0 to count - 1 in the smallest type of OpenCV that holds them, which is the fastest."""
     return labels.astype(np.uint8 if count <= 2**8 else np.uint16 if count <= 2**16 else np.float32)
 
 
 def label_borders(labels: NDArray[np.int32], size: int) -> Mask:
     """Return the pixels with more than one label in the square of `size` pixels around them; labels are 0 to 2^24."""
-    square, image = np.ones((size, size), np.uint8), _smallest(labels, int(labels.max()) + 1)
+    square, image = np.ones((size, size), np.uint8), _in_smallest_type(labels, int(labels.max()) + 1)
     return np.asarray(cv2.dilate(image, square) != cv2.erode(image, square))
 
 
 def label_sizes(labels: NDArray[np.int32], count: int) -> NDArray[np.intp]:
-    """Return the number of pixels of each label from 0 to count - 1, at most 2^24."""
-    image = _smallest(labels, count)
+    """Return the number of pixels of each label from 0 to count - 1; exact up to 2^24 labels and pixels of a label."""
+    image = _in_smallest_type(labels, count)
     return np.asarray(cv2.calcHist([image], [0], None, [count], [0, count])).ravel().astype(np.intp)
 
 
-def middle(values: NDArray[np.float32]) -> float:
-    """Return the median, or the greater of the two middle ones of an even number of values."""
+def median_high(values: NDArray[np.float32]) -> float:
+    """Return the high median: the median, or the larger of the two middle values."""
     half = len(values) // 2
     return float(np.partition(values, half)[half])
 

@@ -16,7 +16,7 @@ from thor2_jax.segmentation.depth_edges import depth_edges
 from thor2_jax.segmentation.foreground import find_foreground
 from thor2_jax.segmentation.markers import flood
 from thor2_jax.segmentation.merging import merge_pieces
-from thor2_jax.segmentation.pixels import Mask, components, grow, label_borders, label_sizes, middle, watershed
+from thor2_jax.segmentation.pixels import Mask, components, grow, label_borders, label_sizes, median_high, watershed
 from thor2_jax.segmentation.planes import DepthImage, Plane, dominant_planes
 
 __all__ = ["segment_table"]
@@ -140,7 +140,7 @@ def _is_thing(mask: Mask, z: NDArray[np.float32], depth: DepthImage, region: Mas
         return False
     z = z[mask]
     z = z[z > 0]
-    distance = middle(z) if len(z) else 1.0
+    distance = median_high(z) if len(z) else 1.0
     return LEAST_AREA <= size * (distance * depth.pixel_size) ** 2 <= LARGEST_AREA
 
 

@@ -42,8 +42,8 @@ class EmbeddingFit:
         rate: learning rate of AdamW at the first step; it falls to 0 along a cosine.
         margin: subtracted from the cosine between a view and its own proxy.
         seed: seed for weights, proxies, sample order and dropout.
-        networks: networks that are fitted one after the other, from different weights. The first one embeds, and all
-            classify; an embedding without classes needs no more.
+        networks: number of networks, fitted one after the other from different weights. Only the first one embeds; all
+            classify. Use 1 without classes.
 
     Raises:
         InputError: a value is out of range.
@@ -160,26 +160,29 @@ def fit_embedding(
     embedding.model.color_basis[...] = jnp.asarray(basis)
     models = []
     for number in range(options.networks):
-        seed, source = options.seed, embedding
+        seed, model = options.seed, embedding.model
         if number:
             seed = int(np.random.SeedSequence([options.seed, number]).generate_state(1)[0])
-            only_learned = dataclasses.replace(sizes, color=0)
-            source = Embedding.create(config, network, only_learned, seed, classes, embedding.distractors)
+            model = embedding.create_further(seed)
 
-        def of_network(epoch: int, loss: float, before: int = number * options.epochs) -> None:
+        def report_epoch(epoch: int, loss: float, before: int = number * options.epochs) -> None:
             progress(before + epoch, options.networks * options.epochs, loss)
 
-        models.append(_fit_network(source, samples, dataclasses.replace(options, seed=seed), of_network))
+        models.append(_fit_network(model, embedding, samples, dataclasses.replace(options, seed=seed), report_epoch))
     fitted = dataclasses.replace(embedding, model=models[0], further=tuple(models[1:]))
     return fitted if classes else fitted.without_proxies()
 
 
 def _fit_network(
-    source: Embedding, samples: Samples, options: EmbeddingFit, progress: Callable[[int, float], object]
+    model: EmbeddingNetwork,
+    embedding: Embedding,
+    samples: Samples,
+    options: EmbeddingFit,
+    progress: Callable[[int, float], object],
 ) -> EmbeddingNetwork:
-    """Fit the network of an embedding; `progress` is called after each epoch with (epochs done, mean loss)."""
+    """Fit a network of an embedding; `progress` is called after each epoch with (epochs done, mean loss)."""
     n_steps = len(samples) // options.batch_size
-    split: Any = nnx.split(source.model, nnx.Param, ...)
+    split: Any = nnx.split(model, nnx.Param, ...)
     graph, parameters, rest = split
     optimizer = _adamw(options.rate, n_steps * options.epochs)
     state = parameters, rest, optimizer.init(parameters), jax.random.key(options.seed)
@@ -188,7 +191,7 @@ def _fit_network(
         total = jnp.zeros(())
         for rows in order[: n_steps * options.batch_size].reshape(n_steps, -1):
             batch = samples.take(rows)
-            state, loss = _step(graph, optimizer, options.margin, source.network, source.config, state, batch)
+            state, loss = _step(graph, optimizer, options.margin, embedding.network, embedding.config, state, batch)
             total += loss
         mean = float(total) / n_steps
         if not np.isfinite(mean):

@@ -28,8 +28,8 @@ __all__ = ["Distractors", "fit_run_embedding"]
 COPIES = 2
 """Samples of each view, in random orientations."""
 
-NETWORKS = 3
-"""Networks of an embedding."""
+N_NETWORKS = 3
+"""Number of networks in the embedding of a run; docs/decisions.md says why."""
 
 HELD_OUT = 10
 """One distractor of so many is held out."""
@@ -87,6 +87,7 @@ class Distractors:
             "meshes": sorted(self.meshes),
             "views": self.views,
             "epochs": self.epochs,
+            "networks": N_NETWORKS,
         }
 
 
@@ -151,7 +152,7 @@ def fit_run_embedding(
         joined_samples(fitted, config),
         network,
         config,
-        EmbeddingFit(epochs=distractors.epochs, seed=seed, networks=NETWORKS),
+        EmbeddingFit(epochs=distractors.epochs, seed=seed, networks=N_NETWORKS),
         progress=lambda done, total, loss: progress("fit embedding", done, total, f"loss {loss:.3f}"),
         classes=classes,
     )

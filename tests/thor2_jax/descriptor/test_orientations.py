@@ -1,7 +1,9 @@
 """Candidate orientations: their order, their geometry and their number."""
 
 import dataclasses
+from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ import pytest
 import colornet
 import thor2_jax as thor2
 from thor2_jax.config import ORIENTATION_COUNTS
+from thor2_jax.descriptor import chunking, orientations
 from thor2_jax.descriptor.orientations import candidate_orientations, describe_orientations
 
 CONFIG = thor2.DescriptorConfig(homology="closed_form")
@@ -70,6 +73,26 @@ def test_an_empty_cloud_stays_empty() -> None:
 def test_other_counts_are_refused(count: int) -> None:
     with pytest.raises(thor2.InputError, match=f"count is {count}"):
         candidate_orientations(clouds(LONG), CONFIG, count)
+    with pytest.raises(thor2.InputError, match=f"count is {count}"):
+        describe_orientations(clouds(LONG), colornet.load_default(), CONFIG, count)
+
+
+@pytest.mark.parametrize(("backend", "calls"), [("cpu", 3), ("gpu", 1)])
+def test_chunks_have_the_descriptors_of_the_batch(backend: str, calls: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    batch, network = clouds(LONG, SQUARE, LONG), colornet.load_default()
+    whole = describe_orientations(batch, network, CONFIG, 4)
+    sizes = []
+
+    def record(chunk: thor2.PointClouds, config: thor2.DescriptorConfig, count: int) -> Any:
+        sizes.append(len(chunk.mask))
+        return candidate_orientations(chunk, config, count)
+
+    monkeypatch.setattr(chunking, "MAX_LARGE_CHUNK_POINTS", 4 * batch.mask.shape[1])
+    monkeypatch.setattr(orientations, "candidate_orientations", record)
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
+    chunked = describe_orientations(batch, network, CONFIG, 4)
+    assert len(sizes) == calls
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), chunked, whole)
 
 
 def test_an_occluded_end_decides_the_half_turn() -> None:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -55,19 +56,19 @@ def test_described_clouds_give_the_same_embedding(embedding: Embedding, clouds: 
 
 
 def ensemble() -> Embedding:
-    """Two networks of equal sizes, of two classes and three distractors."""
-    first, second = (Embedding.create(sizes=SIZES, seed=seed, classes=("a", "b"), distractors=3) for seed in (0, 1))
-    return dataclasses.replace(first, further=(second.model,))
+    """Three networks of two classes and three distractors."""
+    first = Embedding.create(sizes=SIZES, classes=("a", "b"), distractors=3)
+    return dataclasses.replace(first, further=(first.create_further(1), first.create_further(2)))
 
 
-def test_class_probabilities_are_means_over_networks_and_orientations(clouds: thor2.PointClouds) -> None:
+def test_class_probabilities_are_geometric_means(clouds: thor2.PointClouds) -> None:
     embedding = ensemble()
     oriented = describe_orientations(clouds, embedding.network, embedding.config, 4)
     weights = np.array([[1, 0, 0, 0], [0.25] * 4, [0, 0, 0.5, 0.5]], np.float32)
     actual = embedding.class_probabilities(dataclasses.replace(oriented, weights=jnp.asarray(weights)))
     means = []
     for model in (embedding.model, *embedding.further):
-        one = dataclasses.replace(embedding, model=model, further=())
+        one = dataclasses.replace(embedding, model=model, further=())  # its first block is the learned one
         unit = np.asarray(one.embed_oriented(oriented)[..., : SIZES.learned], np.float64)
         unit /= np.linalg.norm(unit, axis=-1, keepdims=True)
         proxies = np.asarray(model.proxies[...], np.float16).astype(np.float64)
@@ -80,16 +81,27 @@ def test_class_probabilities_are_means_over_networks_and_orientations(clouds: th
 
 
 def test_a_file_holds_all_networks(clouds: thor2.PointClouds, tmp_path: Path) -> None:
-    embedding = ensemble()
-    without_color = Embedding.create(sizes=dataclasses.replace(SIZES, color=0), classes=("a", "b"), distractors=3)
-    embedding = dataclasses.replace(embedding, further=(without_color.model, without_color.model))
-    embedding.save(tmp_path / "embedding.safetensors")
-    loaded = Embedding.load(tmp_path / "embedding.safetensors")
+    embedding, path = ensemble(), tmp_path / "embedding.safetensors"
+    embedding.save(path)
+    loaded = Embedding.load(path)
     oriented = describe_orientations(clouds, embedding.network, embedding.config, 2)
-    assert len(loaded.further) == 2 and loaded.fingerprint == embedding.fingerprint
-    assert np.array_equal(loaded.class_probabilities(oriented), embedding.class_probabilities(oriented))
+    probabilities = np.asarray(embedding.class_probabilities(oriented))
+    assert loaded.fingerprint == embedding.fingerprint
+    assert np.array_equal(loaded.class_probabilities(oriented), probabilities)
     assert np.array_equal(loaded.embed(clouds), embedding.embed(clouds))
     assert not loaded.without_proxies().further
+    for further in ((), embedding.further[:1], embedding.further[:1] * 2):  # each network counts
+        fewer = dataclasses.replace(embedding, further=further)
+        assert np.abs(fewer.class_probabilities(oriented) - probabilities).max() > 1e-3
+
+
+@pytest.mark.parametrize("prefix", ["further/1/", "further/", "further/0/head"])
+def test_a_missing_network_is_reported(prefix: str, tmp_path: Path) -> None:
+    path = tmp_path / "embedding.safetensors"
+    ensemble().save(path)
+    rewritten(path, lambda name: not name.startswith(prefix))
+    with pytest.raises(thor2.InputError, match="embedding.safetensors is missing or damaged"):
+        Embedding.load(path)
 
 
 def test_padding_and_batch_do_not_matter(embedding: Embedding) -> None:
@@ -130,11 +142,11 @@ def test_a_file_gives_the_same_embeddings(tmp_path: Path, clouds: thor2.PointClo
     assert (tmp_path / "again.safetensors").read_bytes() == (tmp_path / "embedding.safetensors").read_bytes()
 
 
-def rewritten(path: Path, **changes: object) -> None:
-    """Replace values in the metadata of a file."""
+def rewritten(path: Path, keep: Callable[[str], bool] = lambda name: True, **changes: object) -> None:
+    """Replace values in the metadata of a file, and keep some of its arrays."""
     with safetensors.safe_open(path, "numpy") as stored:
         about = json.loads(stored.metadata()["embedding"])
-        arrays = {name: stored.get_tensor(name) for name in stored.keys()}
+        arrays = {name: stored.get_tensor(name) for name in stored.keys() if keep(name)}
     path.write_bytes(safetensors.numpy.save(arrays, {"embedding": json.dumps({**about, **changes})}))
 
 

@@ -215,6 +215,7 @@ def test_train_with_distractors(meshes: Path, images: Path, tmp_path: Path, run:
     assert recognizer.objects.embedding.fingerprint == embedding.fingerprint != load_default().fingerprint
     assert recognizer.default_classifiers == ("tops", "tops2", "embedding")
     record = recognizer.run.record
+    assert record["distractors"]["networks"] == 3 == 1 + len(embedding.further)
     assert record["distractors"]["procedural"] == 30 and record["orientation_copies"] == 1
     own = record["calibration"]["unknown_below"]
     assert set(recognizer.thresholds()) == {own} and 0 < own < 1
