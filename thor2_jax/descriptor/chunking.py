@@ -26,7 +26,6 @@ MAX_CHUNK_POINTS = 2**17
 CHUNKS_PER_STEP = 4
 """Chunks in one step of the loop; XLA can run them concurrently."""
 
-
 MAX_LARGE_CHUNK_POINTS = 2**19
 """Largest number of points in a large chunk, padding and all orientations included."""
 

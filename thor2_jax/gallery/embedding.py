@@ -364,8 +364,8 @@ class Embedding:
                 about = json.loads(stored.metadata()[_METADATA])
                 arrays = {name: stored.get_tensor(name).astype(np.float32) for name in stored.keys()}
             count = int(about.get("further", 0))
-            form = FORMAT_WITH_FURTHER if count else EMBEDDING_FORMAT
-            current = (form, DESCRIPTOR_VERSION, network.fingerprint)
+            version = FORMAT_WITH_FURTHER if count else EMBEDDING_FORMAT
+            current = (version, DESCRIPTOR_VERSION, network.fingerprint)
             for field, expected in zip(("format", "descriptor_version", "color_network"), current, strict=True):
                 if about[field] != expected:
                     raise InputError(f"{field} is {about[field]!r}; expected {expected!r}; fit the embedding again")

@@ -154,9 +154,8 @@ def fit_embedding(
     if len(samples) < options.batch_size:
         raise InputError(f"there are {len(samples)} samples; expected at least {options.batch_size}; add views")
     n_objects = int(samples.label.max()) + 1
-    sizes = sizes or EmbeddingSizes()
     embedding = Embedding.create(config, network, sizes, options.seed, classes, n_objects - len(classes))
-    basis = _color_basis(samples, network, embedding.config, sizes.color, options.batch_size)
+    basis = _color_basis(samples, network, embedding.config, embedding.sizes.color, options.batch_size)
     embedding.model.color_basis[...] = jnp.asarray(basis)
     models = []
     for number in range(options.networks):
