@@ -1,4 +1,5 @@
 # docker build -t thor2 . && docker run --rm -p 127.0.0.1:8080:8080 -v "$PWD/run:/run-folder:ro" thor2
+# Under a name other than localhost, append: --allow-host robot.local
 FROM python:3.11-slim
 
 WORKDIR /app

@@ -1,10 +1,10 @@
-"""What adaptation to a camera gains: `python -m benchmarks.adaptation --model RUN --frames DIR... --out FILE.json`.
+"""Gain of the adaptation to a camera: `python -m benchmarks.adaptation --model RUN --frames DIR... --out FILE.json`.
 
 The recognizer is adapted on one half of the frames (every second one) as a simulated camera sees them, without labels,
 and tested on the other half, and the other way round. The file has, for the frames as they are and for each camera of
-`benchmarks.simulated_cameras`, the mean over both halves of the accuracy over placements before and after, the
-estimated colour transform, the number of instances that it was estimated from, and seconds. With --unknown, frames of
-objects that the run does not know are added to those for the adaptation, seen by the same camera.
+`training.augmentation.simulated_cameras`, the mean over both halves of the accuracy over placements before and after,
+the estimated colour transform, the number of instances that it was estimated from, and seconds. With --unknown, frames
+of objects that the run does not know are added to those for the adaptation, seen by the same camera.
 
 The command resumes: cameras that are in the file are kept.
 """
@@ -20,12 +20,12 @@ from typing import Any
 import numpy as np
 
 from benchmarks.cameras import CAMERAS, LOOK_ALIKES, ORIGINAL, labelled_frames, measure
-from benchmarks.simulated_cameras import SimulatedCamera, through_camera
-from thor2_jax.adaptation.estimate import estimate_transform
+from thor2_jax.adaptation.estimate import adaptation_criterion, estimate_transform
 from thor2_jax.errors import InputError
 from thor2_jax.files import write_text
-from thor2_jax.recognition.frames import RGBDFrame
-from thor2_jax.recognition.prepared_instance import prepare_instance
+from thor2_jax.frames.frames import RGBDFrame
+from thor2_jax.frames.prepared_instance import prepare_instance
+from training.augmentation.simulated_cameras import SimulatedCamera, through_camera
 from training.evaluation.answering import answer_frames
 from training.evaluation.answers import FrameAnswers
 from training.evaluation.runs import Run, load_runs
@@ -49,7 +49,7 @@ def only_labelled(item: LabelledFrame) -> RGBDFrame:
 
 def answers_with(run: Run, frames: Sequence[LabelledFrame], transform: Any) -> list[FrameAnswers]:
     """Return the answers of a run for frames whose colours are corrected by a transform, or by none."""
-    run.recognizer.color_transform = transform
+    run.recognizer.model = dataclasses.replace(run.model, color_transform=transform)
     return [answers for _, answers in answer_frames([run], frames)]
 
 
@@ -71,7 +71,7 @@ def measure_camera(
         usable = [each for each in instances if each.reason is None]
         chosen = [usable[k] for k in np.random.default_rng(half).permutation(len(usable))[:count]]
         start = time.perf_counter()
-        adaptation = estimate_transform(chosen, *recognizer.adaptation_criterion())
+        adaptation = estimate_transform(chosen, *adaptation_criterion(recognizer.model))
         seconds = time.perf_counter() - start
         test = frames[1 - half :: 2]
         seen = [seen_by(camera, item) for item in test]

@@ -1,8 +1,8 @@
 """Accuracy under simulated cameras: `python -m benchmarks.cameras --model RUN... --frames DIR... --out FILE.json`.
 
-Every frame is recognized as it is and as ten simulated cameras see it (`benchmarks.simulated_cameras`): those on which
-settings may be chosen, or those for the final report. For one or several runs on the same classes, the file has the
-mean and the standard deviation over the runs of
+Every frame is recognized as it is and as ten simulated cameras see it (`training.augmentation.simulated_cameras`):
+those on which settings may be chosen, or those for the final report. For one or several runs on the same classes, the
+file has the mean and the standard deviation over the runs of
 
 accuracy              mean over placements, all together and by group (directory) of frames
 accuracy_of_instances
@@ -31,12 +31,12 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from benchmarks.simulated_cameras import CHOOSE, REPORT, SimulatedCamera, through_camera
 from thor2_jax.errors import InputError
 from thor2_jax.files import atomic_write, write_text
-from thor2_jax.recognition.frames import RGBDFrame
-from thor2_jax.recognition.fusion import DEFAULT_RULE
-from thor2_jax.recognition.overlay import COLORS, Annotation, draw_instances
+from thor2_jax.frames.frames import RGBDFrame
+from thor2_jax.frames.overlay import COLORS, Annotation, draw_instances
+from thor2_jax.model.fusion import DEFAULT_RULE
+from training.augmentation.simulated_cameras import CHOOSE, REPORT, SimulatedCamera, through_camera
 from training.evaluation.accuracy import summarize_rows
 from training.evaluation.answering import answer_frames
 from training.evaluation.answers import EvaluatedRun, FrameAnswers

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from thor2_jax.recognition.frames import backproject
+from thor2_jax.frames.frames import backproject
 from training.objects.builtin_objects import builtin_objects
 from training.objects.mesh import TexturedMesh
 from training.objects.meshes import find_meshes, load_mesh

@@ -19,7 +19,7 @@ from PIL import Image
 
 from thor2_jax.capacity import BATCH_BUCKETS
 from thor2_jax.files import write_text
-from thor2_jax.recognition.frames import RGBDFrame
+from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.recognizer import Recognizer
 from training.diagnosis.setup import diagnose
 from training.readers.frame_files import FrameFiles, find_frames
@@ -35,7 +35,7 @@ BASES = (
 
 @dataclasses.dataclass
 class SetUp:
-    """What is stored of a frame, and changed by a damage.
+    """Files of a frame, which a damage changes.
 
     Attributes:
         color: [H, W, 3] uint8.
@@ -53,7 +53,7 @@ class SetUp:
 
     @classmethod
     def of(cls, frame: RGBDFrame) -> "SetUp":
-        """Return what is stored of a frame."""
+        """Return the files of a frame."""
         camera = frame.intrinsics
         values = {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy", "depth_scale")}
         return cls(frame.color.copy(), frame.depth.copy(), frame.label_image.copy(), values)
@@ -179,7 +179,7 @@ def run(data: Path, recognizer: Recognizer, bases: Sequence[str] = BASES) -> dic
             damage(setup)
             with tempfile.TemporaryDirectory() as folder:
                 files, mesh = setup.write(Path(folder))
-                diagnosis = diagnose(files, recognizer=recognizer, meshes=[mesh])
+                diagnosis = diagnose(files, recognizer=recognizer, meshes={"object": mesh})
             codes[name].append([finding.code for finding in diagnosis.findings])
     right = {name: [bool(DAMAGES[name][1] & set(codes_of)) for codes_of in each] for name, each in codes.items()}
     return {
@@ -209,8 +209,7 @@ def main() -> None:
     parser.add_argument("--sound", nargs="*", help="folders of sound frames in --data")
     parser.add_argument("--out", type=Path, help="JSON file")
     options = parser.parse_args()
-    recognizer = Recognizer.load(options.model)
-    recognizer.chunk = BATCH_BUCKETS[-1]
+    recognizer = Recognizer.load(options.model, chunk=BATCH_BUCKETS[-1])
     report = run(options.data, recognizer)
     for folder in options.sound or []:
         knows = folder.startswith("frames/ycbv")

@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 from sklearn.metrics import roc_auc_score
 
+from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances, prepare_instance
 from thor2_jax.gallery.augment import augmented_view
 from thor2_jax.gallery.clouds import CompactClouds
 from thor2_jax.gallery.embedding import Embedding, load_default
-from thor2_jax.gallery.enrollment import ROWS, embed_orientations
+from thor2_jax.gallery.enrollment import ROWS, embed_looks
 from thor2_jax.gallery.gallery import Gallery, GalleryObject
-from thor2_jax.recognition.prepared_instance import PreparedInstance, pack_instances, prepare_instance
 from training.readers.frames import FrameFolder
 
 FOLDS = 4
@@ -60,7 +60,7 @@ def embed(embedding: Embedding, views: Sequence[PreparedInstance]) -> NDArray[np
     for start in range(0, len(views), ROWS):
         rows = order[start : start + ROWS]
         packed = pack_instances([views[k] for k in rows], ROWS)
-        batch = np.asarray(embed_orientations(embedding, packed))[: len(rows)]
+        batch = np.asarray(embed_looks(embedding, packed))[: len(rows)]
         if start == 0:
             embedded = np.zeros((len(views), *batch.shape[1:]), np.float32)
         embedded[rows] = batch

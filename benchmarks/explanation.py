@@ -15,7 +15,7 @@ import numpy as np
 from thor2_jax.explanation.attributions import Faithfulness, attribute_points
 from thor2_jax.explanation.class_scores import ClassScores, classifier_scores
 from thor2_jax.files import write_text
-from thor2_jax.recognition.prepared_instance import prepare_instance
+from thor2_jax.frames.prepared_instance import prepare_instance
 from thor2_jax.recognizer import Recognizer
 from training.readers.frame_files import find_frames
 
@@ -51,7 +51,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="file for the results")
     arguments = parser.parse_args()
     recognizer = Recognizer.load(arguments.model)
-    scores = classifier_scores(recognizer)
+    scores = classifier_scores(recognizer.model)
     results = {}
     for directory in arguments.directories:
         checks = []

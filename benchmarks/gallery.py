@@ -25,7 +25,7 @@ from thor2_jax.gallery.enrollment import instance_view
 from thor2_jax.gallery.gallery import NEAREST, GalleryObject
 from thor2_jax.gallery.objects import ObjectGallery
 from thor2_jax.gallery.search import ExactSearch, IndexSearch, ViewSearch
-from thor2_jax.recognition.run_directory import EMBEDDING_FILE, TrainedRun, save_run
+from thor2_jax.model.run_directory import EMBEDDING_FILE, TrainedRun, save_run
 from thor2_jax.recognizer import Recognizer
 from training.enrollment import mesh_views
 from training.objects.builtin_objects import builtin_objects

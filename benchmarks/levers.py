@@ -1,4 +1,4 @@
-"""What helps on other cameras: `python -m benchmarks.levers --meshes DIR --frames DIR... --out OUT`.
+"""Effects of settings on other cameras: `python -m benchmarks.levers --meshes DIR --frames DIR... --out OUT`.
 
 For each lever, a row of `LEVERS`, recognizers are trained with several seeds by `thor2 train` on views that
 `thor2 render` has rendered once, and evaluated as `benchmarks.cameras` does. Levers that differ in recognition only
@@ -40,7 +40,7 @@ from benchmarks.cameras import (
 )
 from thor2_jax.errors import InputError
 from thor2_jax.files import write_text
-from thor2_jax.recognition.fusion import DEFAULT_RULE
+from thor2_jax.model.fusion import DEFAULT_RULE
 from training.enrollment import mesh_views
 from training.evaluation.fusion import ALL_CLASSIFIERS, BOTH, EMBEDDED, GALLERY, Rule
 from training.evaluation.runs import Run, load_runs
@@ -60,7 +60,7 @@ class Lever:
         name: name in the table.
         render: further options of `thor2 render`.
         train: further options of `thor2 train`.
-        orientations: candidate orientations of a cloud in recognition; None for those of the run.
+        looks: looks at a cloud in recognition; None for those of the run.
         fusion: column of an evaluation that answers, see `fusions`; None for the one that the run answers by. With
             "gallery" or "both", the meshes are enrolled.
         rule: rule of the fusion.
@@ -69,7 +69,7 @@ class Lever:
     name: str
     render: str = ""
     train: str = ""
-    orientations: int | None = 1
+    looks: int | None = 1
     fusion: str | None = "THOR2"
     rule: Rule = DEFAULT_RULE
 
@@ -91,17 +91,17 @@ class Lever:
 
 PLAIN = "--epochs 24 --orientation-copies 0 --embedding 0"
 ORIENTED = "--epochs 24 --orientation-copies 2 --embedding 0"
-DISTRACTED = "--epochs 24 --orientation-copies 2 --embedding 1500"
+DISTRACTED = "--epochs 24 --orientation-copies 2 --embedding 1500 --classifiers tops,tops2,ce"
 """Options of trainings without orientation copies and embedding, with the copies, and with both."""
 
 LEVERS = (
     Lever("default", train=PLAIN),
-    Lever("2 orientations in recognition", train=PLAIN, orientations=2),
-    Lever("4 orientations in recognition", train=PLAIN, orientations=4),
+    Lever("2 looks in recognition", train=PLAIN, looks=2),
+    Lever("4 looks in recognition", train=PLAIN, looks=4),
     Lever("orientation copies in training", train=ORIENTED),
-    Lever("orientation copies, 4 orientations", train=ORIENTED, orientations=4),
-    Lever("embedding fitted on distractors, alone", train=DISTRACTED, orientations=4, fusion=EMBEDDED),
-    Lever("with THOR2", train=DISTRACTED, orientations=4, fusion=ALL_CLASSIFIERS),
+    Lever("orientation copies, 4 looks", train=ORIENTED, looks=4),
+    Lever("embedding fitted on distractors, alone", train=DISTRACTED, looks=4, fusion=EMBEDDED),
+    Lever("with THOR2", train=DISTRACTED, looks=4, fusion=ALL_CLASSIFIERS),
     Lever('fusion rule "max"', train=PLAIN, rule="max"),
     Lever('fusion rule "mean"', train=PLAIN, rule="mean"),
     Lever("CE, TOPS and TOPS2", train=PLAIN, fusion="CE+TOPS+TOPS2"),
@@ -109,7 +109,7 @@ LEVERS = (
     Lever("classifiers and gallery", train=PLAIN, fusion=BOTH),
     Lever("registration and base in training", render="--registration --base", train=PLAIN),
     Lever("five copies in fewer epochs", render="--copies 5", train="--epochs 16 --orientation-copies 1 --embedding 0"),
-    Lever("total", render="--registration --base --copies 5", orientations=None, fusion=None),
+    Lever("total", render="--registration --base --copies 5", looks=None, fusion=None),
 )
 """The table's rows. The default is that of versions without orientation copies and distractors; "total" is what
 `thor2 train` and recognition do by default now."""
@@ -200,9 +200,10 @@ class Table:
         runs = load_runs(directories)
         for run in runs:
             recognizer = run.recognizer
-            if lever.orientations is not None:
-                config = dataclasses.replace(recognizer.run.config, orientations=lever.orientations)
-                recognizer.run = dataclasses.replace(recognizer.run, config=config)
+            if lever.looks is not None:
+                config = dataclasses.replace(recognizer.run.config, looks=lever.looks)
+                changed = dataclasses.replace(recognizer.run, config=config)
+                recognizer.model = dataclasses.replace(recognizer.model, run=changed)
             if lever.enrolls:
                 recognizer.objects.open(self.out / "galleries" / recognizer.objects.embedding.fingerprint[:12])
                 for name, path in self.meshes.items():
@@ -273,7 +274,7 @@ def grouped(levers: Sequence[Lever]) -> list[list[Lever]]:
     """Return levers that share trainings, descriptors and galleries together, in the order of the first ones."""
     groups: dict[tuple[Any, ...], list[Lever]] = {}
     for lever in levers:
-        key = lever.training, lever.orientations, lever.enrolls
+        key = lever.training, lever.looks, lever.enrolls
         groups.setdefault(key, []).append(lever)
     return list(groups.values())
 

@@ -1,4 +1,4 @@
-"""What `benchmarks.paper` measures: accuracy by column, paired comparisons of the paper's claims, recognition time."""
+"""Measurements of `benchmarks.paper`: accuracy by column, paired comparisons of the claims, recognition time."""
 
 import dataclasses
 import time
@@ -6,12 +6,15 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.paired import paired_difference
 from thor2_jax.files import json_digest
-from thor2_jax.recognition.fusion import DEFAULT_RULE
+from thor2_jax.model.answers import DescribedFrame
+from thor2_jax.model.fusion import DEFAULT_RULE
+from thor2_jax.model.inference import infer
 from training.baselines.baseline import baseline_inputs
 from training.baselines.names import CLOUD_BASELINES, NETWORKS, TITLES
 from training.evaluation.answers import FrameAnswers, read_answers
@@ -159,8 +162,12 @@ def recognition_seconds(run: Run, dataset: Dataset) -> dict[str, float]:
             function(number)
         return (time.perf_counter() - start) / max(n_instances, 1)
 
+    def classify(frame: DescribedFrame) -> object:
+        names = tuple(run.model.classifiers)
+        return jax.block_until_ready(infer(run.model, frame.oriented, classifiers=names).probabilities)
+
     describing = timed(lambda number: recognizer.describe(frames[number]))
-    seconds = {"THOR2": describing + timed(lambda number: recognizer.probabilities(described[number].oriented))}
+    seconds = {"THOR2": describing + timed(lambda number: classify(described[number]))}
     for name, model in run.baselines.items():
 
         def predict(number: int, model: Any = model) -> object:

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from thor2_jax.files import atomic_write
-from thor2_jax.recognition.fusion import DEFAULT_RULE
+from thor2_jax.model.fusion import DEFAULT_RULE
 from training.baselines.names import TITLES
 from training.evaluation.page import accuracy_table, comparison_table, comparison_text, comparison_title
 

@@ -1,4 +1,4 @@
-"""What several frames gain: `python -m benchmarks.tracking --model RUN... --frames DIR... --out FILE.json`.
+"""Gain of several frames: `python -m benchmarks.tracking --model RUN... --frames DIR... --out FILE.json`.
 
 For each run, every frame from the fifth of a video on is answered alone and by a tracker over it and the four frames
 before it. The file has the steadiness and the accuracy over placements of both, and the placements whose accuracy is
@@ -20,21 +20,21 @@ The command resumes: finished runs and scenes are kept in the file.
 
 import argparse
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.cameras import labelled_frames
 from thor2_jax.capacity import point_bucket
-from thor2_jax.descriptor.orientations import describe_orientations
 from thor2_jax.errors import InputError
 from thor2_jax.files import write_text
-from thor2_jax.recognition.answers import Evidence
-from thor2_jax.recognition.frames import Intrinsics, RGBDFrame
-from thor2_jax.recognition.prepared_instance import PreparedInstance, pack_instances, prepare_instance
+from thor2_jax.frames.frames import Intrinsics, RGBDFrame
+from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances, prepare_instance
+from thor2_jax.model.inference import Inference, answers, infer_clouds
 from thor2_jax.recognizer import Recognizer
 from thor2_jax.tracking.fusion import FusedEvidence, view_weight
 from thor2_jax.tracking.merging import merge_views
@@ -69,18 +69,25 @@ Probabilities = Mapping[str, NDArray[np.floating]]
 
 
 class _Cached:
-    """A recognizer that computes the evidence of a frame once."""
+    """A recognizer that evaluates the model once for each frame."""
 
     def __init__(self, recognizer: Recognizer) -> None:
         self._recognizer = recognizer
-        self._evidence: dict[int, tuple[list[PreparedInstance], Evidence]] = {}
-        self.run, self.gallery, self.fused = recognizer.run, recognizer.gallery, recognizer.fused
-        self.evidence_of, self.recognitions = recognizer.evidence_of, recognizer.recognitions
+        self._instances: dict[int, list[PreparedInstance]] = {}
+        self._inferences: dict[int, tuple[list[PreparedInstance], Inference]] = {}
+        self.model = recognizer.model
 
-    def frame_evidence(self, frame: RGBDFrame) -> tuple[list[PreparedInstance], Evidence]:
-        if id(frame) not in self._evidence:
-            self._evidence[id(frame)] = self._recognizer.frame_evidence(frame)
-        return self._evidence[id(frame)]
+    def prepare(self, frame: RGBDFrame) -> list[PreparedInstance]:
+        if id(frame) not in self._instances:
+            self._instances[id(frame)] = list(self._recognizer.prepare(frame))
+        return self._instances[id(frame)]
+
+    def infer(self, instances: Iterable[PreparedInstance]) -> tuple[list[PreparedInstance], Inference]:
+        if not isinstance(instances, list):  # merged from several frames
+            return self._recognizer.infer(instances)
+        if id(instances) not in self._inferences:
+            self._inferences[id(instances)] = self._recognizer.infer(instances)
+        return self._inferences[id(instances)]
 
 
 def measure_tracks(recognizer: Recognizer, frames: Sequence[LabelledFrame]) -> dict[str, Any]:
@@ -99,7 +106,7 @@ def measure_tracks(recognizer: Recognizer, frames: Sequence[LabelledFrame]) -> d
         tracker = Tracker(cached)
         for each in video[-WINDOW:]:
             tracked = tracker.update(each.frame)
-        alone = {answer.label: answer for answer in cached.recognitions(*cached.frame_evidence(item.frame))}
+        alone = {answer.label: answer for answer in answers(cached.model, *cached.infer(cached.prepare(item.frame)))}
         for answer in tracked:
             truth = item.truth.get(answer.label)
             if truth in recognizer.classes:
@@ -109,11 +116,11 @@ def measure_tracks(recognizer: Recognizer, frames: Sequence[LabelledFrame]) -> d
     results: dict[str, Any] = {"instances": len(rows), "placements": int(placement.max() + 1)}
     correct = {}
     for index, name in ((2, "alone"), (3, "tracked")):
-        answers = np.unique([row[index] for row in rows], return_inverse=True)[1]
+        given = np.unique([row[index] for row in rows], return_inverse=True)[1]
         correct[name] = np.array([row[index] == row[1] for row in rows])
         results[name] = {
             "accuracy": placement_accuracy(placement, correct[name]),
-            "steadiness": steadiness(placement, answers),
+            "steadiness": steadiness(placement, given),
         }
     names = np.unique([row[0] for row in rows])
     results["placements with lower accuracy"] = [
@@ -126,14 +133,13 @@ def measure_tracks(recognizer: Recognizer, frames: Sequence[LabelledFrame]) -> d
 
 def probabilities_of(recognizer: Recognizer, instances: Sequence[PreparedInstance]) -> list[dict[str, Any]]:
     """Return classifier -> class probabilities [C] of each instance."""
-    answers: list[dict[str, Any]] = []
+    computed: list[dict[str, Any]] = []
     for start in range(0, len(instances), 16):
         rows = instances[start : start + 16]
         clouds = pack_instances(rows, 16, max(2048, point_bucket(max(len(each.points) for each in rows))))
-        oriented = describe_orientations(clouds, recognizer.run.network, recognizer.run.config)
-        values = recognizer.probabilities(oriented, recognizer.default_classifiers)
-        answers += [{name: p[k] for name, p in values.items()} for k in range(len(rows))]
-    return answers
+        values = jax.tree.map(np.asarray, infer_clouds(recognizer.model, clouds, answer_by="classifiers").probabilities)
+        computed += [{name: p[k] for name, p in values.items()} for k in range(len(rows))]
+    return computed
 
 
 def _fuse(recognizer: Recognizer, views: Sequence[tuple[PreparedInstance, Probabilities]]) -> NDArray[np.floating]:
@@ -141,7 +147,7 @@ def _fuse(recognizer: Recognizer, views: Sequence[tuple[PreparedInstance, Probab
     evidence = FusedEvidence()
     for instance, probabilities in views:
         evidence.add(view_weight(instance), probabilities, None)
-    return recognizer.fused({name: p[None] for name, p in evidence.fused()[0].items()})[0]
+    return recognizer.model.fused({name: p[None] for name, p in evidence.fused()[0].items()})[0]
 
 
 def measure_scene(

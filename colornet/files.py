@@ -1,9 +1,10 @@
 """Atomic writes, and files of named arrays."""
 
 import contextlib
+import errno
 import io
 import os
-import re
+import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -12,13 +13,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["atomic_write", "errors_name", "read_arrays", "remove_leftovers", "write_arrays"]
+__all__ = [
+    "atomic_write",
+    "check_replaceable",
+    "errors_name",
+    "read_arrays",
+    "remove_leftovers",
+    "temporary_directory",
+    "write_arrays",
+]
 
 MAX_ARRAY_BYTES = 2**26
 """Largest total size of the arrays in a file; compressed zeros need only a thousandth of it on disk."""
 
 
-_TEMPORARY = re.compile(r"\..+\.[a-z0-9_]{8}(\.\w+)?")
+_PREFIX = ".thor2-"
+_MARKER, _MARKER_TEXT = ".thor2", b"Temporary directory of thor2. The next command removes it with all that is in it.\n"
 
 
 @contextlib.contextmanager
@@ -34,34 +44,58 @@ def errors_name(path: str | Path) -> Iterator[None]:
         raise OSError(error.errno, error.strerror or str(error), str(path)) from None
 
 
+def check_replaceable(path: Path) -> None:
+    """Raise OSError if something other than a file has this name: replacing a device would remove it."""
+    if path.is_dir():
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    if path.exists() and not path.is_file():
+        raise FileExistsError(errno.EEXIST, "a device, pipe or socket, which would be replaced", str(path))
+
+
+@contextlib.contextmanager
+def temporary_directory(parent: str | Path) -> Iterator[Path]:
+    """Yield a new hidden directory in `parent`, which is removed at the end; a killed process leaves it.
+
+    Its name and a file in it say that it is one, see `remove_leftovers`.
+    """
+    directory = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=parent))
+    try:
+        (directory / _MARKER).write_bytes(_MARKER_TEXT)
+        yield directory
+    finally:
+        shutil.rmtree(directory, ignore_errors=True)
+
+
 @contextlib.contextmanager
 def atomic_write(path: str | Path) -> Iterator[Path]:
-    """Yield a temporary file beside `path` to write to; on success it replaces `path`, readable by everyone.
+    """Yield a temporary file to write to; on success it replaces `path`, readable by everyone.
 
-    On any error or interrupt the temporary file is removed, and an older file at `path` stays as it was. A process that
-    is killed leaves it, see `remove_leftovers`.
+    On any error or interrupt the temporary file is removed, and an older file at `path` stays as it was.
 
     Raises:
-        OSError: the folder does not exist or cannot be written; it names `path`.
+        OSError: the folder does not exist or cannot be written, or a directory, device, pipe or socket has this name;
+            it names `path`.
     """
     path = Path(path)
     with errors_name(path):
-        descriptor, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=path.suffix, dir=path.parent)
-        os.close(descriptor)
-        temporary = Path(name)
-        try:
+        check_replaceable(path)
+        with temporary_directory(path.parent) as directory:
+            temporary = directory / path.name
             yield temporary
             temporary.chmod(0o644)
             temporary.replace(path)
-        finally:
-            temporary.unlink(missing_ok=True)
 
 
 def remove_leftovers(directory: Path) -> None:
-    """Remove the temporary files of `atomic_write` that a killed process has left in a directory, if it exists."""
-    for path in directory.glob(".*.*"):
-        if _TEMPORARY.fullmatch(path.name):
-            path.unlink(missing_ok=True)
+    """Remove the temporary directories that a killed process has left in a directory, if it exists.
+
+    Other files stay, whatever their names.
+    """
+    for path in directory.glob(f"{_PREFIX}*"):
+        marker = path / _MARKER
+        with contextlib.suppress(PermissionError):  # another user's
+            if not path.is_symlink() and marker.is_file() and marker.read_bytes() == _MARKER_TEXT:
+                shutil.rmtree(path)
 
 
 def write_arrays(path: str | Path, arrays: Mapping[str, NDArray[Any]]) -> None:

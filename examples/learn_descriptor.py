@@ -33,8 +33,8 @@ import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.color_membership import region_sets
 from thor2_jax.files import check_output_directory
-from thor2_jax.recognition.classifier import MLP, feature_of
-from thor2_jax.recognition.run_directory import TrainedRun, input_size, save_run
+from thor2_jax.model.classifier import MLP, feature_of
+from thor2_jax.model.run_directory import TrainedRun, input_size, save_run
 from thor2_jax.recognizer import THOR2
 from training.evaluation.answering import answer_frames
 from training.evaluation.fusion import fusions

@@ -1,17 +1,28 @@
 """Fixtures shared by all tests, the tiers of tests, and the compilation cache."""
 
+import gc
 import os
+import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import jax
 import pytest
 from hypothesis import HealthCheck, settings
+from processes import UNOPTIMIZED, end_descendants_with_this_process
 
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser
+
+# Most of the time of the tests is compilation, which takes a third of it without optimization. For the slow tests, CI
+# sets XLA_FLAGS to nothing: they run what users run.
+os.environ.setdefault("XLA_FLAGS", UNOPTIMIZED)
+gc.set_threshold(100_000, 50, 100)  # tracing allocates much that is kept; collections took a tenth of the time
 # Subprocesses inherit these: the processes of a run share their compiled programs, and the next run finds them.
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", f"{tempfile.gettempdir()}/thor2-jax-tests-{os.getuid()}")
-os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE_DIR"])
 jax.config.update(
     "jax_persistent_cache_min_compile_time_secs", float(os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"])
@@ -36,11 +47,30 @@ for folder, numbers in EXAMPLES.items():
 STRICT = ("descriptor", "golden", "properties")
 """Directories whose tests allow no implicit dtype promotion; Flax, which other tests use, relies on it."""
 
+TOGETHER = ("tests/colornet/", "tests/thor2_jax/service/")
+"""Folders whose files share a fixture that takes long: a server, a build."""
+
 SHARED = Path(__file__).resolve().parents[1].parent / "shared"
+
+
+end_descendants_with_this_process()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--thorough", action="store_true", help="run all tests, with many more examples of each property")
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Give the tests of a folder in TOGETHER to one process, if they are distributed by files."""
+    from xdist.scheduler import LoadFileScheduling
+
+    class Scheduling(LoadFileScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            file: str = super()._split_scope(nodeid)
+            return next((folder for folder in TOGETHER if file.startswith(folder)), file)
+
+    return Scheduling(config, log) if config.getoption("dist") == "loadfile" else None
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -68,6 +98,18 @@ def pytest_collectreport() -> None:
 def strict_dtype_promotion(request: pytest.FixtureRequest) -> Iterator[None]:
     with jax.numpy_dtype_promotion("strict" if request.path.parent.name in STRICT else "standard"):
         yield
+
+
+@pytest.fixture(scope="module")  # While it is open, other tests cannot call asyncio.run.
+def browser() -> "Iterator[Browser]":
+    """Headless Chromium, for the tests of the pages."""
+    from playwright.sync_api import sync_playwright
+
+    chromium = shutil.which("chromium")
+    if chromium is None:
+        pytest.skip("chromium is not installed (apt-get install chromium)")
+    with sync_playwright() as playwright:
+        yield playwright.chromium.launch(executable_path=chromium)
 
 
 @pytest.fixture(scope="session")

@@ -1,5 +1,6 @@
 """Helpers of several test files: untrained runs, small clouds and images, the command line, programs, HTML pages."""
 
+import dataclasses
 import io
 import json
 import os
@@ -11,19 +12,24 @@ import zlib
 from collections.abc import Mapping, Sequence
 from html.parser import HTMLParser
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from unittest import mock
 
 import numpy as np
 from flax import nnx
 from numpy.typing import NDArray
 from PIL import Image
+from processes import HANG
 
 import colornet
 import thor2_jax as thor2
-from thor2_jax.gallery.objects import ObjectGallery
-from thor2_jax.recognition.classifier import FEATURES, MLP
-from thor2_jax.recognition.run_directory import TrainedRun, input_size
+from thor2_jax.descriptor.looks import LookDescriptors
+from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
+from thor2_jax.model.classifier import FEATURES, MLP
+from thor2_jax.model.inference import infer
+from thor2_jax.model.model import Model
+from thor2_jax.model.run_classifiers import RunClassifiers
+from thor2_jax.model.run_directory import TrainedRun, input_size
 from training.objects.builtin_objects import builtin_objects
 from training.rendering.camera import Camera, RenderedView
 from training.rendering.scenes import compose_scene
@@ -48,30 +54,42 @@ def untrained_run(
     return TrainedRun(config, network, tuple(classes), classifiers, record or {})
 
 
+def untrained_embedding_run(
+    classes: Sequence[str],
+    features: Sequence[str] = (),
+    config: thor2.DescriptorConfig = SMALL_CONFIG,
+    record: dict[str, object] | None = None,
+) -> TrainedRun:
+    """Return a run whose embedding, two networks with random weights, recognizes the classes; by default, it alone."""
+    run = untrained_run(classes, features, config, record)
+    sizes = EmbeddingSizes(cell=4, hidden=(8,), learned=4, color=2)
+    first = Embedding.create(config, run.network, sizes, classes=run.classes, distractors=2)
+    return dataclasses.replace(run, embedding=dataclasses.replace(first, further=(first.create_further(1),)))
+
+
+class ToyDescriptors(NamedTuple):
+    """Stands in for the descriptors of a frame; `content` is what the toy recognizer reads."""
+
+    content: Any
+    overflow: int = 0
+
+
 class UntaughtRecognizer:
-    """Base of toy recognizers: no object is enrolled."""
+    """Base of toy recognizers, whose `probabilities` maps the content of `ToyDescriptors`; no object is enrolled."""
 
     run: Any
     unknown_below: float | None = None
-    color_transform = None
 
     @property
-    def objects(self) -> ObjectGallery:
-        return ObjectGallery(tuple(self.run.classes))
+    def model(self) -> Model:
+        classifiers = {
+            name: lambda oriented, name=name: self.probabilities(oriented.content)[name]
+            for name in self.run.classifiers
+        }
+        return Model(self.run, RunClassifiers(classifiers), unknown_below=self.unknown_below)
 
-    @property
-    def classifiers(self) -> tuple[str, ...]:
-        return tuple(self.run.classifiers)
-
-    @property
-    def default_classifiers(self) -> tuple[str, ...]:
-        return self.classifiers
-
-    def answers_by(self) -> str:
-        return "classifiers"
-
-    def thresholds(self) -> np.ndarray:
-        return np.full(len(self.run.classes), self.unknown_below or 0.0)
+    def probabilities(self, content: Any) -> dict[str, np.ndarray]:
+        raise NotImplementedError
 
 
 def aligned_cloud(
@@ -144,7 +162,7 @@ def start_program(code: str, *arguments: object, devices: int = 1) -> subprocess
     """Start a Python program on the CPU, which JAX divides into some devices."""
     environment = os.environ | {
         "PYTHONPATH": str(Path(__file__).parents[1]),
-        "XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}",
+        "XLA_FLAGS": f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count={devices}",
         "JAX_PLATFORMS": "cpu",
     }
     command = [sys.executable, "-c", code, *map(str, arguments)]
@@ -156,7 +174,7 @@ def finish_programs(*processes: subprocess.Popen[str]) -> list[str]:
     outputs = []
     try:
         for process in processes:
-            out, err = process.communicate(timeout=300)
+            out, err = process.communicate(timeout=HANG)
             assert process.returncode == 0, err[-3000:]
             outputs.append(out)
     finally:
@@ -258,6 +276,15 @@ def frame_options(folder: Path, **changes: object) -> list[object]:
         "intrinsics": folder / "intrinsics.json",
     }
     return [part for name, value in {**files, **changes}.items() for part in (f"--{name}", value)]
+
+
+def class_probabilities(
+    recognizer: thor2.Recognizer, oriented: LookDescriptors, classifiers: Sequence[str] | None = None
+) -> dict[str, NDArray[np.float32]]:
+    """Return classifier -> class probabilities [B, C], of all classifiers or of those named."""
+    names = tuple(recognizer.model.classifiers) if classifiers is None else classifiers
+    computed = infer(recognizer.model, oriented, classifiers=names).probabilities
+    return {name: np.asarray(values) for name, values in computed.items()}
 
 
 def write_meshes(directory: Path, names: Sequence[str]) -> Path:

@@ -8,6 +8,12 @@ Requires the extra `mutation`. The checkout is not changed: mutants are tested i
 its own process. Cosmic Ray generates them. A place in the source is drawn first and one of its mutants second, so that
 operators with many replacements have no larger share. Annotations are excluded, because they have no effect at run
 time, and so are replacements between families of operators (+ by <<), which are nearly always type errors.
+
+Of ten mutants for each module (seed 0), 248 of 271 are killed. Those that survive are equal to the original: no
+`jax.jit` or another cache size (the same values, more slowly), `strict=False` for lists of equal length, bounds that no
+value reaches (`>=` for `==` on names of devices, `row != height - 1`, 81 for an exponent of 80, indices JAX clips),
+another `DESCRIPTOR_VERSION`, and searches whose results are filtered or compared again (the ball of `mapper.py`, one
+rectangle fewer in `bounding_box.py`, the halving loop of `reductions.py`).
 """
 
 import argparse
@@ -34,7 +40,7 @@ from cosmic_ray.plugins import get_operator, operator_names
 
 ROOT = Path(__file__).resolve().parents[1]
 
-FOLDERS = ("colornet", "thor2_jax", "thor2_jax/descriptor", "thor2_jax/recognition")
+FOLDERS = ("colornet", "thor2_jax", "thor2_jax/descriptor", "thor2_jax/frames", "thor2_jax/model")
 """Directories whose modules are mutated."""
 
 MORE_TESTS = {
@@ -50,10 +56,10 @@ MORE_TESTS = {
     "thor2_jax/descriptor/relaxation.py": ("properties/test_relaxation.py",),
     "thor2_jax/descriptor/released.py": ("thor2_jax/descriptor/test_slicing.py",),
     "thor2_jax/parameters.py": ("thor2_jax/test_types.py", "properties/test_reproducibility.py"),
-    "thor2_jax/recognition/frames.py": ("thor2_jax/test_types.py",),
-    "thor2_jax/recognition/instance_clouds.py": ("thor2_jax/test_types.py",),
-    "thor2_jax/recognition/occlusion.py": ("thor2_jax/test_types.py",),
-    "thor2_jax/recognition/outlier_removal.py": ("thor2_jax/recognition/test_instance_clouds.py",),
+    "thor2_jax/frames/frames.py": ("thor2_jax/test_types.py",),
+    "thor2_jax/frames/instance_clouds.py": ("thor2_jax/test_types.py",),
+    "thor2_jax/frames/occlusion.py": ("thor2_jax/test_types.py",),
+    "thor2_jax/frames/outlier_removal.py": ("thor2_jax/frames/test_instance_clouds.py",),
     "thor2_jax/types.py": ("thor2_jax/descriptor/test_persistence.py",),
 }
 """Module -> test files below tests/ that check it in addition to its own one."""

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from thor2_jax.recognition.frames import Intrinsics, RGBDFrame
+from thor2_jax.frames.frames import Intrinsics, RGBDFrame
 
 HEIGHT, WIDTH = 240, 320
 CAMERA = Intrinsics(290.0, 290.0, 159.5, 119.5)

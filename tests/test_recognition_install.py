@@ -15,7 +15,7 @@ import colornet
 import thor2_jax as thor2
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.run_directory import save_run
+from thor2_jax.model.run_directory import save_run
 from training.cli.app import TRAINING_PACKAGES
 
 ROOT = Path(__file__).parents[1]

@@ -15,9 +15,9 @@ if TYPE_CHECKING:
     from thor2_jax.descriptor.describe import describe, describe_aligned, describe_strips, diagrams, strips
     from thor2_jax.descriptor.view_normalization import align, mirror, turn, view_normalize
     from thor2_jax.explanation.explain import Explanation, explain
+    from thor2_jax.frames.frames import Intrinsics, RGBDFrame, read_frame
+    from thor2_jax.model.answers import Recognition
     from thor2_jax.parameters import Parameters
-    from thor2_jax.recognition.answers import Recognition
-    from thor2_jax.recognition.frames import Intrinsics, RGBDFrame, read_frame
     from thor2_jax.recognizer import Recognizer
     from thor2_jax.segmentation.segmenters import segment, segmented
     from thor2_jax.tracking.tracker import TrackedRecognition, Tracker
@@ -30,8 +30,8 @@ else:
         "descriptor.view_normalization": ("align", "mirror", "turn", "view_normalize"),
         "explanation.explain": ("Explanation", "explain"),
         "parameters": ("Parameters",),
-        "recognition.frames": ("Intrinsics", "RGBDFrame", "read_frame"),
-        "recognition.answers": ("Recognition",),
+        "frames.frames": ("Intrinsics", "RGBDFrame", "read_frame"),
+        "model.answers": ("Recognition",),
         "recognizer": ("Recognizer",),
         "segmentation.segmenters": ("segment", "segmented"),
         "tracking.tracker": ("TrackedRecognition", "Tracker"),
@@ -46,9 +46,10 @@ else:
         "descriptor",
         "explanation",
         "export",
+        "frames",
         "persistence",
         "plot",
-        "recognition",
+        "model",
         "segmentation",
         "testing",
         "tracking",

@@ -1,4 +1,4 @@
-"""Client of the inference service.
+"""Clients of the inference service: `Client`, and `AsyncClient` with the same methods as coroutines.
 
 >>> client = Client("http://127.0.0.1:8080")                                        # doctest: +SKIP
 >>> frame = {"color": "c.png", "depth": "d.png", "labels": "l.png", "intrinsics": "k.json"}
@@ -12,29 +12,92 @@ The service segments a frame without labels (`thor2 serve --segment`); `recogniz
 
 A service that teaches (`thor2 serve --teach`) enrolls and forgets objects:
 
->>> client.enroll("teapot", **frame, instance=3)["views"]                           # doctest: +SKIP
+>>> client.enroll("teapot", **frame, instance=3).views                              # doctest: +SKIP
 1
 >>> client.forget("teapot")                                                         # doctest: +SKIP
 """
 
+import dataclasses
 import io
 import json
-import secrets
-import urllib.error
+import ssl
 import urllib.parse
-import urllib.request
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Coroutine, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Concatenate, ParamSpec, TypeVar, cast
 
+import httpx
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.answers import Recognition
+from thor2_jax.frames.intrinsics import Intrinsics
+from thor2_jax.model.answers import Recognition
+from thor2_jax.types import Descriptors
 
-__all__ = ["Client", "ServiceError", "multipart"]
+__all__ = ["AsyncClient", "Client", "EnrolledObject", "KnownObject", "ServiceError", "ServiceModel", "multipart"]
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+@dataclasses.dataclass(frozen=True)
+class ServiceModel:
+    """The model of a service.
+
+    Attributes:
+        classes: names that may be answered.
+        knows: the same in words.
+        classifiers: classifiers that answer.
+        descriptor_version: version of the descriptor.
+        config: configuration of the descriptor.
+        color_network: fingerprint of the colour network.
+        teaches: whether objects can be enrolled and forgotten.
+        segmenter: segmenter of frames without labels; None if they are refused.
+    """
+
+    classes: tuple[str, ...]
+    knows: str
+    classifiers: tuple[str, ...]
+    descriptor_version: int
+    config: DescriptorConfig
+    color_network: str
+    teaches: bool
+    segmenter: str | None
+
+
+@dataclasses.dataclass(frozen=True)
+class KnownObject:
+    """An object that may be answered.
+
+    Attributes:
+        name: its name.
+        trained: whether the classifiers have an output for it.
+        views: number of enrolled views.
+        source: source of the views: "frames", "mesh" or "mesh and frames"; None without views.
+        date: date of the last enrolment, ISO 8601; None without views.
+    """
+
+    name: str
+    trained: bool
+    views: int
+    source: str | None
+    date: str | None
+
+
+@dataclasses.dataclass(frozen=True)
+class EnrolledObject(KnownObject):
+    """An object after its enrolment.
+
+    Attributes:
+        generation: generation of the gallery, for `undo`.
+        timings: milliseconds per stage of the request.
+    """
+
+    generation: int
+    timings: Mapping[str, float]
 
 
 class ServiceError(Exception):
@@ -54,22 +117,30 @@ class ServiceError(Exception):
 
 def multipart(files: Mapping[str, bytes]) -> tuple[str, bytes]:
     """Return the content type and the body of a multipart form with these files."""
-    boundary = secrets.token_hex(16)
-    sections = [
-        f'--{boundary}\r\nContent-Disposition: form-data; name="{name}"; filename="{name}"\r\n\r\n'.encode()
-        + content
-        + b"\r\n"
-        for name, content in files.items()
-    ]
-    return f"multipart/form-data; boundary={boundary}", b"".join([*sections, f"--{boundary}--\r\n".encode()])
+    request = httpx.Request("POST", "http://service", files=files)
+    return request.headers["Content-Type"], request.read()
 
 
-class Client:
-    """Client of one service. It keeps no connection open and is thread-safe."""
+class _Connection:
+    """Where requests are sent, and how."""
 
     def __init__(self, url: str, token: str | None = None, timeout: float = 30.0) -> None:
         """Create a client of the service at `url` with a bearer token and a timeout per request in seconds."""
-        self._url, self._token, self._timeout = url.rstrip("/"), token, timeout
+        self._url = url.rstrip("/")
+        headers = {} if token is None else {"Authorization": f"Bearer {token}"}
+        self._options: dict[str, Any] = {"headers": headers, "timeout": timeout, "follow_redirects": True}
+        self._options["verify"] = ssl.create_default_context()  # takes longer to create than a request
+
+    def _arguments(self, path: str, method: str | None = None, **body: Any) -> dict[str, Any]:
+        return {"method": method or ("POST" if body else "GET"), "url": self._url + path, **body}
+
+    def _unreachable(self, error: Exception) -> OSError:
+        kind = TimeoutError if isinstance(error, httpx.TimeoutException) else ConnectionError
+        return kind(f"{self._url} gives no answer ({error or type(error).__name__})")
+
+
+class Client(_Connection):
+    """Client of one service. It keeps no connection open and is thread-safe."""
 
     def recognize(
         self,
@@ -83,17 +154,18 @@ class Client:
 
         Args:
             color: 8-bit PNG or JPEG, as a path or the content of the file.
-            depth: 16-bit PNG.
+            depth: 16-bit PNG, by default in millimetres.
             labels: PNG of instance numbers, or an array [H, W] of them up to 65,535; None lets the service segment the
                 frame.
-            intrinsics: JSON file, or a mapping with fx, fy, cx, cy and optionally depth_scale.
+            intrinsics: file in a format of docs/frames.md, or a mapping in one of them, or `Intrinsics`; pixels.
 
         Raises:
             InputError: `labels` is an array of another kind.
             ServiceError: the service returned an error.
             OSError: a file cannot be read, or the service cannot be reached.
         """
-        return self.recognize_frame(color=color, depth=depth, labels=labels, intrinsics=intrinsics)[0]
+        files = _frame_files(color, depth, labels, intrinsics)
+        return self._send("/v1/recognize", lambda content: _recognitions(content)[0], files=files)
 
     def recognize_frame(
         self,
@@ -108,16 +180,13 @@ class Client:
         The labels are None if the request had labels. The service halves their size, as often as needed, if a segmenter
         returns more than 50,000 runs of equal labels. Arguments and exceptions as `recognize`.
         """
-        files = _frame_files(color, depth, labels, intrinsics)
-        answer = json.loads(self._request("/v1/recognize", *multipart(files)))
-        label_map = answer.get("label_map")  # Services of version 0.1.0 have none.
-        return [_recognition(instance) for instance in answer["instances"]], label_map and _label_image(label_map)
+        return self._send("/v1/recognize", _recognitions, files=_frame_files(color, depth, labels, intrinsics))
 
-    def describe(self, clouds: Sequence[tuple[Any, Any]]) -> dict[str, NDArray[Any]]:
+    def describe(self, clouds: Sequence[tuple[Any, Any]]) -> Descriptors:
         """Compute the descriptors of clouds, pairs (xyz [n, 3] in metres, rgb [n, 3] uint8).
 
         Returns:
-            images [B, S, P, P], embeddings [B, S, R, J] and overflow [B].
+            Descriptors of the B clouds, as `thor2_jax.describe` returns them; the fields are NumPy arrays.
 
         Raises:
             InputError: `clouds` is empty.
@@ -133,17 +202,16 @@ class Client:
             colors=np.concatenate([np.asarray(rgb, np.uint8).reshape(-1, 3) for _, rgb in clouds]),
             sizes=np.array([len(xyz) for xyz, _ in clouds]),
         )
-        answer = self._request("/v1/describe", "application/octet-stream", body.getvalue())
-        with np.load(io.BytesIO(answer), allow_pickle=False) as arrays:
-            return dict(arrays)
+        headers = {"Content-Type": "application/octet-stream"}
+        return self._send("/v1/describe", _descriptors, content=body.getvalue(), headers=headers)
 
-    def model(self) -> dict[str, Any]:
-        """Return the classes, classifiers, descriptor version and configuration of the model. Raises as `describe`."""
-        return json.loads(self._request("/v1/model"))
+    def model(self) -> ServiceModel:
+        """Return the model of the service. Raises as `describe`."""
+        return self._send("/v1/model", _model)
 
-    def objects(self) -> list[dict[str, Any]]:
-        """Return the objects that may be answered: name, trained, views, source and date. Raises as `describe`."""
-        return json.loads(self._request("/v1/objects"))["objects"]
+    def objects(self) -> list[KnownObject]:
+        """Return the objects that may be answered. Raises as `describe`."""
+        return self._send("/v1/objects", _objects)
 
     def enroll(
         self,
@@ -156,7 +224,7 @@ class Client:
         instance: int,
         extend: bool = False,
         replace: bool = False,
-    ) -> dict[str, Any]:
+    ) -> EnrolledObject:
         """Enroll an object from one instance of a frame; all processes of the service recognize it from now on.
 
         Args:
@@ -170,7 +238,7 @@ class Client:
             replace: discard the views, and the output of the classifiers, of an object with this name.
 
         Returns:
-            The record of the object, as in `objects`, with the generation of the gallery, for `undo`, and timings.
+            The object, with the generation of the gallery.
 
         Raises:
             InputError: as `recognize`.
@@ -181,7 +249,7 @@ class Client:
         flags = {"extend": str(extend).lower(), "replace": str(replace).lower()}
         fields = {"name": name, "instance": str(instance), **flags}
         files |= {field: value.encode() for field, value in fields.items()}
-        return json.loads(self._request("/v1/objects", *multipart(files)))
+        return self._send("/v1/objects", lambda content: _known(json.loads(content), EnrolledObject), files=files)
 
     def forget(self, name: str) -> int:
         """Forget an object, and return the generation of the gallery, for `undo`.
@@ -191,7 +259,7 @@ class Client:
             OSError: the service cannot be reached.
         """
         path = f"/v1/objects/{urllib.parse.quote(name, safe='')}"
-        return int(json.loads(self._request(path, method="DELETE"))["generation"])
+        return self._send(path, _generation, method="DELETE")
 
     def undo(self, generation: int) -> int:
         """Take back the change of the gallery that gave it this generation, and return the new one.
@@ -200,23 +268,44 @@ class Client:
             ServiceError: as `describe`; status 409 if another change was made since.
             OSError: the service cannot be reached.
         """
-        form = multipart({"generation": str(generation).encode()})
-        return int(json.loads(self._request("/v1/objects/undo", *form))["generation"])
+        return self._send("/v1/objects/undo", _generation, files={"generation": str(generation).encode()})
 
-    def _request(
-        self, path: str, content_type: str | None = None, body: bytes | None = None, method: str | None = None
-    ) -> bytes:
-        request = urllib.request.Request(self._url + path, data=body, method=method)
-        if content_type is not None:
-            request.add_header("Content-Type", content_type)
-        if self._token is not None:
-            request.add_header("Authorization", f"Bearer {self._token}")
-        try:
-            with urllib.request.urlopen(request, timeout=self._timeout) as response:
-                return response.read()
-        except urllib.error.HTTPError as error:
-            with error:
-                raise _service_error(error) from None
+    def _send(self, path: str, parse: Callable[[bytes], T], **request: Any) -> T:
+        """Send a request (content, files, method) and return what `parse` makes of the body of its answer."""
+        with httpx.Client(**self._options) as http:
+            try:
+                response = http.request(**self._arguments(path, **request))
+            except (httpx.HTTPError, httpx.InvalidURL) as error:
+                raise self._unreachable(error) from None
+        return parse(_content(response))
+
+
+def _coroutine(
+    method: Callable[Concatenate[Client, P], T],
+) -> Callable[Concatenate["AsyncClient", P], Coroutine[Any, Any, T]]:
+    """Return a method of `Client` for `AsyncClient`, whose `_send` makes the same function return a coroutine."""
+    return cast(Any, method)
+
+
+class AsyncClient(_Connection):
+    """A `Client` whose methods are coroutines: `await client.recognize(...)`."""
+
+    recognize = _coroutine(Client.recognize)
+    recognize_frame = _coroutine(Client.recognize_frame)
+    describe = _coroutine(Client.describe)
+    model = _coroutine(Client.model)
+    objects = _coroutine(Client.objects)
+    enroll = _coroutine(Client.enroll)
+    forget = _coroutine(Client.forget)
+    undo = _coroutine(Client.undo)
+
+    async def _send(self, path: str, parse: Callable[[bytes], T], **request: Any) -> T:
+        async with httpx.AsyncClient(**self._options) as http:
+            try:
+                response = await http.request(**self._arguments(path, **request))
+            except (httpx.HTTPError, httpx.InvalidURL) as error:
+                raise self._unreachable(error) from None
+        return parse(_content(response))
 
 
 def _frame_files(
@@ -228,9 +317,10 @@ def _frame_files(
     files = {"color": _read(color), "depth": _read(depth)}
     if labels is not None:
         files["labels"] = _encode_labels(labels) if isinstance(labels, np.ndarray) else _read(labels)
-    files["intrinsics"] = (
-        json.dumps(dict(intrinsics)).encode() if isinstance(intrinsics, Mapping) else _read(intrinsics)
-    )
+    if isinstance(intrinsics, Intrinsics):
+        intrinsics = dataclasses.asdict(intrinsics)
+    is_mapping = isinstance(intrinsics, Mapping)
+    files["intrinsics"] = json.dumps(dict(intrinsics)).encode() if is_mapping else _read(intrinsics)
     return files
 
 
@@ -253,22 +343,57 @@ def _encode_labels(labels: NDArray[Any]) -> bytes:
     return stream.getvalue()
 
 
-def _label_image(label_map: Mapping[str, Any]) -> NDArray[np.int32]:
-    flat = np.repeat(np.array(label_map["labels"], np.int32), label_map["lengths"])
-    return flat.reshape(label_map["height"], label_map["width"])
-
-
-def _service_error(error: urllib.error.HTTPError) -> ServiceError:
-    retry_after = error.headers.get("Retry-After")
-    try:
-        problem = json.loads(error.read())
-        field, message = problem["field"], str(problem["message"])
-    except (ValueError, KeyError, TypeError):  # The response comes from a proxy, not from the service.
-        field, message = None, error.reason
-    return ServiceError(error.code, field, message, None if retry_after is None else float(retry_after))
+def _recognitions(content: bytes) -> tuple[list[Recognition], NDArray[np.int32] | None]:
+    answer = json.loads(content)
+    label_map = answer.get("label_map")  # Services of version 0.1.0 have none.
+    return [_recognition(instance) for instance in answer["instances"]], label_map and _label_image(label_map)
 
 
 def _recognition(instance: Mapping[str, Any]) -> Recognition:
     fields = {name: value for name, value in instance.items() if name not in ("top", "unrecognized")}
     top = {classifier: [(c["name"], c["probability"]) for c in best] for classifier, best in instance["top"].items()}
     return Recognition(**fields, top=top, reason=instance["unrecognized"])
+
+
+def _label_image(label_map: Mapping[str, Any]) -> NDArray[np.int32]:
+    flat = np.repeat(np.array(label_map["labels"], np.int32), label_map["lengths"])
+    return flat.reshape(label_map["height"], label_map["width"])
+
+
+def _descriptors(content: bytes) -> Descriptors:
+    with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
+        return Descriptors(**arrays)
+
+
+def _model(content: bytes) -> ServiceModel:
+    values = json.loads(content)
+    values["config"] = DescriptorConfig.of_record(values.pop("descriptor"))
+    values |= {name: tuple(values[name]) for name in ("classes", "classifiers")}
+    return _known({"knows": "", "teaches": False, "segmenter": None} | values, ServiceModel)
+
+
+def _known(values: Mapping[str, Any], kind: type[T]) -> T:
+    """Return a record without the entries of later services."""
+    names = [field.name for field in dataclasses.fields(cast(Any, kind))]
+    return kind(**{name: values[name] for name in names})
+
+
+def _objects(content: bytes) -> list[KnownObject]:
+    return [_known(each, KnownObject) for each in json.loads(content)["objects"]]
+
+
+def _generation(content: bytes) -> int:
+    return int(json.loads(content)["generation"])
+
+
+def _content(response: httpx.Response) -> bytes:
+    """Return the body of an answer; raises ServiceError for one with an error status."""
+    if response.is_success:
+        return response.content
+    retry_after = response.headers.get("Retry-After")
+    try:
+        problem = response.json()
+        field, message = problem["field"], str(problem["message"])
+    except (ValueError, KeyError, TypeError):  # The response comes from a proxy, not from the service.
+        field, message = None, response.reason_phrase
+    raise ServiceError(response.status_code, field, message, None if retry_after is None else float(retry_after))

@@ -8,22 +8,23 @@
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from typing import Any, Literal
 
 from thor2_jax.errors import InputError
 
-__all__ = ["DESCRIPTOR_VERSION", "ORIENTATION_COUNTS", "DescriptorConfig", "Relaxation"]
+__all__ = ["DESCRIPTOR_VERSION", "LOOK_COUNTS", "DescriptorConfig", "Relaxation"]
 
 DESCRIPTOR_VERSION = 1
 """Version of the descriptor's values, stored in every run directory; a run of another version is rejected."""
 
-ORIENTATION_COUNTS = (1, 2, 4)
-"""Numbers of candidate orientations of a cloud; 1 is the paper's."""
+LOOK_COUNTS = (1, 2, 4)
+"""Numbers of looks at a cloud; 1 is the paper's."""
 
 _CHOICES = {
     "homology": ("gudhi", "closed_form"),
     "convention": ("paper", "released"),
-    "orientations": ORIENTATION_COUNTS,
+    "looks": LOOK_COUNTS,
 }
 
 
@@ -80,8 +81,8 @@ class DescriptorConfig:
         image_variance: variance of the Gaussian at each point of a diagram.
         persistence_weight: exponent n of the weight persistence**n of a point in an image; 1 in the paper.
         relaxation: temperatures of soft slices, strips, extremes and colours; None for the paper's hard descriptor.
-        orientations: candidate orientations K of a cloud that recognition describes and fuses, one of
-            `ORIENTATION_COUNTS` (see `descriptor.orientations`); `describe` returns the first one only.
+        looks: looks K at a cloud that recognition describes and fuses, one of `LOOK_COUNTS` (see `descriptor.looks`);
+            `describe` returns the first one only.
 
     Raises:
         InputError: a value is out of range; the message names the field and the value.
@@ -99,7 +100,7 @@ class DescriptorConfig:
     image_variance: float = 0.00025
     persistence_weight: float = 1.0
     relaxation: Relaxation | None = None
-    orientations: int = 1
+    looks: int = 1
 
     def __post_init__(self) -> None:
         for name, allowed in _CHOICES.items():
@@ -137,6 +138,21 @@ class DescriptorConfig:
             changes: other fields of the config.
         """
         return cls(convention="released", **changes)
+
+    @classmethod
+    def of_record(cls, constants: Mapping[str, Any]) -> "DescriptorConfig":
+        """Return the config of a stored record, the `dataclasses.asdict` of one; that of version 0.1 has no looks.
+
+        Raises:
+            TypeError, KeyError: a constant is unknown or missing.
+            InputError: a value is out of range.
+        """
+        stored = dict(constants)
+        relaxation = stored.pop("relaxation")
+        if "orientations" in stored:  # by an earlier version; its first two are the first two looks
+            orientations = stored.pop("orientations")
+            stored["looks"] = 2 if orientations == 4 else orientations
+        return cls(**stored, relaxation=None if relaxation is None else Relaxation(**relaxation))
 
     @property
     def window(self) -> float:

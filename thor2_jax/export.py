@@ -5,7 +5,7 @@
 With jax alone:
 
 >>> exported = jax.export.deserialize(bytearray(blob))                              # doctest: +SKIP
->>> result = exported.call(points, colors, mask, camera, boundary)                   # doctest: +SKIP
+>>> result = exported.call(points, colors, mask, camera, boundary, rim)              # doctest: +SKIP
 >>> result["tops"], result["tops2"], result["overflow"]                                # doctest: +SKIP
 """
 
@@ -17,10 +17,10 @@ import jax.export
 import jax.numpy as jnp
 
 from thor2_jax.capacity import BATCH_BUCKETS, POINT_BUCKETS
-from thor2_jax.descriptor.orientations import describe_orientations
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.classifier import oriented_probabilities
-from thor2_jax.recognition.run_directory import TrainedRun
+from thor2_jax.model.inference import infer_clouds
+from thor2_jax.model.model import Model
+from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.types import PointClouds
 
 __all__ = ["PLATFORMS", "export_recognizer"]
@@ -42,8 +42,9 @@ def export_recognizer(run: TrainedRun, n_points: int, n_clouds: int, platforms: 
 
     Returns:
         Serialized `jax.export.Exported`: a function of the fields of `PointClouds` (points [B, N, 3], colors [B, N, 3],
-        mask [B, N], camera [B, 3], boundary [B, N]) that returns a dictionary with the class probabilities [B, C] of
-        each classifier and overflow [B].
+        mask [B, N], camera [B, 3], boundary [B, N], rim [B, N]) that returns a dictionary with the class probabilities
+        [B, C] of each classifier, also of the embedding if it recognizes the classes (then named "embedding", with
+        probabilities that sum to that of being any class), and overflow [B].
 
     Raises:
         InputError: A size is not a bucket, or a platform is unknown.
@@ -53,17 +54,14 @@ def export_recognizer(run: TrainedRun, n_points: int, n_clouds: int, platforms: 
             raise InputError(f"{name} is {value!r}; expected one of {', '.join(map(str, buckets))}")
     if not platforms or not set(platforms) <= set(PLATFORMS):
         raise InputError(f"platforms is {tuple(platforms)!r}; expected some of {', '.join(PLATFORMS)}")
-    config = dataclasses.replace(run.config, homology="closed_form")
+    model = Model.of_run(dataclasses.replace(run, config=dataclasses.replace(run.config, homology="closed_form")))
 
     def recognize(*fields: jax.Array) -> dict[str, jax.Array]:
-        oriented = describe_orientations(PointClouds(*fields), run.network, config)
-        return {
-            "overflow": oriented.overflow,
-            **{name: oriented_probabilities(model, oriented, name) for name, model in run.classifiers.items()},
-        }
+        inference = infer_clouds(model, PointClouds(*fields), tuple(model.classifiers))
+        return {"overflow": inference.overflow, **inference.probabilities}
 
     shape = jax.ShapeDtypeStruct
     vectors, flags = shape((n_clouds, n_points, 3), jnp.float32), shape((n_clouds, n_points), jnp.bool_)
     camera = shape((n_clouds, 3), jnp.float32)
-    exported = jax.export.export(jax.jit(recognize), platforms=platforms)(vectors, vectors, flags, camera, flags)
+    exported = jax.export.export(jax.jit(recognize), platforms=platforms)(vectors, vectors, flags, camera, flags, flags)
     return bytes(exported.serialize())

@@ -20,15 +20,20 @@ _FONTS = ("DejaVu Sans", "Noto Sans CJK SC", "Noto Sans CJK JP", "WenQuanYi Zen 
 """Fonts for names, those that are installed; matplotlib has the first one."""
 
 
-def save_figure(figure: Figure, path: str | Path) -> None:
+def save_figure(figure: Figure, path: str | Path, *, fit: bool = False) -> None:
     """Write a figure as PNG, atomically.
+
+    Args:
+        figure: the figure.
+        path: path of the picture.
+        fit: change the size of the picture so that it contains everything that is drawn.
 
     Raises:
         OSError: the file cannot be written.
     """
     FigureCanvasAgg(figure)
     with atomic_write(path) as temporary:
-        figure.savefig(temporary, dpi=_DPI, format="png")
+        figure.savefig(temporary, dpi=_DPI, format="png", bbox_inches="tight" if fit else None)
 
 
 def png_bytes(figure: Figure) -> bytes:

@@ -1,28 +1,33 @@
 """Atomic writes, digests, and the check of output directories."""
 
 import contextlib
+import errno
 import functools
 import hashlib
 import json
-import shutil
+import re
 import tempfile
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-from colornet.files import atomic_write, errors_name, remove_leftovers
+from colornet.files import atomic_write, check_replaceable, errors_name, remove_leftovers, temporary_directory
 from thor2_jax.errors import InputError
 
 __all__ = [
     "atomic_directory",
     "atomic_write",
     "check_output_directory",
+    "check_output_file",
     "content_digest",
     "directory_digest",
     "errors_name",
     "file_digest",
+    "has_json",
     "json_digest",
     "remove_leftovers",
+    "remove_written",
+    "temporary_directory",
     "write_text",
 ]
 
@@ -54,20 +59,61 @@ def check_output_directory(directory: str | Path, marker: str | None = None, res
                 f"out: {directory} already contains {', '.join(names[:3])}; expected a new or empty directory"
                 f"{' or an interrupted run of this command' if marker or resumable else ''}; choose another directory"
             )
-        existing = next(path for path in (directory, *directory.absolute().parents) if path.exists())
-        with tempfile.TemporaryFile(dir=existing):
-            pass
+        _check_writable(directory)
     except OSError as error:
         raise InputError(
             f"out: {directory} is not a directory that can be written ({error.strerror}); choose another directory"
         ) from None
 
 
+def check_output_file(name: str, path: Path | None, is_own: Callable[[Path], bool] = lambda path: True) -> None:
+    """Raise unless a command may write a file at the end of its work; missing directories will be created.
+
+    Args:
+        name: name of the argument.
+        path: the file; None for none.
+        is_own: whether a file that exists is an older output of the command, by its content, and may be replaced.
+
+    Raises:
+        InputError: the path is a directory, a device, pipe or socket, a file that the command has not written, or
+            cannot be written.
+    """
+    if path is None:
+        return
+    try:
+        check_replaceable(path)
+        _check_writable(path.absolute().parent)
+    except OSError as error:
+        raise InputError(
+            f"{name}: {path} is not a file that can be written ({error.strerror}); choose another file"
+        ) from None
+    if path.exists() and not is_own(path):
+        raise InputError(f"{name} is {path}, a file that this command has not written; choose another name")
+
+
+def has_json(path: Path, keys: Collection[str]) -> bool:
+    """Return whether a file is JSON: an object with these keys, or a list of such objects."""
+    try:
+        content = json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return False
+    rows = content if isinstance(content, list) else [content]
+    return all(isinstance(row, dict) and row.keys() >= set(keys) for row in rows)
+
+
+def _check_writable(directory: Path) -> None:
+    """Raise OSError unless a directory, or the nearest of its parents that exists, can be written."""
+    existing = next(path for path in (directory, *directory.absolute().parents) if path.exists())
+    with tempfile.TemporaryFile(dir=existing):
+        pass
+
+
 @contextlib.contextmanager
 def atomic_directory(path: str | Path) -> Iterator[Path]:
     """Yield a temporary directory that takes the place of `path` if the block ends without an error.
 
-    A directory that stands there is replaced. After an error, it stays as it was, and nothing else is left behind.
+    In a directory that is not empty, files with the names of new ones are replaced, one after the other, and others
+    stay. After an error in the block, or if a directory or a device has one of the names, everything is as before.
 
     Args:
         path: the directory; its parents are created.
@@ -76,21 +122,51 @@ def atomic_directory(path: str | Path) -> Iterator[Path]:
     created = [parent for parent in path.parents if not parent.exists()]
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
-        unfinished = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
-        try:
-            unfinished.chmod(0o755)
+        with temporary_directory(path.parent) as temporary:
+            unfinished = temporary / path.name
+            unfinished.mkdir(0o755)
             yield unfinished
-            if path.is_dir():
-                shutil.rmtree(path)
-            unfinished.rename(path)
-        except BaseException:
-            shutil.rmtree(unfinished, ignore_errors=True)
-            raise
+            with errors_name(path):
+                try:
+                    unfinished.rename(path)
+                except OSError as error:
+                    if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+                        raise
+                    files = sorted(unfinished.iterdir())
+                    for file in files:
+                        check_replaceable(path / file.name)
+                    for file in files:
+                        file.replace(path / file.name)
     except BaseException:
         for parent in created:
             with contextlib.suppress(OSError):
                 parent.rmdir()
         raise
+
+
+def remove_written(directory: Path, *patterns: str) -> None:
+    """Remove the files in a directory whose relative paths match a regular expression, then what is empty of it.
+
+    All other files stay where they are, also what lies behind symbolic links. If there are none, the directory
+    disappears at once.
+    """
+    if not directory.is_dir():
+        return
+    for folder in [directory, *(path for path in directory.rglob("*") if path.is_dir())]:
+        remove_leftovers(folder)
+    paths = sorted(directory.rglob("*"))
+    folders = [path for path in paths if path.is_dir() and not path.is_symlink()]
+    files = [path for path in paths if path not in folders]
+    written = [p for p in files if any(re.fullmatch(each, p.relative_to(directory).as_posix()) for each in patterns)]
+    if len(written) == len(files) and not directory.is_symlink():
+        with temporary_directory(directory.parent) as temporary:
+            directory.rename(temporary / directory.name)
+        return
+    for path in written:
+        path.unlink(missing_ok=True)
+    for folder in reversed(folders):
+        with contextlib.suppress(OSError):  # It has other files.
+            folder.rmdir()
 
 
 def content_digest(parts: Iterable[str | bytes]) -> str:
@@ -129,6 +205,16 @@ def _file_digest(path: Path, modified: int, size: int) -> str:
 def json_digest(value: Any) -> str:
     """Return the SHA-256 of a JSON value, whatever the order of its keys."""
     return content_digest([json.dumps(value, sort_keys=True)])
+
+
+def safetensors_metadata(content: bytes) -> dict[str, str]:
+    """Return the metadata of a safetensors file from its content, or from the beginning of it with the whole header.
+
+    Raises:
+        ValueError: the header is damaged.
+    """
+    header = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])
+    return dict(header.get("__metadata__", {}))
 
 
 def write_text(path: str | Path, text: str) -> None:

@@ -1,8 +1,50 @@
-"""Names of objects and files as text that terminals and pictures can show."""
+"""Names of objects, and names as text that terminals and pictures can show."""
 
-from collections.abc import Callable
+import re
+import unicodedata
+from collections.abc import Callable, Collection
 
-__all__ = ["escape_characters"]
+from thor2_jax.errors import InputError
+
+__all__ = ["check_name", "escape_characters", "find_name", "normal_name"]
+
+_INVISIBLE = re.compile(
+    "[\u034f\u115f\u1160\u17b4\u17b5\u180b-\u180f\u2800\u3164\ufe00-\ufe0f\uffa0\U000e0100-\U000e01ef]"
+)
+"""Characters that `str.isprintable` accepts, but that show nothing."""
+
+_RESERVED = ("unknown", "unrecognized")
+"""Text in place of the name of an object without one."""
+
+
+def normal_name(name: str) -> str:
+    """Return a name without blanks at its ends and in the Unicode form NFC: equal for names that look alike."""
+    return unicodedata.normalize("NFC", name).strip()
+
+
+def check_name(name: object) -> str:
+    """Return the `normal_name` of an object.
+
+    Raises:
+        InputError: it is no text, empty, longer than 200 characters, has characters that cannot be seen, means that an
+            object has no name, or has a part "." or "..", which addresses and paths cannot contain.
+    """
+    normal = normal_name(name) if isinstance(name, str) else ""
+    if not 1 <= len(normal) <= 200 or not normal.isprintable() or _INVISIBLE.search(normal):
+        raise InputError(f"name is {name!a}; expected a printable text of 1 to 200 visible characters")
+    if normal.casefold() in _RESERVED or not {".", ".."}.isdisjoint(normal.split("/")):
+        raise InputError(f"name is {name!r}, which is reserved; choose another name")
+    return normal
+
+
+def find_name(name: str, known: Collection[str]) -> str | None:
+    """Return the name among the known ones that is this one or looks like it; None if there is none.
+
+    Runs and galleries of older versions have names that are not normal.
+    """
+    if name in known:
+        return name
+    return next((each for each in known if isinstance(name, str) and normal_name(each) == normal_name(name)), None)
 
 
 def escape_characters(text: str, can_show: Callable[[str], bool] = str.isprintable) -> str:

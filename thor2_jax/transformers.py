@@ -7,6 +7,7 @@
 """
 
 import itertools
+import warnings
 from collections.abc import Sequence
 from typing import Any, Self
 
@@ -24,9 +25,12 @@ from thor2_jax.types import Descriptors, as_array, check_cloud
 
 __all__ = ["Tops2Transformer", "TopsTransformer"]
 
+MAX_EXTENT = 2.0
+"""Longest side of a cloud, metres, beyond which its unit is likely another one: descriptors cover about 0.3 m."""
+
 
 class _CloudTransformer(TransformerMixin, BaseEstimator):  # type: ignore[misc]  # scikit-learn has no type hints
-    """What both transformers share: they learn nothing, so `fit` only checks its arguments."""
+    """Base of both transformers: they learn nothing, so `fit` only checks its arguments."""
 
     config: DescriptorConfig | None
     capacity: int | None
@@ -61,6 +65,10 @@ class _CloudTransformer(TransformerMixin, BaseEstimator):  # type: ignore[misc] 
         Raises:
             InputError: a parameter has another type, `X` is empty or is not a list of clouds, or a cloud is invalid or
                 larger than `capacity`. The message gives the index of the cloud.
+
+        Warns:
+            UserWarning: a cloud is too long for coordinates in metres. Nearly all of its points overflow the slices and
+                strips, which cover about 0.3 m, so that its row is near zero; `Descriptors.overflow` has the number.
         """
         config, network = self._check_parameters()
         clouds = self._clouds(X)
@@ -104,6 +112,14 @@ class _CloudTransformer(TransformerMixin, BaseEstimator):  # type: ignore[misc] 
             if len(xyz) > limit:
                 raise InputError(f"X[{i}] has {len(xyz)} points; expected at most {limit}; give a larger capacity")
             clouds.append((xyz, rgb))
+        extents = [float(np.ptp(xyz, axis=0).max()) if len(xyz) else 0.0 for xyz, _ in clouds]
+        if max(extents) > MAX_EXTENT:
+            i = extents.index(max(extents))
+            warnings.warn(
+                f"X[{i}] is {extents[i]:.4g} m long; expected coordinates in metres, of at most {MAX_EXTENT:g} m: if "
+                "they are millimetres, multiply them by 0.001",
+                stacklevel=3,
+            )
         return clouds
 
     def _pair(self, cloud: Any, name: str) -> Any:

@@ -33,6 +33,7 @@ class PointClouds:
         mask: [B, N] bool, False on padding.
         camera: [B, 3] float32, the camera's position in the frame of `points`.
         boundary: [B, N] bool, points on the occlusion boundary of the object; all False for unoccluded views.
+        rim: [B, N] bool, points near the contour of the instance's mask (see `descriptor.looks`); None if unknown.
     """
 
     points: jax.Array
@@ -40,6 +41,7 @@ class PointClouds:
     mask: jax.Array
     camera: jax.Array
     boundary: jax.Array
+    rim: jax.Array | None = None
 
     @classmethod
     def pack(
@@ -49,6 +51,7 @@ class PointClouds:
         camera: ArrayLike | None = None,
         boundary: Sequence[ArrayLike | None] | None = None,
         *,
+        rim: Sequence[ArrayLike | None] | None = None,
         on_host: bool = False,
     ) -> "PointClouds":
         """Pad clouds of different sizes to the same number of points, and stack them.
@@ -60,12 +63,14 @@ class PointClouds:
                 `thor2_jax.capacity.POINT_BUCKETS` that holds it. Compiled functions are reused for equal N.
             camera: [3] or [B, 3], position of the camera; by default the origin.
             boundary: for each cloud an [n] bool array or None, the points on the occlusion boundary.
+            rim: for each cloud an [n] bool array or None, the points near the contour of the instance's mask.
             on_host: keep the fields as NumPy arrays. A compiled function transfers them faster than `device_put`.
 
         Raises:
             InputError: `clouds` is empty, or has wrong shapes or types, coordinates that are not finite in float32, or
                 colours out of range; a cloud exceeds `capacity` or the largest bucket; `capacity` is not a positive
-                integer; `camera` is not finite or has another shape. The message gives the index of the cloud.
+                integer; `camera` is not finite or has another shape; `boundary` or `rim` does not fit the clouds. The
+                message gives the index of the cloud.
         """
         if len(clouds) == 0:
             raise InputError("clouds is empty; expected at least one pair (xyz, rgb)")
@@ -74,26 +79,33 @@ class PointClouds:
         n = _padded_size(sizes, capacity)
         points = np.zeros((len(arrays), n, 3), np.float32)
         colors = np.zeros((len(arrays), n, 3), np.float32)
-        on_boundary = np.zeros((len(arrays), n), bool)
-        if boundary is not None and len(boundary) != len(arrays):
-            raise InputError(f"boundary has {len(boundary)} entries for {len(arrays)} clouds; give one for each cloud")
         for i, (xyz, rgb) in enumerate(arrays):
             points[i, : sizes[i]], colors[i, : sizes[i]] = xyz, rgb
-            if boundary is not None and boundary[i] is not None:
-                flags = np.asarray(boundary[i])
-                if flags.shape != (sizes[i],) or flags.dtype != bool:
-                    raise InputError(f"boundary[{i}] is {flags.dtype} {list(flags.shape)}; expected bool [{sizes[i]}]")
-                on_boundary[i, : sizes[i]] = flags
+        on_boundary = _padded_flags("boundary", [None] * len(arrays) if boundary is None else boundary, sizes, n)
+        on_rim = None if rim is None else _padded_flags("rim", rim, sizes, n)
         position = np.zeros(3, np.float32) if camera is None else _camera_positions(camera, len(arrays))
         mask = np.arange(n) < np.array(sizes)[:, None]
         position = np.broadcast_to(position, (len(arrays), 3))
-        fields: Any = points, colors, mask, position, on_boundary
+        fields: Any = points, colors, mask, position, on_boundary, on_rim
         return cls(*(fields if on_host else jax.device_put(fields)))
 
     def unpack(self) -> list[tuple[NDArray[np.float32], NDArray[np.float32]]]:
         """Return the clouds without padding: pairs of points [n, 3], in their unit, and sRGB [n, 3] in [0, 1]."""
         points, colors, mask = (np.asarray(array) for array in (self.points, self.colors, self.mask))
         return [(xyz[real], rgb[real]) for xyz, rgb, real in zip(points, colors, mask, strict=True)]
+
+
+def _padded_flags(name: str, flags: Sequence[ArrayLike | None], sizes: list[int], n: int) -> NDArray[np.bool_]:
+    if len(flags) != len(sizes):
+        raise InputError(f"{name} has {len(flags)} entries for {len(sizes)} clouds; give one for each cloud")
+    padded = np.zeros((len(sizes), n), bool)
+    for i, (size, values) in enumerate(zip(sizes, flags, strict=True)):
+        if values is not None:
+            given = np.asarray(values)
+            if given.shape != (size,) or given.dtype != bool:
+                raise InputError(f"{name}[{i}] is {given.dtype} {list(given.shape)}; expected bool [{size}]")
+            padded[i, :size] = given
+    return padded
 
 
 def _padded_size(sizes: list[int], capacity: int | None) -> int:
@@ -171,8 +183,8 @@ class Strips:
     """The extremes and the colour vector of every strip of aligned clouds, from which descriptors are computed.
 
     Attributes:
-        low: [..., S, J] float32, least y of the points of the strip; 0 if it is empty.
-        high: [..., S, J] float32, greatest y of the points of the strip; 0 if it is empty.
+        low: [..., S, J] float32, least y of the points of the strip, scaled units; 0 if it is empty.
+        high: [..., S, J] float32, greatest y of the points of the strip, scaled units; 0 if it is empty.
         occupied: [..., S, J] bool, True if the strip has a point.
         color: [..., S, J, R] float32, colour vectors Phi^j of the strips, the rows of the colour matrix C^i.
         overflow: [...] int32, number of points outside the grid of slices and strips.

@@ -5,8 +5,8 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.answers import Recognition
-from thor2_jax.recognition.frames import RGBDFrame
+from thor2_jax.frames.frames import RGBDFrame
+from thor2_jax.model.answers import Recognition
 from thor2_jax.recordings.recorded_frames import RecordedFrame
 from thor2_jax.segmentation.segmenters import Segmenter, segmented
 from training.frame_recognition import FrameAnswer

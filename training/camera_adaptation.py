@@ -3,15 +3,14 @@
 import dataclasses
 import json
 import shutil
-import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from thor2_jax.adaptation.estimate import Adaptation, Report
 from thor2_jax.errors import with_context
-from thor2_jax.files import check_output_directory
-from thor2_jax.recognition.frames import RGBDFrame
-from thor2_jax.recognition.run_directory import RUN_FILE
+from thor2_jax.files import check_output_directory, temporary_directory
+from thor2_jax.frames.frames import RGBDFrame
+from thor2_jax.model.run_directory import RUN_FILE
 from thor2_jax.recognizer import Recognizer
 from training.readers.frame_files import FrameSource
 
@@ -61,8 +60,8 @@ def write_adapted_run(model: Path, adaptation: Adaptation, out: Path) -> None:
     check_output_directory(out)
     out = out.resolve()
     out.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as unfinished:
-        run = Path(unfinished) / "run"
+    with temporary_directory(out.parent) as unfinished:
+        run = unfinished / "run"
         shutil.copytree(model, run, ignore=shutil.ignore_patterns(*UNFINISHED))
         description = json.loads((run / RUN_FILE).read_bytes())
         description["record"] |= {

@@ -5,7 +5,6 @@ enroll_objects(Path("run"), {"mug": mesh_views(Path("mug.glb"))}, "mesh")
 
 import contextlib
 import dataclasses
-import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -13,13 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError, with_context
+from thor2_jax.files import temporary_directory
+from thor2_jax.frames.frames import RGBDFrame
+from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery.enrollment import enrolled_views, instance_view
 from thor2_jax.gallery.gallery import GalleryObject
 from thor2_jax.gallery.objects import ObjectGallery
 from thor2_jax.gallery.store import GALLERY_DIRECTORY
-from thor2_jax.recognition.frames import RGBDFrame
-from thor2_jax.recognition.prepared_instance import PreparedInstance
-from thor2_jax.recognition.run_directory import TrainedRun, save_run
+from thor2_jax.model.run_directory import TrainedRun, save_run
+from thor2_jax.printable import check_name, normal_name
 from thor2_jax.recognizer import Recognizer
 from training.embedding.sampling import AUGMENTATIONS
 from training.objects.mesh import TexturedMesh
@@ -71,11 +72,11 @@ def mesh_views(mesh: Path | TexturedMesh, mesh_scale: float = 1.0) -> list[Prepa
 
 @dataclasses.dataclass(frozen=True)
 class SkippedInstance:
-    """A labelled instance that cannot be used.
+    """A labelled instance that cannot be used, or frames without labels.
 
     Attributes:
-        frame: identifier of its frame.
-        name: name of the object.
+        frame: identifier of its frame; empty for frames without labels.
+        name: name of the object; empty for frames without labels.
         reason: why it cannot be used.
     """
 
@@ -85,44 +86,53 @@ class SkippedInstance:
 
 
 def labelled_views(
-    directories: Sequence[Path],
+    frames: FrameFolder,
     sigma_s: float,
     label_name: str | None = None,
+    instance: int | None = None,
     on_view: Callable[[RGBDFrame, int, str], object] = lambda frame, label, name: None,
 ) -> tuple[dict[str, list[PreparedInstance]], list[SkippedInstance]]:
-    """Return object -> its views in folders of labelled frames, and the instances that cannot be used.
+    """Return object -> its views in frames, and the instances that cannot be used.
 
     Args:
-        directories: folders of frames, or single frames, see `FrameFolder`.
+        frames: the frames.
         sigma_s: scaled units per metre, see `DescriptorConfig`.
-        label_name: only the object that labels.json gives this name.
+        label_name: only the object that labels.json gives this name, and the only one of frames without names.
+        instance: number of the object called `label_name`, in place of labels.json.
         on_view: called with the frame, the label and the object of each usable instance, in the order of the views.
 
     Raises:
-        InputError: a folder or a frame cannot be read, or an object has no usable view.
+        InputError: a folder or a frame cannot be read, or an object has no usable view. Instances whose name
+            `check_name` refuses are skipped.
     """
     views: dict[str, list[PreparedInstance]] = {}
     skipped: list[SkippedInstance] = []
-    for directory in directories:
-        for item in FrameFolder(directory):
-            for label, name in sorted(item.truth.items()):
-                if label_name not in (None, name):
-                    continue
-                views.setdefault(name, [])
-                try:
-                    with with_context(item.identifier):
-                        views[name].append(instance_view(item.frame, label, sigma_s))
-                        on_view(item.frame, label, name)
-                except InputError as error:
-                    skipped.append(SkippedInstance(item.identifier, name, str(error)))
+    if frames.note:
+        skipped.append(SkippedInstance("", "", frames.note))
+    for item in frames:
+        labels: list[tuple[int | None, str]] = [*sorted(item.truth.items())]
+        if label_name is not None:
+            labels = [(label, label_name) for label, name in labels if normal_name(name) == normal_name(label_name)]
+            if instance is not None or not frames.named:
+                labels = [(instance, label_name)]
+        for label, name in labels:
+            try:
+                with with_context(item.identifier):
+                    name = check_name(name) if label_name is None else name
+                    of_object = views.setdefault(name, [])
+                    of_object.append(instance_view(item.frame, label, sigma_s))
+                    on_view(item.frame, of_object[-1].label, name)
+            except InputError as error:
+                skipped.append(SkippedInstance(item.identifier, name, str(error)))
     empty = [name for name, of_object in views.items() if not of_object]
     if empty:
         reason = next(instance.reason for instance in skipped if instance.name == empty[0])
         raise InputError(f"frames: {empty[0]!r} has no usable view ({reason})")
     if not views:
-        shown = ", ".join(map(str, directories))
+        if skipped:
+            raise InputError(f"frames: {skipped[0].reason}")
         wanted = "an object" if label_name is None else repr(label_name)
-        raise InputError(f"frames: no frame of {shown} has a label for {wanted}; see labels.json")
+        raise InputError(f"frames: no frame has a label for {wanted}; see labels.json, or give --instance")
     return views, skipped
 
 
@@ -136,7 +146,7 @@ def enroll_objects(
     replace: bool = False,
     gallery: Path | None = None,
     progress: Callable[[], contextlib.AbstractContextManager[Progress]] = lambda: contextlib.nullcontext(_show_nothing),
-) -> dict[str, int]:
+) -> tuple[dict[str, int], ObjectGallery]:
     """Enroll objects in the gallery of a run directory, in one change; one that does not exist is created.
 
     Args:
@@ -151,13 +161,14 @@ def enroll_objects(
             is called with ("enroll", objects done, number of objects, name).
 
     Returns:
-        Object -> number of its views in the gallery.
+        Object -> number of its views in the gallery, and the gallery.
 
     Raises:
         InputError: the run directory cannot be read, a view cannot be used, or a name exists and neither `extend` nor
             `replace` is given. Nothing is enrolled.
         OSError: a file cannot be written; the gallery is as before, and no run directory is created.
     """
+    model = model.resolve()
     is_new = not model.exists() or (model.is_dir() and not any(model.iterdir()))
     if is_new and gallery is not None:
         raise InputError(f"gallery is {gallery}, and {model} is no run directory; expected one, or leave out gallery")
@@ -168,9 +179,8 @@ def enroll_objects(
         objects.check(name, extend=extend, replace=replace)
     views = read(config.sigma_s)
     if recognizer is not None and source == "frames":
-        views = {each: [recognizer.corrected(view) for view in of_object] for each, of_object in views.items()}
-    for each in views:
-        objects.check(each, extend=extend, replace=replace)
+        views = {each: [recognizer.model.corrected(view) for view in of_object] for each, of_object in views.items()}
+    views = {objects.check(each, extend=extend, replace=replace): of_object for each, of_object in views.items()}
     added = {}
     with progress() as report:
         for number, (each, of_object) in enumerate(views.items()):
@@ -181,15 +191,14 @@ def enroll_objects(
         _create_run(model, objects, added)
     else:
         objects.add(added, extend=extend, replace=replace)
-    return {each: len(objects.gallery.objects[each].clouds) for each in views}
+    return {each: len(objects.gallery.objects[each].clouds) for each in views}, objects
 
 
 def _create_run(model: Path, objects: ObjectGallery, added: Mapping[str, GalleryObject]) -> None:
     """Write a run directory of enrolled objects only. It appears under its name when it is complete."""
-    model = model.resolve()
     model.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f".{model.name}.", dir=model.parent) as unfinished:
-        run = Path(unfinished) / "run"
+    with temporary_directory(model.parent) as unfinished:
+        run = unfinished / "run"
         save_run(TrainedRun(objects.embedding.config, objects.embedding.network, (), {}, {}), run)
         objects.open(run / GALLERY_DIRECTORY)
         objects.add(added)

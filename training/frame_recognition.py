@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 from thor2_jax.capacity import BATCH_BUCKETS
 from thor2_jax.errors import InputError, with_context
 from thor2_jax.files import write_text
-from thor2_jax.recognition.answers import Recognition
-from thor2_jax.recognition.frames import RGBDFrame
-from thor2_jax.recognition.result_files import (
+from thor2_jax.frames.frames import MAX_DEPTH, MIN_DEPTH, RGBDFrame
+from thor2_jax.frames.instance_clouds import unit_question
+from thor2_jax.model.answers import Recognition
+from thor2_jax.model.result_files import (
     BOP_HEADER,
     bop_lines,
     category_numbers,
@@ -39,6 +40,7 @@ __all__ = [
     "ResultTables",
     "recognize_frames",
     "recognize_frames_in_pool",
+    "segmentation_failure",
     "track_frames",
 ]
 
@@ -86,6 +88,17 @@ def recognize_frames(recognizer: Recognizer, sources: Iterable[FrameSource]) -> 
             yield FrameAnswer(source.name, frame, recognitions, time.perf_counter() - start)
 
 
+def segmentation_failure(answer: FrameAnswer) -> str:
+    """Return why nothing was found in a segmented frame if it has no usable depth; otherwise an empty text."""
+    if answer.frame is None or answer.recognitions:
+        return ""
+    depth = answer.frame.depth_m
+    if ((depth >= MIN_DEPTH) & (depth <= MAX_DEPTH)).any():
+        return ""
+    wanted = f"from {MIN_DEPTH} to {MAX_DEPTH} m"
+    return f"segment: nothing was found, since no pixel has depth {wanted}: {unit_question(answer.frame)}"
+
+
 @dataclasses.dataclass(frozen=True)
 class RecognizerArguments:
     """The arguments of `Recognizer.load`, from which each worker process loads the recognizer."""
@@ -96,9 +109,7 @@ class RecognizerArguments:
 
     def load(self) -> Recognizer:
         """Load a recognizer of single frames; raises as `Recognizer.load`."""
-        recognizer = Recognizer.load(self.model, self.unknown_below, answer_by=self.answer_by)
-        recognizer.chunk = BATCH_BUCKETS[-1]
-        return recognizer
+        return Recognizer.load(self.model, self.unknown_below, answer_by=self.answer_by, chunk=BATCH_BUCKETS[-1])
 
 
 def recognize_frames_in_pool(
@@ -195,8 +206,13 @@ class ResultTables:
         )
 
     def write(self, coco: Path | None = None, bop: Path | None = None) -> None:
-        """Write the files that are wanted: COCO results in JSON, BOP results in CSV; raises OSError."""
-        if coco is not None:
-            write_text(coco, json.dumps(self._coco) + "\n")
-        if bop is not None:
-            write_text(bop, "\n".join([BOP_HEADER, *self._bop]) + "\n")
+        """Write the files that are wanted, COCO results in JSON and BOP results in CSV, and create their directories.
+
+        Raises:
+            OSError: a file cannot be written.
+        """
+        contents = {coco: json.dumps(self._coco), bop: "\n".join([BOP_HEADER, *self._bop])}
+        for path, content in contents.items():
+            if path is not None:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                write_text(path, content + "\n")

@@ -2,36 +2,37 @@
 
 import contextlib
 import dataclasses
-import shutil
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 
 from thor2_jax.errors import InputError
 from thor2_jax.files import remove_leftovers
-from thor2_jax.recognition.classifier import check_features
-from thor2_jax.recognition.frames import RGBDFrame
-from thor2_jax.recognition.prepared_instance import PreparedInstance
-from thor2_jax.recognition.run_directory import TrainedRun
+from thor2_jax.frames.frames import RGBDFrame
+from thor2_jax.frames.prepared_instance import PreparedInstance
+from thor2_jax.model.classifier import FEATURES, Feature, check_features
+from thor2_jax.model.run_directory import TrainedRun
+from thor2_jax.printable import normal_name
 from training.baselines.job import train_baselines
 from training.baselines.names import check_baselines, crop_size
 from training.baselines.pretrained import check_weights, pretrained_files
 from training.embedding.run_embedding import Distractors
 from training.enrollment import SkippedInstance, labelled_views
-from training.fitting.checkpoints import CHECKPOINTS
-from training.fitting.job import VIEWS, check_out, check_trained, finished_record, is_finished, train_run
+from training.fitting.job import VIEWS, RunSettings, check_out, check_trained, finished_record, is_finished, train_run
 from training.fitting.protocol import DEFAULT, PAPER, Protocol
 from training.objects.mesh import TexturedMesh
 from training.objects.meshes import find_meshes, read_names, scaled_meshes
+from training.readers.frame_files import find_frames
+from training.readers.frames import FrameFolder
 from training.storage.jobs import check_same_job
-from training.storage.progress import Progress
+from training.storage.progress import Progress, numbered
 from training.storage.workers import local_workers
 from training.views.crop_job import render_crops
 from training.views.crops import rgbd_crop
-from training.views.dataset import ViewDataset
+from training.views.dataset import ViewDataset, remove_views
 from training.views.labelled_views import WithLabelledViews, digest_of_instances
 from training.views.left_out import WithoutClasses
 from training.views.normalized_views import ViewSource
@@ -40,6 +41,9 @@ from training.views.sequences import sequence_sources
 from training.views.view_crops import QuantizedCrop, quantized
 
 __all__ = ["TrainJob", "run_train_job"]
+
+RENDER, RENDER_CROPS = "render", "render crops"
+"""Names of stages."""
 
 
 class LabelledInstances(NamedTuple):
@@ -62,7 +66,7 @@ Display = Callable[[], AbstractContextManager[Progress]]
 
 @dataclasses.dataclass(frozen=True)
 class TrainJob:
-    """What to train, and on which views: at most one of `meshes` and `dataset` is given, `frames`, or both.
+    """A training and its views: at most one of `meshes` and `dataset` is given, `frames`, or both.
 
     Attributes:
         out: run directory, or with `sequences` the directory of the run directories.
@@ -71,7 +75,7 @@ class TrainJob:
         dataset: directory written by `thor2 render`.
         frames: folders of labelled frames, see `FrameFolder`, whose instances are views of their classes, too.
         names: table of object name -> mesh in `meshes`; None uses all meshes.
-        classifiers: any of "tops", "tops2", "ce".
+        classifiers: any of "tops", "tops2", "ce"; None for those of the protocol, or without an embedding all.
         folds: number of folds; with more than one, each gets a model and is its held-out set.
         baselines: any of `BASELINES`.
         weights: directory of pretrained weights for the image networks; None trains them from scratch.
@@ -88,7 +92,7 @@ class TrainJob:
     dataset: Path | None = None
     frames: Sequence[Path] = ()
     names: Path | None = None
-    classifiers: Sequence[str] = ("tops", "tops2", "ce")
+    classifiers: Sequence[str] | None = None
     folds: int = 1
     baselines: Sequence[str] = ()
     weights: Path | None = None
@@ -97,6 +101,20 @@ class TrainJob:
     distractors: Distractors | None = None
     workers: int = 1
     mesh_scale: float = 1.0
+
+    @property
+    def features(self) -> tuple[Feature, ...]:
+        """The classifiers that the job trains; raises InputError if one is unknown."""
+        if self.classifiers is not None:
+            return check_features(self.classifiers, "classifiers")
+        return FEATURES if self.distractors is None else self.protocol.classifiers
+
+    @property
+    def settings(self) -> RunSettings:
+        """What determines its runs beside the views; raises InputError if a classifier is unknown."""
+        protocol = self.protocol
+        mirrors, copies = protocol.mirrors, protocol.orientation_copies
+        return RunSettings(self.features, protocol.fit, protocol.config, self.folds, mirrors, copies, self.distractors)
 
 
 def run_train_job(job: TrainJob, display: Display) -> dict[Path, list[TrainedRun]]:
@@ -111,7 +129,7 @@ def run_train_job(job: TrainJob, display: Display) -> dict[Path, list[TrainedRun
     """
     baselines = check_baselines(job.baselines)
     _check_weights(job, baselines)
-    features = check_features(job.classifiers, "classifiers")
+    settings = job.settings
     labelled = _read_frames(job, baselines)
     if job.sequences is None:
         if not is_finished(job.out):
@@ -126,25 +144,24 @@ def run_train_job(job: TrainJob, display: Display) -> dict[Path, list[TrainedRun
     sources = {job.out: source}
     if job.sequences is not None:
         sources = {job.out / sequence: views for sequence, views in sequence_sources(source, job.sequences).items()}
-    protocol = job.protocol
     for directory, views in sources.items():
-        _check_batch_size(protocol, views)
+        _check_batch_size(job.protocol, views)
         if not is_finished(directory):
             check_out(directory)
         elif not baselines or job.sequences is not None:
-            check_trained(views.digest, directory, features, protocol.fit, job.folds, **_samples(job))
+            check_trained(views.digest, directory, settings)
     runs: dict[Path, list[TrainedRun]] = {}
     for directory, views in sources.items():
         runs[directory] = []
-        with display() as progress:
+        with display() as shown:
+            progress = numbered(shown, _stages(job))
             if not is_finished(directory):
-                runs[directory] = train_run(
-                    views, directory, features, protocol.fit, progress, folds=job.folds, **_samples(job)
-                )
+                runs[directory] = train_run(views, directory, settings, progress)
             if baselines and jax.process_index() == 0:
                 train_baselines(directory, views, baselines, progress, weights=job.weights)
     if job.meshes is not None and jax.process_index() == 0:
-        _remove(job.out / VIEWS)
+        remove_leftovers(job.out)
+        remove_views(job.out / VIEWS)
     return runs
 
 
@@ -158,15 +175,15 @@ def _check_weights(job: TrainJob, baselines: Sequence[str]) -> None:
         check_weights(job.weights, name)
 
 
-def _samples(job: TrainJob) -> Any:
-    """Return the arguments of `train_run` that determine the samples and the descriptor."""
-    protocol = job.protocol
-    return {
-        "mirrors": protocol.mirrors,
-        "config": protocol.config,
-        "orientations": protocol.orientation_copies,
-        "distractors": job.distractors,
-    }
+def _stages(job: TrainJob) -> list[str]:
+    """Return the names of the stages of the training of a run, in their order; those of baselines are none of them."""
+    if job.meshes is None:
+        return job.settings.stages
+    return [RENDER, *([RENDER_CROPS] if _crop_size(job) is not None else []), *job.settings.stages]
+
+
+def _crop_size(job: TrainJob) -> int | None:
+    return crop_size(job.baselines, job.weights is not None)
 
 
 def _check_batch_size(protocol: Protocol, source: ViewSource) -> None:
@@ -204,20 +221,11 @@ def _check_finished_views(job: TrainJob, labelled: LabelledInstances | None) -> 
     )
     if job.baselines:
         return
-    check_trained(stored["digest"], job.out, job.classifiers, protocol.fit, job.folds, **_samples(job))
+    check_trained(stored["digest"], job.out, job.settings)
     remove_leftovers(job.out)
-    for name in (VIEWS, CHECKPOINTS):
-        shutil.rmtree(job.out / f".{name}", ignore_errors=True)
     with contextlib.suppress(InputError):
         if ViewDataset.open(job.out / VIEWS).manifest.job == stored["job"]:
-            _remove(job.out / VIEWS)
-
-
-def _remove(directory: Path) -> None:
-    """Rename a directory first: whenever the process is killed, it is either complete or marked as a leftover."""
-    leftover = directory.with_name(f".{directory.name}")
-    shutil.rmtree(leftover, ignore_errors=True)
-    shutil.rmtree(directory.rename(leftover))
+            remove_views(job.out / VIEWS)
 
 
 def _find_meshes(job: TrainJob) -> dict[str, Path | TexturedMesh]:
@@ -248,7 +256,8 @@ def _read_frames(job: TrainJob, baselines: Sequence[str]) -> LabelledInstances |
         if size is not None:
             crops.setdefault(name, []).append(quantized(rgbd_crop(frame, label, size)))
 
-    views, skipped = labelled_views(job.frames, job.protocol.config.sigma_s, on_view=crop)
+    frames = FrameFolder([source for path in job.frames for source in find_frames([path])])
+    views, skipped = labelled_views(frames, job.protocol.config.sigma_s, on_view=crop)
     return LabelledInstances(views, skipped, crops if size is not None else None)
 
 
@@ -260,19 +269,21 @@ def _check_names(job: TrainJob, names: Sequence[str], labelled: LabelledInstance
         names: classes of the meshes or of the dataset.
         labelled: instances of the frames.
     """
-    classes = [
-        name for name in dict.fromkeys([*names, *(labelled.views if labelled else ())]) if name not in job.leave_out
-    ]
+    known = dict.fromkeys([*names, *(labelled.views if labelled else ())])
+    missing = sorted(set(job.leave_out) - set(known))
+    if missing:
+        raise InputError(f"leave_out has {', '.join(map(repr, missing))}; expected some of {', '.join(known)}")
+    classes = [name for name in known if name not in job.leave_out]
     if job.distractors is not None:
         job.distractors.check(classes)
     if labelled is None:
         return
     folded: dict[str, str] = {}
     for name in classes:
-        other = folded.setdefault(name.casefold(), name)
+        other = folded.setdefault(normal_name(name).casefold(), name)
         if other != name:
             raise InputError(
-                f"frames: the names {other!r} and {name!r} differ only by case; expected one name of an object"
+                f"frames: the names {other!r} and {name!r} differ only by case or form; expected one name of an object"
             )
         if name not in names and len(labelled.views[name]) < 2:
             raise InputError(
@@ -299,15 +310,16 @@ def _open_views(job: TrainJob, labelled: LabelledInstances | None, display: Disp
 
 def _render(job: TrainJob, meshes: Mapping[str, Path | TexturedMesh], display: Display) -> ViewDataset:
     protocol = job.protocol
-    workers, size = local_workers(job.workers), crop_size(job.baselines, job.weights is not None)
-    with display() as progress:
+    workers, size = local_workers(job.workers), _crop_size(job)
+    with display() as shown:
+        progress = numbered(shown, _stages(job))
         dataset = render_dataset(
             meshes,
             job.out / VIEWS,
             protocol.azimuth_step,
             protocol.polar_step,
             workers,
-            lambda done, total: progress("render", done, total, ""),
+            lambda done, total: progress(RENDER, done, total, ""),
             protocol.augmentations,
             protocol.fit.seed,
         )
@@ -317,7 +329,7 @@ def _render(job: TrainJob, meshes: Mapping[str, Path | TexturedMesh], display: D
                 dataset,
                 size,
                 workers,
-                lambda done, total: progress("render crops", done, total, ""),
+                lambda done, total: progress(RENDER_CROPS, done, total, ""),
                 protocol.augmentations,
                 protocol.fit.seed,
             )

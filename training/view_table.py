@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.capacity import point_bucket
-from thor2_jax.descriptor.orientations import describe_orientations
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.prepared_instance import PreparedInstance, pack_instances
+from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
+from thor2_jax.model.inference import infer_clouds
 from thor2_jax.recognizer import Recognizer
 from thor2_jax.tracking.next_view import ViewTable
 from training.objects.mesh import TexturedMesh
@@ -59,7 +59,7 @@ def view_table(recognizer: Recognizer, meshes: Mapping[str, TexturedMesh]) -> Vi
     for start in range(0, len(views), ROWS):
         rows = order[start : start + ROWS]
         clouds = pack_instances([views[k] for k in rows], ROWS, point_bucket(max(len(views[k].points) for k in rows)))
-        oriented = describe_orientations(clouds, recognizer.run.network, recognizer.run.config)
-        probabilities = recognizer.probabilities(oriented, recognizer.default_classifiers)
-        answers[rows] = recognizer.fused(probabilities)[: len(rows)]
+        inference = infer_clouds(recognizer.model, clouds, answer_by="classifiers")
+        probabilities = {name: np.asarray(values) for name, values in inference.probabilities.items()}
+        answers[rows] = recognizer.model.fused(probabilities)[: len(rows)]
     return ViewTable(np.array(labels), np.array(rotations), answers)

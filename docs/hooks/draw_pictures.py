@@ -17,7 +17,7 @@ import colornet
 import thor2_jax as thor2
 from colornet.draw import draw_similarity
 from thor2_jax import plot
-from thor2_jax.recognition.frames import RGBDFrame
+from thor2_jax.frames.frames import RGBDFrame
 from training.objects.builtin_objects import builtin_objects
 from training.rendering.scenes import compose_scene
 from training.rendering.view_sphere import camera_pose

@@ -18,12 +18,18 @@ from nbconvert import MarkdownExporter
 
 import colornet
 from thor2_jax.config import DescriptorConfig
-from thor2_jax.recognition.run_directory import TrainedRun, save_run
+from thor2_jax.model.run_directory import TrainedRun, save_run
 from training.cli.app import app
 
 ROOT = Path(__file__).parents[2]
 
-OUTSIDE = ("CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md", "benchmarks/NOTES.md", "examples/ros2/README.md")
+OUTSIDE = (
+    "CHANGELOG.md",
+    "CONTRIBUTING.md",
+    "SECURITY.md",
+    "benchmarks/notes/accuracy.md",
+    "benchmarks/notes/speed.md",
+)
 """Pages outside of docs/; on the site they have the same paths below `repository/`."""
 
 
@@ -71,6 +77,7 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
     """Point links to notebooks, and between docs/ and the rest of the repository, to the pages of the site."""
     path = page.file.src_uri
     if path.startswith("repository/"):
+        page.meta["search"] = {"exclude": "benchmarks" in path}  # measurements: found from the pages
         above = "../" * (path.count("/") - 1)
         markdown = markdown.replace(f"]({above}docs/", f"]({above}../")
         # Other files of the repository are not part of the site.
@@ -101,6 +108,7 @@ def command_line() -> str:
     for path, command in commands():
         context = typer.Context(command, info_name=path)
         usage = " ".join(command.collect_usage_pieces(context))
+        getattr(command, "insert_values", lambda: None)()
         lines += ["", f"## {path}", "", f"    {path} {usage}", "", _text(command.help or "")]
         rows = [_row(parameter, context) for parameter in command.params if parameter.name != "help"]
         if rows:

@@ -11,9 +11,9 @@ from helpers import untrained_run, write_frame_files
 
 import thor2_jax as thor2
 from benchmarks import cameras
-from benchmarks.simulated_cameras import CHOOSE
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.run_directory import save_run
+from thor2_jax.model.run_directory import save_run
+from training.augmentation.simulated_cameras import CHOOSE
 from training.evaluation.answers import FrameAnswers, InstancePrediction
 
 CLASSES = ("bowl", "can", "mug")

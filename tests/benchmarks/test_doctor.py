@@ -9,8 +9,8 @@ import pytest
 
 import thor2_jax
 from benchmarks.doctor import DAMAGES, run, sound
-from thor2_jax.recognition.answers import Recognition
-from thor2_jax.recognition.frames import RGBDFrame
+from thor2_jax.frames.frames import RGBDFrame
+from thor2_jax.model.answers import Recognition
 from training.readers.frame_files import frame_files
 
 SAMPLES = Path(thor2_jax.__file__).parent / "service" / "page" / "samples"

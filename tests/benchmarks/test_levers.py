@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 from helpers import write_meshes, write_scene
+from processes import UNOPTIMIZED
 
 from benchmarks import levers
 from benchmarks.levers import LEVERS, Lever
@@ -20,7 +21,7 @@ def test_levers_that_differ_in_fusion_share_trainings() -> None:
         Lever("a"),
         Lever("b", train="--epochs 2"),
         Lever("c", rule="max"),
-        Lever("d", orientations=4),
+        Lever("d", looks=4),
         Lever("e", fusion="gallery"),
         Lever("f", fusion="both"),
         Lever("g", render="--base", rule="mean"),
@@ -35,7 +36,7 @@ def test_levers_that_differ_in_fusion_share_trainings() -> None:
 
 def test_rows_of_the_table_differ() -> None:
     assert len({lever.name for lever in LEVERS}) == len(LEVERS)
-    rows = [(lever.training, lever.orientations, lever.fusion, lever.rule) for lever in LEVERS]
+    rows = [(lever.training, lever.looks, lever.fusion, lever.rule) for lever in LEVERS]
     assert len(set(rows)) == len(rows) and {lever.rule for lever in LEVERS} <= set(RULES)
 
 
@@ -56,8 +57,9 @@ def test_bad_arguments_write_nothing(
 
 
 @pytest.fixture
-def given(tmp_path: Path) -> list[Any]:
+def given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """Return options with the meshes and two frames of two built-in objects, and a training of a few seconds."""
+    monkeypatch.setenv("XLA_FLAGS", UNOPTIMIZED)  # of the commands that train
     meshes, frames = write_meshes(tmp_path / "meshes", NAMES), tmp_path / "frames"
     for seed in range(2):
         write_scene(frames / f"{seed}", (*NAMES, "mug_white"), seed)

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers import write_meshes, write_scene
+from processes import UNOPTIMIZED
 from safetensors.numpy import save_file
 
 from benchmarks import paper
@@ -84,8 +85,9 @@ def test_documented_figures_are_those_of_the_results() -> None:
 
 
 @pytest.fixture
-def given(tmp_path: Path) -> list[str]:
+def given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Return options with two frames of two built-in objects, which also join the views."""
+    monkeypatch.setenv("XLA_FLAGS", UNOPTIMIZED)  # of the commands that train
     meshes, frames = write_meshes(tmp_path / "meshes", NAMES), tmp_path / "frames"
     for seed in range(2):
         write_scene(frames / f"{seed}", NAMES, seed)

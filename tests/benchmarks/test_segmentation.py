@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from benchmarks.segmentation import compare, measure
-from thor2_jax.recognition.frames import RGBDFrame
+from thor2_jax.frames.frames import RGBDFrame
 from training.readers.labelled import LabelledFrame
 
 

@@ -23,8 +23,7 @@ def test_packaged_network_is_the_result_of_build(rebuilt: Rebuilt, network: colo
     assert rebuilt.network.fingerprint == network.fingerprint
 
 
-def test_build_takes_little_time_and_memory(rebuilt: Rebuilt) -> None:
-    assert rebuilt.seconds < 60
+def test_build_takes_little_memory(rebuilt: Rebuilt) -> None:
     assert rebuilt.mebibytes < 3 * 1024
 
 

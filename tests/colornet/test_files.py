@@ -179,6 +179,13 @@ def test_flipped_bytes_are_refused_or_have_no_effect(network: colornet.ColorNetw
     assert refused > 150
 
 
+def test_pipes_and_devices_are_not_replaced(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(OSError, match="pipe"):
+        write_arrays(tmp_path / "pipe", {"a": np.zeros(1)})
+    assert (tmp_path / "pipe").is_fifo() and len(os.listdir(tmp_path)) == 1
+
+
 def test_saving_to_a_missing_directory_is_an_error(network: colornet.ColorNetwork, tmp_path: Path) -> None:
     with pytest.raises(OSError):
         network.save(tmp_path / "nowhere" / "network.npz")

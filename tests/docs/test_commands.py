@@ -1,6 +1,7 @@
 """Every `thor2` command of the documentation is parsed by the command line, and every page is in the navigation."""
 
 import re
+from pathlib import Path
 
 import pytest
 import typer
@@ -69,3 +70,18 @@ def test_every_page_is_in_the_navigation() -> None:
     for page in (ROOT / "docs").rglob("*.md"):
         assert re.search(rf"- {re.escape(page.relative_to(ROOT / 'docs').as_posix())}$", text, re.MULTILINE), page
     assert yaml.safe_load(text)["docs_dir"] == "docs"
+
+
+def test_every_page_is_two_links_from_the_landing_page() -> None:
+    """Links in the text alone; the navigation comes on top."""
+    docs = ROOT / "docs"
+
+    def links(page: Path) -> set[Path]:
+        text = page.read_text(encoding="utf-8") if page.suffix == ".md" and page.is_file() else ""
+        return {(page.parent / link).resolve() for link in re.findall(r"\]\(([\w./-]+\.(?:md|ipynb))[)#]", text)}
+
+    first = links(docs / "index.md")
+    reached = first.union(*map(links, first))
+    expected = {path for path in docs.rglob("*") if path.suffix in {".md", ".ipynb"} and path.stem != "index"}
+    assert not expected - reached
+    assert {docs / "reference" / "command-line.md", docs / "reference" / "http.md"} <= reached

@@ -1,4 +1,4 @@
-"""The Python code of docs/explanations.md runs."""
+"""The Python code of docs/explain.md runs."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ from helpers import SMALL_CONFIG, untrained_run
 import thor2_jax as thor2
 from thor2_jax.explanation import class_scores
 
-TEXT = (Path(__file__).parents[2] / "docs" / "explanations.md").read_text()
+TEXT = (Path(__file__).parents[2] / "docs" / "explain.md").read_text()
 
 
 @pytest.mark.slow
@@ -25,6 +25,6 @@ def test_the_code_explains_an_instance(monkeypatch: pytest.MonkeyPatch) -> None:
         "frame": thor2.RGBDFrame(color, depth, labels, thor2.Intrinsics(300.0, 300.0, 59.5, 44.5)),
     }
     (code,) = python_blocks(TEXT)
-    exec(compile(code, "docs/explanations.md", "exec"), names)
+    exec(compile(code, "docs/explain.md", "exec"), names)
     assert {names["explanation"].name, names["explanation"].runner_up} == {"bowl", "mug"}
     assert names["picture"].name == "network"

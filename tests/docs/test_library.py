@@ -1,5 +1,6 @@
-"""The Python code of docs/library.md runs, section by section."""
+"""The Python code of docs/library.md and docs/objects.md runs, section by section."""
 
+import doctest
 import re
 from pathlib import Path
 from typing import Any
@@ -10,9 +11,11 @@ from doc_pages import python_blocks
 from helpers import untrained_run
 
 import thor2_jax as thor2
-from thor2_jax.recognition.run_directory import save_run
+from thor2_jax import recognizer
+from thor2_jax.model.run_directory import save_run
 
-TEXT = (Path(__file__).parents[2] / "docs" / "library.md").read_text()
+PAGE = Path(__file__).parents[2] / "docs" / "library.md"
+TEXT = PAGE.read_text()
 
 
 def code_of(section: str) -> list[str]:
@@ -38,7 +41,8 @@ SECTIONS = {
     "scikit-learn": 2,
     "Persistence of functions on lines": 4,
     "Plots": 1,
-    "Recognizers": 1,
+    "Gradients": 1,
+    "Export": 1,
 }
 """Sections with code, and their numbers of blocks; each has a test below."""
 
@@ -52,6 +56,14 @@ def test_descriptors() -> None:
     xyz, rgb = random_cloud(0)
     result = run_section("Descriptors as a library", xyz=xyz, rgb=rgb)["descriptors"]
     assert result.tops.shape == (1, 7168) and result.tops2.shape == (1, 11942) and result.overflow.shape == (1,)
+
+
+def test_gradients_of_colours() -> None:
+    names = run_section("Descriptors as a library", xyz=random_cloud(0)[0], rgb=random_cloud(0)[1])
+    names = run_section("Gradients", **names)
+    gradient, colors = names["jax"].grad(names["largest"]), names["clouds"].colors
+    assert np.abs(gradient(colors, names["soft"])).max() > 0.01
+    assert not np.any(gradient(colors, names["config"]))
 
 
 def test_plots(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -70,12 +82,26 @@ def test_scikit_learn() -> None:
     assert names["frame"].shape == (8, 7168)
 
 
+def test_pages_that_use_pandas_say_how_to_install_it() -> None:
+    for page in (PAGE, PAGE.parent / "tutorials" / "persistence.ipynb"):
+        text = page.read_text().replace("\\", "")
+        assert 'set_output(transform="pandas")' in text and "pip install -c constraints.txt pandas" in text
+
+
 def test_persistence() -> None:
     names = run_section("Persistence of functions on lines")
     assert names["images"].shape == (2, 16, 16) and len(names["pairs"]) == int(names["diagrams"].mask[0].sum()) > 0
     shallow, noisy, smooth = names["shallow"], names["noisy"], names["smooth"]
     assert shallow(smooth) < 0.2 * shallow(noisy)
     assert float(smooth.min()) == pytest.approx(float(noisy.min()), abs=0.01)
+
+
+@pytest.mark.slow
+def test_export(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    save_run(untrained_run(["mug", "bowl"]), "demo-report/run")
+    run_section("Export")
+    assert (tmp_path / "recognizer.export").stat().st_size > 10_000
 
 
 @pytest.mark.slow
@@ -88,5 +114,14 @@ def test_recognizers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     depth[labels == 3] = 800
     color = np.random.default_rng(0).integers(0, 256, (480, 640, 3), np.uint8)
     frame = thor2.RGBDFrame(color, depth, labels, thor2.Intrinsics(fx=600, fy=600, cx=320, cy=240, depth_scale=1000))
-    run_section("Recognizers", frame=frame, thor2=thor2)
+    (code,) = python_blocks((PAGE.parent / "objects.md").read_text())
+    exec(compile(code, "docs/objects.md", "exec"), {"frame": frame, "thor2": thor2})
     assert (tmp_path / "run" / "gallery").is_dir()
+    labels[20:60, 20:60] = 2
+    depth[labels == 2] = 800
+    names = {
+        "Recognizer": thor2.Recognizer,
+        "read_frame": lambda **files: thor2.RGBDFrame(color, depth, labels, frame.intrinsics),
+    }
+    for example in doctest.DocTestParser().get_examples(str(recognizer.__doc__)):
+        exec(compile(example.source, "thor2_jax.recognizer", "exec"), names)

@@ -19,18 +19,18 @@ from recording_files import table_frame
 
 import thor2_jax as thor2
 from thor2_jax.client import Client
-from thor2_jax.recognition.frames import backproject
-from thor2_jax.recognition.run_directory import save_run
+from thor2_jax.frames.frames import backproject
+from thor2_jax.model.run_directory import save_run
 from thor2_jax.recordings import realsense
 from thor2_jax.tracking.tracker import Tracker
 
 BLOCKS = {
     "README.md": 1,
-    "docs/adaptation.md": 2,
-    "docs/explanations.md": 1,  # test_explanations.py
-    "docs/how-to/export.md": 1,  # test_tutorials.py
+    "docs/cameras.md": 2,
+    "docs/explain.md": 1,  # test_explanations.py
     "docs/index.md": 1,  # test_tutorials.py
-    "docs/library.md": 9,  # test_library.py
+    "docs/library.md": 10,  # test_library.py
+    "docs/objects.md": 1,  # test_library.py
     "docs/recordings.md": 1,
     "docs/segmentation.md": 3,
     "docs/service.md": 2,
@@ -61,7 +61,9 @@ NOT_RUN = {
     "python3": "makes an environment, in the same line of .ci/run",
     "pytest": "the tests",
     "curl": "needs a running service: tests/thor2_jax/service sends the same requests",
-    "python": "benchmarks, of hours: tests/benchmarks runs their parts",
+    "python": "benchmarks, of hours: tests/benchmarks runs their parts; the ROS 2 node: tests/examples",
+    "source": "the environment of ROS 2",
+    "sudo": "installs messages of ROS 2",
     "samples=$(python": "names a directory: the next command is run by test_tutorials.py",
 }
 """First word of other commands -> why they are not run as they stand."""
@@ -87,7 +89,7 @@ def test_every_command_is_run_or_has_a_reason() -> None:
         for words in shell_commands(page):
             if re.match(r"THOR2_\w+=", words[0]):
                 words = words[words.index(next(word for word in words if word.endswith("thor2"))) :]
-            name = words[0].replace(".venv/bin/", "")
+            name = re.sub(r"[\w.-]+/bin/", "", words[0])
             first.add(words[1] if name == "thor2" else name)
     assert first == {*RUN_BY, *NOT_RUN}
     for command, path in RUN_BY.items():
@@ -104,7 +106,7 @@ def test_readme_and_tracks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caps
     (folder / "intrinsics.json").rename("k.json")
     names = run_block("README.md")
     assert capsys.readouterr().out.startswith("3 ")
-    run_block("docs/adaptation.md", recognizer=names["recognizer"], frames=[names["frame"]] * 2)
+    run_block("docs/cameras.md", recognizer=names["recognizer"], frames=[names["frame"]] * 2)
     assert [line.split()[-1] for line in capsys.readouterr().out.splitlines()] == ["1", "2"]
 
 
@@ -116,7 +118,7 @@ def test_next_view(monkeypatch: pytest.MonkeyPatch) -> None:
     tracker.next_view.return_value = types.SimpleNamespace(index=1, expected=[0.2, 0.1])
     reachable = [np.eye(4)] * 2
     names = run_block(
-        "docs/adaptation.md",
+        "docs/cameras.md",
         1,
         tracker=tracker,
         answer=MagicMock(),

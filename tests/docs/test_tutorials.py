@@ -1,4 +1,4 @@
-"""The Python code of the landing page, the first tutorial and the page on export runs, and the tutorial's command."""
+"""The Python code of the landing page and the first tutorial runs, and the tutorial's command."""
 
 import json
 import re
@@ -11,7 +11,7 @@ from doc_pages import python_blocks
 from helpers import run_thor2, untrained_run
 
 import thor2_jax as thor2
-from thor2_jax.recognition.run_directory import save_run
+from thor2_jax.model.run_directory import save_run
 
 DOCS = Path(__file__).parents[2] / "docs"
 SAMPLES = Path(thor2.__path__[0], "service/page/samples")
@@ -38,12 +38,6 @@ def run_code(page: str, **names: Any) -> dict[str, Any]:
 def test_landing_page(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run_code("index.md")
     assert len(capsys.readouterr().out.splitlines()) == 5
-
-
-@pytest.mark.slow
-def test_export(folder: Path) -> None:
-    run_code("how-to/export.md")
-    assert (folder / "recognizer.export").stat().st_size > 10_000
 
 
 @pytest.mark.slow

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import thor2_jax as thor2
-from thor2_jax.recognition.run_directory import TrainedRun, load_run
-from training.fitting.job import train_run
+from thor2_jax.model.run_directory import TrainedRun, load_run
+from training.fitting.job import RunSettings, train_run
 from training.fitting.options import FitOptions
 from training.views.memory_views import MemoryViews
 
@@ -29,7 +29,7 @@ def source() -> MemoryViews:
 
 
 def train(out: Path, **more: Any) -> TrainedRun:
-    (run,) = train_run(source(), out, ("tops",), OPTIONS, config=CONFIG, **more)
+    (run,) = train_run(source(), out, RunSettings(("tops",), OPTIONS, CONFIG), **more)
     return run
 
 

@@ -12,10 +12,11 @@ from helpers import untrained_run
 
 import colornet
 import thor2_jax as thor2
+from colornet import draw
 from colornet.draw import draw_similarity
 from thor2_jax.files import write_text
-from thor2_jax.recognition.overlay import draw_overlay
-from thor2_jax.recognition.run_directory import load_run, save_run
+from thor2_jax.frames.overlay import draw_overlay
+from thor2_jax.model.run_directory import load_run, save_run
 from training.evaluation.answers import AnswerFile, FrameAnswers
 from training.fitting.metrics_log import append_metrics, discard_later_epochs, read_metrics
 from training.fitting.options import EpochMetrics
@@ -40,7 +41,10 @@ WRITERS: dict[str, Callable[[Path], Any]] = {
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS], ids=["full", "read-only"])
 @pytest.mark.parametrize("name", WRITERS)
-def test_files_are_written_atomically(name: str, number: int, tmp_path: Path, disk: Any) -> None:
+def test_files_are_written_atomically(
+    name: str, number: int, tmp_path: Path, disk: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(draw, "_DPI", 30)
     path = tmp_path / name
     path.write_bytes(b"old")
     for step in range(1, 100) if number == errno.ENOSPC else (1, 2, 99):

@@ -1,58 +1,87 @@
-"""Readers under limits of time and memory."""
+"""Readers in a process of their own, where a hang and the memory they take are noticed."""
 
-import contextlib
-import resource
+import multiprocessing
+import re
 import signal
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import cloudpickle
 import pytest
+from processes import HANG, call_pickled
 
 from thor2_jax.errors import InputError
 
-SECONDS = 5
-"""CPU time that a reader may take; elapsed time would depend on other processes."""
 
-MEMORY = 2**30
-"""Bytes that a reader may allocate beyond what the process holds."""
+def measured(read: Callable[[], Any], refusals: Any) -> tuple[Any, str | None, int]:
+    """Return the result of a reader, or None and the message of its refusal, and the bytes that it took at most."""
+
+    def memory(kind: str) -> int:
+        match = re.search(rf"{kind}:\s*(\d+) kB", Path("/proc/self/status").read_text())
+        assert match is not None
+        return 1024 * int(match[1])
+
+    Path("/proc/self/clear_refs").write_text("5")  # The peak is counted from here.
+    before, result, message = memory("VmRSS"), None, None
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # decoders warn about damaged files
+        try:
+            result = read()
+        except refusals as error:
+            message = str(error)
+    return result, message, memory("VmHWM") - before
 
 
-class TimeLimitExceeded(BaseException):
-    """Not an `Exception`, so that no handler of the reader catches it."""
+class ReaderProcess:
+    """Call functions in another process, which is replaced if one of them hangs.
 
+    Attributes:
+        seconds: after these a function hangs.
+        memory: bytes that a reader may take beyond what the process holds.
+    """
 
-@contextlib.contextmanager
-def limits() -> Iterator[None]:
-    def stop(*_: Any) -> None:
-        raise TimeLimitExceeded
+    seconds, memory = HANG, 2**30
 
-    pages = int(Path("/proc/self/statm").read_text().split()[0])
-    before = resource.getrlimit(resource.RLIMIT_AS)
-    handler = signal.signal(signal.SIGPROF, stop)
-    signal.setitimer(signal.ITIMER_PROF, SECONDS)
-    resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + MEMORY, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_AS, before)
-        signal.setitimer(signal.ITIMER_PROF, 0)
-        signal.signal(signal.SIGPROF, handler)
+    def __init__(self) -> None:
+        self.pool: Any = None
+
+    def __call__(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        if self.pool is None:  # a forked process could deadlock on the locks of the threads of JAX
+            self.pool = multiprocessing.get_context("spawn").Pool(1, signal.signal, (signal.SIGINT, signal.SIG_IGN))
+        try:
+            return self.pool.apply_async(call_pickled, (cloudpickle.dumps((function, arguments)),)).get(self.seconds)
+        except multiprocessing.TimeoutError:
+            self.pool.terminate()
+            self.pool = None
+            raise AssertionError(f"the reader crashed, or has not returned after {self.seconds} s") from None
+
+    def close(self) -> None:
+        """Let the process end by itself, which writes its coverage."""
+        if self.pool is not None:
+            self.pool.close()
+            self.pool.join()
 
 
 @pytest.fixture(scope="session")
-def attempt() -> Callable[..., Any]:
-    """Return a function that calls a reader under the limits and returns its result, or None if it raises one line."""
+def reader_process() -> Iterator[ReaderProcess]:
+    process = ReaderProcess()
+    yield process
+    process.close()
+
+
+@pytest.fixture
+def attempt(reader_process: ReaderProcess, request: pytest.FixtureRequest) -> Callable[..., Any]:
+    """Return a function that calls a reader and returns its result, or None if it raises one line."""
+    cloudpickle.register_pickle_by_value(request.module)  # the process cannot import functions of test files
 
     def call(read: Callable[[], Any], refusals: Any = (InputError, OSError)) -> Any:
-        with warnings.catch_warnings(), limits():
-            warnings.simplefilter("ignore")  # decoders warn about damaged files
-            try:
-                return read()
-            except refusals as error:
-                message = str(error)
-        assert message and "\n" not in message and len(message) < 20_000, message[:3000]
-        return None
+        result, message, memory = reader_process(measured, read, refusals)
+        assert memory < reader_process.memory, f"the reader takes {memory} bytes"
+        if message is not None:
+            assert message and "\n" not in message and len(message) < 20_000, message[:3000]
+            return None
+        return result
 
     return call

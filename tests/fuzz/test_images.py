@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.frames import read_color, read_depth, read_intrinsics, read_labels
+from thor2_jax.frames.frames import read_color, read_depth, read_intrinsics, read_labels
 from thor2_jax.testing import damaged
 
 RNG = np.random.default_rng(0)
@@ -84,7 +84,7 @@ def test_damaged_png_chunks_with_valid_checksums(name: str, data: st.DataObject,
 @pytest.mark.parametrize("size", [(65_000, 65_000), (2**31 - 1, 2**31 - 1), (13_000, 13_000), (170_000_000, 1)])
 def test_an_image_that_would_fill_memory_is_refused(size: tuple[int, int], attempt: Any, tmp_path: Path) -> None:
     """The file has a few hundred kilobytes of compressed zeros, or little more than a header."""
-    rows = zlib.compress(bytes(min((size[0] * 3 + 1) * size[1], 2**26)), 9)
+    rows = zlib.compress(bytes(min((size[0] * 3 + 1) * size[1], 2**26)), 1)
     path = tmp_path / "bomb.png"
     path.write_bytes(
         png_file(

@@ -1,9 +1,11 @@
 """Damaged run directories, and damaged files of trainings and evaluations."""
 
+import dataclasses
 import json
 import shutil
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -12,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import thor2_jax as thor2
-from thor2_jax.recognition.run_directory import load_run, save_run
+from thor2_jax.model.run_directory import load_run, save_run
 from thor2_jax.testing import damaged
 from training.baselines.files import StoredBaseline, read_baseline, write_baseline
 from training.evaluation.answers import AnswerFile, FrameAnswers, InstancePrediction
@@ -37,7 +39,7 @@ def read_damaged(path: Path, content: bytes, read: Any, attempt: Any) -> Any:
 
 
 @given(data=st.data())
-def test_descriptions(data: st.DataObject, run: Path, attempt: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_descriptions(data: st.DataObject, run: Path, attempt: Any) -> None:
     """A damaged run.json is refused or read as a run with valid types; weights are not restored here."""
     content = (run / "run.json").read_bytes()
     if data.draw(st.booleans()):
@@ -47,9 +49,12 @@ def test_descriptions(data: st.DataObject, run: Path, attempt: Any, monkeypatch:
         key = data.draw(st.sampled_from(sorted(table)))
         part = data.draw(damaged(json.dumps(table[key]).encode()))
         other = json.dumps(table | {key: "PART"}).encode().replace(b'"PART"', part)
-    with monkeypatch.context() as patch:
-        patch.setattr("thor2_jax.recognition.run_directory.model_from_arrays", lambda create, arrays: None)
-        loaded = read_damaged(run / "run.json", other, lambda: load_run(run), attempt)
+
+    def read() -> Any:
+        with mock.patch("thor2_jax.model.run_directory.model_from_arrays"):
+            return dataclasses.replace(load_run(run), classifiers={})
+
+    loaded = read_damaged(run / "run.json", other, read, attempt)
     if loaded is not None:
         assert isinstance(loaded.config, thor2.DescriptorConfig) and isinstance(loaded.record, dict)
         assert loaded.classes and all(isinstance(name, str) for name in loaded.classes)

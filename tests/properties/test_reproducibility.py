@@ -32,7 +32,7 @@ import numpy as np
 from flax import nnx
 import colornet, thor2_jax as thor2
 from training.fitting.options import FitOptions
-from training.fitting.job import train_run
+from training.fitting.job import RunSettings, train_run
 from training.views.memory_views import MemoryViews
 
 rng = np.random.default_rng(0)
@@ -49,7 +49,7 @@ for homology in ("gudhi", "closed_form"):
 config = thor2.DescriptorConfig(homology="closed_form", n_slices=3, n_strips=8, image_size=8)
 with tempfile.TemporaryDirectory() as folder:
     options = FitOptions(2, batch_size=4, seed=5)
-    (run,) = train_run(MemoryViews(clouds, config), Path(folder) / "run", ("tops2",), options, config=config)
+    (run,) = train_run(MemoryViews(clouds, config), Path(folder) / "run", RunSettings(("tops2",), options, config))
 for path, leaf in sorted(nnx.to_flat_state(nnx.state(run.classifiers["tops2"])), key=lambda pair: str(pair[0])):
     hasher.update(str(path).encode() + np.asarray(leaf[...]).tobytes())
 print(hasher.hexdigest())

@@ -2,8 +2,8 @@
 
 import dataclasses
 import json
-import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -14,7 +14,9 @@ from scipy.spatial.transform import Rotation
 
 import colornet
 import thor2_jax as thor2
-from thor2_jax.recognition.classifier import MLP, class_probabilities
+from benchmarks import run_gpu
+from benchmarks.timing import time_calls
+from thor2_jax.model.classifier import MLP, class_probabilities
 
 NETWORK = colornet.load_default()
 N_CLOUDS = 64
@@ -101,12 +103,15 @@ def test_probabilities_are_those_of_a_cpu(accelerator: jax.Device, clouds: thor2
     np.testing.assert_allclose(probabilities, expected, atol=0.02)
 
 
-def test_the_benchmark_runs(tmp_path: Path) -> None:
+def test_the_benchmark_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Runs on any device; its figures are not checked."""
-    command = [sys.executable, "-m", "benchmarks.run_gpu", "--any-device", "--clouds", "4", "--out", str(tmp_path)]
-    ended = subprocess.run(command, cwd=Path(__file__).parents[2], capture_output=True, text=True, timeout=300)
-    assert ended.returncode == 0, ended.stderr
-    table = [line.split() for line in ended.stdout.splitlines()[2:]]
+    monkeypatch.setattr(sys, "argv", ["run_gpu", "--any-device", "--clouds", "4", "--out", str(tmp_path)])
+    monkeypatch.setattr(run_gpu, "N_POINTS", 512)
+    monkeypatch.setattr(run_gpu, "time_calls", partial(time_calls, seconds=0))
+    run_gpu.main()
+    table = [line.split() for line in capsys.readouterr().out.splitlines()[2:]]
     assert [row[0] for row in table] == ["closed_form", "gudhi"]
     rows = json.loads((tmp_path / "gpu.json").read_text())["rows"]
     for name, rate, *_ in table:

@@ -1,7 +1,9 @@
 """Constants of the descriptor: default and rejected values."""
 
 import dataclasses
+import json
 import math
+import re
 
 import pytest
 
@@ -85,3 +87,47 @@ def test_released_convention_cannot_be_relaxed() -> None:
 def test_integers_beyond_the_largest_float_are_rejected(record: type, name: str) -> None:
     with pytest.raises(InputError, match=f"{name} is 1000"):
         record(**{name: 10**400})
+
+
+def stored(**changes: object) -> dict[str, object]:
+    """Return the record of a config as JSON holds it, with some constants changed; None removes one."""
+    record = json.loads(json.dumps(dataclasses.asdict(DescriptorConfig()))) | changes
+    return {name: value for name, value in record.items() if value is not None or name == "relaxation"}
+
+
+@pytest.mark.parametrize(
+    ("changes", "looks"),
+    [
+        ({}, 1),
+        ({"looks": 4}, 4),
+        ({"looks": None}, 1),
+        *(({"looks": None, "orientations": k}, expected) for k, expected in ((1, 1), (2, 2), (4, 2))),
+    ],
+    ids=str,
+)
+def test_stored_configs_have_their_looks(changes: dict[str, object], looks: int) -> None:
+    record = stored(**changes)
+    before = dict(record)
+    assert DescriptorConfig.of_record(record) == DescriptorConfig(looks=looks)  # type: ignore[arg-type]
+    assert record == before
+
+
+def test_a_stored_relaxation_is_read() -> None:
+    config = DescriptorConfig(relaxation=Relaxation(slice=0.5), looks=2)
+    assert DescriptorConfig.of_record(json.loads(json.dumps(dataclasses.asdict(config)))) == config
+
+
+@pytest.mark.parametrize("name", ["looks", "orientations"])
+@pytest.mark.parametrize("value", [0, 3, 5, -1, "2", [2], {}])
+def test_bad_stored_looks_are_refused(name: str, value: object) -> None:
+    with pytest.raises(InputError, match=re.escape(f"DescriptorConfig.looks is {value!r}")):
+        DescriptorConfig.of_record(stored(**{"looks": None, name: value}))
+
+
+def test_unknown_and_missing_constants_are_refused() -> None:
+    with pytest.raises(TypeError, match="turns"):
+        DescriptorConfig.of_record(stored(turns=2))
+    record = stored()
+    del record["relaxation"]
+    with pytest.raises(KeyError, match="relaxation"):
+        DescriptorConfig.of_record(record)

@@ -1,25 +1,27 @@
 """Exported recognizers."""
 
+import dataclasses
 import subprocess
 import sys
 from pathlib import Path
 
+import jax.export
 import numpy as np
 import pytest
-from helpers import untrained_run
+from helpers import SMALL_CONFIG, class_probabilities, untrained_embedding_run
 
 import thor2_jax as thor2
-from thor2_jax.descriptor.orientations import describe_orientations
+from thor2_jax.descriptor.looks import describe_looks
 from thor2_jax.export import export_recognizer
-from thor2_jax.recognition.classifier import FEATURES
-from thor2_jax.recognition.run_directory import TrainedRun
+from thor2_jax.model.classifier import FEATURES
+from thor2_jax.model.run_directory import TrainedRun
 
-CONFIG = thor2.DescriptorConfig()
+CONFIG = dataclasses.replace(SMALL_CONFIG, homology="gudhi", looks=4)
 
 
 @pytest.fixture(scope="module")
 def run() -> TrainedRun:
-    return untrained_run("abc", config=CONFIG)
+    return untrained_embedding_run("abc", FEATURES, CONFIG)
 
 
 LOADER = """
@@ -27,7 +29,7 @@ import sys
 import jax, jax.export, numpy as np
 exported = jax.export.deserialize(bytearray(open(sys.argv[1], "rb").read()))
 fields = np.load(sys.argv[2])
-outputs = exported.call(*(fields[name] for name in ("points", "colors", "mask", "camera", "boundary")))
+outputs = exported.call(*(fields[name] for name in ("points", "colors", "mask", "camera", "boundary", "rim")))
 assert not any(name.split(".")[0] in ("thor2_jax", "colornet", "flax", "gudhi") for name in sys.modules)
 np.savez(sys.argv[3], **outputs)
 """
@@ -39,24 +41,40 @@ def test_an_exported_recognizer_runs_without_this_package(run: TrainedRun, tmp_p
     clouds = [
         (rng.uniform(0, s, (n, 3)) + [0, 0, 0.6], rng.random((n, 3))) for n, s in zip((500, 31, 0), sizes, strict=True)
     ]
-    packed = thor2.PointClouds.pack([*clouds, clouds[0]], 512)
+    rims = [points[:, 0] < 0.3 * points[:, 0].max(initial=0) for points, _ in clouds]
+    packed = thor2.PointClouds.pack([*clouds, clouds[0]], 512, rim=[*rims, None])
     blob = export_recognizer(run, n_points=512, n_clouds=4)
     (tmp_path / "loader.py").write_text(LOADER)
     (tmp_path / "recognizer.jax").write_bytes(blob)
-    names = ("points", "colors", "mask", "camera", "boundary")
+    names = ("points", "colors", "mask", "camera", "boundary", "rim")
     np.savez(tmp_path / "clouds.npz", **{name: np.asarray(getattr(packed, name)) for name in names})
     arguments = [str(tmp_path / name) for name in ("loader.py", "recognizer.jax", "clouds.npz", "outputs.npz")]
     done = subprocess.run([sys.executable, *arguments], capture_output=True, text=True, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     outputs = np.load(tmp_path / "outputs.npz")
-    assert set(outputs) == {*FEATURES, "overflow"}
+    assert set(outputs) == {*FEATURES, "embedding", "overflow"}
 
-    described = describe_orientations(packed, run.network, CONFIG)  # gudhi: the other backend
+    described = describe_looks(packed, run.network, CONFIG)  # gudhi: the other backend
     np.testing.assert_array_equal(outputs["overflow"], described.first.overflow)
-    expected = thor2.Recognizer(run).probabilities(described)
+    expected = class_probabilities(thor2.Recognizer(run), described)
+    for name, probabilities in expected.items():
+        np.testing.assert_allclose(outputs[name], probabilities, rtol=0, atol=1e-5)
+        assert np.abs(outputs[name][0] - outputs[name][3]).max() > 1e-4  # without its rim, the cloud is another one
     for name in FEATURES:
-        np.testing.assert_allclose(outputs[name], expected[name], rtol=0, atol=1e-6)
         np.testing.assert_allclose(outputs[name].sum(axis=1), 1, atol=1e-5)
+    assert (outputs["embedding"].sum(axis=1) < 1).all()
+
+
+def test_an_embedding_of_other_classes_is_not_exported() -> None:
+    run = untrained_embedding_run("abc", ("tops",))
+    assert run.embedding is not None
+    other = dataclasses.replace(run, embedding=dataclasses.replace(run.embedding, classes=("a",)))
+    calls = []
+    for each in (run, other):
+        exported = jax.export.deserialize(bytearray(export_recognizer(each, n_points=512, n_clouds=1)))
+        packed = thor2.PointClouds.pack([(np.zeros((0, 3)),) * 2], 512, rim=[None])
+        calls.append(set(exported.call(*(getattr(packed, field.name) for field in dataclasses.fields(packed)))))
+    assert calls == [{"tops", "embedding", "overflow"}, {"tops", "overflow"}]
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 import errno
 import hashlib
+import shutil
 import stat
 from pathlib import Path
 
@@ -13,7 +14,11 @@ from thor2_jax.files import (
     atomic_write,
     check_output_directory,
     directory_digest,
+    has_json,
     json_digest,
+    remove_leftovers,
+    remove_written,
+    temporary_directory,
     write_text,
 )
 
@@ -30,7 +35,7 @@ def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
     path = tmp_path / "a.txt"
     path.write_text("old")
     with pytest.raises(RuntimeError), atomic_write(path) as temporary:
-        assert temporary.parent == tmp_path and temporary.suffix == ".txt"
+        assert temporary.parent.parent == tmp_path and temporary.suffix == ".txt"
         temporary.write_text("half")
         assert path.read_text() == "old"
         raise RuntimeError
@@ -128,7 +133,65 @@ def test_a_directory_appears_when_it_is_complete(tmp_path: Path) -> None:
         with atomic_directory(target) as unfinished:
             assert content == "first" or (target / "file").read_text() == "first"
             (unfinished / "file").write_text(content)
+        (target / "scan.ply").write_text("a user's")
     assert (target / "file").read_text() == "second"
     with pytest.raises(KeyError), atomic_directory(target):
         raise KeyError
     assert [path.name for path in target.parent.iterdir()] == ["out"] and (target / "file").read_text() == "second"
+    assert (target / "scan.ply").read_text() == "a user's"
+    (target / "folder").mkdir()
+    with pytest.raises(IsADirectoryError), atomic_directory(target) as unfinished:
+        for name in ("file", "folder"):
+            (unfinished / name).write_text("third")
+    assert (target / "file").read_text() == "second"
+
+
+def killed(directory: Path) -> Path:
+    """Leave what a killed process leaves, and return its directory."""
+    with temporary_directory(directory) as temporary:
+        (temporary / "half").touch()
+        shutil.copytree(temporary, directory / f"{temporary.name}2")
+    return directory / f"{temporary.name}2"
+
+
+def test_only_leftovers_of_this_software_are_removed(tmp_path: Path) -> None:
+    own, similar, link = killed(tmp_path), tmp_path / ".thor2-abcdefgh", tmp_path / ".thor2-link"
+    users = [tmp_path / ".vimrc.original", tmp_path / ".report.ab12_xyz.json", similar / "scan.ply", similar / ".thor2"]
+    similar.mkdir()
+    link.symlink_to(killed(tmp_path.parent))
+    for path in users:
+        path.write_text("a user's")
+    remove_leftovers(tmp_path)
+    remove_leftovers(tmp_path / "missing")
+    assert all(path.read_text() == "a user's" for path in users) and (link / "half").exists() and not own.exists()
+
+
+def test_only_files_that_were_written_are_removed(tmp_path: Path) -> None:
+    directory, elsewhere = tmp_path / "views", tmp_path / "elsewhere"
+    for name in ("manifest.json", "crops/0.npz", "crops/mine.npz", "empty/0.npz"):
+        write_below(directory / name)
+    write_below(elsewhere / "0.npz")
+    (directory / "link").symlink_to(elsewhere)
+    killed(directory / "crops")
+    remove_written(directory, r"manifest\.json", r"(.*/)?0\.npz")
+    left = {path.relative_to(directory).as_posix() for path in directory.rglob("*")}
+    assert left == {"crops", "crops/mine.npz", "link"} and (elsewhere / "0.npz").exists()
+    for path in (directory / "crops" / "mine.npz", directory / "link"):
+        path.unlink()
+    remove_written(directory)
+    remove_written(tmp_path / "missing")
+    assert not directory.exists()
+
+
+def write_below(path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.touch()
+
+
+@pytest.mark.parametrize(
+    ("content", "is_own"),
+    [('[{"a": 1, "b": 2}]', True), ("[]", True), ('{"a": 1}', False), ("[1]", False), ("x", False)],
+)
+def test_json_is_known_by_its_keys(content: str, is_own: bool, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text(content)
+    assert has_json(tmp_path / "file", ("a", "b")) == is_own and not has_json(tmp_path, ("a", "b"))

@@ -5,13 +5,13 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
-from helpers import untrained_run
+from helpers import class_probabilities, untrained_run
 
 import thor2_jax as thor2
-from thor2_jax.recognition.answers import Evidence
-from thor2_jax.recognition.classifier import feature_of
-from thor2_jax.recognition.prepared_instance import PreparedInstance
-from thor2_jax.recognition.run_directory import TrainedRun
+from thor2_jax.frames.prepared_instance import PreparedInstance
+from thor2_jax.model.classifier import feature_of
+from thor2_jax.model.inference import Inference, answers
+from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.recognizer import THOR2, Recognizer
 
 CLASSES = ("a", "b", "c", "d")
@@ -65,7 +65,7 @@ def test_every_instance_is_answered_in_the_order_of_labels(recognizer: Recognize
 
 def test_fusion_is_the_mean_log_probability(recognizer: Recognizer) -> None:
     described = recognizer.describe(tilted(patches()))
-    probabilities = recognizer.probabilities(described.oriented, ("tops", "tops2"))
+    probabilities = class_probabilities(recognizer, described.oriented, ("tops", "tops2"))
     recognized = [answer for answer in recognizer.recognize(tilted(patches())) if answer.reason is None]
     assert len(recognized) == 3
     for row, answer in enumerate(recognized):
@@ -109,7 +109,8 @@ def test_half_of_the_points_may_overflow_with_a_name(recognizer: Recognizer) -> 
     colors, boundary = np.zeros((100, 3), np.uint8), np.zeros(100, bool)
     instance = PreparedInstance(1, np.zeros((100, 3), np.float32), colors, boundary)
     probabilities = {name: np.full((2, 4), [0.7, 0.1, 0.1, 0.1], np.float32) for name in THOR2}
-    named, refused = recognizer.recognitions([instance, instance], Evidence(np.array([50, 51]), probabilities))
+    inference = Inference(np.array([50, 51]), probabilities)
+    named, refused = answers(recognizer.model, [instance, instance], inference)
     assert named.name == "a" and named.reason is None and named.overflow == 50
     assert refused.name is None and refused.overflow == 51 and refused.confidence == named.confidence
     assert refused.reason is not None and "overflow" in refused.reason
@@ -125,7 +126,7 @@ def test_no_names_with_absurd_intrinsics(recognizer: Recognizer, change: dict[st
 def test_probabilities_are_the_classifiers_on_the_descriptors(recognizer: Recognizer, run: TrainedRun) -> None:
     """Against the same layers in NumPy, float64."""
     described = recognizer.describe(tilted(patches()))
-    for name, probabilities in recognizer.probabilities(described.oriented).items():
+    for name, probabilities in class_probabilities(recognizer, described.oriented).items():
         model = run.classifiers[name]
         x = np.asarray(feature_of(described.descriptors, name), np.float64) * np.asarray(model.input_scale[...])
         for layer, norm in zip(model.layers, model.norms, strict=True):

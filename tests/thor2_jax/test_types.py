@@ -11,8 +11,8 @@ import pytest
 
 import colornet
 import thor2_jax as thor2
-from thor2_jax.recognition.instance_clouds import InstanceCloud
-from thor2_jax.recognition.occlusion import OcclusionBoundary
+from thor2_jax.frames.instance_clouds import InstanceCloud
+from thor2_jax.frames.occlusion import OcclusionBoundary
 
 RNG = np.random.default_rng(0)
 
@@ -39,8 +39,8 @@ def test_pack_pads_every_size() -> None:
 
 def test_packing_on_the_host_gives_equal_numpy_arrays() -> None:
     clouds, boundary = [cloud(3), cloud(0)], [np.array([True, False, True]), None]
-    packed = thor2.PointClouds.pack(clouds, 16, [1.0, 2.0, 3.0], boundary)
-    on_host = thor2.PointClouds.pack(clouds, 16, [1.0, 2.0, 3.0], boundary, on_host=True)
+    packed = thor2.PointClouds.pack(clouds, 16, [1.0, 2.0, 3.0], boundary, rim=boundary)
+    on_host = thor2.PointClouds.pack(clouds, 16, [1.0, 2.0, 3.0], boundary, rim=boundary, on_host=True)
     for field in dataclasses.fields(packed):
         expected, actual = getattr(packed, field.name), getattr(on_host, field.name)
         assert isinstance(expected, jax.Array) and isinstance(actual, np.ndarray)
@@ -58,6 +58,15 @@ def test_pack_takes_colors_capacity_camera_and_boundary() -> None:
     np.testing.assert_array_equal(packed.boundary, [[False] * 9, [*boundary, *[False] * 4]])
     each = thor2.PointClouds.pack([(xyz, rgb), (xyz, rgb)], camera=[[1, 2, 3], [4, 5, 6]])
     np.testing.assert_array_equal(each.camera, [[1, 2, 3], [4, 5, 6]])
+
+
+@pytest.mark.parametrize("on_host", [False, True])
+def test_pack_pads_the_rim_if_it_is_given(on_host: bool) -> None:
+    clouds, rim = [cloud(5), cloud(0), cloud(3)], np.array([True, False, True, False, False])
+    packed = thor2.PointClouds.pack(clouds, 8, rim=[rim, np.zeros(0, bool), None], on_host=on_host)
+    np.testing.assert_array_equal(packed.rim, [[*rim, *[False] * 3], [False] * 8, [False] * 8])
+    assert packed.rim is not None and packed.rim.dtype == bool
+    assert thor2.PointClouds.pack(clouds, on_host=on_host).rim is None
 
 
 def test_pack_does_not_modify_its_arguments() -> None:
@@ -107,6 +116,9 @@ def changed(array: np.ndarray, value: float) -> np.ndarray:
         ({"boundary": []}, ["boundary", "0 entries", "1 clouds"]),
         ({"boundary": [np.zeros(2, bool)]}, ["boundary[0]", "[2]", "[3]"]),
         ({"boundary": [np.zeros(3)]}, ["boundary[0]", "float64"]),
+        ({"rim": []}, ["rim", "0 entries", "1 clouds"]),
+        ({"rim": [np.zeros(2, bool)]}, ["rim[0]", "[2]", "[3]"]),
+        ({"rim": [np.zeros(3, np.uint8)]}, ["rim[0]", "uint8", "expected bool"]),
     ],
 )
 def test_pack_rejects(arguments: dict, expected: list[str]) -> None:

@@ -4,8 +4,15 @@ import numpy as np
 import pytest
 
 import colornet
+from thor2_jax import figures
 from thor2_jax.descriptor.color_membership import region_sets
 from training.fitting.samples import Samples
+
+
+@pytest.fixture(autouse=True)
+def coarse_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let figures have a fifth of their pixels: many commands draw some."""
+    monkeypatch.setattr(figures, "_DPI", 60)
 
 
 @pytest.fixture

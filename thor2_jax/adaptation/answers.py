@@ -1,34 +1,24 @@
-"""Compiled answers of a recognizer; their entropy measures how well the colours of a camera fit it."""
-
-from collections.abc import Sequence
+"""The compiled answer of a gallery; its entropy measures how well the colours of a camera fit it."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from thor2_jax.descriptor.orientations import OrientedDescriptors
+from thor2_jax.descriptor.looks import LookDescriptors
 from thor2_jax.gallery.embedding import Embedding
 from thor2_jax.gallery.gallery import GAMMA, RIDGE, Gallery
-from thor2_jax.recognition.run_classifiers import Classifier
+from thor2_jax.model.run_classifiers import Classifier
 
-__all__ = ["MAX_VIEWS", "fused_classifier", "gallery_classifier"]
+__all__ = ["MAX_VIEWS", "gallery_classifier"]
 
 MAX_VIEWS = 1024
 """Views of a gallery that answer at most, evenly spread; the regression is solved for all of them at once."""
 
 
-def fused_classifier(classifiers: Sequence[Classifier]) -> Classifier:
-    """Return the classifier whose probabilities are the normalized geometric mean of those of others."""
-
-    def classify(oriented: OrientedDescriptors) -> jax.Array:
-        logs = [jnp.log(jnp.maximum(each(oriented), 1e-12)) for each in classifiers]
-        return jax.nn.softmax(sum(logs, jnp.zeros(())) / len(logs))
-
-    return classify
-
-
 def gallery_classifier(gallery: Gallery, embedding: Embedding) -> Classifier:
     """Return the classifier whose probabilities are the scores of a gallery, divided by their sum if it exceeds 1.
+
+    Reference views take no part: what matters is which colours make the scores certain, not whether objects are known.
 
     Args:
         gallery: a gallery with at least one object.
@@ -44,7 +34,7 @@ def gallery_classifier(gallery: Gallery, embedding: Embedding) -> Classifier:
     duals = jnp.asarray(np.linalg.solve(kernel, np.eye(len(objects))[owner[kept]]), jnp.float32)
     fixed = jnp.asarray(views, jnp.float32)
 
-    def classify(oriented: OrientedDescriptors) -> jax.Array:
+    def classify(oriented: LookDescriptors) -> jax.Array:
         embedded = embedding.embed_oriented(oriented)
         scores = jnp.clip(jnp.exp(GAMMA * (embedded @ fixed.T - 1)) @ duals, 0, 1)
         mean = (oriented.weights[..., None] * scores).sum(axis=1)

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.prepared_instance import PreparedInstance
-from thor2_jax.recognition.run_record import stored_value
+from thor2_jax.frames.prepared_instance import PreparedInstance
+from thor2_jax.model.run_record import stored_value
 
 __all__ = ["MAX_PARAMETER", "ColorTransform", "transform_colors"]
 

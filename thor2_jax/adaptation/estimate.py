@@ -8,19 +8,33 @@ stays near no change.
 import dataclasses
 from collections.abc import Callable, Iterable, Sequence
 
+import jax
 import numpy as np
 from numpy.typing import NDArray
 
 from colornet import ColorNetwork
+from thor2_jax.adaptation.answers import gallery_classifier
 from thor2_jax.adaptation.color_transform import ColorTransform
 from thor2_jax.adaptation.objective import Objective
 from thor2_jax.config import DescriptorConfig
+from thor2_jax.descriptor.looks import LookDescriptors
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.frames import RGBDFrame
-from thor2_jax.recognition.prepared_instance import PreparedInstance, prepare_instance
-from thor2_jax.recognition.run_classifiers import Classifier
+from thor2_jax.frames.frames import RGBDFrame
+from thor2_jax.frames.prepared_instance import PreparedInstance, prepare_instance
+from thor2_jax.model.classifier import EMBEDDING
+from thor2_jax.model.fusion import fused_probabilities
+from thor2_jax.model.inference import infer
+from thor2_jax.model.model import Model
+from thor2_jax.model.run_classifiers import Classifier
 
-__all__ = ["MAX_INSTANCES", "MIN_INSTANCES", "Adaptation", "camera_instances", "estimate_transform"]
+__all__ = [
+    "MAX_INSTANCES",
+    "MIN_INSTANCES",
+    "Adaptation",
+    "adaptation_criterion",
+    "camera_instances",
+    "estimate_transform",
+]
 
 PRIOR = 0.085
 """Standard deviation of the warmth."""
@@ -83,6 +97,27 @@ def camera_instances(frames: Iterable[RGBDFrame], sigma_s: float) -> list[Prepar
     return instances
 
 
+def adaptation_criterion(model: Model) -> tuple[ColorNetwork, DescriptorConfig, Classifier]:
+    """Return the colour network, the descriptor and the classifier whose certainty an estimate increases.
+
+    It is the embedding, which also knows what is none of the classes; in runs without one, the classifiers, fused by
+    the model's rule; and the gallery if it answers alone.
+
+    Raises:
+        InputError: the model knows no object.
+    """
+    if model.answers_by() == "gallery":
+        if not model.gallery.objects:
+            raise InputError("model has neither classes nor enrolled objects; enroll some first")
+        return model.embedding.network, model.embedding.config, gallery_classifier(model.gallery, model.embedding)
+
+    def fused(oriented: LookDescriptors) -> jax.Array:
+        computed: jax.Array = fused_probabilities(infer(model, oriented).probabilities, model.rule)
+        return computed
+
+    return model.run.network, model.run.config, model.classifiers.get(EMBEDDING, fused)
+
+
 def spread(instances: Sequence[PreparedInstance], count: int = MAX_INSTANCES) -> list[PreparedInstance]:
     """Return at most `count` of the instances, evenly spread."""
     chosen = np.unique(np.linspace(0, len(instances) - 1, min(count, len(instances))).round().astype(int))
@@ -103,7 +138,7 @@ def estimate_transform(
         instances: unlabelled instances with the camera's colours; those that cannot be used are left out.
         network: colour network.
         config: descriptor.
-        classify: what answers, see `objective`.
+        classify: the classifier, see `objective`.
         report: function that shows the progress.
         capacity: see `Objective`.
 

@@ -22,10 +22,10 @@ from thor2_jax.capacity import point_bucket
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.color_membership import RegionSets, color_sets, region_sets
 from thor2_jax.descriptor.describe import strips
-from thor2_jax.descriptor.orientations import candidate_orientations, orient_descriptors
+from thor2_jax.descriptor.looks import aligned_looks, describe_aligned_looks
 from thor2_jax.descriptor.slicing import slices_and_strips
-from thor2_jax.recognition.prepared_instance import PreparedInstance, pack_instances
-from thor2_jax.recognition.run_classifiers import Classifier
+from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
+from thor2_jax.model.run_classifiers import Classifier
 from thor2_jax.types import PointClouds, Strips
 
 __all__ = ["Objective", "entropy"]
@@ -45,13 +45,13 @@ def entropy(probabilities: jax.Array) -> jax.Array:
 
 
 class _Chunk(NamedTuple):
-    """Instances whose geometry has been described: what does not depend on the colours.
+    """Described geometry of instances, which does not depend on the colours.
 
     Attributes:
         clouds: [B, N].
-        aligned: [B * K, N], their orientations.
+        aligned: [B * K, N], the looks at them; their colours are not used.
         weights: [B, K].
-        strips: of the orientations; the colour vectors are not used.
+        strips: of the looks; the colour vectors are not used.
         segment: [B * K, N] int32, number of each point's strip among all strips of all slices; past the last one if
             the point is in none.
         usable: [B] float32, 0 for padding.
@@ -65,6 +65,15 @@ class _Chunk(NamedTuple):
     segment: jax.Array
     usable: jax.Array
     known: jax.Array
+
+
+@partial(jax.jit, static_argnums=1)
+def _segments(aligned: PointClouds, config: DescriptorConfig) -> jax.Array:
+    """Return `_Chunk.segment` of aligned clouds."""
+    x, _, z = jnp.moveaxis(aligned.points, -1, 0)
+    i, j = jax.vmap(partial(slices_and_strips, config=config))(x, z, aligned.mask)
+    inside = aligned.mask & (i >= 0) & (i < config.n_slices) & (j >= 0) & (j < config.n_strips)
+    return jnp.where(inside, i * config.n_strips + j, config.n_slices * config.n_strips)
 
 
 @partial(jax.jit, static_argnums=(3, 4, 5))
@@ -86,7 +95,7 @@ def _uncertainties(
     vectors = add(vectors, chunk.segment, jnp.repeat(regions, count, axis=0))
     described = dataclasses.replace(chunk.strips, color=vectors.reshape(shape))
     aligned = dataclasses.replace(chunk.aligned, colors=jnp.repeat(colors, count, axis=0))
-    oriented = orient_descriptors(aligned, chunk.weights, described, network, config)
+    oriented = describe_aligned_looks(aligned, chunk.weights, described, network, config)
     probabilities = classify(oriented)
     known = jnp.clip(probabilities.sum(axis=1), MIN_KNOWN, 1)
     return (entropy(probabilities) - chunk.known * jnp.log(known)) * chunk.usable
@@ -101,7 +110,7 @@ class Objective:
         network: ColorNetwork,
         config: DescriptorConfig,
         classify: Classifier,
-        orientations: int = 2,
+        looks: int = 2,
         capacity: int | None = None,
     ) -> None:
         """Describe the geometry of the instances.
@@ -110,8 +119,8 @@ class Objective:
             instances: usable instances with the camera's colours.
             network: colour network.
             config: descriptor.
-            classify: what answers.
-            orientations: candidate orientations K.
+            classify: the classifier.
+            looks: number of looks K, 1 or 2; the colours of further ones differ.
             capacity: N, points in a row, so that only one shape is compiled; larger clouds are left out. By default
                 each chunk has the point bucket of its largest cloud.
         """
@@ -122,21 +131,19 @@ class Objective:
         fitting = [each for each in instances if capacity is None or len(each.points) <= capacity]
         ordered = sorted(fitting, key=lambda each: len(each.points))
         parts = [ordered[start : start + ROWS] for start in range(0, len(ordered), ROWS)]
-        self._chunks = [self._describe(part, orientations) for part in parts]
+        self._chunks = [self._describe(part, looks) for part in parts]
 
     def _describe(self, instances: Sequence[PreparedInstance], count: int) -> _Chunk:
         capacity = self._capacity or point_bucket(max(len(each.points) for each in instances))
         clouds = pack_instances(instances, ROWS, capacity)
-        aligned, weights = candidate_orientations(clouds, self._config, count)
-        x, _, z = jnp.moveaxis(aligned.points, -1, 0)
-        i, j = jax.vmap(partial(slices_and_strips, config=self._config))(x, z, aligned.mask)
-        slices, of_slice = self._config.n_slices, self._config.n_strips
-        inside = aligned.mask & (i >= 0) & (i < slices) & (j >= 0) & (j < of_slice)
-        segment = jnp.where(inside, i * of_slice + j, slices * of_slice)
-        described = strips(aligned, self._network, self._config, count)
+        aligned, weights = aligned_looks(clouds, self._config, count)
+        segment = _segments(aligned, self._config)
+        described = strips(aligned, self._network, self._config)
         usable = jnp.asarray(np.arange(ROWS) < len(instances), jnp.float32)
         # A classifier that prepares its weights at the first call must not do so while JAX traces: it is called here.
-        known = self._classify(orient_descriptors(aligned, weights, described, self._network, self._config)).sum(axis=1)
+        known = self._classify(describe_aligned_looks(aligned, weights, described, self._network, self._config)).sum(
+            axis=1
+        )
         return _Chunk(clouds, aligned, weights, described, segment, usable, jnp.minimum(known, 1))
 
     def total(self, parameters: NDArray[np.floating]) -> float:

@@ -11,8 +11,8 @@ from colornet import ColorNetwork
 from thor2_jax.adaptation.estimate import MAX_INSTANCES, MIN_INSTANCES, Adaptation, estimate_transform
 from thor2_jax.adaptation.objective import Objective
 from thor2_jax.config import DescriptorConfig
-from thor2_jax.recognition.prepared_instance import PreparedInstance
-from thor2_jax.recognition.run_classifiers import Classifier
+from thor2_jax.frames.prepared_instance import PreparedInstance
+from thor2_jax.model.run_classifiers import Classifier
 
 __all__ = ["CAPACITY", "OnlineAdaptation"]
 
@@ -43,7 +43,7 @@ class OnlineAdaptation:
         Args:
             network: colour network.
             config: descriptor.
-            classify: what answers.
+            classify: the classifier.
             adapted: called with each new estimate, in the thread that made it.
         """
         self._criterion = network, config, classify

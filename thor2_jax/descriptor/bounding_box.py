@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from thor2_jax.descriptor.reductions import ROWS, argmax, fold, larger, largest, smaller, smallest
+from thor2_jax.descriptor.reductions import ROWS, argmax, fold, larger, largest, rows_of, smaller, smallest
 
 __all__ = ["minimal_box", "rotate", "support_points"]
 
@@ -60,27 +60,30 @@ def support_points(points: jax.Array) -> jax.Array:
     Returns:
         [3, 66] float32; points may repeat.
     """
-    rows = points.reshape(3, ROWS, -1)
-    spread = jnp.sqrt(functools.reduce(jnp.add, (rows[:, k] ** 2 for k in range(ROWS))).sum(axis=-1))
+    folded = points.reshape(3, ROWS, -1)
+    rows = rows_of(folded)
+    spread = jnp.sqrt(functools.reduce(jnp.add, [row * row for row in rows]).sum(axis=-1))
     half = jnp.asarray(_DIRECTIONS) / jnp.where(spread > 0, spread, 1)
 
-    def along(d: jax.Array, rows: jax.Array) -> jax.Array:
-        # Unlike a matmul, explicit sums fuse with the reduction and store no [K, N] array.
-        return d[:, :1] * rows[0] + d[:, 1:2] * rows[1] + d[:, 2:] * rows[2]
-
     # First find the best residue of the point number modulo N / 16, then the best of the 16 points of that residue.
-    each = [along(half, rows[:, k]) for k in range(ROWS)]
+    each = [rotate(half, row) for row in rows]
     extremes = [functools.reduce(larger, each), -functools.reduce(smaller, each)]
     residue = argmax(jnp.concatenate(extremes))
-    candidates = jnp.swapaxes(rows, 1, 2)[:, residue]
-    row = argmax(along(jnp.concatenate([half, -half]), candidates))
-    return points[:, row * rows.shape[2] + residue]
+    candidates = jnp.swapaxes(folded, 1, 2)[:, residue]
+    row = argmax(rotate(jnp.concatenate([half, -half]), candidates))
+    return points[:, row * folded.shape[2] + residue]
 
 
 def rotate(axes: jax.Array, points: jax.Array) -> jax.Array:
-    """Return the coordinates [3, N] of `points` [3, N] along the rows of `axes` [3, 3]."""
-    # Explicit sums are float32 on every device and faster than a matmul with a side of 3.
-    return axes[:, :1] * points[0] + axes[:, 1:2] * points[1] + axes[:, 2:] * points[2]
+    """Return the coordinates [K, N] of `points` [3, N] along the rows of `axes` [K, 3].
+
+    `points` may also be [3, K, N], other ones for each row.
+    """
+    # Explicit sums are float32 on every device and faster than a matmul with a side of 3. They fuse with a reduction,
+    # which then stores no [K, N] array.
+    columns = (jax.lax.slice_in_dim(axes, k, k + 1, axis=1) for k in range(3))
+    each = (jax.lax.index_in_dim(points, k, keepdims=False) for k in range(3))
+    return functools.reduce(jnp.add, [column * coordinate for column, coordinate in zip(columns, each, strict=True)])
 
 
 def _eigenvectors(moments: jax.Array) -> jax.Array:

@@ -27,7 +27,7 @@ CHUNKS_PER_STEP = 4
 """Chunks in one step of the loop; XLA can run them concurrently."""
 
 MAX_LARGE_CHUNK_POINTS = 2**19
-"""Largest number of points in a large chunk, padding and all orientations included."""
+"""Largest number of points in a large chunk, padding and all looks included."""
 
 
 def chunk_size(clouds: PointClouds) -> int:
@@ -66,16 +66,16 @@ def map_chunks(function: Callable[[PointClouds], T], clouds: PointClouds) -> T:
     return _concatenate([results, step(jax.tree.map(lambda a: a[n_clouds - rest :], clouds))])
 
 
-def map_large_chunks(function: Callable[[PointClouds], T], clouds: PointClouds, orientations: int) -> T:
+def map_large_chunks(function: Callable[[PointClouds], T], clouds: PointClouds, looks: int) -> T:
     """Return `function(clouds)`, computed for one large chunk after the other.
 
     Args:
         function: maps clouds [B, N] to arrays [B, ...] and treats each cloud by itself.
         clouds: [B, N].
-        orientations: number of orientations in which the function describes each cloud.
+        looks: number of looks at each cloud that the function describes.
     """
     n_clouds, capacity = clouds.mask.shape
-    size = max(1, MAX_LARGE_CHUNK_POINTS // (max(capacity, 1) * orientations))
+    size = max(1, MAX_LARGE_CHUNK_POINTS // (max(capacity, 1) * looks))
     if jax.default_backend() != "cpu" or n_clouds <= size:
         return function(clouds)
     return _map_slices(function, clouds, size)

@@ -5,13 +5,24 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import NDArray
 
 from thor2_jax.types import PointClouds, Strips
 
-__all__ = ["N_SCALARS", "cloud_statistics", "side_lengths"]
+__all__ = ["N_SCALARS", "cloud_statistics", "is_color", "side_lengths", "square_root"]
 
 N_SCALARS = 12
 """Statistics of a cloud before its colour histogram."""
+
+_COLOR_SCALARS = slice(5, 11)
+"""Mean and standard deviation of the colours."""
+
+
+def is_color(n_regions: int) -> NDArray[np.bool_]:
+    """Return which of the statistics [12 + R] are of colours only."""
+    result = np.arange(N_SCALARS + n_regions) >= N_SCALARS
+    result[_COLOR_SCALARS] = True
+    return result
 
 
 @partial(jax.jit, static_argnums=1)
@@ -25,6 +36,12 @@ def side_lengths(aligned: PointClouds, alpha: float) -> jax.Array:
         sides.append(high - jnp.where(aligned.mask, values, jnp.inf).min(axis=1))
     lengths = jnp.stack(sides, axis=1)
     return -jnp.sort(-jnp.where(jnp.isfinite(lengths), lengths, 0), axis=1)
+
+
+def square_root(values: jax.Array) -> jax.Array:
+    """Return the square roots of values; 0, with a gradient of 0, of those that are not positive."""
+    positive = values > 0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, values, 1)), 0)
 
 
 @jax.jit
@@ -43,7 +60,7 @@ def cloud_statistics(sides: jax.Array, clouds: PointClouds, strips: Strips) -> j
     count = clouds.mask.sum(axis=1, keepdims=True, dtype=jnp.float32)
     weight = clouds.mask[..., None].astype(jnp.float32) / jnp.maximum(count, 1)[..., None]
     mean = (clouds.colors * weight).sum(axis=1)
-    deviation = jnp.sqrt(jnp.maximum((jnp.square(clouds.colors) * weight).sum(axis=1) - jnp.square(mean), 0))
+    deviation = square_root((jnp.square(clouds.colors) * weight).sum(axis=1) - jnp.square(mean))
     scalars = [
         2 * sides,
         3 * jnp.cbrt(sides.prod(axis=1, keepdims=True)),
@@ -54,4 +71,4 @@ def cloud_statistics(sides: jax.Array, clouds: PointClouds, strips: Strips) -> j
     ]
     region_points = strips.color.sum(axis=(1, 2))
     histogram = region_points / jnp.maximum(region_points.sum(axis=1, keepdims=True), 1e-6)
-    return jnp.concatenate([*scalars, jnp.sqrt(histogram)], axis=1)
+    return jnp.concatenate([*scalars, square_root(histogram)], axis=1)

@@ -46,9 +46,7 @@ def _check_batch(clouds: PointClouds) -> None:
 
 
 # Compiled apart from `_strips_of`: fused into its scatter, the look-up would be repeated, one number at a time.
-@partial(jax.jit, static_argnums=2)
-def _color_sets(colors: jax.Array, sets: RegionSets, copies: int) -> jax.Array:
-    return jnp.repeat(color_sets(colors[::copies], sets), copies, axis=0)
+_color_sets = jax.jit(color_sets)
 
 
 @partial(jax.jit, static_argnums=3)
@@ -58,9 +56,9 @@ def _strips_of(aligned: PointClouds, region_set: jax.Array, sets: RegionSets, co
     return jax.vmap(one)(planes, aligned.colors, aligned.mask, region_set)
 
 
-def strips_by_sets(aligned: PointClouds, sets: RegionSets, config: DescriptorConfig, copies: int = 1) -> Strips:
+def strips_by_sets(aligned: PointClouds, sets: RegionSets, config: DescriptorConfig) -> Strips:
     """Return `strips` with the given region sets instead of those of a network."""
-    return _strips_of(aligned, _color_sets(aligned.colors, sets, copies), sets, config)
+    return _strips_of(aligned, _color_sets(aligned.colors, sets), sets, config)
 
 
 @partial(jax.jit, static_argnums=1)
@@ -80,29 +78,27 @@ def _describe_strips(strips: Strips, parameters: Parameters, config: DescriptorC
     )
 
 
-def strips(aligned: PointClouds, network: ColorNetwork, config: DescriptorConfig, copies: int = 1) -> Strips:
+def strips(aligned: PointClouds, network: ColorNetwork, config: DescriptorConfig) -> Strips:
     """Return the extremes and the colour vector of every strip: all that descriptors need, at a fraction of their size.
 
     Args:
         aligned: clouds in scaled units, as `align` returns them.
         network: the colour network, of which only the regions are used.
         config: static.
-        copies: number of consecutive clouds that are orientations of one cloud: their colours are equal, and are looked
-            up once.
     """
     _check_batch(aligned)
-    return strips_by_sets(aligned, _region_sets(network), config, copies)
+    return strips_by_sets(aligned, _region_sets(network), config)
 
 
 def describe_strips(
     strips: Strips, network: ColorNetwork, config: DescriptorConfig, parameters: Parameters | None = None
 ) -> Descriptors:
-    """Return the descriptors of `strips` (fields [B, S, J]); the other arguments are those of `describe`."""
+    """Return the descriptors of `strips` (fields [B, S, J], scaled units); the rest is as in `describe`."""
     return _describe_strips(strips, _default_parameters(network, config) if parameters is None else parameters, config)
 
 
 def diagrams(aligned: PointClouds, config: DescriptorConfig) -> Diagrams:
-    """Return the persistence diagrams of aligned clouds, fields [B, S, J]. Colours are not used."""
+    """Return the persistence diagrams, fields [B, S, J] in scaled units, of aligned clouds. Colours are not used."""
     _check_batch(aligned)
     one_set = RegionSets(jnp.zeros(GRID_SIZE, jnp.int32), jnp.ones((1, 1), jnp.float32))
     return _diagrams(strips_by_sets(aligned, one_set, config), config)
@@ -111,7 +107,7 @@ def diagrams(aligned: PointClouds, config: DescriptorConfig) -> Diagrams:
 def describe_aligned(
     aligned: PointClouds, network: ColorNetwork, config: DescriptorConfig, parameters: Parameters | None = None
 ) -> Descriptors:
-    """Return the descriptors of clouds that are already aligned, as `align` returns them.
+    """Return the descriptors of clouds in scaled units that are already aligned, as `align` returns them.
 
     The other arguments, the result and the errors are those of `describe`.
     """

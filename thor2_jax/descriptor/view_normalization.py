@@ -50,7 +50,7 @@ def _place(rotation: jax.Array, points: jax.Array, mask: jax.Array, camera: jax.
 
 
 class Normalization(NamedTuple):
-    """What the orientation of one cloud is computed from.
+    """Inputs of the orientation of one cloud.
 
     Attributes:
         axes: [3, 3], axes of the minimal box as rows, the longest side first.

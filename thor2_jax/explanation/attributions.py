@@ -2,7 +2,7 @@
 
 Every point has a weight in the relaxed descriptor. The attribution of a point is the gradient of the answer's margin
 with respect to its weight, averaged while the weights of all points increase together to 1 (integrated gradients); the
-frames of the candidate orientations are held constant. To first order, it is the decrease of the margin when the point
+frames of the looks are held constant. To first order, it is the decrease of the margin when the point
 is removed.
 """
 
@@ -17,10 +17,10 @@ from scipy.spatial import KDTree
 
 from thor2_jax.config import DescriptorConfig, Relaxation
 from thor2_jax.descriptor.color_membership import RegionSets, region_sets
-from thor2_jax.descriptor.orientations import orient_descriptors
+from thor2_jax.descriptor.looks import describe_aligned_looks
 from thor2_jax.descriptor.relaxation import relaxed_strips
 from thor2_jax.explanation.class_scores import ClassScores, OrientedCloud, repeat_cloud
-from thor2_jax.recognition.prepared_instance import PreparedInstance
+from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.types import PointClouds, Strips
 
 __all__ = ["Attributions", "Faithfulness", "attribute_points", "select_points", "tenth_of"]
@@ -46,7 +46,7 @@ RANDOM_TENTHS = 20
 
 @dataclasses.dataclass(frozen=True)
 class Faithfulness:
-    """What the exact margin loses with a tenth of the points, all of recognition computed again.
+    """Losses of the exact margin with a tenth of the points, all of recognition computed again.
 
     Attributes:
         margin: margin with all points.
@@ -89,13 +89,17 @@ def tenth_of(n_points: int) -> int:
 def select_points(instance: PreparedInstance, kept: NDArray[np.bool_]) -> PreparedInstance:
     """Return the instance with some of its points only, `kept` [n]."""
     return dataclasses.replace(
-        instance, points=instance.points[kept], colors=instance.colors[kept], boundary=instance.boundary[kept]
+        instance,
+        points=instance.points[kept],
+        colors=instance.colors[kept],
+        boundary=instance.boundary[kept],
+        rim=None if instance.rim is None else instance.rim[kept],
     )
 
 
 @partial(jax.jit, static_argnums=3)
 def _weighted_strips(aligned: PointClouds, weights: jax.Array, sets: RegionSets, config: DescriptorConfig) -> Strips:
-    """Return the relaxed strips [T * K, ...] of a cloud in K orientations, whose points have weights [T, N]."""
+    """Return the relaxed strips [T * K, ...] of K looks at a cloud, whose points have weights [T, N]."""
 
     def one(cloud: PointClouds, weight: jax.Array) -> Strips:
         overflow = jnp.zeros((), jnp.int32)
@@ -117,11 +121,11 @@ def path_gradients(scores: ClassScores, cloud: OrientedCloud, index: int) -> NDA
     config = dataclasses.replace(scores.config, relaxation=RELAXATION)
     sets = region_sets(scores.network)
     aligned = repeat_cloud(cloud.aligned, STEPS)
-    orientation_weights = jnp.tile(cloud.weights, (STEPS, 1))
+    look_weights = jnp.tile(cloud.weights, (STEPS, 1))
 
     def total(weights: jax.Array) -> jax.Array:
         cut = _weighted_strips(cloud.aligned, weights, sets, config)
-        oriented = orient_descriptors(aligned, orientation_weights, cut, scores.network, config)
+        oriented = describe_aligned_looks(aligned, look_weights, cut, scores.network, config)
         return scores.margin(scores.of_descriptors(oriented), index).sum()
 
     levels = (1 + (np.arange(STEPS) + 0.5) / STEPS) / 2
@@ -154,7 +158,7 @@ def attribute_points(
 
     Args:
         scores: class scores.
-        cloud: the instance in its orientations, see `ClassScores.orient`.
+        cloud: the looks at the instance, see `ClassScores.orient`.
         instance: the instance.
         index: number of the name in `scores.names`.
         seed: seed of the random tenths.

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from thor2_jax.config import DescriptorConfig, Relaxation
 from thor2_jax.descriptor.describe import strips
-from thor2_jax.descriptor.orientations import candidate_orientations, orient_descriptors
+from thor2_jax.descriptor.looks import aligned_looks, describe_aligned_looks
 from thor2_jax.descriptor.view_normalization import boxed, oriented
 from thor2_jax.explanation.class_scores import ClassScores, capacity_of
-from thor2_jax.recognition.prepared_instance import PreparedInstance, pack_instances
+from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.types import PointClouds
 
 __all__ = ["CHANGES", "Change", "Kind", "apply_change", "changed_instance", "smallest_change"]
@@ -114,9 +114,9 @@ def _gradient_directions(
     config = dataclasses.replace(scores.config, relaxation=RELAXATION)
 
     def lead(parameters: jax.Array) -> jax.Array:
-        aligned, weights = candidate_orientations(_changed(clouds, axes, parameters, kind), config, scores.count)
+        aligned, weights = aligned_looks(_changed(clouds, axes, parameters, kind), config, scores.count)
         cut = strips(aligned, scores.network, config)
-        values = scores.of_descriptors(orient_descriptors(aligned, weights, cut, scores.network, config))[0]
+        values = scores.of_descriptors(describe_aligned_looks(aligned, weights, cut, scores.network, config))[0]
         return values[index] - jnp.delete(values, index, assume_unique_indices=True).max()
 
     parameters, path = np.zeros(3), []

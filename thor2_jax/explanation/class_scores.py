@@ -1,8 +1,8 @@
 """Class scores: the quantity that an explanation explains, as a differentiable function of descriptors.
 
 The classifiers' answer is explained by its log-odds, that of a gallery by its similarity to the enrolled views. Both
-are fused over the candidate orientations, as recognition fuses them. The embedding of a run, which gives the confidence
-of an answer but does not choose it, is not explained.
+are fused over the looks at an instance, as recognition fuses them. Where the paper's classifiers choose the answer, the
+embedding, which then gives only its confidence, is not explained.
 """
 
 import dataclasses
@@ -18,20 +18,21 @@ from colornet import ColorNetwork
 from thor2_jax.capacity import point_bucket
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.describe import strips
-from thor2_jax.descriptor.orientations import (
-    OrientedDescriptors,
-    candidate_orientations,
-    describe_orientations,
-    orient_descriptors,
+from thor2_jax.descriptor.looks import (
+    LookDescriptors,
+    aligned_looks,
+    describe_aligned_looks,
+    describe_looks,
 )
 from thor2_jax.errors import InputError
+from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.gallery.embedding import Embedding
-from thor2_jax.gallery.enrollment import ORIENTATIONS
+from thor2_jax.gallery.enrollment import LOOKS
 from thor2_jax.gallery.gallery import GalleryObject
-from thor2_jax.recognition.classifier import EMBEDDING
-from thor2_jax.recognition.fusion import FusionRule
-from thor2_jax.recognition.prepared_instance import PreparedInstance, pack_instances
-from thor2_jax.recognizer import Recognizer
+from thor2_jax.model.classifier import EMBEDDING
+from thor2_jax.model.fusion import fused_probabilities
+from thor2_jax.model.inference import infer
+from thor2_jax.model.model import Model
 from thor2_jax.types import PointClouds
 
 __all__ = ["ClassScores", "OrientedCloud", "Unit", "classifier_scores", "gallery_scores"]
@@ -44,25 +45,18 @@ ROWS = 8
 MIN_CAPACITY = 2048
 """Least padded number of points: smaller clouds are hardly faster, and every further size takes long to compile."""
 
-_TINY = np.finfo(np.float32).tiny
-
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class OrientedCloud:
-    """A cloud in its candidate orientations, whose frames are held constant.
+    """The looks at a cloud, whose frames are held constant.
 
     Attributes:
-        aligned: [K, N] aligned clouds in scaled units.
-        weights: [K] float32, weights of the orientations.
+        aligned: [K, N] aligned clouds in scaled units, that of the paper first; each has its own mask.
+        weights: [K] float32, weights of the looks.
     """
 
     aligned: PointClouds
     weights: jax.Array
-
-    @property
-    def shown(self) -> int:
-        """The orientation of the greatest weight, the paper's if several have it."""
-        return int(np.asarray(self.weights).argmax())
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -74,7 +68,7 @@ class ClassScores:
         unit: "log-odds": the scores are fused log-probabilities; "similarity": cosines with the nearest enrolled view.
         config: descriptor, in closed form.
         network: colour network of the descriptor.
-        count: number K of candidate orientations.
+        count: number K of looks.
         of_descriptors: function of the descriptors of B clouds that returns scores [B, n]; differentiable.
     """
 
@@ -83,7 +77,7 @@ class ClassScores:
     config: DescriptorConfig
     network: ColorNetwork
     count: int
-    of_descriptors: Callable[[OrientedDescriptors], jax.Array]
+    of_descriptors: Callable[[LookDescriptors], jax.Array]
 
     def margin(self, scores: jax.Array, index: int) -> jax.Array:
         """Return the margins [B] of the name `index` from scores [B, n], the quantity that is explained.
@@ -98,9 +92,7 @@ class ClassScores:
 
     def orient(self, instance: PreparedInstance) -> OrientedCloud:
         """Return the aligned clouds of an instance."""
-        aligned, weights = candidate_orientations(
-            pack_instances([instance], 1, capacity_of(instance)), self.config, self.count
-        )
+        aligned, weights = aligned_looks(pack_instances([instance], 1, capacity_of(instance)), self.config, self.count)
         return OrientedCloud(aligned, weights[0])
 
     def of_instances(self, instances: Sequence[PreparedInstance]) -> NDArray[np.float32]:
@@ -110,7 +102,7 @@ class ClassScores:
         for start in range(0, len(instances), ROWS):
             rows = instances[start : start + ROWS]
             packed = pack_instances(rows, ROWS, capacity)
-            oriented = describe_orientations(packed, self.network, self.config, self.count)
+            oriented = describe_looks(packed, self.network, self.config, self.count)
             scores.append(np.asarray(self.of_descriptors(oriented))[: len(rows)])
         return np.concatenate(scores)
 
@@ -128,20 +120,26 @@ class ClassScores:
             padded = np.zeros((ROWS, size), bool)
             padded[: len(rows), : rows.shape[1]] = rows
             repeated = repeat_cloud(cloud.aligned, ROWS)
-            part = dataclasses.replace(repeated, mask=jnp.repeat(jnp.asarray(padded), self.count, axis=0))
-            cut = strips(part, self.network, self.config, ROWS * self.count)
-            oriented = orient_descriptors(part, jnp.tile(cloud.weights, (ROWS, 1)), cut, self.network, self.config)
+            mask = repeated.mask & jnp.repeat(jnp.asarray(padded), self.count, axis=0)
+            part = dataclasses.replace(repeated, mask=mask)
+            cut = strips(part, self.network, self.config)
+            oriented = describe_aligned_looks(part, jnp.tile(cloud.weights, (ROWS, 1)), cut, self.network, self.config)
             scores.append(np.asarray(self.of_descriptors(oriented))[: len(rows)])
         return np.concatenate(scores)
 
 
 def capacity_of(instance: PreparedInstance) -> int:
     """Return the padded number of points of an instance."""
-    return max(point_bucket(len(instance.points)), MIN_CAPACITY)
+    return padded_points(len(instance.points))
+
+
+def padded_points(n_points: int) -> int:
+    """Return the padded number of points of an instance with so many."""
+    return max(point_bucket(n_points), MIN_CAPACITY)
 
 
 def repeat_cloud(aligned: PointClouds, times: int) -> PointClouds:
-    """Repeat the K orientations of a cloud, [K, N] to [times * K, N]."""
+    """Repeat the K looks at a cloud, [K, N] to [times * K, N]."""
     repeated: PointClouds = jax.tree.map(lambda a: jnp.tile(a, (times,) + (1,) * (a.ndim - 1)), aligned)
     return repeated
 
@@ -156,59 +154,51 @@ def _checked(config: DescriptorConfig) -> DescriptorConfig:
     return dataclasses.replace(config, homology="closed_form", relaxation=None)
 
 
-def classifier_scores(recognizer: Recognizer) -> ClassScores:
+def classifier_scores(model: Model) -> ClassScores:
     """Return the fused log-probabilities of the classifiers, for all classes that are not forgotten.
 
     Raises:
         InputError: the run's descriptor has the convention of the released code.
     """
-    names = tuple(name for name in recognizer.default_classifiers if name != EMBEDDING)
-    classes, hidden = recognizer.run.classes, set(recognizer.gallery.hidden)
+    default = model.classifiers.default
+    names = tuple(name for name in default if name != EMBEDDING) or default
+    classes, hidden = model.run.classes, set(model.gallery.hidden)
     columns = np.array([k for k, name in enumerate(classes) if name not in hidden], int)
 
-    def of_descriptors(oriented: OrientedDescriptors) -> jax.Array:
-        probabilities = recognizer.evidence(oriented, names).probabilities
-        logs = jnp.stack([jnp.log(jnp.maximum(probabilities[name], _TINY)) for name in names])
-        return _fused_logs(logs, recognizer.rule)[:, columns]
+    def of_descriptors(oriented: LookDescriptors) -> jax.Array:
+        fused = fused_probabilities(infer(model, oriented, classifiers=names).probabilities, model.rule)
+        return jnp.log(jnp.maximum(fused, np.finfo(np.float32).tiny))[:, columns]
 
-    config = _checked(recognizer.run.config)
+    config = _checked(model.run.config)
     shown = tuple(classes[k] for k in columns)
-    return ClassScores(shown, "log-odds", config, recognizer.run.network, config.orientations, of_descriptors)
+    return ClassScores(shown, "log-odds", config, model.run.network, config.looks, of_descriptors)
 
 
-def _fused_logs(logs: jax.Array, rule: FusionRule) -> jax.Array:
-    """Return the fused log-probabilities [B, C] of M classifiers [M, B, C], up to a constant in each row."""
-    if rule == "max":
-        best = logs.max(axis=2).argmax(axis=0)
-        return jnp.take_along_axis(logs, best[None, :, None], axis=0)[0]
-    return jax.nn.logsumexp(logs, axis=0) if rule == "mean" else logs.mean(axis=0)
-
-
-def gallery_scores(recognizer: Recognizer) -> ClassScores:
+def gallery_scores(model: Model) -> ClassScores:
     """Return the similarity of clouds to the enrolled objects: the cosine with the nearest view of each.
 
     Raises:
         InputError: no object is enrolled, or the embedding's descriptor has the convention of the released code.
     """
-    objects = recognizer.gallery.objects
+    objects = model.gallery.objects
     if not objects:
         raise InputError("no object is enrolled; enroll one, or train a run")
-    embedding = recognizer.objects.embedding
+    embedding = model.embedding
     of_descriptors = _nearest_cosines(embedding, list(objects.values()))
     config = _checked(embedding.config)
-    return ClassScores(tuple(objects), "similarity", config, embedding.network, ORIENTATIONS, of_descriptors)
+    count = max(model.run.config.looks, LOOKS)  # as `infer`
+    return ClassScores(tuple(objects), "similarity", config, embedding.network, count, of_descriptors)
 
 
-def _nearest_cosines(
-    embedding: Embedding, objects: Sequence[GalleryObject]
-) -> Callable[[OrientedDescriptors], jax.Array]:
+def _nearest_cosines(embedding: Embedding, objects: Sequence[GalleryObject]) -> Callable[[LookDescriptors], jax.Array]:
     views: Any = jnp.asarray(np.concatenate([one.embeddings for one in objects]), jnp.float32)
     ends = np.cumsum([len(one.embeddings) for one in objects])
     starts = ends - [len(one.embeddings) for one in objects]
 
-    def of_descriptors(oriented: OrientedDescriptors) -> jax.Array:
-        cosines = embedding.embed_oriented(oriented) @ views.T
+    def of_descriptors(oriented: LookDescriptors) -> jax.Array:
+        first: LookDescriptors = jax.tree.map(lambda a: a[:, :LOOKS], oriented)
+        cosines = embedding.embed_oriented(first) @ views.T
         nearest = jnp.stack([cosines[..., a:b].max(axis=-1) for a, b in zip(starts, ends, strict=True)], axis=-1)
-        return (oriented.weights[..., None] * nearest).sum(axis=1)
+        return (first.weights[..., None] * nearest).sum(axis=1) / first.weights.sum(axis=1, keepdims=True)
 
     return of_descriptors

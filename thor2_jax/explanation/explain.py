@@ -4,11 +4,13 @@
 >>> explanation.name, explanation.attributions.values.argmax()                      # doctest: +SKIP
 ('mug', 1204)
 
-With several candidate orientations, the fused answer is explained, since it is the one that recognition gives. Slices,
-strips, diagrams and colour matrices are those of the orientation with the largest weight.
+The fused answer of all looks is explained, since it is the one that recognition gives. Slices, strips, diagrams and
+colour matrices are those of the first look, which is the paper's.
 """
 
 import dataclasses
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -18,7 +20,6 @@ from scipy.spatial import KDTree
 
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.describe import describe_strips, strips
-from thor2_jax.descriptor.orientations import describe_orientations
 from thor2_jax.descriptor.persistence import diagrams_of_strips
 from thor2_jax.errors import InputError
 from thor2_jax.explanation.attributions import Attributions, attribute_points
@@ -32,18 +33,28 @@ from thor2_jax.explanation.class_scores import (
 )
 from thor2_jax.explanation.leave_out import LeftOut, leave_out
 from thor2_jax.explanation.nearest_views import NearestView, nearest_views
-from thor2_jax.recognition.answers import Recognition
-from thor2_jax.recognition.frames import RGBDFrame, pixel_rays
-from thor2_jax.recognition.prepared_instance import DESCRIPTOR_VOXEL, PreparedInstance, pack_instances, prepare_instance
+from thor2_jax.frames.frames import RGBDFrame, pixel_rays
+from thor2_jax.frames.prepared_instance import DESCRIPTOR_VOXEL, PreparedInstance, pack_instances, prepare_instance
+from thor2_jax.model.answers import Recognition
+from thor2_jax.model.inference import answers, infer_clouds, values
+from thor2_jax.model.model import Model
 from thor2_jax.recognizer import Recognizer
 from thor2_jax.types import Diagrams
 
-__all__ = ["DescribedSlices", "Explanation", "explain", "explain_instance", "pixel_attributions"]
+__all__ = [
+    "DescribedSlices",
+    "Explanation",
+    "compile_explanations",
+    "explain",
+    "explain_instance",
+    "explained_kinds",
+    "pixel_attributions",
+]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class DescribedSlices:
-    """The descriptor of an instance in the shown orientation.
+    """The descriptor of the first look at an instance.
 
     Attributes:
         points: [n, 3] float32, aligned points in scaled units.
@@ -66,11 +77,11 @@ class Explanation:
         recognition: the answer.
         name: the name that is explained: the most probable one, also of an unknown object.
         runner_up: the name with the second best score; None if there is no other.
-        scores: what is explained.
+        scores: the explained quantity.
         instance: the cloud, n points.
         described: its descriptor.
         attributions: which points decided.
-        left_out: what slices and strips contribute, as the exact check of the attributions.
+        left_out: contributions of slices and strips, as the exact check of the attributions.
         changes: the smallest changes that give another answer, one for each kind for which one was found.
         nearest: nearest enrolled views; empty without a gallery.
     """
@@ -85,6 +96,11 @@ class Explanation:
     left_out: LeftOut
     changes: tuple[Change, ...]
     nearest: tuple[NearestView, ...]
+
+    @property
+    def title(self) -> str:
+        """The answer in words."""
+        return self.name if self.recognition.name is not None else f"unknown, most like {self.name}"
 
     @property
     def config(self) -> DescriptorConfig:
@@ -139,24 +155,23 @@ def explain(recognizer: Recognizer, frame: RGBDFrame, label: int) -> Explanation
     """
     if label not in frame.instances:
         raise InputError(f"instance is {label}; expected one of {', '.join(map(str, frame.instances)) or 'none'}")
-    return explain_instance(
-        recognizer, recognizer.corrected(prepare_instance(frame, label, recognizer.run.config.sigma_s))
-    )
+    model = recognizer.model
+    return explain_instance(model, model.corrected(prepare_instance(frame, label, model.run.config.sigma_s)))
 
 
-def explain_instance(recognizer: Recognizer, instance: PreparedInstance) -> Explanation:
+def explain_instance(model: Model, instance: PreparedInstance) -> Explanation:
     """Explain the answer for a prepared instance; see `explain`."""
     if instance.reason is not None:
         raise InputError(f"instance {instance.label} cannot be explained: {instance.reason}")
-    recognition, name = _answer(recognizer, instance)
-    scores = _scores_of(recognizer, name)
+    recognition, name = _answer(model, instance)
+    scores = _scores_of(model, name)
     index = scores.names.index(name)
-    values = scores.of_instances([instance])[0]
-    others = [k for k in np.argsort(-values, kind="stable") if k != index]
+    scored = scores.of_instances([instance])[0]
+    others = [k for k in np.argsort(-scored, kind="stable") if k != index]
     cloud = scores.orient(instance)
     attributions = attribute_points(scores, cloud, instance, index)
     # Where classifiers and gallery answer together, the best score need not be that of the answer.
-    kinds = CHANGES if values.argmax() == index else ()
+    kinds = CHANGES if scored.argmax() == index else ()
     changes = [smallest_change(scores, instance, index, kind) for kind in kinds]
     return Explanation(
         recognition=recognition,
@@ -168,37 +183,70 @@ def explain_instance(recognizer: Recognizer, instance: PreparedInstance) -> Expl
         attributions=attributions,
         left_out=leave_out(scores, cloud, index, attributions.values),
         changes=tuple(change for change in changes if change is not None),
-        nearest=tuple(nearest_views(recognizer, instance)),
+        nearest=tuple(nearest_views(model, instance)),
     )
 
 
-def _answer(recognizer: Recognizer, instance: PreparedInstance) -> tuple[Recognition, str]:
-    """Return the answer of the recognizer and the most probable name."""
-    source = recognizer.answers_by()
-    if not recognizer.classes:
+def compile_explanations(model: Model, n_points: int, by_classifiers: bool, is_stopped: Callable[[], bool]) -> None:
+    """Compile what explanations of clouds of a padded size need.
+
+    Args:
+        model: the model.
+        n_points: padded size.
+        by_classifiers: kind of scores, one of `explained_kinds`.
+        is_stopped: asked between the steps, each of which takes seconds, whether to end early.
+    """
+    rng = np.random.default_rng(0)
+    points = rng.uniform(0, (0.12, 0.08, 0.05), (n_points, 3)).astype(np.float32)
+    instance = PreparedInstance(1, points, rng.integers(0, 256, (n_points, 3), np.uint8), np.zeros(n_points, bool))
+    name = explained_kinds(model).get(by_classifiers)
+    if name is None:  # The last such object has been forgotten.
+        return
+    _answer(model, instance)
+    scores = _scores_of(model, name)
+    index = int(scores.of_instances([instance])[0].argmax())
+    cloud = scores.orient(instance)
+    steps: list[Callable[[], object]] = [
+        partial(attribute_points, scores, cloud, instance, index),
+        partial(leave_out, scores, cloud, index, np.zeros(n_points, np.float32)),
+        *(partial(smallest_change, scores, instance, index, kind) for kind in CHANGES),
+        partial(_described, scores, cloud, n_points),
+        partial(nearest_views, model, instance),
+    ]
+    for step in steps:
+        if is_stopped():
+            return
+        step()
+
+
+def explained_kinds(model: Model) -> dict[bool, str]:
+    """Return a name that is explained by the classifiers (key True) and one that is explained by the gallery (False).
+
+    A kind that no name has is left out.
+    """
+    union = model.union
+    by_classifiers = np.asarray(union.has_output) & (model.answers_by() != "gallery")
+    return dict(zip(by_classifiers.tolist(), union.names, strict=True))
+
+
+def _answer(model: Model, instance: PreparedInstance) -> tuple[Recognition, str]:
+    """Return the answer of the model and the most probable name."""
+    if not model.names:
         raise InputError("no object is known; train a run or enroll an object")
-    clouds = pack_instances([instance], 1, capacity_of(instance))
-    oriented = describe_orientations(clouds, recognizer.run.network, recognizer.run.config)
-    names = recognizer.default_classifiers if source != "gallery" else ()
-    evidence = recognizer.evidence(oriented, names, clouds if source != "classifiers" else None)
-    (recognition,) = recognizer.recognitions([instance], evidence)
-    evidence = jax.tree.map(np.asarray, evidence)
-    gallery = None
-    if evidence.embeddings is not None:
-        gallery = recognizer.gallery.scores(evidence.embeddings, evidence.weights)
-    best = int(recognizer.combined(evidence.probabilities, gallery)[0].argmax())
-    return recognition, recognizer.classes[best]
+    inference = infer_clouds(model, pack_instances([instance], 1, capacity_of(instance)))
+    (recognition,) = answers(model, [instance], inference)
+    return recognition, model.names[int(values(model, inference)[0].argmax())]
 
 
-def _scores_of(recognizer: Recognizer, name: str) -> ClassScores:
-    union = recognizer.objects.union
+def _scores_of(model: Model, name: str) -> ClassScores:
+    union = model.union
     has_output = bool(union.has_output[union.names.index(name)])
-    by_classifiers = recognizer.answers_by() != "gallery" and has_output
-    return classifier_scores(recognizer) if by_classifiers else gallery_scores(recognizer)
+    by_classifiers = model.answers_by() != "gallery" and has_output
+    return classifier_scores(model) if by_classifiers else gallery_scores(model)
 
 
 def _described(scores: ClassScores, cloud: OrientedCloud, n: int) -> DescribedSlices:
-    shown = jax.tree.map(lambda a: a[cloud.shown : cloud.shown + 1], cloud.aligned)
+    shown = jax.tree.map(lambda a: a[:1], cloud.aligned)
     cut = strips(shown, scores.network, scores.config)
     diagrams = diagrams_of_strips(cut, scores.config)
     images = describe_strips(cut, scores.network, scores.config).images

@@ -1,6 +1,6 @@
 """Leave-one-out: the decrease of the exact margin without a slice or strip, beside what the attributions predict.
 
-The points of a slice or strip of the shown orientation are removed in all orientations. The frames remain those of the
+The points of a slice or strip of the first look are removed from all looks. The frames remain those of the
 whole cloud, as for the attributions.
 """
 
@@ -19,10 +19,10 @@ __all__ = ["LeftOut", "leave_out"]
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class LeftOut:
-    """What the exact margin of an answer loses without each slice and each strip.
+    """Losses of the exact margin of an answer without each slice and each strip.
 
     Attributes:
-        slice_of: [n] int, slice of each point in the shown orientation.
+        slice_of: [n] int, slice of each point in the first look.
         strip_of: [n] int, strip of each point.
         slices: [S] float32, loss without the slice; NaN if it is empty.
         strips: [S, J] float32, loss without the strip; NaN if it is empty.
@@ -42,13 +42,13 @@ def leave_out(scores: ClassScores, cloud: OrientedCloud, index: int, attribution
 
     Args:
         scores: class scores.
-        cloud: the instance in its orientations.
+        cloud: the looks at the instance.
         index: number of the answer in `scores.names`.
         attributions: [n] attributions of the points.
     """
     config, n = scores.config, len(attributions)
-    points = cloud.aligned.points[cloud.shown, :n]
-    numbers = slices_and_strips(points[:, 0], points[:, 2], cloud.aligned.mask[cloud.shown, :n], config)
+    points = cloud.aligned.points[0, :n]
+    numbers = slices_and_strips(points[:, 0], points[:, 2], cloud.aligned.mask[0, :n], config)
     slice_of, strip_of = (np.asarray(number).astype(np.intp) for number in numbers)
     inside = (slice_of < config.n_slices) & (strip_of < config.n_strips)
     cell_of = np.where(inside, slice_of * config.n_strips + strip_of, -1)

@@ -14,8 +14,8 @@ from thor2_jax import plot
 from thor2_jax.explanation.changes import Change, apply_change
 from thor2_jax.explanation.explain import Explanation, pixel_attributions
 from thor2_jax.figures import name_style, plain_text
-from thor2_jax.recognition.frames import RGBDFrame
-from thor2_jax.recognition.prepared_instance import PreparedInstance
+from thor2_jax.frames.frames import RGBDFrame
+from thor2_jax.frames.prepared_instance import PreparedInstance
 
 __all__ = ["ExplanationPicture", "change_text", "main_pictures", "pictures"]
 
@@ -31,7 +31,7 @@ class ExplanationPicture:
         name: name of its file, without ending.
         section: "decided", "changes", "nearest", "shape", "slices" or "network".
         title: short title.
-        caption: what it shows, in full sentences.
+        caption: description in full sentences.
         figure: the picture.
     """
 

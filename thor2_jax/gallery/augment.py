@@ -10,8 +10,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from thor2_jax.recognition.instance_clouds import MIN_POINTS
-from thor2_jax.recognition.prepared_instance import PreparedInstance
+from thor2_jax.frames.instance_clouds import MIN_POINTS
+from thor2_jax.frames.prepared_instance import PreparedInstance
 
 __all__ = ["augmented_copies", "augmented_view"]
 

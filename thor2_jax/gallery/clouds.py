@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.prepared_instance import PreparedInstance
+from thor2_jax.frames.prepared_instance import PreparedInstance
 
 __all__ = ["CompactClouds"]
 

@@ -23,13 +23,14 @@ import safetensors.numpy
 from flax import nnx
 
 import colornet
-from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig, Relaxation
+from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
 from thor2_jax.descriptor.chunking import map_chunks
-from thor2_jax.descriptor.cloud_statistics import N_SCALARS
-from thor2_jax.descriptor.orientations import OrientedDescriptors, describe_orientations
+from thor2_jax.descriptor.cloud_statistics import N_SCALARS, is_color, square_root
+from thor2_jax.descriptor.looks import LookDescriptors, describe_looks
 from thor2_jax.errors import InputError
-from thor2_jax.files import atomic_write, content_digest
-from thor2_jax.recognition.weights import model_arrays, model_from_arrays
+from thor2_jax.files import atomic_write, content_digest, safetensors_metadata
+from thor2_jax.gallery.references import REFERENCES_FILE, References
+from thor2_jax.model.weights import model_arrays, model_from_arrays
 from thor2_jax.types import Descriptors, PointClouds
 
 __all__ = [
@@ -143,7 +144,7 @@ class EmbeddingNetwork(nnx.Module):
             train: normalize by the statistics of the batch, and drop units.
             rngs: generators of the dropout.
         """
-        colors = jnp.swapaxes(jnp.sqrt(jnp.maximum(descriptors.embeddings, 0)), -1, -2)
+        colors = jnp.swapaxes(square_root(descriptors.embeddings), -1, -2)
         cells = [100 * descriptors.images, 0.5 * colors]
         padded = [jnp.pad(a, ((0, 0), (0, 0), (0, self.positions - a.shape[2]), (0, 0))) for a in cells]
         bias = jnp.asarray(self.cell.bias)
@@ -176,11 +177,11 @@ def class_cosines(learned: jax.Array, proxies: jax.Array) -> jax.Array:
 
 def color_features(embeddings: jax.Array) -> jax.Array:
     """Return the square roots of colour embeddings [B, S, R, J], flat and of unit length."""
-    return _unit(jnp.sqrt(jnp.maximum(embeddings, 0)).reshape(len(embeddings), -1))
+    return _unit(square_root(embeddings).reshape(len(embeddings), -1))
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _embed_oriented(graph: Any, state: Any, oriented: OrientedDescriptors) -> jax.Array:
+def _embed_oriented(graph: Any, state: Any, oriented: LookDescriptors) -> jax.Array:
     embeddings = nnx.merge(graph, state)(*oriented.flat)
     return embeddings.reshape(*oriented.weights.shape, -1)
 
@@ -190,11 +191,11 @@ def _embed_clouds(
     graph: Any, config: DescriptorConfig, network: colornet.ColorNetwork, state: Any, clouds: PointClouds
 ) -> jax.Array:
     model = nnx.merge(graph, state)
-    return map_chunks(lambda chunk: model(*describe_orientations(chunk, network, config, 1).flat), clouds)
+    return map_chunks(lambda chunk: model(*describe_looks(chunk, network, config, 1).flat), clouds)
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _classify(graphs: tuple[Any, ...], states: tuple[Any, ...], oriented: OrientedDescriptors) -> jax.Array:
+def _classify(graphs: tuple[Any, ...], states: tuple[Any, ...], oriented: LookDescriptors) -> jax.Array:
     models = [nnx.merge(graph, state) for graph, state in zip(graphs, states, strict=True)]
     # `fuse` normalizes: the mean logits give the geometric mean of the networks' probabilities.
     return oriented.fuse(jnp.stack([model.class_logits(*oriented.flat) for model in models]).mean(axis=0))
@@ -221,6 +222,8 @@ class Embedding:
         further: networks from `create_further`, fitted as `model` was from other random weights. `class_probabilities`
             averages all networks, which separates unknown objects more reliably (Lakshminarayanan et al., "Simple and
             Scalable Predictive Uncertainty Estimation using Deep Ensembles", NeurIPS 2017). Only `model` embeds.
+        references: embedded views of the classes and of the background, for galleries; None in embeddings of earlier
+            versions, whose galleries know less of what is unknown. Not a part of `fingerprint`.
     """
 
     config: DescriptorConfig
@@ -230,6 +233,7 @@ class Embedding:
     classes: tuple[str, ...] = ()
     distractors: int = 0
     further: tuple[EmbeddingNetwork, ...] = ()
+    references: References | None = None
 
     @classmethod
     def create(
@@ -265,10 +269,17 @@ class Embedding:
         return cls(config, network, sizes, model, classes, distractors)
 
     def create_further(self, seed: int = 0) -> EmbeddingNetwork:
-        """Return a network for `further` with random weights; without a colour block, since it does not embed."""
+        """Return a network for `further` with random weights; without a colour block, since it does not embed.
+
+        Its weights of the statistics of colours are zero, as they stay if it is fitted on statistics without them.
+        """
         sizes = dataclasses.replace(self.sizes, color=0)
-        n_proxies = len(self.classes) + self.distractors
-        return EmbeddingNetwork(self.config, self.network.n_regions, sizes, n_proxies, rngs=nnx.Rngs(seed))
+        n_regions, n_proxies = self.network.n_regions, len(self.classes) + self.distractors
+        model = EmbeddingNetwork(self.config, n_regions, sizes, n_proxies, rngs=nnx.Rngs(seed))
+        kernel = model.layers[0].kernel
+        is_used = np.concatenate([np.ones(kernel.shape[0] - N_SCALARS - n_regions, bool), ~is_color(n_regions)])
+        kernel[...] = jnp.where(is_used[:, None], kernel[...], 0)
+        return model
 
     def without_proxies(self) -> "Embedding":
         """Return the same embedding without classes and distractors."""
@@ -298,17 +309,17 @@ class Embedding:
         graph, state = self._embedder
         return _embed_clouds(graph, self.config, self.network, state, clouds)
 
-    def embed_oriented(self, oriented: OrientedDescriptors) -> jax.Array:
-        """Return the embeddings [B, K, D] of clouds that are described in K orientations, by this descriptor."""
+    def embed_oriented(self, oriented: LookDescriptors) -> jax.Array:
+        """Return the embeddings [B, K, D] of K looks at clouds, described by this descriptor."""
         return _embed_oriented(*self._embedder, oriented)
 
-    def class_probabilities(self, oriented: OrientedDescriptors) -> jax.Array:
+    def class_probabilities(self, oriented: LookDescriptors) -> jax.Array:
         """Return the probabilities [B, C] of the classes; what they lack to 1 is that of the distractors.
 
-        They are the geometric mean over the networks and over the orientations, by their weights.
+        They are the geometric mean over the networks and over the looks, by their weights.
 
         Args:
-            oriented: clouds in K orientations, described by this embedding's descriptor.
+            oriented: K looks at clouds, described by this embedding's descriptor.
         """
         return _classify(*self._classifiers, oriented)[:, : len(self.classes)]
 
@@ -338,11 +349,13 @@ class Embedding:
         return content_digest([self._content])
 
     def save(self, path: str | Path) -> None:
-        """Write the embedding to a file (safetensors, float16), atomically.
+        """Write the embedding to a file (safetensors, float16), and its references beside it, each atomically.
 
         Raises:
-            OSError: the file cannot be written.
+            OSError: a file cannot be written.
         """
+        if self.references is not None:
+            self.references.save(Path(path).with_name(REFERENCES_FILE), self.fingerprint)
         with atomic_write(path) as temporary:
             temporary.write_bytes(self._content)
 
@@ -360,19 +373,16 @@ class Embedding:
         """
         path, network = Path(path), network or colornet.load_default()
         try:
-            with safetensors.safe_open(path, "numpy") as stored:
-                about = json.loads(stored.metadata()[_METADATA])
-                arrays = {name: stored.get_tensor(name).astype(np.float32) for name in stored.keys()}
+            content = path.read_bytes()
+            about = json.loads(safetensors_metadata(content)[_METADATA])
+            arrays = {name: array.astype(np.float32) for name, array in safetensors.numpy.load(content).items()}
             count = int(about.get("further", 0))
             version = FORMAT_WITH_FURTHER if count else EMBEDDING_FORMAT
             current = (version, DESCRIPTOR_VERSION, network.fingerprint)
             for field, expected in zip(("format", "descriptor_version", "color_network"), current, strict=True):
                 if about[field] != expected:
                     raise InputError(f"{field} is {about[field]!r}; expected {expected!r}; fit the embedding again")
-            relaxation = about["descriptor_config"].pop("relaxation")
-            config = DescriptorConfig(
-                **about["descriptor_config"], relaxation=None if relaxation is None else Relaxation(**relaxation)
-            )
+            config = DescriptorConfig.of_record(about["descriptor_config"])
             sizes = EmbeddingSizes(**{**about["sizes"], "hidden": tuple(about["sizes"]["hidden"])})
             classes, distractors = tuple(map(str, about.get("classes", ()))), int(about.get("distractors", 0))
             model = model_from_arrays(lambda: cls.create(config, network, sizes, 0, classes, distractors).model, arrays)
@@ -385,7 +395,13 @@ class Embedding:
             raise InputError(f"embedding: {path}: {error}") from None
         except (OSError, safetensors.SafetensorError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise InputError(f"embedding: {path} is missing or damaged ({type(error).__name__}: {error})") from None
-        return dataclasses.replace(embedding, further=tuple(further))
+        file, references = path.with_name(REFERENCES_FILE), None
+        if file.is_file():
+            references = References.load(file, content_digest([content]), embedding.size)
+        embedding = dataclasses.replace(embedding, further=tuple(further), references=references)
+        # The file determines the fingerprint, also if another version of this software wrote it.
+        embedding.__dict__["_content"] = content
+        return embedding
 
 
 @functools.cache

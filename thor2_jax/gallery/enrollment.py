@@ -1,4 +1,4 @@
-"""Views of an object, embedded for a gallery, and queries embedded in several orientations."""
+"""Views of an object, embedded for a gallery, and queries, embedded in several looks."""
 
 import datetime
 from collections.abc import Iterable, Sequence
@@ -8,19 +8,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.capacity import point_bucket
-from thor2_jax.descriptor.orientations import describe_orientations
+from thor2_jax.descriptor.looks import describe_looks
 from thor2_jax.errors import InputError, with_context
+from thor2_jax.frames.frames import RGBDFrame
+from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances, prepare_instance
 from thor2_jax.gallery.augment import augmented_copies
 from thor2_jax.gallery.clouds import CompactClouds
 from thor2_jax.gallery.embedding import Embedding
 from thor2_jax.gallery.gallery import GalleryObject
-from thor2_jax.recognition.frames import RGBDFrame
-from thor2_jax.recognition.prepared_instance import PreparedInstance, pack_instances, prepare_instance
 from thor2_jax.types import PointClouds
 
 __all__ = [
-    "ORIENTATIONS",
-    "embed_orientations",
+    "LOOKS",
+    "embed_looks",
     "embed_views",
     "enrolled_object",
     "enrolled_views",
@@ -29,17 +29,16 @@ __all__ = [
     "views_to_embed",
 ]
 
-ORIENTATIONS = 2
-"""Candidate orientations of a view, each of which is embedded, and of a query, whose scores are averaged. Four are no
-more accurate on held-out frames."""
+LOOKS = 2
+"""Looks at a view, each of which is embedded, and at a query, whose scores are averaged."""
 
 ROWS = 4
 """Clouds embedded in one call, as recognition does."""
 
 
-def embed_orientations(embedding: Embedding, clouds: PointClouds, count: int = ORIENTATIONS) -> Any:
-    """Return the embeddings [B, count, D] of candidate orientations of clouds in metres."""
-    return embedding.embed_oriented(describe_orientations(clouds, embedding.network, embedding.config, count))
+def embed_looks(embedding: Embedding, clouds: PointClouds, count: int = LOOKS) -> Any:
+    """Return the embeddings [B, count, D] of looks at clouds in metres."""
+    return embedding.embed_oriented(describe_looks(clouds, embedding.network, embedding.config, count))
 
 
 def instance_view(frame: RGBDFrame, label: int | None, sigma_s: float) -> PreparedInstance:
@@ -92,7 +91,7 @@ def embed_views(embedding: Embedding, clouds: CompactClouds, source: str) -> NDA
     batches = []
     for start in range(0, len(views), ROWS):
         chunk = views[start : start + ROWS]
-        batches.append((len(chunk), embed_orientations(embedding, pack_instances(chunk, ROWS))))
+        batches.append((len(chunk), embed_looks(embedding, pack_instances(chunk, ROWS))))
     embedded = [np.asarray(batch)[:count] for count, batch in batches]
     return np.concatenate(embedded).reshape(-1, embedded[0].shape[-1]).astype(np.float16)
 

@@ -4,22 +4,27 @@
 >>> gallery.scores(embeddings).argmax(axis=-1)                                      # doctest: +SKIP
 
 A score is a kernel ridge regression on the views that are nearest to the query (`NEAREST`), with one indicator as the
-target of each object: about 1 amid the views of the object, about 0 far from them or amid the views of others. Its cost
-does not grow with the gallery, and nothing is fitted when an object is enrolled or forgotten.
+target of each name: about 1 amid the views of the object, about 0 far from them or amid the views of others. The views
+are those of the enrolled objects and the references of the embedding: views of the trained classes, and of a background
+of objects that are none of the names. The cost does not grow with the gallery, and nothing is fitted when an object is
+enrolled or forgotten.
 """
 
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from thor2_jax.errors import InputError
 from thor2_jax.gallery.clouds import CompactClouds
+from thor2_jax.gallery.references import References
 from thor2_jax.gallery.search import ExactSearch, IndexSearch, ViewSearch, one_blas_thread
+from thor2_jax.printable import check_name, find_name
 
-__all__ = ["Gallery", "GalleryObject"]
+__all__ = ["Gallery", "GalleryObject", "score_odds"]
 
 NEAREST = 128
 """Views of the gallery in the regression of a query; all views give the same accuracy on held-out frames."""
@@ -30,9 +35,13 @@ GAMMA = 4.0
 RIDGE = 0.3
 """Regularization; chosen on held-out frames."""
 
-KEPT = {1: 0.25, 3: 0.29, 5: 0.31, 10: 0.35, 120: 0.43}
+KEPT = {1: 0.05, 3: 0.11, 5: 0.115, 10: 0.12, 120: 0.3}
+KEPT_WITHOUT_REFERENCES = {1: 0.25, 3: 0.29, 5: 0.31, 10: 0.35, 120: 0.43}
 """Views of an object -> score that 95 % of the correct answers reach: up to ten views from held-out frames, 120 views
 from meshes."""
+
+EVEN, STEEPNESS = 0.2, 3
+"""A score s has the odds (s / EVEN) ** STEEPNESS against everything that is not enrolled; chosen on held-out frames."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -40,7 +49,7 @@ class GalleryObject:
     """The views of an enrolled object.
 
     Attributes:
-        embeddings: [E, D] float16 of unit length: each view in several orientations, and its augmented copies.
+        embeddings: [E, D] float16 of unit length: several looks at each view, and its augmented copies.
         clouds: the views as they were enrolled.
         source: where the views come from: "mesh", "frames" or "mesh and frames".
         date: date of the last enrolment, ISO 8601.
@@ -68,6 +77,7 @@ class Gallery:
         embedding: fingerprint of the embedding that the views are embedded by.
         objects: name -> its views, in the order of enrolment.
         hidden: trained classes that were forgotten or replaced; no classifier answers by them.
+        references: reference views of the embedding; None if it has none.
         search: kind of search, "exact" or "usearch". An index answers queries among millions of views in milliseconds,
             but is built again, in minutes, after every change.
     """
@@ -76,6 +86,7 @@ class Gallery:
     objects: Mapping[str, GalleryObject] = dataclasses.field(default_factory=dict)
     hidden: tuple[str, ...] = ()
     search: str = "exact"
+    references: References | None = None
 
     def __post_init__(self) -> None:
         if self.search not in ("exact", "usearch"):
@@ -96,9 +107,9 @@ class Gallery:
             replace: discard the views of an object that exists.
 
         Raises:
-            InputError: the name is empty, or exists and neither `extend` nor `replace` is given, or both are.
+            InputError: see `check_name`; or the name exists and neither `extend` nor `replace` is given, or both are.
         """
-        check_name(name)
+        name = find_name(name, self.objects) or check_name(name)
         if extend and replace:
             raise InputError("extend and replace are both given; choose one")
         if name in self.objects and not (extend or replace):
@@ -134,24 +145,47 @@ class Gallery:
 
     @functools.cached_property
     def _embeddings(self) -> NDArray[np.float16]:
-        return np.concatenate([views.embeddings for views in self.objects.values()])
+        enrolled = [views.embeddings for views in self.objects.values()]
+        return np.concatenate(enrolled if self.references is None else [*enrolled, self.references.embeddings])
 
     @functools.cached_property
-    def _counts(self) -> NDArray[np.intp]:
-        return np.array([len(views.embeddings) for views in self.objects.values()])
+    def _counts(self) -> NDArray[np.float64]:
+        """[n_objects] views of each object, then their mean for each trained class and for the background."""
+        counts = np.array([len(views.embeddings) for views in self.objects.values()], np.float64)
+        further = 0 if self.references is None else len(self.references.classes) + 1
+        return np.append(counts, np.full(further, counts.mean()))
+
+    @functools.cached_property
+    def _ridge(self) -> NDArray[np.float64]:
+        """[N] regularization of each view: objects of many views shall not outweigh those of few."""
+        counts = self._counts[self._object_of_view]
+        return RIDGE * counts / counts.mean()
 
     @functools.cached_property
     def _object_of_view(self) -> NDArray[np.intp]:
-        return np.repeat(np.arange(len(self._counts)), self._counts)
+        """[N] index of each view's object; those of trained classes, and of the background, follow."""
+        objects = np.repeat(np.arange(len(self.objects)), [len(views.embeddings) for views in self.objects.values()])
+        if self.references is None:
+            return objects
+        # Views of a class belong to the enrolled object of its name; those of a forgotten class to the background.
+        background, number = len(self._counts) - 1, {name: k for k, name in enumerate(self.names)}
+        owner = [
+            background if name in self.hidden else number.get(name, len(self.objects) + k)
+            for k, name in enumerate(self.references.classes)
+        ]
+        of_label = np.array([*owner, background], np.intp)  # the label BACKGROUND is -1
+        return np.concatenate([objects, of_label[self.references.label]])
 
     @functools.cached_property
     def unknown_below(self) -> NDArray[np.float64]:
-        """[n_objects] least score of an answer with the name of each object, by default.
+        """[n_objects] least confidence of an answer with the name of each object, by default.
 
-        It grows with the logarithm of the object's views between the numbers of `KEPT`.
+        Its score grows with the logarithm of the object's views between the numbers of `KEPT`.
         """
         views = [len(views.clouds) for views in self.objects.values()]
-        return np.interp(np.log(views), np.log(list(KEPT)), list(KEPT.values())).round(3)
+        kept = KEPT_WITHOUT_REFERENCES if self.references is None else KEPT
+        odds = score_odds(np.interp(np.log(views), np.log(list(kept)), list(kept.values())))
+        return (odds / (1 + odds)).round(3)
 
     @functools.cached_property
     def _search(self) -> ViewSearch:
@@ -160,9 +194,11 @@ class Gallery:
     def scores(self, embeddings: ArrayLike, weights: ArrayLike | None = None) -> NDArray[np.float32]:
         """Return the scores [B, n_objects] of each object, from 0 to 1, in the order of `names`.
 
+        A score is the value of the regression, times its share in the sum with the value of the best trained class.
+
         Args:
-            embeddings: [B, D] of unit length, or [B, K, D] for K candidate orientations, whose scores are averaged.
-            weights: [B, K] weights of the orientations, which sum to 1; equal by default.
+            embeddings: [B, D] of unit length, or [B, K, D] for K looks, whose scores are averaged.
+            weights: [B, K] weights of the looks, which sum to 1; equal by default.
         """
         queries = np.asarray(embeddings, np.float32)
         if not self.objects or not len(queries):
@@ -174,26 +210,21 @@ class Gallery:
             return np.einsum("bkn,bk->bn", each, np.asarray(weights, np.float32))
         similarity, index = self._search.nearest(queries, NEAREST)
         views, owners = self._embeddings[index].astype(np.float32), self._object_of_view[index]
-        # Objects of many views are regularized more, so that they do not outweigh those of few.
-        ridge = RIDGE * self._counts[owners] / self._counts[self._object_of_view].mean()
         with one_blas_thread():
             kernel = np.exp(GAMMA * (views @ views.transpose(0, 2, 1) - 1)).astype(np.float64)
-            kernel[:, np.arange(kernel.shape[1]), np.arange(kernel.shape[1])] += ridge
+            kernel[:, np.arange(kernel.shape[1]), np.arange(kernel.shape[1])] += self._ridge[index]
             duals = np.linalg.solve(kernel, np.exp(GAMMA * (similarity.astype(np.float64) - 1))[..., None])[..., 0]
-        scores = np.zeros((len(queries), len(self.objects)))
-        np.add.at(scores, (np.arange(len(queries))[:, None], owners), duals)
-        return scores.clip(0, 1).astype(np.float32)
+        values = np.zeros((len(queries), len(self._counts)))
+        np.add.at(values, (np.arange(len(queries))[:, None], owners), duals)
+        scores, trained = values[:, : len(self.objects)].clip(0, 1), values[:, len(self.objects) : -1]
+        if self.references is not None and trained.shape[1]:
+            scores *= scores / np.maximum(scores + trained.max(axis=1, keepdims=True).clip(0), 1e-12)
+        return scores.astype(np.float32)
 
 
-def check_name(name: object) -> str:
-    """Return an object's name.
-
-    Raises:
-        InputError: it is no text, empty, longer than 200 characters or has control characters.
-    """
-    if not isinstance(name, str) or not name.strip() or len(name) > 200 or not name.isprintable():
-        raise InputError(f"name is {name!r}; expected a printable text of 1 to 200 characters")
-    return name
+def score_odds(scores: NDArray[Any]) -> NDArray[Any]:
+    """Return the odds of scores against everything that is not enrolled."""
+    return np.asarray((scores / EVEN) ** STEEPNESS)
 
 
 def shown_names(names: tuple[str, ...], count: int = 5) -> str:

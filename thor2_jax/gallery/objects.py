@@ -5,22 +5,22 @@ import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-import jax
 import numpy as np
 
-from thor2_jax.config import DescriptorConfig
-from thor2_jax.descriptor.orientations import OrientedDescriptors, describe_orientations
 from thor2_jax.errors import InputError
+from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery.clouds import CompactClouds
 from thor2_jax.gallery.embedding import Embedding, load_default
-from thor2_jax.gallery.enrollment import ORIENTATIONS, embed_views, enrolled_views
+from thor2_jax.gallery.enrollment import embed_views, enrolled_views
 from thor2_jax.gallery.gallery import Gallery, GalleryObject
-from thor2_jax.gallery.store import StoredGallery, gallery_stamp, load_gallery, undo_change, update_gallery
+from thor2_jax.gallery.store import StoredGallery, check_index, gallery_stamp, load_gallery, undo_change, update_gallery
 from thor2_jax.gallery.union import ClassUnion
-from thor2_jax.recognition.prepared_instance import PreparedInstance
-from thor2_jax.types import PointClouds
+from thor2_jax.printable import check_name, find_name
 
 __all__ = ["ObjectGallery"]
+
+FEW = 10
+"""With fewer views of an object, or without a background and with fewer objects, most unknown objects are named."""
 
 
 class ObjectGallery:
@@ -51,23 +51,24 @@ class ObjectGallery:
         self._directory: Path | None = None
         self._stored = StoredGallery(Gallery("", search=search), {}, 0)
         self.lock_seconds: float | None = None
-        self._union = self._stored.gallery, ClassUnion(trained)
 
     def open(self, directory: Path, *, reembed: bool = False) -> None:
         """Read the gallery in a directory, which may not exist yet, and write all later changes to it.
 
         Args:
             directory: directory of the gallery.
-            reembed: embed all views again, with the embedding of this run, whatever they were embedded by.
+            reembed: embed all views again, with the embedding of this run, whatever they were embedded by; and rebuild
+                an index that was lost.
 
         Raises:
             InputError: see `refresh`.
             OSError: the gallery cannot be written; it is as before.
         """
         self._directory, self._stored = directory, dataclasses.replace(self._stored, stamp=None)
-        if reembed and gallery_stamp(directory) is not None:
-            self._change(self._reembedded)
+        if reembed and directory.exists():
+            self._change(self._reembedded, rebuild=True)
         else:
+            check_index(directory)
             self.refresh()
 
     @property
@@ -95,28 +96,18 @@ class ObjectGallery:
     @property
     def union(self) -> ClassUnion:
         """The trained classes and the objects of the gallery."""
-        gallery, union = self._union
-        if gallery is not self.gallery:
-            gallery = self.gallery
-            union = ClassUnion(self._trained, gallery.names, gallery.hidden)
-            self._union = gallery, union
-        return union
+        return ClassUnion(self._trained, self.gallery.names, self.gallery.hidden)
 
-    def embed(
-        self, clouds: PointClouds, oriented: OrientedDescriptors, config: DescriptorConfig
-    ) -> tuple[jax.Array, jax.Array]:
-        """Return the embeddings [B, K, D] of clouds in K orientations and their weights [B, K], for `Gallery.scores`.
-
-        Args:
-            clouds: [B, N] in metres.
-            oriented: their descriptors, which are reused if the embedding reads the same ones.
-            config: descriptor of `oriented`.
-        """
-        ours, count = self.embedding.config, max(config.orientations, ORIENTATIONS)
-        is_ours = dataclasses.replace(config, homology=ours.homology, orientations=ours.orientations) == ours
-        if not is_ours or oriented.weights.shape[1] != count:
-            oriented = describe_orientations(clouds, self.embedding.network, ours, count)
-        return self.embedding.embed_oriented(oriented), oriented.weights
+    @property
+    def weak_rejection(self) -> str:
+        """Why unknown objects are hardly rejected, and what helps, in words; empty if they are not."""
+        objects, references = self.gallery.objects.values(), self.gallery.references
+        few = sum(len(views.clouds) < FEW for views in objects)
+        if few:
+            return f"{few} of {len(objects)} enrolled objects have fewer than {FEW} views; add some from other sides"
+        if objects and references is None and not self._trained and len(objects) < FEW:
+            return f"{len(objects)} objects are enrolled in a run without background views; enroll more of them"
+        return ""
 
     def refresh(self) -> bool:
         """Read the gallery again if it has changed on disk, and return whether it has.
@@ -129,14 +120,21 @@ class ObjectGallery:
         self._set(load_gallery(self._directory, self.embedding.fingerprint, self._stored))
         return True
 
-    def _change(self, change: Callable[[Gallery], Gallery], embedding: str | None = None) -> None:
+    def _change(
+        self, change: Callable[[Gallery], Gallery], embedding: str | None = None, rebuild: bool = False
+    ) -> None:
         if self._directory is None:
-            self._stored = dataclasses.replace(self._stored, gallery=change(self.gallery))
+            self._stored = dataclasses.replace(self._stored, gallery=self._completed(change(self.gallery)))
         else:
-            self._set(update_gallery(self._directory, change, embedding, self._stored, self.lock_seconds))
+            self._set(update_gallery(self._directory, change, embedding, self._stored, self.lock_seconds, rebuild))
 
     def _set(self, stored: StoredGallery) -> None:
-        self._stored = dataclasses.replace(stored, gallery=dataclasses.replace(stored.gallery, search=self._search))
+        self._stored = dataclasses.replace(stored, gallery=self._completed(stored.gallery))
+
+    def _completed(self, gallery: Gallery) -> Gallery:
+        """Return a gallery with the kind of search and, once it has objects, with the references of the embedding."""
+        references = self.embedding.references if gallery.objects else None
+        return dataclasses.replace(gallery, search=self._search, references=references)
 
     def check_writable(self) -> None:
         """Raise InputError unless changes can be written to the directory, which is created if it is missing."""
@@ -151,15 +149,25 @@ class ObjectGallery:
                 f"gallery: {self._directory} cannot be written ({error.strerror}); choose another directory (--gallery)"
             ) from None
 
-    def check(self, name: str, *, extend: bool = False, replace: bool = False) -> None:
-        """Raise InputError if `enroll` would refuse the name; a check before views are rendered or embedded."""
+    def check(self, name: str, *, extend: bool = False, replace: bool = False) -> str:
+        """Return the name under which `enroll` would enroll an object, before its views are rendered or embedded.
+
+        Raises:
+            InputError: `enroll` would refuse it.
+        """
+        name = self._found(self.gallery, name) or check_name(name)
         none = GalleryObject(np.zeros((0, self.embedding.size), np.float16), CompactClouds.of([]), "", "")
         self._with_objects(self.gallery, {name: none}, extend, replace)
+        return name
+
+    def _found(self, gallery: Gallery, name: str) -> str | None:
+        return find_name(name, (*gallery.objects, *self._trained))
 
     def _with_objects(
         self, gallery: Gallery, objects: Mapping[str, GalleryObject], extend: bool, replace: bool
     ) -> Gallery:
-        for name, views in objects.items():
+        for given, views in objects.items():
+            name = self._found(gallery, given) or check_name(given)
             gallery = gallery.with_object(name, views, extend=extend, replace=replace)
             if name in self._trained and name not in gallery.hidden:
                 if replace:
@@ -193,7 +201,7 @@ class ObjectGallery:
                 is enrolled.
             OSError: the gallery cannot be written; it is as before.
         """
-        self.check(name, extend=extend, replace=replace)
+        name = self.check(name, extend=extend, replace=replace)
         self.add({name: enrolled_views(self.embedding, views, source)}, extend=extend, replace=replace)
 
     def add(self, objects: Mapping[str, GalleryObject], *, extend: bool = False, replace: bool = False) -> None:
@@ -215,7 +223,8 @@ class ObjectGallery:
         """
 
         def change(gallery: Gallery) -> Gallery:
-            return gallery.without(name, hide=name in self._trained and name not in gallery.hidden)
+            known = self._found(gallery, name) or name
+            return gallery.without(known, hide=known in self._trained and known not in gallery.hidden)
 
         self._change(change, self.embedding.fingerprint)
 

@@ -116,7 +116,7 @@ class IndexSearch:
             raise InputError(
                 "index is usearch, which is not installed; run pip install -c constraints.txt '.[index]'"
             ) from None
-        self._size = len(embeddings)
+        self._embeddings = embeddings
         self._index = usearch.Index(
             ndim=embeddings.shape[1],
             metric="ip",
@@ -128,6 +128,14 @@ class IndexSearch:
 
     def nearest(self, queries: NDArray[np.float32], count: int) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
         """See `ViewSearch.nearest`; some of the nearest views may be missed, and others returned in their place."""
-        matches = self._index.search(queries.astype(np.float16), min(count, self._size))
-        distances, keys = np.atleast_2d(matches.distances), np.atleast_2d(matches.keys)
-        return (1 - distances).astype(np.float32), keys.astype(np.intp)
+        count = min(count, len(self._embeddings))
+        matches = self._index.search(queries.astype(np.float16), count)
+        rows = [matches] if len(queries) == 1 else list(matches)
+        similarity, index = np.zeros((len(rows), count), np.float32), np.zeros((len(rows), count), np.intp)
+        # Where several threads have built the index, it may not reach all views, and return fewer than asked for.
+        short = np.array([len(row) < count for row in rows])
+        for k in np.flatnonzero(~short):
+            similarity[k], index[k] = 1 - rows[k].distances, rows[k].keys
+        if short.any():
+            similarity[short], index[short] = ExactSearch(self._embeddings).nearest(queries[short], count)
+        return similarity, index

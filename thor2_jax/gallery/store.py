@@ -3,17 +3,19 @@
 GALLERY/index.json                      format, generation, fingerprint of the embedding, hidden classes, and for each
                                         object its name, file, number of views, source and date
 GALLERY/previous.json                   index.json before the last change, so that it can be taken back
-GALLERY/objects/<SHA-256>.safetensors   embeddings and compact clouds of one object
+GALLERY/objects/<SHA-256>.safetensors   embeddings and compact clouds of one object, with its name, source and date
 
 A writer holds the lock, writes the files of new objects and then replaces index.json: the gallery on disk is always the
-one before or the one after a change. Files that index.json does not name are removed by the next writer.
+one before or the one after a change. Files of objects that index.json does not name are removed by the next writer;
+all other files stay. If index.json is lost, `thor2 objects --reembed` writes it again from the files of the objects.
 """
 
 import contextlib
 import dataclasses
 import json
 import os
-from collections.abc import Callable, Iterator
+import re
+from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +26,9 @@ import safetensors.numpy
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
-from thor2_jax.files import atomic_write, content_digest, write_text
+from thor2_jax.files import atomic_write, content_digest, remove_leftovers, safetensors_metadata, write_text
 from thor2_jax.gallery.clouds import CompactClouds
-from thor2_jax.gallery.gallery import Gallery, GalleryObject, check_name
+from thor2_jax.gallery.gallery import Gallery, GalleryObject
 
 __all__ = [
     "GALLERY_DIRECTORY",
@@ -35,6 +37,7 @@ __all__ = [
     "GalleryBusyError",
     "GalleryError",
     "StoredGallery",
+    "check_index",
     "gallery_stamp",
     "load_gallery",
     "undo_change",
@@ -49,7 +52,12 @@ GALLERY_DIRECTORY = "gallery"
 
 INDEX_FILE = "index.json"
 
+_DIGEST = re.compile("[0-9a-f]{64}")
+
 PREVIOUS_FILE = "previous.json"
+
+_METADATA = "object"
+# safetensors writes several metadata keys in a random order, and equal objects shall have equal bytes.
 
 LOCK_SECONDS = 20.0
 """Time that a writer waits for another one; a change takes milliseconds."""
@@ -89,6 +97,15 @@ def gallery_stamp(directory: Path) -> tuple[int, int, int] | None:
     return status.st_mtime_ns, status.st_ino, status.st_size
 
 
+def check_index(directory: Path) -> None:
+    """Raise GalleryError if a directory has objects, but no index; the message says how to rebuild it."""
+    if gallery_stamp(directory) is None and any(_own_objects(directory)):
+        raise GalleryError(
+            f"gallery: {directory} has objects, but no {INDEX_FILE}; restore it from a copy, or rebuild it: "
+            f"thor2 objects --reembed --model RUN --gallery {directory}"
+        )
+
+
 def load_gallery(directory: Path, embedding: str | None = None, known: StoredGallery | None = None) -> StoredGallery:
     """Read a gallery; one that does not exist is empty.
 
@@ -104,6 +121,7 @@ def load_gallery(directory: Path, embedding: str | None = None, known: StoredGal
         stamp = gallery_stamp(directory)  # of this index or of an earlier one
         index = _read_index(directory / INDEX_FILE)
         if index is None:
+            check_index(directory)
             return StoredGallery(Gallery(embedding or ""), {}, 0)
         if embedding is not None and index["embedding"] != embedding:
             raise GalleryError(
@@ -127,12 +145,13 @@ def _read_index(path: Path) -> dict[str, Any] | None:
         fields = {"format": int, "generation": int, "embedding": str, "objects": list, "hidden": list}
         if not all(isinstance(index[field], kind) for field, kind in fields.items()):
             raise TypeError("a field has another type")
-        names = [check_name(entry["name"]) for entry in index["objects"]] + [str(name) for name in index["hidden"]]
-        files = [entry["file"] for entry in index["objects"]]
-        if len(set(names[: len(files)])) < len(files) or not all(
-            isinstance(file, str) and len(file) == 64 and file.isalnum() for file in files
-        ):
-            raise ValueError("an object is listed twice, or has no file")
+        json.dumps(index, ensure_ascii=False).encode()  # refuses text that could not be written again
+        names, files = ([entry[field] for entry in index["objects"]] for field in ("name", "file"))
+        # Names of older versions need not pass `check_name`.
+        if len(set(names)) < len(names) or not all(isinstance(name, str) and name.isprintable() for name in names):
+            raise ValueError("a name is missing or listed twice")
+        if not all(isinstance(file, str) and _DIGEST.fullmatch(file) for file in files):
+            raise ValueError("an object has no file")
     except FileNotFoundError:
         return None
     except OSError as error:
@@ -140,7 +159,8 @@ def _read_index(path: Path) -> dict[str, Any] | None:
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         reason = " ".join(str(error).split())
         raise GalleryError(
-            f"gallery: {path} is damaged ({reason}); restore it from a copy, or delete the gallery"
+            f"gallery: {path} is damaged ({reason}); restore it from a copy, or delete this file and rebuild it: "
+            f"thor2 objects --reembed --model RUN --gallery {path.parent}"
         ) from None
     if index["format"] != GALLERY_FORMAT:
         raise GalleryError(f"gallery: {path} has format {index['format']}; expected {GALLERY_FORMAT}")
@@ -151,8 +171,8 @@ def _load_objects(directory: Path, index: dict[str, Any], known: StoredGallery |
     loaded = {} if known is None else {file: known.gallery.objects[name] for name, file in known.files.items()}
     objects: dict[str, GalleryObject] = {}
     for entry in index["objects"]:
-        views = loaded.get(entry["file"]) or _read_object(_object_file(directory, entry["file"]))
-        objects[entry["name"]] = dataclasses.replace(views, source=str(entry["source"]), date=str(entry["date"]))
+        views = loaded.get(entry["file"]) or _read_object(_object_file(directory, entry["file"]))[1]
+        objects[entry["name"]] = _with_origin(views, entry)
     sizes = {views.embeddings.shape[1] for views in objects.values()}
     if len(sizes) > 1:
         raise GalleryError(f"gallery: {directory} has embeddings of {sorted(sizes)} numbers; expected one size")
@@ -164,14 +184,20 @@ def _object_file(directory: Path, digest: str) -> Path:
     return directory / "objects" / f"{digest}.safetensors"
 
 
-def _object_content(views: GalleryObject) -> bytes:
+def _with_origin(views: GalleryObject, entry: Mapping[str, Any]) -> GalleryObject:
+    return dataclasses.replace(views, source=str(entry.get("source", "")), date=str(entry.get("date", "")))
+
+
+def _object_content(name: str, views: GalleryObject) -> bytes:
     arrays: dict[str, NDArray[Any]] = {"embeddings": np.ascontiguousarray(views.embeddings, np.float16)}
     for field in dataclasses.fields(CompactClouds):
         arrays[field.name] = np.ascontiguousarray(getattr(views.clouds, field.name))
-    return safetensors.numpy.save(arrays)
+    about = {"name": name, "source": views.source, "date": views.date}
+    return safetensors.numpy.save(arrays, {_METADATA: json.dumps(about)})
 
 
-def _read_object(path: Path) -> GalleryObject:
+def _read_object(path: Path) -> tuple[str | None, GalleryObject]:
+    """Return the name of an object, which files of version 0.2 and before do not have, and the object."""
     try:
         content = path.read_bytes()
     except FileNotFoundError:
@@ -183,8 +209,9 @@ def _read_object(path: Path) -> GalleryObject:
     try:
         arrays = safetensors.numpy.load(content)
         embeddings = arrays.pop("embeddings")
-        return GalleryObject(embeddings, CompactClouds(**arrays), "", "")
-    except (safetensors.SafetensorError, KeyError, TypeError, ValueError) as error:
+        about = json.loads(safetensors_metadata(content).get(_METADATA, "{}"))
+        return about.get("name"), _with_origin(GalleryObject(embeddings, CompactClouds(**arrays), "", ""), about)
+    except (safetensors.SafetensorError, KeyError, TypeError, ValueError, AttributeError) as error:
         raise GalleryError(f"gallery: {path} is no object of a gallery ({error})") from None
 
 
@@ -211,6 +238,7 @@ def update_gallery(
     embedding: str | None = None,
     known: StoredGallery | None = None,
     lock_seconds: float | None = None,
+    rebuild: bool = False,
 ) -> StoredGallery:
     """Change a gallery on disk; another writer's change is never lost.
 
@@ -220,6 +248,7 @@ def update_gallery(
         embedding: fingerprint that the gallery must have; None accepts any.
         known: an earlier state, whose objects are not read again.
         lock_seconds: time to wait for another writer; by default `LOCK_SECONDS`.
+        rebuild: if the index is missing, begin with the objects whose files are there; `change` embeds them again.
 
     Returns:
         The gallery after the change.
@@ -230,18 +259,23 @@ def update_gallery(
         OSError: a file cannot be written; the gallery is as before.
     """
     with _locked(directory, LOCK_SECONDS if lock_seconds is None else lock_seconds):
-        stored = load_gallery(directory, embedding, known)
+        is_lost = rebuild and gallery_stamp(directory) is None
+        stored = _rebuilt(directory) if is_lost else load_gallery(directory, embedding, known)
         gallery = change(stored.gallery)
         (directory / "objects").mkdir(exist_ok=True)
         _remove_orphans(directory, set(stored.files.values()))
         files: dict[str, str] = {}
         written: list[Path] = []
         try:
+            if stored.stamp is None and not stored.files:
+                # A writer that is killed leaves an empty gallery, and no objects without an index.
+                written.append(directory / INDEX_FILE)
+                write_text(written[0], _index_content(StoredGallery(Gallery(gallery.embedding), {}, 0)))
             for name, views in gallery.objects.items():
                 if name in stored.files and _same_arrays(views, stored.gallery.objects[name]):
                     files[name] = stored.files[name]
                     continue
-                content = _object_content(views)
+                content = _object_content(name, views)
                 files[name] = content_digest([content])
                 path = _object_file(directory, files[name])
                 if not path.exists():
@@ -250,10 +284,12 @@ def update_gallery(
             changed = StoredGallery(gallery, files, stored.generation + 1)
             write_text(directory / INDEX_FILE, _index_content(changed))
         except BaseException:
-            for path in written:
+            for path in reversed(written):
                 path.unlink(missing_ok=True)
             raise
-        with contextlib.suppress(OSError):  # The change is made; it only cannot be taken back.
+        # The change is made; it only cannot be taken back if that fails, or a foreign file has this name.
+        with contextlib.suppress(OSError, GalleryError):
+            _read_index(directory / PREVIOUS_FILE)
             write_text(directory / PREVIOUS_FILE, _index_content(stored))
         return dataclasses.replace(changed, stamp=gallery_stamp(directory))
 
@@ -331,11 +367,41 @@ def _index_content(stored: StoredGallery) -> str:
     return json.dumps(index, indent=1, ensure_ascii=False) + "\n"
 
 
+def _own_objects(
+    directory: Path, used: Collection[str] = ()
+) -> Iterator[tuple[Path, tuple[str | None, GalleryObject]]]:
+    """Yield the files of objects that are not used, those with the name and the content of one, and `_read_object`."""
+    for path in sorted((directory / "objects").glob("*.safetensors")):
+        with contextlib.suppress(GalleryError, _Replaced):
+            if _DIGEST.fullmatch(path.stem) and path.stem not in used:
+                yield path, _read_object(path)
+
+
 def _remove_orphans(directory: Path, used: set[str]) -> None:
     """Remove what an interrupted writer left, and the files of objects that an earlier change removed."""
-    for path in (directory / "objects").iterdir():
-        if path.name.removesuffix(".safetensors") not in used:
+    for folder in (directory, directory / "objects"):
+        remove_leftovers(folder)
+    if (directory / "objects").is_symlink():  # Another gallery may share the files behind it.
+        return
+    for path, _ in _own_objects(directory, used):
+        if not path.is_symlink():
             path.unlink(missing_ok=True)
-    for name in (INDEX_FILE, PREVIOUS_FILE):
-        for path in directory.glob(f".{Path(name).stem}.*"):
-            path.unlink(missing_ok=True)
+
+
+def _rebuilt(directory: Path) -> StoredGallery:
+    """Return the gallery of the objects whose files are there, if the index is lost; its embedding is unknown."""
+    previous: dict[str, Any] = {"objects": [], "hidden": [], "generation": -1}
+    with contextlib.suppress(GalleryError):
+        previous = _read_index(directory / PREVIOUS_FILE) or previous
+    listed = {entry["file"]: entry for entry in previous["objects"]}
+    objects = []
+    for path, (name, views) in _own_objects(directory):
+        entry = listed.get(path.stem)
+        if name is None and entry is not None:
+            name, views = entry["name"], _with_origin(views, entry)
+        # Of two files with one name, the one that is not in the index before the last change is newer.
+        objects.append((entry is None, views.date, name or f"object-{path.stem[:8]}", path.stem, views))
+    objects.sort(key=lambda each: each[:4])
+    gallery = Gallery("", {name: views for *_, name, _, views in objects}, tuple(map(str, previous["hidden"])))
+    files = {name: file for *_, name, file, _ in objects}
+    return StoredGallery(gallery, files, previous["generation"] + 1)

@@ -7,7 +7,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["ClassUnion"]
+from thor2_jax.gallery.gallery import score_odds
+
+__all__ = ["TOYS", "ClassUnion"]
+
+TOYS = frozenset(
+    ("apple banana cereal_box_blue cereal_box_yellow hammer mug_blue mug_white screwdriver soup_can_green soup_can_red "
+     "sponge tennis_ball white_bowl white_cup white_plate wooden_spoon yellow_bottle yellow_box").split()
+)  # fmt: skip
+"""The built-in objects, the classes of the demo's model."""
+
+MAX_LISTED = 6
+"""Names that `ClassUnion.summary` lists."""
 
 Values = NDArray[np.floating[Any]]
 
@@ -45,6 +56,18 @@ class ClassUnion:
         enrolled = set(self.enrolled)
         return np.array([name in enrolled for name in self.names], bool)
 
+    @functools.cached_property
+    def summary(self) -> str:
+        """The names in words, such as "21 objects: mug, bowl, ..."."""
+        toys = [name for name in self.names if name in TOYS] if set(self.trained) == TOYS else []
+        own = [name for name in self.names if name not in toys]
+        listed = ", ".join(own[:MAX_LISTED]) + (", ..." if len(own) > MAX_LISTED else "")
+        if toys:
+            return f"{len(toys)} toy objects of the demo" + (
+                f", and {listed}" if own else "; it knows nothing of yours"
+            )
+        return f"{len(own)} {'objects' if len(own) != 1 else 'object'}: {listed}" if own else "no object yet"
+
     def of_classifiers(self, probabilities: Values) -> Values:
         """Return class probabilities [B, C] in the order of `names` [B, n]; 0 for names without an output."""
         return self._spread(probabilities, self.trained, self.has_output)
@@ -62,25 +85,22 @@ class ClassUnion:
         result[:, known] = values[:, columns]
         return result
 
-    def combine(self, probabilities: Values, scores: Values) -> Values:
-        """Combine the fused probabilities of the classifiers with the scores of the gallery.
+    def combine(self, probabilities: Values | None, scores: Values) -> Values:
+        """Combine the confidences of the classifiers with the scores of the gallery.
 
-        An object without an output takes its score. What the largest such score leaves is for the classes with an
-        output: their probabilities are multiplied by one minus that score. A class with both takes the geometric mean.
+        What the classifiers leave to 1, the probability that their answer is not right, is divided among the enrolled
+        objects, by the odds of their scores, and unknown objects, with odds of 1. All values are then divided by one
+        sum. So an object takes probability only where its score is high, and little from a confident answer.
 
         Args:
-            probabilities: [B, C], fused.
+            probabilities: [B, C], fused; None if the gallery alone answers.
             scores: [B, n_objects].
 
         Returns:
             [B, n] from 0 to 1, in the order of `names`; they need not sum to 1.
         """
-        of_classifiers, of_gallery = self.of_classifiers(probabilities), self.of_gallery(scores)
-        new = of_gallery[:, ~self.has_output]
-        rest = 1 - new.max(axis=1, keepdims=True) if new.shape[1] else 1
-        trained = of_classifiers * rest
-        return np.where(
-            self.has_output,
-            np.where(self.has_views, np.sqrt(trained * of_gallery), trained),
-            of_gallery,
-        )
+        nothing: Values = np.zeros((len(scores), len(self.names)))
+        trained = nothing if probabilities is None else self.of_classifiers(probabilities)
+        rest = (1 - trained.max(axis=1, keepdims=True, initial=0)).clip(0)
+        enrolled = rest * score_odds(self.of_gallery(scores))
+        return (trained + enrolled) / (1 + enrolled.sum(axis=1, keepdims=True))

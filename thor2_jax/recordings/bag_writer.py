@@ -1,31 +1,33 @@
-"""Bags with the detections of a recording, for ROS 2, RViz and Foxglove (extra `bags`).
+"""Bags that are written: detections of a recording, for ROS 2, RViz and Foxglove (extra `bags`).
 
 with DetectionBag(Path("answers.mcap")) as bag:
     bag.write(frame, detections, stamp=stamp, frame_id="camera_color_optical_frame")
 """
 
+import contextlib
 import io
 import os
-import shutil
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
 from thor2_jax.errors import InputError
-from thor2_jax.files import errors_name
-from thor2_jax.recognition.frames import RGBDFrame
-from thor2_jax.recognition.overlay import annotate
+from thor2_jax.files import errors_name, temporary_directory
+from thor2_jax.frames.frames import RGBDFrame
+from thor2_jax.frames.overlay import annotate
 from thor2_jax.recordings.detections import Detection, detection_array, ros_time
 
 __all__ = [
+    "COMPRESSED_IMAGE",
     "DETECTIONS_TOPIC",
     "DETECTION_ARRAY",
     "OVERLAY_TOPIC",
     "VISION_MSGS",
     "DetectionBag",
+    "MessageBag",
     "detection_types",
     "ros_message",
 ]
@@ -67,68 +69,110 @@ def detection_types() -> Any:
     return typestore
 
 
-class DetectionBag:
+class MessageBag:
     """A ROS 2 bag or an MCAP file that is being written.
 
-    It holds `vision_msgs/Detection2DArray` in the topic `/thor2/detections` and, as JPEG, the colour images with
-    outlines and names in `/thor2/overlay/compressed`. It appears when the context ends, also with an exception, if at
-    least one frame was written.
+    It appears when the context ends, also with an exception, if at least one message was written.
 
     Attributes:
         path: the MCAP file (.mcap), or the directory of the ROS 2 bag.
-        n_frames: frames written.
     """
 
-    def __init__(self, path: Path) -> None:
+    argument = "path"
+
+    def __init__(self, path: Path, topics: Mapping[str, str]) -> None:
         """Check that `path` can be written.
+
+        Args:
+            path: the MCAP file (.mcap), or the directory of the ROS 2 bag; it does not exist.
+            topics: topic -> kind of its messages.
 
         Raises:
             InputError: it exists or names a ROS 1 bag, or the package rosbags is missing.
-            OSError: its folder does not exist.
+            OSError: its folder does not exist or cannot be written.
         """
         if path.suffix == ".bag":
             raise InputError(
-                f"out_bag is {path}; expected an MCAP file (.mcap) or a directory for a ROS 2 bag: detections of ROS 1 "
-                "have no names"
+                f"{self.argument} is {path}; expected an MCAP file (.mcap) or a directory for a ROS 2 bag: detections "
+                "of ROS 1 have no names"
             )
         if path.exists() or path.is_symlink():
-            raise InputError(f"out_bag is {path}, which exists; choose another name")
-        if not path.absolute().parent.is_dir():
-            raise FileNotFoundError(2, "No such file or directory", str(path.parent))
+            raise InputError(f"{self.argument} is {path}, which exists; choose another name")
+        with errors_name(path), tempfile.TemporaryFile(dir=path.absolute().parent):
+            pass
         try:
             self._types = detection_types()
         except ImportError as error:
-            raise InputError(f'out_bag is {path}, which needs rosbags ({error}); install "thor2-jax[bags]"') from None
-        self.path, self.n_frames = path, 0
+            raise InputError(
+                f"{self.argument} is {path}, which needs rosbags ({error}); run pip install "
+                "-c constraints.txt '.[bags]'"
+            ) from None
+        self.path, self._topics, self._n_messages = path, topics, 0
 
-    def __enter__(self) -> "DetectionBag":
+    def __enter__(self) -> Self:
         """Create a temporary bag beside `path`."""
         from rosbags.rosbag2 import StoragePlugin, Writer
 
-        self._folder = Path(tempfile.mkdtemp(prefix=f".{self.path.name}.", dir=self.path.absolute().parent))
+        self._stack = contextlib.ExitStack()
+        folder = self._stack.enter_context(temporary_directory(self.path.absolute().parent))
         plugin = StoragePlugin.MCAP if self.path.suffix == ".mcap" else StoragePlugin.SQLITE3
         # ROS 2 names the files of a bag by its directory.
-        self._bag = self._folder / self.path.stem
+        self._bag = folder / self.path.stem
         self._writer = Writer(self._bag, version=8, storage_plugin=plugin)
         self._writer.open()
-        add = self._writer.add_connection
-        self._detections = add(DETECTIONS_TOPIC, DETECTION_ARRAY, typestore=self._types)
-        self._overlays = add(OVERLAY_TOPIC, COMPRESSED_IMAGE, typestore=self._types)
+        self._connections = {
+            topic: self._writer.add_connection(topic, kind, typestore=self._types)
+            for topic, kind in self._topics.items()
+        }
         return self
 
     def __exit__(self, *_: object) -> None:
         """Close the bag and move it to `path`, or remove it if it is empty."""
-        try:
-            with errors_name(self.path):
-                self._writer.close()
-                if self.n_frames:
-                    is_file = self.path.suffix == ".mcap"
-                    os.replace(next(self._bag.glob("*.mcap")) if is_file else self._bag, self.path)
-        finally:
-            shutil.rmtree(self._folder, ignore_errors=True)
+        with self._stack, errors_name(self.path):
+            self._writer.close()
+            if self._n_messages:
+                is_file = self.path.suffix == ".mcap"
+                os.replace(next(self._bag.glob("*.mcap")) if is_file else self._bag, self.path)
+
+    def write_message(self, topic: str, fields: Mapping[str, Any], stamp: int) -> None:
+        """Write a message, recorded at `stamp` (ns) or, as bags have no earlier time, at 0.
+
+        Raises:
+            InputError: the time is out of the range of ROS 2.
+        """
+        if not -(2**31) <= stamp // 10**9 < 2**31:
+            raise InputError(
+                f"{self.argument}: a frame has the time {stamp // 10**9} s; expected {-(2**31)} to {2**31 - 1} s, the "
+                f"range of ROS 2; correct the clock of the recording, or leave out {self.argument}"
+            )
+        kind = self._topics[topic]
+        content = self._types.serialize_cdr(ros_message(self._types, kind, fields), kind)
+        with errors_name(self.path):
+            self._writer.write(self._connections[topic], max(stamp, 0), content)
+        self._n_messages += 1
+
+
+class DetectionBag(MessageBag):
+    """A bag with the detections of a recording.
+
+    It holds `vision_msgs/Detection2DArray` in the topic `/thor2/detections` and, as JPEG, the colour images with
+    outlines and names in `/thor2/overlay/compressed`.
+
+    Attributes:
+        n_frames: frames written.
+    """
+
+    argument = "out_bag"
+
+    def __init__(self, path: Path) -> None:
+        """Check that `path` can be written; exceptions as `MessageBag`."""
+        super().__init__(path, {DETECTIONS_TOPIC: DETECTION_ARRAY, OVERLAY_TOPIC: COMPRESSED_IMAGE})
+        self.n_frames = 0
 
     def write(self, frame: RGBDFrame, detections: Sequence[Detection], *, stamp: int, frame_id: str = "") -> None:
-        """Write the detections of a frame; arguments as `detection_array`."""
+        """Write the detections of a frame; arguments as `detection_array`, exceptions as `write_message`."""
+        array = detection_array(detections, stamp=stamp, frame_id=frame_id)
+        self.write_message(DETECTIONS_TOPIC, array, stamp)
         picture = io.BytesIO()
         annotate(frame.color, frame.label_image, [one.recognition for one in detections]).save(
             picture, "JPEG", quality=_JPEG_QUALITY
@@ -138,14 +182,7 @@ class DetectionBag:
             "format": "rgb8; jpeg compressed bgr8",
             "data": np.frombuffer(picture.getvalue(), np.uint8),
         }
-        array = detection_array(detections, stamp=stamp, frame_id=frame_id)
-        for connection, kind, fields in (
-            (self._detections, DETECTION_ARRAY, array),
-            (self._overlays, COMPRESSED_IMAGE, overlay),
-        ):
-            content = self._types.serialize_cdr(ros_message(self._types, kind, fields), kind)
-            with errors_name(self.path):
-                self._writer.write(connection, stamp, content)
+        self.write_message(OVERLAY_TOPIC, overlay, stamp)
         self.n_frames += 1
 
 

@@ -8,6 +8,7 @@ with Bag("table.mcap") as bag:
 import contextlib
 import dataclasses
 import functools
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from thor2_jax.errors import InputError, with_context
-from thor2_jax.recognition.frames import RGBDFrame
-from thor2_jax.recognition.intrinsics import Intrinsics
+from thor2_jax.frames.frames import RGBDFrame
+from thor2_jax.frames.intrinsics import Intrinsics
 from thor2_jax.recordings.messages import color_image, depth_image, image_kind, stamp_of
 from thor2_jax.recordings.pairs import DEFAULT_MAX_GAP, ImagePair, PairCounts, StampedImage, nearest_pairs
 from thor2_jax.recordings.recorded_frames import RecordedFrame, stamp_name
@@ -25,11 +26,11 @@ from thor2_jax.recordings.truncated_mcap import CompleteRecords, is_truncated
 
 __all__ = ["Bag"]
 
-_ADVICE = {
-    ".bag": "repair it: rosbag reindex",
-    ".mcap": "repair it: mcap recover",
-    ".db3": "repair it: ros2 bag reindex",
-}
+MAX_GAP = 1e9
+"""Largest `max_gap`, seconds."""
+
+_REPAIR = {".bag": "rosbag reindex", ".mcap": "mcap recover", ".db3": "ros2 bag reindex", "": "ros2 bag reindex"}
+"""Suffix of a recording (a directory has none) -> the command that repairs it."""
 
 
 class Bag:
@@ -42,7 +43,7 @@ class Bag:
         frame_id: coordinate frame of the colour images.
         counts: images and pairs so far.
         is_truncated: whether its end is missing. Of MCAP files, the frames before are read nevertheless.
-        notes: what is likely wrong with the recording, without being an error.
+        notes: likely mistakes of the recording that are no errors.
     """
 
     def __init__(
@@ -64,10 +65,10 @@ class Bag:
             max_gap: largest time between the two images of a frame, seconds.
 
         Raises:
-            InputError: `max_gap` is no positive number.
+            InputError: `max_gap` is no positive number, or too large.
         """
-        if not 0 < max_gap < float("inf"):
-            raise InputError(f"max_gap is {max_gap}; expected a positive number of seconds")
+        if not 0 < max_gap <= MAX_GAP:
+            raise InputError(f"max_gap is {max_gap}; expected a positive number of seconds, at most {MAX_GAP:g}")
         self.path = Path(path)
         self.intrinsics: Intrinsics | None = intrinsics
         self._wanted, self._depth_scale, self._max_gap = topics or Topics(), depth_scale, max_gap
@@ -88,7 +89,9 @@ class Bag:
             from rosbags.highlevel import AnyReader
             from rosbags.typesys import Stores, get_typestore
         except ImportError as error:
-            raise InputError(f'bag is {self.path}, which needs rosbags ({error}); install "thor2-jax[bags]"') from None
+            raise InputError(
+                f"bag is {self.path}, which needs rosbags ({error}); run pip install -c constraints.txt '.[bags]'"
+            ) from None
         if not self.path.exists():
             raise FileNotFoundError(2, "No such file or directory", str(self.path))
         if self.path.is_dir() and not (self.path / "metadata.yaml").is_file():
@@ -121,10 +124,13 @@ class Bag:
             InputError: the recording is damaged or missing from here on, or no two images are near enough in time.
         """
         tolerance = round(self._max_gap * 1e9)
+        names: Counter[str] = Counter()
         for pair in nearest_pairs(self._images(), tolerance, self.counts):
             gap = pair.depth.stamp - pair.color.stamp
-            read = functools.partial(self._read, pair)
-            yield RecordedFrame(stamp_name(pair.color.stamp), read, pair.color.stamp, gap, self.frame_id)
+            read, name = functools.partial(self._read, pair), stamp_name(pair.color.stamp)
+            names[name] += 1
+            unique = name if names[name] == 1 else f"{name}-{names[name]}"
+            yield RecordedFrame(unique, read, pair.color.stamp, gap, self.frame_id)
         if self.is_truncated:
             raise self._truncation()
         if self.counts.pairs == 0:
@@ -139,7 +145,7 @@ class Bag:
     def _truncation(self) -> InputError:
         return InputError(
             f"bag: {self.path} is truncated after {self.counts.color} colour images: its end is missing; "
-            f"{_ADVICE['.mcap']} {self.path.name}, or record it again"
+            f"repair it: {_REPAIR['.mcap']} {self.path.name}, or record it again"
         )
 
     def _read(self, pair: ImagePair) -> RGBDFrame:
@@ -210,8 +216,8 @@ class Bag:
             after = f" after {self.counts.color} colour images" if self.counts.color else ""
             raise InputError(
                 f"bag: {self.path} is damaged or of another format{after} ({reason}); expected a ROS 1 bag (.bag), a "
-                f"ROS 2 bag (directory, .db3) or MCAP of ROS 2; "
-                f"{_ADVICE.get(self.path.suffix, 'repair it: ros2 bag reindex')} {self.path.name}"
+                f"ROS 2 bag (directory, .db3) or MCAP of ROS 2"
+                + (f"; repair it: {_REPAIR[self.path.suffix]} {self.path.name}" if self.path.suffix in _REPAIR else "")
             ) from None
 
 

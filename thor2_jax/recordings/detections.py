@@ -8,8 +8,8 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from thor2_jax.recognition.answers import Recognition
-from thor2_jax.recognition.frames import RGBDFrame, pixel_rays
+from thor2_jax.frames.frames import RGBDFrame, pixel_rays
+from thor2_jax.model.answers import Recognition
 
 __all__ = ["Box", "Detection", "detection_array", "detections_as_json", "detections_of", "ros_time"]
 

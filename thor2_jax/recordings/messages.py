@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.image_files import MAX_IMAGE_PIXELS
+from thor2_jax.frames.image_files import MAX_IMAGE_PIXELS
 
 __all__ = ["color_image", "depth_image", "image_kind", "stamp_of"]
 
@@ -102,6 +102,8 @@ def _rows(message: Any, dtype: np.dtype[Any], channels: int) -> NDArray[Any]:
     """Return the pixels [H, W * channels] of an Image, without the padding of its rows."""
     data = np.frombuffer(message.data, np.uint8)
     height, step, used = int(message.height), int(message.step), int(message.width) * channels * dtype.itemsize
+    if height * int(message.width) > MAX_IMAGE_PIXELS:
+        raise InputError(f"an image has {message.width} x {height} pixels; expected at most {MAX_IMAGE_PIXELS}")
     if height * used == 0 or step < used or len(data) < height * step:
         raise InputError(
             f"an image has {len(data)} bytes in rows of {step}; expected {message.width} x {message.height} pixels of "

@@ -37,7 +37,7 @@ class ImagePair(NamedTuple):
 
 
 class PairCounts:
-    """What `nearest_pairs` has seen so far.
+    """Counts of `nearest_pairs` so far.
 
     Attributes:
         color: number of colour images.

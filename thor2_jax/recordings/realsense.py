@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.frames import RGBDFrame
-from thor2_jax.recognition.intrinsics import Intrinsics
+from thor2_jax.frames.frames import RGBDFrame
+from thor2_jax.frames.intrinsics import Intrinsics
 from thor2_jax.recordings.recorded_frames import RecordedFrame, stamp_name
 
 __all__ = ["RealSenseCamera"]
@@ -29,7 +29,7 @@ class RealSenseCamera:
         """Describe the camera; nothing is opened yet.
 
         Args:
-            source: what frames are taken from, with `wait_for_frames(milliseconds)`: a started pipeline or a syncer of
+            source: source of frames, with `wait_for_frames(milliseconds)`: a started pipeline or a syncer of
                 pyrealsense2. By default a pipeline of the first connected camera.
             timeout: seconds without a frame after which the camera counts as unplugged.
         """
@@ -47,8 +47,8 @@ class RealSenseCamera:
             import pyrealsense2 as rs
         except ImportError as error:
             raise InputError(
-                f'realsense needs pyrealsense2 ({error}); install "thor2-jax[realsense]" and the system library '
-                "libusb-1.0-0"
+                f"realsense needs pyrealsense2 ({error}) and the system library libusb-1.0-0; run pip install "
+                "-c constraints.txt '.[realsense]'"
             ) from None
         self._align = rs.align(rs.stream.color)
         if self._source is None:

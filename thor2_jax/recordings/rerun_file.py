@@ -4,6 +4,7 @@ with RerunFile(Path("answers.rrd")) as file:
     file.write(frame, detections, name="000001")
 """
 
+import contextlib
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,14 +13,16 @@ from typing import Any
 import numpy as np
 
 from thor2_jax.errors import InputError
-from thor2_jax.files import errors_name
-from thor2_jax.recognition.frames import RGBDFrame
-from thor2_jax.recognition.overlay import answer_paints
+from thor2_jax.files import check_output_file, errors_name, temporary_directory
+from thor2_jax.frames.frames import RGBDFrame
+from thor2_jax.frames.overlay import answer_paints
 from thor2_jax.recordings.detections import Detection
 
 __all__ = ["RerunFile"]
 
 _JPEG_QUALITY = 85
+
+_APPLICATION = "thor2"
 
 _MAX_CLASS = 2**16 - 1
 """Largest label number of a segmentation image of Rerun."""
@@ -41,27 +44,29 @@ class RerunFile:
         """Check that `path` can be written.
 
         Raises:
-            InputError: its suffix is not .rrd, or the package rerun-sdk is missing.
-            OSError: its folder does not exist.
+            InputError: its suffix is not .rrd, it is a recording of another program, or rerun-sdk is missing.
+            OSError: its folder does not exist or cannot be written.
         """
         if path.suffix != ".rrd" or path.is_dir():
             raise InputError(f"rerun is {path}; expected a file with the suffix .rrd")
-        if not path.absolute().parent.is_dir():
-            raise FileNotFoundError(2, "No such file or directory", str(path.parent))
+        with errors_name(path), tempfile.TemporaryFile(dir=path.absolute().parent):
+            pass
+        check_output_file("rerun", path, _is_own)
         try:
             import rerun
         except ImportError as error:
-            raise InputError(f'rerun is {path}, which needs rerun-sdk ({error}); install "thor2-jax[rerun]"') from None
+            raise InputError(
+                f"rerun is {path}, which needs rerun-sdk ({error}); run pip install -c constraints.txt '.[rerun]'"
+            ) from None
         self._rerun: Any = rerun
-        self.path, self.n_frames = path, 0
+        self.path, self.n_frames, self._folder = path, 0, contextlib.ExitStack()
 
     def __enter__(self) -> "RerunFile":
         """Create a temporary file beside `path`."""
         parent = self.path.absolute().parent
         with errors_name(self.path):
-            self._folder = tempfile.TemporaryDirectory(prefix=f".{self.path.stem}.", dir=parent)
-        self._temporary = Path(self._folder.name) / self.path.name
-        self._recording = self._rerun.RecordingStream("thor2")
+            self._temporary = self._folder.enter_context(temporary_directory(parent)) / self.path.name
+        self._recording = self._rerun.RecordingStream(_APPLICATION)
         self._recording.save(self._temporary)
         # Camera coordinates, as those of OpenCV: x right, y down, z forward.
         self._recording.log("/", self._rerun.ViewCoordinates.RDF, static=True)
@@ -115,6 +120,13 @@ class RerunFile:
         )
         log("objects", points)
         self.n_frames += 1
+
+
+def _is_own(path: Path) -> bool:
+    """Return whether a file is a recording of this software: its head names the application."""
+    with path.open("rb") as file:
+        head = file.read(4096)
+    return head.startswith(b"RRF") and _APPLICATION.encode() in head
 
 
 def _label(detection: Detection) -> str:

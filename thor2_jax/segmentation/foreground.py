@@ -1,4 +1,4 @@
-"""Foreground of a plane: what stands or lies on it, by its height over the plane and its difference in colour."""
+"""Foreground of a plane: pixels that differ from it in height or colour."""
 
 import dataclasses
 
@@ -68,7 +68,7 @@ LARGEST_SMOOTH = 3
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Evidence:
-    """What height and colour say of each pixel; every field is an image [H, W].
+    """Probabilities of each pixel by height and colour; every field is an image [H, W].
 
     Attributes:
         heights: float32, metres over the support; 0 where depth is missing.

@@ -53,7 +53,7 @@ def flood(color: NDArray[np.uint8], depth: DepthImage, evidence: Evidence, steps
     Args:
         color: [H, W, 3] uint8, a little blurred.
         depth: the depth image.
-        evidence: what height and colour say.
+        evidence: probabilities by height and colour.
         steps: [H, W], of depth.
         folds: [H, W], of depth.
     """

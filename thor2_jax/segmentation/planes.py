@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from thor2_jax.recognition.frames import MAX_DEPTH, MIN_DEPTH, Intrinsics
+from thor2_jax.frames.frames import MAX_DEPTH, MIN_DEPTH, Intrinsics
 from thor2_jax.segmentation.pixels import Mask, pixel_mask
 
 __all__ = ["DepthImage", "Plane", "dominant_planes"]

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.frames import RGBDFrame
+from thor2_jax.frames.frames import RGBDFrame
 
 __all__ = ["ENTRY_POINTS", "TABLE", "Segmenter", "load_segmenter", "segment", "segmented", "segmenter_names"]
 
@@ -47,7 +47,7 @@ def load_segmenter(name: str) -> Segmenter:
             return importlib.import_module("thor2_jax.segmentation.table").segment_table
         except ImportError as error:
             raise InputError(
-                f'segmenter is {name!r}, which needs OpenCV ({error}); install "thor2-jax[segment]"'
+                f"segmenter is {name!r}, which needs OpenCV ({error}); run pip install -c constraints.txt '.[segment]'"
             ) from None
     points = list(entry_points(group=ENTRY_POINTS, name=name))
     if not points:

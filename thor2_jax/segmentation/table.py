@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from thor2_jax.recognition.frames import Intrinsics, RGBDFrame
+from thor2_jax.frames.frames import Intrinsics, RGBDFrame
 from thor2_jax.segmentation.depth_edges import depth_edges
 from thor2_jax.segmentation.foreground import find_foreground
 from thor2_jax.segmentation.markers import flood

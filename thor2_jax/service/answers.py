@@ -12,10 +12,10 @@ from thor2_jax.config import DescriptorConfig
 from thor2_jax.explanation.explain import Explanation
 from thor2_jax.explanation.pictures import change_text, main_pictures
 from thor2_jax.figures import png_bytes
+from thor2_jax.frames.frames import RGBDFrame
+from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery.objects import ObjectGallery
-from thor2_jax.recognition.answers import Recognition
-from thor2_jax.recognition.frames import RGBDFrame
-from thor2_jax.recognition.prepared_instance import PreparedInstance
+from thor2_jax.model.answers import Recognition
 from thor2_jax.service.engine import CloudResult
 from thor2_jax.service.preparation import PreparedRequest
 from thor2_jax.service.schemas import (

@@ -14,10 +14,13 @@ from fastapi import APIRouter, Depends, FastAPI, Request, Response
 from fastapi.responses import JSONResponse
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 from starlette.concurrency import run_in_threadpool
+from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
+from starlette.types import ASGIApp, Receive, Scope, Send
 
 from thor2_jax.config import DESCRIPTOR_VERSION
+from thor2_jax.hosts import is_allowed_host
 from thor2_jax.service import schemas
 from thor2_jax.service.answers import adaptation_answer, instance_answer, object_answers
 from thor2_jax.service.engine import CloudResult
@@ -41,7 +44,7 @@ __all__ = ["create_app"]
 LABELLED_FRAME = ("color", "depth", "labels", "intrinsics")
 FRAME, OPTIONAL = ("color", "depth", "intrinsics"), ("labels",)
 WHY_SECONDS = 90.0
-"""Least deadline of an explanation, which may have to compile first."""
+"""Least deadline of an explanation: further ones wait for it."""
 
 FRAME_ERRORS = error_responses(400, 408, 413, 415, 422, 429, 503, 504)
 GALLERY_ERRORS = error_responses(429, 500, 503, 504, 507)
@@ -62,8 +65,8 @@ def create_app(settings: Settings, workers: int = 1) -> FastAPI:
 
     @contextlib.asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
-        await run_in_threadpool(service.start)
         with _stop_accepting_on_signal(service):
+            await run_in_threadpool(service.start)
             if workers > 1:
                 await run_in_threadpool(service.wait_until_ready)
             yield
@@ -78,13 +81,14 @@ def create_app(settings: Settings, workers: int = 1) -> FastAPI:
         redoc_url=None,
     )
     app.state.service = service
+    app.add_middleware(AllowedHosts, names=settings.allow_host)
     app.add_middleware(RequestCounter, metrics=service.metrics)
     app.include_router(_health_routes(service, workers))
     token = settings.token
     authenticated = (
         APIRouter(dependencies=[Depends(_token_check(token))], responses=error_responses(401)) if token else APIRouter()
     )
-    _add_inference_routes(authenticated, service)
+    _add_inference_routes(authenticated, service, settings.adapt)
     _add_model_routes(authenticated, service)
     _add_object_routes(authenticated, service)
     if settings.teach:
@@ -98,6 +102,23 @@ def create_app(settings: Settings, workers: int = 1) -> FastAPI:
     app.add_exception_handler(ClientDisconnect, _on_disconnect)
     app.add_exception_handler(Exception, _on_internal_error)
     return app
+
+
+class AllowedHosts:
+    """ASGI middleware that answers with status 403 unless the header Host names this server."""
+
+    def __init__(self, app: ASGIApp, names: Sequence[str]) -> None:
+        self._app, self._names = app, names
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Call the application, or refuse the request."""
+        if scope["type"] == "http":
+            host = Headers(scope=scope).get("host", "")
+            if not is_allowed_host(host, (scope.get("server") or ("",))[0], self._names):
+                message = f"Host is {host[:100]!r}; expected localhost, the address, or a name given to --allow-host."
+                await _problem_response(403, Problem(field="Host", message=message))(scope, receive, send)
+                return
+        await self._app(scope, receive, send)
 
 
 @contextlib.contextmanager
@@ -140,8 +161,14 @@ def _health_routes(service: Service, workers: int) -> APIRouter:
     return routes
 
 
-def _add_inference_routes(routes: APIRouter, service: Service) -> None:
-    @routes.post("/v1/recognize", responses=FRAME_ERRORS, openapi_extra={"requestBody": schemas.FRAME_FORM})
+def _add_inference_routes(routes: APIRouter, service: Service, adapts: bool) -> None:
+    # With adaptation, a frame changes how the next ones are recognized.
+    observing: dict[str, Any] = {"dependencies": [Depends(check_same_site)]} if adapts else {}
+    frame_errors = FRAME_ERRORS | (error_responses(403) if adapts else {})
+
+    @routes.post(
+        "/v1/recognize", responses=frame_errors, openapi_extra={"requestBody": schemas.FRAME_FORM}, **observing
+    )
     async def recognize(request: Request) -> schemas.FrameAnswer:
         """Recognize every instance of a frame; one without labels is segmented."""
         async with service.admit() as admitted:
@@ -150,6 +177,7 @@ def _add_inference_routes(routes: APIRouter, service: Service) -> None:
             recognitions, label_map = await service.recognize(files, admitted)
         return schemas.FrameAnswer(
             instances=[instance_answer(recognition) for recognition in recognitions],
+            knows=service.engine.model.union.summary,
             label_map=label_map,
             adaptation=adaptation_answer(service.engine.adaptation),
             timings=admitted.milliseconds(),
@@ -158,8 +186,9 @@ def _add_inference_routes(routes: APIRouter, service: Service) -> None:
     @routes.post(
         "/v1/explain",
         response_model=schemas.ExplainedFrame,
-        responses=FRAME_ERRORS,
+        responses=frame_errors,
         openapi_extra={"requestBody": schemas.FRAME_FORM},
+        **observing,
     )
     async def explain(request: Request) -> Response:
         """Recognize every instance of a frame and return the evidence: clouds, persistence images and colours."""
@@ -174,7 +203,7 @@ def _add_inference_routes(routes: APIRouter, service: Service) -> None:
     async def why(request: Request) -> schemas.WhyAnswer:
         """Explain the answer for one instance: the points that decided, and the smallest changes that change it.
 
-        The answer may take a minute, since the first explanation of each size of clouds compiles.
+        Until explanations of clouds of this size are compiled, which begins after the start, the status is 503.
         """
         async with service.admit(max(service.settings.deadline, WHY_SECONDS)) as admitted:
             with admitted.stage("upload"):
@@ -218,7 +247,8 @@ def _add_model_routes(routes: APIRouter, service: Service) -> None:
         run = service.engine.run
         return schemas.ModelAnswer(
             classes=list(service.engine.classes),
-            classifiers=list(run.classifiers),
+            knows=service.engine.model.union.summary,
+            classifiers=list(service.engine.classifiers),
             descriptor_version=DESCRIPTOR_VERSION,
             descriptor=pydantic_core.to_jsonable_python(run.config),
             color_network=run.network.fingerprint,
@@ -317,7 +347,7 @@ def _token_check(token: str) -> Callable[..., Any]:
 
 def _encode_json(results: Sequence[CloudResult], timings: dict[str, float]) -> bytes:
     descriptors = [
-        {"images": r.images.tolist(), "embeddings": r.embeddings.tolist(), "overflow": int(r.evidence.overflow)}
+        {"images": r.images.tolist(), "embeddings": r.embeddings.tolist(), "overflow": int(r.inference.overflow)}
         for r in results
     ]
     return pydantic_core.to_json({"descriptors": descriptors, "timings": timings})
@@ -329,7 +359,7 @@ def _encode_npz(results: Sequence[CloudResult]) -> bytes:
         stream,
         images=np.stack([r.images for r in results]),
         embeddings=np.stack([r.embeddings for r in results]),
-        overflow=np.array([r.evidence.overflow for r in results], np.int32),
+        overflow=np.array([r.inference.overflow for r in results], np.int32),
     )
     return stream.getvalue()
 
@@ -340,7 +370,8 @@ def _problem_response(status: int, problem: Problem, headers: dict[str, str] | N
 
 async def _on_request_error(_: Request, error: Exception) -> Response:
     assert isinstance(error, RequestError)
-    headers = {401: {"WWW-Authenticate": "Bearer"}, 429: {"Retry-After": "1"}, 503: {"Retry-After": "1"}}
+    again = {"Retry-After": str(error.retry_after)}
+    headers = {401: {"WWW-Authenticate": "Bearer"}, 429: again, 503: again}
     return _problem_response(error.status, error.problem, headers.get(error.status))
 
 

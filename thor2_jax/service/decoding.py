@@ -16,7 +16,7 @@ from pydantic import ValidationError
 
 from thor2_jax.capacity import POINT_BUCKETS
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.frames import Intrinsics, RGBDFrame, has_16_bit_channels, parse_intrinsics
+from thor2_jax.frames.frames import Intrinsics, RGBDFrame, has_16_bit_channels, parse_intrinsics
 from thor2_jax.service.problem import RequestError
 from thor2_jax.service.schemas import CloudsBody
 from thor2_jax.service.settings import (
@@ -69,10 +69,12 @@ def decode_frame(color: bytes, depth: bytes, intrinsics: bytes, labels: bytes | 
 
 def check_instances(frame: RGBDFrame) -> None:
     """Raise RequestError (422) if the labels of a frame have more than `MAX_INSTANCES` instances."""
-    if len(frame.instances) > MAX_INSTANCES:
-        raise RequestError(
-            422, "labels", f"labels has {len(frame.instances)} instances; expected at most {MAX_INSTANCES}."
-        )
+    try:
+        count = len(frame.instances)
+    except InputError as error:
+        raise RequestError(422, "labels", f"{error}.") from None
+    if count > MAX_INSTANCES:
+        raise RequestError(422, "labels", f"labels has {count} instances; expected at most {MAX_INSTANCES}.")
 
 
 def _decode_intrinsics(content: bytes) -> Intrinsics:

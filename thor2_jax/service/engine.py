@@ -1,40 +1,46 @@
 """The compiled model: descriptors and class probabilities for batches of a few sizes, all compiled before serving."""
 
-import copy
 import dataclasses
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from thor2_jax.adaptation.estimate import Adaptation
+from thor2_jax.adaptation.estimate import Adaptation, adaptation_criterion
 from thor2_jax.adaptation.online import OnlineAdaptation
 from thor2_jax.capacity import BATCH_BUCKETS, POINT_BUCKETS, batch_bucket, point_bucket
 from thor2_jax.descriptor.describe import strips
-from thor2_jax.descriptor.orientations import candidate_orientations, orient_descriptors
+from thor2_jax.descriptor.looks import aligned_looks, describe_aligned_looks
 from thor2_jax.errors import InputError
-from thor2_jax.explanation.explain import Explanation, explain_instance
+from thor2_jax.explanation.class_scores import padded_points
+from thor2_jax.explanation.explain import Explanation, compile_explanations, explain_instance, explained_kinds
+from thor2_jax.frames.instance_clouds import MIN_POINTS
+from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.gallery.clouds import CompactClouds
-from thor2_jax.gallery.enrollment import ORIENTATIONS, enrolled_object
+from thor2_jax.gallery.enrollment import LOOKS, enrolled_object
 from thor2_jax.gallery.gallery import GalleryObject
 from thor2_jax.gallery.objects import ObjectGallery
-from thor2_jax.gallery.store import INDEX_FILE
-from thor2_jax.recognition.answers import Evidence, Recognition
-from thor2_jax.recognition.fusion import fuse, fused_probabilities, with_temperature
-from thor2_jax.recognition.instance_clouds import MIN_POINTS
-from thor2_jax.recognition.prepared_instance import PreparedInstance, pack_instances
+from thor2_jax.gallery.store import INDEX_FILE, check_index
+from thor2_jax.model.answers import Recognition
+from thor2_jax.model.fusion import fuse, fused_probabilities, with_temperature
+from thor2_jax.model.inference import Inference, answers, infer
+from thor2_jax.model.model import Model
 from thor2_jax.recognizer import THOR2, Recognizer
 from thor2_jax.service.settings import Settings
 
-__all__ = ["CloudResult", "InferenceEngine"]
+__all__ = ["CloudResult", "ExplanationPrograms", "InferenceEngine"]
 
 log = logging.getLogger(__name__)
 
 MIN_POINTS_BUCKET, MIN_BATCH_BUCKET = 2048, 8
 """Smallest shape of a batch. Smaller shapes run hardly faster, and each shape takes seconds to compile."""
+
+
+ExplanationPrograms = tuple[int, bool]
+"""Padded number of points, and kind of scores (`explained_kinds`) of what is compiled for explanations."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -46,14 +52,14 @@ class CloudResult:
         embeddings: [S, R, J] float32, colour embeddings.
         aligned: [N, 3] float32, the aligned cloud in scaled units, with padding.
         strip_colors: [S, J, R] float32, strip colour vectors.
-        evidence: what the cloud is recognized by, fields without the axis of the batch.
+        inference: outputs of the model, fields without the axis of the batch.
     """
 
     images: NDArray[np.float32]
     embeddings: NDArray[np.float32]
     aligned: NDArray[np.float32]
     strip_colors: NDArray[np.float32]
-    evidence: Evidence
+    inference: Inference
 
 
 class InferenceEngine:
@@ -67,30 +73,35 @@ class InferenceEngine:
         """
         if settings.cache is not None:
             _enable_compilation_cache(settings.cache)
-        self._recognizer = _load(settings)
-        run = self._recognizer.run
+        recognizer = _load(settings)
+        run = recognizer.run
         missing = [name for name in THOR2 if run.classifiers and name not in run.classifiers]
         if missing:
             raise InputError(
                 f"model: {settings.model} has no classifier {', '.join(missing)}; "
                 f"serving needs {' and '.join(THOR2)}: train the run with them"
             )
-        self._classifiers = self._recognizer.default_classifiers
         # The closed form computes the same pairs as gudhi without a host callback.
         self.run = dataclasses.replace(run, config=dataclasses.replace(run.config, homology="closed_form"))
-        self._recognizer.run = self.run
+        recognizer.model = dataclasses.replace(recognizer.model, run=self.run)
+        self._recognizer = recognizer
         # A service that teaches compiles the embedding before the first object is enrolled.
         self._embeds = settings.teach or self._uses_gallery
         self._last_error = ""
         self.max_batch = settings.max_batch
         self._online: OnlineAdaptation | None = None
         if settings.adapt:
-            if not run.classifiers:
+            if not self.model.classifiers:
                 raise InputError(f"adapt: {settings.model} has no classifiers; expected a trained run")
-            self._online = OnlineAdaptation(*self._recognizer.adaptation_criterion(), self._set_transform)
+            self._online = OnlineAdaptation(*adaptation_criterion(self.model), self._set_transform)
+
+    @property
+    def model(self) -> Model:
+        """The current model."""
+        return self._recognizer.model
 
     def _set_transform(self, adaptation: Adaptation) -> None:
-        self._recognizer.color_transform = adaptation.transform
+        self._recognizer.model = dataclasses.replace(self.model, color_transform=adaptation.transform)
 
     @property
     def adaptation(self) -> Adaptation | None:
@@ -106,16 +117,22 @@ class InferenceEngine:
         """
         if observe and self._online is not None:
             self._online.observe(instances)
-        return [self._recognizer.corrected(instance) for instance in instances]
+        model = self.model
+        return [model.corrected(instance) for instance in instances]
 
     @property
     def _uses_gallery(self) -> bool:
-        return self._recognizer.answers_by() != "classifiers"
+        return self.model.answers_by() != "classifiers"
+
+    @property
+    def classifiers(self) -> tuple[str, ...]:
+        """Names of the classifiers."""
+        return tuple(self.model.classifiers)
 
     @property
     def classes(self) -> tuple[str, ...]:
         """All names that may be answered."""
-        return self._recognizer.classes
+        return self.model.names
 
     @property
     def objects(self) -> ObjectGallery:
@@ -140,7 +157,7 @@ class InferenceEngine:
 
     def enrolled_object(self, clouds: CompactClouds, results: Sequence[CloudResult]) -> GalleryObject:
         """Return an object to enroll from its clouds and the results of `enrollment.views_to_embed`."""
-        embeddings = np.array([result.evidence.embeddings[:ORIENTATIONS] for result in results])
+        embeddings = np.array([result.inference.embeddings[:LOOKS] for result in results])
         return enrolled_object(embeddings, clouds, "frames")
 
     @property
@@ -168,20 +185,20 @@ class InferenceEngine:
     def _infer(self, instances: Sequence[PreparedInstance], n_clouds: int, n_points: int) -> list[CloudResult]:
         clouds = pack_instances(instances, n_clouds, n_points)
         network, config = self.run.network, self.run.config
-        aligned, weights = candidate_orientations(clouds, config, config.orientations)
-        cloud_strips = strips(aligned, network, config, config.orientations)
-        oriented = orient_descriptors(aligned, weights, cloud_strips, network, config)
-        evidence = self._recognizer.evidence(oriented, self._classifiers, clouds if self._embeds else None)
-        first = slice(None, None, config.orientations)
-        computed = oriented.first, aligned.points[first], cloud_strips.color[first], evidence
-        descriptors, points, colors, evidence = jax.tree.map(np.asarray, computed)
+        aligned, weights = aligned_looks(clouds, config, config.looks)
+        cloud_strips = strips(aligned, network, config)
+        oriented = describe_aligned_looks(aligned, weights, cloud_strips, network, config)
+        inference = infer(self.model, oriented, clouds if self._embeds else None)
+        first = slice(None, None, config.looks)
+        computed = oriented.first, aligned.points[first], cloud_strips.color[first], inference
+        descriptors, points, colors, inference = jax.tree.map(np.asarray, computed)
         return [
             CloudResult(
                 descriptors.images[k],
                 descriptors.embeddings[k],
                 points[k],
                 colors[k],
-                jax.tree.map(lambda a, k=k: a[k], evidence),
+                jax.tree.map(lambda a, k=k: a[k], inference),
             )
             for k in range(len(instances))
         ]
@@ -190,19 +207,26 @@ class InferenceEngine:
         """Return a recognition per instance of a frame; `results` are those of the usable instances, in order."""
         if not results:
             return [Recognition(instance.label, reason=instance.reason) for instance in instances]
-        evidence = jax.tree.map(lambda *rows: np.stack(rows), *[result.evidence for result in results])
-        source = self._recognizer.answers_by()  # A change of the gallery may change it.
+        inference = jax.tree.map(lambda *rows: np.stack(rows), *[result.inference for result in results])
+        model = self.model
+        source = model.answers_by()  # A change of the gallery may change it.
         if source == "classifiers":
-            evidence = evidence._replace(embeddings=None, weights=None)
+            inference = inference._replace(embeddings=None, weights=None)
         elif source == "gallery":
-            evidence = evidence._replace(probabilities={})
-        return self._recognizer.recognitions(instances, evidence)
+            inference = inference._replace(probabilities={})
+        return answers(model, instances, inference)
 
     def explain(self, instance: PreparedInstance) -> Explanation:
         """Explain the answer for an instance; may be called in another thread. Raises as `explain_instance`."""
-        recognizer = copy.copy(self._recognizer)
-        recognizer.objects = copy.copy(recognizer.objects)  # It stays as it is while the gallery changes.
-        return explain_instance(recognizer, instance)
+        return explain_instance(self.model, instance)
+
+    def explanation_programs(self, n_points: int = 1) -> list[ExplanationPrograms]:
+        """Return the programs that explain the answer for a cloud of so many points."""
+        return [(padded_points(n_points), by_classifiers) for by_classifiers in explained_kinds(self.model)]
+
+    def compile_explanations(self, programs: ExplanationPrograms, is_stopped: Callable[[], bool]) -> None:
+        """Compile one of `explanation_programs`, unless stopped; may be called in another thread."""
+        compile_explanations(self.model, *programs, is_stopped)
 
     def calibrated_confidences(self, results: Sequence[CloudResult]) -> list[float | None]:
         """Return the calibrated confidence of the most probable class of each cloud.
@@ -211,14 +235,14 @@ class InferenceEngine:
         classifiers. None without temperatures, which training fits on a held-out set (`thor2 train --folds`), with a
         gallery, and with forgotten classes.
         """
-        temperatures = self.run.record.get("temperatures", {})
+        temperatures, model = self.run.record.get("temperatures", {}), self.model
         if not results or self._uses_gallery or self.objects.gallery.hidden:
             return [None] * len(results)
         probabilities: dict[str, NDArray[np.float32]] = {
-            name: np.stack([r.evidence.probabilities[name] for r in results]) for name in self._classifiers
+            name: np.stack([r.inference.probabilities[name] for r in results]) for name in model.classifiers.default
         }
-        if self._recognizer.calibration is not None:
-            return [float(p) for p in self._recognizer.fused(probabilities).max(axis=1)]
+        if model.calibration is not None:
+            return [float(p) for p in model.fused(probabilities).max(axis=1)]
         if not set(THOR2) <= set(temperatures):
             return [None] * len(results)
         index = fuse({name: probabilities[name] for name in THOR2}).class_index
@@ -234,6 +258,7 @@ def _load(settings: Settings) -> Recognizer:
     """
     directory = settings.gallery
     if directory is not None and not settings.teach and not (directory / INDEX_FILE).is_file():
+        check_index(directory)
         raise InputError(f"gallery: {directory} has no {INDEX_FILE}; expected the directory of a gallery")
     recognizer = Recognizer.load(settings.model, settings.unknown_below, gallery=directory)
     if settings.teach:

@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import threading
 from pathlib import Path
 
 import jax
@@ -9,11 +10,14 @@ from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, gene
 from prometheus_client.multiprocess import MultiProcessCollector, mark_process_dead
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-__all__ = ["CompilationCounter", "Metrics", "RequestCounter"]
+__all__ = ["COMPILER_THREAD", "CompilationCounter", "Metrics", "RequestCounter"]
 
 STAGE_BUCKETS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0)
 BATCH_SIZE_BUCKETS = (1, 2, 4, 8, 16, 32, 64)
 COMPILATION_EVENT = "/jax/core/compile/backend_compile_duration"
+COMPILER_THREAD = "compile-explanations"
+"""Name of the thread whose compilations are not counted, since no request waits for them."""
+
 SHARED_DIRECTORY = "PROMETHEUS_MULTIPROC_DIR"
 
 
@@ -73,13 +77,13 @@ def _remove_dead_workers(directory: Path) -> None:
 
 
 class CompilationCounter:
-    """Count the programs that JAX compiles in this process between `start` and `stop`."""
+    """Count the programs that JAX compiles between `start` and `stop`, except in the thread `COMPILER_THREAD`."""
 
     def __init__(self, counter: Counter) -> None:
         self._counter, self._is_active = counter, False
 
     def _on_event(self, event: str, duration_secs: float, **_: str | int) -> None:
-        if event == COMPILATION_EVENT:
+        if event == COMPILATION_EVENT and not threading.current_thread().name.startswith(COMPILER_THREAD):
             self._counter.inc()
 
     def start(self) -> None:

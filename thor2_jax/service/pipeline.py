@@ -8,18 +8,19 @@ import logging
 import threading
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 
+from thor2_jax.capacity import POINT_BUCKETS
 from thor2_jax.errors import InputError
+from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery.clouds import CompactClouds
 from thor2_jax.gallery.enrollment import views_to_embed
 from thor2_jax.gallery.objects import ObjectGallery
-from thor2_jax.recognition.answers import Recognition
-from thor2_jax.recognition.prepared_instance import PreparedInstance
+from thor2_jax.model.answers import Recognition
 from thor2_jax.service.answers import explained_frame, why_answer
 from thor2_jax.service.batching import Batcher
-from thor2_jax.service.engine import CloudResult, InferenceEngine
-from thor2_jax.service.metrics import CompilationCounter, Metrics
+from thor2_jax.service.engine import CloudResult, ExplanationPrograms, InferenceEngine
+from thor2_jax.service.metrics import COMPILER_THREAD, CompilationCounter, Metrics
 from thor2_jax.service.preparation import (
     PreparationPool,
     PreparedRequest,
@@ -35,6 +36,9 @@ from thor2_jax.service.teaching import Enrolment, gallery_errors
 __all__ = ["AdmittedRequest", "Service"]
 
 log = logging.getLogger(__name__)
+
+WHY_RETRY_SECONDS = 3
+"""Value of Retry-After until explanations are compiled."""
 
 LOCK_SHARE = 0.8
 """Share of the time left to a request for which it waits for another writer, so that it learns the reason."""
@@ -83,6 +87,7 @@ class Service:
         self.progress = ""
         self._compilations = CompilationCounter(self.metrics.compilations)
         self._in_progress = self._accepted = self._finished = 0
+        self._compiled: dict[ExplanationPrograms, Future[None]] = {}
         self._gallery_lock = asyncio.Lock()  # Changes that wait for another process occupy one thread only.
 
     def start(self) -> None:
@@ -92,6 +97,7 @@ class Service:
             self._process_batch, lambda: self._in_progress, self.settings.max_batch, self.settings.window
         )
         self._explainer = ThreadPoolExecutor(1, thread_name_prefix="explain")
+        self._compiler = ThreadPoolExecutor(1, thread_name_prefix=COMPILER_THREAD)
         self._warm_up_thread = threading.Thread(target=self._warm_up, name="warm-up")
         self._warm_up_thread.start()
 
@@ -114,6 +120,27 @@ class Service:
             self.state = "ready"
             self.metrics.ready_workers.set(1)
         log.info("ready: %d batch shapes compiled in %.1f s", len(shapes), time.monotonic() - start)
+        if self.settings.warm_why:
+            self._warm_why([programs for n in POINT_BUCKETS for programs in self.engine.explanation_programs(n)])
+
+    def _warm_why(self, programs: list[ExplanationPrograms]) -> None:
+        """Compile for explanations, one size after the other, so that what requests ask for comes in between."""
+        if programs and self.state == "ready":
+            self._compile_explanations(programs[0]).add_done_callback(lambda _: self._warm_why(programs[1:]))
+
+    def _compile_explanations(self, programs: ExplanationPrograms) -> Future[None]:
+        """Compile what explanations need in the background, unless that has begun already."""
+
+        def compile_all() -> None:
+            try:
+                self.engine.compile_explanations(programs, lambda: self.state != "ready")
+            except Exception:  # Requests compile what is missing, and report the error.
+                log.exception("compiling explanations failed")
+            log.info("explanations of clouds of %d points are compiled", programs[0])
+
+        if programs not in self._compiled:
+            self._compiled[programs] = self._compiler.submit(compile_all)
+        return self._compiled[programs]
 
     def wait_until_ready(self) -> None:
         """Return when the warm-up has ended. Raises RuntimeError if it failed."""
@@ -138,6 +165,7 @@ class Service:
         self._warm_up_thread.join()
         self._pool.close()
         self._batcher.close()
+        self._compiler.shutdown(cancel_futures=True)
         self._explainer.shutdown(cancel_futures=True)
         self._compilations.stop()
         log.info("stopped: %d requests accepted, %d finished", self._accepted, self._finished)
@@ -205,12 +233,18 @@ class Service:
         """Explain the answer for one instance of a frame, one request after the other.
 
         Raises:
-            RequestError: as `prepare_view`, or 422 if the run cannot be explained.
+            RequestError: as `prepare_view`, 422 if the run cannot be explained, or 503 until explanations of clouds of
+                this size are compiled.
         """
         arguments = files, self.engine.run.config.sigma_s, label, True
         prepared = await asyncio.wrap_future(self._pool.submit(request.deadline, prepare_view, *arguments))
         request.seconds.update(prepared.seconds)
         self.engine.refresh()
+        needed = self.engine.explanation_programs(len(prepared.instances[0].points))
+        if not all([self._compile_explanations(programs).done() for programs in needed]):
+            error = RequestError(503, None, "Explanations are still being compiled, which takes up to some minutes.")
+            error.retry_after = WHY_RETRY_SECONDS
+            raise error
 
         def explained() -> WhyAnswer:
             assert prepared.frame is not None

@@ -21,13 +21,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.frames import Intrinsics, RGBDFrame
-from thor2_jax.recognition.prepared_instance import PreparedInstance, prepare_instance
+from thor2_jax.frames.frames import Intrinsics, RGBDFrame
+from thor2_jax.frames.prepared_instance import PreparedInstance, prepare_instance
 from thor2_jax.segmentation.segmenters import load_segmenter, segmented
 from thor2_jax.service.decoding import check_instances, decode_frame, decode_json_clouds, decode_npz_clouds
 from thor2_jax.service.problem import RequestError, deadline_exceeded
 from thor2_jax.service.schemas import LabelMap
 from thor2_jax.service.settings import MAX_LABEL_RUNS
+from thor2_jax.service.signals import signals_blocked
 
 __all__ = ["PreparationPool", "PreparedRequest", "prepare_clouds", "prepare_frame", "prepare_view"]
 
@@ -184,7 +185,8 @@ class _PreparationProcess:
     def __init__(self, context: Any, segmenter: str | None) -> None:
         self.pipe, child_pipe = context.Pipe()
         self.process = context.Process(target=_run_process, args=(child_pipe, segmenter), daemon=True)
-        self.process.start()
+        with signals_blocked(signal.SIGINT, signal.SIGTERM):
+            self.process.start()
         child_pipe.close()
         self.pipe.recv()
 

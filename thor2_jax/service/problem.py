@@ -10,7 +10,7 @@ __all__ = ["FieldError", "Problem", "RequestError", "deadline_exceeded", "error_
 _DESCRIPTIONS = {
     400: "The body cannot be parsed.",
     401: "The bearer token is missing or invalid.",
-    403: "The request comes from a web page of another site.",
+    403: "The request comes from a web page of another site, or its header Host names another server.",
     404: "No object has this name.",
     408: "The body did not arrive before the deadline.",
     409: "The change conflicts with the gallery: the name exists, or another change was made since.",
@@ -19,7 +19,8 @@ _DESCRIPTIONS = {
     422: "A field is missing, damaged, too large, or inconsistent with another field.",
     429: "The queue is full; repeat the request after the number of seconds in Retry-After.",
     500: "Internal error of the service, or a damaged gallery.",
-    503: "The service is starting or stopping, or another process is writing to the gallery.",
+    503: "The service is starting or stopping, explanations are being compiled, or another process is writing to the "
+    "gallery.",
     504: "The deadline of the request was exceeded.",
     507: "The gallery cannot be written, for example on a full disk; it is as before.",
 }
@@ -39,7 +40,13 @@ class Problem(FieldError):
 
 
 class RequestError(Exception):
-    """Error response of a request: a status and the fields of `Problem`. It can be pickled."""
+    """Error response of a request: a status and the fields of `Problem`. It can be pickled.
+
+    Attributes:
+        retry_after: seconds after which a request with status 429 or 503 may be repeated.
+    """
+
+    retry_after = 1
 
     def __init__(self, status: int, field: str | None, message: str, *further: tuple[str | None, str]) -> None:
         super().__init__(status, field, message, *further)
@@ -66,7 +73,7 @@ def error_responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
         status: {
             "model": Problem,
             "description": _DESCRIPTIONS[status],
-            **({"headers": retry_after} if status == 429 else {}),
+            **({"headers": retry_after} if status in (429, 503) else {}),
         }
         for status in statuses
     }

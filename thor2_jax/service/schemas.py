@@ -65,7 +65,7 @@ class InstanceAnswer(BaseModel):
         description="Fused probability of the most probable class, or the score of the gallery."
     )
     classifier: str | None = Field(
-        description="Classifier that gives this class the highest probability: tops or tops2, or gallery."
+        description="Classifier that gives this class the highest probability: tops, tops2 or embedding, or gallery."
     )
     top: dict[str, list[Candidate]] = Field(
         description="Five most probable classes of each classifier, and of the gallery."
@@ -91,6 +91,7 @@ class FrameAnswer(BaseModel):
     """All instances of a frame, in the order of their labels."""
 
     instances: list[InstanceAnswer]
+    knows: str = Field(description="What the model knows, in words; other objects are unknown.")
     label_map: "LabelMap | None" = Field(
         default=None, description="Labels of a frame that was segmented; null if the request had labels."
     )
@@ -218,6 +219,7 @@ class ModelAnswer(BaseModel):
     """The model of the service."""
 
     classes: list[str]
+    knows: str = Field(description="What the model knows, in words.")
     classifiers: list[str]
     descriptor_version: int
     descriptor: dict[str, Any] = Field(description="Configuration of the descriptor.")
@@ -302,7 +304,8 @@ FRAME_FORM: dict[str, Any] = {
                     },
                     "intrinsics": {
                         "type": "string",
-                        "description": "JSON: fx, fy, cx, cy in pixels and optionally depth_scale (units per metre).",
+                        "description": "JSON: fx, fy, cx, cy in pixels and optionally depth_scale (units per metre); "
+                        "or a file of ROS, BOP, RealSense or Open3D, or a 3 x 3 matrix (JSON, YAML, text, NPY).",
                     },
                 },
             }

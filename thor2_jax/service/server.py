@@ -2,6 +2,7 @@
 
 import contextlib
 import copy
+import dataclasses
 import functools
 import logging
 import multiprocessing
@@ -18,10 +19,12 @@ from fastapi import FastAPI
 from uvicorn.config import LOGGING_CONFIG
 from uvicorn.supervisors import Multiprocess
 
+from thor2_jax.errors import InputError
 from thor2_jax.service.app import create_app
 from thor2_jax.service.connections import TimedConnection
 from thor2_jax.service.engine import InferenceEngine
 from thor2_jax.service.settings import Settings
+from thor2_jax.service.signals import ended_by_signals, signals_blocked
 
 __all__ = ["serve"]
 
@@ -38,9 +41,9 @@ def serve(settings: Settings, host: str = "127.0.0.1", port: int = 8080, workers
         workers: number of processes, each with its own model, queue and preparation processes.
 
     Raises:
-        InputError: the run cannot be read.
-        OSError: the address is in use.
+        InputError: the run cannot be read, or the address is in use.
     """
+    settings = dataclasses.replace(settings, allow_host=(*settings.allow_host, host))
     log_config = copy.deepcopy(LOGGING_CONFIG)
     log_config["loggers"]["thor2_jax.service"] = {"handlers": ["default"], "level": "INFO", "propagate": False}
     config = uvicorn.Config(
@@ -57,31 +60,53 @@ def serve(settings: Settings, host: str = "127.0.0.1", port: int = 8080, workers
         timeout_worker_healthcheck=60,  # A worker does not answer while it imports modules.
     )
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    with socket.create_server((host, port), family=family, backlog=config.backlog) as listener:
+    try:
+        server = socket.create_server((host, port), family=family, backlog=config.backlog)
+    except OSError as error:
+        raise InputError(f"port is {port} and host {host}, which cannot be used ({error}); choose others") from None
+    with server as listener:
         url_host = f"[{host}]" if ":" in host else host
         url = f"http://{url_host}:{listener.getsockname()[1]}"
         if workers == 1:
+            with ended_by_signals():
+                config.load()
+            log.info("listening at %s", url)
             # uvicorn raises the signal again after the shutdown, which then is a normal exit.
             signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
-            config.load()
-            log.info("listening at %s", url)
             with contextlib.suppress(KeyboardInterrupt):
                 uvicorn.Server(config).run([listener])
         else:
-            InferenceEngine(settings)  # Report an unreadable run once, not once per worker.
+            with ended_by_signals():
+                InferenceEngine(settings)  # Report an unreadable run once, not once per worker.
             log.info("listening at %s; requests wait until a worker is ready", url)
             listener.set_inheritable(True)
             with tempfile.TemporaryDirectory() as directory:
                 os.environ["PROMETHEUS_MULTIPROC_DIR"] = directory
-                Multiprocess(config, [listener]).run()
+                _Supervisor(config, [listener]).run()
+
+
+class _Supervisor(Multiprocess):
+    """uvicorn's supervisor; only it receives the SIGINT of a terminal, and ends its workers by SIGTERM."""
+
+    def init_processes(self) -> None:
+        """Start the workers."""
+        with signals_blocked(signal.SIGINT):
+            super().init_processes()
+
+    def keep_subprocess_alive(self) -> None:
+        """Replace workers that have died."""
+        with signals_blocked(signal.SIGINT):
+            super().keep_subprocess_alive()
 
 
 def _create_worker(settings: Settings, workers: int) -> FastAPI:
     """Create the application of one process; a worker is terminated when its parent has ended, even by SIGKILL."""
     parent = multiprocessing.parent_process()
-    if parent is not None:
-        threading.Thread(target=_terminate_after, args=(parent,), name="parent-watch", daemon=True).start()
-    return create_app(settings, workers)
+    if parent is None:
+        return create_app(settings, workers)
+    threading.Thread(target=_terminate_after, args=(parent,), name="parent-watch", daemon=True).start()
+    with ended_by_signals():  # uvicorn's handler would wait until everything is compiled.
+        return create_app(settings, workers)
 
 
 def _terminate_after(parent: BaseProcess) -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from thor2_jax.capacity import BATCH_BUCKETS
 from thor2_jax.errors import InputError
+from thor2_jax.hosts import check_host_names
 from thor2_jax.segmentation.segmenters import TABLE, load_segmenter
 
 __all__ = [
@@ -42,6 +43,9 @@ MAX_LABEL_RUNS = 50_000
 MAX_CLOUDS = 32
 """Maximum number of clouds in a request."""
 
+MAX_DEADLINE = 86_400
+"""Largest deadline of a request, in seconds."""
+
 MAX_INTRINSICS_BYTES = 4096
 """Maximum size of the intrinsics file."""
 
@@ -70,6 +74,8 @@ class Settings:
         adapt: the colours of the camera are estimated from the latest frames, and corrected.
         segmenter: name of the segmenter of frames without labels, see `segmentation.segmenters`; None refuses
             them. Default: that of `default_segmenter`.
+        allow_host: names that the header Host may have, besides loopback names and the address that is connected to.
+        warm_why: explanations are compiled in the background after the start; otherwise from the first request on.
 
     Raises:
         InputError: a value is out of range, or the segmenter cannot be loaded.
@@ -88,11 +94,16 @@ class Settings:
     teach: bool = False
     adapt: bool = False
     segmenter: str | None = dataclasses.field(default_factory=default_segmenter)
+    allow_host: tuple[str, ...] = ()
+    warm_why: bool = True
 
     def __post_init__(self) -> None:
         for name in ("queue", "deadline", "processes"):
             if not getattr(self, name) > 0:
                 raise InputError(f"{name} is {getattr(self, name)}; expected a positive number")
+        if self.deadline > MAX_DEADLINE:
+            raise InputError(f"deadline is {self.deadline}; expected at most {MAX_DEADLINE} seconds")
+        check_host_names(self.allow_host)
         if self.cache is not None and self.cache.exists() and not self.cache.is_dir():
             raise InputError(f"cache is {self.cache}, a file; expected a directory, which may be new")
         if self.segmenter is not None:
@@ -100,4 +111,7 @@ class Settings:
         if self.max_batch not in BATCH_BUCKETS:
             raise InputError(f"max_batch is {self.max_batch}; expected one of {', '.join(map(str, BATCH_BUCKETS))}")
         if self.token is not None and not (self.token and self.token.isascii() and self.token.isprintable()):
-            raise InputError("token is empty or has other characters; expected printable ASCII characters")
+            raise InputError(
+                "token (--token or THOR2_TOKEN) is empty or has other characters; expected printable ASCII characters; "
+                "leave both out for a service without a token"
+            )

@@ -10,8 +10,8 @@ from pathlib import Path
 from fastapi import Request
 
 from thor2_jax.errors import InputError
-from thor2_jax.gallery.gallery import check_name
 from thor2_jax.gallery.store import GalleryBusyError, GalleryError
+from thor2_jax.printable import check_name
 from thor2_jax.service.problem import RequestError
 
 __all__ = ["Enrolment", "check_same_site", "gallery_errors", "generation_number", "instance_number", "parse_enrolment"]
@@ -24,7 +24,7 @@ MAX_NAME_BYTES = 1000
 
 @dataclasses.dataclass(frozen=True)
 class Enrolment:
-    """What a request enrolls.
+    """The object that a request enrolls.
 
     Attributes:
         name: name of the object.

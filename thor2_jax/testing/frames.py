@@ -5,8 +5,8 @@ from collections.abc import Callable, Sequence
 import hypothesis.strategies as st
 import numpy as np
 
-from thor2_jax.recognition.frames import Intrinsics, RGBDFrame
-from thor2_jax.recognition.instance_clouds import InstanceCloud
+from thor2_jax.frames.frames import Intrinsics, RGBDFrame
+from thor2_jax.frames.instance_clouds import InstanceCloud
 from thor2_jax.testing.clouds import seeds
 
 __all__ = ["assert_depth_units_agree", "assert_labels_are_names", "frames"]

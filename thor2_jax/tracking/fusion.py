@@ -10,7 +10,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from thor2_jax.recognition.prepared_instance import PreparedInstance
+from thor2_jax.frames.prepared_instance import PreparedInstance
 
 __all__ = ["FusedEvidence", "view_weight"]
 

@@ -10,18 +10,19 @@
 
 import dataclasses
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, Protocol, Self
 
+import jax
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from thor2_jax.errors import InputError
-from thor2_jax.gallery.gallery import Gallery
-from thor2_jax.recognition.answers import MAX_OVERFLOW, Evidence, Recognition
-from thor2_jax.recognition.frames import RGBDFrame
-from thor2_jax.recognition.prepared_instance import EMPTY_INSTANCE, PreparedInstance
-from thor2_jax.recognition.run_directory import TrainedRun
+from thor2_jax.frames.frames import RGBDFrame
+from thor2_jax.frames.prepared_instance import EMPTY_INSTANCE, PreparedInstance
+from thor2_jax.model.answers import MAX_OVERFLOW, Recognition
+from thor2_jax.model.inference import Inference, answers, gallery_scores
+from thor2_jax.model.model import Model
 from thor2_jax.tracking.fusion import FusedEvidence, view_weight
 from thor2_jax.tracking.matching import OccupiedVoxels, match, occupied_voxels
 from thor2_jax.tracking.merging import PosedInstance, merge_views
@@ -56,21 +57,14 @@ class TrackedRecognition(Recognition):
 
 
 class FrameRecognizer(Protocol):
-    """What a tracker needs of a recognizer, see `Recognizer`."""
+    """The part of a recognizer that a tracker uses, see `Recognizer`."""
 
     @property
-    def run(self) -> TrainedRun: ...
+    def model(self) -> Model: ...
 
-    @property
-    def gallery(self) -> Gallery: ...
+    def prepare(self, frame: RGBDFrame) -> Iterable[PreparedInstance]: ...
 
-    def evidence_of(self, instances: Iterable[PreparedInstance]) -> tuple[list[PreparedInstance], Evidence]: ...
-
-    def frame_evidence(self, frame: RGBDFrame) -> tuple[list[PreparedInstance], Evidence]: ...
-
-    def recognitions(self, instances: Sequence[PreparedInstance], evidence: Evidence) -> list[Recognition]: ...
-
-    def fused(self, probabilities: Mapping[str, NDArray[np.float32]]) -> NDArray[np.floating[Any]]: ...
+    def infer(self, instances: Iterable[PreparedInstance]) -> tuple[list[PreparedInstance], Inference]: ...
 
 
 class _Track:
@@ -79,12 +73,12 @@ class _Track:
     Attributes:
         number: from 1, in the order of appearance.
         voxels: those of its last view.
-        instance: what was described last: its last view, with poses merged with those before it.
+        instance: the cloud that was described last: its last view, with poses merged with those before it.
         overflow: points of that cloud outside the descriptor's grid.
         seen: number of the frame of its last view.
         views: its latest views and the poses of their cameras; empty without poses.
         frames: number of views.
-        evidence: what it is recognized by.
+        evidence: fused inferences of its views.
     """
 
     def __init__(self, number: int) -> None:
@@ -132,12 +126,12 @@ class Tracker:
         if self._frame and (world is not None) != self._has_poses:
             given, expected = ("given", "none") if world is not None else ("None", "a pose")
             raise InputError(f"pose is {given}; expected {expected}, as for the first frame: give all poses or none")
-        instances, evidence = self._recognizer.frame_evidence(frame)
+        instances, inference = self._recognizer.infer(self._recognizer.prepare(frame))
         self._size, self._has_poses = frame.depth.shape, world is not None
         self._frame += 1
         self._tracks = [track for track in self._tracks if self._frame - track.seen <= MAX_MISSED]
         usable = [instance for instance in instances if instance.reason is None]
-        self._extend(usable, evidence, world)
+        self._extend(usable, inference, world)
         by_label = {track.instance.label: track for track in self._tracks if track.seen == self._frame}
         answers = iter(self._answers([by_label[instance.label] for instance in usable]))
         return [
@@ -168,13 +162,13 @@ class Tracker:
         if not followed.views or not probabilities:
             missing = "answers of classifiers" if followed.views else "poses"
             raise InputError(f"track {track} has no {missing}; next_view needs them")
-        fused = self._recognizer.fused({name: p[None].astype(np.float32) for name, p in probabilities.items()})[0]
+        fused = self._recognizer.model.fused({name: p[None].astype(np.float32) for name, p in probabilities.items()})[0]
         pose, points = followed.views[-1][1], followed.instance.points
         centre = (points.min(axis=0, keepdims=True) + points.max(axis=0, keepdims=True)) / 2
         return next_view(fused, transform(pose, centre)[0], pose, candidates, table)
 
     def _extend(
-        self, usable: Sequence[PreparedInstance], evidence: Evidence, world: NDArray[np.float64] | None
+        self, usable: Sequence[PreparedInstance], inference: Inference, world: NDArray[np.float64] | None
     ) -> None:
         """Add every instance to its track, or start a track with it."""
         points = [each.points if world is None else transform(world, each.points) for each in usable]
@@ -186,50 +180,45 @@ class Tracker:
             track.seen, track.frames = self._frame, track.frames + 1
             if world is not None:
                 track.views.append((instance, world))
-        self._add_evidence(tracks, evidence)
+        self._add_evidence(tracks, inference)
         several = [track for track in tracks if len(track.views) > 1]
         for track in several:
-            track.instance = merge_views(track.views, self._recognizer.run.config.sigma_s)
+            track.instance = merge_views(track.views, self._recognizer.model.run.config.sigma_s)
         if several:
-            self._add_evidence(several, self._recognizer.evidence_of(track.instance for track in several)[1])
+            self._add_evidence(several, self._recognizer.infer(track.instance for track in several)[1])
 
     def _start_track(self) -> _Track:
         self._last_number += 1
         self._tracks.append(_Track(self._last_number))
         return self._tracks[-1]
 
-    def _add_evidence(self, tracks: Sequence[_Track], evidence: Evidence) -> None:
-        """Add the rows of the evidence to those of the tracks, weighted by the clouds that were described."""
-        scores = self._scores(evidence, len(tracks))
+    def _add_evidence(self, tracks: Sequence[_Track], inference: Inference) -> None:
+        """Add the rows of an inference to those of the tracks, weighted by the clouds that were described."""
+        model = self._recognizer.model
+        inference = jax.tree.map(lambda a: np.asarray(a)[: len(tracks)], inference)
+        scores = gallery_scores(model, inference)
         for row, track in enumerate(tracks):
-            track.overflow = int(evidence.overflow[row])
+            track.overflow = int(inference.overflow[row])
             fits = track.overflow <= MAX_OVERFLOW * len(track.instance.points)
             weight = view_weight(track.instance) if fits else 0.0
-            probabilities = {name: np.asarray(values)[row] for name, values in evidence.probabilities.items()}
-            track.evidence.add(weight, probabilities, None if scores is None else scores[row])
-
-    def _scores(self, evidence: Evidence, count: int) -> list[dict[str, float]] | None:
-        """Return the scores of the gallery of each instance, by name; None if the classifiers alone answer."""
-        if evidence.embeddings is None:
-            return None
-        gallery = self._recognizer.gallery
-        scores = gallery.scores(np.asarray(evidence.embeddings)[:count], np.asarray(evidence.weights)[:count])
-        return [dict(zip(gallery.names, row.tolist(), strict=True)) for row in scores]
+            probabilities = {name: values[row] for name, values in inference.probabilities.items()}
+            by_name = None if scores is None else dict(zip(model.gallery.names, scores[row].tolist(), strict=True))
+            track.evidence.add(weight, probabilities, by_name)
 
     def _answers(self, tracks: Sequence[_Track]) -> list[TrackedRecognition]:
         if not tracks:
             return []
+        model = self._recognizer.model
         fused = [track.evidence.fused() for track in tracks]
         probabilities = {name: np.stack([each[0][name] for each in fused]) for name in fused[0][0]}
         scores = None
         if fused[0][1] is not None:
-            names = self._recognizer.gallery.names
-            scores = np.array([[(each or {}).get(name, 0.0) for name in names] for _, each in fused])
-        evidence = Evidence(np.array([track.overflow for track in tracks]), probabilities, scores=scores)
-        answers = self._recognizer.recognitions([track.instance for track in tracks], evidence)
+            scores = np.array([[(each or {}).get(name, 0.0) for name in model.gallery.names] for _, each in fused])
+        inference = Inference(np.array([track.overflow for track in tracks]), probabilities, scores=scores)
+        answered = answers(model, [track.instance for track in tracks], inference)
         return [
             TrackedRecognition(**_fields(answer), track=track.number, frames=track.frames)
-            for track, answer in zip(tracks, answers, strict=True)
+            for track, answer in zip(tracks, answered, strict=True)
         ]
 
 

@@ -16,9 +16,9 @@ from typing import Any
 from PIL import Image
 
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.answers import Recognition
-from thor2_jax.recognition.frames import RGBDFrame
-from thor2_jax.recognition.overlay import COLORS, UNRECOGNIZED, Annotation, Paint, draw_instances
+from thor2_jax.frames.frames import RGBDFrame
+from thor2_jax.frames.overlay import COLORS, UNRECOGNIZED, Annotation, Paint, draw_instances
+from thor2_jax.model.answers import Recognition
 from thor2_jax.recordings.detections import Detection, detections_of
 from thor2_jax.recordings.recorded_frames import RecordedFrame
 from thor2_jax.segmentation.segmenters import Segmenter, segmented
@@ -38,7 +38,7 @@ _JPEG_QUALITY = 80
 def paced(
     frames: Iterable[RecordedFrame],
     clock: Callable[[], float] = time.monotonic,
-    sleep: Callable[[float], None] = time.sleep,
+    sleep: Callable[[float], object] = time.sleep,
 ) -> Iterator[RecordedFrame]:
     """Yield the frames of a recording at the speed at which they were taken; those that are late are left out.
 
@@ -71,7 +71,7 @@ class LiveView:
         Args:
             recognize: `Recognizer.recognize`, or `Tracker.update`, whose answers have tracks.
             segmenter: gives labels to the frames that have none.
-            broadcast: what the messages are published to.
+            broadcast: receiver of the messages.
         """
         self._recognize, self._segmenter, self._broadcast = recognize, segmenter, broadcast
         self._times: deque[float] = deque(maxlen=FPS_FRAMES)

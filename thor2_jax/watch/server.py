@@ -7,12 +7,13 @@ with serve_live(broadcast, port=0) as url:
 import contextlib
 import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
 from thor2_jax.errors import InputError
+from thor2_jax.hosts import check_host_names, is_allowed_host
 from thor2_jax.watch.broadcast import Broadcast
 
 __all__ = ["serve_live"]
@@ -37,8 +38,6 @@ _HEADERS = {
     "Cache-Control": "no-store",
 }
 
-_LOOPBACK = ("localhost", "127.0.0.1", "[::1]", "::1")
-
 KEEP_ALIVE = 2.0
 """Seconds without a message after which a comment is sent, so that a closed connection is noticed."""
 
@@ -47,9 +46,10 @@ class _Server(ThreadingHTTPServer):
     daemon_threads = True
     block_on_close = False
 
-    def __init__(self, address: tuple[str, int], broadcast: Broadcast) -> None:
+    def __init__(self, address: tuple[str, int], broadcast: Broadcast, allow_host: Sequence[str]) -> None:
         self.address_family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
         self.broadcast, self.is_stopping = broadcast, threading.Event()
+        self.allow_host = (*allow_host, address[0])
         super().__init__(address, _Handler)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
@@ -62,9 +62,9 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         """Answer with a file, or with the messages of the live view."""
-        host = self.headers.get("Host", "").rpartition(":")[0] or self.headers.get("Host", "")
-        if self.server.server_address[0] in _LOOPBACK and host not in _LOOPBACK:
-            self.send_error(403)  # A page of another site that has given its own name this address.
+        address = self.connection.getsockname()[0]
+        if not is_allowed_host(self.headers.get("Host", ""), address, self.server.allow_host):
+            self.send_error(403, "Host is another server's; see --allow-host")
         elif self.path == "/events":
             self._send_events()
         elif self.path in _FILES:
@@ -101,19 +101,23 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 @contextlib.contextmanager
-def serve_live(broadcast: Broadcast, host: str = "127.0.0.1", port: int = 8090) -> Iterator[str]:
+def serve_live(
+    broadcast: Broadcast, host: str = "127.0.0.1", port: int = 8090, allow_host: Sequence[str] = ()
+) -> Iterator[str]:
     """Serve a live view in threads of this process; yield its address.
 
     Args:
         broadcast: the messages.
         host: address to listen on.
         port: port to listen on; 0 chooses a free one.
+        allow_host: names that the header Host may have, besides loopback names and the address that is connected to.
 
     Raises:
-        InputError: the address cannot be used.
+        InputError: the address cannot be used, or a name is none.
     """
+    check_host_names(allow_host)
     try:
-        server = _Server((host, port), broadcast)
+        server = _Server((host, port), broadcast, allow_host)
     except (OSError, OverflowError) as error:
         raise InputError(
             f"port is {port} and host {host}, which cannot be used ({error}); choose another one"

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.frames import RGBDFrame
-from thor2_jax.recognition.outlier_removal import flying_pixels
+from thor2_jax.frames.frames import RGBDFrame
+from thor2_jax.frames.outlier_removal import flying_pixels
 from training.augmentation.base import Base, without_base
 from training.augmentation.illumination import Illumination, relit
 from training.augmentation.occlusion import Occlusion, occluded
@@ -27,6 +27,9 @@ from training.augmentation.sensor import Sensor, sensed
 from training.rendering.camera import RenderedView
 
 __all__ = ["Augmentations", "augment"]
+
+MAX_COPIES = 1000
+"""Largest number of augmented copies of a view."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,7 +46,7 @@ class Augmentations:
         copies: number of augmented copies of each view.
 
     Raises:
-        InputError: `copies` is not an integer of at least 1, or an augmentation has another type.
+        InputError: `copies` is not an integer from 1 to `MAX_COPIES`, or an augmentation has another type.
     """
 
     illumination: Illumination | None = None
@@ -67,8 +70,8 @@ class Augmentations:
             value = getattr(self, name)
             if value is not None and not isinstance(value, kind):
                 raise InputError(f"augmentations.{name} is {value!r}; it must be None or {kind.__name__}")
-        if not isinstance(self.copies, int) or isinstance(self.copies, bool) or self.copies < 1:
-            raise InputError(f"augmentations.copies is {self.copies!r}; it must be an integer of at least 1")
+        if not isinstance(self.copies, int) or isinstance(self.copies, bool) or not 1 <= self.copies <= MAX_COPIES:
+            raise InputError(f"augmentations.copies is {self.copies!r}; expected an integer from 1 to {MAX_COPIES}")
 
     def __bool__(self) -> bool:
         settings = self.illumination, self.sensor, self.occlusion, self.segmentation, self.registration, self.base

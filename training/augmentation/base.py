@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from thor2_jax.recognition.frames import backproject
+from thor2_jax.frames.frames import backproject
 from training.augmentation.pixels import without
 from training.augmentation.settings import Range, check_fields
 from training.rendering.camera import RenderedView

@@ -12,10 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from thor2_jax.descriptor.orientations import NEARLY_EQUAL
 from thor2_jax.types import PointClouds
 
 __all__ = ["reorient"]
+
+NEARLY_EQUAL = 0.85
+"""Least ratio of a side of the box to the next longer one at which the two may be swapped."""
 
 MAX_ROTATION = 10.0
 """Largest random rotation of a normalized cloud, degrees."""

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, binary_erosion, maximum_filter
 
-from thor2_jax.recognition.frames import Intrinsics
-from thor2_jax.recognition.outlier_removal import PIECE_CELL
+from thor2_jax.frames.frames import Intrinsics
+from thor2_jax.frames.outlier_removal import PIECE_CELL
 from training.augmentation.pixels import FRAME_PIXEL, pixel_width, without
 from training.augmentation.settings import Range, check_fields
 from training.rendering.camera import TRAINING_CAMERA, RenderedView

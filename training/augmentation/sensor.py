@@ -6,6 +6,7 @@ Lovell, "Modeling Kinect sensor noise for improved 3D reconstruction and trackin
 
 import dataclasses
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,8 +56,8 @@ class Sensor:
         )
 
 
-def axial_deviation(z: float) -> float:
-    """Return the axial standard deviation of depth at a distance z, both in metres (Nguyen, Izadi and Lovell 2012)."""
+def axial_deviation(z: Any) -> Any:
+    """Return the axial standard deviation of depth at distances z, both in metres (Nguyen, Izadi and Lovell 2012)."""
     return 0.0012 + 0.0019 * (z - 0.4) ** 2
 
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.view_normalization import view_normalize
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.answers import DescribedFrame
-from thor2_jax.recognition.frames import RGBDFrame
+from thor2_jax.frames.frames import RGBDFrame
+from thor2_jax.model.answers import DescribedFrame
 from thor2_jax.types import PointClouds
 from training.views.crops import rgbd_crop
 from training.views.view_crops import ViewCrops, quantized, stacked

@@ -1,6 +1,7 @@
 """Fitting an image network: AdamW on cross-entropy, with a cosine schedule and a checkpoint for each epoch."""
 
 import dataclasses
+from collections.abc import Iterator
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -10,7 +11,6 @@ import optax  # type: ignore[import-untyped]
 from flax import nnx
 from numpy.typing import NDArray
 
-from thor2_jax.errors import InputError
 from thor2_jax.files import file_digest
 from training.baselines.image_network import ImageNetwork
 from training.baselines.networks.architectures import ARCHITECTURES
@@ -19,6 +19,7 @@ from training.baselines.networks.weights import load_backbone
 from training.baselines.pretrained import weights_file
 from training.baselines.task import FitTask, FittedBaseline
 from training.fitting.checkpoints import Checkpoints
+from training.fitting.loop import Steps, run_epochs
 from training.views.view_crops import ViewCrops
 
 __all__ = ["CropSamples", "fit_network", "read_samples"]
@@ -141,30 +142,25 @@ def _fit(
     """Fit the network on the crops of these rows."""
     n_views = len(np.unique(np.stack([samples.label[rows], samples.view[rows]]), axis=1).T)
     epochs, batch_size = task.options.epochs, min(BATCH_SIZE, n_views)
-    steps = n_views // batch_size
+    steps = Steps(epochs, n_views // batch_size, batch_size)
     model.train()
     split: Any = nnx.split(model, nnx.Param, nnx.BatchStat)
     graph, params, statistics = split
-    state = _State(params, statistics, _optimizer(0.0).init(params))
+    leaves, structure = jax.tree.flatten(_State(params, statistics, _optimizer(0.0).init(params)))
+
+    def epoch(number: int) -> Iterator[tuple[ViewCrops, NDArray[np.int32]]]:
+        rng = np.random.default_rng((task.options.seed, number - 1))
+        order = rng.permutation(rows)[: steps.of_epoch * batch_size]
+        for batch in order.reshape(-1, batch_size):
+            yield _mirrored(samples.rows(batch), rng), samples.label[batch]
+
+    def step(leaves: list[Any], number: int, batch: tuple[ViewCrops, NDArray[np.int32]]) -> tuple[list[Any], Any]:
+        crops, label = batch
+        rate = _learning_rate(highest, (number + 0.5) / (epochs * steps.of_epoch))
+        state, *metrics = _step(graph, jax.tree.unflatten(structure, leaves), crops.color, crops.normals, label, rate)
+        return jax.tree.leaves(state), metrics
+
     with Checkpoints(task.scratch / ("pretrained" if highest == PRETRAINED_RATE else "scratch")) as checkpoints:
-        if checkpoints.last_epoch:
-            state = jax.tree.unflatten(jax.tree.structure(state), checkpoints.last(jax.tree.leaves(state)))
-        for epoch in range(checkpoints.last_epoch, epochs):
-            rng = np.random.default_rng((task.options.seed, epoch))
-            order = rng.permutation(rows)[: steps * batch_size]
-            correct = 0.0
-            for step in range(steps):
-                batch = order[step * batch_size : (step + 1) * batch_size]
-                crops = _mirrored(samples.rows(batch), rng)
-                rate = _learning_rate(highest, (epoch * steps + step + 0.5) / (epochs * steps))
-                state, loss, accuracy = _step(graph, state, crops.color, crops.normals, samples.label[batch], rate)
-                correct += float(accuracy)
-                if not np.isfinite(loss):
-                    raise InputError(
-                        f"baselines: the loss of {name} is {loss} in epoch {epoch + 1}; check the views, or leave "
-                        "it out"
-                    )
-                note = f"epoch {epoch + 1}, accuracy {correct / (step + 1):.3f}"
-                task.progress(f"fit {name}", epoch * steps + step + 1, epochs * steps, note)
-            checkpoints.save(epoch + 1, jax.tree.leaves(state), correct / steps)
+        leaves = run_epochs(name, leaves, steps, epoch, step, checkpoints, progress=task.report(name))
+    state = jax.tree.unflatten(structure, leaves)
     return nnx.merge(graph, state.params, state.statistics)

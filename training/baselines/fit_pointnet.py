@@ -1,5 +1,6 @@
 """Fitting the PointNet baseline: Adam on cross-entropy, with a cosine schedule."""
 
+from collections.abc import Iterator
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -9,9 +10,10 @@ import optax  # type: ignore[import-untyped]
 from flax import nnx
 from numpy.typing import NDArray
 
-from thor2_jax.errors import InputError
 from training.baselines.pointnet import POINTS, ColoredPointNet, PointNet, point_features, random_indices
 from training.baselines.task import FitTask, FittedBaseline
+from training.fitting.checkpoints import Checkpoints
+from training.fitting.loop import Steps, run_epochs
 
 __all__ = ["fit_pointnet"]
 
@@ -77,7 +79,9 @@ def _step(graph: Any, params: Any, optimizer: Any, x: jax.Array, label: jax.Arra
 
 
 def fit_pointnet(task: FitTask) -> FittedBaseline:
-    """Fit a PointNet; each epoch uses every view once, with a random sample of points and random mirroring.
+    """Fit a PointNet; an interrupted fit resumes after its last epoch.
+
+    Each epoch uses every view once, with a random sample of points and random mirroring.
 
     Raises:
         InputError: the loss is not finite.
@@ -94,25 +98,22 @@ def fit_pointnet(task: FitTask) -> FittedBaseline:
 def _fit(task: FitTask, views: _Views, rows: NDArray[np.intp]) -> ColoredPointNet:
     """Fit a PointNet on the views of these rows."""
     epochs, batch_size = task.options.epochs, min(BATCH_SIZE, len(rows))
-    steps = len(rows) // batch_size
+    steps = Steps(epochs, len(rows) // batch_size, batch_size)
     split: Any = nnx.split(PointNet(len(task.source.classes), rngs=nnx.Rngs(task.options.seed)))
     graph, params = split
-    optimizer = optax.adam(0.0).init(params)
-    for epoch in range(epochs):
-        rng = np.random.default_rng((task.options.seed, epoch))
-        order = rng.permutation(rows)
-        total_accuracy = 0.0
-        for step in range(steps):
-            batch = order[step * batch_size : (step + 1) * batch_size]
-            x = views.draw(batch, rng)
-            progress = (epoch * steps + step) / (epochs * steps)
-            rate = np.float32(RATES[1] + (RATES[0] - RATES[1]) * (1 + np.cos(np.pi * progress)) / 2)
-            params, optimizer, loss, accuracy = _step(graph, params, optimizer, x, views.label[batch], rate)
-            total_accuracy += float(accuracy)
-            if not np.isfinite(loss):
-                raise InputError(
-                    f"baselines: the loss of pointnet is {loss} in epoch {epoch + 1}; check the views, or leave it out"
-                )
-            note = f"epoch {epoch + 1}, accuracy {total_accuracy / (step + 1):.3f}"
-            task.progress("fit pointnet", epoch * steps + step + 1, epochs * steps, note)
-    return ColoredPointNet(nnx.merge(graph, params))
+    leaves, structure = jax.tree.flatten((params, optax.adam(0.0).init(params)))
+
+    def epoch(number: int) -> Iterator[tuple[NDArray[np.float32], NDArray[np.int32]]]:
+        rng = np.random.default_rng((task.options.seed, number - 1))
+        order = rng.permutation(rows)[: steps.of_epoch * batch_size]
+        for batch in order.reshape(-1, batch_size):
+            yield views.draw(batch, rng), views.label[batch]
+
+    def step(leaves: list[Any], number: int, batch: tuple[Any, Any]) -> tuple[list[Any], Any]:
+        rate = RATES[1] + (RATES[0] - RATES[1]) * (1 + np.cos(np.pi * number / (epochs * steps.of_epoch))) / 2
+        *state, loss, accuracy = _step(graph, *jax.tree.unflatten(structure, leaves), *batch, np.float32(rate))
+        return jax.tree.leaves(state), (loss, accuracy)
+
+    with Checkpoints(task.scratch / "fit") as checkpoints:
+        leaves = run_epochs("pointnet", leaves, steps, epoch, step, checkpoints, progress=task.report("pointnet"))
+    return ColoredPointNet(nnx.merge(graph, jax.tree.unflatten(structure, leaves)[0]))

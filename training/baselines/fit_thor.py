@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.classifier import MLP
+from thor2_jax.model.classifier import MLP
 from training.baselines.task import FitTask, FittedBaseline
 from training.baselines.thor import THOR, VIEW_TYPES, ViewType
 from training.fitting.calibration import sample_probabilities

@@ -1,15 +1,14 @@
 """Training the baselines of finished runs; each becomes a file in the run directory."""
 
 import contextlib
-import shutil
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
 from thor2_jax.errors import InputError
-from thor2_jax.files import file_digest, remove_leftovers
-from thor2_jax.recognition.run_directory import TrainedRun, load_run
+from thor2_jax.files import file_digest, remove_leftovers, remove_written
+from thor2_jax.model.run_directory import TrainedRun, load_run
 from training.baselines.files import StoredBaseline, baseline_file, read_baseline, write_baseline
 from training.baselines.fit_forest import fit_forest
 from training.baselines.fit_network import fit_network
@@ -129,4 +128,4 @@ def _train(
     seconds = time.perf_counter() - start
     temperature = fit_temperature(fitted.probabilities, fitted.truth) if len(fitted.truth) else None
     write_baseline(file, StoredBaseline(fitted.model.arrays(), temperature, seconds, fitted.weights), run.classes)
-    shutil.rmtree(scratch)
+    remove_written(scratch, r"[^/]+/(.*/)?[0-9]+/.*")  # checkpoints

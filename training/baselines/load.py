@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.run_directory import TrainedRun
+from thor2_jax.model.run_directory import TrainedRun
 from training.baselines.baseline import Baseline
 from training.baselines.files import baseline_file, read_baseline
 from training.baselines.forest import Forest

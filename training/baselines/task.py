@@ -13,7 +13,7 @@ from colornet import ColorNetwork
 from thor2_jax.config import DescriptorConfig
 from training.baselines.baseline import Baseline
 from training.fitting.folds import fold_of_views
-from training.fitting.options import FitOptions
+from training.fitting.options import EpochMetrics, FitOptions
 from training.views.normalized_views import ViewSource
 
 __all__ = ["FitTask", "FittedBaseline"]
@@ -52,6 +52,14 @@ class FitTask:
         if self.folds == 1:
             return np.zeros(len(label), bool)
         return fold_of_views(label, view, self.source.classes, self.folds, self.options.seed) == self.fold
+
+    def report(self, name: str) -> Callable[[int, int, EpochMetrics], object]:
+        """Return the function that shows the progress of `run_epochs` for a network of this name."""
+
+        def report(done: int, total: int, metrics: EpochMetrics) -> None:
+            self.progress(f"fit {name}", done, total, f"epoch {metrics.epoch}, accuracy {metrics.accuracy:.3f}")
+
+        return report
 
 
 class FittedBaseline(NamedTuple):

@@ -26,5 +26,6 @@ def colornet(
     same = network.fingerprint == colornet_package.load_default().fingerprint
     console.print(
         f"{network.n_raw_nodes} raw nodes, {network.n_regions} regions, {len(network.edges)} edges; "
-        f"{'equal to' if same else 'DIFFERENT from'} the packaged network; written to {out}"
+        f"{'equal to' if same else 'DIFFERENT from'} the packaged network; "
+        f"written to {out}; use it with: ColorNetwork.load({str(out / 'network.npz')!r})"
     )

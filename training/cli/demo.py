@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from training.cli.app import QuietOption, app, console
+from training.cli.app import QuietOption, app, console, finish
 from training.cli.progress import show_progress
 
 
@@ -25,9 +25,9 @@ def demo(
     from training.demo import run_demo
 
     with show_progress(quiet) as progress:
-        figures = run_demo(out, seed, progress)
+        figures = run_demo(out, seed, progress, workers=2)
     table = Table("", *figures.names)
     for part, values in figures.accuracy.items():
         table.add_row(part, *(f"{v:.3f}" for v in values))
     console.print(table)
-    console.print(f"report: {out / 'report.html'}")
+    finish(f"report: {out / 'report.html'}", "try its model in a browser", "serve", "--model", out / "run")

@@ -2,71 +2,95 @@
 
 import dataclasses
 import json
+import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from thor2_jax.errors import InputError
 from thor2_jax.printable import escape_characters
-from training.cli.app import MeshScaleOption, app
+from training.cli.app import FrameOptions, MeshScaleOption, app, finish, grouped_options
+
+if TYPE_CHECKING:
+    from training.diagnosis.findings import Diagnosis
 
 
 @app.command()
+@grouped_options
 def doctor(
-    color: Annotated[Path, typer.Option(help="Color image, PNG or JPEG.")],
-    depth: Annotated[Path, typer.Option(help="Depth image: 16-bit PNG, float TIFF, NPY or EXR.")],
-    intrinsics: Annotated[
-        Path, typer.Option(help="fx, fy, cx, cy in JSON, ROS camera_info, K, BOP, RealSense or Open3D.")
-    ],
-    labels: Annotated[Path | None, typer.Option(help="Instance labels, PNG; 0 is background.")] = None,
-    depth_scale: Annotated[
-        float | None, typer.Option(help="Depth units per metre. Default: that of the intrinsics, or 1000.")
-    ] = None,
+    given: FrameOptions,
     model: Annotated[
         Path | None, typer.Option("--model", help="Run directory that knows the objects: checks the channel order.")
     ] = None,
     meshes: Annotated[
-        Path | None, typer.Option(help="Mesh, or directory of meshes, of the objects: checks units and sizes.")
+        Path | None,
+        typer.Option(help="Mesh, or directory of meshes, of the objects: checks units, sizes and the focal length."),
     ] = None,
     mesh_scale: MeshScaleOption = 1.0,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON: findings and notes.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON: findings and notes, of each FRAME.")] = False,
 ) -> None:
-    """Say what is likely wrong with a frame: units, intrinsics, registration, labels, colours.
+    """Say what is likely wrong with frames: units, intrinsics, registration, labels, colours.
 
     The exit code is 0 if nothing is found, 1 if something is likely wrong, and 2 if a file is missing.
     """
     from training.diagnosis.setup import diagnose
     from training.objects.meshes import find_meshes
-    from training.readers.frame_files import FrameFiles
 
     if meshes is None and mesh_scale != 1:
         raise InputError(f"mesh_scale is {mesh_scale:g}; it belongs to --meshes")
-    paths: list[Path] = []
+    sources = given.sources(masks=False)
+    paths = {}
     if meshes is not None:
-        paths = list(find_meshes(meshes).values()) if meshes.is_dir() else [meshes]
+        paths = find_meshes(meshes) if meshes.is_dir() else {meshes.stem: meshes}
     recognizer = None
     if model is not None:
         from thor2_jax.capacity import BATCH_BUCKETS
         from thor2_jax.recognizer import Recognizer
 
-        recognizer = Recognizer.load(model)
-        recognizer.chunk = BATCH_BUCKETS[-1]
-    diagnosis = diagnose(
-        FrameFiles(color, depth, labels, intrinsics),
-        depth_scale=depth_scale,
-        recognizer=recognizer,
-        meshes=paths,
-        mesh_scale=mesh_scale,
-    )
-    if as_json:
-        print(json.dumps(dataclasses.asdict(diagnosis)))
-    else:
-        for finding in diagnosis.findings:
-            print(escape_characters(f"{finding.code}: {finding.message} {finding.advice}"))
-        for note in diagnosis.notes:
-            print(escape_characters(f"note: {note}"))
-        if not diagnosis.findings:
-            print("nothing found")
-    if diagnosis.findings:
+        recognizer = Recognizer.load(model, chunk=BATCH_BUCKETS[-1])
+    options: dict[str, Any] = {
+        "depth_scale": given.depth_scale,
+        "recognizer": recognizer,
+        "meshes": paths,
+        "mesh_scale": mesh_scale,
+    }
+    is_sound, failed = True, []
+    for source in sources:
+        try:
+            diagnosis = diagnose(source.files or source.read(), **options)
+        except (InputError, OSError) as error:
+            if given.color:
+                raise
+            failed.append(source.name)
+            print(f"failed: {escape_characters(f'{source.name}: {error}')}", file=sys.stderr)
+        else:
+            is_sound &= _report(diagnosis, as_json, None if given.color else source.name)
+    if failed:
+        raise InputError(f"{len(failed)} of {len(sources)} frames cannot be read; see above")
+    again = ["doctor", *given.arguments]
+    if is_sound:
+        again = ["recognize", *given.arguments, "--model", str(model or "RUN")]
+    elif meshes is not None:
+        again += ["--meshes", str(meshes), *(["--mesh-scale", f"{mesh_scale:g}"] if mesh_scale != 1 else [])]
+    if not as_json:
+        purpose = "recognize" if is_sound else "after a change, check again"
+        finish(f"frames checked: {len(sources)}", purpose, *again)
+    if not is_sound:
         raise typer.Exit(1)
+
+
+def _report(diagnosis: "Diagnosis", as_json: bool, frame: str | None = None) -> bool:
+    """Print a diagnosis; return whether nothing was found."""
+    if as_json:
+        print(json.dumps(({} if frame is None else {"frame": frame}) | dataclasses.asdict(diagnosis)), flush=True)
+        return not diagnosis.findings
+    if frame is not None:
+        print(f"{escape_characters(frame)}:")
+    for finding in diagnosis.findings:
+        print(escape_characters(f"{finding.code}: {finding.message} {finding.advice}"))
+    for note in diagnosis.notes:
+        print(escape_characters(f"note: {note}"))
+    if not diagnosis.findings:
+        print("nothing found", flush=True)
+    return not diagnosis.findings

@@ -1,73 +1,109 @@
 """`thor2 enroll`: teach a run new objects, without training."""
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from thor2_jax.errors import InputError
-from training.cli.app import GalleryOption, ManyFrames, MeshScaleOption, QuietOption, app, console
+from thor2_jax.printable import check_name
+from training.cli.app import (
+    FrameOptions,
+    GalleryOption,
+    ManyFrames,
+    MeshScaleOption,
+    QuietOption,
+    SegmentOption,
+    app,
+    console,
+    finish,
+    grouped_options,
+)
 from training.cli.progress import show_progress
 
 if TYPE_CHECKING:
-    from thor2_jax.recognition.prepared_instance import PreparedInstance
+    from thor2_jax.frames.prepared_instance import PreparedInstance
 
 
 @app.command(cls=ManyFrames)
+@grouped_options
 def enroll(
+    *,
     model: Annotated[Path, typer.Option("--model", help="Run directory; created if it does not exist.")],
-    name: Annotated[str | None, typer.Argument(help="Name of the object. Default: every labelled object.")] = None,
-    mesh: Annotated[Path | None, typer.Option(help="Mesh of the object (GLB, OBJ, PLY), in metres.")] = None,
-    frames: Annotated[
-        list[Path] | None, typer.Option(metavar="DIR...", help="Folders of labelled frames, or labelled frames.")
+    name: Annotated[str | None, typer.Argument(help="Name of the object. Default: every object there is.")] = None,
+    given: FrameOptions,
+    mesh: Annotated[
+        Path | None, typer.Option(help="Mesh of the object (GLB, OBJ, PLY), its folder, or a folder of objects.")
+    ] = None,
+    labelled: Annotated[
+        list[Path] | None,
+        typer.Option("--frames", metavar="FRAME...", help="FRAME without a NAME before: every labelled object."),
     ] = None,
     label_name: Annotated[str | None, typer.Option(help="Name of the object in labels.json. Default: NAME.")] = None,
-    color: Annotated[Path | None, typer.Option(help="Color image of one frame, PNG or JPEG.")] = None,
-    depth: Annotated[Path | None, typer.Option(help="Depth image: 16-bit PNG, float TIFF, NPY or EXR.")] = None,
-    labels: Annotated[Path | None, typer.Option(help="Instance labels, PNG; 0 is background.")] = None,
-    intrinsics: Annotated[
-        Path | None, typer.Option(help="fx, fy, cx, cy in JSON, ROS camera_info, K, BOP, RealSense or Open3D.")
+    instance: Annotated[
+        int | None, typer.Option(help="Label number of the object. Default: by labels.json, or the only instance.")
     ] = None,
-    instance: Annotated[int | None, typer.Option(help="Label number of the object in this frame.")] = None,
+    segment: SegmentOption = None,
     mesh_scale: MeshScaleOption = 1.0,
     extend: Annotated[bool, typer.Option("--extend", help="Add views to an object that exists.")] = False,
     replace: Annotated[bool, typer.Option("--replace", help="Discard the views of an object that exists.")] = False,
     gallery: GalleryOption = None,
     quiet: QuietOption = False,
 ) -> None:
-    """Enroll an object from a mesh, from labelled frames, or from one frame; it is recognized at once.
+    """Enroll an object from a mesh or from frames; it is recognized at once.
 
-    Without NAME, every labelled object of the frames is enrolled. A frame is a folder with color.png, depth.png,
-    mask.png, intrinsics.json and labels.json. The confidence below which an object is unknown depends on its number of
-    views; see --unknown-below of `thor2 recognize`.
+    Without NAME, every object that the frames name in labels.json, or every object in the folder of --mesh, is
+    enrolled. With NAME, frames without names need --instance, or the object as their only instance. A frame is a
+    folder with color.png, depth.png, mask.png, intrinsics.json and labels.json. The confidence below which an object
+    is unknown depends on its number of views; see --unknown-below of `thor2 recognize`.
     """
-    from thor2_jax.gallery.enrollment import instance_view
-    from training.enrollment import enroll_objects, labelled_views, mesh_views
-
-    images = {"color": color, "depth": depth, "labels": labels, "intrinsics": intrinsics, "instance": instance}
-    _check_sources(name, mesh, frames, label_name, images)
+    name = None if name is None else check_name(name)
+    given = dataclasses.replace(given, frames=[*(given.frames or []), *(labelled or [])])
+    has_frames = any((given.frames, given.color, given.depth, given.labels, given.intrinsics, given.bag))
+    if bool(mesh) == has_frames:
+        raise InputError("give exactly one of --mesh and frames: FRAME... after a NAME, --frames, --color ... or --bag")
+    if mesh is None:
+        given.check()
+    if name is None and (label_name is not None or instance is not None):
+        raise InputError("name is missing; --label-name and --instance enroll one object")
+    if extend and replace:
+        raise InputError("extend and replace are both given; choose one")
+    for option, value in (("label_name", label_name), ("instance", instance)):
+        if mesh is not None and value is not None:
+            raise InputError(f"{option} is {value}; it belongs to frames")
     if mesh is None and mesh_scale != 1:
         raise InputError(f"mesh_scale is {mesh_scale:g}; it belongs to --mesh")
+    from training.readers.frames import FrameFolder
+
+    meshes = {} if mesh is None else _readable_meshes(mesh, name, mesh_scale)
+    for path in (given.color, given.depth, given.labels, given.intrinsics):
+        if path is not None and not path.is_file():
+            raise FileNotFoundError(2, "No such file", str(path))
+    frames = None if meshes else FrameFolder(given.sources(segment), named=name is None)
+
+    # These take seconds to import.
+    from training.enrollment import enroll_objects, labelled_views, mesh_views
+
     skipped: list[str] = []
 
     def read(sigma_s: float) -> Mapping[str, Sequence["PreparedInstance"]]:
-        if mesh is not None:
-            assert name is not None
-            return {name: mesh_views(mesh, mesh_scale)}
-        if frames:
-            views, unusable = labelled_views(frames, sigma_s, label_name or name)
-            skipped.extend(f"skipped: {each.reason}" for each in unusable)
-            return views if name is None else {name: [view for each in views.values() for view in each]}
-        from thor2_jax.recognition.frames import read_frame
-
-        assert name is not None and color and depth and labels and intrinsics and instance is not None
-        frame = read_frame(color=color, depth=depth, labels=labels, intrinsics=intrinsics)
-        return {name: [instance_view(frame, instance, sigma_s)]}
+        if meshes:
+            rendered = {}
+            with show_progress(quiet) as progress:
+                for number, (each, path) in enumerate(meshes.items()):
+                    progress("render", number, len(meshes), each)
+                    rendered[each] = mesh_views(path, mesh_scale)
+            return rendered
+        assert frames is not None
+        views, unusable = labelled_views(frames, sigma_s, label_name or name, instance)
+        skipped.extend(f"skipped: {each.reason}" for each in unusable)
+        return views if name is None else {name: [view for each in views.values() for view in each]}
 
     source = "frames" if mesh is None else "mesh"
-    counts = enroll_objects(
+    counts, known = enroll_objects(
         model,
         read,
         source,
@@ -81,19 +117,16 @@ def enroll(
         console.print(line)
     for each, count in counts.items():
         console.print(f"{each}: {count} views")
-    console.print(f"enrolled in {gallery or model}")
+    if known.weak_rejection:
+        console.print(f"warning: unknown objects are hardly rejected: {known.weak_rejection}")
+    enrolled = f"enrolled in {gallery or model}, which knows {known.union.summary}"
+    finish(enrolled, "recognize a frame", "recognize", "FRAME", "--model", model)
 
 
-def _check_sources(
-    name: str | None, mesh: Path | None, frames: list[Path] | None, label_name: str | None, images: dict[str, Any]
-) -> None:
-    given = [option for option, value in images.items() if value is not None]
-    if bool(mesh) + bool(frames) + bool(given) != 1:
-        raise InputError("give exactly one of --mesh, --frames, and --color with --depth, --labels, --intrinsics, ...")
-    if given and len(given) < len(images):
-        missing = ", ".join(f"--{option}" for option in images if option not in given)
-        raise InputError(f"{given[0]} is given without {missing}; one frame needs all of them")
-    if name is None and (not frames or label_name is not None):
-        raise InputError("name is missing; only --frames without --label-name enrolls every labelled object")
-    if label_name is not None and not frames:
-        raise InputError(f"label_name is {label_name!r}; it belongs to --frames")
+def _readable_meshes(mesh: Path, name: str | None, scale: float) -> dict[str, Path]:
+    from training.objects.meshes import find_object_meshes, load_mesh
+
+    meshes = find_object_meshes(mesh, name)
+    for path in meshes.values():
+        load_mesh(path, scale)
+    return meshes

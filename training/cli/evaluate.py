@@ -1,21 +1,20 @@
 """`thor2 evaluate`: measure the accuracy of trained runs, one command per dataset format."""
 
+import dataclasses
 import functools
 import hashlib
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 from rich.table import Table
 
-from training.cli.app import QuietOption, app, console, show_help
+from thor2_jax.printable import escape_characters
+from training.cli.app import FrameOptions, QuietOption, app, console, finish, grouped_options, show_help
 from training.cli.progress import show_progress
-from training.cli.workers import AddressOption, EngineOption, WorkersOption, worker_pool
-
-if TYPE_CHECKING:
-    from training.storage.workers import WorkerPool
+from training.cli.workers import WorkerOptions
 
 evaluate_app = typer.Typer(
     callback=show_help, invoke_without_command=True, help="Measure the accuracy of trained runs on a labelled dataset."
@@ -26,56 +25,65 @@ MAX_LISTED = 10
 """Labels that the summary lists."""
 
 DatasetArgument = Annotated[Path, typer.Argument(help="Directory of the dataset.")]
-ModelsOption = Annotated[
-    list[Path], typer.Option("--model", help="Run directory, or the directory of a training with several folds.")
-]
 MoreModels = Annotated[list[Path] | None, typer.Argument(metavar="[RUN]...", help="Further run directories.")]
-ReportOption = Annotated[
-    Path | None,
-    typer.Option("--out", help="Directory for report.html and report.json; an interrupted evaluation resumes."),
-]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class EvaluationOptions(WorkerOptions):
+    """What is evaluated, and where the report is written."""
+
+    model: Annotated[
+        list[Path], typer.Option("--model", help="Run directory, or the directory of a training with several folds.")
+    ]
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", help="Directory for report.html and report.json; an interrupted evaluation resumes."),
+    ] = None
+    quiet: QuietOption = False
 
 
 @evaluate_app.command()
+@grouped_options
 def uwis(
     dataset: DatasetArgument,
-    model: ModelsOption,
+    job: EvaluationOptions,
     runs: MoreModels = None,
-    out: ReportOption = None,
-    workers: WorkersOption = 1,
-    engine: EngineOption = "local",
-    address: AddressOption = None,
-    quiet: QuietOption = False,
 ) -> None:
     """UW-IS Occluded: <video>/images/<id>_{rgb,depth,labels}.png and <id>_poses.yaml."""
     from training.readers.uwis import UWISOccluded
 
-    pool = worker_pool(workers, engine, address)
-    _evaluate("uwis", UWISOccluded(dataset), dataset, [*model, *(runs or [])], out, pool, quiet)
+    _evaluate("uwis", UWISOccluded(dataset), dataset, job, runs)
 
 
 @evaluate_app.command()
+@grouped_options
 def frames(
-    dataset: DatasetArgument,
-    model: ModelsOption,
-    runs: MoreModels = None,
-    out: ReportOption = None,
-    workers: WorkersOption = 1,
-    engine: EngineOption = "local",
-    address: AddressOption = None,
-    quiet: QuietOption = False,
+    given: FrameOptions,
+    job: EvaluationOptions,
 ) -> None:
-    """Single frames: <frame>/{color,depth,mask}.png, intrinsics.json, labels.json."""
+    """Frames whose objects labels.json names: <frame>/{color,depth,mask}.png, intrinsics.json, labels.json.
+
+    A FRAME that is a run directory, or has the folds of a training, is a further model.
+    """
+    from thor2_jax.model.run_directory import RUN_FILE
     from training.readers.frames import FrameFolder
 
-    pool = worker_pool(workers, engine, address)
-    _evaluate("frames", FrameFolder(dataset), dataset, [*model, *(runs or [])], out, pool, quiet)
+    paths = given.frames or [path for path in (given.color, given.bag) if path]
+    runs = [path for path in paths if (path / RUN_FILE).is_file() or any(path.glob(f"fold-*/{RUN_FILE}"))]
+    paths = [path for path in paths if path not in runs]
+    given = dataclasses.replace(given, frames=given.frames and paths)
+    folder = FrameFolder(given.sources())
+    dataset = ", ".join(str(path.resolve()) for path in paths)
+    if folder.note:
+        console.print(f"skipped: {escape_characters(folder.note)}")
+    _evaluate("frames", folder, dataset, job, runs, given=given.arguments)
 
 
 @evaluate_app.command()
+@grouped_options
 def ocid(
     dataset: DatasetArgument,
-    model: ModelsOption,
+    job: EvaluationOptions,
     names: Annotated[
         Path,
         typer.Option(help="Table: sequence -> object names in order of placement; or a table of OCID-VLG."),
@@ -84,87 +92,79 @@ def ocid(
     per_sequence: Annotated[
         bool, typer.Option(help="RUN holds one run per sequence, as written by `train --sequences`.")
     ] = False,
-    out: ReportOption = None,
-    workers: WorkersOption = 1,
-    engine: EngineOption = "local",
-    address: AddressOption = None,
-    quiet: QuietOption = False,
 ) -> None:
     """OCID, subset YCB10: {table,floor}/{bottom,top}/<type>/<sequence>/{rgb,depth,label,pcd}."""
     from training.readers.ocid import OCID
 
-    pool = worker_pool(workers, engine, address)
-    _evaluate("ocid", OCID(dataset, names), dataset, [*model, *(runs or [])], out, pool, quiet, per_sequence, names)
+    _evaluate("ocid", OCID(dataset, names), dataset, job, runs, per_sequence, names)
 
 
 @evaluate_app.command()
+@grouped_options
 def bop(
     dataset: DatasetArgument,
-    model: ModelsOption,
+    job: EvaluationOptions,
     names: Annotated[Path | None, typer.Option(help="YAML or JSON table: obj_id -> name. Default: obj_000001.")] = None,
     runs: MoreModels = None,
-    out: ReportOption = None,
-    workers: WorkersOption = 1,
-    engine: EngineOption = "local",
-    address: AddressOption = None,
-    quiet: QuietOption = False,
 ) -> None:
     """BOP format (YCB-Video and others): <scene>/{rgb,depth,mask_visib}, scene_camera.json and scene_gt.json."""
     from training.readers.bop import BOP
 
-    pool = worker_pool(workers, engine, address)
-    _evaluate("bop", BOP(dataset, names), dataset, [*model, *(runs or [])], out, pool, quiet, names=names)
+    _evaluate("bop", BOP(dataset, names), dataset, job, runs, names=names)
 
 
 def _evaluate(
     kind: str,
     frames: Any,
-    dataset: Path,
-    models: list[Path],
-    out: Path | None,
-    pool: "WorkerPool | None",
-    quiet: bool,
+    dataset: Path | str,
+    job: EvaluationOptions,
+    runs: list[Path] | None,
     per_sequence: bool = False,
     names: Path | None = None,
+    given: Sequence[str] = (),
 ) -> None:
     from training.evaluation.answering import RunArguments, answer_frames_in_pool
     from training.evaluation.job import evaluate_dataset
 
-    arguments = RunArguments(tuple(models), per_sequence)
-    description = {"kind": kind, "path": str(dataset.resolve())}
+    models, out, pool = (*job.model, *(runs or ())), job.out, job.pool()
+    arguments = RunArguments(models, per_sequence)
+    description = {"kind": kind, "path": dataset if isinstance(dataset, str) else str(dataset.resolve())}
     if names:
         description["names"] = hashlib.sha256(names.read_bytes()).hexdigest()
     finished = out is not None and (out / "report.json").is_file()
-    with tempfile.TemporaryDirectory() as temporary, show_progress(quiet) as progress:
-        runs = arguments.load(frames)
+    with tempfile.TemporaryDirectory() as temporary, show_progress(job.quiet) as progress:
+        loaded = arguments.load(frames)
         answering = functools.partial(answer_frames_in_pool, arguments, frames, pool) if pool else None
-        report = evaluate_dataset(runs, frames, description, out or Path(temporary) / "report", progress, answering)
+        report = evaluate_dataset(loaded, frames, description, out or Path(temporary) / "report", progress, answering)
     _print_report(report)
+    result = "no report was written (--out)"
     if out is not None:
-        console.print(f"report: {out / 'report.html'}{' (was finished: nothing was recomputed)' if finished else ''}")
+        result = f"report: {out / 'report.html'}{' (was finished: nothing was recomputed)' if finished else ''}"
+    finish(result, "see why names are wrong", "explain", *(given or ["FRAME"]), "--model", models[0], "--out", "why")
 
 
 def _print_report(report: Mapping[str, Any]) -> None:
-    from training.evaluation.page import accuracy_table, comparison_table, comparison_text, comparison_title
+    from training.evaluation import page
 
     counts, speed = report["instances"], report["speed"]
-    if report["fusions"]:
-        shown = Table("", "instances", *report["fusions"])
-        for table in report["accuracy"][report["rule"]]:
-            header, rows = accuracy_table(table, report["fusions"])
-            shown.add_section()
-            if header[0]:
-                shown.add_row(f"by {header[0]}", style="bold")
-            for row in rows:
-                shown.add_row(*row)
+    shown = Table("", "instances", title="accuracy without rejection")
+    for number, table in enumerate(report["accuracy"][report["rule"]]):
+        header, rows = page.marked(page.accuracy_table(table, report["fusions"]), report["main"])
+        for column in [] if number else header[2:]:
+            shown.add_column(column)
+        shown.add_section()
+        if header[0]:
+            shown.add_row(f"by {header[0]}", style="bold")
+        for row in rows:
+            shown.add_row(*row)
+    console.print(shown)
+    for table in report["published_tables"]:
+        header, rows = page.marked(page.comparison_table(table, report["main"]), report["main"])
+        shown = Table(*header, title=page.comparison_title(table))
+        for row in rows:
+            shown.add_row(*row)
         console.print(shown)
-        for table in report["published_tables"]:
-            header, rows = comparison_table(table, report["main"])
-            shown = Table(*header, title=comparison_title(table))
-            for row in rows:
-                shown.add_row(*row)
-            console.print(shown)
-            console.print(comparison_text(table))
+        console.print(page.comparison_text(table))
     console.print(
         f"{counts['scored']} instances scored, {sum(counts['not_described'].values())} of them could not be described "
         f"(counted as incorrect); {sum(counts['no_class'].values())} are of no class of the runs"
@@ -178,3 +178,5 @@ def _print_report(report: Mapping[str, Any]) -> None:
             f"{speed['frames']} frames, {speed['frames_per_second']:.2f} a second with compilation; "
             f"median {speed['median_seconds']:.2f} s a frame"
         )
+    for text in page.answer_texts(report):
+        console.print(escape_characters(text))

@@ -8,23 +8,29 @@ import typer
 
 from thor2_jax.errors import InputError
 from thor2_jax.printable import escape_characters
-from training.cli.app import GalleryOption, ModelOption, app, console
+from training.cli.app import (
+    FrameOptions,
+    GalleryOption,
+    ModelOption,
+    SegmentOption,
+    app,
+    console,
+    finish,
+    grouped_options,
+)
 
 
 @app.command()
+@grouped_options
 def explain(
     model: ModelOption,
-    frames: Annotated[
-        list[Path], typer.Argument(metavar="FRAME...", help="Folders of frames: color, depth, mask, intrinsics.")
-    ],
+    given: FrameOptions,
     out: Annotated[Path, typer.Option(help="Directory; each page is OUT/<frame>/<instance>/explanation.html.")],
     instance: Annotated[
         list[int] | None, typer.Option(help="Number of an object in the label image; repeatable. Default: all.")
     ] = None,
+    segment: SegmentOption = None,
     gallery: GalleryOption = None,
-    depth_scale: Annotated[
-        float | None, typer.Option(help="Depth units per metre. Default: that of the intrinsics, or 1000.")
-    ] = None,
 ) -> None:
     """Explain answers: the points that decided, slices, colours, smallest changes, nearest views.
 
@@ -33,10 +39,9 @@ def explain(
     from thor2_jax.explanation.explain import explain as explain_answer
     from thor2_jax.files import check_output_directory
     from thor2_jax.recognizer import Recognizer
-    from training.readers.frame_files import find_frames
-    from training.reports.explanation_page import PAGE, write_explanation
+    from training.reports.explanation_page import PAGE, check_no_foreign_files, write_explanation
 
-    sources = find_frames(frames, depth_scale)
+    sources = given.sources(segment)
     check_output_directory(out, resumable={source.name.split("/")[0] for source in sources})
     recognizer = Recognizer.load(model, gallery=gallery)
     explained = 0
@@ -44,6 +49,8 @@ def explain(
         frame = source.read()
         labels = frame.instances if instance is None else instance
         for label in labels:
+            directory = out / source.name / str(label)
+            check_no_foreign_files(directory)
             try:
                 explanation = explain_answer(recognizer, frame, label)
             except InputError as error:
@@ -51,9 +58,10 @@ def explain(
                     raise InputError(f"{source.name}: {error}") from None
                 print(f"skipped: {escape_characters(source.name)}: {error}", file=sys.stderr)
                 continue
-            directory = out / source.name / str(label)
             write_explanation(explanation, frame, source.name, directory)
             explained += 1
-            console.print(f"{escape_characters(explanation.name)}: {directory / PAGE}")
+            console.print(f"{escape_characters(explanation.title)}: {directory / PAGE}")
     if not explained:
         raise InputError("no instance could be explained; see above")
+    again = ["enroll", "NAME", *given.arguments, "--instance", label, "--model", model, "--extend"]
+    finish(f"{explained} pages in {out}", "if a name is wrong, add this view of the object", *again)

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from training.cli.app import QuietOption, app, console, show_help, split_names
+from training.cli.app import QuietOption, app, console, finish, show_help, split_names
 from training.cli.progress import show_progress
 
 fetch_app = typer.Typer(callback=show_help, invoke_without_command=True, help="Download public meshes.")
@@ -33,4 +33,4 @@ def ycb(
         meshes = fetch_ycb(split_names(objects), out, url=url or YCB_URL, progress=progress)
     for name in meshes:
         console.print(name)
-    console.print(f"{len(meshes)} meshes in {out}")
+    finish(f"{len(meshes)} meshes in {out}", "train on them", "train", "--meshes", out, "--out", "run")

@@ -4,8 +4,7 @@ from typing import Annotated
 
 import typer
 
-from thor2_jax.printable import escape_characters
-from training.cli.app import GalleryOption, ModelOption, app, console
+from training.cli.app import GalleryOption, ModelOption, app, finish
 
 
 @app.command()
@@ -19,4 +18,5 @@ def forget(
 
     recognizer = Recognizer.load(model, gallery=gallery)
     recognizer.forget(name)
-    console.print(f"{escape_characters(name)} is forgotten; {model} knows {len(recognizer.classes)} objects")
+    knows = f"{name} is forgotten; {model} knows {recognizer.model.union.summary}"
+    finish(knows, "teach it again", "enroll", name, "FRAME", "--model", model)

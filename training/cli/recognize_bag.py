@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from thor2_jax.errors import InputError
-from thor2_jax.recordings.topics import Topics
+from training.cli.app import FrameOptions, finish
 
 if TYPE_CHECKING:
     from thor2_jax.recordings.bag_writer import DetectionBag
@@ -16,27 +16,27 @@ if TYPE_CHECKING:
     from thor2_jax.recordings.rerun_file import RerunFile
     from training.frame_recognition import FrameAnswer
 
-__all__ = ["BagOptions", "recognize_bag"]
+__all__ = ["BagOutputs", "recognize_bag"]
 
 
 @dataclasses.dataclass(frozen=True)
-class BagOptions:
-    """The options of `thor2 recognize` that belong to a recording."""
+class BagOutputs:
+    """The outputs of `thor2 recognize` for a recording: the directory of all frames, detections, a Rerun file."""
 
-    bag: Path
-    topics: Topics
-    intrinsics: Path | None
-    depth_scale: float | None
-    max_gap: float
-    every: int
-    segment: str | None
-    track: bool
     out: Path | None
     out_bag: Path | None
     rerun: Path | None
 
 
-def recognize_bag(options: BagOptions, model: Path, unknown_below: float | None, answer_by: str | None) -> None:
+def recognize_bag(
+    given: FrameOptions,
+    outputs: BagOutputs,
+    model: Path,
+    unknown_below: float | None,
+    answer_by: str | None,
+    segment: str | None,
+    track: bool,
+) -> None:
     """Recognize the frames of a recording: a line of JSON for each, and the outputs that are wanted.
 
     Raises:
@@ -44,58 +44,53 @@ def recognize_bag(options: BagOptions, model: Path, unknown_below: float | None,
     """
     from thor2_jax.capacity import BATCH_BUCKETS
     from thor2_jax.files import check_output_directory
-    from thor2_jax.recognition.frames import read_intrinsics
     from thor2_jax.recognizer import Recognizer
     from thor2_jax.recordings.bag_writer import DetectionBag
-    from thor2_jax.recordings.bags import Bag
     from thor2_jax.recordings.rerun_file import RerunFile
     from thor2_jax.segmentation.segmenters import TABLE, load_segmenter
     from training.bag_recognition import recognize_recorded
+    from training.frame_recognition import segmentation_failure
 
-    segmenter = load_segmenter(options.segment or TABLE)
-    intrinsics = None if options.intrinsics is None else read_intrinsics(options.intrinsics)
-    bag = Bag(
-        options.bag,
-        options.topics,
-        intrinsics=intrinsics,
-        depth_scale=options.depth_scale,
-        max_gap=options.max_gap,
-    )
-    out_bag = None if options.out_bag is None else DetectionBag(options.out_bag)
-    rerun = None if options.rerun is None else RerunFile(options.rerun)
-    if options.out is not None:
-        check_output_directory(options.out)
-    n_answers, failed, damage = 0, [], None
+    segmenter = load_segmenter(segment or TABLE)
+    bag = given.open_bag()
+    out_bag = None if outputs.out_bag is None else DetectionBag(outputs.out_bag)
+    rerun = None if outputs.rerun is None else RerunFile(outputs.rerun)
+    if outputs.out is not None:
+        check_output_directory(outputs.out)
+    n_answers, failed, without_depth, damage = 0, [], [], None
     with bag:
         for note in bag.notes:
             print(f"note: {note}", file=sys.stderr)
-        recognizer = Recognizer.load(model, unknown_below, answer_by=answer_by)
-        recognizer.chunk = BATCH_BUCKETS[-1]
-        recognize = recognizer.track().update if options.track else recognizer.recognize
+        recognizer = Recognizer.load(model, unknown_below, answer_by=answer_by, chunk=BATCH_BUCKETS[-1])
+        recognize = recognizer.track().update if track else recognizer.recognize
         with out_bag or contextlib.nullcontext(), rerun or contextlib.nullcontext():
             try:
-                for recorded, answer in recognize_recorded(recognize, bag.frames(), segmenter, options.every):
+                for recorded, answer in recognize_recorded(recognize, bag.frames(), segmenter, given.every):
                     n_answers += answer.error is None
                     if answer.error is not None:
                         failed.append(recorded.name)
                         print(f"failed: {answer.name}: {answer.error}", file=sys.stderr)
-                    _write(recorded, answer, options.out, out_bag, rerun)
+                    else:
+                        without_depth.append(segmentation_failure(answer))
+                    _write(recorded, answer, outputs.out, out_bag, rerun)
             except InputError as error:
                 damage = str(error)
-    written = [str(path) for path in (options.out, options.out_bag, options.rerun) if path is not None and n_answers]
+    written = [str(path) for path in dataclasses.astuple(outputs) if path is not None and n_answers and path.exists()]
     if damage is not None:
         kept = f"; {n_answers} frames were recognized before" + (f" and are in {', '.join(written)}" if written else "")
         raise InputError(damage + (kept if n_answers else ""))
     unpaired = bag.counts.color - bag.counts.pairs
     if unpaired:
         print(
-            f"{unpaired} of {bag.counts.color} images of {bag.topics.color} have no depth within {options.max_gap:g} s",
+            f"{unpaired} of {bag.counts.color} images of {bag.topics.color} have no depth within {given.max_gap:g} s",
             file=sys.stderr,
         )
-    for path in written:
-        print(f"written to {path}", file=sys.stderr)
+    result = f"written to {', '.join(written)}" if written else f"frames recognized: {n_answers}"
+    finish(result, "see why", "explain", *given.arguments, "--model", model, "--out", "why", file=sys.stderr)
     if failed:
         raise InputError(f"{len(failed)} of {n_answers + len(failed)} frames could not be recognized; see above")
+    if without_depth and all(without_depth):
+        raise InputError(without_depth[0])
 
 
 def _write(
@@ -105,7 +100,7 @@ def _write(
     out_bag: "DetectionBag | None",
     rerun: "RerunFile | None",
 ) -> None:
-    from thor2_jax.recognition.result_files import write_recognitions
+    from thor2_jax.model.result_files import write_recognitions
     from thor2_jax.recordings.detections import detections_as_json, detections_of
 
     line = {"frame": recorded.name, "depth_gap": recorded.gap / 1e9}

@@ -1,18 +1,32 @@
 """`thor2 render`: render a dataset of training views."""
 
+import dataclasses
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from thor2_jax.errors import InputError
-from training.cli.app import MeshScaleOption, QuietOption, app, console
+from training.cli.app import MeshScaleOption, QuietOption, app, finish, grouped_options
 from training.cli.progress import show_progress
-from training.cli.workers import AddressOption, EngineOption, WorkersOption, worker_pool
+from training.cli.workers import WorkerOptions
+
+MAX_CROP = 2048
+"""Largest side of a crop, pixels."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RenderWorkers(WorkerOptions):
+    """Where views are rendered; by default, in two processes."""
+
+    workers: Annotated[int, typer.Option(min=1, help="Worker processes; with Ray, concurrent tasks.")] = 2
 
 
 @app.command()
+@grouped_options
 def render(
+    *,
+    processes: RenderWorkers,
     meshes: Annotated[Path, typer.Option(help="Directory of meshes (GLB, OBJ, PLY), one per file or subdirectory.")],
     out: Annotated[Path, typer.Option(help="Directory for the views: new, or begun by this command.")],
     names: Annotated[
@@ -20,9 +34,6 @@ def render(
     ] = None,
     azimuth_step: Annotated[float, typer.Option(help="Degrees between cameras around the object.")] = 5.0,
     polar_step: Annotated[float, typer.Option(help="Degrees between cameras from pole to pole.")] = 5.0,
-    workers: WorkersOption = 2,
-    engine: EngineOption = "local",
-    address: AddressOption = None,
     illumination: Annotated[bool, typer.Option("--illumination", help="Augment: light and camera response.")] = False,
     sensor: Annotated[bool, typer.Option("--sensor", help="Augment: noise and faults of the depth sensor.")] = False,
     occlusion: Annotated[bool, typer.Option("--occlusion", help="Augment: another object in front.")] = False,
@@ -30,7 +41,7 @@ def render(
     registration: Annotated[
         bool, typer.Option("--registration", help="Augment: colour that is blurred and shifted against depth.")
     ] = False,
-    base: Annotated[bool, typer.Option("--base", help="Augment: masks without the lowest centimetre.")] = False,
+    base: Annotated[bool, typer.Option("--base", help="Augment: masks without the lowest part.")] = False,
     copies: Annotated[int, typer.Option(help="Augmented copies of each view, if there are augmentations.")] = 5,
     seed: Annotated[int, typer.Option(help="Seed for the augmentations.")] = 0,
     crops: Annotated[
@@ -57,9 +68,9 @@ def render(
     from training.views.crop_job import render_crops
     from training.views.render_job import render_dataset
 
-    if crops is not None and crops < 1:
-        raise InputError(f"crops is {crops}; expected at least 1 pixel")
-    pool = worker_pool(workers, engine, address) or IN_PROCESS
+    if crops is not None and not 1 <= crops <= MAX_CROP:
+        raise InputError(f"crops is {crops}; expected 1 to {MAX_CROP} pixels")
+    pool = processes.pool() or IN_PROCESS
     augmentations = Augmentations(
         illumination=Illumination() if illumination else None,
         sensor=Sensor() if sensor else None,
@@ -91,6 +102,5 @@ def render(
                 augmentations or None,
                 seed,
             )
-    console.print(
-        f"{len(dataset)} views of {len(dataset.classes)} objects ({dataset.manifest.left_out} left out) in {out}"
-    )
+    views = f"{len(dataset)} views of {len(dataset.classes)} objects ({dataset.manifest.left_out} left out) in {out}"
+    finish(views, "train on them", "train", "--dataset", out, "--out", "run")

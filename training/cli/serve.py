@@ -1,18 +1,21 @@
 """`thor2 serve`: the HTTP service."""
 
+import os
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from thor2_jax.errors import InputError
-from training.cli.app import ModelOption, UnknownOption, app
+from thor2_jax.service.signals import ended_by_signals
+from training.cli.app import AllowHostOption, ModelOption, UnknownOption, app
 
 
 @app.command()
 def serve(
     model: ModelOption,
     host: Annotated[str, typer.Option(help="Address to listen on; 0.0.0.0 for other machines.")] = "127.0.0.1",
+    allow_host: AllowHostOption = None,
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port; 0 selects a free one, named in the log.")] = 8080,
     workers: Annotated[int, typer.Option(min=1, help="Server processes, each with its own model and queue.")] = 1,
     processes: Annotated[int, typer.Option(min=1, help="Processes per worker that decode and prepare frames.")] = 2,
@@ -34,33 +37,42 @@ def serve(
     adapt: Annotated[
         bool, typer.Option("--adapt", help="Estimate the camera's colours from the latest frames, and correct them.")
     ] = False,
+    warm_why: Annotated[
+        bool,
+        typer.Option(
+            help="Compile explanations (/v1/why) in the background after the start, not only from the first request on."
+        ),
+    ] = True,
     token: Annotated[
         str | None, typer.Option(envvar="THOR2_TOKEN", help="Bearer token that clients must send.")
     ] = None,
 ) -> None:
     """Serve recognition over HTTP (extra `serve`); see /openapi.json."""
-    try:
-        from thor2_jax.service.server import serve as serve_forever
-    except ModuleNotFoundError as error:
-        if (error.name or "").startswith("thor2_jax"):
-            raise
-        raise InputError(
-            f"{error.name} is not installed; install it: pip install -c constraints.txt '.[serve]'"
-        ) from None
-    from thor2_jax.service.settings import Settings, default_segmenter
+    with ended_by_signals():
+        try:
+            from thor2_jax.service.server import serve as serve_forever
+        except ModuleNotFoundError as error:
+            if (error.name or "").startswith("thor2_jax"):
+                raise
+            raise InputError(
+                f"{error.name} is not installed; install it: pip install -c constraints.txt '.[serve]'"
+            ) from None
+        from thor2_jax.service.settings import Settings, default_segmenter
 
-    settings = Settings(
-        model,
-        token,
-        queue,
-        deadline,
-        max_batch,
-        processes=processes,
-        unknown_below=unknown_below,
-        cache=cache,
-        gallery=gallery,
-        teach=teach,
-        adapt=adapt,
-        segmenter=default_segmenter() if segment is None else segment if segment != "none" else None,
-    )
+        settings = Settings(
+            model,
+            os.environ.get("THOR2_TOKEN") if token is None else token,  # typer ignores an empty one
+            queue,
+            deadline,
+            max_batch,
+            processes=processes,
+            unknown_below=unknown_below,
+            cache=cache,
+            gallery=gallery,
+            teach=teach,
+            adapt=adapt,
+            segmenter=default_segmenter() if segment is None else segment if segment != "none" else None,
+            allow_host=tuple(allow_host or ()),
+            warm_why=warm_why,
+        )
     serve_forever(settings, host, port, workers)

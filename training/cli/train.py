@@ -1,17 +1,39 @@
 """`thor2 train`: train a recognizer."""
 
+import dataclasses
 import functools
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from thor2_jax.errors import InputError
-from training.cli.app import ManyFrames, MeshScaleOption, QuietOption, app, console, split_names
+from training.cli.app import ManyFrames, MeshScaleOption, QuietOption, app, console, finish, split_names
 from training.cli.progress import show_progress
 
+if TYPE_CHECKING:
+    from training.embedding.run_embedding import Distractors
+    from training.fitting.protocol import Protocol
 
-@app.command(cls=ManyFrames)
+
+class _TrainCommand(ManyFrames):
+    """The command, whose help states the defaults of the protocols."""
+
+    def insert_values(self) -> None:
+        """Insert the values into the help; the protocols take a second to import, so this is not done before."""
+        from training.fitting.protocol import DEFAULT, PAPER, QUICK
+
+        options: list[Any] = self.params
+        for option in options:
+            option.help = (option.help or "").format(default=DEFAULT, paper=PAPER, quick=QUICK)
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Insert the values, and show the help."""
+        self.insert_values()
+        super().format_help(ctx, formatter)
+
+
+@app.command(cls=_TrainCommand)
 def train(
     out: Annotated[Path, typer.Option(help="Run directory: new, or begun by this command.")],
     meshes: Annotated[Path | None, typer.Option(help="Directory of meshes (GLB, OBJ, PLY) to render.")] = None,
@@ -26,17 +48,42 @@ def train(
         Path | None, typer.Option(help="JSON or YAML table: object name -> mesh. Default: all meshes.")
     ] = None,
     paper: Annotated[bool, typer.Option(help="Use the paper's protocol.")] = False,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Train in half of the time, with fewer distractors and networks.")
+    ] = False,
     azimuth_step: Annotated[
-        float | None, typer.Option(help="Degrees between cameras around the object. (20; paper: 5)")
+        float | None,
+        typer.Option(
+            help="Degrees between cameras around the object. ({default.azimuth_step:g}; paper: {paper.azimuth_step:g})"
+        ),
     ] = None,
     polar_step: Annotated[
-        float | None, typer.Option(help="Degrees between cameras from pole to pole. (15; paper: 5)")
+        float | None,
+        typer.Option(
+            help="Degrees between cameras from pole to pole. ({default.polar_step:g}; paper: {paper.polar_step:g})"
+        ),
     ] = None,
-    classifiers: Annotated[str, typer.Option(help="Comma-separated: tops, tops2, ce.")] = "tops,tops2,ce",
+    classifiers: Annotated[
+        str | None,
+        typer.Option(
+            help="The paper's classifiers to train beside the embedding, comma-separated: tops, tops2, ce. (none; "
+            "without an embedding, as with --paper: all)"
+        ),
+    ] = None,
     epochs: Annotated[
-        int | None, typer.Option(help="Half at a learning rate of 1e-2, half at 1e-3. (24; paper: 100)")
+        int | None,
+        typer.Option(
+            help="Passes over the samples: of the embedding ({default.distractors.epochs}) and of the classifiers, "
+            "half at a learning rate of {default.fit.learning_rates[0]:g}, half at {default.fit.learning_rates[1]:g} "
+            "({default.fit.epochs}; paper: {paper.fit.epochs})."
+        ),
     ] = None,
-    batch_size: Annotated[int | None, typer.Option(help="Samples per step. (256; paper: 128)")] = None,
+    batch_size: Annotated[
+        int | None,
+        typer.Option(
+            help="Samples per step of the classifiers. ({default.fit.batch_size}; paper: {paper.fit.batch_size})"
+        ),
+    ] = None,
     seed: Annotated[int, typer.Option(help="Seed for augmentations, weights, sample order and dropout.")] = 0,
     folds: Annotated[int, typer.Option(min=1, help="More than 1: one model per fold, which is its held-out set.")] = 1,
     baselines: Annotated[
@@ -60,11 +107,17 @@ def train(
         typer.Option(
             min=0,
             metavar="N",
-            help="Fit the run's embedding on N procedural distractors and the views; 0 fits none. (1500; paper: 0)",
+            help="Fit the run's embedding on N procedural distractors and the views; 0 fits none. "
+            "({default.distractors.procedural}; quick: {quick.distractors.procedural}; paper: 0)",
         ),
     ] = None,
     orientation_copies: Annotated[
-        int | None, typer.Option(min=0, help="Further samples of each view, in random orientations. (2; paper: 0)")
+        int | None,
+        typer.Option(
+            min=0,
+            help="Further samples of each view for the classifiers, in random orientations. "
+            "({default.orientation_copies}; paper: {paper.orientation_copies})",
+        ),
     ] = None,
     distractors: Annotated[
         Path | None, typer.Option(help="Directory of meshes of objects that are none of the classes.")
@@ -80,9 +133,13 @@ def train(
 ) -> None:
     """Train a recognizer on synthetic views of meshes. An interrupted training resumes.
 
-    With --meshes, each view is used as rendered and in five augmented copies, with other light, partial occlusion,
-    depth sensor errors and inexact masks. A --dataset has the copies that it was rendered with. --paper trains as the
-    paper does: more views, no augmented copies, four mirrors of each view and more epochs.
+    A run recognizes objects by an embedding: several small networks, fitted on the views and on distractors, objects
+    that are none of the classes, so that unknown objects get a low confidence. New objects are enrolled with it, too.
+
+    With --meshes, each view is used as rendered and in augmented copies, with other light, partial occlusion, depth
+    sensor errors and inexact masks. A --dataset has the copies that it was rendered with. --quick fits fewer networks
+    on fewer distractors. --paper trains the paper's classifiers as the paper does, and no embedding: more
+    views, no augmented copies, four mirrors of each view and more epochs.
 
     With --frames, labelled real instances are views of their objects, too, each with augmented copies. Objects may have
     a mesh, frames or both. A frame is a folder with color.png, depth.png, mask.png, intrinsics.json and labels.json.
@@ -91,12 +148,12 @@ def train(
     `thor2 render --crops`) and are trained from scratch or from --weights.
 
     With --sequences, one run is trained for each sequence, on its objects only (see `thor2 evaluate ocid
-    --per-sequence`); finished runs must have the same options. The embedding gives the confidence of an answer, and
-    objects are enrolled in the run with it. It is also fitted on distractors, objects that are none of the classes, so
-    that unknown objects get a low confidence.
+    --per-sequence`); finished runs must have the same options.
     """
     import jax
 
+    if paper and quick:
+        raise InputError("paper and quick are given; expected one of them")
     if (meshes is None) == (dataset is None) and (meshes is not None or not frames):
         raise InputError("give one of --meshes and --dataset, --frames, or both")
     for option, value in (("names", names), ("azimuth-step", azimuth_step), ("polar-step", polar_step)):
@@ -116,54 +173,65 @@ def train(
                 "coordinator: several processes need a --dataset that all of them can read, not --meshes or --frames"
             )
         jax.distributed.initialize(coordinator, processes, process)
-    from training.fitting.protocol import DEFAULT, PAPER
+    from thor2_jax.model.run_directory import RUN_FILE
+    from training.fitting.protocol import DEFAULT, PAPER, QUICK
     from training.train_job import TrainJob, run_train_job
 
+    protocol = (PAPER if paper else QUICK if quick else DEFAULT).replace(
+        azimuth_step=azimuth_step,
+        polar_step=polar_step,
+        epochs=epochs,
+        batch_size=batch_size,
+        seed=seed,
+        orientation_copies=orientation_copies,
+    )
     job = TrainJob(
         out=out,
-        protocol=(PAPER if paper else DEFAULT).replace(
-            azimuth_step=azimuth_step,
-            polar_step=polar_step,
-            epochs=epochs,
-            batch_size=batch_size,
-            seed=seed,
-            orientation_copies=orientation_copies,
-        ),
+        protocol=protocol,
         meshes=meshes,
         dataset=dataset,
         frames=frames or (),
         names=names,
-        classifiers=split_names(classifiers),
+        classifiers=None if classifiers is None else split_names(classifiers),
         folds=folds,
         baselines=split_names(baselines),
         weights=weights,
         leave_out=split_names(leave_out),
         sequences=sequences,
-        distractors=_distractors(0 if paper and embedding is None else embedding, distractors, workers),
+        distractors=_distractors(protocol, embedding, distractors, epochs, workers),
         workers=workers,
         mesh_scale=mesh_scale,
     )
     trained = run_train_job(job, functools.partial(show_progress, quiet))
     for directory, runs in trained.items():
-        if not runs:
-            console.print(f"finished already: nothing was trained; the run is in {directory}")
-            continue
-        for reason in runs[0].record["dataset"].get("frames", {}).get("skipped", []):
+        for reason in runs[0].record["dataset"].get("frames", {}).get("skipped", []) if runs else []:
             console.print(f"skipped: {reason}")
         for run in runs:
+            fold = f"fold {run.record['fold']}: " if len(runs) > 1 else ""
             for name, accuracy in run.record["held_out_accuracy"].items():
-                console.print(f"fold {run.record['fold']}: {name} has a held-out accuracy of {accuracy:.3f}")
-        console.print(f"run written to {directory}")
+                console.print(f"{fold}{name} has a held-out accuracy of {accuracy:.3f}")
+        written = "run written to" if runs else "finished already: nothing was trained; the run is in"
+        model = directory if (directory / RUN_FILE).is_file() else directory / "fold-0"
+        frame = "--color color.png --depth depth.png --labels mask.png --intrinsics intrinsics.json".split()
+        finish(f"{written} {directory}", "recognize a frame", "recognize", "--model", model, *frame)
 
 
-def _distractors(procedural: int | None, meshes: Path | None, workers: int) -> Any:
-    """Return the distractors of the options; None fits no embedding."""
+def _distractors(
+    protocol: "Protocol", procedural: int | None, meshes: Path | None, epochs: int | None, workers: int
+) -> "Distractors | None":
+    """Return the distractors of the protocol with the given values; None fits no embedding."""
     from training.embedding.run_embedding import Distractors
     from training.objects.meshes import find_meshes
 
+    default = protocol.distractors or Distractors()
+    if procedural is None:
+        procedural = 0 if protocol.distractors is None else default.procedural
     if procedural == 0 and meshes is None:
         return None
-    paths = {} if meshes is None else find_meshes(meshes)
-    if procedural is None:
-        return Distractors(meshes=paths, workers=workers)
-    return Distractors(procedural, paths, workers=workers)
+    return dataclasses.replace(
+        default,
+        procedural=procedural,
+        meshes={} if meshes is None else find_meshes(meshes),
+        epochs=default.epochs if epochs is None else epochs,
+        workers=workers,
+    )

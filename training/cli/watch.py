@@ -1,10 +1,11 @@
 """`thor2 watch`: a live page with the recognized objects of a recording, a folder or a camera."""
 
 import contextlib
+import os
+import queue
+import signal
 import sys
-import threading
-import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,7 +13,7 @@ import typer
 
 from thor2_jax.errors import InputError
 from thor2_jax.recordings.topics import Topics
-from training.cli.app import ModelOption, UnknownOption, app
+from training.cli.app import AllowHostOption, ModelOption, UnknownOption, app, finish
 
 if TYPE_CHECKING:
     from thor2_jax.recordings.recorded_frames import RecordedFrame
@@ -39,6 +40,7 @@ def watch(
     unknown_below: UnknownOption = None,
     answer_by: Annotated[str | None, typer.Option(help="classifiers, gallery or both.")] = None,
     host: Annotated[str, typer.Option(help="Address to listen on; 0.0.0.0 for other machines.")] = "127.0.0.1",
+    allow_host: AllowHostOption = None,
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port; 0 selects a free one.")] = 8090,
 ) -> None:
     """Show the recognized objects of a recording or a camera on a live page, until Ctrl-C.
@@ -46,43 +48,81 @@ def watch(
     A bag plays at the speed at which it was recorded; frames for which there is no time are left out. All frames of a
     folder are shown.
     """
-    from thor2_jax.capacity import BATCH_BUCKETS
-    from thor2_jax.recognizer import Recognizer
-    from thor2_jax.segmentation.segmenters import TABLE, load_segmenter
-    from thor2_jax.watch.broadcast import Broadcast
-    from thor2_jax.watch.live import LiveView
-    from thor2_jax.watch.server import serve_live
-
-    sources = {"--bag": bag, "--folder": folder, "--realsense": realsense or None}
-    given = [name for name, value in sources.items() if value is not None]
-    if len(given) != 1:
-        raise InputError(f"{' and '.join(given) or 'no source'} is given; expected one of {', '.join(sources)}")
-    topics = Topics(color_topic, depth_topic, camera_topic)
-    if bag is None and topics != Topics():
-        raise InputError("color_topic, depth_topic and camera_topic belong to --bag")
-    segmenter = load_segmenter(segment or TABLE)
     with contextlib.ExitStack() as stack:
-        frames = _frames(stack, bag, folder, topics, segment)
-        recognizer = Recognizer.load(model, unknown_below, answer_by=answer_by)
-        recognizer.chunk = BATCH_BUCKETS[-1]
+        wait = stack.enter_context(_ctrl_c())
+        from thor2_jax.capacity import BATCH_BUCKETS
+        from thor2_jax.recognizer import Recognizer
+        from thor2_jax.segmentation.segmenters import TABLE, load_segmenter
+        from thor2_jax.watch.broadcast import Broadcast
+        from thor2_jax.watch.live import LiveView
+        from thor2_jax.watch.server import serve_live
+
+        sources = {"--bag": bag, "--folder": folder, "--realsense": realsense or None}
+        given = [name for name, value in sources.items() if value is not None]
+        if len(given) != 1:
+            raise InputError(f"{' and '.join(given) or 'no source'} is given; expected one of {', '.join(sources)}")
+        topics = Topics(color_topic, depth_topic, camera_topic)
+        if bag is None and topics != Topics():
+            raise InputError("color_topic, depth_topic and camera_topic belong to --bag")
+        segmenter = load_segmenter(segment or TABLE)
+        frames = _frames(stack, bag, folder, topics, segment, wait)
+        recognizer = Recognizer.load(model, unknown_below, answer_by=answer_by, chunk=BATCH_BUCKETS[-1])
         broadcast = Broadcast()
-        print(f"watch at {stack.enter_context(serve_live(broadcast, host, port))}", file=sys.stderr, flush=True)
+        url = stack.enter_context(serve_live(broadcast, host, port, allow_host or ()))
+        print(f"watch at {url}", file=sys.stderr, flush=True)
         view = LiveView(recognizer.track().update if track else recognizer.recognize, segmenter, broadcast)
-        with contextlib.suppress(KeyboardInterrupt):
-            try:
-                for recorded in frames:
-                    view.show(recorded)
-            except (InputError, OSError) as error:
-                view.publish_state("failed", str(error))
-                time.sleep(NOTICE_SECONDS)
-                raise
-            view.publish_state("ended", f"There are no more frames; {view.n_frames} were recognized.")
-            print(f"no more frames, {view.n_frames} were recognized; Ctrl-C ends", file=sys.stderr, flush=True)
-            threading.Event().wait()
+        try:
+            for recorded in frames:
+                if wait(0):
+                    return
+                view.show(recorded)
+        except (InputError, OSError) as error:
+            view.publish_state("failed", str(error))
+            wait(NOTICE_SECONDS)
+            raise
+        view.publish_state("ended", f"There are no more frames; {view.n_frames} were recognized.")
+        shown = f"no more frames, {view.n_frames} were recognized; Ctrl-C ends"
+        source = [folder or "FRAME"] if bag is None else ["--bag", bag]
+        finish(shown, "keep the names", "recognize", *source, "--model", model, "--out", "answers", file=sys.stderr)
+        wait(None)
+
+
+@contextlib.contextmanager
+def _ctrl_c() -> Iterator[Callable[[float | None], bool]]:
+    """Yield a function that waits for Ctrl-C, at most for some seconds, and returns whether it has been pressed.
+
+    Python's own handler raises an exception, which gets lost where JAX ignores those of its callbacks.
+    """
+    pressed: queue.SimpleQueue[None] = queue.SimpleQueue()  # Signal handlers may put into it.
+
+    def press(*_: object) -> None:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        pressed.put(None)
+        os.write(2, b"ending after this frame; Ctrl-C again ends at once\n")  # A handler may not print.
+
+    def wait(seconds: float | None) -> bool:
+        try:
+            pressed.put(pressed.get(timeout=seconds))
+        except queue.Empty:
+            return False
+        return True
+
+    previous = signal.getsignal(signal.SIGINT)
+    if previous is not signal.SIG_IGN:  # Background jobs ignore it.
+        signal.signal(signal.SIGINT, press)
+    try:
+        yield wait
+    finally:
+        signal.signal(signal.SIGINT, previous)
 
 
 def _frames(
-    stack: contextlib.ExitStack, bag: Path | None, folder: Path | None, topics: Topics, segment: str | None
+    stack: contextlib.ExitStack,
+    bag: Path | None,
+    folder: Path | None,
+    topics: Topics,
+    segment: str | None,
+    wait: Callable[[float], object],
 ) -> Iterator["RecordedFrame"]:
     """Open the source and return its frames."""
     from thor2_jax.recordings.bags import Bag
@@ -96,7 +136,7 @@ def _frames(
     opened = stack.enter_context(Bag(bag, topics))
     for note in opened.notes:
         print(f"note: {note}", file=sys.stderr)
-    return paced(opened.frames())
+    return paced(opened.frames(), sleep=wait)
 
 
 def _folder_frames(folder: Path, relabel: bool) -> Iterator["RecordedFrame"]:
@@ -104,7 +144,7 @@ def _folder_frames(folder: Path, relabel: bool) -> Iterator["RecordedFrame"]:
     import dataclasses
     import functools
 
-    from thor2_jax.recognition.frames import RGBDFrame
+    from thor2_jax.frames.frames import RGBDFrame
     from thor2_jax.recordings.recorded_frames import RecordedFrame
     from training.readers.frame_files import FrameSource, find_frames
 

@@ -1,1 +1,1 @@
-"""Diagnosis of set-ups: what is likely wrong with the files of a frame."""
+"""Diagnosis of set-ups: likely mistakes in the files of a frame."""

@@ -2,7 +2,7 @@
 
 import math
 
-from thor2_jax.recognition.frames import Intrinsics
+from thor2_jax.frames.frames import Intrinsics
 from training.diagnosis.findings import Diagnosis
 
 __all__ = ["check_camera"]

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from thor2_jax.recognition.frames import RGBDFrame
+from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.recognizer import Recognizer
 from training.diagnosis.findings import Diagnosis
 

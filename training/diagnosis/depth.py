@@ -1,13 +1,12 @@
 """Checks of depth: its unit, its range, and how much of it there is."""
 
 import math
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping
+from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import NDArray
 
-from thor2_jax.recognition.frames import MAX_DEPTH, MIN_DEPTH, RGBDFrame, pixel_rays
+from thor2_jax.frames.frames import MAX_DEPTH, MIN_DEPTH, RGBDFrame, pixel_rays
 from training.diagnosis.findings import Diagnosis
 
 __all__ = ["check_depth", "instance_extents"]
@@ -27,6 +26,13 @@ MIN_EXTENT, MAX_EXTENT = 0.02, 0.45
 EXTENT_MARGIN = 2.0
 """How much smaller or larger than all meshes the median object may be."""
 
+MAX_RATIO = 1.35
+"""Largest median ratio of an object's visible longest side to that of its mesh. Sound frames have 0.8 to 1.1, occluded
+objects less, so that a focal length that is too large does not show."""
+
+MAX_FOCAL_FACTOR = 3.0
+"""Largest factor of sizes that a focal length explains; a unit of depth is wrong by a larger one."""
+
 MIN_ROOM, MAX_ROOM = 0.12, 8.0
 """Range of median depths that need no other unit, metres, if there are no labels to measure."""
 
@@ -40,15 +46,15 @@ MIN_PIXELS = 50
 """Least number of pixels with depth of an instance that is measured."""
 
 
-def instance_extents(frame: RGBDFrame) -> list[float]:
-    """Return the longest side of the visible part of each instance, metres.
+def instance_extents(frame: RGBDFrame) -> dict[int, float]:
+    """Return label -> longest side of the visible part of the instance, metres.
 
     Sides run from the 2nd to the 98th percentile along the principal axes of the points whose depth is within a quarter
     of the median. Instances with few pixels are left out.
     """
-    extents = []
+    extents = {}
     depths = frame.depth_m.ravel()
-    for pixels in frame.instance_pixels.values():
+    for label, pixels in frame.instance_pixels.items():
         depth = depths[pixels]
         median = np.median(depth[depth > 0]) if (depth > 0).any() else 0
         chosen = (depth > 0) & (np.abs(depth - median) < 0.25 * median)
@@ -57,19 +63,25 @@ def instance_extents(frame: RGBDFrame) -> list[float]:
         rays = pixel_rays(pixels[chosen], frame.depth.shape[1], frame.intrinsics)
         points = rays * depth[chosen, None]
         axes = np.linalg.eigh(np.cov(points.T))[1]
-        extents.append(float(np.ptp(np.percentile(points @ axes, (2, 98), axis=0), axis=0).max()))
+        extents[label] = float(np.ptp(np.percentile(points @ axes, (2, 98), axis=0), axis=0).max())
     return extents
 
 
 def check_depth(
-    diagnosis: Diagnosis, frame: RGBDFrame, mesh_sides: Sequence[float] = (), *, trust_camera: bool = True
+    diagnosis: Diagnosis,
+    frame: RGBDFrame,
+    mesh_sides: Mapping[str, float] = MappingProxyType({}),
+    names: Mapping[int, str] = MappingProxyType({}),
+    *,
+    trust_camera: bool = True,
 ) -> None:
     """Check the depth of a frame with or without labels.
 
     Args:
         diagnosis: receives the findings.
         frame: the frame.
-        mesh_sides: longest sides of the meshes, metres, which the objects are compared with.
+        mesh_sides: object -> longest side of its mesh, metres, which the objects are compared with.
+        names: label -> object, if it is known.
         trust_camera: whether the intrinsics are right, so that extents mean something.
     """
     labelled = None if frame.labels is None or not (frame.labels != 0).any() else frame.labels != 0
@@ -86,24 +98,58 @@ def check_depth(
         )
     if not valid.size:
         return
-    if _check_unit(diagnosis, frame, valid, labelled is not None and trust_camera, mesh_sides):
+    extents = instance_extents(frame) if labelled is not None and trust_camera else {}
+    median = float(np.median(valid))
+    if MIN_DEPTH <= median <= MAX_DEPTH and _check_focal_length(diagnosis, median, extents, mesh_sides, names):
+        return
+    if _check_unit(diagnosis, frame, median, list(extents.values()), list(mesh_sides.values())):
         return
     in_range = float(((valid >= MIN_DEPTH) & (valid <= MAX_DEPTH)).mean())
     if in_range < MIN_IN_RANGE:
         diagnosis.add(
             "distance",
             f"{1 - in_range:.0%} of the depth of {where} lies outside {MIN_DEPTH} to {MAX_DEPTH} m (median "
-            f"{np.median(valid):.2f} m) and is not used.",
+            f"{median:.2f} m) and is not used.",
             "Bring the camera to 0.5 to 1.5 m from the objects; if it is there already, depth_scale is wrong.",
         )
 
 
+def _check_focal_length(
+    diagnosis: Diagnosis,
+    median: float,
+    extents: Mapping[int, float],
+    mesh_sides: Mapping[str, float],
+    names: Mapping[int, str],
+) -> bool:
+    """Check the sizes of objects at a plausible distance against their meshes; return whether fx, fy are too small.
+
+    Where no object has a name, as many meshes are compared in the order of their sizes, and otherwise the longest mesh
+    bounds all objects. If one instance is much larger, `_check_unit` says that it covers several objects.
+    """
+    ratios = [extent / mesh_sides[names[label]] for label, extent in extents.items() if names.get(label) in mesh_sides]
+    largest = MAX_FOCAL_FACTOR
+    if not ratios and mesh_sides:
+        sides = sorted(mesh_sides.values())
+        sides = sides if len(sides) == len(extents) else [sides[-1]] * len(extents)
+        ratios = [extent / side for extent, side in zip(sorted(extents.values()), sides, strict=True)]
+        largest = EXTENT_MARGIN if len(ratios) == 1 else MAX_FOCAL_FACTOR
+    ratio = float(np.median(ratios)) if ratios else 1.0
+    if not MAX_RATIO < ratio <= largest:
+        return False
+    diagnosis.add(
+        "intrinsics-focal",
+        f"The objects would measure {ratio:.2g} times as much as their meshes (longest sides, median of {len(ratios)}) "
+        f"at a distance of {_length(median)}.",
+        f"If the distance is right, fx and fy are too small by a factor of about {ratio:.2g}: give the intrinsics of "
+        "these images. If it is wrong, depth_scale is.",
+    )
+    return True
+
+
 def _check_unit(
-    diagnosis: Diagnosis, frame: RGBDFrame, valid: NDArray[Any], with_extents: bool, mesh_sides: Sequence[float]
+    diagnosis: Diagnosis, frame: RGBDFrame, median: float, extents: list[float], mesh_sides: list[float]
 ) -> bool:
     """Check the unit of depth; return whether it is likely wrong."""
-    median = float(np.median(valid))
-    extents = instance_extents(frame) if with_extents else []
     extent = float(np.median(extents)) if extents else None
     low, high = MIN_EXTENT, MAX_EXTENT
     if mesh_sides:

@@ -1,4 +1,4 @@
-"""What the diagnosis of a set-up finds."""
+"""Findings of the diagnosis of a set-up."""
 
 import dataclasses
 
@@ -11,8 +11,8 @@ class Finding:
 
     Attributes:
         code: short name of the problem, for machines: "depth-unit", "intrinsics-size", ...; docs/frames.md lists them.
-        message: what was measured, and what it means, in plain words.
-        advice: what to do.
+        message: the measurement and its meaning, in plain words.
+        advice: remedy for the user.
     """
 
     code: str
@@ -25,8 +25,8 @@ class Diagnosis:
     """The result of a diagnosis.
 
     Attributes:
-        findings: what is likely wrong; empty for a sound set-up.
-        notes: what could not be checked, and why.
+        findings: likely mistakes; empty for a sound set-up.
+        notes: checks that were not possible, and why.
     """
 
     findings: list[Finding] = dataclasses.field(default_factory=list)

@@ -1,6 +1,6 @@
 """Check of the unit of meshes."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -17,24 +17,25 @@ USUAL_SIDE = (0.03, 0.6)
 SCALES = {0.001: "millimetres", 0.01: "centimetres", 0.0254: "inches", 1000.0: "kilometres"}
 
 
-def check_meshes(diagnosis: Diagnosis, paths: Sequence[Path], scale: float = 1.0) -> list[float]:
-    """Check the unit of mesh files; return their longest sides in metres, or nothing if the unit is likely wrong.
+def check_meshes(diagnosis: Diagnosis, meshes: Mapping[str, Path], scale: float = 1.0) -> dict[str, float]:
+    """Check the unit of mesh files; return object -> longest side in metres, or nothing if the unit is likely wrong.
 
     Args:
         diagnosis: receives the findings.
-        paths: mesh files.
+        meshes: object -> mesh file.
         scale: factor that converts their unit to metres.
     """
-    sides = []
-    for path in paths:
+    sides = {}
+    for name, path in meshes.items():
         try:
-            sides.append(longest_side(path) * scale)
+            sides[name] = longest_side(path) * scale
         except InputError as error:
             diagnosis.add("mesh", f"A mesh cannot be used: {error}.", "Repair it, or leave it out.")
     if not sides:
-        return []
-    median = float(np.median(sides))
-    if MIN_SIDE <= min(sides) and max(sides) <= MAX_SIDE and median >= USUAL_SIDE[0] / 3:
+        return {}
+    values = list(sides.values())
+    median = float(np.median(values))
+    if MIN_SIDE <= min(values) and max(values) <= MAX_SIDE and median >= USUAL_SIDE[0] / 3:
         return sides
     fitting = [each for each in SCALES if USUAL_SIDE[0] <= median * each <= USUAL_SIDE[1]]
     unit = f"it is likely in {SCALES[fitting[0]]}" if fitting else "its unit is unknown"
@@ -46,4 +47,4 @@ def check_meshes(diagnosis: Diagnosis, paths: Sequence[Path], scale: float = 1.0
         f"{USUAL_SIDE[1]:g}: {unit}.",
         f"Meshes are read in metres; {mend}.",
     )
-    return []
+    return {}

@@ -4,14 +4,16 @@ for finding in diagnose(FrameFiles(color, depth, labels, intrinsics)).findings:
     print(finding.message, finding.advice)
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TypeVar
+from types import MappingProxyType
+from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.frames import Intrinsics, RGBDFrame, frame_intrinsics, read_color, read_depth, read_labels
+from thor2_jax.frames.frames import Intrinsics, RGBDFrame, frame_intrinsics, read_color, read_depth, read_labels
 from thor2_jax.recognizer import Recognizer
 from training.diagnosis.camera import check_camera
 from training.diagnosis.colors import check_channel_order, check_light
@@ -21,6 +23,7 @@ from training.diagnosis.labels import check_labels
 from training.diagnosis.meshes import check_meshes
 from training.diagnosis.registration import check_labels_alignment, check_registration
 from training.readers.frame_files import FrameFiles
+from training.readers.frames import read_names
 
 __all__ = ["diagnose"]
 
@@ -28,37 +31,60 @@ T = TypeVar("T")
 
 
 def diagnose(
-    files: FrameFiles,
+    files: FrameFiles | RGBDFrame,
     *,
     depth_scale: float | None = None,
     recognizer: Recognizer | None = None,
-    meshes: Sequence[Path] = (),
+    meshes: Mapping[str, Path] = MappingProxyType({}),
     mesh_scale: float = 1.0,
 ) -> Diagnosis:
     """Diagnose the set-up that a frame was recorded with.
 
+    If `labels.json` is beside the labels, the objects are compared with their own meshes.
+
     Args:
-        files: the files of a frame, with or without labels.
-        depth_scale: depth units per metre, in place of the one in the intrinsics.
+        files: the files of a frame, with or without labels, or the frame.
+        depth_scale: depth units per metre, in place of the one in the intrinsics of the files.
         recognizer: a trained recognizer, which is needed to check the order of the colour channels.
-        meshes: mesh files of the objects.
+        meshes: object -> mesh file.
         mesh_scale: factor that converts the meshes to metres.
 
     Raises:
         InputError: a file is missing.
         OSError: a file cannot be opened.
     """
+    diagnosis = Diagnosis()
+    if isinstance(files, RGBDFrame):
+        sides = check_meshes(diagnosis, meshes, mesh_scale)
+        return _check(diagnosis, files.color, files.depth, files.labels, files.intrinsics, {}, sides, recognizer)
     missing = [
         path for path in (files.color, files.depth, files.labels, files.intrinsics) if path and not path.exists()
     ]
     if missing:
         raise InputError(f"{missing[0]} is missing; expected the files of a frame")
-    diagnosis = Diagnosis()
     sides = check_meshes(diagnosis, meshes, mesh_scale)
     color = _read(diagnosis, "color", lambda: read_color(files.color))
     depth = _read(diagnosis, "depth", lambda: read_depth(files.depth))
     labels = _read(diagnosis, "labels", lambda: None if files.labels is None else read_labels(files.labels))
     camera = _read(diagnosis, "intrinsics", lambda: frame_intrinsics(files.intrinsics, files.color, depth_scale))
+    table = files.names
+    names = _read(diagnosis, "names", lambda: read_names(table)) if files.labels and table.is_file() else None
+    if files.labels is None:
+        diagnosis.notes.append("labels: none are given, so the sizes of the objects were not checked")
+    return _check(diagnosis, color, depth, labels, camera, names or {}, sides, recognizer)
+
+
+def _check(
+    diagnosis: Diagnosis,
+    color: NDArray[np.uint8] | None,
+    depth: NDArray[Any] | None,
+    labels: NDArray[Any] | None,
+    camera: Intrinsics | None,
+    names: Mapping[int, str],
+    sides: Mapping[str, float],
+    recognizer: Recognizer | None,
+) -> Diagnosis:
+    """Check what could be read of a frame."""
     shape = next((image.shape[:2] for image in (color, depth, labels) if image is not None), None)
     for name, image in (("depth", depth), ("labels", labels)):
         if color is not None and image is not None and image.shape != color.shape[:2]:
@@ -76,8 +102,6 @@ def diagnose(
     camera_is_right = camera is not None and shape is not None and check_camera(diagnosis, camera, shape[1], shape[0])
     if labels is not None and not check_labels(diagnosis, labels):
         labels = None
-    elif files.labels is None:
-        diagnosis.notes.append("labels: none are given, so the sizes of the objects were not checked")
     light_is_right = color is not None and check_light(diagnosis, color, labels)
     if color is not None and labels is not None:
         check_labels_alignment(diagnosis, color, labels)
@@ -88,7 +112,8 @@ def diagnose(
     if color is not None:
         check_registration(diagnosis, color, frame.depth_m)
     # Without registration the labels are of other pixels.
-    check_depth(diagnosis, frame, sides, trust_camera=camera_is_right and len(diagnosis.findings) == n_findings)
+    trust_camera = camera_is_right and len(diagnosis.findings) == n_findings
+    check_depth(diagnosis, frame, sides, names, trust_camera=trust_camera)
     depth_is_right = len(diagnosis.findings) == n_findings and camera_is_right
     _check_order(diagnosis, frame, recognizer, light_is_right and depth_is_right and color is not None)
     return diagnosis

@@ -6,7 +6,7 @@ the end. `--meshes` adds the objects of a directory.
 """
 
 import argparse
-import shutil
+import dataclasses
 import sys
 import time
 from collections.abc import Sequence
@@ -15,10 +15,13 @@ from pathlib import Path
 import colornet
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
+from thor2_jax.files import check_output_directory, check_output_file, remove_written
 from thor2_jax.gallery.embedding import Embedding
 from training.embedding.fit import EmbeddingFit, fit_embedding
+from training.embedding.references import reference_views
 from training.embedding.sampling import ObjectSource, build_samples
 from training.objects.meshes import find_meshes
+from training.storage.jobs import JOB_FILE
 from training.storage.progress import Progress
 from training.storage.workers import local_workers
 
@@ -59,6 +62,8 @@ def build_embedding(
     sources: list[ObjectSource] = [*range(objects), *(mesh for mesh in meshes for _ in range(MESH_WEIGHT))]
     network, config = colornet.load_default(), DescriptorConfig(homology="closed_form")
     directory = out.with_name(f"{out.name}.samples")
+    check_output_file("out", out, lambda path: bool(Embedding.load(path)))
+    check_output_directory(directory, JOB_FILE)
     samples = build_samples(
         sources,
         directory,
@@ -73,10 +78,11 @@ def build_embedding(
         network,
         config,
         options,
-        progress=lambda done, total, loss: progress("embedding", done, total, f"loss {loss:.3f}"),
+        progress=lambda done, total, metrics: progress("embedding", done, total, f"loss {metrics.loss:.3f}"),
     )
+    embedding = dataclasses.replace(embedding, references=reference_views(embedding, samples))
     embedding.save(out)
-    shutil.rmtree(directory)
+    remove_written(directory, r"job\.json", r"\.lock", r"[0-9]{5,}\.safetensors")
     return embedding
 
 

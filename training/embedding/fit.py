@@ -8,8 +8,8 @@ as a classifier.
 
 import dataclasses
 import functools
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,11 +20,16 @@ from numpy.typing import NDArray
 
 from colornet import ColorNetwork
 from thor2_jax.config import DescriptorConfig
+from thor2_jax.descriptor.cloud_statistics import is_color
 from thor2_jax.descriptor.describe import describe_strips
+from thor2_jax.descriptor.looks import LookDescriptors
 from thor2_jax.errors import InputError
-from thor2_jax.gallery.embedding import Embedding, EmbeddingNetwork, EmbeddingSizes, class_cosines, color_features
+from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes, class_cosines, color_features
 from thor2_jax.types import Descriptors, Strips
 from training.embedding.samples import Batch, Samples
+from training.fitting.checkpoints import Checkpoints
+from training.fitting.loop import Steps, run_epochs
+from training.fitting.options import EpochMetrics
 
 __all__ = ["EmbeddingFit", "batch_descriptors", "fit_embedding"]
 
@@ -42,8 +47,8 @@ class EmbeddingFit:
         rate: learning rate of AdamW at the first step; it falls to 0 along a cosine.
         margin: subtracted from the cosine between a view and its own proxy.
         seed: seed for weights, proxies, sample order and dropout.
-        networks: number of networks, fitted one after the other from different weights. Only the first one embeds; all
-            classify. Use 1 without classes.
+        networks: number of networks, fitted together on the same batches from different weights. Only the first one
+            embeds; all classify. Use 1 without classes.
 
     Raises:
         InputError: a value is out of range.
@@ -79,6 +84,14 @@ def batch_descriptors(
     return describe_strips(strips, network, config)
 
 
+@functools.partial(jax.jit, static_argnums=(1, 2))
+def batch_looks(batch: Batch, network: ColorNetwork, config: DescriptorConfig) -> LookDescriptors:
+    """Return the descriptors of the samples of a batch, one look each."""
+    descriptors = batch_descriptors(batch.length, batch.color, network, config)
+    each, statistics = jax.tree.map(lambda a: a[:, None], (descriptors, jnp.asarray(batch.statistics)))
+    return LookDescriptors(each, statistics, jnp.ones((len(batch.label), 1)))
+
+
 @functools.partial(jax.jit, static_argnums=(0, 1))
 def _color_features(network: ColorNetwork, config: DescriptorConfig, batch: Batch) -> jax.Array:
     return color_features(batch_descriptors(batch.length, batch.color, network, config).embeddings)
@@ -89,10 +102,8 @@ def _color_basis(
 ) -> NDArray[np.float32]:
     """Return the principal components [F, size] of the colour features, not centred: projections keep cosines."""
     rows = np.arange(len(samples))[:: max(1, len(samples) // BASIS_SAMPLES)][:BASIS_SAMPLES]
-    rows = np.resize(rows, -(-len(rows) // batch_size) * batch_size)
-    features = np.concatenate(
-        [_color_features(network, config, samples.take(chunk)) for chunk in rows.reshape(-1, batch_size)]
-    )
+    batches = samples.batches(rows, batch_size)
+    features = np.concatenate([_color_features(network, config, batch) for batch in batches])
     variances, vectors = np.linalg.eigh(features @ features.T)
     largest = slice(-1, -size - 1, -1)
     basis = features.T @ (vectors[:, largest] / np.sqrt(np.maximum(variances[largest], 1e-6)))
@@ -104,27 +115,52 @@ def _adamw(rate: float, n_steps: int) -> Any:
     return optax.adamw(optax.cosine_decay_schedule(rate, n_steps), weight_decay=1e-3)
 
 
+class NetworkState(NamedTuple):
+    """All that the fit of one network changes. A pytree.
+
+    Attributes:
+        parameters: weights.
+        rest: batch statistics and constants.
+        moments: state of the optimizer.
+    """
+
+    parameters: Any
+    rest: Any
+    moments: Any
+
+
 @functools.partial(jax.jit, static_argnums=(0, 1, 2, 3, 4), donate_argnums=5)
 def _step(
-    graph: Any, optimizer: Any, margin: float, network: ColorNetwork, config: DescriptorConfig, state: Any, batch: Batch
-) -> tuple[Any, jax.Array]:
-    """Make one step and return the next state and the loss before it."""
-    parameters, rest, moments, key = state
-    key, dropout = jax.random.split(key)
+    graphs: tuple[Any, ...],
+    optimizer: Any,
+    margin: float,
+    network: ColorNetwork,
+    config: DescriptorConfig,
+    states: tuple[NetworkState, ...],
+    batch: Batch,
+    seen: jax.Array,
+    keys: jax.Array,
+) -> tuple[tuple[NetworkState, ...], jax.Array]:
+    """Make one step of every network; return the next states, and the mean loss and accuracy [2] before the step."""
     descriptors = batch_descriptors(batch.length, batch.color, network, config)
 
-    def loss_of(parameters: Any) -> Any:
-        model = nnx.merge(graph, parameters, rest, copy=True)
-        learned = model.learned(descriptors, batch.statistics, train=True, rngs=nnx.Rngs(dropout=dropout))
-        cosines = class_cosines(learned, model.proxies[...])
-        own = jax.nn.one_hot(batch.label, cosines.shape[1])
-        logits = jnp.exp(model.log_scale[...]) * (cosines - margin * own)
-        loss = optax.softmax_cross_entropy_with_integer_labels(logits, batch.label).mean()
-        return loss, nnx.state(model, nnx.Not(nnx.Param))
+    def step(graph: Any, state: NetworkState, seen: jax.Array, key: jax.Array) -> tuple[NetworkState, jax.Array]:
+        def loss_of(parameters: Any) -> Any:
+            model = nnx.merge(graph, parameters, state.rest, copy=True)
+            learned = model.learned(descriptors, batch.statistics * seen, train=True, rngs=nnx.Rngs(dropout=key))
+            cosines = class_cosines(learned, model.proxies[...])
+            own = jax.nn.one_hot(batch.label, cosines.shape[1])
+            logits = jnp.exp(model.log_scale[...]) * (cosines - margin * own)
+            loss = optax.softmax_cross_entropy_with_integer_labels(logits, batch.label).mean()
+            accuracy = (cosines.argmax(axis=1) == batch.label).mean()
+            return loss, (nnx.state(model, nnx.Not(nnx.Param)), accuracy)
 
-    (loss, rest), gradients = jax.value_and_grad(loss_of, has_aux=True)(parameters)
-    updates, moments = optimizer.update(gradients, moments, parameters)
-    return (optax.apply_updates(parameters, updates), rest, moments, key), loss
+        (loss, (rest, accuracy)), gradients = jax.value_and_grad(loss_of, has_aux=True)(state.parameters)
+        updates, moments = optimizer.update(gradients, state.moments, state.parameters)
+        return NetworkState(optax.apply_updates(state.parameters, updates), rest, moments), jnp.stack([loss, accuracy])
+
+    after, metrics = zip(*(step(*each) for each in zip(graphs, states, seen, keys, strict=True)), strict=True)
+    return after, jnp.stack(metrics).mean(axis=0)
 
 
 def fit_embedding(
@@ -133,10 +169,14 @@ def fit_embedding(
     config: DescriptorConfig,
     options: EmbeddingFit,
     sizes: EmbeddingSizes | None = None,
-    progress: Callable[[int, int, float], object] = lambda epoch, epochs, loss: None,
+    progress: Callable[[int, int, EpochMetrics], object] = lambda done, total, metrics: None,
     classes: tuple[str, ...] = (),
+    checkpoints: Checkpoints | None = None,
+    epoch_done: Callable[[EpochMetrics], object] = lambda metrics: None,
 ) -> Embedding:
-    """Fit an embedding; on the same machine, equal arguments give equal weights.
+    """Fit an embedding, or resume from the last checkpoint.
+
+    On the same machine, equal arguments give equal weights, also if the fit was interrupted.
 
     Args:
         samples: of at least two objects.
@@ -144,12 +184,15 @@ def fit_embedding(
         config: descriptor of the samples.
         options: of the fit.
         sizes: of the network.
-        progress: called after each epoch with (epochs done, epochs of all networks, mean loss).
+        progress: called with (steps done, total steps, metrics of the epoch so far), for some of the steps.
         classes: names of the first objects, which the embedding also recognizes: their proxies, and those of the other
             objects as distractors, are kept. None by default: the proxies are discarded.
+        checkpoints: of this fit only, written after each epoch; None writes none.
+        epoch_done: called after each epoch, before its checkpoint is written.
 
     Raises:
-        InputError: there are fewer samples than in a batch, or the loss is not finite.
+        InputError: there are fewer samples than in a batch, the loss is not finite, or a checkpoint is unreadable.
+        OSError: a checkpoint cannot be written; the previous one stays.
     """
     if len(samples) < options.batch_size:
         raise InputError(f"there are {len(samples)} samples; expected at least {options.batch_size}; add views")
@@ -157,44 +200,39 @@ def fit_embedding(
     embedding = Embedding.create(config, network, sizes, options.seed, classes, n_objects - len(classes))
     basis = _color_basis(samples, network, embedding.config, embedding.sizes.color, options.batch_size)
     embedding.model.color_basis[...] = jnp.asarray(basis)
-    models = []
-    for number in range(options.networks):
-        seed, model = options.seed, embedding.model
-        if number:
-            seed = int(np.random.SeedSequence([options.seed, number]).generate_state(1)[0])
-            model = embedding.create_further(seed)
+    further = [
+        embedding.create_further(int(np.random.SeedSequence([options.seed, number]).generate_state(1)[0]))
+        for number in range(1, options.networks)
+    ]
+    n_steps = len(samples) // options.batch_size
+    optimizer = _adamw(options.rate, n_steps * options.epochs)
+    split: Any = [nnx.split(model, nnx.Param, ...) for model in (embedding.model, *further)]
+    graphs = tuple(graph for graph, _, _ in split)
+    states = tuple(NetworkState(weights, rest, optimizer.init(weights)) for _, weights, rest in split)
+    # The further networks do not read the statistics of colours, which differ most between renderings and cameras.
+    seen = np.ones((options.networks, samples.statistics.shape[1]), np.float32)
+    seen[1:, is_color(embedding.network.n_regions)] = 0
 
-        def report_epoch(epoch: int, loss: float, before: int = number * options.epochs) -> None:
-            progress(before + epoch, options.networks * options.epochs, loss)
+    def epoch(number: int) -> Iterator[Batch]:
+        # Order and dropout are drawn from seed and step, so that a resumed fit needs no generator state.
+        order = np.random.default_rng([options.seed, number]).permutation(len(samples))
+        return samples.batches(order[: n_steps * options.batch_size], options.batch_size)
 
-        models.append(_fit_network(model, embedding, samples, dataclasses.replace(options, seed=seed), report_epoch))
+    def step(states: tuple[NetworkState, ...], number: int, batch: Batch) -> tuple[tuple[NetworkState, ...], Any]:
+        keys = jax.random.split(jax.random.fold_in(jax.random.key(options.seed), number + 1), options.networks)
+        return _step(graphs, optimizer, options.margin, embedding.network, embedding.config, states, batch, seen, keys)
+
+    states = run_epochs(
+        "the embedding",
+        states,
+        Steps(options.epochs, n_steps, options.batch_size),
+        epoch,
+        step,
+        checkpoints,
+        progress=progress,
+        epoch_done=epoch_done,
+        place=lambda states: jax.tree.map(jnp.asarray, states),
+    )
+    models = [nnx.merge(graph, state.parameters, state.rest) for graph, state in zip(graphs, states, strict=True)]
     fitted = dataclasses.replace(embedding, model=models[0], further=tuple(models[1:]))
     return fitted if classes else fitted.without_proxies()
-
-
-def _fit_network(
-    model: EmbeddingNetwork,
-    embedding: Embedding,
-    samples: Samples,
-    options: EmbeddingFit,
-    progress: Callable[[int, float], object],
-) -> EmbeddingNetwork:
-    """Fit a network of an embedding; `progress` is called after each epoch with (epochs done, mean loss)."""
-    n_steps = len(samples) // options.batch_size
-    split: Any = nnx.split(model, nnx.Param, ...)
-    graph, parameters, rest = split
-    optimizer = _adamw(options.rate, n_steps * options.epochs)
-    state = parameters, rest, optimizer.init(parameters), jax.random.key(options.seed)
-    for epoch in range(options.epochs):
-        order = np.random.default_rng([options.seed, epoch]).permutation(len(samples))
-        total = jnp.zeros(())
-        for rows in order[: n_steps * options.batch_size].reshape(n_steps, -1):
-            batch = samples.take(rows)
-            state, loss = _step(graph, optimizer, options.margin, embedding.network, embedding.config, state, batch)
-            total += loss
-        mean = float(total) / n_steps
-        if not np.isfinite(mean):
-            raise InputError(f"the loss is {mean} in epoch {epoch + 1}; expected a finite one; lower the rate")
-        progress(epoch + 1, mean)
-    fitted: EmbeddingNetwork = nnx.merge(graph, state[0], state[1])
-    return fitted

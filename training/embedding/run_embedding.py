@@ -5,7 +5,7 @@ them is held out, so that the confidence is calibrated on unknown objects that n
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,21 +15,34 @@ from numpy.typing import NDArray
 from colornet import ColorNetwork
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
-from thor2_jax.gallery.embedding import Embedding
+from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
 from training.embedding.fit import EmbeddingFit, fit_embedding
+from training.embedding.references import reference_views
+from training.embedding.sample_cache import cached_samples
 from training.embedding.samples import Samples, joined_samples, sample_views
-from training.embedding.sampling import ObjectSource, build_samples
+from training.embedding.sampling import ObjectSource, build_samples, sampling_job
+from training.fitting.checkpoints import Checkpoints
+from training.fitting.options import EpochMetrics
+from training.objects.meshes import load_mesh
+from training.storage.jobs import JOB_FILE
 from training.storage.progress import Progress
 from training.storage.workers import local_workers
 from training.views.normalized_views import ViewSource
+from training.views.render_job import mesh_digest
 
-__all__ = ["Distractors", "fit_run_embedding"]
+__all__ = ["STAGES", "Distractors", "fit_run_embedding"]
 
 COPIES = 2
 """Samples of each view, in random orientations."""
 
-N_NETWORKS = 3
-"""Number of networks in the embedding of a run; docs/decisions.md says why."""
+SEED = 0
+"""Seed of the distractors of all runs, which therefore share their samples in the user's cache."""
+
+SIZES = EmbeddingSizes(cell=12, hidden=(256, 192))
+"""Sizes of each network; several small networks are steadier than fewer large ones."""
+
+RENDER, DESCRIBE, FIT = STAGES = ("render distractors", "describe for the embedding", "fit networks")
+"""Names of the stages, for the progress."""
 
 HELD_OUT = 10
 """One distractor of so many is held out."""
@@ -44,6 +57,7 @@ class Distractors:
         meshes: name -> file of other objects.
         views: views of each distractor.
         epochs: passes over the samples.
+        networks: number of networks in the embedding; docs/decisions.md says why there are several.
         workers: rendering processes; they do not affect the result.
 
     Raises:
@@ -53,20 +67,21 @@ class Distractors:
     procedural: int = 1500
     meshes: Mapping[str, Path] = dataclasses.field(default_factory=dict)
     views: int = 8
-    epochs: int = 10
+    epochs: int = 8
+    networks: int = 5
     workers: int = 1
 
     def __post_init__(self) -> None:
         count = self.procedural + len(self.meshes)
-        if self.procedural < 0 or count < HELD_OUT or min(self.views, self.epochs, self.workers) < 1:
+        if self.procedural < 0 or count < HELD_OUT or min(self.views, self.epochs, self.networks, self.workers) < 1:
             raise InputError(
-                f"distractors: there are {count} objects with {self.views} views, fitted in {self.epochs} epochs; "
-                f"expected at least {HELD_OUT} objects, 1 view and 1 epoch"
+                f"distractors: there are {count} objects with {self.views} views, {self.networks} networks and "
+                f"{self.epochs} epochs; expected at least {HELD_OUT} objects, 1 view, 1 network and 1 epoch"
             )
 
     @property
     def sources(self) -> list[ObjectSource]:
-        """The meshes, then the procedural objects; the same kinds of objects at any place of the list."""
+        """The meshes and the procedural objects in a random order, always the same, so that both kinds are held out."""
         mixed: list[ObjectSource] = [*self.meshes.values(), *range(self.procedural)]
         return [mixed[k] for k in np.random.default_rng(0).permutation(len(mixed))]
 
@@ -81,14 +96,40 @@ class Distractors:
 
     @property
     def record(self) -> dict[str, Any]:
-        """What determines the embedding, as JSON holds it."""
+        """All that determines the embedding, as JSON holds it."""
         return {
             "procedural": self.procedural,
             "meshes": sorted(self.meshes),
             "views": self.views,
             "epochs": self.epochs,
-            "networks": N_NETWORKS,
+            "networks": self.networks,
         }
+
+
+def _distractor_samples(
+    distractors: Distractors, directory: Path, network: ColorNetwork, config: DescriptorConfig, progress: Progress
+) -> Samples:
+    """Render and sample the distractors, unless the user's cache has their samples."""
+    sources = distractors.sources
+    objects = [mesh_digest(load_mesh(source)) if isinstance(source, Path) else source for source in sources]
+
+    def build() -> Samples:
+        return build_samples(
+            sources,
+            directory,
+            network,
+            config,
+            distractors.views,
+            COPIES,
+            SEED,
+            local_workers(distractors.workers),
+            lambda done, total: progress(RENDER, done, total, ""),
+        )
+
+    job = sampling_job(objects, network, config, distractors.views, COPIES, SEED)
+    samples = cached_samples(job, build, resumes=(directory / JOB_FILE).is_file())
+    progress(RENDER, len(sources), len(sources), "")
+    return samples
 
 
 def fit_run_embedding(
@@ -100,6 +141,8 @@ def fit_run_embedding(
     config: DescriptorConfig,
     seed: int,
     progress: Progress,
+    checkpoints: Checkpoints | None = None,
+    epoch_done: Callable[[EpochMetrics], object] = lambda metrics: None,
 ) -> tuple[Embedding, Samples]:
     """Fit the embedding of a run.
 
@@ -107,11 +150,14 @@ def fit_run_embedding(
         source: normalized views of the classes.
         held_out: label -> indices of the views of the held-out set.
         distractors: the other objects.
-        directory: for the samples of the distractors, from which an interrupted training resumes.
+        directory: for the samples of the distractors, from which an interrupted training resumes; unused if the
+            user's cache has them.
         network: colour network.
         config: descriptor.
-        seed: seed for weights, order and orientations.
+        seed: seed for weights, order and orientations of the views of the classes.
         progress: called with (stage, done, total, note).
+        checkpoints: see `fit_embedding`.
+        epoch_done: likewise.
 
     Returns:
         The embedding, which recognizes the classes, and the samples of the held-out set: those of distractors have
@@ -122,17 +168,7 @@ def fit_run_embedding(
         OSError: a file cannot be written.
     """
     config, classes = dataclasses.replace(config, homology="closed_form"), tuple(source.classes)
-    others = build_samples(
-        distractors.sources,
-        directory,
-        network,
-        config,
-        distractors.views,
-        COPIES,
-        seed,
-        local_workers(distractors.workers),
-        lambda done, total: progress("render distractors", done, total, ""),
-    )
+    others = _distractor_samples(distractors, directory, network, config, progress)
     fitted: list[dict[str, NDArray[Any]]] = []
     kept: list[dict[str, NDArray[Any]]] = []
     for index, shard in enumerate(source.shards):
@@ -141,19 +177,28 @@ def fit_run_embedding(
         for rows, chunks in ((~mask, fitted), (mask, kept)):
             if rows.any():
                 chunks.append(sample_views(views, rows, network, config, COPIES, rng))
-        progress("describe for the embedding", index + 1, len(source.shards), "")
+        progress(DESCRIBE, index + 1, len(source.shards), "")
     is_held_out = others.label % HELD_OUT == 0
     # Labels of fitted distractors are consecutive.
     label = others.label - (others.label // HELD_OUT + 1) * ~is_held_out + len(classes)
     others = dataclasses.replace(others, label=label.astype(np.int32))
     fitted.append(others.fields(np.flatnonzero(~is_held_out)))
     kept.append(others.fields(np.flatnonzero(is_held_out)))
+
+    def show(done: int, total: int, metrics: EpochMetrics) -> None:
+        progress(FIT, done, total, metrics.describe(distractors.epochs))
+
+    samples = joined_samples(fitted, config)
     embedding = fit_embedding(
-        joined_samples(fitted, config),
+        samples,
         network,
         config,
-        EmbeddingFit(epochs=distractors.epochs, seed=seed, networks=N_NETWORKS),
-        progress=lambda done, total, loss: progress("fit embedding", done, total, f"loss {loss:.3f}"),
+        EmbeddingFit(epochs=distractors.epochs, seed=seed, networks=distractors.networks),
+        SIZES,
+        progress=show,
         classes=classes,
+        checkpoints=checkpoints,
+        epoch_done=epoch_done,
     )
+    embedding = dataclasses.replace(embedding, references=reference_views(embedding, samples, seed))
     return embedding, joined_samples(kept, config)

@@ -4,7 +4,7 @@ A sample stores only its occupied strips, about a tenth of all, and the statisti
 """
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -94,6 +94,11 @@ class Samples:
         length[sample, strip], color[sample, strip] = self.length[entry], self.color[entry]
         grid = len(rows), *self.shape
         return Batch(length.reshape(grid), color.reshape(*grid, -1), self.statistics[rows], self.label[rows])
+
+    def batches(self, rows: NDArray[np.integer[Any]], size: int) -> Iterator[Batch]:
+        """Yield the samples with the given indices in batches of one size; the last one is filled with the first."""
+        for chunk in np.resize(rows, -(-len(rows) // size) * size).reshape(-1, size):
+            yield self.take(chunk)
 
 
 def sample_clouds(

@@ -10,6 +10,7 @@ import dataclasses
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import safetensors.numpy
@@ -38,7 +39,7 @@ from training.storage.locks import locked
 from training.storage.workers import IN_PROCESS, WorkerPool
 from training.views.mesh_views import MIN_VIEW_POINTS, cloud_of
 
-__all__ = ["AUGMENTATIONS", "ObjectSource", "ViewTask", "build_samples", "render_clouds"]
+__all__ = ["AUGMENTATIONS", "ObjectSource", "ViewTask", "build_samples", "render_clouds", "sampling_job"]
 
 OBJECTS_PER_SHARD = 32
 
@@ -99,6 +100,27 @@ def render_clouds(task: ViewTask) -> list[tuple[int, Cloud]]:
     return clouds
 
 
+def sampling_job(
+    objects: Sequence[int | str],
+    network: ColorNetwork,
+    config: DescriptorConfig,
+    views: int,
+    copies: int,
+    seed: int,
+) -> dict[str, Any]:
+    """Return the record of a sampling; `objects` says what they are, see `build_samples` for the others."""
+    return {
+        "descriptor_version": DESCRIPTOR_VERSION,
+        "descriptor_config": dataclasses.asdict(config),
+        "color_network": network.fingerprint,
+        "objects": list(objects),
+        "views": views,
+        "copies": copies,
+        "seed": seed,
+        "augmentations": AUGMENTATIONS.record(),
+    }
+
+
 def build_samples(
     sources: Sequence[ObjectSource],
     directory: str | Path,
@@ -133,16 +155,7 @@ def build_samples(
         raise InputError(f"there are {len(sources)} objects with {views} views each; expected at least 2 with 1 view")
     directory = Path(directory)
     label_of = {source: index for index, source in reversed(list(enumerate(sources)))}
-    job = {
-        "descriptor_version": DESCRIPTOR_VERSION,
-        "descriptor_config": dataclasses.asdict(config),
-        "color_network": network.fingerprint,
-        "objects": [str(source) for source in sources],
-        "views": views,
-        "copies": copies,
-        "seed": seed,
-        "augmentations": AUGMENTATIONS.record(),
-    }
+    job = sampling_job([str(source) for source in sources], network, config, views, copies, seed)
     with locked(directory):
         begin_job(directory, job)
         starts = range(0, len(sources), OBJECTS_PER_SHARD)

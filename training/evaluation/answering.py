@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.frames import RGBDFrame, pixel_rays
+from thor2_jax.frames.frames import RGBDFrame, pixel_rays
+from thor2_jax.printable import find_name
 from training.baselines.baseline import baseline_inputs
 from training.evaluation.answers import FrameAnswers, InstancePrediction, all_predictors
 from training.evaluation.runs import Run, load_runs, load_sequence_runs
@@ -46,7 +47,7 @@ def answer_frames(
 
 @dataclasses.dataclass(frozen=True)
 class RunArguments:
-    """What the runs of an evaluation are loaded from, in this process and in each worker.
+    """Directories of the runs of an evaluation, which each process loads.
 
     Attributes:
         models: see `load_runs`; with `per_sequence`, the directory of `load_sequence_runs`.
@@ -124,7 +125,8 @@ def _answer(runs: Sequence[Run], item: LabelledFrame) -> list[InstancePrediction
     rows = {instance.label: row for row, instance in enumerate(described.usable)}
     reasons = {instance.label: instance.reason for instance in described.instances}
     answers = []
-    for label, truth in sorted(item.truth.items()):
+    for label, name in sorted(item.truth.items()):
+        truth = find_name(name, runs[0].classes) or name
         position = _position(item.frame, label)
         if label in rows:
             row = rows[label]

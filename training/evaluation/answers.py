@@ -22,7 +22,7 @@ __all__ = ["AnswerFile", "EvaluatedRun", "FrameAnswers", "InstancePrediction", "
 
 
 class EvaluatedRun(Protocol):
-    """What the results of an evaluation need to know of a run."""
+    """The facts of a run that results of an evaluation depend on."""
 
     @property
     def name(self) -> str:
@@ -38,7 +38,7 @@ class EvaluatedRun(Protocol):
 
     @property
     def answer_by(self) -> str:
-        """What the recognizer answers by: "classifiers", "gallery" or "both"."""
+        """Source of the answers: "classifiers", "gallery" or "both"."""
 
     @property
     def temperatures(self) -> Mapping[str, float]:

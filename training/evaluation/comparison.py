@@ -32,7 +32,7 @@ _PAPER_RULE: Rule = "max"
 
 @dataclasses.dataclass(frozen=True)
 class EvaluationConditions:
-    """What an evaluation must state beside published figures.
+    """Facts that an evaluation states beside published figures.
 
     Attributes:
         own_objects: whether the classes are the objects of the frame's own sequence.
@@ -122,7 +122,7 @@ def _fractions(figure: PublishedFigure) -> dict[str, float | None]:
 
 
 def _network_differences(titles: Iterable[str], conditions: EvaluationConditions) -> list[str]:
-    """Return what a reader must know of the measured image networks."""
+    """Return the limits of the measured image networks."""
     sentences = []
     for title in dict.fromkeys(titles):
         if title.endswith(_SMALL):

@@ -1,13 +1,12 @@
 """Pictures of an evaluation, drawn while the frames are in memory."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from training.evaluation.answers import EvaluatedRun, FrameAnswers
-from training.evaluation.fusion import main_fusion
-from training.evaluation.results import fuse_answers, incorrect_answers
+from training.evaluation.answers import EvaluatedRun, FrameAnswers, InstancePrediction
+from training.evaluation.results import named_answers
 from training.readers.labelled import LabelledFrame
 from training.reports.instance_pictures import draw_crop, draw_judged
 
@@ -18,9 +17,10 @@ FRAMES = 12
 
 
 class FramePictures:
-    """Pictures of some frames with the answers of the first run, and of the most confident instance of each confusion.
+    """Pictures of some frames with the answers of the first run, and of the most confident instance of each wrong name.
 
-    They are `frames/<number>.jpg`, counted from 0, and `confusions/<truth>-<prediction>.jpg` with class indices.
+    They are `frames/<number>.jpg`, counted from 0, and `confusions/<truth>-<name>.jpg` with class indices; unknown
+    objects have the numbers after the classes.
 
     Attributes:
         shown: numbers of the frames that are drawn.
@@ -37,7 +37,7 @@ class FramePictures:
         Raises:
             OSError: a directory cannot be created.
         """
-        self._out, self._runs, self._classes = out, runs, runs[0].classes
+        self._out, self._runs, self._names = out, runs, list(runs[0].classes)
         self.shown = sorted({int(n) for n in np.linspace(0, n_frames - 1, FRAMES)})
         self._highest: dict[tuple[str, str], float] = {}
         for name in ("frames", "confusions"):
@@ -47,39 +47,45 @@ class FramePictures:
         """Return the path of the picture of a frame."""
         return self._out / "frames" / f"{number}.jpg"
 
-    def confusion_path(self, truth: str, prediction: str) -> Path:
-        """Return the path of the picture of a confusion."""
-        return self._out / "confusions" / f"{self._classes.index(truth)}-{self._classes.index(prediction)}.jpg"
+    def confusion_path(self, truth: str, name: str) -> Path:
+        """Return the path of the picture of an object with a wrong name."""
+        return self._out / "confusions" / f"{self._names.index(truth)}-{self._names.index(name)}.jpg"
 
     def restore(self, answers: FrameAnswers) -> None:
         """Take into account a frame that was drawn before the evaluation was interrupted."""
-        for instance, prediction, confidence in incorrect_answers(answers, self._runs):
-            pair = instance.truth, prediction
-            self._highest[pair] = max(confidence, self._highest.get(pair, -1.0))
+        for _ in self._most_confident(answers):
+            pass
 
     def draw(self, number: int, item: LabelledFrame, answers: FrameAnswers) -> None:
-        """Draw the frame if it is shown, and those of its incorrect answers that are the most confident so far.
+        """Draw the frame if it is shown, and those of its wrong names that are the most confident so far.
 
         Raises:
             OSError: a file cannot be written.
         """
-        for instance, prediction, confidence in incorrect_answers(answers, self._runs):
-            if confidence > self._highest.get((instance.truth, prediction), -1.0):
-                self._highest[instance.truth, prediction] = confidence
-                mask = item.frame.label_image == instance.label
-                draw_crop(item.frame.color, mask, self.confusion_path(instance.truth, prediction))
+        for instance, name in self._most_confident(answers):
+            draw_crop(
+                item.frame.color, item.frame.label_image == instance.label, self.confusion_path(instance.truth, name)
+            )
         if number in self.shown:
             draw_judged(item.frame.color, item.frame.label_image, self._judge(answers), self.frame_path(number))
 
+    def _most_confident(self, answers: FrameAnswers) -> Iterator[tuple[InstancePrediction, str]]:
+        """Yield instance and name of each wrong name that is more confident than all equal ones so far."""
+        for _, instance, name, confidence in named_answers(answers.instances, self._runs):
+            if instance.truth not in self._names:
+                self._names.append(instance.truth)
+            if name in (None, instance.truth) or confidence <= self._highest.get((instance.truth, str(name)), -1.0):
+                continue
+            self._highest[instance.truth, str(name)] = confidence
+            yield instance, str(name)
+
     def _judge(self, answers: FrameAnswers) -> dict[int, tuple[bool, str]]:
-        """Return label -> (correct, text) for the instances of known objects."""
-        known = [i for i in answers.instances if i.truth in self._classes]
-        judged = {i.label: (False, f"none ({i.truth})") for i in known}
-        described = [i for i in known if i.probabilities is not None]
-        predictions = fuse_answers(described, self._runs)
-        first = next(iter(predictions[main_fusion(predictions, self._runs[0].answer_by)].values()))
-        for instance, index in zip(described, first.class_index, strict=True):
-            name = self._classes[index]
-            correct = name == instance.truth
-            judged[instance.label] = correct, name if correct else f"{name} ({instance.truth})"
+        """Return label -> (correct, text) of what the first run answers; an unknown object should have no name."""
+        names = {i.label: name for run, i, name, _ in named_answers(answers.instances, self._runs) if run == 0}
+        judged = {}
+        for instance in answers.instances:
+            name = names.get(instance.label)
+            correct = name == (instance.truth if instance.truth in self._runs[0].classes else None)
+            text = name or ("unknown" if instance.label in names else "none")
+            judged[instance.label] = correct, text if name == instance.truth else f"{text} ({instance.truth})"
         return judged

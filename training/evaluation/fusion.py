@@ -7,8 +7,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from thor2_jax.recognition.classifier import FEATURES
-from thor2_jax.recognition.fusion import FUSION_RULES, FusionRule, fuse, with_temperature
+from thor2_jax.model.classifier import FEATURES
+from thor2_jax.model.fusion import FUSION_RULES, FusionRule, fuse, with_temperature
 from training.baselines.names import TITLES
 
 __all__ = [
@@ -29,8 +29,8 @@ RULES: tuple[Rule, ...] = (*FUSION_RULES, "calibrated")
 """The rules of `fuse`, and "calibrated": the rule "max" on temperature-scaled probabilities."""
 
 EMBEDDED, ALL_CLASSIFIERS, GALLERY, BOTH = "embedding", "THOR2+embedding", "gallery", "both"
-"""Columns of the embedding alone, of THOR2 with the confidence that the embedding gives, of the gallery alone, and of
-all combined. The recognizer computes them, and no rule fuses them with others."""
+"""Columns of the embedding alone, of THOR2 with the confidence that the embedding gives (in runs with the paper's
+classifiers), of the gallery alone, and of all combined. The recognizer computes them; no rule fuses them."""
 
 WHOLE = (EMBEDDED, ALL_CLASSIFIERS, GALLERY, BOTH)
 """All columns that no rule fuses."""
@@ -54,11 +54,11 @@ def main_fusion(titles: Iterable[str], answer_by: str = "classifiers") -> str:
 
     Args:
         titles: the columns, at least one.
-        answer_by: "classifiers" (with the embedding if it is among them, else THOR2, else the last title), "gallery" or
-            "both".
+        answer_by: "classifiers" (the embedding with THOR2, THOR2, the embedding, or the last title: the first of them
+            that is among the titles), "gallery" or "both".
     """
     titles = list(titles)
-    for title in (answer_by, ALL_CLASSIFIERS, "THOR2"):
+    for title in (answer_by, ALL_CLASSIFIERS, "THOR2", EMBEDDED):
         if title in titles:
             return title
     return [title for title in titles if title not in WHOLE][-1]

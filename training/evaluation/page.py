@@ -1,5 +1,6 @@
 """The report of an evaluation as a page: `report.html` and its pictures."""
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -8,13 +9,21 @@ import numpy as np
 
 from training.baselines.names import TITLES
 from training.evaluation.frame_pictures import FramePictures
-from training.evaluation.fusion import ALL_CLASSIFIERS, RULES, WHOLE
+from training.evaluation.fusion import ALL_CLASSIFIERS, EMBEDDED, RULES, WHOLE
 from training.evaluation.published import published_seconds
 from training.evaluation.results import COVERAGE
 from training.reports.html import Picture, Section, Table, write_page
 from training.reports.plots import draw_accuracy, draw_confusion, draw_known_unknown, draw_reliability
 
-__all__ = ["accuracy_table", "comparison_table", "comparison_text", "comparison_title", "write_report_page"]
+__all__ = [
+    "accuracy_table",
+    "answer_texts",
+    "comparison_table",
+    "comparison_text",
+    "comparison_title",
+    "marked",
+    "write_report_page",
+]
 
 NO_VALUE = {"mean": None, "std": None}
 
@@ -38,6 +47,16 @@ def _percent(statistics: Mapping[str, Any]) -> str:
         return "–"
     std = statistics["std"]
     return f"{100 * statistics['mean']:.2f}" + ("" if std is None else f" ±\u00a0{100 * std:.2f}")
+
+
+def _marked(title: str, main: str) -> str:
+    return f"{title} (thor2 recognize)" if title == main else title
+
+
+def marked(table: Table, main: str) -> Table:
+    """Return a table whose column `main`, by which `thor2 recognize` answers, is marked."""
+    header, rows = table
+    return [_marked(title, main) for title in header], rows
 
 
 def accuracy_table(table: Mapping[str, Any], titles: Sequence[str]) -> Table:
@@ -86,7 +105,8 @@ def comparison_table(table: Mapping[str, Any], main: str) -> Table:
         if method in table["ours"]:
             columns.append(("accuracy", table["ours"][method]))
         columns.append(("published", method))
-    header = ["", "instances", *(f"{name}, published" if key == "published" else name for key, name in columns)]
+    header = ["", "instances"]
+    header += [f"{name}, published" if key == "published" else name for key, name in columns]
     rows = [
         [
             ", ".join(cell["where"].values()) or "all",
@@ -112,13 +132,13 @@ def write_report_page(report: Mapping[str, Any], pictures: FramePictures, out: P
     sections: list[Section] = []
     if report["fusions"]:
         sections += [
+            _answer_section(report, pictures, out),
             *_accuracy_sections(report, out),
             *_published_sections(report),
-            _fusion_section(report),
+            *_fusion_sections(report),
             *_placement_sections(report),
             _confidence_section(report, out),
             *_unknown_sections(report, out),
-            _confusion_section(report, pictures, out),
         ]
     sections += [_frame_section(report, pictures, out), _measurement_section(report)]
     dataset, runs = report["dataset"], len(report["runs"])
@@ -133,15 +153,58 @@ def _relative(path: Path, out: Path) -> str:
     return path.relative_to(out).as_posix()
 
 
+def answer_texts(report: Mapping[str, Any]) -> list[str]:
+    """Return what `thor2 recognize` answers: accuracy, unknown objects that have a name, wrong names."""
+    counts, worst = report["answers"], report["worst"]
+    without = counts["known"] - counts["correct"] - counts["wrong"]
+    texts = [
+        f"Accuracy of the answers of thor2 recognize: {counts['correct'] / counts['known']:.3f}. "
+        f"Of {counts['known']:,} instances of known objects, {counts['correct']:,} have their name, "
+        f"{counts['wrong']:,} a wrong one and {without:,} none.",
+        f"Unknown objects: {counts['unknown_named']:,} of {counts['unknown']:,} instances have a name."
+        if counts["unknown"]
+        else "The dataset has no unknown objects, so it does not show whether they are rejected.",
+    ]
+    pairs = [f"{p['truth']}{'' if p['known'] else ' (unknown)'} as {p['answer']} ({p['count']})" for p in worst]
+    return texts + [f"Wrong names: {', '.join(pairs)}."] * bool(pairs)
+
+
+def _answer_section(report: Mapping[str, Any], pictures: FramePictures, out: Path) -> Section:
+    shown, rows = [], []
+    for pair in report["worst"]:
+        truth, name = f"{pair['truth']}{'' if pair['known'] else ' (unknown object)'}", pair["answer"]
+        rows.append([truth, name, f"{pair['count']}", f"{pair['share']:.0%}"])
+        crop = pictures.confusion_path(pair["truth"], name)
+        if crop.is_file():
+            shown.append(Picture(_relative(crop, out), f"{truth}, recognized as {name}", small=True))
+    models = f" Counts are sums over {len(report['runs'])} models." if len(report["runs"]) > 1 else ""
+    text = " ".join(answer_texts(report)[:2]) + models
+    text += " The most frequent wrong names, each with its most confident instance:" if rows else " No name is wrong."
+    draw_confusion(np.array(report["confusion"]), report["classes"], report["main"], out / "confusion.png")
+    caption = f"Confusion matrix of {report['main']} without rejection, summed over all models."
+    matrix = Section("Confusion matrix of the known objects", pictures=[Picture("confusion.png", caption)])
+    header = ["object", "recognized as", "count", "fraction of the object's instances"]
+    return Section("Answers", text, (header, rows) if rows else None, shown, matrix)
+
+
 def _accuracy_sections(report: Mapping[str, Any], out: Path) -> list[Section]:
-    first, *tables = report["accuracy"][report["rule"]]
-    table = accuracy_table(first, report["fusions"])
-    sections = [Section("Accuracy", _accuracy_text(report), table)]
-    for number, each in enumerate(tables):
-        heading = f"Accuracy by {' and '.join(each['by'])}"
-        chart = _bar_chart(each, report["fusions"], heading, out / f"accuracy-{number}.png")
-        sections.append(Section(heading, "", accuracy_table(each, report["fusions"]), chart))
+    sections, text = [], _accuracy_text(report)
+    for number, table in enumerate(report["accuracy"][report["rule"]]):
+        heading = f"Accuracy by {' and '.join(table['by'])}" if table["by"] else "Accuracy without rejection"
+        chart = _bar_chart(table, report["fusions"], heading, out / f"accuracy-{number - 1}.png")
+        every = marked(accuracy_table(table, report["fusions"]), report["main"])
+        main = marked(accuracy_table(table, [report["main"]]), report["main"])
+        sections.append(_with_fold(Section(heading, text, main), every, chart))
+        text = ""
     return sections
+
+
+def _with_fold(section: Section, every: Table, pictures: Sequence[Picture] = ()) -> Section:
+    """Return a section on what `recognize` answers by with the whole table folded, if there is more in it."""
+    if every == section.table:
+        return dataclasses.replace(section, pictures=[*section.pictures, *pictures])
+    folded = Section("Every classifier and baseline", table=every, pictures=pictures)
+    return dataclasses.replace(section, folded=folded)
 
 
 def _published_sections(report: Mapping[str, Any]) -> list[Section]:
@@ -149,7 +212,7 @@ def _published_sections(report: Mapping[str, Any]) -> list[Section]:
         Section(
             comparison_title(table),
             comparison_text(table),
-            comparison_table(table, report["main"]),
+            marked(comparison_table(table, report["main"]), report["main"]),
         )
         for table in report["published_tables"]
     ]
@@ -158,9 +221,15 @@ def _published_sections(report: Mapping[str, Any]) -> list[Section]:
 def _accuracy_text(report: Mapping[str, Any]) -> str:
     text = (
         "Fraction of the instances that are recognized correctly; an instance that could not be described counts as "
-        "incorrect. CE uses colour only, TOPS shape only, TOPS2 both. THOR2 is the fusion of TOPS and TOPS2; a plus "
-        f"sign marks other fusions. The fusion rule is {report['rule']}; other rules are compared below. "
+        "incorrect. "
     )
+    if _fused_titles(report):
+        text += (
+            "CE uses colour only, TOPS shape only, TOPS2 both. THOR2 is the fusion of TOPS and TOPS2; a plus sign "
+            f"marks other fusions. The fusion rule is {report['rule']}; other rules are compared below. "
+        )
+    elif EMBEDDED in report["fusions"]:
+        text += f"The column {EMBEDDED} has the answers of the model, whose embedding uses shape and colour. "
     if ALL_CLASSIFIERS in report["fusions"]:
         text += (
             f"{ALL_CLASSIFIERS} has the names of THOR2 with the confidence that the embedding gives; here, answers "
@@ -193,9 +262,16 @@ def _bar_chart(table: Mapping[str, Any], titles: Sequence[str], caption: str, pa
     return [Picture(path.name, f"{caption}.")]
 
 
-def _fusion_section(report: Mapping[str, Any]) -> Section:
+def _fused_titles(report: Mapping[str, Any]) -> list[str]:
+    return [title for title in report["fusions"] if ("+" in title or title == "THOR2") and title not in WHOLE]
+
+
+def _fusion_sections(report: Mapping[str, Any]) -> list[Section]:
+    """Return the section on fusion rules; none if no classifiers are fused."""
     cells = {rule: report["accuracy"][rule][0]["cells"][0]["accuracy"] for rule in RULES}
-    titles = [title for title in report["fusions"] if ("+" in title or title == "THOR2") and title not in WHOLE]
+    titles = _fused_titles(report)
+    if not titles:
+        return []
     rows = [[title, *(_mean_std(cells[rule].get(title, NO_VALUE)) for rule in RULES)] for title in titles]
     text = (
         'Accuracy on all instances by fusion rule. With "max", the paper\'s rule, the classifier with the higher top-1 '
@@ -203,7 +279,7 @@ def _fusion_section(report: Mapping[str, Any]) -> Section:
         'log-probability. "calibrated" is "max" after temperature scaling of each classifier. '
         f"This page and the command thor2 recognize use {report['rule']}."
     )
-    return Section("Fusion rules", text, (["fusion", *RULES], rows))
+    return [Section("Fusion rules", text, folded=Section("Accuracy by rule", table=(["fusion", *RULES], rows)))]
 
 
 def _placement_sections(report: Mapping[str, Any]) -> list[Section]:
@@ -227,7 +303,16 @@ def _placement_sections(report: Mapping[str, Any]) -> list[Section]:
         "the mean of the placements' accuracies. Steadiness is the share of instances with the most frequent answer of "
         "their placement, among placements of at least two instances."
     )
-    return [Section("Placements", text, (header, rows))]
+    return [_main_row(Section("Placements", text, (header, rows)), report["main"])]
+
+
+def _main_row(section: Section, main: str) -> Section:
+    """Return a section whose table has one row for each fusion, with the main row shown and the table folded."""
+    assert section.table is not None
+    header, rows = section.table
+    every = [[_marked(row[0], main), *row[1:]] for row in rows]
+    shown = [row for each, row in zip(rows, every, strict=True) if each[0] == main]
+    return _with_fold(dataclasses.replace(section, table=(header, shown)), (header, every))
 
 
 def _unknown_sections(report: Mapping[str, Any], out: Path) -> list[Section]:
@@ -289,9 +374,9 @@ def _confidence_section(report: Mapping[str, Any], out: Path) -> Section:
     ]
     temperatures = [f"{name} {_mean_std(t)}" for name, t in report["temperatures"].items() if t["runs"]]
     text = (
-        "Calibration error is the expected calibration error over 15 bins. Calibrated columns use temperatures fitted "
-        "on the synthetic views that each training held out"
-        + (f" ({', '.join(temperatures)})" if temperatures else "; these models have no held-out set")
+        "Calibration error is the expected calibration error over 15 bins. Calibrated columns use temperatures of "
+        "classifiers, fitted on the synthetic views that each training held out"
+        + (f" ({', '.join(temperatures)})" if temperatures else "; these models have none")
         + ". AUROC is the probability that a correct answer has a higher confidence than an incorrect one, or a known "
         "object than an unknown one; known objects are those the models were trained on. Open-set rejection: the "
         f"threshold accepts {COVERAGE:.0%} of the known objects, and an instance below it is an unknown object. It "
@@ -300,31 +385,14 @@ def _confidence_section(report: Mapping[str, Any], out: Path) -> Section:
     )
     draw_reliability(report["reliability"], report["main"], out / "reliability.png")
     caption = f"Accuracy of {report['main']} by confidence."
-    return Section("Confidence", text, (["", *columns], rows), [Picture("reliability.png", caption, half=True)])
-
-
-def _confusion_section(report: Mapping[str, Any], pictures: FramePictures, out: Path) -> Section:
-    main = report["main"]
-    draw_confusion(np.array(report["confusion"]), report["classes"], main, out / "confusion.png")
-    shown = [Picture("confusion.png", f"Confusion matrix of {main}, summed over all models.")]
-    rows = []
-    for pair in report["worst"]:
-        truth, prediction = pair["truth"], pair["answer"]
-        rows.append([truth, prediction, f"{pair['count']}", f"{pair['share']:.0%}"])
-        crop = pictures.confusion_path(truth, prediction)
-        if crop.is_file():
-            shown.append(Picture(_relative(crop, out), f"{truth}, recognized as {prediction}", small=True))
-    if not rows:
-        return Section("Confusions", "No object was confused with another one.", pictures=shown)
-    text = "The most frequent confusions, each with its most confident instance."
-    table = ["object", "recognized as", "count", "fraction of the object's instances"], rows
-    return Section("Confusions", text, table, shown)
+    pictures = [Picture("reliability.png", caption, half=True)]
+    return _main_row(Section("Confidence", text, (["", *columns], rows), pictures), report["main"])
 
 
 def _frame_section(report: Mapping[str, Any], pictures: FramePictures, out: Path) -> Section:
     text = (
-        "Answers of the first model. Green: correct. Red: incorrect, with the true object in brackets; none: the "
-        "instance could not be described."
+        "Answers of the first model. Green: correct, also an unknown object without a name. Orange: incorrect. The "
+        "true object stands in brackets; none: the instance could not be described."
     )
     shown = [
         Picture(_relative(pictures.frame_path(number), out), f"Frame {name}.", half=True)

@@ -57,12 +57,12 @@ class PublishedTable:
     Attributes:
         source: the publication.
         number: number of the table in the publication; None if it is not known.
-        title: what the table compares.
+        title: title of the table.
         own_objects: whether the classes are the objects of the frame's own sequence (OCID); None if the dataset has no
             such distinction.
         objects: number of objects that are scored; None if it is not known or differs by sequence.
         models: number of models behind each figure; None if it is not known.
-        notes: what a reader must know of the figures.
+        notes: limits of the figures.
         cells: the rows, in the order of the publication.
     """
 

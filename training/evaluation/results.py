@@ -2,13 +2,13 @@
 
 import dataclasses
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from thor2_jax.recognition.fusion import DEFAULT_RULE
+from thor2_jax.model.fusion import DEFAULT_RULE
 from training.evaluation.accuracy import attribute_tables, group_by_attributes, summarize_rows, summarize_runs
 from training.evaluation.answers import EvaluatedRun, FrameAnswers, InstancePrediction, all_predictors
 from training.evaluation.comparison import EvaluationConditions, compare_with_published
@@ -24,7 +24,7 @@ from training.evaluation.placements import find_placements, placement_accuracy, 
 from training.evaluation.published import published_means
 from training.readers.labelled import sequence_of
 
-__all__ = ["COVERAGE", "Predictions", "compute_results", "fuse_answers", "incorrect_answers"]
+__all__ = ["COVERAGE", "Predictions", "compute_results", "fuse_answers", "named_answers"]
 
 COVERAGE = 0.95
 """Fraction of the answers to known objects, or of the correct ones, that is accepted in the open-set metrics."""
@@ -33,7 +33,7 @@ CURVE = tuple(k / 100 for k in range(101))
 """Shares of the correct answers at which the known/unknown curve is computed."""
 
 MOST_FREQUENT = 12
-"""Confusions listed in a report."""
+"""Pairs of object and wrong name listed in a report, of known and of unknown objects."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -72,17 +72,20 @@ def fuse_answers(
     return {title: by_run for title, by_run in predictions.items() if by_run}
 
 
-def incorrect_answers(
-    frame: FrameAnswers, runs: Sequence[EvaluatedRun]
-) -> Iterable[tuple[InstancePrediction, str, float]]:
-    """Yield instance, predicted name and confidence for every incorrect answer of any run's main fusion."""
-    classes = runs[0].classes
-    described = [i for i in frame.instances if i.probabilities is not None and i.truth in classes]
+def named_answers(
+    instances: Sequence[InstancePrediction], runs: Sequence[EvaluatedRun]
+) -> Iterator[tuple[int, InstancePrediction, str | None, float]]:
+    """Yield what `recognize` answers with each run: index of the run, described instance, name or None, confidence.
+
+    The name is None if the confidence is below the run's threshold: the object is unknown.
+    """
+    described = [i for i in instances if i.probabilities is not None]
     predictions = fuse_answers(described, runs)
-    for by_run in predictions[main_fusion(predictions, runs[0].answer_by)].values():
-        for instance, index, confidence in zip(described, by_run.class_index, by_run.confidence, strict=True):
-            if classes[index] != instance.truth:
-                yield instance, classes[index], float(confidence)
+    for run, answers in predictions[main_fusion(predictions, runs[0].answer_by)].items():
+        thresholds = runs[run].thresholds
+        for instance, index, confidence in zip(described, answers.class_index, answers.confidence, strict=True):
+            name = runs[run].classes[index] if confidence >= thresholds[index] else None
+            yield run, instance, name, float(confidence)
 
 
 def compute_results(
@@ -195,8 +198,7 @@ def _scores(
         "known_unknown": _known_unknown([(by_run[run], unknown_predictions[run]) for run in by_run], truth[described]),
         "reliability": _reliability(predictions, truth[described]),
         "confusion": confusion.tolist(),
-        "worst": _most_frequent(confusion, classes),
-    }
+    } | _answers([*instances, *unknown], runs)
 
 
 def _correct(
@@ -349,12 +351,26 @@ def _confusion(
     return counts
 
 
-def _most_frequent(confusion: NDArray[np.intp], classes: Sequence[str]) -> list[dict[str, Any]]:
-    """Return the most frequent confusions between two classes."""
-    pairs: list[dict[str, Any]] = [
-        {"truth": truth, "answer": answer, "count": int(row[j]), "share": float(row[j] / row.sum())}
-        for i, (truth, row) in enumerate(zip(classes, confusion, strict=True))
-        for j, answer in enumerate(classes)
-        if i != j and row[j]
+def _answers(instances: Sequence[InstancePrediction], runs: Sequence[EvaluatedRun]) -> dict[str, Any]:
+    """Return the numbers of answers over all runs, and the most frequent wrong names, of unknown objects first."""
+    classes, count, wrong = runs[0].classes, Counter[str](), Counter[tuple[str, str]]()
+    for _, instance, name, _ in named_answers(instances, runs):
+        count["correct"] += name == instance.truth
+        if name not in (None, instance.truth):
+            count["wrong" if instance.truth in classes else "unknown_named"] += 1
+            wrong[instance.truth, str(name)] += 1
+    total = Counter(instance.truth for instance in instances for _ in runs)
+    known = sum(n for truth, n in total.items() if truth in classes)
+    worst = [
+        {"truth": truth, "answer": name, "count": n, "share": n / total[truth], "known": truth in classes}
+        for (truth, name), n in wrong.most_common()
     ]
-    return sorted(pairs, key=lambda pair: -pair["count"])[:MOST_FREQUENT]
+    of_unknown, of_known = ([pair for pair in worst if pair["known"] is of_class] for of_class in (False, True))
+    return {
+        "answers": {
+            "known": known,
+            "unknown": total.total() - known,
+            **{key: count[key] for key in ("correct", "wrong", "unknown_named")},
+        },
+        "worst": of_unknown[:MOST_FREQUENT] + of_known[:MOST_FREQUENT],
+    }

@@ -9,15 +9,19 @@ import functools
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
+import jax
 import numpy as np
 from numpy.typing import NDArray
 
+from thor2_jax.capacity import BATCH_BUCKETS
 from thor2_jax.errors import InputError
 from thor2_jax.files import content_digest, json_digest
 from thor2_jax.gallery.store import GALLERY_DIRECTORY, INDEX_FILE
-from thor2_jax.recognition.answers import DescribedFrame
-from thor2_jax.recognition.classifier import EMBEDDING
-from thor2_jax.recognition.run_directory import EMBEDDING_FILE, RUN_FILE
+from thor2_jax.model.answers import DescribedFrame
+from thor2_jax.model.classifier import EMBEDDING
+from thor2_jax.model.inference import gallery_scores, infer
+from thor2_jax.model.model import Model
+from thor2_jax.model.run_directory import EMBEDDING_FILE, RUN_FILE
 from thor2_jax.recognizer import Recognizer
 from training.baselines.baseline import Baseline, BaselineInputs
 from training.baselines.files import baseline_file
@@ -25,7 +29,7 @@ from training.baselines.load import load_baselines
 from training.baselines.names import NETWORKS, TEMPLATES, TITLES
 from training.evaluation.fusion import ALL_CLASSIFIERS, BOTH, EMBEDDED, GALLERY
 from training.fitting.run_directories import find_run_directories
-from training.readers.labelled import path_ends, sequence_of
+from training.readers.labelled import named_path, path_ends, sequence_of
 
 __all__ = ["Run", "SequenceRun", "has_real_views", "load_runs", "load_sequence_runs", "scratch_networks"]
 
@@ -51,30 +55,35 @@ class Run:
     weights: Mapping[str, Sequence[str]] = dataclasses.field(default_factory=dict)
 
     @property
+    def model(self) -> Model:
+        """The model of `recognizer`."""
+        return self.recognizer.model
+
+    @property
     def classes(self) -> tuple[str, ...]:
         """Names of the trained classes and the enrolled objects, in the order of the probabilities."""
-        return self.recognizer.objects.union.names
+        return self.model.names
 
     @property
     def predictors(self) -> tuple[str, ...]:
         """Names of the classifiers and baselines; with an embedding or enrolled objects, their columns too."""
-        recognizer = self.recognizer
-        names = (*recognizer.run.classifiers, *self.baselines)
-        if EMBEDDING in recognizer.classifiers:
-            names += EMBEDDED, ALL_CLASSIFIERS
-        if recognizer.objects.gallery.objects:
-            names += (GALLERY, BOTH) if recognizer.run.classifiers else (GALLERY,)
+        model = self.model
+        names = (*model.run.classifiers, *self.baselines)
+        if EMBEDDING in model.classifiers:
+            names += (EMBEDDED, ALL_CLASSIFIERS) if model.run.classifiers else (EMBEDDED,)
+        if model.gallery.objects:
+            names += (GALLERY, BOTH) if model.classifiers else (GALLERY,)
         return names
 
     @property
     def answer_by(self) -> str:
-        """What the recognizer answers by: "classifiers", "gallery" or "both"."""
-        return self.recognizer.answers_by()
+        """Source of the answers: "classifiers", "gallery" or "both"."""
+        return self.model.answers_by()
 
     @property
     def thresholds(self) -> NDArray[np.float64]:
         """[C] confidence below which an object of each class is unknown; 0 if it is always named."""
-        return self.recognizer.thresholds()
+        return self.model.thresholds()
 
     def probabilities(
         self, frame: str, described: DescribedFrame, inputs: BaselineInputs | None
@@ -86,20 +95,24 @@ class Run:
             described: the described frame.
             inputs: inputs of the baselines; None if no run has any.
         """
-        by_classifiers = self.recognizer.probabilities(described.oriented)
-        default = {name: by_classifiers[name] for name in self.recognizer.default_classifiers}
-        values = dict(by_classifiers)
-        if ALL_CLASSIFIERS in self.predictors:
-            values[ALL_CLASSIFIERS] = np.asarray(self.recognizer.fused(default), np.float32)
+        model = self.model
+        clouds = described.packed if GALLERY in self.predictors and described.usable else None
+        inference = jax.tree.map(np.asarray, infer(model, described.oriented, clouds, tuple(model.classifiers)))
+        default = {name: inference.probabilities[name] for name in model.classifiers.default}
+        values = dict(inference.probabilities)
+        if EMBEDDING in default:
+            column = ALL_CLASSIFIERS if ALL_CLASSIFIERS in self.predictors else EMBEDDED
+            values[column] = np.asarray(model.fused(default), np.float32)
         if inputs is not None:
             values |= {name: baseline.probabilities(inputs) for name, baseline in self.baselines.items()}
-        union = self.recognizer.objects.union
-        values = {name: union.of_classifiers(p) for name, p in values.items()}
+        values = {name: model.union.of_classifiers(p) for name, p in values.items()}
         if GALLERY in self.predictors:
-            scores = self.recognizer.gallery_scores(described)
-            values[GALLERY] = union.of_gallery(scores)
+            scores = gallery_scores(model, inference)
+            if scores is None:  # no instance is usable
+                scores = np.zeros((len(inference.overflow), len(model.gallery.names)), np.float32)
+            values[GALLERY] = model.combined({}, scores)
         if BOTH in self.predictors:
-            values[BOTH] = self.recognizer.combined(default, scores)
+            values[BOTH] = model.combined(default, scores)
         return values
 
 
@@ -144,13 +157,13 @@ def load_runs(paths: Sequence[Path]) -> list[Run]:
 
 
 def _check_same_descriptor(run: Run, first: Run, directory: Path, first_directory: Path) -> None:
-    a, b = run.recognizer.run, first.recognizer.run
+    a, b = run.model.run, first.model.run
     if a.config != b.config or a.network.fingerprint != b.network.fingerprint:
         raise InputError(
             f"model: {first_directory} and {directory} have different descriptors or colour networks; "
             "evaluate them separately"
         )
-    if run.recognizer.color_transform != first.recognizer.color_transform:
+    if run.model.color_transform != first.model.color_transform:
         raise InputError(
             f"model: {first_directory} and {directory} are adapted to different cameras; evaluate them separately"
         )
@@ -233,7 +246,7 @@ def load_sequence_runs(directory: Path, frames: Iterable[str]) -> list[SequenceR
     for fold, run in enumerate(first):
         runs_of_fold = {sequence: runs[fold] for sequence, runs in of_sequence.items()}
         digest = json_digest({sequence: run.digest for sequence, run in runs_of_fold.items()})
-        name = f"{directory.absolute().name}/*" + (f"/fold-{fold}" if len(first) > 1 else "")
+        name = f"{named_path(directory).name}/*" + (f"/fold-{fold}" if len(first) > 1 else "")
         result.append(
             SequenceRun(name, digest, run.recognizer, run.baselines, weights=run.weights, of_sequence=runs_of_fold)
         )
@@ -242,7 +255,7 @@ def load_sequence_runs(directory: Path, frames: Iterable[str]) -> list[SequenceR
 
 def has_real_views(runs: Sequence[Run]) -> bool:
     """Return whether runs were trained on labelled real instances, too."""
-    return any("frames" in run.recognizer.run.record.get("dataset", {}) for run in runs)
+    return any("frames" in run.model.run.record.get("dataset", {}) for run in runs)
 
 
 def scratch_networks(runs: Sequence[Run]) -> list[str]:
@@ -252,12 +265,12 @@ def scratch_networks(runs: Sequence[Run]) -> list[str]:
 
 
 def _load(directory: Path) -> Run:
-    recognizer = Recognizer.load(directory)
+    recognizer = Recognizer.load(directory, chunk=BATCH_BUCKETS[-1])
     baselines = load_baselines(directory, recognizer.run)
     temperatures = baselines.temperatures | recognizer.run.record.get("temperatures", {})
     return Run(_name(directory), _digest(directory), recognizer, baselines.models, temperatures, baselines.weights)
 
 
 def _name(directory: Path) -> str:
-    directory = directory.absolute()
+    directory = named_path(directory)
     return f"{directory.parent.name}/{directory.name}" if directory.name.startswith("fold-") else directory.name

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from colornet import ColorNetwork
 from thor2_jax.config import DescriptorConfig
-from thor2_jax.recognition.classifier import MLP, Feature, class_probabilities
+from thor2_jax.model.classifier import MLP, Feature, class_probabilities
 from training.fitting.samples import Batch, Samples
 from training.fitting.steps import FitContext, describe_batch
 from training.fitting.temperature import fit_temperature

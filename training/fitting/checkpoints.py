@@ -29,10 +29,13 @@ from orbax.checkpoint import checkpoint_managers
 from thor2_jax.errors import InputError
 from thor2_jax.files import directory_digest, write_text
 
-__all__ = ["CHECKPOINTS", "Checkpoints"]
+__all__ = ["BEGUN", "CHECKPOINTS", "Checkpoints"]
 
 CHECKPOINTS = "checkpoints"
 """Directory inside the run directory of an unfinished training."""
+
+BEGUN = "begun.json"
+"""Job record of an unfinished training in this directory."""
 
 DIGEST_FILE = "sha256"
 
@@ -85,7 +88,7 @@ class Checkpoints:
         Raises:
             OSError: if the checkpoint cannot be written, for example because the disk is full.
         """
-        host = jax.tree.map(np.asarray, state)
+        host = _storable(jax.tree.map(np.asarray, state))
         try:
             with _quiet_orbax():
                 self._manager.save(epoch, args=ocp.args.StandardSave(host), metrics={"score": score})
@@ -124,7 +127,8 @@ class Checkpoints:
             ):
                 raise ValueError("it is damaged")
             with _quiet_orbax():
-                state = self._manager.restore(epoch, args=ocp.args.StandardRestore(target))
+                state = self._manager.restore(epoch, args=ocp.args.StandardRestore(_storable(target)))
+            state = jax.tree.map(lambda leaf, expected: leaf if expected.size else expected, state, target)
             for leaf, expected in zip(jax.tree.leaves(state), jax.tree.leaves(target), strict=True):
                 if (leaf.shape, leaf.dtype) != (expected.shape, expected.dtype):
                     raise ValueError(f"it has {leaf.dtype} {leaf.shape}; expected {expected.dtype} {expected.shape}")
@@ -133,6 +137,11 @@ class Checkpoints:
                 f"checkpoint: {path} cannot be read ({_first_line(error)}); remove {self.directory} to restart this fit"
             ) from None
         return state
+
+
+def _storable(state: Any) -> Any:
+    """Return a state with an element in each empty array, which orbax does not store."""
+    return jax.tree.map(lambda a: a if a.size else np.zeros(1, a.dtype), state)
 
 
 def _score(metrics: dict[str, float]) -> float:

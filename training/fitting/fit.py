@@ -7,11 +7,8 @@ another number of devices, floating-point sums are rounded differently, and the 
 """
 
 import dataclasses
-import math
-import time
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator
-from typing import Any, TypeVar
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -21,9 +18,10 @@ from jax.sharding import Mesh
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.classifier import MLP
-from thor2_jax.recognition.run_directory import input_size
+from thor2_jax.model.classifier import MLP
+from thor2_jax.model.run_directory import input_size
 from training.fitting.checkpoints import Checkpoints
+from training.fitting.loop import Steps, run_epochs
 from training.fitting.options import EpochMetrics, FitOptions
 from training.fitting.samples import Batch, Samples
 from training.fitting.steps import (
@@ -39,23 +37,8 @@ from training.fitting.steps import (
 
 __all__ = ["check_batch_size", "fit"]
 
-STEPS_IN_FLIGHT = 2
-"""Steps dispatched to the devices before the first result is awaited: the host gathers batches meanwhile."""
-
 SCALE_SAMPLES = 1024
 """Approximate number of training samples that determine the input scaling."""
-
-T = TypeVar("T")
-
-
-def _delayed(items: Iterable[T]) -> Iterator[T]:
-    """Yield the items, each after the next STEPS_IN_FLIGHT have been requested."""
-    waiting: deque[T] = deque()
-    for item in items:
-        waiting.append(item)
-        if len(waiting) > STEPS_IN_FLIGHT:
-            yield waiting.popleft()
-    yield from waiting
 
 
 def check_batch_size(batch_size: int, mesh: Mesh) -> None:
@@ -83,7 +66,7 @@ def fit(
         options: epochs, learning rates, batch size and seed.
         checkpoints: of this fit only; written after each epoch.
         held_out: [M], True for samples of the held-out set; by default there is none.
-        progress: called after each step with (steps done, total steps, metrics of the epoch so far).
+        progress: called with (steps done, total steps, metrics of the epoch so far), for some of the steps.
         epoch_done: called after each epoch, before its checkpoint is written.
 
     Returns:
@@ -96,21 +79,25 @@ def fit(
         OSError: A checkpoint cannot be written; the previous one stays.
     """
     fitter = _Fitter.create(samples, context, options, held_out)
-    if checkpoints.last_epoch:
-        fitter.state = checkpoints.last(fitter.state)
-    fitter.state = replicate(fitter.state, context.mesh)
-    for epoch in range(checkpoints.last_epoch + 1, options.epochs + 1):
-        metrics = fitter.train_epoch(epoch, progress)
-        epoch_done(metrics)
-        score = -metrics.loss if metrics.held_out_accuracy is None else metrics.held_out_accuracy
-        checkpoints.save(epoch, fitter.state, score)
-    best = jax.tree.map(jnp.asarray, checkpoints.best(fitter.state))
+    state = run_epochs(
+        context.feature,
+        fitter.state,
+        Steps(options.epochs, fitter.steps_per_epoch, fitter.batch_size),
+        fitter.epoch,
+        fitter.step,
+        checkpoints,
+        progress=progress,
+        epoch_done=epoch_done,
+        held_out_accuracy=fitter.held_out_accuracy,
+        place=lambda state: replicate(state, context.mesh),
+    )
+    best = jax.tree.map(jnp.asarray, checkpoints.best(state))
     return nnx.merge(fitter.graph, best.params, best.rest), checkpoints.best_epoch
 
 
-@dataclasses.dataclass
+@dataclasses.dataclass(frozen=True)
 class _Fitter:
-    """A fit in progress: its samples, what is static, and the state that each step replaces."""
+    """A fit: its samples, what is static, and the state before the first step."""
 
     samples: Samples
     context: FitContext
@@ -154,41 +141,19 @@ class _Fitter:
         for first in range(jax.process_index() * chunk, len(rows), self.batch_size):
             yield shard_batch(self.samples.take(rows[first : first + chunk]), self.context.mesh)
 
-    def steps(self, epoch: int) -> Iterator[tuple[jax.Array, jax.Array]]:
-        """Train one epoch and yield the loss and accuracy of each batch."""
+    def epoch(self, epoch: int) -> Iterator[Batch]:
+        """Yield the batches of an epoch."""
         # The order is drawn from seed and epoch, so that a resumed fit needs no generator state.
         order = np.random.default_rng((self.options.seed, epoch)).permutation(self.train_rows)
-        order = order[: self.steps_per_epoch * self.batch_size]
+        return self.batches(order[: self.steps_per_epoch * self.batch_size])
+
+    def step(self, state: FitState, number: int, batch: Batch) -> tuple[FitState, tuple[jax.Array, jax.Array]]:
+        """Make one step; return the next state, and loss and accuracy."""
+        epoch = number // self.steps_per_epoch + 1
         rate = np.float32(self.options.learning_rates[epoch > (self.options.epochs + 1) // 2])
-        seed = np.uint32(self.options.seed)
-        for step, batch in enumerate(self.batches(order), (epoch - 1) * self.steps_per_epoch):
-            self.state, metrics = train_step(self.context, self.graph, self.state, batch, rate, seed, np.uint32(step))
-            yield metrics
+        return train_step(self.context, self.graph, state, batch, rate, np.uint32(self.options.seed), np.uint32(number))
 
-    def train_epoch(self, epoch: int, progress: Callable[[int, int, EpochMetrics], object]) -> EpochMetrics:
-        """Train one epoch and return its metrics.
-
-        Raises:
-            InputError: The loss is not finite.
-        """
-        total = np.zeros(2)
-        n_steps = self.steps_per_epoch
-        for done, batch_metrics in enumerate(_delayed(self.steps(epoch)), 1):
-            total += jax.device_get(batch_metrics)
-            loss, accuracy = (total / done).tolist()
-            if not math.isfinite(loss):
-                raise InputError(
-                    f"the training loss of {self.context.feature} is {loss} in epoch {epoch}; it must be finite; try a "
-                    "smaller learning rate"
-                )
-            if done == 1:
-                start = time.perf_counter()
-            rate = (done - 1) * self.batch_size / max(time.perf_counter() - start, 1e-9)
-            metrics = EpochMetrics(epoch, loss, accuracy, rate)
-            progress((epoch - 1) * n_steps + done, n_steps * self.options.epochs, metrics)
-        return dataclasses.replace(metrics, held_out_accuracy=self.held_out_accuracy())
-
-    def held_out_accuracy(self) -> float | None:
+    def held_out_accuracy(self, state: FitState) -> float | None:
         """Return the accuracy on the held-out set; None if it is empty."""
         rows = self.held_out_rows
         if not len(rows):
@@ -196,7 +161,7 @@ class _Fitter:
         padded = np.resize(rows, len(rows) + -len(rows) % self.batch_size)
         remaining = range(len(rows), 0, -self.batch_size)
         correct = [
-            count_correct(self.context, self.graph, self.state, batch, np.int32(n))
+            count_correct(self.context, self.graph, state, batch, np.int32(n))
             for n, batch in zip(remaining, self.batches(padded), strict=True)
         ]
         return float(np.sum(jax.device_get(correct)) / len(rows))

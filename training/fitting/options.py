@@ -58,3 +58,10 @@ class EpochMetrics:
     accuracy: float
     samples_per_second: float
     held_out_accuracy: float | None = None
+
+    def describe(self, epochs: int) -> str:
+        """Return the metrics as a note for a progress display, of `epochs` in all."""
+        return (
+            f"epoch {self.epoch}/{epochs}, loss {self.loss:.3f}, accuracy {self.accuracy:.3f}, "
+            f"{self.samples_per_second:,.0f} samples/s"
+        )

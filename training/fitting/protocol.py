@@ -1,15 +1,17 @@
-"""Training protocols, from camera steps to learning rates: the paper's, and the more accurate default."""
+"""Training protocols, from camera steps to learning rates: the paper's, the more accurate default, and a quick one."""
 
 import dataclasses
 from typing import Any
 
 from thor2_jax.config import DescriptorConfig
+from thor2_jax.model.classifier import FEATURES, Feature
 from training.augmentation.augmentations import Augmentations
+from training.embedding.run_embedding import Distractors
 from training.embedding.sampling import AUGMENTATIONS
 from training.fitting.options import FitOptions
 from training.fitting.samples import MIRRORS, PAPER_MIRRORS
 
-__all__ = ["DEFAULT", "PAPER", "Protocol"]
+__all__ = ["DEFAULT", "PAPER", "QUICK", "Protocol"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,10 +22,12 @@ class Protocol:
         azimuth_step: degrees between cameras around the object.
         polar_step: degrees between cameras from pole to pole.
         augmentations: augmented copies of each view; None adds none.
-        mirrors: mirrors in which each view is used.
-        orientation_copies: further samples of each view, in random orientations.
-        config: descriptor, with the number of candidate orientations in recognition.
+        mirrors: mirrors in which the classifiers use each view.
+        orientation_copies: further samples of each view for the classifiers, in random orientations.
+        config: descriptor, with the number of looks in recognition.
         fit: fit options of every classifier.
+        classifiers: the paper's classifiers to fit beside the embedding.
+        distractors: distractors and options of the embedding; None fits no embedding.
     """
 
     azimuth_step: float
@@ -33,6 +37,8 @@ class Protocol:
     orientation_copies: int
     config: DescriptorConfig
     fit: FitOptions
+    classifiers: tuple[Feature, ...] = ()
+    distractors: Distractors | None = None
 
     def replace(
         self,
@@ -69,10 +75,17 @@ DEFAULT = Protocol(
     augmentations=AUGMENTATIONS,
     mirrors=("",),
     orientation_copies=1,
-    config=DescriptorConfig(homology="closed_form", orientations=2),
+    config=DescriptorConfig(homology="closed_form", looks=4),
     fit=FitOptions(epochs=16, batch_size=256),
+    distractors=Distractors(),
 )
-"""Fewer views than the paper's, each with five augmented copies and in one more orientation."""
+"""Fewer views than the paper's, each with five augmented copies; an embedding, and none of the paper's classifiers."""
+
+QUICK = dataclasses.replace(
+    DEFAULT,
+    distractors=Distractors(procedural=600, networks=2),
+)
+"""The default with fewer distractors and networks: half of its time."""
 
 PAPER = Protocol(
     azimuth_step=5.0,
@@ -82,5 +95,6 @@ PAPER = Protocol(
     orientation_copies=0,
     config=DescriptorConfig(homology="closed_form"),
     fit=FitOptions(epochs=100, batch_size=128),
+    classifiers=FEATURES,
 )
 """The paper's protocol (section "Training"): 72 x 37 views per object, four mirrors, 100 epochs."""

@@ -4,8 +4,8 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.run_directory import RUN_FILE
-from training.fitting.checkpoints import CHECKPOINTS
+from thor2_jax.model.run_directory import RUN_FILE
+from training.fitting.checkpoints import BEGUN, CHECKPOINTS
 
 __all__ = ["find_run_directories"]
 
@@ -21,7 +21,7 @@ def find_run_directories(paths: Iterable[Path]) -> list[Path]:
         folds = [f.parent for f in path.glob(f"fold-*/{RUN_FILE}") if f.parent.name[5:].isdecimal()]
         if (path / RUN_FILE).is_file() or not folds:
             directories.append(path)
-        elif (path / CHECKPOINTS).exists():
+        elif (path / CHECKPOINTS / BEGUN).exists():
             raise InputError(
                 f"model: {path} holds an unfinished training; finish it with `thor2 train`, or give single folds of it"
             )

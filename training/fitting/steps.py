@@ -21,7 +21,7 @@ from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.color_membership import region_sets
 from thor2_jax.descriptor.describe import describe_strips
 from thor2_jax.descriptor.sharding import BATCH_AXIS, batch_mesh
-from thor2_jax.recognition.classifier import MLP, Feature, feature_of
+from thor2_jax.model.classifier import MLP, Feature, feature_of
 from thor2_jax.types import Descriptors
 from training.fitting.samples import Batch, expand
 
@@ -54,7 +54,7 @@ class FitState(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class FitContext:
-    """What is constant during a fit; static under jit.
+    """Constants of a fit; static under jit.
 
     Attributes:
         feature: which part of the descriptor the classifier reads.

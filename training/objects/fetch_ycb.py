@@ -9,7 +9,6 @@ import http.client
 import re
 import shutil
 import tarfile
-import tempfile
 import urllib.error
 import urllib.request
 import zlib
@@ -17,6 +16,7 @@ from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
 from thor2_jax.errors import InputError
+from thor2_jax.files import remove_leftovers, temporary_directory
 from training.objects.meshes import load_mesh
 from training.storage.locks import locked
 from training.storage.progress import Progress
@@ -39,8 +39,6 @@ TIMEOUT = 30.0
 CHUNK_BYTES = 2**18
 MAX_BYTES = 2**29
 """Largest archive and largest content of an archive; those of the set have about 10 MB."""
-
-_TEMPORARY = ".extracting-"
 
 
 def fetch_ycb(
@@ -73,8 +71,7 @@ def fetch_ycb(
     directory.mkdir(parents=True, exist_ok=True)
     meshes = {}
     with locked(directory):
-        for leftover in directory.glob(f"{_TEMPORARY}*"):
-            shutil.rmtree(leftover)
+        remove_leftovers(directory)
         for name in objects:
             meshes[name] = directory / name / MESH_FILE
             if meshes[name].is_file():
@@ -93,8 +90,12 @@ def fetch_ycb(
 def _download(address: str, archive: Path, name: str, progress: Progress | None) -> None:
     """Download to `archive`, from the end of what it contains on."""
     have = archive.stat().st_size if archive.exists() else 0
-    request = urllib.request.Request(address, headers={"Range": f"bytes={have}-"} if have else {})
+    if have:
+        with archive.open("rb") as stream:
+            if stream.read(2) != b"\x1f\x8b":
+                raise InputError(f"out: {archive} is not a download of this command (gzip); move it")
     try:
+        request = urllib.request.Request(address, headers={"Range": f"bytes={have}-"} if have else {})
         with urllib.request.urlopen(request, timeout=TIMEOUT) as answer:
             if answer.status != 206:  # the server sends the whole archive
                 have = 0
@@ -110,6 +111,10 @@ def _download(address: str, archive: Path, name: str, progress: Progress | None)
                         progress(name, (have + received) // 1000, (have + max(missing, received)) // 1000, "kB")
             if received < missing:
                 raise http.client.IncompleteRead(b"", missing - received)
+    except InputError:
+        raise
+    except (http.client.InvalidURL, ValueError) as error:
+        raise InputError(f"url: {address!r} is no address ({error}); expected one such as {YCB_URL}") from None
     except urllib.error.HTTPError as error:
         error.close()
         if error.code == 416:  # nothing is missing; a damaged archive is removed by `_extract`
@@ -143,8 +148,8 @@ def _check_bytes(size: int, archive: Path) -> None:
 def _extract(archive: Path, directory: Path, name: str) -> None:
     """Move the files of the archive to `directory / name` and remove the archive, also on an error."""
     try:
-        with tempfile.TemporaryDirectory(prefix=_TEMPORARY, dir=directory) as temporary:
-            folder = Path(temporary) / name
+        with temporary_directory(directory) as temporary:
+            folder = temporary / name
             folder.mkdir()
             _extract_files(archive, folder)
             load_mesh(folder / MESH_FILE)
@@ -153,7 +158,7 @@ def _extract(archive: Path, directory: Path, name: str) -> None:
     except (tarfile.TarError, gzip.BadGzipFile, EOFError, zlib.error) as error:
         raise InputError(f"objects: the archive of {name} is damaged ({error}); repeat the command") from None
     except InputError as error:
-        reason = str(error).replace(f"{directory}/{_TEMPORARY}", "")
+        reason = str(error).replace(f"{temporary}/", "")
         raise InputError(
             f"objects: the archive of {name} has no usable mesh ({reason}); report this to its host"
         ) from None

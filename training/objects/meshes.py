@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from PIL import Image
 from trimesh.visual.material import PBRMaterial, SimpleMaterial, empty_material
 
-from thor2_jax.errors import InputError
-from thor2_jax.recognition.frames import MAX_IMAGE_PIXELS
+from thor2_jax.errors import InputError, with_context
+from thor2_jax.frames.frames import MAX_IMAGE_PIXELS
+from thor2_jax.printable import check_name
 from thor2_jax.tables import parse_json, parse_yaml
 from training.objects.mesh import TexturedMesh, merge_meshes
 
@@ -20,6 +21,7 @@ __all__ = [
     "MESH_SUFFIXES",
     "MIN_SIDE",
     "find_meshes",
+    "find_object_meshes",
     "load_mesh",
     "longest_side",
     "read_names",
@@ -36,6 +38,17 @@ MAX_TEXTURE_COORDINATE = 2**23
 """Largest texture coordinate: beyond it, float32 cannot represent fractions."""
 
 
+TEXTURES = (
+    "image",
+    "baseColorTexture",
+    "normalTexture",
+    "emissiveTexture",
+    "occlusionTexture",
+    "metallicRoughnessTexture",
+)
+"""Attributes of trimesh's materials that hold images."""
+
+
 def _solid(vertices: NDArray[np.float64], faces: NDArray[np.int32], color: NDArray[np.uint8]) -> TexturedMesh:
     return TexturedMesh(
         vertices,
@@ -46,11 +59,24 @@ def _solid(vertices: NDArray[np.float64], faces: NDArray[np.int32], color: NDArr
     )
 
 
+def _check_textures(geometry: Any) -> None:
+    """Check the sizes of a geometry's textures, which are decoded only when they are copied or read.
+
+    Raises:
+        InputError: A texture is too large.
+    """
+    material = getattr(getattr(geometry, "visual", None), "material", None)
+    for name in TEXTURES:
+        image = getattr(material, name, None)
+        if isinstance(image, Image.Image) and image.width * image.height > MAX_IMAGE_PIXELS:
+            raise InputError(f"a texture of {image.width} x {image.height} pixels; at most {MAX_IMAGE_PIXELS} are read")
+
+
 def _part(geometry: trimesh.Trimesh) -> TexturedMesh:
     """Convert one geometry of a file.
 
     Raises:
-        InputError: The geometry has no colour, a texture that is too large, or faces with invalid vertex indices.
+        InputError: The geometry has no colour, or faces with invalid vertex indices.
     """
     vertices, faces = np.asarray(geometry.vertices, np.float64), np.asarray(geometry.faces, np.int32)
     if faces.min() < 0 or faces.max() >= len(vertices):
@@ -75,8 +101,6 @@ def _part(geometry: trimesh.Trimesh) -> TexturedMesh:
     factor = np.full(3, 255, np.uint8) if factor is None else np.asarray(factor, np.uint8)[:3]
     if image is None or visual.uv is None:
         return _solid(vertices, faces, factor)
-    if isinstance(image, Image.Image) and image.width * image.height > MAX_IMAGE_PIXELS:
-        raise InputError(f"a texture of {image.width} x {image.height} pixels; at most {MAX_IMAGE_PIXELS} are read")
     texture = np.asarray(image.convert("RGB") if isinstance(image, Image.Image) else image, np.uint8)
     if (factor < 255).any():
         texture = np.rint(texture * (factor / 255.0)).astype(np.uint8)
@@ -187,8 +211,12 @@ def _parsed(path: Path) -> TexturedMesh:
         if path.suffix.lower() == ".obj":
             _check_obj_references(path)
         # Processing would silently drop vertices that are not finite.
-        loaded = trimesh.load_scene(path, process=False).dump(concatenate=False)
-        geometries = [part for part in loaded if isinstance(part, trimesh.Trimesh) and len(part.faces)]
+        scene = trimesh.load_scene(path, process=False)
+        for geometry in scene.geometry.values():
+            _check_textures(geometry)
+        geometries = [
+            part for part in scene.dump(concatenate=False) if isinstance(part, trimesh.Trimesh) and len(part.faces)
+        ]
         if not geometries:
             raise InputError("no faces")
         mesh = merge_meshes([_part(geometry) for geometry in geometries])
@@ -231,8 +259,8 @@ def find_meshes(folder: str | Path, names: Mapping[str, str] | None = None) -> d
             its own name.
 
     Raises:
-        InputError: The directory is missing or has no mesh, a scan exists twice or is ambiguous, or `names` has an
-            unknown scan.
+        InputError: The directory is missing or has no mesh, a scan exists twice or is ambiguous, `names` has an
+            unknown scan, or `check_name` refuses the name of an object.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -253,13 +281,50 @@ def find_meshes(folder: str | Path, names: Mapping[str, str] | None = None) -> d
     if names is None:
         if not scans:
             raise InputError(f"mesh folder {folder}: no {', '.join(MESH_SUFFIXES)} file in it or in its folders")
-        return scans
+        return _named(folder, scans)
     if not names:
         raise InputError("names is empty; expected at least one object")
     unknown = sorted(set(names.values()) - set(scans))
     if unknown:
         raise InputError(f"mesh folder {folder}: no mesh for {', '.join(unknown)}")
-    return {name: scans[names[name]] for name in sorted(names)}
+    return _named(folder, {name: scans[names[name]] for name in sorted(names)})
+
+
+def _named(folder: Path, meshes: Mapping[str, Path]) -> dict[str, Path]:
+    """Return the meshes under the names that `check_name` makes of theirs."""
+    named: dict[str, Path] = {}
+    for name, path in meshes.items():
+        with with_context(f"mesh folder {folder}"):
+            if named.setdefault(check_name(name), path) != path:
+                raise InputError(f"object {name!r} is there twice; expected one mesh of each object")
+    return named
+
+
+def find_object_meshes(path: Path, name: str | None) -> dict[str, Path]:
+    """Return object name -> mesh file.
+
+    Args:
+        path: a mesh file, the folder of one object, or a folder of objects as for `find_meshes`.
+        name: the one object wanted; None takes all objects of a folder, under their own names.
+
+    Raises:
+        InputError: there is no such mesh, or `name` is None for a file.
+    """
+    if not path.is_dir():
+        if name is None:
+            raise InputError(f"name is missing; mesh {path} is one file")
+        return {name: path}
+    own = path.resolve().name
+    if any(file.stem.lower() == "textured" for file in path.iterdir()) or name == own:
+        mesh = _mesh_in(path)
+        if mesh is not None:
+            return _named(path.resolve().parent, {name or own: mesh})
+    meshes = find_meshes(path)
+    if name is None:
+        return meshes
+    if name not in meshes and len(meshes) > 1:
+        raise InputError(f"mesh folder {path}: none of {', '.join(meshes)} is {name!r}; leave out NAME to enroll all")
+    return {name: meshes.get(name) or next(iter(meshes.values()))}
 
 
 def read_names(path: str | Path) -> dict[str, str]:

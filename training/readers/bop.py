@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError, with_context
-from thor2_jax.recognition.frames import Intrinsics, RGBDFrame, read_color, read_depth, read_labels
+from thor2_jax.frames.frames import Intrinsics, RGBDFrame, read_color, read_depth, read_labels
 from thor2_jax.tables import read_table
-from training.readers.labelled import LabelledFrame, LabelledFrames
+from training.readers.labelled import LabelledFrame, LabelledFrames, named_path
 
 __all__ = ["BOP", "SMALLEST_VISIBLE", "read_object_names"]
 
@@ -44,7 +44,7 @@ class BOP(LabelledFrames):
             InputError: There are no frames, or `names` is damaged.
             OSError: `names` cannot be opened.
         """
-        path = Path(path).absolute()  # so that a scene's folder has a name, that of "." too
+        path = named_path(path)
         if not path.is_dir():
             raise InputError(f"dataset: {path} is not a directory; expected a dataset")
         scenes = sorted(f.parent for f in [*path.glob("scene_camera.json"), *path.glob("*/scene_camera.json")])

@@ -2,13 +2,15 @@
 
 import dataclasses
 import functools
+import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.frames import RGBDFrame, read_frame
+from thor2_jax.frames.frames import Intrinsics, RGBDFrame, read_frame
 from thor2_jax.segmentation.segmenters import Segmenter, segmented
 from training.readers.bop import BOP
+from training.readers.labelled import named_path
 
 __all__ = ["FILE_NAMES", "FrameFiles", "FrameSource", "find_frames", "frame_files", "segmented_source"]
 
@@ -33,7 +35,7 @@ FILE_NAMES = {
 
 @dataclasses.dataclass(frozen=True)
 class FrameFiles:
-    """The files of a frame; the arguments of `read_frame`.
+    """The files of a frame: the arguments of `read_frame`, and labels.json, which may name the objects beside them.
 
     Attributes:
         color: colour image.
@@ -57,6 +59,15 @@ class FrameFiles:
             depth_scale=depth_scale,
         )
 
+    @property
+    def names(self) -> Path:
+        """The file with the names of the objects, which need not exist."""
+        return (self.labels or self.color).with_name("labels.json")
+
+    def source(self, name: str, depth_scale: float | None = None) -> "FrameSource":
+        """Return the frame of these files."""
+        return FrameSource(name, functools.partial(self.read, depth_scale), self)
+
 
 @dataclasses.dataclass(frozen=True)
 class FrameSource:
@@ -65,10 +76,12 @@ class FrameSource:
     Attributes:
         name: its folder, or scene and image.
         read: function that returns the frame; raises InputError and OSError. Worker processes get it pickled.
+        files: its files; None for a frame of a BOP scene or a recording, and for one that is segmented.
     """
 
     name: str
     read: Callable[[], RGBDFrame]
+    files: FrameFiles | None = None
 
 
 def frame_files(folder: Path) -> FrameFiles:
@@ -87,7 +100,7 @@ def frame_files(folder: Path) -> FrameFiles:
 
 
 def find_frames(paths: Sequence[Path], depth_scale: float | None = None) -> list[FrameSource]:
-    """Find the frames in folders, in the order of their names.
+    """Find the frames in folders, in the order of their names, which are unique.
 
     Args:
         paths: folders of one frame, folders that hold such folders at any depth or links to them, and BOP splits or
@@ -95,11 +108,14 @@ def find_frames(paths: Sequence[Path], depth_scale: float | None = None) -> list
         depth_scale: see `read_frame`; BOP scenes have their own.
 
     Raises:
-        InputError: a path is no directory or holds no frame, or two frames have the same name.
+        InputError: a path is no directory or holds no frame, a frame is given twice, or `depth_scale` is out of range.
     """
+    if depth_scale is not None:
+        Intrinsics(1.0, 1.0, 0.0, 0.0, depth_scale)
     sources: list[FrameSource] = []
+    folders: list[Path] = []
     for path in paths:
-        path = path.absolute()  # gives "." a name
+        path = named_path(path)
         if not path.is_dir():
             raise InputError(f"frames: {path} is not a directory; expected a folder of frames")
         if any(path.glob("scene_camera.json")) or any(path.glob("*/scene_camera.json")):
@@ -109,21 +125,27 @@ def find_frames(paths: Sequence[Path], depth_scale: float | None = None) -> list
                 for k, name in enumerate(dataset.identifiers)
             ]
         else:
-            # "**" does not follow links to folders, "*" does.
-            patterns = [pattern for name in FILE_NAMES["color"] for pattern in (f"**/{name}", f"*/{name}")]
-            colors = [file for pattern in patterns for file in path.glob(pattern)]
+            # "**" does not follow links to folders, "*" does. A frame without colour is found too, so that it fails.
+            names = [*FILE_NAMES["color"], *FILE_NAMES["depth"]]
+            images = [file for name in names for pattern in (f"**/{name}", f"*/{name}") for file in path.glob(pattern)]
             of_path = [
-                FrameSource(_name(folder, path), functools.partial(frame_files(folder).read, depth_scale))
-                for folder in sorted({file.parent for file in colors})
+                frame_files(folder).source(_name(folder, path), depth_scale)
+                for folder in sorted({file.parent for file in images})
             ]
         if not of_path:
             raise InputError(f"frames: {path} has no {' or '.join(FILE_NAMES['color'])}; expected a folder of frames")
         sources += of_path
+        folders += [path if each.files and each.files.color.parent == path else path / each.name for each in of_path]
     names = [source.name for source in sources]
-    repeated = sorted({name for name in names if names.count(name) > 1}) if len(set(names)) < len(names) else []
+    if len(set(names)) == len(names):
+        return sources
+    # Frames in different folders may have the same name: they are then named from the folder that holds all of them.
+    common = Path(os.path.commonpath([path.parent for path in folders]))
+    names = [path.relative_to(common).as_posix() for path in folders]
+    repeated = sorted({name for name in names if names.count(name) > 1})
     if repeated:
-        raise InputError(f"frames: two frames are called {repeated[0]}; give each folder once, or one that holds both")
-    return sources
+        raise InputError(f"frames: {repeated[0]} is given twice; give each folder once, or one that holds both")
+    return [dataclasses.replace(source, name=name) for source, name in zip(sources, names, strict=True)]
 
 
 def segmented_source(source: FrameSource, segmenter: Segmenter) -> FrameSource:

@@ -5,14 +5,20 @@ import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-from thor2_jax.recognition.frames import RGBDFrame
+from thor2_jax.frames.frames import RGBDFrame
 
-__all__ = ["LabelledFrame", "LabelledFrames", "path_ends", "sequence_of"]
+__all__ = ["LabelledFrame", "LabelledFrames", "named_path", "path_ends", "sequence_of"]
 
 
 def sequence_of(identifier: str) -> str:
     """Return the sequence of a frame: a/b/c for a/b/c/d."""
     return identifier.rpartition("/")[0]
+
+
+def named_path(path: str | Path) -> Path:
+    """Return the absolute path of a folder, of "." and "x/.." too, so that its last part is a name."""
+    path = Path(path)
+    return path.resolve() if ".." in path.parts else path.absolute()
 
 
 def path_ends(sequence: str) -> list[str]:

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError, with_context
-from thor2_jax.recognition.frames import Intrinsics, RGBDFrame, read_color, read_depth, read_labels
+from thor2_jax.frames.frames import Intrinsics, RGBDFrame, read_color, read_depth, read_labels
 from thor2_jax.tables import parse_json, read_table
 from training.readers.labelled import LabelledFrame, LabelledFrames, path_ends
 from training.readers.pcd import read_organized_points

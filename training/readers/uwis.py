@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from thor2_jax.errors import InputError, with_context
-from thor2_jax.recognition.frames import Intrinsics, RGBDFrame, read_color, read_depth, read_labels
+from thor2_jax.frames.frames import Intrinsics, RGBDFrame, read_color, read_depth, read_labels
 from thor2_jax.tables import parse_yaml
 from training.readers.labelled import LabelledFrame, LabelledFrames
 

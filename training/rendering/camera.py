@@ -6,7 +6,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from thor2_jax.recognition.frames import Intrinsics
+from thor2_jax.frames.frames import Intrinsics
 
 __all__ = ["TRAINING_CAMERA", "Camera", "RenderedView"]
 

@@ -14,7 +14,7 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
-from thor2_jax.recognition.frames import Intrinsics
+from thor2_jax.frames.frames import Intrinsics
 from training.objects.mesh import TexturedMesh
 from training.rendering.camera import TRAINING_CAMERA, Camera, RenderedView
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.frames import Intrinsics, RGBDFrame
+from thor2_jax.frames.frames import Intrinsics, RGBDFrame
 from training.objects.mesh import TexturedMesh
 from training.rendering.camera import Camera
 from training.rendering.ray_caster import RayCaster, pixel_rays, render_view
@@ -248,6 +248,10 @@ def compose_views(
     n_views: int = 4,
     camera: Camera = SCENE_CAMERA,
     arc: float = 2 * np.pi,
+    clutter: float = 0.85,
+    noise: float = 1.0,
+    light: float = 0.08,
+    level: bool = False,
 ) -> list[tuple[Scene, NDArray[np.float64]]]:
     """Place random objects on a table and render them from cameras around it, at equal angles.
 
@@ -260,6 +264,10 @@ def compose_views(
         n_views: number of cameras.
         camera: camera of the frames.
         arc: angle between the first camera and the one that would follow the last, radians; by default all around.
+        clutter: as in `compose_scene`.
+        noise: likewise.
+        light: likewise.
+        level: whether all cameras have the height and the distance of the first, as those of a moving camera.
 
     Returns:
         Scene and pose [4, 4] of each camera, from camera to world coordinates, as `compose_scene`.
@@ -269,11 +277,11 @@ def compose_views(
     """
     names = _choose(objects, n_objects, rng)
     azimuth, _ = _random_pose(rng)
-    meshes = _arrange([objects[name] for name in names], np.array([np.cos(azimuth), np.sin(azimuth)]), 0.85, rng)
+    meshes = _arrange([objects[name] for name in names], np.array([np.cos(azimuth), np.sin(azimuth)]), clutter, rng)
     views = []
     for turn in np.arange(n_views) * arc / n_views:
-        _, pose = _random_pose(rng, azimuth + turn)
-        views.append((_render(names, meshes, pose, camera, 1.0, 0.08, rng), pose))
+        _, pose = _random_pose(np.random.default_rng(0) if level else rng, azimuth + turn)
+        views.append((_render(names, meshes, pose, camera, noise, light, rng), pose))
     return views
 
 

@@ -1,25 +1,31 @@
 """The files of an explanation: a self-contained page, its pictures and JSON."""
 
 import json
+import re
 from pathlib import Path
 
+from thor2_jax.errors import InputError
 from thor2_jax.explanation.explain import Explanation
 from thor2_jax.explanation.pictures import change_text, pictures
 from thor2_jax.figures import save_figure
-from thor2_jax.files import atomic_directory, write_text
-from thor2_jax.recognition.answers import Recognition
-from thor2_jax.recognition.frames import RGBDFrame
+from thor2_jax.files import atomic_directory, has_json, remove_written, write_text
+from thor2_jax.frames.frames import RGBDFrame
+from thor2_jax.model.answers import Recognition
 from training.reports.html import Picture, Section, Table, write_page
 
-__all__ = ["PAGE", "write_explanation"]
+__all__ = ["PAGE", "check_no_foreign_files", "write_explanation"]
 
 PAGE = "explanation.html"
+VALUES = "explanation.json"
+
+_PICTURES = "photo|cloud|slices-attributions|check|changes|nearest|slices|diagrams|slice-[0-9]+|network"
+_WRITTEN = rf"{re.escape(PAGE)}|{re.escape(VALUES)}|({_PICTURES})\.png"
 
 _SOURCES = {
     "tops": "shape (TOPS)",
     "tops2": "shape and colour (TOPS2)",
     "ce": "colour (CE)",
-    "embedding": "embedding (gives the confidence)",
+    "embedding": "shape and colour (embedding)",
     "gallery": "gallery",
 }
 
@@ -41,14 +47,23 @@ _SLICES = (
 )
 
 
+def check_no_foreign_files(directory: Path) -> None:
+    """Raise InputError if `write_explanation` would replace files that are not those of an older explanation."""
+    names = sorted(path.name for path in directory.glob("*") if re.fullmatch(_WRITTEN, path.name))
+    if names and not has_json(directory / VALUES, ("label", "explained_name", "faithfulness")):
+        raise InputError(
+            f"out: {directory} has {names[0]}, which this command has not written; choose another directory"
+        )
+
+
 def write_explanation(explanation: Explanation, frame: RGBDFrame, name: str, directory: Path) -> None:
-    """Write an explanation to a directory, which appears only when it is complete.
+    """Write an explanation to a directory, which appears only when it is complete; it replaces an older explanation.
 
     Args:
         explanation: the explanation.
         frame: the frame that it was made from.
         name: name of the frame.
-        directory: directory; what stands there is replaced.
+        directory: directory; other files in it stay.
 
     Raises:
         OSError: a file cannot be written; nothing is left behind.
@@ -60,14 +75,15 @@ def write_explanation(explanation: Explanation, frame: RGBDFrame, name: str, dir
             is_slice = picture.section == "slices"
             shown = Picture(f"{picture.name}.png", picture.caption, half=not is_slice, third=is_slice)
             sections.setdefault(picture.section, []).append(shown)
-        write_text(unfinished / "explanation.json", json.dumps(explanation.as_json()) + "\n")
+        write_text(unfinished / VALUES, json.dumps(explanation.as_json()) + "\n")
         write_page(
             unfinished / PAGE,
-            title=f"Why {explanation.name}?",
+            title=f"Why {explanation.title}?",
             lead=_lead(explanation, name),
             sections=_page_sections(explanation, sections),
             embed=True,
         )
+        remove_written(directory, _WRITTEN)
 
 
 def _lead(explanation: Explanation, name: str) -> str:
@@ -104,12 +120,34 @@ def _page_sections(explanation: Explanation, pictures: dict[str, list[Picture]])
     ]
     if "nearest" in pictures:
         sections.append(Section("What it resembles", pictures=pictures["nearest"]))
+    sections.append(Section("If the name is wrong", _advice(explanation)))
     return [
         *sections,
         Section("What the descriptor sees", _SHAPE, pictures=pictures["shape"]),
         Section("Slice by slice", _SLICES, pictures=pictures.get("slices", ())),
         Section("Its colours", pictures=pictures["network"]),
     ]
+
+
+def _advice(explanation: Explanation) -> str:
+    answer, other = explanation.recognition, explanation.runner_up
+    sentences = [
+        "Add this view to the object that it is; no training is needed: thor2 enroll NAME FRAME --instance "
+        f"{answer.label} --model RUN --extend."
+    ]
+    if other is not None:
+        sentences.append(
+            f"If {explanation.name} and {other} look alike from this side, add views of both from this side: they show "
+            "the difference."
+        )
+    if any(change.kind == "color" for change in explanation.changes):
+        sentences.append(
+            "A shift of the colours gives another name: if the whole frame is warmer or cooler than the views of "
+            "training, adapt the model to the camera: thor2 adapt FRAME... --model RUN --out RUN2."
+        )
+    if answer.occluded:
+        sentences.append("It is partly occluded: look from another side, and fuse the frames (--track).")
+    return " ".join(sentences)
 
 
 def _changes_text(explanation: Explanation) -> str:

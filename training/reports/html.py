@@ -35,12 +35,13 @@ class Picture:
 
 @dataclasses.dataclass(frozen=True)
 class Section:
-    """A section of the page: a heading, and optionally a paragraph, a table and pictures."""
+    """A section of the page: a heading, and optionally a paragraph, a table, pictures and a part that unfolds."""
 
     heading: str
     text: str = ""
     table: Table | None = None
     pictures: Sequence[Picture] = ()
+    folded: "Section | None" = None
 
 
 _STYLE = """
@@ -60,6 +61,7 @@ figure.third { flex: 0 1 21rem; max-width: calc(33.3% - .7rem); }
 figure.small { flex: 0 1 10rem; max-width: calc(50% - .5rem); }
 @media (max-width: 56rem) { figure.half, figure.third { max-width: 100%; } }
 img { max-width: 100%; height: auto; display: block; }
+summary { color: #555; cursor: pointer; }
 figcaption { color: #555; font-size: .9rem; }
 """
 
@@ -82,13 +84,20 @@ def _figure(picture: Picture, embedded_from: Path | None) -> str:
 
 
 def _section(section: Section, embedded_from: Path | None) -> str:
-    elements = [f"<h2>{html.escape(section.heading)}</h2>"]
+    return f"<h2>{html.escape(section.heading)}</h2>\n{_content(section, embedded_from)}"
+
+
+def _content(section: Section, embedded_from: Path | None) -> str:
+    elements = []
     if section.text:
         elements.append(f"<p>{html.escape(section.text)}</p>")
     if section.table is not None:
         elements.append(_table(section.table))
     figures = "".join(_figure(picture, embedded_from) for picture in section.pictures)
     elements.append(f'<div class="pictures">{figures}</div>')
+    if section.folded is not None:
+        summary = f"<summary>{html.escape(section.folded.heading)}</summary>"
+        elements.append(f"<details>{summary}\n{_content(section.folded, embedded_from)}</details>")
     return "\n".join(elements)
 
 

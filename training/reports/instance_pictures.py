@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from thor2_jax.files import atomic_write
-from thor2_jax.recognition.overlay import COLORS, UNRECOGNIZED, Annotation, draw_instances
+from thor2_jax.frames.overlay import COLORS, UNRECOGNIZED, Annotation, draw_instances
 
 __all__ = ["CORRECT", "INCORRECT", "draw_crop", "draw_judged"]
 

@@ -67,12 +67,12 @@ def draw_confusion(counts: NDArray[np.integer[Any]], classes: Sequence[str], nam
     Raises:
         OSError: the file cannot be written.
     """
-    side = 2.2 + 0.36 * (len(classes) + bool(counts[:, -1].any()))
-    figure = Figure(figsize=(side, side), layout="constrained")
-    axes = figure.add_subplot()
+    columns = len(classes) + bool(counts[:, -1].any())
+    figure = Figure(figsize=(0.36 * columns, 0.36 * len(classes)))
+    axes = figure.add_axes((0, 0, 1, 1))
     plot.confusion(axes, counts, classes)
     axes.set_xlabel(f"recognized by {name} as")
-    save_figure(figure, path)
+    save_figure(figure, path, fit=True)  # labels may be longer than a small matrix
 
 
 def draw_reliability(bins: Mapping[str, Sequence[Any]], name: str, path: str | Path) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 from thor2_jax.errors import InputError
 from thor2_jax.files import write_text
 
-__all__ = ["begin_job", "check_same_job"]
+__all__ = ["JOB_FILE", "begin_job", "check_same_job"]
 
 JOB_FILE = "job.json"
 

@@ -15,8 +15,8 @@ from typing import NamedTuple
 import numpy as np
 
 from thor2_jax.errors import InputError
-from thor2_jax.files import atomic_write, remove_leftovers
-from thor2_jax.recognition.frames import RGBDFrame
+from thor2_jax.files import atomic_write, check_output_directory, remove_leftovers
+from thor2_jax.frames.frames import RGBDFrame
 from training.augmentation.augmentations import Augmentations
 from training.objects.mesh import TexturedMesh
 from training.rendering.camera import RenderedView
@@ -69,6 +69,7 @@ def _begin(directory: Path, dataset: ViewDataset, size: int) -> dict[str, str]:
     Raises:
         InputError: the crops have another size, or are of another dataset.
     """
+    check_output_directory(directory, MANIFEST)
     if not (directory / MANIFEST).is_file():
         return {}
     stored = CropManifest.read(directory)

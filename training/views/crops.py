@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.frames import RGBDFrame, pixel_rays
+from thor2_jax.frames.frames import RGBDFrame, pixel_rays
 
 __all__ = ["CROP_SIZE", "RGBDCrop", "fill_depth", "rgbd_crop", "surface_normals"]
 

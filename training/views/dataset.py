@@ -19,6 +19,7 @@ The manifest has the job, everything that determines the views, and the finished
 time stamps: the same job gives the same bytes.
 """
 
+import contextlib
 import dataclasses
 import hashlib
 import json
@@ -31,14 +32,22 @@ import safetensors.numpy
 
 from thor2_jax.config import DESCRIPTOR_VERSION
 from thor2_jax.errors import InputError
-from thor2_jax.files import write_text
+from thor2_jax.files import remove_written, write_text
 from training.views.normalized_views import COORDINATE_STEP, NormalizedViews
-from training.views.view_crops import ViewCrops, read_crops
+from training.views.view_crops import CROPS, ViewCrops, read_crops
 
-__all__ = ["MANIFEST", "Manifest", "NormalizedViews", "Shard", "ViewDataset", "encode"]
+__all__ = ["MANIFEST", "Manifest", "NormalizedViews", "Shard", "ViewDataset", "encode", "remove_views"]
 
 MANIFEST_FORMAT = 2
 MANIFEST = "manifest.json"
+
+
+def remove_views(directory: Path) -> None:
+    """Remove a dataset of views and their crops; files that `thor2 render` has not written stay."""
+    with contextlib.suppress(OSError, InputError):
+        Manifest.parse((directory / MANIFEST).read_bytes(), directory / MANIFEST)
+        names = r"(manifest\.json|\.lock|[0-9]{4,}-[0-9]{4,}\.(safetensors|npz))"
+        remove_written(directory, rf"({CROPS}/)?{names}")
 
 
 def encode(views: NormalizedViews) -> bytes:

@@ -13,8 +13,8 @@ import numpy as np
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError, with_context
 from thor2_jax.files import content_digest
+from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery.augment import augmented_view
-from thor2_jax.recognition.prepared_instance import PreparedInstance
 from training.views.normalized_views import NormalizedViews, ViewSource, normalize_views
 from training.views.view_crops import QuantizedCrop, ViewCrops, repeated, stacked
 
@@ -112,7 +112,7 @@ class WithLabelledViews:
         """Read a shard of the rendered views, or augment and normalize the instances of a class.
 
         Raises:
-            InputError: what the source of the rendered views raises, or an instance is too long.
+            InputError: as the source of the rendered views, or an instance is too long.
         """
         if index < self._first:
             assert self._rendered is not None
@@ -135,7 +135,7 @@ class WithLabelledViews:
         """Read the crops of a shard of the rendered views, or repeat those of a class's instances for their copies.
 
         Raises:
-            InputError: what the source of the rendered views raises, or there are no crops of the instances.
+            InputError: as the source of the rendered views, or there are no crops of the instances.
         """
         if index < self._first:
             assert self._rendered is not None

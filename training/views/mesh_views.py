@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.frames import backproject
-from thor2_jax.recognition.prepared_instance import DESCRIPTOR_VOXEL
-from thor2_jax.recognition.voxel_grid import downsample_to_fit
+from thor2_jax.frames.frames import backproject
+from thor2_jax.frames.prepared_instance import DESCRIPTOR_VOXEL
+from thor2_jax.frames.voxel_grid import downsample_to_fit
 from thor2_jax.types import Cloud
 from training.augmentation.augmentations import Augmentations, augment
 from training.objects.mesh import TexturedMesh

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
 from thor2_jax.errors import InputError, with_context
 from thor2_jax.files import atomic_write, check_output_directory, content_digest, remove_leftovers
-from thor2_jax.recognition.prepared_instance import DESCRIPTOR_VOXEL
+from thor2_jax.frames.prepared_instance import DESCRIPTOR_VOXEL
 from training.augmentation.augmentations import Augmentations
 from training.objects.mesh import TexturedMesh
 from training.rendering.camera import TRAINING_CAMERA
@@ -41,7 +41,7 @@ from training.views.mesh_views import (
 )
 from training.views.normalized_views import COORDINATE_STEP, MAX_VIEW_LENGTH, normalize_views
 
-__all__ = ["ShardPlan", "dataset_job", "render_dataset"]
+__all__ = ["ShardPlan", "dataset_job", "mesh_digest", "render_dataset"]
 
 CLOUDS_PER_SHARD = 256
 """Clouds per shard, rounded down to whole views: a few megabytes, about a second of rendering."""
@@ -49,7 +49,7 @@ CLOUDS_PER_SHARD = 256
 SUFFIX = ".safetensors"
 
 
-def _digest(mesh: TexturedMesh) -> str:
+def mesh_digest(mesh: TexturedMesh) -> str:
     """Return the SHA-256 of a mesh's arrays: mesh files refer to others, and meshes need not come from files."""
     parts: list[str | bytes] = []
     for array in (mesh.vertices, mesh.faces, mesh.uv, mesh.face_texture, mesh.corner_colors, *mesh.textures):
@@ -67,7 +67,7 @@ def _objects(meshes: Mapping[str, Path | TexturedMesh], angles: NDArray[np.float
                 f"object {name!r} has a diameter of {diameter:.2f} m; at most {MAX_VIEW_LENGTH / SIGMA_S:.2f} m can be "
                 "stored; scale the mesh to metres"
             )
-        objects.append({"name": name, "mesh": _digest(mesh)})
+        objects.append({"name": name, "mesh": mesh_digest(mesh)})
     return objects
 
 

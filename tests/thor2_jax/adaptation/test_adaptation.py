@@ -6,24 +6,26 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import untrained_run
+from helpers import class_probabilities, untrained_embedding_run, untrained_run
 from scipy.stats import entropy as scipy_entropy
 
 import thor2_jax as thor2
-from thor2_jax.adaptation.answers import fused_classifier, gallery_classifier
+from thor2_jax.adaptation.answers import gallery_classifier
 from thor2_jax.adaptation.color_transform import ColorTransform, transform_colors
 from thor2_jax.adaptation.estimate import (
     EVIDENCE,
     GRID,
     MIN_INSTANCES,
     PRIOR,
+    adaptation_criterion,
     estimate_transform,
     posterior_mean,
     spread,
 )
 from thor2_jax.adaptation.objective import Objective, entropy
-from thor2_jax.descriptor.orientations import OrientedDescriptors, describe_orientations
-from thor2_jax.recognition.prepared_instance import PreparedInstance, pack_instances
+from thor2_jax.descriptor.looks import LookDescriptors, describe_looks
+from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
+from thor2_jax.model.fusion import FUSION_RULES, FusionRule
 from thor2_jax.recognizer import Recognizer
 
 RUN = untrained_run(("a", "b", "c"))
@@ -71,24 +73,24 @@ def test_entropy_counts_what_the_classes_lack() -> None:
 def test_the_objective_is_the_entropy_of_the_answers() -> None:
     made = instances(11)  # two chunks, one with padding
     recognizer = Recognizer(RUN)
-    network, config, classify = recognizer.adaptation_criterion()
+    network, config, classify = adaptation_criterion(recognizer.model)
     objective = Objective(made, network, config, classify)
     for transform in (ColorTransform(), WARM):
         corrected = [transform.corrected(each) for each in made]
-        oriented = describe_orientations(pack_instances(corrected, 16), network, config, 2)
-        fused = recognizer.fused(recognizer.probabilities(oriented, ("tops", "tops2")))[: len(made)]
+        oriented = describe_looks(pack_instances(corrected, 16), network, config, 2)
+        fused = recognizer.model.fused(class_probabilities(recognizer, oriented, ("tops", "tops2")))[: len(made)]
         expected = sum(scipy_entropy(row) for row in fused)
         # Colours are rounded to 8 bits before a camera's correction, not in between.
         assert objective.total(np.array(dataclasses.astuple(transform))) == pytest.approx(expected, rel=2e-3)
 
 
-def grey_is_known(oriented: OrientedDescriptors) -> jax.Array:
+def grey_is_known(oriented: LookDescriptors) -> jax.Array:
     """Answer one class, the more surely the closer the mean colour is to grey."""
     mean = oriented.statistics[:, 0, 5:8]  # see `cloud_statistics`
     return jnp.exp(-10 * jnp.square(mean[:, :1] - mean[:, 2:]))
 
 
-def none_is_known(oriented: OrientedDescriptors) -> jax.Array:
+def none_is_known(oriented: LookDescriptors) -> jax.Array:
     return jnp.zeros((len(oriented.weights), 3))
 
 
@@ -140,7 +142,7 @@ def frame(seed: int, size: tuple[int, int] = (120, 160)) -> thor2.RGBDFrame:
 def test_an_adapted_recognizer_sees_corrected_colors() -> None:
     recognizer = Recognizer(RUN)
     adaptation = recognizer.adapt([frame(seed) for seed in range(2)])
-    assert recognizer.color_transform == adaptation.transform != ColorTransform()
+    assert recognizer.model.color_transform == adaptation.transform != ColorTransform()
     image = frame(7)
     by_hand = dataclasses.replace(image, color=adaptation.transform(image.color))
     assert recognizer.recognize(image) == Recognizer(RUN).recognize(by_hand)
@@ -155,7 +157,7 @@ def test_frames_of_another_size_or_too_few_change_nothing() -> None:
         recognizer.adapt([frame(0), frame(1, (110, 160)), frame(2)])
     with pytest.raises(thor2.InputError, match="5 usable instances"):
         recognizer.adapt([frame(0)])
-    assert recognizer.color_transform is None
+    assert recognizer.model.color_transform is None
 
 
 def test_gallery_answers_are_its_scores() -> None:
@@ -163,13 +165,34 @@ def test_gallery_answers_are_its_scores() -> None:
     for name, seed in (("mug", 0), ("bowl", 1)):
         recognizer.enroll(name, [(frame(seed), 2), (frame(seed), 3)])
     embedding = recognizer.objects.embedding
-    oriented = describe_orientations(pack_instances(instances(4), 4), embedding.network, embedding.config, 2)
-    scores = recognizer.gallery.scores(embedding.embed_oriented(oriented), oriented.weights)
+    oriented = describe_looks(pack_instances(instances(4), 4), embedding.network, embedding.config, 2)
+    gallery = dataclasses.replace(recognizer.gallery, references=None)
+    scores = gallery.scores(embedding.embed_oriented(oriented), oriented.weights)
     expected = scores / np.maximum(scores.sum(axis=1, keepdims=True), 1)
     np.testing.assert_allclose(gallery_classifier(recognizer.gallery, embedding)(oriented), expected, atol=2e-3)
 
 
-def test_fused_answers_are_geometric_means() -> None:
-    p, q = np.array([[0.7, 0.2, 0.1]]), np.array([[0.2, 0.5, 0.3]])
-    fused = fused_classifier([lambda _: jnp.asarray(p), lambda _: jnp.asarray(q)])(None)  # type: ignore[arg-type]
-    np.testing.assert_allclose(fused, np.sqrt(p * q) / np.sqrt(p * q).sum(), rtol=1e-5)
+@pytest.mark.parametrize("rule", FUSION_RULES)
+def test_the_criterion_obeys_the_fusion_rule(rule: FusionRule) -> None:
+    recognizer = Recognizer(RUN, rule=rule)
+    network, config, classify = adaptation_criterion(recognizer.model)
+    oriented = describe_looks(pack_instances(instances(4), 4), network, config, 2)
+    p, q = (
+        np.asarray(each, np.float64) for each in class_probabilities(recognizer, oriented, ("tops", "tops2")).values()
+    )
+    geometric = np.sqrt(p * q)
+    expected = {
+        "max": np.where(p.max(axis=1, keepdims=True) >= q.max(axis=1, keepdims=True), p, q),
+        "mean": (p + q) / 2,
+        "log-mean": geometric / geometric.sum(axis=1, keepdims=True),
+    }
+    np.testing.assert_allclose(jax.jit(classify)(oriented), expected[rule], atol=1e-5)
+
+
+def test_an_embedding_alone_is_the_criterion() -> None:
+    recognizer = Recognizer(untrained_embedding_run(("a", "b", "c"), config=dataclasses.replace(RUN.config, looks=4)))
+    adaptation = recognizer.adapt([frame(seed) for seed in range(2)])
+    assert recognizer.model.color_transform == adaptation.transform and adaptation.instances == 10
+    network, config, classify = adaptation_criterion(recognizer.model)
+    oriented = describe_looks(pack_instances(instances(4), 4), network, config, 2)
+    np.testing.assert_array_equal(classify(oriented), class_probabilities(recognizer, oriented)["embedding"])

@@ -49,7 +49,7 @@ def test_large_chunks_count_points_in_all_orientations(count: int, sizes: list[i
         return {"points": chunk.points, "mask": chunk.mask}
 
     clouds = clouds_of(count, 4096)
-    results = map_large_chunks(keep, clouds, orientations=4)
+    results = map_large_chunks(keep, clouds, 4)
     assert seen == sizes
     np.testing.assert_array_equal(results["points"], clouds.points)
     np.testing.assert_array_equal(results["mask"], clouds.mask)

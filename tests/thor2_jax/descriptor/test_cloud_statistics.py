@@ -1,11 +1,14 @@
 """Statistics of clouds, compared with NumPy."""
 
+import dataclasses
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 import colornet
 import thor2_jax as thor2
-from thor2_jax.descriptor.cloud_statistics import N_SCALARS, cloud_statistics, side_lengths
+from thor2_jax.descriptor.cloud_statistics import N_SCALARS, cloud_statistics, side_lengths, square_root
 from thor2_jax.descriptor.describe import strips
 
 CONFIG = thor2.DescriptorConfig(homology="closed_form")
@@ -32,3 +35,23 @@ def test_side_lengths_are_those_before_the_turn() -> None:
     normal = np.asarray(thor2.view_normalize(clouds, CONFIG).points)[0]
     sides = side_lengths(thor2.align(clouds, CONFIG), CONFIG.alpha)[0]
     np.testing.assert_allclose(sides, np.sort(np.ptp(normal, axis=0))[::-1], atol=1e-4)
+
+
+def test_square_roots_have_finite_gradients() -> None:
+    values = np.array([-1e-7, 0, 1e-6, 0.25, 4])
+    np.testing.assert_allclose(square_root(jnp.asarray(values)), np.sqrt(values.clip(0)), rtol=1e-6)
+    gradient = jax.grad(lambda v: square_root(v).sum())(jnp.asarray(values))
+    np.testing.assert_allclose(gradient, [0, 0, 500, 1, 0.25], rtol=1e-5)
+
+
+def test_statistics_of_one_color_have_gradients() -> None:
+    clouds = thor2.PointClouds.pack([(np.random.default_rng(0).random((50, 3)), np.full((50, 3), 90, np.uint8))])
+    described = strips(thor2.align(clouds, CONFIG), colornet.load_default(), CONFIG)
+
+    def total(colors: jax.Array, vectors: jax.Array) -> jax.Array:
+        changed = dataclasses.replace(clouds, colors=colors), dataclasses.replace(described, color=vectors)
+        return cloud_statistics(jnp.ones((1, 3)), *changed).sum()
+
+    assert not np.asarray(described.color).sum(axis=(0, 1, 2)).all()  # most colour regions have no point
+    of_colors, of_vectors = jax.grad(total, (0, 1))(clouds.colors, described.color)
+    assert np.isfinite(of_colors).all() and np.asarray(of_colors).any() and np.isfinite(of_vectors).all()

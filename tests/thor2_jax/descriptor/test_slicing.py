@@ -119,22 +119,6 @@ def test_points_outside_on_every_side_are_counted() -> None:
     assert float(strips.color.sum()) == pytest.approx(1)
 
 
-def test_order_duplicates_and_padding() -> None:
-    points, rgb = aligned_cloud(7, 333)
-    order = np.random.default_rng(0).permutation(333)
-    plain = thor2.strips(thor2.PointClouds.pack([(points, rgb)]), NETWORK, PAPER)
-    others = {
-        "order": (thor2.PointClouds.pack([(points[order], rgb[order])]), 1),
-        "padding": (thor2.PointClouds.pack([(points, rgb)], capacity=1024), 1),
-        "duplicates": (thor2.PointClouds.pack([(np.tile(points, (3, 1)), np.tile(rgb, (3, 1)))]), 3),
-    }
-    for name, (clouds, times) in others.items():
-        strips = thor2.strips(clouds, NETWORK, PAPER)
-        for field in ("low", "high", "occupied"):
-            np.testing.assert_array_equal(getattr(strips, field), getattr(plain, field), err_msg=name)
-        np.testing.assert_allclose(strips.color, times * plain.color, atol=1e-5, err_msg=name)
-
-
 def test_gradients_reach_one_point_per_extreme() -> None:
     points, rgb = aligned_cloud(1, 333)
     clouds = thor2.PointClouds.pack([(points, rgb)], capacity=400)

@@ -8,13 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import SMALL_CONFIG, untrained_run
+from helpers import SMALL_CONFIG, class_probabilities, untrained_embedding_run, untrained_run
 from scipy.special import logit
 
 import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.color_membership import region_sets
-from thor2_jax.descriptor.orientations import OrientedDescriptors, describe_orientations, orient_descriptors
+from thor2_jax.descriptor.looks import LookDescriptors, describe_aligned_looks, describe_looks
 from thor2_jax.descriptor.relaxation import relaxed_strips
 from thor2_jax.explanation import attributions as attributions_module
 from thor2_jax.explanation import class_scores
@@ -30,12 +30,14 @@ from thor2_jax.explanation.changes import apply_change, changed_instance, smalle
 from thor2_jax.explanation.class_scores import ClassScores, classifier_scores, gallery_scores
 from thor2_jax.explanation.explain import Explanation, explain, pixel_attributions
 from thor2_jax.explanation.leave_out import leave_out
-from thor2_jax.recognition.prepared_instance import PreparedInstance, pack_instances, prepare_instance
+from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances, prepare_instance
+from thor2_jax.model.confidence import Calibration
+from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.recognizer import Recognizer
 
 NETWORK = colornet.load_default()
 CLASSES = ("a", "b", "c")
-FOUR = dataclasses.replace(SMALL_CONFIG, orientations=4)
+FOUR = dataclasses.replace(SMALL_CONFIG, looks=4)
 
 
 @pytest.fixture(scope="module")
@@ -64,14 +66,14 @@ def explanation(recognizer: Recognizer, frame: thor2.RGBDFrame) -> Explanation:
     return explain(recognizer, frame, 3)
 
 
-def toy(score: Callable[[OrientedDescriptors], Any], config: thor2.DescriptorConfig = SMALL_CONFIG) -> ClassScores:
+def toy(score: Callable[[LookDescriptors], Any], config: thor2.DescriptorConfig = SMALL_CONFIG) -> ClassScores:
     """Return scores of two names: 0, and a function of the descriptors."""
 
-    def scores(oriented: OrientedDescriptors) -> jax.Array:
+    def scores(oriented: LookDescriptors) -> jax.Array:
         value = score(oriented)
         return jnp.stack([jnp.zeros_like(value), value], axis=1)
 
-    return ClassScores(("plain", "special"), "log-odds", config, NETWORK, config.orientations, scores)
+    return ClassScores(("plain", "special"), "log-odds", config, NETWORK, config.looks, scores)
 
 
 @pytest.fixture(autouse=True)
@@ -79,39 +81,80 @@ def small_clouds(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(class_scores, "MIN_CAPACITY", 512)
 
 
+@pytest.mark.parametrize("make_run", [untrained_run, untrained_embedding_run])
 @pytest.mark.parametrize("rule", ["max", "mean", "log-mean"])
-def test_margin_is_the_log_odds_of_the_answer(rule: str, frame: thor2.RGBDFrame, instance: PreparedInstance) -> None:
-    recognizer = Recognizer(untrained_run(CLASSES, config=FOUR), rule=rule)
+def test_margin_is_the_log_odds_of_the_answer(
+    rule: str, make_run: Callable[..., TrainedRun], frame: thor2.RGBDFrame, instance: PreparedInstance
+) -> None:
+    recognizer = Recognizer(make_run(CLASSES, config=FOUR), rule=rule)
     (answer,) = [one for one in recognizer.recognize(frame) if one.label == 3]
-    scores = classifier_scores(recognizer)
+    scores = classifier_scores(recognizer.model)
     values = scores.of_instances([instance])
     index = CLASSES.index(str(answer.name))
     assert values[0].argmax() == index
     assert float(scores.margin(jnp.asarray(values), index)[0]) == pytest.approx(logit(answer.confidence), abs=1e-3)
 
 
+@pytest.mark.parametrize("looks", [1, 2, 4])
+def test_a_gallery_is_explained_by_the_looks_of_recognition(looks: int, frame: thor2.RGBDFrame) -> None:
+    run = untrained_embedding_run(CLASSES, config=dataclasses.replace(SMALL_CONFIG, looks=looks))
+    recognizer = Recognizer(run)
+    recognizer.enroll("mixed", [(frame, 3)])
+    instances, inference = recognizer.infer(recognizer.prepare(frame))
+    usable = [one for one in instances if one.reason is None]
+    embeddings = np.asarray(inference.embeddings)[: len(usable)]
+    assert embeddings.shape[1] == 2
+    cosines = embeddings @ recognizer.gallery.objects["mixed"].embeddings.astype(np.float32).T
+    expected = cosines.max(axis=-1).mean(axis=1)
+    np.testing.assert_allclose(gallery_scores(recognizer.model).of_instances(usable)[:, 0], expected, atol=1e-5)
+
+
 def test_forgotten_classes_have_no_score(instance: PreparedInstance) -> None:
     recognizer = Recognizer(untrained_run(CLASSES, config=FOUR))
-    whole = classifier_scores(recognizer).of_instances([instance])
+    whole = classifier_scores(recognizer.model).of_instances([instance])
     recognizer.forget("b")
-    scores = classifier_scores(recognizer)
+    scores = classifier_scores(recognizer.model)
     assert scores.names == ("a", "c")
     np.testing.assert_allclose(scores.of_instances([instance]), whole[:, [0, 2]], rtol=1e-5)
 
 
 def test_all_points_have_the_score_of_the_cloud(recognizer: Recognizer, instance: PreparedInstance) -> None:
-    scores = classifier_scores(recognizer)
+    scores = classifier_scores(recognizer.model)
     masks = np.ones((9, len(instance.points)), bool)  # more than one batch
     of_masks = scores.of_masks(scores.orient(instance), masks)
     np.testing.assert_allclose(of_masks, scores.of_instances([instance] * 9), atol=1e-4)
 
 
+def test_parts_keep_the_mask_of_each_look(instance: PreparedInstance) -> None:
+    """Without the points of the rim, the second look, which has none of them, is unchanged; without others, empty."""
+    rim = instance.rim
+    assert rim is not None and 0 < rim.sum() < len(rim) / 2
+    sums = []
+    for number in range(4):
+        scores = toy(lambda oriented, k=number: oriented.each.images[:, k].sum(axis=(1, 2, 3)), FOUR)
+        sums.append(scores.of_masks(scores.orient(instance), np.array([rim | True, ~rim, rim]))[:, 1])
+    for number, (whole, inner, outer) in enumerate(sums):
+        assert whole > 1e-3
+        assert (inner == pytest.approx(whole, rel=1e-6)) == (number == 1)
+        assert (outer == 0) == (number == 1)
+
+
+def test_selected_points_keep_their_flags(recognizer: Recognizer, instance: PreparedInstance) -> None:
+    kept = np.arange(len(instance.points)) % 3 > 0
+    selected = select_points(instance, kept)
+    packed = pack_instances([selected], 1)
+    assert instance.rim is not None and packed.rim is not None
+    np.testing.assert_array_equal(packed.rim[0, : kept.sum()], instance.rim[kept])
+    assert np.isfinite(classifier_scores(recognizer.model).of_instances([selected])).all()
+    assert select_points(dataclasses.replace(instance, rim=None), kept).rim is None
+
+
 def test_a_left_out_slice_is_an_empty_slice(instance: PreparedInstance) -> None:
     recognizer = Recognizer(untrained_run(CLASSES, config=SMALL_CONFIG))
-    scores, index = classifier_scores(recognizer), 1
+    scores, index = classifier_scores(recognizer.model), 1
     cloud = scores.orient(instance)
     left = leave_out(scores, cloud, index, np.zeros(len(instance.points), np.float32))
-    oriented = describe_orientations(pack_instances([instance], 1), NETWORK, SMALL_CONFIG)
+    oriented = describe_looks(pack_instances([instance], 1), NETWORK, SMALL_CONFIG)
     margin = lambda o: float(scores.margin(scores.of_descriptors(o), index)[0])  # noqa: E731
     for number in range(2):
         blank = lambda a, number=number: a.at[:, :, number].set(0)  # noqa: E731
@@ -143,7 +186,7 @@ def relaxed(scores: ClassScores, instance: PreparedInstance, weight: float) -> f
         for k in range(scores.count)
     ]
     together = jax.tree.map(lambda *a: jnp.stack(a), *cut)
-    oriented = orient_descriptors(cloud.aligned, cloud.weights[None], together, NETWORK, config)
+    oriented = describe_aligned_looks(cloud.aligned, cloud.weights[None], together, NETWORK, config)
     return float(scores.margin(scores.of_descriptors(oriented), 1)[0])
 
 
@@ -153,7 +196,7 @@ def test_attributions_are_complete(
 ) -> None:
     """The mean gradient on the path, summed over the points, is the slope of the margin from half to whole weights."""
     monkeypatch.setattr(attributions_module, "STEPS", 32)
-    scores = classifier_scores(recognizer)
+    scores = classifier_scores(recognizer.model)
     gradients = path_gradients(scores, scores.orient(instance), 1)
     assert gradients.shape[0] == 32 and not gradients[:, len(instance.points) :].any()
     slope = (relaxed(scores, instance, 1.0) - relaxed(scores, instance, 0.5)) / 0.5
@@ -181,7 +224,7 @@ def test_points_of_the_decisive_color_are_found(instance: PreparedInstance) -> N
     red = np.asarray(NETWORK.membership(np.array([200, 30, 30], np.uint8))) > 0
     similarity = np.linalg.inv(NETWORK.similarity)
 
-    def redness(oriented: OrientedDescriptors) -> jax.Array:
+    def redness(oriented: LookDescriptors) -> jax.Array:
         # E = (C Delta)^T: the inverse of Delta gives back the colour vectors.
         counts = jnp.einsum("bksrj,rq->bq", oriented.each.embeddings, similarity)
         return counts[:, red].sum(axis=1) / 100
@@ -206,7 +249,7 @@ def test_smoothing_averages_over_neighbours() -> None:
 
 @pytest.mark.slow
 def test_smallest_change_is_smallest_and_confirmed(instance: PreparedInstance) -> None:
-    def width(oriented: OrientedDescriptors) -> jax.Array:
+    def width(oriented: LookDescriptors) -> jax.Array:
         return -oriented.each.images.sum(axis=(1, 2, 3, 4))
 
     raw = toy(width)
@@ -232,6 +275,25 @@ def test_changed_extents_keep_the_other_sides(instance: PreparedInstance) -> Non
     shifted = changed_instance(instance, "color", np.array([0.1, 0, -1]), axes)
     np.testing.assert_allclose(shifted.colors[:, 0], np.minimum(instance.colors[:, 0] + 25.5, 255), atol=0.51)
     assert not shifted.colors[:, 2].any()
+
+
+@pytest.mark.slow
+def test_an_embedding_alone_is_explained(frame: thor2.RGBDFrame) -> None:
+    calibration = Calibration(0.0, 1.0, 1.0, 0.5, 0.0)
+    run = untrained_embedding_run(CLASSES, config=FOUR, record={"calibration": dataclasses.asdict(calibration)})
+    recognizer = Recognizer(run)
+    explanation = explain(recognizer, frame, 3)
+    (answer,) = [one for one in recognizer.recognize(frame) if one.label == 3]
+    assert explanation.name == answer.name and set(explanation.recognition.top) == {"embedding"}
+    assert explanation.recognition.confidence == pytest.approx(answer.confidence, abs=1e-5)
+    assert explanation.scores.names == CLASSES and explanation.scores.count == 4
+    assert np.isfinite(explanation.attributions.values).all() and explanation.attributions.values.any()
+    # The confidence is calibrated, the margin is that of the probabilities among the classes.
+    prepared = prepare_instance(frame, 3, FOUR.sigma_s)
+    described = describe_looks(pack_instances([prepared], 1), NETWORK, FOUR)
+    probabilities = class_probabilities(recognizer, described)["embedding"][0]
+    share = float(probabilities.max() / probabilities.sum())
+    assert explanation.attributions.faithfulness.margin == pytest.approx(logit(share), abs=1e-3)
 
 
 @pytest.mark.slow
@@ -293,7 +355,7 @@ def test_errors_name_the_argument(recognizer: Recognizer, frame: thor2.RGBDFrame
     with pytest.raises(thor2.InputError, match="no object"):
         explain(Recognizer(untrained_run((), features=())), frame, 3)
     with pytest.raises(thor2.InputError, match="no object is enrolled"):
-        gallery_scores(recognizer)
+        gallery_scores(recognizer.model)
     released = thor2.DescriptorConfig.released(n_slices=2, n_strips=5, image_size=8)
     with pytest.raises(thor2.InputError, match="convention"):
         explain(Recognizer(untrained_run(CLASSES, config=released)), frame, 3)

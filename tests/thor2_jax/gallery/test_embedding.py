@@ -5,6 +5,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ import scipy.special
 from helpers import SMALL_CONFIG
 
 import thor2_jax as thor2
-from thor2_jax.descriptor.orientations import describe_orientations
+from thor2_jax.descriptor.looks import describe_looks
 from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes, load_default
 
 SIZES = EmbeddingSizes(cell=4, hidden=(16, 16), learned=8, color=6)
@@ -51,19 +52,19 @@ def test_embeddings_have_unit_length(embedding: Embedding, clouds: thor2.PointCl
 
 
 def test_described_clouds_give_the_same_embedding(embedding: Embedding, clouds: thor2.PointClouds) -> None:
-    oriented = describe_orientations(clouds, embedding.network, embedding.config, 2)
+    oriented = describe_looks(clouds, embedding.network, embedding.config, 2)
     np.testing.assert_allclose(embedding.embed_oriented(oriented)[:, 0], embedding.embed(clouds), atol=1e-5)
 
 
 def ensemble() -> Embedding:
     """Three networks of two classes and three distractors."""
-    first = Embedding.create(sizes=SIZES, classes=("a", "b"), distractors=3)
+    first = Embedding.create(SMALL_CONFIG, sizes=SIZES, classes=("a", "b"), distractors=3)
     return dataclasses.replace(first, further=(first.create_further(1), first.create_further(2)))
 
 
 def test_class_probabilities_are_geometric_means(clouds: thor2.PointClouds) -> None:
     embedding = ensemble()
-    oriented = describe_orientations(clouds, embedding.network, embedding.config, 4)
+    oriented = describe_looks(clouds, embedding.network, embedding.config, 4)
     weights = np.array([[1, 0, 0, 0], [0.25] * 4, [0, 0, 0.5, 0.5]], np.float32)
     actual = embedding.class_probabilities(dataclasses.replace(oriented, weights=jnp.asarray(weights)))
     means = []
@@ -84,7 +85,7 @@ def test_a_file_holds_all_networks(clouds: thor2.PointClouds, tmp_path: Path) ->
     embedding, path = ensemble(), tmp_path / "embedding.safetensors"
     embedding.save(path)
     loaded = Embedding.load(path)
-    oriented = describe_orientations(clouds, embedding.network, embedding.config, 2)
+    oriented = describe_looks(clouds, embedding.network, embedding.config, 2)
     probabilities = np.asarray(embedding.class_probabilities(oriented))
     assert loaded.fingerprint == embedding.fingerprint
     assert np.array_equal(loaded.class_probabilities(oriented), probabilities)
@@ -93,6 +94,15 @@ def test_a_file_holds_all_networks(clouds: thor2.PointClouds, tmp_path: Path) ->
     for further in ((), embedding.further[:1], embedding.further[:1] * 2):  # each network counts
         fewer = dataclasses.replace(embedding, further=further)
         assert np.abs(fewer.class_probabilities(oriented) - probabilities).max() > 1e-3
+
+
+def test_embeddings_have_gradients(embedding: Embedding, clouds: thor2.PointClouds) -> None:
+    """Most strips have no point of most colours: their colour embeddings are 0, where a square root has no slope."""
+    oriented = describe_looks(clouds, embedding.network, embedding.config, 2)
+    assert not np.asarray(oriented.each.embeddings).all()
+    gradients = jax.grad(lambda looks: embedding.embed_oriented(looks)[..., 0].sum(), allow_int=True)(oriented)
+    for gradient in (gradients.each.images, gradients.each.embeddings, gradients.statistics):
+        assert np.isfinite(gradient).all() and np.asarray(gradient).any()
 
 
 @pytest.mark.parametrize("prefix", ["further/1/", "further/", "further/0/head"])

@@ -1,5 +1,7 @@
 """Galleries on disk: atomic changes, concurrent writers, and damaged files."""
 
+import dataclasses
+import hashlib
 import json
 import os
 import signal
@@ -11,13 +13,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import safetensors.numpy
 
 from thor2_jax.errors import InputError
+from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery import store
 from thor2_jax.gallery.clouds import CompactClouds
 from thor2_jax.gallery.gallery import Gallery, GalleryObject
-from thor2_jax.gallery.store import gallery_stamp, load_gallery, undo_change, update_gallery
-from thor2_jax.recognition.prepared_instance import PreparedInstance
+from thor2_jax.gallery.store import GalleryError, gallery_stamp, load_gallery, undo_change, update_gallery
 
 FINGERPRINT = "f" * 64
 
@@ -166,6 +169,90 @@ def test_a_gallery_of_another_embedding_is_refused(directory: Path) -> None:
     assert content(directory) == before
 
 
+def test_files_of_the_user_stay_and_hinder_nothing(directory: Path) -> None:
+    content_addressed = hashlib.sha256(b"a user's").hexdigest()
+    names = [f"objects/{name}" for name in ("scan.ply", ".DS_Store", f"{content_addressed}.safetensors", "a/b.txt")]
+    users = [directory / name for name in (*names, ".index.backup12.json", ".vimrc.original", "notes.txt")]
+    for path in users:
+        path.parent.mkdir(exist_ok=True)
+        path.write_text("a user's")
+    for seed in (5, 6):
+        update_gallery(directory, add("mug", seed, replace=True), FINGERPRINT)
+    assert all(path.read_text() == "a user's" for path in users)
+    assert len(list((directory / "objects").glob("*.safetensors"))) == 2 + 1 + 1  # of the change before, and the user's
+
+
+def test_a_former_index_of_the_user_is_not_replaced(tmp_path: Path) -> None:
+    (tmp_path / "previous.json").write_text("a user's")
+    update_gallery(tmp_path, add("mug", 0), FINGERPRINT)
+    assert (tmp_path / "previous.json").read_text() == "a user's"
+
+
+def test_nothing_behind_a_symbolic_link_is_removed(directory: Path, tmp_path: Path) -> None:
+    (directory / "objects").rename(tmp_path / "shared")
+    (directory / "objects").symlink_to(tmp_path / "shared")
+    before = content(tmp_path / "shared")
+    for seed in (5, 6):
+        update_gallery(directory, add("mug", seed, replace=True), FINGERPRINT)
+    assert before.items() <= content(tmp_path / "shared").items()
+
+
+def test_a_lost_index_is_refused_and_rebuilt(directory: Path) -> None:
+    update_gallery(directory, add("mug", 5, replace=True), FINGERPRINT)
+    expected = load_gallery(directory)
+    for names in (("index.json",), ("index.json", "previous.json")):
+        for name in names:
+            (directory / name).unlink(missing_ok=True)
+        before = content(directory)
+        for act in (lambda: load_gallery(directory), lambda: update_gallery(directory, add("new", 7), FINGERPRINT)):
+            with pytest.raises(GalleryError, match="thor2 objects --reembed") as caught:
+                act()
+            assert str(directory) in str(caught.value) and content(directory) == before
+        rebuilt = update_gallery(
+            directory, lambda gallery: dataclasses.replace(gallery, embedding=FINGERPRINT), rebuild=True
+        )
+        if len(names) == 1:  # Without the former index, the two files of the mug are equally old.
+            assert rebuilt.files == expected.files
+        for name, views in load_gallery(directory, FINGERPRINT).gallery.objects.items():
+            other = expected.gallery.objects[name]
+            assert (len(views.clouds), views.source, views.date) == (len(other.clouds), other.source, other.date)
+
+
+def without_name(path: Path) -> str:
+    """Write an object's file as version 0.2 wrote it, and return its digest."""
+    content = safetensors.numpy.save(safetensors.numpy.load_file(path))
+    digest = hashlib.sha256(content).hexdigest()
+    path.unlink()
+    path.with_name(f"{digest}.safetensors").write_bytes(content)
+    return digest
+
+
+def test_galleries_of_older_versions_are_read_and_rebuilt(directory: Path) -> None:
+    index = json.loads((directory / "index.json").read_text())
+    for entry, name in zip(index["objects"], ("mug ", "unknown"), strict=True):
+        entry |= {"name": name, "file": without_name(directory / "objects" / f"{entry['file']}.safetensors")}
+        del entry["source"], entry["date"]
+    for name in ("index.json", "previous.json"):
+        (directory / name).write_text(json.dumps(index))
+    assert load_gallery(directory, FINGERPRINT).gallery.names == ("mug ", "unknown")
+    changed = update_gallery(directory, add("mug", 5, extend=True), FINGERPRINT).gallery
+    assert {name: len(views.clouds) for name, views in changed.objects.items()} == {"mug ": 4, "unknown": 2}
+    assert changed.without("unknown").names == ("mug ",)
+    for name in ("index.json", "previous.json"):
+        (directory / name).unlink()
+    names = update_gallery(directory, lambda gallery: gallery, rebuild=True).gallery.names
+    assert "mug " in names and sum(name.startswith("object-") for name in names) == 2
+
+
+@pytest.mark.parametrize("field", ["source", "date"])
+def test_an_entry_without_source_or_date_is_read(field: str, directory: Path) -> None:
+    index = json.loads((directory / "index.json").read_text())
+    del index["objects"][0][field]
+    edit(directory / "index.json", objects=index["objects"])
+    assert getattr(load_gallery(directory).gallery.objects["mug"], field) == ""
+    assert update_gallery(directory, lambda gallery: gallery.without("mug"), FINGERPRINT).gallery.names == ("bowl",)
+
+
 DAMAGES: dict[str, Callable[[Path], object]] = {
     "cut index": lambda path: (path / "index.json").write_text('{"format": 1'),
     "a list": lambda path: (path / "index.json").write_text("[]"),
@@ -173,6 +260,10 @@ DAMAGES: dict[str, Callable[[Path], object]] = {
     "no objects": lambda path: edit(path / "index.json", objects=[{}]),
     "other path": lambda path: edit(
         path / "index.json", objects=[{"name": "a", "file": "../../x", "source": "", "date": ""}]
+    ),
+    "hidden surrogate": lambda path: edit(path / "index.json", hidden=["\ud800"]),
+    "source surrogate": lambda path: edit(
+        path / "index.json", objects=[{"name": "a", "file": 64 * "0", "source": "\ud800", "date": ""}]
     ),
     "missing file": lambda path: next((path / "objects").iterdir()).unlink(),
     "cut file": lambda path: cut(next((path / "objects").iterdir())),
@@ -237,6 +328,17 @@ def test_a_killed_writer_leaves_the_gallery_before_or_after(step: str, after: bo
     assert load_gallery(directory).gallery.names == (*before, *(["new"] if finished else []))
     update_gallery(directory, lambda gallery: gallery, FINGERPRINT)
     assert len(list((directory / "objects").iterdir())) == 2 + finished
+
+
+@pytest.mark.parametrize(
+    ("step", "after"),
+    [("_write_durably", False), ("_write_durably", True), ("write_text", False), ("write_text", True)],
+)
+def test_a_killed_first_enrolment_leaves_an_empty_gallery(step: str, after: bool, tmp_path: Path) -> None:
+    assert writer(tmp_path, ["mug"], step, after).wait() == -signal.SIGKILL
+    assert load_gallery(tmp_path, FINGERPRINT).gallery.names == ()
+    assert update_gallery(tmp_path, add("bowl", 1), FINGERPRINT).gallery.names == ("bowl",)
+    assert len(list((tmp_path / "objects").iterdir())) == 1
 
 
 def test_two_writers_at_once_both_succeed(directory: Path) -> None:

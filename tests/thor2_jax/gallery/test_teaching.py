@@ -11,11 +11,14 @@ from helpers import SMALL_CONFIG, untrained_run
 import thor2_jax as thor2
 from thor2_jax.gallery.augment import augmented_copies
 from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
-from thor2_jax.gallery.enrollment import ORIENTATIONS, instance_view
+from thor2_jax.gallery.enrollment import LOOKS, instance_view
 from thor2_jax.gallery.objects import ObjectGallery
 from thor2_jax.gallery.union import ClassUnion
-from thor2_jax.recognition.confidence import Calibration
-from thor2_jax.recognition.run_directory import EMBEDDING_FILE, TrainedRun, load_run, save_run
+from thor2_jax.model.confidence import Calibration
+from thor2_jax.model.inference import answers
+from thor2_jax.model.model import Model
+from thor2_jax.model.run_directory import EMBEDDING_FILE, TrainedRun, load_run, save_run
+from training.objects.builtin_objects import builtin_objects
 
 INTRINSICS = thor2.Intrinsics(600.0, 600.0, 159.5, 119.5)
 SIZES = EmbeddingSizes(4, (16,), 8, 4)
@@ -49,7 +52,7 @@ CLUTTER = frame(RED, BLUE, (150, 40, 40, 40, (90, 200, 60)))
 
 
 def taught(run: TrainedRun, embedding: Embedding, **options: object) -> thor2.Recognizer:
-    recognizer = thor2.Recognizer(run, embedding=embedding, **options)  # type: ignore[arg-type]
+    recognizer = thor2.Recognizer(dataclasses.replace(run, embedding=embedding), **options)  # type: ignore[arg-type]
     recognizer.enroll("brick", [frame(RED, seed=1), (CLUTTER, 1)])
     recognizer.enroll("book", [frame(BLUE, seed=2)])
     return recognizer
@@ -57,7 +60,7 @@ def taught(run: TrainedRun, embedding: Embedding, **options: object) -> thor2.Re
 
 def test_enrolled_objects_are_recognized_without_training(embedding: Embedding) -> None:
     recognizer = taught(untrained_run((), ()), embedding)
-    assert recognizer.classes == ("brick", "book") and recognizer.answers_by() == "gallery"
+    assert recognizer.classes == ("brick", "book") and recognizer.model.answers_by() == "gallery"
     answers = recognizer.recognize(frame(RED, BLUE, seed=3))
     assert [answer.name for answer in answers] == ["brick", "book"]
     for answer in answers:
@@ -65,8 +68,25 @@ def test_enrolled_objects_are_recognized_without_training(embedding: Embedding) 
         assert answer.top["gallery"][0] == (answer.name, pytest.approx(answer.confidence))
 
 
+def test_a_model_says_what_it_knows(run: TrainedRun, embedding: Embedding, monkeypatch: pytest.MonkeyPatch) -> None:
+    objects = ObjectGallery(tuple(builtin_objects()))
+    assert objects.union.summary == "18 toy objects of the demo; it knows nothing of yours"
+    objects.forget("apple")
+    assert objects.union.summary.startswith("17 toy objects")
+    objects = taught(run, embedding).objects
+    assert objects.union.summary == "5 objects: a, b, c, brick, book"
+    alone = taught(untrained_run((), ()), embedding).objects
+    assert alone.union.summary == "2 objects: brick, book" and "2 of 2 enrolled objects" in alone.weak_rejection
+    for few, warning in ((2, "1 of 2"), (1, "")):
+        monkeypatch.setattr("thor2_jax.gallery.objects.FEW", few)
+        assert alone.weak_rejection.startswith(warning) and bool(alone.weak_rejection) is (few > 1)
+    assert not objects.weak_rejection and not ObjectGallery(()).weak_rejection
+    assert ObjectGallery(()).union.summary == "no object yet"
+    assert ObjectGallery(tuple("abcdefg")).union.summary.endswith("f, ...")
+
+
 def test_forgetting_restores_every_answer(run: TrainedRun, embedding: Embedding) -> None:
-    plain = thor2.Recognizer(run, embedding=embedding)
+    plain = thor2.Recognizer(dataclasses.replace(run, embedding=embedding))
     before = plain.recognize(CLUTTER)
     plain.enroll("brick", [frame(RED)])
     assert plain.recognize(CLUTTER) != before
@@ -82,7 +102,7 @@ def test_forgetting_restores_every_answer(run: TrainedRun, embedding: Embedding)
 
 def test_both_answers_by_the_union_of_classes(run: TrainedRun, embedding: Embedding) -> None:
     recognizer = taught(run, embedding)
-    assert recognizer.answers_by() == "both" and recognizer.classes == ("a", "b", "c", "brick", "book")
+    assert recognizer.model.answers_by() == "both" and recognizer.classes == ("a", "b", "c", "brick", "book")
     for answer in recognizer.recognize(CLUTTER):
         assert list(answer.top) == ["tops", "tops2", "gallery"] and 0 <= answer.confidence <= 1  # type: ignore[operator]
     by_classifiers = recognizer.recognize(CLUTTER, answer_by="classifiers")
@@ -92,8 +112,8 @@ def test_both_answers_by_the_union_of_classes(run: TrainedRun, embedding: Embedd
 
 def test_the_record_and_the_argument_choose_what_answers(run: TrainedRun, embedding: Embedding) -> None:
     stored = taught(dataclasses.replace(run, record={"answer_by": "gallery"}), embedding)
-    assert (stored.answers_by(), stored.answers_by("both")) == ("gallery", "both")
-    assert taught(run, embedding, answer_by="classifiers").answers_by() == "classifiers"
+    assert (stored.model.answers_by(), stored.model.answers_by("both")) == ("gallery", "both")
+    assert taught(run, embedding, answer_by="classifiers").model.answers_by() == "classifiers"
     with pytest.raises(thor2.InputError, match="answer_by is 'all'"):
         thor2.Recognizer(run, answer_by="all")  # type: ignore[arg-type]
 
@@ -102,41 +122,43 @@ CALIBRATION = dataclasses.asdict(Calibration(0.0, 1.0, 0.0, 1.0, unknown_below=0
 
 
 def test_the_default_thresholds_of_each_source(run: TrainedRun, embedding: Embedding) -> None:
-    """A trained class has the run's threshold, an object that of its views; brick has two, and book one."""
+    """A trained class has the run's threshold, an object that of its views; brick has two, and book one.
+
+    The scores .275 and .25 have the odds (.275 / .2)^3 and (.25 / .2)^3, hence .723 and .661.
+    """
     calibrated = taught(dataclasses.replace(run, record={"calibration": CALIBRATION}), embedding)
     calibrated.enroll("b", [frame(RED)], extend=True)
     calibrated.enroll("c", [frame(RED)], replace=True)
     assert calibrated.classes == ("a", "b", "brick", "book", "c")
-    assert calibrated.thresholds().tolist() == [0.625, 0.625, 0.275, 0.25, 0.25]
-    assert calibrated.thresholds("gallery")[1:].tolist() == [0.25, 0.275, 0.25, 0.25]
-    assert taught(run, embedding).thresholds().tolist() == [0, 0, 0, 0.275, 0.25]
+    assert calibrated.thresholds().tolist() == [0.625, 0.625, 0.723, 0.661, 0.661]
+    assert calibrated.thresholds("gallery")[1:].tolist() == [0.661, 0.723, 0.661, 0.661]
+    assert taught(run, embedding).thresholds().tolist() == [0, 0, 0, 0.723, 0.661]
     explicit = taught(run, embedding, unknown_below=0.25)
     assert explicit.thresholds().tolist() == explicit.thresholds("gallery").tolist() == [0.25] * 5
-    assert thor2.Recognizer(run).thresholds().tolist() == [0, 0, 0]
+    assert thor2.Recognizer(run).model.thresholds().tolist() == [0, 0, 0]
 
 
 @pytest.mark.parametrize(
-    "score, names", [(0.24, [None, None]), (0.26, [None, "book"]), (0.27, [None, "book"]), (0.28, ["brick", "book"])]
+    "score, names", [(0.66, [None, None]), (0.67, [None, "book"]), (0.72, [None, "book"]), (0.73, ["brick", "book"])]
 )
 def test_a_gallery_alone_rejects_unknown_objects(
     score: float, names: list[str | None], embedding: Embedding, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Scores as given: the brick has two views and is named from .275, the book has one and is named from .25."""
+    """Values as given: the brick has two views and is named from .723, the book has one and is named from .661."""
     instance = instance_view(CLUTTER, 1, 2.5)
     for unknown_below, expected in ((None, names), (0.0, ["brick", "book"])):
         recognizer = taught(untrained_run((), ()), embedding, unknown_below=unknown_below)
-        described = recognizer.describe(CLUTTER)
-        evidence = recognizer.evidence(described.oriented, (), described.packed)
+        _, inference = recognizer.infer([instance])
         for column, name in enumerate(expected):
             values = np.eye(2, dtype=np.float32)[[column]] * score
-            monkeypatch.setattr(recognizer, "combined", lambda *_, values=values: values)
-            (answer,) = recognizer.recognitions([instance], evidence)
+            monkeypatch.setattr(Model, "combined", lambda *_, values=values: values)
+            (answer,) = answers(recognizer.model, [instance], inference)
             assert answer.name == name and (answer.reason is None) == (name is not None)
             assert answer.reason is None or answer.reason.startswith("unknown: ")
 
 
 def test_a_forgotten_class_is_never_answered(run: TrainedRun, embedding: Embedding) -> None:
-    recognizer = thor2.Recognizer(run, embedding=embedding)
+    recognizer = thor2.Recognizer(dataclasses.replace(run, embedding=embedding))
     first = {answer.name for answer in recognizer.recognize(CLUTTER)}
     for name in first:
         recognizer.forget(name)  # type: ignore[arg-type]
@@ -150,7 +172,7 @@ def test_a_forgotten_class_is_never_answered(run: TrainedRun, embedding: Embeddi
 
 
 def test_a_trained_class_needs_extend_or_replace(run: TrainedRun, embedding: Embedding) -> None:
-    recognizer = thor2.Recognizer(run, embedding=embedding)
+    recognizer = thor2.Recognizer(dataclasses.replace(run, embedding=embedding))
     with pytest.raises(thor2.InputError, match="'a' is a trained class"):
         recognizer.enroll("a", [frame(RED)])
     assert recognizer.gallery.names == ()
@@ -218,7 +240,7 @@ def test_another_embedding_embeds_the_views_again(embedding: Embedding, tmp_path
     with pytest.raises(thor2.InputError, match="gallery.*reembed"):
         thor2.Recognizer.load(path)
     ObjectGallery((), other).open(path / "gallery", reembed=True)
-    expected = thor2.Recognizer(untrained_run((), ()), embedding=other)
+    expected = thor2.Recognizer(dataclasses.replace(untrained_run((), ()), embedding=other))
     expected.enroll("brick", [(CLUTTER, 1)])
     embeddings = thor2.Recognizer.load(path).gallery.objects["brick"].embeddings
     np.testing.assert_array_equal(embeddings, expected.gallery.objects["brick"].embeddings)
@@ -226,10 +248,10 @@ def test_another_embedding_embeds_the_views_again(embedding: Embedding, tmp_path
 
 
 def test_embeddings_of_a_query_have_one_row_per_orientation(embedding: Embedding) -> None:
-    recognizer = thor2.Recognizer(untrained_run((), ()), embedding=embedding)
-    described = recognizer.describe(CLUTTER)
-    embeddings, weights = recognizer.objects.embed(described.packed, described.oriented, recognizer.run.config)
-    assert embeddings.shape == (4, ORIENTATIONS, embedding.size) and weights.shape == (4, ORIENTATIONS)
+    recognizer = thor2.Recognizer(dataclasses.replace(untrained_run((), ()), embedding=embedding))
+    _, inference = recognizer.infer(recognizer.prepare(CLUTTER), answer_by="gallery")
+    embeddings, weights = inference.embeddings, inference.weights
+    assert embeddings.shape == (4, LOOKS, embedding.size) and weights.shape == (4, LOOKS)
 
 
 def test_combined_values_of_classes_and_objects() -> None:
@@ -238,6 +260,10 @@ def test_combined_values_of_classes_and_objects() -> None:
     p, s = np.array([[0.5, 0.4, 0.1]]), np.array([[0.25, 0.9]])
     np.testing.assert_allclose(union.of_classifiers(p), [[0.5, 0.4, 0]])
     np.testing.assert_allclose(union.of_gallery(s), [[0, 0.9, 0.25]])
-    np.testing.assert_allclose(union.combine(p, s), [[0.375, np.sqrt(0.3 * 0.9), 0.25]])
+    # What the best class leaves, 0.5, is divided by odds: 91.1 for b, 1.95 for x, 1 for unknown.
+    x, b = (0.25 / 0.2) ** 3, 4.5**3
+    total = 1 + 0.5 * (x + b)
+    np.testing.assert_allclose(union.combine(p, s), [[0.5 / total, (0.4 + 0.5 * b) / total, 0.5 * x / total]])
+    np.testing.assert_allclose(union.combine(None, s), [[0, b / (1 + x + b), x / (1 + x + b)]])
     same = ClassUnion(("a", "b"))
     assert same.of_classifiers(p) is p and same.combine(p[:, :2], np.zeros((1, 0))) == pytest.approx(p[:, :2])

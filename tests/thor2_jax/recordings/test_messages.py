@@ -1,6 +1,8 @@
 """Images in ROS messages to arrays."""
 
 import struct
+import tracemalloc
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -43,6 +45,20 @@ def test_depth_encodings(pixels: np.ndarray, encoding: str) -> None:
     read = depth_image(message)
     np.testing.assert_array_equal(read, pixels)
     assert read.dtype == pixels.dtype.newbyteorder("=")
+
+
+@pytest.mark.parametrize(("encoding", "read"), [("rgb8", color_image), ("16UC1", depth_image)])
+def test_raw_images_of_too_many_pixels(encoding: str, read: Callable[[Any], Any]) -> None:
+    message = image(np.zeros((1, 1, 6), np.uint8), encoding)
+    message.width, message.height, message.step = 2**13, 2**13 + 1, 2**15
+    message.data = np.zeros(message.step * message.height, np.uint8)
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError, match="8192 x 8193 pixels; expected at most"):
+            read(message)
+        assert tracemalloc.get_traced_memory()[1] < 2**20
+    finally:
+        tracemalloc.stop()
 
 
 def test_compressed_images() -> None:

@@ -15,7 +15,7 @@ WIDTH, HEIGHT = 64, 48
 
 def test_without_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyrealsense2", None)
-    with pytest.raises(InputError, match=r"thor2-jax\[realsense\]"), RealSenseCamera():
+    with pytest.raises(InputError, match=r"\.\[realsense\]"), RealSenseCamera():
         pass
 
 
@@ -84,7 +84,7 @@ def test_frames_of_the_software_device(camera: SoftwareCamera) -> None:
     colors = [rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8) for _ in range(8)]
     for k, color in enumerate(colors):
         camera.give(k, Depth=np.full((HEIGHT, WIDTH), 4000 + k, np.uint16), Color=color)
-    with RealSenseCamera(camera, timeout=0.5) as opened:
+    with RealSenseCamera(camera, timeout=5.0) as opened:
         frames = opened.frames()
         recorded = next(frames)
         frame = recorded.read()

@@ -9,7 +9,7 @@ import pytest
 from recording_files import table_frame
 
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.answers import Recognition
+from thor2_jax.model.answers import Recognition
 from thor2_jax.recordings.detections import detections_of
 from thor2_jax.recordings.rerun_file import RerunFile
 from thor2_jax.segmentation.segmenters import segmented
@@ -62,11 +62,26 @@ def test_no_frames_leave_no_file(reader: Any, tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+def test_only_a_recording_of_this_software_is_replaced(reader: Any, tmp_path: Path) -> None:
+    for count in (1, 2):
+        with RerunFile(tmp_path / "a.rrd") as file:
+            for _ in range(count):
+                file.write(segmented(table_frame()), [], name="x")
+    assert read(reader, tmp_path / "a.rrd")["/camera/boxes"]["frame"] == [0, 1]
+
+
+def test_a_recording_of_the_user_is_not_replaced(tmp_path: Path) -> None:
+    (tmp_path / "a.rrd").write_bytes(b"RRF2 another program")
+    with pytest.raises(InputError, match=r"rerun is .*a\.rrd"):
+        RerunFile(tmp_path / "a.rrd")
+    assert (tmp_path / "a.rrd").read_bytes() == b"RRF2 another program"
+
+
 def test_invalid_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(InputError, match=r"\.rrd"):
         RerunFile(tmp_path / "a.mcap")
     with pytest.raises(OSError, match="No such file"):
         RerunFile(tmp_path / "none" / "a.rrd")
     monkeypatch.setitem(sys.modules, "rerun", None)
-    with pytest.raises(InputError, match=r"thor2-jax\[rerun\]"):
+    with pytest.raises(InputError, match=r"\.\[rerun\]"):
         RerunFile(tmp_path / "a.rrd")

@@ -5,7 +5,7 @@ import pytest
 import trimesh
 from segmentation_scenes import best_overlaps, camera_pose
 
-from thor2_jax.recognition.frames import Intrinsics, RGBDFrame
+from thor2_jax.frames.frames import Intrinsics, RGBDFrame
 from thor2_jax.segmentation.table import segment_table
 
 WHITE, RED = (225, 225, 220), (170, 60, 50)

@@ -10,7 +10,7 @@ import pytest
 
 import thor2_jax as thor2
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.frames import RGBDFrame
+from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.segmentation import segmenters
 from thor2_jax.segmentation.segmenters import ENTRY_POINTS, load_segmenter, segment, segmented, segmenter_names
 from thor2_jax.segmentation.table import segment_table

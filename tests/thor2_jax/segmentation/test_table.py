@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from segmentation_scenes import Box, best_overlaps, render
 
-from thor2_jax.recognition.frames import Intrinsics, RGBDFrame
+from thor2_jax.frames.frames import Intrinsics, RGBDFrame
 from thor2_jax.segmentation.table import _refined, _trimmed, segment_table
 
 RED, BLUE, GREEN, YELLOW = (190, 30, 40), (30, 60, 190), (30, 150, 60), (220, 200, 40)

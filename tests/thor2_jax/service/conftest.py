@@ -1,8 +1,10 @@
 """Runs with random weights, a frame, running services that tests share, and their page in headless Chromium."""
 
+import functools
 import json
 import re
 import signal
+import ssl
 import subprocess
 import sys
 import threading
@@ -18,18 +20,32 @@ import uvicorn
 from fastapi import FastAPI
 from helpers import SMALL_CONFIG, encode_image, untrained_run
 from playwright.sync_api import Browser, Page, Route, expect
+from processes import HANG
 from segmentation_scenes import Box, render
 
 import thor2_jax as thor2
+from thor2_jax.adaptation import online
+from thor2_jax.explanation import class_scores
 from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
-from thor2_jax.recognition.run_directory import EMBEDDING_FILE, save_run
+from thor2_jax.model.run_directory import EMBEDDING_FILE, save_run
+from thor2_jax.service import engine
 from thor2_jax.service.app import create_app
 from thor2_jax.service.settings import Settings
+
+expect.set_options(timeout=1000 * HANG)
 
 Files = dict[str, bytes]
 SAMPLE_INDEX = Path(thor2.__file__).parent / "service" / "page" / "samples" / "index.json"
 CLASSES = tuple(sorted({name for sample in json.loads(SAMPLE_INDEX.read_text()) for name in sample["objects"]}))
 CAMERA = {"fx": 600.0, "fy": 600.0, "cx": 159.5, "cy": 119.5}
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_tls_context() -> Iterator[None]:
+    """Let all HTTP clients share their certificates, which no test needs: reading them takes 30 ms for each client."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ssl, "create_default_context", functools.cache(ssl.create_default_context))
+        yield
 
 
 @pytest.fixture(scope="session")
@@ -43,6 +59,14 @@ def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("service") / "run"
     save_run(run, folder)
     return folder
+
+
+@pytest.fixture
+def small_buckets(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let batches, estimates and explanations have the padded size of small clouds, so that they share programs."""
+    monkeypatch.setattr(engine, "MIN_POINTS_BUCKET", 512)
+    monkeypatch.setattr(online, "CAPACITY", 512)
+    monkeypatch.setattr(class_scores, "MIN_CAPACITY", 512)
 
 
 @pytest.fixture(scope="session")
@@ -106,7 +130,10 @@ class Server:
         command = [sys.executable, "-m", "training.cli", "serve", "--model", str(run), "--port", "0"]
         with log.open("wb") as stream:
             self.process = subprocess.Popen(
-                [*command, "--max-batch", "8", "--cache", str(cache), *options],
+                [
+                    *(*command, "--max-batch", "8", "--cache", str(cache), "--deadline", str(HANG)),
+                    *("--no-warm-why", *options),
+                ],
                 cwd=Path(__file__).parents[3],
                 stdout=stream,
                 stderr=stream,
@@ -116,7 +143,7 @@ class Server:
 
     def _wait_for(self, condition: Callable[[], re.Match[str] | None]) -> re.Match[str]:
         start = time.monotonic()
-        while time.monotonic() - start < 240:
+        while time.monotonic() - start < HANG:
             match = condition()
             if match:
                 return match
@@ -132,7 +159,7 @@ class Server:
 
     def terminate(self) -> int:
         self.process.send_signal(signal.SIGTERM)
-        return self.process.wait(60)
+        return self.process.wait(HANG)
 
 
 @pytest.fixture(scope="session")
@@ -163,7 +190,9 @@ def teaching_gallery(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def teaching_app(teaching_run: Path, teaching_gallery: Path) -> FastAPI:
     """A service that teaches, with a gallery outside of the run directory."""
-    settings = Settings(teaching_run, max_batch=8, processes=1, gallery=teaching_gallery, teach=True, deadline=20)
+    settings = Settings(
+        teaching_run, max_batch=8, processes=1, gallery=teaching_gallery, teach=True, deadline=HANG, warm_why=False
+    )
     return create_app(settings)
 
 
@@ -186,7 +215,7 @@ def teaching_url(teaching_app: FastAPI) -> Iterator[str]:
 
 @pytest.fixture
 def http(server: Server) -> Iterator[httpx.Client]:
-    with httpx.Client(base_url=server.url, timeout=60) as client:
+    with httpx.Client(base_url=server.url, timeout=HANG) as client:
         yield client
 
 
@@ -200,7 +229,7 @@ def open_page(browser: Browser, request: pytest.FixtureRequest) -> Iterator[Call
         sources.append(f"{url}/")
         contexts.append(browser.new_context(**options))
         page = contexts[-1].new_page()
-        page.set_default_timeout(15_000)
+        page.set_default_timeout(1000 * HANG)
         page.on("request", lambda request: urls.append(request.url))
         page.on("pageerror", lambda error: errors.append(str(error)))
         # Error statuses also appear in the console; tests check how the page shows them.

@@ -4,12 +4,15 @@ import dataclasses
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from thor2_jax.adaptation.online import EVERY, OnlineAdaptation
-from thor2_jax.recognition.prepared_instance import PreparedInstance
+from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.service.answers import adaptation_answer
 from thor2_jax.service.engine import InferenceEngine
 from thor2_jax.service.settings import Settings
+
+pytestmark = pytest.mark.usefixtures("small_buckets")
 
 
 def views(count: int) -> list[PreparedInstance]:

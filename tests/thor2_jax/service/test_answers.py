@@ -1,6 +1,8 @@
 """Answers of a running service to valid requests, compared with the library on the same run."""
 
+import asyncio
 import io
+import socket
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,7 +14,7 @@ from PIL import Image
 
 import colornet
 import thor2_jax as thor2
-from thor2_jax.client import Client, ServiceError
+from thor2_jax.client import AsyncClient, Client, ServiceError
 from thor2_jax.errors import InputError
 
 
@@ -79,9 +81,8 @@ def test_describe_matches_the_library(server: Any, http: httpx.Client) -> None:
     config = thor2.DescriptorConfig(homology="closed_form")
     expected = thor2.describe(thor2.PointClouds.pack(inputs), colornet.load_default(), config)
     answer = Client(server.url).describe(inputs)
-    np.testing.assert_allclose(answer["images"], expected.images, atol=1e-5)
-    np.testing.assert_allclose(answer["embeddings"], expected.embeddings, rtol=1e-5, atol=1e-4)
-    np.testing.assert_array_equal(answer["overflow"], expected.overflow)
+    np.testing.assert_allclose(answer.tops2, expected.tops2, rtol=1e-5, atol=1e-4)
+    np.testing.assert_array_equal(answer.overflow, expected.overflow)
     body = {"clouds": [{"points": xyz.tolist(), "colors": rgb.tolist()} for xyz, rgb in inputs[:2]]}
     answer = http.post("/v1/describe", json=body).json()
     assert set(answer["timings"]) == {"upload", "decode", "device", "total"}
@@ -96,16 +97,16 @@ def test_empty_and_degenerate_clouds(server: Any, http: httpx.Client) -> None:
     one_point = np.ones((1, 3), np.float32), np.zeros((1, 3), np.uint8)
     far_apart = np.array([[-100, 0, 0], [100, 0, 0], [0, 100, 1e-30]], np.float32), np.zeros((3, 3), np.uint8)
     answer = Client(server.url).describe([empty, one_point, far_apart])
-    assert not answer["images"][0].any() and not answer["embeddings"][0].any()
-    assert all(np.isfinite(values).all() for values in answer.values())
+    assert not answer.tops2[0].any() and np.isfinite(answer.tops2).all()
     assert http.post("/v1/describe", json={"clouds": [{"points": [], "colors": []}]}).status_code == 200
 
 
 def test_model_and_color_network(server: Any, http: httpx.Client, classes: tuple[str, ...]) -> None:
     network = colornet.load_default()
     model = Client(server.url).model()
-    assert model["classes"] == list(classes) and set(model["classifiers"]) == {"ce", "tops", "tops2"}
-    assert model["descriptor"]["n_slices"] == 7 and model["color_network"] == network.fingerprint
+    assert model.classes == classes and set(model.classifiers) == {"ce", "tops", "tops2"}
+    assert model.config.n_slices == 7 and model.color_network == network.fingerprint
+    assert model.knows == f"{len(classes)} objects: {', '.join(classes[:6])}, ..."
     assert "local/path" not in str(model)
     answer = http.get("/v1/colornet").json()
     np.testing.assert_allclose(answer["mean_rgb"], network.mean_rgb)
@@ -132,6 +133,37 @@ def test_client_raises_service_error(server: Any, files: dict[str, bytes]) -> No
     with pytest.raises(ServiceError, match="depth") as error:
         Client(server.url).recognize(**files | {"depth": b"not an image"})
     assert (error.value.status, error.value.field, error.value.retry_after) == (422, "depth", None)
+
+
+def test_the_asynchronous_client_gives_the_same_answers(server: Any, files: dict[str, bytes]) -> None:
+    async def ask() -> Any:
+        client = AsyncClient(server.url)
+        with pytest.raises(ServiceError, match="depth"):
+            await client.recognize(**files | {"depth": b"not an image"})
+        return await asyncio.gather(
+            client.recognize(**files), client.recognize_frame(**files), client.model(), client.objects(),
+            client.describe(clouds(2)),
+        )  # fmt: skip
+
+    recognitions, (of_frame, labels), model, objects, descriptors = asyncio.run(ask())
+    client = Client(server.url)
+    assert recognitions == of_frame == client.recognize(**files) and labels is None
+    assert model == client.model() and objects == client.objects()
+    np.testing.assert_array_equal(descriptors.tops2, client.describe(clouds(2)).tops2)
+    methods = {name for name in vars(Client) if not name.startswith("_")}
+    assert methods == {name for name in vars(AsyncClient) if not name.startswith("_")}
+
+
+def test_services_that_give_no_answer() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        url = f"http://127.0.0.1:{listening.getsockname()[1]}"
+        with pytest.raises(TimeoutError, match="127.0.0.1"):
+            Client(url, timeout=0.01).model()
+    with pytest.raises(ConnectionError, match="127.0.0.1"):
+        asyncio.run(AsyncClient(url).model())
+    for wrong in ("127.0.0.1:8080", "http://", "ftp://a", "http://[", ""):
+        with pytest.raises(ConnectionError, match="gives no answer"):
+            Client(wrong).model()
 
 
 def test_client_refuses_an_empty_list_of_clouds() -> None:

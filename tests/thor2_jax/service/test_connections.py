@@ -11,13 +11,15 @@ from typing import Any
 
 import pytest
 import uvicorn
+from processes import HANG
 
 from thor2_jax.service import connections
 from thor2_jax.service.page_files import PageFiles
 
 WORK = 1.0
-HEAD = b"%s /%s HTTP/1.1\r\nHost: x\r\n%s\r\n"
+HEAD = b"%s /%s HTTP/1.1\r\nHost: localhost\r\n%s\r\n"
 SLOW, QUICK = HEAD % (b"GET", b"slow", b""), HEAD % (b"GET", b"", b"")
+LAST = HEAD % (b"GET", b"", b"Connection: close\r\n")
 CUT = QUICK[:-6]
 UPLOAD = HEAD % (b"POST", b"", b"Content-Length: 1000\r\n")
 
@@ -38,9 +40,11 @@ def serve(app: Any) -> Iterator[Any]:
         server = uvicorn.Server(config)
         thread = threading.Thread(target=server.run, args=([listening],))
         thread.start()
-        yield listening.getsockname()
-        server.should_exit = True
-        thread.join()
+        try:
+            yield listening.getsockname()
+        finally:
+            server.should_exit = True
+            thread.join()
 
 
 @pytest.fixture
@@ -57,7 +61,7 @@ def until_closed(address: Any, sent: bytes, then: bytes = b"") -> int:
     with socket.create_connection(address) as connection:
         connection.sendall(sent)
         connection.settimeout(WORK / 20)
-        for _ in range(200):
+        for _ in range(round(HANG / WORK * 20)):
             try:
                 received = connection.recv(4096)
             except TimeoutError:
@@ -85,12 +89,14 @@ def test_slow_bytes_do_not_keep_a_connection_open(address: Any, sent: bytes, the
     assert until_closed(address, sent, then) == bool(sent)
 
 
-def test_body_may_arrive_after_its_answer(address: Any) -> None:
-    with socket.create_connection(address, timeout=30) as connection:
+def test_body_may_arrive_after_its_answer(address: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connections, "EARLY_ANSWER_SECONDS", HANG)
+    with socket.create_connection(address, timeout=HANG) as connection:
         connection.sendall(UPLOAD)
-        time.sleep(WORK / 2)
-        connection.sendall(bytes(1000) + QUICK)
         answers = b""
+        while not answers.endswith(b"done"):
+            answers += connection.recv(4096)
+        connection.sendall(bytes(1000) + QUICK)
         while received := connection.recv(4096):
             answers += received
     assert answers.count(b"done") == 2
@@ -98,18 +104,19 @@ def test_body_may_arrive_after_its_answer(address: Any) -> None:
 
 @pytest.mark.parametrize("start", [b"GET /", CUT + b"\r\nX: "])
 def test_endless_head_closes_the_connection(address: Any, start: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(connections, "HEAD_SECONDS", 60)
-    with socket.create_connection(address, timeout=30) as connection, pytest.raises(ConnectionError):
+    monkeypatch.setattr(connections, "HEAD_SECONDS", HANG)
+    with socket.create_connection(address, timeout=HANG) as connection, pytest.raises(ConnectionError):
         connection.sendall(start)
         for _ in range(64):
             connection.sendall(b"x" * 2**20)
 
 
-def test_many_pipelined_requests(address: Any) -> None:
+def test_many_pipelined_requests(address: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Together the requests are larger than the limit for one head."""
+    monkeypatch.setattr(connections, "HEAD_SECONDS", HANG)
     count = connections.MAX_HEAD // len(QUICK) + 1000
-    with socket.create_connection(address, timeout=30) as connection:
-        threading.Thread(target=connection.sendall, args=(QUICK * count,)).start()
+    with socket.create_connection(address, timeout=HANG) as connection:
+        threading.Thread(target=connection.sendall, args=(QUICK * (count - 1) + LAST,)).start()
         answers = b""
         while received := connection.recv(2**16):
             answers += received
@@ -124,8 +131,8 @@ def test_reset_connections_leave_no_traceback(caplog: pytest.LogCaptureFixture) 
                 connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
                 connection.sendall(HEAD % (b"GET", b"samples/clutter/color.jpg", b"") * count)
                 time.sleep(0.002 * count)
-        with socket.create_connection(address, timeout=30) as connection:
-            connection.sendall(HEAD % (b"GET", b"style.css", b"") * 20 + HEAD % (b"GET", b"", b"Connection: close\r\n"))
+        with socket.create_connection(address, timeout=HANG) as connection:
+            connection.sendall(HEAD % (b"GET", b"style.css", b"") * 20 + LAST)
             answers = b""
             while received := connection.recv(2**16):
                 answers += received

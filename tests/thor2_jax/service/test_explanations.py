@@ -13,8 +13,10 @@ import pytest
 import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.describe import strips
-from thor2_jax.recognition.answers import DescribedFrame, Evidence
-from thor2_jax.recognition.confidence import Calibration
+from thor2_jax.model.answers import DescribedFrame
+from thor2_jax.model.confidence import Calibration
+from thor2_jax.model.inference import Inference
+from thor2_jax.model.run_classifiers import RunClassifiers
 from thor2_jax.service.answers import explained_frame
 from thor2_jax.service.engine import CloudResult, InferenceEngine
 from thor2_jax.service.preparation import PreparedRequest, prepare_frame
@@ -89,7 +91,7 @@ def test_calibrated_confidence_uses_the_temperatures(run_dir: Path) -> None:
     shape = len(engine.run.classes)
     probabilities = {name: rng.dirichlet(np.full(shape, 0.1)).astype(np.float32) for name in ("tops", "tops2")}
     empty = np.zeros(0, np.float32)
-    result = CloudResult(empty, empty, empty, empty, Evidence(0, probabilities))
+    result = CloudResult(empty, empty, empty, empty, Inference(0, probabilities))
     assert engine.calibrated_confidences([result]) == [None] and engine.calibrated_confidences([]) == []
     engine.run.record["temperatures"] = {"tops": 2.0, "tops2": 3.0}
     (confidence,) = engine.calibrated_confidences([result])
@@ -100,16 +102,18 @@ def test_calibrated_confidence_uses_the_temperatures(run_dir: Path) -> None:
 
 def test_confidence_of_a_calibrated_run_is_calibrated(run_dir: Path) -> None:
     engine = InferenceEngine(Settings(run_dir))
-    recognizer = engine._recognizer
-    recognizer.calibration = Calibration(0.0, 1.0, 1.0, 0.5, 0.2)
-    engine._classifiers = (*engine._classifiers, "embedding")
-    probabilities = {
-        name: np.array([0.7, 0.2, 0.1], np.float32)[: len(engine.run.classes)] for name in engine._classifiers
-    }
+    record = {"calibration": dataclasses.asdict(Calibration(0.0, 1.0, 1.0, 0.5, 0.2))}
+    run = dataclasses.replace(engine.run, record=record)
+    classifiers = RunClassifiers({**engine.model.classifiers, "embedding": lambda oriented: oriented})
+    engine._recognizer.model = dataclasses.replace(engine.model, run=run, classifiers=classifiers)
+    names = engine.model.classifiers.default
+    probabilities = {name: np.array([0.7, 0.2, 0.1], np.float32)[: len(engine.run.classes)] for name in names}
     empty = np.zeros(0, np.float32)
-    (confidence,) = engine.calibrated_confidences([CloudResult(empty, empty, empty, empty, Evidence(0, probabilities))])
+    (confidence,) = engine.calibrated_confidences(
+        [CloudResult(empty, empty, empty, empty, Inference(0, probabilities))]
+    )
     rows = {name: values[None] for name, values in probabilities.items()}
-    assert confidence == pytest.approx(float(recognizer.fused(rows).max()))
+    assert confidence == pytest.approx(float(engine.model.fused(rows).max()))
 
 
 def test_label_map_decodes_to_the_label_image(answer: Any, frame: thor2.RGBDFrame) -> None:
@@ -138,7 +142,7 @@ def explained(instance: Any, count: int, config: thor2.DescriptorConfig, z: np.n
         np.zeros((7, 22, 31), np.float32),
         np.column_stack([z, z, z]).astype(np.float32),
         np.zeros((7, 31, 22), np.float32),
-        Evidence(0, {}),
+        Inference(0, {}),
     )
     empty = LabelMap(width=1, height=1, labels=[0], lengths=[1])
     instances = [dataclasses.replace(instance, label=k) for k in range(count)]

@@ -10,6 +10,7 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
+from processes import HANG
 
 import thor2_jax as thor2
 from thor2_jax.client import Client
@@ -60,7 +61,7 @@ def segment_by(wrapper: None) -> Iterator[Callable[[str, Files], Any]]:
     def prepare(name: str, files: Files) -> Any:
         if name not in pools:
             pools[name] = PreparationPool(1, name)
-        return pools[name].submit(time.monotonic() + 60, prepare_frame, files, 2.5, False, name).result(60)
+        return pools[name].submit(time.monotonic() + HANG, prepare_frame, files, 2.5, False, name).result(HANG)
 
     yield prepare
     for pool in pools.values():

@@ -1,16 +1,21 @@
-"""The engine of the service on a run that has enrolled objects and no classifiers."""
+"""The engine of the service on runs with enrolled objects, or with an embedding alone."""
 
+import dataclasses
 from pathlib import Path
 
+import jax
 import pytest
-from helpers import SMALL_CONFIG, untrained_run
+from helpers import SMALL_CONFIG, untrained_embedding_run, untrained_run
 
 import thor2_jax as thor2
+from thor2_jax.frames.prepared_instance import prepare_instance
 from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
-from thor2_jax.recognition.prepared_instance import prepare_instance
-from thor2_jax.recognition.run_directory import EMBEDDING_FILE, save_run
+from thor2_jax.model.confidence import Calibration
+from thor2_jax.model.run_directory import EMBEDDING_FILE, save_run
 from thor2_jax.service.engine import InferenceEngine
 from thor2_jax.service.settings import Settings
+
+pytestmark = pytest.mark.usefixtures("small_buckets")
 
 
 @pytest.mark.parametrize(
@@ -37,3 +42,32 @@ def test_the_engine_answers_as_the_recognizer(
     assert engine.calibrated_confidences(results) == [None] * 3
     unusable = [instance for instance in instances if instance.reason is not None]
     assert [answer.name for answer in engine.recognize(unusable, [])] == [None]
+
+
+@pytest.mark.parametrize("calibration", [None, Calibration(0.0, 1.0, 1.0, 0.5, 0.1)])
+def test_an_embedding_alone_answers(calibration: Calibration | None, frame: thor2.RGBDFrame, tmp_path: Path) -> None:
+    record: dict[str, object] = {} if calibration is None else {"calibration": dataclasses.asdict(calibration)}
+    run = untrained_embedding_run(("a", "b", "c"), config=dataclasses.replace(SMALL_CONFIG, looks=2), record=record)
+    save_run(run, tmp_path / "run")
+    engine = InferenceEngine(Settings(tmp_path / "run", max_batch=8, adapt=True))
+    assert engine.classes == ("a", "b", "c") and engine.classifiers == ("embedding",)
+    engine.compile_adaptation()
+    instances = [prepare_instance(frame, label, engine.run.config.sigma_s) for label in frame.instances]
+    usable = [instance for instance in instances if instance.reason is None]
+    results = engine.infer(engine.correct(usable, observe=True))
+    recognizer = thor2.Recognizer.load(tmp_path / "run")
+    answers, expected = engine.recognize(instances, results), recognizer.recognize(frame)
+    for answer, one in zip(answers, expected, strict=True):
+        assert (answer.label, answer.name, answer.reason) == (one.label, one.name, one.reason)
+        assert answer.confidence == pytest.approx(one.confidence, abs=1e-4)
+        assert answer.classifier == one.classifier and answer.top.keys() == one.top.keys()
+    calibrated = engine.calibrated_confidences(results)
+    of_usable = [one.confidence for one in expected if one.confidence is not None]
+    assert len(of_usable) == len(results) and {one.classifier for one in answers} <= {"embedding", None}
+    assert calibrated == (
+        [None] * len(results) if calibration is None else [pytest.approx(each, abs=1e-4) for each in of_usable]
+    )
+    assert results[0].aligned.shape == (len(results[0].aligned), 3)
+    assert jax.tree.map(len, results[0].inference.probabilities) == {"embedding": 3}
+    explained = engine.explain(usable[0])
+    assert explained.name == max(answers[0].top["embedding"], key=lambda pair: pair[1])[0]

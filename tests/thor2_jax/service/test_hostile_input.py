@@ -1,5 +1,7 @@
 """Invalid requests receive a 4xx status whose JSON names the field, and the next valid request is answered."""
 
+import contextlib
+import dataclasses
 import io
 import json
 import socket
@@ -12,10 +14,11 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
+from fastapi import FastAPI
 from helpers import deep_png
 from PIL import Image
+from processes import HANG
 
-from thor2_jax.service.connections import HEAD_SECONDS
 from thor2_jax.service.settings import MAX_BODY
 
 Files = dict[str, bytes]
@@ -39,10 +42,14 @@ def check_refused(answer: httpx.Response, status: int, field: str | None, *words
 
 def test_incomplete_heads_time_out(server: Any) -> None:
     host, port = server.url.removeprefix("http://").split(":")
-    whole = b"GET /healthz HTTP/1.1\r\nHost: x\r\n\r\n"
-    for sent in (b"", b"GET /healthz HTTP/1.1\r\nHost:", whole + b"GET /healthz HTTP/1.1\r\n"):
-        with socket.create_connection((host, int(port)), timeout=HEAD_SECONDS + 10) as connection:
-            connection.sendall(sent)
+    whole = b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n"
+    heads = (b"", b"GET /healthz HTTP/1.1\r\nHost:", whole + b"GET /healthz HTTP/1.1\r\n")
+    with contextlib.ExitStack() as stack:
+        connections = []
+        for sent in heads:
+            connections.append(stack.enter_context(socket.create_connection((host, int(port)), timeout=HANG)))
+            connections[-1].sendall(sent)
+        for sent, connection in zip(heads, connections, strict=True):
             answer = b""
             while received := connection.recv(4096):
                 answer += received
@@ -164,12 +171,20 @@ def test_bodies_over_the_size_limit(http: httpx.Client, files: Files) -> None:
     check_refused(http.post("/v1/describe", content=endless(), headers=NPZ), 413, "body")
 
 
-def test_body_that_never_arrives(server: Any) -> None:
+@pytest.fixture
+def short_deadline(teaching_app: FastAPI, teaching_url: str, monkeypatch: pytest.MonkeyPatch) -> str:
+    """The URL of a service whose requests have half a second; a process has at least one for them."""
+    service = teaching_app.state.service
+    monkeypatch.setattr(service, "settings", dataclasses.replace(service.settings, deadline=0.5))
+    return teaching_url
+
+
+def test_body_that_never_arrives(short_deadline: str) -> None:
     """The connection times out without affecting others."""
-    host, port = server.url.removeprefix("http://").split(":")
-    with socket.create_connection((host, int(port)), timeout=30) as slow:
+    host, port = short_deadline.removeprefix("http://").split(":")
+    with socket.create_connection((host, int(port)), timeout=HANG) as slow:
         slow.sendall(
-            b"POST /v1/describe HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\nContent-Length: 9\r\n\r\n"
+            b"POST /v1/describe HTTP/1.1\r\nHost: [::1]\r\nContent-Type: application/json\r\nContent-Length: 9\r\n\r\n"
         )
         assert b" 408 " in slow.recv(4096).split(b"\r\n")[0]
 
@@ -283,8 +298,8 @@ def test_unsupported_content_types(http: httpx.Client) -> None:
         assert http.post("/v1/describe", content=b"{}", headers={"content-type": kind}).status_code == 415
 
 
-def test_slow_frame_is_answered_or_cut_off(http: httpx.Client, files: Files, encode: Callable[..., bytes]) -> None:
-    """Noise over the largest image, where every point is a voxel, is answered or cut off in bounded time."""
+def test_slow_frame_is_answered_or_cut_off(short_deadline: str, files: Files, encode: Callable[..., bytes]) -> None:
+    """Noise over the largest image, where every point is a voxel, takes more than a second on most machines."""
     rng = np.random.default_rng(0)
     shape = (1080, 1920)
     images = {
@@ -292,6 +307,5 @@ def test_slow_frame_is_answered_or_cut_off(http: httpx.Client, files: Files, enc
         "depth": encode(rng.integers(260, 2500, shape).astype(np.uint16)),
         "labels": encode(np.ones(shape, np.uint8)),
     }
-    answer = http.post("/v1/recognize", files=files | images)
+    answer = httpx.post(f"{short_deadline}/v1/recognize", files=files | images, timeout=HANG)
     assert answer.status_code in (200, 504)
-    assert answer.elapsed.total_seconds() < 20  # The deadline is 5 s.

@@ -27,6 +27,12 @@ def choose_sample(page: Page) -> np.ndarray:
     return np.asarray(Image.open(SAMPLES / folder / "labels.png"))
 
 
+def unfold(page: Page) -> None:
+    """Open the details, which are folded on a phone."""
+    for summary in page.locator("#evidence .fold > summary").all():
+        summary.tap()
+
+
 def changed_answers(change: Callable[[Any], None]) -> Callable[[Route], None]:
     """Return a route that changes the answers of /v1/explain."""
 
@@ -107,7 +113,7 @@ def test_click_shows_the_details_of_an_object(open_page: Callable[..., Page]) ->
         shares = [float(text.strip("<>%\xa0")) for text in shown]
         assert len(shares) == 5 and shares == sorted(shares, reverse=True)
     expect(page.locator(".badge")).to_have_text("higher probability")
-    expect(page.locator("#evidence > details")).to_contain_text("Higher probability")
+    expect(page.locator("#help")).to_contain_text("Higher probability")
 
 
 def test_keyboard_navigation(open_page: Callable[..., Page], classes: tuple[str, ...]) -> None:
@@ -200,7 +206,9 @@ def test_samples_need_a_model_that_knows_their_objects(
                 route.continue_()
                 return
             response = route.fetch()
-            route.fulfill(response=response, json=response.json() | {"classes": names})
+            route.fulfill(
+                response=response, json=response.json() | {"classes": names, "knows": f"{len(names)} objects"}
+            )
 
         return route
 
@@ -240,11 +248,24 @@ def test_details_are_visible_without_scrolling(open_page: Callable[..., Page]) -
     assert page.evaluate("scrollY") == 0
     for selector in ("#overlay", "#details-facts", "#cloud", "#classifiers"):
         expect(page.locator(selector)).to_be_in_viewport(ratio=1)
-    phone = open_page(viewport={"width": 360, "height": 740}, is_mobile=True, has_touch=True)
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_a_phone_scrolls_little_and_keeps_the_picture(open_page: Callable[..., Page], scheme: str) -> None:
+    size = {"width": 390, "height": 844}
+    phone = open_page(viewport=size, is_mobile=True, has_touch=True, color_scheme=scheme)
     choose_sample(phone)
-    expect(phone.locator("#details-title")).not_to_be_in_viewport()
     phone.locator("#objects button").nth(1).tap()
-    expect(phone.locator("#details-title")).to_be_in_viewport()
+    assert phone.evaluate("document.documentElement.scrollHeight") - size["height"] <= 800
+    expect(phone.locator("#details-facts")).to_be_in_viewport(ratio=1)
+    expect(phone.locator("#answer")).to_contain_text(phone.locator("#details-title").inner_text())
+    phone.evaluate("scrollTo(0, document.documentElement.scrollHeight)")
+    for selector in ("#overlay", "#answer"):
+        expect(phone.locator(selector)).to_be_in_viewport(ratio=1)
+    expect(phone.locator("#cloud, #classifiers, #slices").first).to_be_hidden()
+    unfold(phone)
+    expect(phone.locator("#slices canvas").first).to_be_visible()
+    assert len(np.unique(pixels(phone.locator("#cloud")).reshape(-1, 3), axis=0)) > 20
 
 
 def test_sixteen_objects_have_different_colors(
@@ -293,6 +314,23 @@ def test_confidence_is_calibrated_or_said_not_to_be(open_page: Callable[..., Pag
     expect(page.locator("#objects .confidence").first).to_have_text("87\xa0%")
     page.get_by_text("How to read this").click()
     for words in ("calibrated", "geometric mean"):
+        expect(page.locator("#confidence-help")).to_contain_text(words)
+
+
+def test_details_of_an_embedding_alone(open_page: Callable[..., Page]) -> None:
+    def with_confidence(calibrated: float | None) -> Callable[[Route], None]:
+        def change(answer: Any) -> None:
+            for one in answer["instances"]:
+                one["top"], one["classifier"] = {"embedding": one["top"]["tops"]}, "embedding"
+                one["details"]["calibrated_confidence"] = calibrated
+
+        return changed_answers(change)
+
+    for calibrated, words in ((None, "highest probability; divided by"), (0.5, "highest probability. The embedding")):
+        page = open_page(with_confidence(calibrated))
+        choose_sample(page)
+        expect(page.locator("#classifiers h3")).to_have_text(["Embedding: shape and colour"])
+        page.get_by_text("How to read this").click()
         expect(page.locator("#confidence-help")).to_contain_text(words)
 
 
@@ -383,8 +421,10 @@ def test_phone_width(open_page: Callable[..., Page], files: Files) -> None:
     expect(page.locator("#objects button")).to_have_count(4)
     expect(page.locator("#status")).to_be_in_viewport()
     page.locator('#objects button[data-label="200"]').tap()
-    expect(page.locator("#slices li").first).to_be_visible()
     expect(page.locator("#details-title")).to_be_in_viewport()
+    fits()
+    unfold(page)
+    expect(page.locator("#slices li").first).to_be_visible()
     fits()
 
 

@@ -95,6 +95,21 @@ def test_a_known_name_gets_another_view(open_teaching: Open, files: Files, teach
     assert [each["views"] for each in listed if each["name"] == "teapot"] == [1]
 
 
+def test_what_is_typed_while_the_frame_is_recognized_again_stays(open_teaching: Open, files: Files) -> None:
+    waiting: list[Route] = []
+    page = open_teaching()
+    recognize(page, files)
+    page.route("**/v1/explain*", lambda route: waiting.append(route), times=1)  # noqa: PLW0108 -- a built-in cannot be a handler
+    name_object(page, 200, "teapot")
+    expect(page.locator("#status")).to_contain_text("Recognizing")
+    page.locator('#objects button[data-label="7"]').click()
+    page.locator("#name").fill("cup")
+    waiting.pop().continue_()
+    expect(page.locator("#status")).not_to_contain_text("Recognizing")
+    expect(page.locator('#objects button[aria-pressed="true"]')).to_have_attribute("data-label", "7")
+    expect(page.locator("#name")).to_have_value("cup")
+
+
 def test_undo_after_another_change_is_refused(open_teaching: Open, files: Files, teaching_url: str) -> None:
     page = open_teaching()
     recognize(page, files)

@@ -10,7 +10,7 @@ import pytest
 from helpers import encode_image, png_file, with_checksums
 
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.frames import read_frame
+from thor2_jax.frames.frames import read_frame
 from thor2_jax.service.decoding import decode_frame
 from thor2_jax.service.problem import RequestError
 

@@ -1,42 +1,61 @@
 """`thor2 serve` reports errors at startup in one line and exits with code 2."""
 
+import asyncio
 import os
+import signal
 import socket
 import subprocess
 import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
+import uvicorn
+from helpers import run_thor2
+from processes import HANG
+from uvicorn.supervisors import Multiprocess
 
+from thor2_jax.errors import InputError
+from thor2_jax.service import server
+from thor2_jax.service.app import create_app
+from thor2_jax.service.settings import Settings
 from training.cli import main
 
 
 def run_serve(*options: str) -> str:
     """Run the command, which must fail, and return its standard error."""
     command = [sys.executable, "-m", "training.cli", "serve", *options]
-    ended = subprocess.run(command, cwd=Path(__file__).parents[3], capture_output=True, text=True, timeout=120)
+    ended = subprocess.run(command, cwd=Path(__file__).parents[3], capture_output=True, text=True, timeout=HANG)
     assert ended.returncode == 2, ended.stderr
     return ended.stderr
 
 
-def serve(*options: str) -> str:
-    """Run the command, which must fail, and return its error line."""
-    (line,) = [line for line in run_serve(*options).splitlines() if not line.startswith("INFO: ")]
-    assert line.startswith("error: ")
-    return line
+@pytest.fixture
+def serve(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., str]]:
+    """Return a function that runs the command in this process, where it must fail, and returns its error line."""
+
+    def run(*options: object) -> str:
+        assert run_thor2("serve", *options) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith("error: ")
+        return line
+
+    monkeypatch.setattr(uvicorn.Config, "configure_logging", lambda _: None)
+    handler = signal.getsignal(signal.SIGTERM)
+    yield run
+    signal.signal(signal.SIGTERM, handler)
 
 
 @pytest.mark.parametrize("workers", ["1", "2"])
 def test_missing_run_directory(tmp_path: Path, workers: str) -> None:
-    assert "model: " in serve("--model", str(tmp_path), "--port", "0", "--workers", workers)
+    err = run_serve("--model", str(tmp_path), "--port", "0", "--workers", workers)
+    (line,) = [line for line in err.splitlines() if not line.startswith("INFO: ")]
+    assert line.startswith("error: ") and "model: " in line
+    assert "listening at" not in err  # that is logged after the model is loaded
 
 
-@pytest.mark.parametrize("workers", ["1", "2"])
-def test_listening_is_logged_after_loading_the_model(tmp_path: Path, workers: str) -> None:
-    assert "listening at" not in run_serve("--model", str(tmp_path), "--port", "0", "--workers", workers)
-
-
-def test_cache_that_is_a_file(run_dir: Path, tmp_path: Path) -> None:
+def test_cache_that_is_a_file(run_dir: Path, tmp_path: Path, serve: Callable[..., str]) -> None:
     (tmp_path / "cache").touch()
     assert "cache" in serve("--model", str(run_dir), "--port", "0", "--cache", str(tmp_path / "cache"))
 
@@ -49,14 +68,103 @@ def test_xla_log_is_silenced_before_jax_is_imported() -> None:
     assert ended.stdout.split() == ["False", "3"], ended.stderr
 
 
-def test_port_in_use(run_dir: Path) -> None:
+def test_port_in_use(run_dir: Path, serve: Callable[..., str]) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         assert "in use" in serve("--model", str(run_dir), "--port", str(taken.getsockname()[1]))
 
 
-def test_option_out_of_range(run_dir: Path) -> None:
+def test_option_out_of_range(run_dir: Path, serve: Callable[..., str]) -> None:
     assert "max_batch is 7" in serve("--model", str(run_dir), "--max-batch", "7")
     assert "unknown_below is 2.0" in serve("--model", str(run_dir), "--unknown-below", "2")
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        (["--token", ""], "token"),
+        (["--deadline", "inf"], "deadline is inf"),
+        (["--deadline", "1e300"], "deadline is 1e+300"),
+        (["--allow-host", "http://robot.local"], "allow_host is 'http://robot.local'"),
+    ],
+)
+def test_invalid_settings(
+    run_dir: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, options: list[str], named: str
+) -> None:
+    monkeypatch.setattr(server, "serve", lambda *_: None)
+    assert run_thor2("serve", "--model", run_dir, *options) == 2
+    assert named in capfd.readouterr().err
+
+
+def test_empty_token_in_the_environment(
+    run_dir: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It would otherwise switch authentication off."""
+    monkeypatch.setattr(server, "serve", lambda *_: None)
+    monkeypatch.setenv("THOR2_TOKEN", "")
+    assert run_thor2("serve", "--model", run_dir) == 2
+    assert "THOR2_TOKEN" in capfd.readouterr().err
+
+
+def test_ctrl_c_while_the_model_is_loaded(run_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An exception of Python's own handler can get lost there."""
+    actions: list[Any] = []
+
+    def load(*_: object) -> None:
+        actions.extend(signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM))
+        raise InputError("ends the command")
+
+    before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    monkeypatch.setattr(server, "InferenceEngine", load)
+    monkeypatch.setattr(server, "create_app", load)
+    for workers in (1, 2):
+        with pytest.raises(InputError, match="ends"):
+            server.serve(Settings(run_dir), port=0, workers=workers)
+    assert actions == [signal.SIG_IGN if handler is signal.SIG_IGN else signal.SIG_DFL for handler in before] * 2
+    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
+
+
+def test_ctrl_c_reaches_no_other_process_of_the_service(monkeypatch: pytest.MonkeyPatch) -> None:
+    masks: list[set[signal.Signals]] = []
+
+    def record(_: object) -> None:
+        masks.append(set(signal.pthread_sigmask(signal.SIG_BLOCK, ())))
+
+    monkeypatch.setattr(Multiprocess, "init_processes", record)
+    monkeypatch.setattr(Multiprocess, "keep_subprocess_alive", record)
+    supervisor = object.__new__(server._Supervisor)
+    supervisor.init_processes()
+    supervisor.keep_subprocess_alive()
+    assert all(signal.SIGINT in mask and signal.SIGTERM not in mask for mask in masks) and len(masks) == 2
+    # A new process, whose fork server is that of the pool. The fork server imports modules for seconds.
+    code = (
+        "import signal, time; from thor2_jax.service.preparation import PreparationPool; pool = PreparationPool(1); "
+        "call = pool.submit(time.monotonic() + 60, signal.pthread_sigmask, signal.SIG_BLOCK, ()); "
+        "print(*sorted(call.result())); print(signal.pthread_sigmask(signal.SIG_BLOCK, ())); pool.close()"
+    )
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
+    assert ended.stdout.split("\n") == [f"{int(signal.SIGINT)} {int(signal.SIGTERM)}", "set()", ""], ended.stderr
+
+
+def test_signal_while_processes_start(run_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    app = create_app(Settings(run_dir), workers=2)
+    states: list[str] = []
+
+    def start() -> None:
+        signal.raise_signal(signal.SIGTERM)
+
+    async def run() -> None:
+        async with app.router.lifespan_context(app):
+            states.append(app.state.service.state)
+
+    monkeypatch.setattr(app.state.service, "start", start)
+    for name in ("wait_until_ready", "close"):
+        monkeypatch.setattr(app.state.service, name, lambda: None)
+    handler = signal.signal(signal.SIGTERM, lambda *_: None)
+    try:
+        asyncio.run(run())
+    finally:
+        signal.signal(signal.SIGTERM, handler)
+    assert states == ["stopping"]
 
 
 def test_missing_package_names_the_extra(

@@ -2,15 +2,21 @@
 
 import base64
 import io
+import threading
 from collections.abc import Callable
+from typing import Any
 
 import httpx
 import pytest
+from fastapi import FastAPI
 from page_actions import upload
 from PIL import Image
 from playwright.sync_api import Page, Route, expect
+from processes import HANG
 
+from thor2_jax.errors import InputError
 from thor2_jax.explanation import class_scores
+from thor2_jax.service.engine import ExplanationPrograms
 
 Open = Callable[..., Page]
 Files = dict[str, bytes]
@@ -44,10 +50,62 @@ ANSWER = {
 }
 
 
+def ask(url: str, files: Files, instance: int) -> httpx.Response:
+    return httpx.post(f"{url}/v1/why", files=files, data={"instance": str(instance)}, timeout=HANG)
+
+
+def test_why_is_503_until_explanations_are_compiled(
+    teaching_url: str, teaching_app: FastAPI, files: Files, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    service, is_compiled, compiled = teaching_app.state.service, threading.Event(), []
+
+    def compile_explanations(programs: ExplanationPrograms, is_stopped: Callable[[], bool]) -> None:
+        assert is_compiled.wait(300) and not is_stopped()
+        compiled.append(programs)
+
+    def explain(_: object) -> None:
+        raise InputError("instance is explained")
+
+    monkeypatch.setattr(service, "_compiled", {})
+    monkeypatch.setattr(service.engine, "compile_explanations", compile_explanations)
+    monkeypatch.setattr(service.engine, "explain", explain)
+    for _ in range(2):
+        response = ask(teaching_url, files, 3)
+        assert response.status_code == 503 and int(response.headers["retry-after"]) >= 1
+        assert "compiled" in response.json()["message"]
+    assert httpx.post(f"{teaching_url}/v1/recognize", files=files, timeout=60).status_code == 200
+    is_compiled.set()
+    (future,) = service._compiled.values()
+    future.result(300)
+    response = ask(teaching_url, files, 3)
+    assert response.status_code == 422 and "is explained" in response.json()["message"]
+    assert compiled == service.engine.explanation_programs()
+
+
+def test_failed_compilation_leaves_the_error_to_requests(
+    teaching_url: str, teaching_app: FastAPI, files: Files, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise InputError("explanations need a convention")
+
+    service = teaching_app.state.service
+    monkeypatch.setattr(service, "_compiled", {})
+    monkeypatch.setattr(service.engine, "compile_explanations", fail)
+    monkeypatch.setattr(service.engine, "explain", fail)
+    service._compile_explanations(*service.engine.explanation_programs()).result(300)
+    response = ask(teaching_url, files, 3)
+    assert response.status_code == 422 and "convention" in response.json()["message"]
+
+
 @pytest.mark.slow
-def test_why_returns_pictures(teaching_url: str, files: Files) -> None:
-    response = httpx.post(f"{teaching_url}/v1/why", files=files, data={"instance": "3"}, timeout=120)
+def test_why_returns_pictures(teaching_url: str, teaching_app: FastAPI, files: Files) -> None:
+    """Almost all programs of an explanation are compiled before the first one."""
+    service = teaching_app.state.service
+    service._compile_explanations(*service.engine.explanation_programs()).result(600)
+    before = service.metrics.compilations._value.get()
+    response = ask(teaching_url, files, 3)
     assert response.status_code == 200
+    assert service.metrics.compilations._value.get() - before < 30  # of about 290
     answer = response.json()
     assert answer["label"] == 3 and answer["explained_name"] in ("a", "b") and answer["unit"] == "log-odds"
     assert set(answer["timings"]) >= {"upload", "decode", "clouds", "explain", "total"}
@@ -64,11 +122,27 @@ def test_why_errors_name_the_field(teaching_url: str, files: Files) -> None:
         ({"instance": "5"}, "instance"),
         ({"instance": "x"}, "instance"),
     ):
-        response = httpx.post(f"{teaching_url}/v1/why", files=files, data=data, timeout=60)
+        response = httpx.post(f"{teaching_url}/v1/why", files=files, data=data, timeout=HANG)
         assert response.status_code == 422 and response.json()["field"] == field
     damaged = files | {"depth": b"damaged"}
-    response = httpx.post(f"{teaching_url}/v1/why", files=damaged, data={"instance": "3"}, timeout=60)
+    response = httpx.post(f"{teaching_url}/v1/why", files=damaged, data={"instance": "3"}, timeout=HANG)
     assert response.status_code == 422 and response.json()["field"] == "depth"
+
+
+def ask_why(open_page: Open, url: str, files: Files, answer: Callable[[Route], None], **options: Any) -> Page:
+    """Open the page, whose requests for explanations `answer` answers, and click on "Why?" for object 3."""
+
+    def route_all(route: Route) -> None:
+        if route.request.url.endswith("/v1/why"):
+            answer(route)
+        else:
+            route.continue_()
+
+    page = open_page(route_all, url=url, **options)
+    upload(page, files)
+    page.locator('#objects button[data-label="3"]').click()
+    page.get_by_role("button", name="Why?").click()
+    return page
 
 
 @pytest.mark.parametrize("width", [1280, 390])
@@ -76,16 +150,10 @@ def test_page_shows_why(open_page: Open, teaching_url: str, files: Files, width:
     forms = []
 
     def answer_why(route: Route) -> None:
-        if not route.request.url.endswith("/v1/why"):
-            route.continue_()
-            return
         forms.append(route.request.post_data_buffer)
         route.fulfill(json=ANSWER)
 
-    page = open_page(answer_why, url=teaching_url, viewport={"width": width, "height": 900})
-    upload(page, files)
-    page.locator('#objects button[data-label="3"]').click()
-    page.get_by_role("button", name="Why?").click()
+    page = ask_why(open_page, teaching_url, files, answer_why, viewport={"width": width, "height": 900})
     expect(page.locator("#why-status")).to_contain_text("2.5")
     expect(page.locator("#why-status")).to_contain_text("red +20")
     shown = page.locator("#why-pictures canvas")
@@ -99,17 +167,29 @@ def test_page_shows_why(open_page: Open, teaching_url: str, files: Files, width:
     expect(page.locator("#why-status")).to_have_text("")
 
 
+def test_page_waits_while_explanations_are_compiled(open_page: Open, teaching_url: str, files: Files) -> None:
+    requests: list[Route] = []
+
+    def compile_first(route: Route) -> None:
+        requests.append(route)
+        if len(requests) == 1:
+            problem = {"field": None, "message": "Explanations are still being compiled."}
+            route.fulfill(status=503, json=problem, headers={"Retry-After": "1"})
+        else:
+            route.fulfill(json=ANSWER)
+
+    page = ask_why(open_page, teaching_url, files, compile_first)
+    expect(page.locator("#why-status")).to_contain_text("still being compiled")
+    expect(page.get_by_role("button", name="Why?")).to_be_disabled()
+    expect(page.locator("#why-status")).to_contain_text("2.5", timeout=60_000)
+    expect(page.locator("#why-pictures canvas")).to_have_count(2)
+
+
 def test_page_shows_why_there_is_no_explanation(open_page: Open, teaching_url: str, files: Files) -> None:
     def refuse(route: Route) -> None:
-        if route.request.url.endswith("/v1/why"):
-            route.fulfill(status=422, json={"field": "instance", "message": "instance 3 cannot be explained."})
-        else:
-            route.continue_()
+        route.fulfill(status=422, json={"field": "instance", "message": "instance 3 cannot be explained."})
 
-    page = open_page(refuse, url=teaching_url)
-    upload(page, files)
-    page.locator('#objects button[data-label="3"]').click()
-    page.get_by_role("button", name="Why?").click()
+    page = ask_why(open_page, teaching_url, files, refuse)
     expect(page.locator("#why-status")).to_have_text("instance 3 cannot be explained.")
     expect(page.get_by_role("button", name="Why?")).to_be_enabled()
     page.locator('#objects button[data-label="5"]').click()  # too few points to be described

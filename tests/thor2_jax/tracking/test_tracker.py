@@ -1,16 +1,15 @@
 """Trackers with a toy recognizer that reads an instance's probabilities from its colour."""
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable
 
 import numpy as np
 import pytest
 from helpers import untrained_run
 
 import thor2_jax as thor2
-from thor2_jax.gallery.gallery import Gallery
-from thor2_jax.recognition.answers import Evidence, Recognition
-from thor2_jax.recognition.prepared_instance import PreparedInstance
+from thor2_jax.frames.prepared_instance import PreparedInstance
+from thor2_jax.model.inference import Inference
 from thor2_jax.recognizer import Recognizer
 from thor2_jax.tracking.fusion import FusedEvidence
 from thor2_jax.tracking.next_view import ViewTable
@@ -26,25 +25,18 @@ class ToyRecognizer:
 
     def __init__(self) -> None:
         self._recognizer = Recognizer(RUN)
-        self.run = RUN
-        self.gallery: Gallery = self._recognizer.gallery
+        self.model = self._recognizer.model
         self.described: list[PreparedInstance] = []
 
-    def frame_evidence(self, frame: thor2.RGBDFrame) -> tuple[list[PreparedInstance], Evidence]:
-        described = self._recognizer.describe(frame)
-        return list(described.instances), self.evidence_of(described.usable)[1]
+    def prepare(self, frame: thor2.RGBDFrame) -> Iterable[PreparedInstance]:
+        return self._recognizer.prepare(frame)
 
-    def evidence_of(self, instances: Iterable[PreparedInstance]) -> tuple[list[PreparedInstance], Evidence]:
-        usable = list(instances)
+    def infer(self, instances: Iterable[PreparedInstance]) -> tuple[list[PreparedInstance], Inference]:
+        given = list(instances)
+        usable = [each for each in given if each.reason is None]
         self.described += usable
         p = np.array([each.colors.mean(axis=0) / 255 for each in usable])
-        return usable, Evidence(np.zeros(len(p), int), {"tops": p, "tops2": p})
-
-    def recognitions(self, instances: Sequence[PreparedInstance], evidence: Evidence) -> list[Recognition]:
-        return self._recognizer.recognitions(instances, evidence)
-
-    def fused(self, probabilities: Mapping[str, np.ndarray]) -> np.ndarray:
-        return np.asarray(self._recognizer.fused(probabilities))
+        return given, Inference(np.zeros(len(p), int), {"tops": p, "tops2": p})
 
 
 def frame(boxes: dict[int, tuple[int, int, tuple[int, int, int]]], size: int = 40) -> thor2.RGBDFrame:

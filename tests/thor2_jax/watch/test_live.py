@@ -14,11 +14,12 @@ import numpy as np
 import pytest
 from PIL import Image
 from playwright.sync_api import Browser, expect
+from processes import HANG
 from recording_files import table_frame
 
 import thor2_jax as thor2
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.answers import Recognition
+from thor2_jax.model.answers import Recognition
 from thor2_jax.recordings.recorded_frames import RecordedFrame
 from thor2_jax.segmentation.table import segment_table
 from thor2_jax.watch.broadcast import Broadcast
@@ -140,7 +141,7 @@ def test_slow_readers_get_the_latest_message() -> None:
 
 
 def get(url: str, path: str, host: str | None = None) -> tuple[int, dict[str, str], bytes]:
-    connection = http.client.HTTPConnection(url.removeprefix("http://"), timeout=10)
+    connection = http.client.HTTPConnection(url.removeprefix("http://"), timeout=HANG)
     connection.request("GET", path, headers={"Host": host} if host else {})
     response = connection.getresponse()
     content = response.read() if path != "/events" else response.fp.readline()
@@ -161,6 +162,8 @@ def test_server_serves_its_files_and_events_only() -> None:
             assert get(url, path)[0] == 404
         assert get(url, "/", "attacker.example:80")[0] == 403
         assert get(url, "/", "localhost:80")[0] == 200
+        with serve_live(broadcast, port=0, allow_host=["robot.local"]) as allowed:
+            assert get(allowed, "/", "robot.local:80")[0] == 200
         with pytest.raises(InputError, match="port is"), serve_live(broadcast, port=int(url.rpartition(":")[2])):
             pass
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, binary_erosion, distance_transform_cdt
 
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.frames import Intrinsics, RGBDFrame, backproject
-from thor2_jax.recognition.instance_clouds import instance_clouds
+from thor2_jax.frames.frames import Intrinsics, RGBDFrame, backproject
+from thor2_jax.frames.instance_clouds import instance_clouds
 from training.augmentation.augmentations import Augmentations, _without_flying, augment
 from training.augmentation.base import Base
 from training.augmentation.illumination import Illumination

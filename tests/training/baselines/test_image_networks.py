@@ -14,8 +14,8 @@ from safetensors.numpy import load_file, save_file
 import colornet
 import thor2_jax as thor2
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.classifier import MLP
-from thor2_jax.recognition.run_directory import TrainedRun, load_run, save_run
+from thor2_jax.model.classifier import MLP
+from thor2_jax.model.run_directory import TrainedRun, load_run, save_run
 from training.baselines import fit_network as module
 from training.baselines.baseline import BaselineInputs
 from training.baselines.files import read_baseline

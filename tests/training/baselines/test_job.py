@@ -16,8 +16,8 @@ import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.describe import describe
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.classifier import MLP
-from thor2_jax.recognition.run_directory import TrainedRun, load_run, save_run
+from thor2_jax.model.classifier import MLP
+from thor2_jax.model.run_directory import TrainedRun, load_run, save_run
 from thor2_jax.types import Cloud
 from training.baselines import job
 from training.baselines.baseline import baseline_inputs
@@ -173,6 +173,7 @@ def test_run_with_checkpoints_is_not_finished(tmp_path: Path) -> None:
     folder = write_run(tmp_path / "run" / "fold-0").parent
     assert is_finished(folder) and is_finished(folder / "fold-0")
     (folder / "checkpoints").mkdir()
+    (folder / "checkpoints" / "begun.json").touch()
     assert not is_finished(folder)
 
 

@@ -8,7 +8,7 @@ import pytest
 from flax import nnx
 
 import thor2_jax as thor2
-from thor2_jax.recognition.classifier import MLP
+from thor2_jax.model.classifier import MLP
 from training.baselines.baseline import BaselineInputs
 from training.baselines.fit_thor import camera_types
 from training.baselines.thor import THOR, VIEW_TYPES, view_types

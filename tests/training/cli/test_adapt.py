@@ -1,19 +1,21 @@
 """`thor2 adapt`, and the commands that use the adapted run; the run's weights are random."""
 
+import dataclasses
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import run_thor2, untrained_run, write_frame
+from helpers import SMALL_CONFIG, json_lines, run_thor2, untrained_embedding_run, untrained_run, write_frame
 
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.frames import read_frame
-from thor2_jax.recognition.run_directory import load_run, save_run
+from thor2_jax.frames.frames import read_frame
+from thor2_jax.model.run_directory import load_run, save_run
 from thor2_jax.recognizer import Recognizer
 from training.evaluation.runs import load_runs
 
 OBJECTS = {1: "brick", 2: "book", 3: "leaf"}
+FILES = {"color": "color.png", "depth": "depth.png", "labels": "mask.png", "intrinsics": "intrinsics.json"}
 
 
 @pytest.fixture(scope="module")
@@ -69,10 +71,34 @@ def test_runs_of_different_cameras_are_not_evaluated_together(model: Path, adapt
         load_runs([model, adapted])
 
 
+def test_commands_use_a_run_whose_embedding_alone_answers(
+    video: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    model, out, names = tmp_path / "run", tmp_path / "adapted", tuple(OBJECTS.values())
+    save_run(untrained_embedding_run(names, config=dataclasses.replace(SMALL_CONFIG, looks=4)), model)
+    assert run_thor2("adapt", "--model", model, video, "--out", out, "--quiet") == 0
+    recognizer = Recognizer.load(out)
+    assert recognizer.model.color_transform is not None and set(recognizer.model.classifiers) == {"embedding"}
+    capfd.readouterr()
+    for options in ((), ("--track",)):
+        assert run_thor2("recognize", "--model", out, video, "--json", *options) == 0
+        frames = [line["instances"] for line in json_lines(capfd.readouterr().out)]
+        assert len(frames) == 4 and all(set(one["top"]) == {"embedding"} for frame in frames for one in frame)
+        if options:  # one answer for the objects of all frames
+            assert [one["confidence"] for one in frames[0]] == [one["confidence"] for one in frames[3]]
+            continue
+        frame = read_frame(**{name: video / "0" / file for name, file in FILES.items()})  # type: ignore[arg-type]
+        for one, expected in zip(frames[0], recognizer.recognize(frame), strict=True):
+            assert one["name"] == expected.name and one["confidence"] == pytest.approx(expected.confidence, abs=1e-4)
+    write_frame(tmp_path / "labelled" / "0", OBJECTS)
+    assert run_thor2("evaluate", "frames", tmp_path / "labelled", "--model", out, "--out", tmp_path / "report") == 0
+    report = json.loads((tmp_path / "report" / "report.json").read_text())
+    assert report["main"] == "embedding" and report["instances"]["scored"] == 3
+
+
 def test_enrolled_frames_are_corrected(adapted: Path, tmp_path: Path) -> None:
     folder = write_frame(tmp_path / "labelled", {1: "brick"})
-    files = {"color": "color.png", "depth": "depth.png", "labels": "mask.png", "intrinsics": "intrinsics.json"}
-    frame = read_frame(**{name: folder / file for name, file in files.items()})  # type: ignore[arg-type]
+    frame = read_frame(**{name: folder / file for name, file in FILES.items()})  # type: ignore[arg-type]
     gallery = tmp_path / "gallery"
     assert (
         run_thor2(
@@ -82,8 +108,9 @@ def test_enrolled_frames_are_corrected(adapted: Path, tmp_path: Path) -> None:
     )
     recognizer = Recognizer.load(adapted, gallery=gallery)
     stored = next(iter(recognizer.gallery.objects["mug"].clouds.views()))
-    assert recognizer.color_transform is not None
-    expected = recognizer.color_transform(frame.color[frame.labels == 1]).mean(axis=0)
+    transform = recognizer.model.color_transform
+    assert transform is not None
+    expected = transform(frame.color[frame.labels == 1]).mean(axis=0)
     np.testing.assert_allclose(stored.colors.mean(axis=0), expected, atol=4)
 
 

@@ -2,6 +2,7 @@
 
 import os
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -10,6 +11,7 @@ import pytest
 from helpers import run_thor2
 
 import thor2_jax as thor2
+from training.cli.app import FrameOptions, finish
 
 ROOT = Path(__file__).parents[3]
 
@@ -42,6 +44,66 @@ def test_a_usage_error_is_one_line(arguments: tuple[str, ...], capsys: pytest.Ca
     assert err.startswith("error: ") and err.endswith("--help\n")
 
 
+@pytest.mark.parametrize("arguments", [("--workers", "0"), ("--workers=0",), ("--depth-scale", "0x10")])
+def test_a_usage_error_states_the_value(arguments: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_thor2("recognize", "--model", "m", "f", *arguments) == 2
+    assert f"(given: {arguments[-1].rpartition('=')[2]})" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (("recognize", "--model", "", "f"), "--model is empty"),
+        (("recognize", "--model", "m", "f", "--out="), "--out is empty"),
+        (("recognize", "--model", "m", ""), "the argument after m is empty"),
+        (("explain", "", "--model", "m", "--out", "o"), "the argument after explain is empty"),
+    ],
+)
+def test_an_empty_argument_is_no_directory(
+    arguments: tuple[str, ...], named: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run_thor2(*arguments) == 2
+    error = capsys.readouterr().err
+    assert named in error and error.count("\n") == 1
+
+
+@pytest.mark.parametrize("command", ["recognize", "explain", "evaluate frames", "enroll mug", "doctor", "adapt"])
+def test_frames_are_named_in_one_way(command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = ("--out", tmp_path / "out") if command in ("explain", "adapt") else ()
+    for given, expected in (
+        (("--bag", "absent.mcap"), "absent.mcap"),
+        (("--bag", "b", "--color", "c.png"), "color is c.png and bag is b"),
+        (("frames", "--every", 2), "every is 2; it belongs to --bag"),
+        (("absent",), "absent"),
+        (("--color", "c.png"), "c.png" if command == "enroll mug" else "--depth"),
+    ):
+        assert run_thor2(*command.split(), *given, "--model", tmp_path / "run", *out) == 2
+        error = capsys.readouterr().err
+        assert expected in error and error.count("\n") == 1
+
+
+def test_the_next_command_has_the_same_frames(capsys: pytest.CaptureFixture[str]) -> None:
+    given = FrameOptions(frames=[Path("a b"), Path("c")], depth_scale=100.0, max_gap=0.5)
+    finish("done", "see why", "explain", *given.arguments)
+    line = capsys.readouterr().out
+    assert line.startswith("done; see why with: thor2 explain ") and line.count("\n") == 1
+    assert shlex.split(line)[-6:] == ["a b", "c", "--depth-scale", "100.0", "--max-gap", "0.5"]
+
+
+@pytest.mark.parametrize(("option", "value"), [("copies", 10**20), ("copies", 0), ("crops", 99_999_999), ("crops", 0)])
+def test_impossible_renderings_are_refused(option: str, value: int, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_thor2("render", "--meshes", "m", "--out", "o", f"--{option}", value, "--sensor") == 2
+    assert f"{option} is {value}; expected" in capsys.readouterr().err
+
+
+def test_a_loop_of_links_is_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "a").symlink_to("b")
+    (tmp_path / "b").symlink_to("a")
+    assert run_thor2("forget", "mug", "--model", tmp_path / "a") == 2
+    error = capsys.readouterr().err
+    assert str(tmp_path / "a") in error and error.count("\n") == 1
+
+
 def test_version(capsys: pytest.CaptureFixture[str]) -> None:
     assert run_thor2("--version") == 0
     assert capsys.readouterr().out == f"thor2 {thor2.__version__}\n"
@@ -52,6 +114,14 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
 def test_short_help(arguments: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> None:
     assert run_thor2(*arguments) == 0
     assert "Usage:" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", ["recognize", "serve", "watch"])
+def test_help_states_no_threshold_of_the_gallery(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """It depends on the number of views, and its numbers are measured anew from time to time."""
+    assert run_thor2(command, "--help") == 0
+    printed = capsys.readouterr().out.partition("--unknown-below")[2].partition("--")[0]
+    assert "0." not in printed and "views" in printed
 
 
 @pytest.mark.parametrize("command", ["train", "render", "demo", "evaluate frames", "evaluate uwis", "evaluate bop"])

@@ -1,23 +1,34 @@
 """The command line: every command and invalid input, with a small model that is trained once."""
 
+import contextlib
 import dataclasses
 import json
+import shlex
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import frame_options, run_thor2, write_frame_files, write_meshes
+from helpers import SMALL_CONFIG, frame_options, run_thor2, write_frame_files, write_meshes
 from PIL import Image
 
-from thor2_jax.gallery.embedding import Embedding, load_default
-from thor2_jax.recognition.run_directory import load_run, save_run
+import colornet
+from thor2_jax.files import temporary_directory
+from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes, load_default
+from thor2_jax.model.classifier import FEATURES
+from thor2_jax.model.run_directory import load_run, save_run
 from thor2_jax.recognizer import Recognizer
+from training import train_job
+from training.embedding import run_embedding
+from training.fitting import protocol
+from training.fitting.protocol import DEFAULT, PAPER, QUICK
 from training.objects.builtin_objects import builtin_objects
 from training.rendering.scenes import Scene, compose_scene
+from training.train_job import TrainJob
 
 Run = Callable[..., tuple[int, str, str]]
+SMALL = pytest.mark.usefixtures("small_descriptors")
 NAMES = ("soup_can_red", "cereal_box_blue", "mug_white")
 
 
@@ -51,13 +62,31 @@ def run(capsys: pytest.CaptureFixture[str]) -> Run:
     return run
 
 
+@contextlib.contextmanager
+def smaller_descriptors() -> Iterator[None]:
+    """Let the protocols describe views by small descriptors, and fit two networks."""
+    with pytest.MonkeyPatch.context() as patch:
+        config = dataclasses.replace(SMALL_CONFIG, sigma_1=0.4, sigma_2=0.2)  # covers the objects
+        networks = dataclasses.replace(DEFAULT.distractors, networks=2)
+        patch.setattr(protocol, "DEFAULT", dataclasses.replace(DEFAULT, config=config, distractors=networks))
+        patch.setattr(protocol, "PAPER", dataclasses.replace(PAPER, config=config))
+        yield
+
+
+@pytest.fixture
+def small_descriptors() -> Iterator[None]:
+    with smaller_descriptors():
+        yield
+
+
 @pytest.fixture(scope="module")
 def model(meshes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the run directory of a model of three objects, trained for six epochs."""
+    """Return the run directory of a model of three objects, trained for two epochs."""
     out = tmp_path_factory.mktemp("model") / "run"
-    steps = ("--azimuth-step", 60, "--polar-step", 45, "--workers", 1)
-    options = ("--epochs", 6, "--batch-size", 16, "--classifiers", "tops,tops2,ce", "--embedding", 0)
-    assert run_thor2("train", "--meshes", meshes, "--out", out, *steps, *options) == 0
+    steps = ("--azimuth-step", 120, "--polar-step", 90, "--workers", 1)
+    options = ("--epochs", 2, "--batch-size", 16, "--classifiers", "tops,tops2,ce", "--embedding", 0)
+    with smaller_descriptors():
+        assert run_thor2("train", "--meshes", meshes, "--out", out, *steps, *options) == 0
     return out
 
 
@@ -71,14 +100,15 @@ def one_line(err: str) -> str:
 def test_files_of_a_run_directory(model: Path) -> None:
     files = ["curves.png", "metrics.jsonl", "network.npz", "run.json", "weights"]
     assert sorted(p.name for p in model.iterdir()) == files
-    assert len((model / "metrics.jsonl").read_text().splitlines()) == 18
+    assert len((model / "metrics.jsonl").read_text().splitlines()) == 6
     description = json.loads((model / "run.json").read_text())
     assert sorted(description["classes"]) == sorted(NAMES)
     assert description["descriptor_version"] == 1
 
 
 def test_recognize(model: Path, images: Path, scene: Scene, tmp_path: Path, run: Run) -> None:
-    code, out, _ = run("recognize", "--model", model, *frame_options(images), "--out", tmp_path / "answer")
+    known = ("--unknown-below", 0)
+    code, out, _ = run("recognize", "--model", model, *frame_options(images), "--out", tmp_path / "answer", *known)
     assert code == 0
     answers = json.loads((tmp_path / "answer" / "recognition.json").read_text())
     assert [a["label"] for a in answers] == list(scene.frame.instances)
@@ -102,7 +132,7 @@ def test_evaluate_frames(model: Path, images: Path, scene: Scene, tmp_path: Path
     code, out, _ = run(*command)
     assert code == 0 and "THOR2" in out and "a second" in out
     report = json.loads((tmp_path / "report" / "report.json").read_text())
-    run("recognize", "--model", model, *frame_options(images), "--out", tmp_path / "answer")
+    run("recognize", "--model", model, *frame_options(images), "--out", tmp_path / "answer", "--unknown-below", 0)
     answers = json.loads((tmp_path / "answer" / "recognition.json").read_text())
     expected = np.mean([a["name"] == scene.truth[a["label"]] for a in answers])
     whole = report["accuracy"][report["rule"]][0]["cells"][0]
@@ -191,16 +221,89 @@ def test_options_without_effect_are_refused(meshes: Path, tmp_path: Path, run: R
     assert code == 2 and "azimuth_step" in one_line(err) and not out.exists()
 
 
+@SMALL
 def test_train_on_rendered_dataset_equals_train_on_meshes(meshes: Path, model: Path, tmp_path: Path) -> None:
     """Views written by `render` and read back train the same model as views rendered by `train`."""
-    steps = ("--azimuth-step", 60, "--polar-step", 45, "--workers", 1)
-    options = ("--epochs", 6, "--batch-size", 16, "--classifiers", "tops,tops2,ce", "--embedding", 0)
+    steps = ("--azimuth-step", 120, "--polar-step", 90, "--workers", 1)
+    options = ("--epochs", 2, "--batch-size", 16, "--classifiers", "tops,tops2,ce", "--embedding", 0)
     augmentations = ("--illumination", "--sensor", "--occlusion", "--segmentation", "--registration", "--base")
     assert run_thor2("render", "--meshes", meshes, "--out", tmp_path / "views", *steps, *augmentations) == 0
     assert run_thor2("train", "--dataset", tmp_path / "views", "--out", tmp_path / "run", *options) == 0
     assert not (model / "views").exists()
     first, second = (json.loads((f / "run.json").read_text()) for f in (model, tmp_path / "run"))
     assert first["record"]["curves"] == second["record"]["curves"]
+
+
+@SMALL
+def test_a_default_training_recognizes_and_is_evaluated(
+    meshes: Path, images: Path, scene: Scene, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without --classifiers, a run has an embedding alone; the command that is printed recognizes with it."""
+    monkeypatch.setattr(run_embedding, "SIZES", EmbeddingSizes(cell=4, hidden=(16,), learned=8, color=4))
+    monkeypatch.setenv("THOR2_CACHE", str(tmp_path / "cache"))
+    out = tmp_path / "my run"
+    steps = ("--azimuth-step", 90, "--polar-step", 45, "--workers", 1, "--epochs", 1, "--embedding", 10)
+    command = ("train", "--meshes", meshes, "--out", out, *steps)
+    code, printed, err = run(*command)
+    assert code == 0 and "embedding has a held-out accuracy of 0." in printed.replace("1.000", "0.")
+    stages = [line.split(":")[0] for line in err.splitlines() if line.startswith("stage ")]
+    assert list(dict.fromkeys(stages)) == [f"stage {number} of 4" for number in (1, 2, 3, 4)]
+    assert load_run(out).record["classifiers"] == [] and list(load_run(out).record["curves"]) == ["embedding"]
+    assert Recognizer.load(out).model.classifiers.default == ("embedding",)
+    assert len(list((tmp_path / "cache").glob("distractors-*"))) == 1
+
+    (line,) = [line for line in printed.splitlines() if "thor2 recognize" in line]
+    program, *arguments = shlex.split(line.split(" with: ")[1])
+    monkeypatch.chdir(images)
+    assert program == "thor2" and str(out) in line
+    code, answers, _ = run(*arguments, "--unknown-below", 0)
+    assert code == 0 and any(name in answers for name in NAMES)
+    code, printed, _ = run("evaluate", "frames", images.parent, "--model", out, "--out", tmp_path / "report")
+    assert code == 0 and "embedding" in printed
+    report = json.loads((tmp_path / "report" / "report.json").read_text())
+    assert list(report["accuracy"][report["rule"]][0]["cells"][0]["accuracy"]) == ["embedding"]
+    code, printed, _ = run(*command)
+    assert code == 0 and "nothing was trained" in printed and line.split(" with: ")[1] in printed
+    code, _, err = run(*command, "--classifiers", "ce")
+    assert code == 2 and "classifiers" in one_line(err)
+
+
+def test_options_replace_values_of_the_protocols(
+    meshes: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    jobs: list[TrainJob] = []
+    monkeypatch.setattr(train_job, "run_train_job", lambda job, display: jobs.append(job) or {})
+
+    def job(*options: object) -> TrainJob:
+        assert run("train", "--meshes", meshes, "--out", tmp_path / "run", *options)[0] == 0
+        return jobs[-1]
+
+    default = dataclasses.replace(DEFAULT.distractors, workers=2)
+    assert (job().protocol, jobs[-1].distractors, jobs[-1].features) == (DEFAULT, default, ())
+    quick = dataclasses.replace(QUICK.distractors, workers=2)
+    assert (job("--quick").protocol, jobs[-1].distractors, jobs[-1].features) == (QUICK, quick, ())
+    changed = job("--quick", "--embedding", 50, "--epochs", 2, "--azimuth-step", 40)
+    assert changed.distractors == dataclasses.replace(quick, procedural=50, epochs=2)
+    assert (changed.protocol.azimuth_step, changed.protocol.polar_step) == (40, QUICK.polar_step)
+    assert job("--classifiers", "ce").features == ("ce",) and jobs[-1].distractors == default
+    assert (job("--embedding", 0).features, jobs[-1].distractors) == (FEATURES, None)
+    assert (job("--paper").protocol, jobs[-1].distractors, jobs[-1].features) == (PAPER, None, FEATURES)
+    assert job("--paper", "--embedding", 20, "--epochs", 3).distractors == dataclasses.replace(
+        default, procedural=20, epochs=3
+    )
+    code, _, err = run("train", "--meshes", meshes, "--out", tmp_path / "run", "--quick", "--paper")
+    assert code == 2 and "quick" in one_line(err)
+
+
+def test_help_states_the_values_of_the_protocols(run: Run) -> None:
+    code, out, _ = run("train", "--help")
+    text = " ".join(out.replace("│", " ").split())
+    assert code == 0 and "{" not in text
+    for name in ("azimuth_step", "polar_step"):
+        values = (f"{getattr(protocol, name):g}" for protocol in (DEFAULT, PAPER))
+        assert "({}; paper: {})".format(*values) in text
+    assert f"({DEFAULT.distractors.procedural}; quick: {QUICK.distractors.procedural}; paper: 0)" in text
+    assert f"({DEFAULT.distractors.epochs})" in text
 
 
 @pytest.mark.slow
@@ -213,12 +316,13 @@ def test_train_with_distractors(meshes: Path, images: Path, tmp_path: Path, run:
     embedding, recognizer = Embedding.load(out / "embedding.safetensors"), Recognizer.load(out)
     assert embedding.classes == recognizer.run.classes and embedding.distractors == 27
     assert recognizer.objects.embedding.fingerprint == embedding.fingerprint != load_default().fingerprint
-    assert recognizer.default_classifiers == ("tops", "tops2", "embedding")
+    assert recognizer.model.classifiers.default == ("tops", "tops2", "embedding")
     record = recognizer.run.record
-    assert record["distractors"]["networks"] == 3 == 1 + len(embedding.further)
+    assert record["distractors"]["networks"] == DEFAULT.distractors.networks == 1 + len(embedding.further)
+    assert record["distractors"]["epochs"] == record["epochs"] == 4
     assert record["distractors"]["procedural"] == 30 and record["orientation_copies"] == 1
     own = record["calibration"]["unknown_below"]
-    assert set(recognizer.thresholds()) == {own} and 0 < own < 1
+    assert set(recognizer.model.thresholds()) == {own} and 0 < own < 1
     assert set(Recognizer.load(out, 0.25).thresholds()) == {0.25}
     assert run("recognize", "--model", out, *frame_options(images), "--out", tmp_path / "answer")[0] == 0
     answers = json.loads((tmp_path / "answer" / "recognition.json").read_text())
@@ -228,8 +332,9 @@ def test_train_with_distractors(meshes: Path, images: Path, tmp_path: Path, run:
     assert code == 2 and "orientation_copies" in one_line(err)
 
 
+@SMALL
 def test_train_by_folds(meshes: Path, tmp_path: Path, run: Run) -> None:
-    steps = ("--azimuth-step", 90, "--polar-step", 45, "--workers", 1)
+    steps = ("--azimuth-step", 180, "--polar-step", 90, "--workers", 1)
     options = ("--epochs", 1, "--batch-size", 16, "--classifiers", "ce", "--folds", 2, "--embedding", 0)
     arguments = ("train", "--meshes", meshes, "--out", tmp_path / "run", *steps, *options)
     code, out, _ = run(*arguments)
@@ -239,13 +344,13 @@ def test_train_by_folds(meshes: Path, tmp_path: Path, run: Run) -> None:
     (tmp_path / "run" / "views").mkdir()
     (tmp_path / "run" / "views" / "manifest.json").write_bytes(bytes(9))
     before = {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()}
-    (tmp_path / "run" / ".views").mkdir()
-    (tmp_path / "run" / ".curves.12345678.png").touch()
+    with temporary_directory(tmp_path / "run") as temporary:
+        shutil.copytree(temporary, tmp_path / "run" / ".thor2-killed")
     code, out, _ = run(*arguments)
     assert code == 0 and "nothing was trained" in out
     code, _, err = run("train", "--dataset", tmp_path / "run" / "views", "--out", tmp_path / "run", "--embedding", 0)
     assert code == 2 and "manifest.json" in one_line(err)
-    for change in (("--epochs", 2), ("--seed", 1), ("--polar-step", 90), ("--leave-out", NAMES[0])):
+    for change in (("--epochs", 2), ("--seed", 1), ("--polar-step", 45), ("--leave-out", NAMES[0])):
         code, _, err = run(*arguments, *change)
         assert code == 2 and "was written with" in one_line(err)
     assert {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()} == before
@@ -257,11 +362,12 @@ def test_train_by_folds(meshes: Path, tmp_path: Path, run: Run) -> None:
     assert not [path for path in (tmp_path / "run").iterdir() if path.name[0] == "." or path.name == "views"]
 
 
+@SMALL
 def test_train_by_sequences(meshes: Path, tmp_path: Path, run: Run) -> None:
     """Each run has the objects of its sequence; a repeated command trains only missing runs."""
     soup, cereal, mug = NAMES
     table, out = tmp_path / "table.yaml", tmp_path / "runs"
-    steps = ("--azimuth-step", 90, "--polar-step", 45, "--workers", 1)
+    steps = ("--azimuth-step", 180, "--polar-step", 90, "--workers", 1)
     assert run_thor2("render", "--meshes", meshes, "--out", tmp_path / "views", *steps) == 0
     options = ("--sequences", table, "--epochs", 1, "--batch-size", 16, "--classifiers", "ce", "--embedding", 0)
     arguments = ("train", "--dataset", tmp_path / "views", "--out", out, *options)
@@ -305,7 +411,8 @@ def test_one_invalid_instance_leaves_the_others_recognized(
     labels[0, :5] = 9
     Image.fromarray(labels).save(tmp_path / "labels.png")
     changed = frame_options(images, labels=tmp_path / "labels.png")
-    code, out, _ = run("recognize", "--model", model, *changed, "--out", tmp_path / "answer")
+    known = ("--unknown-below", 0)
+    code, out, _ = run("recognize", "--model", model, *changed, "--out", tmp_path / "answer", *known)
     assert code == 0 and "unrecognized" in out
     answers = {a["label"]: a for a in json.loads((tmp_path / "answer" / "recognition.json").read_text())}
     assert answers[9]["name"] is None and "30" in answers[9]["reason"]
@@ -382,6 +489,7 @@ def test_invalid_models_are_refused(model: Path, images: Path, tmp_path: Path, r
         assert expected in one_line(err), path
 
 
+@SMALL
 def test_invalid_training_input_is_refused(meshes: Path, tmp_path: Path, run: Run) -> None:
     unknown = tmp_path / "names.json"
     unknown.write_text(json.dumps({"mug": "no_such_scan"}))
@@ -423,16 +531,17 @@ def test_invalid_training_input_is_refused(meshes: Path, tmp_path: Path, run: Ru
     assert run("train", "--meshes", meshes, "--out", out, *coarse, *last)[0] == 0
 
 
+@SMALL
 def test_paper_protocol(meshes: Path, tmp_path: Path) -> None:
     """The paper's protocol uses plain views in four mirrors; options replace values of the protocol."""
-    options = ("--azimuth-step", 90, "--polar-step", 45, "--workers", 1, "--epochs", 1, "--classifiers", "ce")
+    options = ("--azimuth-step", 180, "--polar-step", 90, "--workers", 1, "--epochs", 1, "--classifiers", "ce")
     for name, paper in (("paper", ["--paper"]), ("default", ["--embedding", 0])):
         assert run_thor2("train", "--meshes", meshes, "--out", tmp_path / name, *options, *paper) == 0
     of = {name: json.loads((tmp_path / name / "run.json").read_text())["record"] for name in ("paper", "default")}
-    assert of["paper"]["samples"] == 4 * of["paper"]["dataset"]["views"] == 4 * 3 * 4 * 5
+    assert of["paper"]["samples"] == 4 * of["paper"]["dataset"]["views"] == 4 * 3 * 2 * 3
     assert of["paper"]["batch_size"] == 128 and of["default"]["batch_size"] > 100
     # Augmented copies with too few points are left out.
-    assert 5 * 3 * 4 * 5 < of["default"]["samples"] / 2 <= 6 * 3 * 4 * 5
+    assert 5 * 3 * 2 * 3 < of["default"]["samples"] / 2 <= 6 * 3 * 2 * 3
     assert of["default"]["samples"] == 2 * of["default"]["dataset"]["views"]
 
 
@@ -450,7 +559,8 @@ def test_usage_errors_have_exit_code_2(run: Run) -> None:
     assert run("--help")[0] == 0
 
 
-def test_colornet(tmp_path: Path, run: Run) -> None:
+def test_colornet(tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(colornet, "build", colornet.load_default)  # tests/colornet builds it
     code, out, _ = run("colornet", "--out", tmp_path / "network")
     assert code == 0
     assert "23 raw nodes, 22 regions, 55 edges; equal to the packaged network" in " ".join(out.split())

@@ -10,7 +10,7 @@ import pytest
 from helpers import encode_image, untrained_run
 
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.run_directory import save_run
+from thor2_jax.model.run_directory import save_run
 from training.cli.compilation_cache import enable_compilation_cache
 
 ROOT = Path(__file__).parents[3]

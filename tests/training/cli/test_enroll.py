@@ -10,12 +10,14 @@ import pytest
 import trimesh
 from helpers import SMALL_CONFIG, run_thor2, untrained_run, write_frame
 from PIL import Image
+from recording_files import table_frame, write_recording
 
 from thor2_jax.gallery import embedding as embeddings
 from thor2_jax.gallery import objects as gallery_objects
 from thor2_jax.gallery import store
 from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
-from thor2_jax.recognition.run_directory import load_run, save_run
+from thor2_jax.model import model as models
+from thor2_jax.model.run_directory import load_run, save_run
 from thor2_jax.recognizer import Recognizer
 from training import enrollment
 
@@ -24,7 +26,7 @@ from training import enrollment
 def small_embedding(monkeypatch: pytest.MonkeyPatch) -> None:
     """Replace the packaged embedding by a small one with random weights, which compiles quickly."""
     small = Embedding.create(SMALL_CONFIG, sizes=EmbeddingSizes(4, (16,), 8, 4))
-    for module in (embeddings, gallery_objects):
+    for module in (embeddings, gallery_objects, models):
         monkeypatch.setattr(module, "load_default", lambda: small)
     monkeypatch.setattr(enrollment, "MESH_VIEWS", 3)
 
@@ -71,6 +73,13 @@ def test_every_labelled_object_is_enrolled_in_a_new_run(model: Path, frames: Pat
     assert [(answer["label"], answer["name"]) for answer in answers] == [(1, "brick"), (5, "book")]
 
 
+def test_frames_without_labels_are_listed(model: Path, frames: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (frames / "001" / "labels.json").unlink()
+    for command in (("enroll", "--replace", "--frames", frames), ("evaluate", "frames", frames)):
+        assert run_thor2(*command, "--model", model) == 0
+        assert "1 frames without labels.json: 001" in capsys.readouterr().out.replace("\n", " ")
+
+
 def test_evaluation_has_a_gallery_column(model: Path, tmp_path: Path) -> None:
     frames = tmp_path / "test"
     write_frame(frames / "a", {2: "book", 3: "brick", 4: "leaf"}, 7)
@@ -80,6 +89,9 @@ def test_evaluation_has_a_gallery_column(model: Path, tmp_path: Path) -> None:
     cell = report["accuracy"][report["rule"]][0]["cells"][0]
     assert cell["instances"] == 2 and cell["accuracy"]["gallery"]["mean"] == 1.0
     assert report["instances"]["no_class"] == {"leaf": 1}
+    page = (tmp_path / "report" / "report.html").read_text()
+    assert run_thor2("evaluate", "frames", *one_frame(frames / "a", 2)[:-2], "--model", model) == 0
+    assert "<td>" in page and "<tbody></tbody>" not in page and "THOR2 is the fusion" not in page
 
 
 def test_a_trained_run_answers_by_both(frames: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -119,6 +131,21 @@ def test_one_frame_enrolls_one_instance(model: Path, frames: Path) -> None:
     assert len(Recognizer.load(model).gallery.objects["single"].clouds) == 1
 
 
+def test_frames_without_names(model: Path, frames: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """They have the object as their only instance, or --instance names it; so do the segments of a recording."""
+    for folder in ("000", "001"):
+        (frames / folder / "labels.json").unlink()
+    assert "2 instances" in error_of(capsys, "enroll", "new", frames, "--model", model)
+    assert run_thor2("enroll", "new", frames, "--instance", 5, "--model", model) == 0
+    (write_frame(tmp_path / "one", {3: "leaf"}) / "labels.json").unlink()
+    assert run_thor2("enroll", "only", *one_frame(tmp_path / "one", 3)[:-2], "--model", model) == 0
+    bag = write_recording(tmp_path / "a.mcap", [table_frame(0), table_frame(3)])
+    assert run_thor2("enroll", "box", "--bag", bag, "--instance", 1, "--model", model) == 0
+    counts = {name: len(v.clouds) for name, v in Recognizer.load(model).gallery.objects.items()}
+    assert counts == {"brick": 2, "book": 2, "new": 2, "only": 1, "box": 2}
+    assert "no labels.json" in error_of(capsys, "evaluate", "frames", "--bag", bag, "--model", model)
+
+
 def test_a_mesh_is_enrolled_from_all_sides(model: Path, tmp_path: Path) -> None:
     box = trimesh.creation.box((0.1, 0.2, 0.15))
     box.visual.vertex_colors = [[200, 100, 50, 255]] * len(box.vertices)
@@ -129,6 +156,99 @@ def test_a_mesh_is_enrolled_from_all_sides(model: Path, tmp_path: Path) -> None:
     box.apply_scale(1000)
     box.export(tmp_path / "large.ply")
     assert run_thor2("enroll", "large", "--model", model, "--mesh", tmp_path / "large.ply", "--mesh-scale", 0.001) == 0
+
+
+def write_mesh(path: Path) -> None:
+    box = trimesh.creation.box((0.1, 0.2, 0.15))
+    box.visual.vertex_colors = [[200, 100, 50, 255]] * len(box.vertices)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    box.export(path)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "names"),
+    [
+        (("025_mug", "meshes/025_mug"), {"025_mug"}),
+        ((None, "meshes/025_mug"), {"025_mug"}),
+        (("red mug", "meshes/025_mug"), {"red mug"}),
+        (("can", "meshes"), {"can"}),
+        ((None, "meshes"), {"025_mug", "can", "caf\u00e9"}),
+    ],
+)
+def test_a_folder_of_meshes_is_enrolled(
+    arguments: tuple[str | None, str], names: set[str], model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(enrollment, "MESH_VIEWS", 1)
+    for name in ("025_mug/textured.ply", "can.ply", "cafe\u0301/a.ply"):
+        write_mesh(tmp_path / "meshes" / name)
+    name, folder = arguments
+    assert run_thor2("enroll", *filter(None, [name]), "--mesh", tmp_path / folder, "--model", model) == 0
+    assert set(Recognizer.load(model).gallery.names) == {"brick", "book"} | names
+
+
+def test_arguments_are_checked_before_anything_is_loaded(
+    model: Path, frames: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def load(*_: object, **__: object) -> None:
+        raise AssertionError("the run was loaded")
+
+    monkeypatch.setattr(Recognizer, "load", load)
+    for name in ("two/a.ply", "two/b.ply", "one.ply"):
+        write_mesh(tmp_path / name)
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "damaged.ply").write_text("ply")
+    for arguments, text in (
+        (("unknown", "--mesh", tmp_path / "one.ply"), "reserved"),
+        (("..", "--frames", frames), "reserved"),
+        (("mug\u200b", "--frames", frames), "visible"),
+        (("--mesh", tmp_path / "one.ply"), "name is missing"),
+        (("mug", "--mesh", tmp_path / "none.ply"), "no such file"),
+        (("mug", "--mesh", tmp_path / "damaged.ply"), "damaged.ply"),
+        (("mug", "--mesh", tmp_path / "empty"), "no .glb"),
+        (("mug", "--mesh", tmp_path / "two"), "none of a, b is 'mug'"),
+        (("mug", "--mesh", tmp_path / "one.ply", "--mesh-scale", 1000), "--mesh-scale"),
+        (("mug", "--mesh", tmp_path / "one.ply", "--extend", "--replace"), "extend and replace"),
+        (("mug", "--frames", tmp_path / "absent"), "absent"),
+        (("mug", *one_frame(tmp_path / "absent", 1)), "absent"),
+    ):
+        assert text in error_of(capsys, "enroll", "--model", model, *arguments)
+
+
+def test_few_views_give_a_warning(
+    model: Path, frames: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    again = ("enroll", "--frames", frames, "--extend", "--model", model)
+    for few, warned in ((10, True), (1, False)):
+        monkeypatch.setattr(gallery_objects, "FEW", few)
+        assert run_thor2(*again) == 0
+        printed = capsys.readouterr().out
+        assert ("unknown objects are hardly rejected" in printed) is warned
+        assert f"thor2 recognize FRAME --model {model}" in printed and "2 objects: " in printed
+
+
+def test_labels_that_are_no_names_are_skipped(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    frame = write_frame(tmp_path / "frame", {1: "brick", 5: "book"})
+    (frame / "labels.json").write_text('{"labels": {"1": "mug ", "5": "unknown"}}')
+    assert run_thor2("enroll", "--frames", frame, "--model", tmp_path / "run") == 0
+    assert "skipped: frame: name is 'unknown'" in capsys.readouterr().out
+    assert Recognizer.load(tmp_path / "run").gallery.names == ("mug",)
+    assert run_thor2("evaluate", "frames", frame, "--model", tmp_path / "run", "--out", tmp_path / "report") == 0
+    report = json.loads((tmp_path / "report" / "report.json").read_text())
+    assert report["instances"]["no_class"] == {"unknown": 1} and report["instances"]["scored"] == 1
+
+
+def test_a_lost_index_is_rebuilt_by_the_command(model: Path, frames: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    gallery = model / "gallery"
+    (gallery / "index.json").unlink()
+    before = files(gallery)
+    for command in (("enroll", "new", *one_frame(frames / "000", 5)), ("objects",), ("forget", "brick")):
+        error = error_of(capsys, *command, "--model", model)
+        assert f"thor2 objects --reembed --model RUN --gallery {gallery}" in error and files(gallery) == before
+    assert run_thor2("objects", "--reembed", "--model", model, "--gallery", gallery) == 0
+    table = capsys.readouterr().out
+    assert all(re.search(rf"{name}\W+2\W+frames\W+20\d\d-", table) for name in ("brick", "book"))
+    assert run_thor2("enroll", "new", "--model", model, *one_frame(frames / "000", 5)) == 0
+    assert set(Recognizer.load(model).gallery.names) == {"brick", "book", "new"}
 
 
 def test_objects_lists_views_source_and_date(model: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -186,7 +306,7 @@ BAD: dict[str, tuple[Callable[[Path, Path], list[object]], str]] = {
     "no folder": (lambda tmp, frames: ["new", "--frames", tmp / "none"], "none"),
     "another label name": (lambda tmp, frames: ["new", "--frames", frames], "'new'"),
     "no such instance": (lambda tmp, frames: ["new", *one_frame(frames / "000", 4)], "instance is 4"),
-    "empty name": (lambda tmp, frames: ["", *one_frame(frames / "000", 5)], "name is ''"),
+    "empty name": (lambda tmp, frames: ["", *one_frame(frames / "000", 5)], "the argument after enroll is empty"),
     "extend and replace": (lambda tmp, frames: ["--frames", frames, "--extend", "--replace"], "extend and replace"),
 }
 

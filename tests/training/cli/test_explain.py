@@ -2,13 +2,14 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from helpers import SMALL_CONFIG, ParsedPage, run_thor2, untrained_run, write_frame
 
 from thor2_jax.explanation import class_scores
-from thor2_jax.recognition.run_directory import save_run
+from thor2_jax.model.run_directory import save_run
 from training.reports import explanation_page
 
 
@@ -33,8 +34,9 @@ def frame(tmp_path: Path) -> Path:
 def test_a_page_for_every_instance(model: Path, frame: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
     assert run_thor2("explain", "--model", model, frame, "--out", out) == 0
-    printed = capfd.readouterr().out.splitlines()
-    assert sorted(path.name for path in (out / "table").iterdir()) == ["1", "4"] and len(printed) == 2
+    *pages, last = capfd.readouterr().out.splitlines()
+    assert sorted(path.name for path in (out / "table").iterdir()) == ["1", "4"] and len(pages) == 2
+    assert "thor2 enroll" in last
     for label in (1, 4):
         directory = out / "table" / str(label)
         page = ParsedPage((directory / "explanation.html").read_text())
@@ -59,6 +61,47 @@ def test_nothing_is_left_after_an_error(
     assert run_thor2("explain", "--model", model, frame, "--instance", 1, "--out", tmp_path / "deep" / "out") == 2
     assert not (tmp_path / "deep").exists()
     assert "No space left" in capfd.readouterr().err
+
+
+def test_folders_of_the_user_are_not_replaced(
+    model: Path, frame: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("1/scan.ply", "4/photo.png"):
+        (frame / name).parent.mkdir()
+        (frame / name).write_text("a user's")
+
+    def write(unfinished: Path, **_: Any) -> None:
+        unfinished.write_text("a page")
+
+    values = {"label": 1, "explained_name": "mug", "faithfulness": {}}
+    explanation = SimpleNamespace(title="mug", as_json=lambda: values)
+    monkeypatch.setattr("thor2_jax.explanation.explain.explain", lambda *_: explanation)
+    monkeypatch.setattr(explanation_page, "write_page", write)
+    monkeypatch.setattr(explanation_page, "pictures", lambda *_: [])
+    monkeypatch.setattr(explanation_page, "_lead", lambda *_: "")
+    monkeypatch.setattr(explanation_page, "_page_sections", lambda *_: [])
+    command = ("explain", "--model", model, frame.parent, "--out", frame.parent, "--instance")
+    for _ in range(2):  # The second explanation replaces the first one.
+        assert run_thor2(*command, 1) == 0
+        assert sorted(path.name for path in (frame / "1").iterdir()) == [
+            "explanation.html",
+            "explanation.json",
+            "scan.ply",
+        ]
+    assert run_thor2(*command, 4) == 2
+    assert "photo.png" in capfd.readouterr().err
+    assert {(frame / name).read_text() for name in ("1/scan.ply", "4/photo.png")} == {"a user's"}
+
+
+def test_advice_on_a_wrong_name() -> None:
+    """It names the instance and the look-alike, and adaptation where a shift of the colours gives another name."""
+    change = SimpleNamespace(kind="color")
+    for occluded, other, changes in ((True, "bowl", [change]), (False, None, [])):
+        answer = SimpleNamespace(label=7, occluded=occluded)
+        explanation = SimpleNamespace(recognition=answer, name="mug", runner_up=other, changes=changes)
+        advice = explanation_page._advice(explanation)  # type: ignore[arg-type]
+        assert "thor2 enroll NAME FRAME --instance 7" in advice
+        assert [part in advice for part in ("mug and bowl", "thor2 adapt", "--track")] == [occluded] * 3
 
 
 def test_wrong_arguments_are_one_line(

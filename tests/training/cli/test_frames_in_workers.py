@@ -16,7 +16,7 @@ from helpers import run_thor2, small_frame, untrained_run, write_frame_files
 
 import thor2_jax as thor2
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.run_directory import save_run
+from thor2_jax.model.run_directory import save_run
 from training.evaluation.answering import RunArguments, answer_frames, answer_frames_in_pool
 from training.frame_recognition import (
     FRAMES_PER_CHUNK,

@@ -1,13 +1,13 @@
 """Progress on a standard error that is not a terminal, and without standard error."""
 
 import sys
-import time
 from typing import Any
 
 import pytest
 
 from training.cli import progress
 from training.cli.progress import show_progress
+from training.storage.progress import numbered
 
 
 def test_lines_come_every_few_seconds(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -28,11 +28,21 @@ def test_lines_come_every_few_seconds(capsys: pytest.CaptureFixture[str], monkey
 
 
 def test_a_line_is_written_at_once(capsys: pytest.CaptureFixture[str]) -> None:
-    start = time.monotonic()
     with show_progress() as show:
         show("render", 0, 10, "")
         assert capsys.readouterr().err == "render: 0 of 10\n"
-    assert time.monotonic() - start < 1
+
+
+def test_stages_are_numbered() -> None:
+    shown: list[tuple[str, int, int, str]] = []
+    show = numbered(lambda *values: shown.append(values), ["render", "fit"])
+    for stage in ("fit", "render", "fit thor"):
+        show(stage, 1, 2, "note")
+    assert shown == [
+        ("stage 2 of 2: fit", 1, 2, "note"),
+        ("stage 1 of 2: render", 1, 2, "note"),
+        ("fit thor", 1, 2, "note"),
+    ]
 
 
 def test_quiet_shows_nothing(capsys: pytest.CaptureFixture[str]) -> None:

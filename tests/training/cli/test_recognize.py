@@ -1,7 +1,9 @@
 """`thor2 recognize` with several frames, other formats and other outputs; the run's weights are random."""
 
 import csv
+import dataclasses
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -108,10 +110,11 @@ def test_several_folders_and_tables(model: Path, tmp_path: Path, capfd: pytest.C
         (["--color", "{frames}/one/color.png"], "--depth, --labels, --intrinsics is missing"),
         (["{frames}/absent"], "not a directory"),
         (["{empty}"], "has no color.png"),
-        (["{frames}", "{frames}"], "two frames are called one"),
+        (["{frames}", "{frames}"], "one is given twice"),
         (["{frames}", "--names", "{frames}/names.json"], "it belongs to --coco"),
-        (["{frames}", "--coco", "{empty}", "--names", "{frames}/one/intrinsics.json"], "expected an obj_id"),
+        (["{frames}", "--coco", "{empty}/c.json", "--names", "{frames}/one/intrinsics.json"], "expected an obj_id"),
         (["{frames}", "--out", "{frames}"], "expected a new or empty directory"),
+        (["{frames}", "--depth-scale", "1e-300"], "depth_scale is 1e-300"),
     ],
 )
 def test_invalid_arguments(
@@ -126,6 +129,32 @@ def test_invalid_arguments(
     assert expected in err and err.startswith("error: ") and err.count("\n") == 1
 
 
+@pytest.mark.parametrize(
+    ("name", "content", "options"),
+    [
+        ("f/recognition.json", '{"a": "user\'s"}', ("--out", "")),
+        ("f/overlay.png", "a user's", ("--out", "")),
+        ("instances.json", '[{"image_id": 1, "category_id": 2}]', ("--coco", "instances.json")),
+        (
+            "poses.csv",
+            "scene_id,im_id,obj_id,score,R,t,time\n1,1,1,.5,0 1 0 1 0 0 0 0 -1,0 0 9,1\n",
+            ("--bop", "poses.csv"),
+        ),
+    ],
+)
+def test_no_file_of_the_user_is_replaced(
+    model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], name: str, content: str, options: tuple[str, str]
+) -> None:
+    frames = tmp_path / "frames"
+    write_frame_files(frames / "f", small_frame())
+    (frames / name).write_text(content)
+    before = {path: path.read_bytes() for path in frames.rglob("*") if path.is_file()}
+    assert run_thor2("recognize", "--model", model, frames, options[0], frames / options[1]) == 2
+    err = capfd.readouterr().err
+    assert Path(name).name in err and err.startswith("error: ") and err.count("\n") == 1
+    assert {path: path.read_bytes() for path in frames.rglob("*") if path.is_file()} == before
+
+
 def test_frames_without_labels_are_segmented(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     folder = write_frame_files(tmp_path / "frames" / "a", table_frame())
     files = frame_options(folder)
@@ -138,6 +167,59 @@ def test_frames_without_labels_are_segmented(model: Path, tmp_path: Path, capfd:
     assert "--segment" in capfd.readouterr().err
     assert run_thor2("recognize", "--model", model, tmp_path / "frames") == 2
     assert "--segment" in capfd.readouterr().err
+
+
+def test_a_frame_without_colour_fails(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    for name in ("a", "b"):
+        write_frame_files(tmp_path / "frames" / name, small_frame())
+    (tmp_path / "frames" / "b" / "color.png").unlink()
+    assert run_thor2("recognize", "--model", model, tmp_path / "frames", "--json") == 2
+    out, err = capfd.readouterr()
+    assert ["error" in line for line in json_lines(out)] == [False, True]
+    assert "1 of 2 frames" in err and "b/color.png" in err
+
+
+def test_tables_in_directories_that_do_not_exist(model: Path, tmp_path: Path) -> None:
+    folder, new = write_frame_files(tmp_path / "one", small_frame()), tmp_path / "new"
+    files = ("--coco", new / "a" / "coco.json", "--bop", new / "b" / "bop.csv")
+    assert run_thor2("recognize", "--model", model, folder, *files) == 0
+    assert all(file.is_file() for file in files[1::2])
+
+
+@pytest.mark.parametrize("option", ["--coco", "--bop"])
+def test_tables_that_cannot_be_written(
+    model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], option: str
+) -> None:
+    """They are refused before the frames are recognized."""
+    folder, other = write_frame_files(tmp_path / "one", small_frame()), "--bop" if option == "--coco" else "--coco"
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path, folder / "color.png" / "results", tmp_path / "pipe"):
+        assert run_thor2("recognize", "--model", model, folder, option, path) == 2
+        out, err = capfd.readouterr()
+        assert out == "" and f"{option[2:]}: {path} is not a file" in err and err.count("\n") == 1
+    assert run_thor2("recognize", "--model", model, folder, option, "x", other, "x") == 2
+    assert "coco and bop are x" in capfd.readouterr().err
+    assert (tmp_path / "pipe").is_fifo()
+
+
+def test_outputs_stay_in_out(model: Path, tmp_path: Path) -> None:
+    folder, out = write_frame_files(tmp_path / "one", small_frame()), tmp_path / "outputs" / "out"
+    (folder / "sub").mkdir()
+    assert run_thor2("recognize", "--model", model, folder / "sub" / "..", "--out", out) == 0
+    assert [path.name for path in out.parent.iterdir()] == ["out"] and (out / "one" / "overlay.png").is_file()
+
+
+def test_a_wrong_unit_of_depth(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """Without usable depth, the segmenter finds nothing: that is an error if it is so in all frames."""
+    frame = table_frame()
+    write_frame_files(tmp_path / "a", frame)
+    command = ("recognize", "--model", model, tmp_path / "a", "--segment", "table", "--out", tmp_path / "out")
+    assert run_thor2(*command, "--depth-scale", 1, "--coco", tmp_path / "coco.json") == 2
+    error = capfd.readouterr().err
+    assert "depth_scale" in error and "It is 1 units" in error and error.count("\n") == 1
+    assert json.loads((tmp_path / "coco.json").read_text()) == []
+    write_frame_files(tmp_path / "b", dataclasses.replace(frame, depth=frame.depth * 0))
+    assert run_thor2("recognize", "--model", model, tmp_path / "a", tmp_path / "b", "--segment", "table") == 0
 
 
 def test_labels_are_replaced_where_a_folder_is_segmented(

@@ -8,10 +8,21 @@ import numpy as np
 import pytest
 from helpers import json_lines, run_thor2, write_frame_files
 from PIL import Image
-from recording_files import COLOR, PERIOD, START, bag_writer, image, table_frame, write_recording
+from recording_files import (
+    CAMERA,
+    COLOR,
+    DEPTH,
+    PERIOD,
+    START,
+    bag_writer,
+    camera_info,
+    image,
+    table_frame,
+    write_recording,
+)
 from rosbags.highlevel import AnyReader
 
-from thor2_jax.recognition.frames import read_frame
+from thor2_jax.frames.frames import read_frame
 from thor2_jax.segmentation.segmenters import segment
 
 FRAMES = [table_frame(shift) for shift in (0, 3, 6)]
@@ -121,6 +132,40 @@ def test_what_was_done_before_the_end_is_kept(model: Path, tmp_path: Path, capfd
     assert len(messages_of(tmp_path / "out.mcap")["/thor2/detections"]) == n_frames
 
 
+def test_frames_with_one_stamp_and_before_1970(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "a.mcap"
+    with bag_writer(path) as write:
+        for arrival, stamp in enumerate((-1, START, START, START)):
+            write(CAMERA, camera_info(FRAMES[0].intrinsics, FRAMES[0].depth.shape, stamp), arrival)
+            write(COLOR, image(FRAMES[0].color, "rgb8", stamp), arrival)
+            write(DEPTH, image(FRAMES[0].depth, "16UC1", stamp), arrival)
+    command = ("recognize", "--model", model, "--bag", path, "--out", tmp_path / "out")
+    assert run_thor2(*command, "--out-bag", tmp_path / "out.mcap") == 0
+    names = [line["frame"] for line in json_lines(capfd.readouterr().out)]
+    assert names == ["-0.000000001", *(f"1700000000.000000000{end}" for end in ("", "-2", "-3"))]
+    assert sorted(one.name for one in (tmp_path / "out").iterdir()) == sorted(names)
+    messages = messages_of(tmp_path / "out.mcap")["/thor2/detections"]
+    assert [time for time, _ in messages] == [0, START, START, START]
+    assert (messages[0][1].header.stamp.sec, messages[0][1].header.stamp.nanosec) == (-1, 10**9 - 1)
+
+
+def test_a_wrong_unit_of_depth(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    path = write_recording(tmp_path / "a.mcap", FRAMES[:2])
+    assert run_thor2("recognize", "--model", model, "--bag", path, "--depth-scale", 10) == 2
+    assert "is depth_scale right? It is 10 units" in capfd.readouterr().err
+
+
+def test_a_time_out_of_the_range_of_ros_2(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    path, late = tmp_path / "a.mcap", 2**31 * 10**9
+    with bag_writer(path) as write:  # images without a time stamp have the time at which they were recorded
+        write(CAMERA, camera_info(FRAMES[0].intrinsics, FRAMES[0].depth.shape, 0), late)
+        write(COLOR, image(FRAMES[0].color, "rgb8", 0), late)
+        write(DEPTH, image(FRAMES[0].depth, "16UC1", 0), late)
+    assert run_thor2("recognize", "--model", model, "--bag", path, "--out-bag", tmp_path / "out.mcap") == 2
+    assert "error: out_bag: a frame has the time 2147483648 s" in (error := capfd.readouterr().err)
+    assert str(tmp_path / "out.mcap") not in error and not (tmp_path / "out.mcap").exists()
+
+
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
@@ -133,6 +178,10 @@ def test_what_was_done_before_the_end_is_kept(model: Path, tmp_path: Path, capfd
         (["--out-bag", "{there}/none/a.mcap"], "No such file"),
         (["--color-topic", "/x"], "color_topic is /x"),
         (["--max-gap", "0"], "max_gap is 0"),
+        (["--max-gap", "1e300"], "max_gap is 1e+300"),
+        (["--every", "99999999999999999999"], "'--every'"),
+        (["--out-bag", "{there}/in.mcap/a.mcap"], "a.mcap: Not a directory"),
+        (["--depth-scale", "0"], "depth_scale is 0"),
         (["--max-gap", "0.001", "--out-bag", "{there}/out"], "expected at most 0.001 s"),
         (["--segment", "sam"], "segmenter is 'sam'"),
         (["--rerun", "{there}/a.mcap"], "the suffix .rrd"),

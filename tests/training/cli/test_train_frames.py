@@ -1,6 +1,7 @@
 """`thor2 train --frames`: labelled instances alone and beside meshes, with tiny configurations."""
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import trimesh
 from helpers import run_thor2, write_frame
 from PIL import Image
 
-from thor2_jax.recognition.run_directory import load_run
+from thor2_jax.model.run_directory import load_run
 from thor2_jax.recognizer import Recognizer
 
 TINY = ("--embedding", 0, "--orientation-copies", 0, "--classifiers", "ce", "--epochs", 1, "--batch-size", 4, "--quiet")
@@ -61,7 +62,7 @@ def test_train_on_frames_alone(frames: Path, tmp_path: Path, capsys: pytest.Capt
     record = record_of(run)
     assert record["views"] == 4 * 9 and record["frames"]["instances"] == {"brick": 2, "book": 2}
     recognizer = Recognizer.load(run)
-    assert recognizer.classes == ("brick", "book") and recognizer.answers_by() == "classifiers"
+    assert recognizer.classes == ("brick", "book") and recognizer.model.answers_by() == "classifiers"
     assert run_thor2(*command) == 0 and "finished already" in capsys.readouterr().out
     message = error_of(capsys, "--frames", frames / "0", frames / "0", "--out", run, *TINY)
     assert "out: " in message and "dataset" in message
@@ -95,18 +96,23 @@ def test_frames_that_cannot_be_trained_on_are_refused(
     case = tmp_path / "case" / "a"
     write_frame(case, {1: "brick", 2: "book"})
     (case / "labels.json").write_text(json.dumps({"labels": {"1": "Brick", "2": "BRICK"}}))
+    (tmp_path / "reserved").mkdir()
+    shutil.copy(meshes / "box.ply", tmp_path / "reserved" / "unknown.ply")
     unlabelled = tmp_path / "unlabelled" / "a"
     write_frame(unlabelled, {1: "brick"})
     (unlabelled / "labels.json").write_text('{"labels": {}}')
     out = tmp_path / "run"
     for words, options in (
         ("give one of --meshes and --dataset, --frames, or both", ()),
-        ("no labels.json", ("--frames", empty)),
-        ("no frame of", ("--frames", unlabelled)),
+        ("has no color.png", ("--frames", empty)),
+        ("no frame has", ("--frames", unlabelled)),
         ("the objects are brick; expected at least two", ("--frames", one)),
         ("the objects are book; expected", ("--frames", frames, "--leave-out", "brick")),
+        ("leave_out has 'nobody'", ("--frames", frames, "--leave-out", "nobody")),
+        ("leave_out has 'nobody'", ("--meshes", meshes, "--leave-out", "nobody")),
         ("one usable instance", ("--frames", frames / "0")),
-        ("'brick' and 'Brick' differ only by case", ("--meshes", meshes, "--frames", case)),
+        ("'brick' and 'Brick' differ only by case or form", ("--meshes", meshes, "--frames", case)),
+        ("name is 'unknown', which is reserved", ("--meshes", tmp_path / "reserved", "--frames", one)),
         ("azimuth-step is 30", ("--frames", frames, "--azimuth-step", 30)),
         ("mesh-scale is 0.001", ("--frames", frames, "--mesh-scale", 0.001)),
         ("baselines: thor", ("--frames", frames, "--baselines", "thor")),

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,13 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from helpers import encode_image, run_thor2
+from helpers import encode_image, json_lines, run_thor2
 from PIL import Image
 
 import thor2_jax
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.answers import Recognition
-from thor2_jax.recognition.frames import Intrinsics, RGBDFrame, backproject
+from thor2_jax.frames.frames import Intrinsics, RGBDFrame, backproject
+from thor2_jax.model.answers import Recognition
 from training.diagnosis import registration
 from training.diagnosis.camera import check_camera
 from training.diagnosis.colors import check_channel_order, check_light
@@ -143,15 +144,40 @@ def test_extents_of_a_tilted_plate() -> None:
     across = points[..., 1] * np.cos(angle) - points[..., 0] * np.sin(angle)
     labels = ((np.abs(along) < 0.15) & (np.abs(across) < 0.05)).astype(np.uint8)
     plate = RGBDFrame(np.zeros((240, 320, 3), np.uint8), points[..., 2], labels, camera)
-    assert instance_extents(plate) == [pytest.approx(0.3 * 0.96, rel=0.02)]
+    assert instance_extents(plate) == {1: pytest.approx(0.3 * 0.96, rel=0.02)}
 
 
 def test_objects_are_compared_with_the_meshes(frame: RGBDFrame) -> None:
-    extents = instance_extents(frame)
-    assert codes(lambda diagnosis: check_depth(diagnosis, frame, extents)) == []
-    assert codes(lambda diagnosis: check_depth(diagnosis, frame, [e / 10 for e in extents])) == ["depth-unit"]
-    untrusted = codes(lambda diagnosis: check_depth(diagnosis, frame, [0.01], trust_camera=False))
+    sides = {str(label): extent for label, extent in instance_extents(frame).items()}
+    tenths = {name: side / 10 for name, side in sides.items()}
+    assert codes(lambda diagnosis: check_depth(diagnosis, frame, sides)) == []
+    assert codes(lambda diagnosis: check_depth(diagnosis, frame, tenths)) == ["depth-unit"]
+    untrusted = codes(lambda diagnosis: check_depth(diagnosis, frame, {"pin": 0.01}, trust_camera=False))
     assert untrusted == []
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("factor", [0.5, 0.6, 1.0])
+def test_sizes_of_named_meshes_tell_the_focal_length(name: str, factor: float) -> None:
+    sound = frame_files(SAMPLES / name).read()
+    k = sound.intrinsics
+    scaled = change(sound, intrinsics=dataclasses.replace(k, fx=k.fx * factor, fy=k.fy * factor))
+    names = {label: str(label) for label in sound.instances}
+    sides = {names[label]: 1.1 * extent for label, extent in instance_extents(sound).items()}
+    diagnosis = Diagnosis()
+    check_depth(diagnosis, scaled, {**sides, "a large object": 0.6}, names)
+    assert [finding.code for finding in diagnosis.findings] == ([] if factor == 1 else ["intrinsics-focal"])
+
+
+def test_sizes_without_names_tell_a_halved_focal_length(frame: RGBDFrame) -> None:
+    k = frame.intrinsics
+    halved = change(frame, intrinsics=dataclasses.replace(k, fx=k.fx / 2, fy=k.fy / 2))
+    sides = {str(label): extent for label, extent in instance_extents(frame).items()}
+    side = float(np.median(list(sides.values())))
+    for meshes in (sides, {"median": side, "small": side / 3}):
+        assert codes(lambda diagnosis, meshes=meshes: check_depth(diagnosis, frame, meshes)) == []
+        halved_codes = codes(lambda diagnosis, meshes=meshes: check_depth(diagnosis, halved, meshes))
+        assert halved_codes == ["intrinsics-focal"]
 
 
 # Labels
@@ -309,15 +335,15 @@ def test_units_of_meshes(tmp_path: Path, side: float, scale: float, expected: li
     mesh.visual = trimesh.visual.ColorVisuals(mesh, vertex_colors=np.full((8, 4), 200, np.uint8))
     mesh.export(tmp_path / "box.ply")
     diagnosis = Diagnosis()
-    sides = check_meshes(diagnosis, [tmp_path / "box.ply"], scale)
+    sides = check_meshes(diagnosis, {"box": tmp_path / "box.ply"}, scale)
     assert [finding.code for finding in diagnosis.findings] == expected
     assert all(factor in finding.advice for finding in diagnosis.findings)
-    assert sides == ([] if expected else [pytest.approx(0.2)])
+    assert sides == ({} if expected else {"box": pytest.approx(0.2)})
 
 
 def test_meshes_that_cannot_be_read(tmp_path: Path) -> None:
     (tmp_path / "bad.ply").write_text("no mesh")
-    assert codes(lambda diagnosis: check_meshes(diagnosis, [tmp_path / "bad.ply"])) == ["mesh"]
+    assert codes(lambda diagnosis: check_meshes(diagnosis, {"bad": tmp_path / "bad.ply"})) == ["mesh"]
 
 
 # Whole set-ups
@@ -371,3 +397,60 @@ def test_the_command(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     out, err = capfd.readouterr()
     assert out == "" and err.startswith("error: ") and err.count("\n") == 1
     assert run_thor2("doctor", *options(files), "--mesh-scale", 0.001) == 2
+
+
+def test_folders_of_frames(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """The names in labels.json tell which mesh an object is compared with; a frame that is missing files fails."""
+    for name in ("breakfast", "tools"):
+        shutil.copytree(SAMPLES / name, tmp_path / "frames" / name)
+    frame = frame_files(tmp_path / "frames" / "tools").read()
+    names = {label: f"object{label}" for label in frame.instances}
+    (tmp_path / "frames" / "tools" / "labels.json").write_text(json.dumps({"labels": names}))
+    for label, extent in {**instance_extents(frame), 99: 0.6}.items():
+        mesh = trimesh.creation.box((extent, extent / 2, extent / 3))
+        mesh.visual = trimesh.visual.ColorVisuals(mesh, vertex_colors=np.full((8, 4), 200, np.uint8))
+        (tmp_path / "meshes").mkdir(exist_ok=True)
+        mesh.export(tmp_path / "meshes" / f"{names.get(label, 'large')}.ply")
+    command = ("doctor", tmp_path / "frames", "--meshes", tmp_path / "meshes", "--json")
+    assert run_thor2(*command) == 0
+    assert [line["frame"] for line in json_lines(capfd.readouterr().out)] == ["breakfast", "tools"]
+    camera = tmp_path / "frames" / "tools" / "intrinsics.json"
+    values = json.loads(camera.read_text())
+    camera.write_text(json.dumps(values | {"fx": values["fx"] / 2, "fy": values["fy"] / 2}))
+    assert run_thor2(*command) == 1
+    reports = json_lines(capfd.readouterr().out)
+    assert [[finding["code"] for finding in report["findings"]] for report in reports] == [[], ["intrinsics-focal"]]
+    assert run_thor2("doctor", tmp_path / "frames" / "tools") == 0
+    assert capfd.readouterr().out.startswith("tools:\n")
+    frame_files(tmp_path / "frames" / "breakfast").color.unlink()
+    assert run_thor2(*command) == 2
+    out, err = capfd.readouterr()
+    assert [report["frame"] for report in json_lines(out)] == ["tools"]
+    assert "failed: breakfast: " in err and "error: 1 of 2 frames" in err
+
+
+def test_scenes_of_bop(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    scene, frame = tmp_path / "000001", frame_files(SAMPLES / "breakfast").read()
+    k, label = frame.intrinsics, frame.instances[0]
+    for folder, name, pixels in (
+        ("rgb", "000000.png", frame.color),
+        ("depth", "000000.png", frame.depth),
+        ("mask_visib", "000000_000000.png", (frame.labels == label).astype(np.uint8)),
+    ):
+        (scene / folder).mkdir(parents=True)
+        (scene / folder / name).write_bytes(encode_image(pixels))
+    camera = {"cam_K": [k.fx, 0, k.cx, 0, k.fy, k.cy, 0, 0, 1], "depth_scale": 1000 / k.depth_scale}
+    (scene / "scene_camera.json").write_text(json.dumps({"0": camera}))
+    (scene / "scene_gt.json").write_text(json.dumps({"0": [{"obj_id": 1}]}))
+    assert run_thor2("doctor", scene, "--json") == 0
+    assert [line["frame"] for line in json_lines(capfd.readouterr().out)] == ["000001/000000"]
+
+
+def test_frames_and_files_exclude_each_other(capfd: pytest.CaptureFixture[str]) -> None:
+    for arguments, expected in (
+        ((), "give either FRAME"),
+        ((SAMPLES, "--color", "c.png"), "give either FRAME"),
+        (("--color", "c.png"), "--depth, --intrinsics is missing"),
+    ):
+        assert run_thor2("doctor", *arguments) == 2
+        assert expected in capfd.readouterr().err

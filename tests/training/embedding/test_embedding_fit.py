@@ -13,9 +13,10 @@ from helpers import SMALL_CONFIG
 import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.describe import strips
-from thor2_jax.descriptor.orientations import orient_descriptors
+from thor2_jax.descriptor.looks import describe_aligned_looks
 from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
-from thor2_jax.recognition.weights import model_arrays
+from thor2_jax.gallery.references import REFERENCES_FILE
+from thor2_jax.model.weights import model_arrays
 from training.augmentation import orientation
 from training.embedding import fit, sampling
 from training.embedding.build import main
@@ -90,7 +91,7 @@ def test_unturned_samples_have_the_descriptor_of_their_cloud(monkeypatch: pytest
 def embedded(embedding: Embedding, aligned: thor2.PointClouds) -> np.ndarray:
     described = strips(aligned, NETWORK, embedding.config)
     weights = jnp.ones((len(aligned.mask), 1))
-    oriented = orient_descriptors(aligned, weights, described, NETWORK, embedding.config)
+    oriented = describe_aligned_looks(aligned, weights, described, NETWORK, embedding.config)
     return np.asarray(embedding.embed_oriented(oriented))[:, 0]
 
 
@@ -127,7 +128,7 @@ def test_views_of_one_object_become_more_similar(views: Samples) -> None:
     losses = []
     fitted = fit_embedding(views, NETWORK, SMALL_CONFIG, OPTIONS, SIZES, lambda *numbers: losses.append(numbers))
     again = fit_embedding(views, NETWORK, SMALL_CONFIG, OPTIONS, SIZES)
-    assert losses[11][:2] == (12, 12) and losses[11][2] < 0.5 * losses[0][2]
+    assert losses[11][:2] == (36, 36) and losses[11][2].loss < 0.5 * losses[0][2].loss
     assert fitted.fingerprint == again.fingerprint
     batch = views.take(np.arange(len(views)))
     descriptors = fit.batch_descriptors(jnp.asarray(batch.length), jnp.asarray(batch.color), NETWORK, fitted.config)
@@ -155,7 +156,7 @@ def test_further_networks_leave_the_first_as_it_is(views: Samples) -> None:
         lambda *numbers: done.append(numbers[:2]),
         classes,
     )
-    assert done == [(1, 4), (2, 4), (3, 4), (4, 4)]
+    assert done == [(3, 6), (6, 6)]
     (second,) = two.further
     first, same = model_arrays(one.model), model_arrays(two.model)
     assert first.keys() == same.keys() and all(np.array_equal(first[name], same[name]) for name in first)
@@ -178,9 +179,18 @@ def test_too_few_samples_or_objects_are_rejected(views: Samples, tmp_path: Path)
         build_samples([3], tmp_path / "samples", NETWORK, SMALL_CONFIG, 2)
 
 
+@pytest.mark.parametrize("name", ["embedding.safetensors", "embedding.safetensors.samples/00000.safetensors"])
+def test_files_of_the_user_are_not_replaced(name: str, tmp_path: Path) -> None:
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / name).write_text("a user's")
+    with pytest.raises(SystemExit, match="embedding.safetensors"):
+        main(["--out", str(tmp_path / "embedding.safetensors")])
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == [tmp_path / name]
+
+
 @pytest.mark.slow
 def test_the_command_writes_an_embedding(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "embedding.safetensors"
     main(["--out", str(out), "--objects", "24", "--views", "6", "--epochs", "1", "--workers", "1"])
     assert capsys.readouterr().out.split()[-1] == Embedding.load(out).fingerprint
-    assert [path.name for path in tmp_path.iterdir()] == [out.name]
+    assert {path.name for path in tmp_path.iterdir()} == {out.name, REFERENCES_FILE}

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import UntaughtRecognizer
+from helpers import ToyDescriptors, UntaughtRecognizer
 
 import thor2_jax as thor2
 from training.evaluation.answering import answer_frames
@@ -17,7 +17,7 @@ from training.readers.labelled import LabelledFrame
 class ToyRecognizer(UntaughtRecognizer):
     """Stand-in for a recognizer: the k-th usable instance of a frame has row k of the given probabilities."""
 
-    run = SimpleNamespace(classes=("mug", "bowl", "can"), classifiers={"tops": None, "tops2": None})
+    run = SimpleNamespace(classes=("mug", "bowl", "can"), classifiers={"tops": None, "tops2": None}, record={})
 
     def __init__(
         self, labels: list[int], unusable: dict[int, str], probabilities: dict[str, list[list[float]]]
@@ -29,7 +29,7 @@ class ToyRecognizer(UntaughtRecognizer):
 
     def describe(self, frame: Any) -> Any:
         usable = [instance for instance in self.instances if instance.reason is None]
-        return SimpleNamespace(instances=self.instances, usable=usable, oriented=None)
+        return SimpleNamespace(instances=self.instances, usable=usable, oriented=ToyDescriptors(None))
 
     def probabilities(self, oriented: Any) -> dict[str, np.ndarray]:
         return self.table

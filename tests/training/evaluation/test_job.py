@@ -1,7 +1,9 @@
 """Evaluations with stand-ins for recognizers: interrupted, resumed and refused ones; the page and its pictures."""
 
+import dataclasses
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -11,14 +13,19 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import ParsedPage, UntaughtRecognizer
+from helpers import SMALL_CONFIG, ParsedPage, ToyDescriptors, UntaughtRecognizer, untrained_embedding_run
 from PIL import Image
+from processes import HANG
 
 import thor2_jax as thor2
 from thor2_jax.errors import InputError
+from thor2_jax.files import temporary_directory
+from thor2_jax.model.confidence import Calibration
+from thor2_jax.model.run_directory import save_run
+from thor2_jax.recognizer import Recognizer
 from training.evaluation.answers import AnswerFile
 from training.evaluation.job import evaluate_dataset
-from training.evaluation.runs import Run
+from training.evaluation.runs import Run, load_runs
 from training.readers.labelled import LabelledFrame, LabelledFrames
 from training.storage.locks import LOCK, locked
 
@@ -70,7 +77,7 @@ class ToyRecognizer(UntaughtRecognizer):
         with self.log.open("a") as file:
             file.write(f"{number}\n")
         instances = [SimpleNamespace(label=label, reason=None, occluded=False) for label in frame.instances]
-        return SimpleNamespace(instances=instances, usable=instances, oriented=number)
+        return SimpleNamespace(instances=instances, usable=instances, oriented=ToyDescriptors(number))
 
     def probabilities(self, oriented: int) -> dict[str, np.ndarray]:
         rng = np.random.default_rng([self.seed, oriented])
@@ -99,7 +106,7 @@ def test_killed_evaluation_resumes_with_the_same_result(tmp_path: Path) -> None:
     program = f"import runpy; from pathlib import Path; m = runpy.run_path({__file__!r}); "
     program += f"m['evaluate_toys'](Path({str(tmp_path / 'killed')!r}), 9, kill_at=5)"
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    killed = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, timeout=120)
+    killed = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, timeout=HANG)
     assert killed.returncode == -signal.SIGKILL, killed.stderr.decode()[-500:]
     report = tmp_path / "killed" / "report"
     assert not (report / "report.json").exists()
@@ -151,6 +158,40 @@ def test_runs_may_have_different_classifiers(tmp_path: Path) -> None:
     assert np.sum(report["confusion"]) == 20 and np.sum(report["confusion"], axis=0)[-1] == 4
 
 
+@pytest.mark.parametrize("calibrated", [False, True])
+def test_an_embedding_alone_is_evaluated(tmp_path: Path, calibrated: bool) -> None:
+    record: dict[str, object] = {"calibration": vars(Calibration(0.0, 1.0, 1.0, 0.5, 0.1))} if calibrated else {}
+    config = dataclasses.replace(SMALL_CONFIG, looks=4)
+    save_run(untrained_embedding_run(CLASSES, config=config, record=record), tmp_path / "run")
+    (run,) = load_runs([tmp_path / "run"])
+    assert run.predictors == ("embedding",) and run.answer_by == "classifiers"
+    dataset, path = ToyDataset(5), {"kind": "frames", "path": "toys"}
+    report = evaluate_dataset([run], dataset, path, tmp_path / "report")
+    assert report["main"] == "embedding" and report["fusions"] == ["embedding"]
+    assert report["temperatures"]["embedding"]["runs"] == 0
+    confusion, confidences = np.zeros((3, 4), int), []
+    for number in range(5):
+        item = dataset[number]
+        answers = Recognizer.load(tmp_path / "run", unknown_below=0.0).recognize(item.frame)
+        answered = {answer.label: answer for answer in answers}
+        for label in (1, 2):
+            answer = answered.get(label)  # every fourth frame has no label 2
+            column = 3 if answer is None else CLASSES.index(answer.top["embedding"][0][0])
+            confusion[CLASSES.index(item.truth[label]), column] += 1
+            confidences += [] if answer is None else [answer.confidence]
+    assert report["confusion"] == confusion.tolist()
+    (cell,) = report["accuracy"][report["rule"]][0]["cells"]
+    assert cell["accuracy"]["embedding"]["mean"] == pytest.approx(np.trace(confusion) / 10)
+    bins = report["reliability"]
+    assert sum(bins["answers"]) == len(confidences) == 8
+    sums = [count * mean for count, mean in zip(bins["answers"], bins["confidence"], strict=True) if count]
+    assert sum(sums) == pytest.approx(sum(filter(None, confidences)), abs=1e-3)
+    page = ParsedPage((tmp_path / "report" / "report.html").read_text())
+    text = " ".join(page.text)
+    assert "Fusion rules" not in page.text and "THOR2 is the fusion" not in text and "column embedding" in text
+    assert "Confidence" in page.text and "reliability.png" in {p["src"] for p in page.pictures}
+
+
 @pytest.mark.parametrize("n", [1, 2, 15])
 def test_page_for_datasets_of_any_size(tmp_path: Path, n: int) -> None:
     report = evaluate_toys(tmp_path, n)
@@ -161,7 +202,8 @@ def test_page_for_datasets_of_any_size(tmp_path: Path, n: int) -> None:
     shown = [p for p in page.pictures if str(p["src"]).startswith("frames/")]
     assert len(shown) == min(n, 12) and len(report["shown"]) == len(shown)
     crops = {str(p["src"]) for p in page.pictures if str(p["src"]).startswith("confusions/")}
-    assert len(crops) == len(report["worst"])
+    assert len(crops) == len(report["worst"]) and report["worst"][0]["truth"] == "dragon"
+    assert "No name is wrong" not in " ".join(page.text) and "THOR2 (thor2 recognize)" in page.text
     assert "known-unknown.png" in {p["src"] for p in page.pictures} and "Unknown objects" in page.text
     assert "Placements" not in page.text  # every toy is arranged anew
     whole = report["accuracy"][report["rule"]][0]["cells"][0]["accuracy"]["THOR2"]
@@ -251,8 +293,9 @@ def test_answers_for_changed_files_are_refused(tmp_path: Path) -> None:
 
 def test_leftovers_of_a_kill_are_removed(tmp_path: Path) -> None:
     evaluate_toys(tmp_path, 2)
-    for name in (".report.ab12_xyz.json", "frames/.0.12345678.jpg"):
-        (tmp_path / "report" / name).touch()
+    for folder in (tmp_path / "report", tmp_path / "report" / "frames"):
+        with temporary_directory(folder) as temporary:
+            shutil.copytree(temporary, folder / ".thor2-killed")
     evaluate_toys(tmp_path, 2)
     assert not [path for path in (tmp_path / "report").rglob(".*") if path.name != LOCK]
 
@@ -359,9 +402,9 @@ def test_page_of_a_video_and_of_stored_thresholds(tmp_path: Path) -> None:
 
     runs = toys(tmp_path / "log")
     for run in runs:
-        run.recognizer.unknown_below = 0.5
+        run.recognizer.unknown_below = 0.5  # type: ignore[attr-defined]
     report = evaluate_dataset(runs, Video(), {"kind": "frames", "path": "v"}, tmp_path / "report")
     page = ParsedPage((tmp_path / "report" / "report.html").read_text())
     assert report["placements"]["count"] == 1 and report["placements"]["steadiness"]["THOR2"]["mean"] == 1
-    assert page.open == [] and {"Placements", "Unknown objects"} <= set(page.text)
+    assert page.open == [] and {"Placements", "Unknown objects"} <= set(page.text) and "details" in page.tags
     assert any(text.startswith("threshold 0.500") for text in page.text)

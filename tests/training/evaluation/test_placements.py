@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import UntaughtRecognizer
+from helpers import ToyDescriptors, UntaughtRecognizer
 
 import thor2_jax as thor2
 from training.evaluation.answering import answer_frames
@@ -91,12 +91,13 @@ class Unable(UntaughtRecognizer):
     class run:
         classes = ("mug",)
         classifiers = {"tops": None}
+        record: dict[str, Any] = {}
 
     def describe(self, frame: Any) -> Any:
         class Described:
             instances: list[Any] = []
             usable: list[Any] = []
-            oriented = None
+            oriented = ToyDescriptors(None)
 
         return Described()
 

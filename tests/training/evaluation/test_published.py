@@ -9,7 +9,7 @@ import pytest
 
 from training.evaluation.answers import FrameAnswers, InstancePrediction
 from training.evaluation.comparison import EvaluationConditions, compare_with_published
-from training.evaluation.page import comparison_table, comparison_title
+from training.evaluation.page import comparison_table, comparison_title, marked
 from training.evaluation.published import (
     PublishedTable,
     published_attributes,
@@ -134,7 +134,7 @@ def test_comparison_table_pairs_columns_and_prints_percent() -> None:
         if table["number"] == 6
     )
     assert comparison_title(light).startswith("Published table 6: ") and "assumed" in " ".join(light["notes"])
-    header, (row,) = comparison_table(light, "THOR2")
+    header, (row,) = marked(comparison_table(light, "THOR2"), "THOR2")
     assert dict(zip(header, row, strict=True)) == {
         "": "lounge, dim",
         "instances": "8",
@@ -143,7 +143,7 @@ def test_comparison_table_pairs_columns_and_prints_percent() -> None:
         "RGB-D ViT, published": "44.80 ±\u00a01.70",
         "THOR": "0.00 ±\u00a00.00",
         "THOR, published": "57.64 ±\u00a00.39",
-        "THOR2": "93.75 ±\u00a08.84",
+        "THOR2 (thor2 recognize)": "93.75 ±\u00a08.84",
         "THOR2, published": "63.95 ±\u00a00.51",
     }
     assert comparison_table(light, "gallery")[0][2] == "gallery"

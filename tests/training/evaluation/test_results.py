@@ -10,7 +10,8 @@ from sklearn.metrics import confusion_matrix
 from training.evaluation.accuracy import attribute_tables, group_by_attributes, summarize_runs
 from training.evaluation.answers import FrameAnswers, InstancePrediction
 from training.evaluation.fusion import fuse_by, fusions, main_fusion
-from training.evaluation.results import compute_results, incorrect_answers
+from training.evaluation.page import answer_texts
+from training.evaluation.results import compute_results, named_answers
 
 CLASSES = ("bowl", "can", "mug")
 
@@ -75,6 +76,11 @@ def test_fusions_have_the_titles_of_the_paper() -> None:
         "gallery",
         "both",
     ]
+    alone = fusions(["embedding"])
+    assert alone == {"embedding": ("embedding",)} and main_fusion(alone) == "embedding"
+    assert main_fusion(fusions(["forest", "embedding", "gallery", "both"]), "both") == "both"
+    assert main_fusion(fusions(["forest", "embedding"])) == "embedding"
+    assert main_fusion(fusions(["tops", "tops2", "embedding", "THOR2+embedding"])) == "THOR2+embedding"
     assert main_fusion(fusions(["ce", "gallery"])) == "CE" and main_fusion(["gallery"], "gallery") == "gallery"
 
 
@@ -193,11 +199,15 @@ def test_results_match_numpy_and_sklearn() -> None:
     assert report["speed"]["frames_per_second"] == pytest.approx(2)
 
 
-def test_incorrect_answers_are_those_of_the_main_fusion() -> None:
+def test_named_answers_are_those_of_the_main_fusion_and_the_threshold() -> None:
     sure = np.array([[0, 0, 1], [0, 0, 1], [1, 0, 0], [1, 0, 0], [0.9, 0.1, 0]], np.float32)
-    instances = [InstancePrediction(1, "mug", probabilities=sure), InstancePrediction(2, "dragon", probabilities=sure)]
-    incorrect = list(incorrect_answers(FrameAnswers("f", {}, 0.1, instances), RUNS))
-    assert [(i.label, answer, confidence) for i, answer, confidence in incorrect] == [(1, "bowl", 1.0)]
+    instances = [InstancePrediction(1, "mug", probabilities=sure), InstancePrediction(2, "dragon")]
+    runs = [RUNS[0]._replace(thresholds=np.full(3, 1.1)), RUNS[1]]
+    named = list(named_answers(instances, runs))
+    assert [(run, i.label, name, confidence) for run, i, name, confidence in named] == [
+        (0, 1, None, 1.0),
+        (1, 1, "bowl", 1.0),
+    ]
 
 
 def sure_of(name: str, confidence: float) -> np.ndarray:
@@ -233,6 +243,13 @@ def test_rejection_and_placements_match_hand_calculation() -> None:
         "incorrect_at_threshold": pytest.approx(1 / 6),
         "unknown_named_at_threshold": pytest.approx(1 / 3),
     }
+    assert report["answers"] == {"known": 6, "unknown": 3, "correct": 2, "wrong": 1, "unknown_named": 1}
+    assert report["worst"] == [
+        {"truth": "dragon", "answer": "mug", "count": 1, "share": pytest.approx(1 / 3), "known": False},
+        {"truth": "mug", "answer": "can", "count": 1, "share": pytest.approx(1 / 4), "known": True},
+    ]
+    texts = " ".join(answer_texts(report))
+    assert all(part in texts for part in ("0.333", "1 of 3", "dragon (unknown) as mug (1)"))
     curve = report["known_unknown"]
     points = dict(zip(curve["kept"], curve["named"], strict=True))
     assert [points[0.0], points[0.33], points[0.5], points[0.95], points[1.0]] == pytest.approx([0, 0, 0, 1 / 3, 1 / 3])

@@ -11,9 +11,9 @@ from helpers import untrained_run
 
 import colornet
 from thor2_jax.config import DescriptorConfig
-from thor2_jax.descriptor.orientations import describe_orientations
+from thor2_jax.descriptor.looks import describe_looks
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.run_directory import save_run
+from thor2_jax.model.run_directory import save_run
 from thor2_jax.types import PointClouds
 from training.baselines.files import baseline_file
 from training.evaluation.runs import load_runs, load_sequence_runs
@@ -83,7 +83,7 @@ def test_each_sequence_is_answered_by_its_run(make: Maker, tmp_path: Path) -> No
 
     rng = np.random.default_rng(0)
     clouds = PointClouds.pack([(rng.random((50, 3)), rng.random((50, 3))) for _ in range(3)])
-    described = SimpleNamespace(oriented=describe_orientations(clouds, colornet.load_default(), CONFIG))
+    described = SimpleNamespace(oriented=describe_looks(clouds, colornet.load_default(), CONFIG))
     for fold, run in enumerate(runs):
         for frame, own, columns in (("x/bottom/s1/f2", "bottom/s1", [1, 2]), ("x/top/s2/f1", "s2", [0, 1])):
             (alone,) = load_runs([tmp_path / "runs" / own / f"fold-{fold}"])

@@ -8,12 +8,12 @@ from flax import nnx
 
 import colornet
 import thor2_jax as thor2
-from thor2_jax.recognition.classifier import MLP, Feature, class_probabilities
-from thor2_jax.recognition.run_directory import input_size
+from thor2_jax.model.classifier import MLP, Feature, class_probabilities
+from thor2_jax.model.run_directory import input_size
 from training.evaluation.runs import load_runs
 from training.fitting import calibration
 from training.fitting.calibration import sample_probabilities, temperatures
-from training.fitting.job import train_run
+from training.fitting.job import RunSettings, train_run
 from training.fitting.options import FitOptions
 from training.fitting.samples import MIRRORS, build_samples
 from training.fitting.steps import FitContext
@@ -75,7 +75,7 @@ def test_temperatures_are_fitted_to_the_held_out_set() -> None:
 
 def test_runs_of_several_folds_keep_their_temperatures(tmp_path: Path) -> None:
     options = FitOptions(epochs=2, batch_size=4)
-    train_run(source(4), tmp_path / "run", ("tops",), options, config=CONFIG, folds=2)
+    train_run(source(4), tmp_path / "run", RunSettings(("tops",), options, CONFIG, 2))
     for run in load_runs([tmp_path / "run"]):
         assert set(run.temperatures) == {"tops"} and 0.01 <= run.temperatures["tops"] <= 100
         assert run.recognizer.run.record["temperatures"] == run.temperatures

@@ -22,7 +22,8 @@ class State(NamedTuple):
 
 def state(seed: int, size: int = 100) -> State:
     rng = np.random.default_rng(seed)
-    return State({"a": jnp.asarray(rng.random((size, 7)))}, jnp.int32(seed), jnp.asarray([seed], jnp.uint32))
+    weights = {"a": jnp.asarray(rng.random((size, 7))), "none": jnp.zeros((3, 0))}
+    return State(weights, jnp.int32(seed), jnp.asarray([seed], jnp.uint32))
 
 
 def assert_equal(a: State, b: State) -> None:

@@ -7,8 +7,8 @@ import pytest
 from helpers import SMALL_CONFIG, untrained_run
 
 import colornet
-import thor2_jax as thor2
 from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
+from thor2_jax.model.inference import Inference
 from training.embedding.samples import Samples, joined_samples, sample_clouds
 from training.fitting import confidence
 from training.fitting.confidence import fit_calibration
@@ -41,13 +41,13 @@ def test_confidence_separates_and_keeps_its_share(held_out: Samples, monkeypatch
     fused = np.stack([np.where(answer == k, top, 1 - top) for k in (0, 1)], axis=1)
     embedded = fused * np.where(known, 0.9, 0.1)[:, None]
     values = {"tops": fused, "tops2": fused, "embedding": embedded}
-    monkeypatch.setattr(
-        thor2.Recognizer, "probabilities", lambda *a: {k: np.resize(v, (128, 2)) for k, v in values.items()}
-    )
-    fitted = fit_calibration(run, embedding, held_out)
+    inference = Inference(0, {k: np.resize(v, (128, 2)) for k, v in values.items()})
+    monkeypatch.setattr(confidence, "infer", lambda *_: inference)
+    fitted, accuracy = fit_calibration(run, embedding, held_out)
     assert fitted is not None and min(fitted.known_factor, fitted.correct_factor, fitted.score_factor) > 0
     scores, correct = fitted.confidence(fused, embedded), answer == held_out.label
     assert np.min(scores[known & ~wrong]) > 0.7 > np.max(scores[~known])
+    assert accuracy == correct[known].mean() < 1
     assert np.mean(scores[known]) == pytest.approx(correct[known].mean(), abs=0.05)  # most instances are known
     assert fitted.unknown_below == pytest.approx(np.quantile(scores[correct], 1 - confidence.KEPT))
 
@@ -57,4 +57,22 @@ def test_without_correct_answers_there_is_no_confidence(held_out: Samples) -> No
     sizes = EmbeddingSizes(cell=4, hidden=(8,), learned=4, color=2)
     embedding = Embedding.create(SMALL_CONFIG, NETWORK, sizes, classes=("a", "b"), distractors=2)
     unknown = dataclasses.replace(held_out, label=held_out.label + 2)
-    assert fit_calibration(run, embedding, unknown) is None
+    assert fit_calibration(run, embedding, unknown)[0] is None
+
+
+def test_unknown_objects_are_told_apart_without_incorrect_answers(
+    held_out: Samples, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = untrained_run(("a", "b"), ("tops", "tops2"), SMALL_CONFIG)
+    sizes = EmbeddingSizes(cell=4, hidden=(8,), learned=4, color=2)
+    embedding = Embedding.create(SMALL_CONFIG, NETWORK, sizes, classes=("a", "b"), distractors=2)
+    known = held_out.label < 2
+    fused = np.stack([np.where(np.where(known, held_out.label, 0) == k, 0.9, 0.1) for k in (0, 1)], axis=1)
+    embedded = fused * np.where(known, 0.9, 0.1)[:, None]
+    values = {"tops": fused, "tops2": fused, "embedding": embedded}
+    inference = Inference(0, {k: np.resize(v, (128, 2)) for k, v in values.items()})
+    monkeypatch.setattr(confidence, "infer", lambda *_: inference)
+    fitted, accuracy = fit_calibration(run, embedding, held_out)
+    assert fitted is not None and accuracy == 1
+    scores = fitted.confidence(fused, embedded)
+    assert np.max(scores[~known]) < fitted.unknown_below <= np.min(scores[known]) + 1e-9

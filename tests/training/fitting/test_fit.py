@@ -14,7 +14,7 @@ from flax import nnx
 import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.color_membership import region_sets
-from thor2_jax.recognition.classifier import MLP, Feature, feature_of
+from thor2_jax.model.classifier import MLP, Feature, feature_of
 from training.fitting.checkpoints import Checkpoints
 from training.fitting.fit import fit
 from training.fitting.options import EpochMetrics, FitOptions
@@ -73,7 +73,7 @@ def test_separable_classes_are_learned(separable: Samples, fitted: Fit) -> None:
     assert curve[-1].loss < curve[0].loss / 3 and curve[-1].accuracy > 0.8
     assert best == min(curve, key=lambda metrics: metrics.loss).epoch
     assert all(math.isfinite(metrics.loss) and metrics.held_out_accuracy is None for metrics in curve)
-    assert steps == [(done, 24, (done + 2) // 3) for done in range(1, 25)]
+    assert steps == [(3 * epoch, 24, epoch) for epoch in range(1, 9)]
 
 
 @pytest.mark.slow

@@ -1,5 +1,6 @@
 """Trainings: uninterrupted, interrupted and resumed, and with several folds."""
 
+import dataclasses
 import errno
 import json
 import os
@@ -8,7 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +19,13 @@ from flax import nnx
 from PIL import Image
 
 import thor2_jax as thor2
-from thor2_jax.recognition.run_directory import TrainedRun, load_run
+from thor2_jax.model.run_directory import TrainedRun, load_run
 from thor2_jax.types import Cloud
 from training.fitting import job as module
+from training.fitting import loop
 from training.fitting import metrics_log as metrics
 from training.fitting.checkpoints import Checkpoints
-from training.fitting.job import train_run
+from training.fitting.job import RunSettings, train_run
 from training.fitting.options import FitOptions
 from training.fitting.run_directories import find_run_directories
 from training.views.memory_views import MemoryViews
@@ -49,7 +51,7 @@ def source(seed: int = 0, views: int = 6) -> MemoryViews:
 
 
 def train(out: Path, features: tuple[str, ...] = ("tops",), options: FitOptions = OPTIONS, **more: Any) -> TrainedRun:
-    (run,) = train_run(source(), out, features, options, config=CONFIG, **more)
+    (run,) = train_run(source(), out, RunSettings(features, options, CONFIG), **more)
     return run
 
 
@@ -74,6 +76,14 @@ def names(folder: Path) -> list[str]:
 def logged_rows(path: Path) -> list[tuple[Any, ...]]:
     rows = metrics.read_metrics(path / "metrics.jsonl")
     return [(row["fold"], row["classifier"], row["epoch"], row["loss"], row["accuracy"]) for row in rows]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def every_step_is_reported() -> Iterator[None]:
+    """Report each step, so that a training can be interrupted at any of them."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(loop, "STEPS_PER_REPORT", 1)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -137,7 +147,7 @@ def test_nothing_is_written_for_bad_views(
     bad: Mapping[str, list[Cloud]], folds: int, message: str, tmp_path: Path
 ) -> None:
     with pytest.raises(thor2.InputError, match=message):
-        train_run(MemoryViews(bad, CONFIG), tmp_path / "run", ["tops"], OPTIONS, config=CONFIG, folds=folds)
+        train_run(MemoryViews(bad, CONFIG), tmp_path / "run", RunSettings(["tops"], OPTIONS, CONFIG, folds))
     assert names(tmp_path) == []
 
 
@@ -151,6 +161,21 @@ def stop_when(stage: str, step: int) -> Any:
             raise Interrupted
 
     return progress
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run directory of a training that was interrupted before its run was published."""
+    out = tmp_path_factory.mktemp("fitted") / "run"
+
+    def interrupted(*_: Any, **__: Any) -> None:
+        raise Interrupted
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "save_run", interrupted)
+        with pytest.raises(Interrupted):
+            train(out, ("tops", "ce"))
+    return out
 
 
 def test_an_interrupted_run_resumes_to_the_same_result(whole: tuple[Path, TrainedRun], tmp_path: Path) -> None:
@@ -169,18 +194,18 @@ def test_an_interrupted_run_resumes_to_the_same_result(whole: tuple[Path, Traine
         train(out, ("tops", "ce"))
 
 
-@pytest.mark.parametrize("moved", ["nothing", "weights", "network.npz", "run.json"])
+@pytest.mark.parametrize("moved", ["nothing", "tops.safetensors", "network.npz", "run.json"])
 def test_interrupted_while_the_run_is_published(
-    moved: str, whole: tuple[Path, TrainedRun], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    moved: str, whole: tuple[Path, TrainedRun], fitted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    out = tmp_path / "run"
+    out = Path(shutil.copytree(fitted, tmp_path / "run"))
     rename = Path.rename
 
     def stopping(self: Path, target: Path) -> Path:
-        if self.parent.name == "run" and moved == "nothing":
+        if target.suffix == ".safetensors" and moved == "nothing":
             raise Interrupted
         renamed = rename(self, target)
-        if self.name == moved and target.parent == out:
+        if self.name == moved and target.parent in (out, out / "weights"):
             raise Interrupted
         return renamed
 
@@ -204,7 +229,7 @@ def test_interrupted_while_checkpoints_are_removed(tmp_path: Path, monkeypatch: 
 
     monkeypatch.setattr(os, "rmdir", stopping)
     with pytest.raises(Interrupted):
-        train_run(source(), tmp_path / "run", ["tops"], OPTIONS, config=CONFIG, folds=2)
+        train_run(source(), tmp_path / "run", RunSettings(["tops"], OPTIONS, CONFIG, 2))
     assert module.is_finished(tmp_path / "run")
     assert [load_run(folder).record["fold"] for folder in find_run_directories([tmp_path / "run"])] == [0, 1]
 
@@ -221,17 +246,39 @@ def test_other_options_or_views_are_refused(tmp_path: Path) -> None:
         (r"classifiers\[0\] \"tops\", not \"ce\"", {"features": ("tops", "ce")}),
         ("folds 1, not 3", {"folds": 3}),
     ]
+    begun = RunSettings(("tops",), OPTIONS, CONFIG)
     for message, changes in cases:
         with pytest.raises(thor2.InputError, match=f"out: {out} was written with {message}"):
-            train(out, **changes)
+            train_run(source(), out, dataclasses.replace(begun, **changes))
     with pytest.raises(thor2.InputError, match=f'was written with dataset "{source().digest}", not '):
-        train_run(source(1), out, ["tops"], OPTIONS, config=CONFIG)
+        train_run(source(1), out, RunSettings(["tops"], OPTIONS, CONFIG))
     with pytest.raises(thor2.InputError, match=r"was written with descriptor_config\.\w+ "):
-        train_run(source(), out, ["tops"], OPTIONS)
+        train_run(source(), out, RunSettings(["tops"], OPTIONS))
     assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
     (out / "checkpoints" / "begun.json").write_text("{")
     with pytest.raises(thor2.InputError, match=r"begun\.json cannot be read"):
         train(out)
+
+
+def test_files_of_the_user_stay_in_a_run_directory(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    (out / "checkpoints").mkdir(parents=True)
+    (out / "checkpoints" / "epoch1.pt").write_text("a user's")
+    with pytest.raises(thor2.InputError, match=r"already contains epoch1\.pt"):
+        train(out)
+    (out / "checkpoints" / "epoch1.pt").rename(tmp_path / "epoch1.pt")
+    with pytest.raises(Interrupted):
+        train(out, progress=stop_when("fit tops", 8))
+    users = [
+        out / name
+        for name in ("checkpoints/notes.txt", "weights/pretrained.npz", ".checkpoints/a", ".curves.12345678.png")
+    ]
+    for path in users:
+        path.parent.mkdir(exist_ok=True)
+        path.write_text("a user's")
+    train(out)
+    assert all(path.read_text() == "a user's" for path in users) and module.is_finished(out)
+    assert names(out / "checkpoints") == ["notes.txt"] and load_run(out).classes == ("red brick", "stick")
 
 
 def test_a_damaged_checkpoint_is_refused(tmp_path: Path) -> None:
@@ -294,7 +341,7 @@ def test_folds(tmp_path: Path) -> None:
             raise Interrupted
 
     def run() -> list[TrainedRun]:
-        return train_run(source(views=6), out, ["tops"], OPTIONS, progress, CONFIG, folds=3)
+        return train_run(source(views=6), out, RunSettings(["tops"], OPTIONS, CONFIG, 3), progress)
 
     with pytest.raises(Interrupted):
         run()

@@ -19,7 +19,7 @@ import numpy as np
 from flax import nnx
 import thor2_jax as thor2
 from training.fitting.options import FitOptions
-from training.fitting.job import train_run
+from training.fitting.job import RunSettings, train_run
 from training.views.memory_views import MemoryViews
 
 rng = np.random.default_rng(0)
@@ -30,8 +30,8 @@ def clouds(size, low, high):
 config = thor2.DescriptorConfig(homology="closed_form", n_slices=3, n_strips=8, image_size=8)
 views = {"brick": clouds((0.1, 0.05, 0.03), 0, 99), "stick": clouds((0.2, 0.02, 0.02), 99, 255)}
 stages = []
-runs = train_run(MemoryViews(views, config), out, ["tops2"], FitOptions(epochs=4, batch_size=16),
-                 lambda *stage: stages.append(stage), config, folds=2)
+settings = RunSettings(["tops2"], FitOptions(epochs=4, batch_size=16), config, 2)
+runs = train_run(MemoryViews(views, config), out, settings, lambda *stage: stages.append(stage))
 assert len(jax.devices()) == int(sys.argv[4])
 for fold, run in enumerate(runs):
     state = nnx.to_flat_state(nnx.state(run.classifiers["tops2"]))

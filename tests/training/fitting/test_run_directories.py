@@ -26,6 +26,7 @@ def test_unfinished_training_is_refused_but_not_its_folds(tmp_path: Path) -> Non
     fold.mkdir(parents=True)
     (fold / "run.json").touch()
     (tmp_path / "run" / "checkpoints").mkdir()
+    (tmp_path / "run" / "checkpoints" / "begun.json").touch()
     with pytest.raises(InputError, match="model: "):
         find_run_directories([tmp_path / "run"])
     assert find_run_directories([fold]) == [fold]

@@ -6,7 +6,7 @@ from scipy.special import softmax
 from sklearn.metrics import log_loss
 
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.fusion import with_temperature
+from thor2_jax.model.fusion import with_temperature
 from training.evaluation.confidence import expected_calibration_error
 from training.fitting.temperature import fit_temperature, negative_log_likelihood
 

@@ -1,6 +1,7 @@
 """Downloads of YCB meshes from a local server: resumed, damaged, missing and hostile archives, and no network."""
 
 import io
+import shutil
 import socket
 import tarfile
 from collections.abc import Iterator
@@ -136,8 +137,18 @@ def test_damaged_archives_leave_nothing(server: Server, tmp_path: Path, data: by
     server.files = {f"/google/{NAME}_google_16k.tgz": data}
     with pytest.raises(InputError, match=NAME) as error:
         fetch_ycb([NAME], tmp_path, url=server.url)
-    assert "\n" not in str(error.value) and ".extracting" not in str(error.value)
+    assert "\n" not in str(error.value) and ".thor2" not in str(error.value)
     assert [path.name for path in tmp_path.iterdir()] == [".lock"]
+
+
+def test_files_of_the_user_stay(server: Server, tmp_path: Path) -> None:
+    (tmp_path / ".extracting-mine").mkdir()
+    fetch_ycb([NAME], tmp_path, url=server.url)
+    shutil.rmtree(tmp_path / NAME)
+    (tmp_path / f".{NAME}.tgz").write_text("a user's")
+    with pytest.raises(InputError, match=f"{NAME}.tgz"):
+        fetch_ycb([NAME], tmp_path, url=server.url)
+    assert (tmp_path / f".{NAME}.tgz").read_text() == "a user's" and (tmp_path / ".extracting-mine").is_dir()
 
 
 def test_archive_writes_only_into_its_folder(server: Server, tmp_path: Path) -> None:
@@ -158,6 +169,24 @@ def test_archive_writes_only_into_its_folder(server: Server, tmp_path: Path) -> 
 def test_unknown_objects_are_errors(server: Server, tmp_path: Path, names: list[str]) -> None:
     with pytest.raises(InputError, match="objects"):
         fetch_ycb(names, tmp_path, url=server.url)
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        "ftp://a",
+        "http://",
+        "http://[::1",
+        "http://a:b",
+        "http://a b",
+        "http://a..b",
+        "http://\u2100.com",
+        "http://\uff0e",
+    ],
+)
+def test_malformed_addresses_are_errors(tmp_path: Path, url: str) -> None:
+    with pytest.raises(InputError, match="expected"):
+        fetch_ycb([NAME], tmp_path, url=url)
 
 
 def test_foreign_folder_is_not_replaced(server: Server, tmp_path: Path) -> None:

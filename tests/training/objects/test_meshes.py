@@ -256,6 +256,17 @@ def test_finding_meshes(tmp_path: Path) -> None:
     assert [(name, path.stem) for name, path in by_class.items()] == [("again", "mug"), ("cup", "mug"), ("soup", "can")]
 
 
+def test_names_of_meshes_are_normal_and_differ(tmp_path: Path) -> None:
+    (tmp_path / "cafe\u0301.ply").touch()
+    assert list(find_meshes(tmp_path)) == ["caf\u00e9"]
+    assert list(find_meshes(tmp_path, {" cup": "cafe\u0301"})) == ["cup"]
+    (tmp_path / "caf\u00e9.glb").touch()
+    with pytest.raises(InputError, match="'caf\u00e9' is there twice|'cafe\u0301' is there twice"):
+        find_meshes(tmp_path)
+    with pytest.raises(InputError, match="name is '..', which is reserved"):
+        find_meshes(tmp_path, {"..": "cafe\u0301"})
+
+
 def test_missing_meshes_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="nowhere: no such folder"):
         find_meshes(tmp_path / "nowhere")

@@ -10,11 +10,11 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from helpers import UntaughtRecognizer, run_thor2
+from helpers import ToyDescriptors, UntaughtRecognizer, run_thor2
 from PIL import Image
 
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.frames import backproject
+from thor2_jax.frames.frames import backproject
 from training.evaluation.answering import answer_frames
 from training.evaluation.results import compute_results
 from training.evaluation.runs import Run as EvaluatedRun
@@ -374,7 +374,9 @@ class LabelIsClass(UntaughtRecognizer):
             SimpleNamespace(label=k, reason="too few points" if k == last else None, occluded=False)
             for k in frame.instances
         ]
-        return SimpleNamespace(instances=instances, usable=instances[:-1], oriented=range(len(instances) - 1))
+        return SimpleNamespace(
+            instances=instances, usable=instances[:-1], oriented=ToyDescriptors(range(len(instances) - 1))
+        )
 
     def probabilities(self, usable: range) -> dict[str, np.ndarray]:
         return {"tops": np.array([[0.9, 0.1] if k == 0 else [0.2, 0.8] for k in usable]).reshape(-1, 2)}

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from helpers import UntaughtRecognizer, run_thor2
+from helpers import ToyDescriptors, UntaughtRecognizer, run_thor2
 from PIL import Image
 
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.frames import Intrinsics, backproject
+from thor2_jax.frames.frames import Intrinsics, backproject
 from training.evaluation.answering import answer_frames
 from training.evaluation.results import compute_results
 from training.evaluation.runs import Run as EvaluatedRun
@@ -391,7 +391,7 @@ class NamesInOrder(UntaughtRecognizer):
 
     def describe(self, frame: Any) -> Any:
         instances = [SimpleNamespace(label=label, reason=None, occluded=False) for label in frame.instances]
-        return SimpleNamespace(instances=instances, usable=instances, oriented=instances)
+        return SimpleNamespace(instances=instances, usable=instances, oriented=ToyDescriptors(instances))
 
     def probabilities(self, clouds: Sequence[Any]) -> dict[str, np.ndarray]:
         return {"tops": np.array([[0.9, 0.1] if k == 0 else [0.2, 0.8] for k in range(len(clouds))]).reshape(-1, 2)}
@@ -430,7 +430,7 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     report = json.loads((tmp_path / "report" / "report.json").read_text())
     assert report["instances"]["scored"] == 2 and sum(report["instances"]["no_class"].values()) == 1
     page = (tmp_path / "report" / "report.html").read_text()
-    assert "Models: run." in page and "confusions/" not in page
+    assert "Models: run." in page and "banana (unknown object)" in page
     cell = report["accuracy"]["max"][0]["cells"][0]
     assert cell["instances"] == 2 and cell["accuracy"]["TOPS"]["mean"] == 1.0
     names.unlink()

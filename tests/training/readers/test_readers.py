@@ -11,8 +11,9 @@ import pytest
 from PIL import Image
 
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.frames import read_labels
+from thor2_jax.frames.frames import read_labels
 from training.readers import FrameFolder, UWISOccluded
+from training.readers.frame_files import find_frames
 from training.readers.uwis import INTRINSICS, video_attributes
 
 # The dataset's table: (category, occlusion, light) -> video numbers.
@@ -206,13 +207,13 @@ def test_uwis_labels_that_two_objects_share(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("reader", [UWISOccluded, FrameFolder])
 def test_paths_that_are_not_a_dataset(reader: Callable[[Path], Any], tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"^dataset: .*absent "):
+    with pytest.raises(InputError, match=r"^(dataset|frames): .*absent "):
         reader(tmp_path / "absent")
     (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match=r"^dataset: .*file "):
+    with pytest.raises(InputError, match=r"^(dataset|frames): .*file "):
         reader(tmp_path / "file")
     (tmp_path / "41" / "images").mkdir(parents=True)
-    with pytest.raises(InputError, match=r"^dataset: .* has no "):
+    with pytest.raises(InputError, match=r"^(dataset|frames): .* has no "):
         reader(tmp_path)
 
 
@@ -224,8 +225,10 @@ def test_a_folder_of_frames(tmp_path: Path) -> None:
     write_frame(tmp_path / "a", {"labels": {}}, seed=2)
     (tmp_path / "c").mkdir()
     (tmp_path / "index.json").write_text("{}")
+    assert FrameFolder(tmp_path).note == ""
+    (write_frame(tmp_path / "d", {}) / "labels.json").unlink()
     dataset = FrameFolder(tmp_path)
-    assert len(dataset) == 2
+    assert len(dataset) == 2 and dataset.note == "1 frames without labels.json: d"
     items = list(dataset)
     assert [item.identifier for item in items] == ["a", "b"]
     assert [item.truth for item in items] == [{}, {1: "mug", 200: "bowl"}]
@@ -241,6 +244,20 @@ def test_one_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert [(item.identifier, item.truth) for item in FrameFolder(folder)] == [("only", {1: "mug"})]
     monkeypatch.chdir(folder)
     assert [item.identifier for item in FrameFolder(".")] == ["only"]
+    (folder / "sub").mkdir()
+    assert [item.identifier for item in FrameFolder("sub/..")] == ["only"]
+
+
+def test_frames_of_one_name_in_two_folders(tmp_path: Path) -> None:
+    for folder in ("a", "b/deep"):
+        write_frame(tmp_path / folder / "000", {"labels": {"1": "mug"}})
+    for paths in (("a", "b"), ("a/000", "b/deep/000")):
+        names = [source.name for source in find_frames([tmp_path / path for path in paths])]
+        assert names == (["a/000", "b/deep/000"] if paths[0] == "a/000" else ["000", "deep/000"])
+    names = [source.name for source in find_frames([tmp_path / "a", tmp_path / "b" / "deep"])]
+    assert names == ["a/000", "b/deep/000"]
+    with pytest.raises(InputError, match="000 is given twice"):
+        find_frames([tmp_path / "a", tmp_path / "a"])
 
 
 def test_labels_of_another_mask_are_refused(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ import pytest
 import trimesh
 from helpers import full_image
 
-from thor2_jax.recognition.frames import Intrinsics, backproject
+from thor2_jax.frames.frames import Intrinsics, backproject
 from training.objects.mesh import TexturedMesh
 from training.rendering.camera import Camera
 from training.rendering.ray_caster import RayCaster, pixel_rays, render_view

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 import thor2_jax
-from thor2_jax.recognition.frames import RGBDFrame, read_frame
+from thor2_jax.frames.frames import RGBDFrame, read_frame
 from training.rendering.sample_frames import write_sample_frames
 
 PACKAGED = Path(thor2_jax.__file__).parent / "service" / "page" / "samples"

@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.frames import Intrinsics, backproject
+from thor2_jax.frames.frames import Intrinsics, backproject
 from training.objects.builtin_objects import builtin_objects
 from training.objects.mesh import TexturedMesh
 from training.rendering.camera import Camera

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import ParsedPage
+from helpers import SMALL_CONFIG, ParsedPage
 from PIL import Image
 
 import colornet
@@ -26,11 +26,13 @@ from training.reports.plots import (
 
 
 def test_page_escapes_its_content(tmp_path: Path) -> None:
-    section = Section("A < B", "x & y", (["name", "value"], [["<b>", "1"]]), [Picture("p.png", 'the "first"')])
+    folded = Section("more & more", table=(["all"], [["<i>"]]))
+    picture = Picture("p.png", 'the "first"')
+    section = Section("A < B", "x & y", (["name", "value"], [["<b>", "1"]]), [picture], folded)
     write_page(tmp_path / "page.html", title="T<script>", lead="l", sections=[section])
     page = ParsedPage((tmp_path / "page.html").read_text())
-    assert page.open == []
-    assert {"T<script>", "A < B", "x & y", "<b>", 'the "first"'} <= set(page.text)
+    assert page.open == [] and {"details", "summary"} <= page.tags
+    assert {"more & more", "<i>", "T<script>", "A < B", "x & y", "<b>", 'the "first"'} <= set(page.text)
     assert page.pictures == [{"src": "p.png", "alt": 'the "first"'}]
     assert [p.name for p in tmp_path.iterdir()] == ["page.html"]
 
@@ -38,6 +40,17 @@ def test_page_escapes_its_content(tmp_path: Path) -> None:
 def colors_in(path: Path) -> int:
     with Image.open(path) as image:
         return len(np.unique(np.asarray(image.convert("RGB")).reshape(-1, 3), axis=0))
+
+
+@pytest.mark.parametrize("n_classes", [1, 4, 30])
+def test_a_confusion_matrix_shows_all_of_its_label(tmp_path: Path, n_classes: int) -> None:
+    """A label that is cut reaches the border of the picture."""
+    classes = [f"object {k}" for k in range(n_classes)]
+    for name in ("gallery", "embedding + classifiers"):
+        draw_confusion(np.eye(n_classes, n_classes + 1, dtype=int), classes, name, tmp_path / "confusion.png")
+        with Image.open(tmp_path / "confusion.png") as image:
+            pixels = np.asarray(image.convert("L"))
+        assert all((side == 255).all() for side in (pixels[0], pixels[-1], pixels[:, 0], pixels[:, -1]))
 
 
 def test_every_plot_is_drawn(tmp_path: Path) -> None:
@@ -82,13 +95,22 @@ def test_missing_directory_raises_oserror(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+def test_pictures_of_the_user_are_not_those_of_a_demo(tmp_path: Path) -> None:
+    (tmp_path / "pictures").mkdir()
+    (tmp_path / "pictures" / "scene-0.png").write_text("a user's")
+    with pytest.raises(thor2.InputError, match="already contains pictures"):
+        demo.run_demo(tmp_path)
+    assert [path.name for path in tmp_path.rglob("*.*")] == ["scene-0.png"]
+
+
 @pytest.mark.slow
 def test_small_demo_is_interrupted_and_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     names = ("mug_blue", "soup_can_red", "cereal_box_yellow", "sponge", "white_bowl")
     everything = builtin_objects()
     monkeypatch.setattr(demo, "builtin_objects", lambda: {name: everything[name] for name in names})
     monkeypatch.setattr(demo, "N_SCENES", 6)
-    small = {"azimuth_step": 45.0, "polar_step": 30.0, "fit": FitOptions(epochs=4, batch_size=128)}
+    fit = FitOptions(epochs=4, batch_size=128)
+    small = {"azimuth_step": 45.0, "polar_step": 30.0, "fit": fit, "config": SMALL_CONFIG}
     monkeypatch.setattr(demo, "PROTOCOL", dataclasses.replace(demo.PROTOCOL, **small))
 
     class Interrupted(BaseException):

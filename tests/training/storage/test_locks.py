@@ -16,7 +16,7 @@ from pathlib import Path
 from training.storage.locks import locked
 with locked(Path(sys.argv[1])):
     print("locked", flush=True)
-    time.sleep(60)
+    time.sleep(10_000)
 """
 
 

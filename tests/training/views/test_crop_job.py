@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ import trimesh
 from helpers import run_thor2
 
 from thor2_jax.errors import InputError
-from thor2_jax.recognition.frames import RGBDFrame
+from thor2_jax.frames.frames import RGBDFrame
 from training.objects.mesh import TexturedMesh
 from training.objects.meshes import find_meshes, load_mesh
 from training.rendering.ray_caster import RayCaster, render_view
@@ -56,6 +57,16 @@ def test_crops_are_those_of_the_rendered_views(meshes: Path, dataset: ViewDatase
         color, normals = quantized(rgbd_crop(frame, 1, SIZE))
         np.testing.assert_array_equal(crops.color[row], color)
         np.testing.assert_array_equal(crops.normals[row], normals)
+
+
+def test_crops_of_the_user_are_not_replaced(meshes: Path, dataset: ViewDataset, tmp_path: Path) -> None:
+    copied = shutil.copytree(dataset.directory, tmp_path / "views", ignore=shutil.ignore_patterns("crops"))
+    (copied / "crops").mkdir()
+    for file in (dataset.directory / "crops").glob("*.npz"):
+        (copied / "crops" / file.name).write_text("a user's")
+    with pytest.raises(InputError, match="already contains"):
+        render_crops(find_meshes(meshes), ViewDataset.open(copied), SIZE)
+    assert all(file.read_text() == "a user's" for file in (copied / "crops").glob("*.npz"))
 
 
 def test_interrupted_crops_resume_with_the_same_bytes(

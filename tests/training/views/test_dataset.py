@@ -13,7 +13,7 @@ import thor2_jax
 from thor2_jax.errors import InputError
 from thor2_jax.types import Cloud
 from training.objects.builtin_objects import builtin_objects
-from training.views.dataset import Manifest, ViewDataset, encode
+from training.views.dataset import Manifest, ViewDataset, encode, remove_views
 from training.views.mesh_views import render_views
 from training.views.normalized_views import (
     COORDINATE_STEP,
@@ -42,6 +42,18 @@ def copied(written: Path, tmp_path: Path) -> Path:
 
 def views_of(clouds: list[Cloud]) -> NormalizedViews:
     return normalize_views(clouds, 3, range(len(clouds)), [0] * len(clouds), CONFIG)
+
+
+def test_only_what_was_rendered_is_removed(copied: Path) -> None:
+    (copied / "crops").mkdir()
+    users = [copied / "notes.txt", copied / "crops" / "mine.npz"]
+    for path in users:
+        path.write_text("a user's")
+    remove_views(copied)
+    assert sorted(path for path in copied.rglob("*") if path.is_file()) == sorted(users[::-1])
+    (copied / "manifest.json").write_text("a user's")
+    remove_views(copied)
+    assert all(path.read_text() == "a user's" for path in (*users, copied / "manifest.json"))
 
 
 def test_views_are_read_normalized(written: Path) -> None:

@@ -1,7 +1,7 @@
 // Main module of the page: choose a frame, recognize it, show its objects.
 
 import { showDetails } from "./details.js";
-import { breakable, confidenceOf, element, percent, rgb } from "./drawing.js";
+import { breakable, confidenceOf, element, isNarrow, percent, rgb } from "./drawing.js";
 import { decoded, labelImage } from "./label_image.js";
 import { MaskTools } from "./masks.js";
 import { instanceColors, Overlay, textColor } from "./overlay.js";
@@ -74,11 +74,11 @@ async function whenStarted(request, signal) {
 }
 
 /**
- * Recognize a frame and show it, with the object `selected` if it is given.
+ * Recognize a frame and show it, with the object of label `selected()`.
  *
  * `history` has the label images before each correction of masks; null if the masks came with the frame.
  */
-async function recognize(title, fileSource, fields, selected, history = null) {
+async function recognize(title, fileSource, fields, selected = () => null, history = null) {
   currentRequest.abort();
   const { signal } = (currentRequest = new AbortController());
   clearProblems();
@@ -95,7 +95,7 @@ async function recognize(title, fileSource, fields, selected, history = null) {
       files = { ...files, labels: await labelImage(decoded(answer.label_map), width, height) };
       history = [];
     }
-    if (!signal.aborted) show({ ...answer, title, files, fields, history }, bitmap, selected);
+    if (!signal.aborted) show({ ...answer, title, files, fields, history }, bitmap, selected());
   } catch (problem) {
     if (signal.aborted) return;
     hideResult();
@@ -119,7 +119,7 @@ function show(answer, bitmap, selected) {
   const unknown = instances.length - named.length;
   const empty = history ? "there are no masks" : "the label image is 0 everywhere";
   if (!instances.length) setStatus(`${title}: no objects: ${empty}.`);
-  else setStatus(`${title}: ${count}${unknown ? `, ${unknown} of them unknown` : ""}.`);
+  else setStatus(`${title}: ${count}${unknown ? `, ${unknown} of them unknown. ${unknownHint()}` : "."}`);
   byId("chooser").classList.add("compact");
   byId("upload").open = false;
   byId("result").hidden = false;
@@ -135,6 +135,13 @@ function show(answer, bitmap, selected) {
   if (first) select(first.label);
   scrollTo({ top: 0 });
   if (byId("overlay").getBoundingClientRect().bottom > innerHeight) byId("status").scrollIntoView();
+}
+
+/** Return what the model knows, and how to teach it. */
+function unknownHint() {
+  const { knows, teaches } = loaded.model;
+  const how = teaches ? "Click an object to name it." : "Teach it by thor2 enroll, or here after thor2 serve --teach.";
+  return `This model knows ${knows}. ${how}`;
 }
 
 function objectButton(instance, color) {
@@ -164,7 +171,8 @@ function objectButton(instance, color) {
 /** Use a click on an object for the masks, or select it; return whether it was selected. */
 function choose(click) {
   if (maskTools.takes(click) || !click.label) return false;
-  select(click.label, true);
+  // On a phone, the picture that is tapped stays where it is: the answer is below it.
+  select(click.label, click.x === undefined || !isNarrow.matches);
   return true;
 }
 
@@ -172,13 +180,13 @@ async function changeMasks(map, selected) {
   const { title, files, fields, history } = frame;
   const { width, height } = frame.label_map;
   const labels = await labelImage(map, width, height);
-  await recognize(title, async () => ({ ...files, labels }), fields, selected, [...history, files.labels]);
+  await recognize(title, async () => ({ ...files, labels }), fields, () => selected, [...history, files.labels]);
 }
 
 function undoMasks() {
   const { title, files, fields, history } = frame;
   const corrected = { ...files, labels: history.at(-1) };
-  return recognize(title, async () => corrected, fields, overlay.selected, history.slice(0, -1));
+  return recognize(title, async () => corrected, fields, () => overlay.selected, history.slice(0, -1));
 }
 
 function select(label, byUser = false) {
@@ -187,8 +195,10 @@ function select(label, byUser = false) {
   }
   overlay.select(label);
   const instance = frame.instances.find((one) => one.label === label);
+  const { name } = instance;
+  byId("answer").replaceChildren(...breakable(name ?? "unknown object"), name === null ? "" : ` ${percent(confidenceOf(instance))}`);
   showDetails(instance, loaded.model, loaded.regions);
-  showNaming(instance, loaded.model);
+  showNaming(instance, loaded.model, frame.files);
   showWhy(instance);
   // While masks are corrected, the image stays in view.
   if (byUser && !frame.history && byId("details-title").getBoundingClientRect().bottom > innerHeight) byId("details").scrollIntoView();
@@ -200,7 +210,7 @@ async function load() {
     try {
       const [model, network] = await Promise.all([service.model(), service.colornet()]);
       byId("token-section").hidden = true;
-      showClasses(model.classes);
+      showClasses(model);
       if (model.segmenter === null) byId("labels-hint").textContent = "PNG of instance numbers.";
       await showSamples(model);
       return { model, regions: network.mean_rgb };
@@ -211,8 +221,8 @@ async function load() {
   }
 }
 
-function showClasses(classes) {
-  byId("model-title").textContent = `This model knows ${classes.length} ${classes.length === 1 ? "object" : "objects"}`;
+function showClasses({ classes, knows }) {
+  byId("model-title").textContent = `This model knows ${knows}`;
   byId("classes").replaceChildren(...classes.map((name) => element("li", {}, name)));
   byId("model").hidden = false;
 }
@@ -276,11 +286,9 @@ connectNaming(
   () => frame.files,
   async (files) => {
     loaded.model = await service.model();
-    showClasses(loaded.model.classes);
-    if (frame?.files === files) {
-      const selected = Number(byId("naming").dataset.label);
-      await recognize(frame.title, async () => files, frame.fields, selected, frame.history);
-    }
+    showClasses(loaded.model);
+    if (frame?.files !== files) return;
+    await recognize(frame.title, async () => files, frame.fields, () => overlay.selected, frame.history);
   },
   showProblem,
 );
@@ -300,5 +308,12 @@ async function watchReady() {
   }
 }
 
+/** On a narrow screen, details unfold when they are asked for. */
+function fold() {
+  for (const one of document.querySelectorAll(".fold")) one.open = !isNarrow.matches;
+}
+
+isNarrow.addEventListener("change", fold);
+fold();
 watchReady();
 load().then((value) => (loaded = value), showProblem);

@@ -1,9 +1,14 @@
-// Details of one object: its cloud, its slices, and the probabilities of both classifiers.
+// Details of one object: its cloud, its slices, and the probabilities of each classifier.
 
 import { breakable, element, keepDrawn, percent, rgb, themed } from "./drawing.js";
 
 const byId = (id) => document.getElementById(id);
-const TITLES = { tops: "TOPS: shape", tops2: "TOPS2: shape and colour", gallery: "Gallery: enrolled views" };
+const TITLES = {
+  tops: "TOPS: shape",
+  tops2: "TOPS2: shape and colour",
+  embedding: "Embedding: shape and colour",
+  gallery: "Gallery: enrolled views",
+};
 
 /** Fill the section. `regions` are the mean colours of the colour regions. */
 export function showDetails(instance, model, regions) {
@@ -50,7 +55,11 @@ function confidenceHelp(calibrated, sources) {
   if (sources.includes("gallery")) return `${gallery}${both}The confidence is not calibrated.`;
   const fusion = "The named class has the highest geometric mean of both probabilities; normalized, it is the confidence. ";
   const known = "The embedding tells the classes from other objects: the less likely it finds all of them together, the lower is the confidence. For objects that the model knows, it estimates the probability that the name is correct.";
-  if (sources.includes("embedding")) return `The named class has the highest geometric mean of the other probabilities. ${known}`;
+  const alone = sources.length === 1;
+  if (sources.includes("embedding") && (!alone || calibrated !== null)) {
+    return `The named class has the highest ${alone ? "probability" : "geometric mean of the other probabilities"}. ${known}`;
+  }
+  if (alone) return "The named class has the highest probability; divided by that of all classes, it is the confidence. It is not calibrated.";
   if (calibrated !== null) return `${fusion}The calibrated confidence (temperature scaling on a held-out set) estimates the accuracy of such answers.`;
   return `${fusion}It is not calibrated, since the model was trained without a held-out set: expect fewer correct answers than it suggests.`;
 }

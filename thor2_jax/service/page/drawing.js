@@ -29,6 +29,9 @@ export function keepDrawn(canvas, paint) {
   draw(canvas);
 }
 
+/** Whether the page is as narrow as on a phone: then details are folded. */
+export const isNarrow = matchMedia("(max-width: 48rem)");
+
 /** Return a colour of the style sheet, for example `--muted`. */
 export const themed = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 

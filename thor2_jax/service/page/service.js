@@ -34,7 +34,9 @@ async function call(path, options = {}) {
     response,
   ).catch(() => ({}));
   const again = response.status === 429 ? " Try again in a moment." : "";
-  throw new Problem(response.status, field, message + again, further);
+  const problem = new Problem(response.status, field, message + again, further);
+  problem.retryAfter = Number(response.headers.get("Retry-After") ?? 1);
+  throw problem;
 }
 
 const parse = async (response) =>

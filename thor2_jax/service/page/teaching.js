@@ -14,13 +14,16 @@ function markName(message) {
   else byId("name").removeAttribute("aria-invalid");
 }
 
-/** Show the form for an object if the service teaches. */
-export function showNaming(instance, { teaches, classes }) {
+let shown = {}; // The frame and the object of the form.
+
+/** Show the form for an object of a frame if the service teaches; what is typed for the object that is shown stays. */
+export function showNaming(instance, { teaches, classes }, files) {
   byId("naming").hidden = !teaches || !canBeNamed(instance);
-  byId("naming").dataset.label = instance.label;
   byId("name-label").textContent = instance.name === null ? "Name this object" : "Correct the name";
-  byId("name").value = "";
   byId("known-names").replaceChildren(...classes.map((value) => element("option", { value })));
+  if (shown.files === files && shown.label === instance.label) return;
+  shown = { files, label: instance.label };
+  byId("name").value = "";
   markName("");
 }
 
@@ -59,12 +62,13 @@ export function connectNaming(shownFiles, changed, failed) {
       files = shownFiles();
       let answer;
       try {
-        answer = await service.enroll(files, byId("naming").dataset.label, name);
+        answer = await service.enroll(files, shown.label, name);
       } catch (problem) {
         if (problem.status === 401 || !(problem instanceof service.Problem)) return failed(problem);
         markName(problem.message);
         return byId("name").focus();
       }
+      byId("name").value = "";
       const { name: enrolled, views, generation } = answer;
       showNotice(views === 1 ? `“${enrolled}” is enrolled.` : `“${enrolled}” has ${views} views now.`, generation);
       byId("notice").dataset.name = enrolled;

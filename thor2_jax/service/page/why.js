@@ -1,6 +1,6 @@
 // Explanation of one object: the pictures of /v1/why.
 
-import { element } from "./drawing.js";
+import { element, isNarrow } from "./drawing.js";
 import * as service from "./service.js";
 
 const byId = (id) => document.getElementById(id);
@@ -16,14 +16,15 @@ export function showWhy({ label, details }) {
   byId("why-pictures").replaceChildren();
 }
 
-async function canvasOf({ title, caption, png }) {
+async function pictureOf({ title, caption, png }, number) {
   const bytes = Uint8Array.from(atob(png), (character) => character.charCodeAt(0));
   const bitmap = await createImageBitmap(new Blob([bytes], { type: "image/png" }));
   const canvas = element("canvas", { width: bitmap.width, height: bitmap.height, role: "img" });
   canvas.setAttribute("aria-label", `${title}. ${caption}`);
   canvas.getContext("2d").drawImage(bitmap, 0, 0);
-  const text = element("figcaption", {}, element("h4", {}, title), element("p", { className: "hint" }, caption));
-  return element("figure", {}, text, canvas);
+  const open = number === 0 || !isNarrow.matches;
+  const text = element("p", { className: "hint" }, caption);
+  return element("details", { className: "fold", open }, element("summary", {}, element("h4", {}, title)), text, canvas);
 }
 
 function summary({ name, explained_name, unit, margin, changes, ...answer }) {
@@ -37,15 +38,29 @@ function summary({ name, explained_name, unit, margin, changes, ...answer }) {
   return `${subject}${what}: ${margin.toFixed(1)}. ${fall} ${found}`;
 }
 
+/** Return the answer of /v1/why; while the service compiles explanations, show that and ask again. */
+async function explanation(files, label, signal) {
+  for (;;) {
+    try {
+      return await service.why(files, label, signal);
+    } catch (problem) {
+      if (problem.status !== 503) throw problem;
+      byId("why-status").textContent = `${problem.message} The answer appears here then.`;
+      await new Promise((resolve) => setTimeout(resolve, 1000 * problem.retryAfter));
+      signal.throwIfAborted();
+    }
+  }
+}
+
 /** Connect the button. `shownFiles()` returns the files of the frame, `failed(problem)` shows other problems. */
 export function connectWhy(shownFiles, failed) {
   byId("ask-why").addEventListener("click", async () => {
     const { signal } = (request = new AbortController());
     byId("ask-why").disabled = true;
-    byId("why-status").textContent = "Computing what decided. The first time, this may take a minute.";
+    byId("why-status").textContent = "Computing what decided.";
     try {
-      const answer = await service.why(shownFiles(), byId("ask-why").dataset.label, signal);
-      const figures = await Promise.all(answer.pictures.map(canvasOf));
+      const answer = await explanation(shownFiles(), byId("ask-why").dataset.label, signal);
+      const figures = await Promise.all(answer.pictures.map(pictureOf));
       if (signal.aborted) return;
       byId("why-status").textContent = summary(answer);
       byId("why-pictures").replaceChildren(...figures);

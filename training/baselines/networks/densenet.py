@@ -68,7 +68,7 @@ class DenseNet(nnx.Module):
     """
 
     PREFIX = "features."
-    """What the names of the public files' tensors begin with."""
+    """Prefix of the names of tensors in the public files."""
 
     def __init__(self, growth: int, blocks: tuple[int, ...], *, rngs: nnx.Rngs) -> None:
         """Initialize the weights.

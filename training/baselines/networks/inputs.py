@@ -1,4 +1,4 @@
-"""What the image networks read: crops, scaled as for the public weights."""
+"""Inputs of the image networks: crops, scaled as for the public weights."""
 
 from typing import Any
 

@@ -1,0 +1,81 @@
+"""The commands of docs/recordings.md run on the sample recording; the run's weights are random."""
+
+import json
+import shlex
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+from doc_pages import ROOT, shell_commands
+from helpers import run_thor2, untrained_run
+
+import thor2_jax as thor2
+from thor2_jax.model.run_directory import save_run
+from thor2_jax.recordings.bags import Bag
+from thor2_jax.recordings.topics import Topics
+from thor2_jax.watch.broadcast import Broadcast
+from training.rendering.sample_recording import FRAMES, write_sample_recording
+
+COMMANDS = [words for words in shell_commands("docs/recordings.md") if words[0] in ("thor2", "python")]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the run and the recording of the page."""
+    folder = tmp_path_factory.mktemp("recordings")
+    save_run(untrained_run(("apple", "mug")), folder / "run")
+    write_sample_recording(folder / "table.mcap")
+    (folder / "thor2_jax").symlink_to(ROOT / "thor2_jax")
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def inside(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder)
+
+
+def test_every_command_of_the_page_is_known() -> None:
+    first = [words[1] if words[1] != "-m" else words[2] for words in COMMANDS]
+    assert first == ["training.rendering.sample_recording", *["recognize"] * 2, *["watch"] * 3]
+    assert COMMANDS[0][3] == "table.mcap" and COMMANDS[-1][-1] == "--realsense"  # run by test_watch.py
+
+
+def test_the_recording_shows_four_objects_apart(folder: Path) -> None:
+    assert (folder / "table.mcap").stat().st_size < 500_000
+    with Bag(Path("table.mcap"), Topics()) as bag:
+        frames = [recorded.read() for recorded in bag.frames()]
+    assert len(frames) == FRAMES
+    for frame in frames[:3]:
+        assert len(set(thor2.segment(frame).ravel().tolist()) - {0}) == 4
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [1, 2])
+def test_recordings_are_recognized(number: int, capfd: pytest.CaptureFixture[str]) -> None:
+    words = COMMANDS[number]
+    assert run_thor2(*words[1:]) == 0, shlex.join(words)
+    lines = [json.loads(line) for line in capfd.readouterr().out.splitlines()]
+    assert len(lines) == (FRAMES if number == 1 else 2) and all(len(line["instances"]) >= 4 for line in lines)
+    assert Path("answers.mcap").is_file() == (number == 2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [3, 4])
+def test_recordings_and_folders_are_watched(number: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    published: list[dict[str, Any]] = []
+
+    def record(self: Broadcast, text: str) -> None:
+        published.append(json.loads(text))
+        if published[-1]["state"] == "ended":
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(Broadcast, "publish", record)
+    monkeypatch.setattr("training.cli.watch.NOTICE_SECONDS", 0.0)
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        assert run_thor2(*COMMANDS[number][1:], "--port", "0") == 0
+    finally:
+        signal.signal(signal.SIGINT, handler)
+    live = [one for one in published if one["state"] == "live"]
+    assert live and all(one["objects"] and not one["error"] for one in live)

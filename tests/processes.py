@@ -1,0 +1,61 @@
+"""Processes that tests start end with the process of the tests, even if that is killed."""
+
+import os
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import cloudpickle
+
+MARK = "THOR2_TESTS"
+"""Environment variable whose value, one for each process of tests, the processes inherit that it starts."""
+
+HANG = 900.0
+"""Seconds after which a test gives up: ten times the longest wait that was seen on a busy machine."""
+
+UNOPTIMIZED = (
+    "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
+)
+"""XLA_FLAGS with which programs compile in a third of the time."""
+
+_GUARD = """
+import os, signal, sys
+from pathlib import Path
+mark = f"{sys.argv[1]}={sys.argv[2]}".encode()
+sys.stdin.read()  # ends when all processes that hold the other end of the pipe have ended: the process of the tests
+for folder in Path("/proc").glob("[0-9]*"):
+    try:
+        if mark in (folder / "environ").read_bytes().split(b"\\0"):
+            os.kill(int(folder.name), signal.SIGKILL)
+    except OSError:  # it has ended, or belongs to another user
+        pass
+"""
+
+
+def end_descendants_with_this_process() -> None:
+    """Start a process that kills what this one has started and left behind, once this one has ended in any way.
+
+    It does nothing on systems without /proc.
+    """
+    os.environ.pop(MARK, None)
+    value = f"{os.getpid()}-{time.time_ns()}"
+    command = [sys.executable, "-S", "-E", "-c", _GUARD, MARK, value]
+    read, _ = os.pipe()  # the end for writing is closed when this process ends
+    os.posix_spawn(command[0], command, os.environ, file_actions=[(os.POSIX_SPAWN_DUP2, read, 0)], setsid=True)
+    os.close(read)
+    os.environ[MARK] = value
+
+
+def is_running(pid: int) -> bool:
+    """Return whether a process runs, by /proc; one that has ended and is not collected does not."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
+def call_pickled(content: bytes) -> Any:
+    """Call a function with arguments, both pickled by cloudpickle, in the process that a test started."""
+    function, arguments = cloudpickle.loads(content)
+    return function(*arguments)

@@ -1,0 +1,190 @@
+"""Looks: their order, geometry, colours and masks, against clouds that are changed and packed by NumPy."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import colornet
+import thor2_jax as thor2
+from thor2_jax.config import LOOK_COUNTS
+from thor2_jax.descriptor import chunking, looks
+from thor2_jax.descriptor.cloud_statistics import cloud_statistics, side_lengths
+from thor2_jax.descriptor.describe import strips
+from thor2_jax.descriptor.looks import aligned_looks, describe_looks
+
+CONFIG = thor2.DescriptorConfig(homology="closed_form")
+NETWORK = colornet.load_default()
+WARMER = np.array([1.06, 1, 1 / 1.06], np.float32)
+
+Cloud = tuple[np.ndarray, np.ndarray]
+
+
+def wedge(sides: tuple[float, float, float], seed: int = 0, n: int = 400) -> Cloud:
+    """Points on a wedge, so that its ends differ, half a metre before the camera."""
+    rng = np.random.default_rng(seed)
+    points = rng.random((n, 3)) * sides
+    points[:, 1] *= 1 - 0.3 * points[:, 0] / sides[0]
+    corners = np.array([[0, 0, 0], [0, sides[1], 0], [sides[0], 0, 0], [sides[0], sides[1], sides[2]]])
+    points = np.concatenate([points, corners]) + (0, 0, 0.5)
+    return points.astype(np.float32), rng.integers(0, 256, points.shape, np.uint8)
+
+
+LONG, SQUARE = wedge((0.2, 0.1, 0.06)), wedge((0.12, 0.115, 0.06), 1, n=395)  # 404 and 399 points
+RIMS = [points[:, 1] > 0.07 for points, _ in (LONG, SQUARE)]
+PACKED = thor2.PointClouds.pack([LONG, SQUARE], rim=RIMS)
+
+
+def half_turned(cloud: Cloud) -> np.ndarray:
+    """Return the points [n, 3] of a cloud that is packed alone and aligned after a half turn about z."""
+    normal = thor2.mirror(thor2.view_normalize(thor2.PointClouds.pack([cloud]), CONFIG), "xy")
+    return np.asarray(thor2.turn(normal, CONFIG).points)[0, : len(cloud[0])]
+
+
+def look(aligned: thor2.PointClouds, number: int, which: int, count: int) -> Cloud:
+    """Return the points [n, 3] and colours [n, 3] of one look at a cloud, without masked ones."""
+    row = number * count + which
+    mask = np.asarray(aligned.mask)[row]
+    return np.asarray(aligned.points)[row][mask], np.asarray(aligned.colors)[row][mask]
+
+
+@pytest.mark.parametrize("count", LOOK_COUNTS)
+def test_the_first_look_is_that_of_align(count: int) -> None:
+    (aligned, weights), expected = aligned_looks(PACKED, CONFIG, count), thor2.align(PACKED, CONFIG)
+    assert aligned.points.shape == (2 * count, *PACKED.points.shape[1:])
+    np.testing.assert_allclose(aligned.points[::count], expected.points, atol=1e-6)
+    np.testing.assert_allclose(aligned.camera[::count], expected.camera, atol=1e-6)
+    np.testing.assert_array_equal(aligned.colors[::count], PACKED.colors)
+    np.testing.assert_array_equal(aligned.mask[::count], PACKED.mask)
+    np.testing.assert_allclose(weights, np.full((2, count), 1 / count))
+
+
+def test_the_second_of_two_looks_is_a_half_turn_about_z() -> None:
+    aligned, _ = aligned_looks(PACKED, CONFIG, 2)
+    for number, cloud in enumerate((LONG, SQUARE)):
+        points, colors = look(aligned, number, 1, 2)
+        np.testing.assert_allclose(points, half_turned(cloud), atol=2e-6)
+        np.testing.assert_array_equal(colors, np.float32(cloud[1]) / np.float32(255))
+
+
+def test_four_looks_are_those_of_changed_clouds() -> None:
+    aligned, _ = aligned_looks(PACKED, CONFIG, 4)
+    for number, ((points, colors), rim) in enumerate(zip((LONG, SQUARE), RIMS, strict=True)):
+        assert 0 < rim.sum() < len(rim) / 2
+        given, shades = np.asarray(thor2.align(thor2.PointClouds.pack([(points, colors)]), CONFIG).points), colors / 255
+        inner = points[~rim], colors[~rim]
+        expected = [
+            (given[0, : len(points)], shades),
+            (half_turned(inner), shades[~rim]),
+            (half_turned((points, colors)), (shades * WARMER).clip(0, 1)),
+            (given[0, : len(points)], (shades / WARMER).clip(0, 1)),
+        ]
+        for which, (places, tints) in enumerate(expected):
+            actual = look(aligned, number, which, 4)
+            np.testing.assert_allclose(actual[0], places, atol=5e-6)
+            np.testing.assert_allclose(actual[1], tints, atol=1e-6)
+    warm, cool = (np.asarray(aligned.colors)[2 + k] for k in (0, 1))
+    assert warm.max() == cool.max() == 1 and (warm[:, 0] >= cool[:, 0]).all() and (warm[:, 2] <= cool[:, 2]).all()
+
+
+def test_without_a_rim_the_second_look_is_the_whole_cloud() -> None:
+    unknown, none = (thor2.PointClouds.pack([LONG, SQUARE], rim=rim) for rim in (None, [None, None]))
+    assert unknown.rim is None and none.rim is not None
+    second = [look(aligned_looks(each, CONFIG, 4)[0], 0, 1, 4) for each in (unknown, none)]
+    expected = look(aligned_looks(PACKED, CONFIG, 2)[0], 0, 1, 2)
+    for points, colors in second:
+        np.testing.assert_allclose(points, expected[0], atol=1e-6)
+        np.testing.assert_array_equal(colors, expected[1])
+
+
+@pytest.mark.parametrize("n", [0, 1, 3])
+@pytest.mark.parametrize("all_rim", [False, True])
+def test_tiny_clouds_have_finite_looks(n: int, all_rim: bool) -> None:
+    points, colors = wedge((0.2, 0.1, 0.06))
+    tiny = thor2.PointClouds.pack([(points[:n], colors[:n])] * 2, rim=[np.full(n, all_rim)] * 2)
+    described = describe_looks(tiny, NETWORK, CONFIG, 4)
+    aligned, _ = aligned_looks(tiny, CONFIG, 4)
+    assert np.asarray(aligned.mask).sum(axis=1).tolist() == [n, 0 if all_rim else n, n, n] * 2
+    assert all(np.isfinite(values).all() for values in jax.tree.leaves((described, aligned)))
+
+
+@pytest.mark.parametrize("count", [2, 4])
+def test_looks_are_the_same_when_compiled_and_mapped(count: int) -> None:
+    expected = aligned_looks(PACKED, CONFIG, count)
+    compiled = jax.jit(lambda clouds: aligned_looks(clouds, CONFIG, count))(PACKED)
+    one_by_one = jax.tree.map(lambda a: a[:, None], PACKED)
+    mapped, weights = jax.vmap(lambda clouds: aligned_looks(clouds, CONFIG, count))(one_by_one)
+    flat = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), mapped), weights[:, 0]
+    for actual in (compiled, flat):
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=2e-6), actual, expected)
+
+
+@pytest.mark.parametrize("count", [0, 3, 5])
+def test_other_counts_are_refused(count: int) -> None:
+    with pytest.raises(thor2.InputError, match=f"count is {count}"):
+        aligned_looks(PACKED, CONFIG, count)
+    with pytest.raises(thor2.InputError, match=f"count is {count}"):
+        describe_looks(PACKED, NETWORK, CONFIG, count)
+
+
+@pytest.mark.parametrize(("backend", "calls"), [("cpu", 2), ("gpu", 1)])
+def test_chunks_have_the_descriptors_of_the_batch(backend: str, calls: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = describe_looks(PACKED, NETWORK, CONFIG, 4)
+    sizes = []
+
+    def record(chunk: thor2.PointClouds, config: thor2.DescriptorConfig, count: int) -> Any:
+        sizes.append(len(chunk.mask))
+        return aligned_looks(chunk, config, count)
+
+    monkeypatch.setattr(chunking, "MAX_LARGE_CHUNK_POINTS", 4 * PACKED.mask.shape[1])
+    monkeypatch.setattr(looks, "aligned_looks", record)
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
+    chunked = describe_looks(PACKED, NETWORK, CONFIG, 4)
+    assert len(sizes) == calls
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), chunked, whole)
+
+
+def test_an_occluded_end_decides_the_half_turn() -> None:
+    x = np.asarray(thor2.view_normalize(PACKED, CONFIG).points)[0, :, 0]
+    boundary = np.zeros(PACKED.mask.shape, bool)
+    boundary[0] = np.asarray(PACKED.mask)[0] & (x > x.max() - 0.01)
+    aligned, _ = aligned_looks(dataclasses.replace(PACKED, boundary=jnp.asarray(boundary)), CONFIG, 2)
+    np.testing.assert_array_equal(aligned.points[1], aligned.points[0])
+    assert np.abs(aligned.points[3] - aligned.points[2]).max() > 0.01
+
+
+def test_descriptors_and_statistics_are_those_of_each_look() -> None:
+    described = describe_looks(PACKED, NETWORK, CONFIG, 4)
+    aligned, _ = aligned_looks(PACKED, CONFIG, 4)
+    assert described.statistics.shape[:2] == described.weights.shape == (2, 4)
+    np.testing.assert_allclose(described.first.tops2, thor2.describe(PACKED, NETWORK, CONFIG).tops2, atol=1e-4)
+    for row in range(8):
+        points, colors = look(aligned, row // 4, row % 4, 4)
+        # The cloud of the look alone: points of the rim are not there, instead of masked.
+        alone = dataclasses.replace(thor2.PointClouds.pack([(points, colors)]), camera=aligned.camera[row : row + 1])
+        descriptors = jax.tree.map(lambda a, row=row: a[row // 4, row % 4], described.each)
+        np.testing.assert_allclose(
+            descriptors.tops2, thor2.describe_aligned(alone, NETWORK, CONFIG).tops2[0], atol=1e-4
+        )
+        statistics = cloud_statistics(side_lengths(alone, CONFIG.alpha), alone, strips(alone, NETWORK, CONFIG))[0]
+        np.testing.assert_allclose(described.statistics[row // 4, row % 4], statistics, atol=1e-4)
+    assert np.abs(described.statistics[:, 2] - described.statistics[:, 3]).max() > 1e-3
+
+
+def test_overflow_is_that_of_the_first_look() -> None:
+    short = dataclasses.replace(CONFIG, n_slices=2)
+    described = describe_looks(PACKED, NETWORK, short, 4)
+    np.testing.assert_array_equal(described.overflow, thor2.describe(PACKED, NETWORK, short).overflow)
+    assert np.asarray(described.overflow).min() > 0
+    assert (np.asarray(described.each.overflow)[:, 1] != np.asarray(described.overflow)).any()
+
+
+def test_fused_probabilities_are_geometric_means() -> None:
+    logits = np.random.default_rng(0).normal(size=(8, 3)).astype(np.float32)
+    odds = np.exp(logits.astype(np.float64))
+    means = np.prod((odds / odds.sum(axis=1, keepdims=True)).reshape(2, 4, 3), axis=1) ** 0.25
+    fused = describe_looks(PACKED, NETWORK, CONFIG, 4).fuse(jnp.asarray(logits))
+    np.testing.assert_allclose(fused, means / means.sum(axis=1, keepdims=True), rtol=1e-5)

@@ -1,0 +1,406 @@
+"""Frames: invalid input, files, and the geometry of pixels."""
+
+import dataclasses
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from helpers import deep_png
+from PIL import Image
+
+from thor2_jax.errors import InputError
+from thor2_jax.frames.frames import (
+    MAX_INSTANCES,
+    Intrinsics,
+    RGBDFrame,
+    backproject,
+    pixel_rays,
+    read_color,
+    read_depth,
+    read_frame,
+    read_intrinsics,
+    read_labels,
+)
+
+CAMERA = Intrinsics(500.0, 510.0, 3.5, 2.25)
+
+
+def arrays(height: int = 5, width: int = 7) -> dict[str, Any]:
+    rng = np.random.default_rng(0)
+    return {
+        "color": rng.integers(0, 256, (height, width, 3), dtype=np.uint8),
+        "depth": rng.integers(300, 2000, (height, width), dtype=np.uint16),
+        "labels": rng.integers(0, 4, (height, width), dtype=np.uint8),
+        "intrinsics": CAMERA,
+    }
+
+
+# Intrinsics
+
+
+@pytest.mark.parametrize("name", ["fx", "fy", "cx", "cy", "depth_scale"])
+@pytest.mark.parametrize(
+    "value", [math.nan, math.inf, -math.inf, "500", True, [500], 1 + 0j, 1.1e9, -1.1e9, 2 * 10**30, 10**400]
+)
+def test_intrinsics_that_are_not_finite_numbers(name: str, value: Any) -> None:
+    values = {"fx": 500, "fy": 500, "cx": 3, "cy": 2, name: value}
+    for build in (lambda: Intrinsics(**values), lambda: Intrinsics.of(values)):
+        with pytest.raises(InputError, match=rf"^intrinsics\.{name} is "):
+            build()
+
+
+@pytest.mark.parametrize("name", ["fx", "fy", "depth_scale"])
+@pytest.mark.parametrize("value", [0, -1.5])
+def test_intrinsics_that_are_not_positive(name: str, value: float) -> None:
+    with pytest.raises(InputError, match=rf"^intrinsics\.{name} is {value};"):
+        Intrinsics.of({"fx": 500, "fy": 500, "cx": 3, "cy": 2, name: value})
+
+
+@pytest.mark.parametrize("kind", [int, np.int64, np.float32, np.float64])
+def test_intrinsics_of_numbers_of_any_kind(kind: Any) -> None:
+    assert Intrinsics(*(kind(k) for k in (500, 501, 3, 2))) == Intrinsics(500, 501, 3, 2)
+
+
+def test_a_principal_point_may_lie_outside_the_image() -> None:
+    assert Intrinsics(500, 500, -20.0, 0).cx == -20
+
+
+@pytest.mark.parametrize("missing", ["fx", "fy", "cx", "cy"])
+def test_intrinsics_that_are_incomplete(missing: str) -> None:
+    values = {name: 500 for name in ("fx", "fy", "cx", "cy") if name != missing}
+    with pytest.raises(InputError, match=rf"^intrinsics lacks {missing};"):
+        Intrinsics.of(values)
+
+
+@pytest.mark.parametrize("values", [None, 3, [500, 500, 3, 2], "fx", b"fx"])
+def test_intrinsics_that_are_not_a_mapping(values: Any) -> None:
+    with pytest.raises(InputError, match=rf"^intrinsics is a {type(values).__name__}(;| of shape)"):
+        Intrinsics.of(values)
+
+
+def test_other_entries_of_intrinsics_are_ignored() -> None:
+    assert Intrinsics.of({"fx": 1, "fy": 2, "cx": 3, "cy": 4, "name": "left"}) == Intrinsics(1, 2, 3, 4, 1000.0)
+    assert Intrinsics.of({"fx": 1, "fy": 2, "cx": 3, "cy": 4, "depth_scale": 5}).depth_scale == 5
+
+
+# Frames
+
+
+def test_a_frame_takes_a_mapping_as_intrinsics() -> None:
+    assert RGBDFrame(**{**arrays(), "intrinsics": dataclasses.asdict(CAMERA)}).intrinsics == CAMERA
+
+
+def test_a_frame_refuses_bad_intrinsics() -> None:
+    with pytest.raises(InputError, match=r"^intrinsics lacks cx, cy;"):
+        RGBDFrame(**{**arrays(), "intrinsics": {"fx": 1, "fy": 2}})
+
+
+@pytest.mark.parametrize("shape", [(5, 7), (5, 7, 1), (5, 7, 4), (0, 7, 3), (5, 0, 3), (35, 3), (1, 5, 7, 3)])
+def test_color_of_another_shape(shape: tuple[int, ...]) -> None:
+    with pytest.raises(InputError, match=r"^color has shape .*expected \[H, W, 3\]$"):
+        RGBDFrame(**{**arrays(), "color": np.zeros(shape, np.uint8)})
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.uint16, np.int8, bool])
+def test_color_of_another_type(kind: Any) -> None:
+    with pytest.raises(InputError, match=r"^color has type \w+; expected uint8$"):
+        RGBDFrame(**{**arrays(), "color": np.zeros((5, 7, 3), kind)})
+
+
+@pytest.mark.parametrize("name", ["depth", "labels"])
+@pytest.mark.parametrize("shape", [(7, 5), (5, 6), (5, 7, 1), (35,), ()])
+def test_images_of_another_size(name: str, shape: tuple[int, ...]) -> None:
+    fields = arrays()
+    with pytest.raises(InputError, match=rf"^{name} has shape .*\(5, 7\)"):
+        RGBDFrame(**{**fields, name: np.zeros(shape, fields[name].dtype)})
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.int16, np.int32, bool, np.complex64, object])
+def test_depth_of_another_type(kind: Any) -> None:
+    with pytest.raises(InputError, match=r"^depth has type \w+; expected"):
+        RGBDFrame(**{**arrays(), "depth": np.ones((5, 7), kind)})
+
+
+@pytest.mark.parametrize("kind", [np.float32, bool, object])
+def test_labels_of_another_type(kind: Any) -> None:
+    with pytest.raises(InputError, match=r"^labels has type \w+; expected integers$"):
+        RGBDFrame(**{**arrays(), "labels": np.ones((5, 7), kind)})
+
+
+def test_negative_labels() -> None:
+    labels = np.zeros((5, 7), np.int32)
+    labels[2, 2] = -3
+    with pytest.raises(InputError, match=r"^labels has the value -3"):
+        RGBDFrame(**{**arrays(), "labels": labels})
+
+
+@pytest.mark.parametrize(("kind", "scale"), [(np.uint16, 1000.0), (np.uint16, 10000.0), (np.uint32, 1000.0)])
+def test_depth_in_units(kind: Any, scale: float) -> None:
+    depth = np.array([[0, 1], [1234, 65535]], kind)
+    frame = RGBDFrame(
+        np.zeros((2, 2, 3), np.uint8), depth, np.zeros((2, 2), int), Intrinsics(1, 1, 0, 0, depth_scale=scale)
+    )
+    assert frame.depth_m.dtype == np.float32
+    np.testing.assert_array_equal(frame.depth_m, (depth / scale).astype(np.float32))
+
+
+@pytest.mark.parametrize("kind", [np.float16, np.float32, np.float64])
+def test_depth_in_metres(kind: Any) -> None:
+    depth = np.array([[0.5, np.nan], [np.inf, -np.inf]], kind)
+    frame = RGBDFrame(np.zeros((2, 2, 3), np.uint8), depth, np.zeros((2, 2), int), CAMERA)
+    assert frame.depth_m.dtype == np.float32
+    np.testing.assert_array_equal(frame.depth_m, [[0.5, 0], [0, 0]])
+    assert np.isnan(depth[0, 1])
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.int64])
+@pytest.mark.parametrize("shape", [(1, 1), (5, 7), (31, 17)])
+def test_instances_and_their_pixels(kind: Any, shape: tuple[int, int]) -> None:
+    rng = np.random.default_rng(4)
+    labels = (rng.integers(0, 5, shape) * 40).astype(kind)
+    frame = RGBDFrame(**{**arrays(*shape), "labels": labels})
+    assert frame.instances == tuple(sorted(set(labels.ravel().tolist()) - {0}))
+    assert list(frame.instance_pixels) == list(frame.instances)
+    for label, pixels in frame.instance_pixels.items():
+        assert type(label) is int
+        np.testing.assert_array_equal(pixels, np.flatnonzero(labels == label))
+
+
+def test_no_instance() -> None:
+    frame = RGBDFrame(**{**arrays(), "labels": np.zeros((5, 7), np.uint8)})
+    assert frame.instances == () and frame.instance_pixels == {}
+
+
+def test_a_frame_without_labels() -> None:
+    frame = RGBDFrame(**arrays() | {"labels": None})
+    assert frame.labels is None and frame.depth_m.shape == (5, 7)
+    for read in ("label_image", "instance_pixels", "instances"):
+        with pytest.raises(InputError, match=r"^labels is None;"):
+            getattr(frame, read)
+    labelled = dataclasses.replace(frame, labels=arrays()["labels"])
+    assert labelled.instances == RGBDFrame(**arrays()).instances
+
+
+def test_largest_number_of_instances() -> None:
+    labels = np.arange(MAX_INSTANCES + 1, dtype=np.int32).reshape(7, -1)
+    frame = RGBDFrame(**{**arrays(*labels.shape), "labels": labels})
+    assert frame.instances == tuple(range(1, MAX_INSTANCES + 1))
+    np.testing.assert_array_equal(np.concatenate(list(frame.instance_pixels.values())), frame.instances)
+    more = dataclasses.replace(frame, labels=labels + 1)
+    for of_frame in (lambda: more.instances, lambda: more.instance_pixels):
+        with pytest.raises(InputError, match=f"labels has {MAX_INSTANCES + 1} instances"):
+            of_frame()
+
+
+# Geometry
+
+
+def test_backprojected_points_project_to_their_pixels() -> None:
+    """Projects the points with OpenCV."""
+    depth = np.random.default_rng(2).uniform(0.3, 2.5, (5, 7)).astype(np.float32)
+    points = backproject(depth, CAMERA)
+    assert points.shape == (5, 7, 3) and points.dtype == np.float32
+    np.testing.assert_array_equal(points[..., 2], depth)
+    matrix = np.array([[CAMERA.fx, 0, CAMERA.cx], [0, CAMERA.fy, CAMERA.cy], [0, 0, 1]])
+    pixels = cv2.projectPoints(points.reshape(-1, 3).astype(np.float64), np.zeros(3), np.zeros(3), matrix, None)[0]
+    rows, columns = np.mgrid[:5, :7]
+    np.testing.assert_allclose(pixels.reshape(5, 7, 2), np.stack([columns, rows], -1), atol=1e-4)
+
+
+def test_rays_of_single_pixels() -> None:
+    depth = np.random.default_rng(2).uniform(0.3, 2.5, (5, 7))
+    chosen = np.array([0, 6, 7, 34])
+    rays = pixel_rays(chosen, 7, CAMERA)
+    expected = backproject(depth, CAMERA).reshape(-1, 3)[chosen]
+    np.testing.assert_allclose(rays * depth.ravel()[chosen, None], expected, rtol=1e-12)
+    assert pixel_rays(np.zeros(0, int), 7, CAMERA).shape == (0, 3)
+
+
+# Files
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> dict[str, Path]:
+    """Write the frame of `arrays()` to files."""
+    fields = arrays()
+    paths = {name: tmp_path / f"{name}.png" for name in ("color", "depth", "labels")}
+    for name, path in paths.items():
+        Image.fromarray(fields[name]).save(path)
+    paths["intrinsics"] = tmp_path / "intrinsics.json"
+    paths["intrinsics"].write_text(json.dumps(dataclasses.asdict(CAMERA)))
+    return paths
+
+
+def test_a_frame_of_files(files: dict[str, Path]) -> None:
+    frame, expected = read_frame(**files), arrays()
+    for name in ("color", "depth", "labels"):
+        np.testing.assert_array_equal(getattr(frame, name), expected[name])
+    assert frame.depth.dtype == np.uint16 and frame.intrinsics == CAMERA
+
+
+def test_a_frame_of_files_without_labels(files: dict[str, Path]) -> None:
+    del files["labels"]
+    frame = read_frame(**files)
+    assert frame.labels is None and np.array_equal(frame.depth, read_depth(files["depth"]))
+
+
+@pytest.mark.parametrize("name", ["color", "depth", "labels", "intrinsics"])
+def test_missing_files(files: dict[str, Path], name: str) -> None:
+    files[name].unlink()
+    with pytest.raises(FileNotFoundError) as caught:
+        read_frame(**files)
+    assert Path(caught.value.filename) == files[name]
+
+
+def test_directories_in_place_of_files(files: dict[str, Path], tmp_path: Path) -> None:
+    with pytest.raises(IsADirectoryError):
+        read_frame(**{**files, "depth": tmp_path})
+
+
+@pytest.mark.parametrize("name", ["color", "depth", "labels"])
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda raw: b"",
+        lambda raw: b"not an image",
+        lambda raw: raw[:20],
+        lambda raw: raw[: len(raw) // 2],
+        lambda raw: raw[:45] + bytes([raw[45] ^ 0xFF]) + raw[46:],
+    ],
+    ids=["empty", "text", "header", "half", "flipped byte"],
+)
+def test_damaged_images(files: dict[str, Path], name: str, damage: Callable[[bytes], bytes]) -> None:
+    files[name].write_bytes(damage(files[name].read_bytes()))
+    with pytest.raises(InputError) as caught:
+        read_frame(**files)
+    message = str(caught.value)
+    assert message.startswith(f"{name}: {files[name]} ") and "\n" not in message
+
+
+def test_an_image_that_unpacks_to_gigabytes(tmp_path: Path) -> None:
+    Image.new("L", (20_000, 20_000)).save(tmp_path / "bomb.png", compress_level=1)
+    with pytest.raises(InputError, match=r"^labels: .*bomb\.png "):
+        read_labels(tmp_path / "bomb.png")
+
+
+@pytest.mark.parametrize("name", ["depth", "labels"])
+def test_images_of_different_sizes(files: dict[str, Path], name: str) -> None:
+    Image.fromarray(np.zeros((5, 6), np.uint16)).save(files[name])
+    with pytest.raises(InputError, match=rf"^{name} has shape \(5, 6\).*\(5, 7\)"):
+        read_frame(**files)
+
+
+@pytest.mark.parametrize("mode", ["L", "P", "1", "LA", "I;16", "CMYK"])
+def test_color_files_that_are_not_rgb(tmp_path: Path, mode: str) -> None:
+    path = tmp_path / ("c.jpg" if mode == "CMYK" else "c.png")
+    Image.new(mode, (7, 5)).save(path)
+    with pytest.raises(InputError, match=r"^color: .*expected 8-bit RGB$"):
+        read_color(path)
+
+
+def test_color_files_of_16_bit(tmp_path: Path) -> None:
+    (tmp_path / "color.png").write_bytes(deep_png(12, 16))
+    with pytest.raises(InputError, match="^color: .*;16"):
+        read_color(tmp_path / "color.png")
+
+
+def test_color_files_with_an_alpha_channel(tmp_path: Path) -> None:
+    rgba = np.random.default_rng(0).integers(0, 256, (5, 7, 4), dtype=np.uint8)
+    Image.fromarray(rgba).save(tmp_path / "c.png")
+    np.testing.assert_array_equal(read_color(tmp_path / "c.png"), rgba[..., :3])
+
+
+def test_color_files_of_jpeg(tmp_path: Path) -> None:
+    Image.new("RGB", (7, 5), (200, 100, 50)).save(tmp_path / "c.jpg", quality=95)
+    color = read_color(tmp_path / "c.jpg")
+    assert color.shape == (5, 7, 3) and np.abs(color.astype(int) - (200, 100, 50)).max() <= 3
+
+
+@pytest.mark.parametrize("mode", ["L", "P", "RGB", "1"])
+def test_depth_files_that_are_not_16_bit(tmp_path: Path, mode: str) -> None:
+    Image.new(mode, (7, 5)).save(tmp_path / "d.png")
+    with pytest.raises(InputError, match=r"^depth: .*expected one channel of 16-bit"):
+        read_depth(tmp_path / "d.png")
+
+
+def test_depth_files_of_16_bit(tmp_path: Path) -> None:
+    """OpenCV, an independent encoder, writes the file."""
+    depth = np.array([[0, 1, 255], [256, 40_000, 65_535]], np.uint16)
+    assert cv2.imwrite(str(tmp_path / "d.png"), depth)
+    loaded = read_depth(tmp_path / "d.png")
+    assert loaded.dtype == np.uint16
+    np.testing.assert_array_equal(loaded, depth)
+
+
+@pytest.mark.parametrize("value", [-1, 65_536])
+def test_depth_files_of_32_bit(tmp_path: Path, value: int) -> None:
+    depth = np.array([[0, 65_535]], np.int32)
+    Image.fromarray(depth).save(tmp_path / "d.tiff")
+    np.testing.assert_array_equal(read_depth(tmp_path / "d.tiff"), depth)
+    depth[0, 0] = value
+    Image.fromarray(depth).save(tmp_path / "d.tiff")
+    with pytest.raises(InputError, match=rf"^depth: .*has values from .*{value}.*; expected 0 to 65535$"):
+        read_depth(tmp_path / "d.tiff")
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+def test_label_files(tmp_path: Path, kind: Any) -> None:
+    labels = np.array([[0, 1, 2], [254, 255, np.iinfo(kind).max]], kind)
+    Image.fromarray(labels).save(tmp_path / "l.png")
+    np.testing.assert_array_equal(read_labels(tmp_path / "l.png"), labels)
+
+
+def test_indexed_label_files_contain_indices(tmp_path: Path) -> None:
+    labels = np.array([[0, 1, 2], [3, 2, 5]], np.uint8)
+    image = Image.fromarray(labels, mode="L").copy()
+    image.putpalette(list(np.random.default_rng(0).integers(0, 256, 768)))
+    assert image.mode == "P"
+    image.save(tmp_path / "l.png")
+    np.testing.assert_array_equal(read_labels(tmp_path / "l.png"), labels)
+
+
+@pytest.mark.parametrize("mode", ["RGB", "RGBA", "LA", "1"])
+def test_label_files_that_are_not_integers(tmp_path: Path, mode: str) -> None:
+    Image.new(mode, (7, 5)).save(tmp_path / "l.png")
+    with pytest.raises(InputError, match=r"^labels: .*integers"):
+        read_labels(tmp_path / "l.png")
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("", "intrinsics is a NoneType"),
+        ("{", "is not valid JSON"),
+        ("fx: 500", "intrinsics lacks fy, cx, cy"),
+        ("[" * 100_000, "is not valid JSON"),
+        ("\xff", "is neither JSON, YAML"),
+        ("[500, 500, 3, 2]", "intrinsics is a list of shape (4,)"),
+        ("null", "intrinsics is a NoneType"),
+        ('{"fx": 500, "fy": 500}', "intrinsics lacks cx, cy"),
+        ('{"fx": "500", "fy": 500, "cx": 3, "cy": 2}', "intrinsics.fx is '500'"),
+        ('{"fx": NaN, "fy": 500, "cx": 3, "cy": 2}', "intrinsics.fx is nan"),
+        ('{"fx": 500, "fy": Infinity, "cx": 3, "cy": 2}', "intrinsics.fy is inf"),
+        ('{"fx": 500, "fy": true, "cx": 3, "cy": 2}', "intrinsics.fy is True"),
+        ('{"fx": 500, "fy": -500, "cx": 3, "cy": 2}', "intrinsics.fy is -500"),
+        ('{"fx": 500, "fy": 500, "cx": 3, "cy": 2, "depth_scale": 0}', "intrinsics.depth_scale is 0"),
+    ],
+)
+def test_invalid_intrinsics_files(tmp_path: Path, text: str, expected: str) -> None:
+    path = tmp_path / "k.json"
+    path.write_bytes(text.encode("latin-1"))
+    with pytest.raises(InputError) as caught:
+        read_intrinsics(path)
+    message = str(caught.value)
+    assert expected in message and str(path) in message and "\n" not in message
+
+
+def test_an_integer_beyond_the_largest_float(tmp_path: Path) -> None:
+    path = tmp_path / "k.json"
+    path.write_text('{"fx": 1' + "0" * 400 + ', "fy": 500, "cx": 3, "cy": 2}')
+    with pytest.raises(InputError, match=r"intrinsics\.fx"):
+        read_intrinsics(path)

@@ -1,0 +1,295 @@
+"""Intrinsics: each format as other software writes it, sizes, lens distortion, and invalid files."""
+
+import io
+import json
+import types
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from helpers import encode_image
+
+from thor2_jax.errors import InputError
+from thor2_jax.frames.distortion import distort, undistort
+from thor2_jax.frames.frames import Intrinsics, RGBDFrame, backproject, frame_intrinsics, pixel_rays, read_frame
+from thor2_jax.frames.intrinsics import parse_intrinsics, read_intrinsics
+
+MATRIX = np.array([[615.5, 0.0, 318.25], [0.0, 616.75, 241.5], [0.0, 0.0, 1.0]])
+PINHOLE = {"fx": 615.5, "fy": 616.75, "cx": 318.25, "cy": 241.5}
+DISTORTIONS = {
+    "plumb_bob": (0.12, -0.23, 0.001, -0.002, 0.05),
+    "without k3": (0.05, -0.1, 0.001, 0.002),
+    "rational_polynomial": (0.45, -2.5, 0.0008, -0.0002, 1.4, 0.33, -2.3, 1.36),
+}
+
+ROS1_YAML = """\
+image_width: 640
+image_height: 480
+camera_name: rgb
+camera_matrix:
+  rows: 3
+  cols: 3
+  data: [615.5, 0, 318.25, 0, 616.75, 241.5, 0, 0, 1]
+distortion_model: plumb_bob
+distortion_coefficients:
+  rows: 1
+  cols: 5
+  data: [0, 0, 0, 0, 0]
+rectification_matrix:
+  rows: 3
+  cols: 3
+  data: [1, 0, 0, 0, 1, 0, 0, 0, 1]
+projection_matrix:
+  rows: 3
+  cols: 4
+  data: [600, 0, 318, 0, 0, 600, 241, 0, 0, 0, 1, 0]
+"""
+
+ROS1_ECHO = """\
+header:
+  seq: 0
+  frame_id: "camera_color_optical_frame"
+height: 480
+width: 640
+distortion_model: "plumb_bob"
+D: [0.0, 0.0, 0.0, 0.0, 0.0]
+K: [615.5, 0.0, 318.25, 0.0, 616.75, 241.5, 0.0, 0.0, 1.0]
+R: [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
+P: [615.5, 0.0, 318.25, 0.0, 0.0, 616.75, 241.5, 0.0, 0.0, 0.0, 1.0, 0.0]
+binning_x: 0
+roi: {x_offset: 0, y_offset: 0, height: 0, width: 0, do_rectify: false}
+---
+"""
+
+ROS2_ECHO = ROS1_ECHO.replace("D:", "d:").replace("K:", "k:").replace("R:", "r:").replace("P:", "p:") + ROS1_ECHO
+
+
+def as_text(array: np.ndarray) -> bytes:
+    stream = io.BytesIO()
+    np.savetxt(stream, array)
+    return stream.getvalue()
+
+
+def as_npy(array: np.ndarray, **options: Any) -> bytes:
+    stream = io.BytesIO()
+    np.save(stream, array, **options)
+    return stream.getvalue()
+
+
+def opencv_yaml(path: Path) -> bytes:
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    storage.write("image_width", 640)
+    storage.write("image_height", 480)
+    storage.write("camera_matrix", MATRIX)
+    storage.write("distortion_coefficients", np.zeros((1, 5)))
+    storage.release()
+    return path.read_bytes()
+
+
+BOP_ENTRY = {"cam_K": MATRIX.ravel().tolist(), "depth_scale": 0.1, "cam_R_w2c": [1.0] * 9}
+REALSENSE = {"width": 640, "height": 480, "ppx": 318.25, "ppy": 241.5, "fx": 615.5, "fy": 616.75}
+OPEN3D = {"width": 640, "height": 480, "intrinsic_matrix": [615.5, 0, 0, 0, 616.75, 0, 318.25, 241.5, 1]}
+SIZED = Intrinsics(**PINHOLE, width=640, height=480)
+
+FORMATS: dict[str, tuple[bytes, Intrinsics]] = {
+    "THOR2": (json.dumps({**PINHOLE, "depth_scale": 5000.0}).encode(), Intrinsics(**PINHOLE, depth_scale=5000.0)),
+    "THOR2 with a size": (json.dumps({**PINHOLE, "width": 640, "height": 480}).encode(), SIZED),
+    "THOR2 in YAML": (yaml.safe_dump(PINHOLE).encode(), Intrinsics(**PINHOLE)),
+    "ROS 1 calibration": (ROS1_YAML.encode(), SIZED),
+    "ROS 1 message": (ROS1_ECHO.encode(), SIZED),
+    "ROS 2 messages": (ROS2_ECHO.encode(), SIZED),
+    "ROS 2 message in JSON": (json.dumps(next(yaml.safe_load_all(ROS2_ECHO))).encode(), SIZED),
+    "K": (json.dumps({"K": MATRIX.tolist(), "depth_scale": 4000}).encode(), Intrinsics(**PINHOLE, depth_scale=4000)),
+    "K, nine numbers": (json.dumps({"K": MATRIX.ravel().tolist()}).encode(), Intrinsics(**PINHOLE)),
+    "camera_matrix": (json.dumps({"camera_matrix": MATRIX.tolist()}).encode(), Intrinsics(**PINHOLE)),
+    "matrix in JSON": (json.dumps(MATRIX.tolist()).encode(), Intrinsics(**PINHOLE)),
+    "nine numbers in JSON": (json.dumps(MATRIX.ravel().tolist()).encode(), Intrinsics(**PINHOLE)),
+    "matrix in text": (as_text(MATRIX), Intrinsics(**PINHOLE)),
+    "matrix in CSV": (b"615.5, 0, 318.25\n0, 616.75, 241.5\n0, 0, 1\n", Intrinsics(**PINHOLE)),
+    "matrix in NPY": (as_npy(MATRIX), Intrinsics(**PINHOLE)),
+    "matrix in NPY, float32": (as_npy(MATRIX.astype(np.float32)), Intrinsics(**PINHOLE)),
+    "matrix in NPY, Fortran order": (as_npy(np.asfortranarray(MATRIX)), Intrinsics(**PINHOLE)),
+    "BOP entry": (json.dumps(BOP_ENTRY).encode(), Intrinsics(**PINHOLE, depth_scale=10_000)),
+    "BOP scene": (json.dumps({"7": BOP_ENTRY}).encode(), Intrinsics(**PINHOLE, depth_scale=10_000)),
+    "BOP camera.json": (
+        json.dumps({**PINHOLE, "width": 640, "height": 480, "depth_scale": 0.1}).encode(),
+        Intrinsics(**PINHOLE, depth_scale=10_000, width=640, height=480),
+    ),
+    "RealSense": (
+        json.dumps({**REALSENSE, "model": "distortion.inverse_brown_conrady", "coeffs": [0.0] * 5}).encode(),
+        SIZED,
+    ),
+    "RealSense with a scale": (
+        json.dumps({**REALSENSE, "depth_scale": 0.00025}).encode(),
+        Intrinsics(**PINHOLE, depth_scale=4000, width=640, height=480),
+    ),
+    "Open3D": (json.dumps(OPEN3D).encode(), SIZED),
+    "Open3D camera": (json.dumps({"intrinsic": OPEN3D, "extrinsic": [1.0] * 16}).encode(), SIZED),
+}
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_formats(name: str, tmp_path: Path) -> None:
+    content, expected = FORMATS[name]
+    (tmp_path / "k").write_bytes(content)
+    assert read_intrinsics(tmp_path / "k") == expected
+
+
+def test_a_file_of_opencv(tmp_path: Path) -> None:
+    assert parse_intrinsics(opencv_yaml(tmp_path / "k.yml")) == SIZED
+
+
+def test_a_file_of_open3d(tmp_path: Path) -> None:
+    open3d = pytest.importorskip("open3d", reason="needs open3d (extra benchmark)", exc_type=ImportError)
+    camera = open3d.camera.PinholeCameraIntrinsic(640, 480, 615.5, 616.75, 318.25, 241.5)
+    open3d.io.write_pinhole_camera_intrinsic(str(tmp_path / "k.json"), camera)
+    assert read_intrinsics(tmp_path / "k.json") == SIZED
+
+
+@pytest.mark.parametrize("names", ["KD", "kd"])
+def test_a_ros_message(names: str) -> None:
+    """Bags hold messages whose arrays are NumPy's."""
+    fields = {names[0]: MATRIX.ravel(), names[1]: np.array([0.1, 0, 0, 0, 0])}
+    message = types.SimpleNamespace(width=640, height=480, distortion_model="plumb_bob", **fields)
+    assert Intrinsics.of(message) == Intrinsics(**PINHOLE, width=640, height=480, distortion=(0.1, 0, 0, 0, 0))
+
+
+def test_the_entry_of_a_bop_scene_is_that_of_the_image(tmp_path: Path) -> None:
+    entries = {str(n): {"cam_K": [500 + n, 0, 3, 0, 500, 2, 0, 0, 1], "depth_scale": 1.0} for n in (1, 12)}
+    path = tmp_path / "scene_camera.json"
+    path.write_text(json.dumps(entries))
+    assert frame_intrinsics(path, tmp_path / "000012.png").fx == 512
+    for name in ("000002.png", "color.png"):
+        with pytest.raises(InputError, match="has 2 images and none has the number"):
+            frame_intrinsics(path, tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("camera_matrix: {data: [1, 2]}", "expected fx, 0, cx"),
+        ("K: [1, 0, 3, 0, 2, 2, 0, 0]", "expected fx, 0, cx"),
+        ('{"K": "one"}', "expected fx, 0, cx"),
+        ("615 0 318 0 616 241 0 0", "shape (8,)"),
+        ("615 0 318 7 616 241 0 0 1", "expected fx, 0, cx"),
+        ("615 0 318 0 616 241 0 0 one", "is a str"),
+        ("- 3\n- 4\n", "shape (2,)"),
+        ("a: [", "neither JSON, YAML"),
+        ('{"ppx": 3, "ppy": 2}', "lacks fx, fy"),
+        ('{"ppx": 3, "ppy": 2, "fx": 5, "fy": 5, "depth_scale": 1000}', "metres per depth unit"),
+        ('{"cam_K": [1, 0, 3, 0, 2, 2, 0, 0, 1], "depth_scale": 0}', "depth_scale is 0"),
+        ('{"intrinsic_matrix": [1, 2, 3]}', "intrinsic_matrix is [1, 2, 3]"),
+        ('{"intrinsic_matrix": [615, 0, 318, 0, 616, 241, 0, 0, 1]}', "expected fx, 0, cx"),
+        ('{"fx": 5, "fy": 5, "cx": 3, "cy": 2, "width": 0}', "intrinsics.width is 0"),
+        ('{"fx": 5, "fy": 5, "cx": 3, "cy": 2, "height": "480"}', "intrinsics.height is '480'"),
+        ('{"fx": 5, "fy": 5, "cx": 3, "cy": 2, "distortion": [1, 2]}', "has 2 coefficients"),
+        ('{"fx": 5, "fy": 5, "cx": 3, "cy": 2, "distortion": [1, 2, 3, NaN]}', "coefficient nan"),
+        ('{"fx": 5, "fy": 5, "cx": 3, "cy": 2, "distortion": "none"}', "distortion is 'none'"),
+        ("{}", "has no entry"),
+        ('{"focal": 500}', "has focal"),
+        (ROS1_ECHO.replace("615.5", "0.0"), "intrinsics.fx is 0.0"),
+        ('{"fx": 5, "fy": 5, "cx": 3, "cy": 2, "depth_scale": 1e-300}', "intrinsics.depth_scale is 1e-300"),
+        ('{"fx": 5e-324, "fy": 5, "cx": 3, "cy": 2}', "intrinsics.fx is 5e-324"),
+        ("x" * 100_000, "100000 bytes"),
+    ],
+)
+def test_invalid_files(text: str, expected: str, tmp_path: Path) -> None:
+    (tmp_path / "k").write_text(text)
+    with pytest.raises(InputError) as caught:
+        read_intrinsics(tmp_path / "k")
+    message = str(caught.value)
+    assert expected in message and str(tmp_path / "k") in message and "\n" not in message
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        as_npy(MATRIX)[:100],
+        as_npy(MATRIX)[:40],
+        as_npy(MATRIX[:2]),
+        as_npy(np.array([{}] * 9, object)),
+        as_npy(MATRIX + 0j),
+    ],
+    ids=["truncated", "header", "2 x 3", "pickled", "complex"],
+)
+def test_invalid_npy_files(content: bytes) -> None:
+    with pytest.raises(InputError, match=r"^intrinsics[ .]"):
+        parse_intrinsics(content)
+
+
+def test_the_size_of_the_images_is_checked() -> None:
+    images = np.zeros((48, 64, 3), np.uint8), np.zeros((48, 64), np.uint16), np.zeros((48, 64), np.uint8)
+    for width, height in ((64, 48), (None, 48), (None, None)):
+        RGBDFrame(*images, Intrinsics(60, 60, 32, 24, width=width, height=height))
+    for width, height in ((128, 96), (48, 64), (64, 47)):
+        with pytest.raises(
+            InputError, match=rf"^intrinsics is for images of {width} x {height} pixels; color has 64 x 48"
+        ):
+            RGBDFrame(*images, Intrinsics(60, 60, 32, 24, width=width, height=height))
+
+
+# Lens distortion
+
+
+@pytest.mark.parametrize("name", DISTORTIONS)
+def test_rays_of_a_distorting_lens_project_to_their_pixels(name: str) -> None:
+    """OpenCV projects the points."""
+    camera = Intrinsics(61.5, 62.0, 31.25, 24.5, distortion=DISTORTIONS[name])
+    depth = np.random.default_rng(1).uniform(0.3, 2.0, (48, 64))
+    matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    points = backproject(depth, camera).reshape(-1, 3)
+    pixels = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, np.array(camera.distortion))[0]
+    rows, columns = np.mgrid[:48, :64]
+    np.testing.assert_allclose(pixels.reshape(48, 64, 2), np.stack([columns, rows], -1), atol=1e-3)
+    some = np.array([0, 70, 3071])
+    np.testing.assert_allclose(pixel_rays(some, 64, camera) * depth.ravel()[some, None], points[some], rtol=1e-9)
+    np.testing.assert_array_equal(points[:, 2], depth.ravel())
+
+
+@pytest.mark.parametrize("name", DISTORTIONS)
+def test_undistort_is_the_inverse_of_distort(name: str) -> None:
+    x, y = np.random.default_rng(0).uniform(-0.45, 0.45, (2, 1000))
+    np.testing.assert_allclose(undistort(*distort(x, y, DISTORTIONS[name]), DISTORTIONS[name]), (x, y), atol=1e-8)
+    empty = undistort(x[:0], y[:0], DISTORTIONS[name])
+    assert empty[0].shape == empty[1].shape == (0,)
+
+
+def test_zero_coefficients_are_no_distortion() -> None:
+    assert Intrinsics(**PINHOLE, distortion=[0.0] * 14).distortion == ()
+    longer = [*DISTORTIONS["rational_polynomial"], 0, 0, 0, 0]
+    assert Intrinsics(**PINHOLE, distortion=longer).distortion == DISTORTIONS["rational_polynomial"]
+
+
+@pytest.mark.parametrize(
+    ("values", "name"),
+    [
+        ({"K": MATRIX.tolist(), "D": [0.1, 0, 0, 0], "distortion_model": "equidistant"}, "equidistant"),
+        ({**REALSENSE, "model": "distortion.inverse_brown_conrady", "coeffs": [0.1, 0, 0, 0, 0]}, "inverse_brown"),
+        ({**PINHOLE, "distortion_model": "fov", "distortion": [0.9]}, "fov"),
+    ],
+)
+def test_other_distortion_models_are_refused_by_name(values: Any, name: str) -> None:
+    with pytest.raises(InputError, match=rf"^intrinsics has the distortion model .*{name}.*; expected plumb_bob"):
+        Intrinsics.of(values)
+
+
+@pytest.mark.parametrize("distortion", [(-9.0, 0, 0, 0), (0.0, 0, 80, 0), (0, 0, 0, 0, 0, -5.0, 0, 0)])
+def test_distortion_without_an_inverse_is_refused(distortion: tuple[float, ...]) -> None:
+    images = np.zeros((48, 64, 3), np.uint8), np.zeros((48, 64), np.uint16), np.zeros((48, 64), np.uint8)
+    with pytest.raises(InputError, match="^intrinsics has the distortion .*no inverse"):
+        RGBDFrame(*images, Intrinsics(40, 40, 32, 24, distortion=distortion))
+
+
+def test_a_frame_of_files_with_a_depth_scale_of_its_own(tmp_path: Path) -> None:
+    depth = np.full((4, 6), 5000, np.uint16)
+    images = {"color": np.zeros((4, 6, 3), np.uint8), "depth": depth, "labels": np.ones((4, 6), np.uint8)}
+    files = {name: tmp_path / f"{name}.png" for name in images}
+    for name, path in files.items():
+        path.write_bytes(encode_image(images[name]))
+    (tmp_path / "K.txt").write_bytes(as_text(MATRIX))
+    frame = read_frame(**files, intrinsics=tmp_path / "K.txt", depth_scale=5000)
+    assert frame.intrinsics == Intrinsics(**PINHOLE, depth_scale=5000)
+    np.testing.assert_array_equal(frame.depth_m, 1)

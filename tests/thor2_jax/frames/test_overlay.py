@@ -1,0 +1,267 @@
+"""Overlays of answers against outlines computed by SciPy and the rectangles of the drawn text."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image, ImageDraw
+from scipy import ndimage
+
+from thor2_jax.errors import InputError
+from thor2_jax.frames import overlay
+from thor2_jax.frames.overlay import COLORS, UNRECOGNIZED, draw_overlay
+from thor2_jax.model.answers import Recognition
+
+GREY = 90
+
+
+def photo(height: int = 480, width: int = 640) -> np.ndarray:
+    return np.full((height, width, 3), GREY, np.uint8)
+
+
+def discs(centres: list[tuple[int, int]], radius: int, shape: tuple[int, int] = (480, 640)) -> np.ndarray:
+    """Return the labels 1, 2, ... of discs around (row, column) centres."""
+    row, column = np.indices(shape)
+    labels = np.zeros(shape, np.uint8)
+    for number, (r, c) in enumerate(centres, start=1):
+        labels[(row - r) ** 2 + (column - c) ** 2 <= radius**2] = number
+    return labels
+
+
+def named(label: int, name: str = "mug", occluded: bool = False) -> Recognition:
+    return Recognition(label=label, name=name, confidence=0.756, classifier="tops2", occluded=occluded)
+
+
+def drawn(color: np.ndarray, labels: np.ndarray, answers: list[Recognition], path: Path) -> np.ndarray:
+    before = color.copy(), labels.copy()
+    draw_overlay(color, labels, answers, path)
+    assert np.array_equal(color, before[0]) and np.array_equal(labels, before[1])
+    with Image.open(path) as picture:
+        assert picture.format == "PNG" and picture.mode == "RGB"
+        return np.asarray(picture)
+
+
+@pytest.fixture
+def boxes(monkeypatch: pytest.MonkeyPatch) -> list[tuple[tuple[int, int, int, int], str]]:
+    """Record each label that is drawn: the rectangle behind it, last column and row included, and its text."""
+    labels: list[tuple[tuple[int, int, int, int], str]] = []
+    rectangle, text = ImageDraw.ImageDraw.rectangle, ImageDraw.ImageDraw.multiline_text
+    last: list[tuple[int, int, int, int]] = []
+
+    def with_rectangle(self: ImageDraw.ImageDraw, xy: tuple[int, int, int, int], **options: object) -> None:
+        last.append(xy)
+        rectangle(self, xy, **options)
+
+    def with_text(
+        self: ImageDraw.ImageDraw, xy: tuple[float, float], words: str, *rest: object, **options: float
+    ) -> None:
+        left, top, right, bottom = self.multiline_textbbox(xy, words, rest[1], spacing=options["spacing"])
+        box = last[-1]
+        assert box[0] < left and box[1] < top and right <= box[2] and bottom <= box[3], "the text leaves its box"
+        labels.append((box, words))
+        text(self, xy, words, *rest, **options)
+
+    monkeypatch.setattr(ImageDraw.ImageDraw, "rectangle", with_rectangle)
+    monkeypatch.setattr(ImageDraw.ImageDraw, "multiline_text", with_text)
+    return labels
+
+
+def outside(boxes: list[tuple[tuple[int, int, int, int], str]], shape: tuple[int, int]) -> np.ndarray:
+    free = np.ones(shape, bool)
+    for (left, top, right, bottom), _ in boxes:
+        free[top : bottom + 1, left : right + 1] = False
+    return free
+
+
+def test_outlines_lie_on_the_inner_edge_of_the_masks(tmp_path: Path, boxes: list) -> None:
+    labels = discs([(120, 150), (300, 400)], 60)
+    labels[300:320, 390:410] = 0  # holes have an outline too
+    answers = [named(1), Recognition(label=2, reason="too few points")]
+    picture = drawn(photo(), labels, answers, tmp_path / "a.png")
+    free = outside(boxes, labels.shape)
+    for answer, paint in zip(answers, (COLORS[0], UNRECOGNIZED), strict=True):
+        mask = labels == answer.label
+        rim = mask & ~ndimage.binary_erosion(mask, iterations=2) & free
+        assert rim.sum() > 500
+        assert (picture[rim] == paint).all()
+        inside = ndimage.binary_erosion(mask, iterations=5) & free
+        assert inside.sum() > 5000
+        assert (picture[inside] == GREY).all()
+
+
+def test_touching_neighbours_keep_their_own_outlines(tmp_path: Path, boxes: list) -> None:
+    labels = np.zeros((480, 640), np.uint8)
+    labels[200:300, 200:300], labels[200:300, 300:400] = 1, 2
+    picture = drawn(photo(), labels, [named(1), named(2)], tmp_path / "a.png")
+    rows = np.flatnonzero(outside(boxes, labels.shape)[200:300, 298:302].all(axis=1)) + 200
+    assert len(rows) > 20
+    assert (picture[rows, 298:300] == COLORS[0]).all() and (picture[rows, 300:302] == COLORS[1]).all()
+
+
+def test_labels_are_complete_and_do_not_overlap(tmp_path: Path, boxes: list) -> None:
+    labels = discs([(5, 5), (5, 630), (470, 5), (470, 630), (240, 320), (250, 340), (260, 330)], 40)
+    answers = [
+        named(1, "mug"),
+        named(2, "bowl", occluded=True),
+        Recognition(label=3, reason="too few points"),
+        Recognition(label=4, occluded=True, reason="too few points"),
+        Recognition(label=5, name="plate", confidence=1.0, classifier="tops"),
+        named(6, "pitcher"),
+        Recognition(label=7, name="spoon"),
+    ]
+    drawn(photo(), labels, answers, tmp_path / "a.png")
+    assert [text for _, text in boxes] == [
+        "mug 0.76\nTOPS2",
+        "bowl 0.76\nTOPS2, occluded",
+        "unrecognized",
+        "unrecognized\noccluded",
+        "plate 1.00\nTOPS",
+        "pitcher 0.76\nTOPS2",
+        "spoon",
+    ]
+    count = np.zeros(labels.shape, int)
+    for (left, top, right, bottom), _ in boxes:
+        assert 0 <= left < right < 640 and 0 <= top < bottom < 480
+        count[top : bottom + 1, left : right + 1] += 1
+    assert count.max() == 1
+
+
+def test_text_is_legible_on_its_box(tmp_path: Path, boxes: list) -> None:
+    labels = discs([(100, 100), (100, 300), (100, 500), (350, 100), (350, 300), (350, 500)], 40)
+    answers = [*(named(k) for k in range(1, 6)), Recognition(label=6)]
+    picture = drawn(photo(), labels, answers, tmp_path / "a.png")
+    for (box, _), paint in zip(boxes, (*COLORS, UNRECOGNIZED), strict=True):
+        inside = picture[box[1] : box[3] + 1, box[0] : box[2] + 1].reshape(-1, 3)
+        ink = (255, 255, 255) if paint == (0, 114, 178) else (0, 0, 0)
+        assert (inside == paint).all(axis=1).mean() > 0.5
+        assert 0.02 < (inside == ink).all(axis=1).mean() < 0.5
+        assert contrast(ink, paint) > 4.5  # minimum of WCAG for text
+
+
+def contrast(a: tuple[int, ...], b: tuple[int, ...]) -> float:
+    low, high = sorted(0.05 + np.dot((0.2126, 0.7152, 0.0722), [linear(v / 255) for v in c]) for c in (a, b))
+    return float(high / low)
+
+
+def linear(value: float) -> float:
+    return value / 12.92 if value <= 0.04045 else ((value + 0.055) / 1.055) ** 2.4
+
+
+def test_a_leader_connects_a_label_with_its_instance(tmp_path: Path, boxes: list) -> None:
+    labels = np.zeros((480, 640), np.uint8)
+    labels[140:340, 220:420] = 1  # surrounds a small instance, whose label must move away
+    labels[238:242, 318:322] = 2
+    picture = drawn(photo(), labels, [named(1), named(2)], tmp_path / "a.png")
+    ((left, top, right, bottom), _) = boxes[1]
+    assert not (left <= 321 and right >= 318 and top <= 241 and bottom >= 238)
+    joined, _ = ndimage.label((picture == COLORS[1]).all(axis=2), np.ones((3, 3)))
+    assert joined[238, 318] == joined[top, left] > 0
+
+
+def test_long_names_shrink_to_fit(tmp_path: Path, boxes: list) -> None:
+    labels = discs([(60, 80)], 20, (120, 160))
+    drawn(photo(120, 160), labels, [named(1, "an_object_of_long_name")], tmp_path / "a.png")
+    (((left, _, right, _), text),) = boxes
+    assert text.startswith("an_object_of_long_name 0.76") and 0 <= left < right < 160
+
+
+def test_sizes_scale_with_the_image(tmp_path: Path, boxes: list) -> None:
+    for scale in (1, 3):
+        labels = discs([(240 * scale, 320 * scale)], 60 * scale, (480 * scale, 640 * scale))
+        picture = drawn(photo(*labels.shape), labels, [named(1)], tmp_path / f"{scale}.png")
+        line = (picture[240 * scale] == COLORS[0]).all(axis=1)[200 * scale : 290 * scale]
+        assert line.sum() == round(800 * scale / 350)
+    heights = [bottom - top for (_, top, _, bottom), _ in boxes]
+    assert heights[1] > 1.8 * heights[0]
+
+
+def test_no_answers_give_the_photo(tmp_path: Path) -> None:
+    color = np.random.default_rng(0).integers(0, 256, (31, 17, 3), dtype=np.uint8)
+    assert np.array_equal(drawn(color, np.ones((31, 17), np.int64), [], tmp_path / "a.png"), color)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.int32, np.uint64])
+def test_tiny_pictures_have_outlines_without_labels(tmp_path: Path, boxes: list, dtype: type) -> None:
+    labels = np.zeros((8, 8), dtype)
+    labels[1:7, 1:7], labels[7, 7] = 1, 2
+    picture = drawn(photo(8, 8), labels, [named(1), Recognition(label=2)], tmp_path / "a.png")
+    assert boxes == []
+    assert (picture[1, 1:7] == COLORS[0]).all() and (picture[7, 7] == UNRECOGNIZED).all()
+    assert (picture[3:5, 3:5] == GREY).all() and (picture[0] == GREY).all()
+
+
+def test_one_pixel(tmp_path: Path) -> None:
+    assert (drawn(photo(1, 1), np.ones((1, 1), int), [named(1)], tmp_path / "a.png") == COLORS[0]).all()
+
+
+@pytest.mark.parametrize("label", [0, 4, -1, 300])
+def test_an_answer_without_an_instance(tmp_path: Path, label: int) -> None:
+    with pytest.raises(InputError, match=f"answers: label {label} "):
+        draw_overlay(photo(), discs([(100, 100)], 20), [named(1), named(label)], tmp_path / "a.png")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("color", "labels", "message"),
+    [
+        (np.zeros((4, 5), np.uint8), np.zeros((4, 5), int), r"color has shape \(4, 5\)"),
+        (np.zeros((0, 5, 3), np.uint8), np.zeros((0, 5), int), r"color has shape \(0, 5, 3\)"),
+        (np.zeros((4, 5, 3), float), np.zeros((4, 5), int), "color has type float64"),
+        (np.zeros((4, 5, 3), np.uint8), np.zeros((5, 4), int), r"labels has shape \(5, 4\)"),
+        (np.zeros((4, 5, 3), np.uint8), np.zeros((4, 5)), "labels has type float64"),
+    ],
+)
+def test_bad_input(tmp_path: Path, color: np.ndarray, labels: np.ndarray, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        draw_overlay(color, labels, [], tmp_path / "a.png")
+
+
+def test_a_failing_write_leaves_the_old_picture_and_nothing_else(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "a.png"
+    path.write_bytes(b"old")
+
+    def fail(self: Image.Image, target: Path, **options: object) -> None:
+        Path(target).write_bytes(b"half")
+        raise OSError("disk full")
+
+    monkeypatch.setattr(overlay.Image.Image, "save", fail)
+    with pytest.raises(OSError, match="disk full"):
+        draw_overlay(photo(), discs([(100, 100)], 20), [named(1)], path)
+    assert list(tmp_path.iterdir()) == [path] and path.read_bytes() == b"old"
+
+
+def test_a_missing_folder_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(OSError):
+        draw_overlay(photo(), discs([(100, 100)], 20), [named(1)], tmp_path / "none" / "a.png")
+
+
+def test_real_frames(shared: Path, tmp_path: Path, boxes: list) -> None:
+    folders = sorted((shared / "data" / "frames" / "ycbv_posecnn_demo").glob("[0-9]*"))
+    if not folders:
+        pytest.skip("no real frames in the shared folder")
+    for folder in folders:
+        boxes.clear()
+        with Image.open(folder / "color.png") as color, Image.open(folder / "mask.png") as mask:
+            pixels, labels = np.asarray(color.convert("RGB")), np.asarray(mask)
+        numbers = [int(k) for k in np.unique(labels) if k]
+        picture = drawn(pixels, labels, [named(k, f"object_{k}") for k in numbers], tmp_path / "a.png")
+        assert len(boxes) == len(numbers)
+        covered = sum((right - left + 1) * (bottom - top + 1) for (left, top, right, bottom), _ in boxes)
+        assert (~outside(boxes, labels.shape)).sum() == covered, "labels overlap"
+        changed = (picture != pixels).any(axis=2) & outside(boxes, labels.shape)
+        assert changed[labels > 0].mean() < 0.35
+        assert changed[labels == 0].sum() < 2 * math.hypot(*labels.shape)  # only leaders
+
+
+@pytest.mark.parametrize(
+    "name, drawn", [("Tasse ä", "Tasse ä"), ("\U0001f34e", r"\U0001f34e"), ("a\u202eb", r"a\u202eb"), ("\x1b", r"\x1b")]
+)
+def test_missing_characters_are_escaped(name: str, drawn: str, tmp_path: Path) -> None:
+    labels = np.zeros((480, 640), np.uint8)
+    labels[80:120, 20:60] = 1
+    draw_overlay(photo(), labels, [Recognition(label=1, name=name)], tmp_path / "overlay.png")
+    lettering = overlay._fit(ImageDraw.Draw(Image.new("RGB", (9, 9))), name, 20, (400, 200))
+    assert lettering is not None and lettering.text == drawn

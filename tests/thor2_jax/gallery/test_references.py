@@ -1,0 +1,52 @@
+"""The file of reference views."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+
+from thor2_jax.errors import InputError
+from thor2_jax.gallery.embedding import Embedding, load_default
+from thor2_jax.gallery.references import BACKGROUND, REFERENCES_FILE, References
+
+VIEWS = np.eye(4, dtype=np.float16)[[0, 1, 2]]
+REFERENCES = References(VIEWS, np.array([0, 1, BACKGROUND], np.int32), ("mug", "bowl"))
+
+
+def test_references_are_read_as_written(tmp_path: Path) -> None:
+    REFERENCES.save(tmp_path / "r", "print")
+    loaded = References.load(tmp_path / "r", "print", 4)
+    assert_array_equal(loaded.embeddings, VIEWS)
+    assert_array_equal(loaded.label, REFERENCES.label)
+    assert loaded.classes == ("mug", "bowl")
+
+
+@pytest.mark.parametrize(
+    "fingerprint, size, message", [("other", 4, "of another embedding"), ("print", 5, "damaged"), ("cut", 4, "damaged")]
+)
+def test_references_that_do_not_fit_are_refused(fingerprint: str, size: int, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "r"
+    REFERENCES.save(path, "print")
+    if fingerprint == "cut":
+        path.write_bytes(path.read_bytes()[:-3])
+    with pytest.raises(InputError, match=message):
+        References.load(path, fingerprint, size)
+
+
+def test_labels_out_of_range_are_refused(tmp_path: Path) -> None:
+    References(VIEWS, np.array([0, 1, 2], np.int32), ("mug", "bowl")).save(tmp_path / "r", "print")
+    with pytest.raises(InputError, match="out of range"):
+        References.load(tmp_path / "r", "print", 4)
+
+
+def test_an_embedding_keeps_its_references_beside_it(tmp_path: Path) -> None:
+    packaged = load_default()
+    assert packaged.references is not None and packaged.references.embeddings.shape == (4096, packaged.size)
+    assert (packaged.references.label == BACKGROUND).all() and packaged.references.classes == ()
+    packaged.save(tmp_path / "embedding.safetensors")
+    loaded = Embedding.load(tmp_path / "embedding.safetensors")
+    assert loaded.fingerprint == packaged.fingerprint and loaded.references is not None
+    assert_array_equal(loaded.references.embeddings, packaged.references.embeddings)
+    (tmp_path / REFERENCES_FILE).unlink()
+    assert Embedding.load(tmp_path / "embedding.safetensors").references is None

@@ -1,0 +1,119 @@
+"""The classifier against the same layers in NumPy, float64."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+
+import thor2_jax as thor2
+from thor2_jax.model.classifier import FEATURES, HIDDEN, MLP, SPARSE_BATCH, check_features, feature_of
+
+RNG = np.random.default_rng(0)
+apply = nnx.jit(lambda model, x: model(x))
+train = nnx.jit(lambda model, x, rngs=None: model(x, train=True, rngs=rngs))
+
+
+def random_classifier(n_inputs: int, n_classes: int) -> MLP:
+    """Return a classifier with random batch statistics and scales."""
+    model = MLP(n_inputs, n_classes, rngs=nnx.Rngs(0))
+    model.input_scale[...] = jnp.asarray(RNG.uniform(0.5, 2, n_inputs), jnp.float32)
+    for norm in model.norms:
+        for values in (norm.mean, norm.bias):
+            values[...] = jnp.asarray(RNG.normal(size=values.shape), jnp.float32)
+        for values in (norm.var, norm.scale):
+            values[...] = jnp.asarray(RNG.uniform(0.5, 2, values.shape), jnp.float32)
+    return model
+
+
+@pytest.fixture(scope="module")
+def model() -> MLP:
+    return random_classifier(33, 5)
+
+
+def numpy_logits(model: MLP, x: np.ndarray, own_statistics: bool) -> np.ndarray:
+    x = x.astype(np.float64) * np.asarray(model.input_scale[...])
+    for layer, norm in zip(model.layers, model.norms, strict=True):
+        x = x @ np.asarray(layer.kernel[...]) + np.asarray(layer.bias[...])
+        mean, var = (x.mean(0), x.var(0)) if own_statistics else (np.asarray(norm.mean[...]), np.asarray(norm.var[...]))
+        x = (x - mean) / np.sqrt(var + 1e-5) * np.asarray(norm.scale[...]) + np.asarray(norm.bias[...])
+        x = np.maximum(x, 0)
+    return x @ np.asarray(model.head.kernel[...]) + np.asarray(model.head.bias[...])
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, 7])
+def test_logits_against_numpy(n: int, model: MLP) -> None:
+    x = RNG.normal(size=(n, 33)).astype(np.float32)
+    logits = apply(model, jnp.asarray(x))
+    assert logits.shape == (n, 5)
+    np.testing.assert_allclose(logits, numpy_logits(model, x, own_statistics=False), rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("n", [1, SPARSE_BATCH, SPARSE_BATCH + 1])
+@pytest.mark.parametrize(
+    "n_used", [0, 1, 4, 5, 9, 10, 33]
+)  # a tenth of 33 inputs, rounded up, is 4, and a quarter is 9
+def test_logits_and_gradients_where_most_inputs_are_zero(n_used: int, n: int, model: MLP) -> None:
+    x = np.zeros((n, 33), np.float32)
+    x[:, RNG.permutation(33)[:n_used]] = RNG.normal(size=(n, n_used))
+    np.testing.assert_allclose(apply(model, x), numpy_logits(model, x, own_statistics=False), rtol=1e-4, atol=1e-4)
+
+    # More rows than SPARSE_BATCH, of which only the first count, switch off the sparse product.
+    def loss(x: jax.Array, extra_rows: int) -> jax.Array:
+        return jnp.sin(model(jnp.pad(x, ((0, extra_rows), (0, 0))))[:n]).sum()
+
+    gradient = jax.jit(jax.grad(loss), static_argnums=1)
+    expected = gradient(x, SPARSE_BATCH + 1)
+    assert n_used == 33 or float(jnp.abs(expected[x == 0]).min()) > 0
+    np.testing.assert_allclose(gradient(x, 0), expected, rtol=1e-3, atol=1e-4)
+
+
+def test_the_papers_layers() -> None:
+    model = MLP(40, 6, rngs=nnx.Rngs(0))
+    assert HIDDEN == (512, 256, 128, 64)
+    shapes = [layer.kernel[...].shape for layer in [*model.layers, model.head]]
+    assert shapes == [(40, 512), (512, 256), (256, 128), (128, 64), (64, 6)]
+    assert model.dropout.rate == 0.2
+
+
+def test_training_uses_batch_statistics_and_moves_running_ones() -> None:
+    model = MLP(33, 5, rngs=nnx.Rngs(0), dropout=0.0)
+    x = RNG.normal(size=(16, 33)).astype(np.float32)
+    expected = numpy_logits(model, x, own_statistics=True)
+    np.testing.assert_allclose(train(model, jnp.asarray(x)), expected, rtol=1e-3, atol=1e-3)
+    first = x @ np.asarray(model.layers[0].kernel[...]) + np.asarray(model.layers[0].bias[...])
+    np.testing.assert_allclose(model.norms[0].mean[...], 0.1 * first.mean(axis=0), atol=1e-5)
+    np.testing.assert_allclose(model.norms[0].var[...], 0.9 + 0.1 * first.var(axis=0), atol=1e-5)
+
+
+def test_dropout_is_active_only_in_training() -> None:
+    model = MLP(33, 5, rngs=nnx.Rngs(0))
+    x = jnp.asarray(RNG.normal(size=(7, 33)), jnp.float32)
+    np.testing.assert_array_equal(apply(model, x), apply(model, x))
+    runs = [np.asarray(train(model, x, nnx.Rngs(dropout=key))) for key in (0, 1, 1)]
+    assert np.abs(runs[0] - runs[1]).max() > 1e-3
+    np.testing.assert_array_equal(runs[1], runs[2])
+
+
+@pytest.mark.parametrize("names", [*itertools.permutations(FEATURES), ("tops",), ["tops2", "ce"]])
+def test_features_come_in_one_order(names: object) -> None:
+    assert check_features(names, "x") == tuple(name for name in ("ce", "tops", "tops2") if name in names)  # type: ignore[operator]
+
+
+@pytest.mark.parametrize("names", [(), [], ["tops", "tops"], ["shape"], "tops", None, ["tops", None], 3])
+def test_bad_features_are_refused(names: object) -> None:
+    with pytest.raises(thor2.InputError) as caught:
+        check_features(names, "classifiers")
+    message = str(caught.value)
+    assert message.startswith(f"classifiers is {names!r}") and "ce, tops, tops2" in message
+
+
+def test_each_feature_is_its_descriptor() -> None:
+    descriptors = thor2.Descriptors(
+        jnp.asarray(RNG.random((2, 7, 32, 32))), jnp.asarray(RNG.random((2, 7, 22, 31))), jnp.zeros(2, jnp.int32)
+    )
+    sizes = {name: feature_of(descriptors, name).shape for name in FEATURES}
+    assert sizes == {"ce": (2, 4774), "tops": (2, 7168), "tops2": (2, 11942)}
+    np.testing.assert_array_equal(feature_of(descriptors, "ce"), descriptors.color)

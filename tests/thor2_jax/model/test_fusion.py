@@ -1,0 +1,80 @@
+"""Fusion of the classifiers: the three rules against SciPy and known values."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.stats import gmean
+
+from thor2_jax.model.fusion import FUSION_RULES, FusionRule, fuse, fused_probabilities, with_temperature
+
+RNG = np.random.default_rng(0)
+
+
+@pytest.mark.parametrize("n", [0, 1, 101])
+@pytest.mark.parametrize("rule", ["mean", "log-mean"])
+def test_the_means_against_scipy(n: int, rule: FusionRule) -> None:
+    tops, tops2 = (np.asarray(jax.nn.softmax(RNG.normal(size=(n, 4)))) for _ in range(2))
+    result = fuse({"tops": tops, "tops2": tops2}, rule)
+    for b in range(n):
+        pair = tops[b].astype(np.float64), tops2[b].astype(np.float64)
+        fused = (pair[0] + pair[1]) / 2 if rule == "mean" else gmean(pair) / gmean(pair).sum()
+        best = result.class_index[b]
+        assert best == fused.argmax() and result.confidence[b] == pytest.approx(fused[best], rel=1e-12)
+        assert result.classifier[b] == ("tops" if tops[b, best] >= tops2[b, best] else "tops2")
+    assert len(result.class_index) == n
+
+
+def test_a_class_that_one_classifier_rules_out_loses() -> None:
+    """Classes with a probability of 0 have no logarithm; both classifiers rule out the third class."""
+    result = fuse({"tops": np.array([[0.9, 0.1, 0.0]], np.float32), "tops2": np.array([[0.0, 1.0, 0.0]], np.float32)})
+    assert result.class_index[0] == 1 and result.confidence[0] == pytest.approx(1) and result.classifier[0] == "tops2"
+
+
+@pytest.mark.parametrize("n", [0, 1, 101])
+def test_max_takes_the_most_confident_classifier(n: int) -> None:
+    tops, tops2 = (np.asarray(jax.nn.softmax(RNG.normal(size=(n, 4)))) for _ in range(2))
+    result = fuse({"tops": tops, "tops2": tops2}, "max")
+    for b in range(n):
+        name, row = max((("tops", tops[b]), ("tops2", tops2[b])), key=lambda pair: pair[1].max())
+        assert result.classifier[b] == name
+        assert result.class_index[b] == row.argmax() and result.confidence[b] == row.max()
+    assert len(result.class_index) == n
+
+
+def test_the_first_classifier_wins_a_tie_and_one_is_enough() -> None:
+    first, second = np.array([[0.3, 0.7]]), np.array([[0.7, 0.3]])
+    assert fuse({"tops": first, "tops2": second}, "max") == (np.array([1]), np.array([0.7]), np.array(["tops"]))
+    assert fuse({"tops2": second}).classifier.tolist() == ["tops2"]
+
+
+@pytest.mark.parametrize("temperature", [0.5, 1.0, 2.5])
+def test_a_temperature_is_a_power_of_the_probabilities(temperature: float) -> None:
+    probabilities = np.array([[0.5, 0.3, 0.2], [0.01, 0.98, 0.01]])
+    powers = probabilities ** (1 / temperature)
+    expected = powers / powers.sum(axis=1, keepdims=True)
+    np.testing.assert_allclose(with_temperature(probabilities, temperature), expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("n", [0, 1, 101])
+@pytest.mark.parametrize("rule", FUSION_RULES)
+def test_jax_arrays_are_fused_as_numpy_arrays(rule: FusionRule, n: int) -> None:
+    rows = {name: np.asarray(jax.nn.softmax(RNG.normal(size=(n, 4)))) for name in ("tops", "tops2", "ce")}
+    fused = jax.jit(lambda p: fused_probabilities(p, rule))({name: jnp.asarray(p) for name, p in rows.items()})
+    assert isinstance(fused, jax.Array) and isinstance(fused_probabilities(rows, rule), np.ndarray)
+    # Compiled functions get the classifiers in the order of their names.
+    expected = fused_probabilities(dict(sorted(rows.items())), rule)
+    np.testing.assert_allclose(fused, expected, rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.parametrize("rule", FUSION_RULES)
+def test_fusion_has_gradients(rule: FusionRule) -> None:
+    first, second = np.array([[0.2, 0.5, 0.3]], np.float32), np.array([[0.1, 0.3, 0.6]], np.float32)
+
+    def value(change: np.ndarray) -> float:
+        return float(np.log(fused_probabilities({"a": first + change, "b": second}, rule))[0, 1])
+
+    gradient = jax.grad(lambda p: jnp.log(fused_probabilities({"a": p, "b": jnp.asarray(second)}, rule))[0, 1])
+    steps = 1e-3 * np.eye(3)[:, None]
+    differences = [(value(step) - value(-step)) / 2e-3 for step in steps]
+    np.testing.assert_allclose(gradient(jnp.asarray(first))[0], differences, atol=1e-2)

@@ -1,0 +1,116 @@
+"""Files with answers: COCO results read by pycocotools, BOP results, and the numbers of images and objects."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pycocotools import mask as coco_mask
+from pycocotools.coco import COCO
+
+from thor2_jax.frames.frames import Intrinsics, RGBDFrame, backproject
+from thor2_jax.model.answers import Recognition
+from thor2_jax.model.result_files import (
+    BOP_HEADER,
+    bop_lines,
+    category_numbers,
+    coco_results,
+    image_numbers,
+    run_length_encoding,
+)
+
+pytestmark = pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")  # pycocotools
+
+RNG = np.random.default_rng(0)
+
+
+def frame() -> RGBDFrame:
+    labels = np.zeros((40, 60), np.uint8)
+    labels[5:20, 10:30], labels[0:8, 40:60], labels[30, 7] = 1, 2, 3
+    depth = RNG.integers(500, 900, labels.shape).astype(np.uint16)
+    depth[6:9] = 0
+    return RGBDFrame(RNG.integers(0, 256, (40, 60, 3), dtype=np.uint8), depth, labels, Intrinsics(60, 61, 30, 20))
+
+
+ANSWERS = [Recognition(1, "mug", 0.75), Recognition(2, "bowl", 0.5), Recognition(3, None, 0.125, reason="unknown")]
+
+MASKS = {
+    "empty": np.zeros((5, 7), bool),
+    "full": np.ones((5, 7), bool),
+    "one pixel": np.eye(1, dtype=bool),
+    "no pixel of one": np.zeros((1, 1), bool),
+    "first pixel": np.arange(35).reshape(5, 7) == 0,
+    "last pixel": np.arange(35).reshape(5, 7) == 34,
+    "random": RNG.random((31, 17)) < 0.5,
+    "rare": RNG.random((300, 400)) < 0.0005,
+    "frequent": RNG.random((300, 400)) < 0.9995,
+    "large runs": np.arange(480 * 640).reshape(480, 640) < 200_000,
+}
+
+
+@pytest.mark.parametrize("name", MASKS)
+def test_run_lengths_are_those_of_pycocotools(name: str) -> None:
+    mask = MASKS[name]
+    expected = coco_mask.encode(np.asfortranarray(mask.astype(np.uint8)))
+    encoded = run_length_encoding(mask)
+    assert encoded == {"size": expected["size"], "counts": expected["counts"].decode()}
+    np.testing.assert_array_equal(coco_mask.decode(encoded).astype(bool), mask)
+
+
+def test_pycocotools_loads_the_results(tmp_path: Path) -> None:
+    scene = frame()
+    results = coco_results("table/7", 7, scene, ANSWERS, {"bowl": 1, "mug": 2})
+    (tmp_path / "results.json").write_text(json.dumps(results))
+    dataset = COCO()
+    dataset.dataset = {
+        "images": [{"id": 7, "height": 40, "width": 60}],
+        "annotations": [],
+        "categories": [{"id": 1}, {"id": 2}],
+    }
+    dataset.createIndex()
+    loaded = dataset.loadRes(str(tmp_path / "results.json"))
+    annotations = {entry["category_id"]: entry for entry in loaded.loadAnns(loaded.getAnnIds())}
+    assert set(annotations) == {1, 2}
+    for category, label, score in ((2, 1, 0.75), (1, 2, 0.5)):
+        mask = scene.label_image == label
+        entry = annotations[category]
+        np.testing.assert_array_equal(loaded.annToMask(entry).astype(bool), mask)
+        assert entry["score"] == score and entry["area"] == mask.sum() and entry["image_id"] == 7
+        np.testing.assert_array_equal(entry["bbox"], coco_mask.toBbox(entry["segmentation"]))
+    assert annotations[2]["bbox"] == [10, 5, 20, 15]
+
+
+def test_bop_lines() -> None:
+    scene = frame()
+    lines = bop_lines(48, 7, scene, ANSWERS, {"mug": 14}, 0.25)
+    assert BOP_HEADER.split(",") == ["scene_id", "im_id", "obj_id", "score", "R", "t", "time"]
+    assert len(lines) == 1
+    scene_id, im_id, obj_id, score, rotation, translation, seconds = lines[0].split(",")
+    assert (int(scene_id), int(im_id), int(obj_id), float(score), float(seconds)) == (48, 7, 14, 0.75, 0.25)
+    np.testing.assert_array_equal(np.array(rotation.split(), float).reshape(3, 3), np.eye(3))
+    points = backproject(scene.depth_m, scene.intrinsics)[(scene.label_image == 1) & (scene.depth_m > 0)]
+    np.testing.assert_allclose(np.array(translation.split(), float), 1000 * points.mean(axis=0), atol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        (["000048/000001", "000048/000036", "000049/000001"], [(48, 1), (48, 36), (49, 1)]),
+        (["000007", "000003"], [(1, 7), (1, 3)]),
+        (["a", "000003"], [(1, 1), (1, 2)]),
+        (["day/3", "night/3"], [(1, 1), (1, 2)]),
+        (["3", "03"], [(1, 1), (1, 2)]),
+        (["x/000048/2"], [(48, 2)]),
+        ([], []),
+    ],
+)
+def test_image_numbers(names: list[str], expected: list[tuple[int, int]]) -> None:
+    assert image_numbers(names) == expected
+
+
+def test_category_numbers() -> None:
+    assert category_numbers(["bowl", "mug"]) == {"bowl": 1, "mug": 2}
+    assert category_numbers(["obj_000012", "obj_000003"]) == {"obj_000012": 12, "obj_000003": 3}
+    assert category_numbers(["obj_000012", "mug"]) == {"obj_000012": 1, "mug": 2}
+    assert category_numbers(["bowl", "mug"], {14: "mug", 15: "fork"}) == {"mug": 14}
+    assert category_numbers([]) == {}

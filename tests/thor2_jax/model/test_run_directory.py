@@ -1,0 +1,284 @@
+"""Run directories: a saved run is loaded unchanged, and a damaged one is refused in one line."""
+
+import dataclasses
+import gc
+import hashlib
+import json
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import orbax.checkpoint as ocp
+import pytest
+import safetensors.numpy
+from flax import nnx
+from helpers import class_probabilities, untrained_embedding_run, untrained_run
+
+import colornet
+import thor2_jax as thor2
+from thor2_jax.descriptor.looks import LookDescriptors
+from thor2_jax.gallery.references import BACKGROUND, REFERENCES_FILE, References
+from thor2_jax.model.classifier import FEATURES, MLP
+from thor2_jax.model.run_directory import TrainedRun, input_size, load_run, save_run
+from thor2_jax.model.weights import model_arrays
+from thor2_jax.recognizer import Recognizer
+
+CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=2, n_strips=5, image_size=8, alpha=0.5)
+CLASSES = ("a mug", "b", "ç")
+CONSTANTS = dataclasses.asdict(CONFIG)
+
+
+def make_run(features: tuple[str, ...] = ("tops", "ce")) -> TrainedRun:
+    rng, network = np.random.default_rng(0), colornet.load_default()
+    classifiers = {}
+    for name in features:
+        model = MLP(input_size(name, CONFIG, network.n_regions), len(CLASSES), rngs=nnx.Rngs(1))
+        for norm in model.norms:  # statistics unlike those of a fresh model
+            norm.mean[...] = jnp.asarray(rng.normal(size=norm.mean.shape), jnp.float32)
+        model.input_scale[...] = jnp.asarray(rng.uniform(1, 2, model.input_scale.shape), jnp.float32)
+        classifiers[name] = model
+    return TrainedRun(CONFIG, network, CLASSES, classifiers, {"epochs": 3, "figures": [0.5, 1]})
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("runs") / "deep" / "run"
+    save_run(make_run(), path)
+    return path
+
+
+@pytest.fixture
+def copied(saved: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(saved, tmp_path / "run"))
+
+
+def test_input_sizes() -> None:
+    sizes = {name: input_size(name, thor2.DescriptorConfig(), 22) for name in FEATURES}
+    assert sizes == {"ce": 4774, "tops": 7168, "tops2": 11942}
+
+
+def test_saving_and_loading_round_trips(saved: Path) -> None:
+    run, loaded = make_run(), load_run(saved)
+    assert (loaded.config, loaded.classes, loaded.record) == (run.config, run.classes, run.record)
+    assert loaded.network.fingerprint == run.network.fingerprint
+    assert tuple(loaded.classifiers) == ("ce", "tops")
+    rng = np.random.default_rng(0)
+    images, color = rng.random((1, 1, 2, 8, 8), np.float32), rng.random((1, 1, 2, 22, 5), np.float32)
+    descriptors = thor2.Descriptors(jnp.asarray(images), jnp.asarray(color), jnp.zeros((1, 1), jnp.int32))
+    oriented = LookDescriptors(descriptors, jnp.zeros((1, 1, 34)), jnp.ones((1, 1)))
+    before, after = (class_probabilities(each, oriented) for each in (Recognizer(run), Recognizer.load(saved)))
+    for name in run.classifiers:
+        assert before[name].shape == (1, 3)
+        np.testing.assert_array_equal(before[name], after[name])
+
+
+def test_a_run_directory_has_three_entries_and_is_readable(saved: Path) -> None:
+    assert sorted(p.name for p in saved.iterdir()) == ["network.npz", "run.json", "weights"]
+    assert sorted(p.name for p in saved.parent.iterdir()) == ["run"]
+    assert saved.stat().st_mode & 0o777 == 0o755
+    description = json.loads((saved / "run.json").read_text())
+    assert description["descriptor_version"] == thor2.DESCRIPTOR_VERSION
+    assert description["descriptor_config"] == dataclasses.asdict(CONFIG)
+
+
+def test_an_existing_path_is_refused(saved: Path, tmp_path: Path) -> None:
+    before = (saved / "run.json").read_bytes()
+    (tmp_path / "file").write_text("x")
+    for existing in (saved, tmp_path / "file"):
+        with pytest.raises(thor2.InputError, match=f"out: {existing} "):
+            save_run(make_run(), existing)
+    assert (saved / "run.json").read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["file"]
+
+
+def test_an_empty_directory_may_be_filled(tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    save_run(make_run(("ce",)), tmp_path / "run")
+    assert [p.name for p in tmp_path.iterdir()] == ["run"]
+    assert tuple(load_run(tmp_path / "run").classifiers) == ("ce",)
+
+
+@pytest.mark.parametrize("broken", ["network", "weights", "json"])
+def test_nothing_is_left_behind_when_saving_fails(broken: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: Any, **__: Any) -> None:
+        raise OSError("no space left on device")
+
+    run = make_run()
+    if broken == "network":
+        monkeypatch.setattr(colornet, "save", fail)
+    elif broken == "weights":
+        monkeypatch.setattr(safetensors.numpy, "save", fail)
+    else:
+        run = dataclasses.replace(run, record={"not JSON": object()})
+    with pytest.raises(TypeError if broken == "json" else OSError):
+        save_run(run, tmp_path / "run")
+    assert list(tmp_path.iterdir()) == []
+
+
+def edited(**changes: Any) -> Callable[[Path], None]:
+    def edit(path: Path) -> None:
+        description = json.loads((path / "run.json").read_text())
+        for key, value in changes.items():
+            if value is None:
+                del description[key]
+            else:
+                description[key] = value
+        (path / "run.json").write_text(json.dumps(description))
+
+    return edit
+
+
+def weights(path: Path, name: str) -> Path:
+    return path / "weights" / f"{name}.safetensors"
+
+
+def damage_weights(path: Path) -> None:
+    file = weights(path, "tops")
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+
+
+@pytest.mark.parametrize("relaxation", [None, thor2.Relaxation(color=2.0)], ids=["hard", "relaxed"])
+def test_every_constant_is_restored(relaxation: thor2.Relaxation | None, tmp_path: Path) -> None:
+    config = dataclasses.replace(CONFIG, relaxation=relaxation, persistence_weight=1.5)
+    save_run(dataclasses.replace(make_run(("ce",)), config=config), tmp_path / "run")
+    assert load_run(tmp_path / "run").config == config
+
+
+def write_format_1(run: TrainedRun, path: Path) -> None:
+    """Write a run directory as version 0.1 did: Orbax checkpoints, and a digest of run.json in itself."""
+    save_run(run, path)
+    digests = {}
+    for name, model in run.classifiers.items():
+        weights(path, name).unlink()
+        with ocp.StandardCheckpointer() as checkpointer:
+            state = nnx.to_pure_dict(nnx.state(model, (nnx.Param, nnx.BatchStat)))
+            checkpointer.save(path / "weights" / name, jax.tree.map(np.asarray, state))
+        sha256 = hashlib.sha256(f"{input_size(name, CONFIG, 22)} {len(CLASSES)}".encode())
+        for file in sorted(file for file in (path / "weights" / name).rglob("*") if file.is_file()):
+            content = file.read_bytes()
+            sha256.update(f"{file.relative_to(path / 'weights' / name).as_posix()} {len(content)}".encode() + content)
+        digests[name] = sha256.hexdigest()
+    edited(format=1, weights=digests, digest="0" * 64)(path)
+
+
+def test_format_1_is_still_read(tmp_path: Path) -> None:
+    run = make_run()
+    write_format_1(run, tmp_path / "run")
+    loaded = load_run(tmp_path / "run")
+    assert loaded.record == run.record
+    for name, model in run.classifiers.items():
+        jax.tree.map(np.testing.assert_array_equal, model_arrays(loaded.classifiers[name]), model_arrays(model))
+    file = max((tmp_path / "run" / "weights" / "ce").rglob("d/*"), key=lambda file: file.stat().st_size)
+    file.write_bytes(file.read_bytes()[:-1])
+    with pytest.raises(thor2.InputError, match="weights/ce is damaged"):
+        load_run(tmp_path / "run")
+
+
+def test_equal_runs_have_equal_bytes(saved: Path, tmp_path: Path) -> None:
+    save_run(make_run(), tmp_path / "run")
+    files = sorted(file.relative_to(saved) for file in saved.rglob("*") if file.is_file())
+    assert len(files) == 4
+    assert all((saved / file).read_bytes() == (tmp_path / "run" / file).read_bytes() for file in files)
+
+
+def flip_a_bit(path: Path) -> None:
+    content = bytearray(weights(path, "ce").read_bytes())
+    content[len(content) // 2] ^= 1
+    weights(path, "ce").write_bytes(content)
+
+
+def swap_weights(path: Path) -> None:
+    """Store arrays of other shapes, with their own SHA-256 in run.json."""
+    content = weights(path, "ce").read_bytes()
+    weights(path, "tops").write_bytes(content)
+    sha256 = hashlib.sha256(content).hexdigest()
+    edited(weights={"tops": sha256, "ce": sha256})(path)
+
+
+def other_network(path: Path) -> None:
+    network = colornet.load_default()
+    dataclasses.replace(network, mean_rgb=network.mean_rgb + 1).save(path / "network.npz")
+
+
+DAMAGES: dict[str, tuple[Callable[[Path], Any], str]] = {
+    "no folder": (shutil.rmtree, "run is not a run directory"),
+    "no run.json": (lambda path: (path / "run.json").unlink(), "run is not a run directory"),
+    "cut run.json": (lambda path: (path / "run.json").write_text('{"format": 1,'), "run.json cannot be read"),
+    "binary run.json": (lambda path: (path / "run.json").write_bytes(b"\xff\xfe\x00"), "run.json cannot be read"),
+    "a list": (lambda path: (path / "run.json").write_text("[1]"), "run.json has format 'list'"),
+    "other format": (edited(format=3), "run.json has format 3"),
+    "other version": (edited(descriptor_version=99), "descriptor version 99"),
+    "no record": (edited(record=[1]), "run.json: TypeError"),
+    "no classes": (edited(classes=None), "run.json: KeyError: 'classes'"),
+    "empty classes": (edited(classes=[]), "classes is []"),
+    "numbered classes": (edited(classes=[1, 2, 3]), "classes is [1, 2, 3]"),
+    "one string": (edited(classes="abc"), "classes is 'abc'"),
+    "more classes": (edited(classes=["a", "b", "c", "d"]), "weights/ce.safetensors does not fit"),
+    "unknown classifier": (edited(classifiers=["shape"]), "classifiers is ['shape']"),
+    "missing classifier": (edited(classifiers=["ce", "tops", "tops2"]), "run.json: KeyError: 'tops2'"),
+    "unknown constant": (edited(descriptor_config={**CONSTANTS, "beta": 1}), "beta"),
+    "bad relaxation": (edited(descriptor_config={**CONSTANTS, "relaxation": {"slice": 0}}), "Relaxation.slice is 0"),
+    "no relaxation": (edited(descriptor_config={**CONSTANTS, "relaxation": 5}), "run.json: TypeError"),
+    "list of constants": (edited(descriptor_config=[1]), "run.json: TypeError"),
+    "bad constant": (edited(descriptor_config={**CONSTANTS, "sigma_s": -1}), "DescriptorConfig.sigma_s is -1"),
+    "other constant": (edited(descriptor_config={**CONSTANTS, "n_slices": 3}), "weights/ce.safetensors does not fit"),
+    "no network": (lambda path: (path / "network.npz").unlink(), "network.npz cannot be read"),
+    "cut network": (lambda path: (path / "network.npz").write_bytes(b"PK\x03\x04"), "network.npz cannot be read"),
+    "other network": (other_network, "network.npz is not the colour network"),
+    "cut weights": (damage_weights, "weights/tops.safetensors is damaged"),
+    "flipped bit": (flip_a_bit, "weights/ce.safetensors is damaged"),
+    "swapped weights": (swap_weights, "weights/tops.safetensors does not fit"),
+    "no weights": (lambda path: weights(path, "tops").unlink(), "weights/tops.safetensors is missing"),
+}
+
+
+@pytest.fixture(scope="module")
+def small_heap() -> Iterator[None]:
+    """Freeze the objects that exist, so that a garbage collection takes milliseconds."""
+    gc.collect()
+    gc.freeze()
+    yield
+    gc.unfreeze()
+
+
+@pytest.mark.usefixtures("small_heap")
+@pytest.mark.parametrize("name", DAMAGES)
+def test_a_damaged_run_directory_is_refused_in_one_line(name: str, copied: Path) -> None:
+    """A failed read leaves no open file, which would warn at garbage collection; warnings are errors here."""
+    damage, expected = DAMAGES[name]
+    damage(copied)
+    with pytest.raises(thor2.InputError) as caught:
+        load_run(copied)
+    gc.collect()
+    message = str(caught.value)
+    assert message.startswith("model: ") and expected in message and "\n" not in message and len(message) < 700
+
+
+def test_a_run_without_classifiers_needs_its_embedding(tmp_path: Path) -> None:
+    run = untrained_embedding_run(("a", "b"))
+    save_run(run, tmp_path / "run")
+    loaded = load_run(tmp_path / "run")
+    assert loaded.classes == ("a", "b") and not loaded.classifiers and loaded.embedding_classifier is not None
+    assert loaded.embedding is not None and run.embedding is not None
+    assert loaded.embedding.fingerprint == run.embedding.fingerprint
+    save_run(dataclasses.replace(run, classes=("b", "a")), tmp_path / "renamed")
+    other = dataclasses.replace(run.embedding, further=())
+    other.save(tmp_path / "run" / "embedding.safetensors")
+    with pytest.raises(thor2.InputError, match=r"^model: .*embedding\.safetensors is not the embedding [^\n]*$"):
+        load_run(tmp_path / "run")
+    (tmp_path / "run" / "embedding.safetensors").unlink()
+    for name, expected in (("run", "is missing"), ("renamed", "does not recognize the classes")):
+        with pytest.raises(thor2.InputError, match=rf"^model: .*embedding\.safetensors {expected}.*[^\n]*$"):
+            load_run(tmp_path / name)
+    views = References(np.zeros((1, run.embedding.size), np.float16), np.full(1, BACKGROUND, np.int32))
+    save_run(dataclasses.replace(run, embedding=dataclasses.replace(run.embedding, references=views)), tmp_path / "own")
+    (tmp_path / "own" / REFERENCES_FILE).unlink()
+    with pytest.raises(thor2.InputError, match=r"^model: .*references\.safetensors is missing; copy [^\n]*$"):
+        load_run(tmp_path / "own")
+    # Beside classifiers, an embedding is not needed.
+    save_run(dataclasses.replace(untrained_run(("a", "b")), embedding=None), tmp_path / "paper")
+    assert load_run(tmp_path / "paper").embedding_classifier is None

@@ -1,0 +1,189 @@
+"""Samples of distractors in the user's cache: kept, renewed, bounded, and unusable caches."""
+
+import errno
+import logging
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from helpers import SMALL_CONFIG
+
+import colornet
+import thor2_jax as thor2
+from training.embedding import run_embedding, sample_cache
+from training.embedding.run_embedding import Distractors
+from training.embedding.sample_cache import cached_samples
+from training.embedding.samples import Samples
+from training.storage.locks import locked
+
+SAMPLES = Samples(
+    start=np.array([0, 2, 3]),
+    strip=np.array([1, 4, 2], np.uint16),
+    length=np.array([0.1, 0.2, 0.3], np.float16),
+    color=np.arange(6, dtype=np.float16).reshape(3, 2),
+    statistics=np.ones((2, 14), np.float32),
+    label=np.array([0, 1], np.int32),
+    shape=(2, 5),
+)
+
+
+@pytest.fixture(autouse=True)
+def cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """An empty cache directory of a user."""
+    monkeypatch.delenv("THOR2_CACHE", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
+    return tmp_path / "home" / "thor2-jax" / "distractors"
+
+
+@pytest.fixture
+def counted() -> Callable[..., int]:
+    """Return a function that asks for samples, checks them and returns how often they were built."""
+
+    def get(job: dict[str, Any] | None = None, **options: Any) -> int:
+        calls: list[int] = []
+
+        def build() -> Samples:
+            calls.append(1)
+            return SAMPLES
+
+        samples = cached_samples(job or {"seed": 0}, build, **options)
+        for name, value in vars(SAMPLES).items():
+            assert np.array_equal(getattr(samples, name), value)
+            assert name == "shape" or getattr(samples, name).dtype == value.dtype
+        return len(calls)
+
+    return get
+
+
+def files(cache: Path) -> list[Path]:
+    return sorted(cache.glob("*.safetensors"))
+
+
+def test_samples_are_built_once(cache: Path, counted: Callable[..., int]) -> None:
+    assert [counted(), counted(), counted({"seed": 1}), counted(), counted({"seed": 1})] == [1, 0, 1, 0, 0]
+    assert len(files(cache)) == 2
+    assert counted(resumes=True) == 1  # an interrupted sampling resumes from its own directory
+
+
+def test_another_version_has_other_samples(
+    cache: Path, counted: Callable[..., int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert counted() == 1
+    with monkeypatch.context() as patch:
+        patch.setattr(thor2, "__version__", "99")
+        assert [counted(), counted()] == [1, 0]
+    (code := cache.parent / "code" / "objects").mkdir(parents=True)
+    (code / "procedural.py").write_text("changed = True")
+    monkeypatch.setattr(sample_cache.training, "__file__", str(code.parent / "__init__.py"))
+    assert counted() == 1 and len(files(cache)) == 3
+
+
+def test_three_files_are_kept_and_those_of_the_user(cache: Path, counted: Callable[..., int]) -> None:
+    cache.mkdir(parents=True)
+    users = [cache / name for name in ("mine.safetensors", f"distractors-{'0' * 64}.safetensors", "notes.txt")]
+    for path in users:
+        path.write_bytes(b"a user's")
+    for seed in range(3):
+        assert counted({"seed": seed}) == 1
+    for path in files(cache):
+        os.utime(path, (1, 1))
+    assert counted({"seed": 0}) == 0  # the file used last
+    assert counted({"seed": 3}) == 1
+    own = [path for path in files(cache) if path not in users]
+    assert len(own) == 3 and all(path.read_bytes() == b"a user's" for path in users)
+    assert counted({"seed": 0}) == 0
+
+
+def damage(file: Path, how: str) -> None:
+    content = bytearray(file.read_bytes())
+    if how == "truncated":
+        del content[-5:]
+    elif how == "another value":
+        content[-1] ^= 1
+    elif how == "another format":
+        content = content.replace(b"distractors, 1", b"distractors, 2")
+    else:
+        content = bytearray(b"a user's")
+    file.write_bytes(content)
+
+
+@pytest.mark.parametrize("how", ["truncated", "another value", "another format", "another file"])
+def test_a_damaged_file_costs_one_warning(
+    how: str, cache: Path, counted: Callable[..., int], caplog: pytest.LogCaptureFixture
+) -> None:
+    counted()
+    damage(files(cache)[0], how)
+    before = files(cache)[0].read_bytes()
+    assert counted() == 1
+    (record,) = caplog.records
+    message = record.getMessage()
+    assert record.levelno == logging.WARNING and str(files(cache)[0]) in message and "\n" not in message
+    if how == "another file":
+        assert "delete" in message and files(cache)[0].read_bytes() == before
+    else:
+        assert counted() == 0
+
+
+def test_a_full_or_unwritable_disk_costs_one_warning(
+    cache: Path, counted: Callable[..., int], caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(path: Path) -> Any:
+        raise OSError(errno.ENOSPC, "No space left on device", str(path))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(sample_cache, "atomic_write", full)
+        assert counted() == 1
+    assert files(cache) == [] and "No space left" in caplog.records[-1].getMessage()
+    monkeypatch.setenv("THOR2_CACHE", "/proc/no-such-directory")
+    assert counted() == 1 and len(caplog.records) == 2
+
+
+def test_without_a_cache_nothing_is_kept(
+    cache: Path, counted: Callable[..., int], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("THOR2_CACHE", "off")
+    assert [counted(), counted()] == [1, 1] and not cache.exists()
+    monkeypatch.setenv("THOR2_CACHE", str(tmp_path / "elsewhere"))
+    assert [counted(), counted()] == [1, 0] and not cache.exists() and files(tmp_path / "elsewhere")
+
+
+def test_a_second_process_does_not_disturb_the_first(cache: Path, counted: Callable[..., int]) -> None:
+    with locked(cache):
+        assert counted() == 1
+    assert files(cache) == [] and [counted(), counted()] == [1, 0]
+
+
+def test_what_determines_the_samples(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """The meshes by their content, the network, the views and the descriptor; not epochs, networks or workers."""
+    network, jobs = colornet.load_default(), []
+
+    def record(job: dict[str, Any], build: object, resumes: bool) -> Samples:
+        jobs.append(job)
+        return SAMPLES
+
+    def mesh(extent: float) -> dict[str, Path]:
+        box = trimesh.creation.box((extent, 0.1, 0.1))
+        box.visual.vertex_colors = np.full((8, 4), 255, np.uint8)
+        box.export(tmp_path / "box.ply")
+        return {"box": tmp_path / "box.ply"}
+
+    def key(distractors: Distractors, config: thor2.DescriptorConfig = SMALL_CONFIG) -> dict[str, Any]:
+        monkeypatch.setattr(run_embedding, "cached_samples", record)
+        run_embedding._distractor_samples(distractors, tmp_path / "new", network, config, lambda *values: None)
+        return jobs[-1]
+
+    same = key(Distractors(10))
+    assert key(Distractors(10, epochs=3, networks=2, workers=2)) == same
+    boxes = [key(Distractors(10, meshes=mesh(extent))) for extent in (0.1, 0.1, 0.2)]
+    assert boxes[0] == boxes[1] != boxes[2]
+    others = [
+        key(Distractors(11)),
+        key(Distractors(10, views=3)),
+        key(Distractors(10), thor2.DescriptorConfig(homology="closed_form")),
+        boxes[0],
+    ]
+    assert same not in others and same["color_network"] == network.fingerprint and "augmentations" in same

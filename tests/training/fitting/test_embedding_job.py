@@ -1,0 +1,157 @@
+"""Trainings of an embedding alone: what a run has, interruptions, folds, and the user's cache."""
+
+import dataclasses
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers import SMALL_CONFIG
+
+from thor2_jax.errors import InputError
+from thor2_jax.gallery.embedding import EmbeddingSizes
+from thor2_jax.model.run_directory import TrainedRun, load_run
+from thor2_jax.recognizer import Recognizer
+from thor2_jax.types import Cloud
+from training.embedding import run_embedding
+from training.embedding.run_embedding import Distractors
+from training.fitting.job import RunSettings, check_trained, train_run
+from training.fitting.metrics_log import read_metrics
+from training.fitting.options import FitOptions
+from training.views.memory_views import MemoryViews
+
+CLASSES = ("red brick", "stick")
+OPTIONS = FitOptions()
+DISTRACTORS = Distractors(procedural=10, views=14, epochs=3, networks=2)
+
+
+def source() -> MemoryViews:
+    rng = np.random.default_rng(0)
+    clouds: dict[str, list[Cloud]] = {}
+    for name, size, level in zip(CLASSES, ((0.1, 0.05, 0.03), (0.2, 0.01, 0.01)), (0, 255), strict=True):
+        clouds[name] = [
+            ((rng.random((200, 3)) * size + [0, 0, 0.5]).astype(np.float32), np.full((200, 3), level, np.uint8))
+            for _ in range(8)
+        ]
+    return MemoryViews(clouds, SMALL_CONFIG)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A user's cache, in which the first training keeps the samples of the distractors; and small networks."""
+    directory = tmp_path_factory.mktemp("cache")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("THOR2_CACHE", str(directory))
+        patch.setattr(run_embedding, "SIZES", EmbeddingSizes(cell=4, hidden=(16,), learned=8, color=4))
+        yield directory
+
+
+SETTINGS = RunSettings((), OPTIONS, SMALL_CONFIG, distractors=DISTRACTORS)
+
+
+def train(out: Path, settings: RunSettings = SETTINGS, **more: Any) -> list[TrainedRun]:
+    return train_run(source(), out, settings, **more)
+
+
+@pytest.fixture(scope="module")
+def whole(cache: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, TrainedRun, list[str]]:
+    """A run of an uninterrupted training, and the stages of its progress."""
+    out, stages = tmp_path_factory.mktemp("whole") / "run", dict[str, int]()
+    (run,) = train(out, progress=lambda stage, done, total, note: stages.__setitem__(stage, done - total))
+    assert set(stages.values()) == {0}
+    return out, run, list(stages)
+
+
+def rows(out: Path) -> list[dict[str, Any]]:
+    return [{**row, "samples_per_second": None} for row in read_metrics(out / "metrics.jsonl")]
+
+
+def test_a_run_without_classifiers(whole: tuple[Path, TrainedRun, list[str]], cache: Path) -> None:
+    out, run, stages = whole
+    assert sorted(path.name for path in out.iterdir() if path.name != "weights") == [
+        "curves.png",
+        "embedding.safetensors",
+        "metrics.jsonl",
+        "network.npz",
+        "references.safetensors",
+        "run.json",
+    ]
+    assert stages == SETTINGS.stages and len(stages) == 3
+    assert run.classifiers == {} and run.embedding is not None
+    assert run.embedding.classes == run.classes == CLASSES and len(run.embedding.further) == 1
+    assert [(row["fold"], row["classifier"], row["epoch"]) for row in rows(out)] == [
+        (0, "embedding", epoch) for epoch in (1, 2, 3)
+    ]
+    record = run.record
+    assert record["classifiers"] == [] and record["distractors"] == DISTRACTORS.record
+    assert list(record["curves"]) == ["embedding"]
+    assert [row["epoch"] for row in record["curves"]["embedding"]] == [1, 2, 3]
+    assert [row["loss"] for row in record["curves"]["embedding"]] == [row["loss"] for row in rows(out)]
+    assert 0 <= record["held_out_accuracy"]["embedding"] <= 1
+    recognizer = Recognizer.load(out)
+    assert recognizer.model.classifiers.default == ("embedding",) and recognizer.model.answers_by() == "classifiers"
+    assert len(list(cache.glob("distractors-*.safetensors"))) == 1
+
+
+class Interrupted(BaseException):
+    """Like KeyboardInterrupt, not an Exception."""
+
+
+def stop_when(stage: str, step: int) -> Callable[[str, int, int, str], None]:
+    def progress(now: str, done: int, total: int, note: str) -> None:
+        if (now, done) == (stage, step):
+            raise Interrupted
+
+    return progress
+
+
+def test_an_interrupted_joint_fit_resumes_to_the_same_bytes(
+    whole: tuple[Path, TrainedRun, list[str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without a cache, the samples of the distractors are those of the run's own directory."""
+    monkeypatch.setenv("THOR2_CACHE", "off")
+    out, rendered = tmp_path / "run", []
+    render = run_embedding.build_samples
+
+    def counted(*arguments: Any) -> Any:
+        rendered.append(len(list((out / "checkpoints" / "distractors").glob("*.safetensors"))))
+        return render(*arguments)
+
+    monkeypatch.setattr(run_embedding, "build_samples", counted)
+    for stage, step in (("describe for the embedding", 1), ("fit networks", 1), ("fit networks", 3)):
+        with pytest.raises(Interrupted):
+            train(out, progress=stop_when(stage, step))
+        with pytest.raises(InputError, match=r"run\.json"):
+            load_run(out)
+    with pytest.raises(InputError, match="networks"):
+        train(out, dataclasses.replace(SETTINGS, distractors=dataclasses.replace(DISTRACTORS, networks=3)))
+    (run,) = train(out)
+    assert rendered == [0, 1, 1, 1]
+    assert (out / "embedding.safetensors").read_bytes() == (whole[0] / "embedding.safetensors").read_bytes()
+    assert run.record == whole[1].record and rows(out) == rows(whole[0])
+    assert not (out / "checkpoints").exists()
+
+
+def test_other_distractors_are_refused_for_a_finished_run(whole: tuple[Path, TrainedRun, list[str]]) -> None:
+    check_trained(source().digest, whole[0], SETTINGS)
+    for change in ({"networks": 3}, {"epochs": 4}, {"procedural": 11}):
+        other = dataclasses.replace(DISTRACTORS, **change)
+        with pytest.raises(InputError, match=next(iter(change))):
+            check_trained(source().digest, whole[0], dataclasses.replace(SETTINGS, distractors=other))
+
+
+def test_folds_of_embeddings(tmp_path: Path) -> None:
+    stages: dict[str, None] = {}
+    short = dataclasses.replace(SETTINGS, distractors=dataclasses.replace(DISTRACTORS, epochs=1), folds=2)
+    runs = train(tmp_path / "run", short, progress=lambda stage, *values: stages.setdefault(stage))
+    assert list(stages) == short.stages
+    assert [run.record["fold"] for run in runs] == [0, 1]
+    assert all(list(run.record["held_out_accuracy"]) == ["embedding"] for run in runs)
+    assert [(row["fold"], row["classifier"]) for row in rows(tmp_path / "run")] == [(0, "embedding"), (1, "embedding")]
+
+
+@pytest.mark.parametrize("change", [{"procedural": 9}, {"views": 0}, {"epochs": 0}, {"networks": 0}], ids=str)
+def test_distractors_out_of_range_are_refused(change: dict[str, int]) -> None:
+    with pytest.raises(InputError, match="distractors"):
+        dataclasses.replace(DISTRACTORS, **change)

@@ -1,0 +1,183 @@
+"""Looks: several ways to see one instance, whose answers are fused so that they depend less on any one of them.
+
+The view normalization chooses between two half turns by small differences, masks reach over the edges of their objects,
+and cameras differ in colour. Recognition therefore describes and classifies K looks at each cloud:
+
+- 1: as it is, which is the paper;
+- 2: also after a half turn about z;
+- 4: as it is; after a half turn, without the points near the contour of its mask (`PointClouds.rim`); after a half
+  turn, with warmer colours; and with cooler colours.
+"""
+
+import dataclasses
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+
+from colornet import ColorNetwork
+from thor2_jax.config import LOOK_COUNTS, DescriptorConfig
+from thor2_jax.descriptor.chunking import map_large_chunks
+from thor2_jax.descriptor.cloud_statistics import cloud_statistics, side_lengths
+from thor2_jax.descriptor.describe import describe_strips, strips
+from thor2_jax.descriptor.view_normalization import align, boxed, oriented, place_aligned
+from thor2_jax.errors import InputError
+from thor2_jax.types import Descriptors, PointClouds, Strips
+
+__all__ = ["WARMTH", "LookDescriptors", "aligned_looks", "describe_aligned_looks", "describe_looks"]
+
+WARMTH = 1.06
+"""Factor of red, and divisor of blue, of the warmer look; the inverse of the cooler one."""
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class LookDescriptors:
+    """The descriptors of K looks at each of B clouds.
+
+    Attributes:
+        each: descriptors, fields [B, K, ...].
+        statistics: [B, K, 12 + R] float32, from `cloud_statistics`.
+        weights: [B, K] float32, weight of each look in the fused answer; they sum to 1.
+    """
+
+    each: Descriptors
+    statistics: jax.Array
+    weights: jax.Array
+
+    @property
+    def first(self) -> Descriptors:
+        """The descriptors [B, ...] of the first look, the paper's."""
+        first: Descriptors = jax.tree.map(lambda a: a[:, 0], self.each)
+        return first
+
+    @property
+    def overflow(self) -> jax.Array:
+        """The overflow [B] of the descriptors of the first look."""
+        return self.each.overflow[:, 0]
+
+    def fuse(self, logits: jax.Array) -> jax.Array:
+        """Return class probabilities [B, n] from the logits [B * K, n] of `flat`.
+
+        They are the geometric mean over the looks, by their weights, normalized to sum to 1.
+        """
+        each = jax.nn.log_softmax(logits).reshape(*self.weights.shape, -1)
+        return jax.nn.softmax((self.weights[..., None] * each).sum(axis=1))
+
+    @property
+    def flat(self) -> tuple[Descriptors, jax.Array]:
+        """The descriptors [B * K, ...] and statistics [B * K, 12 + R]; those of a cloud are consecutive."""
+        flat: tuple[Descriptors, jax.Array] = jax.tree.map(
+            lambda a: a.reshape(-1, *a.shape[2:]), (self.each, self.statistics)
+        )
+        return flat
+
+
+def _check_count(count: int) -> None:
+    if count not in LOOK_COUNTS:
+        raise InputError(f"count is {count!r}; expected one of {', '.join(map(str, LOOK_COUNTS))}")
+
+
+@partial(jax.jit, static_argnums=3)
+def _looks(clouds: PointClouds, sigma_s: ArrayLike, alpha: ArrayLike, count: int) -> tuple[PointClouds, jax.Array]:
+    half_turn = jnp.diag(jnp.array([-1, -1, 1], jnp.float32))
+    warmer = jnp.array([WARMTH, 1, 1 / WARMTH], jnp.float32)
+
+    def one(cloud: PointClouds) -> tuple[PointClouds, jax.Array]:
+        def placed(mask: jax.Array) -> list[tuple[jax.Array, jax.Array]]:
+            """Return points and camera, as they are and after a half turn."""
+            normalization = boxed(dataclasses.replace(cloud, mask=mask), sigma_s)
+            rotation, end_is_occluded = oriented(normalization)
+            # Where the occlusion boundary decides which end comes first, there is no half turn.
+            turned = jnp.where(end_is_occluded, rotation, half_turn @ rotation)
+            return [place_aligned(each, normalization, alpha) for each in (rotation, turned)]
+
+        mask, colors = cloud.mask, cloud.colors
+        first, turned = placed(mask)
+        looks = [(first, colors, mask), (turned, colors, mask)]
+        if count == 4:
+            inner = mask if cloud.rim is None else mask & ~cloud.rim
+            warm, cool = (colors * warmer).clip(0, 1), (colors / warmer).clip(0, 1)
+            looks[1:] = (placed(inner)[1], colors, inner), (turned, warm, mask), (first, cool, mask)
+        rows = [
+            dataclasses.replace(cloud, points=points[: len(mask)], camera=camera, colors=color, mask=seen)
+            for (points, camera), color, seen in looks
+        ]
+        return jax.tree.map(lambda *a: jnp.stack(a), *rows), jnp.full(count, 1 / count)
+
+    each, weights = jax.vmap(one)(clouds)
+    return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), each), weights
+
+
+def aligned_looks(clouds: PointClouds, config: DescriptorConfig, count: int) -> tuple[PointClouds, jax.Array]:
+    """Return the aligned clouds of `count` looks at each cloud, that of `align` first, and their weights.
+
+    A half turn is left out where the occlusion boundary decides which end comes first.
+
+    Args:
+        clouds: [B, N] clouds in metres.
+        config: only `sigma_s` and `alpha` are used; other values of them do not compile again.
+        count: K, one of `LOOK_COUNTS`. Static.
+
+    Returns:
+        [B * K, N] aligned clouds in scaled units, those of a cloud consecutive, and weights [B, K], which sum to 1 for
+        each cloud.
+
+    Raises:
+        InputError: `count` is another number.
+    """
+    _check_count(count)
+    if count == 1:
+        return align(clouds, config), jnp.ones((len(clouds.mask), 1))
+    return _looks(clouds, np.float32(config.sigma_s), np.float32(config.alpha), count)
+
+
+def describe_aligned_looks(
+    aligned: PointClouds, weights: jax.Array, strips: Strips, network: ColorNetwork, config: DescriptorConfig
+) -> LookDescriptors:
+    """Return the descriptors of looks.
+
+    Args:
+        aligned: [B * K, N] clouds, from `aligned_looks`.
+        weights: [B, K] float32, likewise.
+        strips: their strips.
+        network: colour network.
+        config: static.
+    """
+    return _group_by_cloud(describe_strips(strips, network, config), aligned, weights, strips, config)
+
+
+@partial(jax.jit, static_argnums=4)
+def _group_by_cloud(
+    descriptors: Descriptors, aligned: PointClouds, weights: jax.Array, strips: Strips, config: DescriptorConfig
+) -> LookDescriptors:
+    """Group the descriptors [B * K, ...] of looks by cloud, and add the statistics of the clouds."""
+    statistics = cloud_statistics(side_lengths(aligned, config.alpha), aligned, strips)
+    each, grouped = jax.tree.map(lambda a: a.reshape(*weights.shape, *a.shape[1:]), (descriptors, statistics))
+    return LookDescriptors(each, grouped, weights)
+
+
+def describe_looks(
+    clouds: PointClouds, network: ColorNetwork, config: DescriptorConfig, count: int | None = None
+) -> LookDescriptors:
+    """Return the descriptors of the looks at clouds.
+
+    Args:
+        clouds: [B, N] clouds in metres.
+        network: colour network.
+        config: static.
+        count: number of looks K; by default `config.looks`. Static.
+
+    Raises:
+        InputError: `count` is not one of `LOOK_COUNTS`.
+    """
+    count = config.looks if count is None else count
+    _check_count(count)
+
+    def describe_chunk(chunk: PointClouds) -> LookDescriptors:
+        aligned, weights = aligned_looks(chunk, config, count)
+        return describe_aligned_looks(aligned, weights, strips(aligned, network, config), network, config)
+
+    return map_large_chunks(describe_chunk, clouds, count)

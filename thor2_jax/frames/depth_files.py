@@ -1,0 +1,97 @@
+"""Depth images in files: 16-bit PNG and TIFF, 32-bit float TIFF, NPY and EXR."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thor2_jax.errors import InputError
+from thor2_jax.frames.image_files import MAX_IMAGE_PIXELS, read_image
+
+__all__ = ["read_depth"]
+
+_EXPECTED = "one channel of 16-bit integers (in depth units) or floats (in metres)"
+
+_EXR_CHANNELS = ("Z", "Y", "R", "V", "depth")
+"""Names of the channel of an EXR file that holds depth, if it has several."""
+
+
+def read_depth(path: str | Path) -> NDArray[Any]:
+    """Read a depth image [H, W].
+
+    Returns:
+        uint16 in depth units from a 16-bit PNG or TIFF, uint16 or uint32 from integers in NPY, and floats in metres
+        from a float TIFF, NPY or EXR.
+
+    Raises:
+        InputError: the file is damaged, of another kind or too large, or is an EXR file and the package OpenEXR is
+            missing; names the file.
+        OSError: the file cannot be opened.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    pixels = (
+        _read_npy(path) if suffix == ".npy" else _read_exr(path) if suffix == ".exr" else read_image(path, "depth")[0]
+    )
+    if pixels.ndim == 3 and pixels.shape[2] == 1:
+        pixels = pixels[..., 0]
+    kind, size = pixels.dtype.kind, pixels.dtype.itemsize
+    if pixels.ndim != 2 or 0 in pixels.shape or kind not in "uif" or (kind != "f" and size < 2):
+        raise InputError(
+            f"depth: {path} has shape {pixels.shape} and type {pixels.dtype}; expected {_EXPECTED}, not a picture of "
+            "depth"
+        )
+    if kind == "f":
+        return pixels.astype(pixels.dtype.newbyteorder("="), copy=False)
+    # Pillow reads some 16-bit files as 32-bit integers.
+    largest = 2**32 - 1 if suffix == ".npy" else 2**16 - 1
+    if pixels.min() < 0 or pixels.max() > largest:
+        raise InputError(f"depth: {path} has values from {pixels.min()} to {pixels.max()}; expected 0 to {largest}")
+    return pixels.astype(np.uint16 if pixels.max() < 2**16 else np.uint32)
+
+
+def _read_npy(path: Path) -> NDArray[Any]:
+    """Read an array; its size is checked before memory is allocated, and nothing is unpickled."""
+    with open(path, "rb") as stream:
+        try:
+            version = np.lib.format.read_magic(stream)
+            read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+            shape, _, dtype = read_header[version](stream)
+            if math.prod(shape) > MAX_IMAGE_PIXELS:
+                raise ValueError(f"shape {shape}; expected at most {MAX_IMAGE_PIXELS} pixels")
+            if dtype.hasobject:
+                raise ValueError("Python objects")
+            stream.seek(0)
+            return np.lib.format.read_array(stream, allow_pickle=False)
+        except Exception as error:  # A damaged header raises many kinds of exception.
+            reason = " ".join(str(error).split()) or type(error).__name__
+            raise InputError(f"depth: {path} is a damaged NPY file ({reason}); expected {_EXPECTED}") from None
+
+
+def _read_exr(path: Path) -> NDArray[Any]:
+    """Read the depth channel of an EXR file."""
+    with open(path, "rb"):  # an OSError if it cannot be opened: OpenEXR raises others
+        pass
+    try:
+        import OpenEXR
+    except ImportError:
+        raise InputError(
+            f"depth: {path} is an EXR file; expected PNG, TIFF or NPY, or the package OpenEXR (pip install OpenEXR)"
+        ) from None
+    try:
+        with OpenEXR.File(str(path), separate_channels=True, header_only=True) as header:
+            low, high = header.header()["dataWindow"]
+        width, height = (int(b) - int(a) + 1 for a, b in zip(low, high, strict=True))
+        if not 0 < width * height <= MAX_IMAGE_PIXELS:
+            raise ValueError(f"{width} x {height} pixels; expected at most {MAX_IMAGE_PIXELS}")
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            channels = {name: channel.pixels for name, channel in file.channels().items()}
+    except Exception as error:  # A damaged file raises many kinds of exception.
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise InputError(f"depth: {path} is a damaged EXR file ({reason}); expected {_EXPECTED}") from None
+    names = [name for name in channels if len(channels) == 1 or name in _EXR_CHANNELS]
+    if not names:
+        raise InputError(f"depth: {path} has the channels {', '.join(channels)}; expected one, or one of them called Z")
+    return channels[min(names, key=lambda name: _EXR_CHANNELS.index(name) if name in _EXR_CHANNELS else -1)]

@@ -1,0 +1,249 @@
+"""RGB-D frames with an instance segmentation: validated when they are made, read from image files.
+
+frame = read_frame(color="c.png", depth="d.png", labels="l.png", intrinsics="k.json")
+frame.instances                        # label numbers; 0 is background
+points = backproject(frame.depth_m, frame.intrinsics)      # [H, W, 3] metres, OpenCV camera frame
+"""
+
+import dataclasses
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thor2_jax.errors import InputError
+from thor2_jax.frames.depth_files import read_depth
+from thor2_jax.frames.distortion import distort, undistort
+from thor2_jax.frames.image_files import MAX_IMAGE_PIXELS, has_16_bit_channels, read_image
+from thor2_jax.frames.intrinsics import Intrinsics, parse_intrinsics, read_intrinsics
+
+__all__ = [
+    "MAX_DEPTH",
+    "MAX_IMAGE_PIXELS",
+    "MIN_DEPTH",
+    "Intrinsics",
+    "RGBDFrame",
+    "backproject",
+    "frame_intrinsics",
+    "has_16_bit_channels",
+    "parse_intrinsics",
+    "pixel_rays",
+    "read_color",
+    "read_depth",
+    "read_frame",
+    "read_intrinsics",
+    "read_labels",
+]
+
+
+MIN_DEPTH, MAX_DEPTH = 0.26, 2.5
+"""Range of valid depth, metres."""
+
+MAX_INSTANCES = 1000
+"""Largest number of instances of a frame; an image that is no label image, such as a depth image, has thousands."""
+
+MAX_DISTORTION_ERROR = 0.5
+"""Largest error of the inverse of a lens distortion, pixels."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class RGBDFrame:
+    """A registered RGB-D image and the instances in it.
+
+    Attributes:
+        color: [H, W, 3] uint8, sRGB.
+        depth: [H, W] distance along the optical axis: unsigned integers in 1 / `intrinsics.depth_scale` metres
+            (millimetres by default) or floats in metres; 0, and in floats also NaN or infinity, where there is none.
+        labels: [H, W] integers; 0 is background, every other number an instance. None for a frame that is not yet
+            segmented: `thor2_jax.segmentation.segmented` returns it with labels.
+        intrinsics: the camera of all three images; a mapping, matrix or ROS message is converted by `Intrinsics.of`.
+
+    Raises:
+        InputError: a shape or type that does not fit, or intrinsics of another image size; names the argument.
+    """
+
+    color: NDArray[np.uint8]
+    depth: NDArray[Any]
+    labels: NDArray[Any] | None
+    intrinsics: Intrinsics
+
+    def __post_init__(self) -> None:
+        color, depth = np.asarray(self.color), np.asarray(self.depth)
+        labels = None if self.labels is None else np.asarray(self.labels)
+        if color.ndim != 3 or color.shape[2] != 3 or 0 in color.shape:
+            raise InputError(f"color has shape {color.shape}; expected [H, W, 3]")
+        if color.dtype != np.uint8:
+            raise InputError(f"color has type {color.dtype}; expected uint8")
+        for name, image in (("depth", depth), ("labels", labels)):
+            if image is not None and image.shape != color.shape[:2]:
+                raise InputError(
+                    f"{name} has shape {image.shape}; expected {color.shape[:2]} (rows, columns), as color"
+                )
+        if depth.dtype.kind not in "uf" or depth.dtype == np.uint8:
+            raise InputError(
+                f"depth has type {depth.dtype}; expected uint16 or uint32 (1 / depth_scale metres) or floats (metres)"
+            )
+        if labels is not None and labels.dtype.kind not in "ui":
+            raise InputError(f"labels has type {labels.dtype}; expected integers")
+        if labels is not None and labels.min() < 0:
+            raise InputError(f"labels has the value {labels.min()}; expected 0 or more")
+        intrinsics = Intrinsics.of(self.intrinsics)
+        _check_camera(intrinsics, *color.shape[:2])
+        for name, value in (("color", color), ("depth", depth), ("labels", labels), ("intrinsics", intrinsics)):
+            object.__setattr__(self, name, value)
+
+    @cached_property
+    def depth_m(self) -> NDArray[np.float32]:
+        """Depth in metres [H, W] float32; 0 where there is none."""
+        if self.depth.dtype.kind == "u":
+            return np.divide(self.depth, self.intrinsics.depth_scale, dtype=np.float32)
+        return np.where(np.isfinite(self.depth), self.depth, 0).astype(np.float32)
+
+    @property
+    def label_image(self) -> NDArray[Any]:
+        """`labels` of a frame that has them.
+
+        Raises:
+            InputError: the frame has no labels.
+        """
+        if self.labels is None:
+            raise InputError("labels is None; expected labels; give them, or segment the frame (--segment table)")
+        return self.labels
+
+    @cached_property
+    def has_usable_depth(self) -> bool:
+        """Whether any pixel of an instance has a depth from `MIN_DEPTH` to `MAX_DEPTH`.
+
+        Raises InputError as `label_image`.
+        """
+        return bool(((self.depth_m >= MIN_DEPTH) & (self.depth_m <= MAX_DEPTH) & (self.label_image != 0)).any())
+
+    @cached_property
+    def instance_pixels(self) -> dict[int, NDArray[np.intp]]:
+        """Label number -> sorted flat indices (row * W + column) of its pixels, in the order of `instances`.
+
+        Raises:
+            InputError: as `label_image`, or there are more than `MAX_INSTANCES` instances.
+        """
+        flat = self.label_image.ravel()
+        pixels = np.flatnonzero(flat != 0)  # several times as fast on booleans as on integers
+        order = np.argsort(flat[pixels], kind="stable")
+        pixels = pixels[order]
+        labels, first = np.unique(flat[pixels], return_index=True)
+        if len(labels) > MAX_INSTANCES:
+            raise InputError(
+                f"labels has {len(labels)} instances; expected at most {MAX_INSTANCES}; give an image in which 0 is "
+                "background and each object has a number of its own"
+            )
+        return dict(zip(labels.tolist(), np.split(pixels, first[1:]), strict=False))
+
+    @cached_property
+    def instances(self) -> tuple[int, ...]:
+        """Label numbers of the frame in increasing order, without 0; raises InputError as `instance_pixels`."""
+        return tuple(self.instance_pixels)
+
+
+def pixel_rays(pixels: NDArray[np.intp], width: int, intrinsics: Intrinsics) -> NDArray[np.float64]:
+    """Return the rays [n, 3] with z = 1 through pixels (flat indices [n]), in the OpenCV camera frame.
+
+    A ray times the pixel's depth is its point.
+    """
+    row, column = np.divmod(pixels, width)
+    rays = np.ones((len(pixels), 3))
+    rays[:, 0] = (column - intrinsics.cx) / intrinsics.fx
+    rays[:, 1] = (row - intrinsics.cy) / intrinsics.fy
+    if intrinsics.distortion:
+        rays[:, 0], rays[:, 1] = undistort(rays[:, 0], rays[:, 1], intrinsics.distortion)
+    return rays
+
+
+def _check_camera(intrinsics: Intrinsics, height: int, width: int) -> None:
+    """Raise an InputError unless the camera fits images of this size."""
+    size = intrinsics.width or width, intrinsics.height or height
+    if size != (width, height):
+        raise InputError(
+            f"intrinsics is for images of {size[0]} x {size[1]} pixels; color has {width} x {height}; expected the "
+            "intrinsics of this image size"
+        )
+    if not intrinsics.distortion:
+        return
+    row, column = np.mgrid[0:height, 0:width][:, :: max(height // 16, 1), :: max(width // 16, 1)].reshape(2, -1)
+    x, y = (column - intrinsics.cx) / intrinsics.fx, (row - intrinsics.cy) / intrinsics.fy
+    with np.errstate(all="ignore"):
+        again_x, again_y = distort(*undistort(x, y, intrinsics.distortion), intrinsics.distortion)
+        pixels = np.hypot((again_x - x) * intrinsics.fx, (again_y - y) * intrinsics.fy).max()
+    if not pixels < MAX_DISTORTION_ERROR:
+        raise InputError(
+            f"intrinsics has the distortion {list(intrinsics.distortion)}, which has no inverse within the image; "
+            "rectify the images and give the intrinsics of the rectified images"
+        )
+
+
+def backproject(depth_m: NDArray[Any], intrinsics: Intrinsics) -> NDArray[Any]:
+    """Return the points [H, W, 3] of a depth image [H, W] in metres.
+
+    The frame is OpenCV's camera frame (x right, y down, z forward).
+    """
+    height, width = depth_m.shape
+    rays = pixel_rays(np.arange(height * width), width, intrinsics)
+    return (rays * depth_m.reshape(-1, 1)).astype(depth_m.dtype).reshape(height, width, 3)
+
+
+def read_color(path: str | Path) -> NDArray[np.uint8]:
+    """Read an 8-bit RGB image [H, W, 3]; an alpha channel is dropped. Raises InputError and OSError as `read_frame`."""
+    pixels, mode = read_image(path, "color")
+    if mode not in ("RGB", "RGBA"):
+        raise InputError(f"color: {path} has the mode {mode}; expected 8-bit RGB")
+    return np.ascontiguousarray(pixels[..., :3])
+
+
+def read_labels(path: str | Path) -> NDArray[Any]:
+    """Read a one-channel or indexed image [H, W] of integers. Raises InputError and OSError as `read_frame`."""
+    pixels, _ = read_image(path, "labels", lossless=True)
+    if pixels.ndim != 2 or pixels.dtype.kind not in "ui":
+        raise InputError(
+            f"labels: {path} has shape {pixels.shape} and type {pixels.dtype}; expected one channel of integers"
+        )
+    return pixels
+
+
+def read_frame(
+    *,
+    color: str | Path,
+    depth: str | Path,
+    labels: str | Path | None = None,
+    intrinsics: str | Path,
+    depth_scale: float | None = None,
+) -> RGBDFrame:
+    """Read a frame from files; docs/frames.md describes the formats.
+
+    Args:
+        color: 8-bit RGB image (PNG, JPEG or TIFF; an alpha channel is dropped).
+        depth: one-channel image, see `read_depth`.
+        labels: one-channel or indexed image of instance numbers, 8 or 16 bits, lossless; 0 is background.
+            None for a frame without labels.
+        intrinsics: file in a format of `thor2_jax.frames.intrinsics`. Of a BOP scene_camera.json, the entry of the
+            image whose number is the name of `color` is taken.
+        depth_scale: depth units per metre, in place of the one in `intrinsics`.
+
+    Raises:
+        InputError: a file is damaged or of the wrong kind, or the images differ in size; names the file or
+            the argument.
+        OSError: a file cannot be opened.
+    """
+    label_image = None if labels is None else read_labels(labels)
+    return RGBDFrame(
+        read_color(color),
+        read_depth(depth),
+        label_image,
+        frame_intrinsics(intrinsics, color, depth_scale),
+    )
+
+
+def frame_intrinsics(path: str | Path, color: str | Path, depth_scale: float | None = None) -> Intrinsics:
+    """Read the intrinsics of the frame with this colour file; arguments and exceptions as `read_frame`."""
+    name = Path(color).stem
+    intrinsics = read_intrinsics(path, int(name) if name.isdecimal() else None)
+    return intrinsics if depth_scale is None else dataclasses.replace(intrinsics, depth_scale=depth_scale)

@@ -1,0 +1,372 @@
+"""Intrinsics of cameras, read from the formats that people have; docs/frames.md shows an example of each.
+
+| format | recognized by | depth_scale in it, if any |
+|---|---|---|
+| THOR2 | fx, fy, cx, cy | depth units per metre |
+| BOP camera.json | fx, fy, cx, cy, width, height and a depth_scale of at most 10 | millimetres per depth unit |
+| BOP scene_camera.json | cam_K, or image number -> entry with cam_K | millimetres per depth unit |
+| RealSense | ppx, ppy | metres per depth unit |
+| ROS camera_info | camera_matrix with data, or K (ROS 2: k) with D or distortion_model | depth units per metre |
+| Open3D | intrinsic_matrix (column by column) | depth units per metre |
+| 3 x 3 matrix | K, camera_matrix or the nine numbers alone, as JSON, YAML, text or NPY | depth units per metre |
+"""
+
+import dataclasses
+import io
+import re
+from collections.abc import Callable, Mapping, Sequence
+from numbers import Integral, Real
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from thor2_jax.errors import InputError, with_context
+from thor2_jax.frames.distortion import DISTORTION_LENGTHS
+from thor2_jax.tables import parse_json, parse_yaml
+
+__all__ = ["DEFAULT_DEPTH_SCALE", "Intrinsics", "parse_intrinsics", "read_intrinsics"]
+
+DEFAULT_DEPTH_SCALE = 1000.0
+
+LARGEST_INTRINSIC = 10**9
+"""Largest absolute value accepted for an intrinsic parameter."""
+
+MAX_BOP_CAMERA_SCALE = 10.0
+"""Largest depth_scale of BOP's camera.json. As depth units per metre it would mean depth in steps of 10 cm and more."""
+
+MAX_TEXT_BYTES = 2**16
+"""Largest NPY file, text or YAML document that is read as intrinsics."""
+
+_PINHOLE = ("fx", "fy", "cx", "cy")
+_PINHOLE_MODELS = ("", "none", "plumb_bob", "rational_polynomial", "brown_conrady", "opencv", "radtan", "pinhole")
+"""Distortion models whose coefficients are those of OpenCV; others are refused unless all coefficients are 0."""
+
+
+def _is_number(value: Any) -> bool:
+    try:
+        return isinstance(value, Real) and not isinstance(value, bool) and abs(float(value)) <= LARGEST_INTRINSIC
+    except OverflowError:  # an integer past the largest float
+        return False
+
+
+@dataclasses.dataclass(frozen=True)
+class Intrinsics:
+    """A pinhole camera, with or without lens distortion; pixel centres have integer coordinates.
+
+    Attributes:
+        fx: focal length along a row, pixels.
+        fy: focal length along a column, pixels.
+        cx: column of the principal point.
+        cy: row of the principal point.
+        depth_scale: depth units per metre; 1000 if depth is in millimetres.
+        width: columns of the images, if known; `RGBDFrame` compares.
+        height: rows of the images, if known.
+        distortion: 0, 4, 5 or 8 coefficients in the order of OpenCV, see `distortion`.
+
+    Raises:
+        InputError: a value is not a finite number or exceeds `LARGEST_INTRINSIC`, a focal length or the depth scale is
+            below its reciprocal, a size is not positive, or the number of coefficients is another one.
+    """
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    depth_scale: float = DEFAULT_DEPTH_SCALE
+    width: int | None = None
+    height: int | None = None
+    distortion: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in (*_PINHOLE, "depth_scale"):
+            value = getattr(self, name)
+            if not _is_number(value):
+                raise InputError(
+                    f"intrinsics.{name} is {value!r}; expected a finite number of at most {LARGEST_INTRINSIC:.0e}"
+                )
+            # Smaller positive numbers make points infinite.
+            if value < 1 / LARGEST_INTRINSIC and name not in ("cx", "cy"):
+                raise InputError(
+                    f"intrinsics.{name} is {value!r}; expected a positive number, at least {1 / LARGEST_INTRINSIC:.0e}"
+                )
+        for name in ("width", "height"):
+            value = getattr(self, name)
+            if value is not None and (not isinstance(value, Integral) or isinstance(value, bool) or value <= 0):
+                raise InputError(f"intrinsics.{name} is {value!r}; expected a positive integer, in pixels")
+        object.__setattr__(self, "distortion", _coefficients(self.distortion))
+
+    @classmethod
+    def of(cls, values: Any) -> "Intrinsics":
+        """Make intrinsics from a mapping, a matrix or a ROS message in one of the formats of this module.
+
+        Other entries of a mapping are ignored.
+
+        Raises:
+            InputError: `values` is none of them, lacks an entry, has an invalid one, or has a lens distortion that is
+                not supported.
+        """
+        if isinstance(values, Intrinsics):
+            return values
+        if isinstance(values, (Sequence, np.ndarray)) and not isinstance(values, (str, bytes)):
+            return _of_matrix_alone(values)
+        if not isinstance(values, Mapping):
+            if hasattr(values, "distortion_model"):  # a CameraInfo message
+                values = {name: getattr(values, name) for name in _MESSAGE_FIELDS if hasattr(values, name)}
+            else:
+                raise InputError(f"intrinsics is a {type(values).__name__}; expected a mapping with fx, fy, cx, cy")
+        for applies, convert in _FORMATS:
+            if applies(values):
+                return convert(values)
+        shown = ", ".join(map(str, list(values)[:8])) or "no entry"
+        raise InputError(
+            f"intrinsics has {shown}; expected fx, fy, cx, cy, or a ROS camera_info, K, cam_K, ppx and ppy, or "
+            "intrinsic_matrix"
+        )
+
+    @classmethod
+    def of_matrix(
+        cls,
+        matrix: Any,
+        depth_scale: float = DEFAULT_DEPTH_SCALE,
+        *,
+        width: int | None = None,
+        height: int | None = None,
+        distortion: Any = (),
+    ) -> "Intrinsics":
+        """Make intrinsics from the nine numbers of a camera matrix, row by row.
+
+        Raises:
+            InputError: `matrix` is not of the form fx, 0, cx, 0, fy, cy, 0, 0, 1, or a value is invalid.
+        """
+        try:
+            fx, skew, cx, a, fy, cy, b, c, one = np.asarray(matrix, dtype=object).ravel().tolist()
+        except (TypeError, ValueError):
+            skew = None
+        if skew is None or [skew, a, b, c, one] != [0, 0, 0, 0, 1]:
+            shown = " ".join(str(matrix).split())
+            raise InputError(f"intrinsics is {shown[:200]}; expected fx, 0, cx, 0, fy, cy, 0, 0, 1")
+        return cls(fx, fy, cx, cy, depth_scale, width, height, distortion)
+
+
+def _coefficients(distortion: Any) -> tuple[float, ...]:
+    """Check the coefficients of a lens distortion and return them, or none if all are 0."""
+    if isinstance(distortion, (str, bytes, Mapping)) or not isinstance(distortion, (Sequence, np.ndarray)):
+        raise InputError(f"intrinsics.distortion is {distortion!r}; expected a list of coefficients")
+    values = np.asarray(distortion, dtype=object).ravel().tolist()
+    for value in values:
+        if not _is_number(value):
+            raise InputError(f"intrinsics.distortion has the coefficient {value!r}; expected finite numbers")
+    if not any(values):
+        return ()
+    if len(values) > DISTORTION_LENGTHS[-1] and not any(values[DISTORTION_LENGTHS[-1] :]):
+        values = values[: DISTORTION_LENGTHS[-1]]
+    if len(values) not in DISTORTION_LENGTHS:
+        raise InputError(
+            f"intrinsics.distortion has {len(values)} coefficients; expected k1, k2, p1, p2[, k3[, k4, k5, k6]]; for "
+            "other lenses, rectify the images and give the intrinsics of the rectified images"
+        )
+    return tuple(float(value) for value in values)
+
+
+def _supported(model: Any, distortion: Any) -> Any:
+    """Return the coefficients of a distortion model, or none if all are 0.
+
+    Raises:
+        InputError: the model is not supported and distorts.
+    """
+    distortion = () if distortion is None else distortion
+    name = str(model or "").lower().rpartition(".")[2]  # RealSense: distortion.brown_conrady
+    values = np.asarray(distortion, dtype=object).ravel().tolist() if not isinstance(distortion, Mapping) else [1]
+    if name not in _PINHOLE_MODELS and any(values):
+        raise InputError(
+            f"intrinsics has the distortion model {model}; expected plumb_bob or rational_polynomial; rectify the "
+            "images and give the intrinsics of the rectified images"
+        )
+    return distortion
+
+
+def _of_pinhole(values: Mapping[Any, Any]) -> Intrinsics:
+    missing = [name for name in _PINHOLE if name not in values]
+    if missing:
+        raise InputError(f"intrinsics lacks {', '.join(missing)}; expected fx, fy, cx, cy")
+    scale = _given(values, "depth_scale", DEFAULT_DEPTH_SCALE)
+    width, height = _size(values)
+    if None not in (width, height) and _is_number(scale) and 0 < scale <= MAX_BOP_CAMERA_SCALE:
+        scale = 1000 / scale  # BOP's camera.json
+    distortion = _supported(values.get("distortion_model"), _given(values, "distortion", ()))
+    fx, fy, cx, cy = (values[name] for name in _PINHOLE)
+    return Intrinsics(fx, fy, cx, cy, scale, width, height, distortion)
+
+
+def _of_realsense(values: Mapping[Any, Any]) -> Intrinsics:
+    missing = [name for name in ("fx", "fy", "ppx", "ppy") if name not in values]
+    if missing:
+        raise InputError(f"intrinsics lacks {', '.join(missing)}; expected fx, fy, ppx, ppy")
+    scale = _given(values, "depth_scale", 1 / DEFAULT_DEPTH_SCALE)
+    if not _is_number(scale) or not 0 < scale < 1:
+        raise InputError(
+            f"intrinsics.depth_scale is {scale!r} beside ppx and ppy; expected metres per depth unit, such as 0.001"
+        )
+    distortion = _supported(values.get("model"), _given(values, "coeffs", ()))
+    width, height = _size(values)
+    pinhole = values["fx"], values["fy"], values["ppx"], values["ppy"]
+    return Intrinsics(*pinhole, 1 / scale, width, height, distortion)
+
+
+def _of_camera_info(values: Mapping[Any, Any]) -> Intrinsics:
+    matrix = _entry(values, "camera_matrix", "K", "k")
+    coefficients = _entry(values, "distortion_coefficients", "D", "d")
+    width, height = _size(values)
+    return Intrinsics.of_matrix(
+        matrix,
+        _given(values, "depth_scale", DEFAULT_DEPTH_SCALE),
+        width=width,
+        height=height,
+        distortion=_supported(values.get("distortion_model"), () if coefficients is None else coefficients),
+    )
+
+
+def _of_bop(values: Mapping[Any, Any]) -> Intrinsics:
+    scale = _given(values, "depth_scale", 1.0)
+    if not _is_number(scale) or scale <= 0:
+        raise InputError(f"intrinsics.depth_scale is {scale!r}; expected a positive number")
+    width, height = _size(values)
+    return Intrinsics.of_matrix(values["cam_K"], 1000 / scale, width=width, height=height)
+
+
+def _of_open3d(values: Mapping[Any, Any]) -> Intrinsics:
+    matrix = values["intrinsic_matrix"]
+    try:
+        transposed = np.asarray(matrix, dtype=object).reshape(3, 3).T
+    except ValueError:
+        raise InputError(
+            f"intrinsics.intrinsic_matrix is {str(matrix)[:200]}; expected fx, 0, 0, 0, fy, 0, cx, cy, 1"
+        ) from None
+    width, height = _size(values)
+    return Intrinsics.of_matrix(
+        transposed, _given(values, "depth_scale", DEFAULT_DEPTH_SCALE), width=width, height=height
+    )
+
+
+def _of_matrix_alone(matrix: Any) -> Intrinsics:
+    shape = np.shape(np.asarray(matrix, dtype=object))
+    if shape not in ((3, 3), (9,)):
+        raise InputError(f"intrinsics is a {type(matrix).__name__} of shape {shape}; expected a 3 x 3 matrix")
+    return Intrinsics.of_matrix(np.asarray(matrix, dtype=object))
+
+
+def _given(values: Mapping[Any, Any], name: str, default: Any) -> Any:
+    value = values.get(name)
+    return default if value is None else value
+
+
+def _size(values: Mapping[Any, Any]) -> tuple[Any, Any]:
+    return _entry(values, "width", "image_width"), _entry(values, "height", "image_height")
+
+
+def _entry(values: Mapping[Any, Any], *names: str) -> Any:
+    """Return the first of these entries, of a matrix in OpenCV's YAML its data."""
+    value = next((values[name] for name in names if name in values), None)
+    return value.get("data") if isinstance(value, Mapping) else value
+
+
+def _is_camera_info(values: Mapping[Any, Any]) -> bool:
+    return any(name in values for name in ("camera_matrix", "K", "k"))
+
+
+_MESSAGE_FIELDS = ("width", "height", "distortion_model", "D", "d", "K", "k")
+
+_FORMATS: Sequence[tuple[Callable[[Mapping[Any, Any]], bool], Callable[[Mapping[Any, Any]], Intrinsics]]] = (
+    (lambda values: "cam_K" in values, _of_bop),
+    (lambda values: "intrinsic_matrix" in values, _of_open3d),
+    (lambda values: isinstance(values.get("intrinsic"), Mapping), lambda values: Intrinsics.of(values["intrinsic"])),
+    (lambda values: "ppx" in values or "ppy" in values, _of_realsense),
+    (_is_camera_info, _of_camera_info),
+    (lambda values: any(name in values for name in _PINHOLE), _of_pinhole),
+)
+"""Whether a mapping has a format, and its conversion; a matrix under the key K is a camera_info without the rest."""
+
+
+def parse_intrinsics(content: bytes, image: int | None = None) -> Intrinsics:
+    """Make intrinsics from the content of a file in one of the formats of this module.
+
+    Args:
+        content: JSON, YAML (of several documents the first), nine numbers as text, or NPY.
+        image: number of the image, which chooses the entry of a BOP scene_camera.json with several images.
+
+    Raises:
+        InputError: `content` is in none of the formats, or as `Intrinsics.of`.
+    """
+    values = _parse(content)
+    if isinstance(values, Mapping) and values and all(_is_image_entry(*item) for item in values.items()):
+        numbers = {int(number): entry for number, entry in values.items()}
+        if len(numbers) > 1 and image not in numbers:
+            raise InputError(
+                f"intrinsics has {len(numbers)} images and none has the number {image}; expected one that is the name "
+                "of the color file, or a file with a single image"
+            )
+        values = numbers[image] if image in numbers else next(iter(numbers.values()))
+    return Intrinsics.of(values)
+
+
+def _is_image_entry(number: Any, entry: Any) -> bool:
+    return str(number).isdecimal() and isinstance(entry, Mapping) and "cam_K" in entry
+
+
+def _parse(content: bytes) -> Any:
+    """Return the value in a file, whose format shows in its first bytes."""
+    is_json = content.lstrip()[:1] in (b"{", b"[")
+    if not is_json:
+        content = _first_document(content)
+        if len(content) > MAX_TEXT_BYTES:
+            raise InputError(f"intrinsics has {len(content)} bytes; expected at most {MAX_TEXT_BYTES}")
+    if content.startswith(b"\x93NUMPY"):
+        try:
+            return np.load(io.BytesIO(content), allow_pickle=False)
+        except Exception:  # a damaged header raises many kinds of exception
+            raise InputError("intrinsics is a damaged NPY file; expected a 3 x 3 matrix") from None
+    if is_json:
+        try:
+            return parse_json(content)
+        except ValueError as error:
+            reason = "not UTF-8" if isinstance(error, UnicodeDecodeError) else error
+            raise InputError(
+                f"intrinsics is not valid JSON ({reason}); expected fx, fy, cx, cy or another known format"
+            ) from None
+    try:
+        return np.array([float(word) for word in content.replace(b",", b" ").split()]) if content.strip() else None
+    except ValueError:
+        pass
+    try:
+        # OpenCV's FileStorage writes a directive and tags that YAML parsers refuse.
+        return parse_yaml(re.sub(rb"^%YAML.*\n|!!opencv-matrix", b"", content))
+    except ValueError:
+        raise InputError(
+            "intrinsics is neither JSON, YAML, NPY nor nine numbers; expected fx, fy, cx, cy or another known format"
+        ) from None
+
+
+def _first_document(content: bytes) -> bytes:
+    """Return the text before the line --- that ends each message of `ros2 topic echo`."""
+    if content.startswith(b"\x93NUMPY"):
+        return content
+    lines = content.splitlines(keepends=True)
+    is_filled = False
+    for number, line in enumerate(lines):
+        if is_filled and line.rstrip() == b"---":
+            return b"".join(lines[:number])
+        is_filled = is_filled or not line.startswith((b"#", b"%", b"---")) and bool(line.strip())
+    return content
+
+
+def read_intrinsics(path: str | Path, image: int | None = None) -> Intrinsics:
+    """Read intrinsics from a file, see `parse_intrinsics`.
+
+    Raises:
+        InputError: as `parse_intrinsics`; names the file.
+        OSError: the file cannot be opened.
+    """
+    content = Path(path).read_bytes()
+    with with_context(str(path)):
+        return parse_intrinsics(content, image)

@@ -1,0 +1,149 @@
+"""Outlier removal on the cloud of an instance (paper, section "Recognition").
+
+A mask extends past the edge of its object, onto the background and onto flying pixels between the two. Three rules
+remove them: flying pixels are found by steps in depth, stray points by the mean distance to their neighbours, and
+background by small pieces that are apart from the rest.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.spatial import KDTree
+
+from thor2_jax.frames.frames import RGBDFrame
+
+__all__ = ["flying_pixels", "remove_outliers"]
+
+MAX_SLOPE = 15.0
+"""Steepest slope of a visible surface: change of depth from pixel to pixel, in pixel widths (86 degrees from facing the
+camera)."""
+
+NEIGHBORS = 30
+"""Neighbours of a point on the voxel grid of 3 mm; on a plane, they lie within 9 mm, at its corners within 19 mm."""
+
+MAX_NEIGHBOR_DISTANCE = 0.016
+"""Largest mean distance of a point to its nearest `NEIGHBORS`, metres; at the corner of a plane it is 0.012."""
+
+PIECE_CELL = 0.01
+"""Cell side of the grid that finds pieces, metres. Cells that touch, even at a corner, are one piece."""
+
+GRID_REACH = 100
+"""Cells of that grid on either side of the cloud's median along each axis (1 m), which bounds its memory. All points
+outside count as one piece."""
+
+MIN_PIECE_SHARE = 0.1
+"""Least size of a piece that is kept, as a share of the points of the largest piece."""
+
+
+def flying_pixels(frame: RGBDFrame, pixels: NDArray[np.intp]) -> NDArray[np.bool_]:
+    """Return which pixels are flying pixels: farther behind a 4-neighbour of their instance than `MAX_SLOPE` allows.
+
+    Args:
+        frame: the frame.
+        pixels: [n] flat indices of pixels of one instance.
+
+    Returns:
+        [n] bool; False where there is no depth.
+    """
+    height, width = frame.depth.shape
+    labels, depth = frame.label_image.ravel(), frame.depth_m.ravel()
+    row, column = np.divmod(pixels, width)
+    here, instance = depth[pixels], labels[pixels]
+    # A pixel is a flying pixel if a neighbour is closer than this. At the image border, a pixel is its own neighbour.
+    nearest = here - MAX_SLOPE / frame.intrinsics.fx * here
+    flying = np.zeros(len(pixels), bool)
+    for beside in (
+        pixels + (column < width - 1),
+        pixels - (column > 0),
+        pixels + width * (row < height - 1),
+        pixels - width * (row > 0),
+    ):
+        there = depth[beside]
+        flying |= (there < nearest) & (there > 0) & (labels[beside] == instance)
+    return flying
+
+
+def _grid(points: NDArray[np.float64]) -> tuple[NDArray[np.int64], tuple[int, ...]]:
+    """Return the flat cell index [n] of each of `points` [3, n] and the shape of the grid.
+
+    Points past `GRID_REACH` get index 0. Two layers of cells on every side are empty, so that no other cell touches
+    cell 0.
+    """
+    place = np.floor(points / PIECE_CELL)
+    near = None
+    if np.ptp(place, axis=1).max() > GRID_REACH:
+        place -= np.floor(np.median(place, axis=1, keepdims=True))
+        near = (np.abs(place) <= GRID_REACH).all(axis=0)
+        place = np.where(near, place, 0)
+    cells = (place - place.min(axis=1, keepdims=True)).astype(np.int64) + 2
+    shape = tuple((cells.max(axis=1) + 3).tolist())
+    flat = np.ravel_multi_index(tuple(cells), shape)
+    return flat if near is None else np.where(near, flat, 0), shape
+
+
+def _surrounded(points: NDArray[np.float64], cell: NDArray[np.int64], shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Return which of `points` [3, n] surely pass the neighbour rule, from counts and moments of grid cells.
+
+    Where more than `NEIGHBORS` points lie in a point's cell and those that it touches, the mean distance to the nearest
+    of them is at most the root of the mean square distance to all of them.
+    """
+    points = points - points.mean(axis=1, keepdims=True)
+    square = (points**2).sum(axis=0)
+    sums = np.stack([np.bincount(cell, weights=w, minlength=math.prod(shape)) for w in (None, *points, square)])
+    sums[:, 0] = 0
+    for step in (1, shape[2], shape[1] * shape[2]):
+        row = sums.copy()
+        row[:, step:] += sums[:, :-step]
+        row[:, :-step] += sums[:, step:]
+        sums = row
+    count, x, y, z, squares = sums[:, cell]
+    total = squares - 2 * (points * (x, y, z)).sum(axis=0) + count * square
+    others = count - 1
+    return np.asarray((others >= NEIGHBORS) & (total <= others * MAX_NEIGHBOR_DISTANCE**2))
+
+
+def _among_others(points: NDArray[np.float64], cell: NDArray[np.int64], shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    n_points = points.shape[1]
+    if n_points <= NEIGHBORS:
+        return np.zeros(n_points, bool)
+    among = _surrounded(points, cell, shape)
+    rest = np.flatnonzero(~among)
+    if len(rest):
+        tree = KDTree(points.T, leafsize=32, balanced_tree=False, compact_nodes=False)  # quick to build
+        distances = tree.query(points[:, rest].T, k=NEIGHBORS + 1)[0][:, 1:]
+        among[rest] = distances.mean(axis=1) <= MAX_NEIGHBOR_DISTANCE
+    return among
+
+
+def _in_large_piece(cell: NDArray[np.int64], shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    full = np.zeros(shape, bool)
+    full.ravel()[cell[cell > 0]] = True
+    pieces, _ = ndimage.label(full, structure=np.ones((3, 3, 3)))
+    piece = pieces.ravel()[cell]
+    size = np.bincount(piece)
+    return np.asarray(size[piece] >= MIN_PIECE_SHARE * size.max())
+
+
+def remove_outliers(points: NDArray[Any]) -> tuple[NDArray[np.intp], bool]:
+    """Return which points belong to the object.
+
+    Args:
+        points: [n, 3] metres, on a voxel grid of 3 mm.
+
+    Returns:
+        Indices of the points to keep, in increasing order, never none of n > 0; and whether the rule of `NEIGHBORS` was
+        left out because it would have dropped more than half of the object, as of a small one or one seen through gaps.
+    """
+    kept = np.arange(len(points))
+    if len(points) == 0:
+        return kept, False
+    planes = points.T.astype(np.float64, order="C")
+    cell, shape = _grid(planes)
+    among = _among_others(planes, cell, shape)
+    relaxed = 2 * int(among.sum()) < len(points)
+    if not relaxed:
+        kept = kept[among]
+    return kept[_in_large_piece(cell[kept], shape)], relaxed

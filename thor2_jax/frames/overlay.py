@@ -1,0 +1,300 @@
+"""Pictures of recognized frames: the photo with the outline of each instance and a label with its answer.
+
+draw_overlay(frame.color, frame.labels, recognizer.recognize(frame), "overlay.png")
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib.util
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+from thor2_jax.errors import InputError
+from thor2_jax.files import atomic_write
+from thor2_jax.printable import escape_characters
+
+if TYPE_CHECKING:
+    from thor2_jax.model.answers import Recognition
+
+__all__ = [
+    "COLORS",
+    "UNRECOGNIZED",
+    "Annotation",
+    "Paint",
+    "annotate",
+    "answer_paints",
+    "draw_instances",
+    "draw_overlay",
+]
+
+Paint = tuple[int, int, int]
+"""An sRGB colour, 0 to 255."""
+
+COLORS: tuple[Paint, ...] = ((86, 180, 233), (240, 228, 66), (0, 158, 115), (204, 121, 167), (0, 114, 178))
+"""Colours of recognized instances, in turn: sky blue, yellow, bluish green, reddish purple and blue of the palette of
+Okabe and Ito, which people with colour blindness can distinguish."""
+
+UNRECOGNIZED: Paint = (213, 94, 0)
+"""Colour of instances without a name: vermilion of the same palette. Its orange is too close and not used."""
+
+_SMALLEST_LETTERS = 8
+"""Size of the smallest legible letters, pixels."""
+
+
+class Annotation(NamedTuple):
+    """Drawing on an instance.
+
+    Attributes:
+        label: its number in the label image.
+        paint: colour of the outline and of the label's background.
+        text: the label, of one or more lines; empty for none.
+    """
+
+    label: int
+    paint: Paint
+    text: str
+
+
+class _Box(NamedTuple):
+    """A rectangle of pixels; `right` and `bottom` are not included."""
+
+    left: int
+    top: int
+    right: int
+    bottom: int
+
+
+class _Mask(NamedTuple):
+    """An instance's mask, cropped with a margin of one pixel: `pixels[1, 1]` is the corner (left, top) of `box`."""
+
+    box: _Box
+    pixels: NDArray[np.bool_]
+
+
+class _Lettering(NamedTuple):
+    """A label's text, font and size; `start` is its position relative to the corner of a box of width x height."""
+
+    text: str
+    font: ImageFont.FreeTypeFont | ImageFont.ImageFont
+    size: int
+    spacing: int
+    start: tuple[float, float]
+    width: int
+    height: int
+
+
+def draw_overlay(
+    color: NDArray[np.uint8], labels: NDArray[Any], answers: Sequence[Recognition], path: str | Path
+) -> None:
+    """Draw the answers for a frame on its photo and write a PNG, which appears only when it is complete.
+
+    A label shows the name, the confidence, the classifier and whether the instance is occluded, or "unrecognized".
+
+    Args:
+        color: [H, W, 3] uint8, sRGB.
+        labels: [H, W] integers; 0 is background, every other number an instance.
+        answers: for instances in `labels`; instances without an answer are not drawn.
+        path: path of the picture.
+
+    Raises:
+        InputError: shapes or types that do not fit, or an answer for a label that does not occur in `labels`.
+        OSError: the file cannot be written.
+    """
+    color, labels = np.asarray(color), np.asarray(labels)
+    if color.ndim != 3 or color.shape[2] != 3 or 0 in color.shape:
+        raise InputError(f"color has shape {color.shape}; expected [H, W, 3]")
+    if color.dtype != np.uint8:
+        raise InputError(f"color has type {color.dtype}; expected uint8")
+    if labels.shape != color.shape[:2]:
+        raise InputError(f"labels has shape {labels.shape}; expected {color.shape[:2]} (rows, columns), as color")
+    if labels.dtype.kind not in "ui":
+        raise InputError(f"labels has type {labels.dtype}; expected integers")
+    for answer in answers:
+        if answer.label == 0 or not (labels == answer.label).any():
+            raise InputError(f"answers: label {answer.label} is no instance of labels")
+    picture = annotate(color, labels, answers)
+    with atomic_write(path) as temporary:
+        picture.save(temporary, format="PNG")
+
+
+def annotate(color: NDArray[np.uint8], labels: NDArray[Any], answers: Sequence[Recognition]) -> Image.Image:
+    """Return the picture that `draw_overlay` writes, of valid arguments."""
+    annotations = [
+        Annotation(answer.label, paint, _text(answer))
+        for answer, paint in zip(answers, answer_paints(answers), strict=True)
+    ]
+    return draw_instances(color, labels, annotations)
+
+
+def draw_instances(color: NDArray[np.uint8], labels: NDArray[Any], annotations: Sequence[Annotation]) -> Image.Image:
+    """Return a photo with the outlines and labels of instances.
+
+    Letters and outlines grow with the picture. Labels lie inside it, clear of each other while there is space; the
+    first annotations choose first. Letters shrink if a label is wider than the picture; a label that does not fit in
+    the smallest legible letters is left out.
+
+    Args:
+        color: [H, W, 3] uint8, sRGB.
+        labels: [H, W] integers; 0 is background, every other number an instance.
+        annotations: of labels that occur in `labels`.
+    """
+    masks = [_crop(labels, annotation.label) for annotation in annotations]
+    diagonal = math.hypot(*labels.shape)
+    thickness = max(1, round(diagonal / 350))
+    # Letters grow less than in proportion: a large picture is looked at enlarged.
+    size = max(11, round(14 * (diagonal / 800) ** 0.75))
+    pixels = color.copy()
+    for mask, annotation in zip(masks, annotations, strict=True):
+        _draw_outline(pixels, mask, annotation.paint, thickness)
+    picture = Image.fromarray(pixels)
+    _draw_labels(picture, labels != 0, masks, annotations, size)
+    return picture
+
+
+def answer_paints(answers: Sequence[Recognition]) -> list[Paint]:
+    """Return the colour of each answer: `COLORS` in turn, or `UNRECOGNIZED`."""
+    recognized = np.cumsum([answer.name is not None for answer in answers])
+    return [
+        UNRECOGNIZED if answer.name is None else COLORS[(int(count) - 1) % len(COLORS)]
+        for answer, count in zip(answers, recognized, strict=True)
+    ]
+
+
+def _text(answer: Recognition) -> str:
+    occluded = ["occluded"] if answer.occluded else []
+    if answer.name is None:
+        return "\n".join(["unrecognized", *occluded])
+    sure = "" if answer.confidence is None else f" {answer.confidence:.2f}"
+    surest = [] if answer.classifier is None else [answer.classifier.upper()]
+    return f"{answer.name}{sure}\n{', '.join(surest + occluded)}".rstrip()
+
+
+def _crop(labels: NDArray[Any], label: int) -> _Mask:
+    mask = labels == label
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    box = _Box(int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1)
+    return _Mask(box, np.pad(mask[box.top : box.bottom, box.left : box.right], 1))
+
+
+def _eroded(mask: NDArray[np.bool_], steps: int) -> NDArray[np.bool_]:
+    """Return the mask without its outermost `steps` layers of 4-neighbours; its margin must be empty."""
+    for _ in range(steps):
+        inner = np.zeros_like(mask)
+        inner[1:-1, 1:-1] = mask[1:-1, 1:-1] & mask[:-2, 1:-1] & mask[2:, 1:-1] & mask[1:-1, :-2] & mask[1:-1, 2:]
+        mask = inner
+    return mask
+
+
+def _draw_outline(pixels: NDArray[np.uint8], mask: _Mask, paint: Paint, thickness: int) -> None:
+    """Draw a coloured line along the inner edge of the mask and a thin black or white one beside it."""
+    left, top, right, bottom = mask.box
+    within = _eroded(mask.pixels, thickness)
+    core = _eroded(within, max(1, thickness // 3))
+    target = pixels[top:bottom, left:right]
+    target[(mask.pixels & ~within)[1:-1, 1:-1]] = paint
+    target[(within & ~core)[1:-1, 1:-1]] = _ink(paint)
+
+
+def _ink(paint: Paint) -> Paint:
+    """Return black or white, whichever has more contrast with a colour."""
+    red, green, blue = paint
+    return (0, 0, 0) if 0.299 * red + 0.587 * green + 0.114 * blue > 100 else (255, 255, 255)
+
+
+def _draw_labels(
+    picture: Image.Image,
+    instances: NDArray[np.bool_],
+    masks: Sequence[_Mask],
+    annotations: Sequence[Annotation],
+    size: int,
+) -> None:
+    draw = ImageDraw.Draw(picture)
+    covered = np.pad(instances, ((1, 0), (1, 0))).cumsum(axis=0, dtype=np.int32).cumsum(axis=1, dtype=np.int32)
+    placed: list[tuple[_Box, _Lettering, Paint]] = []
+    for mask, annotation in zip(masks, annotations, strict=True):
+        lettering = _fit(draw, annotation.text, size, picture.size) if annotation.text else None
+        if lettering is not None:
+            box = _place(lettering, mask.box, [other for other, _, _ in placed], covered)
+            placed.append((box, lettering, annotation.paint))
+            _draw_leader(draw, box, mask, annotation.paint, max(1, size // 7))
+    for box, lettering, paint in placed:  # after all leaders, which may cross a label
+        draw.rectangle((box.left, box.top, box.right - 1, box.bottom - 1), fill=paint)
+        start = box.left + lettering.start[0], box.top + lettering.start[1]
+        draw.multiline_text(start, lettering.text, _ink(paint), lettering.font, spacing=lettering.spacing)
+
+
+def _fit(draw: ImageDraw.ImageDraw, text: str, size: int, space: tuple[int, int]) -> _Lettering | None:
+    """Return the text in the largest letters, up to `size`, that fit into `space` (width, height); None if none do."""
+    wide = not all(map(_can_draw, text))
+    text = escape_characters(text, functools.partial(_can_draw, wide=wide))
+    for letters in range(size, _SMALLEST_LETTERS - 1, -1):
+        font, padding = _font(letters, wide), letters // 4
+        left, top, right, bottom = draw.multiline_textbbox((0, 0), text, font, spacing=padding)
+        width, height = math.ceil(right - left) + 2 * padding, math.ceil(bottom - top) + 2 * padding
+        if width <= space[0] and height <= space[1]:
+            return _Lettering(text, font, letters, padding, (padding - left, padding - top), width, height)
+    return None
+
+
+@functools.lru_cache(maxsize=32)
+def _font(size: int, wide: bool = False) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    """Return Pillow's font or, with `wide`, the one that comes with matplotlib, which has many more characters."""
+    matplotlib = importlib.util.find_spec("matplotlib") if wide else None
+    if matplotlib is None or matplotlib.origin is None:
+        return ImageFont.load_default(size)
+    return ImageFont.truetype(Path(matplotlib.origin).with_name("mpl-data") / "fonts" / "ttf" / "DejaVuSans.ttf", size)
+
+
+@functools.lru_cache(maxsize=4096)
+def _can_draw(character: str, wide: bool = False) -> bool:
+    """Return whether a font has a character; it draws the same box for all those that it lacks."""
+
+    def shape(text: str) -> bytes:
+        return bytes(_font(_SMALLEST_LETTERS, wide).getmask(text))
+
+    return character in " \n" or (character.isprintable() and shape(character) != shape("\U0010ffff"))
+
+
+def _place(lettering: _Lettering, target: _Box, placed: Sequence[_Box], covered: NDArray[np.int32]) -> _Box:
+    """Return the best box on a grid over the picture: clear of other labels, near its instance, hiding few others."""
+    rows, columns = covered.shape[0] - 1, covered.shape[1] - 1
+    letters, width, height = lettering.size, lettering.width, lettering.height
+    top, left = (
+        np.unique(np.append(np.arange(0, last + 1, max(1, letters // 2)), last))
+        for last in (rows - height, columns - width)
+    )
+    top = top[:, None]
+    right, bottom = left + width, top + height
+    gap_x = np.maximum(0, np.maximum(left - target.right, target.left - right))
+    gap_y = np.maximum(0, np.maximum(top - target.bottom, target.top - bottom))
+    off_centre = np.hypot(left + right - target.left - target.right, top + bottom - target.top - target.bottom)
+    hidden = covered[bottom, right] - covered[top, right] - covered[bottom, left] + covered[top, left]
+    # In letter heights: hiding an instance under a tenth of the label costs as much as a distance of four letters.
+    cost = np.hypot(gap_x, gap_y) / letters + off_centre / (10 * letters) + 40 * hidden / (width * height)
+    for other in placed:
+        shared_x = np.minimum(right, other.right + 2) - np.maximum(left, other.left - 2)
+        shared_y = np.minimum(bottom, other.bottom + 2) - np.maximum(top, other.top - 2)
+        # The factor exceeds all other costs together: labels overlap only if every place does.
+        cost += 1000 * np.maximum(0, shared_x) * np.maximum(0, shared_y)
+    i, j = np.unravel_index(np.argmin(cost), cost.shape)
+    x, y = int(left[j]), int(top[i, 0])
+    return _Box(x, y, x + width, y + height)
+
+
+def _draw_leader(draw: ImageDraw.ImageDraw, box: _Box, mask: _Mask, paint: Paint, thickness: int) -> None:
+    """Draw a line from a label that lies beside its instance to the nearest pixel of the instance."""
+    row, column = np.nonzero(mask.pixels)
+    row, column = row + mask.box.top - 1, column + mask.box.left - 1
+    from_row, from_column = np.clip(row, box.top, box.bottom - 1), np.clip(column, box.left, box.right - 1)
+    nearest = np.argmin((row - from_row) ** 2 + (column - from_column) ** 2)
+    start = int(from_column[nearest]), int(from_row[nearest])
+    end = int(column[nearest]), int(row[nearest])
+    if start != end:
+        draw.line((start, end), fill=paint, width=thickness)

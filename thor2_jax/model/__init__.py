@@ -1,0 +1,1 @@
+"""The model, and the answers that it gives."""

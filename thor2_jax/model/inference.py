@@ -1,0 +1,150 @@
+"""Inference: the outputs of a model for clouds, and the answers that follow from them.
+
+>>> inference = infer(model, describe_looks(clouds, network, config))               # doctest: +SKIP
+>>> answers(model, instances, inference)                                            # doctest: +SKIP
+
+All that recognizes uses these functions: frames, sequences of frames, the service, explanations and evaluation.
+"""
+
+import dataclasses
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from numpy.typing import NDArray
+
+from thor2_jax.descriptor.looks import LookDescriptors, describe_looks
+from thor2_jax.frames.prepared_instance import PreparedInstance
+from thor2_jax.gallery.enrollment import LOOKS
+from thor2_jax.model.answers import Recognition
+from thor2_jax.model.chunks import compute_by_chunks
+from thor2_jax.model.model import Model
+from thor2_jax.model.naming import name_instances
+from thor2_jax.types import PointClouds
+
+__all__ = ["Inference", "answers", "gallery_scores", "infer", "infer_clouds", "infer_instances", "values"]
+
+
+class Inference(NamedTuple):
+    """Outputs of a model for clouds, one row for each.
+
+    Attributes:
+        overflow: [B] int, of the descriptors of the first look.
+        probabilities: classifier -> class probabilities [B, C], fused over the looks; empty if the gallery alone
+            answers. Those of the embedding sum to the probability that an object is one of the classes.
+        embeddings: [B, K, D] float32, embeddings for the gallery; None if the classifiers alone answer.
+        weights: [B, K] float32, weights of their looks; None likewise.
+        scores: [B, n_objects] scores of the gallery, of an inference that is fused over frames, in place of embeddings.
+    """
+
+    overflow: Any
+    probabilities: Mapping[str, Any]
+    embeddings: Any = None
+    weights: Any = None
+    scores: Any = None
+
+
+def infer(
+    model: Model, oriented: LookDescriptors, clouds: PointClouds | None = None, classifiers: Sequence[str] | None = None
+) -> Inference:
+    """Evaluate a model on descriptors; arrays stay on the device.
+
+    Args:
+        model: the model.
+        oriented: descriptors of the looks at B clouds.
+        clouds: [B, N] the clouds in metres, to embed them for the gallery; None if the classifiers alone answer.
+        classifiers: classifiers to evaluate; none if the gallery alone answers, by default those that answer.
+    """
+    names = model.classifiers.default if classifiers is None else classifiers
+    probabilities = model.classifiers.probabilities(oriented, names)
+    if clouds is None:
+        return Inference(oriented.overflow, probabilities)
+    ours, config = model.embedding.config, model.run.config
+    is_ours = dataclasses.replace(config, homology=ours.homology, looks=ours.looks) == ours
+    first = oriented
+    if not is_ours or oriented.weights.shape[1] < LOOKS:
+        first = describe_looks(clouds, model.embedding.network, ours, LOOKS)
+    first = jax.tree.map(lambda a: a[:, :LOOKS], first)
+    weights = first.weights / first.weights.sum(axis=1, keepdims=True)
+    return Inference(oriented.overflow, probabilities, model.embedding.embed_oriented(first), weights)
+
+
+def infer_clouds(
+    model: Model, clouds: PointClouds, classifiers: Sequence[str] | None = None, answer_by: str | None = None
+) -> Inference:
+    """Describe clouds [B, N] in metres and evaluate a model on them; arrays stay on the device.
+
+    Args:
+        model: the model.
+        clouds: the clouds.
+        classifiers: classifiers to evaluate, if they answer; by default those that do.
+        answer_by: source of the answers, see `Model.answers_by`.
+    """
+    source = model.answers_by(answer_by)
+    oriented = describe_looks(clouds, model.run.network, model.run.config)
+    names = classifiers if source != "gallery" else ()
+    return infer(model, oriented, clouds if source != "classifiers" else None, names)
+
+
+def infer_instances(
+    model: Model,
+    instances: Iterable[PreparedInstance],
+    chunk: int,
+    classifiers: Sequence[str] | None = None,
+    answer_by: str | None = None,
+) -> tuple[list[PreparedInstance], Inference]:
+    """Evaluate a model on the instances of a frame, a few at a time.
+
+    Args:
+        model: the model.
+        instances: an iterable that prepares them, with corrected colours.
+        chunk: usable instances that are computed in one call.
+        classifiers: see `infer_clouds`.
+        answer_by: see `infer_clouds`.
+
+    Returns:
+        All instances, and the outputs for the usable ones: arrays on the host, whose first rows are theirs, in order.
+
+    Raises:
+        InputError: a classifier that the run does not have.
+    """
+    names = model.classifiers.checked(classifiers) if model.answers_by(answer_by) != "gallery" else ()
+    return compute_by_chunks(instances, chunk, lambda clouds: infer_clouds(model, clouds, names, answer_by))
+
+
+def gallery_scores(model: Model, inference: Inference) -> NDArray[np.float32] | None:
+    """Return the scores [B, n_objects] of the enrolled objects; None if the classifiers alone answer."""
+    if inference.embeddings is None:
+        scores: NDArray[np.float32] | None = inference.scores
+        return scores
+    return model.gallery.scores(inference.embeddings, inference.weights)
+
+
+def values(model: Model, inference: Inference) -> NDArray[np.floating[Any]]:
+    """Return the values [B, n] of all names, whose largest one is the answer and its confidence."""
+    return model.combined(jax.tree.map(np.asarray, inference.probabilities), gallery_scores(model, inference))
+
+
+def answers(model: Model, instances: Sequence[PreparedInstance], inference: Inference) -> list[Recognition]:
+    """Return the answer for each instance of a frame.
+
+    Args:
+        model: the model.
+        instances: all of them; the usable ones are the first rows of the inference, in order.
+        inference: outputs of the model for them.
+    """
+    n_usable = sum(instance.reason is None for instance in instances)
+    inference = jax.tree.map(lambda a: np.asarray(a)[:n_usable], inference)
+    scores = gallery_scores(model, inference)
+    by_source = {name: model.union.of_classifiers(p) for name, p in inference.probabilities.items()}
+    if scores is not None:
+        by_source["gallery"] = model.union.combine(None, scores)
+    return name_instances(
+        instances,
+        model.names,
+        model.combined(inference.probabilities, scores),
+        model.thresholds("both" if inference.probabilities else "gallery"),
+        by_source,
+        inference.overflow,
+    )

@@ -1,0 +1,202 @@
+"""Files with the recognitions of frames: JSON and overlay, COCO results, BOP results.
+
+A frame has a name. COCO and BOP number images and objects instead: `image_numbers` and `category_numbers`.
+"""
+
+import dataclasses
+import json
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thor2_jax.errors import InputError
+from thor2_jax.files import has_json, write_text
+from thor2_jax.frames.frames import RGBDFrame, pixel_rays
+from thor2_jax.frames.overlay import draw_overlay
+from thor2_jax.model.answers import Recognition
+
+__all__ = [
+    "BOP_HEADER",
+    "RESULT_FILES",
+    "bop_lines",
+    "category_numbers",
+    "check_no_foreign_results",
+    "coco_results",
+    "image_numbers",
+    "instances_as_json",
+    "is_bop_file",
+    "is_coco_file",
+    "run_length_encoding",
+    "write_recognitions",
+]
+
+RESULT_FILES = ("recognition.json", "overlay.png")
+
+BOP_HEADER = "scene_id,im_id,obj_id,score,R,t,time"
+_IDENTITY = "1 0 0 0 1 0 0 0 1"
+
+
+def instances_as_json(recognitions: Sequence[Recognition]) -> list[dict[str, Any]]:
+    """Return the answers for the instances of a frame as JSON values, one object per instance."""
+    return [dataclasses.asdict(recognition) for recognition in recognitions]
+
+
+def check_no_foreign_results(out: Path) -> None:
+    """Raise InputError if `write_recognitions` would replace a file that it has not written."""
+    names = [name for name in RESULT_FILES if (out / name).exists()]
+    if names and not has_json(out / RESULT_FILES[0], ("label", "name", "confidence", "points_used")):
+        raise InputError(f"out: {out} has {names[0]}, which this command has not written; choose another directory")
+
+
+def is_coco_file(path: Path) -> bool:
+    """Return whether a file has entries of `coco_results`."""
+    return has_json(path, ("image_id", "category_id", "frame", "category_name"))
+
+
+def is_bop_file(path: Path) -> bool:
+    """Return whether a file has lines of `bop_lines`, whose rotations are all the identity."""
+    try:
+        header, *lines = path.read_text(encoding="utf-8").splitlines() or [""]
+    except (OSError, ValueError):
+        return False
+    return header == BOP_HEADER and all(f",{_IDENTITY}," in line for line in lines)
+
+
+def write_recognitions(out: Path, frame: RGBDFrame, recognitions: Sequence[Recognition]) -> None:
+    """Write `recognition.json`, one object per instance, and `overlay.png` to a directory; create it if necessary.
+
+    Raises:
+        OSError: A file cannot be written.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    write_text(out / RESULT_FILES[0], json.dumps(instances_as_json(recognitions), indent=1) + "\n")
+    draw_overlay(frame.color, frame.label_image, recognitions, out / RESULT_FILES[1])
+
+
+def image_numbers(names: Sequence[str]) -> list[tuple[int, int]]:
+    """Return scene number and image number of each frame.
+
+    They are the last two parts of the name (`000048/000001`: scene 48, image 1; `000001`: scene 1) if these are numbers
+    and differ between the frames; otherwise all frames are of scene 1 and are counted from 1.
+    """
+    numbers = []
+    for name in names:
+        scene, _, image = name.rpartition("/")
+        scene = scene.rpartition("/")[2]
+        if not image.isdecimal() or (scene and not scene.isdecimal()):
+            break
+        numbers.append((int(scene or 1), int(image)))
+    if len(set(numbers)) < len(names):
+        return [(1, position) for position in range(1, len(names) + 1)]
+    return numbers
+
+
+def category_numbers(classes: Sequence[str], names: Mapping[int, str] | None = None) -> dict[str, int]:
+    """Return class -> number.
+
+    Args:
+        classes: names of the objects.
+        names: number -> name; a class that it lacks gets no number. By default `obj_000012` has the number 12 if all
+            classes have such names, and otherwise the classes are counted from 1.
+    """
+    if names is not None:
+        numbers = {name: number for number, name in names.items()}
+        return {name: numbers[name] for name in classes if name in numbers}
+    matches = [re.fullmatch(r"obj_(\d+)", name) for name in classes]
+    return {
+        name: int(match[1]) if match and all(matches) else position
+        for position, (name, match) in enumerate(zip(classes, matches, strict=True), start=1)
+    }
+
+
+def run_length_encoding(mask: NDArray[np.bool_]) -> dict[str, Any]:
+    """Return the compressed run-length encoding of a mask [H, W], as COCO defines it."""
+    flat = np.concatenate([[False], mask.ravel(order="F"), [False]])
+    borders = np.flatnonzero(flat[1:] != flat[:-1])
+    counts = np.diff(np.concatenate([[0], borders, [mask.size]])).tolist()
+    if counts[-1] == 0:
+        counts.pop()
+    text = bytearray()
+    for position, count in enumerate(counts):
+        value = count - counts[position - 2] if position > 2 else count
+        more = True
+        while more:
+            digit, value = value & 0x1F, value >> 5
+            more = value != (-1 if digit & 0x10 else 0)
+            text.append(48 + digit + (0x20 if more else 0))
+    return {"size": list(mask.shape), "counts": text.decode("ascii")}
+
+
+def coco_results(
+    name: str, image_id: int, frame: RGBDFrame, recognitions: Iterable[Recognition], categories: Mapping[str, int]
+) -> list[dict[str, Any]]:
+    """Return the entries of a frame in COCO's results format, with mask, box and score.
+
+    Instances without a name, or whose name has no number in `categories`, have none.
+
+    Args:
+        name: name of the frame, which is stored with each entry, as is the name of the object.
+        image_id: its number.
+        frame: the frame.
+        recognitions: its answers.
+        categories: name -> category_id.
+    """
+    entries = []
+    for recognition in recognitions:
+        category = categories.get(recognition.name or "")
+        if category is None:
+            continue
+        rows, columns = np.divmod(frame.instance_pixels[recognition.label], frame.depth.shape[1])
+        left, top = int(columns.min()), int(rows.min())
+        entries.append(
+            {
+                "image_id": image_id,
+                "category_id": category,
+                "bbox": [left, top, int(columns.max()) + 1 - left, int(rows.max()) + 1 - top],
+                "score": recognition.confidence,
+                "segmentation": run_length_encoding(frame.label_image == recognition.label),
+                "frame": name,
+                "category_name": recognition.name,
+            }
+        )
+    return entries
+
+
+def bop_lines(
+    scene_id: int,
+    image_id: int,
+    frame: RGBDFrame,
+    recognitions: Iterable[Recognition],
+    categories: Mapping[str, int],
+    seconds: float,
+) -> list[str]:
+    """Return the lines of a frame in BOP's results format (`BOP_HEADER`).
+
+    THOR2 estimates no pose: R is the identity, and t the mean of the visible points, in millimetres. Instances without
+    a name, or whose name has no number in `categories`, have no line.
+
+    Args:
+        scene_id: number of the scene.
+        image_id: number of the image.
+        frame: the frame.
+        recognitions: its answers.
+        categories: name -> obj_id.
+        seconds: time for the whole frame.
+    """
+    lines = []
+    for recognition in recognitions:
+        category = categories.get(recognition.name or "")
+        if category is None:
+            continue
+        pixels = frame.instance_pixels[recognition.label]
+        depth = frame.depth_m.ravel()[pixels]
+        rays = pixel_rays(pixels[depth > 0], frame.depth.shape[1], frame.intrinsics)
+        centre = 1000 * (rays * depth[depth > 0, None]).mean(axis=0)
+        translation = " ".join(f"{value:.3f}" for value in centre)
+        score = recognition.confidence
+        lines.append(f"{scene_id},{image_id},{category},{score},{_IDENTITY},{translation},{seconds:.4f}")
+    return lines

@@ -1,0 +1,215 @@
+"""Run directories: a trained model on disk with everything that recognition needs.
+
+RUN/run.json                    format, descriptor version and constants, class names, classifiers and SHA-256 of their
+                                weights, and a record of the training
+RUN/network.npz                 the colour network whose regions the descriptors use
+RUN/weights/NAME.safetensors    parameters and batch statistics of one classifier
+RUN/embedding.safetensors       the embedding of the gallery, in place of the packaged one, which may also recognize
+                                the classes
+RUN/references.safetensors      its reference views, with which galleries tell unknown objects apart
+
+These five are the model: none of them may be deleted or edited. `thor2 train` adds files that recognition does not
+read, and each of them may be deleted: `baselines/` (models that `thor2 evaluate` compares with), `metrics.jsonl` and
+`curves.png` (loss and accuracy of each epoch) and, while a training is unfinished, `checkpoints/` and `views/`, from
+which an interrupted training resumes. `gallery/` has enrolled objects (see `gallery.store`). A run whose embedding
+recognizes the classes may have no classifiers, and one that was made by enrolling has neither classes nor classifiers.
+With several folds, each of `fold-0/`, `fold-1/`, ... is a run directory.
+
+A run directory appears under its name only when it is complete, and everything is checked when it is loaded. Two
+trainings that are equal (see `training.fitting.fit`) give the same bytes in these five.
+"""
+
+import dataclasses
+import json
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import safetensors
+import safetensors.numpy
+from flax import nnx
+
+import colornet
+from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
+from thor2_jax.descriptor.looks import LookDescriptors
+from thor2_jax.errors import InputError
+from thor2_jax.files import atomic_directory, check_output_directory, content_digest
+from thor2_jax.gallery.embedding import Embedding
+from thor2_jax.gallery.references import REFERENCES_FILE
+from thor2_jax.model.classifier import MLP, Feature, check_features
+from thor2_jax.model.orbax_weights import load_orbax_classifier
+from thor2_jax.model.weights import model_arrays, model_from_arrays
+
+__all__ = ["EMBEDDING_FILE", "RUN_FILE", "TrainedRun", "input_size", "load_run", "save_run", "weights_file"]
+
+RUN_FORMAT = 2
+"""Version of the layout above. Format 1 has Orbax checkpoints (RUN/weights/NAME/) and is still read."""
+
+RUN_FILE = "run.json"
+
+EMBEDDING_FILE = "embedding.safetensors"
+"""Embedding of a run directory, in place of the packaged one."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainedRun:
+    """The content of a run directory.
+
+    Attributes:
+        config: constants of the descriptor.
+        network: the colour network.
+        classes: class names, in the order of a classifier's outputs; none in a run of enrolled objects only.
+        classifiers: feature -> trained MLP.
+        record: how the run was made (options, counts, training metrics), as JSON holds it.
+        embedding: embedding of the run, which may recognize its classes, too; None for the packaged one.
+    """
+
+    config: DescriptorConfig
+    network: colornet.ColorNetwork
+    classes: tuple[str, ...]
+    classifiers: Mapping[Feature, MLP]
+    record: Mapping[str, Any]
+    embedding: Embedding | None = None
+
+    @property
+    def embedding_classifier(self) -> Callable[[LookDescriptors], jax.Array] | None:
+        """`class_probabilities` of the embedding; None if it does not recognize exactly the classes of the run."""
+        if self.embedding is None or not self.classes or self.embedding.classes != self.classes:
+            return None
+        return self.embedding.class_probabilities
+
+
+def input_size(feature: Feature, config: DescriptorConfig, n_regions: int) -> int:
+    """Return the number of floats in a descriptor."""
+    image, embedding = config.image_size**2, n_regions * config.n_strips
+    return config.n_slices * {"ce": embedding, "tops": image, "tops2": image + embedding}[feature]
+
+
+def save_run(run: TrainedRun, path: str | Path) -> None:
+    """Write a run directory. It appears under its name only when it is complete.
+
+    Raises:
+        InputError: the path exists and is not an empty directory.
+        OSError: the directory cannot be written; nothing is left behind.
+    """
+    path = Path(path).resolve()
+    check_output_directory(path)
+    with atomic_directory(path) as unfinished:
+        colornet.save(run.network, unfinished / "network.npz")
+        (unfinished / "weights").mkdir()
+        if run.embedding is not None:
+            run.embedding.save(unfinished / EMBEDDING_FILE)
+        contents = {name: safetensors.numpy.save(model_arrays(model)) for name, model in run.classifiers.items()}
+        for name, content in contents.items():
+            weights_file(unfinished, name).write_bytes(content)
+        (unfinished / RUN_FILE).write_text(json.dumps(_description(run, contents), indent=2) + "\n")
+
+
+def _description(run: TrainedRun, weights: Mapping[Feature, bytes]) -> dict[str, Any]:
+    return {
+        "format": RUN_FORMAT,
+        "descriptor_version": DESCRIPTOR_VERSION,
+        "descriptor_config": dataclasses.asdict(run.config),
+        "color_network": run.network.fingerprint,
+        "classes": list(run.classes),
+        "classifiers": list(run.classifiers),
+        "weights": {name: content_digest([content]) for name, content in weights.items()},
+        **({} if run.embedding is None else {"embedding": run.embedding.fingerprint}),
+        **({} if run.embedding is None or run.embedding.references is None else {"references": True}),
+        "record": run.record,
+    }
+
+
+def load_run(path: str | Path) -> TrainedRun:
+    """Read a run directory.
+
+    Raises:
+        InputError: the path is not a run directory, a file is damaged, the format or the descriptor version is another
+            one, or the files do not belong together. The message names the file.
+    """
+    path = Path(path).absolute()
+    description = _read_description(path)
+    try:
+        config = DescriptorConfig.of_record(description["descriptor_config"])
+        classes, record = description["classes"], dict(description["record"])
+        # A run of enrolled objects only has neither.
+        names = check_features(description["classifiers"], "classifiers") if description["classifiers"] else ()
+        fingerprint = description["color_network"]
+        digests = {name: description["weights"][name] for name in names}
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"model: {path / RUN_FILE}: {type(error).__name__}: {error}") from None
+    if (
+        not isinstance(classes, list)
+        or not all(isinstance(name, str) for name in classes)
+        or bool(names) > bool(classes)
+    ):
+        raise InputError(f"model: {path / RUN_FILE}: classes is {classes!r}; expected a list of names")
+    try:
+        network = colornet.load(path / "network.npz")
+    except (OSError, ValueError) as error:
+        raise InputError(f"model: {path / 'network.npz'} cannot be read: {error}") from None
+    if network.fingerprint != fingerprint:
+        raise InputError(f"model: {path / 'network.npz'} is not the colour network that run.json names")
+    load = load_orbax_classifier if description["format"] == 1 else _load_classifier
+    classifiers = {}
+    for name in names:
+        sizes = input_size(name, config, network.n_regions), len(classes)
+        classifiers[name] = load(path / "weights" / name, partial(_create_mlp, *sizes), digests[name])
+    file = path / EMBEDDING_FILE
+    embedding = Embedding.load(file, network) if file.is_file() else None
+    if embedding is None and description.get("embedding") is not None:
+        raise InputError(f"model: {file} is missing; copy the whole run directory")
+    if embedding is not None and embedding.references is None and description.get("references"):
+        raise InputError(f"model: {path / REFERENCES_FILE} is missing; copy the whole run directory")
+    if embedding is not None and description.get("embedding", embedding.fingerprint) != embedding.fingerprint:
+        raise InputError(f"model: {file} is not the embedding that run.json names; copy the whole run directory")
+    run = TrainedRun(config, network, tuple(classes), classifiers, record, embedding)
+    if classes and not classifiers and run.embedding_classifier is None:
+        state = "is missing" if embedding is None else "does not recognize the classes of run.json"
+        raise InputError(f"model: {file} {state}; copy the whole run directory")
+    return run
+
+
+def _read_description(path: Path) -> dict[str, Any]:
+    try:
+        description = json.loads((path / RUN_FILE).read_text())
+    except FileNotFoundError:
+        raise InputError(f"model: {path} is not a run directory; expected one with run.json") from None
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(f"model: {path / RUN_FILE} cannot be read: {error}") from None
+    if not isinstance(description, dict) or description.get("format") not in (1, RUN_FORMAT):
+        value = description.get("format") if isinstance(description, dict) else type(description).__name__
+        raise InputError(f"model: {path / RUN_FILE} has format {value!r}; expected 1 or {RUN_FORMAT}")
+    if description.get("descriptor_version") != DESCRIPTOR_VERSION:
+        raise InputError(
+            f"model: {path} was trained on descriptor version {description.get('descriptor_version')!r}; "
+            f"this version computes {DESCRIPTOR_VERSION}; train it again"
+        )
+    return description
+
+
+def weights_file(run: Path, name: str) -> Path:
+    """Return the path of a classifier's weights in a run directory."""
+    return run / "weights" / f"{name}.safetensors"
+
+
+def _create_mlp(n_inputs: int, n_classes: int) -> MLP:
+    return MLP(n_inputs, n_classes, rngs=nnx.Rngs(0))
+
+
+def _load_classifier(path: Path, create: Callable[[], MLP], digest: str) -> MLP:
+    path = path.with_suffix(".safetensors")
+    try:
+        content = path.read_bytes()
+    except FileNotFoundError:
+        raise InputError(f"model: {path} is missing; copy the whole run directory") from None
+    except OSError as error:
+        raise InputError(f"model: {path} cannot be read ({error.strerror})") from None
+    if content_digest([content]) != digest:
+        raise InputError(f"model: {path} is damaged: its SHA-256 is not the one in {RUN_FILE}")
+    try:
+        return model_from_arrays(create, safetensors.numpy.load(content))
+    except (ValueError, safetensors.SafetensorError) as error:
+        raise InputError(f"model: {path} does not fit the classifier ({error})") from None

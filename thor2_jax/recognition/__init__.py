@@ -1,1 +1,0 @@
-"""From RGB-D frames to object names: instance clouds, classifiers, the recognizer and its files."""

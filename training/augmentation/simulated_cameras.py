@@ -1,0 +1,232 @@
+"""Twenty simulated cameras: how other RGB-D cameras and segmenters would have seen a real frame.
+
+    seen = through_camera(frame, CHOOSE[0])
+
+A camera changes the whole image, as training/augmentation changes a single view: the response to light, a blurred
+colour image that is shifted against depth, noise, steps, holes and missing edges of depth, and masks that are too
+small, too large or end above the table. Everything is determined by the table below and the frame.
+"""
+
+import dataclasses
+import zlib
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
+
+from thor2_jax.frames.frames import RGBDFrame, backproject
+from training.augmentation.illumination import LUMA
+from training.augmentation.sensor import axial_deviation
+
+__all__ = ["CHOOSE", "REPORT", "SimulatedCamera", "through_camera"]
+
+EDGE_STEP = 0.03
+"""Difference in depth within three pixels, metres, from which a pixel counts as an edge."""
+
+MIN_MASK = 0.5
+"""Least share of a mask that remains; otherwise the mask stays as it is."""
+
+TABLE_MARGIN = 15
+"""Pixels around the masks in which the table is searched."""
+
+TABLE_TOLERANCE = 0.006
+"""Largest distance of a point of the table to its plane, metres."""
+
+N_HYPOTHESES = 150
+
+
+@dataclasses.dataclass(frozen=True)
+class SimulatedCamera:
+    """A camera, and the segmenter that makes its masks; by default it changes nothing.
+
+    Attributes:
+        name: name in reports.
+        gamma: exponent of all channels.
+        gain: factor of all channels.
+        saturation: factor of a colour's distance from grey.
+        warmth: share by which red is amplified and blue is weakened; negative for cool light.
+        veil: weight of white that is mixed in.
+        blur: standard deviation of the blur of the colour image, pixels.
+        noise: standard deviation per pixel and channel, of values from 0 to 1.
+        shift: rows down and columns to the right by which colour is shifted against depth.
+        axial: standard deviation of depth, as a factor of `axial_deviation`.
+        step: depth is rounded to multiples of this, millimetres.
+        holes: number of elliptic holes in depth.
+        radius: largest half axis of a hole, pixels.
+        edges: share of the pixels without depth along edges of depth.
+        mask: pixels by which masks are dilated; eroded if negative.
+        base: height of the part above the table that masks lack, metres.
+    """
+
+    name: str
+    gamma: float = 1.0
+    gain: float = 1.0
+    saturation: float = 1.0
+    warmth: float = 0.0
+    veil: float = 0.0
+    blur: float = 0.0
+    noise: float = 0.0
+    shift: tuple[int, int] = (0, 0)
+    axial: float = 0.0
+    step: int = 1
+    holes: int = 0
+    radius: int = 14
+    edges: float = 0.0
+    mask: int = 0
+    base: float = 0.0
+
+
+CHOOSE = (
+    SimulatedCamera("warm lamp", gamma=1.1, gain=0.95, warmth=0.15, noise=0.01, shift=(0, 2), axial=0.5, edges=0.1),
+    SimulatedCamera("dim room", 1.25, 0.6, 0.9, warmth=0.05, noise=0.02, axial=0.8, edges=0.1, mask=-1),
+    SimulatedCamera("pale", saturation=0.55, veil=0.05, noise=0.005, shift=(1, -2), axial=0.5, holes=10, edges=0.2),
+    SimulatedCamera("shifted right", 1.05, 0.9, 0.9, warmth=0.03, noise=0.005, shift=(0, 6), axial=0.5, edges=0.2),
+    SimulatedCamera("shifted far left", 0.95, 1.05, warmth=-0.03, noise=0.005, shift=(-2, -9), axial=0.5, edges=0.1),
+    SimulatedCamera("noisy depth", 1.1, 0.85, 0.8, noise=0.01, shift=(1, 1), axial=1.5, step=3, edges=0.3),
+    SimulatedCamera("small holes", 0.9, 0.9, 0.9, noise=0.01, shift=(0, -1), axial=0.6, holes=40, edges=0.6),
+    SimulatedCamera("no base", 1.05, 0.9, 0.85, warmth=0.05, noise=0.005, axial=0.4, edges=0.1, base=0.01),
+    SimulatedCamera("tight masks", 1.0, 0.8, 1.1, warmth=-0.05, noise=0.01, axial=0.5, edges=0.2, mask=-3, base=0.005),
+    SimulatedCamera(
+        "worn",
+        1.2,
+        0.75,
+        0.7,
+        0.1,
+        0.05,
+        1.0,
+        0.015,
+        (3, 5),
+        axial=1.0,
+        step=2,
+        holes=20,
+        edges=0.3,
+        mask=-2,
+        base=0.008,
+    ),
+)
+"""Cameras on which settings may be chosen."""
+
+REPORT = (
+    SimulatedCamera("cool daylight", 0.95, 1.1, 1.05, -0.16, noise=0.01, shift=(-2, 1), axial=0.5, edges=0.15),
+    SimulatedCamera("overexposed", 0.8, 1.4, 0.9, noise=0.01, shift=(1, 0), axial=0.5, edges=0.1, mask=1),
+    SimulatedCamera("vivid", 1.35, 1.1, 1.5, blur=0.7, noise=0.005, axial=0.6, edges=0.2),
+    SimulatedCamera("shifted down", 1.1, 0.9, 0.9, -0.05, noise=0.005, shift=(8, 1), axial=0.5, edges=0.2),
+    SimulatedCamera("shifted diagonally", 0.9, 0.95, 1.1, 0.06, noise=0.01, shift=(-7, 7), axial=0.6, edges=0.1),
+    SimulatedCamera("coarse depth", 1.15, 0.8, 1.15, -0.05, blur=1.0, shift=(2, -2), axial=0.3, step=6, edges=0.1),
+    SimulatedCamera("large holes", 0.85, 0.85, 0.8, 0.08, noise=0.01, axial=0.9, holes=8, radius=40, edges=0.4),
+    SimulatedCamera("loose masks", 1.1, 1.05, 0.75, noise=0.01, shift=(0, 3), axial=0.7, edges=0.2, mask=3),
+    SimulatedCamera("thick table", 0.9, 0.8, 1.2, -0.08, noise=0.005, axial=0.6, edges=0.2, mask=-1, base=0.014),
+    SimulatedCamera(
+        "cheap",
+        0.8,
+        0.8,
+        1.3,
+        -0.1,
+        0.1,
+        1.7,
+        0.02,
+        (5, -4),
+        axial=1.8,
+        step=4,
+        holes=15,
+        edges=0.5,
+        mask=2,
+        base=0.012,
+    ),
+)
+"""Cameras for the final report, of other kinds or strengths than `CHOOSE`."""
+
+
+def through_camera(frame: RGBDFrame, camera: SimulatedCamera) -> RGBDFrame:
+    """Return the frame as a simulated camera sees it; depth becomes uint16 millimetres.
+
+    Args:
+        frame: a frame; without labels, the changes of masks are left out.
+        camera: one of `CHOOSE` or `REPORT`, or another one.
+    """
+    rng = np.random.default_rng([zlib.crc32(camera.name.encode()), zlib.crc32(np.asarray(frame.depth).tobytes())])
+    color = _color(frame.color, camera, rng)
+    depth = _depth(frame.depth_m, camera, rng)
+    labels = None if frame.labels is None else _labels(frame, frame.labels, camera, rng)
+    return RGBDFrame(color, depth, labels, dataclasses.replace(frame.intrinsics, depth_scale=1000.0))
+
+
+def _color(color: NDArray[np.uint8], camera: SimulatedCamera, rng: np.random.Generator) -> NDArray[np.uint8]:
+    values = (color.astype(np.float32) / 255) ** camera.gamma
+    values *= camera.gain * np.array([1 + camera.warmth, 1, 1 - camera.warmth], np.float32)
+    grey = (values @ LUMA)[..., None]
+    values = (grey + camera.saturation * (values - grey)) * (1 - camera.veil) + camera.veil
+    if camera.blur:
+        values = gaussian_filter(values, (camera.blur, camera.blur, 0))
+    (row, column), (height, width) = camera.shift, color.shape[:2]
+    rows, columns = (np.arange(n) - s for n, s in ((height, row), (width, column)))
+    values = values[rows.clip(0, height - 1)][:, columns.clip(0, width - 1)]
+    if camera.noise:
+        values += np.float32(camera.noise) * rng.standard_normal(values.shape, np.float32)
+    return (255 * values + 0.5).clip(0, 255).astype(np.uint8)
+
+
+def _depth(depth_m: NDArray[np.float32], camera: SimulatedCamera, rng: np.random.Generator) -> NDArray[np.uint16]:
+    deviation = 1000 * camera.axial * axial_deviation(depth_m)
+    noisy = 1000 * depth_m + deviation * rng.standard_normal(depth_m.shape, np.float32)
+    measured = np.rint(noisy / camera.step) * camera.step
+    edge = maximum_filter(depth_m, 3) - minimum_filter(depth_m, 3) > EDGE_STEP
+    missing = (depth_m == 0) | (edge & (rng.random(depth_m.shape, np.float32) < camera.edges))
+    missing |= _ellipses(depth_m.shape, camera, rng)
+    return np.where(missing, 0, measured.clip(1, 65535)).astype(np.uint16)
+
+
+def _ellipses(shape: tuple[int, ...], camera: SimulatedCamera, rng: np.random.Generator) -> NDArray[np.bool_]:
+    holes = np.zeros(shape, bool)
+    row, column = np.ogrid[: shape[0], : shape[1]]
+    for _ in range(camera.holes):
+        y, x = row - rng.uniform(0, shape[0]), column - rng.uniform(0, shape[1])
+        (a, b), angle = rng.uniform(2, camera.radius, 2), rng.uniform(0, np.pi)
+        along, across = x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle)
+        holes |= (along / a) ** 2 + (across / b) ** 2 < 1
+    return holes
+
+
+def _labels(
+    frame: RGBDFrame, labels: NDArray[np.integer], camera: SimulatedCamera, rng: np.random.Generator
+) -> NDArray[np.integer]:
+    changed = labels.copy()
+    size = 2 * abs(camera.mask) + 1
+    if camera.mask > 0:
+        changed = np.where(labels == 0, maximum_filter(labels, size), labels)
+    elif camera.mask < 0:
+        inside = minimum_filter(labels, size) == maximum_filter(labels, size)
+        changed = _cut(changed, ~inside)
+    if camera.base:
+        changed = _cut(changed, _near_table(frame, labels, camera.base, rng))
+    return changed
+
+
+def _cut(labels: NDArray[np.integer], pixels: NDArray[np.bool_]) -> NDArray[np.integer]:
+    """Return the labels without `pixels` [H, W], except those of masks of which less than `MIN_MASK` would remain."""
+    counts, lost = (np.bincount(values.ravel()) for values in (labels, labels[pixels]))
+    share = np.zeros(len(counts))
+    share[: len(lost)] = lost / np.maximum(counts[: len(lost)], 1)
+    return np.where(pixels & (share <= 1 - MIN_MASK)[labels], 0, labels).astype(labels.dtype)
+
+
+def _near_table(
+    frame: RGBDFrame, labels: NDArray[np.integer], height: float, rng: np.random.Generator
+) -> NDArray[np.bool_]:
+    """Return the pixels [H, W] less than `height` metres away from the plane of most points around the masks."""
+    points = backproject(frame.depth_m, frame.intrinsics)
+    seen = frame.depth_m > 0
+    around = points[seen & (labels == 0) & (maximum_filter(labels, 2 * TABLE_MARGIN + 1) > 0)]
+    if len(around) < 3:
+        return np.zeros(labels.shape, bool)
+    sample = around[rng.integers(len(around), size=4000)]
+    corners = sample[rng.integers(len(sample), size=(N_HYPOTHESES, 3))]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    lengths = np.linalg.norm(normals, axis=1)
+    usable = lengths > 1e-6  # square metres; the three points do not lie in a line
+    if not usable.any():
+        return np.zeros(labels.shape, bool)
+    normals = normals[usable] / lengths[usable, None]
+    offsets = (normals * corners[usable, 0]).sum(axis=1)
+    best = (np.abs(sample @ normals.T - offsets) < TABLE_TOLERANCE).sum(axis=0).argmax()
+    return seen & (np.abs(points @ normals[best] - offsets[best]) < height)
