@@ -43,7 +43,8 @@ class Batcher(Generic[Item, Result]):
         """
         self._process_batch, self._count_expected = process_batch, count_expected
         self._max_batch, self._window = max_batch, window
-        self._waiting: queue.SimpleQueue[_Job[Item, Result] | None] = queue.SimpleQueue()
+        # A SimpleQueue of CPython 3.11 may wait for ever where its timeout passes before it begins to wait.
+        self._waiting: queue.Queue[_Job[Item, Result] | None] = queue.Queue()
         self._thread = threading.Thread(target=self._run, name="device")
         self._thread.start()
 

@@ -2,9 +2,9 @@
 
 import contextlib
 import os
-import queue
 import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -93,19 +93,19 @@ def _ctrl_c() -> Iterator[Callable[[float | None], bool]]:
 
     Python's own handler raises an exception, which gets lost where JAX ignores those of its callbacks.
     """
-    pressed: queue.SimpleQueue[None] = queue.SimpleQueue()  # Signal handlers may put into it.
+    awaited = threading.Lock()  # Signal handlers may release it, but not set an Event.
+    awaited.acquire()
 
     def press(*_: object) -> None:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
-        pressed.put(None)
+        awaited.release()
         os.write(2, b"ending after this frame; Ctrl-C again ends at once\n")  # A handler may not print.
 
     def wait(seconds: float | None) -> bool:
-        try:
-            pressed.put(pressed.get(timeout=seconds))
-        except queue.Empty:
-            return False
-        return True
+        is_pressed = awaited.acquire(timeout=-1 if seconds is None else seconds)
+        if is_pressed:
+            awaited.release()
+        return is_pressed
 
     previous = signal.getsignal(signal.SIGINT)
     if previous is not signal.SIG_IGN:  # Background jobs ignore it.
