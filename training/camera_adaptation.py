@@ -10,7 +10,7 @@ from thor2_jax.adaptation.estimate import Adaptation, Report
 from thor2_jax.errors import with_context
 from thor2_jax.files import check_output_directory, temporary_directory
 from thor2_jax.frames.frames import RGBDFrame
-from thor2_jax.model.run_directory import RUN_FILE
+from thor2_jax.model.run_record import RUN_FILE
 from thor2_jax.recognizer import Recognizer
 from training.readers.frame_files import FrameSource
 

@@ -175,11 +175,11 @@ def _check_weights(job: TrainJob, baselines: Sequence[str]) -> None:
         check_weights(job.weights, name)
 
 
-def _stages(job: TrainJob) -> list[str]:
-    """Return the names of the stages of the training of a run, in their order; those of baselines are none of them."""
+def _stages(job: TrainJob) -> dict[str, float]:
+    """Return the stages of the training of a run, see `RunSettings.stages`; those of baselines are none of them."""
     if job.meshes is None:
         return job.settings.stages
-    return [RENDER, *([RENDER_CROPS] if _crop_size(job) is not None else []), *job.settings.stages]
+    return {RENDER: 1.0} | ({RENDER_CROPS: 1.0} if _crop_size(job) is not None else {}) | job.settings.stages
 
 
 def _crop_size(job: TrainJob) -> int | None:

@@ -5,6 +5,7 @@ Preparation is pure NumPy and its results can be pickled, so it can run in other
 
 import dataclasses
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +14,9 @@ from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.instance_clouds import instance_cloud
 from thor2_jax.frames.occlusion import find_occlusion
 from thor2_jax.frames.voxel_grid import downsample_to_fit
-from thor2_jax.types import PointClouds
+
+if TYPE_CHECKING:
+    from thor2_jax.types import PointClouds
 
 __all__ = ["DESCRIPTOR_VOXEL", "EMPTY_INSTANCE", "PreparedInstance", "pack_instances", "prepare_instance"]
 
@@ -72,7 +75,7 @@ def prepare_instance(frame: RGBDFrame, label: int, sigma_s: float) -> PreparedIn
     return PreparedInstance(label, points, colors, boundary, occlusion.occluded, cloud.kept_by_fallback, rim=rim)
 
 
-def pack_instances(instances: Sequence[PreparedInstance], n_rows: int, capacity: int | None = None) -> PointClouds:
+def pack_instances(instances: Sequence[PreparedInstance], n_rows: int, capacity: int | None = None) -> "PointClouds":
     """Pack instances as a batch of `n_rows` clouds in host memory; the last ones are empty.
 
     Args:
@@ -80,6 +83,8 @@ def pack_instances(instances: Sequence[PreparedInstance], n_rows: int, capacity:
         n_rows: B, clouds in the batch.
         capacity: N, points in a row; by default the bucket of the largest cloud, see `PointClouds.pack`.
     """
+    from thor2_jax.types import PointClouds  # imports JAX, which preparation does not need
+
     padded = [*instances, *[EMPTY_INSTANCE] * (n_rows - len(instances))]
     clouds = [(instance.points, instance.colors) for instance in padded]
     boundary, rim = [instance.boundary for instance in padded], [instance.rim for instance in padded]

@@ -40,14 +40,10 @@ from thor2_jax.gallery.embedding import Embedding
 from thor2_jax.gallery.references import REFERENCES_FILE
 from thor2_jax.model.classifier import MLP, Feature, check_features
 from thor2_jax.model.orbax_weights import load_orbax_classifier
+from thor2_jax.model.run_record import RUN_FILE, RUN_FORMAT, read_description
 from thor2_jax.model.weights import model_arrays, model_from_arrays
 
-__all__ = ["EMBEDDING_FILE", "RUN_FILE", "TrainedRun", "input_size", "load_run", "save_run", "weights_file"]
-
-RUN_FORMAT = 2
-"""Version of the layout above. Format 1 has Orbax checkpoints (RUN/weights/NAME/) and is still read."""
-
-RUN_FILE = "run.json"
+__all__ = ["EMBEDDING_FILE", "TrainedRun", "input_size", "load_run", "save_run", "weights_file"]
 
 EMBEDDING_FILE = "embedding.safetensors"
 """Embedding of a run directory, in place of the packaged one."""
@@ -130,7 +126,7 @@ def load_run(path: str | Path) -> TrainedRun:
             one, or the files do not belong together. The message names the file.
     """
     path = Path(path).absolute()
-    description = _read_description(path)
+    description = read_description(path)
     try:
         config = DescriptorConfig.of_record(description["descriptor_config"])
         classes, record = description["classes"], dict(description["record"])
@@ -140,11 +136,7 @@ def load_run(path: str | Path) -> TrainedRun:
         digests = {name: description["weights"][name] for name in names}
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"model: {path / RUN_FILE}: {type(error).__name__}: {error}") from None
-    if (
-        not isinstance(classes, list)
-        or not all(isinstance(name, str) for name in classes)
-        or bool(names) > bool(classes)
-    ):
+    if names and not classes:
         raise InputError(f"model: {path / RUN_FILE}: classes is {classes!r}; expected a list of names")
     try:
         network = colornet.load(path / "network.npz")
@@ -170,24 +162,6 @@ def load_run(path: str | Path) -> TrainedRun:
         state = "is missing" if embedding is None else "does not recognize the classes of run.json"
         raise InputError(f"model: {file} {state}; copy the whole run directory")
     return run
-
-
-def _read_description(path: Path) -> dict[str, Any]:
-    try:
-        description = json.loads((path / RUN_FILE).read_text())
-    except FileNotFoundError:
-        raise InputError(f"model: {path} is not a run directory; expected one with run.json") from None
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"model: {path / RUN_FILE} cannot be read: {error}") from None
-    if not isinstance(description, dict) or description.get("format") not in (1, RUN_FORMAT):
-        value = description.get("format") if isinstance(description, dict) else type(description).__name__
-        raise InputError(f"model: {path / RUN_FILE} has format {value!r}; expected 1 or {RUN_FORMAT}")
-    if description.get("descriptor_version") != DESCRIPTOR_VERSION:
-        raise InputError(
-            f"model: {path} was trained on descriptor version {description.get('descriptor_version')!r}; "
-            f"this version computes {DESCRIPTOR_VERSION}; train it again"
-        )
-    return description
 
 
 def weights_file(run: Path, name: str) -> Path:

@@ -1,14 +1,48 @@
-"""Values that a training, or a later step such as adaptation, stores in the record of a run."""
+"""The description of a run, run.json, and the values that a training or adaptation stores in its record. No JAX."""
 
 import dataclasses
+import json
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, TypeVar
 
+from thor2_jax.config import DESCRIPTOR_VERSION
 from thor2_jax.errors import InputError
 
-__all__ = ["stored_value"]
+__all__ = ["RUN_FILE", "RUN_FORMAT", "read_description", "stored_value"]
+
+RUN_FORMAT = 2
+"""Version of the layout. Format 1 has Orbax checkpoints (RUN/weights/NAME/) and is still read."""
+
+RUN_FILE = "run.json"
 
 T = TypeVar("T")
+
+
+def read_description(path: Path) -> dict[str, Any]:
+    """Return the content of run.json in a run directory.
+
+    Raises:
+        InputError: the path is not a run directory, or its format or descriptor version is another one.
+    """
+    try:
+        description = json.loads((path / RUN_FILE).read_text())
+    except FileNotFoundError:
+        raise InputError(f"model: {path} is not a run directory; expected one with run.json") from None
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(f"model: {path / RUN_FILE} cannot be read: {error}") from None
+    if not isinstance(description, dict) or description.get("format") not in (1, RUN_FORMAT):
+        value = description.get("format") if isinstance(description, dict) else type(description).__name__
+        raise InputError(f"model: {path / RUN_FILE} has format {value!r}; expected 1 or {RUN_FORMAT}")
+    if description.get("descriptor_version") != DESCRIPTOR_VERSION:
+        raise InputError(
+            f"model: {path} was trained on descriptor version {description.get('descriptor_version')!r}; "
+            f"this version computes {DESCRIPTOR_VERSION}; train it again"
+        )
+    classes = description.get("classes")
+    if not isinstance(classes, list) or not all(isinstance(name, str) for name in classes):
+        raise InputError(f"model: {path / RUN_FILE}: classes is {classes!r}; expected a list of names")
+    return description
 
 
 def stored_value(kind: type[T], name: str, record: Mapping[str, Any], remedy: str) -> T | None:

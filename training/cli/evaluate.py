@@ -65,7 +65,7 @@ def frames(
 
     A FRAME that is a run directory, or has the folds of a training, is a further model.
     """
-    from thor2_jax.model.run_directory import RUN_FILE
+    from thor2_jax.model.run_record import RUN_FILE
     from training.readers.frames import FrameFolder
 
     paths = given.frames or [path for path in (given.color, given.bag) if path]

@@ -23,21 +23,27 @@ def objects(
     ] = False,
 ) -> None:
     """List the trained classes and the enrolled objects: number of views, source and date of enrolment."""
-    from thor2_jax.gallery.store import INDEX_FILE
-    from thor2_jax.recognizer import Recognizer
+    from thor2_jax.gallery.store import GALLERY_DIRECTORY, INDEX_FILE, load_gallery
+    from thor2_jax.gallery.union import ClassUnion
+    from thor2_jax.model.run_record import read_description
 
     if gallery is not None and not (gallery / INDEX_FILE).is_file() and not (gallery / "objects").is_dir():
         raise InputError(f"gallery: {gallery} has no {INDEX_FILE}; expected the directory of a gallery")
-    recognizer = Recognizer.load(model, gallery=gallery, reembed=reembed)
+    if reembed:
+        from thor2_jax.recognizer import Recognizer
+
+        Recognizer.load(model, gallery=gallery, reembed=True)
+    trained = tuple(read_description(model)["classes"])
+    known = load_gallery(model / GALLERY_DIRECTORY if gallery is None else gallery).gallery
+    union = ClassUnion(trained, known.names, known.hidden)
     table = Table("name", "views", "source", "enrolled")
-    enrolled = recognizer.gallery.objects
-    for name in recognizer.classes:
+    for name in union.names:
         sources, views, date = [], "", ""
-        if name in recognizer.run.classes and name not in recognizer.gallery.hidden:
+        if name in trained and name not in known.hidden:
             sources.append("training")
-        if name in enrolled:
-            views, date = str(len(enrolled[name].clouds)), enrolled[name].date
-            sources.append(enrolled[name].source)
+        if name in known.objects:
+            views, date = str(len(known.objects[name].clouds)), known.objects[name].date
+            sources.append(known.objects[name].source)
         table.add_row(escape_characters(name), views, " and ".join(sources), date)
     console.print(table)
-    finish(f"{model} knows {recognizer.model.union.summary}", "teach it", "enroll", "NAME", "FRAME", "--model", model)
+    finish(f"{model} knows {union.summary}", "teach it", "enroll", "NAME", "FRAME", "--model", model)

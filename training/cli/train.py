@@ -173,7 +173,7 @@ def train(
                 "coordinator: several processes need a --dataset that all of them can read, not --meshes or --frames"
             )
         jax.distributed.initialize(coordinator, processes, process)
-    from thor2_jax.model.run_directory import RUN_FILE
+    from thor2_jax.model.run_record import RUN_FILE
     from training.fitting.protocol import DEFAULT, PAPER, QUICK
     from training.train_job import TrainJob, run_train_job
 

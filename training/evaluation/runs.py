@@ -21,7 +21,8 @@ from thor2_jax.model.answers import DescribedFrame
 from thor2_jax.model.classifier import EMBEDDING
 from thor2_jax.model.inference import gallery_scores, infer
 from thor2_jax.model.model import Model
-from thor2_jax.model.run_directory import EMBEDDING_FILE, RUN_FILE
+from thor2_jax.model.run_directory import EMBEDDING_FILE
+from thor2_jax.model.run_record import RUN_FILE
 from thor2_jax.recognizer import Recognizer
 from training.baselines.baseline import Baseline, BaselineInputs
 from training.baselines.files import baseline_file

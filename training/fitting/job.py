@@ -33,7 +33,8 @@ from thor2_jax.gallery.embedding import Embedding
 from thor2_jax.gallery.references import REFERENCES_FILE
 from thor2_jax.model.classifier import EMBEDDING, MLP, Feature, check_features
 from thor2_jax.model.confidence import Calibration
-from thor2_jax.model.run_directory import EMBEDDING_FILE, RUN_FILE, TrainedRun, load_run, save_run, weights_file
+from thor2_jax.model.run_directory import EMBEDDING_FILE, TrainedRun, load_run, save_run, weights_file
+from thor2_jax.model.run_record import RUN_FILE
 from training.embedding.run_embedding import STAGES, Distractors, fit_run_embedding
 from training.fitting.calibration import temperatures
 from training.fitting.checkpoints import BEGUN, CHECKPOINTS, Checkpoints
@@ -61,6 +62,9 @@ CURVES = "curves.png"
 
 DESCRIBE = "describe"
 """Name of the first stage."""
+
+FIT_SHARES: Mapping[Feature, float] = {"ce": 0.3, "tops": 0.4, "tops2": 0.7}
+"""Time of fitting a classifier, divided by that of rendering its views; for the time left."""
 
 CURVE = ("epoch", "loss", "accuracy", "held_out_accuracy")
 """Metrics of an epoch that the record keeps: those that a repeated training reproduces."""
@@ -103,11 +107,14 @@ class RunSettings:
         return colornet.load_default()
 
     @property
-    def stages(self) -> list[str]:
-        """The names of the stages of the training, in their order."""
-        of_fold = [f"fit {name}" for name in self.features] + ([] if self.distractors is None else [*STAGES])
+    def stages(self) -> dict[str, float]:
+        """The stages of the training, in their order, with their times, divided by that of rendering the views."""
+        of_fold = {f"fit {name}": FIT_SHARES[name] for name in self.features}
+        if self.distractors is not None:
+            of_fold |= dict(zip(STAGES, (0.1, 0.4, 0.45 * self.distractors.networks), strict=True))
         folds = range(self.folds)
-        return [DESCRIBE] * bool(self.features) + [self.of_fold(stage, fold) for fold in folds for stage in of_fold]
+        described = {DESCRIBE: 0.3} if self.features else {}
+        return described | {self.of_fold(stage, fold): share for fold in folds for stage, share in of_fold.items()}
 
     def of_fold(self, stage: str, fold: int) -> str:
         """Return the name of a stage of a fold."""

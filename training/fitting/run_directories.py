@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from thor2_jax.errors import InputError
-from thor2_jax.model.run_directory import RUN_FILE
+from thor2_jax.model.run_record import RUN_FILE
 from training.fitting.checkpoints import BEGUN, CHECKPOINTS
 
 __all__ = ["find_run_directories"]

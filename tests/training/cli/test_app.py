@@ -147,8 +147,12 @@ def test_the_shell_completes_commands() -> None:
     assert done.stdout.split() == ["recognize", "render"], done.stderr
 
 
-def test_help_and_version_import_no_jax() -> None:
-    code = "import training.cli, thor2_jax, sys; sys.exit('jax' in sys.modules or 'scipy' in sys.modules)"
+def test_help_objects_and_preparation_import_no_jax() -> None:
+    code = (
+        "import training.cli, thor2_jax, sys; assert not {'jax', 'scipy'} & {*sys.modules};"
+        "import thor2_jax.gallery.store, thor2_jax.gallery.union, thor2_jax.model.run_record;"
+        "import thor2_jax.service.preparation; assert 'jax' not in sys.modules"
+    )
     subprocess.run([sys.executable, "-c", code], check=True, env=os.environ | {"PYTHONPATH": str(ROOT)})
 
 

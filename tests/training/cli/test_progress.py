@@ -33,15 +33,26 @@ def test_a_line_is_written_at_once(capsys: pytest.CaptureFixture[str]) -> None:
         assert capsys.readouterr().err == "render: 0 of 10\n"
 
 
-def test_stages_are_numbered() -> None:
+def test_stages_are_numbered_and_the_time_left_is_that_of_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [100.0]
+    monkeypatch.setattr("training.storage.progress.time.monotonic", lambda: now[0])
     shown: list[tuple[str, int, int, str]] = []
-    show = numbered(lambda *values: shown.append(values), ["render", "fit"])
-    for stage in ("fit", "render", "fit thor"):
-        show(stage, 1, 2, "note")
+    show = numbered(lambda *values: shown.append(values), {"render": 1.0, "fit": 3.0})
+    for stage, done, seconds in (
+        ("render", 0, 0),
+        ("render", 2, 10),
+        ("fit", 1, 20),
+        ("fit thor", 1, 9),
+        ("fit", 2, 6),
+    ):
+        now[0] += seconds
+        show(stage, done, 2, "loss 1" if stage == "fit" else "")
     assert shown == [
-        ("stage 2 of 2: fit", 1, 2, "note"),
-        ("stage 1 of 2: render", 1, 2, "note"),
-        ("fit thor", 1, 2, "note"),
+        ("stage 1 of 2: render", 0, 2, ""),
+        ("stage 1 of 2: render", 2, 2, "about 30 s left in all"),
+        ("stage 2 of 2: fit", 1, 2, "loss 1, about 18 s left in all"),
+        ("fit thor", 1, 2, ""),
+        ("stage 2 of 2: fit", 2, 2, "loss 1"),
     ]
 
 

@@ -77,7 +77,7 @@ def test_a_run_without_classifiers(whole: tuple[Path, TrainedRun, list[str]], ca
         "references.safetensors",
         "run.json",
     ]
-    assert stages == SETTINGS.stages and len(stages) == 3
+    assert stages == [*SETTINGS.stages] and len(stages) == 3
     assert run.classifiers == {} and run.embedding is not None
     assert run.embedding.classes == run.classes == CLASSES and len(run.embedding.further) == 1
     assert [(row["fold"], row["classifier"], row["epoch"]) for row in rows(out)] == [
@@ -145,7 +145,7 @@ def test_folds_of_embeddings(tmp_path: Path) -> None:
     stages: dict[str, None] = {}
     short = dataclasses.replace(SETTINGS, distractors=dataclasses.replace(DISTRACTORS, epochs=1), folds=2)
     runs = train(tmp_path / "run", short, progress=lambda stage, *values: stages.setdefault(stage))
-    assert list(stages) == short.stages
+    assert list(stages) == list(short.stages)
     assert [run.record["fold"] for run in runs] == [0, 1]
     assert all(list(run.record["held_out_accuracy"]) == ["embedding"] for run in runs)
     assert [(row["fold"], row["classifier"]) for row in rows(tmp_path / "run")] == [(0, "embedding"), (1, "embedding")]
