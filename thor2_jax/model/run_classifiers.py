@@ -1,7 +1,8 @@
 """The classifiers of a run by name: compiled, evaluated, and chosen by default."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Self
+from functools import lru_cache, partial
+from typing import Any, Self
 
 import jax
 from flax import nnx
@@ -56,9 +57,15 @@ def _compiled(name: Feature, model: MLP) -> Classifier:
     graph, state = nnx.split(model)
     # As a flat list: JAX would take an nnx state apart, in Python, at every call.
     leaves, structure = jax.tree.flatten(state)
+    return partial(_forward(graph, structure, name), leaves)
+
+
+@lru_cache(maxsize=16)
+def _forward(graph: Any, structure: Any, name: Feature) -> Callable[[list[jax.Array], LookDescriptors], jax.Array]:
+    """Return the function of a classifier's weights, which classifiers of its sizes share, with the programs."""
 
     @jax.jit
     def forward(leaves: list[jax.Array], oriented: LookDescriptors) -> jax.Array:
         return oriented_probabilities(nnx.merge(graph, jax.tree.unflatten(structure, leaves)), oriented, name)
 
-    return lambda oriented: forward(leaves, oriented)
+    return forward
