@@ -1,11 +1,12 @@
 """Enrolling objects in the gallery of a run directory: from meshes, and from folders of labelled frames.
 
-enroll_objects(Path("run"), {"mug": mesh_views(Path("mug.glb"))}, "mesh")
+enroll_objects(Path("run"), lambda sigma_s: {"mug": lambda: mesh_views(Path("mug.glb"))}, "mesh")
 """
 
 import contextlib
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -138,7 +139,7 @@ def labelled_views(
 
 def enroll_objects(
     model: Path,
-    read: Callable[[float], Mapping[str, Sequence[PreparedInstance]]],
+    read: Callable[[float], Mapping[str, Callable[[], Sequence[PreparedInstance]]]],
     source: str,
     *,
     name: str | None = None,
@@ -151,7 +152,8 @@ def enroll_objects(
 
     Args:
         model: the run directory.
-        read: function of sigma_s that returns object -> views.
+        read: function of sigma_s that returns object -> function that returns its views. A second thread calls that of
+            one object while the one before is embedded.
         source: "mesh" or "frames".
         name: the name that `read` will return, if there is one: it is checked before anything is read.
         extend: add the views to those of objects that exist.
@@ -178,13 +180,17 @@ def enroll_objects(
     if name is not None:
         objects.check(name, extend=extend, replace=replace)
     views = read(config.sigma_s)
-    if recognizer is not None and source == "frames":
-        views = {each: [recognizer.model.corrected(view) for view in of_object] for each, of_object in views.items()}
-    views = {objects.check(each, extend=extend, replace=replace): of_object for each, of_object in views.items()}
+    views = {objects.check(each, extend=extend, replace=replace): views_of for each, views_of in views.items()}
     added = {}
-    with progress() as report:
-        for number, (each, of_object) in enumerate(views.items()):
+    with progress() as report, ThreadPoolExecutor(1) as pool:
+        following = map(pool.submit, views.values())
+        coming = next(following, None)
+        for number, each in enumerate(views):
             report("enroll", number, len(views), each)
+            assert coming is not None
+            of_object, coming = coming.result(), next(following, None)
+            if recognizer is not None and source == "frames":
+                of_object = [recognizer.model.corrected(view) for view in of_object]
             added[each] = enrolled_views(objects.embedding, of_object, source)
         report("enroll", len(views), len(views), "")
     if is_new:

@@ -1,7 +1,7 @@
 """`thor2 enroll`: teach a run new objects, without training."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -89,18 +89,13 @@ def enroll(
 
     skipped: list[str] = []
 
-    def read(sigma_s: float) -> Mapping[str, Sequence["PreparedInstance"]]:
-        if meshes:
-            rendered = {}
-            with show_progress(quiet) as progress:
-                for number, (each, path) in enumerate(meshes.items()):
-                    progress("render", number, len(meshes), each)
-                    rendered[each] = mesh_views(path, mesh_scale)
-            return rendered
-        assert frames is not None
+    def read(sigma_s: float) -> Mapping[str, Callable[[], Sequence["PreparedInstance"]]]:
+        if frames is None:
+            return {each: partial(mesh_views, path, mesh_scale) for each, path in meshes.items()}
         views, unusable = labelled_views(frames, sigma_s, label_name or name, instance)
         skipped.extend(f"skipped: {each.reason}" for each in unusable)
-        return views if name is None else {name: [view for each in views.values() for view in each]}
+        views = views if name is None else {name: [view for each in views.values() for view in each]}
+        return {each: partial(list, of_object) for each, of_object in views.items()}
 
     source = "frames" if mesh is None else "mesh"
     counts, known = enroll_objects(
