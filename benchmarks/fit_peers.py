@@ -1,0 +1,142 @@
+"""Fit the TOPS2 classifier beside common libraries: `python -m benchmarks.fit_peers --python PYTHON`.
+
+PYTHON is an interpreter that has torch, scikit-learn and NumPy; its environment needs nothing else. All fit the same
+layers with Adam, on the same samples in batches of the same size, one epoch each in turns. This project expands its
+samples to descriptors in every step; the peers are given the descriptors. Compilation is not timed.
+"""
+
+import argparse
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+BATCH, TURNS, RATE = 256, 7, 1e-3
+HIDDEN = (512, 256, 128, 64)
+STEPS = ((20.0, 20.0), (60.0, 45.0))
+"""Camera steps in degrees, and those of --quick."""
+
+
+def torch_epoch(x: np.ndarray, y: np.ndarray) -> Callable[[], object]:
+    """Return a function that fits one epoch with torch."""
+    import torch
+
+    layers: list[torch.nn.Module] = []
+    for a, b in zip((x.shape[1], *HIDDEN[:-1]), HIDDEN, strict=True):
+        layers += [torch.nn.Linear(a, b), torch.nn.BatchNorm1d(b), torch.nn.ReLU(), torch.nn.Dropout(0.2)]
+    model = torch.nn.Sequential(*layers, torch.nn.Linear(HIDDEN[-1], int(y.max()) + 1)).train()
+    optimizer, loss_of = torch.optim.Adam(model.parameters(), RATE), torch.nn.CrossEntropyLoss()
+    inputs, labels = torch.from_numpy(x), torch.from_numpy(y)
+
+    def epoch() -> None:
+        for rows in torch.randperm(len(x)).split(BATCH):
+            optimizer.zero_grad()
+            loss_of(model(inputs[rows]), labels[rows]).backward()
+            optimizer.step()
+
+    return epoch
+
+
+def sklearn_epoch(x: np.ndarray, y: np.ndarray) -> Callable[[], object]:
+    """Return a function that fits one epoch with scikit-learn."""
+    from sklearn.neural_network import MLPClassifier
+
+    model, classes = MLPClassifier(HIDDEN, batch_size=BATCH, learning_rate_init=RATE, alpha=0.0), np.unique(y)
+    return lambda: model.partial_fit(x, y, classes=classes)
+
+
+def own_epoch(folder: Path, steps: tuple[float, float]) -> Callable[[], object]:
+    """Write the descriptors of the samples for the peers; return a function that fits one epoch with this project."""
+    import jax
+    from flax import nnx
+
+    import colornet
+    from thor2_jax import DescriptorConfig
+    from thor2_jax.model.classifier import MLP
+    from training.fitting.samples import build_samples
+    from training.fitting.steps import FitContext, describe_batch, initial_state, shard_batch, train_step
+    from training.objects.builtin_objects import builtin_objects
+    from training.views.memory_views import MemoryViews
+    from training.views.mesh_views import render_views
+
+    network, config = colornet.load_default(), DescriptorConfig(homology="closed_form")
+    samples = build_samples(MemoryViews(render_views(builtin_objects(), *steps), config), network, config)
+    context = FitContext("tops2", network, config)
+    rows = np.arange(len(samples) // BATCH * BATCH)
+    chunks = [samples.take(rows[first : first + BATCH]) for first in range(0, len(rows), BATCH)]
+    describe = jax.jit(lambda batch: describe_batch(batch, network, config).tops2)
+    np.save(folder / "x.npy", np.concatenate([describe(chunk) for chunk in chunks]))
+    np.save(folder / "y.npy", samples.label[: len(rows)].astype(np.int64))
+    n_inputs = len(describe(chunks[0])[0])
+    graph, state = initial_state(MLP(n_inputs, len(samples.classes), rngs=nnx.Rngs(0)))
+    rng = np.random.default_rng(0)
+
+    def epoch() -> None:
+        nonlocal state
+        order = rng.permutation(rows)
+        for number, first in enumerate(range(0, len(order), BATCH)):
+            batch = shard_batch(samples.take(order[first : first + BATCH]), context.mesh)
+            state, _ = train_step(context, graph, state, batch, np.float32(RATE), np.uint32(0), np.uint32(number))
+        jax.block_until_ready(state)
+
+    return epoch
+
+
+PEERS = {"torch": torch_epoch, "scikit-learn": sklearn_epoch}
+
+
+def serve_peer(name: str, folder: Path) -> None:
+    """Fit an epoch for each line of standard input, and print its seconds."""
+    epoch = PEERS[name](np.load(folder / "x.npy"), np.load(folder / "y.npy"))
+    for _ in sys.stdin:
+        start = time.perf_counter()
+        epoch()
+        print(time.perf_counter() - start, flush=True)
+
+
+def main() -> None:
+    """Print the samples that each library fits in a second, and its time divided by this project's in the same turn."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--python", required=True, help="interpreter with torch and scikit-learn")
+    parser.add_argument("--quick", action="store_true", help="fewer samples")
+    parser.add_argument("--peer", help=argparse.SUPPRESS)
+    parser.add_argument("--folder", type=Path, help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.peer:
+        return serve_peer(args.peer, args.folder)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        own = own_epoch(folder, STEPS[args.quick])
+        n_samples = len(np.load(folder / "y.npy"))
+        command = [args.python, __file__, "--python", args.python, "--folder", name, "--peer"]
+        processes = {
+            peer: subprocess.Popen([*command, peer], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+            for peer in PEERS
+        }
+
+        def seconds(library: str) -> float:
+            if library in processes:
+                process = processes[library]
+                assert process.stdin is not None and process.stdout is not None
+                print("epoch", file=process.stdin, flush=True)
+                return float(process.stdout.readline())
+            start = time.perf_counter()
+            own()
+            return time.perf_counter() - start
+
+        times = [{library: seconds(library) for library in ("thor2", *PEERS)} for _ in range(TURNS + 1)][1:]
+        for process in processes.values():
+            process.communicate()
+    for library in times[0]:
+        rate = n_samples / statistics.median(turn[library] for turn in times)
+        ratio = statistics.median(turn[library] / turn["thor2"] for turn in times)
+        print(f"{library}: {rate:,.0f} samples a second, {ratio:.2f} times the time of thor2 ({n_samples:,} samples)")
+
+
+if __name__ == "__main__":
+    main()
