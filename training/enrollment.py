@@ -152,14 +152,14 @@ def enroll_objects(
 
     Args:
         model: the run directory.
-        read: function of sigma_s that returns object -> function that returns its views. A second thread calls that of
-            one object while the one before is embedded.
+        read: function of sigma_s that returns object -> function that returns its views. While one object is embedded,
+            a second thread calls the function of the next.
         source: "mesh" or "frames".
         name: the name that `read` will return, if there is one: it is checked before anything is read.
         extend: add the views to those of objects that exist.
         replace: discard the views of objects that exist.
         gallery: directory of the gallery, of a run directory that exists; by default `gallery` in the run directory.
-        progress: function that shows the progress of embedding, like `show_progress` of the command line; its context
+        progress: function that shows the progress, like `show_progress` of the command line; its context
             is called with ("enroll", objects done, number of objects, name).
 
     Returns:

@@ -40,14 +40,16 @@ def model_from_arrays(create: Callable[[], Model], arrays: Mapping[str, NDArray[
 
     Args:
         create: function without arguments that constructs the model, its random generators included; one that is a
-            `partial` is traced once for each function and positional arguments.
+            `partial` without keywords is traced once for each function and arguments.
         arrays: arrays by name, as `model_arrays` returns them.
 
     Raises:
         ValueError: if an array is missing or has another shape.
     """
-    traced = _traced(create.func, *create.args) if isinstance(create, functools.partial) else _traced(create)
-    model: Model = nnx.merge(*traced, copy=True)
+    if isinstance(create, functools.partial) and not create.keywords:
+        model: Model = nnx.merge(*_traced(create.func, *create.args), copy=True)
+    else:
+        model = nnx.eval_shape(create)
     state, expected = _state(model)
     loaded = {}
     for path, like in expected.items():

@@ -33,8 +33,10 @@ def objects(
         from thor2_jax.recognizer import Recognizer
 
         Recognizer.load(model, gallery=gallery, reembed=True)
-    trained = tuple(read_description(model)["classes"])
-    known = load_gallery(model / GALLERY_DIRECTORY if gallery is None else gallery).gallery
+    description = read_description(model)
+    trained, embedding = tuple(description["classes"]), description.get("embedding")
+    directory = model / GALLERY_DIRECTORY if gallery is None else gallery
+    known = load_gallery(directory, None if embedding is None else str(embedding)).gallery
     union = ClassUnion(trained, known.names, known.hidden)
     table = Table("name", "views", "source", "enrolled")
     for name in union.names:

@@ -98,7 +98,8 @@ def _ctrl_c() -> Iterator[Callable[[float | None], bool]]:
 
     def press(*_: object) -> None:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
-        awaited.release()
+        if awaited.locked():
+            awaited.release()
         os.write(2, b"ending after this frame; Ctrl-C again ends at once\n")  # A handler may not print.
 
     def wait(seconds: float | None) -> bool:

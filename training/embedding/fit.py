@@ -111,7 +111,6 @@ def _color_basis(
 
 
 @functools.cache  # equal optimizers share the compiled step
-@functools.lru_cache(maxsize=1)  # equal fits share the compiled step, of which the optimizer is a static argument
 def _adamw(rate: float, n_steps: int) -> Any:
     return optax.adamw(optax.cosine_decay_schedule(rate, n_steps), weight_decay=1e-3)
 

@@ -63,8 +63,8 @@ CURVES = "curves.png"
 DESCRIBE = "describe"
 """Name of the first stage."""
 
-FIT_SHARES: Mapping[Feature, float] = {"ce": 0.3, "tops": 0.4, "tops2": 0.7}
-"""Time of fitting a classifier, divided by that of rendering its views; for the time left."""
+EPOCH_SHARES: Mapping[Feature, float] = {"ce": 0.05, "tops": 0.08, "tops2": 0.15}
+"""Time of an epoch of a classifier, divided by that of rendering its views; for the time left."""
 
 CURVE = ("epoch", "loss", "accuracy", "held_out_accuracy")
 """Metrics of an epoch that the record keeps: those that a repeated training reproduces."""
@@ -109,9 +109,10 @@ class RunSettings:
     @property
     def stages(self) -> dict[str, float]:
         """The stages of the training, in their order, with their times, divided by that of rendering the views."""
-        of_fold = {f"fit {name}": FIT_SHARES[name] for name in self.features}
-        if self.distractors is not None:
-            of_fold |= dict(zip(STAGES, (0.1, 0.4, 0.45 * self.distractors.networks), strict=True))
+        of_fold = {f"fit {name}": EPOCH_SHARES[name] * self.options.epochs for name in self.features}
+        if self.distractors is not None:  # Often they are in the cache.
+            fit_share = 0.044 * self.distractors.networks * self.distractors.epochs
+            of_fold |= dict(zip(STAGES, (0.0, 0.3, fit_share), strict=True))
         folds = range(self.folds)
         described = {DESCRIBE: 0.3} if self.features else {}
         return described | {self.of_fold(stage, fold): share for fold in folds for stage, share in of_fold.items()}

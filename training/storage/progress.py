@@ -13,25 +13,27 @@ Progress = Callable[[str, int, int, str], object]
 def numbered(progress: Progress, stages: Mapping[str, float]) -> Progress:
     """Return a callback that adds to each stage which one of how many it is, and the time left of all to its note.
 
+    The time is that of the progress seen so far: what a resumed stage has done before does not count.
+
     Args:
         progress: the callback that is called with both.
-        stages: name -> share of the time of the whole job, in any unit, in the order of the stages. Stages that are not
-            among them stay as they are.
+        stages: name -> share of the time of all stages, in any unit, in the order of the stages; 0 if it is not known.
+            Stages that are not among them stay as they are.
     """
     names = {stage: f"stage {number} of {len(stages)}: {stage}" for number, stage in enumerate(stages, 1)}
     earlier = dict(zip(stages, itertools.accumulate(stages.values(), initial=0.0), strict=False))
-    whole = sum(stages.values())
-    begun: list[tuple[float, float]] = []
+    seconds, made, last = 0.0, 0.0, ("", 0.0, 0.0)
 
     def show(stage: str, done: int, total: int, note: str) -> None:
-        if stage in names:
+        nonlocal seconds, made, last
+        if stages.get(stage):
             now, part = time.monotonic(), earlier[stage] + stages[stage] * done / max(total, 1)
-            begun.append((now, part))
-            start, first = begun[0]
-            del begun[1:]
-            if now - start >= 1 and first < part < whole:
-                left = (now - start) * (whole - part) / (part - first)
-                note = ", ".join(filter(None, (note, f"about {left:.0f} s left in all")))
+            if stage == last[0]:
+                seconds, made = seconds + now - last[1], made + part - last[2]
+            last = stage, now, part
+            left = seconds * (sum(stages.values()) - part) / made if made > 0 else 0.0
+            if seconds >= 1 and left >= 1:
+                note = ", ".join(filter(None, (note, f"about {left:.0f} s left of all stages")))
         progress(names.get(stage, stage), done, total, note)
 
     return show

@@ -1,5 +1,6 @@
 """Options of all commands, and usage errors."""
 
+import json
 import os
 import re
 import shlex
@@ -147,13 +148,20 @@ def test_the_shell_completes_commands() -> None:
     assert done.stdout.split() == ["recognize", "render"], done.stderr
 
 
-def test_help_objects_and_preparation_import_no_jax() -> None:
+def test_help_objects_and_preparation_import_no_jax(tmp_path: Path) -> None:
+    description = {"format": 2, "descriptor_version": thor2.DESCRIPTOR_VERSION, "classes": ["mug"]}
+    (tmp_path / "run.json").write_text(json.dumps(description))
     code = (
         "import training.cli, thor2_jax, sys; assert not {'jax', 'scipy'} & {*sys.modules};"
-        "import thor2_jax.gallery.store, thor2_jax.gallery.union, thor2_jax.model.run_record;"
-        "import thor2_jax.service.preparation; assert 'jax' not in sys.modules"
+        "import thor2_jax.service.preparation;"
+        "sys.exitfunc = None\ntry: training.cli.main()\n"
+        "except SystemExit as end: assert not end.code and 'jax' not in sys.modules"
     )
-    subprocess.run([sys.executable, "-c", code], check=True, env=os.environ | {"PYTHONPATH": str(ROOT)})
+    command = [sys.executable, "-c", code, "objects", "--model", str(tmp_path)]
+    done = subprocess.run(
+        command, capture_output=True, text=True, check=False, env=os.environ | {"PYTHONPATH": str(ROOT)}
+    )
+    assert done.returncode == 0 and "1 object: mug" in done.stdout, done.stderr
 
 
 def test_public_names_are_imported_when_used() -> None:
