@@ -17,19 +17,18 @@ from pathlib import Path
 import numpy as np
 
 BATCH, TURNS, RATE = 256, 7, 1e-3
-HIDDEN = (512, 256, 128, 64)
 STEPS = ((20.0, 20.0), (60.0, 45.0))
 """Camera steps in degrees, and those of --quick."""
 
 
-def torch_epoch(x: np.ndarray, y: np.ndarray) -> Callable[[], object]:
+def torch_epoch(x: np.ndarray, y: np.ndarray, hidden: list[int]) -> Callable[[], object]:
     """Return a function that fits one epoch with torch."""
     import torch
 
     layers: list[torch.nn.Module] = []
-    for a, b in zip((x.shape[1], *HIDDEN[:-1]), HIDDEN, strict=True):
+    for a, b in zip((x.shape[1], *hidden[:-1]), hidden, strict=True):
         layers += [torch.nn.Linear(a, b), torch.nn.BatchNorm1d(b), torch.nn.ReLU(), torch.nn.Dropout(0.2)]
-    model = torch.nn.Sequential(*layers, torch.nn.Linear(HIDDEN[-1], int(y.max()) + 1)).train()
+    model = torch.nn.Sequential(*layers, torch.nn.Linear(hidden[-1], int(y.max()) + 1)).train()
     optimizer, loss_of = torch.optim.Adam(model.parameters(), RATE), torch.nn.CrossEntropyLoss()
     inputs, labels = torch.from_numpy(x), torch.from_numpy(y)
 
@@ -42,22 +41,22 @@ def torch_epoch(x: np.ndarray, y: np.ndarray) -> Callable[[], object]:
     return epoch
 
 
-def sklearn_epoch(x: np.ndarray, y: np.ndarray) -> Callable[[], object]:
+def sklearn_epoch(x: np.ndarray, y: np.ndarray, hidden: list[int]) -> Callable[[], object]:
     """Return a function that fits one epoch with scikit-learn."""
     from sklearn.neural_network import MLPClassifier
 
-    model, classes = MLPClassifier(HIDDEN, batch_size=BATCH, learning_rate_init=RATE, alpha=0.0), np.unique(y)
+    model, classes = MLPClassifier(hidden, batch_size=BATCH, learning_rate_init=RATE, alpha=0.0), np.unique(y)
     return lambda: model.partial_fit(x, y, classes=classes)
 
 
 def own_epoch(folder: Path, steps: tuple[float, float]) -> Callable[[], object]:
-    """Write the descriptors of the samples for the peers; return a function that fits one epoch with this project."""
+    """Write the arrays that the peers read; return a function that fits one epoch with this project."""
     import jax
     from flax import nnx
 
     import colornet
     from thor2_jax import DescriptorConfig
-    from thor2_jax.model.classifier import MLP
+    from thor2_jax.model.classifier import HIDDEN, MLP
     from training.fitting.samples import build_samples
     from training.fitting.steps import FitContext, describe_batch, initial_state, shard_batch, train_step
     from training.objects.builtin_objects import builtin_objects
@@ -70,10 +69,10 @@ def own_epoch(folder: Path, steps: tuple[float, float]) -> Callable[[], object]:
     rows = np.arange(len(samples) // BATCH * BATCH)
     chunks = [samples.take(rows[first : first + BATCH]) for first in range(0, len(rows), BATCH)]
     describe = jax.jit(lambda batch: describe_batch(batch, network, config).tops2)
-    np.save(folder / "x.npy", np.concatenate([describe(chunk) for chunk in chunks]))
-    np.save(folder / "y.npy", samples.label[: len(rows)].astype(np.int64))
-    n_inputs = len(describe(chunks[0])[0])
-    graph, state = initial_state(MLP(n_inputs, len(samples.classes), rngs=nnx.Rngs(0)))
+    x = np.concatenate([describe(chunk) for chunk in chunks])
+    for name, array in {"x": x, "y": samples.label[: len(rows)].astype(np.int64), "hidden": np.array(HIDDEN)}.items():
+        np.save(folder / f"{name}.npy", array)
+    graph, state = initial_state(MLP(x.shape[1], len(samples.classes), rngs=nnx.Rngs(0)))
     rng = np.random.default_rng(0)
 
     def epoch() -> None:
@@ -92,7 +91,8 @@ PEERS = {"torch": torch_epoch, "scikit-learn": sklearn_epoch}
 
 def serve_peer(name: str, folder: Path) -> None:
     """Fit an epoch for each line of standard input, and print its seconds."""
-    epoch = PEERS[name](np.load(folder / "x.npy"), np.load(folder / "y.npy"))
+    x, y, hidden = (np.load(folder / f"{array}.npy") for array in ("x", "y", "hidden"))
+    epoch = PEERS[name](x, y, hidden.tolist())
     for _ in sys.stdin:
         start = time.perf_counter()
         epoch()

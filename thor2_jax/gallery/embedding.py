@@ -82,18 +82,6 @@ class EmbeddingSizes:
             raise InputError(f"EmbeddingSizes is {dataclasses.asdict(self)}; expected positive integers")
 
 
-def _create(
-    config: DescriptorConfig,
-    network: colornet.ColorNetwork,
-    sizes: EmbeddingSizes,
-    classes: tuple[str, ...] = (),
-    distractors: int = 0,
-    is_further: bool = False,
-) -> "EmbeddingNetwork":
-    embedding = Embedding.create(config, network, sizes, 0, classes, distractors)
-    return embedding.create_further() if is_further else embedding.model
-
-
 def _unit(x: jax.Array) -> jax.Array:
     """Scale the last axis to unit length; zeros stay zeros."""
     return x * jax.lax.rsqrt(jnp.maximum(jnp.square(x).sum(axis=-1, keepdims=True), 1e-12))
@@ -296,7 +284,7 @@ class Embedding:
     def without_proxies(self) -> "Embedding":
         """Return the same embedding without classes and distractors."""
         arrays = model_arrays(self.model)
-        model = model_from_arrays(functools.partial(_create, self.config, self.network, self.sizes), arrays)
+        model = model_from_arrays(lambda: Embedding.create(self.config, self.network, self.sizes).model, arrays)
         return Embedding(self.config, self.network, self.sizes, model)
 
     @property
@@ -397,13 +385,12 @@ class Embedding:
             config = DescriptorConfig.of_record(about["descriptor_config"])
             sizes = EmbeddingSizes(**{**about["sizes"], "hidden": tuple(about["sizes"]["hidden"])})
             classes, distractors = tuple(map(str, about.get("classes", ()))), int(about.get("distractors", 0))
-            create = functools.partial(_create, config, network, sizes, classes, distractors)
-            embedding = cls(config, network, sizes, model_from_arrays(create, arrays), classes, distractors)
-            create_further = functools.partial(create, True)
+            model = model_from_arrays(lambda: cls.create(config, network, sizes, 0, classes, distractors).model, arrays)
+            embedding = cls(config, network, sizes, model, classes, distractors)
             further = []
             for prefix in map(_prefix_of_further, range(count)):
                 own = {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
-                further.append(model_from_arrays(create_further, own))
+                further.append(model_from_arrays(embedding.create_further, own))
         except InputError as error:
             raise InputError(f"embedding: {path}: {error}") from None
         except (OSError, safetensors.SafetensorError, ValueError, KeyError, TypeError, AttributeError) as error:

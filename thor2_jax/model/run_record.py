@@ -12,7 +12,7 @@ from thor2_jax.errors import InputError
 __all__ = ["RUN_FILE", "RUN_FORMAT", "read_description", "stored_value"]
 
 RUN_FORMAT = 2
-"""Version of the layout. Format 1 has Orbax checkpoints (RUN/weights/NAME/) and is still read."""
+"""Version of the layout, see `run_directory`. Format 1 has Orbax checkpoints (RUN/weights/NAME/) and is still read."""
 
 RUN_FILE = "run.json"
 

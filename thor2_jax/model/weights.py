@@ -1,6 +1,5 @@
 """Weights of Flax modules as named arrays, which safetensors files hold."""
 
-import functools
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
@@ -20,12 +19,6 @@ def _state(model: nnx.Module) -> tuple[Any, dict[tuple[Any, ...], Any]]:
     return state, dict(flax.traverse_util.flatten_dict(nnx.to_pure_dict(state)))
 
 
-@functools.lru_cache(maxsize=64)
-def _traced(create: Callable[..., nnx.Module], *arguments: Any) -> tuple[Any, Any]:
-    graph, state = nnx.split(nnx.eval_shape(functools.partial(create, *arguments)))
-    return graph, state
-
-
 def _name(path: tuple[Any, ...]) -> str:
     return "/".join(map(str, path))
 
@@ -39,17 +32,13 @@ def model_from_arrays(create: Callable[[], Model], arrays: Mapping[str, NDArray[
     """Create a model with the given parameters and batch statistics; no weights are drawn.
 
     Args:
-        create: function without arguments that constructs the model, its random generators included; one that is a
-            `partial` without keywords is traced once for each function and arguments.
+        create: function without arguments that constructs the model, its random generators included.
         arrays: arrays by name, as `model_arrays` returns them.
 
     Raises:
         ValueError: if an array is missing or has another shape.
     """
-    if isinstance(create, functools.partial) and not create.keywords:
-        model: Model = nnx.merge(*_traced(create.func, *create.args), copy=True)
-    else:
-        model = nnx.eval_shape(create)
+    model = nnx.eval_shape(create)
     state, expected = _state(model)
     loaded = {}
     for path, like in expected.items():

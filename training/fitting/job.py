@@ -63,8 +63,11 @@ CURVES = "curves.png"
 DESCRIBE = "describe"
 """Name of the first stage."""
 
-EPOCH_SHARES: Mapping[Feature, float] = {"ce": 0.05, "tops": 0.08, "tops2": 0.15}
-"""Time of an epoch of a classifier, divided by that of rendering its views; for the time left."""
+DESCRIBE_SHARE = 0.3
+"""Time of describing the views, divided by that of rendering them; for the time left."""
+
+EPOCH_SHARES = {"ce": 0.05, "tops": 0.08, "tops2": 0.15, EMBEDDING: 0.044}
+"""The same of an epoch of a classifier, or of one network of the embedding."""
 
 CURVE = ("epoch", "loss", "accuracy", "held_out_accuracy")
 """Metrics of an epoch that the record keeps: those that a repeated training reproduces."""
@@ -110,11 +113,12 @@ class RunSettings:
     def stages(self) -> dict[str, float]:
         """The stages of the training, in their order, with their times, divided by that of rendering the views."""
         of_fold = {f"fit {name}": EPOCH_SHARES[name] * self.options.epochs for name in self.features}
-        if self.distractors is not None:  # Often they are in the cache.
-            fit_share = 0.044 * self.distractors.networks * self.distractors.epochs
-            of_fold |= dict(zip(STAGES, (0.0, 0.3, fit_share), strict=True))
+        if self.distractors is not None:
+            fit_share = EPOCH_SHARES[EMBEDDING] * self.distractors.networks * self.distractors.epochs
+            # Rendering distractors takes no time if they are in the cache.
+            of_fold |= dict(zip(STAGES, (0.0, DESCRIBE_SHARE, fit_share), strict=True))
         folds = range(self.folds)
-        described = {DESCRIBE: 0.3} if self.features else {}
+        described = {DESCRIBE: DESCRIBE_SHARE} if self.features else {}
         return described | {self.of_fold(stage, fold): share for fold in folds for stage, share in of_fold.items()}
 
     def of_fold(self, stage: str, fold: int) -> str:
