@@ -39,7 +39,7 @@ class LookDescriptors:
 
     Attributes:
         each: descriptors, fields [B, K, ...].
-        statistics: [B, K, 12 + R] float32, from `cloud_statistics`.
+        statistics: [B, K, 12 + R + N_BALANCED] float32, from `cloud_statistics`.
         weights: [B, K] float32, weight of each look in the fused answer; they sum to 1.
     """
 
@@ -68,7 +68,7 @@ class LookDescriptors:
 
     @property
     def flat(self) -> tuple[Descriptors, jax.Array]:
-        """The descriptors [B * K, ...] and statistics [B * K, 12 + R]; those of a cloud are consecutive."""
+        """The descriptors [B * K, ...] and statistics [B * K, ...]; those of a cloud are consecutive."""
         flat: tuple[Descriptors, jax.Array] = jax.tree.map(
             lambda a: a.reshape(-1, *a.shape[2:]), (self.each, self.statistics)
         )

@@ -3,9 +3,10 @@
     embedding = load_default()                              # packaged, trained on procedural objects
     similarity = embedding.embed(clouds) @ embedding.embed(others).T
 
-An embedding has three blocks, each of unit length before it is weighted: the output of a trained network on the
-descriptor, the colour embeddings of the strips projected to their principal components, and the colour histogram. The
-last two depend little on what the network was trained on. The embedding of a run also classifies: by this network and
+An embedding has two blocks, each of unit length before it is weighted: the output of a trained network on the
+descriptor; and the colour embeddings of the strips with the histogram of balanced colours, projected to their principal
+components, which depend little on what the network was trained on. In embeddings of earlier versions, the histogram is
+that of the colour regions, in a block of its own. The embedding of a run also classifies: by this network and
 further ones, whose class probabilities are averaged. `training.embedding` fits the networks.
 """
 
@@ -25,7 +26,7 @@ from flax import nnx
 import colornet
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
 from thor2_jax.descriptor.chunking import map_chunks
-from thor2_jax.descriptor.cloud_statistics import N_SCALARS, is_color, square_root
+from thor2_jax.descriptor.cloud_statistics import N_BALANCED, N_SCALARS, is_color, square_root
 from thor2_jax.descriptor.looks import LookDescriptors, describe_looks
 from thor2_jax.errors import InputError
 from thor2_jax.files import atomic_write, content_digest, safetensors_metadata
@@ -65,7 +66,8 @@ class EmbeddingSizes:
         cell: outputs of the layer that is shared by all strip positions.
         hidden: units of the hidden layers.
         learned: length of the network's block of the embedding.
-        color: length of the block of projected colour embeddings.
+        color: length of the block of projected colours.
+        balanced: whether that has the histogram of balanced colours; False in embeddings of earlier versions.
 
     Raises:
         InputError: a size is not a positive integer (`color` may be 0).
@@ -74,7 +76,8 @@ class EmbeddingSizes:
     cell: int = 20
     hidden: tuple[int, ...] = (384, 256)
     learned: int = 128
-    color: int = 106
+    color: int = 120
+    balanced: bool = True
 
     def __post_init__(self) -> None:
         values = (self.cell, *self.hidden, self.learned, self.color + 1)
@@ -113,6 +116,7 @@ class EmbeddingNetwork(nnx.Module):
             rngs: generators of the weights and the dropout.
         """
         self.positions = max(config.image_size, config.n_strips)
+        self.n_regions, self.balanced = n_regions, sizes.balanced
         n_cells = config.n_slices * self.positions
         widths = (n_cells * sizes.cell + N_SCALARS + n_regions, *sizes.hidden)
         he = nnx.initializers.he_normal()
@@ -126,9 +130,9 @@ class EmbeddingNetwork(nnx.Module):
         self.norms = nnx.List([nnx.BatchNorm(n, momentum=0.9, rngs=rngs) for n in sizes.hidden])
         self.dropout = nnx.Dropout(0.15)
         self.head = nnx.Linear(sizes.hidden[-1], sizes.learned, use_bias=False, kernel_init=he, rngs=rngs)
-        n_colors = config.n_slices * n_regions * config.n_strips
+        n_colors = config.n_slices * n_regions * config.n_strips + (N_BALANCED if sizes.balanced else 0)
         self.color_basis = nnx.BatchStat(jnp.zeros((n_colors, sizes.color)))
-        self.block_weights = nnx.BatchStat(jnp.ones(3))
+        self.block_weights = nnx.BatchStat(jnp.array([1.0, 2.0]) if sizes.balanced else jnp.ones(3))
         if n_proxies:
             self.proxies = nnx.Param(jax.random.normal(rngs.params(), (sizes.learned, n_proxies)))
             self.log_scale = nnx.Param(jnp.log(16.0))
@@ -140,7 +144,7 @@ class EmbeddingNetwork(nnx.Module):
 
         Args:
             descriptors: of B clouds.
-            statistics: [B, 12 + R], from `cloud_statistics`.
+            statistics: [B, 12 + R + N_BALANCED], from `cloud_statistics`; those after the first 12 + R are not read.
             train: normalize by the statistics of the batch, and drop units.
             rngs: generators of the dropout.
         """
@@ -149,8 +153,9 @@ class EmbeddingNetwork(nnx.Module):
         padded = [jnp.pad(a, ((0, 0), (0, 0), (0, self.positions - a.shape[2]), (0, 0))) for a in cells]
         bias = jnp.asarray(self.cell.bias)
         x = nnx.relu(self.cell(jnp.concatenate(padded, axis=-1))) - nnx.relu(bias)
-        scale = jnp.where(jnp.arange(statistics.shape[1]) < N_SCALARS, 1, 2)
-        x = jnp.concatenate([x.reshape(len(x), -1), statistics * scale], axis=1)
+        read = statistics[:, : N_SCALARS + self.n_regions]
+        scale = jnp.where(jnp.arange(read.shape[1]) < N_SCALARS, 1, 2)
+        x = jnp.concatenate([x.reshape(len(x), -1), read * scale], axis=1)
         for layer, norm in zip(self.layers, self.norms, strict=True):
             x = nnx.relu(norm(layer(x), use_running_average=not train))
             x = self.dropout(x, deterministic=not train, rngs=rngs)
@@ -163,11 +168,16 @@ class EmbeddingNetwork(nnx.Module):
 
     def __call__(self, descriptors: Descriptors, statistics: jax.Array) -> jax.Array:
         """Return the embeddings [B, D], of unit length; the arguments are those of `learned`."""
-        histogram = statistics[:, N_SCALARS:]
-        colors = color_features(descriptors.embeddings) @ self.color_basis[...]
-        blocks = [self.learned(descriptors, statistics), _unit(colors), histogram]
+        features = color_features(descriptors.embeddings, statistics if self.balanced else None)
+        blocks = [self.learned(descriptors, statistics), _unit(features @ self.color_basis[...])]
+        if not self.balanced:
+            blocks.append(statistics[:, N_SCALARS : N_SCALARS + self.n_regions])
         weights = jnp.sqrt(self.block_weights[...])
         return _unit(jnp.concatenate([w * block for w, block in zip(weights, blocks, strict=True)], axis=1))
+
+
+def _embedding_size(sizes: EmbeddingSizes, network: colornet.ColorNetwork) -> int:
+    return sizes.learned + sizes.color + (0 if sizes.balanced else network.n_regions)
 
 
 def class_cosines(learned: jax.Array, proxies: jax.Array) -> jax.Array:
@@ -175,9 +185,13 @@ def class_cosines(learned: jax.Array, proxies: jax.Array) -> jax.Array:
     return learned @ (proxies / jnp.linalg.norm(proxies, axis=0))
 
 
-def color_features(embeddings: jax.Array) -> jax.Array:
-    """Return the square roots of colour embeddings [B, S, R, J], flat and of unit length."""
-    return _unit(square_root(embeddings).reshape(len(embeddings), -1))
+def color_features(embeddings: jax.Array, statistics: jax.Array | None) -> jax.Array:
+    """Return the square roots of colour embeddings [B, S, R, J], flat and of unit length.
+
+    With statistics, from `cloud_statistics`, those of the histogram of balanced colours follow, also of unit length.
+    """
+    strips = _unit(square_root(embeddings).reshape(len(embeddings), -1))
+    return strips if statistics is None else jnp.concatenate([strips, statistics[:, -N_BALANCED:]], axis=1)
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -261,7 +275,7 @@ class Embedding:
         """
         config = dataclasses.replace(config or DescriptorConfig(), homology="closed_form")
         network, sizes = network or colornet.load_default(), sizes or EmbeddingSizes()
-        size = sizes.learned + sizes.color + network.n_regions
+        size = _embedding_size(sizes, network)
         if size > MAX_EMBEDDING_SIZE:
             raise InputError(f"sizes give embeddings of {size} numbers; expected at most {MAX_EMBEDDING_SIZE}")
         n_proxies = len(classes) + distractors
@@ -290,7 +304,7 @@ class Embedding:
     @property
     def size(self) -> int:
         """Length D of an embedding."""
-        return self.sizes.learned + self.sizes.color + self.network.n_regions
+        return _embedding_size(self.sizes, self.network)
 
     @functools.cached_property
     def _embedder(self) -> tuple[Any, Any]:
@@ -383,7 +397,7 @@ class Embedding:
                 if about[field] != expected:
                     raise InputError(f"{field} is {about[field]!r}; expected {expected!r}; fit the embedding again")
             config = DescriptorConfig.of_record(about["descriptor_config"])
-            sizes = EmbeddingSizes(**{**about["sizes"], "hidden": tuple(about["sizes"]["hidden"])})
+            sizes = EmbeddingSizes(**{"balanced": False, **about["sizes"], "hidden": tuple(about["sizes"]["hidden"])})
             classes, distractors = tuple(map(str, about.get("classes", ()))), int(about.get("distractors", 0))
             model = model_from_arrays(lambda: cls.create(config, network, sizes, 0, classes, distractors).model, arrays)
             embedding = cls(config, network, sizes, model, classes, distractors)

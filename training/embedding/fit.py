@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from colornet import ColorNetwork
 from thor2_jax.config import DescriptorConfig
-from thor2_jax.descriptor.cloud_statistics import is_color
+from thor2_jax.descriptor.cloud_statistics import N_SCALARS, is_color
 from thor2_jax.descriptor.describe import describe_strips
 from thor2_jax.descriptor.looks import LookDescriptors
 from thor2_jax.errors import InputError
@@ -34,7 +34,7 @@ from training.fitting.options import EpochMetrics
 __all__ = ["EmbeddingFit", "batch_descriptors", "fit_embedding"]
 
 BASIS_SAMPLES = 2048
-"""Samples whose colour embeddings determine the principal components."""
+"""Samples whose colours determine the principal components."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,7 +94,8 @@ def batch_looks(batch: Batch, network: ColorNetwork, config: DescriptorConfig) -
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
 def _color_features(network: ColorNetwork, config: DescriptorConfig, batch: Batch) -> jax.Array:
-    return color_features(batch_descriptors(batch.length, batch.color, network, config).embeddings)
+    embeddings = batch_descriptors(batch.length, batch.color, network, config).embeddings
+    return color_features(embeddings, jnp.asarray(batch.statistics))
 
 
 def _color_basis(
@@ -147,7 +148,8 @@ def _step(
     def step(graph: Any, state: NetworkState, seen: jax.Array, key: jax.Array) -> tuple[NetworkState, jax.Array]:
         def loss_of(parameters: Any) -> Any:
             model = nnx.merge(graph, parameters, state.rest, copy=True)
-            learned = model.learned(descriptors, batch.statistics * seen, train=True, rngs=nnx.Rngs(dropout=key))
+            statistics = batch.statistics[:, : len(seen)] * seen
+            learned = model.learned(descriptors, statistics, train=True, rngs=nnx.Rngs(dropout=key))
             cosines = class_cosines(learned, model.proxies[...])
             own = jax.nn.one_hot(batch.label, cosines.shape[1])
             logits = jnp.exp(model.log_scale[...]) * (cosines - margin * own)
@@ -210,7 +212,7 @@ def fit_embedding(
     graphs = tuple(graph for graph, _, _ in split)
     states = tuple(NetworkState(weights, rest, optimizer.init(weights)) for _, weights, rest in split)
     # The further networks do not read the statistics of colours, which differ most between renderings and cameras.
-    seen = np.ones((options.networks, samples.statistics.shape[1]), np.float32)
+    seen = np.ones((options.networks, N_SCALARS + network.n_regions), np.float32)
     seen[1:, is_color(embedding.network.n_regions)] = 0
 
     def epoch(number: int) -> Iterator[Batch]:

@@ -31,7 +31,7 @@ class Batch(NamedTuple):
     Attributes:
         length: [B, S, J] float16, largest less smallest y of each strip, scaled units; 0 if it is empty.
         color: [B, S, J, R] float16, colour vectors of the strips.
-        statistics: [B, 12 + R] float32, from `cloud_statistics`.
+        statistics: [B, 12 + R + N_BALANCED] float32, from `cloud_statistics`.
         label: [B] int32.
     """
 
@@ -50,7 +50,7 @@ class Samples:
         strip: [T] uint16, slice x J + strip.
         length: [T] float16.
         color: [T, R] float16.
-        statistics: [M, 12 + R] float32.
+        statistics: [M, 12 + R + N_BALANCED] float32.
         label: [M] int32.
         shape: S and J.
     """

@@ -17,6 +17,7 @@ import safetensors.numpy
 
 from colornet import ColorNetwork
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
+from thor2_jax.descriptor.cloud_statistics import N_BALANCED
 from thor2_jax.errors import InputError
 from thor2_jax.files import atomic_write
 from thor2_jax.types import Cloud
@@ -113,6 +114,7 @@ def sampling_job(
         "descriptor_version": DESCRIPTOR_VERSION,
         "descriptor_config": dataclasses.asdict(config),
         "color_network": network.fingerprint,
+        "balanced_bins": N_BALANCED,
         "objects": list(objects),
         "views": views,
         "copies": copies,
