@@ -170,9 +170,10 @@ def test_an_embedding_alone_is_evaluated(tmp_path: Path, calibrated: bool) -> No
     assert report["main"] == "embedding" and report["fusions"] == ["embedding"]
     assert report["temperatures"]["embedding"]["runs"] == 0
     confusion, confidences = np.zeros((3, 4), int), []
+    recognizer = Recognizer.load(tmp_path / "run", unknown_below=0.0)
     for number in range(5):
         item = dataset[number]
-        answers = Recognizer.load(tmp_path / "run", unknown_below=0.0).recognize(item.frame)
+        answers = recognizer.recognize(item.frame)
         answered = {answer.label: answer for answer in answers}
         for label in (1, 2):
             answer = answered.get(label)  # every fourth frame has no label 2
