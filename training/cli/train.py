@@ -86,7 +86,9 @@ def train(
         ),
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed for augmentations, weights, sample order and dropout.")] = 0,
-    folds: Annotated[int, typer.Option(min=1, help="More than 1: one model per fold, which is its held-out set.")] = 1,
+    folds: Annotated[
+        int, typer.Option(min=1, max=1000, help="More than 1: one model per fold, which is its held-out set.")
+    ] = 1,
     baselines: Annotated[
         str,
         typer.Option(
