@@ -213,7 +213,7 @@ def test_invalid_files(text: str, expected: str, tmp_path: Path) -> None:
         as_npy(MATRIX[:2]),
         as_npy(np.array([{}] * 9, object)),
         as_npy(MATRIX + 0j),
-        as_npy(np.zeros(10**14, "V0")),
+        as_npy(np.zeros(9, "V0")).replace(b"(9,), }" + b" " * 13, b"(99999999999999,), }"),
     ],
     ids=["truncated", "header", "2 x 3", "pickled", "complex", "no bytes"],
 )
