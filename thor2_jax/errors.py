@@ -5,13 +5,21 @@ from collections.abc import Iterator
 
 __all__ = ["InputError", "with_context"]
 
+MAX_MESSAGE = 1000
+"""Characters of a message that are kept: a damaged file may have a name or a number of millions."""
+
 
 class InputError(ValueError):
     """Invalid input from the user; its message names the argument or the file and the offending value, in one line.
 
     The command line prints it on standard error and exits with code 2. Every other exception is a defect of this
-    software and keeps its traceback.
+    software and keeps its traceback. The middle of a message that would fill a screen is left out.
     """
+
+    def __init__(self, message: str) -> None:
+        if len(message) > MAX_MESSAGE:
+            message = f"{message[: MAX_MESSAGE // 2]} ... {message[-MAX_MESSAGE // 2 :]}"
+        super().__init__(message)
 
 
 @contextlib.contextmanager

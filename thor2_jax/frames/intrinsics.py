@@ -250,10 +250,11 @@ def _of_open3d(values: Mapping[Any, Any]) -> Intrinsics:
 
 
 def _of_matrix_alone(matrix: Any) -> Intrinsics:
-    shape = np.shape(np.asarray(matrix, dtype=object))
-    if shape not in ((3, 3), (9,)):
-        raise InputError(f"intrinsics is a {type(matrix).__name__} of shape {shape}; expected a 3 x 3 matrix")
-    return Intrinsics.of_matrix(np.asarray(matrix, dtype=object))
+    # Values without bytes, type V0 of a small NPY file, would fill gigabytes as objects.
+    array = matrix if isinstance(matrix, np.ndarray) else np.asarray(matrix, dtype=object)
+    if array.shape not in ((3, 3), (9,)):
+        raise InputError(f"intrinsics is a {type(matrix).__name__} of shape {array.shape}; expected a 3 x 3 matrix")
+    return Intrinsics.of_matrix(array)
 
 
 def _given(values: Mapping[Any, Any], name: str, default: Any) -> Any:

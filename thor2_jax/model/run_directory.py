@@ -141,7 +141,8 @@ def load_run(path: str | Path) -> TrainedRun:
     try:
         network = colornet.load(path / "network.npz")
     except (OSError, ValueError) as error:
-        raise InputError(f"model: {path / 'network.npz'} cannot be read: {error}") from None
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"model: {path / 'network.npz'} cannot be read: {reason}") from None
     if network.fingerprint != fingerprint:
         raise InputError(f"model: {path / 'network.npz'} is not the colour network that run.json names")
     load = load_orbax_classifier if description["format"] == 1 else _load_classifier

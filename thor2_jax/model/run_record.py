@@ -30,7 +30,8 @@ def read_description(path: Path) -> dict[str, Any]:
     except FileNotFoundError:
         raise InputError(f"model: {path} is not a run directory; expected one with run.json") from None
     except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"model: {path / RUN_FILE} cannot be read: {error}") from None
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"model: {path / RUN_FILE} cannot be read: {reason}") from None
     if not isinstance(description, dict) or description.get("format") not in (1, RUN_FORMAT):
         value = description.get("format") if isinstance(description, dict) else type(description).__name__
         raise InputError(f"model: {path / RUN_FILE} has format {value!r}; expected 1 or {RUN_FORMAT}")

@@ -18,6 +18,7 @@ import numpy as np
 from thor2_jax.errors import InputError, with_context
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.intrinsics import Intrinsics
+from thor2_jax.recordings.decompression import limit_decompression
 from thor2_jax.recordings.messages import color_image, depth_image, image_kind, stamp_of
 from thor2_jax.recordings.pairs import DEFAULT_MAX_GAP, ImagePair, PairCounts, StampedImage, nearest_pairs
 from thor2_jax.recordings.recorded_frames import RecordedFrame, stamp_name
@@ -88,6 +89,8 @@ class Bag:
         try:
             from rosbags.highlevel import AnyReader
             from rosbags.typesys import Stores, get_typestore
+
+            limit_decompression()
         except ImportError as error:
             raise InputError(
                 f"bag is {self.path}, which needs rosbags ({error}); run pip install -c constraints.txt '.[bags]'"

@@ -119,8 +119,9 @@ def serve_live(
     try:
         server = _Server((host, port), broadcast, allow_host)
     except (OSError, OverflowError) as error:
+        reason = getattr(error, "strerror", None) or error
         raise InputError(
-            f"port is {port} and host {host}, which cannot be used ({error}); choose another one"
+            f"port is {port} and host {host}, which cannot be used ({reason}); choose another one"
         ) from None
     thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.1}, daemon=True)
     thread.start()

@@ -9,7 +9,7 @@ import typer
 from thor2_jax.errors import InputError
 from training.cli.app import MeshScaleOption, QuietOption, app, finish, grouped_options
 from training.cli.progress import show_progress
-from training.cli.workers import WorkerOptions
+from training.cli.workers import MAX_WORKERS, WorkerOptions
 
 MAX_CROP = 2048
 """Largest side of a crop, pixels."""
@@ -19,7 +19,9 @@ MAX_CROP = 2048
 class RenderWorkers(WorkerOptions):
     """Where views are rendered; by default, in two processes."""
 
-    workers: Annotated[int, typer.Option(min=1, help="Worker processes; with Ray, concurrent tasks.")] = 2
+    workers: Annotated[
+        int, typer.Option(min=1, max=MAX_WORKERS, help="Worker processes; with Ray, concurrent tasks.")
+    ] = 2
 
 
 @app.command()

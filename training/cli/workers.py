@@ -10,16 +10,21 @@ from thor2_jax.errors import InputError
 if TYPE_CHECKING:
     from training.storage.workers import WorkerPool
 
-__all__ = ["Engine", "WorkerOptions"]
+__all__ = ["MAX_WORKERS", "Engine", "WorkerOptions"]
 
 Engine = Literal["local", "ray"]
+
+MAX_WORKERS = 1024
+"""Largest number of processes of a command: each needs memory and open files."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class WorkerOptions:
     """Where a command computes."""
 
-    workers: Annotated[int, typer.Option(min=1, help="Worker processes; with Ray, concurrent tasks.")] = 1
+    workers: Annotated[
+        int, typer.Option(min=1, max=MAX_WORKERS, help="Worker processes; with Ray, concurrent tasks.")
+    ] = 1
     engine: Annotated[
         Engine,
         typer.Option(help="Work on this machine or on a Ray cluster (extra `cluster`), which has the same paths."),

@@ -208,6 +208,7 @@ DAMAGES: dict[str, tuple[Callable[[Path], Any], str]] = {
     "no folder": (shutil.rmtree, "run is not a run directory"),
     "no run.json": (lambda path: (path / "run.json").unlink(), "run is not a run directory"),
     "cut run.json": (lambda path: (path / "run.json").write_text('{"format": 1,'), "run.json cannot be read"),
+    "a directory": (lambda path: (path / "run.json").unlink() or (path / "run.json").mkdir(), "cannot be read: Is a"),
     "binary run.json": (lambda path: (path / "run.json").write_bytes(b"\xff\xfe\x00"), "run.json cannot be read"),
     "a list": (lambda path: (path / "run.json").write_text("[1]"), "run.json has format 'list'"),
     "other format": (edited(format=3), "run.json has format 3"),
