@@ -1,8 +1,10 @@
 """Depth images in files: 16-bit PNG and TIFF, 32-bit float TIFF, NPY and EXR."""
 
+import contextlib
 import math
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +12,7 @@ from numpy.typing import NDArray
 from thor2_jax.errors import InputError
 from thor2_jax.frames.image_files import MAX_IMAGE_PIXELS, read_image
 
-__all__ = ["read_depth"]
+__all__ = ["read_depth", "read_npy"]
 
 _EXPECTED = "one channel of 16-bit integers (in depth units) or floats (in metres)"
 
@@ -32,9 +34,11 @@ def read_depth(path: str | Path) -> NDArray[Any]:
     """
     path = Path(path)
     suffix = path.suffix.lower()
-    pixels = (
-        _read_npy(path) if suffix == ".npy" else _read_exr(path) if suffix == ".exr" else read_image(path, "depth")[0]
-    )
+    if suffix == ".npy":
+        with open(path, "rb") as stream, _damage_named(path, "NPY"):
+            pixels = read_npy(stream, MAX_IMAGE_PIXELS)
+    else:
+        pixels = _read_exr(path) if suffix == ".exr" else read_image(path, "depth")[0]
     if pixels.ndim == 3 and pixels.shape[2] == 1:
         pixels = pixels[..., 0]
     kind, size = pixels.dtype.kind, pixels.dtype.itemsize
@@ -52,22 +56,29 @@ def read_depth(path: str | Path) -> NDArray[Any]:
     return pixels.astype(np.uint16 if pixels.max() < 2**16 else np.uint32)
 
 
-def _read_npy(path: Path) -> NDArray[Any]:
-    """Read an array; its size is checked before memory is allocated, and nothing is unpickled."""
-    with open(path, "rb") as stream:
-        try:
-            version = np.lib.format.read_magic(stream)
-            read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-            shape, _, dtype = read_header[version](stream)
-            if math.prod(shape) > MAX_IMAGE_PIXELS:
-                raise ValueError(f"shape {shape}; expected at most {MAX_IMAGE_PIXELS} pixels")
-            if dtype.hasobject:
-                raise ValueError("Python objects")
-            stream.seek(0)
-            return np.lib.format.read_array(stream, allow_pickle=False)
-        except Exception as error:  # A damaged header raises many kinds of exception.
-            reason = " ".join(str(error).split()) or type(error).__name__
-            raise InputError(f"depth: {path} is a damaged NPY file ({reason}); expected {_EXPECTED}") from None
+@contextlib.contextmanager
+def _damage_named(path: Path, kind: str) -> Iterator[None]:
+    """Turn what decoders raise on damaged files, many kinds of exception, into an InputError."""
+    try:
+        yield
+    except Exception as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise InputError(f"depth: {path} is a damaged {kind} file ({reason}); expected {_EXPECTED}") from None
+
+
+def read_npy(stream: BinaryIO, max_values: int) -> NDArray[Any]:
+    """Read an array of an NPY file; its size is checked before memory is allocated, and nothing is unpickled.
+
+    Raises:
+        Exception: of many kinds, if the file is damaged, holds Python objects or more than `max_values` values.
+    """
+    version = np.lib.format.read_magic(stream)
+    read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    shape, _, _ = read_header[version](stream)
+    if math.prod(shape) > max_values:
+        raise ValueError(f"shape {shape}; expected at most {max_values} values")
+    stream.seek(0)
+    return np.lib.format.read_array(stream, allow_pickle=False)
 
 
 def _read_exr(path: Path) -> NDArray[Any]:
@@ -80,7 +91,7 @@ def _read_exr(path: Path) -> NDArray[Any]:
         raise InputError(
             f"depth: {path} is an EXR file; expected PNG, TIFF or NPY, or the package OpenEXR (pip install OpenEXR)"
         ) from None
-    try:
+    with _damage_named(path, "EXR"):
         with OpenEXR.File(str(path), separate_channels=True, header_only=True) as header:
             low, high = header.header()["dataWindow"]
         width, height = (int(b) - int(a) + 1 for a, b in zip(low, high, strict=True))
@@ -88,9 +99,6 @@ def _read_exr(path: Path) -> NDArray[Any]:
             raise ValueError(f"{width} x {height} pixels; expected at most {MAX_IMAGE_PIXELS}")
         with OpenEXR.File(str(path), separate_channels=True) as file:
             channels = {name: channel.pixels for name, channel in file.channels().items()}
-    except Exception as error:  # A damaged file raises many kinds of exception.
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(f"depth: {path} is a damaged EXR file ({reason}); expected {_EXPECTED}") from None
     names = [name for name in channels if len(channels) == 1 or name in _EXR_CHANNELS]
     if not names:
         raise InputError(f"depth: {path} has the channels {', '.join(channels)}; expected one, or one of them called Z")

@@ -26,6 +26,7 @@ __all__ = [
     "Intrinsics",
     "RGBDFrame",
     "backproject",
+    "check_images",
     "frame_intrinsics",
     "has_16_bit_channels",
     "parse_intrinsics",
@@ -72,21 +73,11 @@ class RGBDFrame:
     def __post_init__(self) -> None:
         color, depth = np.asarray(self.color), np.asarray(self.depth)
         labels = None if self.labels is None else np.asarray(self.labels)
-        if color.ndim != 3 or color.shape[2] != 3 or 0 in color.shape:
-            raise InputError(f"color has shape {color.shape}; expected [H, W, 3]")
-        if color.dtype != np.uint8:
-            raise InputError(f"color has type {color.dtype}; expected uint8")
-        for name, image in (("depth", depth), ("labels", labels)):
-            if image is not None and image.shape != color.shape[:2]:
-                raise InputError(
-                    f"{name} has shape {image.shape}; expected {color.shape[:2]} (rows, columns), as color"
-                )
+        check_images(color, depth=depth, labels=labels)
         if depth.dtype.kind not in "uf" or depth.dtype == np.uint8:
             raise InputError(
                 f"depth has type {depth.dtype}; expected uint16 or uint32 (1 / depth_scale metres) or floats (metres)"
             )
-        if labels is not None and labels.dtype.kind not in "ui":
-            raise InputError(f"labels has type {labels.dtype}; expected integers")
         if labels is not None and labels.min() < 0:
             raise InputError(f"labels has the value {labels.min()}; expected 0 or more")
         intrinsics = Intrinsics.of(self.intrinsics)
@@ -143,6 +134,19 @@ class RGBDFrame:
     def instances(self) -> tuple[int, ...]:
         """Label numbers of the frame in increasing order, without 0; raises InputError as `instance_pixels`."""
         return tuple(self.instance_pixels)
+
+
+def check_images(color: NDArray[Any], *, labels: NDArray[Any] | None, depth: NDArray[Any] | None = None) -> None:
+    """Raise InputError unless the images of a frame have shapes and types that fit; that of depth is not checked."""
+    if color.ndim != 3 or color.shape[2] != 3 or 0 in color.shape:
+        raise InputError(f"color has shape {color.shape}; expected [H, W, 3]")
+    if color.dtype != np.uint8:
+        raise InputError(f"color has type {color.dtype}; expected uint8")
+    for name, image in (("depth", depth), ("labels", labels)):
+        if image is not None and image.shape != color.shape[:2]:
+            raise InputError(f"{name} has shape {image.shape}; expected {color.shape[:2]} (rows, columns), as color")
+    if labels is not None and labels.dtype.kind not in "ui":
+        raise InputError(f"labels has type {labels.dtype}; expected integers")
 
 
 def pixel_rays(pixels: NDArray[np.intp], width: int, intrinsics: Intrinsics) -> NDArray[np.float64]:

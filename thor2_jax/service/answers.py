@@ -45,18 +45,7 @@ def instance_answer(recognition: Recognition) -> InstanceAnswer:
         classifier: [Candidate(name=name, probability=p) for name, p in candidates]
         for classifier, candidates in recognition.top.items()
     }
-    return InstanceAnswer(
-        label=recognition.label,
-        name=recognition.name,
-        confidence=recognition.confidence,
-        classifier=recognition.classifier,
-        top=top,
-        occluded=recognition.occluded,
-        overflow=recognition.overflow,
-        points_used=recognition.points_used,
-        kept_by_fallback=recognition.kept_by_fallback,
-        unrecognized=recognition.reason,
-    )
+    return InstanceAnswer(**{**vars(recognition), "top": top, "unrecognized": recognition.reason})
 
 
 def why_answer(explanation: Explanation, frame: RGBDFrame) -> WhyAnswer:
