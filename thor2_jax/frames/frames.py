@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
-from thor2_jax.frames.depth_files import read_depth
 from thor2_jax.frames.distortion import distort, undistort
-from thor2_jax.frames.image_files import MAX_IMAGE_PIXELS, has_16_bit_channels, read_image
+from thor2_jax.frames.image_files import MAX_IMAGE_PIXELS, has_16_bit_channels, read_depth, read_image
 from thor2_jax.frames.intrinsics import Intrinsics, parse_intrinsics, read_intrinsics
 
 __all__ = [
