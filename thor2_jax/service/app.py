@@ -4,7 +4,6 @@ import contextlib
 import io
 import os
 import secrets
-import signal
 import threading
 from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from pathlib import Path
@@ -33,6 +32,7 @@ from thor2_jax.service.pipeline import Service, gallery_errors
 from thor2_jax.service.problem import RequestError, error_responses
 from thor2_jax.service.schemas import NPZ
 from thor2_jax.service.settings import Settings
+from thor2_jax.service.signals import handlers_replaced
 
 __all__ = ["PageFiles", "create_app"]
 
@@ -135,21 +135,17 @@ def _stop_accepting_on_signal(service: Service) -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    previous = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
 
-    def stop(number: int, frame: Any) -> None:
-        service.stop_accepting()
-        handler = previous[signal.Signals(number)]
-        if callable(handler):
-            handler(number, frame)
+    def stop_before(handler: Any) -> Callable[[int, Any], None]:
+        def stop(number: int, frame: Any) -> None:
+            service.stop_accepting()
+            if callable(handler):
+                handler(number, frame)
 
-    for number in previous:
-        signal.signal(number, stop)
-    try:
+        return stop
+
+    with handlers_replaced(stop_before):
         yield
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
 
 
 def _health_routes(service: Service, workers: int) -> APIRouter:

@@ -30,6 +30,7 @@ from thor2_jax.service.preparation import (
     prepare_clouds,
     prepare_frame,
     prepare_view,
+    timed,
 )
 from thor2_jax.service.problem import RequestError, deadline_exceeded
 from thor2_jax.service.schemas import ExplainedFrame, LabelMap, WhyAnswer
@@ -85,12 +86,9 @@ class AdmittedRequest:
         self.deadline = self._start + time_limit
         self.seconds: dict[str, float] = {}
 
-    @contextlib.contextmanager
-    def stage(self, name: str) -> Iterator[None]:
+    def stage(self, name: str) -> contextlib.AbstractContextManager[None]:
         """Measure the duration of the context, unless it raises."""
-        start = time.monotonic()
-        yield
-        self.seconds[name] = time.monotonic() - start
+        return timed(self.seconds, name)
 
     def milliseconds(self) -> dict[str, float]:
         """Return the durations of all finished stages and the total so far."""

@@ -318,8 +318,8 @@ WHY_FORM = _form({**_FRAME, "instance": _INSTANCE})
 ENROLMENT_FORM = _form(
     {
         **_FRAME,
-        "instance": _INSTANCE,
         "name": {"type": "string", "minLength": 1, "maxLength": 200, "description": "Name of the object."},
+        "instance": _INSTANCE,
         "extend": {"type": "boolean", "description": "Add the view to those of an object that exists."},
         "replace": {"type": "boolean", "description": "Discard the views of an object that exists."},
     },
