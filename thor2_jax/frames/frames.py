@@ -6,6 +6,7 @@ points = backproject(frame.depth_m, frame.intrinsics)      # [H, W, 3] metres, O
 """
 
 import dataclasses
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
-from thor2_jax.frames.distortion import distort, undistort
 from thor2_jax.frames.image_files import MAX_IMAGE_PIXELS, has_16_bit_channels, read_depth, read_image
 from thor2_jax.frames.intrinsics import Intrinsics, parse_intrinsics, read_intrinsics
 
@@ -26,6 +26,7 @@ __all__ = [
     "RGBDFrame",
     "backproject",
     "check_images",
+    "distort",
     "frame_intrinsics",
     "has_16_bit_channels",
     "parse_intrinsics",
@@ -35,6 +36,7 @@ __all__ = [
     "read_frame",
     "read_intrinsics",
     "read_labels",
+    "undistort",
 ]
 
 
@@ -46,6 +48,11 @@ MAX_INSTANCES = 1000
 
 MAX_DISTORTION_ERROR = 0.5
 """Largest error of the inverse of a lens distortion, pixels."""
+
+_ITERATIONS = 30
+"""Steps of the iteration that inverts a lens distortion."""
+
+Array = NDArray[np.floating[Any]]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -146,6 +153,37 @@ def check_images(color: NDArray[Any], *, labels: NDArray[Any] | None, depth: NDA
             raise InputError(f"{name} has shape {image.shape}; expected {color.shape[:2]} (rows, columns), as color")
     if labels is not None and labels.dtype.kind not in "ui":
         raise InputError(f"labels has type {labels.dtype}; expected integers")
+
+
+def _terms(x: Array, y: Array, coefficients: Sequence[float]) -> tuple[Array, Array, Array]:
+    """Return the radial factor and the tangential terms of both axes, of OpenCV's polynomial or rational model.
+
+    Coordinates, here and below, are x / z and y / z in the camera frame; the coefficients are `Intrinsics.distortion`.
+    """
+    k1, k2, p1, p2, k3, k4, k5, k6 = (*coefficients, 0.0, 0.0, 0.0, 0.0)[:8]
+    squared = x * x + y * y
+    radial = (1 + squared * (k1 + squared * (k2 + squared * k3))) / (1 + squared * (k4 + squared * (k5 + squared * k6)))
+    product = 2 * x * y
+    return radial, p1 * product + p2 * (squared + 2 * x * x), p1 * (squared + 2 * y * y) + p2 * product
+
+
+def distort(x: Array, y: Array, coefficients: Sequence[float]) -> tuple[Array, Array]:
+    """Return where the lens images the directions (x, y) of an ideal pinhole camera."""
+    radial, tangential_x, tangential_y = _terms(x, y, coefficients)
+    return x * radial + tangential_x, y * radial + tangential_y
+
+
+def undistort(x: Array, y: Array, coefficients: Sequence[float]) -> tuple[Array, Array]:
+    """Return the directions that the lens images at (x, y): the inverse of `distort`, by fixed-point iteration.
+
+    Where the model has no inverse, the result is arbitrary; `distort` of it shows that.
+    """
+    ideal_x, ideal_y = x, y
+    with np.errstate(all="ignore"):
+        for _ in range(_ITERATIONS):
+            radial, tangential_x, tangential_y = _terms(ideal_x, ideal_y, coefficients)
+            ideal_x, ideal_y = (x - tangential_x) / radial, (y - tangential_y) / radial
+    return ideal_x, ideal_y
 
 
 def pixel_rays(pixels: NDArray[np.intp], width: int, intrinsics: Intrinsics) -> NDArray[np.float64]:

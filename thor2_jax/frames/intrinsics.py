@@ -22,7 +22,6 @@ from typing import Any
 import numpy as np
 
 from thor2_jax.errors import InputError, with_context
-from thor2_jax.frames.distortion import DISTORTION_LENGTHS
 from thor2_jax.tables import parse_json, parse_yaml
 
 __all__ = ["DEFAULT_DEPTH_SCALE", "Intrinsics", "parse_intrinsics", "read_intrinsics"]
@@ -37,6 +36,10 @@ MAX_BOP_CAMERA_SCALE = 10.0
 
 MAX_TEXT_BYTES = 2**16
 """Largest NPY file, text or YAML document that is read as intrinsics."""
+
+DISTORTION_LENGTHS = (0, 4, 5, 8)
+"""Numbers of coefficients: no distortion, OpenCV's polynomial model (ROS: plumb_bob) without and with k3, and its
+rational one (ROS: rational_polynomial)."""
 
 _PINHOLE = ("fx", "fy", "cx", "cy")
 _PINHOLE_MODELS = ("", "none", "plumb_bob", "rational_polynomial", "brown_conrady", "opencv", "radtan", "pinhole")
@@ -62,7 +65,7 @@ class Intrinsics:
         depth_scale: depth units per metre; 1000 if depth is in millimetres.
         width: columns of the images, if known; `RGBDFrame` compares.
         height: rows of the images, if known.
-        distortion: 0, 4, 5 or 8 coefficients in the order of OpenCV, see `distortion`.
+        distortion: 0, 4, 5 or 8 coefficients in the order of OpenCV: k1, k2, p1, p2, then k3, then k4, k5, k6.
 
     Raises:
         InputError: a value is not a finite number or exceeds `LARGEST_INTRINSIC`, a focal length or the depth scale is

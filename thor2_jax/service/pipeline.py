@@ -112,7 +112,7 @@ class Service:
         self.state = "starting"
         self.progress = ""
         self._compilations = CompilationCounter(self.metrics.compilations)
-        self._in_progress = self._accepted = self._finished = 0
+        self._in_progress = self._accepted = 0
         self._compiled: dict[ExplanationPrograms, Future[None]] = {}
         self._gallery_lock = asyncio.Lock()  # Changes that wait for another process occupy one thread only.
 
@@ -194,7 +194,7 @@ class Service:
         self._compiler.shutdown(cancel_futures=True)
         self._explainer.shutdown(cancel_futures=True)
         self._compilations.stop()
-        log.info("stopped: %d requests accepted, %d finished", self._accepted, self._finished)
+        log.info("stopped: %d requests accepted, %d finished", self._accepted, self._accepted - self._in_progress)
 
     @contextlib.asynccontextmanager
     async def admit(self, seconds: float | None = None) -> AsyncIterator[AdmittedRequest]:
@@ -224,7 +224,6 @@ class Service:
             raise RequestError(408, "body", "The body did not arrive before the deadline.") from None
         finally:
             self._in_progress -= 1
-            self._finished += 1
             self.metrics.in_progress.dec()
             for name, duration in request.seconds.items():
                 self.metrics.stages.labels(name).observe(duration)
