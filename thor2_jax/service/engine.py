@@ -191,8 +191,8 @@ class InferenceEngine:
         inference = infer(self.model, oriented, clouds if self._embeds else None)
         first = slice(None, None, config.looks)
         images, embeddings = oriented.first.images, oriented.first.embeddings
-        computed = CloudResult(images, embeddings, aligned.points[first], cloud_strips.color[first], inference)
-        batch = jax.tree.map(np.asarray, computed)
+        computed = images, embeddings, aligned.points[first], cloud_strips.color[first], inference
+        batch = CloudResult(*jax.tree.map(np.asarray, computed))
         return [jax.tree.map(lambda a, k=k: a[k], batch) for k in range(len(instances))]
 
     def recognize(self, instances: Sequence[PreparedInstance], results: Sequence[CloudResult]) -> list[Recognition]:
