@@ -15,12 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
-from thor2_jax.frames.image_files import MAX_IMAGE_PIXELS, has_16_bit_channels, read_depth, read_image
-from thor2_jax.frames.intrinsics import Intrinsics, parse_intrinsics, read_intrinsics
+from thor2_jax.frames.image_files import read_depth, read_image
+from thor2_jax.frames.intrinsics import Intrinsics, read_intrinsics
 
 __all__ = [
     "MAX_DEPTH",
-    "MAX_IMAGE_PIXELS",
     "MIN_DEPTH",
     "Intrinsics",
     "RGBDFrame",
@@ -28,8 +27,6 @@ __all__ = [
     "check_images",
     "distort",
     "frame_intrinsics",
-    "has_16_bit_channels",
-    "parse_intrinsics",
     "pixel_rays",
     "read_color",
     "read_depth",

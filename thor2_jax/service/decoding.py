@@ -15,8 +15,9 @@ from pydantic import ValidationError
 
 from thor2_jax.capacity import POINT_BUCKETS
 from thor2_jax.errors import InputError
-from thor2_jax.frames.frames import Intrinsics, RGBDFrame, has_16_bit_channels, parse_intrinsics
-from thor2_jax.frames.image_files import read_npy
+from thor2_jax.frames.frames import RGBDFrame
+from thor2_jax.frames.image_files import has_16_bit_channels, read_npy
+from thor2_jax.frames.intrinsics import Intrinsics, parse_intrinsics
 from thor2_jax.service.problem import RequestError
 from thor2_jax.service.schemas import CloudsBody
 from thor2_jax.service.settings import (
