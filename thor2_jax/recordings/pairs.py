@@ -1,6 +1,5 @@
 """Pairs of colour and depth images by the nearest time stamp."""
 
-import dataclasses
 from collections import deque
 from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple
@@ -37,7 +36,6 @@ class ImagePair(NamedTuple):
     depth: StampedImage
 
 
-@dataclasses.dataclass
 class PairCounts:
     """Counts of `nearest_pairs` so far.
 
@@ -48,10 +46,11 @@ class PairCounts:
         smallest_gap: smallest time between a colour image and a depth image, nanoseconds; None if there was none.
     """
 
-    color: int = 0
-    depth: int = 0
-    pairs: int = 0
-    smallest_gap: int | None = None
+    def __init__(self) -> None:
+        self.color = 0
+        self.depth = 0
+        self.pairs = 0
+        self.smallest_gap: int | None = None
 
 
 def nearest_pairs(images: Iterable[StampedImage], tolerance: int, counts: PairCounts) -> Iterator[ImagePair]:
