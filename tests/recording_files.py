@@ -125,14 +125,6 @@ def write_recording(
     return path
 
 
-def overwrite_the_middle(path: Path) -> None:
-    """Damage a file, and keep its beginning and its end."""
-    content = bytearray(path.read_bytes())
-    first, last = 6 * len(content) // 10, 3 * len(content) // 4
-    content[first:last] = bytes(last - first)
-    path.write_bytes(content)
-
-
 def table_frame(shift: int = 0) -> thor2.RGBDFrame:
     """Return a frame without labels: two boxes on a table that is seen from straight above."""
     color, depth = np.full((240, 320, 3), (150, 120, 90), np.uint8), np.full((240, 320), 900, np.uint16)

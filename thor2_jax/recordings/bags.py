@@ -22,6 +22,7 @@ from thor2_jax.recordings.messages import color_image, depth_image, image_kind, 
 from thor2_jax.recordings.pairs import DEFAULT_MAX_GAP, ImagePair, PairCounts, StampedImage, nearest_pairs
 from thor2_jax.recordings.recorded_frames import RecordedFrame, stamp_name
 from thor2_jax.recordings.topics import CAMERA_TYPE, IMAGE_TYPES, Topics, choose_topics
+from thor2_jax.recordings.truncated_mcap import CompleteRecords, is_truncated
 
 __all__ = ["Bag"]
 
@@ -41,6 +42,7 @@ class Bag:
         intrinsics: the colour camera.
         frame_id: coordinate frame of the colour images.
         counts: images and pairs so far.
+        is_truncated: whether its end is missing. Of MCAP files, the frames before are read nevertheless.
         notes: likely mistakes of the recording that are no errors.
     """
 
@@ -71,6 +73,7 @@ class Bag:
         self.intrinsics: Intrinsics | None = intrinsics
         self._wanted, self._depth_scale, self._max_gap = topics or Topics(), depth_scale, max_gap
         self.topics, self.frame_id, self.counts = Topics(), "", PairCounts()
+        self.is_truncated = False
         self.notes: list[str] = []
         self._reader: Any = None
 
@@ -93,7 +96,9 @@ class Bag:
             )
         with self._damage_named():
             # ROS 2 before Iron stores no message definitions; those of images have not changed.
-            self._reader = AnyReader([self.path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+            self.is_truncated = self.path.suffix == ".mcap" and is_truncated(self.path)
+            source: Any = CompleteRecords(self.path) if self.is_truncated else self.path
+            self._reader = AnyReader([source], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
             self._reader.open()
         try:
             self._choose()
@@ -122,6 +127,8 @@ class Bag:
             names[name] += 1
             unique = name if names[name] == 1 else f"{name}-{names[name]}"
             yield RecordedFrame(unique, read, pair.color.stamp, gap, self.frame_id)
+        if self.is_truncated:
+            raise self._truncation()
         if self.counts.pairs == 0:
             smallest = self.counts.smallest_gap
             apart = "" if smallest is None else f", at least {smallest / 1e9:.3g} s apart"
@@ -130,6 +137,12 @@ class Bag:
                 f"{self.topics.depth}{apart}; expected at most {self._max_gap:g} s; check the clocks of the streams, "
                 "or raise max_gap"
             )
+
+    def _truncation(self) -> InputError:
+        return InputError(
+            f"bag: {self.path} is truncated after {self.counts.color} colour images: its end is missing; "
+            f"repair it: {_REPAIR['.mcap']} {self.path.name}, or record it again"
+        )
 
     def _read(self, pair: ImagePair) -> RGBDFrame:
         color, depth = color_image(pair.color.message), depth_image(pair.depth.message)
@@ -159,6 +172,8 @@ class Bag:
     def _choose(self) -> None:
         """Choose the topics by their first messages, and read the camera."""
         types = {connection.topic: connection.msgtype for connection in self._reader.connections}
+        if self.is_truncated and not types:
+            raise self._truncation()
         first = {topic: self._first(topic) for topic, kind in types.items() if kind in (*IMAGE_TYPES, CAMERA_TYPE)}
         first = {topic: message for topic, message in first.items() if message is not None}
         kinds = {t: "camera" if types[t] == CAMERA_TYPE else image_kind(message) for t, message in first.items()}

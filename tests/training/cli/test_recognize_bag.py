@@ -17,7 +17,6 @@ from recording_files import (
     bag_writer,
     camera_info,
     image,
-    overwrite_the_middle,
     table_frame,
     write_recording,
 )
@@ -124,7 +123,7 @@ def test_a_frame_that_fails_does_not_stop_the_others(
 
 def test_what_was_done_before_the_end_is_kept(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     path = write_recording(tmp_path / "a.mcap", [table_frame(k) for k in range(8)])
-    overwrite_the_middle(path)
+    path.write_bytes(path.read_bytes()[: -(10**6)])
     assert run_thor2("recognize", "--model", model, "--bag", path, "--out-bag", tmp_path / "out.mcap") == 2
     out, err = capfd.readouterr()
     n_frames = len(json_lines(out))

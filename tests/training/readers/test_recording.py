@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from recording_files import overwrite_the_middle, table_frame, write_recording
+from recording_files import table_frame, write_recording
 
 from thor2_jax.errors import InputError
 from thor2_jax.recordings.bags import Bag
@@ -28,7 +28,7 @@ def test_frames_are_read_in_any_order(tmp_path: Path, every: int) -> None:
 
 def test_a_damaged_recording_has_the_frames_before(tmp_path: Path) -> None:
     path = write_recording(tmp_path / "a.mcap", [table_frame(k) for k in range(8)])
-    overwrite_the_middle(path)
+    path.write_bytes(path.read_bytes()[: -(10**6)])
     sources, (note,) = recorded_sources(functools.partial(Bag, path))
     assert "mcap recover" in note and 0 < len(sources) < 8 and sources[-1].read().color.shape == FRAMES[0].color.shape
     (tmp_path / "b.mcap").write_bytes(b"damaged")
