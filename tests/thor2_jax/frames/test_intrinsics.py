@@ -13,8 +13,16 @@ import yaml
 from helpers import encode_image
 
 from thor2_jax.errors import InputError
-from thor2_jax.frames.distortion import distort, undistort
-from thor2_jax.frames.frames import Intrinsics, RGBDFrame, backproject, frame_intrinsics, pixel_rays, read_frame
+from thor2_jax.frames.frames import (
+    Intrinsics,
+    RGBDFrame,
+    backproject,
+    distort,
+    frame_intrinsics,
+    pixel_rays,
+    read_frame,
+    undistort,
+)
 from thor2_jax.frames.intrinsics import parse_intrinsics, read_intrinsics
 
 MATRIX = np.array([[615.5, 0.0, 318.25], [0.0, 616.75, 241.5], [0.0, 0.0, 1.0]])
