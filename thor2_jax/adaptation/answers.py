@@ -7,7 +7,7 @@ import numpy as np
 from thor2_jax.descriptor.looks import LookDescriptors
 from thor2_jax.gallery.embedding import Embedding
 from thor2_jax.gallery.gallery import GAMMA, RIDGE, Gallery
-from thor2_jax.model.run_classifiers import Classifier
+from thor2_jax.model.classifier import Classifier
 
 __all__ = ["MAX_VIEWS", "gallery_classifier"]
 

@@ -21,11 +21,10 @@ from thor2_jax.descriptor.looks import LookDescriptors
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.prepared_instance import PreparedInstance, prepare_instance
-from thor2_jax.model.classifier import EMBEDDING
+from thor2_jax.model.classifier import EMBEDDING, Classifier
 from thor2_jax.model.fusion import fused_probabilities
 from thor2_jax.model.inference import infer
 from thor2_jax.model.model import Model
-from thor2_jax.model.run_classifiers import Classifier
 
 __all__ = [
     "MAX_INSTANCES",

@@ -25,7 +25,7 @@ from thor2_jax.descriptor.describe import strips
 from thor2_jax.descriptor.looks import aligned_looks, describe_aligned_looks
 from thor2_jax.descriptor.slicing import slices_and_strips
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
-from thor2_jax.model.run_classifiers import Classifier
+from thor2_jax.model.classifier import Classifier
 from thor2_jax.types import PointClouds, Strips
 
 __all__ = ["Objective", "entropy"]

@@ -30,7 +30,7 @@ from thor2_jax.descriptor.looks import LookDescriptors, describe_looks
 from thor2_jax.errors import InputError
 from thor2_jax.files import atomic_write, content_digest, safetensors_metadata
 from thor2_jax.gallery.references import REFERENCES_FILE, References
-from thor2_jax.model.weights import model_arrays, model_from_arrays
+from thor2_jax.model.classifier import model_arrays, model_from_arrays
 from thor2_jax.types import Descriptors, PointClouds
 
 __all__ = [

@@ -17,13 +17,15 @@ from numpy.typing import NDArray
 from thor2_jax.descriptor.looks import LookDescriptors, describe_looks
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery.enrollment import LOOKS
-from thor2_jax.model.answers import Recognition
+from thor2_jax.model.answers import MAX_OVERFLOW, Recognition
 from thor2_jax.model.chunks import compute_by_chunks
 from thor2_jax.model.model import Model
-from thor2_jax.model.naming import name_instances
 from thor2_jax.types import PointClouds
 
 __all__ = ["Inference", "answers", "gallery_scores", "infer", "infer_clouds", "infer_instances", "values"]
+
+N_TOP = 5
+"""Most probable names of each classifier that an answer lists."""
 
 
 class Inference(NamedTuple):
@@ -57,7 +59,7 @@ def infer(
         classifiers: classifiers to evaluate; none if the gallery alone answers, by default those that answer.
     """
     names = model.classifiers.default if classifiers is None else classifiers
-    probabilities = model.classifiers.probabilities(oriented, names)
+    probabilities = {name: model.classifiers[name](oriented) for name in names}
     if clouds is None:
         return Inference(oriented.overflow, probabilities)
     ours, config = model.embedding.config, model.run.config
@@ -137,14 +139,59 @@ def answers(model: Model, instances: Sequence[PreparedInstance], inference: Infe
     n_usable = sum(instance.reason is None for instance in instances)
     inference = jax.tree.map(lambda a: np.asarray(a)[:n_usable], inference)
     scores = gallery_scores(model, inference)
+    combined = model.combined(inference.probabilities, scores)
+    thresholds = model.thresholds("both" if inference.probabilities else "gallery")
     by_source = {name: model.union.of_classifiers(p) for name, p in inference.probabilities.items()}
     if scores is not None:
         by_source["gallery"] = model.union.combine(None, scores)
-    return name_instances(
-        instances,
-        model.names,
-        model.combined(inference.probabilities, scores),
-        model.thresholds("both" if inference.probabilities else "gallery"),
-        by_source,
-        inference.overflow,
+    rows = iter(range(n_usable))
+    result = []
+    for instance in instances:
+        if instance.reason is not None:
+            result.append(Recognition(instance.label, reason=instance.reason))
+            continue
+        row = next(rows)
+        of_source = {source: array[row] for source, array in by_source.items()}
+        result.append(
+            _answer(instance, model.names, combined[row], thresholds, of_source, int(inference.overflow[row]))
+        )
+    return result
+
+
+def _answer(
+    instance: PreparedInstance,
+    names: Sequence[str],
+    values: NDArray[np.floating[Any]],
+    thresholds: NDArray[np.float64],
+    by_source: Mapping[str, NDArray[Any]],
+    overflow: int,
+) -> Recognition:
+    best = int(values.argmax()) if names else -1
+    confidence = float(values[best]) if names else 0.0
+    reason = None
+    if overflow > MAX_OVERFLOW * len(instance.points):
+        reason = (
+            f"overflow: {overflow} points and pairs of {len(instance.points)} points lie outside the descriptor's "
+            "grid; check the intrinsics and the depth scale"
+        )
+    elif not names:
+        reason = "unknown: no object is enrolled"
+    elif confidence < thresholds[best]:
+        reason = f"unknown: a confidence of {confidence:.3f}, below {thresholds[best]:.3g}"
+    return Recognition(
+        label=instance.label,
+        name=names[best] if reason is None else None,
+        confidence=confidence,
+        classifier=max(by_source, key=lambda source: by_source[source][best]) if names else None,
+        top={source: _top(names, of_source) for source, of_source in by_source.items()},
+        occluded=instance.occluded,
+        overflow=overflow,
+        points_used=len(instance.points),
+        kept_by_fallback=instance.kept_by_fallback,
+        reason=reason,
     )
+
+
+def _top(names: Sequence[str], values: NDArray[Any]) -> list[tuple[str, float]]:
+    best = np.argsort(-values, kind="stable")[:N_TOP]
+    return [(names[i], float(values[i])) for i in best]
