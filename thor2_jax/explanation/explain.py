@@ -24,17 +24,11 @@ from thor2_jax.descriptor.persistence import diagrams_of_strips
 from thor2_jax.errors import InputError
 from thor2_jax.explanation.attributions import Attributions, attribute_points
 from thor2_jax.explanation.changes import CHANGES, Change, smallest_change
-from thor2_jax.explanation.class_scores import (
-    ClassScores,
-    OrientedCloud,
-    capacity_of,
-    classifier_scores,
-    gallery_scores,
-)
+from thor2_jax.explanation.class_scores import ClassScores, OrientedCloud, classifier_scores, gallery_scores, packed
 from thor2_jax.explanation.leave_out import LeftOut, leave_out
 from thor2_jax.explanation.nearest_views import NearestView, nearest_views
 from thor2_jax.frames.frames import RGBDFrame, pixel_rays
-from thor2_jax.frames.prepared_instance import DESCRIPTOR_VOXEL, PreparedInstance, pack_instances, prepare_instance
+from thor2_jax.frames.prepared_instance import DESCRIPTOR_VOXEL, PreparedInstance, prepare_instance
 from thor2_jax.model.answers import Recognition
 from thor2_jax.model.inference import answers, infer_clouds, values
 from thor2_jax.model.model import Model
@@ -224,25 +218,22 @@ def explained_kinds(model: Model) -> dict[bool, str]:
 
     A kind that no name has is left out.
     """
-    union = model.union
-    by_classifiers = np.asarray(union.has_output) & (model.answers_by() != "gallery")
-    return dict(zip(by_classifiers.tolist(), union.names, strict=True))
+    by_classifiers = model.union.has_output & (model.answers_by() != "gallery")
+    return dict(zip(by_classifiers.tolist(), model.names, strict=True))
 
 
 def _answer(model: Model, instance: PreparedInstance) -> tuple[Recognition, str]:
     """Return the answer of the model and the most probable name."""
     if not model.names:
         raise InputError("no object is known; train a run or enroll an object")
-    inference = infer_clouds(model, pack_instances([instance], 1, capacity_of(instance)))
+    inference = infer_clouds(model, packed(instance))
     (recognition,) = answers(model, [instance], inference)
     return recognition, model.names[int(values(model, inference)[0].argmax())]
 
 
 def _scores_of(model: Model, name: str) -> ClassScores:
-    union = model.union
-    has_output = bool(union.has_output[union.names.index(name)])
-    by_classifiers = model.answers_by() != "gallery" and has_output
-    return classifier_scores(model) if by_classifiers else gallery_scores(model)
+    has_output = model.union.has_output[model.names.index(name)]
+    return classifier_scores(model) if has_output and model.answers_by() != "gallery" else gallery_scores(model)
 
 
 def _described(scores: ClassScores, cloud: OrientedCloud, n: int) -> DescribedSlices:
