@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.config import DescriptorConfig
-from thor2_jax.descriptor.reductions import ROWS
+from thor2_jax.descriptor.bounding_box import ROWS
 from thor2_jax.types import PointClouds
 
 __all__ = ["UNIT", "alignment_drift", "embedding_rounding", "image_lipschitz", "image_rounding"]
