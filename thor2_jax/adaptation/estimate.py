@@ -22,7 +22,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.prepared_instance import PreparedInstance, prepare_instance
 from thor2_jax.gallery.embedding import Embedding
-from thor2_jax.gallery.gallery import GAMMA, RIDGE, Gallery
+from thor2_jax.gallery.gallery import GAMMA, Gallery
 from thor2_jax.model.classifier import EMBEDDING, Classifier
 from thor2_jax.model.fusion import fused_probabilities
 from thor2_jax.model.inference import infer
@@ -132,14 +132,11 @@ def gallery_classifier(gallery: Gallery, embedding: Embedding) -> Classifier:
         gallery: a gallery with at least one object.
         embedding: the embedding of its views.
     """
-    objects = list(gallery.objects.values())
-    counts = np.array([len(each.embeddings) for each in objects])
-    owner = np.repeat(np.arange(len(objects)), counts)
+    views, owner, ridge = dataclasses.replace(gallery, references=None).regression
     kept = np.unique(np.linspace(0, len(owner) - 1, min(len(owner), MAX_VIEWS)).round().astype(int))
-    views = np.concatenate([each.embeddings for each in objects])[kept].astype(np.float64)
-    ridge = RIDGE * counts[owner[kept]] / counts[owner].mean()
-    kernel = np.exp(GAMMA * (views @ views.T - 1)) + np.diag(ridge)
-    duals = jnp.asarray(np.linalg.solve(kernel, np.eye(len(objects))[owner[kept]]), jnp.float32)
+    views = views[kept].astype(np.float64)
+    kernel = np.exp(GAMMA * (views @ views.T - 1)) + np.diag(ridge[kept])
+    duals = jnp.asarray(np.linalg.solve(kernel, np.eye(len(gallery.objects))[owner[kept]]), jnp.float32)
     fixed = jnp.asarray(views, jnp.float32)
 
     def classify(oriented: LookDescriptors) -> jax.Array:

@@ -9,8 +9,7 @@ colour matrices are those of the first look, which is the paper's.
 """
 
 import dataclasses
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
@@ -159,26 +158,25 @@ def explain_instance(model: Model, instance: PreparedInstance) -> Explanation:
         raise InputError(f"instance {instance.label} cannot be explained: {instance.reason}")
     recognition, name = _answer(model, instance)
     scores = _scores_of(model, name)
-    index = scores.names.index(name)
+    parts = dict(_parts(model, scores, instance, scores.names.index(name)))
+    return Explanation(recognition=recognition, name=name, scores=scores, instance=instance, **parts)
+
+
+def _parts(model: Model, scores: ClassScores, instance: PreparedInstance, index: int) -> Iterator[tuple[str, Any]]:
+    """Yield the further fields of an explanation, most of which compile for seconds."""
     scored = scores.of_instances([instance])[0]
     others = [k for k in np.argsort(-scored, kind="stable") if k != index]
+    yield "runner_up", scores.names[others[0]] if others else None
     cloud = scores.orient(instance)
     attributions = attribute_points(scores, cloud, instance, index)
+    yield "attributions", attributions
+    yield "left_out", leave_out(scores, cloud, index, attributions.values)
     # Where classifiers and gallery answer together, the best score need not be that of the answer.
     kinds = CHANGES if scored.argmax() == index else ()
     changes = [smallest_change(scores, instance, index, kind) for kind in kinds]
-    return Explanation(
-        recognition=recognition,
-        name=name,
-        runner_up=scores.names[others[0]] if others else None,
-        scores=scores,
-        instance=instance,
-        described=_described(scores, cloud, len(instance.points)),
-        attributions=attributions,
-        left_out=leave_out(scores, cloud, index, attributions.values),
-        changes=tuple(change for change in changes if change is not None),
-        nearest=tuple(nearest_views(model, instance)),
-    )
+    yield "changes", tuple(change for change in changes if change is not None)
+    yield "described", _described(scores, cloud, len(instance.points))
+    yield "nearest", tuple(nearest_views(model, instance))
 
 
 def compile_explanations(model: Model, n_points: int, by_classifiers: bool, is_stopped: Callable[[], bool]) -> None:
@@ -199,18 +197,9 @@ def compile_explanations(model: Model, n_points: int, by_classifiers: bool, is_s
     _answer(model, instance)
     scores = _scores_of(model, name)
     index = int(scores.of_instances([instance])[0].argmax())
-    cloud = scores.orient(instance)
-    steps: list[Callable[[], object]] = [
-        partial(attribute_points, scores, cloud, instance, index),
-        partial(leave_out, scores, cloud, index, np.zeros(n_points, np.float32)),
-        *(partial(smallest_change, scores, instance, index, kind) for kind in CHANGES),
-        partial(_described, scores, cloud, n_points),
-        partial(nearest_views, model, instance),
-    ]
-    for step in steps:
-        if is_stopped():
-            return
-        step()
+    parts = _parts(model, scores, instance, index)
+    while not is_stopped() and next(parts, None) is not None:
+        pass
 
 
 def explained_kinds(model: Model) -> dict[bool, str]:
