@@ -1,6 +1,7 @@
 """The enrolled objects of a recognizer: a gallery that can be taught, in memory or on disk, with its embedding."""
 
 import dataclasses
+import functools
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -66,7 +67,8 @@ class ObjectGallery:
         """
         self._directory, self._stored = directory, dataclasses.replace(self._stored, stamp=None)
         if reembed and directory.exists():
-            self._change(self._reembedded, rebuild=True)
+            embed = functools.partial(embed_views, self.embedding)
+            self._change(lambda gallery: gallery.reembed(self.embedding.fingerprint, embed), rebuild=True)
         else:
             check_index(directory)
             self.refresh()
@@ -239,7 +241,3 @@ class ObjectGallery:
             raise InputError("undo needs a gallery on disk; open one")
         fingerprint = self.embedding.fingerprint
         self._set(undo_change(self._directory, generation, fingerprint, self._stored, self.lock_seconds))
-
-    def _reembedded(self, gallery: Gallery) -> Gallery:
-        embedding = self.embedding
-        return gallery.reembed(embedding.fingerprint, lambda clouds, source: embed_views(embedding, clouds, source))

@@ -95,22 +95,20 @@ def save_run(run: TrainedRun, path: str | Path) -> None:
         contents = {name: safetensors.numpy.save(model_arrays(model)) for name, model in run.classifiers.items()}
         for name, content in contents.items():
             weights_file(unfinished, name).write_bytes(content)
-        (unfinished / RUN_FILE).write_text(json.dumps(_description(run, contents), indent=2) + "\n")
-
-
-def _description(run: TrainedRun, weights: Mapping[Feature, bytes]) -> dict[str, Any]:
-    return {
-        "format": RUN_FORMAT,
-        "descriptor_version": DESCRIPTOR_VERSION,
-        "descriptor_config": dataclasses.asdict(run.config),
-        "color_network": run.network.fingerprint,
-        "classes": list(run.classes),
-        "classifiers": list(run.classifiers),
-        "weights": {name: content_digest([content]) for name, content in weights.items()},
-        **({} if run.embedding is None else {"embedding": run.embedding.fingerprint}),
-        **({} if run.embedding is None or run.embedding.references is None else {"references": True}),
-        "record": run.record,
-    }
+        embedding = run.embedding
+        description = {
+            "format": RUN_FORMAT,
+            "descriptor_version": DESCRIPTOR_VERSION,
+            "descriptor_config": dataclasses.asdict(run.config),
+            "color_network": run.network.fingerprint,
+            "classes": list(run.classes),
+            "classifiers": list(run.classifiers),
+            "weights": {name: content_digest([content]) for name, content in contents.items()},
+            **({} if embedding is None else {"embedding": embedding.fingerprint}),
+            **({} if embedding is None or embedding.references is None else {"references": True}),
+            "record": run.record,
+        }
+        (unfinished / RUN_FILE).write_text(json.dumps(description, indent=2) + "\n")
 
 
 def load_run(path: str | Path) -> TrainedRun:
