@@ -16,6 +16,7 @@ The answers of several frames are fused by a `Tracker` (`Recognizer.track`).
 """
 
 import dataclasses
+import functools
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -244,11 +245,8 @@ class Recognizer:
     def describe(self, frame: RGBDFrame) -> DescribedFrame:
         """Prepare and describe the instances of a frame, of which there may be more than the largest batch bucket."""
         run = self.run
-        return DescribedFrame(
-            *compute_by_chunks(
-                self.prepare(frame), self.chunk, lambda clouds: describe_looks(clouds, run.network, run.config)
-            )
-        )
+        describe = functools.partial(describe_looks, network=run.network, config=run.config)
+        return DescribedFrame(*compute_by_chunks(self.prepare(frame), self.chunk, describe))
 
     def recognize(
         self, frame: RGBDFrame, classifiers: Sequence[str] | None = None, answer_by: str | None = None
