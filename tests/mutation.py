@@ -45,12 +45,11 @@ FOLDERS = ("colornet", "thor2_jax", "thor2_jax/descriptor", "thor2_jax/frames", 
 
 MORE_TESTS = {
     "colornet/__init__.py": ("colornet/test_files.py", "colornet/test_build.py"),
-    "colornet/builder.py": ("colornet/test_build.py",),
+    "colornet/builder.py": ("colornet/test_build.py", "colornet/test_regions.py"),
     "colornet/grid.py": ("colornet/test_color_math.py", "colornet/test_membership.py"),
     "colornet/lab.py": ("colornet/test_color_math.py", "colornet/test_build.py"),
     "colornet/mapper.py": ("colornet/test_color_math.py", "colornet/test_build.py"),
     "colornet/network.py": ("colornet/test_files.py", "colornet/test_membership.py"),
-    "colornet/regions.py": ("colornet/test_build.py",),
     "thor2_jax/descriptor/bounding_box.py": ("thor2_jax/descriptor/test_view_normalization.py",),
     "thor2_jax/descriptor/color_membership.py": ("thor2_jax/test_types.py",),
     "thor2_jax/descriptor/relaxation.py": ("properties/test_relaxation.py",),

@@ -88,9 +88,8 @@ def tenth_of(n_points: int) -> int:
 
 def select_points(instance: PreparedInstance, kept: NDArray[np.bool_]) -> PreparedInstance:
     """Return the instance with some of its points only, `kept` [n]."""
-    points, colors, boundary = (each[kept] for each in (instance.points, instance.colors, instance.boundary))
-    rim = None if instance.rim is None else instance.rim[kept]
-    return dataclasses.replace(instance, points=points, colors=colors, boundary=boundary, rim=rim)
+    flags = {"boundary": instance.boundary[kept], "rim": None if instance.rim is None else instance.rim[kept]}
+    return dataclasses.replace(instance, points=instance.points[kept], colors=instance.colors[kept], **flags)
 
 
 @partial(jax.jit, static_argnums=3)

@@ -279,10 +279,7 @@ def update_gallery(
                 path = _object_file(directory, files[name])
                 if not path.exists():
                     written.append(path)
-                    with atomic_write(path) as temporary, temporary.open("wb") as file:
-                        file.write(content)
-                        file.flush()
-                        os.fsync(file.fileno())  # the index must not reach the disk before the files that it names
+                    _write_durably(path, content)
             changed = StoredGallery(gallery, files, stored.generation + 1)
             write_text(directory / INDEX_FILE, _index_content(changed))
         except BaseException:
@@ -335,6 +332,13 @@ def undo_change(
         raise InputError(f"generation is {generation}, and files of the gallery before it are missing")
 
     return update_gallery(directory, previous, embedding, known, lock_seconds)
+
+
+def _write_durably(path: Path, content: bytes) -> None:
+    with atomic_write(path) as temporary, temporary.open("wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())  # the index must not reach the disk before the files that it names
 
 
 def _index_content(stored: StoredGallery) -> str:

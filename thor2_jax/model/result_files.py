@@ -136,7 +136,7 @@ def _with_category(
 ) -> Iterator[tuple[Recognition, int]]:
     """Yield the answers whose names have numbers, with their numbers."""
     for recognition in recognitions:
-        if recognition.name in categories:
+        if recognition.name is not None and recognition.name in categories:
             yield recognition, categories[recognition.name]
 
 
