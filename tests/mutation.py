@@ -53,7 +53,6 @@ MORE_TESTS = {
     "thor2_jax/descriptor/bounding_box.py": ("thor2_jax/descriptor/test_view_normalization.py",),
     "thor2_jax/descriptor/color_membership.py": ("thor2_jax/test_types.py",),
     "thor2_jax/descriptor/relaxation.py": ("properties/test_relaxation.py",),
-    "thor2_jax/descriptor/released.py": ("thor2_jax/descriptor/test_slicing.py",),
     "thor2_jax/parameters.py": ("thor2_jax/test_types.py", "properties/test_reproducibility.py"),
     "thor2_jax/frames/frames.py": ("thor2_jax/test_types.py",),
     "thor2_jax/frames/instance_clouds.py": ("thor2_jax/test_types.py",),

@@ -25,9 +25,9 @@ from thor2_jax.explanation.attributions import Attributions, attribute_points
 from thor2_jax.explanation.changes import CHANGES, Change, smallest_change
 from thor2_jax.explanation.class_scores import ClassScores, OrientedCloud, classifier_scores, gallery_scores, packed
 from thor2_jax.explanation.leave_out import LeftOut, leave_out
-from thor2_jax.explanation.nearest_views import NearestView, nearest_views
 from thor2_jax.frames.frames import RGBDFrame, pixel_rays
 from thor2_jax.frames.prepared_instance import DESCRIPTOR_VOXEL, PreparedInstance, prepare_instance
+from thor2_jax.gallery.enrollment import embed_looks
 from thor2_jax.model.answers import Recognition
 from thor2_jax.model.inference import answers, infer_clouds, values
 from thor2_jax.model.model import Model
@@ -37,12 +37,17 @@ from thor2_jax.types import Diagrams
 __all__ = [
     "DescribedSlices",
     "Explanation",
+    "NearestView",
     "compile_explanations",
     "explain",
     "explain_instance",
     "explained_kinds",
     "pixel_attributions",
 ]
+
+
+OBJECTS = 3
+"""Objects of which the nearest view is shown."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -60,6 +65,23 @@ class DescribedSlices:
     diagrams: Diagrams
     images: NDArray[np.float32]
     colors: NDArray[np.float32]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class NearestView:
+    """An enrolled view.
+
+    Attributes:
+        name: name of the object.
+        number: number of the view among those of the object, in the order of enrolment.
+        similarity: largest cosine of the embeddings of the looks at both, at most 1.
+        view: its cloud.
+    """
+
+    name: str
+    number: int
+    similarity: float
+    view: PreparedInstance
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -176,7 +198,7 @@ def _parts(model: Model, scores: ClassScores, instance: PreparedInstance, index:
     changes = [smallest_change(scores, instance, index, kind) for kind in kinds]
     yield "changes", tuple(change for change in changes if change is not None)
     yield "described", _described(scores, cloud, len(instance.points))
-    yield "nearest", tuple(nearest_views(model, instance))
+    yield "nearest", tuple(_nearest_views(model, instance))
 
 
 def compile_explanations(model: Model, n_points: int, by_classifiers: bool, is_stopped: Callable[[], bool]) -> None:
@@ -232,6 +254,28 @@ def _described(scores: ClassScores, cloud: OrientedCloud, n: int) -> DescribedSl
     images = describe_strips(cut, scores.network, scores.config).images
     first = jax.tree.map(lambda a: np.asarray(a[0]), (shown.points, diagrams, images, cut.color))
     return DescribedSlices(first[0][:n], *first[1:])
+
+
+def _nearest_views(model: Model, instance: PreparedInstance) -> list[NearestView]:
+    """Return the nearest view of each of the most similar enrolled objects, the most similar one first.
+
+    Args:
+        model: its gallery may be empty; the result then is, too.
+        instance: the instance.
+    """
+    objects = model.gallery.objects
+    if not objects:
+        return []
+    scores = gallery_scores(model).of_instances([instance])[0]
+    query = embed_looks(model.embedding, [instance])[0]
+    nearest = []
+    for index in np.argsort(-scores, kind="stable")[:OBJECTS]:
+        name = model.gallery.names[index]
+        views = list(objects[name].clouds.views())
+        cosines = (embed_looks(model.embedding, views) @ query.T).max(axis=(1, 2))
+        number = int(cosines.argmax())
+        nearest.append(NearestView(name, number, float(cosines[number]), views[number]))
+    return sorted(nearest, key=lambda one: -one.similarity)
 
 
 def pixel_attributions(explanation: Explanation, frame: RGBDFrame) -> NDArray[np.float32]:
