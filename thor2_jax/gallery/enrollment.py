@@ -16,7 +16,6 @@ from thor2_jax.gallery.augment import augmented_copies
 from thor2_jax.gallery.clouds import CompactClouds
 from thor2_jax.gallery.embedding import Embedding
 from thor2_jax.gallery.gallery import GalleryObject
-from thor2_jax.types import PointClouds
 
 __all__ = [
     "LOOKS",
@@ -36,9 +35,14 @@ ROWS = 4
 """Clouds embedded in one call, as recognition does."""
 
 
-def embed_looks(embedding: Embedding, clouds: PointClouds, count: int = LOOKS) -> Any:
-    """Return the embeddings [B, count, D] of looks at clouds in metres."""
-    return embedding.embed_oriented(describe_looks(clouds, embedding.network, embedding.config, count))
+def embed_looks(embedding: Embedding, views: Sequence[PreparedInstance]) -> NDArray[np.float32]:
+    """Return the embeddings [V, K, D] of the looks at views."""
+    batches = []
+    for start in range(0, len(views), ROWS):
+        clouds = pack_instances(views[start : start + ROWS], ROWS)
+        looks = describe_looks(clouds, embedding.network, embedding.config, LOOKS)
+        batches.append(embedding.embed_oriented(looks))
+    return np.concatenate(batches)[: len(views)]
 
 
 def instance_view(frame: RGBDFrame, label: int | None, sigma_s: float) -> PreparedInstance:
@@ -88,12 +92,7 @@ def embed_views(embedding: Embedding, clouds: CompactClouds, source: str) -> NDA
     """
     # Views of similar size share a bucket.
     views = sorted(views_to_embed(clouds, source), key=lambda view: point_bucket(len(view.points)))
-    batches = []
-    for start in range(0, len(views), ROWS):
-        chunk = views[start : start + ROWS]
-        batches.append((len(chunk), embed_looks(embedding, pack_instances(chunk, ROWS))))
-    embedded = [np.asarray(batch)[:count] for count, batch in batches]
-    return np.concatenate(embedded).reshape(-1, embedded[0].shape[-1]).astype(np.float16)
+    return embed_looks(embedding, views).reshape(-1, embedding.size).astype(np.float16)
 
 
 def enrolled_object(embeddings: NDArray[Any], clouds: CompactClouds, source: str) -> GalleryObject:

@@ -9,7 +9,7 @@ import numpy as np
 from flax import nnx
 from numpy.typing import NDArray
 
-from thor2_jax.model.weights import model_arrays, model_from_arrays
+from thor2_jax.model.classifier import model_arrays, model_from_arrays
 from training.baselines.baseline import BaselineInputs
 from training.baselines.networks.architectures import ARCHITECTURES
 from training.baselines.networks.inputs import network_inputs

@@ -10,7 +10,7 @@ import numpy as np
 from flax import nnx
 from numpy.typing import NDArray
 
-from thor2_jax.model.weights import model_arrays, model_from_arrays
+from thor2_jax.model.classifier import model_arrays, model_from_arrays
 from training.baselines.baseline import BaselineInputs
 
 __all__ = ["POINTS", "ColoredPointNet", "PointNet", "point_features", "random_indices"]

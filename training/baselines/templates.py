@@ -14,7 +14,7 @@ import numpy as np
 from flax import nnx
 from numpy.typing import NDArray
 
-from thor2_jax.model.weights import model_arrays, model_from_arrays
+from thor2_jax.model.classifier import model_arrays, model_from_arrays
 from training.baselines.baseline import BaselineInputs
 from training.baselines.image_network import in_batches
 from training.baselines.networks.architectures import ARCHITECTURES

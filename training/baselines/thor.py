@@ -25,8 +25,7 @@ from numpy.typing import NDArray
 
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.view_normalization import OCCLUSION_BIN, turn
-from thor2_jax.model.classifier import MLP
-from thor2_jax.model.weights import model_arrays, model_from_arrays
+from thor2_jax.model.classifier import MLP, model_arrays, model_from_arrays
 from thor2_jax.types import PointClouds
 from training.baselines.baseline import BaselineInputs
 
