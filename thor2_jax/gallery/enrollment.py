@@ -35,6 +35,10 @@ LOOKS = 2
 ROWS = 4
 """Clouds embedded in one call, as recognition does."""
 
+MANY_ROWS, MANY_POINTS = 16, 2048
+"""Clouds embedded in one call, and the least number of points that they are padded to, if there are many: a call costs
+as much as two rows, and tracing a program as much as a thousand rows, whatever their number of points."""
+
 
 def embed_looks(embedding: Embedding, clouds: PointClouds, count: int = LOOKS) -> Any:
     """Return the embeddings [B, count, D] of looks at clouds in metres."""
@@ -86,12 +90,17 @@ def embed_views(embedding: Embedding, clouds: CompactClouds, source: str) -> NDA
         clouds: the views.
         source: where they come from, see `augmented_copies`.
     """
-    # Views of similar size share a bucket.
-    views = sorted(views_to_embed(clouds, source), key=lambda view: point_bucket(len(view.points)))
+    views = views_to_embed(clouds, source)
+    rows, n_points = (MANY_ROWS, MANY_POINTS) if len(views) > 4 * MANY_ROWS else (ROWS, 0)
+
+    def capacity(view: PreparedInstance) -> int:
+        return point_bucket(max(len(view.points), n_points))
+
+    views.sort(key=capacity)  # views of similar size share a bucket
     batches = []
-    for start in range(0, len(views), ROWS):
-        chunk = views[start : start + ROWS]
-        batches.append((len(chunk), embed_looks(embedding, pack_instances(chunk, ROWS))))
+    for start in range(0, len(views), rows):
+        chunk = views[start : start + rows]
+        batches.append((len(chunk), embed_looks(embedding, pack_instances(chunk, rows, capacity(chunk[-1])))))
     embedded = [np.asarray(batch)[:count] for count, batch in batches]
     return np.concatenate(embedded).reshape(-1, embedded[0].shape[-1]).astype(np.float16)
 
