@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thor2_jax.capacity import point_bucket
+from thor2_jax.capacity import batch_points, point_bucket
 from thor2_jax.descriptor.looks import describe_looks
 from thor2_jax.errors import InputError, with_context
 from thor2_jax.frames.frames import RGBDFrame
@@ -35,9 +35,8 @@ LOOKS = 2
 ROWS = 4
 """Clouds embedded in one call, as recognition does."""
 
-MANY_ROWS, MANY_POINTS = 16, 2048
-"""Clouds embedded in one call, and the least number of points that they are padded to, if there are many: a call costs
-as much as two rows, and tracing a program as much as a thousand rows, whatever their number of points."""
+MANY_ROWS = 16
+"""Clouds embedded in one call if there are many: a call costs as much as several clouds."""
 
 
 def embed_looks(embedding: Embedding, clouds: PointClouds, count: int = LOOKS) -> Any:
@@ -90,17 +89,15 @@ def embed_views(embedding: Embedding, clouds: CompactClouds, source: str) -> NDA
         clouds: the views.
         source: where they come from, see `augmented_copies`.
     """
-    views = views_to_embed(clouds, source)
-    rows, n_points = (MANY_ROWS, MANY_POINTS) if len(views) > 4 * MANY_ROWS else (ROWS, 0)
-
-    def capacity(view: PreparedInstance) -> int:
-        return point_bucket(max(len(view.points), n_points))
-
-    views.sort(key=capacity)  # views of similar size share a bucket
+    # Views of similar size share a bucket.
+    views = sorted(views_to_embed(clouds, source), key=lambda view: point_bucket(len(view.points)))
+    many = len(views) > 4 * MANY_ROWS
+    rows = MANY_ROWS if many else ROWS
     batches = []
     for start in range(0, len(views), rows):
         chunk = views[start : start + rows]
-        batches.append((len(chunk), embed_looks(embedding, pack_instances(chunk, rows, capacity(chunk[-1])))))
+        capacity = batch_points(len(view.points) for view in chunk) if many else None
+        batches.append((len(chunk), embed_looks(embedding, pack_instances(chunk, rows, capacity))))
     embedded = [np.asarray(batch)[:count] for count, batch in batches]
     return np.concatenate(embedded).reshape(-1, embedded[0].shape[-1]).astype(np.float16)
 

@@ -75,7 +75,7 @@ class TexturedMesh:
             a, b, c = np.moveaxis(self.corner_colors[face].astype(np.float32), 1, 0)
             return np.rint(a + second * (b - a) + third * (c - a)).clip(0, 255).astype(np.uint8)
         assert self.uv is not None and self.face_texture is not None
-        a, b, c = np.moveaxis(self.uv[face], 1, 0)
+        a, b, c = np.moveaxis(self.uv.take(face, axis=0), 1, 0)
         uv = a + second * (b - a) + third * (c - a)
         if len(self.textures) == 1:
             return _nearest_texel(self.textures[0], uv)
@@ -91,7 +91,7 @@ def _nearest_texel(image: NDArray[np.uint8], uv: NDArray[np.floating]) -> NDArra
     height, width = image.shape[:2]
     column = np.floor(uv[:, 0] * width).astype(np.int64) % width
     row = np.floor((1 - uv[:, 1]) * height).astype(np.int64) % height
-    return image[row, column]
+    return image.reshape(-1, image.shape[2]).take(row * width + column, axis=0)
 
 
 def merge_meshes(parts: Sequence[TexturedMesh]) -> TexturedMesh:
