@@ -91,7 +91,7 @@ def _nearest_texel(image: NDArray[np.uint8], uv: NDArray[np.floating]) -> NDArra
     height, width = image.shape[:2]
     column = np.floor(uv[:, 0] * width).astype(np.int64) % width
     row = np.floor((1 - uv[:, 1]) * height).astype(np.int64) % height
-    return image.reshape(-1, image.shape[2]).take(row * width + column, axis=0)
+    return image[row, column]
 
 
 def merge_meshes(parts: Sequence[TexturedMesh]) -> TexturedMesh:
