@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thor2_jax.capacity import point_bucket
+from thor2_jax.capacity import batch_points, point_bucket
 from thor2_jax.descriptor.looks import describe_looks
 from thor2_jax.errors import InputError, with_context
 from thor2_jax.frames.frames import RGBDFrame
@@ -34,12 +34,18 @@ LOOKS = 2
 ROWS = 4
 """Clouds embedded in one call, as recognition does."""
 
+MANY_ROWS = 16
+"""Clouds embedded in one call if there are many: a call costs as much as several clouds."""
+
 
 def embed_looks(embedding: Embedding, views: Sequence[PreparedInstance]) -> NDArray[np.float32]:
     """Return the embeddings [V, K, D] of the looks at views."""
+    many = len(views) > 4 * MANY_ROWS
+    rows = MANY_ROWS if many else ROWS
     batches = []
-    for start in range(0, len(views), ROWS):
-        clouds = pack_instances(views[start : start + ROWS], ROWS)
+    for start in range(0, len(views), rows):
+        chunk = views[start : start + rows]
+        clouds = pack_instances(chunk, rows, batch_points(len(view.points) for view in chunk) if many else None)
         looks = describe_looks(clouds, embedding.network, embedding.config, LOOKS)
         batches.append(embedding.embed_oriented(looks))
     return np.concatenate(batches)[: len(views)]

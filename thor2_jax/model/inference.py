@@ -83,7 +83,10 @@ def infer_clouds(
         answer_by: source of the answers, see `Model.answers_by`.
     """
     source = model.answers_by(answer_by)
-    oriented = describe_looks(clouds, model.run.network, model.run.config)
+    config = model.run.config
+    # The gallery alone needs two looks, which `infer` would otherwise describe again.
+    count = max(config.looks, LOOKS) if source == "gallery" else config.looks
+    oriented = describe_looks(clouds, model.run.network, config, count)
     names = classifiers if source != "gallery" else ()
     return infer(model, oriented, clouds if source != "classifiers" else None, names)
 

@@ -8,6 +8,7 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
+from thor2_jax.capacity import batch_points
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.view_normalization import view_normalize
 from thor2_jax.errors import InputError
@@ -44,7 +45,7 @@ def padded_batches(
         boundary: for each cloud [n] bool, the points on the occlusion boundary; None if there are none.
 
     Yields:
-        The number of given clouds in the batch, and the batch, padded to the bucket of its largest cloud.
+        The number of given clouds in the batch, and the batch, padded by `batch_points`.
 
     Raises:
         InputError: A cloud has more points than the largest bucket.
@@ -54,7 +55,8 @@ def padded_batches(
         chunk = list(clouds[start : start + size])
         padding = size - len(chunk)
         marks = None if boundary is None else [*boundary[start : start + size], *[None] * padding]
-        yield len(chunk), PointClouds.pack(chunk + [empty] * padding, boundary=marks)
+        capacity = batch_points(len(xyz) for xyz, _ in chunk)
+        yield len(chunk), PointClouds.pack(chunk + [empty] * padding, capacity, boundary=marks)
 
 
 @dataclasses.dataclass(frozen=True)
