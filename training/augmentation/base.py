@@ -6,7 +6,7 @@ import numpy as np
 
 from thor2_jax.frames.frames import backproject
 from training.augmentation.pixels import without
-from training.augmentation.settings import Range, check_fields
+from training.augmentation.settings import Range, Settings, limited
 from training.rendering.camera import RenderedView
 
 __all__ = ["Base", "without_base"]
@@ -16,24 +16,18 @@ MAX_CUT = 0.4
 
 
 @dataclasses.dataclass(frozen=True)
-class Base:
+class Base(Settings):
     """Ranges of the missing base; values are drawn once per view.
 
     Attributes:
         missing: probability that the base is missing.
         height: height of the missing part, metres.
         upright: probability that the object stands as its mesh does; otherwise it lies in a random orientation.
-
-    Raises:
-        InputError: A value is outside its limits.
     """
 
-    missing: float = 0.3
-    height: Range = (0.003, 0.015)
-    upright: float = 0.6
-
-    def __post_init__(self) -> None:
-        check_fields(self, missing=(0, 1), height=(0, 0.1), upright=(0, 1))
+    missing: float = limited(0.3, 0, 1)
+    height: Range = limited((0.003, 0.015), 0, 0.1)
+    upright: float = limited(0.6, 0, 1)
 
 
 def without_base(view: RenderedView, base: Base, rng: np.random.Generator) -> RenderedView:

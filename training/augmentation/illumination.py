@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 
-from training.augmentation.settings import Range, check_fields
+from training.augmentation.settings import Range, Settings, limited
 from training.rendering.camera import RenderedView
 
 __all__ = ["Illumination", "relit"]
@@ -30,7 +30,7 @@ STEEPEST = 3.0
 
 
 @dataclasses.dataclass(frozen=True)
-class Illumination:
+class Illumination(Settings):
     """Ranges of light and camera response; values are drawn once per view.
 
     Attributes:
@@ -43,30 +43,15 @@ class Illumination:
         saturation: factor of a colour's distance from grey.
         veil: weight of white that is mixed in.
         noise: standard deviation per pixel and channel.
-
-    Raises:
-        InputError: A value is outside its limits.
     """
 
-    gamma: Range = (0.6, 1.6)
-    gain: Range = (0.4, 1.7)
-    cast: float = 0.15
-    shading: Range = (0.0, 1.0)
-    saturation: Range = (0.4, 1.7)
-    veil: Range = (0.0, 0.12)
-    noise: Range = (0.0, 0.02)
-
-    def __post_init__(self) -> None:
-        check_fields(
-            self,
-            gamma=(0.1, 10),
-            gain=(0, 10),
-            cast=(0, 0.9),
-            shading=(0, 1),
-            saturation=(0, 10),
-            veil=(0, 1),
-            noise=(0, 1),
-        )
+    gamma: Range = limited((0.6, 1.6), 0.1, 10)
+    gain: Range = limited((0.4, 1.7), 0, 10)
+    cast: float = limited(0.15, 0, 0.9)
+    shading: Range = limited((0.0, 1.0), 0, 1)
+    saturation: Range = limited((0.4, 1.7), 0, 10)
+    veil: Range = limited((0.0, 0.12), 0, 1)
+    noise: Range = limited((0.0, 0.02), 0, 1)
 
 
 def relit(view: RenderedView, light: Illumination, rng: np.random.Generator) -> RenderedView:

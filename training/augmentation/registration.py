@@ -9,31 +9,25 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from training.augmentation.pixels import FRAME_PIXEL, pixel_width
-from training.augmentation.settings import Range, check_fields
+from training.augmentation.settings import Range, Settings, limited
 from training.rendering.camera import RenderedView
 
 __all__ = ["Registration", "misregistered"]
 
 
 @dataclasses.dataclass(frozen=True)
-class Registration:
+class Registration(Settings):
     """Ranges of the registration error; values are drawn once per view.
 
     Attributes:
         shifted: probability of a shift.
         shift: largest shift along rows and columns, in pixels of a real frame.
         blur: standard deviation of the blur of the colour image, in pixels of a real frame.
-
-    Raises:
-        InputError: A value is outside its limits.
     """
 
-    shifted: float = 0.5
-    shift: float = 10.0
-    blur: Range = (0.0, 3.0)
-
-    def __post_init__(self) -> None:
-        check_fields(self, shifted=(0, 1), shift=(0, 100), blur=(0, 50))
+    shifted: float = limited(0.5, 0, 1)
+    shift: float = limited(10.0, 0, 100)
+    blur: Range = limited((0.0, 3.0), 0, 50)
 
 
 def misregistered(view: RenderedView, registration: Registration, rng: np.random.Generator) -> RenderedView:

@@ -13,7 +13,7 @@ from scipy.ndimage import binary_dilation, binary_erosion, maximum_filter
 from thor2_jax.frames.frames import Intrinsics
 from thor2_jax.frames.outlier_removal import PIECE_CELL
 from training.augmentation.pixels import FRAME_PIXEL, pixel_width, without
-from training.augmentation.settings import Range, check_fields
+from training.augmentation.settings import Range, Settings, limited
 from training.rendering.camera import TRAINING_CAMERA, RenderedView
 
 __all__ = ["Segmentation", "resegmented"]
@@ -23,7 +23,7 @@ MAX_BACKGROUND_GAP = 2 * PIECE_CELL
 
 
 @dataclasses.dataclass(frozen=True)
-class Segmentation:
+class Segmentation(Settings):
     """Ranges of the mask's error; values are drawn once per view.
 
     Attributes:
@@ -31,18 +31,12 @@ class Segmentation:
         tilt: angle between the background's normal and the optical axis, degrees.
         touching: probability that the background touches the visible object, as a table does.
         gap: distance between object and background otherwise, metres.
-
-    Raises:
-        InputError: A value is outside its limits.
     """
 
-    pixels: Range = (-5.0, 4.0)
-    tilt: Range = (0.0, 70.0)
-    touching: float = 0.7
-    gap: Range = (0.0, 0.5)
-
-    def __post_init__(self) -> None:
-        check_fields(self, pixels=(-50, 50), tilt=(0, 75), touching=(0, 1), gap=(0, 10))
+    pixels: Range = limited((-5.0, 4.0), -50, 50)
+    tilt: Range = limited((0.0, 70.0), 0, 75)
+    touching: float = limited(0.7, 0, 1)
+    gap: Range = limited((0.0, 0.5), 0, 10)
 
 
 def resegmented(view: RenderedView, segmentation: Segmentation, rng: np.random.Generator) -> RenderedView:

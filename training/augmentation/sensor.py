@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from training.augmentation.pixels import FRAME_PIXEL, pixel_width, without
-from training.augmentation.settings import Range, check_fields
+from training.augmentation.settings import Range, Settings, limited
 from training.rendering.camera import RenderedView
 
 __all__ = ["Sensor", "axial_deviation", "sensed"]
 
 
 @dataclasses.dataclass(frozen=True)
-class Sensor:
+class Sensor(Settings):
     """Ranges of the depth sensor's errors; values are drawn once per view.
 
     Attributes:
@@ -30,30 +30,15 @@ class Sensor:
         missing: share of edge pixels without depth; edges are outlines, depth discontinuities and grazing surfaces.
         flying: share of the other edge pixels whose depth lies between the surface's and the background's.
         background: distance of the background behind the object, metres.
-
-    Raises:
-        InputError: A value is outside its limits.
     """
 
-    distance: Range = (0.6, 1.2)
-    axial: Range = (0.3, 1.5)
-    lateral: float = 0.8
-    grazing: float = 78.0
-    missing: float = 0.3
-    flying: float = 0.3
-    background: Range = (0.1, 1.0)
-
-    def __post_init__(self) -> None:
-        check_fields(
-            self,
-            distance=(0.2, 5),
-            axial=(0, 10),
-            lateral=(0, 10),
-            grazing=(45, 89),
-            missing=(0, 1),
-            flying=(0, 1),
-            background=(0, 10),
-        )
+    distance: Range = limited((0.6, 1.2), 0.2, 5)
+    axial: Range = limited((0.3, 1.5), 0, 10)
+    lateral: float = limited(0.8, 0, 10)
+    grazing: float = limited(78.0, 45, 89)
+    missing: float = limited(0.3, 0, 1)
+    flying: float = limited(0.3, 0, 1)
+    background: Range = limited((0.1, 1.0), 0, 10)
 
 
 def axial_deviation(z: Any) -> Any:

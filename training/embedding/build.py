@@ -22,7 +22,7 @@ from training.embedding.references import reference_views
 from training.embedding.sampling import ObjectSource, build_samples
 from training.objects.meshes import find_meshes
 from training.storage.jobs import JOB_FILE
-from training.storage.progress import Progress
+from training.storage.progress import Progress, of_stage
 from training.storage.workers import local_workers
 
 __all__ = ["build_embedding", "main"]
@@ -71,7 +71,7 @@ def build_embedding(
         config,
         views,
         pool=local_workers(workers),
-        progress=lambda done, total: progress("render for the embedding", done, total, ""),
+        progress=of_stage(progress, "render for the embedding"),
     )
     embedding = fit_embedding(
         samples,

@@ -25,7 +25,7 @@ from training.fitting.checkpoints import Checkpoints
 from training.fitting.options import EpochMetrics
 from training.objects.meshes import load_mesh
 from training.storage.jobs import JOB_FILE
-from training.storage.progress import Progress
+from training.storage.progress import Progress, of_stage
 from training.storage.workers import local_workers
 from training.views.normalized_views import ViewSource
 from training.views.render_job import mesh_digest
@@ -114,17 +114,8 @@ def _distractor_samples(
     objects = [mesh_digest(load_mesh(source)) if isinstance(source, Path) else source for source in sources]
 
     def build() -> Samples:
-        return build_samples(
-            sources,
-            directory,
-            network,
-            config,
-            distractors.views,
-            COPIES,
-            SEED,
-            local_workers(distractors.workers),
-            lambda done, total: progress(RENDER, done, total, ""),
-        )
+        pool, show = local_workers(distractors.workers), of_stage(progress, RENDER)
+        return build_samples(sources, directory, network, config, distractors.views, COPIES, SEED, pool, show)
 
     job = sampling_job(objects, network, config, distractors.views, COPIES, SEED)
     samples = cached_samples(job, build, resumes=(directory / JOB_FILE).is_file())

@@ -20,13 +20,7 @@ from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
 from thor2_jax.errors import InputError
 from thor2_jax.files import atomic_write
 from thor2_jax.types import Cloud
-from training.augmentation.augmentations import Augmentations, augment
-from training.augmentation.base import Base
-from training.augmentation.illumination import Illumination
-from training.augmentation.occlusion import Occlusion
-from training.augmentation.registration import Registration
-from training.augmentation.segmentation import Segmentation
-from training.augmentation.sensor import Sensor
+from training.augmentation.augmentations import KINDS, Augmentations, augment
 from training.embedding.samples import Samples, joined_samples, sample_clouds
 from training.objects.mesh import TexturedMesh
 from training.objects.meshes import load_mesh
@@ -43,14 +37,7 @@ __all__ = ["AUGMENTATIONS", "ObjectSource", "ViewTask", "build_samples", "render
 
 OBJECTS_PER_SHARD = 32
 
-AUGMENTATIONS = Augmentations(
-    illumination=Illumination(),
-    sensor=Sensor(),
-    occlusion=Occlusion(),
-    segmentation=Segmentation(),
-    registration=Registration(),
-    base=Base(),
-)
+AUGMENTATIONS = Augmentations.of_names(KINDS)
 
 UNCHANGED = 0.2
 """Share of views without augmentation."""

@@ -1,13 +1,12 @@
 """Breakdown of a dataset by attributes, and statistics over runs (paper, section "Results")."""
 
-import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["RunStatistics", "attribute_tables", "group_by_attributes", "summarize_rows", "summarize_runs"]
+__all__ = ["attribute_tables", "group_by_attributes", "summarize_rows", "summarize_runs"]
 
 _ORDER = {"none": 0, "low": 1, "high": 2}
 
@@ -42,30 +41,18 @@ def group_by_attributes(
     return {values: np.array(groups[values], np.intp) for values in ordered}
 
 
-@dataclasses.dataclass(frozen=True)
-class RunStatistics:
-    """Statistics of a value over several runs.
-
-    Attributes:
-        mean: mean over the runs; None if no run has the value.
-        std: sample standard deviation (n - 1); None for fewer than two runs.
-        runs: number of runs that have the value.
-    """
-
-    mean: float | None
-    std: float | None
-    runs: int
-
-
 def summarize_runs(values: Sequence[float]) -> dict[str, Any]:
-    """Return `RunStatistics` of the finite values as a JSON table."""
+    """Return the statistics of a value over several runs as a JSON table.
+
+    They are the `mean` over the runs that have a finite value, None if none has; the sample standard deviation (n - 1)
+    `std`, None for fewer than two; and the number of these `runs`.
+    """
     finite: NDArray[Any] = np.array([value for value in values if np.isfinite(value)])
-    statistics = RunStatistics(
-        float(finite.mean()) if len(finite) else None,
-        float(finite.std(ddof=1)) if len(finite) > 1 else None,
-        len(finite),
-    )
-    return dataclasses.asdict(statistics)
+    return {
+        "mean": float(finite.mean()) if len(finite) else None,
+        "std": float(finite.std(ddof=1)) if len(finite) > 1 else None,
+        "runs": len(finite),
+    }
 
 
 def summarize_rows(rows: Sequence[Mapping[str, float]]) -> dict[str, Any]:

@@ -9,7 +9,7 @@ import dataclasses
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,38 +18,13 @@ from thor2_jax.errors import InputError
 from thor2_jax.files import errors_name, write_text
 from training.storage.jobs import check_same_job
 
-__all__ = ["AnswerFile", "EvaluatedRun", "FrameAnswers", "InstancePrediction", "all_predictors", "read_answers"]
+if TYPE_CHECKING:
+    from training.evaluation.runs import Run
+
+__all__ = ["AnswerFile", "FrameAnswers", "InstancePrediction", "all_predictors", "read_answers"]
 
 
-class EvaluatedRun(Protocol):
-    """The facts of a run that results of an evaluation depend on."""
-
-    @property
-    def name(self) -> str:
-        """Name in reports."""
-
-    @property
-    def classes(self) -> tuple[str, ...]:
-        """Class names, in the order of the probabilities."""
-
-    @property
-    def predictors(self) -> tuple[str, ...]:
-        """Names of the classifiers and baselines."""
-
-    @property
-    def answer_by(self) -> str:
-        """Source of the answers: "classifiers", "gallery" or "both"."""
-
-    @property
-    def temperatures(self) -> Mapping[str, float]:
-        """Temperatures of the calibrated classifiers and baselines."""
-
-    @property
-    def thresholds(self) -> NDArray[np.float64]:
-        """[C] confidence below which an object of each class is unknown; 0 if it is always named."""
-
-
-def all_predictors(runs: Sequence[EvaluatedRun]) -> tuple[tuple[int, str], ...]:
+def all_predictors(runs: Sequence["Run"]) -> tuple[tuple[int, str], ...]:
     """Return (index of the run, name) of every classifier and baseline of all runs."""
     return tuple((index, name) for index, run in enumerate(runs) for name in run.predictors)
 

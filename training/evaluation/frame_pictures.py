@@ -5,8 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
-from training.evaluation.answers import EvaluatedRun, FrameAnswers, InstancePrediction
+from training.evaluation.answers import FrameAnswers, InstancePrediction
 from training.evaluation.results import named_answers
+from training.evaluation.runs import Run
 from training.readers.labelled import LabelledFrame
 from training.reports.instance_pictures import draw_crop, draw_judged
 
@@ -26,7 +27,7 @@ class FramePictures:
         shown: numbers of the frames that are drawn.
     """
 
-    def __init__(self, out: Path, runs: Sequence[EvaluatedRun], n_frames: int) -> None:
+    def __init__(self, out: Path, runs: Sequence[Run], n_frames: int) -> None:
         """Create the directories in `out`.
 
         Args:

@@ -4,10 +4,15 @@ import itertools
 import time
 from collections.abc import Callable, Mapping
 
-__all__ = ["Progress", "numbered"]
+__all__ = ["Progress", "numbered", "of_stage"]
 
 Progress = Callable[[str, int, int, str], object]
 """Called with (stage, done, total, note)."""
+
+
+def of_stage(progress: Progress, stage: str) -> Callable[[int, int], object]:
+    """Return the callback of a stage without notes, called with (done, total)."""
+    return lambda done, total: progress(stage, done, total, "")
 
 
 def numbered(progress: Progress, stages: Mapping[str, float]) -> Progress:

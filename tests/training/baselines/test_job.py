@@ -21,8 +21,7 @@ from thor2_jax.model.run_directory import TrainedRun, load_run, save_run
 from thor2_jax.types import Cloud
 from training.baselines import job
 from training.baselines.baseline import baseline_inputs
-from training.baselines.job import train_baselines
-from training.baselines.load import load_baselines
+from training.baselines.job import load_baselines, train_baselines
 from training.baselines.names import CLOUD_BASELINES, check_baselines
 from training.cli import app
 from training.evaluation.runs import load_runs
