@@ -37,14 +37,20 @@ from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.overlay import COLORS, Annotation, draw_instances
 from thor2_jax.model.fusion import DEFAULT_RULE
 from training.augmentation.simulated_cameras import CHOOSE, REPORT, SimulatedCamera, through_camera
-from training.evaluation.accuracy import summarize_rows
 from training.evaluation.answering import answer_frames
 from training.evaluation.answers import FrameAnswers
-from training.evaluation.confidence import auroc, expected_calibration_error, unknown_named
 from training.evaluation.fusion import Rule, main_fusion
-from training.evaluation.placements import find_placements, placement_accuracy, steadiness
 from training.evaluation.results import COVERAGE, fuse_answers
 from training.evaluation.runs import Run, load_runs
+from training.evaluation.scores import (
+    auroc,
+    expected_calibration_error,
+    find_placements,
+    placement_accuracy,
+    steadiness,
+    summarize_rows,
+    unknown_named,
+)
 from training.objects.builtin_objects import builtin_objects
 from training.readers.frames import FrameFolder
 from training.readers.labelled import LabelledFrame, sequence_of

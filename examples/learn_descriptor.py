@@ -47,8 +47,8 @@ from training.objects.builtin_objects import COLOR_PAIRS, SHAPE_PAIRS, builtin_o
 from training.objects.meshes import find_meshes, read_names
 from training.readers import FrameFolder, LabelledFrame, UWISOccluded
 from training.rendering.scenes import compose_scene
-from training.views.memory_views import MemoryViews
 from training.views.mesh_views import render_views
+from training.views.normalized_views import MemoryViews
 
 NETWORK = colornet.load_default()
 CONFIG = thor2.DescriptorConfig(homology="closed_form")

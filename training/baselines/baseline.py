@@ -20,14 +20,13 @@ from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.model.answers import DescribedFrame
 from thor2_jax.types import PointClouds
+from training.fitting.calibration import fit_temperature
 from training.fitting.checkpoints import Checkpoints
 from training.fitting.folds import fold_of_views
 from training.fitting.loop import Steps, run_epochs
 from training.fitting.options import EpochMetrics, FitOptions
-from training.fitting.temperature import fit_temperature
-from training.views.crops import rgbd_crop
+from training.views.crops import ViewCrops, quantized, rgbd_crop, stacked
 from training.views.normalized_views import ViewSource
-from training.views.view_crops import ViewCrops, quantized, stacked
 
 __all__ = [
     "Baseline",

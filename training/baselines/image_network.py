@@ -16,7 +16,7 @@ from thor2_jax.model.weights import model_arrays, model_from_arrays
 from training.baselines.baseline import BaselineInputs, FitTask, FittedBaseline, NetworkFit, fit_network, in_batches
 from training.baselines.networks.architectures import ARCHITECTURES, network_inputs
 from training.baselines.networks.weights import load_weights
-from training.views.view_crops import ViewCrops
+from training.views.crops import ViewCrops
 
 __all__ = ["CropSamples", "ImageNetwork", "fit_image_network", "read_samples"]
 

@@ -23,7 +23,7 @@ from training.baselines.image_network import INFERENCE_BATCH, ImageNetwork, read
 from training.baselines.networks.architectures import ARCHITECTURES, network_inputs
 from training.baselines.networks.vit import VIT_DINOV2_SMALL, ViT
 from training.baselines.networks.weights import load_weights
-from training.views.view_crops import ViewCrops
+from training.views.crops import ViewCrops
 
 __all__ = ["BACKBONES", "DINOV2", "Templates", "backbone_size", "create_backbone", "fit_templates"]
 

@@ -17,13 +17,13 @@ from training.cli.app import (
     ModelOption,
     SegmentOption,
     UnknownOption,
+    WorkerOptions,
     app,
     console,
     finish,
     grouped_options,
 )
 from training.cli.recognize_bag import BagOutputs, recognize_bag
-from training.cli.workers import WorkerOptions
 
 if TYPE_CHECKING:
     from thor2_jax.model.answers import Recognition

@@ -48,8 +48,7 @@ def recognize_bag(
     from thor2_jax.recordings.bag_writer import DetectionBag
     from thor2_jax.recordings.rerun_file import RerunFile
     from thor2_jax.segmentation.segmenters import TABLE, load_segmenter
-    from training.bag_recognition import recognize_recorded
-    from training.frame_recognition import segmentation_failure
+    from training.frame_recognition import recognize_recorded, segmentation_failure
 
     segmenter = load_segmenter(segment or TABLE)
     bag = given.open_bag()

@@ -7,9 +7,8 @@ from typing import Annotated
 import typer
 
 from thor2_jax.errors import InputError
-from training.cli.app import MeshScaleOption, QuietOption, app, finish, grouped_options
+from training.cli.app import MeshScaleOption, QuietOption, WorkerOptions, app, finish, grouped_options
 from training.cli.progress import show_progress
-from training.cli.workers import WorkerOptions
 
 MAX_CROP = 2048
 """Largest side of a crop, pixels."""

@@ -17,8 +17,7 @@ from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
 from thor2_jax.files import check_output_directory, check_output_file, remove_written
 from thor2_jax.gallery.embedding import Embedding
-from training.embedding.fit import EmbeddingFit, fit_embedding
-from training.embedding.references import reference_views
+from training.embedding.fit import EmbeddingFit, fit_embedding, reference_views
 from training.embedding.sampling import ObjectSource, build_samples
 from training.objects.meshes import find_meshes
 from training.storage.jobs import JOB_FILE

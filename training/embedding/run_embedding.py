@@ -5,6 +5,7 @@ them is held out, so that the confidence is calibrated on unknown objects that n
 """
 
 import dataclasses
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,11 +17,9 @@ from colornet import ColorNetwork
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
 from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
-from training.embedding.fit import EmbeddingFit, fit_embedding
-from training.embedding.references import reference_views
-from training.embedding.sample_cache import cached_samples
-from training.embedding.samples import Samples, joined_samples, sample_views
-from training.embedding.sampling import ObjectSource, build_samples, sampling_job
+from training.embedding.fit import EmbeddingFit, fit_embedding, reference_views
+from training.embedding.samples import Samples, joined_samples, sample_clouds
+from training.embedding.sampling import ObjectSource, build_samples, cached_samples, sampling_job
 from training.fitting.checkpoints import Checkpoints
 from training.fitting.options import EpochMetrics
 from training.objects.meshes import load_mesh
@@ -165,9 +164,11 @@ def fit_run_embedding(
     for index, shard in enumerate(source.shards):
         views, rng = source.read(index), np.random.default_rng([seed, index])
         mask = np.isin(views.view, held_out.get(shard.label, []))
-        for rows, chunks in ((~mask, fitted), (mask, kept)):
-            if rows.any():
-                chunks.append(sample_views(views, rows, network, config, COPIES, rng))
+        for is_kept, chunks in ((False, fitted), (True, kept)):
+            clouds = list(itertools.compress(views.clouds(), mask == is_kept))
+            if clouds:
+                labels = [views.label] * len(clouds)
+                chunks.append(sample_clouds(clouds, labels, network, config, COPIES, rng, are_normal=True))
         progress(DESCRIBE, index + 1, len(source.shards), "")
     is_held_out = others.label % HELD_OUT == 0
     # Labels of fitted distractors are consecutive.

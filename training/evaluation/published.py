@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from training.evaluation.accuracy import summarize_runs
 from training.evaluation.fusion import Rule
+from training.evaluation.scores import summarize_runs
 
 __all__ = [
     "EvaluationConditions",

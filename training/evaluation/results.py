@@ -9,18 +9,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.model.fusion import DEFAULT_RULE
-from training.evaluation.accuracy import attribute_tables, group_by_attributes, summarize_rows, summarize_runs
 from training.evaluation.answers import FrameAnswers, InstancePrediction, all_predictors
-from training.evaluation.confidence import (
+from training.evaluation.fusion import RULES, Rule, fuse_by, fusions, main_fusion
+from training.evaluation.published import EvaluationConditions, compare_with_published, published_means
+from training.evaluation.scores import (
     accuracy_at_coverage,
+    attribute_tables,
     auroc,
     expected_calibration_error,
+    find_placements,
+    group_by_attributes,
+    placement_accuracy,
     reliability,
+    steadiness,
+    summarize_rows,
+    summarize_runs,
     unknown_named,
 )
-from training.evaluation.fusion import RULES, Rule, fuse_by, fusions, main_fusion
-from training.evaluation.placements import find_placements, placement_accuracy, steadiness
-from training.evaluation.published import EvaluationConditions, compare_with_published, published_means
 from training.readers.labelled import sequence_of
 
 if TYPE_CHECKING:

@@ -36,18 +36,15 @@ from thor2_jax.model.confidence import Calibration
 from thor2_jax.model.run_directory import EMBEDDING_FILE, TrainedRun, load_run, save_run, weights_file
 from thor2_jax.model.run_record import RUN_FILE
 from training.embedding.run_embedding import STAGES, Distractors, fit_run_embedding
-from training.fitting.calibration import temperatures
+from training.fitting.calibration import fit_calibration, temperatures
 from training.fitting.checkpoints import BEGUN, CHECKPOINTS, Checkpoints
-from training.fitting.confidence import fit_calibration
 from training.fitting.fit import check_batch_size, fit
 from training.fitting.folds import fold_of_views
-from training.fitting.metrics_log import append_metrics, discard_later_epochs, read_metrics
-from training.fitting.options import EpochMetrics, FitOptions
+from training.fitting.options import EpochMetrics, FitOptions, append_metrics, discard_later_epochs, read_metrics
 from training.fitting.samples import MIRRORS, Samples, build_samples
 from training.fitting.steps import FitContext
 from training.reports.plots import draw_curves
-from training.storage.jobs import check_same_job
-from training.storage.locks import locked
+from training.storage.jobs import check_same_job, locked
 from training.storage.progress import Progress
 from training.views.normalized_views import ViewSource
 

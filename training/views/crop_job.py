@@ -21,14 +21,10 @@ from training.augmentation.augmentations import Augmentations
 from training.objects.mesh import TexturedMesh
 from training.rendering.camera import RenderedView
 from training.rendering.view_sphere import view_angles
-from training.storage.jobs import check_same_job
-from training.storage.locks import locked
+from training.storage.jobs import check_same_job, locked
 from training.storage.workers import IN_PROCESS, WorkerPool
-from training.views.crops import CROP_SIZE, rgbd_crop
-from training.views.dataset import ViewDataset
-from training.views.mesh_views import RenderProgress, ViewTask, all_views, clouds_per_view, view_tasks
-from training.views.render_job import ShardPlan
-from training.views.view_crops import (
+from training.views.crops import (
+    CROP_SIZE,
     CROPS,
     MANIFEST,
     CropManifest,
@@ -38,8 +34,12 @@ from training.views.view_crops import (
     encode_crops,
     intact_content,
     quantized,
+    rgbd_crop,
     stacked,
 )
+from training.views.dataset import ViewDataset
+from training.views.mesh_views import RenderProgress, ViewTask, all_views, clouds_per_view, view_tasks
+from training.views.render_job import ShardPlan
 
 __all__ = ["render_crops", "view_crop"]
 

@@ -10,6 +10,7 @@ import contextlib
 import dataclasses
 import functools
 import hashlib
+import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -25,9 +26,9 @@ from training.augmentation.augmentations import Augmentations
 from training.objects.mesh import TexturedMesh
 from training.rendering.camera import TRAINING_CAMERA
 from training.rendering.view_sphere import DISTANCE, view_angles
-from training.storage.jobs import check_same_job
-from training.storage.locks import locked
+from training.storage.jobs import check_same_job, locked
 from training.storage.workers import IN_PROCESS, WorkerPool
+from training.views.crops import intact_content
 from training.views.dataset import MANIFEST, Manifest, Shard, ViewDataset, encode
 from training.views.mesh_views import (
     MIN_VIEW_POINTS,
@@ -71,14 +72,6 @@ def _objects(meshes: Mapping[str, Path | TexturedMesh], angles: NDArray[np.float
     return objects
 
 
-def _is_intact(shard: Shard, directory: Path) -> bool:
-    try:
-        shard.content(directory)
-    except InputError:
-        return False
-    return True
-
-
 def _begin(directory: Path, job: Mapping[str, Any]) -> Manifest:
     """Return the manifest with the intact shards; write it if it is missing or lists damaged shards.
 
@@ -92,7 +85,8 @@ def _begin(directory: Path, job: Mapping[str, Any]) -> Manifest:
         check_same_job(directory, stored.job, job)
     remove_leftovers(directory)
     shards = stored.shards if stored else ()
-    manifest = Manifest(job, tuple(shard for shard in shards if _is_intact(shard, directory)))
+    is_intact = [intact_content(directory, shard.file, shard.sha256) is not None for shard in shards]
+    manifest = Manifest(job, tuple(itertools.compress(shards, is_intact)))
     if manifest != stored:
         manifest.write(directory)
     return manifest

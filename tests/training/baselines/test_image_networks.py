@@ -27,8 +27,8 @@ from training.baselines.networks.weights import tensor_shapes
 from training.baselines.templates import BACKBONES, Templates, create_backbone
 from training.fitting.options import FitOptions
 from training.train_job import TrainJob, run_train_job
-from training.views.memory_views import MemoryViews
-from training.views.view_crops import ViewCrops
+from training.views.crops import ViewCrops
+from training.views.normalized_views import MemoryViews
 
 CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=1, image_size=8)
 NAMES = ("red", "blue")

@@ -28,8 +28,7 @@ from training.evaluation.runs import load_runs
 from training.fitting.folds import fold_of_views
 from training.fitting.job import is_finished
 from training.views.left_out import WithoutClasses
-from training.views.memory_views import MemoryViews
-from training.views.normalized_views import normalize_views
+from training.views.normalized_views import MemoryViews, normalize_views
 
 CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=1, image_size=8)
 NAMES = ("plank", "cube")

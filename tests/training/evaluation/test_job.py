@@ -27,7 +27,7 @@ from training.evaluation.answers import AnswerFile
 from training.evaluation.job import evaluate_dataset
 from training.evaluation.runs import Run, load_runs
 from training.readers.labelled import LabelledFrame, LabelledFrames
-from training.storage.locks import LOCK, locked
+from training.storage.jobs import LOCK, locked
 
 CLASSES = ("bowl", "can", "mug")
 

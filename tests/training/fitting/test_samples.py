@@ -14,8 +14,7 @@ from thor2_jax.descriptor.color_membership import region_sets
 from thor2_jax.types import Cloud
 from training.fitting import samples as module
 from training.fitting.samples import PAPER_MIRRORS, Samples, build_samples, expand
-from training.views.memory_views import MemoryViews
-from training.views.normalized_views import NormalizedViews
+from training.views.normalized_views import MemoryViews, NormalizedViews
 
 NETWORK = colornet.load_default()
 CONFIG = thor2.DescriptorConfig(homology="closed_form")

@@ -18,11 +18,10 @@ from training.rendering.ray_caster import RayCaster, render_view
 from training.rendering.view_sphere import camera_pose, view_angles
 from training.views import crop_job
 from training.views.crop_job import render_crops
-from training.views.crops import rgbd_crop
+from training.views.crops import ViewCrops, quantized, rgbd_crop, stacked
 from training.views.dataset import ViewDataset
 from training.views.left_out import WithoutClasses
 from training.views.render_job import render_dataset
-from training.views.view_crops import ViewCrops, quantized, stacked
 
 SIZE = 24
 
