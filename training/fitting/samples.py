@@ -131,7 +131,7 @@ def build_samples(
     source: ViewSource,
     network: ColorNetwork,
     config: DescriptorConfig,
-    progress: Callable[[int], object] = lambda n: None,
+    progress: Callable[[int, int], object] = lambda done, total: None,
     mirrors: Sequence[str] = MIRRORS,
     orientations: int = 0,
     seed: int = 0,
@@ -142,7 +142,7 @@ def build_samples(
         source: normalized views.
         network: colour network that gives the regions.
         config: descriptor. Static.
-        progress: called with the number of views done since the last call.
+        progress: called with (views done, number of views).
         mirrors: axes of each mirror, such as "xy"; one sample each.
         orientations: further samples of each view, in random orientations.
         seed: seed for the orientations.
@@ -159,6 +159,7 @@ def build_samples(
     # With one "region" per set, colour vectors count the sets: sparse, with integer values.
     counting = RegionSets(sets.of_color, jnp.eye(len(sets.weights)))
     chunks: list[dict[str, NDArray[Any]]] = []
+    all_done, total = 0, sum(shard.views for shard in source.shards)
     for index, shard in enumerate(source.shards):
         views, rng = source.read(index), np.random.default_rng([seed, index])
         done = 0
@@ -170,7 +171,8 @@ def build_samples(
                 compact["label"] = np.full(count, shard.label, np.int32)
                 chunks.append(compact | {"view": views.view[done : done + count]})
             done += count
-            progress(count)
+            progress(all_done + done, total)
+        all_done += done
     fields = {name: np.concatenate([chunk[name] for chunk in chunks]) for name in chunks[0]}
     for name in ("strip", "color"):
         fields[f"{name}_start"] = np.concatenate([[0], np.cumsum(fields.pop(f"{name}_entries"), dtype=np.int64)])

@@ -10,9 +10,13 @@ Progress = Callable[[str, int, int, str], object]
 """Called with (stage, done, total, note)."""
 
 
-def of_stage(progress: Progress, stage: str) -> Callable[[int, int], object]:
+def of_stage(progress: Progress, stage: str) -> Callable[[int, int], None]:
     """Return the callback of a stage without notes, called with (done, total)."""
-    return lambda done, total: progress(stage, done, total, "")
+
+    def show(done: int, total: int) -> None:
+        progress(stage, done, total, "")
+
+    return show
 
 
 def numbered(progress: Progress, stages: Mapping[str, float]) -> Progress:

@@ -49,10 +49,10 @@ def test_every_view_is_used_mirrored_in_four_ways(
 ) -> None:
     monkeypatch.setattr(module, "VIEWS_PER_BATCH", 2)
     source = MemoryViews({"mug": views(0, (300, 299, 1)), "box": views(1, (40,))}, config)
-    progress: list[int] = []
-    samples = build_samples(source, NETWORK, config, progress.append, PAPER_MIRRORS)
+    progress: list[tuple[int, ...]] = []
+    samples = build_samples(source, NETWORK, config, lambda *done: progress.append(done), PAPER_MIRRORS)
     assert samples.classes == ("mug", "box") and len(samples) == 16
-    assert progress == [2, 1, 1]
+    assert progress == [(2, 4), (3, 4), (4, 4)]
     assert sorted(zip(samples.label.tolist(), samples.view.tolist(), strict=True)) == sorted(
         [(0, v) for v in range(3)] * 4 + [(1, 0)] * 4
     )
