@@ -159,10 +159,7 @@ _BUILD: dict[str, Callable[[Mapping[str, Any], TrainedRun], Baseline]] = {
     "thor": lambda arrays, run: THOR.with_arrays(arrays, run.config, len(run.classes)),
     "forest": lambda arrays, run: Forest(arrays, run.network, run.config),
     "pointnet": lambda arrays, run: ColoredPointNet.with_arrays(arrays, len(run.classes)),
-    **{
-        name: lambda arrays, run, name=name: ImageNetwork.with_arrays(name, arrays, len(run.classes))
-        for name in NETWORKS
-    },
+    **{name: partial(_network, name) for name in NETWORKS},
     "templates": lambda arrays, run: Templates.with_arrays(arrays, len(run.classes)),
 }
 
