@@ -15,7 +15,7 @@ from training.augmentation.pixels import FRAME_PIXEL, pixel_width, without
 from training.augmentation.settings import Range, Settings, limited
 from training.rendering.camera import RenderedView
 
-__all__ = ["Sensor", "axial_deviation", "sensed"]
+__all__ = ["Sensor", "axial_deviation", "depth_edges", "sensed"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,7 +59,7 @@ def sensed(view: RenderedView, sensor: Sensor, rng: np.random.Generator) -> Rend
     # The margin has no depth, so that the border of the view is an edge and lateral samples can fall there.
     margin = 1 + math.ceil(4 * lateral)
     depth = np.pad(view.depth, margin).astype(np.float32)
-    edge = _edges(depth, 1000 * width * math.tan(math.radians(sensor.grazing)))
+    edge = depth_edges(depth, 1000 * width * math.tan(math.radians(sensor.grazing)))
     shift = np.rint(np.float32(lateral) * rng.standard_normal((2, n), np.float32)).clip(-margin, margin)
     row, column = np.divmod(pixels, view.depth.shape[1])
     at = (row + margin) * depth.shape[1] + column + margin
@@ -76,7 +76,7 @@ def sensed(view: RenderedView, sensor: Sensor, rng: np.random.Generator) -> Rend
     return without(dataclasses.replace(view, depth=measured), pixels[lost])
 
 
-def _edges(depth: NDArray[np.float32], step: float) -> NDArray[np.bool_]:
+def depth_edges(depth: NDArray[np.floating], step: float) -> NDArray[np.bool_]:
     """Return the pixels whose depth differs from a neighbour's by more than `step`; missing depth counts as 0."""
     edge = np.zeros(depth.shape, bool)
     for here, beside in ((edge, depth), (edge.T, depth.T)):

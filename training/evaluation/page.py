@@ -34,19 +34,17 @@ MAX_GROUPS = 8
 """Largest number of table rows that is also drawn as a bar chart."""
 
 
-def _mean_std(statistics: Mapping[str, Any]) -> str:
+def _mean_std(statistics: Mapping[str, Any], factor: float = 1.0, digits: int = 3) -> str:
     """Return the mean, and the standard deviation if there are several runs."""
     if statistics["mean"] is None:
         return "–"
-    return f"{statistics['mean']:.3f}" + ("" if statistics["std"] is None else f" ±\u00a0{statistics['std']:.3f}")
+    values = [value for value in (statistics["mean"], statistics["std"]) if value is not None]
+    return " ±\u00a0".join(f"{factor * value:.{digits}f}" for value in values)
 
 
 def _percent(statistics: Mapping[str, Any]) -> str:
     """Return `_mean_std` in percent, with two decimals as in the publications."""
-    if statistics["mean"] is None:
-        return "–"
-    std = statistics["std"]
-    return f"{100 * statistics['mean']:.2f}" + ("" if std is None else f" ±\u00a0{100 * std:.2f}")
+    return _mean_std(statistics, 100.0, 2)
 
 
 def _marked(title: str, main: str) -> str:
@@ -67,15 +65,14 @@ def accuracy_table(table: Mapping[str, Any], titles: Sequence[str]) -> Table:
         titles: fusions to show.
     """
     header = [", ".join(table["by"]), "instances", *titles]
-    rows = []
-    for cell in table["cells"]:
-        rows.append(
-            [
-                ", ".join(cell["where"].values()) or "all",
-                f"{cell['instances']:,}",
-                *(_mean_std(cell["accuracy"][title]) for title in titles),
-            ]
-        )
+    rows = [
+        [
+            ", ".join(cell["where"].values()) or "all",
+            f"{cell['instances']:,}",
+            *(_mean_std(cell["accuracy"][title]) for title in titles),
+        ]
+        for cell in table["cells"]
+    ]
     return header, rows
 
 
@@ -288,15 +285,8 @@ def _placement_sections(report: Mapping[str, Any]) -> list[Section]:
     if placements["count"] == overall["instances"]:
         return []
     header = ["", "accuracy over instances", "accuracy over placements", "steadiness"]
-    rows = [
-        [
-            title,
-            _mean_std(overall["accuracy"][title]),
-            _mean_std(placements["accuracy"][title]),
-            _mean_std(placements["steadiness"][title]),
-        ]
-        for title in report["fusions"]
-    ]
+    columns = overall["accuracy"], placements["accuracy"], placements["steadiness"]
+    rows = [[title, *(_mean_std(column[title]) for column in columns)] for title in report["fusions"]]
     text = (
         f"The {overall['instances']:,} instances are {placements['count']:,} placements: an object that does not move "
         "in neighbouring frames is one placement, since its answers are not independent. Accuracy over placements is "
