@@ -32,7 +32,7 @@ from training.baselines.files import baseline_file
 from training.baselines.job import check_weights, pretrained_files
 from training.baselines.names import check_baselines, crop_size
 from training.evaluation.runs import load_runs
-from training.fitting.run_directories import find_run_directories
+from training.fitting.checkpoints import find_run_directories
 from training.objects.meshes import find_meshes, read_names
 from training.readers.frames import FrameFolder
 from training.readers.labelled import LabelledFrames

@@ -29,13 +29,12 @@ from training.readers.frames import FrameFolder
 from training.storage.jobs import check_same_job
 from training.storage.progress import Progress, numbered, of_stage
 from training.storage.workers import local_workers
-from training.views.crop_job import render_crops
 from training.views.crops import QuantizedCrop, quantized, rgbd_crop
 from training.views.dataset import ViewDataset, remove_views
 from training.views.labelled_views import WithLabelledViews, digest_of_instances
 from training.views.left_out import WithoutClasses, sequence_sources
 from training.views.normalized_views import ViewSource
-from training.views.render_job import dataset_job, render_dataset
+from training.views.render_job import dataset_job, render_crops, render_dataset
 
 __all__ = ["TrainJob", "run_train_job"]
 

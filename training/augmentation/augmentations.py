@@ -18,12 +18,10 @@ import numpy as np
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.outlier_removal import flying_pixels
-from training.augmentation.base import Base, without_base
-from training.augmentation.illumination import Illumination, relit
+from training.augmentation.illumination import Illumination, Registration, misregistered, relit
 from training.augmentation.occlusion import Occlusion, occluded
 from training.augmentation.pixels import without
-from training.augmentation.registration import Registration, misregistered
-from training.augmentation.segmentation import Segmentation, resegmented
+from training.augmentation.segmentation import Base, Segmentation, resegmented, without_base
 from training.augmentation.sensor import Sensor, sensed
 from training.rendering.camera import RenderedView
 

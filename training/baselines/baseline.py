@@ -22,9 +22,9 @@ from thor2_jax.model.answers import DescribedFrame
 from thor2_jax.types import PointClouds
 from training.fitting.calibration import fit_temperature
 from training.fitting.checkpoints import Checkpoints
-from training.fitting.folds import fold_of_views
 from training.fitting.loop import Steps, run_epochs
 from training.fitting.options import EpochMetrics, FitOptions
+from training.fitting.samples import fold_of_views
 from training.views.crops import ViewCrops, quantized, rgbd_crop, stacked
 from training.views.normalized_views import ViewSource
 

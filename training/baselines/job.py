@@ -22,8 +22,8 @@ from training.baselines.networks.weights import load_weights, weights_file
 from training.baselines.pointnet import ColoredPointNet, fit_pointnet
 from training.baselines.templates import DINOV2, Templates, create_backbone, fit_templates
 from training.baselines.thor import THOR, fit_thor
+from training.fitting.checkpoints import find_run_directories
 from training.fitting.options import FitOptions
-from training.fitting.run_directories import find_run_directories
 from training.storage.progress import Progress
 from training.views.normalized_views import ViewSource
 

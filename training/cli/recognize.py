@@ -91,7 +91,7 @@ def recognize(
         track_frames,
     )
     from training.readers.bop import read_object_names
-    from training.readers.poses import read_poses
+    from training.readers.frame_files import read_poses
 
     given.check()
     arguments = RecognizerArguments(model, unknown_below, answer_by)

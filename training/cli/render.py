@@ -59,8 +59,7 @@ def render(
     from training.objects.meshes import find_meshes, read_names, scaled_meshes
     from training.storage.progress import of_stage
     from training.storage.workers import IN_PROCESS
-    from training.views.crop_job import render_crops
-    from training.views.render_job import render_dataset
+    from training.views.render_job import render_crops, render_dataset
 
     if crops is not None and not 1 <= crops <= MAX_CROP:
         raise InputError(f"crops is {crops}; expected 1 to {MAX_CROP} pixels")

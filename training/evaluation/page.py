@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from training.baselines.names import TITLES
+from training.evaluation.answers import ALL_CLASSIFIERS, EMBEDDED, RULES, WHOLE
 from training.evaluation.frame_pictures import FramePictures
-from training.evaluation.fusion import ALL_CLASSIFIERS, EMBEDDED, RULES, WHOLE
 from training.evaluation.published import published_seconds
 from training.evaluation.results import COVERAGE
 from training.reports.html import Picture, Section, Table, write_page

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from training.evaluation.fusion import Rule
+from training.evaluation.answers import Rule
 from training.evaluation.scores import summarize_runs
 
 __all__ = [

@@ -9,8 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.model.fusion import DEFAULT_RULE
-from training.evaluation.answers import FrameAnswers, InstancePrediction, all_predictors
-from training.evaluation.fusion import RULES, Rule, fuse_by, fusions, main_fusion
+from training.evaluation.answers import (
+    RULES,
+    FrameAnswers,
+    InstancePrediction,
+    Rule,
+    all_predictors,
+    fuse_by,
+    fusions,
+    main_fusion,
+)
 from training.evaluation.published import EvaluationConditions, compare_with_published, published_means
 from training.evaluation.scores import (
     accuracy_at_coverage,

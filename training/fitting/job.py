@@ -39,9 +39,8 @@ from training.embedding.run_embedding import STAGES, Distractors, fit_run_embedd
 from training.fitting.calibration import fit_calibration, temperatures
 from training.fitting.checkpoints import BEGUN, CHECKPOINTS, Checkpoints
 from training.fitting.fit import check_batch_size, fit
-from training.fitting.folds import fold_of_views
 from training.fitting.options import EpochMetrics, FitOptions, append_metrics, discard_later_epochs, read_metrics
-from training.fitting.samples import MIRRORS, Samples, build_samples
+from training.fitting.samples import MIRRORS, Samples, build_samples, fold_of_views
 from training.fitting.steps import FitContext
 from training.reports.plots import draw_curves
 from training.storage.jobs import check_same_job, locked
@@ -328,9 +327,11 @@ class _Fold(NamedTuple):
     def fit_classifiers(self) -> tuple[dict[Feature, MLP], dict[Feature, int]]:
         """Fit the classifiers; return them and the epochs that they are from."""
         settings, samples, first = self.settings, self.samples, jax.process_index() == 0
+        if not isinstance(samples, Samples):
+            return {}, {}
         classifiers: dict[Feature, MLP] = {}
         best_epochs: dict[Feature, int] = {}
-        for name in settings.features if isinstance(samples, Samples) else ():
+        for name in settings.features:
             stage = settings.of_fold(f"fit {name}", self.number)
 
             def show(done: int, total: int, metrics: EpochMetrics, stage: str = stage) -> None:

@@ -25,8 +25,8 @@ from training.baselines.job import load_baselines, train_baselines
 from training.baselines.names import CLOUD_BASELINES, check_baselines
 from training.cli import app
 from training.evaluation.runs import load_runs
-from training.fitting.folds import fold_of_views
 from training.fitting.job import is_finished
+from training.fitting.samples import fold_of_views
 from training.views.left_out import WithoutClasses
 from training.views.normalized_views import MemoryViews, normalize_views
 
