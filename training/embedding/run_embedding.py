@@ -96,13 +96,8 @@ class Distractors:
     @property
     def record(self) -> dict[str, Any]:
         """All that determines the embedding, as JSON holds it."""
-        return {
-            "procedural": self.procedural,
-            "meshes": sorted(self.meshes),
-            "views": self.views,
-            "epochs": self.epochs,
-            "networks": self.networks,
-        }
+        named = {field.name: getattr(self, field.name) for field in dataclasses.fields(self) if field.name != "workers"}
+        return named | {"meshes": sorted(self.meshes)}
 
 
 def _distractor_samples(

@@ -128,10 +128,14 @@ def write_report_page(report: Mapping[str, Any], pictures: FramePictures, out: P
     """
     sections: list[Section] = []
     if report["fusions"]:
+        main = report["main"]
         sections += [
             _answer_section(report, pictures, out),
             *_accuracy_sections(report, out),
-            *_published_sections(report),
+            *(
+                Section(comparison_title(table), comparison_text(table), marked(comparison_table(table, main), main))
+                for table in report["published_tables"]
+            ),
             *_fusion_sections(report),
             *_placement_sections(report),
             _confidence_section(report, out),
@@ -144,10 +148,6 @@ def write_report_page(report: Mapping[str, Any], pictures: FramePictures, out: P
         f"{runs} trained {'model' if runs == 1 else 'models'}. Dataset: {dataset['path']}"
     )
     write_page(out / "report.html", title=f"Evaluation on {dataset['kind']}", lead=lead, sections=sections)
-
-
-def _relative(path: Path, out: Path) -> str:
-    return path.relative_to(out).as_posix()
 
 
 def answer_texts(report: Mapping[str, Any]) -> list[str]:
@@ -173,7 +173,7 @@ def _answer_section(report: Mapping[str, Any], pictures: FramePictures, out: Pat
         rows.append([truth, name, f"{pair['count']}", f"{pair['share']:.0%}"])
         crop = pictures.confusion_path(pair["truth"], name)
         if crop.is_file():
-            shown.append(Picture(_relative(crop, out), f"{truth}, recognized as {name}", small=True))
+            shown.append(Picture(crop.relative_to(out).as_posix(), f"{truth}, recognized as {name}", small=True))
     models = f" Counts are sums over {len(report['runs'])} models." if len(report["runs"]) > 1 else ""
     text = " ".join(answer_texts(report)[:2]) + models
     text += " The most frequent wrong names, each with its most confident instance:" if rows else " No name is wrong."
@@ -202,17 +202,6 @@ def _with_fold(section: Section, every: Table, pictures: Sequence[Picture] = ())
         return dataclasses.replace(section, pictures=[*section.pictures, *pictures])
     folded = Section("Every classifier and baseline", table=every, pictures=pictures)
     return dataclasses.replace(section, folded=folded)
-
-
-def _published_sections(report: Mapping[str, Any]) -> list[Section]:
-    return [
-        Section(
-            comparison_title(table),
-            comparison_text(table),
-            marked(comparison_table(table, report["main"]), report["main"]),
-        )
-        for table in report["published_tables"]
-    ]
 
 
 def _accuracy_text(report: Mapping[str, Any]) -> str:
@@ -385,7 +374,7 @@ def _frame_section(report: Mapping[str, Any], pictures: FramePictures, out: Path
         "true object stands in brackets; none: the instance could not be described."
     )
     shown = [
-        Picture(_relative(pictures.frame_path(number), out), f"Frame {name}.", half=True)
+        Picture(pictures.frame_path(number).relative_to(out).as_posix(), f"Frame {name}.", half=True)
         for number, name in zip(pictures.shown, report["shown"], strict=True)
     ]
     return Section("Frames", text, pictures=shown)
