@@ -84,6 +84,13 @@ class Shard:
     left_out: int
     points: int
 
+    def __post_init__(self) -> None:
+        numbers = (self.label, self.views, self.left_out, self.points)
+        if not all(type(number) is int and number >= 0 for number in numbers):
+            raise ValueError(f"label, views, left_out, points are {numbers!r}; expected non-negative integers")
+        if not isinstance(self.file, str) or Path(self.file).name != self.file:
+            raise ValueError(f"file is {self.file!r}; expected a plain file name")
+
     def content(self, directory: Path) -> bytes:
         """Return the bytes of the file.
 
@@ -163,7 +170,15 @@ class Manifest:
                 checksum = table.pop("sha256")
                 if checksum != hashlib.sha256(_dump(table).encode()).hexdigest():
                     raise ValueError("its checksum differs")
-                return cls(table["job"], tuple(Shard(**shard) for shard in table["shards"]))
+                manifest = cls(table["job"], tuple(Shard(**shard) for shard in table["shards"]))
+                names = [entry["name"] for entry in manifest.job["objects"]]
+                if not all(isinstance(name, str) for name in names):
+                    raise ValueError(f"its objects are named {names!r}")
+                if any(shard.label >= len(names) for shard in manifest.shards):
+                    raise ValueError("a shard has a label without an object")
+                if type(manifest.job["shards"]) is not int or "descriptor_version" not in manifest.job:
+                    raise ValueError("its job lacks the number of shards or the descriptor version")
+                return manifest
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise InputError(f"dataset: {path} is damaged ({type(error).__name__}: {error})") from None
         raise InputError(f"dataset: {path} has format {table['format']!r}; expected {MANIFEST_FORMAT}; render it again")
