@@ -40,7 +40,7 @@ from thor2_jax.tracking.fusion import FusedEvidence, view_weight
 from thor2_jax.tracking.next_view import ViewTable, next_view
 from thor2_jax.tracking.poses import merge_views, transform
 from thor2_jax.tracking.tracker import Tracker
-from training.evaluation.placements import placement_accuracy, steadiness
+from training.evaluation.scores import placement_accuracy, steadiness
 from training.objects.mesh import TexturedMesh
 from training.objects.meshes import find_meshes, load_mesh, read_names
 from training.readers.labelled import LabelledFrame, sequence_of

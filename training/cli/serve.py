@@ -8,8 +8,7 @@ import typer
 
 from thor2_jax.errors import InputError
 from thor2_jax.service.signals import ended_by_signals
-from training.cli.app import AllowHostOption, ModelOption, UnknownOption, app
-from training.cli.workers import MAX_WORKERS
+from training.cli.app import MAX_WORKERS, AllowHostOption, ModelOption, UnknownOption, app
 
 
 @app.command()

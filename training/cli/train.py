@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from thor2_jax.errors import InputError
-from training.cli.app import ManyFrames, MeshScaleOption, QuietOption, app, console, finish, split_names
+from training.cli.app import MAX_WORKERS, ManyFrames, MeshScaleOption, QuietOption, app, console, finish, split_names
 from training.cli.progress import show_progress
-from training.cli.workers import MAX_WORKERS
 
 if TYPE_CHECKING:
     from training.embedding.run_embedding import Distractors

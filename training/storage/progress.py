@@ -4,10 +4,19 @@ import itertools
 import time
 from collections.abc import Callable, Mapping
 
-__all__ = ["Progress", "numbered"]
+__all__ = ["Progress", "numbered", "of_stage"]
 
 Progress = Callable[[str, int, int, str], object]
 """Called with (stage, done, total, note)."""
+
+
+def of_stage(progress: Progress, stage: str) -> Callable[[int, int], None]:
+    """Return the callback of a stage without notes, called with (done, total)."""
+
+    def show(done: int, total: int) -> None:
+        progress(stage, done, total, "")
+
+    return show
 
 
 def numbered(progress: Progress, stages: Mapping[str, float]) -> Progress:

@@ -27,7 +27,7 @@ from training.evaluation.answers import AnswerFile
 from training.evaluation.job import evaluate_dataset
 from training.evaluation.runs import Run, load_runs
 from training.readers.labelled import LabelledFrame, LabelledFrames
-from training.storage.locks import LOCK, locked
+from training.storage.jobs import LOCK, locked
 
 CLASSES = ("bowl", "can", "mug")
 
@@ -312,7 +312,7 @@ def test_an_unreadable_first_frame_leaves_no_directory(tmp_path: Path) -> None:
 
 
 def test_outlines_show_correct_and_incorrect_answers(tmp_path: Path) -> None:
-    from training.reports.instance_pictures import CORRECT, INCORRECT, draw_crop, draw_judged
+    from training.evaluation.frame_pictures import CORRECT, INCORRECT, draw_crop, draw_judged
 
     color = np.full((60, 90, 3), 128, np.uint8)
     labels = np.zeros((60, 90), np.uint8)
