@@ -49,7 +49,6 @@ def batch_bucket(n_clouds: int) -> int:
 def batch_points(counts: Iterable[int]) -> int:
     """Return the padded number of points for clouds with these numbers of points, in batches of a command.
 
-    Raises:
-        InputError: a number exceeds the largest bucket.
+    It is at most the largest bucket; `PointClouds.pack` names the cloud that has more points.
     """
-    return point_bucket(max([MIN_BATCH_POINTS, *counts]))
+    return point_bucket(min(max([MIN_BATCH_POINTS, *counts]), POINT_BUCKETS[-1]))

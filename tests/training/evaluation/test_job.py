@@ -47,7 +47,8 @@ class ToyDataset(LabelledFrames):
         labels[5:20, 5:25] = 1
         labels[25:40, 20:60] = 2 if number % 4 else 0
         labels[2:9, 40:60] = 3
-        depth = np.full((48, 64), 800, np.uint16)
+        rows, columns = np.indices(labels.shape)  # curved, since a plane has several boxes of equal size
+        depth = (800 + rows * rows // 40 + columns * columns // 60).astype(np.uint16)
         frame = thor2.RGBDFrame(color, depth, labels, thor2.Intrinsics(50.0, 50.0, 32.0, 24.0))
         truth = {1: CLASSES[number % 3], 2: "mug", 3: "dragon"}
         return LabelledFrame(self.identifiers[number], frame, truth, {"light": str(number % 2)})
