@@ -37,14 +37,19 @@ from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.overlay import COLORS, Annotation, draw_instances
 from thor2_jax.model.fusion import DEFAULT_RULE
 from training.augmentation.simulated_cameras import CHOOSE, REPORT, SimulatedCamera, through_camera
-from training.evaluation.accuracy import summarize_rows
 from training.evaluation.answering import answer_frames
-from training.evaluation.answers import EvaluatedRun, FrameAnswers
-from training.evaluation.confidence import auroc, expected_calibration_error, unknown_named
-from training.evaluation.fusion import Rule, main_fusion
-from training.evaluation.placements import find_placements, placement_accuracy, steadiness
+from training.evaluation.answers import FrameAnswers, Rule, main_fusion
 from training.evaluation.results import COVERAGE, fuse_answers
 from training.evaluation.runs import Run, load_runs
+from training.evaluation.scores import (
+    auroc,
+    expected_calibration_error,
+    find_placements,
+    placement_accuracy,
+    steadiness,
+    summarize_rows,
+    unknown_named,
+)
 from training.objects.builtin_objects import builtin_objects
 from training.readers.frames import FrameFolder
 from training.readers.labelled import LabelledFrame, sequence_of
@@ -123,7 +128,7 @@ def answers_by_camera(
 
 
 def measure(
-    runs: Sequence[EvaluatedRun],
+    runs: Sequence[Run],
     answers: Mapping[str, Sequence[FrameAnswers]],
     title: str | None = None,
     rule: Rule = DEFAULT_RULE,
@@ -152,7 +157,7 @@ def measure(
 
 
 def _measure(
-    runs: Sequence[EvaluatedRun],
+    runs: Sequence[Run],
     cameras: Sequence[Sequence[FrameAnswers]],
     placements: Sequence[NDArray[np.intp]],
     title: str | None,
@@ -220,7 +225,7 @@ def at_threshold(
 
 
 def summarize(results: Sequence[RunResults]) -> dict[str, dict[str, Any]]:
-    """Return `RunStatistics` over the runs, as JSON tables, in place of the values of `measure`."""
+    """Return `summarize_runs` over the runs, as JSON tables, in place of the values of `measure`."""
     return {name: summarize_rows([of_run[name] for of_run in results]) for name in results[0]}
 
 

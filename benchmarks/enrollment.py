@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 from sklearn.metrics import roc_auc_score
 
-from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances, prepare_instance
+from thor2_jax.frames.prepared_instance import PreparedInstance, prepare_instance
 from thor2_jax.gallery.augment import augmented_view
 from thor2_jax.gallery.clouds import CompactClouds
 from thor2_jax.gallery.embedding import Embedding, load_default
-from thor2_jax.gallery.enrollment import ROWS, embed_looks
+from thor2_jax.gallery.enrollment import LOOKS, embed_looks
 from thor2_jax.gallery.gallery import Gallery, GalleryObject
 from training.readers.frames import FrameFolder
 
@@ -56,14 +56,9 @@ class Instances:
 def embed(embedding: Embedding, views: Sequence[PreparedInstance]) -> NDArray[np.float32]:
     """Return embeddings [V, K, D]."""
     order = np.argsort([len(view.points) for view in views], kind="stable")
-    embedded = np.zeros((len(views), 1, 1), np.float32)
-    for start in range(0, len(views), ROWS):
-        rows = order[start : start + ROWS]
-        packed = pack_instances([views[k] for k in rows], ROWS)
-        batch = np.asarray(embed_looks(embedding, packed))[: len(rows)]
-        if start == 0:
-            embedded = np.zeros((len(views), *batch.shape[1:]), np.float32)
-        embedded[rows] = batch
+    embedded = np.zeros((len(views), LOOKS, embedding.size), np.float32)
+    if len(views):
+        embedded[order] = embed_looks(embedding, [views[k] for k in order])
     return embedded
 
 

@@ -60,8 +60,8 @@ def own_epoch(folder: Path, steps: tuple[float, float]) -> Callable[[], object]:
     from training.fitting.samples import build_samples
     from training.fitting.steps import FitContext, describe_batch, initial_state, shard_batch, train_step
     from training.objects.builtin_objects import builtin_objects
-    from training.views.memory_views import MemoryViews
     from training.views.mesh_views import render_views
+    from training.views.normalized_views import MemoryViews
 
     network, config = colornet.load_default(), DescriptorConfig(homology="closed_form")
     samples = build_samples(MemoryViews(render_views(builtin_objects(), *steps), config), network, config)

@@ -42,7 +42,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.files import write_text
 from thor2_jax.model.fusion import DEFAULT_RULE
 from training.enrollment import mesh_views
-from training.evaluation.fusion import ALL_CLASSIFIERS, BOTH, EMBEDDED, GALLERY, Rule
+from training.evaluation.answers import ALL_CLASSIFIERS, BOTH, EMBEDDED, GALLERY, Rule
 from training.evaluation.runs import Run, load_runs
 from training.objects.meshes import find_meshes, read_names
 from training.readers.labelled import LabelledFrame

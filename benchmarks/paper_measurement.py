@@ -17,12 +17,11 @@ from thor2_jax.model.fusion import DEFAULT_RULE
 from thor2_jax.model.inference import infer
 from training.baselines.baseline import baseline_inputs
 from training.baselines.names import CLOUD_BASELINES, NETWORKS, TITLES
-from training.evaluation.answers import FrameAnswers, read_answers
-from training.evaluation.fusion import Rule
+from training.evaluation.answers import FrameAnswers, Rule, read_answers
 from training.evaluation.job import ANSWERS, evaluate_dataset
-from training.evaluation.placements import find_placements
 from training.evaluation.results import compute_results, fuse_answers
 from training.evaluation.runs import Run, has_real_views, scratch_networks
+from training.evaluation.scores import find_placements
 from training.readers.labelled import LabelledFrames
 
 __all__ = ["CLAIMS", "Claim", "Dataset", "compare_runs", "recognition_seconds"]

@@ -1,14 +1,19 @@
-"""Construction of the colour network from the colour grid (paper, section "Color network")."""
+"""Construction of the colour network: regions, edges and similarity (paper, section "Color network")."""
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components, dijkstra
 
 from colornet.grid import grid_colors
 from colornet.lab import GRID_WHITE, MEAN_WHITE, hyab, to_lab
 from colornet.mapper import EPS, map_colors
 from colornet.network import ColorNetwork
-from colornet.regions import mean_color, merge_redundant, relabel, similarity
 
-__all__ = ["build_network"]
+__all__ = ["build_network", "mean_color", "merge_redundant", "relabel", "similarity"]
+
+_MIN_SHARED = 0.95
+"""Share of the smaller node's colours above which two nodes can be redundant."""
 
 
 def build_network() -> ColorNetwork:
@@ -39,3 +44,79 @@ def build_network() -> ColorNetwork:
         region_bits=bits,
         n_raw_nodes=len(graph.members),
     )
+
+
+def mean_color(colors: NDArray[np.uint8], members: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the arithmetic mean of sRGB colours.
+
+    Args:
+        colors: [n, 3] uint8, sRGB.
+        members: [m] int64, the rows of `colors` to average.
+
+    Returns:
+        [3] float64, 0..255.
+    """
+    return np.asarray(colors[members].mean(axis=0, dtype=np.float64))
+
+
+def merge_redundant(
+    colors: NDArray[np.uint8], members: list[NDArray[np.int64]], eps: float
+) -> tuple[list[NDArray[np.int64]], NDArray[np.int64]]:
+    """Merge redundant nodes.
+
+    Two nodes are redundant if they share more than 95 % of the members of the smaller one and the HyAB distance of
+    their mean colours is at most `eps`.
+
+    Args:
+        colors: [n, 3] uint8, sRGB.
+        members: for each node the sorted rows of `colors` in it, int64 [m].
+        eps: largest HyAB distance of mean colours.
+
+    Returns:
+        The members of each region, in the order of the regions' first nodes; and the region of each node, [nodes]
+        int64.
+    """
+    n = len(members)
+    means = to_lab(np.array([mean_color(colors, m) for m in members]), MEAN_WHITE)
+    redundant = np.zeros((n, n), bool)
+    for i in range(n):
+        for j in range(i + 1, n):
+            shared = np.intersect1d(members[i], members[j], assume_unique=True).size
+            overlaps = shared > _MIN_SHARED * min(members[i].size, members[j].size)
+            redundant[i, j] = overlaps and hyab(means[i], means[j]) <= eps
+    n_regions, component = connected_components(csr_array(redundant), directed=False)
+    _, first = np.unique(component, return_index=True)
+    region = np.argsort(np.argsort(first))[component].astype(np.int64)
+    merged = [
+        np.unique(np.concatenate([m for m, r in zip(members, region, strict=True) if r == k])) for k in range(n_regions)
+    ]
+    return merged, region
+
+
+def relabel(edges: NDArray[np.int64], region: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Convert edges between nodes to edges between regions: distinct sorted pairs i < j.
+
+    Args:
+        edges: [e, 2] int64, pairs of nodes.
+        region: [nodes] int64, the region of each node.
+    """
+    moved = np.sort(region[edges], axis=1)
+    return np.unique(moved[moved[:, 0] != moved[:, 1]], axis=0)
+
+
+def similarity(n_regions: int, edges: NDArray[np.integer], weights: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the similarity Delta, 1 / (1 + length of the shortest path); 0 between regions without a path.
+
+    Args:
+        n_regions: number of regions n.
+        edges: [e, 2] integers, pairs of regions, each once.
+        weights: [e] float64, positive.
+
+    Returns:
+        [n, n] float64, symmetric, diagonal 1.
+    """
+    graph = csr_array((weights, (edges[:, 0], edges[:, 1])), shape=(n_regions, n_regions))
+    lengths = dijkstra(graph, directed=False)
+    # Lengths are summed along the path: the minimum of both directions makes the matrix exactly symmetric.
+    lengths = np.minimum(lengths, lengths.T)
+    return np.asarray(1.0 / (1.0 + lengths))

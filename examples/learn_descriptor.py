@@ -37,7 +37,7 @@ from thor2_jax.model.classifier import MLP, feature_of
 from thor2_jax.model.run_directory import TrainedRun, input_size, save_run
 from thor2_jax.recognizer import THOR2
 from training.evaluation.answering import answer_frames
-from training.evaluation.fusion import fusions
+from training.evaluation.answers import fusions
 from training.evaluation.results import compute_results
 from training.evaluation.runs import Run
 from training.fitting.fit import FitOptions
@@ -47,8 +47,8 @@ from training.objects.builtin_objects import COLOR_PAIRS, SHAPE_PAIRS, builtin_o
 from training.objects.meshes import find_meshes, read_names
 from training.readers import FrameFolder, LabelledFrame, UWISOccluded
 from training.rendering.scenes import compose_scene
-from training.views.memory_views import MemoryViews
 from training.views.mesh_views import render_views
+from training.views.normalized_views import MemoryViews
 
 NETWORK = colornet.load_default()
 CONFIG = thor2.DescriptorConfig(homology="closed_form")

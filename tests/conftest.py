@@ -47,9 +47,6 @@ for folder, numbers in EXAMPLES.items():
 STRICT = ("descriptor", "golden", "properties")
 """Directories whose tests allow no implicit dtype promotion; Flax, which other tests use, relies on it."""
 
-TOGETHER = ("tests/colornet/", "tests/thor2_jax/service/")
-"""Folders whose files share a fixture that takes long: a server, a build."""
-
 SHARED = Path(__file__).resolve().parents[1].parent / "shared"
 
 
@@ -62,13 +59,13 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
-    """Give the tests of a folder in TOGETHER to one process, if they are distributed by files."""
+    """Give the tests of a folder to one process, if they are distributed by files: they share servers and programs."""
     from xdist.scheduler import LoadFileScheduling
 
     class Scheduling(LoadFileScheduling):
         def _split_scope(self, nodeid: str) -> str:
             file: str = super()._split_scope(nodeid)
-            return next((folder for folder in TOGETHER if file.startswith(folder)), file)
+            return file.rpartition("/")[0]
 
     return Scheduling(config, log) if config.getoption("dist") == "loadfile" else None
 

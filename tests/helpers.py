@@ -25,10 +25,9 @@ import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.looks import LookDescriptors
 from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
-from thor2_jax.model.classifier import FEATURES, MLP
+from thor2_jax.model.classifier import FEATURES, MLP, RunClassifiers
 from thor2_jax.model.inference import infer
 from thor2_jax.model.model import Model
-from thor2_jax.model.run_classifiers import RunClassifiers
 from thor2_jax.model.run_directory import TrainedRun, input_size
 from training.objects.builtin_objects import builtin_objects
 from training.rendering.camera import Camera, RenderedView

@@ -13,7 +13,7 @@ Of ten mutants for each module (seed 0), 248 of 271 are killed. Those that survi
 `jax.jit` or another cache size (the same values, more slowly), `strict=False` for lists of equal length, bounds that no
 value reaches (`>=` for `==` on names of devices, `row != height - 1`, 81 for an exponent of 80, indices JAX clips),
 another `DESCRIPTOR_VERSION`, and searches whose results are filtered or compared again (the ball of `mapper.py`, one
-rectangle fewer in `bounding_box.py`, the halving loop of `reductions.py`).
+rectangle fewer in `bounding_box.py`, its halving loop).
 """
 
 import argparse
@@ -45,16 +45,14 @@ FOLDERS = ("colornet", "thor2_jax", "thor2_jax/descriptor", "thor2_jax/frames", 
 
 MORE_TESTS = {
     "colornet/__init__.py": ("colornet/test_files.py", "colornet/test_build.py"),
-    "colornet/builder.py": ("colornet/test_build.py",),
+    "colornet/builder.py": ("colornet/test_build.py", "colornet/test_regions.py"),
     "colornet/grid.py": ("colornet/test_color_math.py", "colornet/test_membership.py"),
     "colornet/lab.py": ("colornet/test_color_math.py", "colornet/test_build.py"),
     "colornet/mapper.py": ("colornet/test_color_math.py", "colornet/test_build.py"),
     "colornet/network.py": ("colornet/test_files.py", "colornet/test_membership.py"),
-    "colornet/regions.py": ("colornet/test_build.py",),
     "thor2_jax/descriptor/bounding_box.py": ("thor2_jax/descriptor/test_view_normalization.py",),
     "thor2_jax/descriptor/color_membership.py": ("thor2_jax/test_types.py",),
     "thor2_jax/descriptor/relaxation.py": ("properties/test_relaxation.py",),
-    "thor2_jax/descriptor/released.py": ("thor2_jax/descriptor/test_slicing.py",),
     "thor2_jax/parameters.py": ("thor2_jax/test_types.py", "properties/test_reproducibility.py"),
     "thor2_jax/frames/frames.py": ("thor2_jax/test_types.py",),
     "thor2_jax/frames/instance_clouds.py": ("thor2_jax/test_types.py",),

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
@@ -86,13 +86,21 @@ def camera_info(camera: thor2.Intrinsics, size: tuple[int, int], stamp: int = ST
 
 
 @contextlib.contextmanager
-def bag_writer(path: Path) -> Iterator[Any]:
-    """Yield a function (topic, message, time of arrival) that writes to a bag of the kind that the suffix says."""
+def bag_writer(path: Path, compression: str = "") -> Iterator[Any]:
+    """Yield a function (topic, message, time of arrival) that writes to a bag of the kind that the suffix says.
+
+    The compression is a format of ROS 1 (bz2, lz4) or a mode of ROS 2 (message, storage).
+    """
     ros = 1 if path.suffix == ".bag" else 2
     types, connections = TYPES[ros], {}
     folder = path.with_suffix(".folder") if path.suffix == ".mcap" else path
     plugin = StoragePlugin.MCAP if path.suffix == ".mcap" else StoragePlugin.SQLITE3
-    with Writer1(path) if ros == 1 else Writer2(folder, version=8, storage_plugin=plugin) as writer:
+    unopened: Any = Writer1(path) if ros == 1 else Writer2(folder, version=8, storage_plugin=plugin)
+    if compression and ros == 1:
+        unopened.set_compression(Writer1.CompressionFormat[compression.upper()])
+    elif compression:
+        unopened.set_compression(CompressionMode[compression.upper()], CompressionFormat.ZSTD)
+    with unopened as writer:
 
         def write(topic: str, message: Any, arrival: int) -> None:
             kind = message.__msgtype__
@@ -107,11 +115,16 @@ def bag_writer(path: Path) -> Iterator[Any]:
 
 
 def write_recording(
-    path: Path, frames: Sequence[thor2.RGBDFrame], *, is_compressed: bool = False, gap: int = 4_000_000
+    path: Path,
+    frames: Sequence[thor2.RGBDFrame],
+    *,
+    is_compressed: bool = False,
+    gap: int = 4_000_000,
+    compression: str = "",
 ) -> Path:
     """Write a recording of frames at 30 Hz, whose depth is taken `gap` nanoseconds after colour."""
     ros = 1 if path.suffix == ".bag" else 2
-    with bag_writer(path) as write:
+    with bag_writer(path, compression) as write:
         for number, frame in enumerate(frames):
             stamp = START + number * PERIOD
             if is_compressed:

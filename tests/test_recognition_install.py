@@ -54,7 +54,7 @@ def test_recognition_and_the_service_need_no_package_of_training(model: Path, tm
     (tmp_path / "intrinsics.json").write_text(json.dumps({"fx": 120.0, "fy": 120.0, "cx": 60.0, "cy": 45.0}))
     service = (
         "import thor2_jax.service.server, thor2_jax.client, thor2_jax.segmentation.table, thor2_jax.export, "
-        "thor2_jax.recordings.bags, thor2_jax.recordings.bag_writer, thor2_jax.watch.live, training.bag_recognition"
+        "thor2_jax.recordings.bags, thor2_jax.recordings.bag_writer, thor2_jax.watch.live, training.frame_recognition"
     )
     ended = run_without("recognize", "--model", model, tmp_path, "--json", before=service)
     assert ended.returncode == 0, ended.stderr

@@ -5,15 +5,20 @@ smallest of a few fixed numbers of points that holds it, and a batch to a batch 
 been warmed up, no call compiles any more.
 """
 
+from collections.abc import Iterable
+
 from thor2_jax.errors import InputError
 
-__all__ = ["BATCH_BUCKETS", "POINT_BUCKETS", "batch_bucket", "point_bucket"]
+__all__ = ["BATCH_BUCKETS", "POINT_BUCKETS", "batch_bucket", "batch_points", "point_bucket"]
 
 POINT_BUCKETS = (512, 1024, 2048, 4096, 8192)
 """Padded numbers of points of a cloud."""
 
 BATCH_BUCKETS = (1, 2, 4, 8, 16, 32, 64, 128, 256)
 """Padded numbers of clouds of a batch."""
+
+MIN_BATCH_POINTS = 2048
+"""Least padded number of points in batches of commands: fewer save a tenth of the time, and compile for seconds."""
 
 
 def _smallest_bucket(buckets: tuple[int, ...], n: int, name: str, advice: str) -> int:
@@ -39,3 +44,11 @@ def batch_bucket(n_clouds: int) -> int:
         InputError: `n_clouds` exceeds the largest bucket.
     """
     return _smallest_bucket(BATCH_BUCKETS, n_clouds, "n_clouds", "split the batch")
+
+
+def batch_points(counts: Iterable[int]) -> int:
+    """Return the padded number of points for clouds with these numbers of points, in batches of a command.
+
+    It is at most the largest bucket; `PointClouds.pack` names the cloud that has more points.
+    """
+    return point_bucket(min(max([MIN_BATCH_POINTS, *counts]), POINT_BUCKETS[-1]))

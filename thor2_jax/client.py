@@ -17,12 +17,13 @@ A service that teaches (`thor2 serve --teach`) enrolls and forgets objects:
 >>> client.forget("teapot")                                                         # doctest: +SKIP
 """
 
+import contextlib
 import dataclasses
 import io
 import json
 import ssl
 import urllib.parse
-from collections.abc import Callable, Coroutine, Mapping, Sequence
+from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Concatenate, ParamSpec, TypeVar, cast
 
@@ -128,15 +129,17 @@ class _Connection:
         """Create a client of the service at `url` with a bearer token and a timeout per request in seconds."""
         self._url = url.rstrip("/")
         headers = {} if token is None else {"Authorization": f"Bearer {token}"}
-        self._options: dict[str, Any] = {"headers": headers, "timeout": timeout, "follow_redirects": True}
+        self._options: dict[str, Any] = {"base_url": url, "headers": headers, "timeout": timeout}
+        self._options["follow_redirects"] = True
         self._options["verify"] = ssl.create_default_context()  # takes longer to create than a request
 
-    def _arguments(self, path: str, method: str | None = None, **body: Any) -> dict[str, Any]:
-        return {"method": method or ("POST" if body else "GET"), "url": self._url + path, **body}
-
-    def _unreachable(self, error: Exception) -> OSError:
-        kind = TimeoutError if isinstance(error, httpx.TimeoutException) else ConnectionError
-        return kind(f"{self._url} gives no answer ({error or type(error).__name__})")
+    @contextlib.contextmanager
+    def _no_answer_named(self) -> Iterator[None]:
+        try:
+            yield
+        except (httpx.HTTPError, httpx.InvalidURL) as error:
+            kind = TimeoutError if isinstance(error, httpx.TimeoutException) else ConnectionError
+            raise kind(f"{self._url} gives no answer ({error or type(error).__name__})") from None
 
 
 class Client(_Connection):
@@ -165,7 +168,7 @@ class Client(_Connection):
             OSError: a file cannot be read, or the service cannot be reached.
         """
         files = _frame_files(color, depth, labels, intrinsics)
-        return self._send("/v1/recognize", lambda content: _recognitions(content)[0], files=files)
+        return self._send("POST", "/v1/recognize", lambda content: _recognitions(content)[0], files=files)
 
     def recognize_frame(
         self,
@@ -180,7 +183,7 @@ class Client(_Connection):
         The labels are None if the request had labels. The service halves their size, as often as needed, if a segmenter
         returns more than 50,000 runs of equal labels. Arguments and exceptions as `recognize`.
         """
-        return self._send("/v1/recognize", _recognitions, files=_frame_files(color, depth, labels, intrinsics))
+        return self._send("POST", "/v1/recognize", _recognitions, files=_frame_files(color, depth, labels, intrinsics))
 
     def describe(self, clouds: Sequence[tuple[Any, Any]]) -> Descriptors:
         """Compute the descriptors of clouds, pairs (xyz [n, 3] in metres, rgb [n, 3] uint8).
@@ -203,15 +206,15 @@ class Client(_Connection):
             sizes=np.array([len(xyz) for xyz, _ in clouds]),
         )
         headers = {"Content-Type": "application/octet-stream"}
-        return self._send("/v1/describe", _descriptors, content=body.getvalue(), headers=headers)
+        return self._send("POST", "/v1/describe", _descriptors, content=body.getvalue(), headers=headers)
 
     def model(self) -> ServiceModel:
         """Return the model of the service. Raises as `describe`."""
-        return self._send("/v1/model", _model)
+        return self._send("GET", "/v1/model", _model)
 
     def objects(self) -> list[KnownObject]:
         """Return the objects that may be answered. Raises as `describe`."""
-        return self._send("/v1/objects", _objects)
+        return self._send("GET", "/v1/objects", _objects)
 
     def enroll(
         self,
@@ -246,10 +249,11 @@ class Client(_Connection):
             OSError: as `recognize`.
         """
         files = _frame_files(color, depth, labels, intrinsics)
-        flags = {"extend": str(extend).lower(), "replace": str(replace).lower()}
-        fields = {"name": name, "instance": str(instance), **flags}
-        files |= {field: value.encode() for field, value in fields.items()}
-        return self._send("/v1/objects", lambda content: _known(json.loads(content), EnrolledObject), files=files)
+        fields = {"name": name, "instance": instance, "extend": extend, "replace": replace}
+        files |= {field: str(value).encode() for field, value in fields.items()}
+        return self._send(
+            "POST", "/v1/objects", lambda content: _known(json.loads(content), EnrolledObject), files=files
+        )
 
     def forget(self, name: str) -> int:
         """Forget an object, and return the generation of the gallery, for `undo`.
@@ -258,8 +262,7 @@ class Client(_Connection):
             ServiceError: as `describe`; status 404 if no object has this name.
             OSError: the service cannot be reached.
         """
-        path = f"/v1/objects/{urllib.parse.quote(name, safe='')}"
-        return self._send(path, _generation, method="DELETE")
+        return self._send("DELETE", f"/v1/objects/{urllib.parse.quote(name, safe='')}", _generation)
 
     def undo(self, generation: int) -> int:
         """Take back the change of the gallery that gave it this generation, and return the new one.
@@ -268,15 +271,12 @@ class Client(_Connection):
             ServiceError: as `describe`; status 409 if another change was made since.
             OSError: the service cannot be reached.
         """
-        return self._send("/v1/objects/undo", _generation, files={"generation": str(generation).encode()})
+        return self._send("POST", "/v1/objects/undo", _generation, files={"generation": str(generation).encode()})
 
-    def _send(self, path: str, parse: Callable[[bytes], T], **request: Any) -> T:
-        """Send a request (content, files, method) and return what `parse` makes of the body of its answer."""
-        with httpx.Client(**self._options) as http:
-            try:
-                response = http.request(**self._arguments(path, **request))
-            except (httpx.HTTPError, httpx.InvalidURL) as error:
-                raise self._unreachable(error) from None
+    def _send(self, method: str, path: str, parse: Callable[[bytes], T], **body: Any) -> T:
+        """Send a request with a body (content, files) and return what `parse` makes of the body of its answer."""
+        with self._no_answer_named(), httpx.Client(**self._options) as http:
+            response = http.request(method, path, **body)
         return parse(_content(response))
 
 
@@ -299,12 +299,10 @@ class AsyncClient(_Connection):
     forget = _coroutine(Client.forget)
     undo = _coroutine(Client.undo)
 
-    async def _send(self, path: str, parse: Callable[[bytes], T], **request: Any) -> T:
-        async with httpx.AsyncClient(**self._options) as http:
-            try:
-                response = await http.request(**self._arguments(path, **request))
-            except (httpx.HTTPError, httpx.InvalidURL) as error:
-                raise self._unreachable(error) from None
+    async def _send(self, method: str, path: str, parse: Callable[[bytes], T], **body: Any) -> T:
+        with self._no_answer_named():
+            async with httpx.AsyncClient(**self._options) as http:
+                response = await http.request(method, path, **body)
         return parse(_content(response))
 
 

@@ -70,7 +70,7 @@ class DescriptorConfig:
     Attributes:
         homology: source of the persistence diagrams, "gudhi" (one host callback for a batch) or "closed_form" (the same
             pairs, computed by JAX).
-        convention: "paper" for the paper's equations, "released" for the authors' released code (see `released`).
+        convention: "paper" for the paper's equations, "released" for the authors' released code (see `slicing`).
         sigma_s: scaled units per metre.
         sigma_1: thickness of a slice, along z of the aligned cloud.
         sigma_2: width of a strip, along x of the aligned cloud; also the side of a pixel of an image.

@@ -1,17 +1,25 @@
-"""The exception for invalid input, and a prefix for its message."""
+"""The exception for invalid input, a prefix for its message, and the message for a package that is missing."""
 
 import contextlib
 from collections.abc import Iterator
 
-__all__ = ["InputError", "with_context"]
+__all__ = ["InputError", "needs_extra", "with_context"]
+
+MAX_MESSAGE = 1000
+"""Characters of a message that are kept: a damaged file may have a name or a number of millions."""
 
 
 class InputError(ValueError):
     """Invalid input from the user; its message names the argument or the file and the offending value, in one line.
 
     The command line prints it on standard error and exits with code 2. Every other exception is a defect of this
-    software and keeps its traceback.
+    software and keeps its traceback. The middle of a message that would fill a screen is left out.
     """
+
+    def __init__(self, message: str) -> None:
+        if len(message) > MAX_MESSAGE:
+            message = f"{message[: MAX_MESSAGE // 2]} ... {message[-MAX_MESSAGE // 2 :]}"
+        super().__init__(message)
 
 
 @contextlib.contextmanager
@@ -27,3 +35,23 @@ def with_context(identifier: str) -> Iterator[None]:
         raise InputError(f"{identifier}: {error.filename} is missing") from None
     except InputError as error:
         raise InputError(f"{identifier}: {error}") from None
+
+
+@contextlib.contextmanager
+def needs_extra(subject: str, package: str, extra: str) -> Iterator[None]:
+    """Name the package and the extra that has it if an import inside fails.
+
+    Args:
+        subject: beginning of the message, which ends before "needs".
+        package: name of the package.
+        extra: extra of this distribution.
+
+    Raises:
+        InputError: the package is missing.
+    """
+    try:
+        yield
+    except ImportError as error:
+        raise InputError(
+            f"{subject} needs {package} ({error}); run pip install -c constraints.txt '.[{extra}]'"
+        ) from None

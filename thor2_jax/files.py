@@ -32,6 +32,14 @@ __all__ = [
 ]
 
 
+@contextlib.contextmanager
+def _refusal_named(message: str) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise InputError(f"{message} that can be written ({error.strerror}); choose another one") from None
+
+
 def check_output_directory(directory: str | Path, marker: str | None = None, resumable: Collection[str] = ()) -> None:
     """Raise unless a command may write to a directory, so that nothing foreign is overwritten and no work is lost.
 
@@ -48,7 +56,7 @@ def check_output_directory(directory: str | Path, marker: str | None = None, res
         InputError: if the directory holds anything else, or cannot be written.
     """
     directory = Path(directory)
-    try:
+    with _refusal_named(f"out: {directory} is not a directory"):
         names = (
             sorted(path.name for path in directory.iterdir()) if directory.exists() or directory.is_symlink() else []
         )
@@ -60,10 +68,6 @@ def check_output_directory(directory: str | Path, marker: str | None = None, res
                 f"{' or an interrupted run of this command' if marker or resumable else ''}; choose another directory"
             )
         _check_writable(directory)
-    except OSError as error:
-        raise InputError(
-            f"out: {directory} is not a directory that can be written ({error.strerror}); choose another directory"
-        ) from None
 
 
 def check_output_file(name: str, path: Path | None, is_own: Callable[[Path], bool] = lambda path: True) -> None:
@@ -80,13 +84,9 @@ def check_output_file(name: str, path: Path | None, is_own: Callable[[Path], boo
     """
     if path is None:
         return
-    try:
+    with _refusal_named(f"{name}: {path} is not a file"):
         check_replaceable(path)
         _check_writable(path.absolute().parent)
-    except OSError as error:
-        raise InputError(
-            f"{name}: {path} is not a file that can be written ({error.strerror}); choose another file"
-        ) from None
     if path.exists() and not is_own(path):
         raise InputError(f"{name} is {path}, a file that this command has not written; choose another name")
 

@@ -43,10 +43,5 @@ class Parameters:
         """Return the values of a network and a config."""
         # Concrete arrays even while a caller's function is traced, so that they can be cached.
         with jax.ensure_compile_time_eval():
-            return cls(
-                similarity=jnp.asarray(network.similarity, jnp.float32),
-                alpha=jnp.asarray(config.alpha, jnp.float32),
-                sigma_s=jnp.asarray(config.sigma_s, jnp.float32),
-                image_variance=jnp.asarray(config.image_variance, jnp.float32),
-                persistence_weight=jnp.asarray(config.persistence_weight, jnp.float32),
-            )
+            values = config.alpha, config.sigma_s, config.image_variance, config.persistence_weight
+            return cls(*(jnp.asarray(value, jnp.float32) for value in (network.similarity, *values)))

@@ -384,11 +384,9 @@ def reliability(ax: Axes, bins: Mapping[str, Sequence[Any]], *, counts: Axes | N
     ax.plot([0, 1], [0, 1], color="#222222", linewidth=1, linestyle="--", label="perfect calibration")
     ax.set(xlim=(0, 1), ylim=(0, 1), ylabel="accuracy")
     ax.legend(frameon=False, loc="upper left")
-    lowest = ax
     if counts is not None:
         counts.bar(edges[:-1], answers, 1 / len(answers), align="edge", color="#888888", edgecolor="white")
         counts.set(ylabel="answers")
-        lowest = counts
-    lowest.set_xlabel("confidence")
+    (ax if counts is None else counts).set_xlabel("confidence")
     for axes in filter(None, (ax, counts)):
         axes.spines[["top", "right"]].set_visible(False)

@@ -16,6 +16,7 @@ The answers of several frames are fused by a `Tracker` (`Recognizer.track`).
 """
 
 import dataclasses
+import functools
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -35,10 +36,10 @@ from thor2_jax.gallery.objects import ObjectGallery
 from thor2_jax.gallery.store import GALLERY_DIRECTORY
 from thor2_jax.model.answers import AnswerBy, DescribedFrame, Recognition
 from thor2_jax.model.chunks import compute_by_chunks, padded_rows
+from thor2_jax.model.classifier import THOR2
 from thor2_jax.model.fusion import DEFAULT_RULE, FusionRule
-from thor2_jax.model.inference import Inference, answers, infer_clouds, infer_instances
+from thor2_jax.model.inference import Inference, answers, infer_clouds
 from thor2_jax.model.model import Model
-from thor2_jax.model.run_classifiers import THOR2
 from thor2_jax.model.run_directory import TrainedRun, load_run
 from thor2_jax.tracking.tracker import Tracker
 
@@ -244,11 +245,8 @@ class Recognizer:
     def describe(self, frame: RGBDFrame) -> DescribedFrame:
         """Prepare and describe the instances of a frame, of which there may be more than the largest batch bucket."""
         run = self.run
-        return DescribedFrame(
-            *compute_by_chunks(
-                self.prepare(frame), self.chunk, lambda clouds: describe_looks(clouds, run.network, run.config)
-            )
-        )
+        describe = functools.partial(describe_looks, network=run.network, config=run.config)
+        return DescribedFrame(*compute_by_chunks(self.prepare(frame), self.chunk, describe))
 
     def recognize(
         self, frame: RGBDFrame, classifiers: Sequence[str] | None = None, answer_by: str | None = None
@@ -272,8 +270,23 @@ class Recognizer:
         classifiers: Sequence[str] | None = None,
         answer_by: str | None = None,
     ) -> tuple[list[PreparedInstance], Inference]:
-        """Return instances and the outputs of the model for them; see `infer_instances`."""
-        return infer_instances(self.model, instances, self.chunk, classifiers, answer_by)
+        """Evaluate the model on the instances of a frame, a chunk at a time.
+
+        Args:
+            instances: an iterable that prepares them, with corrected colours.
+            classifiers: see `recognize`.
+            answer_by: see `recognize`.
+
+        Returns:
+            All instances, and the outputs for the usable ones: arrays on the host, whose first rows are theirs, in
+            order.
+
+        Raises:
+            InputError: a classifier that the run does not have.
+        """
+        model = self.model
+        names = model.classifiers.checked(classifiers) if model.answers_by(answer_by) != "gallery" else ()
+        return compute_by_chunks(instances, self.chunk, lambda clouds: infer_clouds(model, clouds, names, answer_by))
 
     def track(self) -> Tracker:
         """Return a tracker, which follows the objects of successive frames and fuses the answers for each of them."""

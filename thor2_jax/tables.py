@@ -50,6 +50,8 @@ def parse_yaml(content: bytes) -> Any:
 def _expanded_size(value: Any, sizes: dict[int, float]) -> float:
     """Return the number of values in `value`, counting shared ones each time they occur."""
     if not isinstance(value, (dict, list, set, tuple)):
+        if isinstance(value, int):
+            str(value)  # raises ValueError for thousands of digits, as JSON does; no message could show them
         return 1
     if id(value) not in sizes:
         sizes[id(value)] = math.inf  # a value that contains itself is infinite

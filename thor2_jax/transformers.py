@@ -21,7 +21,7 @@ from thor2_jax.capacity import BATCH_BUCKETS, POINT_BUCKETS, batch_bucket
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.streaming import describe_stream
 from thor2_jax.errors import InputError
-from thor2_jax.types import Descriptors, as_array, check_cloud
+from thor2_jax.types import as_array, check_cloud
 
 __all__ = ["Tops2Transformer", "TopsTransformer"]
 
@@ -33,7 +33,9 @@ class _CloudTransformer(TransformerMixin, BaseEstimator):  # type: ignore[misc] 
     """Base of both transformers: they learn nothing, so `fit` only checks its arguments."""
 
     config: DescriptorConfig | None
+    network: ColorNetwork | None = None
     capacity: int | None
+    _has_color = True
 
     def fit(self, X: Sequence[Any], y: Any = None) -> Self:
         """Check the parameters and the clouds; nothing is learned, so calling it before `transform` is optional.
@@ -76,7 +78,8 @@ class _CloudTransformer(TransformerMixin, BaseEstimator):  # type: ignore[misc] 
         # Empty clouds fill the last batch, so that what is computed from a batch has few shapes as well.
         empty = (np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
         padded = itertools.chain(clouds, [empty] * (-len(clouds) % batch))
-        rows = [self._rows(d) for d in describe_stream(padded, network, config, self.capacity, batch)]
+        described = describe_stream(padded, network, config, self.capacity, batch)
+        rows = [np.asarray(each.tops2 if self._has_color else each.tops) for each in described]
         return np.concatenate(rows)[: len(clouds)]
 
     def get_feature_names_out(self, input_features: Any = None) -> NDArray[np.object_]:
@@ -86,13 +89,19 @@ class _CloudTransformer(TransformerMixin, BaseEstimator):  # type: ignore[misc] 
             input_features: ignored, since a cloud has no features.
         """
         config, network = self._check_parameters()
-        return np.array(self._names(config, network), object)
+        pixels, names = range(config.image_size), []
+        for i in range(config.n_slices):
+            names += [f"slice{i}_birth{b}_persistence{p}" for b in pixels for p in pixels]
+            if self._has_color:
+                strips = range(config.n_strips)
+                names += [f"slice{i}_region{r}_strip{j}" for r in range(network.n_regions) for j in strips]
+        return np.array(names, object)
 
     def _check_parameters(self) -> tuple[DescriptorConfig, ColorNetwork]:
         config = DescriptorConfig(homology="closed_form") if self.config is None else self.config
         if not isinstance(config, DescriptorConfig):
             raise InputError(f"config is {config!r}; expected a DescriptorConfig, or None for the default one")
-        network = getattr(self, "network", None)
+        network = self.network
         if not (network is None or isinstance(network, ColorNetwork)):
             raise InputError(f"network is {network!r}; expected a ColorNetwork, or None for the packaged one")
         capacity = self.capacity
@@ -125,12 +134,6 @@ class _CloudTransformer(TransformerMixin, BaseEstimator):  # type: ignore[misc] 
     def _pair(self, cloud: Any, name: str) -> Any:
         return cloud
 
-    def _rows(self, descriptors: Descriptors) -> NDArray[np.float32]:
-        raise NotImplementedError
-
-    def _names(self, config: DescriptorConfig, network: ColorNetwork) -> list[str]:
-        raise NotImplementedError
-
     def __sklearn_is_fitted__(self) -> bool:
         return True
 
@@ -139,11 +142,6 @@ class _CloudTransformer(TransformerMixin, BaseEstimator):  # type: ignore[misc] 
         tags.requires_fit = False
         tags.input_tags.two_d_array = False
         return tags
-
-
-def _image_names(config: DescriptorConfig, index: int) -> list[str]:
-    pixels = range(config.image_size)
-    return [f"slice{index}_birth{b}_persistence{p}" for b in pixels for p in pixels]
 
 
 class TopsTransformer(_CloudTransformer):
@@ -159,6 +157,8 @@ class TopsTransformer(_CloudTransformer):
             batch, at most 8192.
     """
 
+    _has_color = False
+
     def __init__(self, config: DescriptorConfig | None = None, capacity: int | None = None) -> None:
         self.config = config
         self.capacity = capacity
@@ -166,12 +166,6 @@ class TopsTransformer(_CloudTransformer):
     def _pair(self, cloud: Any, name: str) -> Any:
         xyz = as_array(cloud[0] if isinstance(cloud, tuple | list) and len(cloud) == 2 else cloud, f"{name}: xyz")
         return xyz, np.zeros(xyz.shape, np.uint8)
-
-    def _rows(self, descriptors: Descriptors) -> NDArray[np.float32]:
-        return np.asarray(descriptors.tops)
-
-    def _names(self, config: DescriptorConfig, network: ColorNetwork) -> list[str]:
-        return [name for i in range(config.n_slices) for name in _image_names(config, i)]
 
 
 class Tops2Transformer(_CloudTransformer):
@@ -197,13 +191,3 @@ class Tops2Transformer(_CloudTransformer):
         self.config = config
         self.network = network
         self.capacity = capacity
-
-    def _rows(self, descriptors: Descriptors) -> NDArray[np.float32]:
-        return np.asarray(descriptors.tops2)
-
-    def _names(self, config: DescriptorConfig, network: ColorNetwork) -> list[str]:
-        names = []
-        for i in range(config.n_slices):
-            names += _image_names(config, i)
-            names += [f"slice{i}_region{r}_strip{j}" for r in range(network.n_regions) for j in range(config.n_strips)]
-        return names

@@ -120,7 +120,7 @@ def _padded_size(sizes: list[int], capacity: int | None) -> int:
     if not isinstance(capacity, int) or isinstance(capacity, bool) or capacity < 1:
         raise InputError(f"capacity is {capacity!r}; expected a positive integer")
     if largest > capacity:
-        raise InputError(f"capacity is {capacity}; clouds[{sizes.index(largest)}] needs at least {largest}")
+        raise InputError(f"capacity is {capacity}; clouds[{sizes.index(largest)}] has {largest} points; raise it")
     return capacity
 
 

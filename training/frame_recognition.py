@@ -1,4 +1,4 @@
-"""Recognition of several frames, one after the other, and the files with all answers.
+"""Recognition of several frames or of a recording, one frame after the other, and the files with all answers.
 
 for answer in recognize_frames(recognizer, find_frames([Path("frames")])):
     print(answer.name, answer.error or answer.recognitions)
@@ -7,9 +7,10 @@ for answer in recognize_frames(recognizer, find_frames([Path("frames")])):
 import contextlib
 import dataclasses
 import functools
+import itertools
 import json
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,8 @@ from thor2_jax.model.result_files import (
     instances_as_json,
 )
 from thor2_jax.recognizer import Recognizer
+from thor2_jax.recordings.recorded_frames import RecordedFrame
+from thor2_jax.segmentation.segmenters import Segmenter, segmented
 from thor2_jax.tracking.tracker import TrackedRecognition
 from training.readers.frame_files import FrameSource
 from training.storage.workers import WorkerPool
@@ -40,6 +43,7 @@ __all__ = [
     "ResultTables",
     "recognize_frames",
     "recognize_frames_in_pool",
+    "recognize_recorded",
     "segmentation_failure",
     "track_frames",
 ]
@@ -216,3 +220,31 @@ class ResultTables:
             if path is not None:
                 path.parent.mkdir(parents=True, exist_ok=True)
                 write_text(path, content + "\n")
+
+
+def recognize_recorded(
+    recognize: Callable[[RGBDFrame], Sequence[Recognition]],
+    frames: Iterator[RecordedFrame],
+    segmenter: Segmenter,
+    every: int = 1,
+) -> Iterator[tuple[RecordedFrame, FrameAnswer]]:
+    """Segment and recognize recorded frames; one that fails has an `error` and does not stop the others.
+
+    Args:
+        recognize: `Recognizer.recognize`, or `Tracker.update`.
+        frames: the frames, without labels.
+        segmenter: gives them labels.
+        every: recognize the first of so many frames.
+
+    Raises:
+        InputError: as `frames`.
+    """
+    for recorded in itertools.islice(frames, 0, None, every):
+        try:
+            frame = segmented(recorded.read(), segmenter)
+            start = time.perf_counter()
+            recognitions = recognize(frame)
+        except InputError as error:
+            yield recorded, FrameAnswer(recorded.name, error=str(error))
+        else:
+            yield recorded, FrameAnswer(recorded.name, frame, recognitions, time.perf_counter() - start)

@@ -16,9 +16,8 @@ from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.model.classifier import FEATURES, Feature, check_features
 from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.printable import normal_name
-from training.baselines.job import train_baselines
+from training.baselines.job import check_weights, pretrained_files, train_baselines
 from training.baselines.names import check_baselines, crop_size
-from training.baselines.pretrained import check_weights, pretrained_files
 from training.embedding.run_embedding import Distractors
 from training.enrollment import SkippedInstance, labelled_views
 from training.fitting.job import VIEWS, RunSettings, check_out, check_trained, finished_record, is_finished, train_run
@@ -28,17 +27,14 @@ from training.objects.meshes import find_meshes, read_names, scaled_meshes
 from training.readers.frame_files import find_frames
 from training.readers.frames import FrameFolder
 from training.storage.jobs import check_same_job
-from training.storage.progress import Progress, numbered
+from training.storage.progress import Progress, numbered, of_stage
 from training.storage.workers import local_workers
-from training.views.crop_job import render_crops
-from training.views.crops import rgbd_crop
+from training.views.crops import QuantizedCrop, quantized, rgbd_crop
 from training.views.dataset import ViewDataset, remove_views
 from training.views.labelled_views import WithLabelledViews, digest_of_instances
-from training.views.left_out import WithoutClasses
+from training.views.left_out import WithoutClasses, sequence_sources
 from training.views.normalized_views import ViewSource
-from training.views.render_job import dataset_job, render_dataset
-from training.views.sequences import sequence_sources
-from training.views.view_crops import QuantizedCrop, quantized
+from training.views.render_job import dataset_job, render_crops, render_dataset
 
 __all__ = ["TrainJob", "run_train_job"]
 
@@ -309,28 +305,12 @@ def _open_views(job: TrainJob, labelled: LabelledInstances | None, display: Disp
 
 
 def _render(job: TrainJob, meshes: Mapping[str, Path | TexturedMesh], display: Display) -> ViewDataset:
-    protocol = job.protocol
-    workers, size = local_workers(job.workers), _crop_size(job)
+    protocol, workers, size = job.protocol, local_workers(job.workers), _crop_size(job)
+    steps, augmentations, seed = (protocol.azimuth_step, protocol.polar_step), protocol.augmentations, protocol.fit.seed
     with display() as shown:
         progress = numbered(shown, _stages(job))
-        dataset = render_dataset(
-            meshes,
-            job.out / VIEWS,
-            protocol.azimuth_step,
-            protocol.polar_step,
-            workers,
-            lambda done, total: progress(RENDER, done, total, ""),
-            protocol.augmentations,
-            protocol.fit.seed,
-        )
+        render = of_stage(progress, RENDER)
+        dataset = render_dataset(meshes, job.out / VIEWS, *steps, workers, render, augmentations, seed)
         if size is not None:
-            render_crops(
-                meshes,
-                dataset,
-                size,
-                workers,
-                lambda done, total: progress(RENDER_CROPS, done, total, ""),
-                protocol.augmentations,
-                protocol.fit.seed,
-            )
+            render_crops(meshes, dataset, size, workers, of_stage(progress, RENDER_CROPS), augmentations, seed)
     return dataset

@@ -11,7 +11,7 @@ from processes import UNOPTIMIZED
 
 from benchmarks import levers
 from benchmarks.levers import LEVERS, Lever
-from training.evaluation.fusion import RULES
+from training.evaluation.answers import RULES
 
 NAMES = ("soup_can_red", "cereal_box_blue")
 

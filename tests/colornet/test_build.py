@@ -5,10 +5,10 @@ import dataclasses
 import numpy as np
 
 import colornet
+from colornet.builder import merge_redundant, relabel
 from colornet.grid import grid_colors
 from colornet.lab import GRID_WHITE, MEAN_WHITE, hyab, to_lab
 from colornet.mapper import EPS
-from colornet.regions import merge_redundant, relabel
 
 from .conftest import Rebuilt
 

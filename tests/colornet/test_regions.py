@@ -4,9 +4,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 import colornet
+from colornet.builder import mean_color, merge_redundant, relabel, similarity
 from colornet.grid import grid_colors
 from colornet.lab import MEAN_WHITE, hyab, to_lab
-from colornet.regions import mean_color, merge_redundant, relabel, similarity
 
 from .test_color_math import reference_hyab, reference_lab
 

@@ -1,5 +1,6 @@
 """The notebooks of the documentation run, and their stored outputs say nothing about the machine that made them."""
 
+import ast
 import json
 import os
 import re
@@ -26,6 +27,16 @@ def test_both_library_tutorials_are_notebooks() -> None:
     assert [path.stem for path in NOTEBOOKS] == ["descriptors", "persistence"]
 
 
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_cells_are_python_whose_imports_exist(path: Path) -> None:
+    cells = [cell.source for cell in nbformat.read(path, as_version=4).cells if cell.cell_type == "code"]
+    lines = [line for source in cells for line in ast.parse(re.sub(r"(?m)^%.*$", "", source)).body]
+    imports: list[ast.stmt] = [line for line in lines if isinstance(line, (ast.Import, ast.ImportFrom))]
+    assert imports
+    exec(compile(ast.Module(imports, []), str(path), "exec"), {})
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_notebook_runs(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     notebook = nbformat.read(path, as_version=4)

@@ -19,7 +19,7 @@ import colornet
 import thor2_jax as thor2
 from thor2_jax.model.run_directory import TrainedRun, load_run, save_run
 from training.baselines.files import baseline_file, read_baseline
-from training.fitting.metrics_log import read_metrics
+from training.fitting.options import read_metrics
 from training.views.dataset import MANIFEST, Manifest
 
 pytestmark = pytest.mark.slow

@@ -10,7 +10,7 @@ import thor2_jax as thor2
 from thor2_jax.model.run_directory import TrainedRun, load_run
 from training.fitting.job import RunSettings, train_run
 from training.fitting.options import FitOptions
-from training.views.memory_views import MemoryViews
+from training.views.normalized_views import MemoryViews
 
 CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=3, n_strips=8, image_size=8)
 OPTIONS = FitOptions(epochs=2, batch_size=4)

@@ -18,7 +18,7 @@ from thor2_jax.model.run_directory import load_run, save_run
 from thor2_jax.testing import damaged
 from training.baselines.files import StoredBaseline, read_baseline, write_baseline
 from training.evaluation.answers import AnswerFile, FrameAnswers, InstancePrediction
-from training.fitting.metrics_log import read_metrics
+from training.fitting.options import read_metrics
 
 
 @pytest.fixture(scope="module")

@@ -20,8 +20,7 @@ from thor2_jax.testing import damaged, networks
 from training.objects.meshes import read_names
 from training.readers.bop import BOP
 from training.readers.frames import FrameFolder
-from training.readers.ocid import OCID
-from training.readers.pcd import read_organized_points
+from training.readers.ocid import OCID, read_organized_points
 from training.readers.uwis import UWISOccluded
 from training.views.dataset import MANIFEST, Manifest, Shard, ViewDataset, encode
 from training.views.normalized_views import NormalizedViews

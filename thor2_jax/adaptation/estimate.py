@@ -9,11 +9,11 @@ import dataclasses
 from collections.abc import Callable, Iterable, Sequence
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
 from colornet import ColorNetwork
-from thor2_jax.adaptation.answers import gallery_classifier
 from thor2_jax.adaptation.color_transform import ColorTransform
 from thor2_jax.adaptation.objective import Objective
 from thor2_jax.config import DescriptorConfig
@@ -21,11 +21,12 @@ from thor2_jax.descriptor.looks import LookDescriptors
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.prepared_instance import PreparedInstance, prepare_instance
-from thor2_jax.model.classifier import EMBEDDING
+from thor2_jax.gallery.embedding import Embedding
+from thor2_jax.gallery.gallery import GAMMA, Gallery
+from thor2_jax.model.classifier import EMBEDDING, Classifier
 from thor2_jax.model.fusion import fused_probabilities
 from thor2_jax.model.inference import infer
 from thor2_jax.model.model import Model
-from thor2_jax.model.run_classifiers import Classifier
 
 __all__ = [
     "MAX_INSTANCES",
@@ -34,6 +35,7 @@ __all__ = [
     "adaptation_criterion",
     "camera_instances",
     "estimate_transform",
+    "gallery_classifier",
 ]
 
 PRIOR = 0.085
@@ -48,6 +50,9 @@ MIN_INSTANCES = 10
 
 MAX_INSTANCES = 40
 """Instances that are used at most; more take longer and change little."""
+
+MAX_VIEWS = 1024
+"""Views of a gallery that answer at most, evenly spread; the regression is solved for all of them at once."""
 
 EVIDENCE = 0.5
 """Weight of an instance's uncertainty: instances of the same few objects are not independent. Chosen on real frames."""
@@ -116,6 +121,31 @@ def adaptation_criterion(model: Model) -> tuple[ColorNetwork, DescriptorConfig, 
         return computed
 
     return model.run.network, model.run.config, model.classifiers.get(EMBEDDING, fused)
+
+
+def gallery_classifier(gallery: Gallery, embedding: Embedding) -> Classifier:
+    """Return the classifier whose probabilities are the scores of a gallery, divided by their sum if it exceeds 1.
+
+    Reference views take no part: what matters is which colours make the scores certain, not whether objects are known.
+
+    Args:
+        gallery: a gallery with at least one object.
+        embedding: the embedding of its views.
+    """
+    views, owner, ridge = dataclasses.replace(gallery, references=None).regression
+    kept = np.unique(np.linspace(0, len(owner) - 1, min(len(owner), MAX_VIEWS)).round().astype(int))
+    views = views[kept].astype(np.float64)
+    kernel = np.exp(GAMMA * (views @ views.T - 1)) + np.diag(ridge[kept])
+    duals = jnp.asarray(np.linalg.solve(kernel, np.eye(len(gallery.objects))[owner[kept]]), jnp.float32)
+    fixed = jnp.asarray(views, jnp.float32)
+
+    def classify(oriented: LookDescriptors) -> jax.Array:
+        embedded = embedding.embed_oriented(oriented)
+        scores = jnp.clip(jnp.exp(GAMMA * (embedded @ fixed.T - 1)) @ duals, 0, 1)
+        mean = (oriented.weights[..., None] * scores).sum(axis=1)
+        return mean / jnp.maximum(mean.sum(axis=1, keepdims=True), 1)
+
+    return classify
 
 
 def spread(instances: Sequence[PreparedInstance], count: int = MAX_INSTANCES) -> list[PreparedInstance]:

@@ -12,7 +12,7 @@ from thor2_jax.adaptation.estimate import MAX_INSTANCES, MIN_INSTANCES, Adaptati
 from thor2_jax.adaptation.objective import Objective
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.frames.prepared_instance import PreparedInstance
-from thor2_jax.model.run_classifiers import Classifier
+from thor2_jax.model.classifier import Classifier
 
 __all__ = ["CAPACITY", "OnlineAdaptation"]
 

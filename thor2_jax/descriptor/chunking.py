@@ -46,24 +46,17 @@ def map_chunks(function: Callable[[PointClouds], T], clouds: PointClouds) -> T:
         clouds: [B, N].
     """
     n_clouds, size = len(clouds.mask), chunk_size(clouds)
-    if n_clouds <= size:
-        return function(clouds)
-
-    def step(clouds: PointClouds) -> T:
-        return _map_slices(function, clouds, size)
-
     clouds_per_step = size * CHUNKS_PER_STEP
     if n_clouds <= clouds_per_step:
-        return step(clouds)
+        return _map_slices(function, clouds, size)
     n_steps, rest = divmod(n_clouds, clouds_per_step)
-    head = jax.tree.map(
-        lambda a: a[: n_clouds - rest].reshape(n_steps, clouds_per_step, *a.shape[1:]),
-        clouds,
-    )
-    results = jax.tree.map(lambda a: a.reshape(n_clouds - rest, *a.shape[2:]), jax.lax.map(step, head))
+    head = jax.tree.map(lambda a: a[: n_clouds - rest].reshape(n_steps, clouds_per_step, *a.shape[1:]), clouds)
+    results = jax.lax.map(lambda step: _map_slices(function, step, size), head)
+    results = jax.tree.map(lambda a: a.reshape(n_clouds - rest, *a.shape[2:]), results)
     if rest == 0:
         return results
-    return _concatenate([results, step(jax.tree.map(lambda a: a[n_clouds - rest :], clouds))])
+    tail = jax.tree.map(lambda a: a[n_clouds - rest :], clouds)
+    return _concatenate([results, _map_slices(function, tail, size)])
 
 
 def map_large_chunks(function: Callable[[PointClouds], T], clouds: PointClouds, looks: int) -> T:
@@ -82,7 +75,7 @@ def map_large_chunks(function: Callable[[PointClouds], T], clouds: PointClouds, 
 
 
 def _map_slices(function: Callable[[PointClouds], T], clouds: PointClouds, size: int) -> T:
-    starts = range(0, len(clouds.mask), size)
+    starts = range(0, max(len(clouds.mask), 1), size)
     return _concatenate([function(jax.tree.map(lambda a, k=k: a[k : k + size], clouds)) for k in starts])
 
 

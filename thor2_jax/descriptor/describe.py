@@ -61,9 +61,7 @@ def strips_by_sets(aligned: PointClouds, sets: RegionSets, config: DescriptorCon
     return _strips_of(aligned, _color_sets(aligned.colors, sets), sets, config)
 
 
-@partial(jax.jit, static_argnums=1)
-def _diagrams(strips: Strips, config: DescriptorConfig) -> Diagrams:
-    return diagrams_of_strips(strips, config)
+_diagrams = jax.jit(diagrams_of_strips, static_argnums=1)
 
 
 @partial(jax.jit, static_argnums=2)
@@ -151,12 +149,6 @@ def describe(
     _check_batch(clouds)
     if len(clouds.mask) > chunk_size(clouds):
         return _describe_in_chunks(clouds, network, config, parameters)
-    return _describe_chunk(clouds, network, config, parameters)
-
-
-def _describe_chunk(
-    clouds: PointClouds, network: ColorNetwork, config: DescriptorConfig, parameters: Parameters | None
-) -> Descriptors:
     return describe_aligned(align(clouds, config, parameters), network, config, parameters)
 
 
@@ -164,4 +156,4 @@ def _describe_chunk(
 def _describe_in_chunks(
     clouds: PointClouds, network: ColorNetwork, config: DescriptorConfig, parameters: Parameters | None
 ) -> Descriptors:
-    return map_chunks(lambda chunk: _describe_chunk(chunk, network, config, parameters), clouds)
+    return map_chunks(lambda chunk: describe(chunk, network, config, parameters), clouds)

@@ -86,24 +86,26 @@ def _looks(clouds: PointClouds, sigma_s: ArrayLike, alpha: ArrayLike, count: int
     warmer = jnp.array([WARMTH, 1, 1 / WARMTH], jnp.float32)
 
     def one(cloud: PointClouds) -> tuple[PointClouds, jax.Array]:
-        def placed(mask: jax.Array) -> list[tuple[jax.Array, jax.Array]]:
-            """Return points and camera, as they are and after a half turn."""
+        def placed(mask: jax.Array) -> tuple[jax.Array, jax.Array]:
+            """Return points [2, N, 3] and cameras [2, 3], as they are and after a half turn."""
             normalization = boxed(dataclasses.replace(cloud, mask=mask), sigma_s)
             rotation, end_is_occluded = oriented(normalization)
             # Where the occlusion boundary decides which end comes first, there is no half turn.
-            turned = jnp.where(end_is_occluded, rotation, half_turn @ rotation)
-            return [place_aligned(each, normalization, alpha) for each in (rotation, turned)]
+            both = jnp.stack([rotation, jnp.where(end_is_occluded, rotation, half_turn @ rotation)])
+            return jax.vmap(lambda each: place_aligned(each, normalization, alpha))(both)
 
-        mask, colors = cloud.mask, cloud.colors
-        first, turned = placed(mask)
-        looks = [(first, colors, mask), (turned, colors, mask)]
+        masks, colors = [cloud.mask], cloud.colors
+        looks = [(0, 0, colors), (0, 1, colors)]  # number of the mask, half turn, colours
         if count == 4:
-            inner = mask if cloud.rim is None else mask & ~cloud.rim
+            masks += [] if cloud.rim is None else [cloud.mask & ~cloud.rim]
             warm, cool = (colors * warmer).clip(0, 1), (colors / warmer).clip(0, 1)
-            looks[1:] = (placed(inner)[1], colors, inner), (turned, warm, mask), (first, cool, mask)
+            looks[1:] = (len(masks) - 1, 1, colors), (0, 1, warm), (0, 0, cool)
+        points, cameras = jax.vmap(placed)(jnp.stack(masks))
         rows = [
-            dataclasses.replace(cloud, points=points[: len(mask)], camera=camera, colors=color, mask=seen)
-            for (points, camera), color, seen in looks
+            dataclasses.replace(
+                cloud, points=points[m, k, : len(masks[m])], camera=cameras[m, k], colors=color, mask=masks[m]
+            )
+            for m, k, color in looks
         ]
         return jax.tree.map(lambda *a: jnp.stack(a), *rows), jnp.full(count, 1 / count)
 

@@ -19,6 +19,7 @@ import numpy as np
 from colornet.grid import GRID_LEVELS, GRID_STEP, grid_colors
 from thor2_jax.config import DescriptorConfig, Relaxation
 from thor2_jax.descriptor.bounding_box import HIGHEST
+from thor2_jax.descriptor.cloud_statistics import square_root
 from thor2_jax.descriptor.color_membership import RegionSets
 from thor2_jax.types import Strips
 
@@ -141,9 +142,7 @@ def to_lab(colors: jax.Array) -> jax.Array:
 def hyab(first: jax.Array, second: jax.Array) -> jax.Array:
     """Return the HyAB difference |dL*| + sqrt(da*^2 + db*^2), [..., 3] to [...]; its gradient is 0 at equal colours."""
     difference = first - second
-    squared = (difference[..., 1:] ** 2).sum(axis=-1)
-    chroma = jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1)), 0)
-    return jnp.abs(difference[..., 0]) + chroma
+    return jnp.abs(difference[..., 0]) + square_root((difference[..., 1:] ** 2).sum(axis=-1))
 
 
 @functools.cache

@@ -54,11 +54,7 @@ def shard_clouds(clouds: PointClouds, mesh: Mesh) -> PointClouds:
 
 @functools.lru_cache(maxsize=8)
 def _sharded(network: ColorNetwork, config: DescriptorConfig, mesh: Mesh) -> Any:
-    spec = PartitionSpec(BATCH_AXIS)
-
-    def local(clouds: PointClouds) -> Descriptors:
-        return describe(clouds, network, config)
-
+    spec, local = PartitionSpec(BATCH_AXIS), functools.partial(describe, network=network, config=config)
     return jax.jit(jax.shard_map(local, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False))
 
 

@@ -1,7 +1,6 @@
 """Describe more clouds than fit into memory, batch by batch."""
 
 import itertools
-from collections import deque
 from collections.abc import Iterable, Iterator
 from typing import Any
 
@@ -52,14 +51,13 @@ def _stream(
     clouds: Iterator[tuple[Any, Any]], network: ColorNetwork, config: DescriptorConfig, capacity: int | None, batch: int
 ) -> Iterator[Descriptors]:
     empty_cloud = (np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
-    running: deque[tuple[int, Descriptors]] = deque()
+    running: list[tuple[int, Descriptors]] = []
     while chunk := list(itertools.islice(clouds, batch)):
         packed = PointClouds.pack(chunk + [empty_cloud] * (batch - len(chunk)), capacity)
         running.append((len(chunk), describe(packed, network, config)))
         if len(running) > 1:
-            yield _fetch(*running.popleft())
-    while running:
-        yield _fetch(*running.popleft())
+            yield _fetch(*running.pop(0))
+    yield from (_fetch(*last) for last in running)
 
 
 def _fetch(count: int, descriptors: Descriptors) -> Descriptors:

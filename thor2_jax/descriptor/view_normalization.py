@@ -17,8 +17,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from thor2_jax.config import DescriptorConfig
-from thor2_jax.descriptor.bounding_box import HIGHEST, minimal_box, rotate
-from thor2_jax.descriptor.reductions import ROWS, largest, smallest, total
+from thor2_jax.descriptor.bounding_box import HIGHEST, ROWS, fold, minimal_box, rotate
 from thor2_jax.errors import InputError
 from thor2_jax.parameters import Parameters
 from thor2_jax.types import PointClouds
@@ -44,7 +43,7 @@ def _planes(cloud: PointClouds) -> tuple[jax.Array, jax.Array]:
 def _place(rotation: jax.Array, points: jax.Array, mask: jax.Array, camera: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Rotate points [3, M] and camera [3] and translate them to the first octant; padding is 0."""
     points = rotate(rotation, points)
-    low = smallest(jnp.where(mask, points, jnp.inf))
+    low = jnp.where(mask, points, jnp.inf).min(axis=1)
     low = jnp.where(jnp.isfinite(low), low, 0)
     return jnp.where(mask, points - low[:, None], 0), jnp.matmul(rotation, camera, precision=HIGHEST) - low
 
@@ -75,7 +74,7 @@ def boxed(cloud: PointClouds, sigma_s: ArrayLike) -> Normalization:
     """Scale and centre one cloud and find its minimal box."""
     points, mask = _planes(cloud)
     scaled = points * sigma_s
-    centre = total(jnp.where(mask, scaled, 0)) / jnp.maximum(mask.sum(dtype=scaled.dtype), 1)
+    centre = fold(jnp.where(mask, scaled, 0), jnp.add).sum(axis=1) / jnp.maximum(mask.sum(dtype=scaled.dtype), 1)
     # Padding moves to the mean, inside the convex hull, where it is never an extreme point.
     centred = jnp.where(mask, scaled - centre[:, None], 0)
     camera = cloud.camera * sigma_s - centre
@@ -101,27 +100,25 @@ def oriented(normalization: Normalization) -> tuple[jax.Array, jax.Array]:
 
     x_low = jnp.minimum(low[0] * x_sign, high[0] * x_sign)
     bins = jnp.floor(rotate(axes[:1], normalization.points)[0] * x_sign / OCCLUSION_BIN - x_low / OCCLUSION_BIN)
-    last = largest(jnp.where(normalization.mask, bins, -1))
+    last = jnp.where(normalization.mask, bins, -1).max()
     # A half turn about z moves the occluded end away from the first slice.
-    first_end, last_end = (
-        (normalization.boundary & (bins <= 1)).sum(),
-        (normalization.boundary & (bins >= last - 1)).sum(),
-    )
+    first_end, last_end = ((normalization.boundary & end).sum() for end in (bins <= 1, bins >= last - 1))
     x_sign = jnp.where(first_end > last_end, -x_sign, x_sign)
 
     x, z = axes[0] * x_sign, axes[2] * z_sign
     return jax.lax.stop_gradient(jnp.stack([x, jnp.cross(z, x), z])), first_end != last_end
 
 
-def _normalize_one(cloud: PointClouds, sigma_s: ArrayLike) -> PointClouds:
-    normalization = boxed(cloud, sigma_s)
-    points, camera = _place(oriented(normalization)[0], normalization.points, normalization.mask, normalization.camera)
-    return dataclasses.replace(cloud, points=points.T[: len(cloud.mask)], camera=camera)
-
-
 @jax.jit
 def _view_normalize(clouds: PointClouds, sigma_s: ArrayLike) -> PointClouds:
-    return jax.vmap(lambda cloud: _normalize_one(cloud, sigma_s))(clouds)
+    def one(cloud: PointClouds) -> PointClouds:
+        normalization = boxed(cloud, sigma_s)
+        points, camera = _place(
+            oriented(normalization)[0], normalization.points, normalization.mask, normalization.camera
+        )
+        return dataclasses.replace(cloud, points=points.T[: len(cloud.mask)], camera=camera)
+
+    return jax.vmap(one)(clouds)
 
 
 def view_normalize(clouds: PointClouds, config: DescriptorConfig, parameters: Parameters | None = None) -> PointClouds:
@@ -157,14 +154,13 @@ def _about_y(alpha: ArrayLike) -> jax.Array:
     return jnp.array([[c, 0, -s], [0, 1, 0], [s, 0, c]])
 
 
-def _turn_one(cloud: PointClouds, alpha: ArrayLike) -> PointClouds:
-    points, camera = _place(_about_y(alpha), *_planes(cloud), cloud.camera)
-    return dataclasses.replace(cloud, points=points.T[: len(cloud.mask)], camera=camera)
-
-
 @jax.jit
 def _turn(normal: PointClouds, alpha: ArrayLike) -> PointClouds:
-    return jax.vmap(lambda cloud: _turn_one(cloud, alpha))(normal)
+    def one(cloud: PointClouds) -> PointClouds:
+        points, camera = _place(_about_y(alpha), *_planes(cloud), cloud.camera)
+        return dataclasses.replace(cloud, points=points.T[: len(cloud.mask)], camera=camera)
+
+    return jax.vmap(one)(normal)
 
 
 def turn(normal: PointClouds, config: DescriptorConfig, parameters: Parameters | None = None) -> PointClouds:

@@ -88,13 +88,9 @@ def tenth_of(n_points: int) -> int:
 
 def select_points(instance: PreparedInstance, kept: NDArray[np.bool_]) -> PreparedInstance:
     """Return the instance with some of its points only, `kept` [n]."""
-    return dataclasses.replace(
-        instance,
-        points=instance.points[kept],
-        colors=instance.colors[kept],
-        boundary=instance.boundary[kept],
-        rim=None if instance.rim is None else instance.rim[kept],
-    )
+    points, colors = instance.points[kept], instance.colors[kept]
+    rim = None if instance.rim is None else instance.rim[kept]
+    return dataclasses.replace(instance, points=points, colors=colors, boundary=instance.boundary[kept], rim=rim)
 
 
 @partial(jax.jit, static_argnums=3)

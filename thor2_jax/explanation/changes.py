@@ -17,8 +17,8 @@ from thor2_jax.config import DescriptorConfig, Relaxation
 from thor2_jax.descriptor.describe import strips
 from thor2_jax.descriptor.looks import aligned_looks, describe_aligned_looks
 from thor2_jax.descriptor.view_normalization import boxed, oriented
-from thor2_jax.explanation.class_scores import ClassScores, capacity_of
-from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
+from thor2_jax.explanation.class_scores import ClassScores, packed
+from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.types import PointClouds
 
 __all__ = ["CHANGES", "Change", "Kind", "apply_change", "changed_instance", "smallest_change"]
@@ -103,8 +103,7 @@ def apply_change(instance: PreparedInstance, change: Change, config: DescriptorC
     """Return an instance after a change that was found for it; `config` is the descriptor's configuration."""
     values = np.array(change.values)
     parameters = values / 255 if change.kind == "color" else np.log(values)
-    axes = np.asarray(_axes(pack_instances([instance], 1, capacity_of(instance)), config), np.float64)
-    return changed_instance(instance, change.kind, parameters, axes)
+    return changed_instance(instance, change.kind, parameters, np.asarray(_axes(packed(instance), config), np.float64))
 
 
 def _gradient_directions(
@@ -147,32 +146,24 @@ def smallest_change(scores: ClassScores, instance: PreparedInstance, index: int,
     """
     if len(scores.names) < 2:
         return None
-    clouds = pack_instances([instance], 1, capacity_of(instance))
+    clouds = packed(instance)
     axes = _axes(clouds, scores.config)
     directions = _gradient_directions(scores, clouds, axes, index, kind)
     lengths = LARGEST[kind] * np.arange(1, SCALES + 1) / SCALES
     frame = np.asarray(axes, np.float64)
 
     def first_change(tried: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float32]] | None:
-        variants = [changed_instance(instance, kind, parameters, frame) for parameters in tried]
-        values = scores.of_instances(variants)
+        values = scores.of_instances([changed_instance(instance, kind, parameters, frame) for parameters in tried])
         other = np.flatnonzero(values.argmax(axis=1) != index)
         return (tried[other[0]], values[other[0]]) if len(other) else None
 
-    by_length = (lengths[:, None, None] * directions).reshape(-1, 3)
-    changed = first_change(by_length)
+    changed = first_change((lengths[:, None, None] * directions).reshape(-1, 3))
     if changed is None:
         return None
     # Between the last length that was tried and the one that was found.
     step = lengths[0] / np.linalg.norm(changed[0])
     finer = first_change(changed[0] * (1 - step * np.arange(7, 0, -1) / 8)[:, None])
     parameters, values = finer or changed
-    return _record(scores, index, kind, parameters, values)
-
-
-def _record(
-    scores: ClassScores, index: int, kind: Kind, parameters: NDArray[np.float64], values: NDArray[np.float32]
-) -> Change:
     shown = 255 * parameters if kind == "color" else np.exp(parameters)
     size = np.linalg.norm(shown) if kind == "color" else np.abs(shown - 1).max()
     first, second, third = (float(value) for value in shown)

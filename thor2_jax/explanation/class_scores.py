@@ -18,17 +18,10 @@ from colornet import ColorNetwork
 from thor2_jax.capacity import point_bucket
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.describe import strips
-from thor2_jax.descriptor.looks import (
-    LookDescriptors,
-    aligned_looks,
-    describe_aligned_looks,
-    describe_looks,
-)
+from thor2_jax.descriptor.looks import LookDescriptors, aligned_looks, describe_aligned_looks, describe_looks
 from thor2_jax.errors import InputError
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
-from thor2_jax.gallery.embedding import Embedding
 from thor2_jax.gallery.enrollment import LOOKS
-from thor2_jax.gallery.gallery import GalleryObject
 from thor2_jax.model.classifier import EMBEDDING
 from thor2_jax.model.fusion import fused_probabilities
 from thor2_jax.model.inference import infer
@@ -92,19 +85,17 @@ class ClassScores:
 
     def orient(self, instance: PreparedInstance) -> OrientedCloud:
         """Return the aligned clouds of an instance."""
-        aligned, weights = aligned_looks(pack_instances([instance], 1, capacity_of(instance)), self.config, self.count)
+        aligned, weights = aligned_looks(packed(instance), self.config, self.count)
         return OrientedCloud(aligned, weights[0])
 
     def of_instances(self, instances: Sequence[PreparedInstance]) -> NDArray[np.float32]:
         """Return the scores [B, n] of instances, each in its own frames, as recognition computes them."""
-        capacity = max(map(capacity_of, instances), default=MIN_CAPACITY)
-        scores = [np.zeros((0, len(self.names)), np.float32)]
-        for start in range(0, len(instances), ROWS):
-            rows = instances[start : start + ROWS]
-            packed = pack_instances(rows, ROWS, capacity)
-            oriented = describe_looks(packed, self.network, self.config, self.count)
-            scores.append(np.asarray(self.of_descriptors(oriented))[: len(rows)])
-        return np.concatenate(scores)
+        capacity = padded_points(max((len(instance.points) for instance in instances), default=1))
+
+        def describe(rows: Sequence[PreparedInstance]) -> LookDescriptors:
+            return describe_looks(pack_instances(rows, ROWS, capacity), self.network, self.config, self.count)
+
+        return self._of_rows(instances, describe)
 
     def of_masks(self, cloud: OrientedCloud, masks: NDArray[np.bool_]) -> NDArray[np.float32]:
         """Return the exact scores [B, n] of parts of a cloud; its frames are those of the whole cloud.
@@ -113,29 +104,33 @@ class ClassScores:
             cloud: the cloud.
             masks: [B, n] bool, points of each part.
         """
-        scores = [np.zeros((0, len(self.names)), np.float32)]
-        size = cloud.aligned.mask.shape[1]
-        for start in range(0, len(masks), ROWS):
-            rows = masks[start : start + ROWS]
-            padded = np.zeros((ROWS, size), bool)
-            padded[: len(rows), : rows.shape[1]] = rows
-            repeated = repeat_cloud(cloud.aligned, ROWS)
-            mask = repeated.mask & jnp.repeat(jnp.asarray(padded), self.count, axis=0)
-            part = dataclasses.replace(repeated, mask=mask)
+        repeated, weights = repeat_cloud(cloud.aligned, ROWS), jnp.tile(cloud.weights, (ROWS, 1))
+
+        def describe(rows: NDArray[np.bool_]) -> LookDescriptors:
+            padded = np.pad(rows, ((0, ROWS - len(rows)), (0, repeated.mask.shape[1] - rows.shape[1])))
+            part = dataclasses.replace(repeated, mask=repeated.mask & jnp.repeat(padded, self.count, axis=0))
             cut = strips(part, self.network, self.config)
-            oriented = describe_aligned_looks(part, jnp.tile(cloud.weights, (ROWS, 1)), cut, self.network, self.config)
-            scores.append(np.asarray(self.of_descriptors(oriented))[: len(rows)])
+            return describe_aligned_looks(part, weights, cut, self.network, self.config)
+
+        return self._of_rows(masks, describe)
+
+    def _of_rows(self, items: Any, describe: Callable[[Any], LookDescriptors]) -> NDArray[np.float32]:
+        """Return the scores [B, n] of items, described `ROWS` at a time."""
+        scores = [np.zeros((0, len(self.names)), np.float32)]
+        for start in range(0, len(items), ROWS):
+            rows = items[start : start + ROWS]
+            scores.append(np.asarray(self.of_descriptors(describe(rows)))[: len(rows)])
         return np.concatenate(scores)
-
-
-def capacity_of(instance: PreparedInstance) -> int:
-    """Return the padded number of points of an instance."""
-    return padded_points(len(instance.points))
 
 
 def padded_points(n_points: int) -> int:
     """Return the padded number of points of an instance with so many."""
     return max(point_bucket(n_points), MIN_CAPACITY)
+
+
+def packed(instance: PreparedInstance) -> PointClouds:
+    """Return an instance as a batch of one cloud, in metres."""
+    return pack_instances([instance], 1, padded_points(len(instance.points)))
 
 
 def repeat_cloud(aligned: PointClouds, times: int) -> PointClouds:
@@ -183,22 +178,16 @@ def gallery_scores(model: Model) -> ClassScores:
     objects = model.gallery.objects
     if not objects:
         raise InputError("no object is enrolled; enroll one, or train a run")
-    embedding = model.embedding
-    of_descriptors = _nearest_cosines(embedding, list(objects.values()))
-    config = _checked(embedding.config)
-    count = max(model.run.config.looks, LOOKS)  # as `infer`
-    return ClassScores(tuple(objects), "similarity", config, embedding.network, count, of_descriptors)
-
-
-def _nearest_cosines(embedding: Embedding, objects: Sequence[GalleryObject]) -> Callable[[LookDescriptors], jax.Array]:
-    views: Any = jnp.asarray(np.concatenate([one.embeddings for one in objects]), jnp.float32)
-    ends = np.cumsum([len(one.embeddings) for one in objects])
-    starts = ends - [len(one.embeddings) for one in objects]
+    embedding, each = model.embedding, [views.embeddings for views in objects.values()]
+    views: Any = jnp.asarray(np.concatenate(each), jnp.float32)
+    ends = np.cumsum([len(one) for one in each])
 
     def of_descriptors(oriented: LookDescriptors) -> jax.Array:
         first: LookDescriptors = jax.tree.map(lambda a: a[:, :LOOKS], oriented)
-        cosines = embedding.embed_oriented(first) @ views.T
-        nearest = jnp.stack([cosines[..., a:b].max(axis=-1) for a, b in zip(starts, ends, strict=True)], axis=-1)
+        cosines = jnp.split(embedding.embed_oriented(first) @ views.T, ends[:-1], axis=-1)
+        nearest = jnp.stack([of_object.max(axis=-1) for of_object in cosines], axis=-1)
         return (first.weights[..., None] * nearest).sum(axis=1) / first.weights.sum(axis=1, keepdims=True)
 
-    return of_descriptors
+    count = max(model.run.config.looks, LOOKS)  # as `infer`
+    config = _checked(embedding.config)
+    return ClassScores(tuple(objects), "similarity", config, embedding.network, count, of_descriptors)

@@ -9,8 +9,7 @@ colour matrices are those of the first look, which is the paper's.
 """
 
 import dataclasses
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
@@ -24,17 +23,11 @@ from thor2_jax.descriptor.persistence import diagrams_of_strips
 from thor2_jax.errors import InputError
 from thor2_jax.explanation.attributions import Attributions, attribute_points
 from thor2_jax.explanation.changes import CHANGES, Change, smallest_change
-from thor2_jax.explanation.class_scores import (
-    ClassScores,
-    OrientedCloud,
-    capacity_of,
-    classifier_scores,
-    gallery_scores,
-)
+from thor2_jax.explanation.class_scores import ClassScores, OrientedCloud, classifier_scores, gallery_scores, packed
 from thor2_jax.explanation.leave_out import LeftOut, leave_out
-from thor2_jax.explanation.nearest_views import NearestView, nearest_views
 from thor2_jax.frames.frames import RGBDFrame, pixel_rays
-from thor2_jax.frames.prepared_instance import DESCRIPTOR_VOXEL, PreparedInstance, pack_instances, prepare_instance
+from thor2_jax.frames.prepared_instance import DESCRIPTOR_VOXEL, PreparedInstance, prepare_instance
+from thor2_jax.gallery.enrollment import embed_looks
 from thor2_jax.model.answers import Recognition
 from thor2_jax.model.inference import answers, infer_clouds, values
 from thor2_jax.model.model import Model
@@ -44,12 +37,17 @@ from thor2_jax.types import Diagrams
 __all__ = [
     "DescribedSlices",
     "Explanation",
+    "NearestView",
     "compile_explanations",
     "explain",
     "explain_instance",
     "explained_kinds",
     "pixel_attributions",
 ]
+
+
+OBJECTS = 3
+"""Objects of which the nearest view is shown."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -67,6 +65,23 @@ class DescribedSlices:
     diagrams: Diagrams
     images: NDArray[np.float32]
     colors: NDArray[np.float32]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class NearestView:
+    """An enrolled view.
+
+    Attributes:
+        name: name of the object.
+        number: number of the view among those of the object, in the order of enrolment.
+        similarity: largest cosine of the embeddings of the looks at both, at most 1.
+        view: its cloud.
+    """
+
+    name: str
+    number: int
+    similarity: float
+    view: PreparedInstance
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -165,26 +180,25 @@ def explain_instance(model: Model, instance: PreparedInstance) -> Explanation:
         raise InputError(f"instance {instance.label} cannot be explained: {instance.reason}")
     recognition, name = _answer(model, instance)
     scores = _scores_of(model, name)
-    index = scores.names.index(name)
+    parts = dict(_parts(model, scores, instance, scores.names.index(name)))
+    return Explanation(recognition=recognition, name=name, scores=scores, instance=instance, **parts)
+
+
+def _parts(model: Model, scores: ClassScores, instance: PreparedInstance, index: int) -> Iterator[tuple[str, Any]]:
+    """Yield the further fields of an explanation, most of which compile for seconds."""
     scored = scores.of_instances([instance])[0]
     others = [k for k in np.argsort(-scored, kind="stable") if k != index]
+    yield "runner_up", scores.names[others[0]] if others else None
     cloud = scores.orient(instance)
     attributions = attribute_points(scores, cloud, instance, index)
+    yield "attributions", attributions
+    yield "left_out", leave_out(scores, cloud, index, attributions.values)
     # Where classifiers and gallery answer together, the best score need not be that of the answer.
     kinds = CHANGES if scored.argmax() == index else ()
     changes = [smallest_change(scores, instance, index, kind) for kind in kinds]
-    return Explanation(
-        recognition=recognition,
-        name=name,
-        runner_up=scores.names[others[0]] if others else None,
-        scores=scores,
-        instance=instance,
-        described=_described(scores, cloud, len(instance.points)),
-        attributions=attributions,
-        left_out=leave_out(scores, cloud, index, attributions.values),
-        changes=tuple(change for change in changes if change is not None),
-        nearest=tuple(nearest_views(model, instance)),
-    )
+    yield "changes", tuple(change for change in changes if change is not None)
+    yield "described", _described(scores, cloud, len(instance.points))
+    yield "nearest", tuple(_nearest_views(model, instance))
 
 
 def compile_explanations(model: Model, n_points: int, by_classifiers: bool, is_stopped: Callable[[], bool]) -> None:
@@ -205,18 +219,9 @@ def compile_explanations(model: Model, n_points: int, by_classifiers: bool, is_s
     _answer(model, instance)
     scores = _scores_of(model, name)
     index = int(scores.of_instances([instance])[0].argmax())
-    cloud = scores.orient(instance)
-    steps: list[Callable[[], object]] = [
-        partial(attribute_points, scores, cloud, instance, index),
-        partial(leave_out, scores, cloud, index, np.zeros(n_points, np.float32)),
-        *(partial(smallest_change, scores, instance, index, kind) for kind in CHANGES),
-        partial(_described, scores, cloud, n_points),
-        partial(nearest_views, model, instance),
-    ]
-    for step in steps:
-        if is_stopped():
-            return
-        step()
+    parts = _parts(model, scores, instance, index)
+    while not is_stopped() and next(parts, None) is not None:
+        pass
 
 
 def explained_kinds(model: Model) -> dict[bool, str]:
@@ -224,25 +229,22 @@ def explained_kinds(model: Model) -> dict[bool, str]:
 
     A kind that no name has is left out.
     """
-    union = model.union
-    by_classifiers = np.asarray(union.has_output) & (model.answers_by() != "gallery")
-    return dict(zip(by_classifiers.tolist(), union.names, strict=True))
+    by_classifiers = model.union.has_output & (model.answers_by() != "gallery")
+    return dict(zip(by_classifiers.tolist(), model.names, strict=True))
 
 
 def _answer(model: Model, instance: PreparedInstance) -> tuple[Recognition, str]:
     """Return the answer of the model and the most probable name."""
     if not model.names:
         raise InputError("no object is known; train a run or enroll an object")
-    inference = infer_clouds(model, pack_instances([instance], 1, capacity_of(instance)))
+    inference = infer_clouds(model, packed(instance))
     (recognition,) = answers(model, [instance], inference)
     return recognition, model.names[int(values(model, inference)[0].argmax())]
 
 
 def _scores_of(model: Model, name: str) -> ClassScores:
-    union = model.union
-    has_output = bool(union.has_output[union.names.index(name)])
-    by_classifiers = model.answers_by() != "gallery" and has_output
-    return classifier_scores(model) if by_classifiers else gallery_scores(model)
+    has_output = model.union.has_output[model.names.index(name)]
+    return classifier_scores(model) if has_output and model.answers_by() != "gallery" else gallery_scores(model)
 
 
 def _described(scores: ClassScores, cloud: OrientedCloud, n: int) -> DescribedSlices:
@@ -252,6 +254,28 @@ def _described(scores: ClassScores, cloud: OrientedCloud, n: int) -> DescribedSl
     images = describe_strips(cut, scores.network, scores.config).images
     first = jax.tree.map(lambda a: np.asarray(a[0]), (shown.points, diagrams, images, cut.color))
     return DescribedSlices(first[0][:n], *first[1:])
+
+
+def _nearest_views(model: Model, instance: PreparedInstance) -> list[NearestView]:
+    """Return the nearest view of each of the most similar enrolled objects, the most similar one first.
+
+    Args:
+        model: its gallery may be empty; the result then is, too.
+        instance: the instance.
+    """
+    objects = model.gallery.objects
+    if not objects:
+        return []
+    scores = gallery_scores(model).of_instances([instance])[0]
+    query = embed_looks(model.embedding, [instance])[0]
+    nearest = []
+    for index in np.argsort(-scores, kind="stable")[:OBJECTS]:
+        name = model.gallery.names[index]
+        views = list(objects[name].clouds.views())
+        cosines = (embed_looks(model.embedding, views) @ query.T).max(axis=(1, 2))
+        number = int(cosines.argmax())
+        nearest.append(NearestView(name, number, float(cosines[number]), views[number]))
+    return sorted(nearest, key=lambda one: -one.similarity)
 
 
 def pixel_attributions(explanation: Explanation, frame: RGBDFrame) -> NDArray[np.float32]:

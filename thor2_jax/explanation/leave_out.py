@@ -26,7 +26,8 @@ class LeftOut:
         strip_of: [n] int, strip of each point.
         slices: [S] float32, loss without the slice; NaN if it is empty.
         strips: [S, J] float32, loss without the strip; NaN if it is empty.
-        agreement: rank correlation (Spearman) of the losses of the strips with the sums of their attributions; None if
+        predicted: [S, J] float32, sum of the attributions of the strip; NaN if it is empty.
+        agreement: rank correlation (Spearman) of the losses of the strips with their predictions; None if
             there are fewer than three strips or all are equal.
     """
 
@@ -34,6 +35,7 @@ class LeftOut:
     strip_of: NDArray[np.intp]
     slices: NDArray[np.float32]
     strips: NDArray[np.float32]
+    predicted: NDArray[np.float32]
     agreement: float | None
 
 
@@ -59,9 +61,10 @@ def leave_out(scores: ClassScores, cloud: OrientedCloud, index: int, attribution
 
     slices = np.full(config.n_slices, np.nan, np.float32)
     slices[used_slices] = losses[: len(used_slices)]
-    strips = np.full(config.n_slices * config.n_strips, np.nan, np.float32)
+    strips, predicted = np.full((2, config.n_slices * config.n_strips), np.nan, np.float32)
     strips[cells] = losses[len(used_slices) :]
-    predicted = np.array([attributions[cell_of == k].sum() for k in cells])
-    varies = len(cells) > 2 and np.ptp(predicted) > 0 and np.ptp(strips[cells]) > 0
-    agreement = float(spearmanr(predicted, strips[cells]).statistic) if varies else None
-    return LeftOut(slice_of, strip_of, slices, strips.reshape(config.n_slices, config.n_strips), agreement)
+    predicted[cells] = [attributions[cell_of == k].sum() for k in cells]
+    varies = len(cells) > 2 and np.ptp(predicted[cells]) > 0 and np.ptp(strips[cells]) > 0
+    agreement = float(spearmanr(predicted[cells], strips[cells]).statistic) if varies else None
+    grid = config.n_slices, config.n_strips
+    return LeftOut(slice_of, strip_of, slices, strips.reshape(grid), predicted.reshape(grid), agreement)

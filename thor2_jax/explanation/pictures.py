@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -65,9 +65,9 @@ def pictures(explanation: Explanation, frame: RGBDFrame) -> Iterator[Explanation
         frame: the frame that it was made from.
     """
     yield from main_pictures(explanation, frame)
-    yield _decided_slices(explanation)
+    yield _slices(explanation, decided=True)
     yield _check(explanation)
-    yield _slices(explanation)
+    yield _slices(explanation, decided=False)
     yield _diagrams(explanation)
     for number in np.flatnonzero(explanation.described.colors.any(axis=(1, 2))):
         yield _slice(explanation, int(number))
@@ -130,28 +130,14 @@ def _point_size(instance: PreparedInstance) -> float:
     return float(np.clip(16000 / max(len(instance.points), 1), 4, 25))
 
 
-def _decided_slices(explanation: Explanation) -> ExplanationPicture:
-    figure, axes = _figure()
-    instance, points = explanation.instance, explanation.described.points
-    values, size = explanation.attributions.values, _point_size(instance)
-    plot.slices(axes, points, instance.colors, explanation.config, values, strips=True, size=size)
-    _color_bar(figure, axes, explanation)
-    caption = "The same points, turned as the descriptor sees them, with slices (numbered rows) and strips (columns)."
-    return ExplanationPicture("slices-attributions", "decided", "What decided, in slices and strips", caption, figure)
-
-
 def _check(explanation: Explanation) -> ExplanationPicture:
-    left, config = explanation.left_out, explanation.config
-    predicted = np.full(config.n_slices * config.n_strips, np.nan)
-    cell_of = left.slice_of * config.n_strips + left.strip_of
-    for cell in np.flatnonzero(np.isfinite(left.strips.ravel())):
-        predicted[cell] = explanation.attributions.values[cell_of == cell].sum()
+    left = explanation.left_out
     used = np.isfinite(left.strips)
     rows, columns = (int(np.flatnonzero(used.any(axis=axis)).max(initial=0)) + 1 for axis in (1, 0))
     figure = Figure(figsize=_SIZE, layout="constrained")
     for axes, values, title in zip(
         figure.subplots(2, 1, sharex=True),
-        (left.strips, predicted.reshape(left.strips.shape)),
+        (left.strips, left.predicted),
         ("exact: what the answer loses without the strip", "sum of the attributions of the strip"),
         strict=True,
     ):
@@ -194,17 +180,12 @@ def change_text(change: Change) -> str:
 
 
 def _changes(explanation: Explanation) -> ExplanationPicture:
-    shown = [("as it is", explanation.name, explanation.instance)]
+    shown = [(f"as it is:\n{explanation.name}", explanation.instance)]
     for change in explanation.changes:
         title = "other colour" if change.kind == "color" else "other extents"
-        shown.append((title, change.answer, apply_change(explanation.instance, change, explanation.config)))
-    figure = Figure(figsize=(_SIZE[0], 2.6), layout="constrained")
-    all_axes = figure.subplots(1, len(shown), sharex=True, sharey=True)
-    for axes, (title, name, instance) in zip(all_axes, shown, strict=True):
-        points = instance.points - instance.points.mean(axis=0)
-        plot.cloud(axes, points, instance.colors, size=_point_size(instance) / 2)
-        axes.set_title(f"{title}:\n{plain_text(name)}", fontsize=9, **name_style())
-        axes.set(xticks=[], yticks=[], xlabel="", ylabel="")
+        changed = apply_change(explanation.instance, change, explanation.config)
+        shown.append((f"{title}:\n{change.answer}", changed))
+    figure = _clouds(shown, len(shown), 2.6)
     caption = (
         "The smallest changes of the object's colour and of its extents that were found to give another answer. Each "
         "was confirmed by recognizing the changed cloud."
@@ -213,18 +194,9 @@ def _changes(explanation: Explanation) -> ExplanationPicture:
 
 
 def _nearest(explanation: Explanation) -> ExplanationPicture:
-    shown = [("this object", "", explanation.instance)]
-    shown += [(one.name, f"\n{one.similarity:.2f}", one.view) for one in explanation.nearest]
-    columns = 2
-    figure = Figure(figsize=(_SIZE[0], 2.9 * math.ceil(len(shown) / columns)), layout="constrained")
-    grid = figure.subplots(math.ceil(len(shown) / columns), columns, squeeze=False).flat
-    for axes, (title, similarity, instance) in zip(grid, shown, strict=False):
-        plot.cloud(axes, instance.points, instance.colors, size=_point_size(instance) / 2)
-        axes.set_title(plain_text(title + similarity), fontsize=9, **name_style())
-    for axes in figure.axes:
-        axes.set(xticks=[], yticks=[], xlabel="", ylabel="")
-    for axes in figure.axes[len(shown) :]:
-        axes.set_visible(False)
+    shown = [("this object", explanation.instance)]
+    shown += [(f"{one.name}\n{one.similarity:.2f}", one.view) for one in explanation.nearest]
+    figure = _clouds(shown, 2, 2.9, own_scales=True)
     caption = (
         "The enrolled views that the object resembles most, one for each of the most similar objects, each as its "
         "camera saw it and at its own scale. Numbers are similarities (1: equal)."
@@ -232,12 +204,36 @@ def _nearest(explanation: Explanation) -> ExplanationPicture:
     return ExplanationPicture("nearest", "nearest", "Nearest enrolled views", caption, figure)
 
 
-def _slices(explanation: Explanation) -> ExplanationPicture:
+def _clouds(
+    shown: Sequence[tuple[str, PreparedInstance]], columns: int, height: float, own_scales: bool = False
+) -> Figure:
+    """Draw clouds with their titles in rows of a height in inches, around their means or at scales of their own."""
+    rows = math.ceil(len(shown) / columns)
+    figure = Figure(figsize=(_SIZE[0], rows * height), layout="constrained")
+    grid = figure.subplots(rows, columns, squeeze=False, sharex=not own_scales, sharey=not own_scales).flat
+    for axes, (title, instance) in zip(grid, shown, strict=False):
+        points = instance.points if own_scales else instance.points - instance.points.mean(axis=0)
+        plot.cloud(axes, points, instance.colors, size=_point_size(instance) / 2)
+        axes.set_title(plain_text(title), fontsize=9, **name_style())
+        axes.set(xticks=[], yticks=[], xlabel="", ylabel="")
+    for axes in figure.axes[len(shown) :]:
+        axes.set_visible(False)
+    return figure
+
+
+def _slices(explanation: Explanation, decided: bool) -> ExplanationPicture:
     figure, axes = _figure()
-    instance = explanation.instance
+    instance, config = explanation.instance, explanation.config
+    values = explanation.attributions.values if decided else None
     size = _point_size(instance)
-    plot.slices(axes, explanation.described.points, instance.colors, explanation.config, strips=True, size=size)
-    config = explanation.config
+    plot.slices(axes, explanation.described.points, instance.colors, config, values, strips=True, size=size)
+    if decided:
+        _color_bar(figure, axes, explanation)
+        caption = (
+            "The same points, turned as the descriptor sees them, with slices (numbered rows) and strips (columns)."
+        )
+        title = "What decided, in slices and strips"
+        return ExplanationPicture("slices-attributions", "decided", title, caption, figure)
     slice_mm, strip_mm = (1000 * width / config.sigma_s for width in (config.sigma_1, config.sigma_2))
     caption = (
         "The points seen from the side, after the object was turned so that its longest side rises at 45 degrees. "

@@ -6,6 +6,7 @@ points = backproject(frame.depth_m, frame.intrinsics)      # [H, W, 3] metres, O
 """
 
 import dataclasses
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -14,27 +15,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
-from thor2_jax.frames.depth_files import read_depth
-from thor2_jax.frames.distortion import distort, undistort
-from thor2_jax.frames.image_files import MAX_IMAGE_PIXELS, has_16_bit_channels, read_image
-from thor2_jax.frames.intrinsics import Intrinsics, parse_intrinsics, read_intrinsics
+from thor2_jax.frames.image_files import read_depth, read_image
+from thor2_jax.frames.intrinsics import Intrinsics, read_intrinsics
 
 __all__ = [
     "MAX_DEPTH",
-    "MAX_IMAGE_PIXELS",
     "MIN_DEPTH",
     "Intrinsics",
     "RGBDFrame",
     "backproject",
+    "check_images",
+    "distort",
     "frame_intrinsics",
-    "has_16_bit_channels",
-    "parse_intrinsics",
     "pixel_rays",
     "read_color",
     "read_depth",
     "read_frame",
     "read_intrinsics",
     "read_labels",
+    "undistort",
 ]
 
 
@@ -46,6 +45,11 @@ MAX_INSTANCES = 1000
 
 MAX_DISTORTION_ERROR = 0.5
 """Largest error of the inverse of a lens distortion, pixels."""
+
+_ITERATIONS = 30
+"""Steps of the iteration that inverts a lens distortion."""
+
+Array = NDArray[np.floating[Any]]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -72,21 +76,11 @@ class RGBDFrame:
     def __post_init__(self) -> None:
         color, depth = np.asarray(self.color), np.asarray(self.depth)
         labels = None if self.labels is None else np.asarray(self.labels)
-        if color.ndim != 3 or color.shape[2] != 3 or 0 in color.shape:
-            raise InputError(f"color has shape {color.shape}; expected [H, W, 3]")
-        if color.dtype != np.uint8:
-            raise InputError(f"color has type {color.dtype}; expected uint8")
-        for name, image in (("depth", depth), ("labels", labels)):
-            if image is not None and image.shape != color.shape[:2]:
-                raise InputError(
-                    f"{name} has shape {image.shape}; expected {color.shape[:2]} (rows, columns), as color"
-                )
+        check_images(color, depth=depth, labels=labels)
         if depth.dtype.kind not in "uf" or depth.dtype == np.uint8:
             raise InputError(
                 f"depth has type {depth.dtype}; expected uint16 or uint32 (1 / depth_scale metres) or floats (metres)"
             )
-        if labels is not None and labels.dtype.kind not in "ui":
-            raise InputError(f"labels has type {labels.dtype}; expected integers")
         if labels is not None and labels.min() < 0:
             raise InputError(f"labels has the value {labels.min()}; expected 0 or more")
         intrinsics = Intrinsics.of(self.intrinsics)
@@ -143,6 +137,50 @@ class RGBDFrame:
     def instances(self) -> tuple[int, ...]:
         """Label numbers of the frame in increasing order, without 0; raises InputError as `instance_pixels`."""
         return tuple(self.instance_pixels)
+
+
+def check_images(color: NDArray[Any], *, labels: NDArray[Any] | None, depth: NDArray[Any] | None = None) -> None:
+    """Raise InputError unless the images of a frame have shapes and types that fit; that of depth is not checked."""
+    if color.ndim != 3 or color.shape[2] != 3 or 0 in color.shape:
+        raise InputError(f"color has shape {color.shape}; expected [H, W, 3]")
+    if color.dtype != np.uint8:
+        raise InputError(f"color has type {color.dtype}; expected uint8")
+    for name, image in (("depth", depth), ("labels", labels)):
+        if image is not None and image.shape != color.shape[:2]:
+            raise InputError(f"{name} has shape {image.shape}; expected {color.shape[:2]} (rows, columns), as color")
+    if labels is not None and labels.dtype.kind not in "ui":
+        raise InputError(f"labels has type {labels.dtype}; expected integers")
+
+
+def _terms(x: Array, y: Array, coefficients: Sequence[float]) -> tuple[Array, Array, Array]:
+    """Return the radial factor and the tangential terms of both axes, of OpenCV's polynomial or rational model.
+
+    Coordinates, here and below, are x / z and y / z in the camera frame; the coefficients are `Intrinsics.distortion`.
+    """
+    k1, k2, p1, p2, k3, k4, k5, k6 = (*coefficients, 0.0, 0.0, 0.0, 0.0)[:8]
+    squared = x * x + y * y
+    radial = (1 + squared * (k1 + squared * (k2 + squared * k3))) / (1 + squared * (k4 + squared * (k5 + squared * k6)))
+    product = 2 * x * y
+    return radial, p1 * product + p2 * (squared + 2 * x * x), p1 * (squared + 2 * y * y) + p2 * product
+
+
+def distort(x: Array, y: Array, coefficients: Sequence[float]) -> tuple[Array, Array]:
+    """Return where the lens images the directions (x, y) of an ideal pinhole camera."""
+    radial, tangential_x, tangential_y = _terms(x, y, coefficients)
+    return x * radial + tangential_x, y * radial + tangential_y
+
+
+def undistort(x: Array, y: Array, coefficients: Sequence[float]) -> tuple[Array, Array]:
+    """Return the directions that the lens images at (x, y): the inverse of `distort`, by fixed-point iteration.
+
+    Where the model has no inverse, the result is arbitrary; `distort` of it shows that.
+    """
+    ideal_x, ideal_y = x, y
+    with np.errstate(all="ignore"):
+        for _ in range(_ITERATIONS):
+            radial, tangential_x, tangential_y = _terms(ideal_x, ideal_y, coefficients)
+            ideal_x, ideal_y = (x - tangential_x) / radial, (y - tangential_y) / radial
+    return ideal_x, ideal_y
 
 
 def pixel_rays(pixels: NDArray[np.intp], width: int, intrinsics: Intrinsics) -> NDArray[np.float64]:

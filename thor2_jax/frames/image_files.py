@@ -1,7 +1,10 @@
-"""Reading of PNG, JPEG and TIFF files whose content is not trusted."""
+"""Reading of files whose content is not trusted: PNG, JPEG and TIFF, and depth also as NPY and EXR."""
 
+import contextlib
+import math
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,13 +12,28 @@ from PIL import Image, ImageFile
 
 from thor2_jax.errors import InputError
 
-__all__ = ["MAX_IMAGE_PIXELS", "has_16_bit_channels", "read_image"]
+__all__ = ["MAX_IMAGE_PIXELS", "has_16_bit_channels", "read_depth", "read_image", "read_npy"]
 
 IMAGE_FORMATS = ("PNG", "JPEG", "TIFF")
 """Image formats that are read. For some of its other formats, Pillow runs external programs."""
 
 MAX_IMAGE_PIXELS = 2**26
 """Largest number of pixels of an image that is read: a small file can decompress to gigabytes."""
+
+_EXPECTED = "one channel of 16-bit integers (in depth units) or floats (in metres)"
+
+_EXR_CHANNELS = ("Z", "Y", "R", "V", "depth")
+"""Names of the channel of an EXR file that holds depth, if it has several."""
+
+
+@contextlib.contextmanager
+def _damage_named(message: str, expected: str) -> Iterator[None]:
+    """Turn what decoders raise on damaged files, many kinds of exception, into an InputError."""
+    try:
+        yield
+    except Exception as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise InputError(f"{message} ({reason}); expected {expected}") from None
 
 
 def has_16_bit_channels(image: ImageFile.ImageFile) -> bool:
@@ -32,19 +50,89 @@ def read_image(path: str | Path, argument: str, lossless: bool = False) -> tuple
         OSError: the file cannot be opened.
     """
     expected = "PNG or TIFF without JPEG compression" if lossless else ", ".join(IMAGE_FORMATS)
-    with open(path, "rb") as stream:
-        try:
-            with Image.open(stream, formats=IMAGE_FORMATS) as image:
-                if image.width * image.height > MAX_IMAGE_PIXELS:
-                    raise ValueError(f"{image.width} x {image.height} pixels; expected at most {MAX_IMAGE_PIXELS}")
-                if lossless and "JPEG" in (image.format, str(image.info.get("compression")).upper()):
-                    raise ValueError("JPEG compression changes label numbers")
-                image.verify()  # decoding does not check the checksums of a PNG
-            stream.seek(0)
-            with Image.open(stream, formats=IMAGE_FORMATS) as image:
-                mode = f"{image.mode};16" if has_16_bit_channels(image) else image.mode
-                return np.asarray(image), mode
-        # On damaged files, the decoders raise many kinds of exception; nothing but the content can cause them here.
-        except Exception as error:
-            reason = " ".join(str(error).split()) or type(error).__name__
-            raise InputError(f"{argument}: {path} is damaged or no image ({reason}); expected {expected}") from None
+    with open(path, "rb") as stream, _damage_named(f"{argument}: {path} is damaged or no image", expected):
+        with Image.open(stream, formats=IMAGE_FORMATS) as image:
+            if image.width * image.height > MAX_IMAGE_PIXELS:
+                raise ValueError(f"{image.width} x {image.height} pixels; expected at most {MAX_IMAGE_PIXELS}")
+            if lossless and "JPEG" in (image.format, str(image.info.get("compression")).upper()):
+                raise ValueError("JPEG compression changes label numbers")
+            image.verify()  # decoding does not check the checksums of a PNG
+        stream.seek(0)
+        with Image.open(stream, formats=IMAGE_FORMATS) as image:
+            mode = f"{image.mode};16" if has_16_bit_channels(image) else image.mode
+            return np.asarray(image), mode
+
+
+def read_depth(path: str | Path) -> NDArray[Any]:
+    """Read a depth image [H, W].
+
+    Returns:
+        uint16 in depth units from a 16-bit PNG or TIFF, uint16 or uint32 from integers in NPY, and floats in metres
+        from a float TIFF, NPY or EXR.
+
+    Raises:
+        InputError: the file is damaged, of another kind or too large, or is an EXR file and the package OpenEXR is
+            missing; names the file.
+        OSError: the file cannot be opened.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix == ".npy":
+        with open(path, "rb") as stream, _damage_named(f"depth: {path} is a damaged NPY file", _EXPECTED):
+            pixels = read_npy(stream, MAX_IMAGE_PIXELS)
+    else:
+        pixels = _read_exr(path) if suffix == ".exr" else read_image(path, "depth")[0]
+    if pixels.ndim == 3 and pixels.shape[2] == 1:
+        pixels = pixels[..., 0]
+    kind, size = pixels.dtype.kind, pixels.dtype.itemsize
+    if pixels.ndim != 2 or 0 in pixels.shape or kind not in "uif" or (kind != "f" and size < 2):
+        raise InputError(
+            f"depth: {path} has shape {pixels.shape} and type {pixels.dtype}; expected {_EXPECTED}, not a picture of "
+            "depth"
+        )
+    if kind == "f":
+        return pixels.astype(pixels.dtype.newbyteorder("="), copy=False)
+    # Pillow reads some 16-bit files as 32-bit integers.
+    largest = 2**32 - 1 if suffix == ".npy" else 2**16 - 1
+    if pixels.min() < 0 or pixels.max() > largest:
+        raise InputError(f"depth: {path} has values from {pixels.min()} to {pixels.max()}; expected 0 to {largest}")
+    return pixels.astype(np.uint16 if pixels.max() < 2**16 else np.uint32)
+
+
+def read_npy(stream: BinaryIO, max_values: int) -> NDArray[Any]:
+    """Read an array of an NPY file; its size is checked before memory is allocated, and nothing is unpickled.
+
+    Raises:
+        Exception: of many kinds, if the file is damaged, holds Python objects or more than `max_values` values.
+    """
+    version = np.lib.format.read_magic(stream)
+    read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    shape, _, _ = read_header[version](stream)
+    if math.prod(shape) > max_values:
+        raise ValueError(f"shape {shape}; expected at most {max_values} values")
+    stream.seek(0)
+    return np.lib.format.read_array(stream, allow_pickle=False)
+
+
+def _read_exr(path: Path) -> NDArray[Any]:
+    """Read the depth channel of an EXR file."""
+    with open(path, "rb"):  # an OSError if it cannot be opened: OpenEXR raises others
+        pass
+    try:
+        import OpenEXR
+    except ImportError:
+        raise InputError(
+            f"depth: {path} is an EXR file; expected PNG, TIFF or NPY, or the package OpenEXR (pip install OpenEXR)"
+        ) from None
+    with _damage_named(f"depth: {path} is a damaged EXR file", _EXPECTED):
+        with OpenEXR.File(str(path), separate_channels=True, header_only=True) as header:
+            low, high = header.header()["dataWindow"]
+        width, height = (int(b) - int(a) + 1 for a, b in zip(low, high, strict=True))
+        if not 0 < width * height <= MAX_IMAGE_PIXELS:
+            raise ValueError(f"{width} x {height} pixels; expected at most {MAX_IMAGE_PIXELS}")
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            channels = {name: channel.pixels for name, channel in file.channels().items()}
+    names = [name for name in channels if len(channels) == 1 or name in _EXR_CHANNELS]
+    if not names:
+        raise InputError(f"depth: {path} has the channels {', '.join(channels)}; expected one, or one of them called Z")
+    return channels[min(names, key=lambda name: _EXR_CHANNELS.index(name) if name in _EXR_CHANNELS else -1)]

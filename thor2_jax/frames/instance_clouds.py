@@ -14,15 +14,7 @@ from thor2_jax.frames.frames import MAX_DEPTH, MIN_DEPTH, RGBDFrame, pixel_rays
 from thor2_jax.frames.outlier_removal import flying_pixels, remove_outliers
 from thor2_jax.frames.voxel_grid import voxel_downsample
 
-__all__ = [
-    "MAX_DEPTH",
-    "MIN_DEPTH",
-    "MIN_POINTS",
-    "InstanceCloud",
-    "instance_cloud",
-    "instance_clouds",
-    "unit_question",
-]
+__all__ = ["MIN_POINTS", "InstanceCloud", "instance_cloud", "instance_clouds", "unit_question"]
 
 CLOUD_VOXEL = 0.003
 """Voxel side of the grid on which outliers are removed, metres."""

@@ -22,7 +22,6 @@ from typing import Any
 import numpy as np
 
 from thor2_jax.errors import InputError, with_context
-from thor2_jax.frames.distortion import DISTORTION_LENGTHS
 from thor2_jax.tables import parse_json, parse_yaml
 
 __all__ = ["DEFAULT_DEPTH_SCALE", "Intrinsics", "parse_intrinsics", "read_intrinsics"]
@@ -37,6 +36,10 @@ MAX_BOP_CAMERA_SCALE = 10.0
 
 MAX_TEXT_BYTES = 2**16
 """Largest NPY file, text or YAML document that is read as intrinsics."""
+
+DISTORTION_LENGTHS = (0, 4, 5, 8)
+"""Numbers of coefficients: no distortion, OpenCV's polynomial model (ROS: plumb_bob) without and with k3, and its
+rational one (ROS: rational_polynomial)."""
 
 _PINHOLE = ("fx", "fy", "cx", "cy")
 _PINHOLE_MODELS = ("", "none", "plumb_bob", "rational_polynomial", "brown_conrady", "opencv", "radtan", "pinhole")
@@ -62,7 +65,7 @@ class Intrinsics:
         depth_scale: depth units per metre; 1000 if depth is in millimetres.
         width: columns of the images, if known; `RGBDFrame` compares.
         height: rows of the images, if known.
-        distortion: 0, 4, 5 or 8 coefficients in the order of OpenCV, see `distortion`.
+        distortion: 0, 4, 5 or 8 coefficients in the order of OpenCV: k1, k2, p1, p2, then k3, then k4, k5, k6.
 
     Raises:
         InputError: a value is not a finite number or exceeds `LARGEST_INTRINSIC`, a focal length or the depth scale is
@@ -115,9 +118,13 @@ class Intrinsics:
                 values = {name: getattr(values, name) for name in _MESSAGE_FIELDS if hasattr(values, name)}
             else:
                 raise InputError(f"intrinsics is a {type(values).__name__}; expected a mapping with fx, fy, cx, cy")
-        for applies, convert in _FORMATS:
-            if applies(values):
-                return convert(values)
+        if isinstance(values.get("intrinsic"), Mapping):  # a camera of Open3D
+            values = values["intrinsic"]
+        for names, convert in _FORMATS:
+            if any(name in values for name in names):
+                matrix, scale, distortion = convert(values)
+                width, height = _entry(values, "width", "image_width"), _entry(values, "height", "image_height")
+                return cls.of_matrix(matrix, scale, width=width, height=height, distortion=distortion)
         shown = ", ".join(map(str, list(values)[:8])) or "no entry"
         raise InputError(
             f"intrinsics has {shown}; expected fx, fy, cx, cy, or a ROS camera_info, K, cam_K, ppx and ppy, or "
@@ -186,56 +193,51 @@ def _supported(model: Any, distortion: Any) -> Any:
     return distortion
 
 
-def _of_pinhole(values: Mapping[Any, Any]) -> Intrinsics:
-    missing = [name for name in _PINHOLE if name not in values]
+_Parts = tuple[Any, float, Any]
+"""A camera matrix row by row, depth units per metre, and coefficients of a lens distortion."""
+
+
+def _pinhole_matrix(values: Mapping[Any, Any], *names: str) -> list[Any]:
+    missing = [name for name in names if name not in values]
     if missing:
-        raise InputError(f"intrinsics lacks {', '.join(missing)}; expected fx, fy, cx, cy")
+        raise InputError(f"intrinsics lacks {', '.join(missing)}; expected {', '.join(names)}")
+    fx, fy, cx, cy = (values[name] for name in names)
+    return [fx, 0, cx, 0, fy, cy, 0, 0, 1]
+
+
+def _of_pinhole(values: Mapping[Any, Any]) -> _Parts:
     scale = _given(values, "depth_scale", DEFAULT_DEPTH_SCALE)
-    width, height = _size(values)
-    if None not in (width, height) and _is_number(scale) and 0 < scale <= MAX_BOP_CAMERA_SCALE:
+    has_size = None not in (values.get("width"), values.get("height"))
+    if has_size and _is_number(scale) and 0 < scale <= MAX_BOP_CAMERA_SCALE:
         scale = 1000 / scale  # BOP's camera.json
-    distortion = _supported(values.get("distortion_model"), _given(values, "distortion", ()))
-    fx, fy, cx, cy = (values[name] for name in _PINHOLE)
-    return Intrinsics(fx, fy, cx, cy, scale, width, height, distortion)
+    distortion = _supported(values.get("distortion_model"), values.get("distortion"))
+    return _pinhole_matrix(values, *_PINHOLE), scale, distortion
 
 
-def _of_realsense(values: Mapping[Any, Any]) -> Intrinsics:
-    missing = [name for name in ("fx", "fy", "ppx", "ppy") if name not in values]
-    if missing:
-        raise InputError(f"intrinsics lacks {', '.join(missing)}; expected fx, fy, ppx, ppy")
+def _of_realsense(values: Mapping[Any, Any]) -> _Parts:
+    matrix = _pinhole_matrix(values, "fx", "fy", "ppx", "ppy")
     scale = _given(values, "depth_scale", 1 / DEFAULT_DEPTH_SCALE)
     if not _is_number(scale) or not 0 < scale < 1:
         raise InputError(
             f"intrinsics.depth_scale is {scale!r} beside ppx and ppy; expected metres per depth unit, such as 0.001"
         )
-    distortion = _supported(values.get("model"), _given(values, "coeffs", ()))
-    width, height = _size(values)
-    pinhole = values["fx"], values["fy"], values["ppx"], values["ppy"]
-    return Intrinsics(*pinhole, 1 / scale, width, height, distortion)
+    return matrix, 1 / scale, _supported(values.get("model"), values.get("coeffs"))
 
 
-def _of_camera_info(values: Mapping[Any, Any]) -> Intrinsics:
+def _of_camera_info(values: Mapping[Any, Any]) -> _Parts:
+    coefficients = _supported(values.get("distortion_model"), _entry(values, "distortion_coefficients", "D", "d"))
     matrix = _entry(values, "camera_matrix", "K", "k")
-    coefficients = _entry(values, "distortion_coefficients", "D", "d")
-    width, height = _size(values)
-    return Intrinsics.of_matrix(
-        matrix,
-        _given(values, "depth_scale", DEFAULT_DEPTH_SCALE),
-        width=width,
-        height=height,
-        distortion=_supported(values.get("distortion_model"), () if coefficients is None else coefficients),
-    )
+    return matrix, _given(values, "depth_scale", DEFAULT_DEPTH_SCALE), coefficients
 
 
-def _of_bop(values: Mapping[Any, Any]) -> Intrinsics:
+def _of_bop(values: Mapping[Any, Any]) -> _Parts:
     scale = _given(values, "depth_scale", 1.0)
     if not _is_number(scale) or scale <= 0:
         raise InputError(f"intrinsics.depth_scale is {scale!r}; expected a positive number")
-    width, height = _size(values)
-    return Intrinsics.of_matrix(values["cam_K"], 1000 / scale, width=width, height=height)
+    return values["cam_K"], 1000 / scale, ()
 
 
-def _of_open3d(values: Mapping[Any, Any]) -> Intrinsics:
+def _of_open3d(values: Mapping[Any, Any]) -> _Parts:
     matrix = values["intrinsic_matrix"]
     try:
         transposed = np.asarray(matrix, dtype=object).reshape(3, 3).T
@@ -243,26 +245,20 @@ def _of_open3d(values: Mapping[Any, Any]) -> Intrinsics:
         raise InputError(
             f"intrinsics.intrinsic_matrix is {str(matrix)[:200]}; expected fx, 0, 0, 0, fy, 0, cx, cy, 1"
         ) from None
-    width, height = _size(values)
-    return Intrinsics.of_matrix(
-        transposed, _given(values, "depth_scale", DEFAULT_DEPTH_SCALE), width=width, height=height
-    )
+    return transposed, _given(values, "depth_scale", DEFAULT_DEPTH_SCALE), ()
 
 
 def _of_matrix_alone(matrix: Any) -> Intrinsics:
-    shape = np.shape(np.asarray(matrix, dtype=object))
-    if shape not in ((3, 3), (9,)):
-        raise InputError(f"intrinsics is a {type(matrix).__name__} of shape {shape}; expected a 3 x 3 matrix")
-    return Intrinsics.of_matrix(np.asarray(matrix, dtype=object))
+    # Values without bytes, type V0 of a small NPY file, would fill gigabytes as objects.
+    array = matrix if isinstance(matrix, np.ndarray) else np.asarray(matrix, dtype=object)
+    if array.shape not in ((3, 3), (9,)):
+        raise InputError(f"intrinsics is a {type(matrix).__name__} of shape {array.shape}; expected a 3 x 3 matrix")
+    return Intrinsics.of_matrix(array)
 
 
 def _given(values: Mapping[Any, Any], name: str, default: Any) -> Any:
     value = values.get(name)
     return default if value is None else value
-
-
-def _size(values: Mapping[Any, Any]) -> tuple[Any, Any]:
-    return _entry(values, "width", "image_width"), _entry(values, "height", "image_height")
 
 
 def _entry(values: Mapping[Any, Any], *names: str) -> Any:
@@ -271,21 +267,16 @@ def _entry(values: Mapping[Any, Any], *names: str) -> Any:
     return value.get("data") if isinstance(value, Mapping) else value
 
 
-def _is_camera_info(values: Mapping[Any, Any]) -> bool:
-    return any(name in values for name in ("camera_matrix", "K", "k"))
-
-
 _MESSAGE_FIELDS = ("width", "height", "distortion_model", "D", "d", "K", "k")
 
-_FORMATS: Sequence[tuple[Callable[[Mapping[Any, Any]], bool], Callable[[Mapping[Any, Any]], Intrinsics]]] = (
-    (lambda values: "cam_K" in values, _of_bop),
-    (lambda values: "intrinsic_matrix" in values, _of_open3d),
-    (lambda values: isinstance(values.get("intrinsic"), Mapping), lambda values: Intrinsics.of(values["intrinsic"])),
-    (lambda values: "ppx" in values or "ppy" in values, _of_realsense),
-    (_is_camera_info, _of_camera_info),
-    (lambda values: any(name in values for name in _PINHOLE), _of_pinhole),
+_FORMATS: Sequence[tuple[Sequence[str], Callable[[Mapping[Any, Any]], _Parts]]] = (
+    (("cam_K",), _of_bop),
+    (("intrinsic_matrix",), _of_open3d),
+    (("ppx", "ppy"), _of_realsense),
+    (("camera_matrix", "K", "k"), _of_camera_info),
+    (_PINHOLE, _of_pinhole),
 )
-"""Whether a mapping has a format, and its conversion; a matrix under the key K is a camera_info without the rest."""
+"""Entries that show a format, and its conversion; a matrix under the key K is a camera_info without the rest."""
 
 
 def parse_intrinsics(content: bytes, image: int | None = None) -> Intrinsics:

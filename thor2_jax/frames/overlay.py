@@ -15,9 +15,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
+from scipy import ndimage
 
 from thor2_jax.errors import InputError
 from thor2_jax.files import atomic_write
+from thor2_jax.frames.frames import check_images
 from thor2_jax.printable import escape_characters
 
 if TYPE_CHECKING:
@@ -108,14 +110,7 @@ def draw_overlay(
         OSError: the file cannot be written.
     """
     color, labels = np.asarray(color), np.asarray(labels)
-    if color.ndim != 3 or color.shape[2] != 3 or 0 in color.shape:
-        raise InputError(f"color has shape {color.shape}; expected [H, W, 3]")
-    if color.dtype != np.uint8:
-        raise InputError(f"color has type {color.dtype}; expected uint8")
-    if labels.shape != color.shape[:2]:
-        raise InputError(f"labels has shape {labels.shape}; expected {color.shape[:2]} (rows, columns), as color")
-    if labels.dtype.kind not in "ui":
-        raise InputError(f"labels has type {labels.dtype}; expected integers")
+    check_images(color, labels=labels)
     for answer in answers:
         if answer.label == 0 or not (labels == answer.label).any():
             raise InputError(f"answers: label {answer.label} is no instance of labels")
@@ -183,20 +178,11 @@ def _crop(labels: NDArray[Any], label: int) -> _Mask:
     return _Mask(box, np.pad(mask[box.top : box.bottom, box.left : box.right], 1))
 
 
-def _eroded(mask: NDArray[np.bool_], steps: int) -> NDArray[np.bool_]:
-    """Return the mask without its outermost `steps` layers of 4-neighbours; its margin must be empty."""
-    for _ in range(steps):
-        inner = np.zeros_like(mask)
-        inner[1:-1, 1:-1] = mask[1:-1, 1:-1] & mask[:-2, 1:-1] & mask[2:, 1:-1] & mask[1:-1, :-2] & mask[1:-1, 2:]
-        mask = inner
-    return mask
-
-
 def _draw_outline(pixels: NDArray[np.uint8], mask: _Mask, paint: Paint, thickness: int) -> None:
     """Draw a coloured line along the inner edge of the mask and a thin black or white one beside it."""
     left, top, right, bottom = mask.box
-    within = _eroded(mask.pixels, thickness)
-    core = _eroded(within, max(1, thickness // 3))
+    within = ndimage.binary_erosion(mask.pixels, iterations=thickness)
+    core = ndimage.binary_erosion(within, iterations=max(1, thickness // 3))
     target = pixels[top:bottom, left:right]
     target[(mask.pixels & ~within)[1:-1, 1:-1]] = paint
     target[(within & ~core)[1:-1, 1:-1]] = _ink(paint)

@@ -4,6 +4,7 @@ Views, whether a few frames or renderings of a mesh, show little of how another 
 drawn from the cloud itself, so that each copy of a view is the same in every embedding.
 """
 
+import math
 import zlib
 from collections.abc import Sequence
 
@@ -75,4 +76,5 @@ def _cut(points: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.bo
     angle = rng.uniform(0, 2 * np.pi)
     rays = points[:, :2] / np.maximum(points[:, 2:], 0.1)
     along = rays @ np.array([np.cos(angle), np.sin(angle)])
-    return np.asarray(along < np.quantile(along, rng.uniform(0, 0.125)))
+    rank = math.ceil(rng.uniform(0, 0.125) * (len(along) - 1))
+    return np.asarray(along < np.partition(along, rank)[rank])

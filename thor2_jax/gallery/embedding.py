@@ -25,13 +25,12 @@ from flax import nnx
 
 import colornet
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
-from thor2_jax.descriptor.chunking import map_chunks
 from thor2_jax.descriptor.cloud_statistics import N_BALANCED, N_SCALARS, is_color, square_root
 from thor2_jax.descriptor.looks import LookDescriptors, describe_looks
 from thor2_jax.errors import InputError
 from thor2_jax.files import atomic_write, content_digest, safetensors_metadata
 from thor2_jax.gallery.references import REFERENCES_FILE, References
-from thor2_jax.model.weights import model_arrays, model_from_arrays
+from thor2_jax.model.classifier import model_arrays, model_from_arrays
 from thor2_jax.types import Descriptors, PointClouds
 
 __all__ = [
@@ -53,9 +52,8 @@ _METADATA = "embedding"
 # safetensors writes several metadata keys in a random order, and equal embeddings shall have equal bytes.
 
 
-def _prefix_of_further(number: int) -> str:
-    """Return the prefix of the names of the arrays of a further network in the file."""
-    return f"further/{number}/"
+_FURTHER = "further/{}/"
+"""Prefix of the names of the arrays of a further network in the file, with its number."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -200,14 +198,6 @@ def _embed_oriented(graph: Any, state: Any, oriented: LookDescriptors) -> jax.Ar
     return embeddings.reshape(*oriented.weights.shape, -1)
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1, 2))
-def _embed_clouds(
-    graph: Any, config: DescriptorConfig, network: colornet.ColorNetwork, state: Any, clouds: PointClouds
-) -> jax.Array:
-    model = nnx.merge(graph, state)
-    return map_chunks(lambda chunk: model(*describe_looks(chunk, network, config, 1).flat), clouds)
-
-
 @functools.partial(jax.jit, static_argnums=0)
 def _classify(graphs: tuple[Any, ...], states: tuple[Any, ...], oriented: LookDescriptors) -> jax.Array:
     models = [nnx.merge(graph, state) for graph, state in zip(graphs, states, strict=True)]
@@ -320,8 +310,7 @@ class Embedding:
 
         Each shape [B, N] of the batch compiles once for all embeddings of the same sizes and descriptor.
         """
-        graph, state = self._embedder
-        return _embed_clouds(graph, self.config, self.network, state, clouds)
+        return self.embed_oriented(describe_looks(clouds, self.network, self.config, 1))[:, 0]
 
     def embed_oriented(self, oriented: LookDescriptors) -> jax.Array:
         """Return the embeddings [B, K, D] of K looks at clouds, described by this descriptor."""
@@ -352,8 +341,7 @@ class Embedding:
             about["further"] = len(self.further)
         arrays = model_arrays(self.model)
         for number, model in enumerate(self.further):
-            prefix = _prefix_of_further(number)
-            arrays |= {prefix + name: array for name, array in model_arrays(model).items()}
+            arrays |= {_FURTHER.format(number) + name: array for name, array in model_arrays(model).items()}
         arrays = {name: array.astype(np.float16) for name, array in arrays.items()}
         return safetensors.numpy.save(arrays, {_METADATA: json.dumps(about, sort_keys=True)})
 
@@ -402,7 +390,7 @@ class Embedding:
             model = model_from_arrays(lambda: cls.create(config, network, sizes, 0, classes, distractors).model, arrays)
             embedding = cls(config, network, sizes, model, classes, distractors)
             further = []
-            for prefix in map(_prefix_of_further, range(count)):
+            for prefix in map(_FURTHER.format, range(count)):
                 own = {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
                 further.append(model_from_arrays(embedding.create_further, own))
         except InputError as error:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thor2_jax.capacity import point_bucket
+from thor2_jax.capacity import batch_points, point_bucket
 from thor2_jax.descriptor.looks import describe_looks
 from thor2_jax.errors import InputError, with_context
 from thor2_jax.frames.frames import RGBDFrame
@@ -16,7 +16,6 @@ from thor2_jax.gallery.augment import augmented_copies
 from thor2_jax.gallery.clouds import CompactClouds
 from thor2_jax.gallery.embedding import Embedding
 from thor2_jax.gallery.gallery import GalleryObject
-from thor2_jax.types import PointClouds
 
 __all__ = [
     "LOOKS",
@@ -35,10 +34,21 @@ LOOKS = 2
 ROWS = 4
 """Clouds embedded in one call, as recognition does."""
 
+MANY_ROWS = 16
+"""Clouds embedded in one call if there are many: a call costs as much as several clouds."""
 
-def embed_looks(embedding: Embedding, clouds: PointClouds, count: int = LOOKS) -> Any:
-    """Return the embeddings [B, count, D] of looks at clouds in metres."""
-    return embedding.embed_oriented(describe_looks(clouds, embedding.network, embedding.config, count))
+
+def embed_looks(embedding: Embedding, views: Sequence[PreparedInstance]) -> NDArray[np.float32]:
+    """Return the embeddings [V, K, D] of the looks at views."""
+    many = len(views) > 4 * MANY_ROWS
+    rows = MANY_ROWS if many else ROWS
+    batches = []
+    for start in range(0, len(views), rows):
+        chunk = views[start : start + rows]
+        clouds = pack_instances(chunk, rows, batch_points(len(view.points) for view in chunk) if many else None)
+        looks = describe_looks(clouds, embedding.network, embedding.config, LOOKS)
+        batches.append(embedding.embed_oriented(looks))
+    return np.concatenate(batches)[: len(views)]
 
 
 def instance_view(frame: RGBDFrame, label: int | None, sigma_s: float) -> PreparedInstance:
@@ -88,12 +98,7 @@ def embed_views(embedding: Embedding, clouds: CompactClouds, source: str) -> NDA
     """
     # Views of similar size share a bucket.
     views = sorted(views_to_embed(clouds, source), key=lambda view: point_bucket(len(view.points)))
-    batches = []
-    for start in range(0, len(views), ROWS):
-        chunk = views[start : start + ROWS]
-        batches.append((len(chunk), embed_looks(embedding, pack_instances(chunk, ROWS))))
-    embedded = [np.asarray(batch)[:count] for count, batch in batches]
-    return np.concatenate(embedded).reshape(-1, embedded[0].shape[-1]).astype(np.float16)
+    return embed_looks(embedding, views).reshape(-1, embedding.size).astype(np.float16)
 
 
 def enrolled_object(embeddings: NDArray[Any], clouds: CompactClouds, source: str) -> GalleryObject:

@@ -144,37 +144,31 @@ class Gallery:
         return dataclasses.replace(self, embedding=embedding, objects=objects)
 
     @functools.cached_property
-    def _embeddings(self) -> NDArray[np.float16]:
-        enrolled = [views.embeddings for views in self.objects.values()]
-        return np.concatenate(enrolled if self.references is None else [*enrolled, self.references.embeddings])
+    def regression(self) -> tuple[NDArray[np.float16], NDArray[np.intp], NDArray[np.float64]]:
+        """Embeddings [N, D] of all views, the number of the owner of each, and its regularization.
 
-    @functools.cached_property
-    def _counts(self) -> NDArray[np.float64]:
-        """[n_objects] views of each object, then their mean for each trained class and for the background."""
-        counts = np.array([len(views.embeddings) for views in self.objects.values()], np.float64)
-        further = 0 if self.references is None else len(self.references.classes) + 1
-        return np.append(counts, np.full(further, counts.mean()))
+        Owners are the objects, the trained classes and the background; those of many views shall not outweigh those of
+        few. Views of a class belong to the enrolled object of its name, those of a forgotten class to the background.
+        """
+        embeddings = [views.embeddings for views in self.objects.values()]
+        counts = np.array([len(each) for each in embeddings], np.float64)
+        owner = np.repeat(np.arange(len(counts)), counts.astype(int))
+        if self.references is not None:
+            number, background = {name: k for k, name in enumerate(self.names)}, self._n_owners - 1
+            of_class = [
+                background if name in self.hidden else number.get(name, len(counts) + k)
+                for k, name in enumerate(self.references.classes)
+            ]
+            of_label = np.array([*of_class, background])  # the label BACKGROUND is -1
+            owner = np.concatenate([owner, of_label[self.references.label]])
+            embeddings.append(self.references.embeddings)
+            counts = np.append(counts, np.full(self._n_owners - len(counts), counts.mean()))
+        of_owner = counts[owner]
+        return np.concatenate(embeddings), owner, RIDGE * of_owner / of_owner.mean()
 
-    @functools.cached_property
-    def _ridge(self) -> NDArray[np.float64]:
-        """[N] regularization of each view: objects of many views shall not outweigh those of few."""
-        counts = self._counts[self._object_of_view]
-        return RIDGE * counts / counts.mean()
-
-    @functools.cached_property
-    def _object_of_view(self) -> NDArray[np.intp]:
-        """[N] index of each view's object; those of trained classes, and of the background, follow."""
-        objects = np.repeat(np.arange(len(self.objects)), [len(views.embeddings) for views in self.objects.values()])
-        if self.references is None:
-            return objects
-        # Views of a class belong to the enrolled object of its name; those of a forgotten class to the background.
-        background, number = len(self._counts) - 1, {name: k for k, name in enumerate(self.names)}
-        owner = [
-            background if name in self.hidden else number.get(name, len(self.objects) + k)
-            for k, name in enumerate(self.references.classes)
-        ]
-        of_label = np.array([*owner, background], np.intp)  # the label BACKGROUND is -1
-        return np.concatenate([objects, of_label[self.references.label]])
+    @property
+    def _n_owners(self) -> int:
+        return len(self.objects) + (0 if self.references is None else len(self.references.classes) + 1)
 
     @functools.cached_property
     def unknown_below(self) -> NDArray[np.float64]:
@@ -189,7 +183,7 @@ class Gallery:
 
     @functools.cached_property
     def _search(self) -> ViewSearch:
-        return IndexSearch(self._embeddings) if self.search == "usearch" else ExactSearch(self._embeddings)
+        return (IndexSearch if self.search == "usearch" else ExactSearch)(self.regression[0])
 
     def scores(self, embeddings: ArrayLike, weights: ArrayLike | None = None) -> NDArray[np.float32]:
         """Return the scores [B, n_objects] of each object, from 0 to 1, in the order of `names`.
@@ -209,13 +203,14 @@ class Gallery:
                 return each.mean(axis=1)
             return np.einsum("bkn,bk->bn", each, np.asarray(weights, np.float32))
         similarity, index = self._search.nearest(queries, NEAREST)
-        views, owners = self._embeddings[index].astype(np.float32), self._object_of_view[index]
+        embeddings, owner, ridge = self.regression
+        views = embeddings[index].astype(np.float32)
         with one_blas_thread():
             kernel = np.exp(GAMMA * (views @ views.transpose(0, 2, 1) - 1)).astype(np.float64)
-            kernel[:, np.arange(kernel.shape[1]), np.arange(kernel.shape[1])] += self._ridge[index]
+            kernel[:, np.arange(kernel.shape[1]), np.arange(kernel.shape[1])] += ridge[index]
             duals = np.linalg.solve(kernel, np.exp(GAMMA * (similarity.astype(np.float64) - 1))[..., None])[..., 0]
-        values = np.zeros((len(queries), len(self._counts)))
-        np.add.at(values, (np.arange(len(queries))[:, None], owners), duals)
+        values = np.zeros((len(queries), self._n_owners))
+        np.add.at(values, (np.arange(len(queries))[:, None], owner[index]), duals)
         scores, trained = values[:, : len(self.objects)].clip(0, 1), values[:, len(self.objects) : -1]
         if self.references is not None and trained.shape[1]:
             scores *= scores / np.maximum(scores + trained.max(axis=1, keepdims=True).clip(0), 1e-12)

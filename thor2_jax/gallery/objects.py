@@ -1,6 +1,7 @@
 """The enrolled objects of a recognizer: a gallery that can be taught, in memory or on disk, with its embedding."""
 
 import dataclasses
+import functools
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -66,7 +67,8 @@ class ObjectGallery:
         """
         self._directory, self._stored = directory, dataclasses.replace(self._stored, stamp=None)
         if reembed and directory.exists():
-            self._change(self._reembedded, rebuild=True)
+            embed = functools.partial(embed_views, self.embedding)
+            self._change(lambda gallery: gallery.reembed(self.embedding.fingerprint, embed), rebuild=True)
         else:
             check_index(directory)
             self.refresh()
@@ -124,17 +126,15 @@ class ObjectGallery:
         self, change: Callable[[Gallery], Gallery], embedding: str | None = None, rebuild: bool = False
     ) -> None:
         if self._directory is None:
-            self._stored = dataclasses.replace(self._stored, gallery=self._completed(change(self.gallery)))
+            self._set(dataclasses.replace(self._stored, gallery=change(self.gallery)))
         else:
             self._set(update_gallery(self._directory, change, embedding, self._stored, self.lock_seconds, rebuild))
 
     def _set(self, stored: StoredGallery) -> None:
-        self._stored = dataclasses.replace(stored, gallery=self._completed(stored.gallery))
-
-    def _completed(self, gallery: Gallery) -> Gallery:
-        """Return a gallery with the kind of search and, once it has objects, with the references of the embedding."""
-        references = self.embedding.references if gallery.objects else None
-        return dataclasses.replace(gallery, search=self._search, references=references)
+        """Keep a state, with the kind of search and, once it has objects, with the references of the embedding."""
+        references = self.embedding.references if stored.gallery.objects else None
+        gallery = dataclasses.replace(stored.gallery, search=self._search, references=references)
+        self._stored = dataclasses.replace(stored, gallery=gallery)
 
     def check_writable(self) -> None:
         """Raise InputError unless changes can be written to the directory, which is created if it is missing."""
@@ -226,6 +226,8 @@ class ObjectGallery:
             known = self._found(gallery, name) or name
             return gallery.without(known, hide=known in self._trained and known not in gallery.hidden)
 
+        if self._directory is not None and not self._directory.exists():
+            change(self.gallery)  # a name that is refused leaves no directory behind
         self._change(change, self.embedding.fingerprint)
 
     def undo(self, generation: int) -> None:
@@ -239,7 +241,3 @@ class ObjectGallery:
             raise InputError("undo needs a gallery on disk; open one")
         fingerprint = self.embedding.fingerprint
         self._set(undo_change(self._directory, generation, fingerprint, self._stored, self.lock_seconds))
-
-    def _reembedded(self, gallery: Gallery) -> Gallery:
-        embedding = self.embedding
-        return gallery.reembed(embedding.fingerprint, lambda clouds, source: embed_views(embedding, clouds, source))

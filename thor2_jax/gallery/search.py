@@ -67,23 +67,18 @@ class ExactSearch:
 
     def nearest(self, queries: NDArray[np.float32], count: int) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
         """See `ViewSearch.nearest`; views of equal similarity are in the order of their indices."""
-        if len(self._embeddings) <= FAST_VIEWS:
-            with one_blas_thread():
-                return self._nearest(queries, count)
-        return self._nearest(queries, count)
-
-    def _nearest(self, queries: NDArray[np.float32], count: int) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
         similarity: NDArray[np.float32] = np.zeros((len(queries), 0), np.float32)
         index: NDArray[np.intp] = np.zeros((len(queries), 0), np.intp)
-        for start in range(0, len(self._embeddings), CHUNK):
-            chunk = self._embeddings[start : start + CHUNK]
-            products = queries @ chunk.T.astype(np.float32, copy=False)
-            best = _largest(products, count)
-            index = np.concatenate([index, best + start], axis=1)
-            similarity = np.concatenate([similarity, np.take_along_axis(products, best, axis=1)], axis=1)
-            best = _largest(similarity, count)
-            index = np.take_along_axis(index, best, axis=1)
-            similarity = np.take_along_axis(similarity, best, axis=1)
+        with one_blas_thread() if len(self._embeddings) <= FAST_VIEWS else contextlib.nullcontext():
+            for start in range(0, len(self._embeddings), CHUNK):
+                chunk = self._embeddings[start : start + CHUNK]
+                products = queries @ chunk.T.astype(np.float32, copy=False)
+                best = _largest(products, count)
+                index = np.concatenate([index, best + start], axis=1)
+                similarity = np.concatenate([similarity, np.take_along_axis(products, best, axis=1)], axis=1)
+                best = _largest(similarity, count)
+                index = np.take_along_axis(index, best, axis=1)
+                similarity = np.take_along_axis(similarity, best, axis=1)
         return similarity, index
 
 

@@ -184,6 +184,10 @@ def _object_file(directory: Path, digest: str) -> Path:
     return directory / "objects" / f"{digest}.safetensors"
 
 
+def _origin(views: GalleryObject) -> dict[str, str]:
+    return {"source": views.source, "date": views.date}
+
+
 def _with_origin(views: GalleryObject, entry: Mapping[str, Any]) -> GalleryObject:
     return dataclasses.replace(views, source=str(entry.get("source", "")), date=str(entry.get("date", "")))
 
@@ -192,8 +196,7 @@ def _object_content(name: str, views: GalleryObject) -> bytes:
     arrays: dict[str, NDArray[Any]] = {"embeddings": np.ascontiguousarray(views.embeddings, np.float16)}
     for field in dataclasses.fields(CompactClouds):
         arrays[field.name] = np.ascontiguousarray(getattr(views.clouds, field.name))
-    about = {"name": name, "source": views.source, "date": views.date}
-    return safetensors.numpy.save(arrays, {_METADATA: json.dumps(about)})
+    return safetensors.numpy.save(arrays, {_METADATA: json.dumps({"name": name, **_origin(views)})})
 
 
 def _read_object(path: Path) -> tuple[str | None, GalleryObject]:
@@ -215,21 +218,16 @@ def _read_object(path: Path) -> tuple[str | None, GalleryObject]:
         raise GalleryError(f"gallery: {path} is no object of a gallery ({error})") from None
 
 
-@contextlib.contextmanager
-def _locked(directory: Path, seconds: float) -> Iterator[None]:
+def _lock(directory: Path, seconds: float) -> contextlib.AbstractContextManager[object]:
+    """Lock the gallery of a directory, which is created if it is missing, for the context that is returned."""
     directory.mkdir(parents=True, exist_ok=True)
-    # A soft lock would outlive a killed process.
-    lock = filelock.FileLock(directory / ".lock", timeout=seconds, fallback_to_soft=False)
     try:
-        lock.acquire()
+        # A soft lock would outlive a killed process.
+        return filelock.FileLock(directory / ".lock", timeout=seconds, fallback_to_soft=False).acquire()
     except filelock.Timeout:
         raise GalleryBusyError(
             f"gallery: another process has been writing to {directory} for {seconds:.2g} s; try again when it ends"
         ) from None
-    try:
-        yield
-    finally:
-        lock.release()
 
 
 def update_gallery(
@@ -258,7 +256,7 @@ def update_gallery(
         GalleryBusyError: another process holds the lock.
         OSError: a file cannot be written; the gallery is as before.
     """
-    with _locked(directory, LOCK_SECONDS if lock_seconds is None else lock_seconds):
+    with _lock(directory, LOCK_SECONDS if lock_seconds is None else lock_seconds):
         is_lost = rebuild and gallery_stamp(directory) is None
         stored = _rebuilt(directory) if is_lost else load_gallery(directory, embedding, known)
         gallery = change(stored.gallery)
@@ -272,7 +270,8 @@ def update_gallery(
                 written.append(directory / INDEX_FILE)
                 write_text(written[0], _index_content(StoredGallery(Gallery(gallery.embedding), {}, 0)))
             for name, views in gallery.objects.items():
-                if name in stored.files and _same_arrays(views, stored.gallery.objects[name]):
+                old = stored.gallery.objects.get(name)
+                if old is not None and views.embeddings is old.embeddings and views.clouds is old.clouds:
                     files[name] = stored.files[name]
                     continue
                 content = _object_content(name, views)
@@ -335,10 +334,6 @@ def undo_change(
     return update_gallery(directory, previous, embedding, known, lock_seconds)
 
 
-def _same_arrays(views: GalleryObject, other: GalleryObject) -> bool:
-    return views.embeddings is other.embeddings and views.clouds is other.clouds
-
-
 def _write_durably(path: Path, content: bytes) -> None:
     with atomic_write(path) as temporary, temporary.open("wb") as file:
         file.write(content)
@@ -353,13 +348,7 @@ def _index_content(stored: StoredGallery) -> str:
         "generation": stored.generation,
         "embedding": gallery.embedding,
         "objects": [
-            {
-                "name": name,
-                "file": stored.files[name],
-                "views": len(views.clouds),
-                "source": views.source,
-                "date": views.date,
-            }
+            {"name": name, "file": stored.files[name], "views": len(views.clouds), **_origin(views)}
             for name, views in gallery.objects.items()
         ],
         "hidden": list(gallery.hidden),

@@ -38,23 +38,21 @@ class ClassUnion:
     hidden: tuple[str, ...] = ()
 
     @functools.cached_property
+    def _outputs(self) -> tuple[str | None, ...]:
+        """The name of each output of the classifiers; None for hidden classes."""
+        hidden = set(self.hidden)
+        return tuple(None if name in hidden else name for name in self.trained)
+
+    @functools.cached_property
     def names(self) -> tuple[str, ...]:
         """All names."""
-        hidden = set(self.hidden)
-        shown = [name for name in self.trained if name not in hidden]
-        return tuple(dict.fromkeys([*shown, *self.enrolled]))
+        return tuple(dict.fromkeys(name for name in (*self._outputs, *self.enrolled) if name is not None))
 
     @functools.cached_property
     def has_output(self) -> NDArray[np.bool_]:
         """[n] bool, whether the classifiers have an output for each name."""
-        shown = set(self.trained) - set(self.hidden)
-        return np.array([name in shown for name in self.names], bool)
-
-    @functools.cached_property
-    def has_views(self) -> NDArray[np.bool_]:
-        """[n] bool, whether the gallery has views for each name."""
-        enrolled = set(self.enrolled)
-        return np.array([name in enrolled for name in self.names], bool)
+        outputs = set(self._outputs)
+        return np.array([name in outputs for name in self.names], bool)
 
     @functools.cached_property
     def summary(self) -> str:
@@ -70,19 +68,19 @@ class ClassUnion:
 
     def of_classifiers(self, probabilities: Values) -> Values:
         """Return class probabilities [B, C] in the order of `names` [B, n]; 0 for names without an output."""
-        return self._spread(probabilities, self.trained, self.has_output)
+        return self._spread(probabilities, self._outputs)
 
     def of_gallery(self, scores: Values) -> Values:
         """Return scores of the gallery [B, n_objects] in the order of `names` [B, n]; 0 for names without views."""
-        return self._spread(scores, self.enrolled, self.has_views)
+        return self._spread(scores, self.enrolled)
 
-    def _spread(self, values: Values, owners: tuple[str, ...], known: NDArray[np.bool_]) -> Values:
+    def _spread(self, values: Values, owners: tuple[str | None, ...]) -> Values:
         if owners == self.names:
             return values
         result = np.zeros((len(values), len(self.names)), values.dtype)
         column = {name: index for index, name in enumerate(owners)}
-        columns = [column[name] for name, has in zip(self.names, known, strict=True) if has]
-        result[:, known] = values[:, columns]
+        known = [index for index, name in enumerate(self.names) if name in column]
+        result[:, known] = values[:, [column[self.names[index]] for index in known]]
         return result
 
     def combine(self, probabilities: Values | None, scores: Values) -> Values:

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Literal
+from typing import Literal, cast, get_args
 
 from thor2_jax.descriptor.looks import LookDescriptors
 from thor2_jax.errors import InputError
@@ -18,7 +18,6 @@ __all__ = [
 ]
 
 AnswerBy = Literal["classifiers", "gallery", "both"]
-_ANSWER_SOURCES: tuple[AnswerBy, ...] = ("classifiers", "gallery", "both")
 """Sources of answers."""
 
 MAX_OVERFLOW = 0.5
@@ -95,9 +94,6 @@ def check_answer_by(value: str | None) -> AnswerBy | None:
     Raises:
         InputError: it is unknown.
     """
-    for source in _ANSWER_SOURCES:
-        if value == source:
-            return source
-    if value is not None:
-        raise InputError(f"answer_by is {value!r}; expected one of {', '.join(_ANSWER_SOURCES)}")
-    return None
+    if value not in (None, *get_args(AnswerBy)):
+        raise InputError(f"answer_by is {value!r}; expected one of {', '.join(get_args(AnswerBy))}")
+    return cast(AnswerBy | None, value)

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from thor2_jax.capacity import BATCH_BUCKETS, batch_bucket
+from thor2_jax.capacity import BATCH_BUCKETS, batch_bucket, batch_points
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.types import PointClouds
 
@@ -41,7 +41,8 @@ def compute_by_chunks(
     results: list[T] = []
 
     def compute_chunk() -> None:
-        results.append(compute(pack_instances(chunk, padded_rows(len(chunk), size))))
+        capacity = batch_points(len(instance.points) for instance in chunk) if size > MIN_PART else None
+        results.append(compute(pack_instances(chunk, padded_rows(len(chunk), size), capacity)))
         chunk.clear()
 
     for instance in instances:

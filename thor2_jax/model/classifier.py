@@ -1,11 +1,19 @@
-"""The classifiers (paper, section "Recognition"): one MLP for each kind of descriptor."""
+"""The classifiers (paper, section "Recognition"): one MLP for each kind of descriptor.
 
-from functools import partial
-from typing import Any, Literal
+Those of a run are compiled functions by name, from descriptors to class probabilities. The weights of Flax modules are
+stored as named arrays in safetensors files.
+"""
 
+from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache, partial
+from typing import Any, Literal, Self, TypeVar
+
+import flax.traverse_util
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import nnx
+from numpy.typing import NDArray
 
 from thor2_jax.descriptor.looks import LookDescriptors
 from thor2_jax.errors import InputError
@@ -15,20 +23,32 @@ __all__ = [
     "EMBEDDING",
     "FEATURES",
     "HIDDEN",
+    "THOR2",
+    "Classifier",
     "Feature",
     "MLP",
+    "RunClassifiers",
     "check_features",
     "class_probabilities",
     "feature_of",
-    "oriented_probabilities",
+    "model_arrays",
+    "model_from_arrays",
 ]
 
 Feature = Literal["ce", "tops", "tops2"]
 FEATURES: tuple[Feature, ...] = ("ce", "tops", "tops2")
 """Descriptors that a classifier can be trained on: colour embeddings, TOPS, TOPS2."""
 
+THOR2: tuple[Feature, ...] = ("tops", "tops2")
+"""The two classifiers whose fusion is THOR2."""
+
 EMBEDDING = "embedding"
 """Name of the class probabilities that the embedding of a run gives, beside those of the MLPs."""
+
+Classifier = Callable[[LookDescriptors], jax.Array]
+"""From the descriptors of K looks at B clouds to class probabilities [B, C], which may sum to less than 1."""
+
+Module = TypeVar("Module", bound=nnx.Module)
 
 HIDDEN = (512, 256, 128, 64)
 
@@ -117,6 +137,83 @@ def class_probabilities(model: MLP, descriptors: Descriptors, name: Feature) -> 
     return jax.nn.softmax(model(feature_of(descriptors, name)))
 
 
-def oriented_probabilities(model: MLP, oriented: LookDescriptors, name: Feature) -> jax.Array:
-    """Return the class probabilities [B, n_classes] of clouds from the descriptors of K looks at them."""
-    return oriented.fuse(model(feature_of(oriented.flat[0], name)))
+class RunClassifiers(dict[str, Classifier]):
+    """The classifiers of a run by name: the MLPs, and the embedding if it was fitted on the classes."""
+
+    @classmethod
+    def compiled(cls, models: Mapping[Feature, MLP], embedding: Classifier | None) -> Self:
+        """Return compiled classifiers of MLPs, and the one of the embedding; None if it does not know the classes."""
+        classifiers = cls()
+        for name, model in models.items():
+            graph, state = nnx.split(model)
+            # As a flat list: JAX would take an nnx state apart, in Python, at every call.
+            leaves, structure = jax.tree.flatten(state)
+            classifiers[name] = partial(_forward(graph, structure, name), leaves)
+        if embedding is not None:
+            classifiers[EMBEDDING] = embedding
+        return classifiers
+
+    @property
+    def default(self) -> tuple[str, ...]:
+        """Names of the paper's two and of the embedding, as far as the run has them; of all if it has none of these."""
+        return tuple(name for name in (*THOR2, EMBEDDING) if name in self) or tuple(self)
+
+    def checked(self, names: Sequence[str] | None) -> tuple[str, ...]:
+        """Return names without repetitions; None stands for `default`.
+
+        Raises:
+            InputError: there is no name, or a classifier that the run does not have.
+        """
+        names = self.default if names is None else names
+        if not isinstance(names, (list, tuple)) or not names or not set(names) <= set(self):
+            raise InputError(f"classifiers is {names!r}; expected one or more of {', '.join(self)}")
+        return tuple(dict.fromkeys(names))
+
+
+@lru_cache(maxsize=16)
+def _forward(graph: Any, structure: Any, name: Feature) -> Callable[[list[jax.Array], LookDescriptors], jax.Array]:
+    """Return the function of a classifier's weights, which classifiers of its sizes share, with the programs."""
+
+    @jax.jit
+    def forward(leaves: list[jax.Array], oriented: LookDescriptors) -> jax.Array:
+        model: MLP = nnx.merge(graph, jax.tree.unflatten(structure, leaves))
+        return oriented.fuse(model(feature_of(oriented.flat[0], name)))
+
+    return forward
+
+
+def _state(model: nnx.Module) -> tuple[Any, dict[tuple[Any, ...], Any]]:
+    state = nnx.state(model, (nnx.Param, nnx.BatchStat))
+    return state, dict(flax.traverse_util.flatten_dict(nnx.to_pure_dict(state)))
+
+
+def _name(path: tuple[Any, ...]) -> str:
+    return "/".join(map(str, path))
+
+
+def model_arrays(model: nnx.Module) -> dict[str, NDArray[Any]]:
+    """Return the parameters and batch statistics of a model by their paths, for example layers/0/kernel."""
+    return {_name(path): np.asarray(array) for path, array in _state(model)[1].items()}
+
+
+def model_from_arrays(create: Callable[[], Module], arrays: Mapping[str, NDArray[Any]]) -> Module:
+    """Create a model with the given parameters and batch statistics; no weights are drawn.
+
+    Args:
+        create: function without arguments that constructs the model, its random generators included.
+        arrays: arrays by name, as `model_arrays` returns them.
+
+    Raises:
+        ValueError: if an array is missing or has another shape.
+    """
+    model = nnx.eval_shape(create)
+    state, expected = _state(model)
+    loaded = {}
+    for path, like in expected.items():
+        name = _name(path)
+        if name not in arrays or arrays[name].shape != like.shape:
+            raise ValueError(f"{name} is missing or does not have the shape {like.shape}")
+        loaded[path] = jnp.asarray(arrays[name])
+    nnx.replace_by_pure_dict(state, flax.traverse_util.unflatten_dict(loaded))
+    nnx.update(model, state)
+    return model

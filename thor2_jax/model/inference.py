@@ -7,7 +7,7 @@ All that recognizes uses these functions: frames, sequences of frames, the servi
 """
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -17,13 +17,14 @@ from numpy.typing import NDArray
 from thor2_jax.descriptor.looks import LookDescriptors, describe_looks
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery.enrollment import LOOKS
-from thor2_jax.model.answers import Recognition
-from thor2_jax.model.chunks import compute_by_chunks
+from thor2_jax.model.answers import MAX_OVERFLOW, Recognition
 from thor2_jax.model.model import Model
-from thor2_jax.model.naming import name_instances
 from thor2_jax.types import PointClouds
 
-__all__ = ["Inference", "answers", "gallery_scores", "infer", "infer_clouds", "infer_instances", "values"]
+__all__ = ["Inference", "answers", "gallery_scores", "infer", "infer_clouds", "values"]
+
+N_TOP = 5
+"""Most probable names of each classifier that an answer lists."""
 
 
 class Inference(NamedTuple):
@@ -57,7 +58,7 @@ def infer(
         classifiers: classifiers to evaluate; none if the gallery alone answers, by default those that answer.
     """
     names = model.classifiers.default if classifiers is None else classifiers
-    probabilities = model.classifiers.probabilities(oriented, names)
+    probabilities = {name: model.classifiers[name](oriented) for name in names}
     if clouds is None:
         return Inference(oriented.overflow, probabilities)
     ours, config = model.embedding.config, model.run.config
@@ -82,35 +83,12 @@ def infer_clouds(
         answer_by: source of the answers, see `Model.answers_by`.
     """
     source = model.answers_by(answer_by)
-    oriented = describe_looks(clouds, model.run.network, model.run.config)
+    config = model.run.config
+    # The gallery alone needs two looks, which `infer` would otherwise describe again.
+    count = max(config.looks, LOOKS) if source == "gallery" else config.looks
+    oriented = describe_looks(clouds, model.run.network, config, count)
     names = classifiers if source != "gallery" else ()
     return infer(model, oriented, clouds if source != "classifiers" else None, names)
-
-
-def infer_instances(
-    model: Model,
-    instances: Iterable[PreparedInstance],
-    chunk: int,
-    classifiers: Sequence[str] | None = None,
-    answer_by: str | None = None,
-) -> tuple[list[PreparedInstance], Inference]:
-    """Evaluate a model on the instances of a frame, a few at a time.
-
-    Args:
-        model: the model.
-        instances: an iterable that prepares them, with corrected colours.
-        chunk: usable instances that are computed in one call.
-        classifiers: see `infer_clouds`.
-        answer_by: see `infer_clouds`.
-
-    Returns:
-        All instances, and the outputs for the usable ones: arrays on the host, whose first rows are theirs, in order.
-
-    Raises:
-        InputError: a classifier that the run does not have.
-    """
-    names = model.classifiers.checked(classifiers) if model.answers_by(answer_by) != "gallery" else ()
-    return compute_by_chunks(instances, chunk, lambda clouds: infer_clouds(model, clouds, names, answer_by))
 
 
 def gallery_scores(model: Model, inference: Inference) -> NDArray[np.float32] | None:
@@ -136,15 +114,45 @@ def answers(model: Model, instances: Sequence[PreparedInstance], inference: Infe
     """
     n_usable = sum(instance.reason is None for instance in instances)
     inference = jax.tree.map(lambda a: np.asarray(a)[:n_usable], inference)
-    scores = gallery_scores(model, inference)
+    names, scores = model.names, gallery_scores(model, inference)
+    combined = model.combined(inference.probabilities, scores)
+    thresholds = model.thresholds("both" if inference.probabilities else "gallery")
     by_source = {name: model.union.of_classifiers(p) for name, p in inference.probabilities.items()}
     if scores is not None:
         by_source["gallery"] = model.union.combine(None, scores)
-    return name_instances(
-        instances,
-        model.names,
-        model.combined(inference.probabilities, scores),
-        model.thresholds("both" if inference.probabilities else "gallery"),
-        by_source,
-        inference.overflow,
-    )
+    rows = iter(range(n_usable))
+    result = []
+    for instance in instances:
+        if instance.reason is not None:
+            result.append(Recognition(instance.label, reason=instance.reason))
+            continue
+        row = next(rows)
+        overflow, n_points = int(inference.overflow[row]), len(instance.points)
+        best = int(combined[row].argmax()) if names else -1
+        confidence = float(combined[row, best]) if names else 0.0
+        reason = None
+        if overflow > MAX_OVERFLOW * n_points:
+            reason = (
+                f"overflow: {overflow} points and pairs of {n_points} points lie outside the descriptor's grid; check "
+                "the intrinsics and the depth scale"
+            )
+        elif not names:
+            reason = "unknown: no object is enrolled"
+        elif confidence < thresholds[best]:
+            reason = f"unknown: a confidence of {confidence:.3f}, below {thresholds[best]:.3g}"
+        top = {source: np.argsort(-of_all[row], kind="stable")[:N_TOP] for source, of_all in by_source.items()}
+        result.append(
+            Recognition(
+                label=instance.label,
+                name=names[best] if reason is None else None,
+                confidence=confidence,
+                classifier=max(by_source, key=lambda source: by_source[source][row, best]) if names else None,
+                top={source: [(names[k], float(by_source[source][row, k])) for k in top[source]] for source in top},
+                occluded=instance.occluded,
+                overflow=overflow,
+                points_used=n_points,
+                kept_by_fallback=instance.kept_by_fallback,
+                reason=reason,
+            )
+        )
+    return result

@@ -6,7 +6,7 @@ A frame has a name. COCO and BOP number images and objects instead: `image_numbe
 import dataclasses
 import json
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -131,6 +131,15 @@ def run_length_encoding(mask: NDArray[np.bool_]) -> dict[str, Any]:
     return {"size": list(mask.shape), "counts": text.decode("ascii")}
 
 
+def _with_category(
+    recognitions: Iterable[Recognition], categories: Mapping[str, int]
+) -> Iterator[tuple[Recognition, int]]:
+    """Yield the answers whose names have numbers, with their numbers."""
+    for recognition in recognitions:
+        if recognition.name is not None and recognition.name in categories:
+            yield recognition, categories[recognition.name]
+
+
 def coco_results(
     name: str, image_id: int, frame: RGBDFrame, recognitions: Iterable[Recognition], categories: Mapping[str, int]
 ) -> list[dict[str, Any]]:
@@ -146,10 +155,7 @@ def coco_results(
         categories: name -> category_id.
     """
     entries = []
-    for recognition in recognitions:
-        category = categories.get(recognition.name or "")
-        if category is None:
-            continue
+    for recognition, category in _with_category(recognitions, categories):
         rows, columns = np.divmod(frame.instance_pixels[recognition.label], frame.depth.shape[1])
         left, top = int(columns.min()), int(rows.min())
         entries.append(
@@ -188,10 +194,7 @@ def bop_lines(
         seconds: time for the whole frame.
     """
     lines = []
-    for recognition in recognitions:
-        category = categories.get(recognition.name or "")
-        if category is None:
-            continue
+    for recognition, category in _with_category(recognitions, categories):
         pixels = frame.instance_pixels[recognition.label]
         depth = frame.depth_m.ravel()[pixels]
         rays = pixel_rays(pixels[depth > 0], frame.depth.shape[1], frame.intrinsics)

@@ -21,27 +21,22 @@ trainings that are equal (see `training.fitting.fit`) give the same bytes in the
 
 import dataclasses
 import json
-from collections.abc import Callable, Mapping
-from functools import partial
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import jax
 import safetensors
 import safetensors.numpy
 from flax import nnx
 
 import colornet
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
-from thor2_jax.descriptor.looks import LookDescriptors
 from thor2_jax.errors import InputError
 from thor2_jax.files import atomic_directory, check_output_directory, content_digest
 from thor2_jax.gallery.embedding import Embedding
 from thor2_jax.gallery.references import REFERENCES_FILE
-from thor2_jax.model.classifier import MLP, Feature, check_features
-from thor2_jax.model.orbax_weights import load_orbax_classifier
+from thor2_jax.model.classifier import MLP, Classifier, Feature, check_features, model_arrays, model_from_arrays
 from thor2_jax.model.run_record import RUN_FILE, RUN_FORMAT, read_description
-from thor2_jax.model.weights import model_arrays, model_from_arrays
 
 __all__ = ["EMBEDDING_FILE", "TrainedRun", "input_size", "load_run", "save_run", "weights_file"]
 
@@ -70,7 +65,7 @@ class TrainedRun:
     embedding: Embedding | None = None
 
     @property
-    def embedding_classifier(self) -> Callable[[LookDescriptors], jax.Array] | None:
+    def embedding_classifier(self) -> Classifier | None:
         """`class_probabilities` of the embedding; None if it does not recognize exactly the classes of the run."""
         if self.embedding is None or not self.classes or self.embedding.classes != self.classes:
             return None
@@ -100,22 +95,20 @@ def save_run(run: TrainedRun, path: str | Path) -> None:
         contents = {name: safetensors.numpy.save(model_arrays(model)) for name, model in run.classifiers.items()}
         for name, content in contents.items():
             weights_file(unfinished, name).write_bytes(content)
-        (unfinished / RUN_FILE).write_text(json.dumps(_description(run, contents), indent=2) + "\n")
-
-
-def _description(run: TrainedRun, weights: Mapping[Feature, bytes]) -> dict[str, Any]:
-    return {
-        "format": RUN_FORMAT,
-        "descriptor_version": DESCRIPTOR_VERSION,
-        "descriptor_config": dataclasses.asdict(run.config),
-        "color_network": run.network.fingerprint,
-        "classes": list(run.classes),
-        "classifiers": list(run.classifiers),
-        "weights": {name: content_digest([content]) for name, content in weights.items()},
-        **({} if run.embedding is None else {"embedding": run.embedding.fingerprint}),
-        **({} if run.embedding is None or run.embedding.references is None else {"references": True}),
-        "record": run.record,
-    }
+        embedding = run.embedding
+        description = {
+            "format": RUN_FORMAT,
+            "descriptor_version": DESCRIPTOR_VERSION,
+            "descriptor_config": dataclasses.asdict(run.config),
+            "color_network": run.network.fingerprint,
+            "classes": list(run.classes),
+            "classifiers": list(run.classifiers),
+            "weights": {name: content_digest([content]) for name, content in contents.items()},
+            **({} if embedding is None else {"embedding": embedding.fingerprint}),
+            **({} if embedding is None or embedding.references is None else {"references": True}),
+            "record": run.record,
+        }
+        (unfinished / RUN_FILE).write_text(json.dumps(description, indent=2) + "\n")
 
 
 def load_run(path: str | Path) -> TrainedRun:
@@ -141,14 +134,14 @@ def load_run(path: str | Path) -> TrainedRun:
     try:
         network = colornet.load(path / "network.npz")
     except (OSError, ValueError) as error:
-        raise InputError(f"model: {path / 'network.npz'} cannot be read: {error}") from None
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"model: {path / 'network.npz'} cannot be read: {reason}") from None
     if network.fingerprint != fingerprint:
         raise InputError(f"model: {path / 'network.npz'} is not the colour network that run.json names")
-    load = load_orbax_classifier if description["format"] == 1 else _load_classifier
     classifiers = {}
     for name in names:
         sizes = input_size(name, config, network.n_regions), len(classes)
-        classifiers[name] = load(path / "weights" / name, partial(_create_mlp, *sizes), digests[name])
+        classifiers[name] = _load_classifier(weights_file(path, name), *sizes, digests[name])
     file = path / EMBEDDING_FILE
     embedding = Embedding.load(file, network) if file.is_file() else None
     if embedding is None and description.get("embedding") is not None:
@@ -169,12 +162,7 @@ def weights_file(run: Path, name: str) -> Path:
     return run / "weights" / f"{name}.safetensors"
 
 
-def _create_mlp(n_inputs: int, n_classes: int) -> MLP:
-    return MLP(n_inputs, n_classes, rngs=nnx.Rngs(0))
-
-
-def _load_classifier(path: Path, create: Callable[[], MLP], digest: str) -> MLP:
-    path = path.with_suffix(".safetensors")
+def _load_classifier(path: Path, n_inputs: int, n_classes: int, digest: str) -> MLP:
     try:
         content = path.read_bytes()
     except FileNotFoundError:
@@ -184,6 +172,7 @@ def _load_classifier(path: Path, create: Callable[[], MLP], digest: str) -> MLP:
     if content_digest([content]) != digest:
         raise InputError(f"model: {path} is damaged: its SHA-256 is not the one in {RUN_FILE}")
     try:
-        return model_from_arrays(create, safetensors.numpy.load(content))
+        arrays = safetensors.numpy.load(content)
+        return model_from_arrays(lambda: MLP(n_inputs, n_classes, rngs=nnx.Rngs(0)), arrays)
     except (ValueError, safetensors.SafetensorError) as error:
         raise InputError(f"model: {path} does not fit the classifier ({error})") from None

@@ -12,7 +12,7 @@ from thor2_jax.errors import InputError
 __all__ = ["RUN_FILE", "RUN_FORMAT", "read_description", "stored_value"]
 
 RUN_FORMAT = 2
-"""Version of the layout, see `run_directory`. Format 1 has Orbax checkpoints (RUN/weights/NAME/) and is still read."""
+"""Version of the layout, see `run_directory`. Format 1, of versions before 0.2, cannot be read."""
 
 RUN_FILE = "run.json"
 
@@ -30,10 +30,11 @@ def read_description(path: Path) -> dict[str, Any]:
     except FileNotFoundError:
         raise InputError(f"model: {path} is not a run directory; expected one with run.json") from None
     except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"model: {path / RUN_FILE} cannot be read: {error}") from None
-    if not isinstance(description, dict) or description.get("format") not in (1, RUN_FORMAT):
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"model: {path / RUN_FILE} cannot be read: {reason}") from None
+    if not isinstance(description, dict) or description.get("format") != RUN_FORMAT:
         value = description.get("format") if isinstance(description, dict) else type(description).__name__
-        raise InputError(f"model: {path / RUN_FILE} has format {value!r}; expected 1 or {RUN_FORMAT}")
+        raise InputError(f"model: {path / RUN_FILE} has format {value!r}; expected {RUN_FORMAT}; train it again")
     if description.get("descriptor_version") != DESCRIPTOR_VERSION:
         raise InputError(
             f"model: {path} was trained on descriptor version {description.get('descriptor_version')!r}; "

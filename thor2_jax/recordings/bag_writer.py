@@ -14,7 +14,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from thor2_jax.errors import InputError
+from thor2_jax.errors import InputError, needs_extra
 from thor2_jax.files import errors_name, temporary_directory
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.overlay import annotate
@@ -100,13 +100,8 @@ class MessageBag:
             raise InputError(f"{self.argument} is {path}, which exists; choose another name")
         with errors_name(path), tempfile.TemporaryFile(dir=path.absolute().parent):
             pass
-        try:
+        with needs_extra(f"{self.argument} is {path}, which", "rosbags", "bags"):
             self._types = detection_types()
-        except ImportError as error:
-            raise InputError(
-                f"{self.argument} is {path}, which needs rosbags ({error}); run pip install "
-                "-c constraints.txt '.[bags]'"
-            ) from None
         self.path, self._topics, self._n_messages = path, topics, 0
 
     def __enter__(self) -> Self:

@@ -15,9 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from thor2_jax.errors import InputError, with_context
+from thor2_jax.errors import InputError, needs_extra, with_context
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.intrinsics import Intrinsics
+from thor2_jax.recordings.decompression import limit_decompression
 from thor2_jax.recordings.messages import color_image, depth_image, image_kind, stamp_of
 from thor2_jax.recordings.pairs import DEFAULT_MAX_GAP, ImagePair, PairCounts, StampedImage, nearest_pairs
 from thor2_jax.recordings.recorded_frames import RecordedFrame, stamp_name
@@ -85,13 +86,11 @@ class Bag:
                 topic.
             OSError: it cannot be opened.
         """
-        try:
+        with needs_extra(f"bag is {self.path}, which", "rosbags", "bags"):
             from rosbags.highlevel import AnyReader
             from rosbags.typesys import Stores, get_typestore
-        except ImportError as error:
-            raise InputError(
-                f"bag is {self.path}, which needs rosbags ({error}); run pip install -c constraints.txt '.[bags]'"
-            ) from None
+
+            limit_decompression()
         if not self.path.exists():
             raise FileNotFoundError(2, "No such file or directory", str(self.path))
         if self.path.is_dir() and not (self.path / "metadata.yaml").is_file():

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from thor2_jax.errors import InputError
+from thor2_jax.errors import InputError, needs_extra
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.intrinsics import Intrinsics
 from thor2_jax.recordings.recorded_frames import RecordedFrame, stamp_name
@@ -43,13 +43,8 @@ class RealSenseCamera:
         Raises:
             InputError: the package pyrealsense2 is missing, or no camera is connected.
         """
-        try:
+        with needs_extra("realsense", "pyrealsense2 and the system library libusb-1.0-0", "realsense"):
             import pyrealsense2 as rs
-        except ImportError as error:
-            raise InputError(
-                f"realsense needs pyrealsense2 ({error}) and the system library libusb-1.0-0; run pip install "
-                "-c constraints.txt '.[realsense]'"
-            ) from None
         self._align = rs.align(rs.stream.color)
         if self._source is None:
             config = rs.config()

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from thor2_jax.errors import InputError
+from thor2_jax.errors import InputError, needs_extra
 from thor2_jax.files import check_output_file, errors_name, temporary_directory
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.overlay import answer_paints
@@ -52,12 +52,8 @@ class RerunFile:
         with errors_name(path), tempfile.TemporaryFile(dir=path.absolute().parent):
             pass
         check_output_file("rerun", path, _is_own)
-        try:
+        with needs_extra(f"rerun is {path}, which", "rerun-sdk", "rerun"):
             import rerun
-        except ImportError as error:
-            raise InputError(
-                f"rerun is {path}, which needs rerun-sdk ({error}); run pip install -c constraints.txt '.[rerun]'"
-            ) from None
         self._rerun: Any = rerun
         self.path, self.n_frames, self._folder = path, 0, contextlib.ExitStack()
 

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from thor2_jax.segmentation.depth_edges import depth_edges
 from thor2_jax.segmentation.pixels import (
     Mask,
     components,
@@ -68,7 +69,7 @@ LARGEST_SMOOTH = 3
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Evidence:
-    """Probabilities of each pixel by height and colour; every field is an image [H, W].
+    """Probabilities of each pixel by height and colour, and edges of depth; every field is an image [H, W].
 
     Attributes:
         heights: float32, metres over the support; 0 where depth is missing.
@@ -77,6 +78,8 @@ class Evidence:
         colored: pixels on the support, or without depth before it, whose colour is not the support's.
         plain: pixels whose colour is the support's, including soft shadows and highlights.
         region: pixels in the convex hull of the support.
+        steps: steps of depth, see `depth_edges`.
+        folds: folds of depth.
     """
 
     heights: NDArray[np.float32]
@@ -85,6 +88,8 @@ class Evidence:
     colored: Mask
     plain: Mask
     region: Mask
+    steps: Mask
+    folds: Mask
 
 
 def find_foreground(color: NDArray[np.uint8], depth: DepthImage, planes: list[Plane]) -> Evidence:
@@ -114,7 +119,7 @@ def find_foreground(color: NDArray[np.uint8], depth: DepthImage, planes: list[Pl
     plain = _plain_parts(smooth, (contrast < UNIT) & on_support) & (contrast < LARGEST_SMOOTH * UNIT)
     beside = on_support | (~depth.valid & region)
     colored = open_round(beside & known & (contrast > UNIT) & ~plain)
-    return Evidence(heights, open_round(high), contrast, colored, plain, region)
+    return Evidence(heights, open_round(high), contrast, colored, plain, region, *depth_edges(depth))
 
 
 def _plain_parts(smooth: Mask, like_plane: Mask) -> Mask:

@@ -24,6 +24,9 @@ __all__ = [
 
 Mask = NDArray[np.bool_]
 
+CROSS = np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3)), np.uint8)
+"""A cross of three pixels."""
+
 
 def _bytes(mask: Mask) -> NDArray[np.uint8]:
     return np.ascontiguousarray(mask).view(np.uint8)
@@ -51,7 +54,7 @@ def shrink(mask: Mask, size: int) -> Mask:
 
 def open_round(mask: Mask) -> Mask:
     """Return the mask without what a cross of three pixels does not fit in."""
-    return pixel_mask(cv2.morphologyEx(_bytes(mask), cv2.MORPH_OPEN, _cross()))
+    return pixel_mask(cv2.morphologyEx(_bytes(mask), cv2.MORPH_OPEN, CROSS))
 
 
 def close(mask: Mask, size: int) -> Mask:
@@ -119,7 +122,3 @@ def watershed(color: NDArray[np.uint8], markers: NDArray[np.int32]) -> NDArray[n
         np.maximum(largest, flooded.take(line + beside, mode="clip"), out=largest)
     flooded.put(line, largest)
     return flooded
-
-
-def _cross() -> NDArray[np.uint8]:
-    return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3)), np.uint8)

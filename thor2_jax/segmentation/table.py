@@ -12,10 +12,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame
-from thor2_jax.segmentation.depth_edges import depth_edges
 from thor2_jax.segmentation.foreground import find_foreground
-from thor2_jax.segmentation.markers import flood
-from thor2_jax.segmentation.merging import merge_pieces
+from thor2_jax.segmentation.pieces import flood, merge_pieces
 from thor2_jax.segmentation.pixels import Mask, components, grow, label_borders, label_sizes, median_high, watershed
 from thor2_jax.segmentation.planes import DepthImage, Plane, dominant_planes
 
@@ -75,9 +73,7 @@ def _segment(color: NDArray[np.uint8], depth: DepthImage) -> NDArray[np.int32]:
     if not planes:
         return np.zeros(depth.z.shape, np.int32)
     evidence = find_foreground(color, depth, planes)
-    steps, folds = depth_edges(depth)
-    pieces = flood(color, depth, evidence, steps, folds)
-    labels = merge_pieces(pieces, color, depth, evidence, steps, folds)
+    labels = merge_pieces(*flood(color, depth, evidence), color, depth, evidence)
     return _cleaned(labels, depth, planes)
 
 

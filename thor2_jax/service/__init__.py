@@ -2,8 +2,8 @@
 
     thor2 serve --model run
 
-Modules in the order of a request: `app` (routes), `uploads` (size limits, multipart forms), `pipeline` (admission and
-stages), `preparation` (worker processes that decode images and compute instance clouds, with `decoding`), `batching`
-(batches across requests), `engine` (the compiled model), `teaching` (requests that enroll and forget
-objects), `answers` (JSON records). `page/` is the web page served at /.
+Modules in the order of a request: `server` (connections), `app` (routes), `forms` (size limits, multipart forms),
+`pipeline` (admission and stages), `preparation` (worker processes that decode images and compute instance clouds, with
+`decoding`), `batching` (batches across requests), `engine` (the compiled model), `answers` (JSON records, whose fields
+are in `schemas`). `page/` is the web page served at /.
 """

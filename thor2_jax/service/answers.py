@@ -16,21 +16,9 @@ from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery.objects import ObjectGallery
 from thor2_jax.model.answers import Recognition
+from thor2_jax.service import schemas
 from thor2_jax.service.engine import CloudResult
 from thor2_jax.service.preparation import PreparedRequest
-from thor2_jax.service.schemas import (
-    AdaptationAnswer,
-    Candidate,
-    Details,
-    ExplainedFrame,
-    ExplainedInstance,
-    InstanceAnswer,
-    ObjectAnswer,
-    SliceDetails,
-    StripColors,
-    WhyAnswer,
-    WhyPicture,
-)
 from thor2_jax.service.settings import MAX_EXPLAINED
 
 __all__ = ["adaptation_answer", "explained_frame", "instance_answer", "object_answers", "why_answer"]
@@ -39,30 +27,19 @@ MAX_SHOWN_POINTS = 1000
 """Number of points of a cloud in an explanation."""
 
 
-def instance_answer(recognition: Recognition) -> InstanceAnswer:
+def instance_answer(recognition: Recognition) -> schemas.InstanceAnswer:
     """Return the JSON record of one recognized instance."""
     top = {
-        classifier: [Candidate(name=name, probability=p) for name, p in candidates]
+        classifier: [schemas.Candidate(name=name, probability=p) for name, p in candidates]
         for classifier, candidates in recognition.top.items()
     }
-    return InstanceAnswer(
-        label=recognition.label,
-        name=recognition.name,
-        confidence=recognition.confidence,
-        classifier=recognition.classifier,
-        top=top,
-        occluded=recognition.occluded,
-        overflow=recognition.overflow,
-        points_used=recognition.points_used,
-        kept_by_fallback=recognition.kept_by_fallback,
-        unrecognized=recognition.reason,
-    )
+    return schemas.InstanceAnswer(**{**vars(recognition), "top": top, "unrecognized": recognition.reason})
 
 
-def why_answer(explanation: Explanation, frame: RGBDFrame) -> WhyAnswer:
+def why_answer(explanation: Explanation, frame: RGBDFrame) -> schemas.WhyAnswer:
     """Return the JSON record of an explanation, with its main pictures and without timings."""
     check = explanation.attributions.faithfulness
-    return WhyAnswer(
+    return schemas.WhyAnswer(
         label=explanation.recognition.label,
         name=explanation.recognition.name,
         explained_name=explanation.name,
@@ -72,7 +49,7 @@ def why_answer(explanation: Explanation, frame: RGBDFrame) -> WhyAnswer:
         mean_loss_without_random_tenth=check.random,
         changes=[f"{change_text(change)}: {change.answer}" for change in explanation.changes],
         pictures=[
-            WhyPicture(
+            schemas.WhyPicture(
                 title=picture.title, caption=picture.caption, png=base64.b64encode(png_bytes(picture.figure)).decode()
             )
             for picture in main_pictures(explanation, frame)
@@ -81,21 +58,21 @@ def why_answer(explanation: Explanation, frame: RGBDFrame) -> WhyAnswer:
     )
 
 
-def adaptation_answer(adaptation: Adaptation | None) -> AdaptationAnswer | None:
+def adaptation_answer(adaptation: Adaptation | None) -> schemas.AdaptationAnswer | None:
     """Return the JSON record of an estimate of the camera's colours; None if there is none."""
     if adaptation is None:
         return None
-    return AdaptationAnswer(instances=adaptation.instances, **dataclasses.asdict(adaptation.transform))
+    return schemas.AdaptationAnswer(instances=adaptation.instances, **dataclasses.asdict(adaptation.transform))
 
 
-def object_answers(objects: ObjectGallery) -> list[ObjectAnswer]:
+def object_answers(objects: ObjectGallery) -> list[schemas.ObjectAnswer]:
     """Return the JSON records of all objects that may be answered."""
     union, enrolled = objects.union, objects.gallery.objects
     answers = []
     for name, is_trained in zip(union.names, union.has_output, strict=True):
         views = enrolled.get(name)
         answers.append(
-            ObjectAnswer(
+            schemas.ObjectAnswer(
                 name=name,
                 trained=bool(is_trained),
                 views=0 if views is None else len(views.clouds),
@@ -113,7 +90,7 @@ def explained_frame(
     calibrated_confidences: Sequence[float | None],
     config: DescriptorConfig,
     timings: dict[str, float],
-) -> ExplainedFrame:
+) -> schemas.ExplainedFrame:
     """Return the instances of a frame together with the clouds and descriptors behind their names.
 
     Args:
@@ -126,32 +103,32 @@ def explained_frame(
     """
     assert prepared.label_map is not None
     remaining = iter(zip(results, calibrated_confidences, strict=True))
-    instances: list[ExplainedInstance] = []
+    instances: list[schemas.ExplainedInstance] = []
     for instance, recognition in zip(prepared.instances, recognitions, strict=True):
         details = None
         if instance.reason is None:
             result, confidence = next(remaining)
             if len(instances) < MAX_EXPLAINED:
                 details = _details(instance, result, confidence, config)
-        instances.append(ExplainedInstance(**dict(instance_answer(recognition)), details=details))
-    return ExplainedFrame(instances=instances, label_map=prepared.label_map, timings=timings)
+        instances.append(schemas.ExplainedInstance(**dict(instance_answer(recognition)), details=details))
+    return schemas.ExplainedFrame(instances=instances, label_map=prepared.label_map, timings=timings)
 
 
 def _details(
     instance: PreparedInstance, result: CloudResult, calibrated_confidence: float | None, config: DescriptorConfig
-) -> Details:
+) -> schemas.Details:
     aligned = result.aligned[: len(instance.points)]
     shown = np.random.default_rng(0).permutation(len(aligned))[:MAX_SHOWN_POINTS]
     peak = float(result.images.max())
     images = np.rint(result.images * (255 / peak if peak > 0 else 0)).astype(int)
-    return Details(
+    return schemas.Details(
         points=aligned[shown].astype(float).round(4).tolist(),
         colors=instance.colors[shown].tolist(),
         slice_borders=_slice_borders(aligned[:, 2], config),
         calibrated_confidence=calibrated_confidence,
         image_peak=peak,
         slices=[
-            SliceDetails(image=image.tolist(), strips=_strip_colors(colors))
+            schemas.SliceDetails(image=image.tolist(), strips=_strip_colors(colors))
             for image, colors in zip(images, result.strip_colors, strict=True)
         ],
     )
@@ -165,10 +142,10 @@ def _slice_borders(z: NDArray[np.float32], config: DescriptorConfig) -> list[tup
     return [(round(float(border), 4), round(float(border + config.sigma_1), 4)) for border in low]
 
 
-def _strip_colors(colors: NDArray[np.float32]) -> list[StripColors]:
+def _strip_colors(colors: NDArray[np.float32]) -> list[schemas.StripColors]:
     strips = []
     for strip in np.flatnonzero(colors.any(axis=1)):
         regions = np.flatnonzero(colors[strip])
         weights = colors[strip, regions].astype(float).round(3).tolist()
-        strips.append(StripColors(strip=int(strip), regions=regions.tolist(), weights=weights))
+        strips.append(schemas.StripColors(strip=int(strip), regions=regions.tolist(), weights=weights))
     return strips

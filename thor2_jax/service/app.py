@@ -1,11 +1,12 @@
-"""HTTP routes, authentication and error responses."""
+"""HTTP routes, the page at /, authentication and error responses."""
 
 import contextlib
 import io
+import os
 import secrets
-import signal
 import threading
 from collections.abc import AsyncIterator, Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
+from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from thor2_jax.config import DESCRIPTOR_VERSION
@@ -24,30 +26,29 @@ from thor2_jax.hosts import is_allowed_host
 from thor2_jax.service import schemas
 from thor2_jax.service.answers import adaptation_answer, instance_answer, object_answers
 from thor2_jax.service.engine import CloudResult
+from thor2_jax.service.forms import parse_enrolment, parse_number, read_body, read_form
 from thor2_jax.service.metrics import RequestCounter
-from thor2_jax.service.page_files import PageFiles
-from thor2_jax.service.pipeline import Service
-from thor2_jax.service.problem import Problem, RequestError, error_responses
+from thor2_jax.service.pipeline import Service, gallery_errors
+from thor2_jax.service.problem import RequestError, error_responses
 from thor2_jax.service.schemas import NPZ
 from thor2_jax.service.settings import Settings
-from thor2_jax.service.teaching import (
-    check_same_site,
-    gallery_errors,
-    generation_number,
-    instance_number,
-    parse_enrolment,
-)
-from thor2_jax.service.uploads import read_body, read_form
+from thor2_jax.service.signals import handlers_replaced
 
-__all__ = ["create_app"]
+__all__ = ["PageFiles", "create_app"]
 
-LABELLED_FRAME = ("color", "depth", "labels", "intrinsics")
-FRAME, OPTIONAL = ("color", "depth", "intrinsics"), ("labels",)
 WHY_SECONDS = 90.0
 """Least deadline of an explanation: further ones wait for it."""
 
 FRAME_ERRORS = error_responses(400, 408, 413, 415, 422, 429, 503, 504)
 GALLERY_ERRORS = error_responses(429, 500, 503, 504, 507)
+
+PAGE_HEADERS = {
+    # The page loads from and connects to its own server only, has no inline code and cannot be framed.
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; "
+    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    "Referrer-Policy": "no-referrer",
+    "Cache-Control": "no-cache",  # Browsers revalidate each file and transfer it only if it changed.
+}
 
 
 def create_app(settings: Settings, workers: int = 1) -> FastAPI:
@@ -88,20 +89,27 @@ def create_app(settings: Settings, workers: int = 1) -> FastAPI:
     authenticated = (
         APIRouter(dependencies=[Depends(_token_check(token))], responses=error_responses(401)) if token else APIRouter()
     )
-    _add_inference_routes(authenticated, service, settings.adapt)
+    _add_inference_routes(authenticated, service)
     _add_model_routes(authenticated, service)
-    _add_object_routes(authenticated, service)
-    if settings.teach:
-        _add_teaching_routes(authenticated, service)
-    else:
-        _add_refusals_to_teach(authenticated)
+    _add_teaching_routes(authenticated, service)
     app.include_router(authenticated)
     app.router.default = PageFiles()
-    app.add_exception_handler(RequestError, _on_request_error)
-    app.add_exception_handler(HTTPException, _on_http_exception)
-    app.add_exception_handler(ClientDisconnect, _on_disconnect)
-    app.add_exception_handler(Exception, _on_internal_error)
+    for kind in (RequestError, HTTPException, ClientDisconnect, Exception):
+        app.add_exception_handler(kind, _on_error)
     return app
+
+
+class PageFiles(StaticFiles):
+    """Static files of the page (`page/`: HTML, CSS and JavaScript without a build step) with security headers."""
+
+    def __init__(self) -> None:
+        super().__init__(directory=Path(__file__).parent / "page", html=True)
+
+    def file_response(self, full_path: str | os.PathLike[str], *args: Any, **kwargs: Any) -> Response:
+        """Return the response for a file, with `PAGE_HEADERS`."""
+        response = super().file_response(full_path, *args, **kwargs)
+        response.headers.update(PAGE_HEADERS)
+        return response
 
 
 class AllowedHosts:
@@ -116,7 +124,7 @@ class AllowedHosts:
             host = Headers(scope=scope).get("host", "")
             if not is_allowed_host(host, (scope.get("server") or ("",))[0], self._names):
                 message = f"Host is {host[:100]!r}; expected localhost, the address, or a name given to --allow-host."
-                await _problem_response(403, Problem(field="Host", message=message))(scope, receive, send)
+                await _problem_response(RequestError(403, "Host", message))(scope, receive, send)
                 return
         await self._app(scope, receive, send)
 
@@ -127,21 +135,17 @@ def _stop_accepting_on_signal(service: Service) -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    previous = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
 
-    def stop(number: int, frame: Any) -> None:
-        service.stop_accepting()
-        handler = previous[signal.Signals(number)]
-        if callable(handler):
-            handler(number, frame)
+    def stop_before(handler: Any) -> Callable[[int, Any], None]:
+        def stop(number: int, frame: Any) -> None:
+            service.stop_accepting()
+            if callable(handler):
+                handler(number, frame)
 
-    for number in previous:
-        signal.signal(number, stop)
-    try:
+        return stop
+
+    with handlers_replaced(stop_before):
         yield
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
 
 
 def _health_routes(service: Service, workers: int) -> APIRouter:
@@ -161,9 +165,9 @@ def _health_routes(service: Service, workers: int) -> APIRouter:
     return routes
 
 
-def _add_inference_routes(routes: APIRouter, service: Service, adapts: bool) -> None:
-    # With adaptation, a frame changes how the next ones are recognized.
-    observing: dict[str, Any] = {"dependencies": [Depends(check_same_site)]} if adapts else {}
+def _add_inference_routes(routes: APIRouter, service: Service) -> None:
+    adapts = service.settings.adapt  # A frame then changes how the next ones are recognized.
+    observing: dict[str, Any] = {"dependencies": [Depends(_check_same_site)]} if adapts else {}
     frame_errors = FRAME_ERRORS | (error_responses(403) if adapts else {})
 
     @routes.post(
@@ -173,7 +177,7 @@ def _add_inference_routes(routes: APIRouter, service: Service, adapts: bool) -> 
         """Recognize every instance of a frame; one without labels is segmented."""
         async with service.admit() as admitted:
             with admitted.stage("upload"):
-                files = await read_form(request, FRAME, OPTIONAL)
+                files = await read_form(request, schemas.FRAME_FORM)
             recognitions, label_map = await service.recognize(files, admitted)
         return schemas.FrameAnswer(
             instances=[instance_answer(recognition) for recognition in recognitions],
@@ -194,7 +198,7 @@ def _add_inference_routes(routes: APIRouter, service: Service, adapts: bool) -> 
         """Recognize every instance of a frame and return the evidence: clouds, persistence images and colours."""
         async with service.admit() as admitted:
             with admitted.stage("upload"):
-                files = await read_form(request, FRAME, OPTIONAL)
+                files = await read_form(request, schemas.FRAME_FORM)
             answer = await service.explain(files, admitted)
             content = await run_in_threadpool(answer.model_dump_json)
         return Response(content, media_type="application/json")
@@ -207,9 +211,8 @@ def _add_inference_routes(routes: APIRouter, service: Service, adapts: bool) -> 
         """
         async with service.admit(max(service.settings.deadline, WHY_SECONDS)) as admitted:
             with admitted.stage("upload"):
-                fields = await read_form(request, (*FRAME, *OPTIONAL, "instance"))
-            label = instance_number(fields.pop("instance"))
-            return await service.why(fields, label, admitted)
+                files = await read_form(request, schemas.WHY_FORM)
+            return await service.why(files, parse_number(files, "instance"), admitted)
 
     @routes.post(
         "/v1/describe",
@@ -270,8 +273,6 @@ def _add_model_routes(routes: APIRouter, service: Service) -> None:
         """Return the metrics in the Prometheus text format."""
         return Response(service.metrics.text(), media_type="text/plain; version=0.0.4; charset=utf-8")
 
-
-def _add_object_routes(routes: APIRouter, service: Service) -> None:
     @routes.get("/v1/objects", responses=error_responses(500))
     async def objects() -> schemas.ObjectsAnswer:
         """Return the objects that may be answered, with their views."""
@@ -282,7 +283,15 @@ def _add_object_routes(routes: APIRouter, service: Service) -> None:
 
 
 def _add_teaching_routes(authenticated: APIRouter, service: Service) -> None:
-    routes = APIRouter(dependencies=[Depends(check_same_site)], responses=error_responses(403))
+    async def check_teaches() -> None:
+        if not service.settings.teach:
+            raise RequestError(403, None, "The service does not teach; start it with `thor2 serve --teach`.")
+
+    routes = APIRouter(
+        dependencies=[Depends(check_teaches), Depends(_check_same_site)],
+        responses=error_responses(403),
+        include_in_schema=service.settings.teach,
+    )
 
     @routes.post(
         "/v1/objects",
@@ -296,10 +305,10 @@ def _add_teaching_routes(authenticated: APIRouter, service: Service) -> None:
         """
         async with service.admit() as admitted:
             with admitted.stage("upload"):
-                fields = await read_form(request, (*LABELLED_FRAME, "name", "instance"), ("extend", "replace"))
-            enrolment = parse_enrolment(fields)
-            known = await service.enroll({name: fields[name] for name in LABELLED_FRAME}, enrolment, admitted)
-        (enrolled,) = [answer for answer in object_answers(known) if answer.name == enrolment.name]
+                files = await read_form(request, schemas.ENROLMENT_FORM)
+            name, label, flags = parse_enrolment(files)
+            known = await service.enroll(files, name, label, flags, admitted)
+        (enrolled,) = [answer for answer in object_answers(known) if answer.name == name]
         return schemas.EnrolmentAnswer(**dict(enrolled), generation=known.generation, timings=admitted.milliseconds())
 
     @routes.post(
@@ -311,8 +320,8 @@ def _add_teaching_routes(authenticated: APIRouter, service: Service) -> None:
         """Take back the last change of the gallery, unless another one was made since."""
         async with service.admit() as admitted:
             with admitted.stage("upload"):
-                generation = generation_number(await read_form(request, ("generation",)))
-            known = await service.undo(generation, admitted)
+                generation = parse_number(await read_form(request, schemas.UNDO_FORM), "generation")
+            known = await service.change(lambda objects: objects.undo(generation), 409, "generation", admitted)
         return schemas.ChangeAnswer(generation=known.generation)
 
     @routes.delete("/v1/objects/{name:path}", responses=GALLERY_ERRORS | error_responses(404))
@@ -321,18 +330,21 @@ def _add_teaching_routes(authenticated: APIRouter, service: Service) -> None:
         async with service.admit() as admitted:
             with admitted.stage("upload"):
                 pass  # There is no body; a late answer gets status 504.
-            known = await service.forget(name, admitted)
+            known = await service.change(lambda objects: objects.forget(name), 404, "name", admitted)
         return schemas.ChangeAnswer(generation=known.generation)
 
     authenticated.include_router(routes)
 
 
-def _add_refusals_to_teach(routes: APIRouter) -> None:
-    @routes.post("/v1/objects", include_in_schema=False)
-    @routes.post("/v1/objects/undo", include_in_schema=False)
-    @routes.delete("/v1/objects/{name:path}", include_in_schema=False)
-    async def refuse() -> None:
-        raise RequestError(403, None, "The service does not teach; start it with `thor2 serve --teach`.")
+async def _check_same_site(request: Request) -> None:
+    """Raise RequestError (403) if a web page of another site sends the request, as browsers let any page do."""
+    site, origin = request.headers.get("sec-fetch-site"), request.headers.get("origin")
+    if site is not None:  # Browsers send it to https and to localhost.
+        is_foreign = site not in ("same-origin", "none")
+    else:
+        is_foreign = origin is not None and origin.partition("://")[2] != request.headers.get("host")
+    if is_foreign:
+        raise RequestError(403, "Origin", "The request comes from a web page of another site.")
 
 
 def _token_check(token: str) -> Callable[..., Any]:
@@ -364,25 +376,16 @@ def _encode_npz(results: Sequence[CloudResult]) -> bytes:
     return stream.getvalue()
 
 
-def _problem_response(status: int, problem: Problem, headers: dict[str, str] | None = None) -> JSONResponse:
-    return JSONResponse(problem.model_dump(exclude_defaults=True), status, headers)
-
-
-async def _on_request_error(_: Request, error: Exception) -> Response:
-    assert isinstance(error, RequestError)
+async def _on_error(_: Request, error: Exception) -> Response:
+    if isinstance(error, HTTPException):
+        return _problem_response(RequestError(error.status_code, None, error.detail), dict(error.headers or {}))
+    if isinstance(error, ClientDisconnect):
+        return _problem_response(RequestError(400, "body", "The body is incomplete."))
+    if not isinstance(error, RequestError):
+        return _problem_response(RequestError(500, None, "Internal error of the service; see its log."))
     again = {"Retry-After": str(error.retry_after)}
-    headers = {401: {"WWW-Authenticate": "Bearer"}, 429: again, 503: again}
-    return _problem_response(error.status, error.problem, headers.get(error.status))
+    return _problem_response(error, {401: {"WWW-Authenticate": "Bearer"}, 429: again, 503: again}.get(error.status))
 
 
-async def _on_http_exception(_: Request, error: Exception) -> Response:
-    assert isinstance(error, HTTPException)
-    return _problem_response(error.status_code, Problem(field=None, message=error.detail), dict(error.headers or {}))
-
-
-async def _on_disconnect(_: Request, error: Exception) -> Response:
-    return _problem_response(400, Problem(field="body", message="The body is incomplete."))
-
-
-async def _on_internal_error(_: Request, error: Exception) -> Response:
-    return _problem_response(500, Problem(field=None, message="Internal error of the service; see its log."))
+def _problem_response(error: RequestError, headers: dict[str, str] | None = None) -> JSONResponse:
+    return JSONResponse(error.problem.model_dump(exclude_defaults=True), error.status, headers)

@@ -4,7 +4,6 @@ Sizes are checked before anything is decompressed, and every error names the fie
 """
 
 import io
-import math
 import zipfile
 from collections.abc import Callable
 from typing import Any
@@ -16,7 +15,9 @@ from pydantic import ValidationError
 
 from thor2_jax.capacity import POINT_BUCKETS
 from thor2_jax.errors import InputError
-from thor2_jax.frames.frames import Intrinsics, RGBDFrame, has_16_bit_channels, parse_intrinsics
+from thor2_jax.frames.frames import RGBDFrame
+from thor2_jax.frames.image_files import has_16_bit_channels, read_npy
+from thor2_jax.frames.intrinsics import Intrinsics, parse_intrinsics
 from thor2_jax.service.problem import RequestError
 from thor2_jax.service.schemas import CloudsBody
 from thor2_jax.service.settings import (
@@ -125,8 +126,11 @@ def decode_json_clouds(content: bytes) -> CloudArrays:
         raise RequestError(422, field, f"{field}: {first['msg'][:200]}.") from None
     clouds = []
     for k, cloud in enumerate(body.clouds):
-        points, colors = (np.array(rows).reshape(-1, 3) for rows in (cloud.points, cloud.colors))
-        clouds.append(_check_cloud(f"clouds.{k}", points, colors.astype(np.uint8)))
+        points, colors = np.array(cloud.points, np.float32), np.array(cloud.colors, np.uint8)
+        if len(colors) != len(points):
+            message = f"clouds.{k} has {len(points)} points and {len(colors)} colors."
+            raise RequestError(422, f"clouds.{k}.colors", message)
+        clouds.append((points.reshape(-1, 3), colors.reshape(-1, 3)))
     return clouds
 
 
@@ -155,11 +159,10 @@ def decode_npz_clouds(content: bytes) -> CloudArrays:
         raise RequestError(
             422, "sizes", f"sizes must lie between 0 and {POINT_BUCKETS[-1]} and sum to the {len(points)} points."
         )
-    ends = np.cumsum(counts)
-    return [
-        _check_cloud("points", points[end - n : end], colors[end - n : end])
-        for n, end in zip(counts, ends, strict=True)
-    ]
+    if not (np.abs(points) <= MAX_CLOUD_COORDINATE).all():
+        raise RequestError(422, "points", f"points has coordinates that are not within {MAX_CLOUD_COORDINATE} m.")
+    starts = np.cumsum(counts)[:-1]
+    return list(zip(np.split(points.astype(np.float32), starts), np.split(colors, starts), strict=True))
 
 
 def _decode_npz(content: bytes) -> dict[str, NDArray[Any]]:
@@ -177,26 +180,10 @@ def _decode_npz(content: bytes) -> dict[str, NDArray[Any]]:
     total = sum(entry.file_size for entry in entries.values())
     if total > MAX_BODY:
         raise RequestError(413, "body", f"The arrays have {total} bytes; expected at most {MAX_BODY}.")
-    return {name: _decode_npy(name, archive, entry) for name, entry in entries.items()}
-
-
-def _decode_npy(name: str, archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> NDArray[Any]:
-    try:
-        stream = io.BytesIO(archive.read(entry))  # At most entry.file_size bytes.
-        version = np.lib.format.read_magic(stream)
-        read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-        shape, is_fortran_order, dtype = read_header[version](stream)
-        data = stream.read()
-        if dtype.hasobject or math.prod(shape) * dtype.itemsize != len(data):
-            raise ValueError
-        return np.frombuffer(data, dtype).reshape(shape, order="F" if is_fortran_order else "C")
-    except Exception:  # As above.
-        raise RequestError(422, name, f"{name} is not a numeric array, or is damaged.") from None
-
-
-def _check_cloud(field: str, points: NDArray[Any], colors: NDArray[np.uint8]) -> tuple[Any, NDArray[np.uint8]]:
-    if colors.shape != points.shape:
-        raise RequestError(422, f"{field}.colors", f"{field} has {len(points)} points and {len(colors)} colors.")
-    if not (np.abs(points) <= MAX_CLOUD_COORDINATE).all():
-        raise RequestError(422, field, f"{field} has coordinates that are not within {MAX_CLOUD_COORDINATE} m.")
-    return points.astype(np.float32), colors
+    arrays = {}
+    for name, entry in entries.items():
+        try:
+            arrays[name] = read_npy(io.BytesIO(archive.read(entry)), entry.file_size)
+        except Exception:  # As above.
+            raise RequestError(422, name, f"{name} is not a numeric array, or is damaged.") from None
+    return arrays

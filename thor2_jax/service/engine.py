@@ -4,6 +4,7 @@ import dataclasses
 import logging
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -43,9 +44,8 @@ ExplanationPrograms = tuple[int, bool]
 """Padded number of points, and kind of scores (`explained_kinds`) of what is compiled for explanations."""
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class CloudResult:
-    """Descriptor and class probabilities of one cloud.
+class CloudResult(NamedTuple):
+    """Descriptor and class probabilities of one cloud, or of those of a batch with one more axis.
 
     Attributes:
         images: [S, P, P] float32, persistence images.
@@ -190,18 +190,10 @@ class InferenceEngine:
         oriented = describe_aligned_looks(aligned, weights, cloud_strips, network, config)
         inference = infer(self.model, oriented, clouds if self._embeds else None)
         first = slice(None, None, config.looks)
-        computed = oriented.first, aligned.points[first], cloud_strips.color[first], inference
-        descriptors, points, colors, inference = jax.tree.map(np.asarray, computed)
-        return [
-            CloudResult(
-                descriptors.images[k],
-                descriptors.embeddings[k],
-                points[k],
-                colors[k],
-                jax.tree.map(lambda a, k=k: a[k], inference),
-            )
-            for k in range(len(instances))
-        ]
+        images, embeddings = oriented.first.images, oriented.first.embeddings
+        computed = images, embeddings, aligned.points[first], cloud_strips.color[first], inference
+        batch = CloudResult(*jax.tree.map(np.asarray, computed))
+        return [jax.tree.map(lambda a, k=k: a[k], batch) for k in range(len(instances))]
 
     def recognize(self, instances: Sequence[PreparedInstance], results: Sequence[CloudResult]) -> list[Recognition]:
         """Return a recognition per instance of a frame; `results` are those of the usable instances, in order."""

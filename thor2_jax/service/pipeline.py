@@ -7,8 +7,10 @@ import dataclasses
 import logging
 import threading
 import time
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
 
 from thor2_jax.capacity import POINT_BUCKETS
 from thor2_jax.errors import InputError
@@ -16,6 +18,7 @@ from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery.clouds import CompactClouds
 from thor2_jax.gallery.enrollment import views_to_embed
 from thor2_jax.gallery.objects import ObjectGallery
+from thor2_jax.gallery.store import GalleryBusyError, GalleryError
 from thor2_jax.model.answers import Recognition
 from thor2_jax.service.answers import explained_frame, why_answer
 from thor2_jax.service.batching import Batcher
@@ -27,13 +30,13 @@ from thor2_jax.service.preparation import (
     prepare_clouds,
     prepare_frame,
     prepare_view,
+    timed,
 )
 from thor2_jax.service.problem import RequestError, deadline_exceeded
 from thor2_jax.service.schemas import ExplainedFrame, LabelMap, WhyAnswer
 from thor2_jax.service.settings import Settings
-from thor2_jax.service.teaching import Enrolment, gallery_errors
 
-__all__ = ["AdmittedRequest", "Service"]
+__all__ = ["AdmittedRequest", "Service", "gallery_errors"]
 
 log = logging.getLogger(__name__)
 
@@ -42,6 +45,32 @@ WHY_RETRY_SECONDS = 3
 
 LOCK_SHARE = 0.8
 """Share of the time left to a request for which it waits for another writer, so that it learns the reason."""
+
+
+@contextlib.contextmanager
+def gallery_errors(directory: Path | None, refused: int, field: str) -> Iterator[None]:
+    """Turn the errors of a gallery into error responses; they do not say where it lies.
+
+    Args:
+        directory: directory of the gallery.
+        refused: status for a change that the gallery refuses.
+        field: field of the request that is then concerned.
+
+    Raises:
+        RequestError: 500 for a gallery that cannot be read, 503 while another process writes to it, 507 if it cannot be
+            written, `refused` for other errors. The gallery is as before.
+    """
+    try:
+        yield
+    except (GalleryError, OSError) as error:
+        log.error("%s", error)
+        if isinstance(error, OSError):
+            message = f"The gallery cannot be read or written ({error.strerror}); it is as before."
+            raise RequestError(507, None, message) from None
+        message = str(error).replace(f"{directory}/", "").replace(str(directory), "the directory")
+        raise RequestError(503 if isinstance(error, GalleryBusyError) else 500, None, f"{message}.") from None
+    except InputError as error:
+        raise RequestError(refused, field, f"{error}.") from None
 
 
 class AdmittedRequest:
@@ -57,12 +86,9 @@ class AdmittedRequest:
         self.deadline = self._start + time_limit
         self.seconds: dict[str, float] = {}
 
-    @contextlib.contextmanager
-    def stage(self, name: str) -> Iterator[None]:
+    def stage(self, name: str) -> contextlib.AbstractContextManager[None]:
         """Measure the duration of the context, unless it raises."""
-        start = time.monotonic()
-        yield
-        self.seconds[name] = time.monotonic() - start
+        return timed(self.seconds, name)
 
     def milliseconds(self) -> dict[str, float]:
         """Return the durations of all finished stages and the total so far."""
@@ -86,7 +112,7 @@ class Service:
         self.state = "starting"
         self.progress = ""
         self._compilations = CompilationCounter(self.metrics.compilations)
-        self._in_progress = self._accepted = self._finished = 0
+        self._in_progress = self._accepted = 0
         self._compiled: dict[ExplanationPrograms, Future[None]] = {}
         self._gallery_lock = asyncio.Lock()  # Changes that wait for another process occupy one thread only.
 
@@ -168,7 +194,7 @@ class Service:
         self._compiler.shutdown(cancel_futures=True)
         self._explainer.shutdown(cancel_futures=True)
         self._compilations.stop()
-        log.info("stopped: %d requests accepted, %d finished", self._accepted, self._finished)
+        log.info("stopped: %d requests accepted, %d finished", self._accepted, self._accepted - self._in_progress)
 
     @contextlib.asynccontextmanager
     async def admit(self, seconds: float | None = None) -> AsyncIterator[AdmittedRequest]:
@@ -198,7 +224,6 @@ class Service:
             raise RequestError(408, "body", "The body did not arrive before the deadline.") from None
         finally:
             self._in_progress -= 1
-            self._finished += 1
             self.metrics.in_progress.dec()
             for name, duration in request.seconds.items():
                 self.metrics.stages.labels(name).observe(duration)
@@ -236,9 +261,7 @@ class Service:
             RequestError: as `prepare_view`, 422 if the run cannot be explained, or 503 until explanations of clouds of
                 this size are compiled.
         """
-        arguments = files, self.engine.run.config.sigma_s, label, True
-        prepared = await asyncio.wrap_future(self._pool.submit(request.deadline, prepare_view, *arguments))
-        request.seconds.update(prepared.seconds)
+        prepared = await self._prepare(request, prepare_view, files, self.engine.run.config.sigma_s, label, True)
         self.engine.refresh()
         needed = self.engine.explanation_programs(len(prepared.instances[0].points))
         if not all([self._compile_explanations(programs).done() for programs in needed]):
@@ -261,55 +284,45 @@ class Service:
 
     async def describe(self, content: bytes, is_npz: bool, request: AdmittedRequest) -> list[CloudResult]:
         """Describe the clouds of an npz or JSON body. Raises RequestError."""
-        future = self._pool.submit(request.deadline, prepare_clouds, content, is_npz)
-        return await self._infer(await asyncio.wrap_future(future), request)
+        prepared = await self._prepare(request, prepare_clouds, content, is_npz)
+        return await self._infer(prepared.instances, request)
 
-    async def enroll(self, files: dict[str, bytes], enrolment: Enrolment, request: AdmittedRequest) -> ObjectGallery:
+    async def enroll(
+        self, files: dict[str, bytes], name: str, label: int, flags: dict[str, bool], request: AdmittedRequest
+    ) -> ObjectGallery:
         """Enroll an object from one instance of the frame in `files`, and return the gallery with it.
 
-        The view and its augmented copies are embedded in batches, as the instances of frames are.
+        The view and its augmented copies are embedded in batches, as the instances of frames are. The flags are
+        `extend` and `replace` of `ObjectGallery.add`.
 
         Raises:
             RequestError: 409 if the name exists and neither `extend` nor `replace` is true, or as `gallery_errors` and
                 `prepare_view`. Nothing is enrolled.
         """
-        name, flags = enrolment.name, {"extend": enrolment.extend, "replace": enrolment.replace}
         with gallery_errors(self.engine.objects.directory, 409, "name"):
             self.engine.objects.refresh()
             self.engine.objects.check(name, **flags)
-        sigma_s = self.engine.run.config.sigma_s
-        future = self._pool.submit(request.deadline, prepare_view, files, sigma_s, enrolment.instance)
-        prepared = await asyncio.wrap_future(future)
+        prepared = await self._prepare(request, prepare_view, files, self.engine.run.config.sigma_s, label)
         try:
             clouds = CompactClouds.of(self.engine.correct(prepared.instances, observe=False))
         except InputError as error:
-            message = str(error).replace("views[0]", f"instance {enrolment.instance}")
+            message = str(error).replace("views[0]", f"instance {label}")
             raise RequestError(422, "instance", f"{message}.") from None
         views = await asyncio.to_thread(views_to_embed, clouds, "frames")
-        results = await self._infer(PreparedRequest(views, prepared.seconds), request)
-        added = {name: self.engine.enrolled_object(clouds, results)}
-        return await self._change(lambda objects: objects.add(added, **flags), 409, "name", request)
+        added = {name: self.engine.enrolled_object(clouds, await self._infer(views, request))}
+        return await self.change(lambda objects: objects.add(added, **flags), 409, "name", request)
 
-    async def forget(self, name: str, request: AdmittedRequest) -> ObjectGallery:
-        """Forget an object, and return the gallery without it.
-
-        Raises:
-            RequestError: 404 if no object has this name, or as `gallery_errors`.
-        """
-        return await self._change(lambda objects: objects.forget(name), 404, "name", request)
-
-    async def undo(self, generation: int, request: AdmittedRequest) -> ObjectGallery:
-        """Take back the last change of the gallery, the one that gave it this generation, and return the gallery.
-
-        Raises:
-            RequestError: 409 if the gallery has been changed since, or as `gallery_errors`.
-        """
-        return await self._change(lambda objects: objects.undo(generation), 409, "generation", request)
-
-    async def _change(
+    async def change(
         self, change: Callable[[ObjectGallery], None], refused: int, field: str, request: AdmittedRequest
     ) -> ObjectGallery:
-        """Change the gallery on disk in another thread, then read it again in this one, as other processes do."""
+        """Change the gallery on disk in another thread, then read it again in this one, as other processes do.
+
+        Returns:
+            The gallery after the change.
+
+        Raises:
+            RequestError: as `gallery_errors`, of whose arguments `refused` and `field` are two.
+        """
         with request.stage("gallery"):
             async with self._gallery_lock:
                 copied = copy.copy(self.engine.objects)
@@ -322,17 +335,20 @@ class Service:
     async def _infer_frame(
         self, files: dict[str, bytes], with_label_map: bool, request: AdmittedRequest
     ) -> tuple[PreparedRequest, list[CloudResult]]:
-        sigma_s = self.engine.run.config.sigma_s
-        arguments = files, sigma_s, with_label_map, self.settings.segmenter
-        future = self._pool.submit(request.deadline, prepare_frame, *arguments)
-        prepared = await asyncio.wrap_future(future)
+        arguments = files, self.engine.run.config.sigma_s, with_label_map, self.settings.segmenter
+        prepared = await self._prepare(request, prepare_frame, *arguments)
         corrected = self.engine.correct(prepared.instances, observe=True)
-        prepared = dataclasses.replace(prepared, instances=corrected)
-        return prepared, await self._infer(prepared, request)
+        return dataclasses.replace(prepared, instances=corrected), await self._infer(corrected, request)
 
-    async def _infer(self, prepared: PreparedRequest, request: AdmittedRequest) -> list[CloudResult]:
+    async def _prepare(
+        self, request: AdmittedRequest, function: Callable[..., PreparedRequest], *arguments: Any
+    ) -> PreparedRequest:
+        prepared = await asyncio.wrap_future(self._pool.submit(request.deadline, function, *arguments))
         request.seconds.update(prepared.seconds)
-        usable = [instance for instance in prepared.instances if instance.reason is None]
+        return prepared
+
+    async def _infer(self, instances: Sequence[PreparedInstance], request: AdmittedRequest) -> list[CloudResult]:
+        usable = [instance for instance in instances if instance.reason is None]
         with request.stage("device"):
             return await asyncio.wrap_future(self._batcher.submit(usable, request.deadline))
 

@@ -12,7 +12,7 @@ import queue
 import signal
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from multiprocessing.connection import Connection
 from typing import Any
@@ -30,10 +30,18 @@ from thor2_jax.service.schemas import LabelMap
 from thor2_jax.service.settings import MAX_LABEL_RUNS
 from thor2_jax.service.signals import signals_blocked
 
-__all__ = ["PreparationPool", "PreparedRequest", "prepare_clouds", "prepare_frame", "prepare_view"]
+__all__ = ["PreparationPool", "PreparedRequest", "prepare_clouds", "prepare_frame", "prepare_view", "timed"]
 
 MIN_SECONDS = 1.0
 """Minimum time that a process has for a request, so that only exceptionally slow requests are interrupted."""
+
+
+@contextlib.contextmanager
+def timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
+    """Write the duration of the context to `seconds`, unless it raises."""
+    start = time.perf_counter()
+    yield
+    seconds[stage] = time.perf_counter() - start
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -61,18 +69,16 @@ def prepare_frame(
     Raises:
         RequestError: 422 if there are no labels and no segmenter, 500 if the segmenter fails, or as `decode_frame`.
     """
-    start = time.perf_counter()
-    frame = decode_frame(**files)
-    ready = time.perf_counter()
-    seconds = {"decode": ready - start}
+    seconds: dict[str, float] = {}
+    with timed(seconds, "decode"):
+        frame = decode_frame(**files)
     if frame.labels is None:
-        frame = _segmented(frame, segmenter)
+        with timed(seconds, "segment"):
+            frame = _segmented(frame, segmenter)
         with_label_map = True
-        seconds["segment"] = time.perf_counter() - ready
-        ready += seconds["segment"]
-    instances = _prepare_instances(frame, frame.instances, sigma_s)
-    label_map = _encode_label_map(frame.label_image) if with_label_map else None
-    seconds["clouds"] = time.perf_counter() - ready
+    with timed(seconds, "clouds"):
+        instances = _prepare_instances(frame, frame.instances, sigma_s)
+        label_map = _encode_label_map(frame.label_image) if with_label_map else None
     return PreparedRequest(instances, seconds, label_map)
 
 
@@ -110,17 +116,17 @@ def prepare_view(files: dict[str, bytes], sigma_s: float, label: int, with_frame
     Raises:
         RequestError: 422 if there is no such instance or it has too few points, or as `prepare_frame`.
     """
-    start = time.perf_counter()
-    frame = decode_frame(**files)
-    decoded = time.perf_counter()
+    seconds: dict[str, float] = {}
+    with timed(seconds, "decode"):
+        frame = decode_frame(**files)
     if label not in frame.instances:
         first = ", ".join(map(str, frame.instances[:10])) or "none"
         more = " ..." if len(frame.instances) > 10 else ""
         raise RequestError(422, "instance", f"instance is {label}; expected a number of labels: {first}{more}.")
-    (view,) = _prepare_instances(frame, [label], sigma_s)
+    with timed(seconds, "clouds"):
+        (view,) = _prepare_instances(frame, [label], sigma_s)
     if view.reason is not None:
         raise RequestError(422, "instance", f"instance {label} cannot be used: {view.reason}.")
-    seconds = {"decode": decoded - start, "clouds": time.perf_counter() - decoded}
     return PreparedRequest([view], seconds, frame=frame if with_frame else None)
 
 
@@ -148,12 +154,13 @@ def _encode_label_map(labels: NDArray[Any]) -> LabelMap:
 
 def prepare_clouds(content: bytes, is_npz: bool) -> PreparedRequest:
     """Decode the clouds of a request body. Raises RequestError."""
-    start = time.perf_counter()
-    clouds = (decode_npz_clouds if is_npz else decode_json_clouds)(content)
+    seconds: dict[str, float] = {}
+    with timed(seconds, "decode"):
+        clouds = (decode_npz_clouds if is_npz else decode_json_clouds)(content)
     instances = [
         PreparedInstance(k, points, colors, np.zeros(len(points), bool)) for k, (points, colors) in enumerate(clouds)
     ]
-    return PreparedRequest(instances, {"decode": time.perf_counter() - start})
+    return PreparedRequest(instances, seconds)
 
 
 def _run_process(pipe: Connection, segmenter: str | None) -> None:

@@ -5,6 +5,8 @@ from typing import Any
 
 from pydantic import BaseModel, Field
 
+from thor2_jax.printable import escape_characters
+
 __all__ = ["FieldError", "Problem", "RequestError", "deadline_exceeded", "error_responses"]
 
 _DESCRIPTIONS = {
@@ -50,7 +52,7 @@ class RequestError(Exception):
 
     def __init__(self, status: int, field: str | None, message: str, *further: tuple[str | None, str]) -> None:
         super().__init__(status, field, message, *further)
-        self.status, self.field, self.message = status, field, message
+        self.status, self.field, self.message = status, field, escape_characters(message)
         self.further = further
 
     @classmethod

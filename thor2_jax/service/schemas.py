@@ -10,6 +10,7 @@ from thor2_jax.service.settings import MAX_CLOUD_COORDINATE, MAX_CLOUDS, MAX_EXP
 __all__ = [
     "AdaptationAnswer",
     "CLOUDS_BODY",
+    "FORM",
     "FRAME_FORM",
     "ENROLMENT_FORM",
     "NPZ",
@@ -38,6 +39,9 @@ __all__ = [
     "WhyAnswer",
     "WhyPicture",
 ]
+
+FORM = "multipart/form-data"
+"""Content type of forms."""
 
 NPZ = "application/octet-stream"
 """Content type of npz files."""
@@ -282,66 +286,50 @@ class Health(BaseModel):
     status: str
 
 
-FRAME_FORM: dict[str, Any] = {
-    "required": True,
-    "content": {
-        "multipart/form-data": {
-            "schema": {
-                "type": "object",
-                "required": ["color", "depth", "intrinsics"],
-                "properties": {
-                    "color": {"type": "string", "format": "binary", "description": "8-bit RGB, PNG or JPEG."},
-                    "depth": {
-                        "type": "string",
-                        "format": "binary",
-                        "description": "16-bit PNG in units of 1 / depth_scale metres (by default mm); 0: no depth.",
-                    },
-                    "labels": {
-                        "type": "string",
-                        "format": "binary",
-                        "description": "One-channel or indexed PNG of instance numbers; 0 is background. "
-                        "Without it, the frame is segmented.",
-                    },
-                    "intrinsics": {
-                        "type": "string",
-                        "description": "JSON: fx, fy, cx, cy in pixels and optionally depth_scale (units per metre); "
-                        "or a file of ROS, BOP, RealSense or Open3D, or a 3 x 3 matrix (JSON, YAML, text, NPY).",
-                    },
-                },
-            }
-        }
+def _file(description: str) -> dict[str, Any]:
+    return {"type": "string", "format": "binary", "description": description}
+
+
+def _form(properties: dict[str, Any], *optional: str) -> dict[str, Any]:
+    schema = {"required": [name for name in properties if name not in optional], "properties": properties}
+    return {"required": True, "content": {FORM: {"schema": {"type": "object", **schema}}}}
+
+
+_FRAME: dict[str, Any] = {
+    "color": _file("8-bit RGB, PNG or JPEG."),
+    "depth": _file("16-bit PNG in units of 1 / depth_scale metres (by default mm); 0: no depth."),
+    "labels": _file(
+        "One-channel or indexed PNG of instance numbers; 0 is background. Without it, the frame is segmented."
+    ),
+    "intrinsics": {
+        "type": "string",
+        "description": "JSON: fx, fy, cx, cy in pixels and optionally depth_scale (units per metre); "
+        "or a file of ROS, BOP, RealSense or Open3D, or a 3 x 3 matrix (JSON, YAML, text, NPY).",
     },
 }
-"""OpenAPI schema of the body of /v1/recognize. `uploads` parses the form, since FastAPI writes large files to disk."""
+_INSTANCE = {"type": "integer", "minimum": 0, "description": "Number of the object in the label image."}
 
+FRAME_FORM = _form(_FRAME, "labels")
+"""OpenAPI schema of the body of /v1/recognize. `forms` parses it, since FastAPI writes large files to disk."""
 
-def _form(required: dict[str, Any], optional: dict[str, Any]) -> dict[str, Any]:
-    schema = {"type": "object", "required": list(required), "properties": required | optional}
-    return {"required": True, "content": {"multipart/form-data": {"schema": schema}}}
-
-
-_INSTANCE: dict[str, Any] = {
-    **FRAME_FORM["content"]["multipart/form-data"]["schema"]["properties"],
-    "instance": {"type": "integer", "minimum": 0, "description": "Number of the object in the label image."},
-}
-
-WHY_FORM = _form(_INSTANCE, {})
+WHY_FORM = _form({**_FRAME, "instance": _INSTANCE})
 """OpenAPI schema of the body of /v1/why."""
 
 ENROLMENT_FORM = _form(
     {
-        **_INSTANCE,
+        **_FRAME,
         "name": {"type": "string", "minLength": 1, "maxLength": 200, "description": "Name of the object."},
-    },
-    {
+        "instance": _INSTANCE,
         "extend": {"type": "boolean", "description": "Add the view to those of an object that exists."},
         "replace": {"type": "boolean", "description": "Discard the views of an object that exists."},
     },
+    "extend",
+    "replace",
 )
 """OpenAPI schema of the body of POST /v1/objects."""
 
 UNDO_FORM = _form(
-    {"generation": {"type": "integer", "minimum": 0, "description": "Generation in the answer of the change."}}, {}
+    {"generation": {"type": "integer", "minimum": 0, "description": "Generation in the answer of the change."}}
 )
 """OpenAPI schema of the body of POST /v1/objects/undo."""
 

@@ -1,11 +1,25 @@
-"""Ctrl-C while processes of the service start."""
+"""Handlers of Ctrl-C and SIGTERM, also while processes of the service start."""
 
 import contextlib
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from multiprocessing import resource_tracker
+from typing import Any
 
-__all__ = ["ended_by_signals", "signals_blocked"]
+__all__ = ["ended_by_signals", "handlers_replaced", "signals_blocked"]
+
+
+@contextlib.contextmanager
+def handlers_replaced(replace: Callable[[Any], Any]) -> Iterator[None]:
+    """Replace the handlers of SIGINT and SIGTERM by what `replace` returns for each of them, inside the context."""
+    previous = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    for number, handler in previous.items():
+        signal.signal(number, replace(handler))
+    try:
+        yield
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
 
 
 @contextlib.contextmanager
@@ -15,15 +29,8 @@ def ended_by_signals() -> Iterator[None]:
     The exception of Python's handler can get lost while modules and models are loaded, and with it the signal: what is
     raised in a callback, such as those of JAX for garbage collection, is ignored.
     """
-    previous = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    for number, handler in previous.items():
-        if handler is not signal.SIG_IGN:
-            signal.signal(number, signal.SIG_DFL)
-    try:
+    with handlers_replaced(lambda previous: previous if previous is signal.SIG_IGN else signal.SIG_DFL):
         yield
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
 
 
 @contextlib.contextmanager

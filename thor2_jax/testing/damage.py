@@ -5,12 +5,10 @@ def test_reader(content):
     ...
 """
 
-from collections.abc import Callable
-
 import hypothesis.strategies as st
 import numpy as np
 
-from thor2_jax.testing.clouds import seeds
+from thor2_jax.testing.strategies import seeds
 
 __all__ = ["damaged"]
 
@@ -76,14 +74,7 @@ def _lines(content: bytearray, rng: np.random.Generator) -> bytearray:
     return bytearray(b"\n").join(lines)
 
 
-_KINDS: list[Callable[[bytearray, np.random.Generator], bytearray]] = [
-    _flip,
-    _cut,
-    _splice,
-    _extreme,
-    _number,
-    _lines,
-]
+_KINDS = _flip, _cut, _splice, _extreme, _number, _lines
 
 
 def _damage(content: bytes, seed: int, times: int) -> bytes:

@@ -1,4 +1,4 @@
-"""Invariances of descriptors: one assertion for each, for any function from clouds to descriptors.
+"""Invariances of descriptors and of instance clouds: one assertion for each, for any function that computes them.
 
     @given(packed(aligned_clouds(config), size=4, capacity=512), seeds())
     def test_order(clouds, seed):
@@ -10,7 +10,7 @@ which rounding may move an aligned point (`alignment_drift`), from which the bou
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -20,17 +20,20 @@ from numpy.typing import ArrayLike, NDArray
 from colornet import ColorNetwork
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.view_normalization import OCCLUSION_BIN
-from thor2_jax.testing.clouds import settled
-from thor2_jax.testing.comparing import assert_equal, assert_near, joined, taken, with_points
-from thor2_jax.testing.tolerances import UNIT
+from thor2_jax.frames.frames import RGBDFrame
+from thor2_jax.frames.instance_clouds import InstanceCloud
+from thor2_jax.testing.comparing import UNIT, assert_equal, assert_near, joined, taken, with_points
+from thor2_jax.testing.strategies import settled
 from thor2_jax.types import Descriptors, PointClouds, Strips
 
 __all__ = [
     "assert_backends_agree",
     "assert_batch_size_invariant",
     "assert_company_invariant",
+    "assert_depth_units_agree",
     "assert_duplicates_count_twice",
     "assert_flip_follows_rule",
+    "assert_labels_are_names",
     "assert_mirrored_strips",
     "assert_object_unity",
     "assert_padding_invariant",
@@ -42,6 +45,7 @@ __all__ = [
 ]
 
 Describe = Callable[[PointClouds], Descriptors]
+InstanceClouds = Callable[[RGBDFrame], Sequence[InstanceCloud]]
 
 
 def _compare(actual: Descriptors, expected: Descriptors, config: DescriptorConfig, drift: float | None) -> None:
@@ -323,3 +327,32 @@ def assert_mirrored_strips(
     atol = 2 * UNIT * size if axis == "y" else 0
     np.testing.assert_allclose(mirrored.low, low, rtol=0, atol=atol)
     np.testing.assert_allclose(mirrored.high, high, rtol=0, atol=atol)
+
+
+def assert_labels_are_names(instance_clouds: InstanceClouds, frame: RGBDFrame, seed: int) -> None:
+    """Assert that other label numbers give the same clouds, bit by bit."""
+    numbers = np.random.default_rng(seed).permutation(np.arange(1, 256))
+    other = np.concatenate([[0], numbers]).astype(np.uint16)
+    clouds = {
+        c.label: c
+        for c in instance_clouds(RGBDFrame(frame.color, frame.depth, other[frame.label_image], frame.intrinsics))
+    }
+    for cloud in instance_clouds(frame):
+        same = clouds.pop(int(other[cloud.label]))
+        assert (same.n_pixels, same.kept_by_fallback, same.reason) == (
+            cloud.n_pixels,
+            cloud.kept_by_fallback,
+            cloud.reason,
+        )
+        np.testing.assert_array_equal(same.points, cloud.points)
+        np.testing.assert_array_equal(same.colors, cloud.colors)
+    assert not clouds
+
+
+def assert_depth_units_agree(instance_clouds: InstanceClouds, frame: RGBDFrame) -> None:
+    """Assert that depth in integer units and in metres gives the same clouds, bit by bit."""
+    other = RGBDFrame(frame.color, frame.depth_m, frame.label_image, frame.intrinsics)
+    for first, second in zip(instance_clouds(frame), instance_clouds(other), strict=True):
+        assert first.reason == second.reason
+        np.testing.assert_array_equal(first.points, second.points)
+        np.testing.assert_array_equal(first.colors, second.colors)

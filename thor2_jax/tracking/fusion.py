@@ -46,7 +46,7 @@ class FusedEvidence:
         self.weight = 0.0
         self.logs: dict[str, NDArray[np.float64]] = {}
         self.score_weight = 0.0
-        self.scores: dict[str, float] | None = None
+        self.scores: Mapping[str, float] | None = None
 
     def add(
         self, weight: float, probabilities: Mapping[str, NDArray[np.floating]], scores: Mapping[str, float] | None
@@ -66,14 +66,12 @@ class FusedEvidence:
             for name, p in probabilities.items()
         }
         earlier = self.scores or {}
-        if scores is None or set(scores) != set(earlier):
-            self.score_weight, earlier = 0.0, {}
+        if set(scores or {}) != set(earlier):
+            self.score_weight, earlier = 0.0, dict.fromkeys(scores or {}, 0.0)
         self.score_weight = decay * self.score_weight + weight
-        self.scores = (
-            None
-            if scores is None
-            else {name: decay * earlier.get(name, 0.0) + weight * value for name, value in scores.items()}
-        )
+        if scores is not None:
+            scores = {name: decay * earlier[name] + weight * value for name, value in scores.items()}
+        self.scores = scores
 
     def fused(self) -> tuple[dict[str, NDArray[np.float64]], dict[str, float] | None]:
         """Return classifier -> fused class probabilities [C], and object -> fused score; None without a gallery."""

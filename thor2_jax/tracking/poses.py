@@ -1,13 +1,23 @@
-"""Camera poses: rigid motions from camera coordinates to coordinates that are fixed to the scene."""
+"""Camera poses: rigid motions from camera coordinates to coordinates that are fixed to the scene.
 
+Clouds of one object from several known poses are merged in space before they are described.
+"""
+
+import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from thor2_jax.errors import InputError
+from thor2_jax.frames.prepared_instance import DESCRIPTOR_VOXEL, PreparedInstance
+from thor2_jax.frames.voxel_grid import downsample_to_fit
 
-__all__ = ["check_pose", "transform"]
+__all__ = ["PosedInstance", "check_pose", "merge_views", "transform"]
+
+PosedInstance = tuple[PreparedInstance, NDArray[np.float64]]
+"""An instance and the pose [4, 4] of its camera, from camera to world coordinates."""
 
 MAX_DEVIATION = 1e-3
 """Largest deviation of an entry from that of a rigid motion; files round to a few digits."""
@@ -44,3 +54,21 @@ def check_pose(pose: ArrayLike, argument: str = "pose") -> NDArray[np.float64]:
 def transform(pose: NDArray[Any], points: NDArray[Any]) -> NDArray[np.float32]:
     """Return points [n, 3] moved by a pose [4, 4]."""
     return np.asarray(points @ pose[:3, :3].T + pose[:3, 3], np.float32)
+
+
+def merge_views(views: Sequence[PosedInstance], sigma_s: float) -> PreparedInstance:
+    """Return the last view with the points of all, in the coordinates of its camera, on the descriptors' voxel grid.
+
+    What is occluded in one view may be visible in another one, so no point is on the occlusion boundary; likewise none
+    is on the rim of a mask.
+
+    Args:
+        views: at least one view of the object.
+        sigma_s: scaled units per metre, see `DescriptorConfig`.
+    """
+    last, pose = views[-1]
+    to_last = np.linalg.inv(pose)
+    points = np.concatenate([transform(to_last @ other, view.points) for view, other in views])
+    colors = np.concatenate([view.colors for view, _ in views])
+    points, colors = downsample_to_fit(points, colors, DESCRIPTOR_VOXEL / sigma_s)
+    return dataclasses.replace(last, points=points, colors=colors, boundary=np.zeros(len(points), bool), rim=None)

@@ -11,7 +11,7 @@
 import dataclasses
 from collections import deque
 from collections.abc import Iterable, Sequence
-from typing import Any, Protocol, Self
+from typing import Protocol, Self
 
 import jax
 import numpy as np
@@ -25,9 +25,8 @@ from thor2_jax.model.inference import Inference, answers, gallery_scores
 from thor2_jax.model.model import Model
 from thor2_jax.tracking.fusion import FusedEvidence, view_weight
 from thor2_jax.tracking.matching import OccupiedVoxels, match, occupied_voxels
-from thor2_jax.tracking.merging import PosedInstance, merge_views
 from thor2_jax.tracking.next_view import NextView, ViewTable, next_view
-from thor2_jax.tracking.poses import check_pose, transform
+from thor2_jax.tracking.poses import PosedInstance, check_pose, merge_views, transform
 
 __all__ = ["TrackedRecognition", "Tracker"]
 
@@ -217,10 +216,6 @@ class Tracker:
         inference = Inference(np.array([track.overflow for track in tracks]), probabilities, scores=scores)
         answered = answers(model, [track.instance for track in tracks], inference)
         return [
-            TrackedRecognition(**_fields(answer), track=track.number, frames=track.frames)
+            TrackedRecognition(**vars(answer), track=track.number, frames=track.frames)
             for track, answer in zip(tracks, answered, strict=True)
         ]
-
-
-def _fields(answer: Recognition) -> dict[str, Any]:
-    return {field.name: getattr(answer, field.name) for field in dataclasses.fields(answer)}

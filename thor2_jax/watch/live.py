@@ -22,7 +22,7 @@ from thor2_jax.model.answers import Recognition
 from thor2_jax.recordings.detections import Detection, detections_of
 from thor2_jax.recordings.recorded_frames import RecordedFrame
 from thor2_jax.segmentation.segmenters import Segmenter, segmented
-from thor2_jax.watch.broadcast import Broadcast
+from thor2_jax.watch.server import Broadcast
 
 __all__ = ["LiveView", "paced"]
 
@@ -33,6 +33,8 @@ LONGEST_PAUSE = 2.0
 """Longest time that a recording is late, or pauses, without a new start of its time, seconds."""
 
 _JPEG_QUALITY = 80
+
+_ANSWER_FIELDS = ("label", "name", "confidence", "occluded", "reason", "track", "frames")
 
 
 def paced(
@@ -127,8 +129,7 @@ def _paint(answer: Recognition, number: int) -> Paint:
 def _object(detection: Detection, paint: Paint) -> dict[str, Any]:
     answer = detection.recognition
     return {
-        **{name: getattr(answer, name, None) for name in ("label", "name", "confidence", "occluded", "reason")},
-        **{name: getattr(answer, name, None) for name in ("track", "frames")},
+        **{name: getattr(answer, name, None) for name in _ANSWER_FIELDS},
         "position": detection.position,
         "color": "#{:02x}{:02x}{:02x}".format(*paint),
     }

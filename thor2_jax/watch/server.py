@@ -14,9 +14,8 @@ from typing import Any
 
 from thor2_jax.errors import InputError
 from thor2_jax.hosts import check_host_names, is_allowed_host
-from thor2_jax.watch.broadcast import Broadcast
 
-__all__ = ["serve_live"]
+__all__ = ["Broadcast", "serve_live"]
 
 _PAGE = Path(__file__).parent / "page"
 _SERVICE_PAGE = Path(__file__).parents[1] / "service" / "page"
@@ -40,6 +39,32 @@ _HEADERS = {
 
 KEEP_ALIVE = 2.0
 """Seconds without a message after which a comment is sent, so that a closed connection is noticed."""
+
+
+class Broadcast:
+    """The latest message, for which threads may wait. Readers that are slow skip messages."""
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self._number, self._text = 0, ""
+
+    def publish(self, text: str) -> None:
+        """Replace the message."""
+        with self._changed:
+            self._number, self._text = self._number + 1, text
+            self._changed.notify_all()
+
+    def wait(self, after: int, timeout: float) -> tuple[int, str] | None:
+        """Return the number and the text of a message later than number `after`; None if there is none in time.
+
+        Args:
+            after: number of the last message that is known; 0 for none.
+            timeout: seconds to wait.
+        """
+        with self._changed:
+            if self._changed.wait_for(lambda: self._number > after, timeout):
+                return self._number, self._text
+        return None
 
 
 class _Server(ThreadingHTTPServer):
@@ -119,8 +144,9 @@ def serve_live(
     try:
         server = _Server((host, port), broadcast, allow_host)
     except (OSError, OverflowError) as error:
+        reason = getattr(error, "strerror", None) or error
         raise InputError(
-            f"port is {port} and host {host}, which cannot be used ({error}); choose another one"
+            f"port is {port} and host {host}, which cannot be used ({reason}); choose another one"
         ) from None
     thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.1}, daemon=True)
     thread.start()

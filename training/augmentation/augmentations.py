@@ -10,6 +10,7 @@ rendered is always kept as copy 0.
 """
 
 import dataclasses
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -17,19 +18,28 @@ import numpy as np
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.outlier_removal import flying_pixels
-from training.augmentation.base import Base, without_base
-from training.augmentation.illumination import Illumination, relit
+from training.augmentation.illumination import Illumination, Registration, misregistered, relit
 from training.augmentation.occlusion import Occlusion, occluded
 from training.augmentation.pixels import without
-from training.augmentation.registration import Registration, misregistered
-from training.augmentation.segmentation import Segmentation, resegmented
+from training.augmentation.segmentation import Base, Segmentation, resegmented, without_base
 from training.augmentation.sensor import Sensor, sensed
 from training.rendering.camera import RenderedView
 
-__all__ = ["Augmentations", "augment"]
+__all__ = ["KINDS", "Augmentations", "augment"]
 
 MAX_COPIES = 1000
 """Largest number of augmented copies of a view."""
+
+
+KINDS: dict[str, tuple[type, Callable[[RenderedView, Any, np.random.Generator], RenderedView]]] = {
+    "illumination": (Illumination, relit),
+    "registration": (Registration, misregistered),
+    "segmentation": (Segmentation, resegmented),
+    "base": (Base, without_base),
+    "occlusion": (Occlusion, occluded),
+    "sensor": (Sensor, sensed),
+}
+"""The settings of each augmentation and the function that applies it, in the order in which they are applied."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,16 +67,13 @@ class Augmentations:
     registration: Registration | None = None
     base: Base | None = None
 
+    @classmethod
+    def of_names(cls, names: Iterable[str], copies: int = 5) -> "Augmentations":
+        """Return the augmentations of these names with their default settings."""
+        return cls(**{name: KINDS[name][0]() for name in names}, copies=copies)
+
     def __post_init__(self) -> None:
-        kinds = {
-            "illumination": Illumination,
-            "sensor": Sensor,
-            "occlusion": Occlusion,
-            "segmentation": Segmentation,
-            "registration": Registration,
-            "base": Base,
-        }
-        for name, kind in kinds.items():
+        for name, (kind, _) in KINDS.items():
             value = getattr(self, name)
             if value is not None and not isinstance(value, kind):
                 raise InputError(f"augmentations.{name} is {value!r}; it must be None or {kind.__name__}")
@@ -74,8 +81,7 @@ class Augmentations:
             raise InputError(f"augmentations.copies is {self.copies!r}; expected an integer from 1 to {MAX_COPIES}")
 
     def __bool__(self) -> bool:
-        settings = self.illumination, self.sensor, self.occlusion, self.segmentation, self.registration, self.base
-        return any(settings)
+        return any(getattr(self, name) for name in KINDS)
 
     def record(self) -> dict[str, Any]:
         """Return all settings as JSON holds them: None for a disabled augmentation, ranges as lists."""
@@ -101,18 +107,9 @@ def augment(view: RenderedView, augmentations: Augmentations, rng: np.random.Gen
         A view with the same pose. If the mask is dilated, the image may be larger by some pixels on each side; corner
         and intrinsics are adapted.
     """
-    if augmentations.illumination:
-        view = relit(view, augmentations.illumination, rng)
-    if augmentations.registration:
-        view = misregistered(view, augmentations.registration, rng)
-    if augmentations.segmentation:
-        view = resegmented(view, augmentations.segmentation, rng)
-    if augmentations.base:
-        view = without_base(view, augmentations.base, rng)
-    if augmentations.occlusion:
-        view = occluded(view, augmentations.occlusion, rng)
-    if augmentations.sensor:
-        view = sensed(view, augmentations.sensor, rng)
+    for name, (_, apply) in KINDS.items():
+        settings = getattr(augmentations, name)
+        view = apply(view, settings, rng) if settings else view
     return _without_flying(view) if augmentations.segmentation or augmentations.sensor else view
 
 

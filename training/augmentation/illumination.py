@@ -1,20 +1,24 @@
-"""Augmentation of light and camera response: changes colours only.
+"""Augmentation of light, camera response, and the registration of colour and depth: changes colours only.
 
 A camera image of an object differs from the scanned texture by the strength, colour and direction of the light and by
 the camera's response. Applied in this order to sRGB values in [0, 1]: c ** gamma; gain, colour cast and shading;
 saturation (distance from the grey of the same luma); a veil of stray light; noise.
+
+Some RGB-D cameras blur colour and shift it by up to ten pixels against depth. Points near the outline then have colours
+of the background.
 """
 
 import dataclasses
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import uniform_filter
+from scipy.ndimage import gaussian_filter, uniform_filter
 
-from training.augmentation.settings import Range, check_fields
+from training.augmentation.pixels import FRAME_PIXEL, pixel_width
+from training.augmentation.settings import Range, Settings, limited
 from training.rendering.camera import RenderedView
 
-__all__ = ["Illumination", "relit"]
+__all__ = ["Illumination", "Registration", "misregistered", "relit"]
 
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 """Luma coefficients of red, green and blue (ITU-R BT.601)."""
@@ -30,7 +34,7 @@ STEEPEST = 3.0
 
 
 @dataclasses.dataclass(frozen=True)
-class Illumination:
+class Illumination(Settings):
     """Ranges of light and camera response; values are drawn once per view.
 
     Attributes:
@@ -43,30 +47,15 @@ class Illumination:
         saturation: factor of a colour's distance from grey.
         veil: weight of white that is mixed in.
         noise: standard deviation per pixel and channel.
-
-    Raises:
-        InputError: A value is outside its limits.
     """
 
-    gamma: Range = (0.6, 1.6)
-    gain: Range = (0.4, 1.7)
-    cast: float = 0.15
-    shading: Range = (0.0, 1.0)
-    saturation: Range = (0.4, 1.7)
-    veil: Range = (0.0, 0.12)
-    noise: Range = (0.0, 0.02)
-
-    def __post_init__(self) -> None:
-        check_fields(
-            self,
-            gamma=(0.1, 10),
-            gain=(0, 10),
-            cast=(0, 0.9),
-            shading=(0, 1),
-            saturation=(0, 10),
-            veil=(0, 1),
-            noise=(0, 1),
-        )
+    gamma: Range = limited((0.6, 1.6), 0.1, 10)
+    gain: Range = limited((0.4, 1.7), 0, 10)
+    cast: float = limited(0.15, 0, 0.9)
+    shading: Range = limited((0.0, 1.0), 0, 1)
+    saturation: Range = limited((0.4, 1.7), 0, 10)
+    veil: Range = limited((0.0, 0.12), 0, 1)
+    noise: Range = limited((0.0, 0.02), 0, 1)
 
 
 def relit(view: RenderedView, light: Illumination, rng: np.random.Generator) -> RenderedView:
@@ -117,3 +106,43 @@ def _slopes(depth: NDArray[np.float32], focal: float) -> NDArray[np.float32]:
     counted[:, 1:] = (depth[:, 1:] > 0) & (np.abs(slope[:, 1:]) < STEEPEST)
     total, weight = (uniform_filter(array, SMOOTH, mode="constant") for array in (slope * counted, counted))
     return total / np.maximum(weight, np.float32(1e-6))
+
+
+@dataclasses.dataclass(frozen=True)
+class Registration(Settings):
+    """Ranges of the registration error; values are drawn once per view.
+
+    Attributes:
+        shifted: probability of a shift.
+        shift: largest shift along rows and columns, in pixels of a real frame.
+        blur: standard deviation of the blur of the colour image, in pixels of a real frame.
+    """
+
+    shifted: float = limited(0.5, 0, 1)
+    shift: float = limited(10.0, 0, 100)
+    blur: Range = limited((0.0, 3.0), 0, 50)
+
+
+def misregistered(view: RenderedView, registration: Registration, rng: np.random.Generator) -> RenderedView:
+    """Return the view with a blurred, shifted colour image; the background has one random colour."""
+    seen = view.depth > 0
+    if not seen.any():
+        return view
+    scale = FRAME_PIXEL / pixel_width(view)
+    blur = rng.uniform(*registration.blur) * scale
+    shift = np.zeros(2, int)
+    if rng.random() < registration.shifted:
+        shift = np.rint(rng.uniform(-registration.shift, registration.shift, 2) * scale).astype(int)
+    background = rng.integers(0, 256, 3).astype(np.uint8)
+    color = view.color
+    if blur > 0.1:
+        # Divided by the blurred mask, so that the object's border keeps its colour.
+        weight = np.maximum(gaussian_filter(seen.astype(np.float32), blur), 1e-3)[..., None]
+        color = gaussian_filter(color.astype(np.float32), (blur, blur, 0)) / weight
+        color = color.clip(0, 255).astype(np.uint8)
+    color = np.where(seen[..., None], color, background)
+    margin = int(abs(shift).max())
+    padded = np.pad(color - background, ((margin, margin), (margin, margin), (0, 0))) + background
+    (row, column), (height, width) = margin + shift, seen.shape
+    moved = padded[row : row + height, column : column + width]
+    return dataclasses.replace(view, color=np.where(seen[..., None], moved, 0).astype(np.uint8))

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from training.augmentation.pixels import pixel_width, without
-from training.augmentation.settings import Range, check_fields
+from training.augmentation.settings import Range, Settings, limited
 from training.objects.builtin_objects import builtin_objects
 from training.rendering.camera import Camera, RenderedView
 from training.rendering.ray_caster import RayCaster, render_view
@@ -35,7 +35,7 @@ SHARE_TOLERANCE = 0.05
 
 
 @dataclasses.dataclass(frozen=True)
-class Occlusion:
+class Occlusion(Settings):
     """Ranges of the occlusion; values are drawn once per view.
 
     Attributes:
@@ -43,18 +43,12 @@ class Occlusion:
         none: probability that a view is not occluded.
         straight: probability, for the others, that a straight edge (a large object) occludes it.
         nearer: scale of the silhouette; the occluding object is nearer to the camera by this factor.
-
-    Raises:
-        InputError: A value is outside its limits.
     """
 
-    share: Range = (0.05, 0.6)
-    none: float = 0.3
-    straight: float = 0.3
-    nearer: Range = (1.0, 1.5)
-
-    def __post_init__(self) -> None:
-        check_fields(self, share=(0, 0.95), none=(0, 1), straight=(0, 1), nearer=(1, 10))
+    share: Range = limited((0.05, 0.6), 0, 0.95)
+    none: float = limited(0.3, 0, 1)
+    straight: float = limited(0.3, 0, 1)
+    nearer: Range = limited((1.0, 1.5), 1, 10)
 
 
 def occluded(view: RenderedView, occlusion: Occlusion, rng: np.random.Generator) -> RenderedView:

@@ -2,6 +2,8 @@
 
 The background is a plane: the table, or a wall behind. Beyond the outline only background near the object in depth is
 added: outlier removal in recognition drops the rest, a strip a few millimetres wide, as strays or as a small component.
+
+Segmenters that remove the table plane also remove the base of an object, its lowest part.
 """
 
 import dataclasses
@@ -10,20 +12,20 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, binary_erosion, maximum_filter
 
-from thor2_jax.frames.frames import Intrinsics
+from thor2_jax.frames.frames import Intrinsics, backproject
 from thor2_jax.frames.outlier_removal import PIECE_CELL
 from training.augmentation.pixels import FRAME_PIXEL, pixel_width, without
-from training.augmentation.settings import Range, check_fields
+from training.augmentation.settings import Range, Settings, limited
 from training.rendering.camera import TRAINING_CAMERA, RenderedView
 
-__all__ = ["Segmentation", "resegmented"]
+__all__ = ["Base", "Segmentation", "resegmented", "without_base"]
 
 MAX_BACKGROUND_GAP = 2 * PIECE_CELL
 """Largest distance of remaining background, metres: outlier removal treats adjacent cells as one component."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Segmentation:
+class Segmentation(Settings):
     """Ranges of the mask's error; values are drawn once per view.
 
     Attributes:
@@ -31,18 +33,12 @@ class Segmentation:
         tilt: angle between the background's normal and the optical axis, degrees.
         touching: probability that the background touches the visible object, as a table does.
         gap: distance between object and background otherwise, metres.
-
-    Raises:
-        InputError: A value is outside its limits.
     """
 
-    pixels: Range = (-5.0, 4.0)
-    tilt: Range = (0.0, 70.0)
-    touching: float = 0.7
-    gap: Range = (0.0, 0.5)
-
-    def __post_init__(self) -> None:
-        check_fields(self, pixels=(-50, 50), tilt=(0, 75), touching=(0, 1), gap=(0, 10))
+    pixels: Range = limited((-5.0, 4.0), -50, 50)
+    tilt: Range = limited((0.0, 70.0), 0, 75)
+    touching: float = limited(0.7, 0, 1)
+    gap: Range = limited((0.0, 0.5), 0, 10)
 
 
 def resegmented(view: RenderedView, segmentation: Segmentation, rng: np.random.Generator) -> RenderedView:
@@ -108,3 +104,35 @@ def _background(
     offset = (facing[seen] * view.depth[seen]).min() - 1000 * gap
     depth = offset / np.minimum(facing, -1e-3)
     return np.where(depth < 65535, np.rint(depth), 0).astype(np.uint16)
+
+
+MAX_CUT = 0.4
+"""Largest share of the visible pixels that is removed; a flat object would disappear."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Base(Settings):
+    """Ranges of the missing base; values are drawn once per view.
+
+    Attributes:
+        missing: probability that the base is missing.
+        height: height of the missing part, metres.
+        upright: probability that the object stands as its mesh does; otherwise it lies in a random orientation.
+    """
+
+    missing: float = limited(0.3, 0, 1)
+    height: Range = limited((0.003, 0.015), 0, 0.1)
+    upright: float = limited(0.6, 0, 1)
+
+
+def without_base(view: RenderedView, base: Base, rng: np.random.Generator) -> RenderedView:
+    """Return the view without the pixels near the table, or the view itself if that were most of it."""
+    pixels = np.flatnonzero(view.depth)
+    if len(pixels) == 0 or rng.random() >= base.missing:
+        return view
+    up = np.array([0.0, 0.0, 1.0]) if rng.random() < base.upright else rng.standard_normal(3)
+    up /= np.linalg.norm(up)
+    points = backproject(view.depth.astype(np.float32) / 1000, view.intrinsics).reshape(-1, 3)[pixels]
+    height = points @ (view.pose[:3, :3].T @ up).astype(np.float32)
+    low = height - height.min() < rng.uniform(*base.height)
+    return view if low.mean() > MAX_CUT else without(view, pixels[low])

@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from training.augmentation.pixels import FRAME_PIXEL, pixel_width, without
-from training.augmentation.settings import Range, check_fields
+from training.augmentation.settings import Range, Settings, limited
 from training.rendering.camera import RenderedView
 
-__all__ = ["Sensor", "axial_deviation", "sensed"]
+__all__ = ["Sensor", "axial_deviation", "depth_edges", "sensed"]
 
 
 @dataclasses.dataclass(frozen=True)
-class Sensor:
+class Sensor(Settings):
     """Ranges of the depth sensor's errors; values are drawn once per view.
 
     Attributes:
@@ -30,30 +30,15 @@ class Sensor:
         missing: share of edge pixels without depth; edges are outlines, depth discontinuities and grazing surfaces.
         flying: share of the other edge pixels whose depth lies between the surface's and the background's.
         background: distance of the background behind the object, metres.
-
-    Raises:
-        InputError: A value is outside its limits.
     """
 
-    distance: Range = (0.6, 1.2)
-    axial: Range = (0.3, 1.5)
-    lateral: float = 0.8
-    grazing: float = 78.0
-    missing: float = 0.3
-    flying: float = 0.3
-    background: Range = (0.1, 1.0)
-
-    def __post_init__(self) -> None:
-        check_fields(
-            self,
-            distance=(0.2, 5),
-            axial=(0, 10),
-            lateral=(0, 10),
-            grazing=(45, 89),
-            missing=(0, 1),
-            flying=(0, 1),
-            background=(0, 10),
-        )
+    distance: Range = limited((0.6, 1.2), 0.2, 5)
+    axial: Range = limited((0.3, 1.5), 0, 10)
+    lateral: float = limited(0.8, 0, 10)
+    grazing: float = limited(78.0, 45, 89)
+    missing: float = limited(0.3, 0, 1)
+    flying: float = limited(0.3, 0, 1)
+    background: Range = limited((0.1, 1.0), 0, 10)
 
 
 def axial_deviation(z: Any) -> Any:
@@ -74,7 +59,7 @@ def sensed(view: RenderedView, sensor: Sensor, rng: np.random.Generator) -> Rend
     # The margin has no depth, so that the border of the view is an edge and lateral samples can fall there.
     margin = 1 + math.ceil(4 * lateral)
     depth = np.pad(view.depth, margin).astype(np.float32)
-    edge = _edges(depth, 1000 * width * math.tan(math.radians(sensor.grazing)))
+    edge = depth_edges(depth, 1000 * width * math.tan(math.radians(sensor.grazing)))
     shift = np.rint(np.float32(lateral) * rng.standard_normal((2, n), np.float32)).clip(-margin, margin)
     row, column = np.divmod(pixels, view.depth.shape[1])
     at = (row + margin) * depth.shape[1] + column + margin
@@ -91,7 +76,7 @@ def sensed(view: RenderedView, sensor: Sensor, rng: np.random.Generator) -> Rend
     return without(dataclasses.replace(view, depth=measured), pixels[lost])
 
 
-def _edges(depth: NDArray[np.float32], step: float) -> NDArray[np.bool_]:
+def depth_edges(depth: NDArray[np.floating], step: float) -> NDArray[np.bool_]:
     """Return the pixels whose depth differs from a neighbour's by more than `step`; missing depth counts as 0."""
     edge = np.zeros(depth.shape, bool)
     for here, beside in ((edge, depth), (edge.T, depth.T)):

@@ -87,21 +87,7 @@ CHOOSE = (
     SimulatedCamera("no base", 1.05, 0.9, 0.85, warmth=0.05, noise=0.005, axial=0.4, edges=0.1, base=0.01),
     SimulatedCamera("tight masks", 1.0, 0.8, 1.1, warmth=-0.05, noise=0.01, axial=0.5, edges=0.2, mask=-3, base=0.005),
     SimulatedCamera(
-        "worn",
-        1.2,
-        0.75,
-        0.7,
-        0.1,
-        0.05,
-        1.0,
-        0.015,
-        (3, 5),
-        axial=1.0,
-        step=2,
-        holes=20,
-        edges=0.3,
-        mask=-2,
-        base=0.008,
+        "worn", 1.2, 0.75, 0.7, 0.1, 0.05, 1.0, 0.015, (3, 5), 1.0, step=2, holes=20, edges=0.3, mask=-2, base=0.008
     ),
 )
 """Cameras on which settings may be chosen."""
@@ -117,21 +103,7 @@ REPORT = (
     SimulatedCamera("loose masks", 1.1, 1.05, 0.75, noise=0.01, shift=(0, 3), axial=0.7, edges=0.2, mask=3),
     SimulatedCamera("thick table", 0.9, 0.8, 1.2, -0.08, noise=0.005, axial=0.6, edges=0.2, mask=-1, base=0.014),
     SimulatedCamera(
-        "cheap",
-        0.8,
-        0.8,
-        1.3,
-        -0.1,
-        0.1,
-        1.7,
-        0.02,
-        (5, -4),
-        axial=1.8,
-        step=4,
-        holes=15,
-        edges=0.5,
-        mask=2,
-        base=0.012,
+        "cheap", 0.8, 0.8, 1.3, -0.1, 0.1, 1.7, 0.02, (5, -4), 1.8, step=4, holes=15, edges=0.5, mask=2, base=0.012
     ),
 )
 """Cameras for the final report, of other kinds or strengths than `CHOOSE`."""

@@ -1,22 +1,45 @@
-"""The interface of a trained baseline and the inputs it reads."""
+"""The interface of a trained baseline, the inputs it reads, and what the fits of baselines share."""
 
+import dataclasses
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol
 
+import jax
 import numpy as np
+import optax  # type: ignore[import-untyped]
+from flax import nnx
 from numpy.typing import NDArray
 
+from colornet import ColorNetwork
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.view_normalization import view_normalize
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.model.answers import DescribedFrame
 from thor2_jax.types import PointClouds
-from training.views.crops import rgbd_crop
-from training.views.view_crops import ViewCrops, quantized, stacked
+from training.fitting.calibration import fit_temperature
+from training.fitting.checkpoints import Checkpoints
+from training.fitting.loop import Steps, run_epochs
+from training.fitting.options import EpochMetrics, FitOptions
+from training.fitting.samples import fold_of_views
+from training.views.crops import ViewCrops, quantized, rgbd_crop, stacked
+from training.views.normalized_views import ViewSource
 
-__all__ = ["Baseline", "BaselineInputs", "baseline_inputs"]
+__all__ = [
+    "Baseline",
+    "BaselineInputs",
+    "FitTask",
+    "FittedBaseline",
+    "NetworkFit",
+    "baseline_inputs",
+    "fit_network",
+    "in_batches",
+]
+
+Integers = NDArray[np.integer[Any]]
 
 
 def _no_crops(size: int) -> ViewCrops:
@@ -56,3 +79,149 @@ class Baseline(Protocol):
 
     def arrays(self) -> Mapping[str, NDArray[Any]]:
         """Return all fitted parameters by name."""
+
+
+@dataclasses.dataclass(frozen=True)
+class FitTask:
+    """Data and options for fitting a baseline.
+
+    Attributes:
+        source: views of the run.
+        network: colour network of the run.
+        config: descriptor configuration of the run.
+        options: options of the fit.
+        folds: number of folds that the views are split into.
+        fold: index of the held-out fold; nothing is held out if `folds` is 1.
+        scratch: directory for checkpoints, so that an interrupted fit can resume.
+        run: directory of the run.
+        weights: directory of pretrained weights; None trains networks from scratch.
+        progress: called with (stage, done, total, note).
+    """
+
+    source: ViewSource
+    network: ColorNetwork
+    config: DescriptorConfig
+    options: FitOptions
+    folds: int
+    fold: int
+    scratch: Path
+    run: Path
+    weights: Path | None
+    progress: Callable[[str, int, int, str], object]
+
+    def held_out(self, label: Integers, view: Integers) -> NDArray[np.bool_]:
+        """Return which clouds [M] are held out, given class index and view number: the same views as in the run."""
+        if self.folds == 1:
+            return np.zeros(len(label), bool)
+        return fold_of_views(label, view, self.source.classes, self.folds, self.options.seed) == self.fold
+
+    def temperature(
+        self, label: Integers, held_out: NDArray[np.bool_], predict: Callable[[], NDArray[np.float32]]
+    ) -> float | None:
+        """Return the temperature of a baseline that predicts these probabilities for the held-out clouds, if any."""
+        return fit_temperature(predict(), label[held_out]) if held_out.any() else None
+
+    def shards(self, stage: str, unit: str) -> Iterator[tuple[int, slice, int]]:
+        """Yield index, rows among all clouds, and class index of each shard, and show the progress of a stage."""
+        done, total = 0, self.n_clouds
+        for index, shard in enumerate(self.source.shards):
+            yield index, slice(done, done + shard.views), shard.label
+            done += shard.views
+            self.progress(stage, done, total, unit)
+
+    @property
+    def n_clouds(self) -> int:
+        """Number of clouds of the source."""
+        return sum(shard.views for shard in self.source.shards)
+
+
+class FittedBaseline(NamedTuple):
+    """A baseline, its temperature (None without a held-out set), and its files of pretrained weights -> SHA-256."""
+
+    model: Baseline
+    temperature: float | None
+    weights: Mapping[str, str] = MappingProxyType({})
+
+
+class NetworkFit(NamedTuple):
+    """How a network is fitted.
+
+    Attributes:
+        name: name of the baseline.
+        directory: directory of its checkpoints.
+        draw: function of the rows of a batch and a generator that returns the batch, a tuple of arrays.
+        inputs: function of these arrays that returns the arguments of the network. Static.
+        batch_size: samples of a step.
+        optimizer: function of the learning rate. Static.
+        rate: function of the number of a step and the number of all steps.
+    """
+
+    name: str
+    directory: str
+    draw: Callable[[NDArray[np.intp], np.random.Generator], tuple[Any, ...]]
+    inputs: Callable[..., tuple[Any, ...]]
+    batch_size: int
+    optimizer: Callable[[Any], Any]
+    rate: Callable[[int, int], float]
+
+
+class _State(NamedTuple):
+    params: Any
+    statistics: Any
+    optimizer: Any
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1, 2), donate_argnums=3)
+def _step(graph: Any, inputs: Any, optimizer: Any, state: _State, batch: Any, label: Any, rate: Any) -> Any:
+    def loss_of(params: Any) -> Any:
+        model = nnx.merge(graph, params, state.statistics, copy=True)  # batch normalizations change their statistics
+        logits = model(*inputs(*batch))
+        loss = optax.softmax_cross_entropy_with_integer_labels(logits, label).mean()
+        return loss, (nnx.state(model, nnx.BatchStat), (logits.argmax(axis=1) == label).mean())
+
+    (loss, (statistics, accuracy)), gradients = jax.value_and_grad(loss_of, has_aux=True)(state.params)
+    updates, moments = optimizer(rate).update(gradients, state.optimizer, state.params)
+    return _State(optax.apply_updates(state.params, updates), statistics, moments), loss, accuracy
+
+
+def fit_network(
+    task: FitTask, fit: NetworkFit, model: nnx.Module, label: Integers, rows: NDArray[np.intp], n_samples: int
+) -> Any:
+    """Return a network that is fitted on these rows, `n_samples` of them in an epoch; an interrupted fit resumes.
+
+    Raises:
+        InputError: the loss is not finite.
+    """
+    batch_size = min(fit.batch_size, n_samples)
+    steps = Steps(task.options.epochs, n_samples // batch_size, batch_size)
+    split: Any = nnx.split(model, nnx.Param, nnx.BatchStat)
+    graph, params, statistics = split
+    leaves, structure = jax.tree.flatten(_State(params, statistics, fit.optimizer(0.0).init(params)))
+
+    def epoch(number: int) -> Iterator[tuple[Any, Integers]]:
+        rng = np.random.default_rng((task.options.seed, number - 1))
+        order = rng.permutation(rows)[: steps.of_epoch * batch_size]
+        for batch in order.reshape(-1, batch_size):
+            yield fit.draw(batch, rng), label[batch]
+
+    def step(leaves: list[Any], number: int, batch: tuple[Any, Integers]) -> tuple[list[Any], Any]:
+        rate = np.float32(fit.rate(number, steps.epochs * steps.of_epoch))
+        state, *metrics = _step(graph, fit.inputs, fit.optimizer, jax.tree.unflatten(structure, leaves), *batch, rate)
+        return jax.tree.leaves(state), metrics
+
+    def report(done: int, total: int, metrics: EpochMetrics) -> None:
+        task.progress(f"fit {fit.name}", done, total, f"epoch {metrics.epoch}, accuracy {metrics.accuracy:.3f}")
+
+    with Checkpoints(task.scratch / fit.directory) as checkpoints:
+        leaves = run_epochs(fit.name, leaves, steps, epoch, step, checkpoints, progress=report)
+    state = jax.tree.unflatten(structure, leaves)
+    return nnx.merge(graph, state.params, state.statistics)
+
+
+def in_batches(function: Callable[..., Any], size: int, *arrays: NDArray[Any]) -> NDArray[np.float32]:
+    """Return the results [V, ...] of a function of `size` rows of arrays [V, ...]; V is at least 1."""
+    count, results = len(arrays[0]), []
+    for first in range(0, count, size):
+        rows = np.resize(np.arange(first, min(first + size, count)), size)
+        results.append(np.asarray(function(*(array[rows] for array in arrays)))[: count - first])
+    return np.concatenate(results)

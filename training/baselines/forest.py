@@ -8,15 +8,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
+from sklearn.ensemble import RandomForestClassifier
 
 from colornet import ColorNetwork
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.describe import strips
-from thor2_jax.descriptor.view_normalization import turn
+from thor2_jax.descriptor.view_normalization import mirror, turn
 from thor2_jax.types import PointClouds, Strips
-from training.baselines.baseline import BaselineInputs
+from training.baselines.baseline import BaselineInputs, FitTask, FittedBaseline
+from training.fitting.samples import MIRRORS, VIEWS_PER_BATCH
+from training.views.normalized_views import padded_batches
 
-__all__ = ["Forest", "forest_features"]
+__all__ = ["Forest", "fit_forest", "forest_features", "tree_arrays"]
 
 
 @partial(jax.jit, static_argnums=2)
@@ -81,3 +84,54 @@ class Forest:
             below = features[rows, nodes["feature"][at]] <= nodes["threshold"][at]
             at = np.where(inner, np.where(below, nodes["left"][at], nodes["right"][at]), at)
         return np.stack([nodes["shares"][leaves].mean(axis=0) for leaves in at]).astype(np.float32)
+
+
+TREES = 200
+MIN_LEAF_SAMPLES = 2
+
+
+def tree_arrays(forest: RandomForestClassifier) -> dict[str, NDArray[Any]]:
+    """Return the trees of a fitted scikit-learn forest as the arrays of `Forest`."""
+    trees = [estimator.tree_ for estimator in forest.estimators_]
+    root = np.concatenate([[0], np.cumsum([tree.node_count for tree in trees])[:-1]]).astype(np.int32)
+
+    def children(name: str) -> NDArray[np.int32]:
+        indices = [getattr(tree, name) for tree in trees]
+        return np.concatenate([np.where(i < 0, -1, i + first) for i, first in zip(indices, root, strict=True)])
+
+    counts = np.concatenate([tree.value[:, 0] for tree in trees])
+    return {
+        "left": children("children_left").astype(np.int32),
+        "right": children("children_right").astype(np.int32),
+        "feature": np.concatenate([tree.feature for tree in trees]).astype(np.int16),
+        "threshold": np.concatenate([tree.threshold for tree in trees]),
+        "shares": (counts / counts.sum(axis=1, keepdims=True)).astype(np.float32),
+        "root": root,
+    }
+
+
+def fit_forest(task: FitTask) -> FittedBaseline:
+    """Fit a random forest on the features of every view and its mirror images."""
+    x, y, view = _features_of_views(task)
+    held_out = task.held_out(y, view)
+    forest = RandomForestClassifier(
+        TREES, min_samples_leaf=MIN_LEAF_SAMPLES, max_features="sqrt", random_state=task.options.seed, n_jobs=-1
+    )
+    forest.fit(x[~held_out], y[~held_out])
+    task.progress("grow forest", 1, 1, f"{TREES} trees")
+    model = Forest(tree_arrays(forest), task.network, task.config)
+    return FittedBaseline(model, task.temperature(y, held_out, lambda: model.predict(x[held_out])))
+
+
+def _features_of_views(task: FitTask) -> tuple[NDArray[np.float32], NDArray[np.intp], NDArray[np.intp]]:
+    """Return features, class index and view number of every view in every mirror."""
+    features, label, view = [], [], []
+    for index, _, of_shard in task.shards("measure for forest", "views"):
+        views, first = task.source.read(index), 0
+        for count, normal in padded_batches(views.clouds(), VIEWS_PER_BATCH):
+            for axes in MIRRORS:
+                features.append(forest_features(mirror(normal, axes), task.network, task.config)[:count])
+                label.append(np.full(count, of_shard))
+                view.append(views.view[first : first + count])
+            first += count
+    return np.concatenate(features), np.concatenate(label), np.concatenate(view)

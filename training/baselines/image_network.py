@@ -1,21 +1,24 @@
 """A trained image network as a baseline."""
 
+import dataclasses
 from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
 import jax
 import numpy as np
+import optax  # type: ignore[import-untyped]
 from flax import nnx
 from numpy.typing import NDArray
 
-from thor2_jax.model.weights import model_arrays, model_from_arrays
-from training.baselines.baseline import BaselineInputs
-from training.baselines.networks.architectures import ARCHITECTURES
-from training.baselines.networks.inputs import network_inputs
-from training.views.view_crops import ViewCrops
+from thor2_jax.files import file_digest
+from thor2_jax.model.classifier import model_arrays, model_from_arrays
+from training.baselines.baseline import BaselineInputs, FitTask, FittedBaseline, NetworkFit, fit_network, in_batches
+from training.baselines.networks.architectures import ARCHITECTURES, network_inputs
+from training.baselines.networks.weights import load_weights
+from training.views.crops import ViewCrops
 
-__all__ = ["ImageNetwork", "in_batches"]
+__all__ = ["CropSamples", "ImageNetwork", "fit_image_network", "read_samples"]
 
 INFERENCE_BATCH = 8
 """Crops that a network reads at a time, about the instances of a frame: one compiled program for all."""
@@ -24,15 +27,6 @@ INFERENCE_BATCH = 8
 @partial(jax.jit, static_argnums=0)
 def _probabilities(graph: Any, state: Any, color: Any, normals: Any) -> jax.Array:
     return jax.nn.softmax(nnx.merge(graph, state)(*network_inputs(color, normals)))
-
-
-def in_batches(function: Any, crops: ViewCrops) -> NDArray[np.float32]:
-    """Return the results [V, ...] of a function of `INFERENCE_BATCH` colour and normal images; V is at least 1."""
-    results = []
-    for first in range(0, len(crops), INFERENCE_BATCH):
-        rows = np.resize(np.arange(first, min(first + INFERENCE_BATCH, len(crops))), INFERENCE_BATCH)
-        results.append(np.asarray(function(crops.color[rows], crops.normals[rows]))[: len(crops) - first])
-    return np.concatenate(results)
 
 
 class ImageNetwork:
@@ -73,4 +67,104 @@ class ImageNetwork:
         """Return class probabilities [V, C] of crops of the network's size."""
         if not len(crops):
             return np.zeros((0, self._n_classes), np.float32)
-        return in_batches(partial(_probabilities, self._graph, self._state), crops)
+        return in_batches(
+            partial(_probabilities, self._graph, self._state), INFERENCE_BATCH, crops.color, crops.normals
+        )
+
+
+BATCH_SIZE = 32
+
+SCRATCH_RATE, PRETRAINED_RATE = 1e-3, 1e-4
+"""Highest learning rates, without and with pretrained weights."""
+
+WARM_UP = 0.05
+"""Fraction of the steps in which the learning rate rises."""
+
+WEIGHT_DECAY = 0.05
+
+
+@dataclasses.dataclass(frozen=True)
+class CropSamples:
+    """The crops of all clouds of a source.
+
+    Attributes:
+        crops: V crops.
+        label: [V] class indices.
+        view: [V] view numbers.
+    """
+
+    crops: ViewCrops
+    label: NDArray[np.int32]
+    view: NDArray[np.int32]
+
+    def rows(self, rows: Any) -> ViewCrops:
+        """Return the crops of some rows."""
+        return ViewCrops(self.crops.color[rows], self.crops.normals[rows])
+
+
+def read_samples(task: FitTask, name: str, size: int) -> CropSamples:
+    """Read the crops of all views into memory, 6 bytes for each of their pixels.
+
+    Raises:
+        InputError: the source has no crops, or smaller ones.
+    """
+    shape = task.n_clouds, size, size, 3
+    crops = ViewCrops(np.zeros(shape, np.uint8), np.zeros(shape, np.int8))
+    label, view = np.zeros(task.n_clouds, np.int32), np.zeros(task.n_clouds, np.int32)
+    for index, rows, of_shard in task.shards(f"read for {name}", "crops"):
+        read = task.source.read_crops(index, size)
+        crops.color[rows], crops.normals[rows] = read.color, read.normals
+        label[rows], view[rows] = of_shard, task.source.read(index).view
+    return CropSamples(crops, label, view)
+
+
+def _optimizer(rate: Any) -> Any:
+    return optax.adamw(rate, weight_decay=WEIGHT_DECAY)
+
+
+def _learning_rate(highest: float, number: int, n_steps: int) -> float:
+    """Return the learning rate of a step: it rises, and falls along a cosine."""
+    progress = (number + 0.5) / n_steps
+    if progress < WARM_UP:
+        return highest * progress / WARM_UP
+    return float(highest * (1 + np.cos(np.pi * (progress - WARM_UP) / (1 - WARM_UP))) / 2)
+
+
+def _mirrored(crops: ViewCrops, rng: np.random.Generator) -> tuple[NDArray[np.uint8], NDArray[np.int8]]:
+    """Return copies of colour and normals, mirrored at random along x, with the x of the normals."""
+    flip = rng.random(len(crops)) < 0.5
+    color, normals = crops.color.copy(), crops.normals.copy()
+    color[flip], normals[flip] = color[flip, :, ::-1], normals[flip, :, ::-1] * np.array([-1, 1, 1], np.int8)
+    return color, normals
+
+
+def fit_image_network(task: FitTask, name: str) -> FittedBaseline:
+    """Fit a network of `ARCHITECTURES`; an interrupted fit resumes after its last epoch.
+
+    An epoch uses as many crops as there are views, drawn from all their copies, each mirrored at random.
+
+    Raises:
+        InputError: the source has no crops, a file of weights does not fit, or the loss is not finite.
+    """
+    architecture = ARCHITECTURES[name]
+    n_classes = len(task.source.classes)
+    model: Any = architecture.build(n_classes, task.options.seed)
+    files = [] if task.weights is None else load_weights(task.weights, architecture.backbones(model))
+    weights = {path.name: file_digest(path) for path in files}
+    samples = read_samples(task, name, architecture.size)
+    held_out = task.held_out(samples.label, samples.view)
+    n_views = len(np.unique(np.stack([samples.label, samples.view])[:, ~held_out], axis=1).T)
+    fit = NetworkFit(
+        name,
+        "pretrained" if weights else "scratch",
+        lambda rows, rng: _mirrored(samples.rows(rows), rng),
+        network_inputs,
+        BATCH_SIZE,
+        _optimizer,
+        partial(_learning_rate, PRETRAINED_RATE if weights else SCRATCH_RATE),
+    )
+    model.train()
+    fitted = fit_network(task, fit, model, samples.label, np.flatnonzero(~held_out), n_views)
+    network = ImageNetwork(name, fitted, n_classes)
+    temperature = task.temperature(samples.label, held_out, lambda: network.predict(samples.rows(held_out)))
+    return FittedBaseline(network, temperature, weights)

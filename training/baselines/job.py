@@ -1,36 +1,39 @@
-"""Training the baselines of finished runs; each becomes a file in the run directory."""
+"""Training and loading the baselines of finished runs, RUN/baselines/NAME.safetensors."""
 
 import contextlib
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any, NamedTuple
+
+from flax import nnx
 
 from thor2_jax.errors import InputError
 from thor2_jax.files import file_digest, remove_leftovers, remove_written
 from thor2_jax.model.run_directory import TrainedRun, load_run
+from training.baselines.baseline import Baseline, FitTask, FittedBaseline
 from training.baselines.files import StoredBaseline, baseline_file, read_baseline, write_baseline
-from training.baselines.fit_forest import fit_forest
-from training.baselines.fit_network import fit_network
-from training.baselines.fit_pointnet import fit_pointnet
-from training.baselines.fit_templates import fit_templates
-from training.baselines.fit_thor import fit_thor
+from training.baselines.forest import Forest, fit_forest
+from training.baselines.image_network import ImageNetwork, fit_image_network
 from training.baselines.names import CLOUD_BASELINES, NETWORKS, TEMPLATES, check_baselines
-from training.baselines.pretrained import pretrained_files, weights_file
-from training.baselines.task import FitTask, FittedBaseline
+from training.baselines.networks.architectures import ARCHITECTURES
+from training.baselines.networks.weights import load_weights, weights_file
+from training.baselines.pointnet import ColoredPointNet, fit_pointnet
+from training.baselines.templates import DINOV2, Templates, create_backbone, fit_templates
+from training.baselines.thor import THOR, fit_thor
+from training.fitting.checkpoints import find_run_directories
 from training.fitting.options import FitOptions
-from training.fitting.run_directories import find_run_directories
-from training.fitting.temperature import fit_temperature
 from training.storage.progress import Progress
 from training.views.normalized_views import ViewSource
 
-__all__ = ["train_baselines"]
+__all__ = ["LoadedBaselines", "check_weights", "load_baselines", "pretrained_files", "train_baselines"]
 
 _FIT: dict[str, Callable[[FitTask], FittedBaseline]] = {
     "thor": fit_thor,
     "forest": fit_forest,
     "pointnet": fit_pointnet,
-    **{name: partial(fit_network, name=name) for name in NETWORKS},
+    **{name: partial(fit_image_network, name=name) for name in NETWORKS},
     TEMPLATES: fit_templates,
 }
 
@@ -126,6 +129,80 @@ def _train(
             file.parent.rmdir()
         raise
     seconds = time.perf_counter() - start
-    temperature = fit_temperature(fitted.probabilities, fitted.truth) if len(fitted.truth) else None
-    write_baseline(file, StoredBaseline(fitted.model.arrays(), temperature, seconds, fitted.weights), run.classes)
+    write_baseline(
+        file, StoredBaseline(fitted.model.arrays(), fitted.temperature, seconds, fitted.weights), run.classes
+    )
     remove_written(scratch, r"[^/]+/(.*/)?[0-9]+/.*")  # checkpoints
+
+
+class LoadedBaselines(NamedTuple):
+    """The baselines of a run directory.
+
+    Attributes:
+        models: name -> baseline.
+        temperatures: temperatures of those that were calibrated.
+        seconds: training times.
+        weights: the files of pretrained weights that each was fitted from; empty if it was trained from scratch.
+    """
+
+    models: dict[str, Baseline]
+    temperatures: dict[str, float]
+    seconds: dict[str, float]
+    weights: dict[str, list[str]]
+
+
+def _network(name: str, arrays: Mapping[str, Any], run: TrainedRun) -> Baseline:
+    return ImageNetwork.with_arrays(name, arrays, len(run.classes))
+
+
+_BUILD: dict[str, Callable[[Mapping[str, Any], TrainedRun], Baseline]] = {
+    "thor": lambda arrays, run: THOR.with_arrays(arrays, run.config, len(run.classes)),
+    "forest": lambda arrays, run: Forest(arrays, run.network, run.config),
+    "pointnet": lambda arrays, run: ColoredPointNet.with_arrays(arrays, len(run.classes)),
+    **{name: partial(_network, name) for name in NETWORKS},
+    "templates": lambda arrays, run: Templates.with_arrays(arrays, len(run.classes)),
+}
+
+
+def load_baselines(path: Path, run: TrainedRun) -> LoadedBaselines:
+    """Return the baselines of a run directory.
+
+    Raises:
+        InputError: a file is damaged or does not match the run.
+    """
+    loaded = LoadedBaselines({}, {}, {}, {})
+    for name, build in _BUILD.items():
+        file = baseline_file(path, name)
+        if not file.is_file():
+            continue
+        stored = read_baseline(file, run.classes)
+        try:
+            loaded.models[name] = build(stored.arrays, run)
+        except ValueError as error:
+            raise InputError(
+                f"model: {file} does not match its run ({error}); delete it and train the baseline again"
+            ) from None
+        if stored.temperature is not None:
+            loaded.temperatures[name] = stored.temperature
+        loaded.seconds[name], loaded.weights[name] = stored.seconds, sorted(stored.weights)
+    return loaded
+
+
+def pretrained_files(name: str) -> list[str]:
+    """Return the files of pretrained weights that a baseline reads, without the suffix; none for most baselines."""
+    if name == TEMPLATES:
+        return [DINOV2]
+    return sorted(set(ARCHITECTURES[name].weights.values())) if name in ARCHITECTURES else []
+
+
+def check_weights(directory: Path, name: str) -> None:
+    """Read the files of a baseline's pretrained weights, without keeping them.
+
+    Raises:
+        InputError: a file is missing, damaged or of another architecture.
+    """
+    if name == TEMPLATES:
+        load_weights(directory, [(nnx.eval_shape(lambda: create_backbone(DINOV2)), DINOV2)])
+    elif name in ARCHITECTURES:
+        architecture = ARCHITECTURES[name]
+        load_weights(directory, architecture.backbones(nnx.eval_shape(lambda: architecture.build(2, 0))))

@@ -2,18 +2,19 @@
 
 from collections.abc import Mapping
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax  # type: ignore[import-untyped]
 from flax import nnx
 from numpy.typing import NDArray
 
-from thor2_jax.model.weights import model_arrays, model_from_arrays
-from training.baselines.baseline import BaselineInputs
+from thor2_jax.model.classifier import model_arrays, model_from_arrays
+from training.baselines.baseline import BaselineInputs, FitTask, FittedBaseline, NetworkFit, fit_network, in_batches
 
-__all__ = ["POINTS", "ColoredPointNet", "PointNet", "point_features", "random_indices"]
+__all__ = ["ColoredPointNet", "POINTS", "PointNet", "fit_pointnet", "point_features", "random_indices"]
 
 POINTS = 384
 """Points sampled from each cloud."""
@@ -98,9 +99,77 @@ class ColoredPointNet:
 
     def predict(self, xyz: NDArray[Any], rgb: NDArray[Any], box: NDArray[Any]) -> NDArray[np.float32]:
         """Return class probabilities [V, C] for sampled points [V, POINTS, 3], their colours and boxes [V, 3]."""
-        chunks = []
-        for first in range(0, len(xyz), INFERENCE_BATCH):
-            rows = np.resize(np.arange(first, min(first + INFERENCE_BATCH, len(xyz))), INFERENCE_BATCH)
-            values = _probabilities(self._graph, self._params, xyz[rows].astype(np.float32), rgb[rows], box[rows])
-            chunks.append(np.asarray(values)[: len(xyz) - first])
-        return np.concatenate(chunks)
+        probabilities = partial(_probabilities, self._graph, self._params)
+        return in_batches(probabilities, INFERENCE_BATCH, xyz.astype(np.float32), rgb, box)
+
+
+STORED_POINTS = 2 * POINTS
+"""Points stored for each view, so that every epoch can use a different sample of them."""
+
+RATES = 2e-3, 2e-5
+"""First and last learning rate of the cosine schedule."""
+
+BATCH_SIZE = 64
+
+
+class _Views(NamedTuple):
+    """V views: [V, STORED_POINTS, 3] points and colours in random order, [V, 3] boxes, [V] labels and view numbers."""
+
+    xyz: NDArray[np.float32]
+    rgb: NDArray[np.uint8]
+    box: NDArray[np.float32]
+    label: NDArray[np.int32]
+    view: NDArray[np.int32]
+
+    def draw(self, rows: NDArray[np.intp], rng: np.random.Generator) -> tuple[NDArray[np.float32]]:
+        """Return network inputs for some views: a random sample of their points, mirrored at random in x and y."""
+        first = int(rng.integers(STORED_POINTS - POINTS + 1))
+        window = slice(first, first + POINTS)
+        x = np.array(point_features(self.xyz[rows, window].astype(np.float32), self.rgb[rows, window], self.box[rows]))
+        x[..., :2] *= rng.choice(np.array([-1, 1], np.float32), (len(rows), 1, 2))
+        return (x,)
+
+
+def _read_views(task: FitTask) -> _Views:
+    total = task.n_clouds
+    views = _Views(
+        np.zeros((total, STORED_POINTS, 3), np.float16),
+        np.zeros((total, STORED_POINTS, 3), np.uint8),
+        np.zeros((total, 3), np.float32),
+        np.zeros(total, np.int32),
+        np.zeros(total, np.int32),
+    )
+    rng = np.random.default_rng(task.options.seed)
+    for index, rows, label in task.shards("read for pointnet", "views"):
+        normalized = task.source.read(index)
+        views.label[rows], views.view[rows] = label, normalized.view
+        for row, (xyz, rgb) in enumerate(normalized.clouds(), rows.start):
+            sample = random_indices(len(xyz), STORED_POINTS, rng)
+            views.xyz[row], views.rgb[row], views.box[row] = xyz[sample], rgb[sample], xyz.max(axis=0)
+    return views
+
+
+def _learning_rate(number: int, n_steps: int) -> float:
+    return float(RATES[1] + (RATES[0] - RATES[1]) * (1 + np.cos(np.pi * number / n_steps)) / 2)
+
+
+def _inputs(x: jax.Array) -> tuple[jax.Array]:
+    return (x,)
+
+
+def fit_pointnet(task: FitTask) -> FittedBaseline:
+    """Fit a PointNet; an interrupted fit resumes after its last epoch.
+
+    Each epoch uses every view once, with a random sample of points and random mirroring.
+
+    Raises:
+        InputError: the loss is not finite.
+    """
+    views = _read_views(task)
+    held_out = task.held_out(views.label, views.view)
+    rows = np.flatnonzero(~held_out)
+    fit = NetworkFit("pointnet", "fit", views.draw, _inputs, BATCH_SIZE, optax.adam, _learning_rate)
+    network = PointNet(len(task.source.classes), rngs=nnx.Rngs(task.options.seed))
+    model = ColoredPointNet(fit_network(task, fit, network, views.label, rows, len(rows)))
+    inputs = views.xyz[held_out, :POINTS], views.rgb[held_out, :POINTS], views.box[held_out]
+    return FittedBaseline(model, task.temperature(views.label, held_out, lambda: model.predict(*inputs)))

@@ -14,15 +14,18 @@ import numpy as np
 from flax import nnx
 from numpy.typing import NDArray
 
-from thor2_jax.model.weights import model_arrays, model_from_arrays
-from training.baselines.baseline import BaselineInputs
-from training.baselines.image_network import in_batches
-from training.baselines.networks.architectures import ARCHITECTURES
-from training.baselines.networks.inputs import network_inputs
+from thor2_jax.errors import InputError
+from thor2_jax.files import file_digest
+from thor2_jax.model.classifier import model_arrays, model_from_arrays
+from training.baselines.baseline import BaselineInputs, FitTask, FittedBaseline, in_batches
+from training.baselines.files import baseline_file, read_baseline
+from training.baselines.image_network import INFERENCE_BATCH, ImageNetwork, read_samples
+from training.baselines.networks.architectures import ARCHITECTURES, network_inputs
 from training.baselines.networks.vit import VIT_DINOV2_SMALL, ViT
-from training.views.view_crops import ViewCrops
+from training.baselines.networks.weights import load_weights
+from training.views.crops import ViewCrops
 
-__all__ = ["BACKBONES", "DINOV2", "Templates", "backbone_size", "create_backbone"]
+__all__ = ["BACKBONES", "DINOV2", "Templates", "backbone_size", "create_backbone", "fit_templates"]
 
 SHARPNESS = 20.0
 """Factor of the similarities before the softmax."""
@@ -106,7 +109,7 @@ class Templates:
 
     def embed(self, crops: ViewCrops) -> NDArray[np.float32]:
         """Return the unit features [V, D] of crops of `size` pixels; V is at least 1."""
-        return in_batches(partial(_features, self._graph, self._state), crops)
+        return in_batches(partial(_features, self._graph, self._state), INFERENCE_BATCH, crops.color, crops.normals)
 
     def probabilities(self, inputs: BaselineInputs) -> NDArray[np.float32]:
         """Return class probabilities [B, C]; equal ones for padding rows."""
@@ -121,3 +124,45 @@ class Templates:
         similarity = features @ self._stored.astype(np.float32).T
         nearest = np.stack([similarity[:, self._label == c].max(axis=1) for c in range(self._n_classes)], axis=1)
         return np.asarray(jax.nn.softmax(SHARPNESS * nearest, axis=1))
+
+
+def _backbone(task: FitTask) -> tuple[int, ViT, dict[str, str]]:
+    """Return the number of the backbone, the backbone, and the digests of its files of weights.
+
+    Raises:
+        InputError: there is no backbone, or its file cannot be used.
+    """
+    if task.weights is not None:
+        model = create_backbone(DINOV2)
+        (path,) = load_weights(task.weights, [(model, DINOV2)])
+        return BACKBONES.index(DINOV2), model, {path.name: file_digest(path)}
+    for number, name in enumerate(BACKBONES):
+        file = baseline_file(task.run, name)
+        if file.is_file():
+            stored = read_baseline(file, task.source.classes)
+            network = ImageNetwork.with_arrays(name, stored.arrays, len(task.source.classes))
+            return number, network.model.color, dict(stored.weights)  # type: ignore[attr-defined]
+    raise InputError(
+        f"baselines: templates needs a backbone; expected --weights with {DINOV2}.safetensors, or the "
+        "baseline rgbd-vit or rgbd-vit-small in the same run"
+    )
+
+
+def fit_templates(task: FitTask) -> FittedBaseline:
+    """Store the features of all crops that are not held out.
+
+    Raises:
+        InputError: there is no backbone, or the source has no crops.
+    """
+    number, model, weights = _backbone(task)
+    n_classes = len(task.source.classes)
+    samples = read_samples(task, "templates", backbone_size(BACKBONES[number]))
+    held_out = task.held_out(samples.label, samples.view)
+    features = Templates(number, model, np.zeros((0, 0), np.float16), np.zeros(0, np.int16), n_classes).embed(
+        samples.crops
+    )
+    task.progress("collect templates", 1, 1, f"{len(features)} crops")
+    stored = features[~held_out].astype(np.float16)
+    templates = Templates(number, model, stored, samples.label[~held_out].astype(np.int16), n_classes)
+    temperature = task.temperature(samples.label, held_out, lambda: templates.compare(features[held_out]))
+    return FittedBaseline(templates, temperature, weights)

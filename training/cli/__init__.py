@@ -1,45 +1,20 @@
 """The command line `thor2`: one module per command; each parses its options and calls one function."""
 
+import importlib
 import os
 
 # XLA reports the features it expects of cached programs as errors. The variable is read when JAX is imported.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
-from training.cli import (
-    adapt,
-    colornet,
-    demo,
-    doctor,
-    enroll,
-    evaluate,
-    explain,
-    fetch,
-    forget,
-    objects,
-    recognize,
-    render,
-    serve,
-    train,
-    watch,
-)  # noqa: E402
 from training.cli.app import app, main  # noqa: E402
 
-__all__ = [
-    "adapt",
-    "app",
-    "colornet",
-    "demo",
-    "doctor",
-    "enroll",
-    "evaluate",
-    "explain",
-    "fetch",
-    "forget",
-    "main",
-    "objects",
-    "recognize",
-    "render",
-    "serve",
-    "train",
-    "watch",
-]
+__all__ = ["app", "main"]
+
+COMMANDS = (
+    *("adapt", "colornet", "demo", "doctor", "enroll", "evaluate", "explain", "fetch", "forget", "objects"),
+    *("recognize", "render", "serve", "train", "watch"),
+)
+"""The modules of the commands, in the order of the help; importing one adds its command."""
+
+for _name in COMMANDS:
+    importlib.import_module(f"training.cli.{_name}")

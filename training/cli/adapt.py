@@ -34,10 +34,11 @@ def adapt(
     model is most certain of its answers.
     """
     from training.camera_adaptation import adapt_run
+    from training.storage.progress import of_stage
 
     sources = given.sources(segment)
     with show_progress(quiet) as progress:
-        adaptation = adapt_run(model, sources, out, lambda done, total: progress("adapt", done, total, ""))
+        adaptation = adapt_run(model, sources, out, of_stage(progress, "adapt"))
     console.print(f"warmth: {adaptation.transform.warmth:+.3f}")
     console.print(
         f"{adaptation.instances} instances; mean uncertainty of their answers {adaptation.uncertainty_before:.3f} "

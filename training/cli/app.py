@@ -11,7 +11,7 @@ import shlex
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TextIO
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn, TextIO
 
 import typer
 from rich.console import Console
@@ -24,12 +24,10 @@ from thor2_jax.recordings.pairs import DEFAULT_MAX_GAP
 from thor2_jax.recordings.topics import Topics
 from training.cli.compilation_cache import enable_compilation_cache
 
-if TYPE_CHECKING:
-    from thor2_jax.recordings.bags import Bag
-    from training.readers.frame_files import FrameSource
-
 __all__ = [
+    "MAX_WORKERS",
     "AllowHostOption",
+    "Engine",
     "FrameOptions",
     "GalleryOption",
     "ManyFrames",
@@ -38,6 +36,7 @@ __all__ = [
     "QuietOption",
     "SegmentOption",
     "UnknownOption",
+    "WorkerOptions",
     "app",
     "console",
     "finish",
@@ -46,6 +45,11 @@ __all__ = [
     "show_help",
     "split_names",
 ]
+
+if TYPE_CHECKING:
+    from thor2_jax.recordings.bags import Bag
+    from training.readers.frame_files import FrameSource
+
 
 app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -328,3 +332,43 @@ def _given_value(error: Exception) -> str:
 def _exit_with(message: str) -> NoReturn:
     print(f"error: {escape_characters(' '.join(message.split()))}", file=sys.stderr)
     raise SystemExit(2)
+
+
+if TYPE_CHECKING:
+    from training.storage.workers import WorkerPool
+
+
+Engine = Literal["local", "ray"]
+
+MAX_WORKERS = 1024
+"""Largest number of processes of a command: each needs memory and open files."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class WorkerOptions:
+    """Where a command computes."""
+
+    workers: Annotated[
+        int, typer.Option(min=1, max=MAX_WORKERS, help="Worker processes; with Ray, concurrent tasks.")
+    ] = 1
+    engine: Annotated[
+        Engine,
+        typer.Option(help="Work on this machine or on a Ray cluster (extra `cluster`), which has the same paths."),
+    ] = "local"
+    address: Annotated[
+        str | None, typer.Option(help="Address of the Ray cluster. Default: the one on this machine.")
+    ] = None
+
+    def pool(self) -> "WorkerPool | None":
+        """Return the worker pool of these options; None stands for this process alone.
+
+        Raises:
+            InputError: `address` without Ray, or Ray is not installed.
+        """
+        from training.storage.workers import local_workers, ray_workers
+
+        if self.engine == "ray":
+            return ray_workers(self.workers, self.address)
+        if self.address is not None:
+            raise InputError(f"address is {self.address}; it is only used with --engine ray")
+        return local_workers(self.workers) if self.workers > 1 else None

@@ -13,7 +13,7 @@ from thor2_jax.printable import escape_characters
 from training.cli.app import FrameOptions, MeshScaleOption, app, finish, grouped_options
 
 if TYPE_CHECKING:
-    from training.diagnosis.findings import Diagnosis
+    from training.diagnosis.checks import Diagnosis
 
 
 @app.command()

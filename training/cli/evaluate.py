@@ -12,9 +12,8 @@ import typer
 from rich.table import Table
 
 from thor2_jax.printable import escape_characters
-from training.cli.app import FrameOptions, QuietOption, app, console, finish, grouped_options, show_help
+from training.cli.app import FrameOptions, QuietOption, WorkerOptions, app, console, finish, grouped_options, show_help
 from training.cli.progress import show_progress
-from training.cli.workers import WorkerOptions
 
 evaluate_app = typer.Typer(
     callback=show_help, invoke_without_command=True, help="Measure the accuracy of trained runs on a labelled dataset."

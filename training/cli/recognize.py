@@ -17,13 +17,13 @@ from training.cli.app import (
     ModelOption,
     SegmentOption,
     UnknownOption,
+    WorkerOptions,
     app,
     console,
     finish,
     grouped_options,
 )
-from training.cli.recognize_bag import BagOutputs, recognize_bag
-from training.cli.workers import WorkerOptions
+from training.cli.recognize_bag import recognize_bag
 
 if TYPE_CHECKING:
     from thor2_jax.model.answers import Recognition
@@ -91,15 +91,16 @@ def recognize(
         track_frames,
     )
     from training.readers.bop import read_object_names
-    from training.readers.poses import read_poses
+    from training.readers.frame_files import read_poses
 
     given.check()
+    arguments = RecognizerArguments(model, unknown_below, answer_by)
     if given.bag is not None:
         refused: dict[str, object] = {"names": names, "coco": coco, "bop": bop, "poses": poses}
         for name, value in {**refused, "workers": processes.workers, "engine": processes.engine}.items():
             if value not in (None, 1, "local"):
                 raise InputError(f"{name} is {value} and bag is {given.bag}; give one of them")
-        recognize_bag(given, BagOutputs(out, out_bag, rerun), model, unknown_below, answer_by, segment, track)
+        recognize_bag(given, arguments, segment, track, out, out_bag, rerun)
         return
     if out_bag is not None:
         raise InputError(f"out_bag is {out_bag}; it belongs to --bag")
@@ -128,7 +129,6 @@ def recognize(
     check_output_file("coco", coco, is_coco_file)
     check_output_file("bop", bop, is_bop_file)
     segmented = ["--segment", segment] if segment else []
-    arguments = RecognizerArguments(model, unknown_below, answer_by)
     recognizer = arguments.load()
     tables = ResultTables([source.name for source in sources], recognizer.classes, numbers)
     failed, without_depth, unknown = [], [], False

@@ -1,7 +1,6 @@
 """`thor2 recognize --bag`: recognize the frames of a recording."""
 
 import contextlib
-import dataclasses
 import json
 import sys
 from pathlib import Path
@@ -14,56 +13,44 @@ if TYPE_CHECKING:
     from thor2_jax.recordings.bag_writer import DetectionBag
     from thor2_jax.recordings.recorded_frames import RecordedFrame
     from thor2_jax.recordings.rerun_file import RerunFile
-    from training.frame_recognition import FrameAnswer
+    from training.frame_recognition import FrameAnswer, RecognizerArguments
 
-__all__ = ["BagOutputs", "recognize_bag"]
-
-
-@dataclasses.dataclass(frozen=True)
-class BagOutputs:
-    """The outputs of `thor2 recognize` for a recording: the directory of all frames, detections, a Rerun file."""
-
-    out: Path | None
-    out_bag: Path | None
-    rerun: Path | None
+__all__ = ["recognize_bag"]
 
 
 def recognize_bag(
     given: FrameOptions,
-    outputs: BagOutputs,
-    model: Path,
-    unknown_below: float | None,
-    answer_by: str | None,
+    arguments: "RecognizerArguments",
     segment: str | None,
     track: bool,
+    out: Path | None,
+    out_bag: Path | None,
+    rerun: Path | None,
 ) -> None:
     """Recognize the frames of a recording: a line of JSON for each, and the outputs that are wanted.
 
     Raises:
         InputError: the recording cannot be read from here on, and what was written so far; or frames failed.
     """
-    from thor2_jax.capacity import BATCH_BUCKETS
     from thor2_jax.files import check_output_directory
-    from thor2_jax.recognizer import Recognizer
     from thor2_jax.recordings.bag_writer import DetectionBag
     from thor2_jax.recordings.rerun_file import RerunFile
     from thor2_jax.segmentation.segmenters import TABLE, load_segmenter
-    from training.bag_recognition import recognize_recorded
-    from training.frame_recognition import segmentation_failure
+    from training.frame_recognition import recognize_recorded, segmentation_failure
 
     segmenter = load_segmenter(segment or TABLE)
     bag = given.open_bag()
-    out_bag = None if outputs.out_bag is None else DetectionBag(outputs.out_bag)
-    rerun = None if outputs.rerun is None else RerunFile(outputs.rerun)
-    if outputs.out is not None:
-        check_output_directory(outputs.out)
+    detection_bag = None if out_bag is None else DetectionBag(out_bag)
+    rerun_file = None if rerun is None else RerunFile(rerun)
+    if out is not None:
+        check_output_directory(out)
     n_answers, failed, without_depth, damage = 0, [], [], None
     with bag:
         for note in bag.notes:
             print(f"note: {note}", file=sys.stderr)
-        recognizer = Recognizer.load(model, unknown_below, answer_by=answer_by, chunk=BATCH_BUCKETS[-1])
+        recognizer = arguments.load()
         recognize = recognizer.track().update if track else recognizer.recognize
-        with out_bag or contextlib.nullcontext(), rerun or contextlib.nullcontext():
+        with detection_bag or contextlib.nullcontext(), rerun_file or contextlib.nullcontext():
             try:
                 for recorded, answer in recognize_recorded(recognize, bag.frames(), segmenter, given.every):
                     n_answers += answer.error is None
@@ -72,10 +59,10 @@ def recognize_bag(
                         print(f"failed: {answer.name}: {answer.error}", file=sys.stderr)
                     else:
                         without_depth.append(segmentation_failure(answer))
-                    _write(recorded, answer, outputs.out, out_bag, rerun)
+                    _write(recorded, answer, out, detection_bag, rerun_file)
             except InputError as error:
                 damage = str(error)
-    written = [str(path) for path in dataclasses.astuple(outputs) if path is not None and n_answers and path.exists()]
+    written = [str(path) for path in (out, out_bag, rerun) if path is not None and n_answers and path.exists()]
     if damage is not None:
         kept = f"; {n_answers} frames were recognized before" + (f" and are in {', '.join(written)}" if written else "")
         raise InputError(damage + (kept if n_answers else ""))
@@ -86,7 +73,7 @@ def recognize_bag(
             file=sys.stderr,
         )
     result = f"written to {', '.join(written)}" if written else f"frames recognized: {n_answers}"
-    finish(result, "see why", "explain", *given.arguments, "--model", model, "--out", "why", file=sys.stderr)
+    finish(result, "see why", "explain", *given.arguments, "--model", arguments.model, "--out", "why", file=sys.stderr)
     if failed:
         raise InputError(f"{len(failed)} of {n_answers + len(failed)} frames could not be recognized; see above")
     if without_depth and all(without_depth):

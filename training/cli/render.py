@@ -7,9 +7,8 @@ from typing import Annotated
 import typer
 
 from thor2_jax.errors import InputError
-from training.cli.app import MeshScaleOption, QuietOption, app, finish, grouped_options
+from training.cli.app import MAX_WORKERS, MeshScaleOption, QuietOption, WorkerOptions, app, finish, grouped_options
 from training.cli.progress import show_progress
-from training.cli.workers import WorkerOptions
 
 MAX_CROP = 2048
 """Largest side of a crop, pixels."""
@@ -19,7 +18,9 @@ MAX_CROP = 2048
 class RenderWorkers(WorkerOptions):
     """Where views are rendered; by default, in two processes."""
 
-    workers: Annotated[int, typer.Option(min=1, help="Worker processes; with Ray, concurrent tasks.")] = 2
+    workers: Annotated[
+        int, typer.Option(min=1, max=MAX_WORKERS, help="Worker processes; with Ray, concurrent tasks.")
+    ] = 2
 
 
 @app.command()
@@ -57,50 +58,28 @@ def render(
     small variants 96).
     """
     from training.augmentation.augmentations import Augmentations
-    from training.augmentation.base import Base
-    from training.augmentation.illumination import Illumination
-    from training.augmentation.occlusion import Occlusion
-    from training.augmentation.registration import Registration
-    from training.augmentation.segmentation import Segmentation
-    from training.augmentation.sensor import Sensor
     from training.objects.meshes import find_meshes, read_names, scaled_meshes
+    from training.storage.progress import of_stage
     from training.storage.workers import IN_PROCESS
-    from training.views.crop_job import render_crops
-    from training.views.render_job import render_dataset
+    from training.views.render_job import render_crops, render_dataset
 
     if crops is not None and not 1 <= crops <= MAX_CROP:
         raise InputError(f"crops is {crops}; expected 1 to {MAX_CROP} pixels")
     pool = processes.pool() or IN_PROCESS
-    augmentations = Augmentations(
-        illumination=Illumination() if illumination else None,
-        sensor=Sensor() if sensor else None,
-        occlusion=Occlusion() if occlusion else None,
-        segmentation=Segmentation() if segmentation else None,
-        registration=Registration() if registration else None,
-        base=Base() if base else None,
-        copies=copies,
-    )
+    switches = {
+        "illumination": illumination,
+        "sensor": sensor,
+        "occlusion": occlusion,
+        "segmentation": segmentation,
+        "registration": registration,
+        "base": base,
+    }
+    augmentations = Augmentations.of_names((name for name, is_on in switches.items() if is_on), copies) or None
     sources = scaled_meshes(find_meshes(meshes, read_names(names) if names else None), mesh_scale)
     with show_progress(quiet) as progress:
-        dataset = render_dataset(
-            sources,
-            out,
-            azimuth_step,
-            polar_step,
-            pool,
-            lambda done, total: progress("render", done, total, ""),
-            augmentations or None,
-            seed,
-        )
+        shown = of_stage(progress, "render")
+        dataset = render_dataset(sources, out, azimuth_step, polar_step, pool, shown, augmentations, seed)
         if crops is not None:
-            render_crops(
-                sources,
-                dataset,
-                crops,
-                pool,
-                lambda done, total: progress("render crops", done, total, ""),
-                augmentations or None,
-                seed,
-            )
+            render_crops(sources, dataset, crops, pool, of_stage(progress, "render crops"), augmentations, seed)
     views = f"{len(dataset)} views of {len(dataset.classes)} objects ({dataset.manifest.left_out} left out) in {out}"
     finish(views, "train on them", "train", "--dataset", out, "--out", "run")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from thor2_jax.errors import InputError
-from training.cli.app import ManyFrames, MeshScaleOption, QuietOption, app, console, finish, split_names
+from training.cli.app import MAX_WORKERS, ManyFrames, MeshScaleOption, QuietOption, app, console, finish, split_names
 from training.cli.progress import show_progress
 
 if TYPE_CHECKING:
@@ -85,7 +85,9 @@ def train(
         ),
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed for augmentations, weights, sample order and dropout.")] = 0,
-    folds: Annotated[int, typer.Option(min=1, help="More than 1: one model per fold, which is its held-out set.")] = 1,
+    folds: Annotated[
+        int, typer.Option(min=1, max=1000, help="More than 1: one model per fold, which is its held-out set.")
+    ] = 1,
     baselines: Annotated[
         str,
         typer.Option(
@@ -123,7 +125,7 @@ def train(
         Path | None, typer.Option(help="Directory of meshes of objects that are none of the classes.")
     ] = None,
     mesh_scale: MeshScaleOption = 1.0,
-    workers: Annotated[int, typer.Option(min=1, help="Rendering processes.")] = 2,
+    workers: Annotated[int, typer.Option(min=1, max=MAX_WORKERS, help="Rendering processes.")] = 2,
     coordinator: Annotated[
         str | None, typer.Option(help="HOST:PORT of process 0, for training with several processes.")
     ] = None,

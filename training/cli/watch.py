@@ -53,9 +53,8 @@ def watch(
         from thor2_jax.capacity import BATCH_BUCKETS
         from thor2_jax.recognizer import Recognizer
         from thor2_jax.segmentation.segmenters import TABLE, load_segmenter
-        from thor2_jax.watch.broadcast import Broadcast
         from thor2_jax.watch.live import LiveView
-        from thor2_jax.watch.server import serve_live
+        from thor2_jax.watch.server import Broadcast, serve_live
 
         sources = {"--bag": bag, "--folder": folder, "--realsense": realsense or None}
         given = [name for name, value in sources.items() if value is not None]

@@ -13,7 +13,7 @@ from scipy import ndimage
 
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.recognizer import Recognizer
-from training.diagnosis.findings import Diagnosis
+from training.diagnosis.checks import Diagnosis
 
 __all__ = ["check_channel_order", "check_light"]
 

@@ -7,7 +7,7 @@ from types import MappingProxyType
 import numpy as np
 
 from thor2_jax.frames.frames import MAX_DEPTH, MIN_DEPTH, RGBDFrame, pixel_rays
-from training.diagnosis.findings import Diagnosis
+from training.diagnosis.checks import Diagnosis
 
 __all__ = ["check_depth", "instance_extents"]
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, ndimage
 
-from training.diagnosis.findings import Diagnosis
+from training.diagnosis.checks import Diagnosis
 
 __all__ = ["Alignment", "align_edges", "check_labels_alignment", "check_registration"]
 

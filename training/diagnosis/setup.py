@@ -15,12 +15,9 @@ from numpy.typing import NDArray
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, frame_intrinsics, read_color, read_depth, read_labels
 from thor2_jax.recognizer import Recognizer
-from training.diagnosis.camera import check_camera
+from training.diagnosis.checks import Diagnosis, check_camera, check_labels, check_meshes
 from training.diagnosis.colors import check_channel_order, check_light
 from training.diagnosis.depth import check_depth
-from training.diagnosis.findings import Diagnosis
-from training.diagnosis.labels import check_labels
-from training.diagnosis.meshes import check_meshes
 from training.diagnosis.registration import check_labels_alignment, check_registration
 from training.readers.frame_files import FrameFiles
 from training.readers.frames import read_names

@@ -18,12 +18,11 @@ from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
 from thor2_jax.files import check_output_directory, check_output_file, remove_written
 from thor2_jax.gallery.embedding import Embedding
-from training.embedding.fit import EmbeddingFit, fit_embedding
-from training.embedding.references import reference_views
+from training.embedding.fit import EmbeddingFit, fit_embedding, reference_views
 from training.embedding.sampling import ObjectSource, build_samples
 from training.objects.meshes import find_meshes
 from training.storage.jobs import JOB_FILE
-from training.storage.progress import Progress
+from training.storage.progress import Progress, of_stage
 from training.storage.workers import local_workers
 
 __all__ = ["build_embedding", "main"]
@@ -72,7 +71,7 @@ def build_embedding(
         config,
         views,
         pool=local_workers(workers),
-        progress=lambda done, total: progress("render for the embedding", done, total, ""),
+        progress=of_stage(progress, "render for the embedding"),
     )
     embedding = fit_embedding(
         samples,

@@ -4,6 +4,8 @@ The loss is the cross-entropy of the scaled cosines between a view and all proxi
 (Movshovitz-Attias et al., "No Fuss Distance Metric Learning Using Proxies", ICCV 2017; Wang et al., "CosFace", CVPR
 2018). Views of a new object are compared with other views, not with proxies. The proxies of a run's classes also serve
 as a classifier.
+
+Reference views of an embedding are chosen from the samples that it was fitted on.
 """
 
 import dataclasses
@@ -25,13 +27,14 @@ from thor2_jax.descriptor.describe import describe_strips
 from thor2_jax.descriptor.looks import LookDescriptors
 from thor2_jax.errors import InputError
 from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes, class_cosines, color_features
+from thor2_jax.gallery.references import BACKGROUND, References
 from thor2_jax.types import Descriptors, Strips
 from training.embedding.samples import Batch, Samples
 from training.fitting.checkpoints import Checkpoints
 from training.fitting.loop import Steps, run_epochs
 from training.fitting.options import EpochMetrics
 
-__all__ = ["EmbeddingFit", "batch_descriptors", "fit_embedding"]
+__all__ = ["EmbeddingFit", "batch_descriptors", "fit_embedding", "reference_views"]
 
 BASIS_SAMPLES = 2048
 """Samples whose colours determine the principal components."""
@@ -238,3 +241,39 @@ def fit_embedding(
     models = [nnx.merge(graph, state.parameters, state.rest) for graph, state in zip(graphs, states, strict=True)]
     fitted = dataclasses.replace(embedding, model=models[0], further=tuple(models[1:]))
     return fitted if classes else fitted.without_proxies()
+
+
+BACKGROUND_VIEWS = 4096
+"""Views of the background; docs/decisions.md says why."""
+
+VIEWS_OF_CLASS = 64
+"""Views of each class, fewer if all classes have more than `BACKGROUND_VIEWS` together."""
+
+BATCH = 256
+
+
+def reference_views(embedding: Embedding, samples: Samples, seed: int = 0) -> References:
+    """Return the embedded reference views of an embedding.
+
+    Args:
+        embedding: the embedding.
+        samples: those that it was fitted on; the first labels are those of its classes.
+        seed: seed for the choice of the views.
+    """
+    rng, n_classes = np.random.default_rng(seed), len(embedding.classes)
+    per_class = min(VIEWS_OF_CLASS, BACKGROUND_VIEWS // max(n_classes, 1))
+    chosen = [_choose(samples.label == label, per_class, rng) for label in range(n_classes)]
+    rows = np.concatenate([*chosen, _choose(samples.label >= n_classes, BACKGROUND_VIEWS, rng)])
+    looks = (batch_looks(batch, embedding.network, embedding.config) for batch in samples.batches(rows, BATCH))
+    chunks = [embedding.embed_oriented(batch)[:, 0] for batch in looks]
+    label = samples.label[rows]
+    return References(
+        np.concatenate(chunks)[: len(rows)].astype(np.float16),
+        np.where(label < n_classes, label, BACKGROUND).astype(np.int32),
+        embedding.classes,
+    )
+
+
+def _choose(allowed: NDArray[np.bool_], count: int, rng: np.random.Generator) -> NDArray[np.intp]:
+    rows = np.flatnonzero(allowed)
+    return np.sort(rng.permutation(rows)[:count])

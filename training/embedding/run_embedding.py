@@ -5,6 +5,7 @@ them is held out, so that the confidence is calibrated on unknown objects that n
 """
 
 import dataclasses
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,16 +17,14 @@ from colornet import ColorNetwork
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
 from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
-from training.embedding.fit import EmbeddingFit, fit_embedding
-from training.embedding.references import reference_views
-from training.embedding.sample_cache import cached_samples
-from training.embedding.samples import Samples, joined_samples, sample_views
-from training.embedding.sampling import ObjectSource, build_samples, sampling_job
+from training.embedding.fit import EmbeddingFit, fit_embedding, reference_views
+from training.embedding.samples import Samples, joined_samples, sample_clouds
+from training.embedding.sampling import ObjectSource, build_samples, cached_samples, sampling_job
 from training.fitting.checkpoints import Checkpoints
 from training.fitting.options import EpochMetrics
 from training.objects.meshes import load_mesh
 from training.storage.jobs import JOB_FILE
-from training.storage.progress import Progress
+from training.storage.progress import Progress, of_stage
 from training.storage.workers import local_workers
 from training.views.normalized_views import ViewSource
 from training.views.render_job import mesh_digest
@@ -97,13 +96,8 @@ class Distractors:
     @property
     def record(self) -> dict[str, Any]:
         """All that determines the embedding, as JSON holds it."""
-        return {
-            "procedural": self.procedural,
-            "meshes": sorted(self.meshes),
-            "views": self.views,
-            "epochs": self.epochs,
-            "networks": self.networks,
-        }
+        named = {field.name: getattr(self, field.name) for field in dataclasses.fields(self) if field.name != "workers"}
+        return named | {"meshes": sorted(self.meshes)}
 
 
 def _distractor_samples(
@@ -114,17 +108,8 @@ def _distractor_samples(
     objects = [mesh_digest(load_mesh(source)) if isinstance(source, Path) else source for source in sources]
 
     def build() -> Samples:
-        return build_samples(
-            sources,
-            directory,
-            network,
-            config,
-            distractors.views,
-            COPIES,
-            SEED,
-            local_workers(distractors.workers),
-            lambda done, total: progress(RENDER, done, total, ""),
-        )
+        pool, show = local_workers(distractors.workers), of_stage(progress, RENDER)
+        return build_samples(sources, directory, network, config, distractors.views, COPIES, SEED, pool, show)
 
     job = sampling_job(objects, network, config, distractors.views, COPIES, SEED)
     samples = cached_samples(job, build, resumes=(directory / JOB_FILE).is_file())
@@ -174,9 +159,11 @@ def fit_run_embedding(
     for index, shard in enumerate(source.shards):
         views, rng = source.read(index), np.random.default_rng([seed, index])
         mask = np.isin(views.view, held_out.get(shard.label, []))
-        for rows, chunks in ((~mask, fitted), (mask, kept)):
-            if rows.any():
-                chunks.append(sample_views(views, rows, network, config, COPIES, rng))
+        for is_kept, chunks in ((False, fitted), (True, kept)):
+            clouds = list(itertools.compress(views.clouds(), mask == is_kept))
+            if clouds:
+                labels = [views.label] * len(clouds)
+                chunks.append(sample_clouds(clouds, labels, network, config, COPIES, rng, are_normal=True))
         progress(DESCRIBE, index + 1, len(source.shards), "")
     is_held_out = others.label % HELD_OUT == 0
     # Labels of fitted distractors are consecutive.

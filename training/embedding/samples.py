@@ -4,7 +4,7 @@ A sample stores only its occupied strips, about a tenth of all, and the statisti
 """
 
 import dataclasses
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -16,11 +16,11 @@ from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.cloud_statistics import cloud_statistics
 from thor2_jax.descriptor.describe import strips
 from thor2_jax.descriptor.view_normalization import turn, view_normalize
-from thor2_jax.types import Cloud, PointClouds
+from thor2_jax.types import Cloud
 from training.augmentation.orientation import reorient
-from training.views.normalized_views import NormalizedViews, padded_batches
+from training.views.normalized_views import padded_batches
 
-__all__ = ["Batch", "Samples", "concatenate_fields", "joined_samples", "sample_clouds", "sample_views"]
+__all__ = ["Batch", "Samples", "concatenate_fields", "joined_samples", "sample_clouds"]
 
 CLOUDS_PER_BATCH = 64
 
@@ -108,59 +108,26 @@ def sample_clouds(
     config: DescriptorConfig,
     copies: int,
     rng: np.random.Generator,
+    are_normal: bool = False,
 ) -> dict[str, NDArray[Any]]:
     """Return the fields of samples of clouds, each in `copies` random orientations.
 
     Args:
-        clouds: xyz [n, 3] float32 metres in the camera frame, rgb [n, 3] uint8.
+        clouds: xyz [n, 3] float32 metres in the camera frame, or normalized; rgb [n, 3] uint8. At least one.
         labels: of the clouds.
         network: colour network.
         config: descriptor. Static.
         copies: samples of each cloud.
         rng: generator of the orientations.
+        are_normal: whether the clouds are normalized. They stay in their order; clouds of one size share a batch
+            otherwise, so that little of it is padding.
     """
-    # Clouds of one size share a batch, so that little of it is padding.
-    order = sorted(range(len(clouds)), key=lambda k: len(clouds[k][0]))
-    batches = padded_batches([clouds[k] for k in order], CLOUDS_PER_BATCH)
-    normal = ((count, view_normalize(batch, config)) for count, batch in batches)
-    return _sample_normal(normal, np.array([labels[k] for k in order], np.int32), network, config, copies, rng)
-
-
-def sample_views(
-    views: NormalizedViews,
-    rows: NDArray[np.bool_],
-    network: ColorNetwork,
-    config: DescriptorConfig,
-    copies: int,
-    rng: np.random.Generator,
-) -> dict[str, NDArray[Any]]:
-    """Return the fields of samples of normalized views of one object, each in `copies` random orientations.
-
-    Args:
-        views: the views.
-        rows: [V], views to sample, at least one.
-        network: colour network.
-        config: descriptor. Static.
-        copies: samples of each view.
-        rng: generator of the orientations.
-    """
-    clouds = [cloud for cloud, chosen in zip(views.clouds(), rows, strict=True) if chosen]
-    labels = np.full(len(clouds), views.label, np.int32)
-    return _sample_normal(padded_batches(clouds, CLOUDS_PER_BATCH), labels, network, config, copies, rng)
-
-
-def _sample_normal(
-    batches: Iterable[tuple[int, PointClouds]],
-    labels: NDArray[np.int32],
-    network: ColorNetwork,
-    config: DescriptorConfig,
-    copies: int,
-    rng: np.random.Generator,
-) -> dict[str, NDArray[Any]]:
-    """Return the fields of samples of batches of normalized clouds; `labels` are those of all clouds."""
+    order = range(len(clouds)) if are_normal else sorted(range(len(clouds)), key=lambda k: len(clouds[k][0]))
+    label = np.array([labels[k] for k in order], np.int32)
     chunks: list[dict[str, NDArray[Any]]] = []
     done = 0
-    for count, normal in batches:
+    for count, batch in padded_batches([clouds[k] for k in order], CLOUDS_PER_BATCH):
+        normal = batch if are_normal else view_normalize(batch, config)
         sides = jnp.max(normal.points, axis=1)
         for _ in range(copies):
             occupied = strips(turn(reorient(normal, rng), config), network, config)
@@ -175,7 +142,7 @@ def _sample_normal(
                     "length": length[sample, strip].astype(np.float16),
                     "color": color[sample, strip].astype(np.float16),
                     "statistics": statistics,
-                    "label": labels[done : done + count],
+                    "label": label[done : done + count],
                 }
             )
         done += count
@@ -188,7 +155,7 @@ def concatenate_fields(chunks: Sequence[Mapping[str, NDArray[Any]]]) -> dict[str
 
 
 def joined_samples(chunks: Sequence[Mapping[str, NDArray[Any]]], config: DescriptorConfig) -> Samples:
-    """Return the samples of the fields that `sample_clouds` and `sample_views` return."""
+    """Return the samples of the fields that `sample_clouds` returns."""
     fields = concatenate_fields(chunks)
     start = np.concatenate([[0], np.cumsum(fields.pop("strips"), dtype=np.int64)])
     return Samples(start=start, shape=(config.n_slices, config.n_strips), **fields)

@@ -68,13 +68,6 @@ class RunArguments:
         return load_sequence_runs(self.models[0], frames.identifiers)
 
 
-@dataclasses.dataclass(frozen=True)
-class _Chunk:
-    arguments: RunArguments
-    frames: LabelledFrames
-    numbers: range
-
-
 def answer_frames_in_pool(
     arguments: RunArguments, frames: LabelledFrames, pool: WorkerPool, numbers: range
 ) -> Generator[tuple[LabelledFrame, FrameAnswers], None, None]:
@@ -86,10 +79,8 @@ def answer_frames_in_pool(
         InputError: as `answer_frames`.
         OSError: a file cannot be opened, or workers die repeatedly.
     """
-    chunks = [
-        _Chunk(arguments, frames, numbers[start : start + FRAMES_PER_CHUNK])
-        for start in range(0, len(numbers), FRAMES_PER_CHUNK)
-    ]
+    starts = range(0, len(numbers), FRAMES_PER_CHUNK)
+    chunks = [(arguments, frames, numbers[start : start + FRAMES_PER_CHUNK]) for start in starts]
     with contextlib.closing(pool(_answer_chunk, chunks)) as results:
         for answered, error in results:
             yield from answered
@@ -101,13 +92,16 @@ _loaded: dict[RunArguments, Sequence[Run]] = {}
 """The runs that this worker process has loaded."""
 
 
-def _answer_chunk(chunk: _Chunk) -> tuple[list[tuple[LabelledFrame, FrameAnswers]], Exception | None]:
-    if chunk.arguments not in _loaded:
+def _answer_chunk(
+    chunk: tuple[RunArguments, LabelledFrames, range],
+) -> tuple[list[tuple[LabelledFrame, FrameAnswers]], Exception | None]:
+    arguments, frames, numbers = chunk
+    if arguments not in _loaded:
         _loaded.clear()
-        _loaded[chunk.arguments] = chunk.arguments.load(chunk.frames)
+        _loaded[arguments] = arguments.load(frames)
     answered = []
     try:
-        for item, answers in answer_frames(_loaded[chunk.arguments], (chunk.frames[n] for n in chunk.numbers)):
+        for item, answers in answer_frames(_loaded[arguments], (frames[n] for n in numbers)):
             frame = dataclasses.replace(item.frame)  # without its cached properties
             answered.append((dataclasses.replace(item, frame=frame), answers))
     except (InputError, OSError) as error:

@@ -1,4 +1,4 @@
-"""Class probabilities of every classifier for every labelled instance, and the file that keeps them.
+"""Class probabilities of every classifier for every labelled instance, the file that keeps them, and their fusion.
 
 The first line of `answers.jsonl` describes the evaluation; each further line holds the answers for one frame. A line
 that an interrupted evaluation left incomplete is removed when the evaluation resumes. The digests of version 0.1.0 are
@@ -6,50 +6,45 @@ ignored.
 """
 
 import dataclasses
+import itertools
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
 from thor2_jax.files import errors_name, write_text
+from thor2_jax.model.classifier import FEATURES
+from thor2_jax.model.fusion import FUSION_RULES, FusionRule, fuse, with_temperature
+from training.baselines.names import TITLES
 from training.storage.jobs import check_same_job
 
-__all__ = ["AnswerFile", "EvaluatedRun", "FrameAnswers", "InstancePrediction", "all_predictors", "read_answers"]
+__all__ = [
+    "ALL_CLASSIFIERS",
+    "AnswerFile",
+    "BOTH",
+    "EMBEDDED",
+    "FrameAnswers",
+    "GALLERY",
+    "InstancePrediction",
+    "RULES",
+    "Rule",
+    "WHOLE",
+    "all_predictors",
+    "fuse_by",
+    "fusions",
+    "main_fusion",
+    "read_answers",
+]
+
+if TYPE_CHECKING:
+    from training.evaluation.runs import Run
 
 
-class EvaluatedRun(Protocol):
-    """The facts of a run that results of an evaluation depend on."""
-
-    @property
-    def name(self) -> str:
-        """Name in reports."""
-
-    @property
-    def classes(self) -> tuple[str, ...]:
-        """Class names, in the order of the probabilities."""
-
-    @property
-    def predictors(self) -> tuple[str, ...]:
-        """Names of the classifiers and baselines."""
-
-    @property
-    def answer_by(self) -> str:
-        """Source of the answers: "classifiers", "gallery" or "both"."""
-
-    @property
-    def temperatures(self) -> Mapping[str, float]:
-        """Temperatures of the calibrated classifiers and baselines."""
-
-    @property
-    def thresholds(self) -> NDArray[np.float64]:
-        """[C] confidence below which an object of each class is unknown; 0 if it is always named."""
-
-
-def all_predictors(runs: Sequence[EvaluatedRun]) -> tuple[tuple[int, str], ...]:
+def all_predictors(runs: Sequence["Run"]) -> tuple[tuple[int, str], ...]:
     """Return (index of the run, name) of every classifier and baseline of all runs."""
     return tuple((index, name) for index, run in enumerate(runs) for name in run.predictors)
 
@@ -191,3 +186,64 @@ def _decode(line: str | bytes) -> FrameAnswers:
         instances.append(InstancePrediction(**instance))
     files = dict(values.get("files", {}))
     return FrameAnswers(values["frame"], values["attributes"], values["seconds"], instances, files)
+
+
+Rule = FusionRule | Literal["calibrated"]
+RULES: tuple[Rule, ...] = (*FUSION_RULES, "calibrated")
+"""The rules of `fuse`, and "calibrated": the rule "max" on temperature-scaled probabilities."""
+
+EMBEDDED, ALL_CLASSIFIERS, GALLERY, BOTH = "embedding", "THOR2+embedding", "gallery", "both"
+"""Columns of the embedding alone, of THOR2 with the confidence that the embedding gives (in runs with the paper's
+classifiers), of the gallery alone, and of all combined. The recognizer computes them; no rule fuses them."""
+
+WHOLE = (EMBEDDED, ALL_CLASSIFIERS, GALLERY, BOTH)
+"""All columns that no rule fuses."""
+
+
+def fusions(available: Iterable[str]) -> dict[str, tuple[str, ...]]:
+    """Return title -> names for each available baseline and gallery alone and for every combination of classifiers.
+
+    Titles are those of the paper: CE, TOPS, ..., THOR2 (TOPS and TOPS2).
+    """
+    names = set(available)
+    features = [name for name in FEATURES if name in names]
+    groups = [group for size in range(1, len(features) + 1) for group in itertools.combinations(features, size)]
+    baselines: dict[str, tuple[str, ...]] = {title: (name,) for name, title in TITLES.items() if name in names}
+    classifiers = {"THOR2" if group == ("tops", "tops2") else "+".join(group).upper(): group for group in groups}
+    return baselines | classifiers | {name: (name,) for name in WHOLE if name in names}
+
+
+def main_fusion(titles: Iterable[str], answer_by: str = "classifiers") -> str:
+    """Return the column that the recognizer answers by.
+
+    Args:
+        titles: the columns, at least one.
+        answer_by: "classifiers" (the embedding with THOR2, THOR2, the embedding, or the last title: the first of them
+            that is among the titles), "gallery" or "both".
+    """
+    titles = list(titles)
+    for title in (answer_by, ALL_CLASSIFIERS, "THOR2", EMBEDDED):
+        if title in titles:
+            return title
+    return [title for title in titles if title not in WHOLE][-1]
+
+
+def fuse_by(
+    rule: Rule, probabilities: Mapping[str, NDArray[np.floating[Any]]], temperatures: Mapping[str, float] | None = None
+) -> tuple[NDArray[np.intp], NDArray[np.floating[Any]]]:
+    """Return the predicted class [B] and its fused probability [B].
+
+    Args:
+        rule: rule of the fusion.
+        probabilities: [B, C] class probabilities of each classifier.
+        temperatures: temperature of each classifier; needed for "calibrated".
+    """
+    if set(probabilities) <= set(WHOLE):
+        (values,) = probabilities.values()  # scores, which need not sum to 1
+        return values.argmax(axis=1), values.max(axis=1)
+    if rule == "calibrated":
+        assert temperatures is not None
+        probabilities = {name: with_temperature(values, temperatures[name]) for name, values in probabilities.items()}
+        rule = "max"
+    fused = fuse(probabilities, rule)
+    return fused.class_index, fused.confidence

@@ -22,7 +22,7 @@ from training.evaluation.page import write_report_page
 from training.evaluation.results import compute_results
 from training.evaluation.runs import Run, SequenceRun, has_real_views, scratch_networks
 from training.readers.labelled import LabelledFrame, LabelledFrames
-from training.storage.locks import locked
+from training.storage.jobs import locked
 from training.storage.progress import Progress
 
 __all__ = ["Answering", "evaluate_dataset"]
@@ -69,55 +69,48 @@ def evaluate_dataset(
     check_output_directory(out, ANSWERS)
     if not out.exists():
         frames[0]  # raises if it cannot be read, before anything is written
+
+    def in_process(numbers: range) -> Generator[tuple[LabelledFrame, FrameAnswers], None, None]:
+        return answer_frames(runs, (frames[number] for number in numbers))
+
     with locked(out):
-        return _evaluate(runs, frames, dataset, out, progress, answering)
-
-
-def _evaluate(
-    runs: Sequence[Run],
-    frames: LabelledFrames,
-    dataset: Mapping[str, str],
-    out: Path,
-    progress: Progress,
-    answering: Answering | None,
-) -> dict[str, Any]:
-    description = {**dataset, "frames": len(frames)}
-    digests = [run.digest for run in runs]
-    header = {
-        "dataset": description,
-        "descriptor_version": DESCRIPTOR_VERSION,
-        "runs": digests,
-        "classifiers": [list(predictor) for predictor in all_predictors(runs)],
-    }
-    file = AnswerFile(out / ANSWERS, header)
-    _check_unchanged(file, frames, out, progress)
-    for directory in (out, out / "frames", out / "confusions"):
-        remove_leftovers(directory)
-    pictures = FramePictures(out, runs, len(frames))
-    for answers in file.frames:
-        pictures.restore(answers)
-    _answer_rest(answering or _in_process(runs, frames), frames, file, pictures, progress)
-    own_objects = isinstance(runs[0], SequenceRun)
-    results = compute_results(
-        dataset["kind"], runs, file.frames, own_objects, has_real_views(runs), scratch_networks(runs)
-    )
-    report = {"dataset": description, "digests": digests, **results}
-    if not report["instances"]["scored"]:
-        raise InputError(
-            f"model: no instance of the dataset is of a class of the runs; the dataset has "
-            f"{_listed(report['instances']['no_class'])}, the runs know {_listed(runs[0].classes)}; check the names, "
-            "or give other runs"
+        description = {**dataset, "frames": len(frames)}
+        digests = [run.digest for run in runs]
+        header = {
+            "dataset": description,
+            "descriptor_version": DESCRIPTOR_VERSION,
+            "runs": digests,
+            "classifiers": [list(predictor) for predictor in all_predictors(runs)],
+        }
+        file = AnswerFile(out / ANSWERS, header)
+        _check_unchanged(file, frames, out, progress)
+        for directory in (out, out / "frames", out / "confusions"):
+            remove_leftovers(directory)
+        pictures = FramePictures(out, runs, len(frames))
+        for answers in file.frames:
+            pictures.restore(answers)
+        _answer_rest(answering or in_process, frames, file, pictures, progress)
+        own_objects = isinstance(runs[0], SequenceRun)
+        results = compute_results(
+            dataset["kind"], runs, file.frames, own_objects, has_real_views(runs), scratch_networks(runs)
         )
-    report["no_pixels"] = [
-        {"frame": answers.frame, "label": instance.label, "truth": instance.truth}
-        for answers in file.frames
-        for instance in answers.instances
-        if instance.reason == NO_PIXELS
-    ]
-    report["shown"] = [file.frames[number].frame for number in pictures.shown]
-    write_report_page(report, pictures, out)
-    write_text(out / "report.json", json.dumps(report, indent=1) + "\n")
-    return report
+        report = {"dataset": description, "digests": digests, **results}
+        if not report["instances"]["scored"]:
+            raise InputError(
+                f"model: no instance of the dataset is of a class of the runs; the dataset has "
+                f"{_listed(report['instances']['no_class'])}, the runs know {_listed(runs[0].classes)}; check the "
+                "names, or give other runs"
+            )
+        report["no_pixels"] = [
+            {"frame": answers.frame, "label": instance.label, "truth": instance.truth}
+            for answers in file.frames
+            for instance in answers.instances
+            if instance.reason == NO_PIXELS
+        ]
+        report["shown"] = [file.frames[number].frame for number in pictures.shown]
+        write_report_page(report, pictures, out)
+        write_text(out / "report.json", json.dumps(report, indent=1) + "\n")
+        return report
 
 
 def _listed(names: Iterable[str]) -> str:
@@ -144,10 +137,6 @@ def _check_unchanged(file: AnswerFile, frames: LabelledFrames, out: Path, progre
                 path = min(stored ^ current)[0]
                 raise InputError(f"out: {out} was written before {path} changed; choose another directory")
         progress("check files", number + 1, len(file.frames), "")
-
-
-def _in_process(runs: Sequence[Run], frames: LabelledFrames) -> Answering:
-    return lambda numbers: answer_frames(runs, (frames[number] for number in numbers))
 
 
 def _answer_rest(

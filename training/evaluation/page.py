@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from training.baselines.names import TITLES
+from training.evaluation.answers import ALL_CLASSIFIERS, EMBEDDED, RULES, WHOLE
 from training.evaluation.frame_pictures import FramePictures
-from training.evaluation.fusion import ALL_CLASSIFIERS, EMBEDDED, RULES, WHOLE
 from training.evaluation.published import published_seconds
 from training.evaluation.results import COVERAGE
 from training.reports.html import Picture, Section, Table, write_page
@@ -34,19 +34,17 @@ MAX_GROUPS = 8
 """Largest number of table rows that is also drawn as a bar chart."""
 
 
-def _mean_std(statistics: Mapping[str, Any]) -> str:
+def _mean_std(statistics: Mapping[str, Any], factor: float = 1.0, digits: int = 3) -> str:
     """Return the mean, and the standard deviation if there are several runs."""
     if statistics["mean"] is None:
         return "–"
-    return f"{statistics['mean']:.3f}" + ("" if statistics["std"] is None else f" ±\u00a0{statistics['std']:.3f}")
+    values = [value for value in (statistics["mean"], statistics["std"]) if value is not None]
+    return " ±\u00a0".join(f"{factor * value:.{digits}f}" for value in values)
 
 
 def _percent(statistics: Mapping[str, Any]) -> str:
     """Return `_mean_std` in percent, with two decimals as in the publications."""
-    if statistics["mean"] is None:
-        return "–"
-    std = statistics["std"]
-    return f"{100 * statistics['mean']:.2f}" + ("" if std is None else f" ±\u00a0{100 * std:.2f}")
+    return _mean_std(statistics, 100.0, 2)
 
 
 def _marked(title: str, main: str) -> str:
@@ -67,15 +65,14 @@ def accuracy_table(table: Mapping[str, Any], titles: Sequence[str]) -> Table:
         titles: fusions to show.
     """
     header = [", ".join(table["by"]), "instances", *titles]
-    rows = []
-    for cell in table["cells"]:
-        rows.append(
-            [
-                ", ".join(cell["where"].values()) or "all",
-                f"{cell['instances']:,}",
-                *(_mean_std(cell["accuracy"][title]) for title in titles),
-            ]
-        )
+    rows = [
+        [
+            ", ".join(cell["where"].values()) or "all",
+            f"{cell['instances']:,}",
+            *(_mean_std(cell["accuracy"][title]) for title in titles),
+        ]
+        for cell in table["cells"]
+    ]
     return header, rows
 
 
@@ -131,10 +128,14 @@ def write_report_page(report: Mapping[str, Any], pictures: FramePictures, out: P
     """
     sections: list[Section] = []
     if report["fusions"]:
+        main = report["main"]
         sections += [
             _answer_section(report, pictures, out),
             *_accuracy_sections(report, out),
-            *_published_sections(report),
+            *(
+                Section(comparison_title(table), comparison_text(table), marked(comparison_table(table, main), main))
+                for table in report["published_tables"]
+            ),
             *_fusion_sections(report),
             *_placement_sections(report),
             _confidence_section(report, out),
@@ -147,10 +148,6 @@ def write_report_page(report: Mapping[str, Any], pictures: FramePictures, out: P
         f"{runs} trained {'model' if runs == 1 else 'models'}. Dataset: {dataset['path']}"
     )
     write_page(out / "report.html", title=f"Evaluation on {dataset['kind']}", lead=lead, sections=sections)
-
-
-def _relative(path: Path, out: Path) -> str:
-    return path.relative_to(out).as_posix()
 
 
 def answer_texts(report: Mapping[str, Any]) -> list[str]:
@@ -176,7 +173,7 @@ def _answer_section(report: Mapping[str, Any], pictures: FramePictures, out: Pat
         rows.append([truth, name, f"{pair['count']}", f"{pair['share']:.0%}"])
         crop = pictures.confusion_path(pair["truth"], name)
         if crop.is_file():
-            shown.append(Picture(_relative(crop, out), f"{truth}, recognized as {name}", small=True))
+            shown.append(Picture(crop.relative_to(out).as_posix(), f"{truth}, recognized as {name}", small=True))
     models = f" Counts are sums over {len(report['runs'])} models." if len(report["runs"]) > 1 else ""
     text = " ".join(answer_texts(report)[:2]) + models
     text += " The most frequent wrong names, each with its most confident instance:" if rows else " No name is wrong."
@@ -205,17 +202,6 @@ def _with_fold(section: Section, every: Table, pictures: Sequence[Picture] = ())
         return dataclasses.replace(section, pictures=[*section.pictures, *pictures])
     folded = Section("Every classifier and baseline", table=every, pictures=pictures)
     return dataclasses.replace(section, folded=folded)
-
-
-def _published_sections(report: Mapping[str, Any]) -> list[Section]:
-    return [
-        Section(
-            comparison_title(table),
-            comparison_text(table),
-            marked(comparison_table(table, report["main"]), report["main"]),
-        )
-        for table in report["published_tables"]
-    ]
 
 
 def _accuracy_text(report: Mapping[str, Any]) -> str:
@@ -288,15 +274,8 @@ def _placement_sections(report: Mapping[str, Any]) -> list[Section]:
     if placements["count"] == overall["instances"]:
         return []
     header = ["", "accuracy over instances", "accuracy over placements", "steadiness"]
-    rows = [
-        [
-            title,
-            _mean_std(overall["accuracy"][title]),
-            _mean_std(placements["accuracy"][title]),
-            _mean_std(placements["steadiness"][title]),
-        ]
-        for title in report["fusions"]
-    ]
+    columns = overall["accuracy"], placements["accuracy"], placements["steadiness"]
+    rows = [[title, *(_mean_std(column[title]) for column in columns)] for title in report["fusions"]]
     text = (
         f"The {overall['instances']:,} instances are {placements['count']:,} placements: an object that does not move "
         "in neighbouring frames is one placement, since its answers are not independent. Accuracy over placements is "
@@ -395,7 +374,7 @@ def _frame_section(report: Mapping[str, Any], pictures: FramePictures, out: Path
         "true object stands in brackets; none: the instance could not be described."
     )
     shown = [
-        Picture(_relative(pictures.frame_path(number), out), f"Frame {name}.", half=True)
+        Picture(pictures.frame_path(number).relative_to(out).as_posix(), f"Frame {name}.", half=True)
         for number, name in zip(pictures.shown, report["shown"], strict=True)
     ]
     return Section("Frames", text, pictures=shown)

@@ -1,19 +1,22 @@
-"""Published accuracies that reports show beside the measured ones; `published.json` gives the sources."""
+"""Published accuracies (sources: `published.json`), the measured ones beside them, and how their data differ."""
 
 import dataclasses
 import functools
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from importlib import resources
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from training.evaluation.answers import Rule
+from training.evaluation.scores import summarize_runs
+
 __all__ = [
-    "PublishedCell",
-    "PublishedDataset",
-    "PublishedFigure",
-    "PublishedTable",
+    "EvaluationConditions",
+    "compare_with_published",
     "published_attributes",
-    "published_dataset",
     "published_means",
     "published_seconds",
     "published_tables",
@@ -24,113 +27,26 @@ _LIGHTS = {"1": "bright", "2": "dim"}
 `published.json`."""
 
 
-@dataclasses.dataclass(frozen=True)
-class PublishedFigure:
-    """An accuracy as printed, in percent.
-
-    Attributes:
-        mean: mean over the models.
-        std: standard deviation over the models; None if it is not known.
-    """
-
-    mean: float
-    std: float | None
-
-
-@dataclasses.dataclass(frozen=True)
-class PublishedCell:
-    """A row of a published table.
-
-    Attributes:
-        where: attribute values of its instances, as the paper names them; empty for the whole dataset.
-        figures: method -> accuracy.
-    """
-
-    where: Mapping[str, str]
-    figures: Mapping[str, PublishedFigure]
-
-
-@dataclasses.dataclass(frozen=True)
-class PublishedTable:
-    """A published table.
-
-    Attributes:
-        source: the publication.
-        number: number of the table in the publication; None if it is not known.
-        title: title of the table.
-        own_objects: whether the classes are the objects of the frame's own sequence (OCID); None if the dataset has no
-            such distinction.
-        objects: number of objects that are scored; None if it is not known or differs by sequence.
-        models: number of models behind each figure; None if it is not known.
-        notes: limits of the figures.
-        cells: the rows, in the order of the publication.
-    """
-
-    source: str
-    number: int | None
-    title: str
-    own_objects: bool | None
-    objects: int | None
-    models: int | None
-    notes: Sequence[str]
-    cells: Sequence[PublishedCell]
-
-    @property
-    def methods(self) -> tuple[str, ...]:
-        """Names of all methods, in the order of the columns."""
-        return tuple(dict.fromkeys(method for cell in self.cells for method in cell.figures))
-
-    def is_comparable(self, own_objects: bool) -> bool:
-        """Return whether the table's classes are those of an evaluation on each sequence's own objects, or on all."""
-        return self.own_objects in (None, own_objects)
-
-
-@dataclasses.dataclass(frozen=True)
-class PublishedDataset:
-    """The data of the published tables.
-
-    Attributes:
-        concerns: the dataset in words.
-        frames: number of frames; None if it is not known.
-        instances: number of instances; None if it is not known.
-    """
-
-    concerns: str
-    frames: int | None
-    instances: int | None
-
-
 @functools.cache
 def _read() -> dict[str, Any]:
     text = resources.files("training.evaluation").joinpath("published.json").read_text(encoding="utf-8")
     return dict(json.loads(text))
 
 
-@functools.cache
-def published_tables(kind: str) -> tuple[PublishedTable, ...]:
-    """Return the published tables of a kind of dataset ("uwis", "ocid"); none for other kinds."""
-    content = _read()
-    tables = []
-    for table in content["tables"]:
-        if table["kind"] == kind:
-            cells = [
-                PublishedCell(
-                    cell["where"], {method: PublishedFigure(*figure) for method, figure in cell["accuracy"].items()}
-                )
-                for cell in table["cells"]
-            ]
-            values = {name: table[name] for name in ("number", "title", "own_objects", "objects", "models", "notes")}
-            tables.append(PublishedTable(source=content["sources"][table["source"]], cells=cells, **values))
-    return tuple(tables)
+def published_tables(kind: str) -> list[dict[str, Any]]:
+    """Return the published tables of a kind of dataset ("uwis", "ocid") as `published.json` has them; often none.
 
-
-def published_dataset(kind: str) -> PublishedDataset:
-    """Return the data of the published tables of a kind of dataset that has some.
-
-    Raises:
-        KeyError: the kind has no published tables.
+    The rows are the `cells`, each with attribute values (`where`) and method -> mean and standard deviation in percent
+    (`accuracy`). The field `source` has the publication itself.
     """
-    return PublishedDataset(**_read()["datasets"][kind])
+    content = _read()
+    tables = (table for table in content["tables"] if table["kind"] == kind)
+    return [{**table, "source": content["sources"][table["source"]]} for table in tables]
+
+
+def _comparable_tables(kind: str, own_objects: bool) -> list[dict[str, Any]]:
+    """Return the tables whose classes are those of an evaluation on each sequence's own objects, or on all."""
+    return [table for table in published_tables(kind) if table["own_objects"] in (None, own_objects)]
 
 
 def published_attributes(kind: str, attributes: Mapping[str, str]) -> dict[str, str]:
@@ -157,15 +73,148 @@ def published_means(kind: str, where: Mapping[str, str], own_objects: bool) -> d
     """
     values = published_attributes(kind, where)
     return {
-        method: figure.mean / 100
-        for table in published_tables(kind)
-        if table.is_comparable(own_objects)
-        for cell in table.cells
-        if cell.where == values
-        for method, figure in cell.figures.items()
+        method: mean / 100
+        for table in _comparable_tables(kind, own_objects)
+        for cell in table["cells"]
+        if cell["where"] == values
+        for method, (mean, _) in cell["accuracy"].items()
     }
 
 
 def published_seconds() -> dict[str, float]:
     """Return system -> seconds per frame."""
     return dict(_read()["seconds_a_frame"])
+
+
+_OURS = {"THOR (MLP)": "THOR"}
+"""Published methods whose name differs from the title of the measured column."""
+
+_SYNTHETIC, _REAL, _SMALL = ", synthetic", ", +100 % YCB", "-small"
+"""What the published tables append to the methods that were trained without and with all real images, and what the
+titles of the small networks end with."""
+
+_PAPER_RULE: Rule = "max"
+"""Fusion rule of the THOR2 paper."""
+
+
+@dataclasses.dataclass(frozen=True)
+class EvaluationConditions:
+    """Facts that an evaluation states beside published figures.
+
+    Attributes:
+        own_objects: whether the classes are the objects of the frame's own sequence.
+        models: number of trained models.
+        frames: number of frames.
+        rule: fusion rule of the measured accuracies.
+        real_views: whether the models were trained on real views, too.
+        scratch: titles of the baselines whose networks were trained without pretrained weights.
+    """
+
+    own_objects: bool
+    models: int
+    frames: int
+    rule: Rule
+    real_views: bool = False
+    scratch: Collection[str] = ()
+
+
+def _measured_column(method: str, conditions: EvaluationConditions, titles: Collection[str]) -> str | None:
+    """Return the title of the measured column of a published method, that of a small network if it stands for it."""
+    other, own = (_SYNTHETIC, _REAL) if conditions.real_views else (_REAL, _SYNTHETIC)
+    if method.endswith(other):
+        return None
+    name = method.removesuffix(own)
+    return next((title for title in (_OURS.get(name, name), name + _SMALL) if title in titles), None)
+
+
+def compare_with_published(
+    kind: str,
+    conditions: EvaluationConditions,
+    attributes: Sequence[Mapping[str, str]],
+    objects: Sequence[str],
+    correct: Mapping[str, Sequence[NDArray[np.bool_]]],
+) -> list[dict[str, Any]]:
+    """Return the published tables that the evaluation has instances for, each with the measured accuracies.
+
+    Args:
+        kind: kind of dataset ("uwis", "ocid", ...).
+        conditions: conditions of the evaluation.
+        attributes: [N] attributes of the scored instances.
+        objects: [N] names of their objects.
+        correct: column title -> for each run, [N] whether the instance is recognized correctly.
+
+    Returns:
+        JSON tables with "number", "title", "source", "notes", "differences" (sentences), "ours" (published method ->
+        title of the measured column, where there is one) and "cells". A cell has "where", "instances", "published"
+        (method -> mean and standard deviation, from 0 to 1) and "accuracy" (title -> `summarize_runs`). Rows without an
+        instance are left out.
+    """
+    values = [published_attributes(kind, each) for each in attributes]
+    comparisons = []
+    for table in _comparable_tables(kind, conditions.own_objects):
+        cells, shown = [], np.zeros(len(values), bool)
+        for cell in table["cells"]:
+            rows = np.array([cell["where"].items() <= each.items() for each in values], bool)
+            if rows.any():
+                shown |= rows
+                published = {
+                    method: {"mean": mean / 100, "std": None if std is None else std / 100}
+                    for method, (mean, std) in cell["accuracy"].items()
+                }
+                accuracy = {t: summarize_runs([marks[rows].mean() for marks in each]) for t, each in correct.items()}
+                counts = {"instances": int(rows.sum())}
+                cells.append({"where": cell["where"], **counts, "published": published, "accuracy": accuracy})
+        if cells:
+            methods = dict.fromkeys(method for cell in table["cells"] for method in cell["accuracy"])
+            columns = {method: _measured_column(method, conditions, correct) for method in methods}
+            ours = {method: title for method, title in columns.items() if title is not None}
+            n_objects = len({name for name, is_shown in zip(objects, shown, strict=True) if is_shown})
+            differences = _differences(kind, table, conditions, n_objects, len(cells))
+            differences += _network_differences(ours.values(), conditions)
+            kept = {name: table[name] for name in ("number", "title", "source", "notes")}
+            comparisons.append({**kept, "differences": differences, "ours": ours, "cells": cells})
+    return comparisons
+
+
+def _network_differences(titles: Iterable[str], conditions: EvaluationConditions) -> list[str]:
+    """Return the limits of the measured image networks."""
+    sentences = []
+    for title in dict.fromkeys(titles):
+        if title.endswith(_SMALL):
+            sentences.append(f"{title} is a smaller network than the published one.")
+        if title in conditions.scratch:
+            sentences.append(
+                f"{title} was trained from scratch, without pretrained weights: its accuracy is no claim about the "
+                "published network."
+            )
+    return sentences
+
+
+def _differences(
+    kind: str, table: Mapping[str, Any], conditions: EvaluationConditions, n_objects: int, n_rows: int
+) -> list[str]:
+    """Return one sentence for each known difference between the data of the table and of the evaluation."""
+    data = _read()["datasets"][kind]
+    size = f" ({data['frames']:,} frames, {data['instances']:,} instances)" if data["frames"] else ""
+    sentences = [
+        f"The published figures concern {data['concerns']}{size}; here {conditions.frames:,} frames are evaluated."
+    ]
+    if table["objects"] is None:
+        sentences.append(f"Number of objects that are scored here: {n_objects}.")
+    elif table["objects"] != n_objects:
+        sentences.append(f"The publication scores {table['objects']} objects, this evaluation {n_objects}.")
+    if n_rows < len(table["cells"]):
+        sentences.append(
+            f"{len(table['cells']) - n_rows} of the table's {len(table['cells'])} rows have no instance here."
+        )
+    models = "models of its own" if table["models"] is None else f"{table['models']} models"
+    sentences.append(
+        f"The publication uses {models}; here {conditions.models} "
+        f"{'model is' if conditions.models == 1 else 'models are'} evaluated, trained on other views and folds."
+    )
+    fuses = any("THOR2" in method for cell in table["cells"] for method in cell["accuracy"])
+    if fuses and conditions.rule != _PAPER_RULE:
+        sentences.append(
+            f"The publication fuses classifiers by the rule {_PAPER_RULE}, this table by {conditions.rule}."
+        )
+    return sentences

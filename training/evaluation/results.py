@@ -3,26 +3,41 @@
 import dataclasses
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.model.fusion import DEFAULT_RULE
-from training.evaluation.accuracy import attribute_tables, group_by_attributes, summarize_rows, summarize_runs
-from training.evaluation.answers import EvaluatedRun, FrameAnswers, InstancePrediction, all_predictors
-from training.evaluation.comparison import EvaluationConditions, compare_with_published
-from training.evaluation.confidence import (
+from training.evaluation.answers import (
+    RULES,
+    FrameAnswers,
+    InstancePrediction,
+    Rule,
+    all_predictors,
+    fuse_by,
+    fusions,
+    main_fusion,
+)
+from training.evaluation.published import EvaluationConditions, compare_with_published, published_means
+from training.evaluation.scores import (
     accuracy_at_coverage,
+    attribute_tables,
     auroc,
     expected_calibration_error,
+    find_placements,
+    group_by_attributes,
+    placement_accuracy,
     reliability,
+    steadiness,
+    summarize_rows,
+    summarize_runs,
     unknown_named,
 )
-from training.evaluation.fusion import RULES, Rule, fuse_by, fusions, main_fusion
-from training.evaluation.placements import find_placements, placement_accuracy, steadiness
-from training.evaluation.published import published_means
 from training.readers.labelled import sequence_of
+
+if TYPE_CHECKING:
+    from training.evaluation.runs import Run
 
 __all__ = ["COVERAGE", "Predictions", "compute_results", "fuse_answers", "named_answers"]
 
@@ -31,6 +46,9 @@ COVERAGE = 0.95
 
 CURVE = tuple(k / 100 for k in range(101))
 """Shares of the correct answers at which the known/unknown curve is computed."""
+
+Flags = NDArray[np.bool_]
+Integers = NDArray[np.intp]
 
 MOST_FREQUENT = 12
 """Pairs of object and wrong name listed in a report, of known and of unknown objects."""
@@ -45,12 +63,16 @@ class Predictions:
         confidence: [N] fused probabilities of these classes.
     """
 
-    class_index: NDArray[np.intp]
+    class_index: Integers
     confidence: NDArray[np.floating[Any]]
 
 
+Fused = Mapping[str, Mapping[int, Predictions]]
+"""Fusion -> index of the run -> predictions."""
+
+
 def fuse_answers(
-    instances: Sequence[InstancePrediction], runs: Sequence[EvaluatedRun], rule: Rule = DEFAULT_RULE
+    instances: Sequence[InstancePrediction], runs: Sequence["Run"], rule: Rule = DEFAULT_RULE
 ) -> dict[str, dict[int, Predictions]]:
     """Return fusion -> index of the run -> predictions for those of `instances` that were described.
 
@@ -73,7 +95,7 @@ def fuse_answers(
 
 
 def named_answers(
-    instances: Sequence[InstancePrediction], runs: Sequence[EvaluatedRun]
+    instances: Sequence[InstancePrediction], runs: Sequence["Run"]
 ) -> Iterator[tuple[int, InstancePrediction, str | None, float]]:
     """Yield what `recognize` answers with each run: index of the run, described instance, name or None, confidence.
 
@@ -90,7 +112,7 @@ def named_answers(
 
 def compute_results(
     kind: str,
-    runs: Sequence[EvaluatedRun],
+    runs: Sequence["Run"],
     frames: Sequence[FrameAnswers],
     own_objects: bool = False,
     real_views: bool = False,
@@ -149,27 +171,31 @@ def _speed(seconds: Sequence[float]) -> dict[str, Any]:
 
 def _scores(
     kind: str,
-    runs: Sequence[EvaluatedRun],
+    runs: Sequence["Run"],
     known: Sequence[tuple[InstancePrediction, Mapping[str, str]]],
-    placement: NDArray[np.intp],
+    placement: Integers,
     unknown: Sequence[InstancePrediction],
     conditions: EvaluationConditions,
 ) -> dict[str, Any]:
     """Return the part of the results that needs instances of the runs' classes."""
     classes = runs[0].classes
-    instances = [instance for instance, _ in known]
+    instances, attributes = [instance for instance, _ in known], [each for _, each in known]
     described = np.array([i.probabilities is not None for i in instances])
     truth = np.array([classes.index(i.truth) for i in instances], np.intp)
     by_rule = {rule: fuse_answers(instances, runs, rule) for rule in RULES}
-    attributes = [each for _, each in known]
+    unknown_by_rule = {rule: fuse_answers(unknown, runs, rule) for rule in (DEFAULT_RULE, "calibrated")}
     tables = attribute_tables(kind, attributes)
     main = main_fusion(by_rule[DEFAULT_RULE], runs[0].answer_by)
-    by_run = by_rule[DEFAULT_RULE][main]
-    predictions = list(by_run.values())
-    unknown_predictions = fuse_answers(unknown, runs, DEFAULT_RULE)[main]
-    confusion = _confusion(predictions, truth, described, len(classes))
-    correct = {rule: _correct(fused, truth, described) for rule, fused in by_rule.items()}
-    rules: dict[str, Rule] = {"confidence": DEFAULT_RULE, "calibrated_confidence": "calibrated"}
+    by_run, unknown_by_run = by_rule[DEFAULT_RULE][main], unknown_by_rule[DEFAULT_RULE][main]
+    answers = {
+        rule: {title: [_of_all(p, described) for p in by_run.values()] for title, by_run in fused.items()}
+        for rule, fused in by_rule.items()
+    }
+    correct = {
+        rule: {title: [answer == truth for answer in each] for title, each in by_title.items()}
+        for rule, by_title in answers.items()
+    }
+    rejection = [_rejection(by_run[run], truth, described, unknown_by_run[run], runs[run].thresholds) for run in by_run]
     return {
         "fusions": list(by_rule[DEFAULT_RULE]),
         "accuracy": {
@@ -183,43 +209,39 @@ def _scores(
             name: summarize_runs([run.temperatures[name] for run in runs if name in run.temperatures])
             for name in dict.fromkeys(name for _, name in all_predictors(runs))
         },
-        **{
-            key: _confidence(by_rule[rule], truth[described], fuse_answers(unknown, runs, rule))
-            for key, rule in rules.items()
+        "confidence": _confidence(by_rule[DEFAULT_RULE], truth[described], unknown_by_rule[DEFAULT_RULE]),
+        "calibrated_confidence": _confidence(by_rule["calibrated"], truth[described], unknown_by_rule["calibrated"]),
+        "placements": {
+            "count": len(np.unique(placement)),
+            "accuracy": {
+                title: summarize_runs([placement_accuracy(placement, marks) for marks in each])
+                for title, each in correct[DEFAULT_RULE].items()
+            },
+            "steadiness": {
+                title: summarize_runs([steadiness(placement, answer) for answer in each])
+                for title, each in answers[DEFAULT_RULE].items()
+            },
         },
-        "placements": _placements(by_rule[DEFAULT_RULE], placement, truth, described),
         "main": main,
-        "rejection": summarize_rows(
-            [
-                _rejection(by_run[run], truth, described, unknown_predictions[run], runs[run].thresholds)
-                for run in by_run
-            ]
-        ),
-        "known_unknown": _known_unknown([(by_run[run], unknown_predictions[run]) for run in by_run], truth[described]),
-        "reliability": _reliability(predictions, truth[described]),
-        "confusion": confusion.tolist(),
+        "rejection": summarize_rows(rejection),
+        "known_unknown": _known_unknown([(by_run[run], unknown_by_run[run]) for run in by_run], truth[described]),
+        "reliability": _reliability(list(by_run.values()), truth[described]),
+        "confusion": _confusion(answers[DEFAULT_RULE][main], truth, len(classes)).tolist(),
     } | _answers([*instances, *unknown], runs)
 
 
-def _correct(
-    fused: Mapping[str, Mapping[int, Predictions]], truth: NDArray[np.intp], described: NDArray[np.bool_]
-) -> dict[str, list[NDArray[np.bool_]]]:
-    """Return which instances each run's fusion predicts correctly; those that were not described are incorrect."""
-    correct: dict[str, list[NDArray[np.bool_]]] = {}
-    for title, by_run in fused.items():
-        correct[title] = []
-        for predictions in by_run.values():
-            marks = np.zeros(len(truth), bool)
-            marks[described] = predictions.class_index == truth[described]
-            correct[title].append(marks)
-    return correct
+def _of_all(predictions: Predictions, described: Flags) -> Integers:
+    """Return the predicted class of every instance [N]; -1 of those that were not described."""
+    answers = np.full(len(described), -1, np.intp)
+    answers[described] = predictions.class_index
+    return answers
 
 
 def _accuracy(
     kind: str,
     names: Sequence[str],
     attributes: Sequence[Mapping[str, str]],
-    correct: Mapping[str, Sequence[NDArray[np.bool_]]],
+    correct: Mapping[str, Sequence[Flags]],
     own_objects: bool,
 ) -> dict[str, Any]:
     """Return the accuracy of each fusion by the named attributes, with published values of the same cells."""
@@ -232,17 +254,12 @@ def _accuracy(
     return {"by": list(names), "cells": cells}
 
 
-def _confidence(
-    fused: Mapping[str, Mapping[int, Predictions]],
-    truth: NDArray[np.intp],
-    unknown: Mapping[str, Mapping[int, Predictions]],
-) -> dict[str, Any]:
+def _confidence(fused: Fused, truth: Integers, unknown: Fused) -> dict[str, Any]:
     """Return confidence metrics of each fusion, on known objects and against unknown ones."""
-    metrics = {}
-    for title, by_run in fused.items():
-        rows = [_confidence_of_run(by_run[run], truth, unknown[title][run]) for run in by_run]
-        metrics[title] = summarize_rows(rows)
-    return metrics
+    return {
+        title: summarize_rows([_confidence_of_run(by_run[run], truth, unknown[title][run]) for run in by_run])
+        for title, by_run in fused.items()
+    }
 
 
 def _confidence_of_run(known: Predictions, truth: NDArray[np.intp], unknown: Predictions) -> dict[str, float]:
@@ -261,44 +278,11 @@ def _confidence_of_run(known: Predictions, truth: NDArray[np.intp], unknown: Pre
     }
 
 
-def _placements(
-    fused: Mapping[str, Mapping[int, Predictions]],
-    placement: NDArray[np.intp],
-    truth: NDArray[np.intp],
-    described: NDArray[np.bool_],
-) -> dict[str, Any]:
-    """Return the number of placements, and accuracy over placements and steadiness of each fusion."""
-    correct = _correct(fused, truth, described)
-    return {
-        "count": len(np.unique(placement)),
-        "accuracy": {
-            title: summarize_runs([placement_accuracy(placement, marks) for marks in each])
-            for title, each in correct.items()
-        },
-        "steadiness": {
-            title: summarize_runs([steadiness(placement, _class_or_none(p, described)) for p in by_run.values()])
-            for title, by_run in fused.items()
-        },
-    }
-
-
-def _class_or_none(predictions: Predictions, described: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """Return the predicted class of every instance [N]; -1 of those that were not described."""
-    answers = np.full(len(described), -1, np.intp)
-    answers[described] = predictions.class_index
-    return answers
-
-
 def _rejection(
-    known: Predictions,
-    truth: NDArray[np.intp],
-    described: NDArray[np.bool_],
-    unknown: Predictions,
-    thresholds: NDArray[np.float64],
+    known: Predictions, truth: Integers, described: Flags, unknown: Predictions, thresholds: NDArray[np.float64]
 ) -> dict[str, float]:
     """Return shares of the known and the unknown objects without rejection and at the run's thresholds [C]."""
-    correct = np.zeros(len(truth), bool)
-    correct[described] = known.class_index == truth[described]
+    correct = _of_all(known, described) == truth
     named = described.copy()
     named[described] = known.confidence >= thresholds[known.class_index]
     return {
@@ -314,7 +298,7 @@ def _rejection(
 
 
 def _known_unknown(
-    predictions: Sequence[tuple[Predictions, Predictions]], truth: NDArray[np.intp]
+    predictions: Sequence[tuple[Predictions, Predictions]], truth: Integers
 ) -> dict[str, list[float]] | None:
     """Return the known/unknown curve, the mean over the runs; None without unknown objects or correct answers.
 
@@ -327,7 +311,7 @@ def _known_unknown(
     return {"kept": list(CURVE), "named": named.mean(axis=0).tolist()} if len(named) else None
 
 
-def _reliability(predictions: Sequence[Predictions], truth: NDArray[np.intp]) -> dict[str, list[Any]]:
+def _reliability(predictions: Sequence[Predictions], truth: Integers) -> dict[str, list[Any]]:
     """Return the bins of the reliability diagram, all runs together."""
     confidence = np.concatenate([p.confidence for p in predictions])
     correct = np.concatenate([p.class_index == truth for p in predictions])
@@ -339,19 +323,15 @@ def _reliability(predictions: Sequence[Predictions], truth: NDArray[np.intp]) ->
     }
 
 
-def _confusion(
-    predictions: Sequence[Predictions], truth: NDArray[np.intp], described: NDArray[np.bool_], n_classes: int
-) -> NDArray[np.intp]:
+def _confusion(answers: Sequence[Integers], truth: Integers, n_classes: int) -> Integers:
     """Return [C, C + 1] counts over all runs: rows are true classes, the last column instances not described."""
     counts = np.zeros((n_classes, n_classes + 1), np.intp)
-    for each in predictions:
-        predicted = np.full(len(truth), n_classes)
-        predicted[described] = each.class_index
-        np.add.at(counts, (truth, predicted), 1)
+    for answer in answers:
+        np.add.at(counts, (truth, answer), 1)  # -1 is the last column
     return counts
 
 
-def _answers(instances: Sequence[InstancePrediction], runs: Sequence[EvaluatedRun]) -> dict[str, Any]:
+def _answers(instances: Sequence[InstancePrediction], runs: Sequence["Run"]) -> dict[str, Any]:
     """Return the numbers of answers over all runs, and the most frequent wrong names, of unknown objects first."""
     classes, count, wrong = runs[0].classes, Counter[str](), Counter[tuple[str, str]]()
     for _, instance, name, _ in named_answers(instances, runs):

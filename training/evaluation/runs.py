@@ -26,10 +26,10 @@ from thor2_jax.model.run_record import RUN_FILE
 from thor2_jax.recognizer import Recognizer
 from training.baselines.baseline import Baseline, BaselineInputs
 from training.baselines.files import baseline_file
-from training.baselines.load import load_baselines
+from training.baselines.job import load_baselines
 from training.baselines.names import NETWORKS, TEMPLATES, TITLES
-from training.evaluation.fusion import ALL_CLASSIFIERS, BOTH, EMBEDDED, GALLERY
-from training.fitting.run_directories import find_run_directories
+from training.evaluation.answers import ALL_CLASSIFIERS, BOTH, EMBEDDED, GALLERY
+from training.fitting.checkpoints import find_run_directories
 from training.readers.labelled import named_path, path_ends, sequence_of
 
 __all__ = ["Run", "SequenceRun", "has_real_views", "load_runs", "load_sequence_runs", "scratch_networks"]

@@ -1,6 +1,7 @@
-"""Temperatures of a fold's classifiers, fitted on its held-out set."""
+"""Temperatures of classifiers (Guo et al., ICML 2017), and the confidence of a run, fitted on held-out sets."""
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from functools import partial
 from typing import Any
@@ -9,15 +10,32 @@ import jax
 import numpy as np
 from flax import nnx
 from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
+from scipy.special import log_softmax, logit
+from sklearn.linear_model import LogisticRegression
 
 from colornet import ColorNetwork
 from thor2_jax.config import DescriptorConfig
-from thor2_jax.model.classifier import MLP, Feature, class_probabilities
+from thor2_jax.errors import InputError
+from thor2_jax.gallery.embedding import Embedding
+from thor2_jax.model.classifier import EMBEDDING, MLP, Feature, class_probabilities
+from thor2_jax.model.confidence import MAX_ODDS, Calibration, answer_features
+from thor2_jax.model.inference import infer
+from thor2_jax.model.model import Model
+from thor2_jax.model.run_directory import TrainedRun
+from training.embedding.fit import batch_looks
+from training.embedding.samples import Samples as EmbeddingSamples
 from training.fitting.samples import Batch, Samples
 from training.fitting.steps import FitContext, describe_batch
-from training.fitting.temperature import fit_temperature
 
-__all__ = ["sample_probabilities", "temperatures"]
+__all__ = [
+    "KEPT",
+    "fit_calibration",
+    "fit_temperature",
+    "negative_log_likelihood",
+    "sample_probabilities",
+    "temperatures",
+]
 
 SAMPLES_PER_BATCH = 256
 """Batch size of the predictions."""
@@ -67,3 +85,95 @@ def temperatures(
         name: fit_temperature(sample_probabilities(model, samples, rows, FitContext(name, network, config)), truth)
         for name, model in classifiers.items()
     }
+
+
+Floats = NDArray[np.floating[Any]]
+
+
+def negative_log_likelihood(probabilities: Floats, truth: NDArray[np.integer[Any]], temperature: float = 1.0) -> float:
+    """Return the mean of -log p(true class) over [N, C] probabilities with true class indices `truth` [N]."""
+    logits = np.log(np.maximum(np.asarray(probabilities, np.float64), np.finfo(np.float32).tiny))
+    return float(-log_softmax(logits / temperature, axis=1)[np.arange(len(truth)), truth].mean())
+
+
+def fit_temperature(probabilities: Floats, truth: NDArray[np.integer[Any]]) -> float:
+    """Return the temperature between 0.01 and 100 that minimizes the negative log-likelihood of a held-out set.
+
+    Args:
+        probabilities: [N, C] class probabilities of views that the classifier was not trained on.
+        truth: [N] class indices.
+
+    Raises:
+        InputError: the shapes do not match, N is 0, or an index is not a class.
+    """
+    probabilities, truth = np.asarray(probabilities), np.asarray(truth)
+    if probabilities.ndim != 2 or truth.shape != probabilities.shape[:1] or len(truth) == 0:
+        raise InputError(
+            f"probabilities and truth have shapes {probabilities.shape} and {truth.shape}; "
+            "expected [N, C] and [N] with N above 0"
+        )
+    if truth.min() < 0 or truth.max() >= probabilities.shape[1]:
+        raise InputError(
+            f"truth has values from {truth.min()} to {truth.max()}; expected 0 to {probabilities.shape[1] - 1}"
+        )
+    optimum = minimize_scalar(
+        lambda exponent: negative_log_likelihood(probabilities, truth, math.exp(exponent)),
+        bounds=(math.log(0.01), math.log(100)),
+        method="bounded",
+        options={"xatol": 1e-6},
+    )
+    return math.exp(optimum.x)
+
+
+KEPT = 0.97
+"""Share of the correct held-out answers whose confidence reaches the threshold of a run.
+
+Cameras are harder than held-out renderings: under them, about .95 reach it (docs/decisions.md).
+"""
+
+BATCH = 128
+
+
+def fit_calibration(
+    run: TrainedRun, embedding: Embedding, held_out: EmbeddingSamples
+) -> tuple[Calibration | None, float]:
+    """Fit the confidence of a run; None if no held-out answer is correct, or no object is unknown.
+
+    Known and unknown objects have equal weights in the score, whatever their numbers.
+
+    Args:
+        run: run with its classifiers, which are fused as recognition does by default.
+        embedding: embedding of the run.
+        held_out: samples of the held-out set; labels from the number of classes on are of unknown objects.
+
+    Returns:
+        The calibration, and the accuracy on known objects.
+    """
+    model = Model.of_run(dataclasses.replace(run, embedding=embedding))
+    batches = held_out.batches(np.arange(len(held_out)), BATCH)
+    chunks = [infer(model, batch_looks(batch, run.network, embedding.config)).probabilities for batch in batches]
+    probabilities = {name: np.concatenate([c[name] for c in chunks])[: len(held_out)] for name in chunks[0]}
+    fused = model.fused(probabilities)  # not calibrated yet
+    features = answer_features(fused, probabilities[EMBEDDING])
+    correct, known = fused.argmax(axis=1) == held_out.label, held_out.label < len(run.classes)
+    accuracy = float(correct.sum() / max(known.sum(), 1))  # correct answers are to known objects
+    if known.all() or not correct.any():
+        return None, accuracy
+    of_known = _logistic(features[:, 1], known, "balanced")
+    if correct[known].all():  # nothing tells when a known object is named incorrectly; unknown ones still are
+        calibration = Calibration(MAX_ODDS, 0.0, *of_known, unknown_below=0.0)
+    else:
+        of_correct = _logistic(features[known, 0], correct[known])
+        calibration = Calibration(*of_correct, *of_known, unknown_below=0.0)
+        score = logit(calibration.score(fused, probabilities[EMBEDDING]))
+        bias, factor = _logistic(score[known], correct[known])
+        if factor > 0:  # otherwise the confidence would not grow with the score
+            calibration = dataclasses.replace(calibration, score_bias=bias, score_factor=factor)
+    confidence = calibration.confidence(fused, probabilities[EMBEDDING])[correct]
+    return dataclasses.replace(calibration, unknown_below=float(np.quantile(confidence, 1 - KEPT))), accuracy
+
+
+def _logistic(feature: NDArray[Any], target: NDArray[np.bool_], class_weight: str | None = None) -> tuple[float, float]:
+    """Return bias and factor of a logistic regression on one feature [N]; "balanced" weights both targets equally."""
+    fit = LogisticRegression(class_weight=class_weight).fit(feature[:, None], target)
+    return float(fit.intercept_[0]), float(fit.coef_[0, 0])

@@ -16,7 +16,7 @@ import logging
 import os
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -28,8 +28,9 @@ from orbax.checkpoint import checkpoint_managers
 
 from thor2_jax.errors import InputError
 from thor2_jax.files import directory_digest, write_text
+from thor2_jax.model.run_record import RUN_FILE
 
-__all__ = ["BEGUN", "CHECKPOINTS", "Checkpoints"]
+__all__ = ["BEGUN", "CHECKPOINTS", "Checkpoints", "find_run_directories"]
 
 CHECKPOINTS = "checkpoints"
 """Directory inside the run directory of an unfinished training."""
@@ -177,3 +178,23 @@ def _quiet_orbax() -> Iterator[None]:
         sys.excepthook = hook
     finally:
         logger.disabled = before
+
+
+def find_run_directories(paths: Iterable[Path]) -> list[Path]:
+    """Return the run directories among `paths`; a directory with fold-0, fold-1, ... is replaced by its folds.
+
+    Raises:
+        InputError: A training is not finished. A path that is not a run directory is refused when it is loaded.
+    """
+    directories: list[Path] = []
+    for path in map(Path, paths):
+        folds = [f.parent for f in path.glob(f"fold-*/{RUN_FILE}") if f.parent.name[5:].isdecimal()]
+        if (path / RUN_FILE).is_file() or not folds:
+            directories.append(path)
+        elif (path / CHECKPOINTS / BEGUN).exists():
+            raise InputError(
+                f"model: {path} holds an unfinished training; finish it with `thor2 train`, or give single folds of it"
+            )
+        else:
+            directories += sorted(folds, key=lambda fold: int(fold.name[5:]))
+    return directories

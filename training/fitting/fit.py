@@ -8,7 +8,6 @@ another number of devices, floating-point sums are rounded differently, and the 
 
 import dataclasses
 from collections.abc import Callable, Iterator
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -78,90 +77,66 @@ def fit(
             is unreadable, or the loss is not finite (the last checkpoint stays).
         OSError: A checkpoint cannot be written; the previous one stays.
     """
-    fitter = _Fitter.create(samples, context, options, held_out)
+    context = dataclasses.replace(context, config=dataclasses.replace(context.config, homology="closed_form"))
+    n_devices, rows = context.mesh.devices.size, np.arange(len(samples))
+    train_rows, held_out_rows = (rows, rows[:0]) if held_out is None else (rows[~held_out], rows[held_out])
+    check_batch_size(options.batch_size, context.mesh)
+    least = max(2, n_devices)
+    if len(train_rows) < least:
+        raise InputError(
+            f"there are {len(train_rows)} samples to train on; at least {least} are required; render more views"
+        )
+    batch_size = min(options.batch_size, len(train_rows) // n_devices * n_devices)
+    steps = Steps(options.epochs, len(train_rows) // batch_size, batch_size)
+    graph, initial = initial_state(_create_model(samples, context, options.seed, train_rows))
+
+    def batches(rows: NDArray[np.intp]) -> Iterator[Batch]:
+        """Yield batches on the devices; this process gathers its own chunk of each."""
+        chunk = batch_size // jax.process_count()
+        for first in range(jax.process_index() * chunk, len(rows), batch_size):
+            yield shard_batch(samples.take(rows[first : first + chunk]), context.mesh)
+
+    def epoch(number: int) -> Iterator[Batch]:
+        # The order is drawn from seed and epoch, so that a resumed fit needs no generator state.
+        order = np.random.default_rng((options.seed, number)).permutation(train_rows)
+        return batches(order[: steps.of_epoch * batch_size])
+
+    def step(state: FitState, number: int, batch: Batch) -> tuple[FitState, tuple[jax.Array, jax.Array]]:
+        is_second_half = number // steps.of_epoch + 1 > (options.epochs + 1) // 2
+        rate = np.float32(options.learning_rates[is_second_half])
+        return train_step(context, graph, state, batch, rate, np.uint32(options.seed), np.uint32(number))
+
+    def held_out_accuracy(state: FitState) -> float | None:
+        if not len(held_out_rows):
+            return None
+        padded = np.resize(held_out_rows, len(held_out_rows) + -len(held_out_rows) % batch_size)
+        remaining = range(len(held_out_rows), 0, -batch_size)
+        correct = [
+            count_correct(context, graph, state, batch, np.int32(n))
+            for n, batch in zip(remaining, batches(padded), strict=True)
+        ]
+        return float(np.sum(jax.device_get(correct)) / len(held_out_rows))
+
     state = run_epochs(
         context.feature,
-        fitter.state,
-        Steps(options.epochs, fitter.steps_per_epoch, fitter.batch_size),
-        fitter.epoch,
-        fitter.step,
+        initial,
+        steps,
+        epoch,
+        step,
         checkpoints,
         progress=progress,
         epoch_done=epoch_done,
-        held_out_accuracy=fitter.held_out_accuracy,
+        held_out_accuracy=held_out_accuracy,
         place=lambda state: replicate(state, context.mesh),
     )
     best = jax.tree.map(jnp.asarray, checkpoints.best(state))
-    return nnx.merge(fitter.graph, best.params, best.rest), checkpoints.best_epoch
+    return nnx.merge(graph, best.params, best.rest), checkpoints.best_epoch
 
 
-@dataclasses.dataclass(frozen=True)
-class _Fitter:
-    """A fit: its samples, what is static, and the state before the first step."""
-
-    samples: Samples
-    context: FitContext
-    options: FitOptions
-    train_rows: NDArray[np.intp]
-    held_out_rows: NDArray[np.intp]
-    batch_size: int
-    graph: Any
-    state: FitState
-
-    @classmethod
-    def create(
-        cls, samples: Samples, context: FitContext, options: FitOptions, held_out: NDArray[np.bool_] | None
-    ) -> "_Fitter":
-        """Split the samples, check the batch size and initialize the classifier; the state stays on the host."""
-        context = dataclasses.replace(context, config=dataclasses.replace(context.config, homology="closed_form"))
-        n_devices = context.mesh.devices.size
-        rows = np.arange(len(samples))
-        train_rows, held_out_rows = (rows, rows[:0]) if held_out is None else (rows[~held_out], rows[held_out])
-        check_batch_size(options.batch_size, context.mesh)
-        least = max(2, n_devices)
-        if len(train_rows) < least:
-            raise InputError(
-                f"there are {len(train_rows)} samples to train on; at least {least} are required; render more views"
-            )
-        batch_size = min(options.batch_size, len(train_rows) // n_devices * n_devices)
-        n_inputs = input_size(context.feature, context.config, context.network.n_regions)
-        model = MLP(n_inputs, len(samples.classes), rngs=nnx.Rngs(options.seed))
-        chosen = samples.take(train_rows[:: max(1, len(train_rows) // SCALE_SAMPLES)][:SCALE_SAMPLES])
-        model.input_scale[...] = scale_inputs(chosen, context.feature, context.network, context.config)
-        graph, state = initial_state(model)
-        return cls(samples, context, options, train_rows, held_out_rows, batch_size, graph, state)
-
-    @property
-    def steps_per_epoch(self) -> int:
-        return len(self.train_rows) // self.batch_size
-
-    def batches(self, rows: NDArray[np.intp]) -> Iterator[Batch]:
-        """Yield batches on the devices; this process gathers its own chunk of each."""
-        chunk = self.batch_size // jax.process_count()
-        for first in range(jax.process_index() * chunk, len(rows), self.batch_size):
-            yield shard_batch(self.samples.take(rows[first : first + chunk]), self.context.mesh)
-
-    def epoch(self, epoch: int) -> Iterator[Batch]:
-        """Yield the batches of an epoch."""
-        # The order is drawn from seed and epoch, so that a resumed fit needs no generator state.
-        order = np.random.default_rng((self.options.seed, epoch)).permutation(self.train_rows)
-        return self.batches(order[: self.steps_per_epoch * self.batch_size])
-
-    def step(self, state: FitState, number: int, batch: Batch) -> tuple[FitState, tuple[jax.Array, jax.Array]]:
-        """Make one step; return the next state, and loss and accuracy."""
-        epoch = number // self.steps_per_epoch + 1
-        rate = np.float32(self.options.learning_rates[epoch > (self.options.epochs + 1) // 2])
-        return train_step(self.context, self.graph, state, batch, rate, np.uint32(self.options.seed), np.uint32(number))
-
-    def held_out_accuracy(self, state: FitState) -> float | None:
-        """Return the accuracy on the held-out set; None if it is empty."""
-        rows = self.held_out_rows
-        if not len(rows):
-            return None
-        padded = np.resize(rows, len(rows) + -len(rows) % self.batch_size)
-        remaining = range(len(rows), 0, -self.batch_size)
-        correct = [
-            count_correct(self.context, self.graph, state, batch, np.int32(n))
-            for n, batch in zip(remaining, self.batches(padded), strict=True)
-        ]
-        return float(np.sum(jax.device_get(correct)) / len(rows))
+def _create_model(samples: Samples, context: FitContext, seed: int, train_rows: NDArray[np.intp]) -> MLP:
+    """Return the classifier before the first step, with the scaling of its inputs."""
+    n_inputs = input_size(context.feature, context.config, context.network.n_regions)
+    model = MLP(n_inputs, len(samples.classes), rngs=nnx.Rngs(seed))
+    chosen = samples.take(train_rows[:: max(1, len(train_rows) // SCALE_SAMPLES)][:SCALE_SAMPLES])
+    model.input_scale[...] = scale_inputs(chosen, context.feature, context.network, context.config)
+    return model

@@ -36,18 +36,14 @@ from thor2_jax.model.confidence import Calibration
 from thor2_jax.model.run_directory import EMBEDDING_FILE, TrainedRun, load_run, save_run, weights_file
 from thor2_jax.model.run_record import RUN_FILE
 from training.embedding.run_embedding import STAGES, Distractors, fit_run_embedding
-from training.fitting.calibration import temperatures
+from training.fitting.calibration import fit_calibration, temperatures
 from training.fitting.checkpoints import BEGUN, CHECKPOINTS, Checkpoints
-from training.fitting.confidence import fit_calibration
 from training.fitting.fit import check_batch_size, fit
-from training.fitting.folds import fold_of_views
-from training.fitting.metrics_log import append_metrics, discard_later_epochs, read_metrics
-from training.fitting.options import EpochMetrics, FitOptions
-from training.fitting.samples import MIRRORS, Samples, build_samples
+from training.fitting.options import EpochMetrics, FitOptions, append_metrics, discard_later_epochs, read_metrics
+from training.fitting.samples import MIRRORS, Samples, build_samples, fold_of_views
 from training.fitting.steps import FitContext
 from training.reports.plots import draw_curves
-from training.storage.jobs import check_same_job
-from training.storage.locks import locked
+from training.storage.jobs import check_same_job, locked
 from training.storage.progress import Progress
 from training.views.normalized_views import ViewSource
 
@@ -144,28 +140,15 @@ class RunSettings:
         }
 
 
-class _Training(NamedTuple):
-    """The job of one run directory: its settings, the labelled views, and the absolute path of the directory."""
-
-    settings: RunSettings
-    source: ViewSource
-    out: Path
-
-    def check_begun(self) -> None:
-        """Raise InputError if `out` holds an interrupted training of another job."""
-        path = self.out / CHECKPOINTS / BEGUN
-        if path.is_file():
-            try:
-                begun = dict(json.loads(path.read_bytes()))
-            except (OSError, ValueError, TypeError, RecursionError) as error:
-                raise InputError(f"out: {path} cannot be read ({error}); delete {path.parent} to start anew") from None
-            check_same_job(self.out, begun, self.settings.record(self.source.digest))
-
-    def begin(self) -> None:
-        """Write the job record unless the training is resumed."""
-        path = self.out / CHECKPOINTS / BEGUN
-        if not path.is_file():
-            write_text(path, json.dumps(self.settings.record(self.source.digest), indent=1) + "\n")
+def _check_begun(out: Path, job: Mapping[str, Any]) -> None:
+    """Raise InputError if a directory holds an interrupted training of another job."""
+    path = out / CHECKPOINTS / BEGUN
+    if path.is_file():
+        try:
+            begun = dict(json.loads(path.read_bytes()))
+        except (OSError, ValueError, TypeError, RecursionError) as error:
+            raise InputError(f"out: {path} cannot be read ({error}); delete {path.parent} to start anew") from None
+        check_same_job(out, begun, job)
 
 
 def check_out(out: str | Path) -> None:
@@ -236,16 +219,16 @@ def train_run(
     out = Path(out).absolute()
     if settings.distractors is not None:
         settings.distractors.check(source.classes)
-    training = _Training(settings, source, out)
+    job = settings.record(source.digest)
     check_out(out)
-    training.check_begun()
+    _check_begun(out, job)
     check_batch_size(settings.options.batch_size, batch_mesh())
     with contextlib.ExitStack() as locks:
         first, resumed = jax.process_index() == 0, (out / CHECKPOINTS).is_dir()
         if first and resumed:
             locks.enter_context(locked(out / CHECKPOINTS))
         # Without classifiers, only the distribution of the views among the folds is needed here.
-        samples = _describe_views(training, progress) if settings.features else _labelled_views(source)
+        samples = _describe_views(settings, source, progress) if settings.features else _labelled_views(source)
         folds = settings.folds
         is_held_out = folds > 1 or settings.distractors is not None
         parts = _held_out_parts(samples) if folds == 1 and is_held_out else folds
@@ -256,12 +239,13 @@ def train_run(
                 check_out(out)  # another process may have been quicker
                 (out / CHECKPOINTS).mkdir(parents=True, exist_ok=True)
                 locks.enter_context(locked(out / CHECKPOINTS))
-                training.check_begun()
-            training.begin()
+                _check_begun(out, job)
+            if not (out / CHECKPOINTS / BEGUN).is_file():
+                write_text(out / CHECKPOINTS / BEGUN, json.dumps(job, indent=1) + "\n")
             remove_leftovers(out)
         _wait_for_all("begun")
         runs = [
-            _train_fold(training, samples, fold, fold_of == fold if is_held_out else None, progress)
+            _Fold(settings, source, out, fold, samples, fold_of == fold if is_held_out else None, progress).train()
             for fold in range(folds)
         ]
         _wait_for_all("trained")
@@ -290,128 +274,106 @@ def _held_out_parts(samples: Samples | _Views) -> int:
     return max(2, min(HELD_OUT, fewest))
 
 
-def _describe_views(training: _Training, progress: Progress) -> Samples:
-    done, total = 0, sum(shard.views for shard in training.source.shards)
-
-    def advance(count: int) -> None:
-        nonlocal done
-        done += count
+def _describe_views(settings: RunSettings, source: ViewSource, progress: Progress) -> Samples:
+    def show(done: int, total: int) -> None:
         progress(DESCRIBE, done, total, "views")
 
-    settings = training.settings
-    return build_samples(
-        training.source,
-        settings.network,
-        settings.config,
-        advance,
-        settings.mirrors,
-        settings.orientations,
-        settings.options.seed,
-    )
+    copies = settings.mirrors, settings.orientations, settings.options.seed
+    return build_samples(source, settings.network, settings.config, show, *copies)
 
 
-def _train_fold(
-    training: _Training, samples: Samples | _Views, fold: int, held_out: NDArray[np.bool_] | None, progress: Progress
-) -> TrainedRun:
-    """Train and publish the run of a fold, unless it is finished, and read it back."""
-    out, settings = training.out, training.settings
-    config, network = settings.config, settings.network
-    directory = out if settings.folds == 1 else out / f"fold-{fold}"
-    if not (directory / RUN_FILE).is_file():
+class _Fold(NamedTuple):
+    """The training of a fold: everything that `train_run` is called with, and which samples are held out."""
+
+    settings: RunSettings
+    source: ViewSource
+    out: Path
+    number: int
+    samples: Samples | _Views
+    held_out: NDArray[np.bool_] | None
+    progress: Progress
+
+    @property
+    def scratch(self) -> Path:
+        """The directory of its checkpoints."""
+        return self.out / CHECKPOINTS / f"fold-{self.number}"
+
+    def train(self) -> TrainedRun:
+        """Train and publish the run, unless it is finished, and read it back."""
+        out, settings, samples = self.out, self.settings, self.samples
+        directory = out if settings.folds == 1 else out / f"fold-{self.number}"
+        if not (directory / RUN_FILE).is_file():
+            classifiers, best_epochs = self.fit_classifiers()
+            calibrated: dict[str, float] = {}
+            if isinstance(samples, Samples):
+                calibrated = temperatures(classifiers, samples, self.held_out, settings.network, settings.config)
+            if jax.process_index() == 0:
+                run = TrainedRun(settings.config, settings.network, samples.classes, classifiers, {})
+                embedding, fitted = self.fit_embedding(run)
+                rows = read_metrics(out / METRICS)
+                names = dict.fromkeys(row["classifier"] for row in rows)
+                draw_curves({name: [row for row in rows if row["classifier"] == name] for name in names}, out / CURVES)
+                record = settings.record(self.source.digest)
+                record |= {"dataset": self.source.record, "samples": len(samples.label), "fold": self.number}
+                record |= _outcome([row for row in rows if row["fold"] == self.number], best_epochs)
+                record["temperatures"] = calibrated
+                if fitted is not None:
+                    calibration, record["held_out_accuracy"][EMBEDDING] = fitted
+                    record |= {"calibration": dataclasses.asdict(calibration)} if calibration is not None else {}
+                _publish(dataclasses.replace(run, record=record, embedding=embedding), self.scratch / "run", directory)
+            _wait_for_all("published")
+        return load_run(directory)
+
+    def fit_classifiers(self) -> tuple[dict[Feature, MLP], dict[Feature, int]]:
+        """Fit the classifiers; return them and the epochs that they are from."""
+        settings, samples, first = self.settings, self.samples, jax.process_index() == 0
+        if not isinstance(samples, Samples):
+            return {}, {}
         classifiers: dict[Feature, MLP] = {}
         best_epochs: dict[Feature, int] = {}
-        calibrated: dict[str, float] = {}
-        if isinstance(samples, Samples):
-            classifiers, best_epochs = _fit_classifiers(training, samples, fold, held_out, progress)
-            calibrated = temperatures(classifiers, samples, held_out, network, config)
-        if jax.process_index() == 0:
-            run = TrainedRun(config, network, samples.classes, classifiers, {})
-            fitted = _fit_embedding(training, samples, fold, held_out, run, progress)
-            rows = read_metrics(out / METRICS)
-            fitted_names = dict.fromkeys(row["classifier"] for row in rows)
-            draw_curves(
-                {name: [row for row in rows if row["classifier"] == name] for name in fitted_names}, out / CURVES
+        for name in settings.features:
+            stage = settings.of_fold(f"fit {name}", self.number)
+
+            def show(done: int, total: int, metrics: EpochMetrics, stage: str = stage) -> None:
+                self.progress(stage, done, total, metrics.describe(settings.options.epochs))
+
+            def epoch_done(metrics: EpochMetrics, name: Feature = name) -> None:
+                if first:
+                    append_metrics(self.out / METRICS, self.number, name, metrics)
+
+            context = FitContext(name, settings.network, settings.config)
+            with Checkpoints(self.scratch / name) as checkpoints:
+                if first:
+                    discard_later_epochs(self.out / METRICS, self.number, name, checkpoints.last_epoch)
+                classifiers[name], best_epochs[name] = fit(
+                    samples, context, settings.options, checkpoints, self.held_out, show, epoch_done
+                )
+        return classifiers, best_epochs
+
+    def fit_embedding(self, run: TrainedRun) -> tuple[Embedding | None, tuple[Calibration | None, float] | None]:
+        """Fit the embedding, and the confidence and the accuracy on the held-out set; None without distractors."""
+        settings, samples, held_out = self.settings, self.samples, self.held_out
+        if settings.distractors is None or held_out is None:
+            return None, None
+        metrics_file, several = self.out / METRICS, jax.process_count() > 1
+        # One of several processes fits the embedding, and checkpoints are written by all of them together.
+        with contextlib.nullcontext() if several else Checkpoints(self.scratch / EMBEDDING) as checkpoints:
+            done = checkpoints.last_epoch if checkpoints is not None else 0
+            discard_later_epochs(metrics_file, self.number, EMBEDDING, done)
+            labels = np.unique(samples.label)
+            embedding, kept = fit_run_embedding(
+                self.source,
+                {label: np.unique(samples.view[held_out & (samples.label == label)]) for label in labels},
+                settings.distractors,
+                self.out / CHECKPOINTS / "distractors",
+                settings.network,
+                settings.config,
+                settings.options.seed,
+                lambda stage, *values: self.progress(settings.of_fold(stage, self.number), *values),
+                checkpoints,
+                lambda metrics: append_metrics(metrics_file, self.number, EMBEDDING, metrics),
             )
-            record = settings.record(training.source.digest)
-            record |= {"dataset": training.source.record, "samples": len(samples.label), "fold": fold}
-            record |= _outcome([row for row in rows if row["fold"] == fold], best_epochs)
-            record["temperatures"] = calibrated
-            if fitted is not None:
-                record["held_out_accuracy"][EMBEDDING] = fitted.accuracy
-            if fitted is not None and fitted.calibration is not None:
-                record["calibration"] = dataclasses.asdict(fitted.calibration)
-            run = dataclasses.replace(run, record=record, embedding=fitted.embedding if fitted is not None else None)
-            _publish(run, out / CHECKPOINTS / f"fold-{fold}" / "run", directory)
-        _wait_for_all("published")
-    return load_run(directory)
-
-
-def _fit_classifiers(
-    training: _Training, samples: Samples, fold: int, held_out: NDArray[np.bool_] | None, progress: Progress
-) -> tuple[dict[Feature, MLP], dict[Feature, int]]:
-    """Fit the classifiers of a fold; return them and the epochs that they are from."""
-    settings = training.settings
-    first, metrics_file = jax.process_index() == 0, training.out / METRICS
-    classifiers: dict[Feature, MLP] = {}
-    best_epochs: dict[Feature, int] = {}
-    for name in settings.features:
-        stage = settings.of_fold(f"fit {name}", fold)
-
-        def show(done: int, total: int, metrics: EpochMetrics, stage: str = stage) -> None:
-            progress(stage, done, total, metrics.describe(settings.options.epochs))
-
-        def epoch_done(metrics: EpochMetrics, name: Feature = name) -> None:
-            if first:
-                append_metrics(metrics_file, fold, name, metrics)
-
-        context = FitContext(name, settings.network, settings.config)
-        with Checkpoints(training.out / CHECKPOINTS / f"fold-{fold}" / name) as checkpoints:
-            if first:
-                discard_later_epochs(metrics_file, fold, name, checkpoints.last_epoch)
-            classifiers[name], best_epochs[name] = fit(
-                samples, context, settings.options, checkpoints, held_out, show, epoch_done
-            )
-    return classifiers, best_epochs
-
-
-class _FittedEmbedding(NamedTuple):
-    """The embedding of a fold, the confidence that was fitted on its held-out set, and the accuracy there."""
-
-    embedding: Embedding
-    calibration: Calibration | None
-    accuracy: float
-
-
-def _fit_embedding(
-    training: _Training,
-    samples: Samples | _Views,
-    fold: int,
-    held_out: NDArray[np.bool_] | None,
-    run: TrainedRun,
-    progress: Progress,
-) -> _FittedEmbedding | None:
-    """Fit the embedding of a fold and calibrate the confidence on its held-out set; None without distractors."""
-    settings = training.settings
-    if settings.distractors is None or held_out is None:
-        return None
-    metrics_file, several = training.out / METRICS, jax.process_count() > 1
-    directory = training.out / CHECKPOINTS / f"fold-{fold}" / EMBEDDING
-    # One of several processes fits the embedding, and checkpoints are written by all of them together.
-    with contextlib.nullcontext() if several else Checkpoints(directory) as checkpoints:
-        discard_later_epochs(metrics_file, fold, EMBEDDING, checkpoints.last_epoch if checkpoints is not None else 0)
-        embedding, kept = fit_run_embedding(
-            training.source,
-            {label: np.unique(samples.view[held_out & (samples.label == label)]) for label in np.unique(samples.label)},
-            settings.distractors,
-            training.out / CHECKPOINTS / "distractors",
-            settings.network,
-            settings.config,
-            settings.options.seed,
-            lambda stage, *values: progress(settings.of_fold(stage, fold), *values),
-            checkpoints,
-            lambda metrics: append_metrics(metrics_file, fold, EMBEDDING, metrics),
-        )
-    return _FittedEmbedding(embedding, *fit_calibration(run, embedding, kept))
+        return embedding, fit_calibration(run, embedding, kept)
 
 
 def _outcome(rows: Sequence[Mapping[str, Any]], best_epochs: Mapping[Feature, int]) -> dict[str, Any]:

@@ -40,33 +40,20 @@ class Protocol:
     classifiers: tuple[Feature, ...] = ()
     distractors: Distractors | None = None
 
-    def replace(
-        self,
-        azimuth_step: float | None = None,
-        polar_step: float | None = None,
-        epochs: int | None = None,
-        batch_size: int | None = None,
-        seed: int | None = None,
-        orientation_copies: int | None = None,
-    ) -> "Protocol":
-        """Return the protocol with the given values; None keeps the protocol's own.
+    def replace(self, **values: Any) -> "Protocol":
+        """Return the protocol with the given values of its own fields or of `fit`; None keeps the protocol's own.
 
         Without copies in other orientations, views are also used in a mirror.
 
         Raises:
             InputError: A value of the fit is invalid.
         """
-        steps = {
-            "azimuth_step": azimuth_step,
-            "polar_step": polar_step,
-            "orientation_copies": orientation_copies,
-        }
-        fit: dict[str, Any] = {"epochs": epochs, "batch_size": batch_size, "seed": seed}
-        given: dict[str, Any] = {name: value for name, value in steps.items() if value is not None}
-        if orientation_copies == 0 and self.orientation_copies:
+        given = {name: value for name, value in values.items() if value is not None}
+        if given.get("orientation_copies") == 0 and self.orientation_copies:
             given["mirrors"] = MIRRORS
-        given["fit"] = dataclasses.replace(self.fit, **{n: v for n, v in fit.items() if v is not None})
-        return dataclasses.replace(self, **given)
+        of_fit = {field.name for field in dataclasses.fields(FitOptions)} & given.keys()
+        fit = dataclasses.replace(self.fit, **{name: given.pop(name) for name in of_fit})
+        return dataclasses.replace(self, fit=fit, **given)
 
 
 DEFAULT = Protocol(

@@ -29,7 +29,7 @@ from thor2_jax.types import Strips
 from training.augmentation.orientation import reorient
 from training.views.normalized_views import ViewSource, padded_batches
 
-__all__ = ["MIRRORS", "PAPER_MIRRORS", "Batch", "Samples", "build_samples", "expand"]
+__all__ = ["Batch", "MIRRORS", "PAPER_MIRRORS", "Samples", "build_samples", "expand", "fold_of_views"]
 
 MIRRORS = ("", "x")
 """Mirrors of a normalized view that change its descriptor: a mirror in y changes no strip length and no count."""
@@ -131,7 +131,7 @@ def build_samples(
     source: ViewSource,
     network: ColorNetwork,
     config: DescriptorConfig,
-    progress: Callable[[int], object] = lambda n: None,
+    progress: Callable[[int, int], object] = lambda done, total: None,
     mirrors: Sequence[str] = MIRRORS,
     orientations: int = 0,
     seed: int = 0,
@@ -142,7 +142,7 @@ def build_samples(
         source: normalized views.
         network: colour network that gives the regions.
         config: descriptor. Static.
-        progress: called with the number of views done since the last call.
+        progress: called with (views done, number of views).
         mirrors: axes of each mirror, such as "xy"; one sample each.
         orientations: further samples of each view, in random orientations.
         seed: seed for the orientations.
@@ -159,6 +159,7 @@ def build_samples(
     # With one "region" per set, colour vectors count the sets: sparse, with integer values.
     counting = RegionSets(sets.of_color, jnp.eye(len(sets.weights)))
     chunks: list[dict[str, NDArray[Any]]] = []
+    all_done, total = 0, sum(shard.views for shard in source.shards)
     for index, shard in enumerate(source.shards):
         views, rng = source.read(index), np.random.default_rng([seed, index])
         done = 0
@@ -170,7 +171,8 @@ def build_samples(
                 compact["label"] = np.full(count, shard.label, np.int32)
                 chunks.append(compact | {"view": views.view[done : done + count]})
             done += count
-            progress(count)
+            progress(all_done + done, total)
+        all_done += done
     fields = {name: np.concatenate([chunk[name] for chunk in chunks]) for name in chunks[0]}
     for name in ("strip", "color"):
         fields[f"{name}_start"] = np.concatenate([[0], np.cumsum(fields.pop(f"{name}_entries"), dtype=np.int64)])
@@ -224,3 +226,34 @@ def expand(batch: Batch, set_weights: jax.Array, config: DescriptorConfig) -> St
         )
 
     return jax.vmap(one)(batch)
+
+
+def fold_of_views(
+    label: NDArray[np.integer[Any]], view: NDArray[np.integer[Any]], classes: Sequence[str], folds: int, seed: int
+) -> NDArray[np.intp]:
+    """Return the fold of each cloud [M], from 0: the views of every class are assigned at random and evenly.
+
+    All clouds of a view (mirrored and augmented copies) are in the same fold: they are nearly equal, and the held-out
+    set must not be known from training.
+
+    Args:
+        label: [M], index into `classes`.
+        view: [M], index of the view among the views of its object.
+        classes: class names.
+        folds: number of folds; with 1, everything is in fold 0.
+        seed: seed for the assignment.
+
+    Raises:
+        InputError: `folds` is not positive, or a class has fewer views than folds.
+    """
+    if folds < 1:
+        raise InputError(f"folds is {folds}; it must be at least 1")
+    rng = np.random.default_rng(seed)
+    fold: NDArray[Any] = np.zeros(len(label), np.intp)
+    for index, name in enumerate(classes):
+        members = label == index
+        views, number = np.unique(view[members], return_inverse=True)
+        if len(views) < folds:
+            raise InputError(f"folds is {folds}; class {name!r} has {len(views)} views; use at most that many folds")
+        fold[members] = (rng.permutation(len(views)) % folds)[number]
+    return fold

@@ -75,7 +75,7 @@ class TexturedMesh:
             a, b, c = np.moveaxis(self.corner_colors[face].astype(np.float32), 1, 0)
             return np.rint(a + second * (b - a) + third * (c - a)).clip(0, 255).astype(np.uint8)
         assert self.uv is not None and self.face_texture is not None
-        a, b, c = np.moveaxis(self.uv[face], 1, 0)
+        a, b, c = np.moveaxis(self.uv.take(face, axis=0), 1, 0)
         uv = a + second * (b - a) + third * (c - a)
         if len(self.textures) == 1:
             return _nearest_texel(self.textures[0], uv)

@@ -11,7 +11,7 @@ from PIL import Image
 from trimesh.visual.material import PBRMaterial, SimpleMaterial, empty_material
 
 from thor2_jax.errors import InputError, with_context
-from thor2_jax.frames.frames import MAX_IMAGE_PIXELS
+from thor2_jax.frames.image_files import MAX_IMAGE_PIXELS
 from thor2_jax.printable import check_name
 from thor2_jax.tables import parse_json, parse_yaml
 from training.objects.mesh import TexturedMesh, merge_meshes

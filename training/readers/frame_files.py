@@ -1,18 +1,23 @@
-"""Frames to recognize: folders with the files of one frame each, and BOP scenes."""
+"""Frames to recognize: folders with the files of one frame each, and BOP scenes; and files of camera poses."""
 
 import dataclasses
 import functools
+import json
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, read_frame
 from thor2_jax.segmentation.segmenters import Segmenter, segmented
+from thor2_jax.tracking.poses import check_pose
 from training.readers.bop import BOP
 from training.readers.labelled import named_path
 
-__all__ = ["FILE_NAMES", "FrameFiles", "FrameSource", "find_frames", "frame_files", "segmented_source"]
+__all__ = ["FILE_NAMES", "FrameFiles", "FrameSource", "find_frames", "frame_files", "read_poses", "segmented_source"]
 
 FILE_NAMES = {
     "color": ("color.png", "color.jpg", "color.jpeg", "rgb.png", "rgb.jpg"),
@@ -164,3 +169,33 @@ def _read_bop(dataset: BOP, number: int) -> RGBDFrame:
 def _name(folder: Path, path: Path) -> str:
     """Return the name of a frame: that of its folder, after those between `path` and it."""
     return folder.name if folder == path else folder.relative_to(path).as_posix()
+
+
+def read_poses(path: Path, names: Sequence[str]) -> list[NDArray[np.float64]]:
+    """Return the pose [4, 4] of each frame, from camera to world coordinates in metres.
+
+    Args:
+        path: JSON file with an object, frame name -> matrix, or with a list of matrices in the order of the frames.
+        names: names of the frames.
+
+    Raises:
+        InputError: the file is invalid, a frame has no pose, there is another number of poses than of frames, or a
+            pose is not a rigid motion. The message names the file.
+        OSError: the file cannot be read.
+    """
+    try:
+        stored = json.loads(path.read_bytes())
+    except (ValueError, RecursionError):
+        stored = None
+    if not isinstance(stored, (dict, list)):
+        raise InputError(f"poses: {path} is invalid; expected JSON: frame name -> [4, 4] matrix, or a list of matrices")
+    if isinstance(stored, dict):
+        missing = [name for name in names if name not in stored]
+        if missing:
+            raise InputError(f"poses: {path} has no pose of frame {missing[0]}; expected one for each frame")
+        return [check_pose(stored[name], f"poses: {path}: the pose of frame {name}") for name in names]
+    if len(stored) != len(names):
+        raise InputError(f"poses: {path} has {len(stored)} poses for {len(names)} frames; expected one for each frame")
+    return [
+        check_pose(pose, f"poses: {path}: the pose of frame {name}") for name, pose in zip(names, stored, strict=True)
+    ]

@@ -75,7 +75,7 @@ class RayCaster:
         for index, mesh in enumerate(self.meshes):
             here = hit[mesh_index[hit] == index]
             if len(here):
-                color[here] = mesh.colors_at(result["primID"][here], barycentric[here])
+                color[here] = mesh.colors_at(result["primID"].take(here), barycentric.take(here, axis=0))
         return Hits(distance, mesh_index, color)
 
 

@@ -15,6 +15,7 @@ from scipy.spatial import ConvexHull
 
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame
+from training.augmentation.sensor import axial_deviation, depth_edges
 from training.objects.mesh import TexturedMesh
 from training.rendering.camera import Camera
 from training.rendering.ray_caster import RayCaster, pixel_rays, render_view
@@ -189,14 +190,7 @@ def _sensed_depth(depth_m: Array, noise: float, rng: np.random.Generator) -> NDA
     The standard deviation of the axial noise is `noise` times 1.2 mm + 1.9 mm (z / m - 0.4)^2 (Nguyen, Izadi and Lovell
     2012). Three in ten pixels at depth steps of more than `EDGE_STEP`, and all beyond `MAX_SENSOR_DEPTH`, are missing.
     """
-    sigma = 0.0012 + 0.0019 * (depth_m - 0.4) ** 2
-    near_edge = np.zeros(depth_m.shape, bool)
-    for axis in (0, 1):
-        step = np.abs(np.diff(depth_m, axis=axis)) > EDGE_STEP
-        rows, columns = (slice(None), slice(1, None)) if axis else (slice(1, None), slice(None))
-        near_edge[rows, columns] |= step
-        rows, columns = (slice(None), slice(None, -1)) if axis else (slice(None, -1), slice(None))
-        near_edge[rows, columns] |= step
+    sigma, near_edge = axial_deviation(depth_m), depth_edges(depth_m, EDGE_STEP)
     noisy = depth_m + noise * sigma * rng.standard_normal(depth_m.shape)
     lost = near_edge & (rng.random(depth_m.shape) < 0.3 * min(noise, 1.0))
     valid = (depth_m > 0) & (depth_m < MAX_SENSOR_DEPTH) & ~lost

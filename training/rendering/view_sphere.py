@@ -25,7 +25,7 @@ MAX_VIEWS = 10**6
 
 
 def _steps(name: str, step: float, turn: float) -> int:
-    count = turn / step if math.isfinite(step) and step > 0 else 0.0
+    count = turn / step if math.isfinite(step) and step > 1e-100 else 0.0  # of smaller ones, the quotient may overflow
     if round(count) < 1 or abs(count - round(count)) > 1e-6:
         raise InputError(f"{name} is {step!r}; expected degrees that divide {turn:g} evenly")
     return round(count)

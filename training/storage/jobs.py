@@ -1,15 +1,18 @@
-"""Job records: whether an output directory belongs to the job that is requested."""
+"""Job records, which tell whether an output directory is that of the requested job, and exclusive locks on it."""
 
+import contextlib
 import itertools
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
+
+import filelock
 
 from thor2_jax.errors import InputError
 from thor2_jax.files import write_text
 
-__all__ = ["JOB_FILE", "begin_job", "check_same_job"]
+__all__ = ["JOB_FILE", "LOCK", "begin_job", "check_same_job", "locked"]
 
 JOB_FILE = "job.json"
 
@@ -73,3 +76,30 @@ def _first_difference(field: str, stored: Any, requested: Any) -> tuple[str, Any
 def _shown(value: Any) -> str:
     text = json.dumps(value)
     return text if len(text) <= MAX_SHOWN else f"{text[:MAX_SHOWN]}..."
+
+
+LOCK = ".lock"
+
+
+@contextlib.contextmanager
+def locked(directory: Path) -> Iterator[None]:
+    """Hold an exclusive lock on an output directory, which is created if it is missing.
+
+    The operating system releases the lock when the process ends, even if it is killed. The lock file stays.
+
+    Raises:
+        InputError: if another process holds the lock.
+        OSError: if the directory cannot be written, or its file system has no locks.
+    """
+    # A soft lock, filelock's fallback on file systems without locks, would outlive a killed process.
+    lock = filelock.FileLock(directory / LOCK, blocking=False, fallback_to_soft=False)
+    try:
+        lock.acquire()
+    except filelock.Timeout:
+        raise InputError(
+            f"out: another process is writing to {directory}; wait until it ends, or choose another directory"
+        ) from None
+    try:
+        yield
+    finally:
+        lock.release()

@@ -4,16 +4,26 @@ import itertools
 import time
 from collections.abc import Callable, Mapping
 
-__all__ = ["Progress", "numbered"]
+__all__ = ["Progress", "numbered", "of_stage"]
 
 Progress = Callable[[str, int, int, str], object]
 """Called with (stage, done, total, note)."""
 
 
+def of_stage(progress: Progress, stage: str) -> Callable[[int, int], None]:
+    """Return the callback of a stage without notes, called with (done, total)."""
+
+    def show(done: int, total: int) -> None:
+        progress(stage, done, total, "")
+
+    return show
+
+
 def numbered(progress: Progress, stages: Mapping[str, float]) -> Progress:
     """Return a callback that adds to each stage which one of how many it is, and the time left of all to its note.
 
-    The time is that of the progress seen so far: what a resumed stage has done before does not count.
+    The present stage keeps its own pace, and later stages take their shares at the pace of all progress seen so far.
+    What a resumed stage has done before does not count.
 
     Args:
         progress: the callback that is called with both.
@@ -22,16 +32,20 @@ def numbered(progress: Progress, stages: Mapping[str, float]) -> Progress:
     """
     names = {stage: f"stage {number} of {len(stages)}: {stage}" for number, stage in enumerate(stages, 1)}
     earlier = dict(zip(stages, itertools.accumulate(stages.values(), initial=0.0), strict=False))
-    seconds, made, last = 0.0, 0.0, ("", 0.0, 0.0)
+    seconds, made, first, last = 0.0, 0.0, (0.0, 0.0), ("", 0.0, 0.0)
 
     def show(stage: str, done: int, total: int, note: str) -> None:
-        nonlocal seconds, made, last
+        nonlocal seconds, made, first, last
         if stages.get(stage):
             now, part = time.monotonic(), earlier[stage] + stages[stage] * done / max(total, 1)
             if stage == last[0]:
                 seconds, made = seconds + now - last[1], made + part - last[2]
-            last = stage, now, part
-            left = seconds * (sum(stages.values()) - part) / made if made > 0 else 0.0
+            else:
+                first = now, part
+            last, end = (stage, now, part), earlier[stage] + stages[stage]
+            pace = seconds / made if made > 0 else 0.0
+            own = (now - first[0]) / (part - first[1]) if part > first[1] else pace
+            left = own * (end - part) + pace * (sum(stages.values()) - end)
             if seconds >= 1 and left >= 1:
                 note = ", ".join(filter(None, (note, f"about {left:.0f} s left of all stages")))
         progress(names.get(stage, stage), done, total, note)

@@ -33,8 +33,8 @@ import safetensors.numpy
 from thor2_jax.config import DESCRIPTOR_VERSION
 from thor2_jax.errors import InputError
 from thor2_jax.files import remove_written, write_text
+from training.views.crops import CROPS, ViewCrops, read_crops
 from training.views.normalized_views import COORDINATE_STEP, NormalizedViews
-from training.views.view_crops import CROPS, ViewCrops, read_crops
 
 __all__ = ["MANIFEST", "Manifest", "NormalizedViews", "Shard", "ViewDataset", "encode", "remove_views"]
 

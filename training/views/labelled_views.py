@@ -15,8 +15,8 @@ from thor2_jax.errors import InputError, with_context
 from thor2_jax.files import content_digest
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery.augment import augmented_view
+from training.views.crops import QuantizedCrop, ViewCrops, repeated, stacked
 from training.views.normalized_views import NormalizedViews, ViewSource, normalize_views
-from training.views.view_crops import QuantizedCrop, ViewCrops, repeated, stacked
 
 __all__ = ["MAX_COPIES", "WithLabelledViews", "digest_of_instances"]
 

@@ -12,6 +12,7 @@ import operator
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import closing
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +22,6 @@ from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import backproject
 from thor2_jax.frames.prepared_instance import DESCRIPTOR_VOXEL
 from thor2_jax.frames.voxel_grid import downsample_to_fit
-from thor2_jax.types import Cloud
 from training.augmentation.augmentations import Augmentations, augment
 from training.objects.mesh import TexturedMesh
 from training.objects.meshes import load_mesh
@@ -29,6 +29,9 @@ from training.rendering.camera import TRAINING_CAMERA, Camera, RenderedView
 from training.rendering.ray_caster import RayCaster, render_view
 from training.rendering.view_sphere import camera_pose, random_angles, view_angles
 from training.storage.workers import local_workers
+
+if TYPE_CHECKING:  # imports JAX, which rendering processes do not need
+    from thor2_jax.types import Cloud
 
 __all__ = [
     "MIN_VIEW_POINTS",
@@ -57,7 +60,7 @@ RenderProgress = Callable[[int, int], object]
 """Called with (clouds done, total clouds)."""
 
 
-def cloud_of(view: RenderedView) -> Cloud:
+def cloud_of(view: RenderedView) -> "Cloud":
     """Back-project a rendered view and downsample it to voxels of 0.01 scaled units, or coarser ones to fit a bucket.
 
     Returns:
@@ -72,7 +75,7 @@ def cloud_of(view: RenderedView) -> Cloud:
     return (points / SIGMA_S).astype(np.float32), np.rint(colors).astype(np.uint8)
 
 
-def view_cloud(mesh: TexturedMesh, pose: NDArray[np.float64], camera: Camera = TRAINING_CAMERA) -> Cloud:
+def view_cloud(mesh: TexturedMesh, pose: NDArray[np.float64], camera: Camera = TRAINING_CAMERA) -> "Cloud":
     """Return the training cloud of one view: depth in steps of 1 mm, back-projected, voxels of 0.01 scaled units.
 
     Each call indexes the mesh; use `render_views` for many views.
@@ -211,7 +214,7 @@ def render_views(
     polar_step: float = 5.0,
     workers: int = 1,
     progress: RenderProgress = lambda done, total: None,
-) -> dict[str, list[Cloud]]:
+) -> dict[str, list["Cloud"]]:
     """Render the training clouds of every object to memory (about 15 kB per view of a scan).
 
     Args:

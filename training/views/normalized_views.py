@@ -1,22 +1,30 @@
-"""Normalized views and where training reads them from (paper, section "View Normalization")."""
+"""Normalized views and where training reads them from (paper, section "View Normalization").
+
+source = MemoryViews(render_views(find_meshes("meshes")), config)
+"""
 
 import dataclasses
+import functools
+import itertools
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import numpy as np
 from numpy.typing import NDArray
 
+from thor2_jax.capacity import batch_points
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.view_normalization import view_normalize
 from thor2_jax.errors import InputError
+from thor2_jax.files import content_digest
 from thor2_jax.types import Cloud, PointClouds
-from training.views.view_crops import ViewCrops
+from training.views.crops import ViewCrops
 
 __all__ = [
-    "MAX_VIEW_LENGTH",
     "COORDINATE_STEP",
+    "MAX_VIEW_LENGTH",
+    "MemoryViews",
     "NormalizedViews",
     "ViewSource",
     "normalize_views",
@@ -44,7 +52,7 @@ def padded_batches(
         boundary: for each cloud [n] bool, the points on the occlusion boundary; None if there are none.
 
     Yields:
-        The number of given clouds in the batch, and the batch, padded to the bucket of its largest cloud.
+        The number of given clouds in the batch, and the batch, padded by `batch_points`.
 
     Raises:
         InputError: A cloud has more points than the largest bucket.
@@ -54,7 +62,8 @@ def padded_batches(
         chunk = list(clouds[start : start + size])
         padding = size - len(chunk)
         marks = None if boundary is None else [*boundary[start : start + size], *[None] * padding]
-        yield len(chunk), PointClouds.pack(chunk + [empty] * padding, boundary=marks)
+        capacity = batch_points(len(xyz) for xyz, _ in chunk)
+        yield len(chunk), PointClouds.pack(chunk + [empty] * padding, capacity, boundary=marks)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -159,3 +168,48 @@ def normalize_views(
         view=np.array(view, np.int32),
         copy=np.array(copy, np.int32),
     )
+
+
+class _Shard(NamedTuple):
+    label: int
+    views: int
+
+
+class MemoryViews:
+    """Clouds in memory as a source of views, one shard per class; `read` normalizes them."""
+
+    def __init__(self, views: Mapping[str, Sequence[Cloud]], config: DescriptorConfig) -> None:
+        """Keep the clouds; nothing is computed yet.
+
+        Args:
+            views: class name -> clouds (xyz [n, 3] float32 metres in the camera frame, rgb [n, 3] uint8).
+            config: descriptor; only `sigma_s` is used.
+        """
+        self.classes = tuple(views)
+        self.shards = tuple(_Shard(label, len(clouds)) for label, clouds in enumerate(views.values()))
+        self._clouds = tuple(views.values())
+        self._config = config
+
+    @functools.cached_property
+    def digest(self) -> str:
+        """SHA-256 of the class names and clouds."""
+        arrays = (array for clouds in self._clouds for cloud in clouds for array in cloud)
+        return content_digest(itertools.chain([repr((self.classes, self.shards))], (a.tobytes() for a in arrays)))
+
+    @property
+    def record(self) -> Mapping[str, Any]:
+        """Digest and number of views, for the record of a run."""
+        return {"digest": self.digest, "views": sum(shard.views for shard in self.shards)}
+
+    def read(self, index: int) -> NormalizedViews:
+        """Normalize the views of a class.
+
+        Raises:
+            InputError: A cloud has more points than the largest bucket, or is too long.
+        """
+        clouds = self._clouds[index]
+        return normalize_views(clouds, index, range(len(clouds)), [0] * len(clouds), self._config)
+
+    def read_crops(self, index: int, size: int) -> ViewCrops:
+        """Raise InputError: clouds in memory have no images."""
+        raise InputError("dataset: clouds in memory have no crops; give a rendered dataset with --dataset")

@@ -10,7 +10,6 @@ from helpers import class_probabilities, untrained_embedding_run, untrained_run
 from scipy.stats import entropy as scipy_entropy
 
 import thor2_jax as thor2
-from thor2_jax.adaptation.answers import gallery_classifier
 from thor2_jax.adaptation.color_transform import ColorTransform, transform_colors
 from thor2_jax.adaptation.estimate import (
     EVIDENCE,
@@ -19,6 +18,7 @@ from thor2_jax.adaptation.estimate import (
     PRIOR,
     adaptation_criterion,
     estimate_transform,
+    gallery_classifier,
     posterior_mean,
     spread,
 )

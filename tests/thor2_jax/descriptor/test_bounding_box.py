@@ -1,16 +1,18 @@
 """Bounding boxes against rectangles (OpenCV), hulls (SciPy), an exhaustive search (trimesh) and known boxes."""
 
 import itertools
+from collections.abc import Callable
 
 import cv2
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from thor2_jax.descriptor.bounding_box import _minimum_area_angle, minimal_box, support_points
+from thor2_jax.descriptor.bounding_box import ROWS, _minimum_area_angle, argmax, fold, minimal_box, support_points
 
 compiled_box, compiled_support = jax.jit(minimal_box), jax.jit(support_points)
 
@@ -138,3 +140,68 @@ def test_a_mirrored_projection_has_the_opposite_angle() -> None:
         angle = float(minimum_area_angle(xy))
         assert 0 < abs(angle) < np.pi / 4
         assert float(minimum_area_angle(xy * np.array([[1], [-1]], np.float32))) == pytest.approx(-angle, abs=1e-6)
+
+
+def numbers(*shape: int, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).normal(size=shape).astype(np.float32)
+
+
+@pytest.mark.parametrize("length", [16, 48])
+def test_fold_combines_entries_a_row_apart(length: int) -> None:
+    values = numbers(2, length)
+    expected = values.astype(np.float64).reshape(2, ROWS, length // ROWS)
+    for op, oracle in ((jnp.add, np.sum), (jnp.minimum, np.min)):
+        folded = fold(jnp.asarray(values), op)
+        assert folded.shape == (2, length // ROWS)
+        np.testing.assert_allclose(folded, oracle(expected, axis=1), atol=1e-5)
+
+
+@pytest.mark.parametrize("length", [1, 15, 17, 47])
+def test_lengths_that_are_not_multiples_are_rejected(length: int) -> None:
+    with pytest.raises(TypeError):
+        fold(jnp.zeros((2, length)), jnp.add)
+
+
+FEW = (*range(1, 21), 24, 32, 33, 40, 48, 64, 66, 80, 96, 112, 127, 128, 130)
+"""Lengths that can be halved 0 to 4 times, to odd and to even ones."""
+
+
+@pytest.fixture(scope="module", params=[FEW, pytest.param(range(1, 131), marks=pytest.mark.slow)], ids=["few", "all"])
+def argmaxes(request: pytest.FixtureRequest) -> Callable[[np.ndarray], dict[int, np.ndarray]]:
+    """Map a length to `argmax` over that many first entries of each row of an [8, 130] array, compiled together."""
+    compiled = jax.jit(lambda values: {length: argmax(values[:, :length]) for length in request.param})
+    return lambda values: {length: np.asarray(index) for length, index in compiled(values).items()}
+
+
+def test_argmax_of_any_length(argmaxes: Callable[[np.ndarray], dict[int, np.ndarray]]) -> None:
+    values = numbers(8, 130)
+    for length, index in argmaxes(values).items():
+        assert index.shape == (8,) and index.dtype == np.int32
+        np.testing.assert_array_equal(index, values[:, :length].argmax(axis=1))
+
+
+def test_argmax_in_every_place(argmaxes: Callable[[np.ndarray], dict[int, np.ndarray]]) -> None:
+    for start in range(0, 123, 8):
+        values, place = np.full((8, 130), -np.inf, np.float32), start + np.arange(8)
+        values[np.arange(8), place] = -3.0
+        for length, index in argmaxes(values).items():
+            np.testing.assert_array_equal(index[place < length], place[place < length])
+            assert (0 <= index).all() and (index < length).all()
+
+
+def test_argmax_of_ties_is_one_of_them(argmaxes: Callable[[np.ndarray], dict[int, np.ndarray]]) -> None:
+    values = np.random.default_rng(1).integers(0, 3, (8, 130)).astype(np.float32)
+    values[0], values[1] = 0, -np.inf
+    for length, index in argmaxes(values).items():
+        assert (0 <= index).all() and (index < length).all()
+        np.testing.assert_array_equal(values[np.arange(8), index], values[:, :length].max(axis=1))
+
+
+def test_argmax_under_vmap_and_without_other_axes() -> None:
+    values = numbers(2, 3, 66)
+    compiled = jax.jit(lambda x: (argmax(x), jax.vmap(argmax)(x), jax.vmap(jax.vmap(argmax))(x), argmax(x[1, 2])))
+    *indices, last = compiled(values)
+    for index in indices:
+        np.testing.assert_array_equal(index, values.argmax(axis=-1))
+    assert last.shape == () and int(last) == values[1, 2].argmax()
+    assert int(argmax(jnp.asarray([3.0, 5.0, 4.0]))) == 1  # not compiled

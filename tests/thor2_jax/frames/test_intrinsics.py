@@ -13,8 +13,16 @@ import yaml
 from helpers import encode_image
 
 from thor2_jax.errors import InputError
-from thor2_jax.frames.distortion import distort, undistort
-from thor2_jax.frames.frames import Intrinsics, RGBDFrame, backproject, frame_intrinsics, pixel_rays, read_frame
+from thor2_jax.frames.frames import (
+    Intrinsics,
+    RGBDFrame,
+    backproject,
+    distort,
+    frame_intrinsics,
+    pixel_rays,
+    read_frame,
+    undistort,
+)
 from thor2_jax.frames.intrinsics import parse_intrinsics, read_intrinsics
 
 MATRIX = np.array([[615.5, 0.0, 318.25], [0.0, 616.75, 241.5], [0.0, 0.0, 1.0]])
@@ -194,6 +202,7 @@ def test_the_entry_of_a_bop_scene_is_that_of_the_image(tmp_path: Path) -> None:
         ('{"fx": 5, "fy": 5, "cx": 3, "cy": 2, "depth_scale": 1e-300}', "intrinsics.depth_scale is 1e-300"),
         ('{"fx": 5e-324, "fy": 5, "cx": 3, "cy": 2}', "intrinsics.fx is 5e-324"),
         ("x" * 100_000, "100000 bytes"),
+        (json.dumps({"k" * 100_000: 1}), "kkk ... "),
     ],
 )
 def test_invalid_files(text: str, expected: str, tmp_path: Path) -> None:
@@ -201,7 +210,7 @@ def test_invalid_files(text: str, expected: str, tmp_path: Path) -> None:
     with pytest.raises(InputError) as caught:
         read_intrinsics(tmp_path / "k")
     message = str(caught.value)
-    assert expected in message and str(tmp_path / "k") in message and "\n" not in message
+    assert expected in message and str(tmp_path / "k") in message and "\n" not in message and len(message) < 1010
 
 
 @pytest.mark.parametrize(
@@ -212,8 +221,9 @@ def test_invalid_files(text: str, expected: str, tmp_path: Path) -> None:
         as_npy(MATRIX[:2]),
         as_npy(np.array([{}] * 9, object)),
         as_npy(MATRIX + 0j),
+        as_npy(np.zeros(9, "V0")).replace(b"(9,), }" + b" " * 13, b"(99999999999999,), }"),
     ],
-    ids=["truncated", "header", "2 x 3", "pickled", "complex"],
+    ids=["truncated", "header", "2 x 3", "pickled", "complex", "no bytes"],
 )
 def test_invalid_npy_files(content: bytes) -> None:
     with pytest.raises(InputError, match=r"^intrinsics[ .]"):

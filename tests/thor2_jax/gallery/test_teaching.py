@@ -157,6 +157,14 @@ def test_a_gallery_alone_rejects_unknown_objects(
             assert answer.reason is None or answer.reason.startswith("unknown: ")
 
 
+def test_a_refused_name_leaves_no_directory(tmp_path: Path, embedding: Embedding) -> None:
+    objects = ObjectGallery(("a", "b"), embedding)
+    objects.open(tmp_path / "gallery")
+    with pytest.raises(thor2.InputError, match="mug"):
+        objects.forget("mug")
+    assert not (tmp_path / "gallery").exists()
+
+
 def test_a_forgotten_class_is_never_answered(run: TrainedRun, embedding: Embedding) -> None:
     recognizer = thor2.Recognizer(dataclasses.replace(run, embedding=embedding))
     first = {answer.name for answer in recognizer.recognize(CLUTTER)}

@@ -9,10 +9,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-import orbax.checkpoint as ocp
 import pytest
 import safetensors.numpy
 from flax import nnx
@@ -24,7 +22,6 @@ from thor2_jax.descriptor.looks import LookDescriptors
 from thor2_jax.gallery.references import BACKGROUND, REFERENCES_FILE, References
 from thor2_jax.model.classifier import FEATURES, MLP
 from thor2_jax.model.run_directory import TrainedRun, input_size, load_run, save_run
-from thor2_jax.model.weights import model_arrays
 from thor2_jax.recognizer import Recognizer
 
 CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=2, n_strips=5, image_size=8, alpha=0.5)
@@ -148,36 +145,6 @@ def test_every_constant_is_restored(relaxation: thor2.Relaxation | None, tmp_pat
     assert load_run(tmp_path / "run").config == config
 
 
-def write_format_1(run: TrainedRun, path: Path) -> None:
-    """Write a run directory as version 0.1 did: Orbax checkpoints, and a digest of run.json in itself."""
-    save_run(run, path)
-    digests = {}
-    for name, model in run.classifiers.items():
-        weights(path, name).unlink()
-        with ocp.StandardCheckpointer() as checkpointer:
-            state = nnx.to_pure_dict(nnx.state(model, (nnx.Param, nnx.BatchStat)))
-            checkpointer.save(path / "weights" / name, jax.tree.map(np.asarray, state))
-        sha256 = hashlib.sha256(f"{input_size(name, CONFIG, 22)} {len(CLASSES)}".encode())
-        for file in sorted(file for file in (path / "weights" / name).rglob("*") if file.is_file()):
-            content = file.read_bytes()
-            sha256.update(f"{file.relative_to(path / 'weights' / name).as_posix()} {len(content)}".encode() + content)
-        digests[name] = sha256.hexdigest()
-    edited(format=1, weights=digests, digest="0" * 64)(path)
-
-
-def test_format_1_is_still_read(tmp_path: Path) -> None:
-    run = make_run()
-    write_format_1(run, tmp_path / "run")
-    loaded = load_run(tmp_path / "run")
-    assert loaded.record == run.record
-    for name, model in run.classifiers.items():
-        jax.tree.map(np.testing.assert_array_equal, model_arrays(loaded.classifiers[name]), model_arrays(model))
-    file = max((tmp_path / "run" / "weights" / "ce").rglob("d/*"), key=lambda file: file.stat().st_size)
-    file.write_bytes(file.read_bytes()[:-1])
-    with pytest.raises(thor2.InputError, match="weights/ce is damaged"):
-        load_run(tmp_path / "run")
-
-
 def test_equal_runs_have_equal_bytes(saved: Path, tmp_path: Path) -> None:
     save_run(make_run(), tmp_path / "run")
     files = sorted(file.relative_to(saved) for file in saved.rglob("*") if file.is_file())
@@ -208,9 +175,11 @@ DAMAGES: dict[str, tuple[Callable[[Path], Any], str]] = {
     "no folder": (shutil.rmtree, "run is not a run directory"),
     "no run.json": (lambda path: (path / "run.json").unlink(), "run is not a run directory"),
     "cut run.json": (lambda path: (path / "run.json").write_text('{"format": 1,'), "run.json cannot be read"),
+    "a directory": (lambda path: (path / "run.json").unlink() or (path / "run.json").mkdir(), "cannot be read: Is a"),
     "binary run.json": (lambda path: (path / "run.json").write_bytes(b"\xff\xfe\x00"), "run.json cannot be read"),
     "a list": (lambda path: (path / "run.json").write_text("[1]"), "run.json has format 'list'"),
     "other format": (edited(format=3), "run.json has format 3"),
+    "earlier format": (edited(format=1), "run.json has format 1; expected 2"),
     "other version": (edited(descriptor_version=99), "descriptor version 99"),
     "no record": (edited(record=[1]), "run.json: TypeError"),
     "no classes": (edited(classes=None), "classes is None"),

@@ -20,6 +20,7 @@ from recording_files import (
 
 import thor2_jax as thor2
 from thor2_jax.errors import InputError
+from thor2_jax.recordings import decompression
 from thor2_jax.recordings.bags import Bag
 from thor2_jax.recordings.topics import Topics, choose_topics
 
@@ -129,6 +130,20 @@ def test_damaged_recordings(tmp_path: Path, name: str, kept: float) -> None:
         assert str(path) in str(error) and "\n" not in str(error)
     else:
         assert kept == 1, "a truncated recording was read without an error"
+
+
+@pytest.mark.parametrize(
+    ("name", "compression"), [("a.bag", "bz2"), ("a.bag", "lz4"), ("a.mcap", "storage"), ("folder", "message")]
+)
+def test_decompression_has_a_limit(
+    tmp_path: Path, name: str, compression: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write_recording(tmp_path / name, FRAMES[:1], compression=compression)
+    with Bag(path) as bag:
+        np.testing.assert_array_equal(next(bag.frames()).read().depth, FRAMES[0].depth)
+    monkeypatch.setattr(decompression, "MAX_DECOMPRESSED", 2**16)
+    with pytest.raises(InputError, match="more than 65536 bytes"), Bag(path) as bag:
+        list(bag.frames())
 
 
 def test_frames_before_the_end_of_a_truncated_mcap(tmp_path: Path) -> None:

@@ -203,10 +203,12 @@ def teaching_url(teaching_app: FastAPI) -> Iterator[str]:
     thread = threading.Thread(target=server.run)
     thread.start()
     try:
-        while not server.started:
-            assert thread.is_alive()
-            time.sleep(0.01)
-        teaching_app.state.service.wait_until_ready()
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(engine, "POINT_BUCKETS", (engine.MIN_POINTS_BUCKET,))  # the tests send small clouds
+            while not server.started:
+                assert thread.is_alive()
+                time.sleep(0.01)
+            teaching_app.state.service.wait_until_ready()
         yield f"http://127.0.0.1:{server.servers[0].sockets[0].getsockname()[1]}"
     finally:
         server.should_exit = True

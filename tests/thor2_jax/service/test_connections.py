@@ -13,8 +13,8 @@ import pytest
 import uvicorn
 from processes import HANG
 
-from thor2_jax.service import connections
-from thor2_jax.service.page_files import PageFiles
+from thor2_jax.service import server as serving
+from thor2_jax.service.app import PageFiles
 
 WORK = 1.0
 HEAD = b"%s /%s HTTP/1.1\r\nHost: localhost\r\n%s\r\n"
@@ -35,7 +35,7 @@ async def application(scope: Any, receive: Any, send: Any) -> None:
 @contextlib.contextmanager
 def serve(app: Any) -> Iterator[Any]:
     """Serve an application in a thread, and yield its address."""
-    config = uvicorn.Config(app, http=connections.TimedConnection, lifespan="off", log_config=None)
+    config = uvicorn.Config(app, http=serving.TimedConnection, lifespan="off", log_config=None)
     with socket.create_server(("127.0.0.1", 0)) as listening:
         server = uvicorn.Server(config)
         thread = threading.Thread(target=server.run, args=([listening],))
@@ -49,8 +49,8 @@ def serve(app: Any) -> Iterator[Any]:
 
 @pytest.fixture
 def address(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    monkeypatch.setattr(connections, "HEAD_SECONDS", WORK / 4)
-    monkeypatch.setattr(connections, "EARLY_ANSWER_SECONDS", WORK)
+    monkeypatch.setattr(serving, "HEAD_SECONDS", WORK / 4)
+    monkeypatch.setattr(serving, "EARLY_ANSWER_SECONDS", WORK)
     with serve(application) as listening_address:
         yield listening_address
 
@@ -90,7 +90,7 @@ def test_slow_bytes_do_not_keep_a_connection_open(address: Any, sent: bytes, the
 
 
 def test_body_may_arrive_after_its_answer(address: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(connections, "EARLY_ANSWER_SECONDS", HANG)
+    monkeypatch.setattr(serving, "EARLY_ANSWER_SECONDS", HANG)
     with socket.create_connection(address, timeout=HANG) as connection:
         connection.sendall(UPLOAD)
         answers = b""
@@ -104,7 +104,7 @@ def test_body_may_arrive_after_its_answer(address: Any, monkeypatch: pytest.Monk
 
 @pytest.mark.parametrize("start", [b"GET /", CUT + b"\r\nX: "])
 def test_endless_head_closes_the_connection(address: Any, start: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(connections, "HEAD_SECONDS", HANG)
+    monkeypatch.setattr(serving, "HEAD_SECONDS", HANG)
     with socket.create_connection(address, timeout=HANG) as connection, pytest.raises(ConnectionError):
         connection.sendall(start)
         for _ in range(64):
@@ -113,8 +113,8 @@ def test_endless_head_closes_the_connection(address: Any, start: bytes, monkeypa
 
 def test_many_pipelined_requests(address: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Together the requests are larger than the limit for one head."""
-    monkeypatch.setattr(connections, "HEAD_SECONDS", HANG)
-    count = connections.MAX_HEAD // len(QUICK) + 1000
+    monkeypatch.setattr(serving, "HEAD_SECONDS", HANG)
+    count = serving.MAX_HEAD // len(QUICK) + 1000
     with socket.create_connection(address, timeout=HANG) as connection:
         threading.Thread(target=connection.sendall, args=(QUICK * (count - 1) + LAST,)).start()
         answers = b""

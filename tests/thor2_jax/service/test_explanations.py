@@ -14,9 +14,9 @@ import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.describe import strips
 from thor2_jax.model.answers import DescribedFrame
+from thor2_jax.model.classifier import RunClassifiers
 from thor2_jax.model.confidence import Calibration
 from thor2_jax.model.inference import Inference
-from thor2_jax.model.run_classifiers import RunClassifiers
 from thor2_jax.service.answers import explained_frame
 from thor2_jax.service.engine import CloudResult, InferenceEngine
 from thor2_jax.service.preparation import PreparedRequest, prepare_frame

@@ -49,12 +49,10 @@ def test_an_embedding_alone_answers(calibration: Calibration | None, frame: thor
     record: dict[str, object] = {} if calibration is None else {"calibration": dataclasses.asdict(calibration)}
     run = untrained_embedding_run(("a", "b", "c"), config=dataclasses.replace(SMALL_CONFIG, looks=2), record=record)
     save_run(run, tmp_path / "run")
-    engine = InferenceEngine(Settings(tmp_path / "run", max_batch=8, adapt=True))
+    engine = InferenceEngine(Settings(tmp_path / "run", max_batch=8))
     assert engine.classes == ("a", "b", "c") and engine.classifiers == ("embedding",)
-    engine.compile_adaptation()
     instances = [prepare_instance(frame, label, engine.run.config.sigma_s) for label in frame.instances]
-    usable = [instance for instance in instances if instance.reason is None]
-    results = engine.infer(engine.correct(usable, observe=True))
+    results = engine.infer([instance for instance in instances if instance.reason is None])
     recognizer = thor2.Recognizer.load(tmp_path / "run")
     answers, expected = engine.recognize(instances, results), recognizer.recognize(frame)
     for answer, one in zip(answers, expected, strict=True):
@@ -69,5 +67,14 @@ def test_an_embedding_alone_answers(calibration: Calibration | None, frame: thor
     )
     assert results[0].aligned.shape == (len(results[0].aligned), 3)
     assert jax.tree.map(len, results[0].inference.probabilities) == {"embedding": 3}
-    explained = engine.explain(usable[0])
-    assert explained.name == max(answers[0].top["embedding"], key=lambda pair: pair[1])[0]
+
+
+@pytest.mark.slow  # quick ones are test_adaptation.py, and of explanations test_an_embedding_alone_is_explained
+def test_an_embedding_alone_adapts_and_is_explained(frame: thor2.RGBDFrame, tmp_path: Path) -> None:
+    save_run(untrained_embedding_run(("a", "b", "c")), tmp_path / "run")
+    engine = InferenceEngine(Settings(tmp_path / "run", max_batch=8, adapt=True))
+    engine.compile_adaptation()
+    instance = prepare_instance(frame, frame.instances[-1], engine.run.config.sigma_s)
+    (result,) = engine.infer(engine.correct([instance], observe=True))
+    (answer,) = engine.recognize([instance], [result])
+    assert engine.explain(instance).name == max(answer.top["embedding"], key=lambda pair: pair[1])[0]

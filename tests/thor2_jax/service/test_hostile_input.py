@@ -132,6 +132,7 @@ def test_invalid_intrinsics(http: httpx.Client, files: Files) -> None:
     good = json.loads(files["intrinsics"])
     texts = [json.dumps(good | {"fx": value}) for value in (float("nan"), float("inf"), 0, -1, "600", None, [1], True)]
     texts += ["", "{", "[]", "null", "{}", '{"fx": 1e999, "fy": 1, "cx": 0, "cy": 0}', "[" * 2000, '{"fx":' * 500]
+    texts += ['{"\\ud800": 1}', "fx: 0x" + "f" * 4000]
     texts += [json.dumps(good | {"fx": 10**400}), '{"fx": ' + "1" * 3000 + ', "fy": 1, "cx": 0, "cy": 0}']
     for text in texts:
         check_refused(http.post("/v1/recognize", files=files | {"intrinsics": text.encode()}), 422, "intrinsics")

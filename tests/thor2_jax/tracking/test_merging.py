@@ -3,7 +3,7 @@
 import numpy as np
 
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
-from thor2_jax.tracking.merging import merge_views
+from thor2_jax.tracking.poses import merge_views
 from training.rendering.view_sphere import camera_pose
 
 

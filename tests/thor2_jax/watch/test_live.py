@@ -22,9 +22,8 @@ from thor2_jax.errors import InputError
 from thor2_jax.model.answers import Recognition
 from thor2_jax.recordings.recorded_frames import RecordedFrame
 from thor2_jax.segmentation.table import segment_table
-from thor2_jax.watch.broadcast import Broadcast
 from thor2_jax.watch.live import LONGEST_PAUSE, LiveView, paced
-from thor2_jax.watch.server import serve_live
+from thor2_jax.watch.server import Broadcast, serve_live
 
 SECOND = 10**9
 

@@ -15,11 +15,9 @@ from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, backproject
 from thor2_jax.frames.instance_clouds import instance_clouds
 from training.augmentation.augmentations import Augmentations, _without_flying, augment
-from training.augmentation.base import Base
-from training.augmentation.illumination import Illumination
+from training.augmentation.illumination import Illumination, Registration
 from training.augmentation.occlusion import Occlusion, _silhouettes
-from training.augmentation.registration import Registration
-from training.augmentation.segmentation import Segmentation, _background, _widened
+from training.augmentation.segmentation import Base, Segmentation, _background, _widened
 from training.augmentation.sensor import Sensor, sensed
 from training.objects.builtin_objects import builtin_objects
 from training.rendering.camera import TRAINING_CAMERA, RenderedView

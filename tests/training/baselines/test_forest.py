@@ -7,8 +7,7 @@ from sklearn.ensemble import RandomForestClassifier
 import colornet
 import thor2_jax as thor2
 from training.baselines.baseline import BaselineInputs
-from training.baselines.fit_forest import tree_arrays
-from training.baselines.forest import Forest, forest_features
+from training.baselines.forest import Forest, forest_features, tree_arrays
 
 NETWORK = colornet.load_default()
 CONFIG = thor2.DescriptorConfig(homology="closed_form")

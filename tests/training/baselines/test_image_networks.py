@@ -16,23 +16,19 @@ import thor2_jax as thor2
 from thor2_jax.errors import InputError
 from thor2_jax.model.classifier import MLP
 from thor2_jax.model.run_directory import TrainedRun, load_run, save_run
-from training.baselines import fit_network as module
+from training.baselines import baseline as module
 from training.baselines.baseline import BaselineInputs
 from training.baselines.files import read_baseline
-from training.baselines.job import train_baselines
-from training.baselines.load import load_baselines
+from training.baselines.job import load_baselines, pretrained_files, train_baselines
 from training.baselines.names import NETWORKS, crop_size
-from training.baselines.networks.architectures import ARCHITECTURES, Architecture
-from training.baselines.networks.inputs import network_inputs
-from training.baselines.networks.rgbd_vit import RGBDViT
-from training.baselines.networks.vit import VIT_TINY
+from training.baselines.networks.architectures import ARCHITECTURES, Architecture, network_inputs
+from training.baselines.networks.vit import VIT_TINY, RGBDViT
 from training.baselines.networks.weights import tensor_shapes
-from training.baselines.pretrained import pretrained_files
 from training.baselines.templates import BACKBONES, Templates, create_backbone
 from training.fitting.options import FitOptions
 from training.train_job import TrainJob, run_train_job
-from training.views.memory_views import MemoryViews
-from training.views.view_crops import ViewCrops
+from training.views.crops import ViewCrops
+from training.views.normalized_views import MemoryViews
 
 CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=1, image_size=8)
 NAMES = ("red", "blue")

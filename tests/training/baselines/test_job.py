@@ -21,16 +21,14 @@ from thor2_jax.model.run_directory import TrainedRun, load_run, save_run
 from thor2_jax.types import Cloud
 from training.baselines import job
 from training.baselines.baseline import baseline_inputs
-from training.baselines.job import train_baselines
-from training.baselines.load import load_baselines
+from training.baselines.job import load_baselines, train_baselines
 from training.baselines.names import CLOUD_BASELINES, check_baselines
 from training.cli import app
 from training.evaluation.runs import load_runs
-from training.fitting.folds import fold_of_views
 from training.fitting.job import is_finished
+from training.fitting.samples import fold_of_views
 from training.views.left_out import WithoutClasses
-from training.views.memory_views import MemoryViews
-from training.views.normalized_views import normalize_views
+from training.views.normalized_views import MemoryViews, normalize_views
 
 CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=1, image_size=8)
 NAMES = ("plank", "cube")

@@ -10,8 +10,7 @@ from flax import nnx
 import thor2_jax as thor2
 from thor2_jax.model.classifier import MLP
 from training.baselines.baseline import BaselineInputs
-from training.baselines.fit_thor import camera_types
-from training.baselines.thor import THOR, VIEW_TYPES, view_types
+from training.baselines.thor import THOR, VIEW_TYPES, camera_types, view_types
 
 CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=3, image_size=4)
 

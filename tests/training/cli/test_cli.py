@@ -242,7 +242,7 @@ def test_a_default_training_recognizes_and_is_evaluated(
     monkeypatch.setattr(run_embedding, "SIZES", EmbeddingSizes(cell=4, hidden=(16,), learned=8, color=4))
     monkeypatch.setenv("THOR2_CACHE", str(tmp_path / "cache"))
     out = tmp_path / "my run"
-    steps = ("--azimuth-step", 90, "--polar-step", 45, "--workers", 1, "--epochs", 1, "--embedding", 10)
+    steps = ("--azimuth-step", 120, "--polar-step", 90, "--workers", 1, "--epochs", 1, "--embedding", 10)
     command = ("train", "--meshes", meshes, "--out", out, *steps)
     code, printed, err = run(*command)
     assert code == 0 and "embedding has a held-out accuracy of 0." in printed.replace("1.000", "0.")

@@ -48,7 +48,7 @@ def test_stages_are_numbered_and_the_time_left_is_that_of_all(monkeypatch: pytes
         ("stage 2 of 3: cached", 1, 2, ""),
         ("stage 3 of 3: fit", 1, 4, "loss 1, about 30 s left of all stages"),
         ("fit thor", 1, 2, ""),
-        ("stage 3 of 3: fit", 2, 4, "loss 1, about 29 s left of all stages"),
+        ("stage 3 of 3: fit", 2, 4, "loss 1, about 38 s left of all stages"),
     ]
 
 

@@ -16,8 +16,8 @@ from helpers import run_thor2, write_frame_files
 from processes import HANG
 from recording_files import table_frame, write_recording
 
-from thor2_jax.watch.broadcast import Broadcast
 from thor2_jax.watch.live import LiveView
+from thor2_jax.watch.server import Broadcast
 
 FRAMES = [table_frame(shift) for shift in (0, 3, 6)]
 

@@ -19,12 +19,9 @@ from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, backproject
 from thor2_jax.model.answers import Recognition
 from training.diagnosis import registration
-from training.diagnosis.camera import check_camera
+from training.diagnosis.checks import Diagnosis, check_camera, check_labels, check_meshes
 from training.diagnosis.colors import check_channel_order, check_light
 from training.diagnosis.depth import check_depth, instance_extents
-from training.diagnosis.findings import Diagnosis
-from training.diagnosis.labels import check_labels
-from training.diagnosis.meshes import check_meshes
 from training.diagnosis.setup import diagnose
 from training.readers.frame_files import FrameFiles, frame_files
 

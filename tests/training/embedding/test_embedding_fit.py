@@ -16,7 +16,7 @@ from thor2_jax.descriptor.describe import strips
 from thor2_jax.descriptor.looks import describe_aligned_looks
 from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
 from thor2_jax.gallery.references import REFERENCES_FILE
-from thor2_jax.model.weights import model_arrays
+from thor2_jax.model.classifier import model_arrays
 from training.augmentation import orientation
 from training.embedding import fit, sampling
 from training.embedding.build import main

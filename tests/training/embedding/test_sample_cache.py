@@ -14,11 +14,11 @@ from helpers import SMALL_CONFIG
 
 import colornet
 import thor2_jax as thor2
-from training.embedding import run_embedding, sample_cache
+from training.embedding import run_embedding, sampling
 from training.embedding.run_embedding import Distractors
-from training.embedding.sample_cache import cached_samples
 from training.embedding.samples import Samples
-from training.storage.locks import locked
+from training.embedding.sampling import cached_samples
+from training.storage.jobs import locked
 
 SAMPLES = Samples(
     start=np.array([0, 2, 3]),
@@ -78,7 +78,7 @@ def test_another_version_has_other_samples(
         assert [counted(), counted()] == [1, 0]
     (code := cache.parent / "code" / "objects").mkdir(parents=True)
     (code / "procedural.py").write_text("changed = True")
-    monkeypatch.setattr(sample_cache.training, "__file__", str(code.parent / "__init__.py"))
+    monkeypatch.setattr(sampling.training, "__file__", str(code.parent / "__init__.py"))
     assert counted() == 1 and len(files(cache)) == 3
 
 
@@ -135,7 +135,7 @@ def test_a_full_or_unwritable_disk_costs_one_warning(
         raise OSError(errno.ENOSPC, "No space left on device", str(path))
 
     with monkeypatch.context() as patch:
-        patch.setattr(sample_cache, "atomic_write", full)
+        patch.setattr(sampling, "atomic_write", full)
         assert counted() == 1
     assert files(cache) == [] and "No space left" in caplog.records[-1].getMessage()
     monkeypatch.setenv("THOR2_CACHE", "/proc/no-such-directory")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from thor2_jax.errors import InputError
-from training.evaluation.confidence import (
+from training.evaluation.scores import (
     accuracy_at_coverage,
     auroc,
     expected_calibration_error,

@@ -27,7 +27,7 @@ from training.evaluation.answers import AnswerFile
 from training.evaluation.job import evaluate_dataset
 from training.evaluation.runs import Run, load_runs
 from training.readers.labelled import LabelledFrame, LabelledFrames
-from training.storage.locks import LOCK, locked
+from training.storage.jobs import LOCK, locked
 
 CLASSES = ("bowl", "can", "mug")
 
@@ -47,7 +47,8 @@ class ToyDataset(LabelledFrames):
         labels[5:20, 5:25] = 1
         labels[25:40, 20:60] = 2 if number % 4 else 0
         labels[2:9, 40:60] = 3
-        depth = np.full((48, 64), 800, np.uint16)
+        rows, columns = np.indices(labels.shape)  # curved, since a plane has several boxes of equal size
+        depth = (800 + rows * rows // 40 + columns * columns // 60).astype(np.uint16)
         frame = thor2.RGBDFrame(color, depth, labels, thor2.Intrinsics(50.0, 50.0, 32.0, 24.0))
         truth = {1: CLASSES[number % 3], 2: "mug", 3: "dragon"}
         return LabelledFrame(self.identifiers[number], frame, truth, {"light": str(number % 2)})
@@ -170,9 +171,10 @@ def test_an_embedding_alone_is_evaluated(tmp_path: Path, calibrated: bool) -> No
     assert report["main"] == "embedding" and report["fusions"] == ["embedding"]
     assert report["temperatures"]["embedding"]["runs"] == 0
     confusion, confidences = np.zeros((3, 4), int), []
+    recognizer = Recognizer.load(tmp_path / "run", unknown_below=0.0)
     for number in range(5):
         item = dataset[number]
-        answers = Recognizer.load(tmp_path / "run", unknown_below=0.0).recognize(item.frame)
+        answers = recognizer.recognize(item.frame)
         answered = {answer.label: answer for answer in answers}
         for label in (1, 2):
             answer = answered.get(label)  # every fourth frame has no label 2
@@ -311,7 +313,7 @@ def test_an_unreadable_first_frame_leaves_no_directory(tmp_path: Path) -> None:
 
 
 def test_outlines_show_correct_and_incorrect_answers(tmp_path: Path) -> None:
-    from training.reports.instance_pictures import CORRECT, INCORRECT, draw_crop, draw_judged
+    from training.evaluation.frame_pictures import CORRECT, INCORRECT, draw_crop, draw_judged
 
     color = np.full((60, 90, 3), 128, np.uint8)
     labels = np.zeros((60, 90), np.uint8)

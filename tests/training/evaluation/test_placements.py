@@ -12,8 +12,8 @@ from helpers import ToyDescriptors, UntaughtRecognizer
 import thor2_jax as thor2
 from training.evaluation.answering import answer_frames
 from training.evaluation.answers import FrameAnswers, InstancePrediction
-from training.evaluation.placements import find_placements, placement_accuracy, steadiness
 from training.evaluation.runs import Run
+from training.evaluation.scores import find_placements, placement_accuracy, steadiness
 from training.readers.frames import FrameFolder
 from training.readers.labelled import LabelledFrame
 

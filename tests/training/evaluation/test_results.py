@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 from sklearn.metrics import confusion_matrix
 
-from training.evaluation.accuracy import attribute_tables, group_by_attributes, summarize_runs
-from training.evaluation.answers import FrameAnswers, InstancePrediction
-from training.evaluation.fusion import fuse_by, fusions, main_fusion
+from training.evaluation.answers import FrameAnswers, InstancePrediction, fuse_by, fusions, main_fusion
 from training.evaluation.page import answer_texts
 from training.evaluation.results import compute_results, named_answers
+from training.evaluation.scores import attribute_tables, group_by_attributes, summarize_runs
 
 CLASSES = ("bowl", "can", "mug")
 

@@ -12,14 +12,12 @@ from thor2_jax.model.classifier import MLP, Feature, class_probabilities
 from thor2_jax.model.run_directory import input_size
 from training.evaluation.runs import load_runs
 from training.fitting import calibration
-from training.fitting.calibration import sample_probabilities, temperatures
+from training.fitting.calibration import fit_temperature, sample_probabilities, temperatures
 from training.fitting.job import RunSettings, train_run
 from training.fitting.options import FitOptions
 from training.fitting.samples import MIRRORS, build_samples
 from training.fitting.steps import FitContext
-from training.fitting.temperature import fit_temperature
-from training.views.memory_views import MemoryViews
-from training.views.normalized_views import padded_batches
+from training.views.normalized_views import MemoryViews, padded_batches
 
 CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=2, n_strips=8, image_size=8)
 NETWORK = colornet.load_default()

@@ -10,8 +10,8 @@ import colornet
 from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
 from thor2_jax.model.inference import Inference
 from training.embedding.samples import Samples, joined_samples, sample_clouds
-from training.fitting import confidence
-from training.fitting.confidence import fit_calibration
+from training.fitting import calibration
+from training.fitting.calibration import fit_calibration
 
 NETWORK = colornet.load_default()
 
@@ -42,14 +42,14 @@ def test_confidence_separates_and_keeps_its_share(held_out: Samples, monkeypatch
     embedded = fused * np.where(known, 0.9, 0.1)[:, None]
     values = {"tops": fused, "tops2": fused, "embedding": embedded}
     inference = Inference(0, {k: np.resize(v, (128, 2)) for k, v in values.items()})
-    monkeypatch.setattr(confidence, "infer", lambda *_: inference)
+    monkeypatch.setattr(calibration, "infer", lambda *_: inference)
     fitted, accuracy = fit_calibration(run, embedding, held_out)
     assert fitted is not None and min(fitted.known_factor, fitted.correct_factor, fitted.score_factor) > 0
     scores, correct = fitted.confidence(fused, embedded), answer == held_out.label
     assert np.min(scores[known & ~wrong]) > 0.7 > np.max(scores[~known])
     assert accuracy == correct[known].mean() < 1
     assert np.mean(scores[known]) == pytest.approx(correct[known].mean(), abs=0.05)  # most instances are known
-    assert fitted.unknown_below == pytest.approx(np.quantile(scores[correct], 1 - confidence.KEPT))
+    assert fitted.unknown_below == pytest.approx(np.quantile(scores[correct], 1 - calibration.KEPT))
 
 
 def test_without_correct_answers_there_is_no_confidence(held_out: Samples) -> None:
@@ -71,7 +71,7 @@ def test_unknown_objects_are_told_apart_without_incorrect_answers(
     embedded = fused * np.where(known, 0.9, 0.1)[:, None]
     values = {"tops": fused, "tops2": fused, "embedding": embedded}
     inference = Inference(0, {k: np.resize(v, (128, 2)) for k, v in values.items()})
-    monkeypatch.setattr(confidence, "infer", lambda *_: inference)
+    monkeypatch.setattr(calibration, "infer", lambda *_: inference)
     fitted, accuracy = fit_calibration(run, embedding, held_out)
     assert fitted is not None and accuracy == 1
     scores = fitted.confidence(fused, embedded)

@@ -17,9 +17,8 @@ from thor2_jax.types import Cloud
 from training.embedding import run_embedding
 from training.embedding.run_embedding import Distractors
 from training.fitting.job import RunSettings, check_trained, train_run
-from training.fitting.metrics_log import read_metrics
-from training.fitting.options import FitOptions
-from training.views.memory_views import MemoryViews
+from training.fitting.options import FitOptions, read_metrics
+from training.views.normalized_views import MemoryViews
 
 CLASSES = ("red brick", "stick")
 OPTIONS = FitOptions()

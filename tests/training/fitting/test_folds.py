@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import thor2_jax as thor2
-from training.fitting.folds import fold_of_views
+from training.fitting.samples import fold_of_views
 
 
 def fold_of(label: Sequence[int], view: Sequence[int], folds: int, seed: int) -> np.ndarray:

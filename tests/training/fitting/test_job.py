@@ -23,12 +23,11 @@ from thor2_jax.model.run_directory import TrainedRun, load_run
 from thor2_jax.types import Cloud
 from training.fitting import job as module
 from training.fitting import loop
-from training.fitting import metrics_log as metrics
-from training.fitting.checkpoints import Checkpoints
+from training.fitting import options as metrics
+from training.fitting.checkpoints import Checkpoints, find_run_directories
 from training.fitting.job import RunSettings, train_run
 from training.fitting.options import FitOptions
-from training.fitting.run_directories import find_run_directories
-from training.views.memory_views import MemoryViews
+from training.views.normalized_views import MemoryViews
 
 CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=3, n_strips=8, image_size=8)
 OPTIONS = FitOptions(epochs=3, batch_size=4)

@@ -6,8 +6,7 @@ from pathlib import Path
 import pytest
 
 import thor2_jax as thor2
-from training.fitting.metrics_log import append_metrics, discard_later_epochs, read_metrics
-from training.fitting.options import EpochMetrics
+from training.fitting.options import EpochMetrics, append_metrics, discard_later_epochs, read_metrics
 
 
 def metrics(epoch: int) -> EpochMetrics:

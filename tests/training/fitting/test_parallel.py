@@ -20,7 +20,7 @@ from flax import nnx
 import thor2_jax as thor2
 from training.fitting.options import FitOptions
 from training.fitting.job import RunSettings, train_run
-from training.views.memory_views import MemoryViews
+from training.views.normalized_views import MemoryViews
 
 rng = np.random.default_rng(0)
 def clouds(size, low, high):

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from thor2_jax.errors import InputError
-from training.fitting.run_directories import find_run_directories
+from training.fitting.checkpoints import find_run_directories
 
 
 def test_folds_are_listed_in_numeric_order(tmp_path: Path) -> None:

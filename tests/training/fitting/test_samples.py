@@ -14,8 +14,7 @@ from thor2_jax.descriptor.color_membership import region_sets
 from thor2_jax.types import Cloud
 from training.fitting import samples as module
 from training.fitting.samples import PAPER_MIRRORS, Samples, build_samples, expand
-from training.views.memory_views import MemoryViews
-from training.views.normalized_views import NormalizedViews
+from training.views.normalized_views import MemoryViews, NormalizedViews
 
 NETWORK = colornet.load_default()
 CONFIG = thor2.DescriptorConfig(homology="closed_form")
@@ -50,10 +49,10 @@ def test_every_view_is_used_mirrored_in_four_ways(
 ) -> None:
     monkeypatch.setattr(module, "VIEWS_PER_BATCH", 2)
     source = MemoryViews({"mug": views(0, (300, 299, 1)), "box": views(1, (40,))}, config)
-    progress: list[int] = []
-    samples = build_samples(source, NETWORK, config, progress.append, PAPER_MIRRORS)
+    progress: list[tuple[int, ...]] = []
+    samples = build_samples(source, NETWORK, config, lambda *done: progress.append(done), PAPER_MIRRORS)
     assert samples.classes == ("mug", "box") and len(samples) == 16
-    assert progress == [2, 1, 1]
+    assert progress == [(2, 4), (3, 4), (4, 4)]
     assert sorted(zip(samples.label.tolist(), samples.view.tolist(), strict=True)) == sorted(
         [(0, v) for v in range(3)] * 4 + [(1, 0)] * 4
     )

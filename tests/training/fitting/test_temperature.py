@@ -7,8 +7,8 @@ from sklearn.metrics import log_loss
 
 from thor2_jax.errors import InputError
 from thor2_jax.model.fusion import with_temperature
-from training.evaluation.confidence import expected_calibration_error
-from training.fitting.temperature import fit_temperature, negative_log_likelihood
+from training.evaluation.scores import expected_calibration_error
+from training.fitting.calibration import fit_temperature, negative_log_likelihood
 
 
 @pytest.mark.parametrize("temperature", [0.4, 1.0, 3.0])

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from thor2_jax.errors import InputError
-from training.readers.pcd import read_organized_points
+from training.readers.ocid import read_organized_points
 
 HEADER = (
     "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS x y z rgba label\nSIZE 4 4 4 4 4\n"

@@ -22,7 +22,7 @@ def test_number_of_views(azimuth_step: float, polar_step: float, count: int) -> 
     assert len(view_angles(azimuth_step, polar_step)) == count
 
 
-@pytest.mark.parametrize("step", [0.0, -5.0, 7.0, math.nan, math.inf, 400.0])
+@pytest.mark.parametrize("step", [0.0, -5.0, 7.0, math.nan, math.inf, 400.0, 1e-300, 1e-320])
 def test_invalid_steps_are_refused(step: float) -> None:
     with pytest.raises(InputError, match="^azimuth_step is"):
         view_angles(step, 5.0)

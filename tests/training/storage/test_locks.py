@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 
 from thor2_jax.errors import InputError
-from training.storage.locks import LOCK, locked
+from training.storage.jobs import LOCK, locked
 
 HOLDER = """
 import sys, time
 from pathlib import Path
-from training.storage.locks import locked
+from training.storage.jobs import locked
 with locked(Path(sys.argv[1])):
     print("locked", flush=True)
     time.sleep(10_000)

@@ -16,13 +16,11 @@ from training.objects.mesh import TexturedMesh
 from training.objects.meshes import find_meshes, load_mesh
 from training.rendering.ray_caster import RayCaster, render_view
 from training.rendering.view_sphere import camera_pose, view_angles
-from training.views import crop_job
-from training.views.crop_job import render_crops
-from training.views.crops import rgbd_crop
+from training.views import render_job
+from training.views.crops import ViewCrops, quantized, rgbd_crop, stacked
 from training.views.dataset import ViewDataset
 from training.views.left_out import WithoutClasses
-from training.views.render_job import render_dataset
-from training.views.view_crops import ViewCrops, quantized, stacked
+from training.views.render_job import render_crops, render_dataset
 
 SIZE = 24
 
@@ -80,8 +78,8 @@ def test_interrupted_crops_resume_with_the_same_bytes(
     with pytest.raises(InputError, match="is missing or damaged"):
         dataset.read_crops(0, SIZE)
     written = []
-    encode = crop_job.encode_crops
-    monkeypatch.setattr(crop_job, "encode_crops", lambda crops: written.append(len(crops)) or encode(crops))
+    encode = render_job.encode_crops
+    monkeypatch.setattr(render_job, "encode_crops", lambda crops: written.append(len(crops)) or encode(crops))
     command = ("--meshes", meshes, "--out", dataset.directory, "--azimuth-step", 180, "--polar-step", 90)
     again = (*command, "--workers", 1, "--illumination", "--copies", 1, "--quiet", "--crops")
     assert run_thor2("render", *again, SIZE) == 0

@@ -109,11 +109,11 @@ def test_empty_views_and_views_beyond_the_range() -> None:
 
 
 def test_padded_batches() -> None:
-    clouds = [(np.full((n, 3), n, np.float32), np.zeros((n, 3), np.uint8)) for n in (3, 600, 5)]
+    clouds = [(np.full((n, 3), n, np.float32), np.zeros((n, 3), np.uint8)) for n in (3, 2100, 5)]
     batches = list(padded_batches(clouds, 2))
     assert [count for count, _ in batches] == [2, 1]
-    assert [batch.mask.shape for _, batch in batches] == [(2, 1024), (2, 512)]
-    assert [batch.mask.sum(axis=1).tolist() for _, batch in batches] == [[3, 600], [5, 0]]
+    assert [batch.mask.shape for _, batch in batches] == [(2, 4096), (2, 2048)]
+    assert [batch.mask.sum(axis=1).tolist() for _, batch in batches] == [[3, 2100], [5, 0]]
     assert list(padded_batches([], 2)) == []
 
 

@@ -13,8 +13,7 @@ from thor2_jax.gallery.augment import augmented_view
 from training.views import labelled_views
 from training.views.labelled_views import FIRST_VIEW, WithLabelledViews
 from training.views.left_out import WithoutClasses
-from training.views.memory_views import MemoryViews
-from training.views.normalized_views import COORDINATE_STEP
+from training.views.normalized_views import COORDINATE_STEP, MemoryViews
 
 CONFIG = DescriptorConfig(homology="closed_form")
 

@@ -25,7 +25,7 @@ from training.augmentation.augmentations import Augmentations
 from training.augmentation.illumination import Illumination
 from training.objects.builtin_objects import builtin_objects
 from training.objects.mesh import TexturedMesh
-from training.storage.locks import locked
+from training.storage.jobs import locked
 from training.storage.workers import local_workers, ray_workers
 from training.views import render_job
 from training.views.dataset import MANIFEST, ViewDataset

@@ -5,15 +5,16 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
+import jax
+import jax.numpy as jnp
+import numpy as np
 from flax import nnx
 
-from training.baselines.networks.densenet import DENSENET_161
-from training.baselines.networks.rcfusion import RCFusion
-from training.baselines.networks.rgbd_vit import RGBDViT
-from training.baselines.networks.vit import VIT_BASE, VIT_TINY_4
-from training.baselines.networks.vit_cnn import ViTCNN
+from training.baselines.networks.densenet import DENSENET_161, ViTCNN
+from training.baselines.networks.resnet import RCFusion
+from training.baselines.networks.vit import VIT_BASE, VIT_TINY_4, RGBDViT
 
-__all__ = ["ARCHITECTURES", "Architecture"]
+__all__ = ["ARCHITECTURES", "Architecture", "network_inputs"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,6 +36,10 @@ class Architecture:
         """Return the network with random weights."""
         network: nnx.Module = self.create(n_classes, rngs=nnx.Rngs(seed))
         return network
+
+    def backbones(self, network: Any) -> list[tuple[nnx.Module, str]]:
+        """Return the backbones of a network with their files."""
+        return [(getattr(network, backbone), file) for backbone, file in self.weights.items()]
 
 
 _LARGE, _SMALL = 224, 96
@@ -66,3 +71,19 @@ ARCHITECTURES: dict[str, Architecture] = {
     ),
 }
 """Name of the baseline -> its network."""
+
+
+MEAN = np.array([0.485, 0.456, 0.406], np.float32)
+DEVIATION = np.array([0.229, 0.224, 0.225], np.float32)
+"""Mean and standard deviation of the colours of ImageNet, in [0, 1]."""
+
+
+def network_inputs(color: Any, normals: Any) -> tuple[jax.Array, jax.Array]:
+    """Return network inputs [B, S, S, 3] of colour and of normals for the arrays of `ViewCrops`.
+
+    Normals are colour-coded, (n + 1) / 2. The background is 0 in both, the mean colour of ImageNet.
+    """
+    mask = jnp.any(normals != 0, axis=-1, keepdims=True)
+    images = color.astype(jnp.float32) / 255, (normals.astype(jnp.float32) / 127 + 1) / 2
+    first, second = (jnp.where(mask, (image - MEAN) / DEVIATION, 0) for image in images)
+    return first, second

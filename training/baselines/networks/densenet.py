@@ -1,12 +1,15 @@
 """DenseNet (Huang et al., CVPR 2017), with the module names of torchvision and timm."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from flax import nnx
 
 from training.baselines.networks.resnet import batch_norm, convolution, stem_pool
+from training.baselines.networks.vit import ViT, ViTConfig
 
-__all__ = ["DENSENET_161", "DenseNet"]
+__all__ = ["DENSENET_161", "DenseNet", "ViTCNN"]
 
 BOTTLENECK = 4
 """Channels between the convolutions of a layer, relative to its output."""
@@ -99,3 +102,30 @@ class DenseNet(nnx.Module):
             if number < self.n_blocks:
                 x = getattr(self, f"transition{number}")(x)
         return nnx.relu(self.norm5(x)).mean(axis=(1, 2))
+
+
+HIDDEN = 512
+
+
+class ViTCNN(nnx.Module):
+    """A ViT on colour, a DenseNet on normals, and an MLP on the features of both."""
+
+    def __init__(self, n_classes: int, vit: ViTConfig, cnn: dict[str, Any], size: int, *, rngs: nnx.Rngs) -> None:
+        """Initialize the weights.
+
+        Args:
+            n_classes: number of classes.
+            vit: architecture of the ViT.
+            cnn: arguments of the DenseNet.
+            size: side of the images, pixels.
+            rngs: random number generators.
+        """
+        self.vit = ViT(vit, size, rngs=rngs)
+        self.cnn = DenseNet(**cnn, rngs=rngs)
+        self.hidden = nnx.Linear(self.vit.channels + self.cnn.channels, HIDDEN, rngs=rngs)
+        self.head = nnx.Linear(HIDDEN, n_classes, rngs=rngs)
+
+    def __call__(self, color: jax.Array, normals: jax.Array) -> jax.Array:
+        """Return logits [B, C] for network inputs [B, S, S, 3] of colour and normals."""
+        features = jnp.concatenate([self.vit(color), self.cnn(normals)], axis=-1)
+        return self.head(nnx.relu(self.hidden(features)))

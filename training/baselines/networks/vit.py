@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
-__all__ = ["VIT_BASE", "VIT_DINOV2_SMALL", "VIT_TINY", "VIT_TINY_4", "ViT", "ViTConfig"]
+__all__ = ["RGBDViT", "VIT_BASE", "VIT_DINOV2_SMALL", "VIT_TINY", "VIT_TINY_4", "ViT", "ViTConfig"]
 
 MLP_RATIO = 4
 EPSILON = 1e-6
@@ -141,3 +141,16 @@ class ViT(nnx.Module):
         for block in self.blocks:
             tokens = block(tokens)
         return self.norm(tokens[:, 0])
+
+
+class RGBDViT(nnx.Module):
+    """A ViT on colour, a ViT on normals, and a linear classifier of the class tokens of both."""
+
+    def __init__(self, n_classes: int, vit: ViTConfig, size: int, *, rngs: nnx.Rngs) -> None:
+        """Initialize the weights; `size` is the side of the images, pixels."""
+        self.color, self.normals = ViT(vit, size, rngs=rngs), ViT(vit, size, rngs=rngs)
+        self.head = nnx.Linear(2 * vit.width, n_classes, rngs=rngs)
+
+    def __call__(self, color: jax.Array, normals: jax.Array) -> jax.Array:
+        """Return logits [B, C] for network inputs [B, S, S, 3] of colour and normals."""
+        return self.head(jnp.concatenate([self.color(color), self.normals(normals)], axis=-1))

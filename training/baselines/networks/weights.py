@@ -5,6 +5,7 @@
 The files are those of timm: a tensor `layer1.0.conv1.weight` is the kernel of `model.layer1[0].conv1`.
 """
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
 
-__all__ = ["load_backbone", "resampled_positions", "tensor_shapes"]
+__all__ = ["load_backbone", "load_weights", "resampled_positions", "tensor_shapes", "weights_file"]
 
 _TENSORS = {"kernel": "weight", "scale": "weight", "mean": "running_mean", "var": "running_var"}
 """Last part of an NNX path -> of the tensor's name."""
@@ -41,6 +42,31 @@ def tensor_shapes(model: nnx.Module) -> dict[str, tuple[int, ...]]:
     """Return the names and shapes of the tensors of a backbone's file."""
     prefix = getattr(model, "PREFIX", "")
     return {_tensor_name(path, prefix): _torch_shape(value.shape, path[-1]) for path, value in _state(model)[1].items()}
+
+
+def weights_file(directory: Path, name: str) -> Path:
+    """Return the file of a backbone's pretrained weights.
+
+    Raises:
+        InputError: it does not exist.
+    """
+    path = directory / f"{name}.safetensors"
+    if not path.is_file():
+        raise InputError(f"weights: {path} does not exist; expected it in the directory, see docs/baselines.md")
+    return path
+
+
+def load_weights(directory: Path, backbones: Iterable[tuple[nnx.Module, str]]) -> list[Path]:
+    """Replace the weights of backbones by those of files in a directory, given without the suffix; return the files.
+
+    Raises:
+        InputError: a file does not exist, or as `load_backbone`.
+    """
+    paths = []
+    for model, name in backbones:
+        paths.append(weights_file(directory, name))
+        load_backbone(model, paths[-1])
+    return paths
 
 
 def load_backbone(model: nnx.Module, path: Path) -> None:

@@ -1,16 +1,39 @@
-"""Pieces that belong together: neighbours without an edge of depth between them, and both sides of hollow things."""
+"""Pieces of things, and those that belong together.
+
+Pieces are found by watershed: regions grow from sure pixels of things and of the background until they meet at colour
+edges. Near depth edges and where depth is missing, the colour image alone decides. Neighbours without an edge of depth
+between them, and both sides of hollow things, are then merged.
+"""
 
 import dataclasses
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from thor2_jax.segmentation.foreground import Evidence
-from thor2_jax.segmentation.markers import Pieces
-from thor2_jax.segmentation.pixels import Mask, grow
+from thor2_jax.segmentation.foreground import FLAT, UNIT, Evidence
+from thor2_jax.segmentation.pixels import Mask, close, components, grow, nearest_known, shrink, watershed
 from thor2_jax.segmentation.planes import DepthImage
 
-__all__ = ["merge_pieces"]
+__all__ = ["flood", "merge_pieces"]
+
+LEAST_MARKER = 10
+"""Least pixels of a marker."""
+
+RIM = 3
+"""Width, pixels, of the square within which depth is not trusted at the border of a thing."""
+
+NECK = 2.4
+"""Half the width, pixels, of a neck that divides a body."""
+
+CLEAR = 0.3
+"""Largest contrast, in units, of a pixel that is clearly the plane's."""
+
+BLEEDING = 7
+"""Width, pixels, of the square within which depth of a thing may reach over the plane."""
+
+OUTSIDE = 21
+"""Width, pixels, of the square within which things may reach over pixels without depth beyond the plane."""
 
 LEAST_CONTACT = 0.08
 """Least share of the border of the smaller piece that two pieces of one thing have in common."""
@@ -41,6 +64,92 @@ SAME_HEIGHT = 0.015
 
 BEFORE, AFTER = 2, 2
 """Pixels beside a border at which the two pieces are compared."""
+
+
+def flood(
+    color: NDArray[np.uint8], depth: DepthImage, evidence: Evidence
+) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
+    """Return the pieces between edges.
+
+    Args:
+        color: [H, W, 3] uint8, a little blurred.
+        depth: the depth image.
+        evidence: probabilities by height and colour, and edges of depth.
+
+    Returns:
+        Labels [H, W], 0 for the background, and for each label [n] whether the piece was found by its colour alone.
+    """
+    steps, folds = evidence.steps, evidence.folds
+    high = evidence.high | (close(evidence.high, 5) & ~depth.valid)
+    like_plane = evidence.plain & (evidence.contrast < CLEAR * UNIT) & (evidence.heights < FLAT)
+    like_plane &= ~shrink(high, BLEEDING)
+    body = high & ~like_plane
+    markers, n_bodies = _body_markers(body, steps | grow(folds, 3) | (grow(folds, 5) & grow(steps, 3)))
+    body_numbers, body_sizes = components(body)
+    marked = np.zeros(len(body_sizes), bool)
+    marked[body_numbers[markers > 0]] = True
+    alone = ~marked & (body_sizes >= LEAST_MARKER)  # bodies that are all rim
+    rank = np.cumsum(alone) * alone
+    markers += np.where(rank > 0, rank + n_bodies, 0).astype(np.int32)[body_numbers]
+    n_bodies += int(alone.sum())
+    body = (marked | alone)[body_numbers]
+    colored = close(evidence.colored | (high & ~like_plane & ~body & (evidence.contrast > UNIT)), 3)
+    near = grow(body, 5)
+    numbers, n_colored = _colored_markers(colored & ~near, near, depth.valid)
+    markers = np.where(numbers > 0, numbers + n_bodies, markers)
+    unknown = (
+        (near & ~(like_plane & ~evidence.high))
+        | colored
+        | _unknown_without_depth(depth, evidence, body, near | colored, like_plane)
+    )
+    markers += 1  # the background is 1, and 0 is flooded
+    markers[(markers == 1) & unknown] = 0
+    labels = watershed(color, markers) - 1
+    return labels, np.arange(1 + n_bodies + n_colored) > n_bodies
+
+
+def _body_markers(body: Mask, edges: Mask) -> tuple[NDArray[np.int32], int]:
+    """Return the numbers [H, W] of the inner parts of bodies between edges, and how many there are.
+
+    Edges have gaps, so parts are also divided at necks. `merge_pieces` undoes what was no edge.
+    """
+    numbers, sizes = components(shrink(body, RIM) & ~edges)
+    room = np.asarray(cv2.distanceTransform((numbers > 0).view(np.uint8), cv2.DIST_L2, 3))
+    parts, part_sizes = components((room > NECK) & (sizes >= LEAST_MARKER)[numbers])
+    part_sizes[part_sizes < LEAST_MARKER] = 0
+    whole = sizes >= LEAST_MARKER
+    whole[numbers[part_sizes[parts] > 0]] = False
+    kept = part_sizes > 0
+    markers = (np.cumsum(kept) * kept).astype(np.int32)[parts]
+    n_parts = int(kept.sum())
+    if n_parts > 0:  # the rest of a divided component goes to its nearest part
+        known = markers > 0
+        nearest = nearest_known(known)
+        same = (numbers[known].take(nearest) == numbers) & (numbers > 0)
+        markers = np.where(same, markers[known].take(nearest), 0)
+    markers += np.where(whole, np.cumsum(whole) + n_parts, 0).astype(np.int32)[numbers]
+    return markers, n_parts + int(whole.sum())
+
+
+def _colored_markers(colored: Mask, near: Mask, valid: Mask) -> tuple[NDArray[np.int32], int]:
+    """Return the numbers [H, W] of things that are found by their colour, and how many there are.
+
+    What is beside a body and has no depth is left to the flood.
+    """
+    numbers, sizes = components(colored, connectivity=8)
+    n_valid = np.bincount(numbers[valid], minlength=len(sizes))
+    beside = np.zeros(len(sizes), bool)
+    beside[numbers[grow(near, 3)]] = True
+    kept = (sizes >= LEAST_MARKER) & (~beside | (n_valid > 0.5 * sizes))
+    return (np.cumsum(kept) * kept).astype(np.int32)[numbers], int(kept.sum())
+
+
+def _unknown_without_depth(depth: DepthImage, evidence: Evidence, body: Mask, things: Mask, like_plane: Mask) -> Mask:
+    """Return pixels without depth that may belong to a thing."""
+    wide = grow(body, OUTSIDE)
+    beside = grow(things, 5) & ~like_plane
+    colored = (evidence.contrast > UNIT) & ~evidence.plain & evidence.region
+    return ~depth.valid & ((~evidence.region & wide) | beside | colored)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -84,12 +193,15 @@ class _Shapes:
 
 
 def merge_pieces(
-    pieces: Pieces, color: NDArray[np.uint8], depth: DepthImage, evidence: Evidence, steps: Mask, folds: Mask
+    labels: NDArray[np.int32],
+    colored: NDArray[np.bool_],
+    color: NDArray[np.uint8],
+    depth: DepthImage,
+    evidence: Evidence,
 ) -> NDArray[np.int32]:
-    """Return the labels [H, W] of pieces after merging, not consecutive; arguments as of `flood`."""
-    labels = pieces.labels
-    n = len(pieces.colored)
-    borders = _find_borders(labels, n, color, depth, evidence, steps, folds)
+    """Return the labels [H, W] of the pieces of `flood` after merging, not consecutive; the arguments are as there."""
+    n = len(colored)
+    borders = _find_borders(labels, n, color, depth, evidence)
     shapes = _measure(labels, n, color, evidence)
     parent = list(range(n))
 
@@ -101,7 +213,7 @@ def merge_pieces(
     for k, (a, b) in enumerate(borders.pairs.tolist()):
         if a == 0:
             continue
-        if _belong_together(k, a, b, borders, shapes, pieces.colored) or (
+        if _belong_together(k, a, b, borders, shapes, colored) or (
             shapes.tall[a] and shapes.tall[b] and _is_hollow(k, a, b, borders, shapes, labels, evidence)
         ):
             parent[max(root(a), root(b))] = min(root(a), root(b))
@@ -174,18 +286,12 @@ def _measure(labels: NDArray[np.int32], n: int, color: NDArray[np.uint8], eviden
 
 
 def _find_borders(
-    labels: NDArray[np.int32],
-    n: int,
-    color: NDArray[np.uint8],
-    depth: DepthImage,
-    evidence: Evidence,
-    steps: Mask,
-    folds: Mask,
+    labels: NDArray[np.int32], n: int, color: NDArray[np.uint8], depth: DepthImage, evidence: Evidence
 ) -> _Borders:
     flat, pixels = labels.ravel(), color.reshape(-1, 3)
     z, heights = depth.z.ravel(), evidence.heights.ravel()
-    near_step = grow(steps, 5)
-    near_edge = (near_step | grow(folds, 3)).ravel()
+    near_step = grow(evidence.steps, 5)
+    near_edge = (near_step | grow(evidence.folds, 3)).ravel()
     near_step = near_step.ravel()
     parts = []
     for step in (1, labels.shape[1]):

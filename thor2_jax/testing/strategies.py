@@ -1,4 +1,4 @@
-"""Hypothesis strategies for coloured point clouds.
+"""Hypothesis strategies for coloured point clouds, RGB-D frames and colour networks.
 
 A cloud is a pair (xyz [n, 3] float32, rgb [n, 3] uint8), as `PointClouds.pack` takes it. NumPy generates the points
 from a seed that Hypothesis draws, which is a thousand times as fast as drawing each coordinate. Hypothesis shrinks the
@@ -9,27 +9,30 @@ number of points and the kind of the cloud.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import hypothesis.strategies as st
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from colornet import ColorNetwork
+from colornet.grid import GRID_SIZE, grid_colors
 from thor2_jax.config import DescriptorConfig
+from thor2_jax.frames.frames import Intrinsics, RGBDFrame
 from thor2_jax.types import Cloud, PointClouds
 
 __all__ = [
     "KINDS",
-    "Cloud",
     "aligned_clouds",
     "camera_clouds",
     "decided_clouds",
+    "frames",
     "lattice_clouds",
+    "networks",
     "packed",
     "rotations",
     "seeds",
-    "settled",
 ]
 
 Points = NDArray[np.float64]
@@ -103,16 +106,8 @@ def _degenerate(rng: np.random.Generator, n: int) -> Points:
     ][rng.integers(5)]
 
 
-_MAKERS: dict[str, Callable[[np.random.Generator, int], Points]] = {
-    "boxes": _boxes,
-    "balls": _balls,
-    "revolutions": _revolutions,
-    "thin": _thin,
-    "flat": _flat,
-    "noisy": _noisy,
-    "partial": _partial,
-    "degenerate": _degenerate,
-}
+_SHAPES = (_boxes, _balls, _revolutions, _thin, _flat, _noisy, _partial, _degenerate)
+_MAKERS = {maker.__name__.removeprefix("_"): maker for maker in _SHAPES}
 
 KINDS = tuple(_MAKERS)
 """Kinds of clouds; each includes empty clouds and clouds of a single point."""
@@ -277,3 +272,71 @@ def decided_clouds(config: DescriptorConfig, max_points: int = 488) -> st.Search
 def packed(clouds: st.SearchStrategy[Cloud], size: int, capacity: int) -> st.SearchStrategy[PointClouds]:
     """Generate batches of `size` clouds padded to `capacity` points, with cameras at the origin, all of one shape."""
     return st.lists(clouds, min_size=size, max_size=size).map(lambda batch: PointClouds.pack(batch, capacity))
+
+
+def _network(seed: int, n_regions: int) -> ColorNetwork:
+    rng = np.random.default_rng(seed)
+    colors = grid_colors().astype(np.float64)
+    # Slabs along a random direction; a tenth of each is shared with the next.
+    along = colors @ rng.normal(size=3)
+    place = np.argsort(np.argsort(along)) / GRID_SIZE * n_regions
+    region = place.astype(np.uint32)
+    shared = (place - region > 0.9) & (region < n_regions - 1)
+    bits = np.uint32(1) << region | np.where(shared, np.uint32(2) << region, np.uint32(0))
+    member = (bits[:, None] >> np.arange(n_regions, dtype=np.uint32)) & 1
+    counts = member.sum(axis=0).astype(np.int64)
+    weights = rng.uniform(5, 50, max(n_regions - 1, 0))
+    at = np.concatenate([[0], np.cumsum(weights)])
+    return ColorNetwork(
+        mean_rgb=member.T @ colors / counts[:, None],
+        member_counts=counts,
+        edges=np.stack([np.arange(n_regions - 1), np.arange(1, n_regions)], axis=1).astype(np.int64),
+        edge_weights=weights,
+        cyclic=np.zeros(n_regions - 1, bool),
+        similarity=1 / (1 + np.abs(at[:, None] - at)),
+        region_bits=bits.astype(np.uint32),
+        n_raw_nodes=n_regions,
+    )
+
+
+def networks(n_regions: int = 5) -> st.SearchStrategy[ColorNetwork]:
+    """Generate networks whose regions are overlapping slabs of the colour cube, connected in a chain.
+
+    All networks with R regions have 2 R - 1 region sets, so that they share compiled functions.
+
+    Args:
+        n_regions: R, 1 to 32.
+    """
+    return st.builds(_network, seeds(), st.just(n_regions))
+
+
+def _frame(seed: int, height: int, width: int, n_objects: int) -> RGBDFrame:
+    rng = np.random.default_rng(seed)
+    row, column = np.mgrid[:height, :width]
+    depth = 0.9 + 0.2 * row / height + rng.normal(scale=0.001, size=(height, width))
+    labels = np.zeros((height, width), np.uint8)
+    color = np.full((height, width, 3), rng.integers(0, 256, 3), np.uint8)
+    for number in rng.choice(np.arange(1, 256), n_objects, replace=False):
+        centre, radius = rng.uniform([0, 0], [height, width]), rng.uniform(0.1, 0.4, 2) * [height, width]
+        inside = ((row - centre[0]) / radius[0]) ** 2 + ((column - centre[1]) / radius[1]) ** 2
+        here = inside < 1
+        depth[here] = rng.uniform(0.5, 0.8) - 0.05 * np.sqrt(1 - inside[here])
+        labels[here] = number
+        color[here] = rng.integers(0, 256, 3)
+    depth[rng.random(depth.shape) < 0.02] = 0
+    focal = rng.uniform(0.8, 2) * width
+    intrinsics = Intrinsics(focal, focal * rng.uniform(0.98, 1.02), (width - 1) / 2, (height - 1) / 2)
+    return RGBDFrame(color, np.rint(depth * 1000).astype(np.uint16), labels, intrinsics)
+
+
+def frames(max_side: int = 120, max_objects: int = 5) -> st.SearchStrategy[RGBDFrame]:
+    """Generate frames of ellipsoids in front of a slanted plane; some are occluded or cut by the border.
+
+    Depth is in millimetres, uint16, with missing values; labels are uint8 and not consecutive.
+
+    Args:
+        max_side: largest height and width in pixels, at least 8.
+        max_objects: largest number of instances; later ones occlude earlier ones.
+    """
+    side = st.integers(8, max_side)
+    return st.builds(_frame, seeds(), side, side, st.integers(0, max_objects))

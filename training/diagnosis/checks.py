@@ -1,0 +1,205 @@
+"""Findings of the diagnosis of a set-up, and checks of intrinsics, the label image and the unit of meshes."""
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from thor2_jax.errors import InputError
+from thor2_jax.frames.frames import Intrinsics
+from training.objects.meshes import MAX_SIDE, MIN_SIDE, longest_side
+
+__all__ = ["Diagnosis", "Finding", "check_camera", "check_labels", "check_meshes"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Finding:
+    """Something that is likely wrong.
+
+    Attributes:
+        code: short name of the problem, for machines: "depth-unit", "intrinsics-size", ...; docs/frames.md lists them.
+        message: the measurement and its meaning, in plain words.
+        advice: remedy for the user.
+    """
+
+    code: str
+    message: str
+    advice: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Diagnosis:
+    """The result of a diagnosis.
+
+    Attributes:
+        findings: likely mistakes; empty for a sound set-up.
+        notes: checks that were not possible, and why.
+    """
+
+    findings: list[Finding] = dataclasses.field(default_factory=list)
+    notes: list[str] = dataclasses.field(default_factory=list)
+
+    def add(self, code: str, message: str, advice: str) -> None:
+        """Add a finding."""
+        self.findings.append(Finding(code, message, advice))
+
+
+MAX_OFF_CENTRE = 0.12
+"""Largest distance of the principal point from the centre of the image, as a fraction of its side. Cameras have .03."""
+
+MAX_PIXEL_ASPECT = 1.15
+"""Largest ratio of the focal lengths."""
+
+MIN_VIEW, MAX_VIEW = 20.0, 120.0
+"""Range of horizontal fields of view of depth cameras, degrees, with a margin."""
+
+ADVICE = "Give the intrinsics of these images: after resizing by a factor, fx, fy, cx and cy are multiplied by it."
+
+
+def check_camera(diagnosis: Diagnosis, intrinsics: Intrinsics, width: int, height: int) -> bool:
+    """Check intrinsics against the size of the colour image in pixels; return whether nothing was found."""
+    n_before = len(diagnosis.findings)
+    size = intrinsics.width or width, intrinsics.height or height
+    cx, cy = intrinsics.cx, intrinsics.cy
+    across, down = cx / width - 0.5, cy / height - 0.5
+    if size != (width, height):
+        diagnosis.add(
+            "intrinsics-size",
+            f"The intrinsics are for images of {size[0]} x {size[1]} pixels, but color has {width} x {height}.",
+            ADVICE,
+        )
+    elif max(abs(across), abs(down)) > MAX_OFF_CENTRE:
+        if max(abs(cy / width - 0.5), abs(cx / height - 0.5)) <= MAX_OFF_CENTRE:
+            reason, advice = "cx and cy are exchanged", "Exchange cx and cy (and fx and fy)."
+        else:
+            reason = f"it suits an image of about {2 * cx:.0f} x {2 * cy:.0f} pixels: K does not fit the image size"
+            advice = ADVICE + " After cropping, the left and upper margin are subtracted from cx and cy."
+        diagnosis.add(
+            "intrinsics-size",
+            f"The principal point cx, cy = {cx:g}, {cy:g} is far from the centre of the image of {width} x {height} "
+            f"pixels; {reason}.",
+            advice,
+        )
+    aspect = intrinsics.fx / intrinsics.fy
+    if not 1 / MAX_PIXEL_ASPECT <= aspect <= MAX_PIXEL_ASPECT:
+        diagnosis.add(
+            "intrinsics-aspect",
+            f"The focal lengths fx, fy = {intrinsics.fx:g}, {intrinsics.fy:g} differ by {100 * abs(aspect - 1):.0f} %; "
+            "pixels of depth cameras are square.",
+            "Check whether width and height were resized by different factors, and the order of fx, fy, cx, cy.",
+        )
+    view = math.degrees(2 * math.atan(width / 2 / intrinsics.fx))
+    if not MIN_VIEW <= view <= MAX_VIEW:
+        diagnosis.add(
+            "intrinsics-focal",
+            f"fx = {intrinsics.fx:g} pixels means a horizontal field of view of {view:.1f} degrees; depth cameras have "
+            f"{MIN_VIEW:.0f} to {MAX_VIEW:.0f}.",
+            "fx and fy are in pixels of these images, not in millimetres. " + ADVICE,
+        )
+    return len(diagnosis.findings) == n_before
+
+
+MAX_INSTANCES = 150
+"""Largest number of instances on a table."""
+
+MAX_INSTANCE_SHARE = 0.6
+"""Largest share of the image that one instance covers."""
+
+MAX_THIN_SHARE = 0.34
+"""Largest share of the instances that vanish if their border of one pixel is removed."""
+
+MIN_THIN = 3
+"""Least number of such instances that counts."""
+
+MIN_PIECES, MIN_PIECE_SHARE = 3, 0.08
+"""Pieces of the only instance of a frame, each with this share of its pixels, that show a mask of the foreground."""
+
+
+def check_labels(diagnosis: Diagnosis, labels: NDArray[Any]) -> bool:
+    """Check whether an image [H, W] of integers numbers instances; return whether nothing was found."""
+    values, counts = np.unique(labels[labels != 0], return_counts=True)
+    n_before = len(diagnosis.findings)
+    advice = "Give an image in which 0 is background and each object has a number of its own; see docs/frames.md."
+    if not len(values):
+        diagnosis.add("labels-empty", "The label image has no instance: all of it is 0, which is background.", advice)
+        return False
+    # A pixel is inside if its eight neighbours have its label.
+    inside = (ndimage.minimum_filter(labels, 3) == labels) & (ndimage.maximum_filter(labels, 3) == labels)
+    thick = np.isin(values, labels[inside & (labels != 0)])
+    n_thin = int((~thick).sum())
+    largest = counts.max() / labels.size
+    if len(values) > MAX_INSTANCES:
+        diagnosis.add(
+            "labels-many",
+            f"The label image has {len(values)} different numbers: it looks like a photo, a depth image or noise.",
+            advice,
+        )
+    elif n_thin >= MIN_THIN and n_thin > MAX_THIN_SHARE * len(values):
+        diagnosis.add(
+            "labels-thin",
+            f"{n_thin} of the {len(values)} instances are nowhere three pixels wide, as in a label image that was "
+            "resized or rotated with interpolation, or compressed with losses.",
+            "Resize label images with nearest-neighbour interpolation and store them as PNG.",
+        )
+    elif largest > MAX_INSTANCE_SHARE:
+        diagnosis.add(
+            "labels-background",
+            f"Instance {values[counts.argmax()]} covers {largest:.0%} of the image: the background seems to have a "
+            "number.",
+            "The background must be 0. " + advice,
+        )
+    elif len(values) == 1:
+        pieces = np.bincount(ndimage.label(labels != 0, np.ones((3, 3)))[0].ravel())[1:]
+        n_pieces = int((pieces > MIN_PIECE_SHARE * counts[0]).sum())
+        if n_pieces >= MIN_PIECES:
+            diagnosis.add(
+                "labels-foreground",
+                f"The only number, {values[0]}, covers {n_pieces} separate regions: this looks like a mask of the "
+                "foreground, not of instances.",
+                advice,
+            )
+    return len(diagnosis.findings) == n_before
+
+
+USUAL_SIDE = (0.03, 0.6)
+"""Range of the median longest side of objects on a table, metres."""
+
+SCALES = {0.001: "millimetres", 0.01: "centimetres", 0.0254: "inches", 1000.0: "kilometres"}
+
+
+def check_meshes(diagnosis: Diagnosis, meshes: Mapping[str, Path], scale: float = 1.0) -> dict[str, float]:
+    """Check the unit of mesh files; return object -> longest side in metres, or nothing if the unit is likely wrong.
+
+    Args:
+        diagnosis: receives the findings.
+        meshes: object -> mesh file.
+        scale: factor that converts their unit to metres.
+    """
+    sides = {}
+    for name, path in meshes.items():
+        try:
+            sides[name] = longest_side(path) * scale
+        except InputError as error:
+            diagnosis.add("mesh", f"A mesh cannot be used: {error}.", "Repair it, or leave it out.")
+    if not sides:
+        return {}
+    values = list(sides.values())
+    median = float(np.median(values))
+    if MIN_SIDE <= min(values) and max(values) <= MAX_SIDE and median >= USUAL_SIDE[0] / 3:
+        return sides
+    fitting = [each for each in SCALES if USUAL_SIDE[0] <= median * each <= USUAL_SIDE[1]]
+    unit = f"it is likely in {SCALES[fitting[0]]}" if fitting else "its unit is unknown"
+    mend = f"--mesh-scale {fitting[0] * scale:g} mends it" if fitting else "--mesh-scale sets the factor"
+    diagnosis.add(
+        "mesh-unit",
+        f"The longest side of the mesh{'es' if len(sides) > 1 else ''} is {median:.4g}"
+        f"{' (median)' if len(sides) > 1 else ''}; in metres, objects on a table have {USUAL_SIDE[0]:g} to "
+        f"{USUAL_SIDE[1]:g}: {unit}.",
+        f"Meshes are read in metres; {mend}.",
+    )
+    return {}
