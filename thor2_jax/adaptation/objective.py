@@ -86,7 +86,8 @@ class Objective:
             self._chunks.append((len(part), clouds, known))
 
     def _probabilities(self, clouds: PointClouds) -> jax.Array:
-        return self._classify(describe_looks(clouds, self._network, self._config, LOOKS))
+        oriented = describe_looks(clouds, self._network, self._config, LOOKS)
+        return self._classify(oriented.with_balanced(clouds))
 
     def total(self, parameters: NDArray[np.floating]) -> float:
         """Return the sum of the uncertainties for parameters [4] of a colour transform."""

@@ -1,7 +1,7 @@
-"""Statistics of a cloud beside its descriptor: side lengths, number of points, colours, and balanced colours.
+"""Statistics of a cloud that a network reads beside the descriptor: side lengths, number of points, colours.
 
-Learned networks read all but the balanced colours, which only galleries compare. They are finer than the colour regions
-of the network, so that objects of one shape with different prints differ, and depend less on the light.
+The histogram of balanced colours is only for galleries. It is finer than the colour regions of the network, so that
+objects of one shape with different prints differ, and depends less on the light.
 """
 
 from functools import partial
@@ -31,7 +31,7 @@ _BINS = 6, 7, 7
 """Bins of lightness, a* and b* of the balanced histogram."""
 
 N_BALANCED = int(np.prod(_BINS))
-"""Statistics of a cloud after its colour histogram: the bins of the balanced histogram."""
+"""Bins of the balanced histogram."""
 
 _CHROMA, _MAX_CHROMA = 10, 60
 """Bins of a* and b* end at `_MAX_CHROMA`; they are narrow below `_CHROMA`, where most surfaces are."""
@@ -71,7 +71,7 @@ def square_root(values: jax.Array) -> jax.Array:
 
 @jax.jit
 def cloud_statistics(sides: jax.Array, clouds: PointClouds, strips: Strips) -> jax.Array:
-    """Return the statistics of clouds, all of order 1.
+    """Return statistics of clouds, all of order 1.
 
     Args:
         sides: [B, 3] side lengths of the bounding box, longest first, scaled units.
@@ -79,9 +79,8 @@ def cloud_statistics(sides: jax.Array, clouds: PointClouds, strips: Strips) -> j
         strips: their strips; the colour vectors give the number of points in each colour region.
 
     Returns:
-        [B, 12 + R + N_BALANCED] float32: side lengths, size of the box, number of points, mean and standard deviation
-        of the colours, ratio of the two longest sides, and the square roots of the colour histogram and of
-        `balanced_histogram`, each of unit length.
+        [B, 12 + R] float32: side lengths, size of the box, number of points, mean and standard deviation of the
+        colours, ratio of the two longest sides, and the square root of the colour histogram, which has unit length.
     """
     count = clouds.mask.sum(axis=1, keepdims=True, dtype=jnp.float32)
     weight = clouds.mask[..., None].astype(jnp.float32) / jnp.maximum(count, 1)[..., None]
@@ -97,23 +96,25 @@ def cloud_statistics(sides: jax.Array, clouds: PointClouds, strips: Strips) -> j
     ]
     region_points = strips.color.sum(axis=(1, 2))
     histogram = region_points / jnp.maximum(region_points.sum(axis=1, keepdims=True), 1e-6)
-    balanced = balanced_histogram(clouds.colors, weight)
-    return jnp.concatenate([*scalars, square_root(histogram), square_root(balanced)], axis=1)
+    return jnp.concatenate([*scalars, square_root(histogram)], axis=1)
 
 
-def balanced_histogram(colors: jax.Array, weight: jax.Array) -> jax.Array:
-    """Return the histograms of clouds in CIELAB, after half of the colour cast and of the exposure is taken out.
+@jax.jit
+def balanced_histogram(colors: jax.Array, mask: jax.Array) -> jax.Array:
+    """Return histograms of clouds in CIELAB, after half of the colour cast and of the exposure is taken out.
 
     Each channel is divided by the square root of its mean: with the whole of it, objects of one colour would be grey. A
     point belongs to neighbouring bins by shares.
 
     Args:
         colors: [B, N, 3] sRGB in [0, 1].
-        weight: [B, N, 1] of the points; they sum to 1 for each cloud.
+        mask: [B, N] bool.
 
     Returns:
-        [B, `N_BALANCED`] float32, which sum to 1.
+        [B, `N_BALANCED`] float32, the square roots of shares that sum to 1; zeros for a cloud without points.
     """
+    inside = mask[..., None].astype(jnp.float32)
+    weight = inside / jnp.maximum(inside.sum(axis=1, keepdims=True), 1)
     mean = (colors * weight).sum(axis=1, keepdims=True)
     lab = cielab((colors * jnp.sqrt(_BALANCE / (mean + 0.03))).clip(0, 1))
     chroma = jnp.arcsinh(lab[..., 1:] / _CHROMA) / np.arcsinh(_MAX_CHROMA / _CHROMA)
@@ -123,4 +124,4 @@ def balanced_histogram(colors: jax.Array, weight: jax.Array) -> jax.Array:
         for k, n in enumerate(_BINS)
     ]
     joint = jnp.einsum("bnl,bna,bnc->blac", shares[0] * weight, *shares[1:])
-    return joint.reshape(len(colors), -1)
+    return square_root(joint.reshape(len(colors), -1))

@@ -20,7 +20,7 @@ from jax.typing import ArrayLike
 from colornet import ColorNetwork
 from thor2_jax.config import LOOK_COUNTS, DescriptorConfig
 from thor2_jax.descriptor.chunking import map_large_chunks
-from thor2_jax.descriptor.cloud_statistics import cloud_statistics, side_lengths
+from thor2_jax.descriptor.cloud_statistics import N_BALANCED, balanced_histogram, cloud_statistics, side_lengths
 from thor2_jax.descriptor.describe import describe_strips, strips
 from thor2_jax.descriptor.view_normalization import align, boxed, oriented, place_aligned
 from thor2_jax.errors import InputError
@@ -39,7 +39,7 @@ class LookDescriptors:
 
     Attributes:
         each: descriptors, fields [B, K, ...].
-        statistics: [B, K, 12 + R + N_BALANCED] float32, from `cloud_statistics`.
+        statistics: [B, K, 12 + R] float32, from `cloud_statistics`; `with_balanced` adds N_BALANCED.
         weights: [B, K] float32, weight of each look in the fused answer; they sum to 1.
     """
 
@@ -68,11 +68,21 @@ class LookDescriptors:
 
     @property
     def flat(self) -> tuple[Descriptors, jax.Array]:
-        """The descriptors [B * K, ...] and statistics [B * K, ...]; those of a cloud are consecutive."""
+        """The descriptors [B * K, ...] and statistics [B * K, 12 + R]; those of a cloud are consecutive."""
         flat: tuple[Descriptors, jax.Array] = jax.tree.map(
             lambda a: a.reshape(-1, *a.shape[2:]), (self.each, self.statistics)
         )
         return flat
+
+    def with_balanced(self, clouds: PointClouds) -> "LookDescriptors":
+        """Return descriptors whose statistics end with the `balanced_histogram` of the first look, for a gallery.
+
+        Args:
+            clouds: [B, N] the clouds, in metres or aligned.
+        """
+        histogram = map_large_chunks(lambda chunk: balanced_histogram(chunk.colors, chunk.mask), clouds, 1)
+        repeated = jnp.broadcast_to(histogram[:, None], (*self.weights.shape, N_BALANCED))
+        return dataclasses.replace(self, statistics=jnp.concatenate([self.statistics, repeated], axis=-1))
 
 
 def _check_count(count: int) -> None:

@@ -142,7 +142,7 @@ class EmbeddingNetwork(nnx.Module):
 
         Args:
             descriptors: of B clouds.
-            statistics: [B, 12 + R + N_BALANCED], from `cloud_statistics`; those after the first 12 + R are not read.
+            statistics: [B, 12 + R] or more, from `cloud_statistics`; those after the first 12 + R are not read.
             train: normalize by the statistics of the batch, and drop units.
             rngs: generators of the dropout.
         """
@@ -165,7 +165,10 @@ class EmbeddingNetwork(nnx.Module):
         return jnp.exp(self.log_scale[...]) * cosines
 
     def __call__(self, descriptors: Descriptors, statistics: jax.Array) -> jax.Array:
-        """Return the embeddings [B, D], of unit length; the arguments are those of `learned`."""
+        """Return the embeddings [B, D], of unit length.
+
+        The arguments are those of `learned`; if the colours are balanced, `balanced_histogram` ends the statistics.
+        """
         features = color_features(descriptors.embeddings, statistics if self.balanced else None)
         blocks = [self.learned(descriptors, statistics), _unit(features @ self.color_basis[...])]
         if not self.balanced:
@@ -186,7 +189,7 @@ def class_cosines(learned: jax.Array, proxies: jax.Array) -> jax.Array:
 def color_features(embeddings: jax.Array, statistics: jax.Array | None) -> jax.Array:
     """Return the square roots of colour embeddings [B, S, R, J], flat and of unit length.
 
-    With statistics, from `cloud_statistics`, those of the histogram of balanced colours follow, also of unit length.
+    With statistics, the `balanced_histogram` that they end with follows, also of unit length.
     """
     strips = _unit(square_root(embeddings).reshape(len(embeddings), -1))
     return strips if statistics is None else jnp.concatenate([strips, statistics[:, -N_BALANCED:]], axis=1)
@@ -310,10 +313,17 @@ class Embedding:
 
         Each shape [B, N] of the batch compiles once for all embeddings of the same sizes and descriptor.
         """
-        return self.embed_oriented(describe_looks(clouds, self.network, self.config, 1))[:, 0]
+        return self.embed_oriented(describe_looks(clouds, self.network, self.config, 1), clouds)[:, 0]
 
-    def embed_oriented(self, oriented: LookDescriptors) -> jax.Array:
-        """Return the embeddings [B, K, D] of K looks at clouds, described by this descriptor."""
+    def embed_oriented(self, oriented: LookDescriptors, clouds: PointClouds | None = None) -> jax.Array:
+        """Return the embeddings [B, K, D] of K looks at clouds.
+
+        Args:
+            oriented: described by this descriptor.
+            clouds: [B, N] the clouds, whose colours are compared too; None if `oriented` is `with_balanced`.
+        """
+        if self.sizes.balanced and clouds is not None:
+            oriented = oriented.with_balanced(clouds)
         return _embed_oriented(*self._embedder, oriented)
 
     def class_probabilities(self, oriented: LookDescriptors) -> jax.Array:

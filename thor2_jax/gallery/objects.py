@@ -131,9 +131,10 @@ class ObjectGallery:
             self._set(update_gallery(self._directory, change, embedding, self._stored, self.lock_seconds, rebuild))
 
     def _set(self, stored: StoredGallery) -> None:
-        """Keep a state, with the kind of search and, once it has objects, with the references of the embedding."""
+        """Keep a state, with what the embedding and the options add to it; references only once it has objects."""
         references = self.embedding.references if stored.gallery.objects else None
-        gallery = dataclasses.replace(stored.gallery, search=self._search, references=references)
+        balanced = self.embedding.sizes.balanced
+        gallery = dataclasses.replace(stored.gallery, search=self._search, references=references, balanced=balanced)
         self._stored = dataclasses.replace(stored, gallery=gallery)
 
     def check_writable(self) -> None:

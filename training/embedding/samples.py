@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from colornet import ColorNetwork
 from thor2_jax.config import DescriptorConfig
-from thor2_jax.descriptor.cloud_statistics import cloud_statistics
+from thor2_jax.descriptor.cloud_statistics import balanced_histogram, cloud_statistics
 from thor2_jax.descriptor.describe import strips
 from thor2_jax.descriptor.view_normalization import turn, view_normalize
 from thor2_jax.types import Cloud
@@ -31,7 +31,7 @@ class Batch(NamedTuple):
     Attributes:
         length: [B, S, J] float16, largest less smallest y of each strip, scaled units; 0 if it is empty.
         color: [B, S, J, R] float16, colour vectors of the strips.
-        statistics: [B, 12 + R + N_BALANCED] float32, from `cloud_statistics`.
+        statistics: [B, 12 + R + N_BALANCED] float32, from `cloud_statistics` and `balanced_histogram`.
         label: [B] int32.
     """
 
@@ -129,9 +129,10 @@ def sample_clouds(
     for count, batch in padded_batches([clouds[k] for k in order], CLOUDS_PER_BATCH):
         normal = batch if are_normal else view_normalize(batch, config)
         sides = jnp.max(normal.points, axis=1)
+        balanced = balanced_histogram(normal.colors, normal.mask)
         for _ in range(copies):
             occupied = strips(turn(reorient(normal, rng), config), network, config)
-            statistics = np.asarray(cloud_statistics(sides, normal, occupied))[:count]
+            statistics = np.hstack([cloud_statistics(sides, normal, occupied), balanced])[:count]
             sample, strip = np.nonzero(np.asarray(occupied.occupied)[:count].reshape(count, -1))
             length = np.asarray(occupied.high - occupied.low).reshape(CLOUDS_PER_BATCH, -1)
             color = np.asarray(occupied.color).reshape(*length.shape, -1)

@@ -53,7 +53,7 @@ def test_embeddings_have_unit_length(embedding: Embedding, clouds: thor2.PointCl
 
 def test_described_clouds_give_the_same_embedding(embedding: Embedding, clouds: thor2.PointClouds) -> None:
     oriented = describe_looks(clouds, embedding.network, embedding.config, 2)
-    np.testing.assert_allclose(embedding.embed_oriented(oriented)[:, 0], embedding.embed(clouds), atol=1e-5)
+    np.testing.assert_allclose(embedding.embed_oriented(oriented, clouds)[:, 0], embedding.embed(clouds), atol=1e-5)
 
 
 def ensemble() -> Embedding:
@@ -70,7 +70,7 @@ def test_class_probabilities_are_geometric_means(clouds: thor2.PointClouds) -> N
     means = []
     for model in (embedding.model, *embedding.further):
         one = dataclasses.replace(embedding, model=model, further=())  # its first block is the learned one
-        unit = np.asarray(one.embed_oriented(oriented)[..., : SIZES.learned], np.float64)
+        unit = np.asarray(one.embed_oriented(oriented, clouds)[..., : SIZES.learned], np.float64)
         unit /= np.linalg.norm(unit, axis=-1, keepdims=True)
         proxies = np.asarray(model.proxies[...], np.float16).astype(np.float64)
         scale = np.exp(np.float16(model.log_scale[...]).astype(np.float64))
@@ -100,7 +100,7 @@ def test_embeddings_have_gradients(embedding: Embedding, clouds: thor2.PointClou
     """Most strips have no point of most colours: their colour embeddings are 0, where a square root has no slope."""
     oriented = describe_looks(clouds, embedding.network, embedding.config, 2)
     assert not np.asarray(oriented.each.embeddings).all()
-    gradients = jax.grad(lambda looks: embedding.embed_oriented(looks)[..., 0].sum(), allow_int=True)(oriented)
+    gradients = jax.grad(lambda looks: embedding.embed_oriented(looks, clouds)[..., 0].sum(), allow_int=True)(oriented)
     for gradient in (gradients.each.images, gradients.each.embeddings, gradients.statistics):
         assert np.isfinite(gradient).all() and np.asarray(gradient).any()
 

@@ -92,7 +92,7 @@ def embedded(embedding: Embedding, aligned: thor2.PointClouds) -> np.ndarray:
     described = strips(aligned, NETWORK, embedding.config)
     weights = jnp.ones((len(aligned.mask), 1))
     oriented = describe_aligned_looks(aligned, weights, described, NETWORK, embedding.config)
-    return np.asarray(embedding.embed_oriented(oriented))[:, 0]
+    return np.asarray(embedding.embed_oriented(oriented, aligned))[:, 0]
 
 
 def aligned(clouds: thor2.PointClouds, mirror: str) -> thor2.PointClouds:
