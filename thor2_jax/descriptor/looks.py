@@ -19,7 +19,7 @@ from jax.typing import ArrayLike
 
 from colornet import ColorNetwork
 from thor2_jax.config import LOOK_COUNTS, DescriptorConfig
-from thor2_jax.descriptor.chunking import map_large_chunks
+from thor2_jax.descriptor.chunking import map_chunks, map_large_chunks
 from thor2_jax.descriptor.cloud_statistics import N_BALANCED, balanced_histogram, cloud_statistics, side_lengths
 from thor2_jax.descriptor.describe import describe_strips, strips
 from thor2_jax.descriptor.view_normalization import align, boxed, oriented, place_aligned
@@ -74,13 +74,14 @@ class LookDescriptors:
         )
         return flat
 
+    @jax.jit
     def with_balanced(self, clouds: PointClouds) -> "LookDescriptors":
         """Return descriptors whose statistics end with the `balanced_histogram` of the first look, for a gallery.
 
         Args:
             clouds: [B, N] the clouds, in metres or aligned.
         """
-        histogram = map_large_chunks(lambda chunk: balanced_histogram(chunk.colors, chunk.mask), clouds, 1)
+        histogram = map_chunks(lambda chunk: balanced_histogram(chunk.colors, chunk.mask), clouds)
         repeated = jnp.broadcast_to(histogram[:, None], (*self.weights.shape, N_BALANCED))
         return dataclasses.replace(self, statistics=jnp.concatenate([self.statistics, repeated], axis=-1))
 
