@@ -45,16 +45,19 @@ BESIDE = 7
 MARGIN = 10
 """Pixels around a candidate that its recognition may read."""
 
-LEAST = 0.7
+LEAST = 0.8
 """Least confidence of a candidate that counts."""
 
 MOST = 0.99
 """Confidence beyond which more does not count."""
 
-COST = 0.3
+SHARE = 0.5
+"""Least share of a piece that is recognized in its division."""
+
+COST = 0.5
 """Log-odds of the confidence in a whole piece that one part more must gain."""
 
-MERGED = 2.0
+MERGED = 3.0
 """Log-odds that two pieces must gain in the mean when they are merged."""
 
 
@@ -84,10 +87,13 @@ def segment_known(
     odds = {candidate: _log_odds(named[candidate]) for candidate in candidates}
     divided = {piece: _best_division(piece, each, area, odds) for piece, each in zip(pieces, inside, strict=True)}
     for piece, division in divided.items():
-        if len({named[part][0] for part in division if odds[part] > 0}) < 2:
+        known = [part for part in division if odds[part] > 0]
+        covered = sum(area[part] for part in known)
+        if len({named[part][0] for part in known}) < 2 or covered < SHARE * area[piece]:
             divided[piece] = (piece,)
-    for gain, a, b in sorted((_gain(a, b, divided, area, odds), a, b) for a, b in pairs)[::-1]:
-        if gain > MERGED and a in divided and b in divided:
+    gains = {(a, b): _gain(a, b, divided, area, odds) for a, b in pairs}
+    for a, b in sorted(pairs, key=lambda pair: -gains[pair]):
+        if gains[a, b] > MERGED and a in divided and b in divided:
             del divided[a], divided[b]
             divided[a | b] = (a | b,)
     result = np.zeros(parts.shape, np.int32)
@@ -100,7 +106,8 @@ def _parts(frame: RGBDFrame, labels: NDArray[np.integer]) -> tuple[NDArray[np.in
     """Return the numbers [H, W] of the parts of all pieces, 0 is background, and the piece of each part [n + 1]."""
     lab = np.asarray(cv2.cvtColor(cv2.medianBlur(frame.color, SMOOTH), cv2.COLOR_RGB2LAB), np.float32)
     features = np.concatenate(
-        [lab * np.float32([0.6, 1, 1]) / CELL[0], backproject(frame.depth_m, frame.intrinsics) / CELL[1]], axis=2
+        [lab * np.array([0.6, 1, 1], np.float32) / CELL[0], backproject(frame.depth_m, frame.intrinsics) / CELL[1]],
+        axis=2,
     ).astype(np.float32)
     parts, piece_of = np.zeros(labels.shape, np.int32), [0]
     numbers = np.unique(labels)
@@ -112,7 +119,8 @@ def _parts(frame: RGBDFrame, labels: NDArray[np.integer]) -> tuple[NDArray[np.in
         if count > 1:
             cv2.setRNGSeed(0)  # equal frames get equal labels
             stop = (cv2.TERM_CRITERIA_MAX_ITER + cv2.TERM_CRITERIA_EPS, 20, 1e-3)
-            _, cluster, _ = cv2.kmeans(features[known], count, None, stop, 1, cv2.KMEANS_PP_CENTERS)
+            start = np.zeros((int(known.sum()), 1), np.int32)
+            _, cluster, _ = cv2.kmeans(features[known], count, start, stop, 1, cv2.KMEANS_PP_CENTERS)
             clusters = np.zeros(labels.shape, np.int32)
             clusters[known] = np.asarray(cluster).ravel() + 1
             found = _connected(clusters, mask, count)
