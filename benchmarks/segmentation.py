@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.recognizer import Recognizer
-from thor2_jax.segmentation.segmenters import load_segmenter, segment
+from thor2_jax.segmentation.segmenters import MODEL, load_segmenter, segment
 from training.readers.frames import FrameFolder
 from training.readers.labelled import LabelledFrame
 
@@ -130,8 +130,8 @@ def main() -> None:
     parser.add_argument("--segment", default="table")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results" / "segmentation.json")
     options = parser.parse_args()
-    segmenter = load_segmenter(options.segment)
     recognizer = None if options.model is None else Recognizer.load(options.model)
+    segmenter = recognizer.segment if recognizer and options.segment == MODEL else load_segmenter(options.segment)
     report = json.loads(options.out.read_text()) if options.out.exists() else {}
     for group in options.groups:
         items = [item for folder in sorted(glob.glob(group)) for item in FrameFolder(folder)]

@@ -41,6 +41,7 @@ from thor2_jax.model.fusion import DEFAULT_RULE, FusionRule
 from thor2_jax.model.inference import Inference, answers, infer_clouds
 from thor2_jax.model.model import Model
 from thor2_jax.model.run_directory import TrainedRun, load_run
+from thor2_jax.segmentation.segmenters import segment
 from thor2_jax.tracking.tracker import Tracker
 
 __all__ = ["THOR2", "AnswerBy", "Recognizer"]
@@ -237,10 +238,11 @@ class Recognizer:
             infer_clouds(self.model, pack_instances([], b, n))
         return len(shapes)
 
-    def prepare(self, frame: RGBDFrame) -> Iterable[PreparedInstance]:
-        """Prepare the instances of a frame, with corrected colours, one after the other."""
+    def prepare(self, frame: RGBDFrame, labels: Iterable[int] | None = None) -> Iterable[PreparedInstance]:
+        """Prepare instances of a frame, by default all, with corrected colours, one after the other."""
         model = self.model
-        return (model.corrected(prepare_instance(frame, each, model.run.config.sigma_s)) for each in frame.instances)
+        chosen = frame.instances if labels is None else labels
+        return (model.corrected(prepare_instance(frame, each, model.run.config.sigma_s)) for each in chosen)
 
     def describe(self, frame: RGBDFrame) -> DescribedFrame:
         """Prepare and describe the instances of a frame, of which there may be more than the largest batch bucket."""
@@ -263,6 +265,24 @@ class Recognizer:
                 `reason` of its answer says why.
         """
         return answers(self.model, *self.infer(self.prepare(frame), classifiers, answer_by))
+
+    def segment(self, frame: RGBDFrame) -> NDArray[np.int32]:
+        """Segment a frame by the segmenter "table", and divide and merge its pieces where known objects result.
+
+        Things in a pile touch without an edge; see `segmentation.known_objects`. This is a segmenter:
+        `segmented(frame, recognizer.segment)` has the labels. It needs OpenCV (extra `segment`).
+
+        Returns:
+            Labels [H, W]; 0 is background.
+        """
+        labels = segment(frame)
+        from thor2_jax.segmentation.known_objects import segment_known  # imports OpenCV
+
+        def recognize(frames: Sequence[RGBDFrame]) -> list[tuple[str | None, float]]:
+            found = answers(self.model, *self.infer(each for frame in frames for each in self.prepare(frame, [1])))
+            return [(answer.name, answer.confidence or 0.0) for answer in found]
+
+        return segment_known(frame, labels, recognize)
 
     def infer(
         self,

@@ -115,6 +115,10 @@ class RecognizerArguments:
         """Load a recognizer of single frames; raises as `Recognizer.load`."""
         return Recognizer.load(self.model, self.unknown_below, answer_by=self.answer_by, chunk=BATCH_BUCKETS[-1])
 
+    def segment(self, frame: RGBDFrame) -> NDArray[Any]:
+        """Segment a frame by `Recognizer.segment`, in a worker process, which loads the recognizer once."""
+        return _loaded(self).segment(frame)
+
 
 def recognize_frames_in_pool(
     arguments: RecognizerArguments, sources: Sequence[FrameSource], pool: WorkerPool

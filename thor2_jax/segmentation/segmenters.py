@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import RGBDFrame
 
-__all__ = ["ENTRY_POINTS", "TABLE", "Segmenter", "load_segmenter", "segment", "segmented", "segmenter_names"]
+__all__ = ["ENTRY_POINTS", "MODEL", "TABLE", "Segmenter", "load_segmenter", "segment", "segmented", "segmenter_names"]
 
 Segmenter = Callable[[RGBDFrame], NDArray[Any]]
 """A function from a frame to labels [H, W]."""
@@ -29,6 +29,9 @@ ENTRY_POINTS = "thor2_jax.segmenters"
 
 TABLE = "table"
 """Name of the built-in segmenter, `table.segment_table`, which needs OpenCV (extra `segment`)."""
+
+MODEL = "model"
+"""Name by which commands that recognize choose `Recognizer.segment`, which is `TABLE` and recognition."""
 
 
 def segmenter_names() -> list[str]:
@@ -42,6 +45,8 @@ def load_segmenter(name: str) -> Segmenter:
     Raises:
         InputError: no segmenter has this name, or its package cannot be imported.
     """
+    if name == MODEL:
+        raise InputError(f"segmenter is {name!r}, which only recognize and explain take; expected {TABLE!r} here")
     if name == TABLE:
         try:
             return importlib.import_module("thor2_jax.segmentation.table").segment_table

@@ -30,6 +30,7 @@ __all__ = [
     "Engine",
     "FrameOptions",
     "GalleryOption",
+    "KnownSegmentOption",
     "ManyFrames",
     "MeshScaleOption",
     "ModelOption",
@@ -48,6 +49,7 @@ __all__ = [
 
 if TYPE_CHECKING:
     from thor2_jax.recordings.bags import Bag
+    from thor2_jax.segmentation.segmenters import Segmenter
     from training.readers.frame_files import FrameSource
 
 
@@ -71,6 +73,12 @@ ModelOption = Annotated[Path, typer.Option("--model", help="Run directory of a t
 SegmentOption = Annotated[
     str | None,
     typer.Option("--segment", help="Segment the frames instead of reading labels: table, or another segmenter."),
+]
+KnownSegmentOption = Annotated[
+    str | None,
+    typer.Option(
+        "--segment", help="Segment the frames instead of reading labels: table, model (for piles), or another one."
+    ),
 ]
 GalleryOption = Annotated[
     Path | None, typer.Option("--gallery", help="Directory of the gallery. Default: gallery in the run directory.")
@@ -157,18 +165,21 @@ class FrameOptions:
         if bool(self.frames) == any((self.color, self.depth, self.labels, self.intrinsics)):
             raise InputError("give either FRAME... or --color, --depth, --labels and --intrinsics, or --bag")
 
-    def sources(self, segment: str | None = None, *, masks: bool = True) -> list["FrameSource"]:
+    def sources(
+        self, segment: str | None = None, model: "Segmenter | None" = None, *, masks: bool = True
+    ) -> list["FrameSource"]:
         """Return the frames, of which none is read yet.
 
         Args:
             segment: segmenter whose labels replace those of the frames; None reads them, and segments recordings.
+            model: the segmenter "model", where the command has one.
             masks: whether the frames need labels; without, recordings are not segmented.
 
         Raises:
             InputError: the options contradict each other, or a folder or a recording cannot be read.
             OSError: a recording cannot be opened.
         """
-        from thor2_jax.segmentation.segmenters import TABLE, load_segmenter
+        from thor2_jax.segmentation.segmenters import MODEL, TABLE, load_segmenter
         from training.readers.frame_files import FrameFiles, find_frames, segmented_source
         from training.readers.recording import recorded_sources
 
@@ -193,7 +204,7 @@ class FrameOptions:
             sources = [files.source(self.color.stem, self.depth_scale)]
         if segment is None:
             return sources
-        segmenter = load_segmenter(segment)
+        segmenter = model if model and segment == MODEL else load_segmenter(segment)
         return [segmented_source(source, segmenter) for source in sources]
 
     def open_bag(self) -> "Bag":

@@ -1,5 +1,6 @@
 """`thor2 explain`: say why instances have their answers."""
 
+import functools
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -11,8 +12,8 @@ from thor2_jax.printable import escape_characters
 from training.cli.app import (
     FrameOptions,
     GalleryOption,
+    KnownSegmentOption,
     ModelOption,
-    SegmentOption,
     app,
     console,
     finish,
@@ -29,7 +30,7 @@ def explain(
     instance: Annotated[
         list[int] | None, typer.Option(help="Number of an object in the label image; repeatable. Default: all.")
     ] = None,
-    segment: SegmentOption = None,
+    segment: KnownSegmentOption = None,
     gallery: GalleryOption = None,
 ) -> None:
     """Explain answers: the points that decided, slices, colours, smallest changes, nearest views.
@@ -41,9 +42,10 @@ def explain(
     from thor2_jax.recognizer import Recognizer
     from training.reports.explanation_page import PAGE, check_no_foreign_files, write_explanation
 
-    sources = given.sources(segment)
+    load = functools.cache(lambda: Recognizer.load(model, gallery=gallery))
+    sources = given.sources(segment, lambda frame: load().segment(frame))
     check_output_directory(out, resumable={source.name.split("/")[0] for source in sources})
-    recognizer = Recognizer.load(model, gallery=gallery)
+    recognizer = load()
     explained = 0
     for source in sources:
         frame = source.read()

@@ -1,5 +1,6 @@
 """`thor2 recognize`: recognize the instances of frames."""
 
+import functools
 import json
 import sys
 from collections.abc import Iterator, Sequence
@@ -14,8 +15,8 @@ from thor2_jax.printable import escape_characters
 from training.cli.app import (
     RECORDINGS,
     FrameOptions,
+    KnownSegmentOption,
     ModelOption,
-    SegmentOption,
     UnknownOption,
     WorkerOptions,
     app,
@@ -40,7 +41,7 @@ def recognize(
     model: ModelOption,
     given: FrameOptions,
     processes: WorkerOptions,
-    segment: SegmentOption = None,
+    segment: KnownSegmentOption = None,
     unknown_below: UnknownOption = None,
     answer_by: Annotated[
         str | None, typer.Option(help="classifiers, gallery or both. Default: what the run has.")
@@ -115,7 +116,9 @@ def recognize(
             f"workers is {processes.workers} and engine is {processes.engine}; they are of no use for {reason}: leave "
             "them out"
         )
-    sources, frames = given.sources(segment), given.frames
+    load = functools.cache(arguments.load)
+    by_model = (lambda frame: load().segment(frame)) if pool is None else arguments.segment
+    sources, frames = given.sources(segment, by_model), given.frames
     of_frames = None if poses is None else read_poses(poses, [source.name for source in sources])
     if out is not None:
         check_output_directory(out, resumable={s.name.split("/")[0] for s in sources} if frames else RESULT_FILES)
@@ -129,7 +132,7 @@ def recognize(
     check_output_file("coco", coco, is_coco_file)
     check_output_file("bop", bop, is_bop_file)
     segmented = ["--segment", segment] if segment else []
-    recognizer = arguments.load()
+    recognizer = load()
     tables = ResultTables([source.name for source in sources], recognizer.classes, numbers)
     failed, without_depth, unknown = [], [], False
     if pool is not None:

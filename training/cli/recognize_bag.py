@@ -35,10 +35,10 @@ def recognize_bag(
     from thor2_jax.files import check_output_directory
     from thor2_jax.recordings.bag_writer import DetectionBag
     from thor2_jax.recordings.rerun_file import RerunFile
-    from thor2_jax.segmentation.segmenters import TABLE, load_segmenter
+    from thor2_jax.segmentation.segmenters import MODEL, TABLE, load_segmenter
     from training.frame_recognition import recognize_recorded, segmentation_failure
 
-    segmenter = load_segmenter(segment or TABLE)
+    segmenter = None if segment == MODEL else load_segmenter(segment or TABLE)
     bag = given.open_bag()
     detection_bag = None if out_bag is None else DetectionBag(out_bag)
     rerun_file = None if rerun is None else RerunFile(rerun)
@@ -52,7 +52,8 @@ def recognize_bag(
         recognize = recognizer.track().update if track else recognizer.recognize
         with detection_bag or contextlib.nullcontext(), rerun_file or contextlib.nullcontext():
             try:
-                for recorded, answer in recognize_recorded(recognize, bag.frames(), segmenter, given.every):
+                by = segmenter or recognizer.segment
+                for recorded, answer in recognize_recorded(recognize, bag.frames(), by, given.every):
                     n_answers += answer.error is None
                     if answer.error is not None:
                         failed.append(recorded.name)

@@ -66,6 +66,11 @@ def test_an_unknown_segmenter(offer: Callable[[str, str], None]) -> None:
         segment(FRAME, "sam")
 
 
+def test_the_segmenter_of_a_model_has_no_function_here() -> None:
+    with pytest.raises(InputError, match="^segmenter is 'model', which only recognize and explain take"):
+        load_segmenter("model")
+
+
 @pytest.mark.parametrize("value", ["no_such_package_anywhere:f", "wrapper:no_such_function", "wrapper:FRAME"])
 def test_an_entry_point_that_is_no_function(offer: Callable[[str, str], None], value: str) -> None:
     offer("broken", value)

@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+import pickle
 import signal
 import threading
 import time
@@ -56,12 +57,13 @@ def halves(frame: thor2.RGBDFrame) -> np.ndarray:
     return (np.arange(frame.depth.size).reshape(frame.depth.shape) > frame.depth.size // 2).astype(np.uint8)
 
 
-@pytest.mark.parametrize("segments", [False, True])
-def test_chunks_of_frames_have_the_same_answers(model: Path, folder: Path, segments: bool) -> None:
+@pytest.mark.parametrize("segmenter", [None, "halves", "model"])
+def test_chunks_of_frames_have_the_same_answers(model: Path, folder: Path, segmenter: str | None) -> None:
     arguments = RecognizerArguments(model)
     sources = find_frames([folder])
-    if segments:
-        sources = [segmented_source(source, halves) for source in sources]
+    if segmenter is not None:
+        function = halves if segmenter == "halves" else pickle.loads(pickle.dumps(arguments.segment))
+        sources = [segmented_source(source, function) for source in sources]
     expected = list(recognize_frames(arguments.load(), sources))
     answers = list(recognize_frames_in_pool(arguments, sources, IN_PROCESS))
     assert [answer.as_json() for answer in answers] == [answer.as_json() for answer in expected]

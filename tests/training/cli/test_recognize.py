@@ -155,12 +155,15 @@ def test_no_file_of_the_user_is_replaced(
     assert {path: path.read_bytes() for path in frames.rglob("*") if path.is_file()} == before
 
 
-def test_frames_without_labels_are_segmented(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("segmenter", ["table", "model"])
+def test_frames_without_labels_are_segmented(
+    model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], segmenter: str
+) -> None:
     folder = write_frame_files(tmp_path / "frames" / "a", table_frame())
     files = frame_options(folder)
     del files[files.index("--labels") : files.index("--labels") + 2]
     for given in (files, [tmp_path / "frames"]):
-        assert run_thor2("recognize", "--model", model, *given, "--segment", "table", "--json") == 0
+        assert run_thor2("recognize", "--model", model, *given, "--segment", segmenter, "--json") == 0
         (answer,) = json_lines(capfd.readouterr().out)
         assert [one["label"] for one in answer["instances"]] == [1, 2]
     assert run_thor2("recognize", "--model", model, *files) == 2

@@ -1,0 +1,92 @@
+"""Pieces that are divided and merged by recognition: toy answers by the overlap with true masks."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from tests.segmentation_scenes import Box, best_overlaps, render
+from thor2_jax.frames.frames import RGBDFrame, backproject
+from thor2_jax.segmentation.known_objects import Answer, segment_known
+
+RED, BLUE = (200, 40, 40), (40, 40, 200)
+FRAME = render(
+    [Box(-0.04, 0, (0.04, 0.05), 0.06, RED), Box(0.03, 0, (0.03, 0.05), 0.06, BLUE)], tilt=30, size=(480, 640)
+)
+TRUTH = np.asarray(FRAME.labels, np.int32)
+ONE_PIECE = (TRUTH > 0).astype(np.int32)
+
+Recognize = Callable[[Sequence[RGBDFrame]], list[Answer]]
+
+
+def knows(*objects: NDArray[np.bool_]) -> Recognize:
+    """Return a recognizer of objects, given their masks, whose confidence is the overlap with the best one."""
+
+    def answer(frame: RGBDFrame) -> Answer:
+        top, left = round(FRAME.intrinsics.cy - frame.intrinsics.cy), round(FRAME.intrinsics.cx - frame.intrinsics.cx)
+        mask = np.zeros(TRUTH.shape, bool)
+        height, width = frame.depth.shape
+        mask[top : top + height, left : left + width] = frame.label_image == 1
+        overlaps = [(mask & each).sum() / (mask | each).sum() for each in objects]
+        return str(np.argmax(overlaps)), float(max(overlaps))
+
+    return lambda frames: [answer(frame) for frame in frames]
+
+
+def test_a_piece_with_two_known_objects_is_divided() -> None:
+    labels = segment_known(FRAME, ONE_PIECE, knows(TRUTH == 1, TRUTH == 2))
+    assert labels.max() == 2
+    assert (best_overlaps(labels, TRUTH) > 0.9).all()
+    np.testing.assert_array_equal(labels > 0, ONE_PIECE > 0)
+
+
+@pytest.mark.parametrize(
+    "recognize",
+    [
+        pytest.param(knows(TRUTH > 0), id="one known object"),
+        pytest.param(knows(TRUTH == 1), id="a known object beside an unknown one"),
+        pytest.param(lambda frames: [(None, 0.99)] * len(frames), id="unknown objects"),
+        pytest.param(lambda frames: [("a", 0.5)] * len(frames), id="without confidence"),
+        pytest.param(lambda frames: [("a", 0.99)] * len(frames), id="the same object everywhere"),
+    ],
+)
+def test_a_piece_without_two_known_objects_remains(recognize: Recognize) -> None:
+    np.testing.assert_array_equal(segment_known(FRAME, ONE_PIECE, recognize), ONE_PIECE)
+
+
+def test_pieces_of_one_known_object_are_merged() -> None:
+    np.testing.assert_array_equal(segment_known(FRAME, TRUTH, knows(TRUTH > 0)), ONE_PIECE)
+
+
+def test_pieces_of_two_known_objects_remain() -> None:
+    np.testing.assert_array_equal(segment_known(FRAME, TRUTH, knows(TRUTH == 1, TRUTH == 2)), TRUTH)
+
+
+def test_candidates_are_shown_where_they_are() -> None:
+    shown: list[RGBDFrame] = []
+
+    def recognize(frames: Sequence[RGBDFrame]) -> list[Answer]:
+        shown.extend(frames)
+        return [(None, 0.0)] * len(frames)
+
+    segment_known(FRAME, TRUTH, recognize)
+    points = backproject(FRAME.depth_m, FRAME.intrinsics)[TRUTH == 1]
+    whole = [frame for frame in shown if (frame.label_image == 1).sum() == len(points)]
+    assert len(whole) == 1 and (whole[0].label_image > 1).any()
+    seen = backproject(whole[0].depth_m, whole[0].intrinsics)[whole[0].label_image == 1]
+    np.testing.assert_allclose(seen, points, atol=1e-5)
+
+
+def test_a_frame_without_pieces_has_no_candidates() -> None:
+    def recognize(frames: Sequence[RGBDFrame]) -> list[Answer]:
+        assert not frames
+        return []
+
+    assert not segment_known(FRAME, np.zeros_like(TRUTH), recognize).any()
+
+
+def test_pieces_without_depth_remain() -> None:
+    frame = RGBDFrame(FRAME.color, np.zeros_like(FRAME.depth), None, FRAME.intrinsics)
+    labels = segment_known(frame, ONE_PIECE, lambda frames: [(None, 0.0)] * len(frames))
+    np.testing.assert_array_equal(labels, ONE_PIECE)
