@@ -118,7 +118,7 @@ class FitTask:
     def temperature(
         self, label: Integers, held_out: NDArray[np.bool_], predict: Callable[[], NDArray[np.float32]]
     ) -> float | None:
-        """Return the temperature of a baseline that predicts these probabilities for the held-out clouds, if any."""
+        """Return the temperature for the probabilities of the held-out clouds, from `predict`; None without any."""
         return fit_temperature(predict(), label[held_out]) if held_out.any() else None
 
     def shards(self, stage: str, unit: str) -> Iterator[tuple[int, slice, int]]:

@@ -77,7 +77,8 @@ SegmentOption = Annotated[
 KnownSegmentOption = Annotated[
     str | None,
     typer.Option(
-        "--segment", help="Segment the frames instead of reading labels: table, model (for piles), or another one."
+        "--segment",
+        help="Segment the frames instead of reading labels: table, model (for piles), or another segmenter.",
     ),
 ]
 GalleryOption = Annotated[
@@ -204,7 +205,10 @@ class FrameOptions:
             sources = [files.source(self.color.stem, self.depth_scale)]
         if segment is None:
             return sources
-        segmenter = model if model and segment == MODEL else load_segmenter(segment)
+        if model is not None and segment == MODEL:
+            load_segmenter(TABLE)  # it begins with these pieces, and their package may be missing
+            return [segmented_source(source, model) for source in sources]
+        segmenter = load_segmenter(segment)
         return [segmented_source(source, segmenter) for source in sources]
 
     def open_bag(self) -> "Bag":

@@ -40,6 +40,7 @@ def explain(
     from thor2_jax.explanation.explain import explain as explain_answer
     from thor2_jax.files import check_output_directory
     from thor2_jax.recognizer import Recognizer
+    from thor2_jax.segmentation.segmenters import MODEL
     from training.reports.explanation_page import PAGE, check_no_foreign_files, write_explanation
 
     load = functools.cache(lambda: Recognizer.load(model, gallery=gallery))
@@ -65,5 +66,9 @@ def explain(
             console.print(f"{escape_characters(explanation.title)}: {directory / PAGE}")
     if not explained:
         raise InputError("no instance could be explained; see above")
-    again = ["enroll", "NAME", *given.arguments, "--instance", label, "--model", model, "--extend"]
+    if segment == MODEL:  # enrolling takes no labels that depend on the model
+        finish(f"{explained} pages in {out}", "see the objects that the model knows", "objects", "--model", model)
+        return
+    segmented = ["--segment", segment] if segment else []
+    again = ["enroll", "NAME", *given.arguments, *segmented, "--instance", label, "--model", model, "--extend"]
     finish(f"{explained} pages in {out}", "if a name is wrong, add this view of the object", *again)

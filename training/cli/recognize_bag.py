@@ -38,7 +38,9 @@ def recognize_bag(
     from thor2_jax.segmentation.segmenters import MODEL, TABLE, load_segmenter
     from training.frame_recognition import recognize_recorded, segmentation_failure
 
-    segmenter = None if segment == MODEL else load_segmenter(segment or TABLE)
+    # The segmenter "model" begins with the pieces of "table", whose package must be there, too.
+    table = load_segmenter(TABLE if segment in (None, MODEL) else segment)
+    segmenter = None if segment == MODEL else table
     bag = given.open_bag()
     detection_bag = None if out_bag is None else DetectionBag(out_bag)
     rerun_file = None if rerun is None else RerunFile(rerun)
@@ -74,7 +76,9 @@ def recognize_bag(
             file=sys.stderr,
         )
     result = f"written to {', '.join(written)}" if written else f"frames recognized: {n_answers}"
-    finish(result, "see why", "explain", *given.arguments, "--model", arguments.model, "--out", "why", file=sys.stderr)
+    segmented = ["--segment", segment] if segment else []
+    again = ["explain", *given.arguments, *segmented, "--model", arguments.model, "--out", "why"]
+    finish(result, "see why", *again, file=sys.stderr)
     if failed:
         raise InputError(f"{len(failed)} of {n_answers + len(failed)} frames could not be recognized; see above")
     if without_depth and all(without_depth):

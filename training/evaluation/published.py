@@ -195,7 +195,9 @@ def _differences(
 ) -> list[str]:
     """Return one sentence for each known difference between the data of the table and of the evaluation."""
     data = _read()["datasets"][kind]
-    size = f" ({data['frames']:,} frames, {data['instances']:,} instances)" if data["frames"] else ""
+    size = (
+        f" ({data['frames']:,} frames, {data['instances']:,} instances)" if data["frames"] and data["instances"] else ""
+    )
     sentences = [
         f"The published figures concern {data['concerns']}{size}; here {conditions.frames:,} frames are evaluated."
     ]

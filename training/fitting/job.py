@@ -219,8 +219,8 @@ def train_run(
     out = Path(out).absolute()
     if settings.distractors is not None:
         settings.distractors.check(source.classes)
-    job = settings.record(source.digest)
     check_out(out)
+    job = settings.record(source.digest)
     _check_begun(out, job)
     check_batch_size(settings.options.batch_size, batch_mesh())
     with contextlib.ExitStack() as locks:
@@ -283,7 +283,7 @@ def _describe_views(settings: RunSettings, source: ViewSource, progress: Progres
 
 
 class _Fold(NamedTuple):
-    """The training of a fold: everything that `train_run` is called with, and which samples are held out."""
+    """One fold of a training: the arguments of `train_run`, its number, all samples, and which are held out."""
 
     settings: RunSettings
     source: ViewSource

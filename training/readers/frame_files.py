@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, read_frame
 from thor2_jax.segmentation.segmenters import Segmenter, segmented
-from thor2_jax.tracking.poses import check_pose
 from training.readers.bop import BOP
 from training.readers.labelled import named_path
 
@@ -183,6 +182,8 @@ def read_poses(path: Path, names: Sequence[str]) -> list[NDArray[np.float64]]:
             pose is not a rigid motion. The message names the file.
         OSError: the file cannot be read.
     """
+    from thor2_jax.tracking.poses import check_pose  # imports SciPy
+
     try:
         stored = json.loads(path.read_bytes())
     except (ValueError, RecursionError):

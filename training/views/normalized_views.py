@@ -1,6 +1,8 @@
 """Normalized views and where training reads them from (paper, section "View Normalization").
 
-source = MemoryViews(render_views(find_meshes("meshes")), config)
+`MemoryViews` holds them in memory:
+
+    source = MemoryViews(render_views(find_meshes("meshes")), config)
 """
 
 import dataclasses
