@@ -140,7 +140,7 @@ def gallery_classifier(gallery: Gallery, embedding: Embedding) -> Classifier:
     fixed = jnp.asarray(views, jnp.float32)
 
     def classify(oriented: LookDescriptors) -> jax.Array:
-        # `ColorObjective` adds the balanced colours.
+        # `Objective` adds the balanced colours.
         embedded = embedding.embed_oriented(oriented)
         scores = jnp.clip(jnp.exp(GAMMA * (embedded @ fixed.T - 1)) @ duals, 0, 1)
         mean = (oriented.weights[..., None] * scores).sum(axis=1)

@@ -39,7 +39,7 @@ class LookDescriptors:
 
     Attributes:
         each: descriptors, fields [B, K, ...].
-        statistics: [B, K, 12 + R] float32, from `cloud_statistics`; `with_balanced` adds N_BALANCED.
+        statistics: [B, K, 12 + R] float32, from `cloud_statistics`; `with_balanced` appends `N_BALANCED` values.
         weights: [B, K] float32, weight of each look in the fused answer; they sum to 1.
     """
 

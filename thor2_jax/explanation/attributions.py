@@ -2,8 +2,8 @@
 
 Every point has a weight in the relaxed descriptor. The attribution of a point is the gradient of the answer's margin
 with respect to its weight, averaged while the weights of all points increase together to 1 (integrated gradients); the
-frames of the looks are held constant. To first order, it is the decrease of the margin when the point
-is removed.
+frames of the looks, and the histogram of balanced colours that galleries compare, are held constant. To first order, it
+is the decrease of the margin when the point is removed.
 """
 
 import dataclasses

@@ -79,7 +79,7 @@ def read_depth(path: str | Path) -> NDArray[Any]:
     suffix = path.suffix.lower()
     if suffix == ".npy":
         with open(path, "rb") as stream, _damage_named(f"depth: {path} is a damaged NPY file", _EXPECTED):
-            pixels = read_npy(stream, MAX_IMAGE_PIXELS)
+            pixels = read_npy(stream, 8 * MAX_IMAGE_PIXELS)
     else:
         pixels = _read_exr(path) if suffix == ".exr" else read_image(path, "depth")[0]
     if pixels.ndim == 3 and pixels.shape[2] == 1:
@@ -99,17 +99,17 @@ def read_depth(path: str | Path) -> NDArray[Any]:
     return pixels.astype(np.uint16 if pixels.max() < 2**16 else np.uint32)
 
 
-def read_npy(stream: BinaryIO, max_values: int) -> NDArray[Any]:
+def read_npy(stream: BinaryIO, max_bytes: int) -> NDArray[Any]:
     """Read an array of an NPY file; its size is checked before memory is allocated, and nothing is unpickled.
 
     Raises:
-        Exception: of many kinds, if the file is damaged, holds Python objects or more than `max_values` values.
+        Exception: of many kinds, if the file is damaged, holds Python objects or more than `max_bytes` of values.
     """
     version = np.lib.format.read_magic(stream)
     read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-    shape, _, _ = read_header[version](stream)
-    if math.prod(shape) > max_values:
-        raise ValueError(f"shape {shape}; expected at most {max_values} values")
+    shape, _, dtype = read_header[version](stream)
+    if math.prod(shape) * dtype.itemsize > max_bytes:
+        raise ValueError(f"shape {shape} of {dtype}; expected at most {max_bytes} bytes")
     stream.seek(0)
     return np.lib.format.read_array(stream, allow_pickle=False)
 

@@ -40,7 +40,7 @@ KEPT_WITHOUT_REFERENCES = {1: 0.24, 3: 0.31, 5: 0.34, 10: 0.355, 120: 0.43}
 KEPT_BEFORE = {1: 0.05, 3: 0.11, 5: 0.115, 10: 0.12, 120: 0.3}
 KEPT_BEFORE_WITHOUT_REFERENCES = {1: 0.25, 3: 0.29, 5: 0.31, 10: 0.35, 120: 0.43}
 """Views of an object -> score that 95 % of the correct answers reach: up to ten views from held-out frames, 120 views
-from meshes. Those `BEFORE` are for embeddings without balanced colours, see `EmbeddingSizes`."""
+from meshes. `KEPT_BEFORE` and `KEPT_BEFORE_WITHOUT_REFERENCES` apply to embeddings without balanced colours."""
 
 EVEN, STEEPNESS = 0.2, 3
 """A score s has the odds (s / EVEN) ** STEEPNESS against everything that is not enrolled; chosen on held-out frames."""

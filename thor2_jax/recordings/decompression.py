@@ -32,8 +32,10 @@ def _limited(decompressor: Callable[[], Any]) -> Callable[..., bytes]:
     def decompress(data: bytes, *_: object) -> bytes:
         stream = decompressor()
         content = bytes(stream.decompress(data, MAX_DECOMPRESSED))
-        if not stream.eof:
-            raise ValueError(f"compressed data is truncated or has more than {MAX_DECOMPRESSED} bytes")
+        if not stream.eof or stream.unused_data:
+            raise ValueError(
+                f"compressed data is truncated, in several parts, or of more than {MAX_DECOMPRESSED} bytes"
+            )
         return content
 
     return decompress
