@@ -279,8 +279,10 @@ class Recognizer:
         from thor2_jax.segmentation.known_objects import segment_known  # imports OpenCV
 
         def recognize(frames: Sequence[RGBDFrame]) -> list[tuple[str | None, float]]:
-            found = answers(self.model, *self.infer(each for frame in frames for each in self.prepare(frame, [1])))
-            return [(answer.name, answer.confidence or 0.0) for answer in found]
+            recognitions = answers(
+                self.model, *self.infer(each for frame in frames for each in self.prepare(frame, [1]))
+            )
+            return [(answer.name, answer.confidence or 0.0) for answer in recognitions]
 
         return segment_known(frame, labels, recognize)
 

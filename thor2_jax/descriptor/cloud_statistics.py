@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from thor2_jax.descriptor.cielab import cielab
+from thor2_jax.descriptor.cielab import to_lab
 from thor2_jax.types import PointClouds, Strips
 
 __all__ = [
@@ -116,7 +116,7 @@ def balanced_histogram(colors: jax.Array, mask: jax.Array) -> jax.Array:
     inside = mask[..., None].astype(jnp.float32)
     weight = inside / jnp.maximum(inside.sum(axis=1, keepdims=True), 1)
     mean = (colors * weight).sum(axis=1, keepdims=True)
-    lab = cielab((colors * jnp.sqrt(_BALANCE / (mean + 0.03))).clip(0, 1))
+    lab = to_lab((colors * jnp.sqrt(_BALANCE / (mean + 0.03))).clip(0, 1))
     chroma = jnp.arcsinh(lab[..., 1:] / _CHROMA) / np.arcsinh(_MAX_CHROMA / _CHROMA)
     place = jnp.concatenate([lab[..., :1] / 100, (chroma + 1) / 2], axis=-1).clip(0, 1)
     shares = [

@@ -19,18 +19,13 @@ import numpy as np
 from colornet.grid import GRID_LEVELS, GRID_STEP, grid_colors
 from thor2_jax.config import DescriptorConfig, Relaxation
 from thor2_jax.descriptor.bounding_box import HIGHEST
+from thor2_jax.descriptor.cielab import to_lab
 from thor2_jax.descriptor.cloud_statistics import square_root
 from thor2_jax.descriptor.color_membership import RegionSets
 from thor2_jax.types import Strips
 
-__all__ = ["hyab", "interval_log_weights", "relaxed_strips", "soft_regions", "to_lab"]
+__all__ = ["hyab", "interval_log_weights", "relaxed_strips", "soft_regions"]
 
-
-_TO_XYZ = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
-"""Matrix from linear sRGB to XYZ, as rounded in IEC 61966-2-1."""
-
-_WHITE = np.array([0.3127 / 0.3290, 1, (1 - 0.3127 - 0.3290) / 0.3290])
-"""XYZ of D65, the white point of the colour grid (`colornet.lab.GRID_WHITE`)."""
 
 _OFFSETS = np.array(list(itertools.product((-1, 0, 1), repeat=3)))
 """[27, 3] offsets, in levels, from the nearest grid colour to itself and its neighbours."""
@@ -126,17 +121,6 @@ def relaxed_strips(
 
     low, high, occupied, color = jax.lax.map(one_slice, log_slice.T)
     return Strips(low, high, occupied, color, overflow)
-
-
-def to_lab(colors: jax.Array) -> jax.Array:
-    """Convert sRGB colours in [0, 1] to CIELAB (D65): [..., 3] to [..., 3], L* in 0..100."""
-    dark = colors <= 0.04045
-    linear = jnp.where(dark, colors / 12.92, ((jnp.where(dark, 1, colors) + 0.055) / 1.055) ** 2.4)
-    xyz = jnp.matmul(linear, jnp.asarray((_TO_XYZ / _WHITE[:, None]).T, linear.dtype), precision=HIGHEST)
-    small = xyz <= (6 / 29) ** 3
-    root = jnp.where(small, xyz * (29 / 6) ** 2 / 3 + 4 / 29, jnp.cbrt(jnp.where(small, 1, xyz)))
-    fx, fy, fz = root[..., 0], root[..., 1], root[..., 2]
-    return jnp.stack([116 * fy - 16, 500 * (fx - fy), 200 * (fy - fz)], axis=-1)
 
 
 def hyab(first: jax.Array, second: jax.Array) -> jax.Array:

@@ -79,8 +79,8 @@ class EmbeddingSizes:
 
     def __post_init__(self) -> None:
         values = (self.cell, *self.hidden, self.learned, self.color + 1)
-        if not all(type(value) is int and value > 0 for value in values):
-            raise InputError(f"EmbeddingSizes is {dataclasses.asdict(self)}; expected positive integers")
+        if not all(type(value) is int and value > 0 for value in values) or type(self.balanced) is not bool:
+            raise InputError(f"EmbeddingSizes is {dataclasses.asdict(self)}; expected positive integers and a bool")
 
 
 def _unit(x: jax.Array) -> jax.Array:

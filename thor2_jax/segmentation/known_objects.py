@@ -49,13 +49,13 @@ LEAST = 0.8
 """Least confidence of a candidate that counts."""
 
 MOST = 0.99
-"""Confidence beyond which more does not count."""
+"""Confidences are clipped to this value."""
 
 SHARE = 0.5
 """Least share of a piece that is recognized in its division."""
 
 COST = 0.5
-"""Log-odds of the confidence in a whole piece that one part more must gain."""
+"""Penalty for each part of a division: these log-odds, times the area of the piece."""
 
 MERGED = 3.0
 """Log-odds that two pieces must gain in the mean when they are merged."""
@@ -115,7 +115,7 @@ def _parts(frame: RGBDFrame, labels: NDArray[np.integer]) -> tuple[NDArray[np.in
         mask = labels == label
         known = mask & (frame.depth_m > 0)
         count = min(int(known.sum()) // LEAST_PART, MOST_PARTS)
-        found = np.where(mask, 1, 0).astype(np.int32)
+        numbers_in_piece = np.where(mask, 1, 0).astype(np.int32)
         if count > 1:
             cv2.setRNGSeed(0)  # equal frames get equal labels
             stop = (cv2.TERM_CRITERIA_MAX_ITER + cv2.TERM_CRITERIA_EPS, 20, 1e-3)
@@ -123,9 +123,9 @@ def _parts(frame: RGBDFrame, labels: NDArray[np.integer]) -> tuple[NDArray[np.in
             _, cluster, _ = cv2.kmeans(features[known], count, start, stop, 1, cv2.KMEANS_PP_CENTERS)
             clusters = np.zeros(labels.shape, np.int32)
             clusters[known] = np.asarray(cluster).ravel() + 1
-            found = _connected(clusters, mask, count)
-        parts[mask] = found[mask] + len(piece_of) - 1
-        piece_of += [piece] * int(found.max())
+            numbers_in_piece = _connected(clusters, mask, count)
+        parts[mask] = numbers_in_piece[mask] + len(piece_of) - 1
+        piece_of += [piece] * int(numbers_in_piece.max())
     return parts, np.array(piece_of, np.intp)
 
 
@@ -164,11 +164,11 @@ def _candidates(
     inside = []
     for piece in pieces:
         level = {frozenset([part]) for part in piece}
-        found = {piece, *level}
+        candidates = {piece, *level}
         for _ in range(MOST_JOINED - 1):
             level = {each | {other} for each in level for part in each for other in beside.get(part, set()) - each}
-            found |= level
-        inside.append([piece, *sorted(found - {piece}, key=sorted)])
+            candidates |= level
+        inside.append([piece, *sorted(candidates - {piece}, key=sorted)])
     return inside, [(pieces[a - 1], pieces[b - 1]) for a, b in sorted(touching)]
 
 

@@ -46,7 +46,9 @@ def load_segmenter(name: str) -> Segmenter:
         InputError: no segmenter has this name, or its package cannot be imported.
     """
     if name == MODEL:
-        raise InputError(f"segmenter is {name!r}, which only recognize and explain take; expected {TABLE!r} here")
+        raise InputError(
+            f"segmenter is {name!r}, which only recognize and explain take; expected {', '.join(segmenter_names())}"
+        )
     if name == TABLE:
         try:
             return importlib.import_module("thor2_jax.segmentation.table").segment_table

@@ -71,10 +71,13 @@ def test_detections_are_read_back(
     assert not [one for one in tmp_path.iterdir() if one.name.startswith(".")]
 
 
-def test_every_second_frame_and_pictures(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("segment", [(), ("--segment", "model")])
+def test_every_second_frame_and_pictures(
+    segment: tuple[str, ...], model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     path = write_recording(tmp_path / "a.mcap", FRAMES)
     command = ("recognize", "--model", model, "--bag", path, "--every", 2, "--out", tmp_path / "out")
-    assert run_thor2(*command, "--unknown-below", 1, "--segment", "model") == 0
+    assert run_thor2(*command, "--unknown-below", 1, *segment) == 0
     lines = json_lines(capfd.readouterr().out)
     assert [line["frame"] for line in lines] == ["1700000000.000000000", "1700000000.066666666"]
     assert all(one["name"] is None for line in lines for one in line["instances"])
