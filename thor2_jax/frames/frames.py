@@ -140,7 +140,7 @@ class RGBDFrame:
 
 
 def check_images(color: NDArray[Any], *, labels: NDArray[Any] | None, depth: NDArray[Any] | None = None) -> None:
-    """Raise InputError unless the images of a frame have shapes and types that fit, not the type of depth."""
+    """Raise InputError unless shapes and types of the images of a frame fit; the type of depth is not checked."""
     if color.ndim != 3 or color.shape[2] != 3 or 0 in color.shape:
         raise InputError(f"color has shape {color.shape}; expected [H, W, 3]")
     if color.dtype != np.uint8:
