@@ -79,12 +79,15 @@ class RayCaster:
         return Hits(distance, mesh_index, color)
 
 
-def pixel_rays(intrinsics: Intrinsics, height: int, width: int) -> NDArray[np.float64]:
-    """Return rays through the pixels [height * width, 3] float64, camera frame, z = 1: hit distances are depths."""
-    rays = np.ones((height, width, 3))
-    rays[..., 0] = (np.arange(width) - intrinsics.cx) / intrinsics.fx
-    rays[..., 1] = ((np.arange(height) - intrinsics.cy) / intrinsics.fy)[:, None]
-    return rays.reshape(-1, 3)
+def pixel_rays(intrinsics: Intrinsics, height: int, width: int, pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return rays through the pixels [height * width, 3] float64 of a camera with this pose [4, 4], in its object frame.
+
+    Along the optical axis their length is 1, so that hit distances are depths.
+    """
+    x, y, z = pose[:3, :3].T
+    columns = ((np.arange(width) - intrinsics.cx) / intrinsics.fx)[:, None] * x
+    rows = ((np.arange(height) - intrinsics.cy) / intrinsics.fy)[:, None] * y
+    return ((rows + z)[:, None] + columns).reshape(-1, 3)
 
 
 def _pixel_box(vertices: NDArray[np.float64], pose: NDArray[np.float64], camera: Camera) -> tuple[int, int, int, int]:
@@ -116,7 +119,7 @@ def render_view(caster: RayCaster, pose: NDArray[np.float64], camera: Camera = T
     k = camera.intrinsics
     intrinsics = Intrinsics(k.fx, k.fy, k.cx - left, k.cy - top)
     height, width = bottom - top, right - left
-    hits = caster.cast(pose[:3, 3], pixel_rays(intrinsics, height, width) @ pose[:3, :3].T)
+    hits = caster.cast(pose[:3, 3], pixel_rays(intrinsics, height, width, pose))
     distance = np.where(hits.mesh >= 0, hits.distance, 0)
     depth = np.rint(distance.astype(np.float64) * 1000).astype(np.uint16).reshape(height, width)
     return RenderedView(hits.color.reshape(height, width, 3), depth, intrinsics, pose, (top, left))

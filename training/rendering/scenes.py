@@ -304,7 +304,7 @@ def _render(
     rng: np.random.Generator,
 ) -> Scene:
     """Render arranged objects; the last arguments are those of `compose_scene`."""
-    rays = pixel_rays(camera.intrinsics, camera.height, camera.width) @ pose[:3, :3].T
+    rays = pixel_rays(camera.intrinsics, camera.height, camera.width, pose)
     hits = RayCaster([_table(), *meshes]).cast(pose[:3, 3], rays)
     shape = (camera.height, camera.width)
     labels = hits.mesh.clip(0).astype(np.uint8 if len(meshes) < 256 else np.uint16).reshape(shape)

@@ -45,7 +45,7 @@ def test_depth_of_a_sphere() -> None:
     mesh = painted(trimesh.creation.icosphere(subdivisions=5, radius=radius))
     view = render_view(RayCaster([mesh]), camera_pose(0.7, 1.1, np.zeros(3), distance), CAMERA)
     _, depth = full_image(view, CAMERA)
-    rays = pixel_rays(CAMERA.intrinsics, CAMERA.height, CAMERA.width)
+    rays = pixel_rays(CAMERA.intrinsics, CAMERA.height, CAMERA.width, np.eye(4))
     # |t r - (0, 0, d)| = R, nearer root; z of r is 1, so t is the depth.
     rr = (rays**2).sum(axis=1)
     root = distance**2 - rr * (distance**2 - radius**2)
@@ -75,7 +75,7 @@ def test_matches_another_intersector_and_crops_nothing_visible() -> None:
     view = render_view(RayCaster([painted(shape)]), pose, CAMERA)
     assert view.depth.size < CAMERA.width * CAMERA.height / 2
     _, depth = full_image(view, CAMERA)
-    rays = pixel_rays(CAMERA.intrinsics, CAMERA.height, CAMERA.width) @ pose[:3, :3].T
+    rays = pixel_rays(CAMERA.intrinsics, CAMERA.height, CAMERA.width, pose)
     expected = intersect_triangles(shape, pose[:3, 3], rays)
     expected = expected.reshape(depth.shape)
     assert np.array_equal(depth > 0, expected > 0)
