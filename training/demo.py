@@ -80,10 +80,7 @@ class DemoSummary:
 
 
 def run_demo(
-    out: str | Path,
-    seed: int = 0,
-    progress: Progress = lambda stage, done, total, note: None,
-    workers: int = 1,
+    out: str | Path, seed: int = 0, progress: Progress = lambda stage, done, total, note: None, workers: int = 1
 ) -> DemoSummary:
     """Train on the built-in objects, recognize scenes of them and write a report. An interrupted demo resumes.
 

@@ -43,11 +43,7 @@ class EvaluationOptions(WorkerOptions):
 
 @evaluate_app.command()
 @grouped_options
-def uwis(
-    dataset: DatasetArgument,
-    job: EvaluationOptions,
-    runs: MoreModels = None,
-) -> None:
+def uwis(dataset: DatasetArgument, job: EvaluationOptions, runs: MoreModels = None) -> None:
     """UW-IS Occluded: <video>/images/<id>_{rgb,depth,labels}.png and <id>_poses.yaml."""
     from training.readers.uwis import UWISOccluded
 
@@ -56,10 +52,7 @@ def uwis(
 
 @evaluate_app.command()
 @grouped_options
-def frames(
-    given: FrameOptions,
-    job: EvaluationOptions,
-) -> None:
+def frames(given: FrameOptions, job: EvaluationOptions) -> None:
     """Frames whose objects labels.json names: <frame>/{color,depth,mask}.png, intrinsics.json, labels.json.
 
     A FRAME that is a run directory, or has the folds of a training, is a further model.
@@ -84,8 +77,7 @@ def ocid(
     dataset: DatasetArgument,
     job: EvaluationOptions,
     names: Annotated[
-        Path,
-        typer.Option(help="Table: sequence -> object names in order of placement; or a table of OCID-VLG."),
+        Path, typer.Option(help="Table: sequence -> object names in order of placement; or a table of OCID-VLG.")
     ],
     runs: MoreModels = None,
     per_sequence: Annotated[

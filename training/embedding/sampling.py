@@ -108,12 +108,7 @@ def render_clouds(task: ViewTask) -> list[tuple[int, Cloud]]:
 
 
 def sampling_job(
-    objects: Sequence[int | str],
-    network: ColorNetwork,
-    config: DescriptorConfig,
-    views: int,
-    copies: int,
-    seed: int,
+    objects: Sequence[int | str], network: ColorNetwork, config: DescriptorConfig, views: int, copies: int, seed: int
 ) -> dict[str, Any]:
     """Return the record of a sampling; `objects` says what they are, see `build_samples` for the others."""
     return {

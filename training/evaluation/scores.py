@@ -174,12 +174,7 @@ def unknown_named(correct: ArrayLike, unknown: ArrayLike, kept: ArrayLike = 0.95
 _ORDER = {"none": 0, "low": 1, "high": 2}
 
 _TABLES: dict[str, tuple[tuple[str, ...], ...]] = {
-    "uwis": (
-        ("environment",),
-        ("environment", "category"),
-        ("environment", "occlusion"),
-        ("environment", "light"),
-    ),
+    "uwis": (("environment",), ("environment", "category"), ("environment", "occlusion"), ("environment", "light")),
     "ocid": (("camera",), ("camera", "place"), ("camera", "type"), ("camera", "place", "type"), ("sequence",)),
 }
 """Attributes of the paper's tables for its two datasets."""

@@ -143,11 +143,7 @@ def _ring_surface(points: Array, v: Array, texture: NDArray[np.uint8]) -> Textur
     # Clipped, so that the last texel does not wrap around to the first.
     uv = uv.clip(1e-4, 1 - 1e-4)
     return TexturedMesh(
-        vertices,
-        faces.astype(np.int32),
-        uv=uv[faces],
-        textures=(texture,),
-        face_texture=np.zeros(len(faces), np.int32),
+        vertices, faces.astype(np.int32), uv=uv[faces], textures=(texture,), face_texture=np.zeros(len(faces), np.int32)
     )
 
 

@@ -12,13 +12,7 @@ from thor2_jax import plot
 from thor2_jax.figures import name_style, plain_text, save_figure
 from thor2_jax.plot import PALETTE
 
-__all__ = [
-    "draw_accuracy",
-    "draw_confusion",
-    "draw_curves",
-    "draw_known_unknown",
-    "draw_reliability",
-]
+__all__ = ["draw_accuracy", "draw_confusion", "draw_curves", "draw_known_unknown", "draw_reliability"]
 
 
 def draw_accuracy(
