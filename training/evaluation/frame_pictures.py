@@ -68,12 +68,11 @@ class FramePictures:
         Raises:
             OSError: a file cannot be written.
         """
+        color, labels = item.frame.color, item.frame.label_image
         for instance, name in self._most_confident(answers):
-            draw_crop(
-                item.frame.color, item.frame.label_image == instance.label, self.confusion_path(instance.truth, name)
-            )
+            draw_crop(color, labels == instance.label, self.confusion_path(instance.truth, name))
         if number in self.shown:
-            draw_judged(item.frame.color, item.frame.label_image, self._judge(answers), self.frame_path(number))
+            draw_judged(color, labels, self._judge(answers), self.frame_path(number))
 
     def _most_confident(self, answers: FrameAnswers) -> Iterator[tuple[InstancePrediction, str]]:
         """Yield instance and name of each wrong name that is more confident than all equal ones so far."""
