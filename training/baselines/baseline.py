@@ -13,12 +13,12 @@ import optax  # type: ignore[import-untyped]
 from flax import nnx
 from numpy.typing import NDArray
 
-from colornet import ColorNetwork
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.view_normalization import view_normalize
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.model.answers import DescribedFrame
+from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.types import PointClouds
 from training.fitting.calibration import fit_temperature
 from training.fitting.checkpoints import Checkpoints
@@ -87,25 +87,23 @@ class FitTask:
 
     Attributes:
         source: views of the run.
-        network: colour network of the run.
-        config: descriptor configuration of the run.
+        run: the run.
         options: options of the fit.
         folds: number of folds that the views are split into.
         fold: index of the held-out fold; nothing is held out if `folds` is 1.
         scratch: directory for checkpoints, so that an interrupted fit can resume.
-        run: directory of the run.
+        directory: directory of the run.
         weights: directory of pretrained weights; None trains networks from scratch.
         progress: called with (stage, done, total, note).
     """
 
     source: ViewSource
-    network: ColorNetwork
-    config: DescriptorConfig
+    run: TrainedRun
     options: FitOptions
     folds: int
     fold: int
     scratch: Path
-    run: Path
+    directory: Path
     weights: Path | None
     progress: Callable[[str, int, int, str], object]
 

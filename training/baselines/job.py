@@ -16,7 +16,7 @@ from training.baselines.baseline import Baseline, FitTask, FittedBaseline
 from training.baselines.files import StoredBaseline, baseline_file, read_baseline, write_baseline
 from training.baselines.forest import Forest, fit_forest
 from training.baselines.image_network import ImageNetwork, fit_image_network
-from training.baselines.names import CLOUD_BASELINES, NETWORKS, TEMPLATES, check_baselines
+from training.baselines.names import BASELINES, CLOUD_BASELINES, NETWORKS, TEMPLATES, check_baselines
 from training.baselines.networks.architectures import ARCHITECTURES
 from training.baselines.networks.weights import load_weights, weights_file
 from training.baselines.pointnet import ColoredPointNet, fit_pointnet
@@ -27,7 +27,7 @@ from training.fitting.options import FitOptions
 from training.storage.progress import Progress
 from training.views.normalized_views import ViewSource
 
-__all__ = ["LoadedBaselines", "check_weights", "load_baselines", "pretrained_files", "train_baselines"]
+__all__ = ["check_weights", "load_baselines", "pretrained_files", "train_baselines"]
 
 _FIT: dict[str, Callable[[FitTask], FittedBaseline]] = {
     "thor": fit_thor,
@@ -84,7 +84,7 @@ def _check_pretrained(directory: Path, run: TrainedRun, name: str, weights: Path
     """Raise InputError if a trained baseline was not trained from these files of weights."""
     file = baseline_file(directory, name)
     paths = [weights_file(weights, each) for each in pretrained_files(name)]
-    if dict(read_baseline(file, run.classes).weights) != {path.name: file_digest(path) for path in paths}:
+    if read_baseline(file, run.classes).weights != {path.name: file_digest(path) for path in paths}:
         raise InputError(
             f"weights is {weights}, but {file} was trained without these files; delete it to train it again, or leave "
             "out weights"
@@ -101,37 +101,24 @@ def _train(
     weights: Path | None,
 ) -> None:
     record = run.record
-    options = options or FitOptions(
-        record["epochs"], tuple(record["learning_rates"]), record["batch_size"], record["seed"]
-    )
+    rates = tuple(record["learning_rates"])
+    options = options or FitOptions(record["epochs"], rates, record["batch_size"], record["seed"])
     file = baseline_file(directory, name)
     remove_leftovers(file.parent)
     scratch = file.with_name(f".{name}")
     scratch.mkdir(parents=True, exist_ok=True)
     start = time.perf_counter()
-    task = FitTask(
-        source=source,
-        network=run.network,
-        config=run.config,
-        options=options,
-        folds=record["folds"],
-        fold=record["fold"],
-        scratch=scratch,
-        run=directory,
-        weights=weights,
-        progress=progress,
-    )
+    fold = record["folds"], record["fold"]
     try:
-        fitted = _FIT[name](task)
+        fitted = _FIT[name](FitTask(source, run, options, *fold, scratch, directory, weights, progress))
     except InputError:
         with contextlib.suppress(OSError):  # they stay with a checkpoint or another baseline
             scratch.rmdir()
             file.parent.rmdir()
         raise
     seconds = time.perf_counter() - start
-    write_baseline(
-        file, StoredBaseline(fitted.model.arrays(), fitted.temperature, seconds, fitted.weights), run.classes
-    )
+    stored = StoredBaseline(fitted.model.arrays(), fitted.temperature, seconds, fitted.weights)
+    write_baseline(file, stored, run.classes)
     remove_written(scratch, r"[^/]+/(.*/)?[0-9]+/.*")  # checkpoints
 
 
@@ -141,27 +128,23 @@ class LoadedBaselines(NamedTuple):
     Attributes:
         models: name -> baseline.
         temperatures: temperatures of those that were calibrated.
-        seconds: training times.
         weights: the files of pretrained weights that each was fitted from; empty if it was trained from scratch.
     """
 
     models: dict[str, Baseline]
     temperatures: dict[str, float]
-    seconds: dict[str, float]
     weights: dict[str, list[str]]
 
 
-def _network(name: str, arrays: Mapping[str, Any], run: TrainedRun) -> Baseline:
-    return ImageNetwork.with_arrays(name, arrays, len(run.classes))
-
-
-_BUILD: dict[str, Callable[[Mapping[str, Any], TrainedRun], Baseline]] = {
-    "thor": lambda arrays, run: THOR.with_arrays(arrays, run.config, len(run.classes)),
-    "forest": lambda arrays, run: Forest(arrays, run.network, run.config),
-    "pointnet": lambda arrays, run: ColoredPointNet.with_arrays(arrays, len(run.classes)),
-    **{name: partial(_network, name) for name in NETWORKS},
-    "templates": lambda arrays, run: Templates.with_arrays(arrays, len(run.classes)),
-}
+def _build(name: str, arrays: Mapping[str, Any], run: TrainedRun) -> Baseline:
+    n_classes = len(run.classes)
+    if name == "thor":
+        return THOR.with_arrays(arrays, run.config, n_classes)
+    if name == "forest":
+        return Forest(arrays, run.network, run.config)
+    if name in NETWORKS:
+        return ImageNetwork.with_arrays(name, arrays, n_classes)
+    return (Templates if name == TEMPLATES else ColoredPointNet).with_arrays(arrays, n_classes)
 
 
 def load_baselines(path: Path, run: TrainedRun) -> LoadedBaselines:
@@ -170,21 +153,20 @@ def load_baselines(path: Path, run: TrainedRun) -> LoadedBaselines:
     Raises:
         InputError: a file is damaged or does not match the run.
     """
-    loaded = LoadedBaselines({}, {}, {}, {})
-    for name, build in _BUILD.items():
-        file = baseline_file(path, name)
+    loaded = LoadedBaselines({}, {}, {})
+    for name, file in ((name, baseline_file(path, name)) for name in BASELINES):
         if not file.is_file():
             continue
         stored = read_baseline(file, run.classes)
         try:
-            loaded.models[name] = build(stored.arrays, run)
+            loaded.models[name] = _build(name, stored.arrays, run)
         except ValueError as error:
             raise InputError(
                 f"model: {file} does not match its run ({error}); delete it and train the baseline again"
             ) from None
         if stored.temperature is not None:
             loaded.temperatures[name] = stored.temperature
-        loaded.seconds[name], loaded.weights[name] = stored.seconds, sorted(stored.weights)
+        loaded.weights[name] = sorted(stored.weights)
     return loaded
 
 

@@ -38,7 +38,7 @@ from training.fitting.samples import Samples, build_samples
 from training.fitting.steps import FitContext
 from training.rendering.view_sphere import view_angles
 
-__all__ = ["Library", "THOR", "VIEW_TYPES", "ViewType", "camera_types", "fit_thor", "view_types"]
+__all__ = ["THOR", "VIEW_TYPES", "camera_types", "fit_thor", "view_types"]
 
 ViewType = Literal["front", "side", "top"]
 VIEW_TYPES: tuple[ViewType, ...] = ("front", "side", "top")
@@ -174,30 +174,34 @@ def fit_thor(task: FitTask) -> FittedBaseline:
         InputError: the camera angles of the source are unknown; or as `fit`.
     """
     types = _types_of_views(task)
-    config = dataclasses.replace(task.config, homology="closed_form")
-    samples = build_samples(task.source, task.network, config)
+    config = dataclasses.replace(task.run.config, homology="closed_form")
+    samples = build_samples(task.source, task.run.network, config)
     held_out = task.held_out(samples.label, samples.view)
     best = np.zeros((len(samples), len(samples.classes)), np.float32)
     library: dict[tuple[ViewType, int], MLP] = {}
     for name in VIEW_TYPES:
         rows = np.flatnonzero([name in types[view] for view in samples.view])
-        subset, marks = _subset(samples, rows), held_out[rows]
         for k in range(1, config.n_slices + 1):
-            library[name, k] = _fit_classifier(task, config, subset, marks, name, k)
+            library[name, k] = _fit_classifier(task, config, samples, held_out, rows, name, k)
         # Held-out views are not occluded: they are classified by all slices, as `THOR` does.
-        context = FitContext("tops", task.network, config)
-        values = sample_probabilities(library[name, config.n_slices], subset, np.flatnonzero(marks), context)
-        held_rows = rows[marks]
+        context, held_rows = FitContext("tops", task.run.network, config), rows[held_out[rows]]
+        values = sample_probabilities(library[name, config.n_slices], samples, held_rows, context)
         better = values.max(axis=1) > best[held_rows].max(axis=1)
         best[held_rows[better]] = values[better]
     temperature = task.temperature(samples.label, held_out, lambda: best[held_out])
-    return FittedBaseline(THOR(library, task.config), temperature)
+    return FittedBaseline(THOR(library, task.run.config), temperature)
 
 
 def _fit_classifier(
-    task: FitTask, config: DescriptorConfig, samples: Samples, held_out: NDArray[np.bool_], name: ViewType, k: int
+    task: FitTask,
+    config: DescriptorConfig,
+    samples: Samples,
+    held_out: NDArray[np.bool_],
+    rows: NDArray[np.intp],
+    name: ViewType,
+    k: int,
 ) -> MLP:
-    """Fit the classifier of one view type on the first `k` slices."""
+    """Fit the classifier of one view type, whose samples have these rows, on the first `k` slices."""
     number, epochs = VIEW_TYPES.index(name) * config.n_slices + k - 1, task.options.epochs
 
     def report(done: int, total: int, metrics: EpochMetrics) -> None:
@@ -205,10 +209,9 @@ def _fit_classifier(
         total_epochs = len(VIEW_TYPES) * config.n_slices * epochs
         task.progress("fit thor", number * epochs + metrics.epoch, total_epochs, note)
 
-    context = FitContext("tops", task.network, dataclasses.replace(config, n_slices=k))
+    context = FitContext("tops", task.run.network, dataclasses.replace(config, n_slices=k))
     with Checkpoints(task.scratch / f"{name}-{k}") as checkpoints:
-        marks = held_out if held_out.any() else None
-        return fit(samples, context, task.options, checkpoints, marks, report)[0]
+        return fit(samples, context, task.options, checkpoints, held_out, report, rows=rows)[0]
 
 
 def _types_of_views(task: FitTask) -> list[tuple[ViewType, ...]]:
@@ -218,27 +221,3 @@ def _types_of_views(task: FitTask) -> list[tuple[ViewType, ...]]:
         raise InputError("baselines: thor needs the camera angles of the views; give a rendered dataset with --dataset")
     degrees = np.rad2deg(view_angles(job["azimuth_step"], job["polar_step"])).round(6)
     return [camera_types(azimuth, polar) for azimuth, polar in degrees.tolist()]
-
-
-def _subset(samples: Samples, rows: NDArray[np.intp]) -> Samples:
-    """Return the samples of these rows."""
-
-    def entries(start: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        counts = np.diff(start)[rows]
-        ends = np.concatenate([[0], np.cumsum(counts)])
-        return ends, np.repeat(start[rows] - ends[:-1], counts) + np.arange(ends[-1])
-
-    strip_start, strips = entries(samples.strip_start)
-    color_start, colors = entries(samples.color_start)
-    return Samples(
-        strip_start=strip_start,
-        color_start=color_start,
-        strip=samples.strip[strips],
-        length=samples.length[strips],
-        color_strip=samples.color_strip[colors],
-        color_set=samples.color_set[colors],
-        color_count=samples.color_count[colors],
-        label=samples.label[rows],
-        view=samples.view[rows],
-        classes=samples.classes,
-    )

@@ -54,6 +54,7 @@ def fit(
     held_out: NDArray[np.bool_] | None = None,
     progress: Callable[[int, int, EpochMetrics], object] = lambda done, total, metrics: None,
     epoch_done: Callable[[EpochMetrics], object] = lambda metrics: None,
+    rows: NDArray[np.intp] | None = None,
 ) -> tuple[MLP, int]:
     """Train the MLP of one feature, or resume from the last checkpoint.
 
@@ -67,6 +68,7 @@ def fit(
         held_out: [M], True for samples of the held-out set; by default there is none.
         progress: called with (steps done, total steps, metrics of the epoch so far), for some of the steps.
         epoch_done: called after each epoch, before its checkpoint is written.
+        rows: the samples that take part; by default all.
 
     Returns:
         The classifier of the best epoch, and that epoch's number: the one with the highest held-out accuracy or,
@@ -78,8 +80,9 @@ def fit(
         OSError: A checkpoint cannot be written; the previous one stays.
     """
     context = dataclasses.replace(context, config=dataclasses.replace(context.config, homology="closed_form"))
-    n_devices, rows = context.mesh.devices.size, np.arange(len(samples))
-    train_rows, held_out_rows = (rows, rows[:0]) if held_out is None else (rows[~held_out], rows[held_out])
+    n_devices, rows = context.mesh.devices.size, np.arange(len(samples)) if rows is None else rows
+    is_held_out = np.zeros(len(rows), bool) if held_out is None else held_out[rows]
+    train_rows, held_out_rows = rows[~is_held_out], rows[is_held_out]
     check_batch_size(options.batch_size, context.mesh)
     least = max(2, n_devices)
     if len(train_rows) < least:

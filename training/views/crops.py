@@ -35,7 +35,6 @@ __all__ = [
     "CropManifest",
     "MANIFEST",
     "QuantizedCrop",
-    "RGBDCrop",
     "ViewCrops",
     "crop_file",
     "encode_crops",
@@ -43,7 +42,6 @@ __all__ = [
     "intact_content",
     "quantized",
     "read_crops",
-    "repeated",
     "rgbd_crop",
     "stacked",
     "surface_normals",
@@ -223,14 +221,12 @@ class ViewCrops:
         """Return the crops with sides of `size` pixels, area-filtered; the same record if they have this size."""
         if size == self.size:
             return self
-        color = [Image.fromarray(image).resize((size, size), Image.Resampling.BOX) for image in self.color]
         shifted = (self.normals.astype(np.int16) + 127).astype(np.uint8)
-        normals = [Image.fromarray(image).resize((size, size), Image.Resampling.BOX) for image in shifted]
-        pairs = [
-            (np.asarray(c), (np.asarray(n).astype(np.int16) - 127).astype(np.int8))
-            for c, n in zip(color, normals, strict=True)
-        ]
-        return stacked(pairs, size)
+        color, normals = (
+            np.stack([Image.fromarray(image).resize((size, size), Image.Resampling.BOX) for image in images])
+            for images in (self.color, shifted)
+        )
+        return ViewCrops(color, (normals.astype(np.int16) - 127).astype(np.int8))
 
 
 def quantized(crop: RGBDCrop) -> QuantizedCrop:
@@ -245,11 +241,6 @@ def stacked(crops: Sequence[QuantizedCrop], size: int) -> ViewCrops:
     for row, (color, normals) in enumerate(crops):
         record.color[row], record.normals[row] = color, normals
     return record
-
-
-def repeated(crops: ViewCrops, times: int) -> ViewCrops:
-    """Return the crops, each `times` times in a row."""
-    return ViewCrops(np.repeat(crops.color, times, axis=0), np.repeat(crops.normals, times, axis=0))
 
 
 def encode_crops(crops: ViewCrops) -> bytes:

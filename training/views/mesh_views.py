@@ -157,13 +157,14 @@ def all_views(task: ViewTask) -> Iterator[tuple[int, int, RenderedView]]:
             yield number, copy, augment(other, task.augmentations, rng)
 
 
-def _all_clouds(task: ViewTask) -> Iterator[ViewCloud]:
-    return (ViewCloud(number, copy, *cloud_of(view)) for number, copy, view in all_views(task))
+def _clouds(task: ViewTask) -> Iterator[ViewCloud]:
+    clouds = (ViewCloud(number, copy, *cloud_of(view)) for number, copy, view in all_views(task))
+    return (cloud for cloud in clouds if len(cloud.xyz) >= MIN_VIEW_POINTS)
 
 
 def render_task(task: ViewTask) -> list[ViewCloud]:
     """Return the clouds of a task that have at least `MIN_VIEW_POINTS` points, ordered by view and copy."""
-    return [cloud for cloud in _all_clouds(task) if len(cloud.xyz) >= MIN_VIEW_POINTS]
+    return list(_clouds(task))
 
 
 def _mesh(source: Path | TexturedMesh) -> TexturedMesh:
@@ -182,7 +183,7 @@ def checked_meshes(
         raise InputError("meshes is empty; expected at least one mesh")
     for name, source in meshes.items():
         mesh = _mesh(source)
-        if not any(len(cloud.xyz) >= MIN_VIEW_POINTS for cloud in _all_clouds(ViewTask(name, mesh, angles))):
+        if next(_clouds(ViewTask(name, mesh, angles)), None) is None:
             raise InputError(
                 f"object {name!r}: none of its {len(angles)} views has at least {MIN_VIEW_POINTS} points; check the "
                 "mesh or leave it out"
