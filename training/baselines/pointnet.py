@@ -131,8 +131,8 @@ class _Views(NamedTuple):
 def _read_views(task: FitTask) -> _Views:
     total = task.n_clouds
     xyz, rgb = (np.zeros((total, STORED_POINTS, 3), kind) for kind in (np.float16, np.uint8))
-    label, view = np.zeros((2, total), np.int32)
-    views = _Views(xyz, rgb, np.zeros((total, 3), np.float32), label, view)
+    of_class, view = np.zeros((2, total), np.int32)
+    views = _Views(xyz, rgb, np.zeros((total, 3), np.float32), of_class, view)
     rng = np.random.default_rng(task.options.seed)
     for index, rows, label in task.shards("read for pointnet", "views"):
         normalized = task.source.read(index)

@@ -207,9 +207,9 @@ class FrameOptions:
             return sources
         if model is not None and segment == MODEL:
             load_segmenter(TABLE)  # it begins with these pieces, and their package may be missing
-            return [segmented_source(source, model) for source in sources]
-        segmenter = load_segmenter(segment)
-        return [segmented_source(source, segmenter) for source in sources]
+        else:
+            model = load_segmenter(segment)
+        return [segmented_source(source, model) for source in sources]
 
     def open_bag(self) -> "Bag":
         """Return the recording, which is not opened yet."""
@@ -217,13 +217,8 @@ class FrameOptions:
         from thor2_jax.recordings.bags import Bag
 
         assert self.bag is not None
-        return Bag(
-            self.bag,
-            self.topics,
-            intrinsics=None if self.intrinsics is None else read_intrinsics(self.intrinsics),
-            depth_scale=self.depth_scale,
-            max_gap=self.max_gap,
-        )
+        intrinsics = None if self.intrinsics is None else read_intrinsics(self.intrinsics)
+        return Bag(self.bag, self.topics, intrinsics=intrinsics, depth_scale=self.depth_scale, max_gap=self.max_gap)
 
 
 def grouped_options(command: Callable[..., None]) -> Callable[..., None]:

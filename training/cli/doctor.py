@@ -40,25 +40,18 @@ def doctor(
     if meshes is None and mesh_scale != 1:
         raise InputError(f"mesh_scale is {mesh_scale:g}; it belongs to --meshes")
     sources = given.sources(masks=False)
-    paths = {}
-    if meshes is not None:
-        paths = find_meshes(meshes) if meshes.is_dir() else {meshes.stem: meshes}
+    paths = {} if meshes is None else find_meshes(meshes) if meshes.is_dir() else {meshes.stem: meshes}
     recognizer = None
     if model is not None:
         from thor2_jax.capacity import BATCH_BUCKETS
         from thor2_jax.recognizer import Recognizer
 
         recognizer = Recognizer.load(model, chunk=BATCH_BUCKETS[-1])
-    options: dict[str, Any] = {
-        "depth_scale": given.depth_scale,
-        "recognizer": recognizer,
-        "meshes": paths,
-        "mesh_scale": mesh_scale,
-    }
+    options: dict[str, Any] = {"recognizer": recognizer, "meshes": paths, "mesh_scale": mesh_scale}
     is_sound, failed = True, []
     for source in sources:
         try:
-            diagnosis = diagnose(source.files or source.read(), **options)
+            diagnosis = diagnose(source.files or source.read(), depth_scale=given.depth_scale, **options)
         except (InputError, OSError) as error:
             if given.color:
                 raise

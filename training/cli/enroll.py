@@ -76,9 +76,12 @@ def enroll(
             raise InputError(f"{option} is {value}; it belongs to frames")
     if mesh is None and mesh_scale != 1:
         raise InputError(f"mesh_scale is {mesh_scale:g}; it belongs to --mesh")
+    from training.objects.meshes import find_object_meshes, load_mesh
     from training.readers.frames import FrameFolder
 
-    meshes = {} if mesh is None else _readable_meshes(mesh, name, mesh_scale)
+    meshes = {} if mesh is None else find_object_meshes(mesh, name)
+    for path in meshes.values():
+        load_mesh(path, mesh_scale)
     for path in (given.color, given.depth, given.labels, given.intrinsics):
         if path is not None and not path.is_file():
             raise FileNotFoundError(2, "No such file", str(path))
@@ -93,7 +96,7 @@ def enroll(
         if frames is None:
             return {each: partial(mesh_views, path, mesh_scale) for each, path in meshes.items()}
         views, unusable = labelled_views(frames, sigma_s, label_name or name, instance)
-        skipped.extend(f"skipped: {each.reason}" for each in unusable)
+        skipped.extend(f"skipped: {reason}" for _, reason in unusable)
         views = views if name is None else {name: [view for each in views.values() for view in each]}
         return {each: partial(list, of_object) for each, of_object in views.items()}
 
@@ -116,12 +119,3 @@ def enroll(
         console.print(f"warning: unknown objects are hardly rejected: {known.weak_rejection}")
     enrolled = f"enrolled in {gallery or model}, which knows {known.union.summary}"
     finish(enrolled, "recognize a frame", "recognize", "FRAME", "--model", model)
-
-
-def _readable_meshes(mesh: Path, name: str | None, scale: float) -> dict[str, Path]:
-    from training.objects.meshes import find_object_meshes, load_mesh
-
-    meshes = find_object_meshes(mesh, name)
-    for path in meshes.values():
-        load_mesh(path, scale)
-    return meshes

@@ -75,13 +75,7 @@ def recognize(
     the frames of one camera are a sequence in the order of their names: an object has one name in all of them.
     """
     from thor2_jax.files import check_output_directory, check_output_file, remove_leftovers
-    from thor2_jax.model.result_files import (
-        RESULT_FILES,
-        check_no_foreign_results,
-        is_bop_file,
-        is_coco_file,
-        write_recognitions,
-    )
+    from thor2_jax.model import result_files
     from thor2_jax.recordings.rerun_file import RerunFile
     from training.frame_recognition import (
         RecognizerArguments,
@@ -121,16 +115,17 @@ def recognize(
     sources, frames = given.sources(segment, by_model), given.frames
     of_frames = None if poses is None else read_poses(poses, [source.name for source in sources])
     if out is not None:
-        check_output_directory(out, resumable={s.name.split("/")[0] for s in sources} if frames else RESULT_FILES)
+        first_parts = {source.name.split("/")[0] for source in sources}
+        check_output_directory(out, resumable=first_parts if frames else result_files.RESULT_FILES)
         for directory in [out / source.name for source in sources] if frames else [out]:
-            check_no_foreign_results(directory)
+            result_files.check_no_foreign_results(directory)
             remove_leftovers(directory)
     if coco is not None and bop is not None and coco.absolute() == bop.absolute():
         raise InputError(f"coco and bop are {coco}; expected two files")
     rerun_file = None if rerun is None else RerunFile(rerun)
     numbers = None if names is None else read_object_names(names)
-    check_output_file("coco", coco, is_coco_file)
-    check_output_file("bop", bop, is_bop_file)
+    check_output_file("coco", coco, result_files.is_coco_file)
+    check_output_file("bop", bop, result_files.is_bop_file)
     segmented = ["--segment", segment] if segment else []
     recognizer = load()
     tables = ResultTables([source.name for source in sources], recognizer.classes, numbers)
@@ -155,7 +150,8 @@ def recognize(
         unknown |= any(each.name is None for each in answer.recognitions)
         tables.add(answer)
         if out is not None:
-            write_recognitions(out / answer.name if frames else out, answer.frame, answer.recognitions)
+            directory = out / answer.name if frames else out
+            result_files.write_recognitions(directory, answer.frame, answer.recognitions)
     tables.write(coco, bop)
     written = ", ".join(str(path) for path in (out, coco, bop, rerun) if path)
     result = f"written to {written}" if written else f"frames recognized: {len(sources) - len(failed)}"

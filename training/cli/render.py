@@ -1,6 +1,7 @@
 """`thor2 render`: render a dataset of training views."""
 
 import dataclasses
+import itertools
 from pathlib import Path
 from typing import Annotated
 
@@ -66,15 +67,9 @@ def render(
     if crops is not None and not 1 <= crops <= MAX_CROP:
         raise InputError(f"crops is {crops}; expected 1 to {MAX_CROP} pixels")
     pool = processes.pool() or IN_PROCESS
-    switches = {
-        "illumination": illumination,
-        "sensor": sensor,
-        "occlusion": occlusion,
-        "segmentation": segmentation,
-        "registration": registration,
-        "base": base,
-    }
-    augmentations = Augmentations.of_names((name for name, is_on in switches.items() if is_on), copies) or None
+    kinds = "illumination", "sensor", "occlusion", "segmentation", "registration", "base"
+    are_chosen = illumination, sensor, occlusion, segmentation, registration, base
+    augmentations = Augmentations.of_names(itertools.compress(kinds, are_chosen), copies) or None
     sources = scaled_meshes(find_meshes(meshes, read_names(names) if names else None), mesh_scale)
     with show_progress(quiet) as progress:
         shown = of_stage(progress, "render")

@@ -179,14 +179,9 @@ def train(
     from training.fitting.protocol import DEFAULT, PAPER, QUICK
     from training.train_job import TrainJob, run_train_job
 
-    protocol = (PAPER if paper else QUICK if quick else DEFAULT).replace(
-        azimuth_step=azimuth_step,
-        polar_step=polar_step,
-        epochs=epochs,
-        batch_size=batch_size,
-        seed=seed,
-        orientation_copies=orientation_copies,
-    )
+    protocol = PAPER if paper else QUICK if quick else DEFAULT
+    protocol = protocol.replace(epochs=epochs, batch_size=batch_size, seed=seed, orientation_copies=orientation_copies)
+    protocol = protocol.replace(azimuth_step=azimuth_step, polar_step=polar_step)
     job = TrainJob(
         out=out,
         protocol=protocol,
@@ -230,10 +225,5 @@ def _distractors(
         procedural = 0 if protocol.distractors is None else default.procedural
     if procedural == 0 and meshes is None:
         return None
-    return dataclasses.replace(
-        default,
-        procedural=procedural,
-        meshes={} if meshes is None else find_meshes(meshes),
-        epochs=default.epochs if epochs is None else epochs,
-        workers=workers,
-    )
+    found, passes = {} if meshes is None else find_meshes(meshes), default.epochs if epochs is None else epochs
+    return dataclasses.replace(default, procedural=procedural, meshes=found, epochs=passes, workers=workers)

@@ -76,14 +76,9 @@ def batch_descriptors(
     length: jax.Array, color: jax.Array, network: ColorNetwork, config: DescriptorConfig
 ) -> Descriptors:
     """Return the descriptors of the strips of a batch; `length` and `color` are fields of `Batch`."""
-    length = length.astype(jnp.float32)
-    strips = Strips(
-        low=jnp.zeros_like(length),
-        high=length,
-        occupied=length > 0,  # a strip of one point has no persistence, so its pair adds nothing to the image
-        color=color.astype(jnp.float32),
-        overflow=jnp.zeros(len(length), jnp.int32),
-    )
+    length, overflow = length.astype(jnp.float32), jnp.zeros(len(length), jnp.int32)
+    occupied = length > 0  # a strip of one point has no persistence, so its pair adds nothing to the image
+    strips = Strips(jnp.zeros_like(length), length, occupied, color.astype(jnp.float32), overflow)
     return describe_strips(strips, network, config)
 
 

@@ -223,12 +223,8 @@ def cached_samples(job: Mapping[str, Any], build: Callable[[], Samples], resumes
                 os.utime(file)
             return samples
     except (OSError, ValueError, KeyError, TypeError, AttributeError, safetensors.SafetensorError) as error:
-        log.warning(
-            "%s cannot be used (%s); the distractors are rendered again%s",
-            file,
-            error,
-            "" if _is_own(file) else "; delete this file",
-        )
+        advice = "" if _is_own(file) else "; delete this file"
+        log.warning("%s cannot be used (%s); the distractors are rendered again%s", file, error, advice)
     samples = build()
     try:
         directory.mkdir(mode=0o700, parents=True, exist_ok=True)

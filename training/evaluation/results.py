@@ -1,7 +1,7 @@
 """All values of a report, computed from the answers, as one JSON table."""
 
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -150,6 +150,10 @@ def compute_results(
     }
     rejection = [_rejection(by_run[run], truth, described, unknown_by_run[run], runs[run].thresholds) for run in by_run]
     conditions = EvaluationConditions(own_objects, len(runs), len(frames), DEFAULT_RULE, real_views, scratch)
+
+    def of_runs(measure: Callable[..., float], by_title: Mapping[str, Sequence[NDArray[Any]]]) -> dict[str, Any]:
+        return {title: summarize_runs([measure(placement, each) for each in by_title[title]]) for title in by_title}
+
     results |= {
         "fusions": list(by_rule[DEFAULT_RULE]),
         "accuracy": {
@@ -167,14 +171,8 @@ def compute_results(
         "calibrated_confidence": _confidence(by_rule["calibrated"], truth[described], unknown_by_rule["calibrated"]),
         "placements": {
             "count": len(np.unique(placement)),
-            "accuracy": {
-                title: summarize_runs([scores.placement_accuracy(placement, marks) for marks in each])
-                for title, each in correct[DEFAULT_RULE].items()
-            },
-            "steadiness": {
-                title: summarize_runs([scores.steadiness(placement, answer) for answer in each])
-                for title, each in answers[DEFAULT_RULE].items()
-            },
+            "accuracy": of_runs(scores.placement_accuracy, correct[DEFAULT_RULE]),
+            "steadiness": of_runs(scores.steadiness, answers[DEFAULT_RULE]),
         },
         "main": main,
         "rejection": summarize_rows(rejection),
@@ -282,9 +280,8 @@ def _reliability(predictions: Sequence[Predictions], truth: Integers) -> dict[st
     correct = np.concatenate([p.class_index == truth for p in predictions])
     bins = scores.reliability(np.minimum(confidence, 1), correct)
     return {
-        "answers": bins.answers.tolist(),
-        "accuracy": [None if np.isnan(value) else float(value) for value in bins.accuracy],
-        "confidence": [None if np.isnan(value) else float(value) for value in bins.confidence],
+        name: [None if np.isnan(value) else value for value in values.tolist()]
+        for name, values in bins._asdict().items()
     }
 
 

@@ -18,11 +18,6 @@ from training.evaluation.answers import FrameAnswers, InstancePrediction
 from training.readers.labelled import sequence_of
 
 __all__ = [
-    "BINS",
-    "Coverage",
-    "MAX_MOVE",
-    "MIN_UNMOVED",
-    "Reliability",
     "accuracy_at_coverage",
     "attribute_tables",
     "auroc",

@@ -181,7 +181,7 @@ def _table() -> TexturedMesh:
     corner = np.array([[-0.8, -0.8, 0], [0.8, -0.8, 0], [0.8, 0.8, 0], [-0.8, 0.8, 0]])
     uv = np.array([[[0, 0], [1, 0], [1, 1]], [[0, 0], [1, 1], [0, 1]]], np.float32).clip(1e-4, 1 - 1e-4)
     faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
-    return TexturedMesh(corner, faces, uv=uv, textures=(texture,), face_texture=np.zeros(2, np.int32))
+    return TexturedMesh(corner, faces, uv, (texture,), np.zeros(2, np.int32))
 
 
 def _sensed_depth(depth_m: Array, noise: float, rng: np.random.Generator) -> NDArray[np.uint16]:
@@ -321,7 +321,5 @@ def _render(
     color = np.where(hits.mesh[:, None] >= 0, hits.color, np.array([92, 96, 104])).reshape(*shape, 3)
     gain = rng.uniform(1 - light, 1 + light) * rng.uniform(1 - light / 4, 1 + light / 4, 3)
     lit = color * gain + noise * 2 * rng.standard_normal(color.shape, np.float32)
-    frame = RGBDFrame(
-        np.rint(lit).clip(0, 255).astype(np.uint8), _sensed_depth(depth, noise, rng), labels, camera.intrinsics
-    )
-    return Scene(frame, truth, visible)
+    seen = np.rint(lit).clip(0, 255).astype(np.uint8), _sensed_depth(depth, noise, rng)
+    return Scene(RGBDFrame(*seen, labels, camera.intrinsics), truth, visible)

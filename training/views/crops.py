@@ -221,12 +221,13 @@ class ViewCrops:
         """Return the crops with sides of `size` pixels, area-filtered; the same record if they have this size."""
         if size == self.size:
             return self
-        shifted = (self.normals.astype(np.int16) + 127).astype(np.uint8)
-        color, normals = (
-            np.stack([Image.fromarray(image).resize((size, size), Image.Resampling.BOX) for image in images])
-            for images in (self.color, shifted)
-        )
-        return ViewCrops(color, (normals.astype(np.int16) - 127).astype(np.int8))
+
+        def smaller(images: NDArray[np.uint8]) -> list[NDArray[np.uint8]]:
+            return [np.asarray(Image.fromarray(each).resize((size, size), Image.Resampling.BOX)) for each in images]
+
+        shifted = smaller((self.normals.astype(np.int16) + 127).astype(np.uint8))
+        normals = [(each.astype(np.int16) - 127).astype(np.int8) for each in shifted]
+        return stacked(list(zip(smaller(self.color), normals, strict=True)), size)
 
 
 def quantized(crop: RGBDCrop) -> QuantizedCrop:

@@ -53,8 +53,8 @@ def remove_views(directory: Path) -> None:
 def encode(views: NormalizedViews) -> bytes:
     """Return the bytes of a shard's file."""
     steps = (views.xyz / np.float32(COORDINATE_STEP)).astype(np.uint16)
-    arrays = {"xyz": steps, "rgb": views.rgb, "counts": views.counts, "view": views.view, "copy": views.copy}
-    return safetensors.numpy.save(arrays)
+    others = {name: getattr(views, name) for name in ("rgb", "counts", "view", "copy")}
+    return safetensors.numpy.save({"xyz": steps, **others})
 
 
 @dataclasses.dataclass(frozen=True)

@@ -116,15 +116,11 @@ class WithLabelledViews:
         views, copies = self._views[name], self._copies(name)
         each = [[view, *(augmented_view(view, copy) for copy in range(copies))] for view in views]
         flat = [view for group in each for view in group]
+        clouds, boundary = [(view.points, view.colors) for view in flat], [view.boundary for view in flat]
+        view = np.repeat(FIRST_VIEW + np.arange(len(views)), 1 + copies).tolist()
+        copy = list(range(1 + copies)) * len(views)
         with with_context(f"frames: {name!r}"):
-            return normalize_views(
-                [(view.points, view.colors) for view in flat],
-                label,
-                np.repeat(FIRST_VIEW + np.arange(len(views)), 1 + copies).tolist(),
-                list(range(1 + copies)) * len(views),
-                self._config,
-                [view.boundary for view in flat],
-            )
+            return normalize_views(clouds, label, view, copy, self._config, boundary)
 
     def read_crops(self, index: int, size: int) -> ViewCrops:
         """Read the crops of a shard of the rendered views, or repeat those of a class's instances for their copies.
