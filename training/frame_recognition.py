@@ -200,9 +200,10 @@ class ResultTables:
             return
         named = [r.name for r in answer.recognitions if r.name is not None]
         self.n_without_number += sum(name not in self._categories for name in named)
-        image, recognized = self._coco_images[answer.name], (answer.frame, answer.recognitions, self._categories)
-        self._coco += result_files.coco_results(answer.name, image, *recognized)
-        self._bop += result_files.bop_lines(*self._images[answer.name], *recognized, answer.seconds)
+        recognized = answer.frame, answer.recognitions, self._categories
+        self._coco += result_files.coco_results(answer.name, self._coco_images[answer.name], *recognized)
+        scene, image = self._images[answer.name]
+        self._bop += result_files.bop_lines(scene, image, *recognized, answer.seconds)
 
     def write(self, coco: Path | None = None, bop: Path | None = None) -> None:
         """Write the files that are wanted, COCO results in JSON and BOP results in CSV, and create their directories.

@@ -289,21 +289,15 @@ def _open_views(job: TrainJob, labelled: LabelledInstances | None, display: Disp
     source: ViewSource | None = None if job.dataset is None else ViewDataset.open(job.dataset)
     _check_names(job, source.classes if source else list(meshes), labelled)
     if meshes:
-        source = _render(job, meshes, display)
+        protocol, workers, size = job.protocol, local_workers(job.workers), _crop_size(job)
+        steps, drawn = (protocol.azimuth_step, protocol.polar_step), (protocol.augmentations, protocol.fit.seed)
+        with display() as shown:
+            progress = numbered(shown, _stages(job))
+            source = render_dataset(meshes, job.out / VIEWS, *steps, workers, of_stage(progress, RENDER), *drawn)
+            if size is not None:
+                render_crops(meshes, source, size, workers, of_stage(progress, RENDER_CROPS), *drawn)
     if labelled is not None:
         reasons = [reason for _, reason in labelled.skipped]
         source = WithLabelledViews(labelled.views, job.protocol.config, source, reasons, labelled.crops)
     assert source is not None
     return source
-
-
-def _render(job: TrainJob, meshes: Mapping[str, Path | TexturedMesh], display: Display) -> ViewDataset:
-    protocol, workers, size = job.protocol, local_workers(job.workers), _crop_size(job)
-    steps, augmentations, seed = (protocol.azimuth_step, protocol.polar_step), protocol.augmentations, protocol.fit.seed
-    with display() as shown:
-        progress = numbered(shown, _stages(job))
-        render = of_stage(progress, RENDER)
-        dataset = render_dataset(meshes, job.out / VIEWS, *steps, workers, render, augmentations, seed)
-        if size is not None:
-            render_crops(meshes, dataset, size, workers, of_stage(progress, RENDER_CROPS), augmentations, seed)
-    return dataset

@@ -27,7 +27,6 @@ from training.cli.compilation_cache import enable_compilation_cache
 __all__ = [
     "MAX_WORKERS",
     "AllowHostOption",
-    "Engine",
     "FrameOptions",
     "GalleryOption",
     "KnownSegmentOption",
@@ -51,6 +50,7 @@ if TYPE_CHECKING:
     from thor2_jax.recordings.bags import Bag
     from thor2_jax.segmentation.segmenters import Segmenter
     from training.readers.frame_files import FrameSource
+    from training.storage.workers import WorkerPool
 
 
 app = typer.Typer(
@@ -342,10 +342,6 @@ def _given_value(error: Exception) -> str:
 def _exit_with(message: str) -> NoReturn:
     print(f"error: {escape_characters(' '.join(message.split()))}", file=sys.stderr)
     raise SystemExit(2)
-
-
-if TYPE_CHECKING:
-    from training.storage.workers import WorkerPool
 
 
 Engine = Literal["local", "ray"]

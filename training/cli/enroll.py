@@ -80,8 +80,8 @@ def enroll(
     from training.readers.frames import FrameFolder
 
     meshes = {} if mesh is None else find_object_meshes(mesh, name)
-    for path in meshes.values():
-        load_mesh(path, mesh_scale)
+    for file in meshes.values():
+        load_mesh(file, mesh_scale)
     for path in (given.color, given.depth, given.labels, given.intrinsics):
         if path is not None and not path.is_file():
             raise FileNotFoundError(2, "No such file", str(path))

@@ -79,12 +79,12 @@ def reliability(confidence: ArrayLike, correct: ArrayLike, bins: int = BINS) -> 
     return Reliability(count, accuracy, mean)
 
 
-def expected_calibration_error(confidence: ArrayLike, correct: ArrayLike, bins: int = BINS) -> float:
+def expected_calibration_error(confidence: ArrayLike, correct: ArrayLike) -> float:
     """Return the mean over the answers of |accuracy - confidence| of their bin; NaN without answers.
 
     Guo et al., "On Calibration of Modern Neural Networks" (ICML 2017). Arguments and errors are those of `reliability`.
     """
-    values = reliability(confidence, correct, bins)
+    values = reliability(confidence, correct)
     used = values.answers > 0
     if not used.any():
         return math.nan

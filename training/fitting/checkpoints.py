@@ -63,9 +63,7 @@ class Checkpoints:
     def __enter__(self) -> "Checkpoints":
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._manager.close()
 
     @property
@@ -123,9 +121,8 @@ class Checkpoints:
         target = jax.tree.map(lambda a: np.zeros(a.shape, a.dtype), like)
         try:
             # A process that is killed between checkpoint and digest leaves no digest.
-            if (path / DIGEST_FILE).is_file() and (path / DIGEST_FILE).read_text() != directory_digest(
-                path / "default"
-            ):
+            digest = path / DIGEST_FILE
+            if digest.is_file() and digest.read_text() != directory_digest(path / "default"):
                 raise ValueError("it is damaged")
             with _quiet_orbax():
                 state = self._manager.restore(epoch, args=ocp.args.StandardRestore(_storable(target)))

@@ -16,7 +16,7 @@ from scipy.spatial import ConvexHull
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame
 from training.augmentation.sensor import axial_deviation, depth_edges
-from training.objects.mesh import TexturedMesh
+from training.objects.mesh import TexturedMesh, moved
 from training.rendering.camera import Camera
 from training.rendering.ray_caster import RayCaster, pixel_rays, render_view
 from training.rendering.view_sphere import camera_pose
@@ -77,15 +77,13 @@ class _Placed:
         return float(self.mesh.vertices[:, 2].max())
 
     def moved(self, x: float, y: float) -> "_Placed":
-        matrix = np.eye(4)
-        matrix[:2, 3] = x, y
-        return _Placed(self.mesh.transformed(matrix), self.corners + [x, y], self.normals)
+        return _Placed(moved(self.mesh, (x, y, 0)), self.corners + [x, y], self.normals)
 
     def apart(self, other: "_Placed", x: float, y: float) -> bool:
         """Return whether this object, moved by x and y, is at least `MIN_GAP` from the other (separating axis test)."""
-        moved, fixed = self.corners + [x, y], other.corners
-        gaps = (self.normals @ fixed.T).min(axis=1) - (self.normals @ moved.T).max(axis=1)
-        other_gaps = (other.normals @ moved.T).min(axis=1) - (other.normals @ fixed.T).max(axis=1)
+        here, there = self.corners + [x, y], other.corners
+        gaps = (self.normals @ there.T).min(axis=1) - (self.normals @ here.T).max(axis=1)
+        other_gaps = (other.normals @ here.T).min(axis=1) - (other.normals @ there.T).max(axis=1)
         return bool(max(gaps.max(), other_gaps.max()) >= MIN_GAP)
 
 

@@ -34,32 +34,10 @@ from training.rendering.camera import TRAINING_CAMERA
 from training.rendering.view_sphere import DISTANCE, view_angles
 from training.storage.jobs import check_same_job, locked
 from training.storage.workers import IN_PROCESS, WorkerPool
-from training.views.crops import (
-    CROP_SIZE,
-    CROPS,
-    CropManifest,
-    QuantizedCrop,
-    ViewCrops,
-    crop_file,
-    encode_crops,
-    intact_content,
-    quantized,
-    rgbd_crop,
-    stacked,
-)
+from training.views import crops, mesh_views
+from training.views.crops import CROP_SIZE, CropManifest, QuantizedCrop, crop_file, intact_content
 from training.views.dataset import MANIFEST, Manifest, Shard, ViewDataset, encode
-from training.views.mesh_views import (
-    MIN_VIEW_POINTS,
-    SIGMA_S,
-    RenderProgress,
-    ViewCloud,
-    ViewTask,
-    all_views,
-    checked_meshes,
-    clouds_per_view,
-    render_task,
-    view_tasks,
-)
+from training.views.mesh_views import SIGMA_S, RenderProgress, ViewTask, clouds_per_view, view_tasks
 from training.views.normalized_views import COORDINATE_STEP, MAX_VIEW_LENGTH, normalize_views
 
 __all__ = ["dataset_job", "mesh_digest", "render_crops", "render_dataset"]
@@ -81,7 +59,7 @@ def mesh_digest(mesh: TexturedMesh) -> str:
 def _objects(meshes: Mapping[str, Path | TexturedMesh], angles: NDArray[np.float64]) -> list[dict[str, str]]:
     """Check every mesh and return the names and digests of the objects."""
     objects = []
-    for name, mesh in checked_meshes(meshes, angles):
+    for name, mesh in mesh_views.checked_meshes(meshes, angles):
         diameter = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
         if SIGMA_S * diameter > MAX_VIEW_LENGTH:
             raise InputError(
@@ -112,7 +90,7 @@ def _begin(directory: Path, job: Mapping[str, Any]) -> Manifest:
     return manifest
 
 
-def _store(path: Path, label: int, planned: int, rendered: Sequence[ViewCloud]) -> Shard:
+def _store(path: Path, label: int, planned: int, rendered: Sequence[mesh_views.ViewCloud]) -> Shard:
     """Normalize the clouds of a shard and write its file; `planned` counts those left out, too.
 
     Raises:
@@ -188,7 +166,7 @@ def dataset_job(
         "sigma_s": SIGMA_S,
         "voxel": DESCRIPTOR_VOXEL,
         "step": COORDINATE_STEP,
-        "min_points": MIN_VIEW_POINTS,
+        "min_points": mesh_views.MIN_VIEW_POINTS,
         "camera": {"width": camera.width, "height": camera.height, "intrinsics": intrinsics, "distance": DISTANCE},
         "azimuth_step": float(azimuth_step),
         "polar_step": float(polar_step),
@@ -240,7 +218,7 @@ def render_dataset(
         missing = [file for file in plan.shards if file not in done]
         starts = [(plan.names[label], first) for label, first in (plan.shards[file] for file in missing)]
         tasks = view_tasks(meshes, angles, starts, plan.size, augmentations, seed)
-        with contextlib.closing(pool(render_task, tasks)) as results:
+        with contextlib.closing(pool(mesh_views.render_task, tasks)) as results:
             for file, rendered in zip(missing, results, strict=True):
                 label, first = plan.shards[file]
                 planned = plan.copies * len(angles[first : first + plan.size])
@@ -257,13 +235,13 @@ def _clouds(shards: Mapping[str, Shard]) -> int:
 
 def _crops_of_task(task: ViewTask, size: int) -> dict[tuple[int, int], QuantizedCrop]:
     """Return (number of the view, of the copy) -> crop of the views of a task in which something is visible."""
-    crops = {}
-    for number, copy, view in all_views(task):
+    of_task = {}
+    for number, copy, view in mesh_views.all_views(task):
         labels = (view.depth > 0).astype(np.uint8)
         if labels.any():
             frame = RGBDFrame(view.color, view.depth, labels, view.intrinsics)
-            crops[number, copy] = quantized(rgbd_crop(frame, 1, size))
-    return crops
+            of_task[number, copy] = crops.quantized(crops.rgbd_crop(frame, 1, size))
+    return of_task
 
 
 def _begin_crops(directory: Path, dataset: ViewDataset, size: int) -> dict[str, str]:
@@ -283,7 +261,7 @@ def _begin_crops(directory: Path, dataset: ViewDataset, size: int) -> dict[str, 
 
 def _of_shard(
     dataset: ViewDataset, index: int, rendered: Mapping[tuple[int, int], QuantizedCrop], size: int
-) -> ViewCrops:
+) -> crops.ViewCrops:
     """Return the crops of the clouds of a shard, in their order."""
     views = dataset.read(index)
     keys = list(zip(views.view.tolist(), views.copy.tolist(), strict=True))
@@ -293,7 +271,7 @@ def _of_shard(
             f"meshes: view {missing[0][0]} of {dataset.classes[views.label]!r} is in {dataset.directory}, but is empty "
             "now; give the meshes of the dataset"
         )
-    return stacked([rendered[key] for key in keys], size)
+    return crops.stacked([rendered[key] for key in keys], size)
 
 
 def render_crops(
@@ -322,7 +300,7 @@ def render_crops(
     """
     if size < 1:
         raise InputError(f"crops is {size}; expected at least 1 pixel")
-    directory = dataset.directory / CROPS
+    directory = dataset.directory / crops.CROPS
     job = dataset.manifest.job
     angles = view_angles(job["azimuth_step"], job["polar_step"])
     plan = ShardPlan(angles, clouds_per_view(augmentations), dataset.classes)
@@ -338,7 +316,7 @@ def render_crops(
         with contextlib.closing(pool(functools.partial(_crops_of_task, size=size), tasks)) as results:
             for index, rendered in zip(missing, results, strict=True):
                 name = crop_file(dataset.shards[index].file)
-                content = encode_crops(_of_shard(dataset, index, rendered, size))
+                content = crops.encode_crops(_of_shard(dataset, index, rendered, size))
                 with atomic_write(directory / name) as temporary:
                     temporary.write_bytes(content)
                 done[name] = hashlib.sha256(content).hexdigest()
