@@ -86,32 +86,34 @@ class FitTask:
     """Data and options for fitting a baseline.
 
     Attributes:
+        name: name of the baseline.
         source: views of the run.
-        run: the run.
+        run: the run. Its fold is held out; nothing is if it is the only one.
         options: options of the fit.
-        folds: number of folds that the views are split into.
-        fold: index of the held-out fold; nothing is held out if `folds` is 1.
-        scratch: directory for checkpoints, so that an interrupted fit can resume.
         directory: directory of the run.
         weights: directory of pretrained weights; None trains networks from scratch.
         progress: called with (stage, done, total, note).
     """
 
+    name: str
     source: ViewSource
     run: TrainedRun
     options: FitOptions
-    folds: int
-    fold: int
-    scratch: Path
     directory: Path
     weights: Path | None
     progress: Callable[[str, int, int, str], object]
 
+    @property
+    def scratch(self) -> Path:
+        """Directory for checkpoints, so that an interrupted fit can resume."""
+        return self.directory / "baselines" / f".{self.name}"
+
     def held_out(self, label: Integers, view: Integers) -> NDArray[np.bool_]:
         """Return which clouds [M] are held out, given class index and view number: the same views as in the run."""
-        if self.folds == 1:
+        folds = self.run.record["folds"]
+        if folds == 1:
             return np.zeros(len(label), bool)
-        return fold_of_views(label, view, self.source.classes, self.folds, self.options.seed) == self.fold
+        return fold_of_views(label, view, self.source.classes, folds, self.options.seed) == self.run.record["fold"]
 
     def temperature(
         self, label: Integers, held_out: NDArray[np.bool_], predict: Callable[[], NDArray[np.float32]]
@@ -145,7 +147,6 @@ class NetworkFit(NamedTuple):
     """How a network is fitted.
 
     Attributes:
-        name: name of the baseline.
         directory: directory of its checkpoints.
         draw: function of the rows of a batch and a generator that returns the batch, a tuple of arrays.
         inputs: function of these arrays that returns the arguments of the network. Static.
@@ -154,7 +155,6 @@ class NetworkFit(NamedTuple):
         rate: function of the number of a step and the number of all steps.
     """
 
-    name: str
     directory: str
     draw: Callable[[NDArray[np.intp], np.random.Generator], tuple[Any, ...]]
     inputs: Callable[..., tuple[Any, ...]]
@@ -208,10 +208,10 @@ def fit_network(
         return jax.tree.leaves(state), metrics
 
     def report(done: int, total: int, metrics: EpochMetrics) -> None:
-        task.progress(f"fit {fit.name}", done, total, f"epoch {metrics.epoch}, accuracy {metrics.accuracy:.3f}")
+        task.progress(f"fit {task.name}", done, total, f"epoch {metrics.epoch}, accuracy {metrics.accuracy:.3f}")
 
     with Checkpoints(task.scratch / fit.directory) as checkpoints:
-        leaves = run_epochs(fit.name, leaves, steps, epoch, step, checkpoints, progress=report)
+        leaves = run_epochs(task.name, leaves, steps, epoch, step, checkpoints, progress=report)
     state = jax.tree.unflatten(structure, leaves)
     return nnx.merge(graph, state.params, state.statistics)
 

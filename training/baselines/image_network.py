@@ -98,7 +98,7 @@ class CropSamples:
         return ViewCrops(self.crops.color[rows], self.crops.normals[rows])
 
 
-def read_samples(task: FitTask, name: str, size: int) -> CropSamples:
+def read_samples(task: FitTask, size: int) -> CropSamples:
     """Read the crops of all views into memory, 6 bytes for each of their pixels.
 
     Raises:
@@ -107,7 +107,7 @@ def read_samples(task: FitTask, name: str, size: int) -> CropSamples:
     shape = task.n_clouds, size, size, 3
     crops = ViewCrops(np.zeros(shape, np.uint8), np.zeros(shape, np.int8))
     label, view = np.zeros(task.n_clouds, np.int32), np.zeros(task.n_clouds, np.int32)
-    for index, rows, of_shard in task.shards(f"read for {name}", "crops"):
+    for index, rows, of_shard in task.shards(f"read for {task.name}", "crops"):
         read = task.source.read_crops(index, size)
         crops.color[rows], crops.normals[rows] = read.color, read.normals
         label[rows], view[rows] = of_shard, task.source.read(index).view
@@ -126,7 +126,7 @@ def _learning_rate(highest: float, number: int, n_steps: int) -> float:
     return float(highest * (1 + np.cos(np.pi * (progress - WARM_UP) / (1 - WARM_UP))) / 2)
 
 
-def fit_image_network(task: FitTask, name: str) -> FittedBaseline:
+def fit_image_network(task: FitTask) -> FittedBaseline:
     """Fit a network of `ARCHITECTURES`; an interrupted fit resumes after its last epoch.
 
     An epoch uses as many crops as there are views, drawn from all their copies, each mirrored at random.
@@ -134,12 +134,12 @@ def fit_image_network(task: FitTask, name: str) -> FittedBaseline:
     Raises:
         InputError: the source has no crops, a file of weights does not fit, or the loss is not finite.
     """
-    architecture = ARCHITECTURES[name]
+    architecture = ARCHITECTURES[task.name]
     n_classes = len(task.source.classes)
     model: Any = architecture.build(n_classes, task.options.seed)
     files = [] if task.weights is None else load_weights(task.weights, architecture.backbones(model))
     weights = {path.name: file_digest(path) for path in files}
-    samples = read_samples(task, name, architecture.size)
+    samples = read_samples(task, architecture.size)
     held_out = task.held_out(samples.label, samples.view)
     n_views = len(np.unique(np.stack([samples.label, samples.view])[:, ~held_out], axis=1).T)
     directory, rate = ("pretrained", PRETRAINED_RATE) if weights else ("scratch", SCRATCH_RATE)
@@ -152,9 +152,9 @@ def fit_image_network(task: FitTask, name: str) -> FittedBaseline:
         crops.normals[flip] = crops.normals[flip, :, ::-1] * np.array([-1, 1, 1], np.int8)
         return crops.color, crops.normals
 
-    fit = NetworkFit(name, directory, draw, network_inputs, BATCH_SIZE, _optimizer, schedule)
+    fit = NetworkFit(directory, draw, network_inputs, BATCH_SIZE, _optimizer, schedule)
     model.train()
     fitted = fit_network(task, fit, model, samples.label, np.flatnonzero(~held_out), n_views)
-    network = ImageNetwork(name, fitted, n_classes)
+    network = ImageNetwork(task.name, fitted, n_classes)
     temperature = task.temperature(samples.label, held_out, lambda: network.predict(samples.rows(held_out)))
     return FittedBaseline(network, temperature, weights)

@@ -3,7 +3,6 @@
 import contextlib
 import time
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -33,7 +32,7 @@ _FIT: dict[str, Callable[[FitTask], FittedBaseline]] = {
     "thor": fit_thor,
     "forest": fit_forest,
     "pointnet": fit_pointnet,
-    **{name: partial(fit_image_network, name=name) for name in NETWORKS},
+    **dict.fromkeys(NETWORKS, fit_image_network),
     TEMPLATES: fit_templates,
 }
 
@@ -73,9 +72,11 @@ def train_baselines(
                 f"dataset: the views with digest {source.digest[:12]} are not those that {directory} was trained on; "
                 "give the dataset of that run"
             )
+        record, rates = run.record, tuple(run.record["learning_rates"])
+        own = FitOptions(record["epochs"], rates, record["batch_size"], record["seed"])
         for name in names:
             if not baseline_file(directory, name).is_file():
-                _train(directory, run, source, name, progress, options, weights)
+                _train(FitTask(name, source, run, options or own, directory, weights, progress))
             elif weights is not None and pretrained_files(name):
                 _check_pretrained(directory, run, name, weights)
 
@@ -91,35 +92,21 @@ def _check_pretrained(directory: Path, run: TrainedRun, name: str, weights: Path
         )
 
 
-def _train(
-    directory: Path,
-    run: TrainedRun,
-    source: ViewSource,
-    name: str,
-    progress: Progress,
-    options: FitOptions | None,
-    weights: Path | None,
-) -> None:
-    record = run.record
-    rates = tuple(record["learning_rates"])
-    options = options or FitOptions(record["epochs"], rates, record["batch_size"], record["seed"])
-    file = baseline_file(directory, name)
+def _train(task: FitTask) -> None:
+    file, start = baseline_file(task.directory, task.name), time.perf_counter()
     remove_leftovers(file.parent)
-    scratch = file.with_name(f".{name}")
-    scratch.mkdir(parents=True, exist_ok=True)
-    start = time.perf_counter()
-    fold = record["folds"], record["fold"]
+    task.scratch.mkdir(parents=True, exist_ok=True)
     try:
-        fitted = _FIT[name](FitTask(source, run, options, *fold, scratch, directory, weights, progress))
+        fitted = _FIT[task.name](task)
     except InputError:
         with contextlib.suppress(OSError):  # they stay with a checkpoint or another baseline
-            scratch.rmdir()
+            task.scratch.rmdir()
             file.parent.rmdir()
         raise
     seconds = time.perf_counter() - start
     stored = StoredBaseline(fitted.model.arrays(), fitted.temperature, seconds, fitted.weights)
-    write_baseline(file, stored, run.classes)
-    remove_written(scratch, r"[^/]+/(.*/)?[0-9]+/.*")  # checkpoints
+    write_baseline(file, stored, task.run.classes)
+    remove_written(task.scratch, r"[^/]+/(.*/)?[0-9]+/.*")  # checkpoints
 
 
 class LoadedBaselines(NamedTuple):

@@ -162,7 +162,7 @@ def fit_pointnet(task: FitTask) -> FittedBaseline:
     views = _read_views(task)
     held_out = task.held_out(views.label, views.view)
     rows = np.flatnonzero(~held_out)
-    fit = NetworkFit("pointnet", "fit", views.draw, _inputs, BATCH_SIZE, optax.adam, _learning_rate)
+    fit = NetworkFit("fit", views.draw, _inputs, BATCH_SIZE, optax.adam, _learning_rate)
     network = PointNet(len(task.source.classes), rngs=nnx.Rngs(task.options.seed))
     model = ColoredPointNet(fit_network(task, fit, network, views.label, rows, len(rows)))
     inputs = views.xyz[held_out, :POINTS], views.rgb[held_out, :POINTS], views.box[held_out]

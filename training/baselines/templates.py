@@ -150,7 +150,7 @@ def fit_templates(task: FitTask) -> FittedBaseline:
     """
     number, model, weights = _backbone(task)
     n_classes = len(task.source.classes)
-    samples = read_samples(task, "templates", backbone_size(BACKBONES[number]))
+    samples = read_samples(task, backbone_size(BACKBONES[number]))
     held_out = task.held_out(samples.label, samples.view)
     untaught = Templates(number, model, np.zeros((0, 0), np.float16), np.zeros(0, np.int16), n_classes)
     features = untaught.embed(samples.crops)

@@ -52,8 +52,10 @@ def watch(
         wait = stack.enter_context(_ctrl_c())
         from thor2_jax.capacity import BATCH_BUCKETS
         from thor2_jax.recognizer import Recognizer
+        from thor2_jax.recordings.bags import Bag
+        from thor2_jax.recordings.realsense import RealSenseCamera
         from thor2_jax.segmentation.segmenters import TABLE, load_segmenter
-        from thor2_jax.watch.live import LiveView
+        from thor2_jax.watch.live import LiveView, paced
         from thor2_jax.watch.server import Broadcast, serve_live
 
         sources = {"--bag": bag, "--folder": folder, "--realsense": realsense or None}
@@ -64,7 +66,15 @@ def watch(
         if bag is None and topics != Topics():
             raise InputError("color_topic, depth_topic and camera_topic belong to --bag")
         segmenter = load_segmenter(segment or TABLE)
-        frames = _frames(stack, bag, folder, topics, segment, wait)
+        if folder is not None:
+            frames = _folder_frames(folder, relabel=segment is not None)
+        elif bag is None:
+            frames = stack.enter_context(RealSenseCamera()).frames()
+        else:
+            opened = stack.enter_context(Bag(bag, topics))
+            for note in opened.notes:
+                print(f"note: {note}", file=sys.stderr)
+            frames = paced(opened.frames(), sleep=wait)
         recognizer = Recognizer.load(model, unknown_below, answer_by=answer_by, chunk=BATCH_BUCKETS[-1])
         broadcast = Broadcast()
         url = stack.enter_context(serve_live(broadcast, host, port, allow_host or ()))
@@ -114,29 +124,6 @@ def _ctrl_c() -> Iterator[Callable[[float | None], bool]]:
         yield wait
     finally:
         signal.signal(signal.SIGINT, previous)
-
-
-def _frames(
-    stack: contextlib.ExitStack,
-    bag: Path | None,
-    folder: Path | None,
-    topics: Topics,
-    segment: str | None,
-    wait: Callable[[float], object],
-) -> Iterator["RecordedFrame"]:
-    """Open the source and return its frames."""
-    from thor2_jax.recordings.bags import Bag
-    from thor2_jax.recordings.realsense import RealSenseCamera
-    from thor2_jax.watch.live import paced
-
-    if folder is not None:
-        return _folder_frames(folder, relabel=segment is not None)
-    if bag is None:
-        return stack.enter_context(RealSenseCamera()).frames()
-    opened = stack.enter_context(Bag(bag, topics))
-    for note in opened.notes:
-        print(f"note: {note}", file=sys.stderr)
-    return paced(opened.frames(), sleep=wait)
 
 
 def _folder_frames(folder: Path, relabel: bool) -> Iterator["RecordedFrame"]:

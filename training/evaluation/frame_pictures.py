@@ -59,8 +59,7 @@ class FramePictures:
 
     def restore(self, answers: FrameAnswers) -> None:
         """Take into account a frame that was drawn before the evaluation was interrupted."""
-        for _ in self._most_confident(answers):
-            pass
+        list(self._most_confident(answers))
 
     def draw(self, number: int, item: LabelledFrame, answers: FrameAnswers) -> None:
         """Draw the frame if it is shown, and those of its wrong names that are the most confident so far.

@@ -297,10 +297,8 @@ def _unknown_sections(report: Mapping[str, Any], out: Path) -> list[Section]:
         named = _mean_std(shares["unknown_named_at_threshold"])
         table.append([f"unknown, named ({n_unknown:,} instances)", "1.000", named])
     header = ["objects", "without rejection", f"threshold {_mean_std(shares['threshold'])}"]
-    text = (
-        f"Shares of the instances for {main}. An answer whose confidence is below the threshold has no name: the "
-        "object is unknown. "
-    )
+    text = f"Shares of the instances for {main}. An answer whose confidence is below the threshold has no name: "
+    text += "the object is unknown. "
     if shares["threshold"]["runs"]:
         text += "The threshold is the one that the models store. Enrolled objects have their own ones, by their "
         text += "numbers of views; the median is shown."

@@ -91,7 +91,11 @@ def fit(
         )
     batch_size = min(options.batch_size, len(train_rows) // n_devices * n_devices)
     steps = Steps(options.epochs, len(train_rows) // batch_size, batch_size)
-    graph, initial = initial_state(_create_model(samples, context, options.seed, train_rows))
+    n_inputs = input_size(context.feature, context.config, context.network.n_regions)
+    model = MLP(n_inputs, len(samples.classes), rngs=nnx.Rngs(options.seed))
+    chosen = samples.take(train_rows[:: max(1, len(train_rows) // SCALE_SAMPLES)][:SCALE_SAMPLES])
+    model.input_scale[...] = scale_inputs(chosen, context.feature, context.network, context.config)
+    graph, initial = initial_state(model)
 
     def batches(rows: NDArray[np.intp]) -> Iterator[Batch]:
         """Yield batches on the devices; this process gathers its own chunk of each."""
@@ -134,12 +138,3 @@ def fit(
     )
     best = jax.tree.map(jnp.asarray, checkpoints.best(state))
     return nnx.merge(graph, best.params, best.rest), checkpoints.best_epoch
-
-
-def _create_model(samples: Samples, context: FitContext, seed: int, train_rows: NDArray[np.intp]) -> MLP:
-    """Return the classifier before the first step, with the scaling of its inputs."""
-    n_inputs = input_size(context.feature, context.config, context.network.n_regions)
-    model = MLP(n_inputs, len(samples.classes), rngs=nnx.Rngs(seed))
-    chosen = samples.take(train_rows[:: max(1, len(train_rows) // SCALE_SAMPLES)][:SCALE_SAMPLES])
-    model.input_scale[...] = scale_inputs(chosen, context.feature, context.network, context.config)
-    return model

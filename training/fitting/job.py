@@ -133,10 +133,8 @@ class RunSettings:
             "folds": self.folds,
             "mirrors": list(self.mirrors),
             "orientation_copies": self.orientations,
-            "epochs": self.options.epochs,
+            **dataclasses.asdict(self.options),
             "learning_rates": list(self.options.learning_rates),
-            "batch_size": self.options.batch_size,
-            "seed": self.options.seed,
         }
 
 

@@ -125,17 +125,6 @@ def _longest(mesh: TexturedMesh) -> float:
     return float(np.ptp(mesh.vertices[np.unique(mesh.faces)], axis=0).max())
 
 
-def _check_size(mesh: TexturedMesh) -> None:
-    """Raise InputError unless the mesh has an object's size in metres."""
-    longest = _longest(mesh)
-    if not MIN_SIDE <= longest <= MAX_SIDE:
-        unit = " (is it in millimetres?)" if longest > MAX_SIDE else ""
-        raise InputError(
-            f"longest side {longest:g}{unit}; expected {MIN_SIDE:g} to {MAX_SIDE:g} metres; scale the mesh, for "
-            "instance by --mesh-scale 0.001"
-        )
-
-
 def _check_obj_references(path: Path) -> None:
     """Check that an OBJ file's materials and textures exist; without them it would be loaded as grey.
 
@@ -175,10 +164,13 @@ def load_mesh(path: str | Path, scale: float = 1.0) -> TexturedMesh:
     mesh = _parsed(Path(path))
     if scale != 1:
         mesh = mesh.transformed(np.diag([scale, scale, scale, 1.0]))
-    try:
-        _check_size(mesh)
-    except InputError as error:
-        raise InputError(f"mesh {path}: {error}") from None
+    longest = _longest(mesh)
+    if not MIN_SIDE <= longest <= MAX_SIDE:
+        unit = " (is it in millimetres?)" if longest > MAX_SIDE else ""
+        raise InputError(
+            f"mesh {path}: longest side {longest:g}{unit}; expected {MIN_SIDE:g} to {MAX_SIDE:g} metres; scale the "
+            "mesh, for instance by --mesh-scale 0.001"
+        )
     return mesh
 
 
@@ -328,10 +320,8 @@ def read_names(path: str | Path) -> dict[str, str]:
     try:
         content = path.read_bytes()
         table = parse_json(content) if suffix == ".json" else parse_yaml(content)
-    except OSError as error:
-        raise InputError(f"names file {path}: {error.strerror}") from error
-    except ValueError as error:
-        raise InputError(f"names file {path}: {error}") from error
+    except (OSError, ValueError) as error:
+        raise InputError(f"names file {path}: {getattr(error, 'strerror', error)}") from error
     if not isinstance(table, dict) or not table:
         raise InputError(f"names file {path}: expected a table of object name: scan")
     for name, scan in table.items():
