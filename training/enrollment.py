@@ -57,10 +57,8 @@ def mesh_views(mesh: Path | TexturedMesh, mesh_scale: float = 1.0) -> list[Prepa
     name, loaded = (mesh.name, load_mesh(mesh, mesh_scale)) if isinstance(mesh, Path) else ("mesh", mesh)
     augmentations = dataclasses.replace(AUGMENTATIONS, copies=1)
     task = ViewTask(name, loaded, _evenly_spread(MESH_VIEWS), augmentations=augmentations)
-    views = [
-        PreparedInstance(number, cloud.xyz, cloud.rgb, np.zeros(len(cloud.xyz), bool))
-        for number, cloud in enumerate(render_task(task))
-    ]
+    clouds = enumerate(render_task(task))
+    views = [PreparedInstance(k, cloud.xyz, cloud.rgb, np.zeros(len(cloud.xyz), bool)) for k, cloud in clouds]
     if not views:
         raise InputError(f"mesh: {name} has too few points in every view; expected an object of a few centimetres")
     return views

@@ -25,6 +25,7 @@ from training.fitting.checkpoints import Checkpoints
 from training.fitting.loop import Steps, run_epochs
 from training.fitting.options import EpochMetrics, FitOptions
 from training.fitting.samples import fold_of_views
+from training.fitting.steps import FitState
 from training.views.crops import ViewCrops, quantized, rgbd_crop, stacked
 from training.views.normalized_views import ViewSource
 
@@ -163,23 +164,17 @@ class NetworkFit(NamedTuple):
     rate: Callable[[int, int], float]
 
 
-class _State(NamedTuple):
-    params: Any
-    statistics: Any
-    optimizer: Any
-
-
 @functools.partial(jax.jit, static_argnums=(0, 1, 2), donate_argnums=3)
-def _step(graph: Any, inputs: Any, optimizer: Any, state: _State, batch: Any, label: Any, rate: Any) -> Any:
+def _step(graph: Any, inputs: Any, optimizer: Any, state: FitState, batch: Any, label: Any, rate: Any) -> Any:
     def loss_of(params: Any) -> Any:
-        model = nnx.merge(graph, params, state.statistics, copy=True)  # batch normalizations change their statistics
+        model = nnx.merge(graph, params, state.rest, copy=True)  # batch normalizations change their statistics
         logits = model(*inputs(*batch))
         loss = optax.softmax_cross_entropy_with_integer_labels(logits, label).mean()
         return loss, (nnx.state(model, nnx.BatchStat), (logits.argmax(axis=1) == label).mean())
 
     (loss, (statistics, accuracy)), gradients = jax.value_and_grad(loss_of, has_aux=True)(state.params)
     updates, moments = optimizer(rate).update(gradients, state.optimizer, state.params)
-    return _State(optax.apply_updates(state.params, updates), statistics, moments), loss, accuracy
+    return FitState(optax.apply_updates(state.params, updates), statistics, moments), loss, accuracy
 
 
 def fit_network(
@@ -194,7 +189,7 @@ def fit_network(
     steps = Steps(task.options.epochs, n_samples // batch_size, batch_size)
     split: Any = nnx.split(model, nnx.Param, nnx.BatchStat)
     graph, params, statistics = split
-    leaves, structure = jax.tree.flatten(_State(params, statistics, fit.optimizer(0.0).init(params)))
+    leaves, structure = jax.tree.flatten(FitState(params, statistics, fit.optimizer(0.0).init(params)))
 
     def epoch(number: int) -> Iterator[tuple[Any, Integers]]:
         rng = np.random.default_rng((task.options.seed, number - 1))
@@ -213,7 +208,7 @@ def fit_network(
     with Checkpoints(task.scratch / fit.directory) as checkpoints:
         leaves = run_epochs(task.name, leaves, steps, epoch, step, checkpoints, progress=report)
     state = jax.tree.unflatten(structure, leaves)
-    return nnx.merge(graph, state.params, state.statistics)
+    return nnx.merge(graph, state.params, state.rest)
 
 
 def in_batches(function: Callable[..., Any], size: int, *arrays: NDArray[Any]) -> NDArray[np.float32]:

@@ -37,6 +37,7 @@ __all__ = [
     "SegmentOption",
     "UnknownOption",
     "WorkerOptions",
+    "WorkersOption",
     "app",
     "console",
     "finish",
@@ -148,11 +149,6 @@ class FrameOptions:
         given = [(f"--{field.name.replace('_', '-')}", value) for field, value in options if value != field.default]
         return [*map(str, self.frames or ()), *(str(part) for pair in given for part in pair)]
 
-    @property
-    def topics(self) -> Topics:
-        """The topics of the recording that are given by name."""
-        return Topics(self.color_topic, self.depth_topic, self.camera_topic)
-
     def check(self) -> None:
         """Raise InputError unless exactly one of FRAME, files and a recording is given, with its own options."""
         if self.bag is not None:
@@ -217,8 +213,9 @@ class FrameOptions:
         from thor2_jax.recordings.bags import Bag
 
         assert self.bag is not None
+        topics = Topics(self.color_topic, self.depth_topic, self.camera_topic)
         intrinsics = None if self.intrinsics is None else read_intrinsics(self.intrinsics)
-        return Bag(self.bag, self.topics, intrinsics=intrinsics, depth_scale=self.depth_scale, max_gap=self.max_gap)
+        return Bag(self.bag, topics, intrinsics=intrinsics, depth_scale=self.depth_scale, max_gap=self.max_gap)
 
 
 def grouped_options(command: Callable[..., None]) -> Callable[..., None]:
@@ -349,14 +346,16 @@ Engine = Literal["local", "ray"]
 MAX_WORKERS = 1024
 """Largest number of processes of a command: each needs memory and open files."""
 
+WorkersOption = Annotated[
+    int, typer.Option("--workers", min=1, max=MAX_WORKERS, help="Worker processes; with Ray, concurrent tasks.")
+]
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class WorkerOptions:
     """Where a command computes."""
 
-    workers: Annotated[
-        int, typer.Option(min=1, max=MAX_WORKERS, help="Worker processes; with Ray, concurrent tasks.")
-    ] = 1
+    workers: WorkersOption = 1
     engine: Annotated[
         Engine,
         typer.Option(help="Work on this machine or on a Ray cluster (extra `cluster`), which has the same paths."),

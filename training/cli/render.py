@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from thor2_jax.errors import InputError
-from training.cli.app import MAX_WORKERS, MeshScaleOption, QuietOption, WorkerOptions, app, finish, grouped_options
+from training.cli.app import MeshScaleOption, QuietOption, WorkerOptions, WorkersOption, app, finish, grouped_options
 from training.cli.progress import show_progress
 
 MAX_CROP = 2048
@@ -19,9 +19,7 @@ MAX_CROP = 2048
 class RenderWorkers(WorkerOptions):
     """Where views are rendered; by default, in two processes."""
 
-    workers: Annotated[
-        int, typer.Option(min=1, max=MAX_WORKERS, help="Worker processes; with Ray, concurrent tasks.")
-    ] = 2
+    workers: WorkersOption = 2
 
 
 @app.command()

@@ -95,9 +95,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
     try:
         meshes = list(find_meshes(options.meshes).values()) if options.meshes else []
-        embedding = build_embedding(
-            options.out, options.objects, options.views, options.epochs, meshes, options.workers, show
-        )
+        numbers = options.objects, options.views, options.epochs
+        embedding = build_embedding(options.out, *numbers, meshes, options.workers, show)
     except InputError as error:
         raise SystemExit(f"error: {error}") from None
     print(f"{options.out}: {embedding.fingerprint}")

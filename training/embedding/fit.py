@@ -262,11 +262,8 @@ def reference_views(embedding: Embedding, samples: Samples, seed: int = 0) -> Re
     looks = (batch_looks(batch, embedding.network, embedding.config) for batch in samples.batches(rows, BATCH))
     chunks = [embedding.embed_oriented(batch)[:, 0] for batch in looks]
     label = samples.label[rows]
-    return References(
-        np.concatenate(chunks)[: len(rows)].astype(np.float16),
-        np.where(label < n_classes, label, BACKGROUND).astype(np.int32),
-        embedding.classes,
-    )
+    embedded, shown = np.concatenate(chunks)[: len(rows)], np.where(label < n_classes, label, BACKGROUND)
+    return References(embedded.astype(np.float16), shown.astype(np.int32), embedding.classes)
 
 
 def _choose(allowed: NDArray[np.bool_], count: int, rng: np.random.Generator) -> NDArray[np.intp]:

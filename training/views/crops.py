@@ -125,9 +125,8 @@ def fill_depth(depth: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[n
     filled = np.where(mask & (depth > 0), depth, np.float32(np.nan))
     rows, columns = np.nonzero(mask & np.isnan(filled))
     while len(rows):
-        windows = np.lib.stride_tricks.sliding_window_view(
-            np.pad(filled, _WINDOW // 2, constant_values=np.nan), (_WINDOW, _WINDOW)
-        )
+        padded = np.pad(filled, _WINDOW // 2, constant_values=np.nan)
+        windows = np.lib.stride_tricks.sliding_window_view(padded, (_WINDOW, _WINDOW))
         around = windows[rows, columns].reshape(len(rows), -1)
         known = ~np.isnan(around).all(axis=1)
         if not known.any():

@@ -105,6 +105,9 @@ class SourceShard(NamedTuple):
     label: int
     views: int
 
+    def __repr__(self) -> str:
+        return f"_Shard(label={self.label}, views={self.views})"  # part of the digests of views in memory
+
 
 class ViewSource(Protocol):
     """Normalized views in shards of one object each: a `ViewDataset` on disk, or `MemoryViews`."""
