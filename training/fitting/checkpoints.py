@@ -41,7 +41,7 @@ BEGUN = "begun.json"
 DIGEST_FILE = "sha256"
 
 
-class Checkpoints:
+class Checkpoints(contextlib.AbstractContextManager["Checkpoints"]):
     """Checkpoints in one directory, which all processes of a training share."""
 
     def __init__(self, directory: str | Path) -> None:
@@ -59,9 +59,6 @@ class Checkpoints:
             preservation_policy=keep, best_fn=_score, cleanup_tmp_directories=True, enable_async_checkpointing=False
         )
         self._manager = ocp.CheckpointManager(self.directory, options=options)
-
-    def __enter__(self) -> "Checkpoints":
-        return self
 
     def __exit__(self, *_: object) -> None:
         self._manager.close()

@@ -8,6 +8,7 @@ another shape, so that neither shape nor colour alone separates all objects.
 
 import colorsys
 import dataclasses
+import functools
 from collections.abc import Callable
 
 import numpy as np
@@ -45,9 +46,9 @@ _PALETTE, _TEXTURE, _SHAPE = range(3)
 def procedural_object(seed: int) -> TexturedMesh:
     """Return the procedural object of a seed, a non-negative integer."""
     shape_seed = seed - (seed % _SIBLINGS == 1)
-    paint = _Paint(seed - (seed % _SIBLINGS == 3))
+    paint = _paint(seed - (seed % _SIBLINGS == 3))
     rng = np.random.default_rng([_SHAPE, shape_seed])
-    mesh = _FAMILIES[rng.choice(len(_FAMILIES), p=_WEIGHTS)](rng, paint.texture)
+    mesh = _FAMILIES[rng.choice(len(_FAMILIES), p=_WEIGHTS)](rng, paint)
     vertices = mesh.vertices - mesh.centre
     if rng.random() < 0.3:
         vertices = vertices * (1 + rng.uniform(-0.2, 0.2, 3))
@@ -68,24 +69,18 @@ def _log_uniform(rng: Rng, low: float, high: float) -> float:
 # ---------------------------------------------------------------------------------------------------------------- paint
 
 
-class _Paint:
-    """Textures of one object in the colours of one palette; `texture(i)` is that of its i-th part."""
+def _paint(seed: int) -> "Paint":
+    """Return the textures of one object's parts, by number, in the colours of one palette."""
+    rng = np.random.default_rng([_PALETTE, seed])
+    palette, is_uniform = _palette(rng), rng.random() < 0.5
 
-    def __init__(self, seed: int) -> None:
-        rng = np.random.default_rng([_PALETTE, seed])
-        self._seed = seed
-        self._palette = _palette(rng)
-        self._uniform = rng.random() < 0.5
-        self._textures: dict[int, Image] = {}
+    @functools.cache
+    def texture(part: int) -> Image:
+        rng = np.random.default_rng([_TEXTURE, seed, part])
+        rotate = part > 0 and rng.random() < 0.5
+        return _texture(rng, palette[1:] + palette[:1] if rotate else palette)
 
-    def texture(self, part: int) -> Image:
-        part = min(part, 1) if self._uniform else part
-        if part not in self._textures:
-            rng = np.random.default_rng([_TEXTURE, self._seed, part])
-            rotate = part > 0 and rng.random() < 0.5
-            palette = self._palette[1:] + self._palette[:1] if rotate else self._palette
-            self._textures[part] = _texture(rng, palette)
-        return self._textures[part]
+    return lambda part: texture(min(part, 1) if is_uniform else part)
 
 
 def _palette(rng: Rng) -> list[Array]:
