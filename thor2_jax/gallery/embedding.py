@@ -33,7 +33,14 @@ from thor2_jax.gallery.references import REFERENCES_FILE, References
 from thor2_jax.model.classifier import model_arrays, model_from_arrays
 from thor2_jax.types import Descriptors, PointClouds
 
-__all__ = ["MAX_EMBEDDING_SIZE", "Embedding", "EmbeddingNetwork", "EmbeddingSizes", "class_cosines", "load_default"]
+__all__ = [
+    "MAX_EMBEDDING_SIZE",
+    "Embedding",
+    "EmbeddingNetwork",
+    "EmbeddingSizes",
+    "class_cosines",
+    "load_default",
+]
 
 EMBEDDING_FORMAT, FORMAT_WITH_FURTHER = 1, 2
 """Version of the file: float16 arrays of one network, or of several, and JSON metadata."""

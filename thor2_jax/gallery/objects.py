@@ -180,7 +180,13 @@ class ObjectGallery:
         return gallery
 
     def enroll(
-        self, name: str, views: Sequence[PreparedInstance], source: str, *, extend: bool = False, replace: bool = False
+        self,
+        name: str,
+        views: Sequence[PreparedInstance],
+        source: str,
+        *,
+        extend: bool = False,
+        replace: bool = False,
     ) -> None:
         """Enroll an object from prepared views.
 

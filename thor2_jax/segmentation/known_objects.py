@@ -62,7 +62,9 @@ MERGED = 3.0
 
 
 def segment_known(
-    frame: RGBDFrame, labels: NDArray[np.integer], recognize: Callable[[Sequence[RGBDFrame]], Sequence[Answer]]
+    frame: RGBDFrame,
+    labels: NDArray[np.integer],
+    recognize: Callable[[Sequence[RGBDFrame]], Sequence[Answer]],
 ) -> NDArray[np.int32]:
     """Return labels whose pieces are divided and merged where known objects result.
 
