@@ -320,8 +320,10 @@ def read_names(path: str | Path) -> dict[str, str]:
     try:
         content = path.read_bytes()
         table = parse_json(content) if suffix == ".json" else parse_yaml(content)
-    except (OSError, ValueError) as error:
-        raise InputError(f"names file {path}: {getattr(error, 'strerror', error)}") from error
+    except OSError as error:
+        raise InputError(f"names file {path}: {error.strerror}") from error
+    except ValueError as error:
+        raise InputError(f"names file {path}: {error}") from error
     if not isinstance(table, dict) or not table:
         raise InputError(f"names file {path}: expected a table of object name: scan")
     for name, scan in table.items():
