@@ -110,7 +110,8 @@ def run_demo(
     (run,) = load_runs([out / "run"])
     answers = _answer_scenes(run, scenes, progress)
     report = compute_results("demo", [run], answers)
-    subsets = dict(_subsets(report))
+    cells = [cell for table in report["accuracy"][report["rule"]] for cell in table["cells"]]
+    subsets = {" ".join(f"{name} {value}" for name, value in cell["where"].items()) or "all": cell for cell in cells}
     accuracy = {subset: [cell["accuracy"][name]["mean"] for name in NAMES] for subset, cell in subsets.items()}
     counts = {subset: cell["instances"] for subset, cell in subsets.items()}
 
@@ -169,12 +170,6 @@ def _answer_scenes(run: Run, scenes: Sequence[Scene], progress: Progress) -> lis
             grouped.append(dataclasses.replace(answers, attributes={"occlusion": degree}, instances=instances))
         progress("recognize scenes", number + 1, N_SCENES, "")
     return grouped
-
-
-def _subsets(report: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]]:
-    for table in report["accuracy"][report["rule"]]:
-        for cell in table["cells"]:
-            yield " ".join(f"{name} {value}" for name, value in cell["where"].items()) or "all", cell
 
 
 def _instances(run: Run, answers: Sequence[FrameAnswers]) -> Iterator[dict[str, Any]]:

@@ -138,11 +138,10 @@ def _print_report(report: Mapping[str, Any]) -> None:
     from training.evaluation import page
 
     counts, speed = report["instances"], report["speed"]
-    shown = Table("", "instances", title="accuracy without rejection")
-    for number, table in enumerate(report["accuracy"][report["rule"]]):
-        header, rows = page.marked(page.accuracy_table(table, report["fusions"]), report["main"])
-        for column in [] if number else header[2:]:
-            shown.add_column(column)
+    titles, _ = page.marked((report["fusions"], ()), report["main"])
+    shown = Table("", "instances", *titles, title="accuracy without rejection")
+    for table in report["accuracy"][report["rule"]]:
+        header, rows = page.accuracy_table(table, report["fusions"])
         shown.add_section()
         if header[0]:
             shown.add_row(f"by {header[0]}", style="bold")

@@ -108,6 +108,7 @@ def compute_results(
     is_known = [instance.truth in classes for instance, _ in labelled]
     instances = [instance for instance, _ in labelled if instance.truth in classes]
     unknown = [instance for instance, _ in labelled if instance.truth not in classes]
+    seconds = [frame.seconds for frame in frames]
     results: dict[str, Any] = {
         "runs": [run.name for run in runs],
         "classes": list(classes),
@@ -118,7 +119,12 @@ def compute_results(
             "not_described": dict(Counter(i.reason for i in instances if i.probabilities is None)),
             "no_class": dict(Counter(i.truth for i in unknown)),
         },
-        "speed": _speed([frame.seconds for frame in frames]),
+        "speed": {
+            "frames": len(seconds),
+            "seconds": sum(seconds),
+            "frames_per_second": len(seconds) / sum(seconds) if sum(seconds) else None,
+            "median_seconds": float(np.median(seconds)) if seconds else None,
+        },
         "fusions": [],
         "worst": [],
         "published_tables": [],
@@ -149,6 +155,10 @@ def compute_results(
         for rule, by_title in answers.items()
     }
     rejection = [_rejection(by_run[run], truth, described, unknown_by_run[run], runs[run].thresholds) for run in by_run]
+    # Rows are true classes; the last column has the instances that are not described, by their index -1.
+    confusion = np.zeros((len(classes), len(classes) + 1), np.intp)
+    for answer in answers[DEFAULT_RULE][main]:
+        np.add.at(confusion, (truth, answer), 1)
     conditions = EvaluationConditions(own_objects, len(runs), len(frames), DEFAULT_RULE, real_views, scratch)
 
     def of_runs(measure: Callable[..., float], by_title: Mapping[str, Sequence[NDArray[Any]]]) -> dict[str, Any]:
@@ -178,18 +188,9 @@ def compute_results(
         "rejection": summarize_rows(rejection),
         "known_unknown": _known_unknown([(by_run[run], unknown_by_run[run]) for run in by_run], truth[described]),
         "reliability": _reliability(list(by_run.values()), truth[described]),
-        "confusion": _confusion(answers[DEFAULT_RULE][main], truth, len(classes)).tolist(),
+        "confusion": confusion.tolist(),
     }
     return results | _answers([*instances, *unknown], runs)
-
-
-def _speed(seconds: Sequence[float]) -> dict[str, Any]:
-    return {
-        "frames": len(seconds),
-        "seconds": sum(seconds),
-        "frames_per_second": len(seconds) / sum(seconds) if sum(seconds) else None,
-        "median_seconds": float(np.median(seconds)) if seconds else None,
-    }
 
 
 def _of_all(predictions: Predictions, described: Flags) -> Integers:
@@ -283,14 +284,6 @@ def _reliability(predictions: Sequence[Predictions], truth: Integers) -> dict[st
         name: [None if np.isnan(value) else value for value in values.tolist()]
         for name, values in bins._asdict().items()
     }
-
-
-def _confusion(answers: Sequence[Integers], truth: Integers, n_classes: int) -> Integers:
-    """Return [C, C + 1] counts over all runs: rows are true classes, the last column instances not described."""
-    counts = np.zeros((n_classes, n_classes + 1), np.intp)
-    for answer in answers:
-        np.add.at(counts, (truth, answer), 1)  # -1 is the last column
-    return counts
 
 
 def _answers(instances: Sequence[InstancePrediction], runs: Sequence["Run"]) -> dict[str, Any]:
