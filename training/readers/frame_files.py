@@ -56,7 +56,11 @@ class FrameFiles:
     def read(self, depth_scale: float | None = None) -> RGBDFrame:
         """Read the frame; arguments and exceptions as `read_frame`."""
         return read_frame(
-            color=self.color, depth=self.depth, labels=self.labels, intrinsics=self.intrinsics, depth_scale=depth_scale
+            color=self.color,
+            depth=self.depth,
+            labels=self.labels,
+            intrinsics=self.intrinsics,
+            depth_scale=depth_scale,
         )
 
     @property
