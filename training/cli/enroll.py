@@ -10,31 +10,21 @@ import typer
 
 from thor2_jax.errors import InputError
 from thor2_jax.printable import check_name
-from training.cli.app import (
-    FrameOptions,
-    GalleryOption,
-    ManyFrames,
-    MeshScaleOption,
-    QuietOption,
-    SegmentOption,
-    app,
-    console,
-    finish,
-    grouped_options,
-)
+from training.cli import options
+from training.cli.app import app, console, finish
 from training.cli.progress import show_progress
 
 if TYPE_CHECKING:
     from thor2_jax.frames.prepared_instance import PreparedInstance
 
 
-@app.command(cls=ManyFrames)
-@grouped_options
+@app.command(cls=options.ManyFrames)
+@options.grouped_options
 def enroll(
     *,
     model: Annotated[Path, typer.Option("--model", help="Run directory; created if it does not exist.")],
     name: Annotated[str | None, typer.Argument(help="Name of the object. Default: every object there is.")] = None,
-    given: FrameOptions,
+    given: options.FrameOptions,
     mesh: Annotated[
         Path | None, typer.Option(help="Mesh of the object (GLB, OBJ, PLY), its folder, or a folder of objects.")
     ] = None,
@@ -46,12 +36,12 @@ def enroll(
     instance: Annotated[
         int | None, typer.Option(help="Label number of the object. Default: by labels.json, or the only instance.")
     ] = None,
-    segment: SegmentOption = None,
-    mesh_scale: MeshScaleOption = 1.0,
+    segment: options.SegmentOption = None,
+    mesh_scale: options.MeshScaleOption = 1.0,
     extend: Annotated[bool, typer.Option("--extend", help="Add views to an object that exists.")] = False,
     replace: Annotated[bool, typer.Option("--replace", help="Discard the views of an object that exists.")] = False,
-    gallery: GalleryOption = None,
-    quiet: QuietOption = False,
+    gallery: options.GalleryOption = None,
+    quiet: options.QuietOption = False,
 ) -> None:
     """Enroll an object from a mesh or from frames; it is recognized at once.
 

@@ -12,7 +12,8 @@ import typer
 from rich.table import Table
 
 from thor2_jax.printable import escape_characters
-from training.cli.app import FrameOptions, QuietOption, WorkerOptions, app, console, finish, grouped_options, show_help
+from training.cli import options
+from training.cli.app import app, console, finish, show_help
 from training.cli.progress import show_progress
 
 evaluate_app = typer.Typer(
@@ -28,7 +29,7 @@ MoreModels = Annotated[list[Path] | None, typer.Argument(metavar="[RUN]...", hel
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class EvaluationOptions(WorkerOptions):
+class EvaluationOptions(options.WorkerOptions):
     """What is evaluated, and where the report is written."""
 
     model: Annotated[
@@ -38,11 +39,11 @@ class EvaluationOptions(WorkerOptions):
         Path | None,
         typer.Option("--out", help="Directory for report.html and report.json; an interrupted evaluation resumes."),
     ] = None
-    quiet: QuietOption = False
+    quiet: options.QuietOption = False
 
 
 @evaluate_app.command()
-@grouped_options
+@options.grouped_options
 def uwis(dataset: DatasetArgument, job: EvaluationOptions, runs: MoreModels = None) -> None:
     """UW-IS Occluded: <video>/images/<id>_{rgb,depth,labels}.png and <id>_poses.yaml."""
     from training.readers.uwis import UWISOccluded
@@ -51,8 +52,8 @@ def uwis(dataset: DatasetArgument, job: EvaluationOptions, runs: MoreModels = No
 
 
 @evaluate_app.command()
-@grouped_options
-def frames(given: FrameOptions, job: EvaluationOptions) -> None:
+@options.grouped_options
+def frames(given: options.FrameOptions, job: EvaluationOptions) -> None:
     """Frames whose objects labels.json names: <frame>/{color,depth,mask}.png, intrinsics.json, labels.json.
 
     A FRAME that is a run directory, or has the folds of a training, is a further model.
@@ -72,7 +73,7 @@ def frames(given: FrameOptions, job: EvaluationOptions) -> None:
 
 
 @evaluate_app.command()
-@grouped_options
+@options.grouped_options
 def ocid(
     dataset: DatasetArgument,
     job: EvaluationOptions,
@@ -91,7 +92,7 @@ def ocid(
 
 
 @evaluate_app.command()
-@grouped_options
+@options.grouped_options
 def bop(
     dataset: DatasetArgument,
     job: EvaluationOptions,

@@ -12,18 +12,8 @@ from rich.table import Table
 
 from thor2_jax.errors import InputError
 from thor2_jax.printable import escape_characters
-from training.cli.app import (
-    RECORDINGS,
-    FrameOptions,
-    KnownSegmentOption,
-    ModelOption,
-    UnknownOption,
-    WorkerOptions,
-    app,
-    console,
-    finish,
-    grouped_options,
-)
+from training.cli import options
+from training.cli.app import app, console, finish
 from training.cli.recognize_bag import recognize_bag
 
 if TYPE_CHECKING:
@@ -36,13 +26,13 @@ MAX_LISTED = 5
 
 
 @app.command()
-@grouped_options
+@options.grouped_options
 def recognize(
-    model: ModelOption,
-    given: FrameOptions,
-    processes: WorkerOptions,
-    segment: KnownSegmentOption = None,
-    unknown_below: UnknownOption = None,
+    model: options.ModelOption,
+    given: options.FrameOptions,
+    processes: options.WorkerOptions,
+    segment: options.KnownSegmentOption = None,
+    unknown_below: options.UnknownOption = None,
     answer_by: Annotated[
         str | None, typer.Option(help="classifiers, gallery or both. Default: what the run has.")
     ] = None,
@@ -66,7 +56,9 @@ def recognize(
     ] = None,
     out_bag: Annotated[
         Path | None,
-        typer.Option(rich_help_panel=RECORDINGS, help="Write detections: MCAP (.mcap), or directory of a ROS 2 bag."),
+        typer.Option(
+            rich_help_panel=options.RECORDINGS, help="Write detections: MCAP (.mcap), or directory of a ROS 2 bag."
+        ),
     ] = None,
 ) -> None:
     """Recognize every instance of RGB-D frames.

@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from thor2_jax.errors import InputError
-from training.cli.app import FrameOptions, finish
+from training.cli import options
+from training.cli.app import finish
 
 if TYPE_CHECKING:
     from thor2_jax.recordings.recorded_frames import RecordedFrame
@@ -17,7 +18,7 @@ __all__ = ["recognize_bag"]
 
 
 def recognize_bag(
-    given: FrameOptions,
+    given: options.FrameOptions,
     arguments: "RecognizerArguments",
     segment: str | None,
     track: bool,

@@ -8,7 +8,8 @@ from typing import Annotated
 import typer
 
 from thor2_jax.errors import InputError
-from training.cli.app import MeshScaleOption, QuietOption, WorkerOptions, WorkersOption, app, finish, grouped_options
+from training.cli import options
+from training.cli.app import app, finish
 from training.cli.progress import show_progress
 
 MAX_CROP = 2048
@@ -16,14 +17,14 @@ MAX_CROP = 2048
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class RenderWorkers(WorkerOptions):
+class RenderWorkers(options.WorkerOptions):
     """Where views are rendered; by default, in two processes."""
 
-    workers: WorkersOption = 2
+    workers: options.WorkersOption = 2
 
 
 @app.command()
-@grouped_options
+@options.grouped_options
 def render(
     *,
     processes: RenderWorkers,
@@ -47,8 +48,8 @@ def render(
     crops: Annotated[
         int | None, typer.Option(metavar="PIXELS", help="Also write crops of this size, for image networks.")
     ] = None,
-    mesh_scale: MeshScaleOption = 1.0,
-    quiet: QuietOption = False,
+    mesh_scale: options.MeshScaleOption = 1.0,
+    quiet: options.QuietOption = False,
 ) -> None:
     """Render views of meshes to a dataset for `train --dataset`. An interrupted rendering resumes.
 

@@ -13,7 +13,8 @@ import typer
 
 from thor2_jax.errors import InputError
 from thor2_jax.recordings.topics import Topics
-from training.cli.app import AllowHostOption, ModelOption, UnknownOption, app, finish
+from training.cli import options
+from training.cli.app import app, finish
 
 if TYPE_CHECKING:
     from thor2_jax.recordings.recorded_frames import RecordedFrame
@@ -24,7 +25,7 @@ NOTICE_SECONDS = 1.0
 
 @app.command()
 def watch(
-    model: ModelOption,
+    model: options.ModelOption,
     bag: Annotated[Path | None, typer.Option(help="ROS 1 bag, ROS 2 bag or MCAP (extra bags).")] = None,
     folder: Annotated[Path | None, typer.Option(help="Folder of frames.")] = None,
     realsense: Annotated[bool, typer.Option("--realsense", help="A RealSense camera (extra realsense).")] = False,
@@ -37,10 +38,10 @@ def watch(
     color_topic: Annotated[str | None, typer.Option(help="Colour images of the bag.")] = None,
     depth_topic: Annotated[str | None, typer.Option(help="Aligned depth images of the bag.")] = None,
     camera_topic: Annotated[str | None, typer.Option(help="camera_info of the bag.")] = None,
-    unknown_below: UnknownOption = None,
+    unknown_below: options.UnknownOption = None,
     answer_by: Annotated[str | None, typer.Option(help="classifiers, gallery or both.")] = None,
     host: Annotated[str, typer.Option(help="Address to listen on; 0.0.0.0 for other machines.")] = "127.0.0.1",
-    allow_host: AllowHostOption = None,
+    allow_host: options.AllowHostOption = None,
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port; 0 selects a free one.")] = 8090,
 ) -> None:
     """Show the recognized objects of a recording or a camera on a live page, until Ctrl-C.
