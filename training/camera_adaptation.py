@@ -14,7 +14,7 @@ from thor2_jax.model.run_record import RUN_FILE
 from thor2_jax.recognizer import Recognizer
 from training.readers.frame_files import FrameSource
 
-__all__ = ["adapt_run", "write_adapted_run"]
+__all__ = ["adapt_run"]
 
 UNFINISHED = ("checkpoints", "views", ".*")
 """Names in a run directory that are not copied."""
@@ -22,6 +22,8 @@ UNFINISHED = ("checkpoints", "views", ".*")
 
 def adapt_run(model: Path, sources: Sequence[FrameSource], out: Path, report: Report) -> Adaptation:
     """Estimate a camera's colour transform and write a run directory that corrects colours by it.
+
+    It is a copy of the run with the transform in its record, and appears under its name when it is complete.
 
     Args:
         model: run directory; a colour transform that it has is replaced.
@@ -44,20 +46,7 @@ def adapt_run(model: Path, sources: Sequence[FrameSource], out: Path, report: Re
             yield frame
 
     adaptation = recognizer.adapt(frames(), report)
-    write_adapted_run(model, adaptation, out)
-    return adaptation
-
-
-def write_adapted_run(model: Path, adaptation: Adaptation, out: Path) -> None:
-    """Copy a run directory and store a colour transform in the copy's record.
-
-    The copy appears under its name when it is complete.
-
-    Raises:
-        InputError: `out` is not empty.
-        OSError: a file cannot be read or written; nothing is left behind.
-    """
-    check_output_directory(out)
+    check_output_directory(out)  # another process may have been quicker
     out = out.resolve()
     out.parent.mkdir(parents=True, exist_ok=True)
     with temporary_directory(out.parent) as unfinished:
@@ -70,3 +59,4 @@ def write_adapted_run(model: Path, adaptation: Adaptation, out: Path) -> None:
         }
         (run / RUN_FILE).write_text(json.dumps(description, indent=2) + "\n")
         run.rename(out)
+    return adaptation

@@ -35,7 +35,7 @@ from training.reports.html import Picture, Section, write_page
 from training.reports.object_plots import draw_descriptor, draw_objects
 from training.reports.plots import draw_accuracy, draw_confusion, draw_curves
 from training.storage.jobs import check_same_job
-from training.storage.progress import Progress
+from training.storage.progress import Progress, of_stage
 from training.storage.workers import local_workers
 from training.train_job import TrainJob
 from training.views.dataset import remove_views
@@ -80,10 +80,7 @@ class DemoSummary:
 
 
 def run_demo(
-    out: str | Path,
-    seed: int = 0,
-    progress: Progress = lambda stage, done, total, note: None,
-    workers: int = 1,
+    out: str | Path, seed: int = 0, progress: Progress = lambda stage, done, total, note: None, workers: int = 1
 ) -> DemoSummary:
     """Train on the built-in objects, recognize scenes of them and write a report. An interrupted demo resumes.
 
@@ -113,7 +110,8 @@ def run_demo(
     (run,) = load_runs([out / "run"])
     answers = _answer_scenes(run, scenes, progress)
     report = compute_results("demo", [run], answers)
-    subsets = dict(_subsets(report))
+    cells = [cell for table in report["accuracy"][report["rule"]] for cell in table["cells"]]
+    subsets = {" ".join(f"{name} {value}" for name, value in cell["where"].items()) or "all": cell for cell in cells}
     accuracy = {subset: [cell["accuracy"][name]["mean"] for name in NAMES] for subset, cell in subsets.items()}
     counts = {subset: cell["instances"] for subset, cell in subsets.items()}
 
@@ -141,16 +139,9 @@ def _train(objects: Mapping[str, TexturedMesh], out: Path, seed: int, progress: 
         run = load_run(out)
         check_same_job(out, {"seed": run.record["seed"]}, {"seed": seed})
     else:
-        dataset = render_dataset(
-            objects,
-            out / VIEWS,
-            PROTOCOL.azimuth_step,
-            PROTOCOL.polar_step,
-            progress=lambda done, total: progress("render views", done, total, ""),
-            augmentations=PROTOCOL.augmentations,
-            seed=seed,
-            pool=local_workers(workers),
-        )
+        steps, show = (PROTOCOL.azimuth_step, PROTOCOL.polar_step), of_stage(progress, "render views")
+        pool = local_workers(workers)
+        dataset = render_dataset(objects, out / VIEWS, *steps, pool, show, PROTOCOL.augmentations, seed)
         settings = TrainJob(out, PROTOCOL.replace(seed=seed), classifiers=FEATURES).settings
         (run,) = train_run(dataset, out, settings, progress)
     remove_views(out / VIEWS)
@@ -181,12 +172,6 @@ def _answer_scenes(run: Run, scenes: Sequence[Scene], progress: Progress) -> lis
     return grouped
 
 
-def _subsets(report: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]]:
-    for table in report["accuracy"][report["rule"]]:
-        for cell in table["cells"]:
-            yield " ".join(f"{name} {value}" for name, value in cell["where"].items()) or "all", cell
-
-
 def _instances(run: Run, answers: Sequence[FrameAnswers]) -> Iterator[dict[str, Any]]:
     """Yield the answers of every fusion for each instance."""
     for frame in answers:
@@ -214,44 +199,38 @@ def _write_report(out: Path, summary: DemoSummary, n_objects: int, n_views: int)
         [subset, str(summary.instances[subset]), *(f"{value:.3f}" for value in values)]
         for subset, values in summary.accuracy.items()
     ]
-    caption = "Outline, recognized object, confidence and the more confident classifier."
-    scenes = [Picture(f"pictures/scene-{number}.png", caption, half=True) for number in range(N_SHOWN)]
-    write_page(
-        out / "report.html",
-        title="THOR2 on built-in objects",
-        lead=(
-            f"Trained on {n_views:,} synthetic views of {n_objects} objects, evaluated on {N_SCENES} cluttered scenes "
-            "as ten simulated cameras see them: with other light and colours, colour shifted against depth, noise and "
-            "holes in depth, and masks that are too small or too large. "
-            f"{summary.seconds:.0f} s, {summary.peak_gib:.1f} GiB of memory."
-        ),
-        sections=[
-            Section(
-                "Accuracy",
-                "Fraction of the instances that are recognized correctly. CE uses colour only, TOPS shape only, TOPS2 "
-                "both; THOR2 is the fusion of TOPS and TOPS2. Occlusion is low if 5 to 30 % of an object are hidden, "
-                "and high if more are.",
-                (header, rows),
-                [Picture("pictures/accuracy.png", "Accuracy by occlusion.")],
-            ),
-            Section("Scenes", "Recognition results in the first scenes.", pictures=scenes),
-            Section(
-                "Objects",
-                "Some objects differ from another one in colour only, some in shape only.",
-                pictures=[Picture("pictures/objects.png", "The objects, as rendered for training.")],
-            ),
-            Section(
-                "From a view to its descriptor",
-                "Left: the point cloud and its slices. Top: the persistence image of each slice (shape). Bottom: the "
-                "colour vectors of the strips of each slice.",
-                pictures=[Picture("pictures/descriptor.png", "One view of the blue mug.")],
-            ),
-            Section(
-                "Confusions and training",
-                pictures=[
-                    Picture("pictures/confusion.png", "Confusion matrix of THOR2 in the scenes.", half=True),
-                    Picture("pictures/training.png", "Loss and accuracy on the training views.", half=True),
-                ],
-            ),
-        ],
+
+    def picture(name: str, caption: str, half: bool = False) -> Picture:
+        return Picture(f"pictures/{name}.png", caption, half)
+
+    lead = (
+        f"Trained on {n_views:,} synthetic views of {n_objects} objects, evaluated on {N_SCENES} cluttered scenes "
+        "as ten simulated cameras see them: with other light and colours, colour shifted against depth, noise and "
+        "holes in depth, and masks that are too small or too large. "
+        f"{summary.seconds:.0f} s, {summary.peak_gib:.1f} GiB of memory."
     )
+    accuracy = (
+        "Fraction of the instances that are recognized correctly. CE uses colour only, TOPS shape only, TOPS2 "
+        "both; THOR2 is the fusion of TOPS and TOPS2. Occlusion is low if 5 to 30 % of an object are hidden, "
+        "and high if more are."
+    )
+    descriptor = (
+        "Left: the point cloud and its slices. Top: the persistence image of each slice (shape). Bottom: the "
+        "colour vectors of the strips of each slice."
+    )
+    differences = "Some objects differ from another one in colour only, some in shape only."
+    caption = "Outline, recognized object, confidence and the more confident classifier."
+    view = picture("descriptor", "One view of the blue mug.")
+    scenes = [picture(f"scene-{number}", caption, half=True) for number in range(N_SHOWN)]
+    fit = [
+        picture("confusion", "Confusion matrix of THOR2 in the scenes.", half=True),
+        picture("training", "Loss and accuracy on the training views.", half=True),
+    ]
+    sections = [
+        Section("Accuracy", accuracy, (header, rows), [picture("accuracy", "Accuracy by occlusion.")]),
+        Section("Scenes", "Recognition results in the first scenes.", pictures=scenes),
+        Section("Objects", differences, pictures=[picture("objects", "The objects, as rendered for training.")]),
+        Section("From a view to its descriptor", descriptor, pictures=[view]),
+        Section("Confusions and training", pictures=fit),
+    ]
+    write_page(out / "report.html", title="THOR2 on built-in objects", lead=lead, sections=sections)

@@ -30,7 +30,7 @@ from training.readers.frames import FrameFolder
 from training.storage.progress import Progress
 from training.views.mesh_views import ViewTask, render_task
 
-__all__ = ["SkippedInstance", "enroll_objects", "labelled_views", "mesh_views"]
+__all__ = ["enroll_objects", "labelled_views", "mesh_views"]
 
 MESH_VIEWS = 60
 """Cameras around a mesh. Each gives two views: the mesh as rendered, and an augmented rendering from another camera."""
@@ -54,36 +54,14 @@ def mesh_views(mesh: Path | TexturedMesh, mesh_scale: float = 1.0) -> list[Prepa
         InputError: the mesh cannot be read, is too large or too small to be in metres, or has no usable view.
         OSError: the file cannot be opened.
     """
-    name = mesh.name if isinstance(mesh, Path) else "mesh"
-    task = ViewTask(
-        name,
-        load_mesh(mesh, mesh_scale) if isinstance(mesh, Path) else mesh,
-        _evenly_spread(MESH_VIEWS),
-        0,
-        dataclasses.replace(AUGMENTATIONS, copies=1),
-    )
-    views = [
-        PreparedInstance(number, cloud.xyz, cloud.rgb, np.zeros(len(cloud.xyz), bool))
-        for number, cloud in enumerate(render_task(task))
-    ]
+    name, loaded = (mesh.name, load_mesh(mesh, mesh_scale)) if isinstance(mesh, Path) else ("mesh", mesh)
+    augmentations = dataclasses.replace(AUGMENTATIONS, copies=1)
+    task = ViewTask(name, loaded, _evenly_spread(MESH_VIEWS), augmentations=augmentations)
+    clouds = enumerate(render_task(task))
+    views = [PreparedInstance(k, cloud.xyz, cloud.rgb, np.zeros(len(cloud.xyz), bool)) for k, cloud in clouds]
     if not views:
         raise InputError(f"mesh: {name} has too few points in every view; expected an object of a few centimetres")
     return views
-
-
-@dataclasses.dataclass(frozen=True)
-class SkippedInstance:
-    """A labelled instance that cannot be used, or frames without labels.
-
-    Attributes:
-        frame: identifier of its frame; empty for frames without labels.
-        name: name of the object; empty for frames without labels.
-        reason: why it cannot be used.
-    """
-
-    frame: str
-    name: str
-    reason: str
 
 
 def labelled_views(
@@ -92,8 +70,10 @@ def labelled_views(
     label_name: str | None = None,
     instance: int | None = None,
     on_view: Callable[[RGBDFrame, int, str], object] = lambda frame, label, name: None,
-) -> tuple[dict[str, list[PreparedInstance]], list[SkippedInstance]]:
-    """Return object -> its views in frames, and the instances that cannot be used.
+) -> tuple[dict[str, list[PreparedInstance]], list[tuple[str, str]]]:
+    """Return object -> its views in frames, and (object, reason) of each instance that cannot be used.
+
+    The object is empty for frames without labels.
 
     Args:
         frames: the frames.
@@ -107,9 +87,7 @@ def labelled_views(
             `check_name` refuses are skipped.
     """
     views: dict[str, list[PreparedInstance]] = {}
-    skipped: list[SkippedInstance] = []
-    if frames.note:
-        skipped.append(SkippedInstance("", "", frames.note))
+    skipped = [("", frames.note)] if frames.note else []
     for item in frames:
         labels: list[tuple[int | None, str]] = [*sorted(item.truth.items())]
         if label_name is not None:
@@ -124,14 +102,14 @@ def labelled_views(
                     of_object.append(instance_view(item.frame, label, sigma_s))
                     on_view(item.frame, of_object[-1].label, name)
             except InputError as error:
-                skipped.append(SkippedInstance(item.identifier, name, str(error)))
+                skipped.append((name, str(error)))
     empty = [name for name, of_object in views.items() if not of_object]
     if empty:
-        reason = next(instance.reason for instance in skipped if instance.name == empty[0])
+        reason = next(reason for name, reason in skipped if name == empty[0])
         raise InputError(f"frames: {empty[0]!r} has no usable view ({reason})")
     if not views:
         if skipped:
-            raise InputError(f"frames: {skipped[0].reason}")
+            raise InputError(f"frames: {skipped[0][1]}")
         wanted = "an object" if label_name is None else repr(label_name)
         raise InputError(f"frames: no frame has a label for {wanted}; see labels.json, or give --instance")
     return views, skipped

@@ -21,15 +21,8 @@ from thor2_jax.errors import InputError, with_context
 from thor2_jax.files import write_text
 from thor2_jax.frames.frames import MAX_DEPTH, MIN_DEPTH, RGBDFrame
 from thor2_jax.frames.instance_clouds import unit_question
+from thor2_jax.model import result_files
 from thor2_jax.model.answers import Recognition
-from thor2_jax.model.result_files import (
-    BOP_HEADER,
-    bop_lines,
-    category_numbers,
-    coco_results,
-    image_numbers,
-    instances_as_json,
-)
 from thor2_jax.recognizer import Recognizer
 from thor2_jax.recordings.recorded_frames import RecordedFrame
 from thor2_jax.segmentation.segmenters import Segmenter, segmented
@@ -74,7 +67,7 @@ class FrameAnswer:
         """Return {"frame", "instances"}, or {"frame", "error"}."""
         if self.error is not None:
             return {"frame": self.name, "error": self.error}
-        return {"frame": self.name, "instances": instances_as_json(self.recognitions)}
+        return {"frame": self.name, "instances": result_files.instances_as_json(self.recognitions)}
 
 
 def recognize_frames(recognizer: Recognizer, sources: Iterable[FrameSource]) -> Iterator[FrameAnswer]:
@@ -191,8 +184,8 @@ class ResultTables:
             classes: names of all objects.
             names: number -> name, see `category_numbers`.
         """
-        self._categories = category_numbers(classes, names)
-        self._images = dict(zip(frames, image_numbers(frames), strict=True))
+        self._categories = result_files.category_numbers(classes, names)
+        self._images = dict(zip(frames, result_files.image_numbers(frames), strict=True))
         scenes = {scene for scene, _ in self._images.values()}
         # COCO has no scenes: images of several scenes are counted from 1.
         numbers = [image for _, image in self._images.values()] if len(scenes) == 1 else range(1, len(frames) + 1)
@@ -207,11 +200,10 @@ class ResultTables:
             return
         named = [r.name for r in answer.recognitions if r.name is not None]
         self.n_without_number += sum(name not in self._categories for name in named)
-        image = self._coco_images[answer.name]
-        self._coco += coco_results(answer.name, image, answer.frame, answer.recognitions, self._categories)
-        self._bop += bop_lines(
-            *self._images[answer.name], answer.frame, answer.recognitions, self._categories, answer.seconds
-        )
+        recognized = answer.frame, answer.recognitions, self._categories
+        self._coco += result_files.coco_results(answer.name, self._coco_images[answer.name], *recognized)
+        scene, image = self._images[answer.name]
+        self._bop += result_files.bop_lines(scene, image, *recognized, answer.seconds)
 
     def write(self, coco: Path | None = None, bop: Path | None = None) -> None:
         """Write the files that are wanted, COCO results in JSON and BOP results in CSV, and create their directories.
@@ -219,7 +211,7 @@ class ResultTables:
         Raises:
             OSError: a file cannot be written.
         """
-        contents = {coco: json.dumps(self._coco), bop: "\n".join([BOP_HEADER, *self._bop])}
+        contents = {coco: json.dumps(self._coco), bop: "\n".join([result_files.BOP_HEADER, *self._bop])}
         for path, content in contents.items():
             if path is not None:
                 path.parent.mkdir(parents=True, exist_ok=True)

@@ -19,7 +19,7 @@ from thor2_jax.printable import normal_name
 from training.baselines.job import check_weights, pretrained_files, train_baselines
 from training.baselines.names import check_baselines, crop_size
 from training.embedding.run_embedding import Distractors
-from training.enrollment import SkippedInstance, labelled_views
+from training.enrollment import labelled_views
 from training.fitting.job import VIEWS, RunSettings, check_out, check_trained, finished_record, is_finished, train_run
 from training.fitting.protocol import DEFAULT, PAPER, Protocol
 from training.objects.mesh import TexturedMesh
@@ -47,12 +47,12 @@ class LabelledInstances(NamedTuple):
 
     Attributes:
         views: object -> its usable instances.
-        skipped: the others.
+        skipped: object and reason of each of the others.
         crops: object -> the crops of its usable instances; None if no baseline reads them.
     """
 
     views: Mapping[str, Sequence[PreparedInstance]]
-    skipped: Sequence[SkippedInstance]
+    skipped: Sequence[tuple[str, str]]
     crops: Mapping[str, Sequence[QuantizedCrop]] | None
 
 
@@ -201,20 +201,13 @@ def _check_finished_views(job: TrainJob, labelled: LabelledInstances | None) -> 
     """
     record = finished_record(job.out)
     protocol, left_out = job.protocol, sorted(set(job.leave_out))
-    requested = dataset_job(
-        _find_meshes(job), protocol.azimuth_step, protocol.polar_step, protocol.augmentations, protocol.fit.seed
-    )
-    stored = record["dataset"]
+    steps = protocol.azimuth_step, protocol.polar_step
+    dataset = dataset_job(_find_meshes(job), *steps, protocol.augmentations, protocol.fit.seed)
     frames = digest_of_instances(labelled.views) if labelled else None
-    check_same_job(
-        job.out,
-        {
-            "dataset": stored.get("job"),
-            "frames": stored.get("frames", {}).get("digest"),
-            "leave_out": stored.get("classes_left_out", []),
-        },
-        {"dataset": requested, "frames": frames, "leave_out": left_out},
-    )
+    requested = {"dataset": dataset, "frames": frames, "leave_out": left_out}
+    stored, of_frames = record["dataset"], record["dataset"].get("frames", {}).get("digest")
+    trained = {"dataset": stored.get("job"), "frames": of_frames, "leave_out": stored.get("classes_left_out", [])}
+    check_same_job(job.out, trained, requested)
     if job.baselines:
         return
     check_trained(stored["digest"], job.out, job.settings)
@@ -296,21 +289,15 @@ def _open_views(job: TrainJob, labelled: LabelledInstances | None, display: Disp
     source: ViewSource | None = None if job.dataset is None else ViewDataset.open(job.dataset)
     _check_names(job, source.classes if source else list(meshes), labelled)
     if meshes:
-        source = _render(job, meshes, display)
+        protocol, workers, size = job.protocol, local_workers(job.workers), _crop_size(job)
+        steps, drawn = (protocol.azimuth_step, protocol.polar_step), (protocol.augmentations, protocol.fit.seed)
+        with display() as shown:
+            progress = numbered(shown, _stages(job))
+            source = render_dataset(meshes, job.out / VIEWS, *steps, workers, of_stage(progress, RENDER), *drawn)
+            if size is not None:
+                render_crops(meshes, source, size, workers, of_stage(progress, RENDER_CROPS), *drawn)
     if labelled is not None:
-        reasons = [instance.reason for instance in labelled.skipped]
+        reasons = [reason for _, reason in labelled.skipped]
         source = WithLabelledViews(labelled.views, job.protocol.config, source, reasons, labelled.crops)
     assert source is not None
     return source
-
-
-def _render(job: TrainJob, meshes: Mapping[str, Path | TexturedMesh], display: Display) -> ViewDataset:
-    protocol, workers, size = job.protocol, local_workers(job.workers), _crop_size(job)
-    steps, augmentations, seed = (protocol.azimuth_step, protocol.polar_step), protocol.augmentations, protocol.fit.seed
-    with display() as shown:
-        progress = numbered(shown, _stages(job))
-        render = of_stage(progress, RENDER)
-        dataset = render_dataset(meshes, job.out / VIEWS, *steps, workers, render, augmentations, seed)
-        if size is not None:
-            render_crops(meshes, dataset, size, workers, of_stage(progress, RENDER_CROPS), augmentations, seed)
-    return dataset

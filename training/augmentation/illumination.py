@@ -63,10 +63,8 @@ def relit(view: RenderedView, light: Illumination, rng: np.random.Generator) -> 
     pixels = np.flatnonzero(view.depth)
     if len(pixels) == 0:
         return view
-    gamma, gain, shading, saturation, veil, noise = (
-        rng.uniform(*drawn)
-        for drawn in (light.gamma, light.gain, light.shading, light.saturation, light.veil, light.noise)
-    )
+    ranges = light.gamma, light.gain, light.shading, light.saturation, light.veil, light.noise
+    gamma, gain, shading, saturation, veil, noise = (rng.uniform(*drawn) for drawn in ranges)
     cast = rng.uniform(1 - light.cast, 1 + light.cast, 3)
     response = ((np.arange(256) / 255) ** gamma).astype(np.float32)
     # Gain, cast, saturation and veil are one matrix: the grey of a pixel is the same in all columns.

@@ -79,13 +79,9 @@ def _widened(view: RenderedView, margin: int) -> RenderedView:
     for first, length, size in zip(view.corner, view.depth.shape, (camera.height, camera.width), strict=True):
         sides.append((min(margin, first), max(0, min(margin, size - first - length))))
     (top, _), (left, _) = sides
-    return RenderedView(
-        np.pad(view.color, (*sides, (0, 0))),
-        np.pad(view.depth, sides),
-        Intrinsics(k.fx, k.fy, k.cx + left, k.cy + top, k.depth_scale),
-        view.pose,
-        (view.corner[0] - top, view.corner[1] - left),
-    )
+    color, depth = np.pad(view.color, (*sides, (0, 0))), np.pad(view.depth, sides)
+    intrinsics = Intrinsics(k.fx, k.fy, k.cx + left, k.cy + top, k.depth_scale)
+    return RenderedView(color, depth, intrinsics, view.pose, (view.corner[0] - top, view.corner[1] - left))
 
 
 def _background(

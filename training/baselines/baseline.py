@@ -13,18 +13,19 @@ import optax  # type: ignore[import-untyped]
 from flax import nnx
 from numpy.typing import NDArray
 
-from colornet import ColorNetwork
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.view_normalization import view_normalize
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.model.answers import DescribedFrame
+from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.types import PointClouds
 from training.fitting.calibration import fit_temperature
 from training.fitting.checkpoints import Checkpoints
 from training.fitting.loop import Steps, run_epochs
 from training.fitting.options import EpochMetrics, FitOptions
 from training.fitting.samples import fold_of_views
+from training.fitting.steps import FitState
 from training.views.crops import ViewCrops, quantized, rgbd_crop, stacked
 from training.views.normalized_views import ViewSource
 
@@ -86,34 +87,34 @@ class FitTask:
     """Data and options for fitting a baseline.
 
     Attributes:
+        name: name of the baseline.
         source: views of the run.
-        network: colour network of the run.
-        config: descriptor configuration of the run.
+        run: the run. Its fold is held out; nothing is if it is the only one.
         options: options of the fit.
-        folds: number of folds that the views are split into.
-        fold: index of the held-out fold; nothing is held out if `folds` is 1.
-        scratch: directory for checkpoints, so that an interrupted fit can resume.
-        run: directory of the run.
+        directory: directory of the run.
         weights: directory of pretrained weights; None trains networks from scratch.
         progress: called with (stage, done, total, note).
     """
 
+    name: str
     source: ViewSource
-    network: ColorNetwork
-    config: DescriptorConfig
+    run: TrainedRun
     options: FitOptions
-    folds: int
-    fold: int
-    scratch: Path
-    run: Path
+    directory: Path
     weights: Path | None
     progress: Callable[[str, int, int, str], object]
 
+    @property
+    def scratch(self) -> Path:
+        """Directory for checkpoints, so that an interrupted fit can resume."""
+        return self.directory / "baselines" / f".{self.name}"
+
     def held_out(self, label: Integers, view: Integers) -> NDArray[np.bool_]:
         """Return which clouds [M] are held out, given class index and view number: the same views as in the run."""
-        if self.folds == 1:
+        folds = self.run.record["folds"]
+        if folds == 1:
             return np.zeros(len(label), bool)
-        return fold_of_views(label, view, self.source.classes, self.folds, self.options.seed) == self.fold
+        return fold_of_views(label, view, self.source.classes, folds, self.options.seed) == self.run.record["fold"]
 
     def temperature(
         self, label: Integers, held_out: NDArray[np.bool_], predict: Callable[[], NDArray[np.float32]]
@@ -147,7 +148,6 @@ class NetworkFit(NamedTuple):
     """How a network is fitted.
 
     Attributes:
-        name: name of the baseline.
         directory: directory of its checkpoints.
         draw: function of the rows of a batch and a generator that returns the batch, a tuple of arrays.
         inputs: function of these arrays that returns the arguments of the network. Static.
@@ -156,7 +156,6 @@ class NetworkFit(NamedTuple):
         rate: function of the number of a step and the number of all steps.
     """
 
-    name: str
     directory: str
     draw: Callable[[NDArray[np.intp], np.random.Generator], tuple[Any, ...]]
     inputs: Callable[..., tuple[Any, ...]]
@@ -165,23 +164,17 @@ class NetworkFit(NamedTuple):
     rate: Callable[[int, int], float]
 
 
-class _State(NamedTuple):
-    params: Any
-    statistics: Any
-    optimizer: Any
-
-
 @functools.partial(jax.jit, static_argnums=(0, 1, 2), donate_argnums=3)
-def _step(graph: Any, inputs: Any, optimizer: Any, state: _State, batch: Any, label: Any, rate: Any) -> Any:
+def _step(graph: Any, inputs: Any, optimizer: Any, state: FitState, batch: Any, label: Any, rate: Any) -> Any:
     def loss_of(params: Any) -> Any:
-        model = nnx.merge(graph, params, state.statistics, copy=True)  # batch normalizations change their statistics
+        model = nnx.merge(graph, params, state.rest, copy=True)  # batch normalizations change their statistics
         logits = model(*inputs(*batch))
         loss = optax.softmax_cross_entropy_with_integer_labels(logits, label).mean()
         return loss, (nnx.state(model, nnx.BatchStat), (logits.argmax(axis=1) == label).mean())
 
     (loss, (statistics, accuracy)), gradients = jax.value_and_grad(loss_of, has_aux=True)(state.params)
     updates, moments = optimizer(rate).update(gradients, state.optimizer, state.params)
-    return _State(optax.apply_updates(state.params, updates), statistics, moments), loss, accuracy
+    return FitState(optax.apply_updates(state.params, updates), statistics, moments), loss, accuracy
 
 
 def fit_network(
@@ -196,7 +189,7 @@ def fit_network(
     steps = Steps(task.options.epochs, n_samples // batch_size, batch_size)
     split: Any = nnx.split(model, nnx.Param, nnx.BatchStat)
     graph, params, statistics = split
-    leaves, structure = jax.tree.flatten(_State(params, statistics, fit.optimizer(0.0).init(params)))
+    leaves, structure = jax.tree.flatten(FitState(params, statistics, fit.optimizer(0.0).init(params)))
 
     def epoch(number: int) -> Iterator[tuple[Any, Integers]]:
         rng = np.random.default_rng((task.options.seed, number - 1))
@@ -210,12 +203,12 @@ def fit_network(
         return jax.tree.leaves(state), metrics
 
     def report(done: int, total: int, metrics: EpochMetrics) -> None:
-        task.progress(f"fit {fit.name}", done, total, f"epoch {metrics.epoch}, accuracy {metrics.accuracy:.3f}")
+        task.progress(f"fit {task.name}", done, total, f"epoch {metrics.epoch}, accuracy {metrics.accuracy:.3f}")
 
     with Checkpoints(task.scratch / fit.directory) as checkpoints:
-        leaves = run_epochs(fit.name, leaves, steps, epoch, step, checkpoints, progress=report)
+        leaves = run_epochs(task.name, leaves, steps, epoch, step, checkpoints, progress=report)
     state = jax.tree.unflatten(structure, leaves)
-    return nnx.merge(graph, state.params, state.statistics)
+    return nnx.merge(graph, state.params, state.rest)
 
 
 def in_batches(function: Callable[..., Any], size: int, *arrays: NDArray[Any]) -> NDArray[np.float32]:

@@ -96,13 +96,13 @@ def tree_arrays(forest: RandomForestClassifier) -> dict[str, NDArray[Any]]:
     root = np.concatenate([[0], np.cumsum([tree.node_count for tree in trees])[:-1]]).astype(np.int32)
 
     def children(name: str) -> NDArray[np.int32]:
-        indices = [getattr(tree, name) for tree in trees]
-        return np.concatenate([np.where(i < 0, -1, i + first) for i, first in zip(indices, root, strict=True)])
+        indices = zip((getattr(tree, name) for tree in trees), root, strict=True)
+        return np.concatenate([np.where(i < 0, -1, i + first) for i, first in indices]).astype(np.int32)
 
     counts = np.concatenate([tree.value[:, 0] for tree in trees])
     return {
-        "left": children("children_left").astype(np.int32),
-        "right": children("children_right").astype(np.int32),
+        "left": children("children_left"),
+        "right": children("children_right"),
         "feature": np.concatenate([tree.feature for tree in trees]).astype(np.int16),
         "threshold": np.concatenate([tree.threshold for tree in trees]),
         "shares": (counts / counts.sum(axis=1, keepdims=True)).astype(np.float32),
@@ -119,18 +119,18 @@ def fit_forest(task: FitTask) -> FittedBaseline:
     )
     forest.fit(x[~held_out], y[~held_out])
     task.progress("grow forest", 1, 1, f"{TREES} trees")
-    model = Forest(tree_arrays(forest), task.network, task.config)
+    model = Forest(tree_arrays(forest), task.run.network, task.run.config)
     return FittedBaseline(model, task.temperature(y, held_out, lambda: model.predict(x[held_out])))
 
 
 def _features_of_views(task: FitTask) -> tuple[NDArray[np.float32], NDArray[np.intp], NDArray[np.intp]]:
     """Return features, class index and view number of every view in every mirror."""
-    features, label, view = [], [], []
+    features, label, view, run = [], [], [], task.run
     for index, _, of_shard in task.shards("measure for forest", "views"):
         views, first = task.source.read(index), 0
         for count, normal in padded_batches(views.clouds(), VIEWS_PER_BATCH):
             for axes in MIRRORS:
-                features.append(forest_features(mirror(normal, axes), task.network, task.config)[:count])
+                features.append(forest_features(mirror(normal, axes), run.network, run.config)[:count])
                 label.append(np.full(count, of_shard))
                 view.append(views.view[first : first + count])
             first += count

@@ -18,7 +18,7 @@ from training.baselines.networks.architectures import ARCHITECTURES, network_inp
 from training.baselines.networks.weights import load_weights
 from training.views.crops import ViewCrops
 
-__all__ = ["CropSamples", "ImageNetwork", "fit_image_network", "read_samples"]
+__all__ = ["ImageNetwork", "fit_image_network", "read_samples"]
 
 INFERENCE_BATCH = 8
 """Crops that a network reads at a time, about the instances of a frame: one compiled program for all."""
@@ -30,22 +30,21 @@ def _probabilities(graph: Any, state: Any, color: Any, normals: Any) -> jax.Arra
 
 
 class ImageNetwork:
-    """A trained network of `ARCHITECTURES`."""
+    """A trained network of `ARCHITECTURES`.
+
+    Attributes:
+        model: the network, in evaluation mode.
+    """
 
     def __init__(self, name: str, model: nnx.Module, n_classes: int) -> None:
         """Store the network called `name`."""
         model.eval()
-        self._model, self._size, self._n_classes = model, ARCHITECTURES[name].size, n_classes
-        self._graph, self._state = nnx.split(model)
-
-    @property
-    def model(self) -> nnx.Module:
-        """The network, in evaluation mode."""
-        return self._model
+        self.model, self._size, self._n_classes = model, ARCHITECTURES[name].size, n_classes
+        self._probabilities = partial(_probabilities, *nnx.split(model))
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return the weights and batch statistics by their paths."""
-        return model_arrays(self._model)
+        return model_arrays(self.model)
 
     @classmethod
     def with_arrays(cls, name: str, arrays: Mapping[str, NDArray[Any]], n_classes: int) -> "ImageNetwork":
@@ -60,16 +59,13 @@ class ImageNetwork:
         """Return class probabilities [B, C]; equal ones for padding rows."""
         values = np.full((len(inputs.tops), self._n_classes), 1 / self._n_classes, np.float32)
         crops = inputs.crops(self._size)
-        values[: len(crops)] = self.predict(crops)
+        if len(crops):
+            values[: len(crops)] = self.predict(crops)
         return values
 
     def predict(self, crops: ViewCrops) -> NDArray[np.float32]:
-        """Return class probabilities [V, C] of crops of the network's size."""
-        if not len(crops):
-            return np.zeros((0, self._n_classes), np.float32)
-        return in_batches(
-            partial(_probabilities, self._graph, self._state), INFERENCE_BATCH, crops.color, crops.normals
-        )
+        """Return class probabilities [V, C] of crops of the network's size; V is at least 1."""
+        return in_batches(self._probabilities, INFERENCE_BATCH, crops.color, crops.normals)
 
 
 BATCH_SIZE = 32
@@ -102,7 +98,7 @@ class CropSamples:
         return ViewCrops(self.crops.color[rows], self.crops.normals[rows])
 
 
-def read_samples(task: FitTask, name: str, size: int) -> CropSamples:
+def read_samples(task: FitTask, size: int) -> CropSamples:
     """Read the crops of all views into memory, 6 bytes for each of their pixels.
 
     Raises:
@@ -111,7 +107,7 @@ def read_samples(task: FitTask, name: str, size: int) -> CropSamples:
     shape = task.n_clouds, size, size, 3
     crops = ViewCrops(np.zeros(shape, np.uint8), np.zeros(shape, np.int8))
     label, view = np.zeros(task.n_clouds, np.int32), np.zeros(task.n_clouds, np.int32)
-    for index, rows, of_shard in task.shards(f"read for {name}", "crops"):
+    for index, rows, of_shard in task.shards(f"read for {task.name}", "crops"):
         read = task.source.read_crops(index, size)
         crops.color[rows], crops.normals[rows] = read.color, read.normals
         label[rows], view[rows] = of_shard, task.source.read(index).view
@@ -130,15 +126,7 @@ def _learning_rate(highest: float, number: int, n_steps: int) -> float:
     return float(highest * (1 + np.cos(np.pi * (progress - WARM_UP) / (1 - WARM_UP))) / 2)
 
 
-def _mirrored(crops: ViewCrops, rng: np.random.Generator) -> tuple[NDArray[np.uint8], NDArray[np.int8]]:
-    """Return copies of colour and normals, mirrored at random along x, with the x of the normals."""
-    flip = rng.random(len(crops)) < 0.5
-    color, normals = crops.color.copy(), crops.normals.copy()
-    color[flip], normals[flip] = color[flip, :, ::-1], normals[flip, :, ::-1] * np.array([-1, 1, 1], np.int8)
-    return color, normals
-
-
-def fit_image_network(task: FitTask, name: str) -> FittedBaseline:
+def fit_image_network(task: FitTask) -> FittedBaseline:
     """Fit a network of `ARCHITECTURES`; an interrupted fit resumes after its last epoch.
 
     An epoch uses as many crops as there are views, drawn from all their copies, each mirrored at random.
@@ -146,25 +134,27 @@ def fit_image_network(task: FitTask, name: str) -> FittedBaseline:
     Raises:
         InputError: the source has no crops, a file of weights does not fit, or the loss is not finite.
     """
-    architecture = ARCHITECTURES[name]
+    architecture = ARCHITECTURES[task.name]
     n_classes = len(task.source.classes)
     model: Any = architecture.build(n_classes, task.options.seed)
     files = [] if task.weights is None else load_weights(task.weights, architecture.backbones(model))
     weights = {path.name: file_digest(path) for path in files}
-    samples = read_samples(task, name, architecture.size)
+    samples = read_samples(task, architecture.size)
     held_out = task.held_out(samples.label, samples.view)
     n_views = len(np.unique(np.stack([samples.label, samples.view])[:, ~held_out], axis=1).T)
-    fit = NetworkFit(
-        name,
-        "pretrained" if weights else "scratch",
-        lambda rows, rng: _mirrored(samples.rows(rows), rng),
-        network_inputs,
-        BATCH_SIZE,
-        _optimizer,
-        partial(_learning_rate, PRETRAINED_RATE if weights else SCRATCH_RATE),
-    )
+    directory, rate = ("pretrained", PRETRAINED_RATE) if weights else ("scratch", SCRATCH_RATE)
+    schedule = partial(_learning_rate, rate)
+
+    def draw(rows: NDArray[np.intp], rng: np.random.Generator) -> tuple[NDArray[np.uint8], NDArray[np.int8]]:
+        """Return copies of colour and normals, mirrored at random along x, with the x of the normals."""
+        crops, flip = samples.rows(rows), rng.random(len(rows)) < 0.5  # fancy indices copy
+        crops.color[flip] = crops.color[flip, :, ::-1]
+        crops.normals[flip] = crops.normals[flip, :, ::-1] * np.array([-1, 1, 1], np.int8)
+        return crops.color, crops.normals
+
+    fit = NetworkFit(directory, draw, network_inputs, BATCH_SIZE, _optimizer, schedule)
     model.train()
     fitted = fit_network(task, fit, model, samples.label, np.flatnonzero(~held_out), n_views)
-    network = ImageNetwork(name, fitted, n_classes)
+    network = ImageNetwork(task.name, fitted, n_classes)
     temperature = task.temperature(samples.label, held_out, lambda: network.predict(samples.rows(held_out)))
     return FittedBaseline(network, temperature, weights)

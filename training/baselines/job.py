@@ -3,7 +3,6 @@
 import contextlib
 import time
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,7 +15,7 @@ from training.baselines.baseline import Baseline, FitTask, FittedBaseline
 from training.baselines.files import StoredBaseline, baseline_file, read_baseline, write_baseline
 from training.baselines.forest import Forest, fit_forest
 from training.baselines.image_network import ImageNetwork, fit_image_network
-from training.baselines.names import CLOUD_BASELINES, NETWORKS, TEMPLATES, check_baselines
+from training.baselines.names import BASELINES, CLOUD_BASELINES, NETWORKS, TEMPLATES, check_baselines
 from training.baselines.networks.architectures import ARCHITECTURES
 from training.baselines.networks.weights import load_weights, weights_file
 from training.baselines.pointnet import ColoredPointNet, fit_pointnet
@@ -27,13 +26,13 @@ from training.fitting.options import FitOptions
 from training.storage.progress import Progress
 from training.views.normalized_views import ViewSource
 
-__all__ = ["LoadedBaselines", "check_weights", "load_baselines", "pretrained_files", "train_baselines"]
+__all__ = ["check_weights", "load_baselines", "pretrained_files", "train_baselines"]
 
 _FIT: dict[str, Callable[[FitTask], FittedBaseline]] = {
     "thor": fit_thor,
     "forest": fit_forest,
     "pointnet": fit_pointnet,
-    **{name: partial(fit_image_network, name=name) for name in NETWORKS},
+    **dict.fromkeys(NETWORKS, fit_image_network),
     TEMPLATES: fit_templates,
 }
 
@@ -73,9 +72,11 @@ def train_baselines(
                 f"dataset: the views with digest {source.digest[:12]} are not those that {directory} was trained on; "
                 "give the dataset of that run"
             )
+        record, rates = run.record, tuple(run.record["learning_rates"])
+        own = FitOptions(record["epochs"], rates, record["batch_size"], record["seed"])
         for name in names:
             if not baseline_file(directory, name).is_file():
-                _train(directory, run, source, name, progress, options, weights)
+                _train(FitTask(name, source, run, options or own, directory, weights, progress))
             elif weights is not None and pretrained_files(name):
                 _check_pretrained(directory, run, name, weights)
 
@@ -84,55 +85,28 @@ def _check_pretrained(directory: Path, run: TrainedRun, name: str, weights: Path
     """Raise InputError if a trained baseline was not trained from these files of weights."""
     file = baseline_file(directory, name)
     paths = [weights_file(weights, each) for each in pretrained_files(name)]
-    if dict(read_baseline(file, run.classes).weights) != {path.name: file_digest(path) for path in paths}:
+    if read_baseline(file, run.classes).weights != {path.name: file_digest(path) for path in paths}:
         raise InputError(
             f"weights is {weights}, but {file} was trained without these files; delete it to train it again, or leave "
             "out weights"
         )
 
 
-def _train(
-    directory: Path,
-    run: TrainedRun,
-    source: ViewSource,
-    name: str,
-    progress: Progress,
-    options: FitOptions | None,
-    weights: Path | None,
-) -> None:
-    record = run.record
-    options = options or FitOptions(
-        record["epochs"], tuple(record["learning_rates"]), record["batch_size"], record["seed"]
-    )
-    file = baseline_file(directory, name)
+def _train(task: FitTask) -> None:
+    file, start = baseline_file(task.directory, task.name), time.perf_counter()
     remove_leftovers(file.parent)
-    scratch = file.with_name(f".{name}")
-    scratch.mkdir(parents=True, exist_ok=True)
-    start = time.perf_counter()
-    task = FitTask(
-        source=source,
-        network=run.network,
-        config=run.config,
-        options=options,
-        folds=record["folds"],
-        fold=record["fold"],
-        scratch=scratch,
-        run=directory,
-        weights=weights,
-        progress=progress,
-    )
+    task.scratch.mkdir(parents=True, exist_ok=True)
     try:
-        fitted = _FIT[name](task)
+        fitted = _FIT[task.name](task)
     except InputError:
         with contextlib.suppress(OSError):  # they stay with a checkpoint or another baseline
-            scratch.rmdir()
+            task.scratch.rmdir()
             file.parent.rmdir()
         raise
     seconds = time.perf_counter() - start
-    write_baseline(
-        file, StoredBaseline(fitted.model.arrays(), fitted.temperature, seconds, fitted.weights), run.classes
-    )
-    remove_written(scratch, r"[^/]+/(.*/)?[0-9]+/.*")  # checkpoints
+    stored = StoredBaseline(fitted.model.arrays(), fitted.temperature, seconds, fitted.weights)
+    write_baseline(file, stored, task.run.classes)
+    remove_written(task.scratch, r"[^/]+/(.*/)?[0-9]+/.*")  # checkpoints
 
 
 class LoadedBaselines(NamedTuple):
@@ -141,27 +115,23 @@ class LoadedBaselines(NamedTuple):
     Attributes:
         models: name -> baseline.
         temperatures: temperatures of those that were calibrated.
-        seconds: training times.
         weights: the files of pretrained weights that each was fitted from; empty if it was trained from scratch.
     """
 
     models: dict[str, Baseline]
     temperatures: dict[str, float]
-    seconds: dict[str, float]
     weights: dict[str, list[str]]
 
 
-def _network(name: str, arrays: Mapping[str, Any], run: TrainedRun) -> Baseline:
-    return ImageNetwork.with_arrays(name, arrays, len(run.classes))
-
-
-_BUILD: dict[str, Callable[[Mapping[str, Any], TrainedRun], Baseline]] = {
-    "thor": lambda arrays, run: THOR.with_arrays(arrays, run.config, len(run.classes)),
-    "forest": lambda arrays, run: Forest(arrays, run.network, run.config),
-    "pointnet": lambda arrays, run: ColoredPointNet.with_arrays(arrays, len(run.classes)),
-    **{name: partial(_network, name) for name in NETWORKS},
-    "templates": lambda arrays, run: Templates.with_arrays(arrays, len(run.classes)),
-}
+def _build(name: str, arrays: Mapping[str, Any], run: TrainedRun) -> Baseline:
+    n_classes = len(run.classes)
+    if name == "thor":
+        return THOR.with_arrays(arrays, run.config, n_classes)
+    if name == "forest":
+        return Forest(arrays, run.network, run.config)
+    if name in NETWORKS:
+        return ImageNetwork.with_arrays(name, arrays, n_classes)
+    return (Templates if name == TEMPLATES else ColoredPointNet).with_arrays(arrays, n_classes)
 
 
 def load_baselines(path: Path, run: TrainedRun) -> LoadedBaselines:
@@ -170,21 +140,20 @@ def load_baselines(path: Path, run: TrainedRun) -> LoadedBaselines:
     Raises:
         InputError: a file is damaged or does not match the run.
     """
-    loaded = LoadedBaselines({}, {}, {}, {})
-    for name, build in _BUILD.items():
-        file = baseline_file(path, name)
+    loaded = LoadedBaselines({}, {}, {})
+    for name, file in ((name, baseline_file(path, name)) for name in BASELINES):
         if not file.is_file():
             continue
         stored = read_baseline(file, run.classes)
         try:
-            loaded.models[name] = build(stored.arrays, run)
+            loaded.models[name] = _build(name, stored.arrays, run)
         except ValueError as error:
             raise InputError(
                 f"model: {file} does not match its run ({error}); delete it and train the baseline again"
             ) from None
         if stored.temperature is not None:
             loaded.temperatures[name] = stored.temperature
-        loaded.seconds[name], loaded.weights[name] = stored.seconds, sorted(stored.weights)
+        loaded.weights[name] = sorted(stored.weights)
     return loaded
 
 

@@ -4,15 +4,7 @@ from collections.abc import Sequence
 
 from thor2_jax.errors import InputError
 
-__all__ = [
-    "BASELINES",
-    "CLOUD_BASELINES",
-    "NETWORKS",
-    "TEMPLATES",
-    "TITLES",
-    "check_baselines",
-    "crop_size",
-]
+__all__ = ["BASELINES", "CLOUD_BASELINES", "NETWORKS", "TEMPLATES", "TITLES", "check_baselines", "crop_size"]
 
 CLOUD_BASELINES = ("thor", "forest", "pointnet")
 """Baselines on point clouds."""

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from thor2_jax.model.classifier import model_arrays, model_from_arrays
 from training.baselines.baseline import BaselineInputs, FitTask, FittedBaseline, NetworkFit, fit_network, in_batches
 
-__all__ = ["ColoredPointNet", "POINTS", "PointNet", "fit_pointnet", "point_features", "random_indices"]
+__all__ = ["ColoredPointNet", "POINTS", "PointNet", "fit_pointnet"]
 
 POINTS = 384
 """Points sampled from each cloud."""
@@ -68,8 +68,7 @@ class ColoredPointNet:
 
     def __init__(self, model: PointNet) -> None:
         """Store the network."""
-        self._model = model
-        self._graph, self._params = nnx.split(model)
+        self._model, self._probabilities = model, partial(_probabilities, *nnx.split(model))
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return the weights by their paths."""
@@ -95,12 +94,11 @@ class ColoredPointNet:
                 sample = random_indices(count, POINTS, np.random.default_rng(SAMPLING_SEED))
                 xyz[row], rgb[row] = points[row, sample], colors[row, sample] * 255
                 box[row] = points[row, :count].max(axis=0)
-        return np.asarray(_probabilities(self._graph, self._params, xyz, rgb, box))
+        return np.asarray(self._probabilities(xyz, rgb, box))
 
     def predict(self, xyz: NDArray[Any], rgb: NDArray[Any], box: NDArray[Any]) -> NDArray[np.float32]:
         """Return class probabilities [V, C] for sampled points [V, POINTS, 3], their colours and boxes [V, 3]."""
-        probabilities = partial(_probabilities, self._graph, self._params)
-        return in_batches(probabilities, INFERENCE_BATCH, xyz.astype(np.float32), rgb, box)
+        return in_batches(self._probabilities, INFERENCE_BATCH, xyz.astype(np.float32), rgb, box)
 
 
 STORED_POINTS = 2 * POINTS
@@ -132,13 +130,9 @@ class _Views(NamedTuple):
 
 def _read_views(task: FitTask) -> _Views:
     total = task.n_clouds
-    views = _Views(
-        np.zeros((total, STORED_POINTS, 3), np.float16),
-        np.zeros((total, STORED_POINTS, 3), np.uint8),
-        np.zeros((total, 3), np.float32),
-        np.zeros(total, np.int32),
-        np.zeros(total, np.int32),
-    )
+    xyz, rgb = (np.zeros((total, STORED_POINTS, 3), kind) for kind in (np.float16, np.uint8))
+    of_class, view = np.zeros((2, total), np.int32)
+    views = _Views(xyz, rgb, np.zeros((total, 3), np.float32), of_class, view)
     rng = np.random.default_rng(task.options.seed)
     for index, rows, label in task.shards("read for pointnet", "views"):
         normalized = task.source.read(index)
@@ -168,7 +162,7 @@ def fit_pointnet(task: FitTask) -> FittedBaseline:
     views = _read_views(task)
     held_out = task.held_out(views.label, views.view)
     rows = np.flatnonzero(~held_out)
-    fit = NetworkFit("pointnet", "fit", views.draw, _inputs, BATCH_SIZE, optax.adam, _learning_rate)
+    fit = NetworkFit("fit", views.draw, _inputs, BATCH_SIZE, optax.adam, _learning_rate)
     network = PointNet(len(task.source.classes), rngs=nnx.Rngs(task.options.seed))
     model = ColoredPointNet(fit_network(task, fit, network, views.label, rows, len(rows)))
     inputs = views.xyz[held_out, :POINTS], views.rgb[held_out, :POINTS], views.box[held_out]

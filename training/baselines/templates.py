@@ -25,7 +25,7 @@ from training.baselines.networks.vit import VIT_DINOV2_SMALL, ViT
 from training.baselines.networks.weights import load_weights
 from training.views.crops import ViewCrops
 
-__all__ = ["BACKBONES", "DINOV2", "Templates", "backbone_size", "create_backbone", "fit_templates"]
+__all__ = ["BACKBONES", "DINOV2", "Templates", "create_backbone", "fit_templates"]
 
 SHARPNESS = 20.0
 """Factor of the similarities before the softmax."""
@@ -77,13 +77,7 @@ class Templates:
         """
         model.eval()
         self._number, self._model, self._stored, self._label = number, model, features, label
-        self._n_classes = n_classes
-        self._graph, self._state = nnx.split(model)
-
-    @property
-    def size(self) -> int:
-        """Side of the crops, pixels."""
-        return backbone_size(BACKBONES[self._number])
+        self._n_classes, self._features = n_classes, partial(_features, *nnx.split(model))
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return the weights of the backbone as `backbone/<path>`, and the templates."""
@@ -108,13 +102,13 @@ class Templates:
         return cls(number, model, arrays["features"], arrays["label"], n_classes)
 
     def embed(self, crops: ViewCrops) -> NDArray[np.float32]:
-        """Return the unit features [V, D] of crops of `size` pixels; V is at least 1."""
-        return in_batches(partial(_features, self._graph, self._state), INFERENCE_BATCH, crops.color, crops.normals)
+        """Return the unit features [V, D] of crops of the backbone's size; V is at least 1."""
+        return in_batches(self._features, INFERENCE_BATCH, crops.color, crops.normals)
 
     def probabilities(self, inputs: BaselineInputs) -> NDArray[np.float32]:
         """Return class probabilities [B, C]; equal ones for padding rows."""
         values = np.full((len(inputs.tops), self._n_classes), 1 / self._n_classes, np.float32)
-        crops = inputs.crops(self.size)
+        crops = inputs.crops(backbone_size(BACKBONES[self._number]))
         if len(crops):
             values[: len(crops)] = self.compare(self.embed(crops))
         return values
@@ -137,7 +131,7 @@ def _backbone(task: FitTask) -> tuple[int, ViT, dict[str, str]]:
         (path,) = load_weights(task.weights, [(model, DINOV2)])
         return BACKBONES.index(DINOV2), model, {path.name: file_digest(path)}
     for number, name in enumerate(BACKBONES):
-        file = baseline_file(task.run, name)
+        file = baseline_file(task.directory, name)
         if file.is_file():
             stored = read_baseline(file, task.source.classes)
             network = ImageNetwork.with_arrays(name, stored.arrays, len(task.source.classes))
@@ -156,11 +150,10 @@ def fit_templates(task: FitTask) -> FittedBaseline:
     """
     number, model, weights = _backbone(task)
     n_classes = len(task.source.classes)
-    samples = read_samples(task, "templates", backbone_size(BACKBONES[number]))
+    samples = read_samples(task, backbone_size(BACKBONES[number]))
     held_out = task.held_out(samples.label, samples.view)
-    features = Templates(number, model, np.zeros((0, 0), np.float16), np.zeros(0, np.int16), n_classes).embed(
-        samples.crops
-    )
+    untaught = Templates(number, model, np.zeros((0, 0), np.float16), np.zeros(0, np.int16), n_classes)
+    features = untaught.embed(samples.crops)
     task.progress("collect templates", 1, 1, f"{len(features)} crops")
     stored = features[~held_out].astype(np.float16)
     templates = Templates(number, model, stored, samples.label[~held_out].astype(np.int16), n_classes)

@@ -5,27 +5,19 @@ from typing import Annotated
 
 import typer
 
-from training.cli.app import (
-    FrameOptions,
-    ModelOption,
-    QuietOption,
-    SegmentOption,
-    app,
-    console,
-    finish,
-    grouped_options,
-)
+from training.cli import options
+from training.cli.app import app, console, finish
 from training.cli.progress import show_progress
 
 
 @app.command()
-@grouped_options
+@options.grouped_options
 def adapt(
-    model: ModelOption,
-    given: FrameOptions,
+    model: options.ModelOption,
+    given: options.FrameOptions,
     out: Annotated[Path, typer.Option(help="Directory for the adapted run, which recognizes as the model does.")],
-    segment: SegmentOption = None,
-    quiet: QuietOption = False,
+    segment: options.SegmentOption = None,
+    quiet: options.QuietOption = False,
 ) -> None:
     """Adapt a run to a camera: its colours are corrected before recognition.
 

@@ -6,7 +6,8 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from training.cli.app import QuietOption, app, console, finish
+from training.cli import options
+from training.cli.app import app, console, finish
 from training.cli.progress import show_progress
 
 
@@ -16,7 +17,7 @@ def demo(
         "demo-report"
     ),
     seed: Annotated[int, typer.Option(help="Seed for the training and the scenes.")] = 0,
-    quiet: QuietOption = False,
+    quiet: options.QuietOption = False,
 ) -> None:
     """Train on built-in objects, recognize cluttered scenes of them and write a report; no download, a few minutes.
 

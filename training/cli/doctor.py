@@ -10,16 +10,17 @@ import typer
 
 from thor2_jax.errors import InputError
 from thor2_jax.printable import escape_characters
-from training.cli.app import FrameOptions, MeshScaleOption, app, finish, grouped_options
+from training.cli import options
+from training.cli.app import app, finish
 
 if TYPE_CHECKING:
     from training.diagnosis.checks import Diagnosis
 
 
 @app.command()
-@grouped_options
+@options.grouped_options
 def doctor(
-    given: FrameOptions,
+    given: options.FrameOptions,
     model: Annotated[
         Path | None, typer.Option("--model", help="Run directory that knows the objects: checks the channel order.")
     ] = None,
@@ -27,7 +28,7 @@ def doctor(
         Path | None,
         typer.Option(help="Mesh, or directory of meshes, of the objects: checks units, sizes and the focal length."),
     ] = None,
-    mesh_scale: MeshScaleOption = 1.0,
+    mesh_scale: options.MeshScaleOption = 1.0,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON: findings and notes, of each FRAME.")] = False,
 ) -> None:
     """Say what is likely wrong with frames: units, intrinsics, registration, labels, colours.
@@ -40,25 +41,18 @@ def doctor(
     if meshes is None and mesh_scale != 1:
         raise InputError(f"mesh_scale is {mesh_scale:g}; it belongs to --meshes")
     sources = given.sources(masks=False)
-    paths = {}
-    if meshes is not None:
-        paths = find_meshes(meshes) if meshes.is_dir() else {meshes.stem: meshes}
+    paths = {} if meshes is None else find_meshes(meshes) if meshes.is_dir() else {meshes.stem: meshes}
     recognizer = None
     if model is not None:
         from thor2_jax.capacity import BATCH_BUCKETS
         from thor2_jax.recognizer import Recognizer
 
         recognizer = Recognizer.load(model, chunk=BATCH_BUCKETS[-1])
-    options: dict[str, Any] = {
-        "depth_scale": given.depth_scale,
-        "recognizer": recognizer,
-        "meshes": paths,
-        "mesh_scale": mesh_scale,
-    }
+    known: dict[str, Any] = {"recognizer": recognizer, "meshes": paths, "mesh_scale": mesh_scale}
     is_sound, failed = True, []
     for source in sources:
         try:
-            diagnosis = diagnose(source.files or source.read(), **options)
+            diagnosis = diagnose(source.files or source.read(), depth_scale=given.depth_scale, **known)
         except (InputError, OSError) as error:
             if given.color:
                 raise

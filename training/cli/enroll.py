@@ -10,31 +10,21 @@ import typer
 
 from thor2_jax.errors import InputError
 from thor2_jax.printable import check_name
-from training.cli.app import (
-    FrameOptions,
-    GalleryOption,
-    ManyFrames,
-    MeshScaleOption,
-    QuietOption,
-    SegmentOption,
-    app,
-    console,
-    finish,
-    grouped_options,
-)
+from training.cli import options
+from training.cli.app import app, console, finish
 from training.cli.progress import show_progress
 
 if TYPE_CHECKING:
     from thor2_jax.frames.prepared_instance import PreparedInstance
 
 
-@app.command(cls=ManyFrames)
-@grouped_options
+@app.command(cls=options.ManyFrames)
+@options.grouped_options
 def enroll(
     *,
     model: Annotated[Path, typer.Option("--model", help="Run directory; created if it does not exist.")],
     name: Annotated[str | None, typer.Argument(help="Name of the object. Default: every object there is.")] = None,
-    given: FrameOptions,
+    given: options.FrameOptions,
     mesh: Annotated[
         Path | None, typer.Option(help="Mesh of the object (GLB, OBJ, PLY), its folder, or a folder of objects.")
     ] = None,
@@ -46,12 +36,12 @@ def enroll(
     instance: Annotated[
         int | None, typer.Option(help="Label number of the object. Default: by labels.json, or the only instance.")
     ] = None,
-    segment: SegmentOption = None,
-    mesh_scale: MeshScaleOption = 1.0,
+    segment: options.SegmentOption = None,
+    mesh_scale: options.MeshScaleOption = 1.0,
     extend: Annotated[bool, typer.Option("--extend", help="Add views to an object that exists.")] = False,
     replace: Annotated[bool, typer.Option("--replace", help="Discard the views of an object that exists.")] = False,
-    gallery: GalleryOption = None,
-    quiet: QuietOption = False,
+    gallery: options.GalleryOption = None,
+    quiet: options.QuietOption = False,
 ) -> None:
     """Enroll an object from a mesh or from frames; it is recognized at once.
 
@@ -76,9 +66,12 @@ def enroll(
             raise InputError(f"{option} is {value}; it belongs to frames")
     if mesh is None and mesh_scale != 1:
         raise InputError(f"mesh_scale is {mesh_scale:g}; it belongs to --mesh")
+    from training.objects.meshes import find_object_meshes, load_mesh
     from training.readers.frames import FrameFolder
 
-    meshes = {} if mesh is None else _readable_meshes(mesh, name, mesh_scale)
+    meshes = {} if mesh is None else find_object_meshes(mesh, name)
+    for file in meshes.values():
+        load_mesh(file, mesh_scale)
     for path in (given.color, given.depth, given.labels, given.intrinsics):
         if path is not None and not path.is_file():
             raise FileNotFoundError(2, "No such file", str(path))
@@ -93,7 +86,7 @@ def enroll(
         if frames is None:
             return {each: partial(mesh_views, path, mesh_scale) for each, path in meshes.items()}
         views, unusable = labelled_views(frames, sigma_s, label_name or name, instance)
-        skipped.extend(f"skipped: {each.reason}" for each in unusable)
+        skipped.extend(f"skipped: {reason}" for _, reason in unusable)
         views = views if name is None else {name: [view for each in views.values() for view in each]}
         return {each: partial(list, of_object) for each, of_object in views.items()}
 
@@ -116,12 +109,3 @@ def enroll(
         console.print(f"warning: unknown objects are hardly rejected: {known.weak_rejection}")
     enrolled = f"enrolled in {gallery or model}, which knows {known.union.summary}"
     finish(enrolled, "recognize a frame", "recognize", "FRAME", "--model", model)
-
-
-def _readable_meshes(mesh: Path, name: str | None, scale: float) -> dict[str, Path]:
-    from training.objects.meshes import find_object_meshes, load_mesh
-
-    meshes = find_object_meshes(mesh, name)
-    for path in meshes.values():
-        load_mesh(path, scale)
-    return meshes

@@ -12,7 +12,8 @@ import typer
 from rich.table import Table
 
 from thor2_jax.printable import escape_characters
-from training.cli.app import FrameOptions, QuietOption, WorkerOptions, app, console, finish, grouped_options, show_help
+from training.cli import options
+from training.cli.app import app, console, finish, show_help
 from training.cli.progress import show_progress
 
 evaluate_app = typer.Typer(
@@ -28,7 +29,7 @@ MoreModels = Annotated[list[Path] | None, typer.Argument(metavar="[RUN]...", hel
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class EvaluationOptions(WorkerOptions):
+class EvaluationOptions(options.WorkerOptions):
     """What is evaluated, and where the report is written."""
 
     model: Annotated[
@@ -38,16 +39,12 @@ class EvaluationOptions(WorkerOptions):
         Path | None,
         typer.Option("--out", help="Directory for report.html and report.json; an interrupted evaluation resumes."),
     ] = None
-    quiet: QuietOption = False
+    quiet: options.QuietOption = False
 
 
 @evaluate_app.command()
-@grouped_options
-def uwis(
-    dataset: DatasetArgument,
-    job: EvaluationOptions,
-    runs: MoreModels = None,
-) -> None:
+@options.grouped_options
+def uwis(dataset: DatasetArgument, job: EvaluationOptions, runs: MoreModels = None) -> None:
     """UW-IS Occluded: <video>/images/<id>_{rgb,depth,labels}.png and <id>_poses.yaml."""
     from training.readers.uwis import UWISOccluded
 
@@ -55,11 +52,8 @@ def uwis(
 
 
 @evaluate_app.command()
-@grouped_options
-def frames(
-    given: FrameOptions,
-    job: EvaluationOptions,
-) -> None:
+@options.grouped_options
+def frames(given: options.FrameOptions, job: EvaluationOptions) -> None:
     """Frames whose objects labels.json names: <frame>/{color,depth,mask}.png, intrinsics.json, labels.json.
 
     A FRAME that is a run directory, or has the folds of a training, is a further model.
@@ -79,13 +73,12 @@ def frames(
 
 
 @evaluate_app.command()
-@grouped_options
+@options.grouped_options
 def ocid(
     dataset: DatasetArgument,
     job: EvaluationOptions,
     names: Annotated[
-        Path,
-        typer.Option(help="Table: sequence -> object names in order of placement; or a table of OCID-VLG."),
+        Path, typer.Option(help="Table: sequence -> object names in order of placement; or a table of OCID-VLG.")
     ],
     runs: MoreModels = None,
     per_sequence: Annotated[
@@ -99,7 +92,7 @@ def ocid(
 
 
 @evaluate_app.command()
-@grouped_options
+@options.grouped_options
 def bop(
     dataset: DatasetArgument,
     job: EvaluationOptions,
@@ -146,11 +139,10 @@ def _print_report(report: Mapping[str, Any]) -> None:
     from training.evaluation import page
 
     counts, speed = report["instances"], report["speed"]
-    shown = Table("", "instances", title="accuracy without rejection")
-    for number, table in enumerate(report["accuracy"][report["rule"]]):
-        header, rows = page.marked(page.accuracy_table(table, report["fusions"]), report["main"])
-        for column in [] if number else header[2:]:
-            shown.add_column(column)
+    titles, _ = page.marked((report["fusions"], ()), report["main"])
+    shown = Table("", "instances", *titles, title="accuracy without rejection")
+    for table in report["accuracy"][report["rule"]]:
+        header, rows = page.accuracy_table(table, report["fusions"])
         shown.add_section()
         if header[0]:
             shown.add_row(f"by {header[0]}", style="bold")

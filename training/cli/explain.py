@@ -9,29 +9,21 @@ import typer
 
 from thor2_jax.errors import InputError
 from thor2_jax.printable import escape_characters
-from training.cli.app import (
-    FrameOptions,
-    GalleryOption,
-    KnownSegmentOption,
-    ModelOption,
-    app,
-    console,
-    finish,
-    grouped_options,
-)
+from training.cli import options
+from training.cli.app import app, console, finish
 
 
 @app.command()
-@grouped_options
+@options.grouped_options
 def explain(
-    model: ModelOption,
-    given: FrameOptions,
+    model: options.ModelOption,
+    given: options.FrameOptions,
     out: Annotated[Path, typer.Option(help="Directory; each page is OUT/<frame>/<instance>/explanation.html.")],
     instance: Annotated[
         list[int] | None, typer.Option(help="Number of an object in the label image; repeatable. Default: all.")
     ] = None,
-    segment: KnownSegmentOption = None,
-    gallery: GalleryOption = None,
+    segment: options.KnownSegmentOption = None,
+    gallery: options.GalleryOption = None,
 ) -> None:
     """Explain answers: the points that decided, slices, colours, smallest changes, nearest views.
 

@@ -5,7 +5,8 @@ from typing import Annotated
 
 import typer
 
-from training.cli.app import QuietOption, app, console, finish, show_help, split_names
+from training.cli import options
+from training.cli.app import app, console, finish, show_help
 from training.cli.progress import show_progress
 
 fetch_app = typer.Typer(callback=show_help, invoke_without_command=True, help="Download public meshes.")
@@ -19,7 +20,7 @@ def ycb(
     ],
     out: Annotated[Path, typer.Option(help="Directory for the meshes, one folder for each object.")],
     url: Annotated[str | None, typer.Option(help="Address of a mirror, the folder that has the archives.")] = None,
-    quiet: QuietOption = False,
+    quiet: options.QuietOption = False,
 ) -> None:
     """Download scans of the YCB Object and Model Set (CC BY 4.0), about 10 MB for each object.
 
@@ -30,7 +31,7 @@ def ycb(
 
     console.print(LICENCE, soft_wrap=True)
     with show_progress(quiet) as progress:
-        meshes = fetch_ycb(split_names(objects), out, url=url or YCB_URL, progress=progress)
+        meshes = fetch_ycb(options.split_names(objects), out, url=url or YCB_URL, progress=progress)
     for name in meshes:
         console.print(name)
     finish(f"{len(meshes)} meshes in {out}", "train on them", "train", "--meshes", out, "--out", "run")

@@ -4,14 +4,15 @@ from typing import Annotated
 
 import typer
 
-from training.cli.app import GalleryOption, ModelOption, app, finish
+from training.cli import options
+from training.cli.app import app, finish
 
 
 @app.command()
 def forget(
     name: Annotated[str, typer.Argument(help="Name of an enrolled object or of a trained class.")],
-    model: ModelOption,
-    gallery: GalleryOption = None,
+    model: options.ModelOption,
+    gallery: options.GalleryOption = None,
 ) -> None:
     """Forget an object: its views are removed, and a trained class is never answered again."""
     from thor2_jax.recognizer import Recognizer

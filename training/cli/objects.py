@@ -7,13 +7,14 @@ from rich.table import Table
 
 from thor2_jax.errors import InputError
 from thor2_jax.printable import escape_characters
-from training.cli.app import GalleryOption, ModelOption, app, console, finish
+from training.cli import options
+from training.cli.app import app, console, finish
 
 
 @app.command()
 def objects(
-    model: ModelOption,
-    gallery: GalleryOption = None,
+    model: options.ModelOption,
+    gallery: options.GalleryOption = None,
     reembed: Annotated[
         bool,
         typer.Option(

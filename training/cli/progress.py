@@ -5,16 +5,8 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 
+from rich import progress
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 
 __all__ = ["show_progress"]
 
@@ -38,16 +30,12 @@ def show_progress(quiet: bool = False) -> Iterator[Callback]:
 
 @contextlib.contextmanager
 def _bars() -> Iterator[Callback]:
-    tasks: dict[str, TaskID] = {}
-    with Progress(
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[note]}", markup=False),
-        console=Console(stderr=True),
-    ) as bars:
+    tasks: dict[str, progress.TaskID] = {}
+    name = progress.TextColumn("{task.description}", markup=False)
+    note = progress.TextColumn("{task.fields[note]}", markup=False)
+    times = progress.TimeElapsedColumn(), progress.TimeRemainingColumn()
+    columns = name, progress.BarColumn(), progress.MofNCompleteColumn(), *times, note
+    with progress.Progress(*columns, console=Console(stderr=True)) as bars:
 
         def show(stage: str, done: int, total: int, note: str) -> None:
             if stage not in tasks:

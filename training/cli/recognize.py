@@ -12,18 +12,8 @@ from rich.table import Table
 
 from thor2_jax.errors import InputError
 from thor2_jax.printable import escape_characters
-from training.cli.app import (
-    RECORDINGS,
-    FrameOptions,
-    KnownSegmentOption,
-    ModelOption,
-    UnknownOption,
-    WorkerOptions,
-    app,
-    console,
-    finish,
-    grouped_options,
-)
+from training.cli import options
+from training.cli.app import app, console, finish
 from training.cli.recognize_bag import recognize_bag
 
 if TYPE_CHECKING:
@@ -36,13 +26,13 @@ MAX_LISTED = 5
 
 
 @app.command()
-@grouped_options
+@options.grouped_options
 def recognize(
-    model: ModelOption,
-    given: FrameOptions,
-    processes: WorkerOptions,
-    segment: KnownSegmentOption = None,
-    unknown_below: UnknownOption = None,
+    model: options.ModelOption,
+    given: options.FrameOptions,
+    processes: options.WorkerOptions,
+    segment: options.KnownSegmentOption = None,
+    unknown_below: options.UnknownOption = None,
     answer_by: Annotated[
         str | None, typer.Option(help="classifiers, gallery or both. Default: what the run has.")
     ] = None,
@@ -66,7 +56,9 @@ def recognize(
     ] = None,
     out_bag: Annotated[
         Path | None,
-        typer.Option(rich_help_panel=RECORDINGS, help="Write detections: MCAP (.mcap), or directory of a ROS 2 bag."),
+        typer.Option(
+            rich_help_panel=options.RECORDINGS, help="Write detections: MCAP (.mcap), or directory of a ROS 2 bag."
+        ),
     ] = None,
 ) -> None:
     """Recognize every instance of RGB-D frames.
@@ -75,13 +67,7 @@ def recognize(
     the frames of one camera are a sequence in the order of their names: an object has one name in all of them.
     """
     from thor2_jax.files import check_output_directory, check_output_file, remove_leftovers
-    from thor2_jax.model.result_files import (
-        RESULT_FILES,
-        check_no_foreign_results,
-        is_bop_file,
-        is_coco_file,
-        write_recognitions,
-    )
+    from thor2_jax.model import result_files
     from thor2_jax.recordings.rerun_file import RerunFile
     from training.frame_recognition import (
         RecognizerArguments,
@@ -121,16 +107,17 @@ def recognize(
     sources, frames = given.sources(segment, by_model), given.frames
     of_frames = None if poses is None else read_poses(poses, [source.name for source in sources])
     if out is not None:
-        check_output_directory(out, resumable={s.name.split("/")[0] for s in sources} if frames else RESULT_FILES)
+        first_parts = {source.name.split("/")[0] for source in sources}
+        check_output_directory(out, resumable=first_parts if frames else result_files.RESULT_FILES)
         for directory in [out / source.name for source in sources] if frames else [out]:
-            check_no_foreign_results(directory)
+            result_files.check_no_foreign_results(directory)
             remove_leftovers(directory)
     if coco is not None and bop is not None and coco.absolute() == bop.absolute():
         raise InputError(f"coco and bop are {coco}; expected two files")
     rerun_file = None if rerun is None else RerunFile(rerun)
     numbers = None if names is None else read_object_names(names)
-    check_output_file("coco", coco, is_coco_file)
-    check_output_file("bop", bop, is_bop_file)
+    check_output_file("coco", coco, result_files.is_coco_file)
+    check_output_file("bop", bop, result_files.is_bop_file)
     segmented = ["--segment", segment] if segment else []
     recognizer = load()
     tables = ResultTables([source.name for source in sources], recognizer.classes, numbers)
@@ -155,7 +142,8 @@ def recognize(
         unknown |= any(each.name is None for each in answer.recognitions)
         tables.add(answer)
         if out is not None:
-            write_recognitions(out / answer.name if frames else out, answer.frame, answer.recognitions)
+            directory = out / answer.name if frames else out
+            result_files.write_recognitions(directory, answer.frame, answer.recognitions)
     tables.write(coco, bop)
     written = ", ".join(str(path) for path in (out, coco, bop, rerun) if path)
     result = f"written to {written}" if written else f"frames recognized: {len(sources) - len(failed)}"

@@ -7,19 +7,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from thor2_jax.errors import InputError
-from training.cli.app import FrameOptions, finish
+from training.cli import options
+from training.cli.app import finish
 
 if TYPE_CHECKING:
-    from thor2_jax.recordings.bag_writer import DetectionBag
     from thor2_jax.recordings.recorded_frames import RecordedFrame
-    from thor2_jax.recordings.rerun_file import RerunFile
     from training.frame_recognition import FrameAnswer, RecognizerArguments
 
 __all__ = ["recognize_bag"]
 
 
 def recognize_bag(
-    given: FrameOptions,
+    given: options.FrameOptions,
     arguments: "RecognizerArguments",
     segment: str | None,
     track: bool,
@@ -33,7 +32,9 @@ def recognize_bag(
         InputError: the recording cannot be read from here on, and what was written so far; or frames failed.
     """
     from thor2_jax.files import check_output_directory
+    from thor2_jax.model.result_files import write_recognitions
     from thor2_jax.recordings.bag_writer import DetectionBag
+    from thor2_jax.recordings.detections import detections_as_json, detections_of
     from thor2_jax.recordings.rerun_file import RerunFile
     from thor2_jax.segmentation.segmenters import MODEL, TABLE, load_segmenter
     from training.frame_recognition import recognize_recorded, segmentation_failure
@@ -46,6 +47,21 @@ def recognize_bag(
     rerun_file = None if rerun is None else RerunFile(rerun)
     if out is not None:
         check_output_directory(out)
+
+    def write(recorded: "RecordedFrame", answer: "FrameAnswer") -> None:
+        line = {"frame": recorded.name, "depth_gap": recorded.gap / 1e9}
+        if answer.frame is None:
+            print(json.dumps({**line, "error": answer.error}), flush=True)
+            return
+        detections = detections_of(answer.frame, answer.recognitions)
+        print(json.dumps({**line, "instances": detections_as_json(detections)}), flush=True)
+        if out is not None:
+            write_recognitions(out / recorded.name, answer.frame, answer.recognitions)
+        if detection_bag is not None:
+            detection_bag.write(answer.frame, detections, stamp=recorded.stamp, frame_id=recorded.frame_id)
+        if rerun_file is not None:
+            rerun_file.write(answer.frame, detections, name=recorded.name, stamp=recorded.stamp)
+
     n_answers, failed, without_depth, damage = 0, [], [], None
     with bag:
         for note in bag.notes:
@@ -62,7 +78,7 @@ def recognize_bag(
                         print(f"failed: {answer.name}: {answer.error}", file=sys.stderr)
                     else:
                         without_depth.append(segmentation_failure(answer))
-                    _write(recorded, answer, out, detection_bag, rerun_file)
+                    write(recorded, answer)
             except InputError as error:
                 damage = str(error)
     written = [str(path) for path in (out, out_bag, rerun) if path is not None and n_answers and path.exists()]
@@ -83,27 +99,3 @@ def recognize_bag(
         raise InputError(f"{len(failed)} of {n_answers + len(failed)} frames could not be recognized; see above")
     if without_depth and all(without_depth):
         raise InputError(without_depth[0])
-
-
-def _write(
-    recorded: "RecordedFrame",
-    answer: "FrameAnswer",
-    out: Path | None,
-    out_bag: "DetectionBag | None",
-    rerun: "RerunFile | None",
-) -> None:
-    from thor2_jax.model.result_files import write_recognitions
-    from thor2_jax.recordings.detections import detections_as_json, detections_of
-
-    line = {"frame": recorded.name, "depth_gap": recorded.gap / 1e9}
-    if answer.frame is None:
-        print(json.dumps({**line, "error": answer.error}), flush=True)
-        return
-    detections = detections_of(answer.frame, answer.recognitions)
-    print(json.dumps({**line, "instances": detections_as_json(detections)}), flush=True)
-    if out is not None:
-        write_recognitions(out / recorded.name, answer.frame, answer.recognitions)
-    if out_bag is not None:
-        out_bag.write(answer.frame, detections, stamp=recorded.stamp, frame_id=recorded.frame_id)
-    if rerun is not None:
-        rerun.write(answer.frame, detections, name=recorded.name, stamp=recorded.stamp)

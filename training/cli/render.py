@@ -1,13 +1,15 @@
 """`thor2 render`: render a dataset of training views."""
 
 import dataclasses
+import itertools
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from thor2_jax.errors import InputError
-from training.cli.app import MAX_WORKERS, MeshScaleOption, QuietOption, WorkerOptions, app, finish, grouped_options
+from training.cli import options
+from training.cli.app import app, finish
 from training.cli.progress import show_progress
 
 MAX_CROP = 2048
@@ -15,16 +17,14 @@ MAX_CROP = 2048
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class RenderWorkers(WorkerOptions):
+class RenderWorkers(options.WorkerOptions):
     """Where views are rendered; by default, in two processes."""
 
-    workers: Annotated[
-        int, typer.Option(min=1, max=MAX_WORKERS, help="Worker processes; with Ray, concurrent tasks.")
-    ] = 2
+    workers: options.WorkersOption = 2
 
 
 @app.command()
-@grouped_options
+@options.grouped_options
 def render(
     *,
     processes: RenderWorkers,
@@ -48,8 +48,8 @@ def render(
     crops: Annotated[
         int | None, typer.Option(metavar="PIXELS", help="Also write crops of this size, for image networks.")
     ] = None,
-    mesh_scale: MeshScaleOption = 1.0,
-    quiet: QuietOption = False,
+    mesh_scale: options.MeshScaleOption = 1.0,
+    quiet: options.QuietOption = False,
 ) -> None:
     """Render views of meshes to a dataset for `train --dataset`. An interrupted rendering resumes.
 
@@ -66,15 +66,9 @@ def render(
     if crops is not None and not 1 <= crops <= MAX_CROP:
         raise InputError(f"crops is {crops}; expected 1 to {MAX_CROP} pixels")
     pool = processes.pool() or IN_PROCESS
-    switches = {
-        "illumination": illumination,
-        "sensor": sensor,
-        "occlusion": occlusion,
-        "segmentation": segmentation,
-        "registration": registration,
-        "base": base,
-    }
-    augmentations = Augmentations.of_names((name for name, is_on in switches.items() if is_on), copies) or None
+    kinds = "illumination", "sensor", "occlusion", "segmentation", "registration", "base"
+    are_chosen = illumination, sensor, occlusion, segmentation, registration, base
+    augmentations = Augmentations.of_names(itertools.compress(kinds, are_chosen), copies) or None
     sources = scaled_meshes(find_meshes(meshes, read_names(names) if names else None), mesh_scale)
     with show_progress(quiet) as progress:
         shown = of_stage(progress, "render")

@@ -8,25 +8,26 @@ import typer
 
 from thor2_jax.errors import InputError
 from thor2_jax.service.signals import ended_by_signals
-from training.cli.app import MAX_WORKERS, AllowHostOption, ModelOption, UnknownOption, app
+from training.cli import options
+from training.cli.app import app
 
 
 @app.command()
 def serve(
-    model: ModelOption,
+    model: options.ModelOption,
     host: Annotated[str, typer.Option(help="Address to listen on; 0.0.0.0 for other machines.")] = "127.0.0.1",
-    allow_host: AllowHostOption = None,
+    allow_host: options.AllowHostOption = None,
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port; 0 selects a free one, named in the log.")] = 8080,
     workers: Annotated[
-        int, typer.Option(min=1, max=MAX_WORKERS, help="Server processes, each with its own model and queue.")
+        int, typer.Option(min=1, max=options.MAX_WORKERS, help="Server processes, each with its own model and queue.")
     ] = 1,
     processes: Annotated[
-        int, typer.Option(min=1, max=MAX_WORKERS, help="Processes per worker that decode and prepare frames.")
+        int, typer.Option(min=1, max=options.MAX_WORKERS, help="Processes per worker that decode and prepare frames.")
     ] = 2,
     queue: Annotated[int, typer.Option(min=1, help="Requests per worker at a time; others get status 429.")] = 32,
     deadline: Annotated[float, typer.Option(help="Seconds per request before it gets status 504.")] = 5.0,
     max_batch: Annotated[int, typer.Option(help="Largest number of clouds in a device batch.")] = 32,
-    unknown_below: UnknownOption = None,
+    unknown_below: options.UnknownOption = None,
     cache: Annotated[
         Path | None, typer.Option(help="Directory for compiled programs, so that the next start is faster.")
     ] = None,

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from thor2_jax.errors import InputError
-from training.cli.app import MAX_WORKERS, ManyFrames, MeshScaleOption, QuietOption, app, console, finish, split_names
+from training.cli import options
+from training.cli.app import app, console, finish
 from training.cli.progress import show_progress
 
 if TYPE_CHECKING:
@@ -16,15 +17,15 @@ if TYPE_CHECKING:
     from training.fitting.protocol import Protocol
 
 
-class _TrainCommand(ManyFrames):
+class _TrainCommand(options.ManyFrames):
     """The command, whose help states the defaults of the protocols."""
 
     def insert_values(self) -> None:
         """Insert the values into the help; the protocols take a second to import, so this is not done before."""
         from training.fitting.protocol import DEFAULT, PAPER, QUICK
 
-        options: list[Any] = self.params
-        for option in options:
+        parameters: list[Any] = self.params
+        for option in parameters:
             option.help = (option.help or "").format(default=DEFAULT, paper=PAPER, quick=QUICK)
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
@@ -124,14 +125,14 @@ def train(
     distractors: Annotated[
         Path | None, typer.Option(help="Directory of meshes of objects that are none of the classes.")
     ] = None,
-    mesh_scale: MeshScaleOption = 1.0,
-    workers: Annotated[int, typer.Option(min=1, max=MAX_WORKERS, help="Rendering processes.")] = 2,
+    mesh_scale: options.MeshScaleOption = 1.0,
+    workers: Annotated[int, typer.Option(min=1, max=options.MAX_WORKERS, help="Rendering processes.")] = 2,
     coordinator: Annotated[
         str | None, typer.Option(help="HOST:PORT of process 0, for training with several processes.")
     ] = None,
     processes: Annotated[int, typer.Option(min=1, help="Number of processes that train together.")] = 1,
     process: Annotated[int, typer.Option(min=0, help="Index of this process.")] = 0,
-    quiet: QuietOption = False,
+    quiet: options.QuietOption = False,
 ) -> None:
     """Train a recognizer on synthetic views of meshes. An interrupted training resumes.
 
@@ -179,14 +180,9 @@ def train(
     from training.fitting.protocol import DEFAULT, PAPER, QUICK
     from training.train_job import TrainJob, run_train_job
 
-    protocol = (PAPER if paper else QUICK if quick else DEFAULT).replace(
-        azimuth_step=azimuth_step,
-        polar_step=polar_step,
-        epochs=epochs,
-        batch_size=batch_size,
-        seed=seed,
-        orientation_copies=orientation_copies,
-    )
+    protocol = PAPER if paper else QUICK if quick else DEFAULT
+    protocol = protocol.replace(epochs=epochs, batch_size=batch_size, seed=seed, orientation_copies=orientation_copies)
+    protocol = protocol.replace(azimuth_step=azimuth_step, polar_step=polar_step)
     job = TrainJob(
         out=out,
         protocol=protocol,
@@ -194,11 +190,11 @@ def train(
         dataset=dataset,
         frames=frames or (),
         names=names,
-        classifiers=None if classifiers is None else split_names(classifiers),
+        classifiers=None if classifiers is None else options.split_names(classifiers),
         folds=folds,
-        baselines=split_names(baselines),
+        baselines=options.split_names(baselines),
         weights=weights,
-        leave_out=split_names(leave_out),
+        leave_out=options.split_names(leave_out),
         sequences=sequences,
         distractors=_distractors(protocol, embedding, distractors, epochs, workers),
         workers=workers,
@@ -230,10 +226,5 @@ def _distractors(
         procedural = 0 if protocol.distractors is None else default.procedural
     if procedural == 0 and meshes is None:
         return None
-    return dataclasses.replace(
-        default,
-        procedural=procedural,
-        meshes={} if meshes is None else find_meshes(meshes),
-        epochs=default.epochs if epochs is None else epochs,
-        workers=workers,
-    )
+    found, passes = {} if meshes is None else find_meshes(meshes), default.epochs if epochs is None else epochs
+    return dataclasses.replace(default, procedural=procedural, meshes=found, epochs=passes, workers=workers)

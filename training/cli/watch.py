@@ -13,7 +13,8 @@ import typer
 
 from thor2_jax.errors import InputError
 from thor2_jax.recordings.topics import Topics
-from training.cli.app import AllowHostOption, ModelOption, UnknownOption, app, finish
+from training.cli import options
+from training.cli.app import app, finish
 
 if TYPE_CHECKING:
     from thor2_jax.recordings.recorded_frames import RecordedFrame
@@ -24,7 +25,7 @@ NOTICE_SECONDS = 1.0
 
 @app.command()
 def watch(
-    model: ModelOption,
+    model: options.ModelOption,
     bag: Annotated[Path | None, typer.Option(help="ROS 1 bag, ROS 2 bag or MCAP (extra bags).")] = None,
     folder: Annotated[Path | None, typer.Option(help="Folder of frames.")] = None,
     realsense: Annotated[bool, typer.Option("--realsense", help="A RealSense camera (extra realsense).")] = False,
@@ -37,10 +38,10 @@ def watch(
     color_topic: Annotated[str | None, typer.Option(help="Colour images of the bag.")] = None,
     depth_topic: Annotated[str | None, typer.Option(help="Aligned depth images of the bag.")] = None,
     camera_topic: Annotated[str | None, typer.Option(help="camera_info of the bag.")] = None,
-    unknown_below: UnknownOption = None,
+    unknown_below: options.UnknownOption = None,
     answer_by: Annotated[str | None, typer.Option(help="classifiers, gallery or both.")] = None,
     host: Annotated[str, typer.Option(help="Address to listen on; 0.0.0.0 for other machines.")] = "127.0.0.1",
-    allow_host: AllowHostOption = None,
+    allow_host: options.AllowHostOption = None,
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port; 0 selects a free one.")] = 8090,
 ) -> None:
     """Show the recognized objects of a recording or a camera on a live page, until Ctrl-C.
@@ -52,8 +53,10 @@ def watch(
         wait = stack.enter_context(_ctrl_c())
         from thor2_jax.capacity import BATCH_BUCKETS
         from thor2_jax.recognizer import Recognizer
+        from thor2_jax.recordings.bags import Bag
+        from thor2_jax.recordings.realsense import RealSenseCamera
         from thor2_jax.segmentation.segmenters import TABLE, load_segmenter
-        from thor2_jax.watch.live import LiveView
+        from thor2_jax.watch.live import LiveView, paced
         from thor2_jax.watch.server import Broadcast, serve_live
 
         sources = {"--bag": bag, "--folder": folder, "--realsense": realsense or None}
@@ -64,7 +67,15 @@ def watch(
         if bag is None and topics != Topics():
             raise InputError("color_topic, depth_topic and camera_topic belong to --bag")
         segmenter = load_segmenter(segment or TABLE)
-        frames = _frames(stack, bag, folder, topics, segment, wait)
+        if folder is not None:
+            frames = _folder_frames(folder, relabel=segment is not None)
+        elif bag is None:
+            frames = stack.enter_context(RealSenseCamera()).frames()
+        else:
+            opened = stack.enter_context(Bag(bag, topics))
+            for note in opened.notes:
+                print(f"note: {note}", file=sys.stderr)
+            frames = paced(opened.frames(), sleep=wait)
         recognizer = Recognizer.load(model, unknown_below, answer_by=answer_by, chunk=BATCH_BUCKETS[-1])
         broadcast = Broadcast()
         url = stack.enter_context(serve_live(broadcast, host, port, allow_host or ()))
@@ -114,29 +125,6 @@ def _ctrl_c() -> Iterator[Callable[[float | None], bool]]:
         yield wait
     finally:
         signal.signal(signal.SIGINT, previous)
-
-
-def _frames(
-    stack: contextlib.ExitStack,
-    bag: Path | None,
-    folder: Path | None,
-    topics: Topics,
-    segment: str | None,
-    wait: Callable[[float], object],
-) -> Iterator["RecordedFrame"]:
-    """Open the source and return its frames."""
-    from thor2_jax.recordings.bags import Bag
-    from thor2_jax.recordings.realsense import RealSenseCamera
-    from thor2_jax.watch.live import paced
-
-    if folder is not None:
-        return _folder_frames(folder, relabel=segment is not None)
-    if bag is None:
-        return stack.enter_context(RealSenseCamera()).frames()
-    opened = stack.enter_context(Bag(bag, topics))
-    for note in opened.notes:
-        print(f"note: {note}", file=sys.stderr)
-    return paced(opened.frames(), sleep=wait)
 
 
 def _folder_frames(folder: Path, relabel: bool) -> Iterator["RecordedFrame"]:

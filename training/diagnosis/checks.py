@@ -14,7 +14,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import Intrinsics
 from training.objects.meshes import MAX_SIDE, MIN_SIDE, longest_side
 
-__all__ = ["Diagnosis", "Finding", "check_camera", "check_labels", "check_meshes"]
+__all__ = ["Diagnosis", "check_camera", "check_labels", "check_meshes"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,15 +65,11 @@ def check_camera(diagnosis: Diagnosis, intrinsics: Intrinsics, width: int, heigh
     """Check intrinsics against the size of the colour image in pixels; return whether nothing was found."""
     n_before = len(diagnosis.findings)
     size = intrinsics.width or width, intrinsics.height or height
-    cx, cy = intrinsics.cx, intrinsics.cy
-    across, down = cx / width - 0.5, cy / height - 0.5
+    fx, fy, cx, cy = intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy
     if size != (width, height):
-        diagnosis.add(
-            "intrinsics-size",
-            f"The intrinsics are for images of {size[0]} x {size[1]} pixels, but color has {width} x {height}.",
-            ADVICE,
-        )
-    elif max(abs(across), abs(down)) > MAX_OFF_CENTRE:
+        message = f"The intrinsics are for images of {size[0]} x {size[1]} pixels, but color has {width} x {height}."
+        diagnosis.add("intrinsics-size", message, ADVICE)
+    elif max(abs(cx / width - 0.5), abs(cy / height - 0.5)) > MAX_OFF_CENTRE:
         if max(abs(cy / width - 0.5), abs(cx / height - 0.5)) <= MAX_OFF_CENTRE:
             reason, advice = "cx and cy are exchanged", "Exchange cx and cy (and fx and fy)."
         else:
@@ -85,19 +81,19 @@ def check_camera(diagnosis: Diagnosis, intrinsics: Intrinsics, width: int, heigh
             f"pixels; {reason}.",
             advice,
         )
-    aspect = intrinsics.fx / intrinsics.fy
+    aspect = fx / fy
     if not 1 / MAX_PIXEL_ASPECT <= aspect <= MAX_PIXEL_ASPECT:
         diagnosis.add(
             "intrinsics-aspect",
-            f"The focal lengths fx, fy = {intrinsics.fx:g}, {intrinsics.fy:g} differ by {100 * abs(aspect - 1):.0f} %; "
-            "pixels of depth cameras are square.",
+            f"The focal lengths fx, fy = {fx:g}, {fy:g} differ by {100 * abs(aspect - 1):.0f} %; pixels of depth "
+            "cameras are square.",
             "Check whether width and height were resized by different factors, and the order of fx, fy, cx, cy.",
         )
-    view = math.degrees(2 * math.atan(width / 2 / intrinsics.fx))
+    view = math.degrees(2 * math.atan(width / 2 / fx))
     if not MIN_VIEW <= view <= MAX_VIEW:
         diagnosis.add(
             "intrinsics-focal",
-            f"fx = {intrinsics.fx:g} pixels means a horizontal field of view of {view:.1f} degrees; depth cameras have "
+            f"fx = {fx:g} pixels means a horizontal field of view of {view:.1f} degrees; depth cameras have "
             f"{MIN_VIEW:.0f} to {MAX_VIEW:.0f}.",
             "fx and fy are in pixels of these images, not in millimetres. " + ADVICE,
         )
@@ -134,11 +130,8 @@ def check_labels(diagnosis: Diagnosis, labels: NDArray[Any]) -> bool:
     n_thin = int((~thick).sum())
     largest = counts.max() / labels.size
     if len(values) > MAX_INSTANCES:
-        diagnosis.add(
-            "labels-many",
-            f"The label image has {len(values)} different numbers: it looks like a photo, a depth image or noise.",
-            advice,
-        )
+        message = f"The label image has {len(values)} different numbers: it looks like a photo, a depth image or noise."
+        diagnosis.add("labels-many", message, advice)
     elif n_thin >= MIN_THIN and n_thin > MAX_THIN_SHARE * len(values):
         diagnosis.add(
             "labels-thin",
@@ -147,12 +140,9 @@ def check_labels(diagnosis: Diagnosis, labels: NDArray[Any]) -> bool:
             "Resize label images with nearest-neighbour interpolation and store them as PNG.",
         )
     elif largest > MAX_INSTANCE_SHARE:
-        diagnosis.add(
-            "labels-background",
-            f"Instance {values[counts.argmax()]} covers {largest:.0%} of the image: the background seems to have a "
-            "number.",
-            "The background must be 0. " + advice,
-        )
+        instance = f"Instance {values[counts.argmax()]} covers {largest:.0%} of the image"
+        message = f"{instance}: the background seems to have a number."
+        diagnosis.add("labels-background", message, "The background must be 0. " + advice)
     elif len(values) == 1:
         pieces = np.bincount(ndimage.label(labels != 0, np.ones((3, 3)))[0].ravel())[1:]
         n_pieces = int((pieces > MIN_PIECE_SHARE * counts[0]).sum())
@@ -188,18 +178,15 @@ def check_meshes(diagnosis: Diagnosis, meshes: Mapping[str, Path], scale: float 
             diagnosis.add("mesh", f"A mesh cannot be used: {error}.", "Repair it, or leave it out.")
     if not sides:
         return {}
-    values = list(sides.values())
-    median = float(np.median(values))
-    if MIN_SIDE <= min(values) and max(values) <= MAX_SIDE and median >= USUAL_SIDE[0] / 3:
+    median = float(np.median(list(sides.values())))
+    if MIN_SIDE <= min(sides.values()) and max(sides.values()) <= MAX_SIDE and median >= USUAL_SIDE[0] / 3:
         return sides
     fitting = [each for each in SCALES if USUAL_SIDE[0] <= median * each <= USUAL_SIDE[1]]
-    unit = f"it is likely in {SCALES[fitting[0]]}" if fitting else "its unit is unknown"
-    mend = f"--mesh-scale {fitting[0] * scale:g} mends it" if fitting else "--mesh-scale sets the factor"
-    diagnosis.add(
-        "mesh-unit",
-        f"The longest side of the mesh{'es' if len(sides) > 1 else ''} is {median:.4g}"
-        f"{' (median)' if len(sides) > 1 else ''}; in metres, objects on a table have {USUAL_SIDE[0]:g} to "
-        f"{USUAL_SIDE[1]:g}: {unit}.",
-        f"Meshes are read in metres; {mend}.",
-    )
+    unit, mend = "its unit is unknown", "--mesh-scale sets the factor"
+    if fitting:
+        unit, mend = f"it is likely in {SCALES[fitting[0]]}", f"--mesh-scale {fitting[0] * scale:g} mends it"
+    measured = f"meshes is {median:.4g} (median)" if len(sides) > 1 else f"mesh is {median:.4g}"
+    usual = f"{USUAL_SIDE[0]:g} to {USUAL_SIDE[1]:g}"
+    message = f"The longest side of the {measured}; in metres, objects on a table have {usual}: {unit}."
+    diagnosis.add("mesh-unit", message, f"Meshes are read in metres; {mend}.")
     return {}

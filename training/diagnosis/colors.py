@@ -37,6 +37,8 @@ MAX_LOGIT = 7.0
 MIN_OBJECTS = 2
 """Least number of objects for a verdict on the order of the channels."""
 
+FAR = "The colours are far from those of training"
+
 LIGHTS = {
     "half as bright": (0.5, 0.5, 0.5),
     "twice as bright": (2.0, 2.0, 2.0),
@@ -61,25 +63,17 @@ def check_light(diagnosis: Diagnosis, color: NDArray[np.uint8], labels: NDArray[
             "Record the colour stream; without colours, only the shape is recognized.",
         )
     elif brightness < MIN_BRIGHTNESS:
-        diagnosis.add(
-            "color-dark",
-            f"The colours are far from those of training: the mean value of the pixels is {brightness:.0f} of 255.",
-            "Raise the exposure or the light. Images of more than 8 bits must be scaled to 0 to 255.",
-        )
+        message = f"{FAR}: the mean value of the pixels is {brightness:.0f} of 255."
+        advice = "Raise the exposure or the light. Images of more than 8 bits must be scaled to 0 to 255."
+        diagnosis.add("color-dark", message, advice)
     elif saturated > MAX_SATURATED:
-        diagnosis.add(
-            "color-bright",
-            f"The colours are far from those of training: {saturated:.0%} of the pixels are overexposed.",
-            "Lower the exposure or the gain of the camera.",
-        )
+        message = f"{FAR}: {saturated:.0%} of the pixels are overexposed."
+        diagnosis.add("color-bright", message, "Lower the exposure or the gain of the camera.")
     elif max(contrasts) > MAX_CAST * min(contrasts):
         strongest, weakest = (("red", "green", "blue")[each(contrasts)] for each in (np.argmax, np.argmin))
-        diagnosis.add(
-            "color-cast",
-            f"The colours are far from those of training: {strongest} has "
-            f"{max(contrasts) / max(min(contrasts), 1e-9):.1f} times the contrast of {weakest}, a strong colour cast.",
-            "Set the white balance of the camera.",
-        )
+        ratio = max(contrasts) / max(min(contrasts), 1e-9)
+        message = f"{FAR}: {strongest} has {ratio:.1f} times the contrast of {weakest}, a strong colour cast."
+        diagnosis.add("color-cast", message, "Set the white balance of the camera.")
     return len(diagnosis.findings) == n_before
 
 
@@ -115,8 +109,8 @@ def check_channel_order(diagnosis: Diagnosis, frame: RGBDFrame, recognizer: Reco
     elif lights[best].mean() - given.mean() > MIN_CONFIDENCE_GAIN:
         diagnosis.add(
             "color-light",
-            f"The colours are far from those of training: if they were {best}, the model would be surer of the objects "
-            f"(mean confidence {lights[best].mean():.2f} in place of {given.mean():.2f}).",
+            f"{FAR}: if they were {best}, the model would be surer of the objects (mean confidence "
+            f"{lights[best].mean():.2f} in place of {given.mean():.2f}).",
             "Set the exposure and the white balance of the camera.",
         )
 

@@ -60,8 +60,7 @@ def instance_extents(frame: RGBDFrame) -> dict[int, float]:
         chosen = (depth > 0) & (np.abs(depth - median) < 0.25 * median)
         if chosen.sum() < MIN_PIXELS:
             continue
-        rays = pixel_rays(pixels[chosen], frame.depth.shape[1], frame.intrinsics)
-        points = rays * depth[chosen, None]
+        points = pixel_rays(pixels[chosen], frame.depth.shape[1], frame.intrinsics) * depth[chosen, None]
         axes = np.linalg.eigh(np.cov(points.T))[1]
         extents[label] = float(np.ptp(np.percentile(points @ axes, (2, 98), axis=0), axis=0).max())
     return extents
@@ -84,11 +83,11 @@ def check_depth(
         names: label -> object, if it is known.
         trust_camera: whether the intrinsics are right, so that extents mean something.
     """
-    labelled = None if frame.labels is None or not (frame.labels != 0).any() else frame.labels != 0
-    depth = frame.depth_m if labelled is None else frame.depth_m[labelled]
+    labelled = frame.labels is not None and bool((frame.labels != 0).any())
+    depth, where, least = frame.depth_m, "the image", MIN_VALID_IMAGE
+    if labelled:
+        depth, where, least = depth[frame.label_image != 0], "the instances", MIN_VALID_INSTANCES
     valid = depth[depth > 0]
-    where = "the image" if labelled is None else "the instances"
-    least = MIN_VALID_IMAGE if labelled is None else MIN_VALID_INSTANCES
     if valid.size < least * depth.size:
         diagnosis.add(
             "depth-missing",
@@ -98,7 +97,7 @@ def check_depth(
         )
     if not valid.size:
         return
-    extents = instance_extents(frame) if labelled is not None and trust_camera else {}
+    extents = instance_extents(frame) if labelled and trust_camera else {}
     median = float(np.median(valid))
     if MIN_DEPTH <= median <= MAX_DEPTH and _check_focal_length(diagnosis, median, extents, mesh_sides, names):
         return
@@ -154,17 +153,17 @@ def _check_unit(
     low, high = MIN_EXTENT, MAX_EXTENT
     if mesh_sides:
         low, high = min(mesh_sides) / EXTENT_MARGIN, max(mesh_sides) * EXTENT_MARGIN
+    is_usual = MIN_ROOM <= median <= MAX_ROOM if extent is None else low <= extent <= high
+    if is_usual:
+        return False
+    is_metric = frame.depth.dtype.kind == "f"
+    distance = _length(median) + ("" if is_metric else f" with depth_scale {frame.intrinsics.depth_scale:g}")
+    measured = f"The median depth would be {distance}"
     if extent is not None:
-        if low <= extent <= high:
-            return False
         measured = f"The objects would measure {_length(extent)} (median of their longest sides) at a distance of "
-        measured += f"{_length(median)}{_unit_used(frame)}"
+        measured += distance
         if mesh_sides:
             measured += f"; the meshes measure {_length(min(mesh_sides))} to {_length(max(mesh_sides))}"
-    else:
-        if MIN_ROOM <= median <= MAX_ROOM:
-            return False
-        measured = f"The median depth would be {_length(median)}{_unit_used(frame)}"
     usual = float(np.median(mesh_sides)) if mesh_sides else USUAL_EXTENT
 
     def misfit(factor: float) -> float:
@@ -172,13 +171,13 @@ def _check_unit(
         fits = extent is None or low <= extent * factor <= high
         if not fits or not MIN_DEPTH <= median * factor <= MAX_DEPTH:
             return math.inf
-        distance = abs(math.log(median * factor / USUAL_DISTANCE))
-        return distance if extent is None else distance + abs(math.log(extent * factor / usual))
+        of_distance = abs(math.log(median * factor / USUAL_DISTANCE))
+        return of_distance if extent is None else of_distance + abs(math.log(extent * factor / usual))
 
-    scale = 1.0 if frame.depth.dtype.kind == "f" else frame.intrinsics.depth_scale
+    scale = 1.0 if is_metric else frame.intrinsics.depth_scale
     best = min(DEPTH_SCALES, key=lambda each: misfit(scale / each))
     likely = best if misfit(scale / best) < math.inf else None
-    if frame.depth.dtype.kind == "f":
+    if is_metric:
         advice = "Floating-point depth must be in metres."
         if likely is not None:
             advice += f" Divide it by {likely:g}: the median would be {_length(median / likely)}."
@@ -198,10 +197,6 @@ def _check_unit(
         return True
     diagnosis.add("depth-unit", f"{measured}: the unit of depth is likely wrong.", advice)
     return True
-
-
-def _unit_used(frame: RGBDFrame) -> str:
-    return "" if frame.depth.dtype.kind == "f" else f" with depth_scale {frame.intrinsics.depth_scale:g}"
 
 
 def _length(metres: float) -> str:

@@ -5,8 +5,7 @@ an edge from dark to bright equals one from bright to dark, and random edges can
 within three pixels of no shift and stands many standard deviations above the rest.
 """
 
-import dataclasses
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +13,7 @@ from scipy import fft, ndimage
 
 from training.diagnosis.checks import Diagnosis
 
-__all__ = ["Alignment", "align_edges", "check_labels_alignment", "check_registration"]
+__all__ = ["align_edges", "check_labels_alignment", "check_registration"]
 
 MAX_SHIFT = 48
 """Largest shift that is searched, pixels of an image of 640 columns."""
@@ -45,8 +44,7 @@ SCALES = (0.75, 0.8, 0.85, 0.9, 1.1, 1.15, 1.2, 1.25, 1.35)
 Field = NDArray[np.complex128]
 
 
-@dataclasses.dataclass(frozen=True)
-class Alignment:
+class Alignment(NamedTuple):
     """The best shift of an edge field onto another one.
 
     Attributes:
@@ -123,8 +121,7 @@ def align_edges(moved: Field, fixed: Field) -> Alignment:
 
 
 def _align(moved: Field, spectrum: Field) -> Alignment:
-    n_edges = int(np.count_nonzero(moved))
-    reach = MAX_SHIFT
+    n_edges, reach = int(np.count_nonzero(moved)), MAX_SHIFT
     product = spectrum * np.conj(fft.fft2(moved.astype(np.complex64), spectrum.shape))
     correlation = fft.ifft2(product)[: 2 * reach + 1, : 2 * reach + 1].real / max(n_edges, 1)
     correlation = ndimage.gaussian_filter(correlation, 1)
@@ -161,7 +158,6 @@ def check_registration(diagnosis: Diagnosis, color: NDArray[np.uint8], depth_m: 
         return
     if plain.distance <= MAX_REGISTERED and plain.height >= MIN_PEAK:
         return
-    advice = "Use the depth image that the camera's driver aligns to the colour image (align_depth, registered depth)."
     candidates = {name: depth_m[flip] for name, flip in FLIPS.items()}
     candidates["rotated by 180 degrees"] = depth_m[::-1, ::-1]
     candidates |= {f"enlarged by a factor of {1 / scale:.2f}": _zoomed(depth_m, scale) for scale in SCALES}
@@ -172,27 +168,18 @@ def check_registration(diagnosis: Diagnosis, color: NDArray[np.uint8], depth_m: 
 
     name = max(alignments, key=weighted_peak)
     best = alignments[name]
+    edges = "The edges of the depth image lie on those of the colour image"
     if best.height >= MIN_PEAK and weighted_peak(name) >= MIN_GAIN * plain.peak:
         shift = f", and {_shift(best, step)}" if best.distance > MAX_REGISTERED else ""
-        diagnosis.add(
-            "registration",
-            f"The depth image is {name} compared with the colour image{shift}: they are not registered.",
-            advice,
-        )
+        message = f"The depth image is {name} compared with the colour image{shift}: they are not registered."
     elif plain.height >= MIN_PEAK and plain.peak >= MIN_GAIN * plain.near:
-        diagnosis.add(
-            "registration",
-            f"The edges of the depth image lie on those of the colour image only if depth is {_shift(plain, step)}: "
-            "they are not registered.",
-            advice,
-        )
+        message = f"{edges} only if depth is {_shift(plain, step)}: they are not registered."
     elif plain.near_height < MIN_NEAR and plain.n_edges >= MIN_EDGES_UNRELATED:
-        diagnosis.add(
-            "registration",
-            "The edges of the depth image lie on those of the colour image at no shift: they are not registered, or "
-            "belong to different frames.",
-            advice,
-        )
+        message = f"{edges} at no shift: they are not registered, or belong to different frames."
+    else:
+        return
+    advice = "Use the depth image that the camera's driver aligns to the colour image (align_depth, registered depth)."
+    diagnosis.add("registration", message, advice)
 
 
 def check_labels_alignment(diagnosis: Diagnosis, color: NDArray[np.uint8], labels: NDArray[Any]) -> None:
@@ -202,17 +189,13 @@ def check_labels_alignment(diagnosis: Diagnosis, color: NDArray[np.uint8], label
     if alignment.n_edges < MIN_EDGES or alignment.height < MIN_PEAK:
         return
     if alignment.distance > MAX_REGISTERED and alignment.peak >= MIN_GAIN * alignment.near:
-        diagnosis.add(
-            "labels-shifted",
-            "The borders of the instances lie on edges of the colour image only if labels is "
-            f"{_shift(alignment, step)}.",
-            "Check that the label image belongs to this frame and was made from this colour image.",
-        )
+        shift = _shift(alignment, step)
+        message = f"The borders of the instances lie on edges of the colour image only if labels is {shift}."
+        advice = "Check that the label image belongs to this frame and was made from this colour image."
+        diagnosis.add("labels-shifted", message, advice)
 
 
 def _shift(alignment: Alignment, step: int) -> str:
-    parts = []
-    for pixels, positive, negative in ((alignment.right, "right", "left"), (alignment.down, "down", "up")):
-        if pixels:
-            parts.append(f"{abs(pixels) * step} pixels {positive if pixels > 0 else negative}")
-    return "moved " + " and ".join(parts)
+    parts = (alignment.right, "right", "left"), (alignment.down, "down", "up")
+    shifts = [f"{abs(n) * step} pixels {positive if n > 0 else negative}" for n, positive, negative in parts if n]
+    return "moved " + " and ".join(shifts)

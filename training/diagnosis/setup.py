@@ -54,9 +54,8 @@ def diagnose(
     if isinstance(files, RGBDFrame):
         sides = check_meshes(diagnosis, meshes, mesh_scale)
         return _check(diagnosis, files.color, files.depth, files.labels, files.intrinsics, {}, sides, recognizer)
-    missing = [
-        path for path in (files.color, files.depth, files.labels, files.intrinsics) if path and not path.exists()
-    ]
+    paths = files.color, files.depth, files.labels, files.intrinsics
+    missing = [path for path in paths if path and not path.exists()]
     if missing:
         raise InputError(f"{missing[0]} is missing; expected the files of a frame")
     sides = check_meshes(diagnosis, meshes, mesh_scale)
@@ -85,10 +84,10 @@ def _check(
     shape = next((image.shape[:2] for image in (color, depth, labels) if image is not None), None)
     for name, image in (("depth", depth), ("labels", labels)):
         if color is not None and image is not None and image.shape != color.shape[:2]:
+            size, color_size = (f"{each.shape[1]} x {each.shape[0]}" for each in (image, color))
             diagnosis.add(
                 "size",
-                f"{name} has {image.shape[1]} x {image.shape[0]} pixels, but color has {color.shape[1]} x "
-                f"{color.shape[0]}.",
+                f"{name} has {size} pixels, but color has {color_size}.",
                 "Colour, depth and labels must have the same size, pixel for pixel: use the depth image that the "
                 "driver aligns to colour.",
             )
@@ -104,7 +103,8 @@ def _check(
         check_labels_alignment(diagnosis, color, labels)
     if depth is None or camera is None:
         return diagnosis
-    frame = _frame(np.zeros((*depth.shape, 3), np.uint8) if color is None else color, depth, labels, camera)
+    pinhole = Intrinsics(camera.fx, camera.fy, camera.cx, camera.cy, camera.depth_scale)  # its size was checked
+    frame = RGBDFrame(np.zeros((*depth.shape, 3), np.uint8) if color is None else color, depth, labels, pinhole)
     n_findings = len(diagnosis.findings)
     if color is not None:
         check_registration(diagnosis, color, frame.depth_m)
@@ -136,9 +136,3 @@ def _read(diagnosis: Diagnosis, name: str, read: Callable[[], T]) -> T | None:
     except InputError as error:
         diagnosis.add(f"unreadable-{name}", f"{name} cannot be used: {error}.", "Formats: docs/frames.md.")
         return None
-
-
-def _frame(color: np.ndarray, depth: np.ndarray, labels: np.ndarray | None, camera: Intrinsics) -> RGBDFrame:
-    """Return a frame; the camera's image size is a finding of its own."""
-    pinhole = Intrinsics(camera.fx, camera.fy, camera.cx, camera.cy, camera.depth_scale)
-    return RGBDFrame(color, depth, labels, pinhole)

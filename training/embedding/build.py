@@ -20,6 +20,7 @@ from thor2_jax.files import check_output_directory, check_output_file, remove_wr
 from thor2_jax.gallery.embedding import Embedding
 from training.embedding.fit import EmbeddingFit, fit_embedding, reference_views
 from training.embedding.sampling import ObjectSource, build_samples
+from training.fitting.options import EpochMetrics
 from training.objects.meshes import find_meshes
 from training.storage.jobs import JOB_FILE
 from training.storage.progress import Progress, of_stage
@@ -64,22 +65,13 @@ def build_embedding(
     directory = out.with_name(f"{out.name}.samples")
     check_output_file("out", out, lambda path: bool(Embedding.load(path)))
     check_output_directory(directory, JOB_FILE)
-    samples = build_samples(
-        sources,
-        directory,
-        network,
-        config,
-        views,
-        pool=local_workers(workers),
-        progress=of_stage(progress, "render for the embedding"),
-    )
-    embedding = fit_embedding(
-        samples,
-        network,
-        config,
-        options,
-        progress=lambda done, total, metrics: progress("embedding", done, total, f"loss {metrics.loss:.3f}"),
-    )
+    pool, show = local_workers(workers), of_stage(progress, "render for the embedding")
+    samples = build_samples(sources, directory, network, config, views, pool=pool, progress=show)
+
+    def report(done: int, total: int, metrics: EpochMetrics) -> None:
+        progress("embedding", done, total, f"loss {metrics.loss:.3f}")
+
+    embedding = fit_embedding(samples, network, config, options, progress=report)
     embedding = dataclasses.replace(embedding, references=reference_views(embedding, samples))
     embedding.save(out)
     remove_written(directory, r"job\.json", r"\.lock", r"[0-9]{5,}\.safetensors")
@@ -103,9 +95,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
     try:
         meshes = list(find_meshes(options.meshes).values()) if options.meshes else []
-        embedding = build_embedding(
-            options.out, options.objects, options.views, options.epochs, meshes, options.workers, show
-        )
+        numbers = options.objects, options.views, options.epochs
+        embedding = build_embedding(options.out, *numbers, meshes, options.workers, show)
     except InputError as error:
         raise SystemExit(f"error: {error}") from None
     print(f"{options.out}: {embedding.fingerprint}")

@@ -76,14 +76,9 @@ def batch_descriptors(
     length: jax.Array, color: jax.Array, network: ColorNetwork, config: DescriptorConfig
 ) -> Descriptors:
     """Return the descriptors of the strips of a batch; `length` and `color` are fields of `Batch`."""
-    length = length.astype(jnp.float32)
-    strips = Strips(
-        low=jnp.zeros_like(length),
-        high=length,
-        occupied=length > 0,  # a strip of one point has no persistence, so its pair adds nothing to the image
-        color=color.astype(jnp.float32),
-        overflow=jnp.zeros(len(length), jnp.int32),
-    )
+    length, overflow = length.astype(jnp.float32), jnp.zeros(len(length), jnp.int32)
+    occupied = length > 0  # a strip of one point has no persistence, so its pair adds nothing to the image
+    strips = Strips(jnp.zeros_like(length), length, occupied, color.astype(jnp.float32), overflow)
     return describe_strips(strips, network, config)
 
 
@@ -267,11 +262,8 @@ def reference_views(embedding: Embedding, samples: Samples, seed: int = 0) -> Re
     looks = (batch_looks(batch, embedding.network, embedding.config) for batch in samples.batches(rows, BATCH))
     chunks = [embedding.embed_oriented(batch)[:, 0] for batch in looks]
     label = samples.label[rows]
-    return References(
-        np.concatenate(chunks)[: len(rows)].astype(np.float16),
-        np.where(label < n_classes, label, BACKGROUND).astype(np.int32),
-        embedding.classes,
-    )
+    embedded, shown = np.concatenate(chunks)[: len(rows)], np.where(label < n_classes, label, BACKGROUND)
+    return References(embedded.astype(np.float16), shown.astype(np.int32), embedding.classes)
 
 
 def _choose(allowed: NDArray[np.bool_], count: int, rng: np.random.Generator) -> NDArray[np.intp]:

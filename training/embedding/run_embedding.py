@@ -176,16 +176,7 @@ def fit_run_embedding(
         progress(FIT, done, total, metrics.describe(distractors.epochs))
 
     samples = joined_samples(fitted, config)
-    embedding = fit_embedding(
-        samples,
-        network,
-        config,
-        EmbeddingFit(epochs=distractors.epochs, seed=seed, networks=distractors.networks),
-        SIZES,
-        progress=show,
-        classes=classes,
-        checkpoints=checkpoints,
-        epoch_done=epoch_done,
-    )
+    options = EmbeddingFit(epochs=distractors.epochs, seed=seed, networks=distractors.networks)
+    embedding = fit_embedding(samples, network, config, options, SIZES, show, classes, checkpoints, epoch_done)
     embedding = dataclasses.replace(embedding, references=reference_views(embedding, samples, seed))
     return embedding, joined_samples(kept, config)

@@ -15,7 +15,7 @@ import json
 import logging
 import os
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -34,7 +34,6 @@ from thor2_jax.files import atomic_write, content_digest, json_digest, remove_le
 from thor2_jax.types import Cloud
 from training.augmentation.augmentations import KINDS, Augmentations, augment
 from training.embedding.samples import Samples, joined_samples, sample_clouds
-from training.objects.mesh import TexturedMesh
 from training.objects.meshes import load_mesh
 from training.objects.procedural import procedural_object
 from training.rendering.camera import Camera
@@ -84,10 +83,6 @@ class ViewTask:
     seed: int
 
 
-def _mesh(source: ObjectSource) -> TexturedMesh:
-    return load_mesh(source) if isinstance(source, Path) else procedural_object(source)
-
-
 def render_clouds(task: ViewTask) -> list[tuple[int, Cloud]]:
     """Return the object's index and the cloud of the views that have at least `MIN_VIEW_POINTS` points.
 
@@ -96,7 +91,7 @@ def render_clouds(task: ViewTask) -> list[tuple[int, Cloud]]:
     """
     clouds = []
     for index, source in task.sources.items():
-        mesh = _mesh(source)
+        mesh = load_mesh(source) if isinstance(source, Path) else procedural_object(source)
         caster = RayCaster([mesh])
         rng = np.random.default_rng([task.seed, index])
         for _ in range(task.views):
@@ -108,12 +103,7 @@ def render_clouds(task: ViewTask) -> list[tuple[int, Cloud]]:
 
 
 def sampling_job(
-    objects: Sequence[int | str],
-    network: ColorNetwork,
-    config: DescriptorConfig,
-    views: int,
-    copies: int,
-    seed: int,
+    objects: Sequence[int | str], network: ColorNetwork, config: DescriptorConfig, views: int, copies: int, seed: int
 ) -> dict[str, Any]:
     """Return the record of a sampling; `objects` says what they are, see `build_samples` for the others."""
     return {
@@ -162,7 +152,8 @@ def build_samples(
     if len(sources) < 2 or views < 1:
         raise InputError(f"there are {len(sources)} objects with {views} views each; expected at least 2 with 1 view")
     directory = Path(directory)
-    label_of = {source: index for index, source in reversed(list(enumerate(sources)))}
+    numbered = list(enumerate(sources))
+    label_of = {source: index for index, source in reversed(numbered)}
     job = sampling_job([str(source) for source in sources], network, config, views, copies, seed)
     with locked(directory):
         begin_job(directory, job)
@@ -170,7 +161,8 @@ def build_samples(
         files = {first: directory / f"{first:05d}.safetensors" for first in starts}
         missing = [first for first in starts if not files[first].is_file()]
         progress(min((len(starts) - len(missing)) * OBJECTS_PER_SHARD, len(sources)), len(sources))
-        with closing(pool(render_clouds, _tasks(sources, missing, views, seed))) as results:
+        tasks = (ViewTask(dict(numbered[first : first + OBJECTS_PER_SHARD]), views, seed) for first in missing)
+        with closing(pool(render_clouds, tasks)) as results:
             for first, rendered in zip(missing, results, strict=True):
                 visible = {index for index, _ in rendered}
                 for index in range(first, min(first + OBJECTS_PER_SHARD, len(sources))):
@@ -183,11 +175,6 @@ def build_samples(
                     temporary.write_bytes(safetensors.numpy.save(arrays))
                 progress(min(first + OBJECTS_PER_SHARD, len(sources)), len(sources))
         return joined_samples([safetensors.numpy.load_file(file) for file in files.values()], config)
-
-
-def _tasks(sources: Sequence[ObjectSource], starts: Sequence[int], views: int, seed: int) -> Iterator[ViewTask]:
-    for first in starts:
-        yield ViewTask(dict(list(enumerate(sources))[first : first + OBJECTS_PER_SHARD]), views, seed)
 
 
 MAX_FILES = 3
@@ -228,12 +215,8 @@ def cached_samples(job: Mapping[str, Any], build: Callable[[], Samples], resumes
                 os.utime(file)
             return samples
     except (OSError, ValueError, KeyError, TypeError, AttributeError, safetensors.SafetensorError) as error:
-        log.warning(
-            "%s cannot be used (%s); the distractors are rendered again%s",
-            file,
-            error,
-            "" if _is_own(file) else "; delete this file",
-        )
+        advice = "" if _is_own(file) else "; delete this file"
+        log.warning("%s cannot be used (%s); the distractors are rendered again%s", file, error, advice)
     samples = build()
     try:
         directory.mkdir(mode=0o700, parents=True, exist_ok=True)

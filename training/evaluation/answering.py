@@ -112,23 +112,21 @@ def _answer_chunk(
 def _answer(runs: Sequence[Run], item: LabelledFrame) -> list[InstancePrediction]:
     recognizer = runs[0].recognizer
     described = recognizer.describe(item.frame)
-    baselines = any(run.baselines for run in runs)
-    inputs = baseline_inputs(described, recognizer.run.config, item.frame) if baselines else None
+    has_baselines = any(run.baselines for run in runs)
+    inputs = baseline_inputs(described, recognizer.run.config, item.frame) if has_baselines else None
     values = [run.probabilities(item.identifier, described, inputs) for run in runs]
     table = np.stack([values[index][name] for index, name in all_predictors(runs)], axis=1)  # [B, M, C]
     rows = {instance.label: row for row, instance in enumerate(described.usable)}
     reasons = {instance.label: instance.reason for instance in described.instances}
     answers = []
     for label, name in sorted(item.truth.items()):
-        truth = find_name(name, runs[0].classes) or name
-        position = _position(item.frame, label)
-        if label in rows:
-            row = rows[label]
-            occluded = described.usable[row].occluded
-            answers.append(InstancePrediction(label, truth, occluded, None, table[row], position))
-        else:
+        truth, position = find_name(name, runs[0].classes) or name, _position(item.frame, label)
+        if (row := rows.get(label)) is None:
             reason = reasons.get(label) or NO_PIXELS
             answers.append(InstancePrediction(label, truth, reason=reason, position=position))
+        else:
+            occluded = described.usable[row].occluded
+            answers.append(InstancePrediction(label, truth, occluded, None, table[row], position))
     return answers
 
 

@@ -10,7 +10,7 @@ import itertools
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,7 @@ __all__ = [
     "FrameAnswers",
     "GALLERY",
     "InstancePrediction",
+    "Predictions",
     "RULES",
     "Rule",
     "WHOLE",
@@ -153,15 +154,11 @@ def read_answers(path: Path) -> list[FrameAnswers]:
 
 
 def _encode(answers: FrameAnswers) -> str:
-    instances = [
-        {
-            **{f.name: getattr(i, f.name) for f in dataclasses.fields(i)},
-            "probabilities": None
-            if i.probabilities is None
-            else [[float(f"{p:.6g}") for p in row] for row in i.probabilities],
-        }
-        for i in answers.instances
-    ]
+    instances = []
+    for instance in answers.instances:
+        table = instance.probabilities
+        rounded = None if table is None else [[float(f"{p:.6g}") for p in row] for row in table]
+        instances.append(vars(instance) | {"probabilities": rounded})
     values = {
         "frame": answers.frame,
         "attributes": dict(answers.attributes),
@@ -222,16 +219,21 @@ def main_fusion(titles: Iterable[str], answer_by: str = "classifiers") -> str:
             that is among the titles), "gallery" or "both".
     """
     titles = list(titles)
-    for title in (answer_by, ALL_CLASSIFIERS, "THOR2", EMBEDDED):
-        if title in titles:
-            return title
-    return [title for title in titles if title not in WHOLE][-1]
+    last = [title for title in titles if title not in WHOLE][-1:]
+    return next(title for title in (answer_by, ALL_CLASSIFIERS, "THOR2", EMBEDDED, *last) if title in titles)
+
+
+class Predictions(NamedTuple):
+    """Predicted classes [B] and their fused probabilities [B]."""
+
+    class_index: NDArray[np.intp]
+    confidence: NDArray[np.floating[Any]]
 
 
 def fuse_by(
     rule: Rule, probabilities: Mapping[str, NDArray[np.floating[Any]]], temperatures: Mapping[str, float] | None = None
-) -> tuple[NDArray[np.intp], NDArray[np.floating[Any]]]:
-    """Return the predicted class [B] and its fused probability [B].
+) -> Predictions:
+    """Return the predicted classes and their fused probabilities.
 
     Args:
         rule: rule of the fusion.
@@ -240,10 +242,9 @@ def fuse_by(
     """
     if set(probabilities) <= set(WHOLE):
         (values,) = probabilities.values()  # scores, which need not sum to 1
-        return values.argmax(axis=1), values.max(axis=1)
+        return Predictions(values.argmax(axis=1), values.max(axis=1))
     if rule == "calibrated":
         assert temperatures is not None
         probabilities = {name: with_temperature(values, temperatures[name]) for name, values in probabilities.items()}
         rule = "max"
-    fused = fuse(probabilities, rule)
-    return fused.class_index, fused.confidence
+    return Predictions(*fuse(probabilities, rule)[:2])

@@ -59,8 +59,7 @@ class FramePictures:
 
     def restore(self, answers: FrameAnswers) -> None:
         """Take into account a frame that was drawn before the evaluation was interrupted."""
-        for _ in self._most_confident(answers):
-            pass
+        list(self._most_confident(answers))
 
     def draw(self, number: int, item: LabelledFrame, answers: FrameAnswers) -> None:
         """Draw the frame if it is shown, and those of its wrong names that are the most confident so far.
@@ -68,12 +67,11 @@ class FramePictures:
         Raises:
             OSError: a file cannot be written.
         """
+        color, labels = item.frame.color, item.frame.label_image
         for instance, name in self._most_confident(answers):
-            draw_crop(
-                item.frame.color, item.frame.label_image == instance.label, self.confusion_path(instance.truth, name)
-            )
+            draw_crop(color, labels == instance.label, self.confusion_path(instance.truth, name))
         if number in self.shown:
-            draw_judged(item.frame.color, item.frame.label_image, self._judge(answers), self.frame_path(number))
+            draw_judged(color, labels, self._judge(answers), self.frame_path(number))
 
     def _most_confident(self, answers: FrameAnswers) -> Iterator[tuple[InstancePrediction, str]]:
         """Yield instance and name of each wrong name that is more confident than all equal ones so far."""

@@ -69,10 +69,7 @@ def evaluate_dataset(
     check_output_directory(out, ANSWERS)
     if not out.exists():
         frames[0]  # raises if it cannot be read, before anything is written
-
-    def in_process(numbers: range) -> Generator[tuple[LabelledFrame, FrameAnswers], None, None]:
-        return answer_frames(runs, (frames[number] for number in numbers))
-
+    answering = answering or (lambda numbers: answer_frames(runs, (frames[number] for number in numbers)))
     with locked(out):
         description = {**dataset, "frames": len(frames)}
         digests = [run.digest for run in runs]
@@ -89,11 +86,16 @@ def evaluate_dataset(
         pictures = FramePictures(out, runs, len(frames))
         for answers in file.frames:
             pictures.restore(answers)
-        _answer_rest(answering or in_process, frames, file, pictures, progress)
-        own_objects = isinstance(runs[0], SequenceRun)
-        results = compute_results(
-            dataset["kind"], runs, file.frames, own_objects, has_real_views(runs), scratch_networks(runs)
-        )
+        first, start = len(file.frames), time.perf_counter()
+        progress("evaluate", first, len(frames), "")
+        with contextlib.closing(answering(range(first, len(frames)))) as answered:
+            for number, (item, answers) in enumerate(answered, first):
+                pictures.draw(number, item, answers)  # before the frame counts as done
+                file.append(dataclasses.replace(answers, files=_file_digests(frames.files(number))))
+                rate = (number + 1 - first) / (time.perf_counter() - start)
+                progress("evaluate", number + 1, len(frames), f"{rate:.2f} frames/s, {item.identifier}")
+        conditions = isinstance(runs[0], SequenceRun), has_real_views(runs), scratch_networks(runs)
+        results = compute_results(dataset["kind"], runs, file.frames, *conditions)
         report = {"dataset": description, "digests": digests, **results}
         if not report["instances"]["scored"]:
             raise InputError(
@@ -137,16 +139,3 @@ def _check_unchanged(file: AnswerFile, frames: LabelledFrames, out: Path, progre
                 path = min(stored ^ current)[0]
                 raise InputError(f"out: {out} was written before {path} changed; choose another directory")
         progress("check files", number + 1, len(file.frames), "")
-
-
-def _answer_rest(
-    answering: Answering, frames: LabelledFrames, file: AnswerFile, pictures: FramePictures, progress: Progress
-) -> None:
-    first, start = len(file.frames), time.perf_counter()
-    progress("evaluate", first, len(frames), "")
-    with contextlib.closing(answering(range(first, len(frames)))) as answered:
-        for number, (item, answers) in enumerate(answered, first):
-            pictures.draw(number, item, answers)  # before the frame counts as done
-            file.append(dataclasses.replace(answers, files=_file_digests(frames.files(number))))
-            rate = (number + 1 - first) / (time.perf_counter() - start)
-            progress("evaluate", number + 1, len(frames), f"{rate:.2f} frames/s, {item.identifier}")

@@ -42,11 +42,6 @@ def _mean_std(statistics: Mapping[str, Any], factor: float = 1.0, digits: int = 
     return " ±\u00a0".join(f"{factor * value:.{digits}f}" for value in values)
 
 
-def _percent(statistics: Mapping[str, Any]) -> str:
-    """Return `_mean_std` in percent, with two decimals as in the publications."""
-    return _mean_std(statistics, 100.0, 2)
-
-
 def _marked(title: str, main: str) -> str:
     return f"{title} (thor2 recognize)" if title == main else title
 
@@ -64,16 +59,15 @@ def accuracy_table(table: Mapping[str, Any], titles: Sequence[str]) -> Table:
         table: an entry of `report["accuracy"][rule]`.
         titles: fusions to show.
     """
-    header = [", ".join(table["by"]), "instances", *titles]
-    rows = [
-        [
-            ", ".join(cell["where"].values()) or "all",
-            f"{cell['instances']:,}",
-            *(_mean_std(cell["accuracy"][title]) for title in titles),
-        ]
-        for cell in table["cells"]
-    ]
-    return header, rows
+    rows = [_row(cell, [cell["accuracy"][title] for title in titles]) for cell in table["cells"]]
+    return [", ".join(table["by"]), "instances", *titles], rows
+
+
+def _row(
+    cell: Mapping[str, Any], values: Sequence[Mapping[str, Any]], factor: float = 1.0, digits: int = 3
+) -> list[str]:
+    where = ", ".join(cell["where"].values()) or "all"
+    return [where, f"{cell['instances']:,}", *(_mean_std(value, factor, digits) for value in values)]
 
 
 def comparison_title(table: Mapping[str, Any]) -> str:
@@ -102,17 +96,10 @@ def comparison_table(table: Mapping[str, Any], main: str) -> Table:
         if method in table["ours"]:
             columns.append(("accuracy", table["ours"][method]))
         columns.append(("published", method))
-    header = ["", "instances"]
-    header += [f"{name}, published" if key == "published" else name for key, name in columns]
-    rows = [
-        [
-            ", ".join(cell["where"].values()) or "all",
-            f"{cell['instances']:,}",
-            *(_percent(cell[key].get(name, NO_VALUE)) for key, name in columns),
-        ]
-        for cell in table["cells"]
-    ]
-    return header, rows
+    header = ["", "instances", *(f"{name}, published" if key == "published" else name for key, name in columns)]
+    values = [[cell[key].get(name, NO_VALUE) for key, name in columns] for cell in table["cells"]]
+    # In percent with two decimals, as in the publications.
+    return header, [_row(cell, each, 100.0, 2) for cell, each in zip(table["cells"], values, strict=True)]
 
 
 def write_report_page(report: Mapping[str, Any], pictures: FramePictures, out: Path) -> None:
@@ -129,7 +116,7 @@ def write_report_page(report: Mapping[str, Any], pictures: FramePictures, out: P
     sections: list[Section] = []
     if report["fusions"]:
         main = report["main"]
-        sections += [
+        sections = [
             _answer_section(report, pictures, out),
             *_accuracy_sections(report, out),
             *(
@@ -307,30 +294,23 @@ def _unknown_sections(report: Mapping[str, Any], out: Path) -> list[Section]:
     ]
     table = [[name, *(_mean_std(shares[key]) for key in keys)] for name, *keys in rows]
     if n_unknown:
-        table.append(
-            [f"unknown, named ({n_unknown:,} instances)", "1.000", _mean_std(shares["unknown_named_at_threshold"])]
-        )
+        named = _mean_std(shares["unknown_named_at_threshold"])
+        table.append([f"unknown, named ({n_unknown:,} instances)", "1.000", named])
     header = ["objects", "without rejection", f"threshold {_mean_std(shares['threshold'])}"]
-    if not shares["threshold"]["runs"]:
+    text = f"Shares of the instances for {main}. An answer whose confidence is below the threshold has no name: "
+    text += "the object is unknown. "
+    if shares["threshold"]["runs"]:
+        text += "The threshold is the one that the models store. Enrolled objects have their own ones, by their "
+        text += "numbers of views; the median is shown."
+    else:
         header, table = header[:2], [row[:2] for row in table]
-    text = (
-        f"Shares of the instances for {main}. An answer whose confidence is below the threshold has no name: the "
-        "object is unknown. "
-    )
-    text += (
-        "The threshold is the one that the models store. Enrolled objects have their own ones, by their numbers of "
-        "views; the median is shown."
-        if shares["threshold"]["runs"]
-        else "These models store no threshold."
-    )
+        text += "These models store no threshold."
     pictures = []
     if curve is not None:
-        named = report["confidence"][main]["unknown_named"]
-        draw_known_unknown(curve, (COVERAGE, named["mean"]), main, out / "known-unknown.png")
-        text += (
-            f" With one that keeps {COVERAGE:.0%} of the correct answers, {_mean_std(named)} of the unknown objects "
-        )
-        text += "have a name."
+        statistics = report["confidence"][main]["unknown_named"]
+        draw_known_unknown(curve, (COVERAGE, statistics["mean"]), main, out / "known-unknown.png")
+        text += f" With one that keeps {COVERAGE:.0%} of the correct answers, {_mean_std(statistics)} of the unknown "
+        text += "objects have a name."
         caption = f"Unknown objects that {main} names, by the share of its correct answers that a threshold keeps."
         pictures = [Picture("known-unknown.png", caption, half=True)]
     return [Section("Unknown objects", text, (header, table), pictures)]
@@ -384,8 +364,8 @@ def _measurement_section(report: Mapping[str, Any]) -> Section:
     speed, counts = report["speed"], report["instances"]
     text = f"Models: {', '.join(report['runs'])}. "
     if speed["frames_per_second"]:
-        text += f"Speed: {speed['frames_per_second']:.2f} frames per second, "
-        text += "from reading the files to the answers of all models, compilation included"
+        text += f"Speed: {speed['frames_per_second']:.2f} frames per second, from reading the files to the answers of "
+        text += "all models, compilation included"
         text += f"; median {speed['median_seconds']:.2f} s per frame." if speed["median_seconds"] else "."
     published_speed = [f"{name} {seconds} s" for name, seconds in published_seconds().items()]
     text += f" Published times per frame: {', '.join(published_speed)}."

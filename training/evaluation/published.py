@@ -178,15 +178,15 @@ def compare_with_published(
 
 def _network_differences(titles: Iterable[str], conditions: EvaluationConditions) -> list[str]:
     """Return the limits of the measured image networks."""
+    scratch = (
+        "was trained from scratch, without pretrained weights: its accuracy is no claim about the published network"
+    )
     sentences = []
     for title in dict.fromkeys(titles):
         if title.endswith(_SMALL):
             sentences.append(f"{title} is a smaller network than the published one.")
         if title in conditions.scratch:
-            sentences.append(
-                f"{title} was trained from scratch, without pretrained weights: its accuracy is no claim about the "
-                "published network."
-            )
+            sentences.append(f"{title} {scratch}.")
     return sentences
 
 
@@ -195,28 +195,22 @@ def _differences(
 ) -> list[str]:
     """Return one sentence for each known difference between the data of the table and of the evaluation."""
     data = _read()["datasets"][kind]
-    size = (
-        f" ({data['frames']:,} frames, {data['instances']:,} instances)" if data["frames"] and data["instances"] else ""
-    )
-    sentences = [
-        f"The published figures concern {data['concerns']}{size}; here {conditions.frames:,} frames are evaluated."
-    ]
+    size = ""
+    if data["frames"] and data["instances"]:
+        size = f" ({data['frames']:,} frames, {data['instances']:,} instances)"
+    frames, rows = f"{conditions.frames:,} frames", len(table["cells"])
+    sentences = [f"The published figures concern {data['concerns']}{size}; here {frames} are evaluated."]
     if table["objects"] is None:
         sentences.append(f"Number of objects that are scored here: {n_objects}.")
     elif table["objects"] != n_objects:
         sentences.append(f"The publication scores {table['objects']} objects, this evaluation {n_objects}.")
-    if n_rows < len(table["cells"]):
-        sentences.append(
-            f"{len(table['cells']) - n_rows} of the table's {len(table['cells'])} rows have no instance here."
-        )
+    if n_rows < rows:
+        sentences.append(f"{rows - n_rows} of the table's {rows} rows have no instance here.")
     models = "models of its own" if table["models"] is None else f"{table['models']} models"
-    sentences.append(
-        f"The publication uses {models}; here {conditions.models} "
-        f"{'model is' if conditions.models == 1 else 'models are'} evaluated, trained on other views and folds."
-    )
+    here = "1 model is" if conditions.models == 1 else f"{conditions.models} models are"
+    sentences.append(f"The publication uses {models}; here {here} evaluated, trained on other views and folds.")
     fuses = any("THOR2" in method for cell in table["cells"] for method in cell["accuracy"])
     if fuses and conditions.rule != _PAPER_RULE:
-        sentences.append(
-            f"The publication fuses classifiers by the rule {_PAPER_RULE}, this table by {conditions.rule}."
-        )
+        rules = f"the rule {_PAPER_RULE}, this table by {conditions.rule}"
+        sentences.append(f"The publication fuses classifiers by {rules}.")
     return sentences

@@ -1,18 +1,19 @@
 """All values of a report, computed from the answers, as one JSON table."""
 
-import dataclasses
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.model.fusion import DEFAULT_RULE
+from training.evaluation import scores
 from training.evaluation.answers import (
     RULES,
     FrameAnswers,
     InstancePrediction,
+    Predictions,
     Rule,
     all_predictors,
     fuse_by,
@@ -20,26 +21,13 @@ from training.evaluation.answers import (
     main_fusion,
 )
 from training.evaluation.published import EvaluationConditions, compare_with_published, published_means
-from training.evaluation.scores import (
-    accuracy_at_coverage,
-    attribute_tables,
-    auroc,
-    expected_calibration_error,
-    find_placements,
-    group_by_attributes,
-    placement_accuracy,
-    reliability,
-    steadiness,
-    summarize_rows,
-    summarize_runs,
-    unknown_named,
-)
+from training.evaluation.scores import summarize_rows, summarize_runs
 from training.readers.labelled import sequence_of
 
 if TYPE_CHECKING:
     from training.evaluation.runs import Run
 
-__all__ = ["COVERAGE", "Predictions", "compute_results", "fuse_answers", "named_answers"]
+__all__ = ["COVERAGE", "compute_results", "fuse_answers", "named_answers"]
 
 COVERAGE = 0.95
 """Fraction of the answers to known objects, or of the correct ones, that is accepted in the open-set metrics."""
@@ -52,19 +40,6 @@ Integers = NDArray[np.intp]
 
 MOST_FREQUENT = 12
 """Pairs of object and wrong name listed in a report, of known and of unknown objects."""
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Predictions:
-    """Predictions of one fusion of one run.
-
-    Attributes:
-        class_index: [N] predicted classes.
-        confidence: [N] fused probabilities of these classes.
-    """
-
-    class_index: Integers
-    confidence: NDArray[np.floating[Any]]
 
 
 Fused = Mapping[str, Mapping[int, Predictions]]
@@ -89,8 +64,8 @@ def fuse_answers(
             if owner == index and (rule != "calibrated" or name in run.temperatures)
         }
         for title, names in fusions(probabilities).items():
-            fused = fuse_by(rule, {name: probabilities[name] for name in names}, run.temperatures)
-            predictions[title][index] = Predictions(*fused)
+            fused = {name: probabilities[name] for name in names}
+            predictions[title][index] = fuse_by(rule, fused, run.temperatures)
     return {title: by_run for title, by_run in predictions.items() if by_run}
 
 
@@ -129,62 +104,46 @@ def compute_results(
         scratch: titles of the baselines whose networks were trained without pretrained weights.
     """
     classes = runs[0].classes
-    labelled = [(instance, _attributes(kind, frame)) for frame in frames for instance in frame.instances]
-    known = [(instance, attributes) for instance, attributes in labelled if instance.truth in classes]
-    placement = np.concatenate([np.zeros(0, np.intp), *find_placements(frames)])
-    placement = placement[[instance.truth in classes for instance, _ in labelled]]
+    labelled = [(instance, frame) for frame in frames for instance in frame.instances]
+    is_known = [instance.truth in classes for instance, _ in labelled]
+    instances = [instance for instance, _ in labelled if instance.truth in classes]
     unknown = [instance for instance, _ in labelled if instance.truth not in classes]
+    seconds = [frame.seconds for frame in frames]
     results: dict[str, Any] = {
         "runs": [run.name for run in runs],
         "classes": list(classes),
         "rule": DEFAULT_RULE,
         "instances": {
             "labelled": len(labelled),
-            "scored": len(known),
-            "not_described": dict(Counter(i.reason for i, _ in known if i.probabilities is None)),
+            "scored": len(instances),
+            "not_described": dict(Counter(i.reason for i in instances if i.probabilities is None)),
             "no_class": dict(Counter(i.truth for i in unknown)),
         },
-        "speed": _speed([frame.seconds for frame in frames]),
+        "speed": {
+            "frames": len(seconds),
+            "seconds": sum(seconds),
+            "frames_per_second": len(seconds) / sum(seconds) if sum(seconds) else None,
+            "median_seconds": float(np.median(seconds)) if seconds else None,
+        },
         "fusions": [],
         "worst": [],
         "published_tables": [],
         "scratch": list(scratch),
     }
-    conditions = EvaluationConditions(own_objects, len(runs), len(frames), DEFAULT_RULE, real_views, scratch)
-    return results | _scores(kind, runs, known, placement, unknown, conditions) if known else results
-
-
-def _attributes(kind: str, frame: FrameAnswers) -> dict[str, str]:
+    if not instances:
+        return results
     # OCID has a table by sequence, which is the directory of the frame.
-    sequence = {"sequence": sequence_of(frame.frame)} if kind == "ocid" else {}
-    return {**frame.attributes, **sequence}
-
-
-def _speed(seconds: Sequence[float]) -> dict[str, Any]:
-    return {
-        "frames": len(seconds),
-        "seconds": sum(seconds),
-        "frames_per_second": len(seconds) / sum(seconds) if sum(seconds) else None,
-        "median_seconds": float(np.median(seconds)) if seconds else None,
-    }
-
-
-def _scores(
-    kind: str,
-    runs: Sequence["Run"],
-    known: Sequence[tuple[InstancePrediction, Mapping[str, str]]],
-    placement: Integers,
-    unknown: Sequence[InstancePrediction],
-    conditions: EvaluationConditions,
-) -> dict[str, Any]:
-    """Return the part of the results that needs instances of the runs' classes."""
-    classes = runs[0].classes
-    instances, attributes = [instance for instance, _ in known], [each for _, each in known]
+    attributes = [
+        {**frame.attributes, **({"sequence": sequence_of(frame.frame)} if kind == "ocid" else {})}
+        for instance, frame in labelled
+        if instance.truth in classes
+    ]
+    placement = np.concatenate(scores.find_placements(frames))[is_known]
     described = np.array([i.probabilities is not None for i in instances])
     truth = np.array([classes.index(i.truth) for i in instances], np.intp)
     by_rule = {rule: fuse_answers(instances, runs, rule) for rule in RULES}
     unknown_by_rule = {rule: fuse_answers(unknown, runs, rule) for rule in (DEFAULT_RULE, "calibrated")}
-    tables = attribute_tables(kind, attributes)
+    tables = scores.attribute_tables(kind, attributes)
     main = main_fusion(by_rule[DEFAULT_RULE], runs[0].answer_by)
     by_run, unknown_by_run = by_rule[DEFAULT_RULE][main], unknown_by_rule[DEFAULT_RULE][main]
     answers = {
@@ -196,14 +155,23 @@ def _scores(
         for rule, by_title in answers.items()
     }
     rejection = [_rejection(by_run[run], truth, described, unknown_by_run[run], runs[run].thresholds) for run in by_run]
-    return {
+    # Rows are true classes; the last column has the instances that are not described, by their index -1.
+    confusion = np.zeros((len(classes), len(classes) + 1), np.intp)
+    for answer in answers[DEFAULT_RULE][main]:
+        np.add.at(confusion, (truth, answer), 1)
+    conditions = EvaluationConditions(own_objects, len(runs), len(frames), DEFAULT_RULE, real_views, scratch)
+
+    def of_runs(measure: Callable[..., float], by_title: Mapping[str, Sequence[NDArray[Any]]]) -> dict[str, Any]:
+        return {title: summarize_runs([measure(placement, each) for each in by_title[title]]) for title in by_title}
+
+    results |= {
         "fusions": list(by_rule[DEFAULT_RULE]),
         "accuracy": {
-            rule: [_accuracy(kind, names, attributes, correct[rule], conditions.own_objects) for names in tables]
+            rule: [_accuracy(kind, names, attributes, correct[rule], own_objects) for names in tables]
             for rule in by_rule
         },
         "published_tables": compare_with_published(
-            kind, conditions, attributes, [i.truth for i in instances], correct[conditions.rule]
+            kind, conditions, attributes, [i.truth for i in instances], correct[DEFAULT_RULE]
         ),
         "temperatures": {
             name: summarize_runs([run.temperatures[name] for run in runs if name in run.temperatures])
@@ -213,21 +181,16 @@ def _scores(
         "calibrated_confidence": _confidence(by_rule["calibrated"], truth[described], unknown_by_rule["calibrated"]),
         "placements": {
             "count": len(np.unique(placement)),
-            "accuracy": {
-                title: summarize_runs([placement_accuracy(placement, marks) for marks in each])
-                for title, each in correct[DEFAULT_RULE].items()
-            },
-            "steadiness": {
-                title: summarize_runs([steadiness(placement, answer) for answer in each])
-                for title, each in answers[DEFAULT_RULE].items()
-            },
+            "accuracy": of_runs(scores.placement_accuracy, correct[DEFAULT_RULE]),
+            "steadiness": of_runs(scores.steadiness, answers[DEFAULT_RULE]),
         },
         "main": main,
         "rejection": summarize_rows(rejection),
         "known_unknown": _known_unknown([(by_run[run], unknown_by_run[run]) for run in by_run], truth[described]),
         "reliability": _reliability(list(by_run.values()), truth[described]),
-        "confusion": _confusion(answers[DEFAULT_RULE][main], truth, len(classes)).tolist(),
-    } | _answers([*instances, *unknown], runs)
+        "confusion": confusion.tolist(),
+    }
+    return results | _answers([*instances, *unknown], runs)
 
 
 def _of_all(predictions: Predictions, described: Flags) -> Integers:
@@ -246,7 +209,7 @@ def _accuracy(
 ) -> dict[str, Any]:
     """Return the accuracy of each fusion by the named attributes, with published values of the same cells."""
     cells = []
-    for values, rows in group_by_attributes(attributes, names).items():
+    for values, rows in scores.group_by_attributes(attributes, names).items():
         where = dict(zip(names, values, strict=True))
         accuracy = {title: summarize_runs([marks[rows].mean() for marks in each]) for title, each in correct.items()}
         others = published_means(kind, where, own_objects)
@@ -265,16 +228,16 @@ def _confidence(fused: Fused, truth: Integers, unknown: Fused) -> dict[str, Any]
 def _confidence_of_run(known: Predictions, truth: NDArray[np.intp], unknown: Predictions) -> dict[str, float]:
     confidence, correct = np.minimum(known.confidence, 1), known.class_index == truth
     of_unknown = np.minimum(unknown.confidence, 1)
-    accepted = accuracy_at_coverage(confidence, correct, COVERAGE)
+    accepted = scores.accuracy_at_coverage(confidence, correct, COVERAGE)
     every = np.concatenate([confidence, of_unknown])
     return {
-        "expected_calibration_error": expected_calibration_error(confidence, correct),
-        "auroc_right": auroc(confidence, correct),
+        "expected_calibration_error": scores.expected_calibration_error(confidence, correct),
+        "auroc_right": scores.auroc(confidence, correct),
         "threshold_at_coverage": accepted.threshold,
         "accuracy_at_coverage": accepted.accuracy,
-        "auroc_known": auroc(every, np.arange(len(every)) < len(confidence)),
+        "auroc_known": scores.auroc(every, np.arange(len(every)) < len(confidence)),
         "unknown_refused": float((of_unknown < accepted.threshold).mean()) if len(of_unknown) else np.nan,
-        "unknown_named": float(unknown_named(confidence[correct], of_unknown, COVERAGE)),
+        "unknown_named": float(scores.unknown_named(confidence[correct], of_unknown, COVERAGE)),
     }
 
 
@@ -306,7 +269,8 @@ def _known_unknown(
         predictions: predictions for known and for unknown objects of each run.
         truth: [N] classes of the known objects.
     """
-    named = np.array([unknown_named(k.confidence[k.class_index == truth], u.confidence, CURVE) for k, u in predictions])
+    correct = [(known.confidence[known.class_index == truth], unknown) for known, unknown in predictions]
+    named = np.array([scores.unknown_named(confidence, unknown.confidence, CURVE) for confidence, unknown in correct])
     named = named[np.isfinite(named).all(axis=1)]
     return {"kept": list(CURVE), "named": named.mean(axis=0).tolist()} if len(named) else None
 
@@ -315,20 +279,11 @@ def _reliability(predictions: Sequence[Predictions], truth: Integers) -> dict[st
     """Return the bins of the reliability diagram, all runs together."""
     confidence = np.concatenate([p.confidence for p in predictions])
     correct = np.concatenate([p.class_index == truth for p in predictions])
-    bins = reliability(np.minimum(confidence, 1), correct)
+    bins = scores.reliability(np.minimum(confidence, 1), correct)
     return {
-        "answers": bins.answers.tolist(),
-        "accuracy": [None if np.isnan(value) else float(value) for value in bins.accuracy],
-        "confidence": [None if np.isnan(value) else float(value) for value in bins.confidence],
+        name: [None if np.isnan(value) else value for value in values.tolist()]
+        for name, values in bins._asdict().items()
     }
-
-
-def _confusion(answers: Sequence[Integers], truth: Integers, n_classes: int) -> Integers:
-    """Return [C, C + 1] counts over all runs: rows are true classes, the last column instances not described."""
-    counts = np.zeros((n_classes, n_classes + 1), np.intp)
-    for answer in answers:
-        np.add.at(counts, (truth, answer), 1)  # -1 is the last column
-    return counts
 
 
 def _answers(instances: Sequence[InstancePrediction], runs: Sequence["Run"]) -> dict[str, Any]:

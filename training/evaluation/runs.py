@@ -220,17 +220,12 @@ def load_sequence_runs(directory: Path, frames: Iterable[str]) -> list[SequenceR
         InputError: a sequence has no run, a run cannot be read, or runs differ in their classifiers, baselines, number
             of folds, descriptor or colour network.
     """
-    loaded: dict[Path, list[Run]] = {}
-    of_sequence: dict[str, list[Run]] = {}
-    missing = []
-    for sequence in dict.fromkeys(map(sequence_of, frames)):
-        path = next((directory / end for end in path_ends(sequence) if (directory / end).is_dir()), None)
-        if path is None:
-            missing.append(sequence)
-        else:
-            if path not in loaded:
-                loaded[path] = load_runs([path])
-            of_sequence[sequence] = loaded[path]
+    paths = {
+        sequence: next((directory / end for end in path_ends(sequence) if (directory / end).is_dir()), None)
+        for sequence in dict.fromkeys(map(sequence_of, frames))
+    }
+    missing = [sequence for sequence, path in paths.items() if path is None]
+    loaded = {path: load_runs([path]) for path in dict.fromkeys(paths.values()) if path is not None}
     if missing or not loaded:
         raise InputError(
             f"model: {directory} has no run for {', '.join(missing) or 'any sequence'}; "
@@ -245,12 +240,10 @@ def load_sequence_runs(directory: Path, frames: Iterable[str]) -> list[SequenceR
         _check_same_descriptor(runs[0], first[0], path, first_path)
     result = []
     for fold, run in enumerate(first):
-        runs_of_fold = {sequence: runs[fold] for sequence, runs in of_sequence.items()}
-        digest = json_digest({sequence: run.digest for sequence, run in runs_of_fold.items()})
+        of_sequence = {sequence: loaded[path][fold] for sequence, path in paths.items() if path is not None}
+        digest = json_digest({sequence: each.digest for sequence, each in of_sequence.items()})
         name = f"{named_path(directory).name}/*" + (f"/fold-{fold}" if len(first) > 1 else "")
-        result.append(
-            SequenceRun(name, digest, run.recognizer, run.baselines, weights=run.weights, of_sequence=runs_of_fold)
-        )
+        result.append(SequenceRun(name, digest, run.recognizer, run.baselines, {}, run.weights, of_sequence))
     return result
 
 
@@ -269,9 +262,6 @@ def _load(directory: Path) -> Run:
     recognizer = Recognizer.load(directory, chunk=BATCH_BUCKETS[-1])
     baselines = load_baselines(directory, recognizer.run)
     temperatures = baselines.temperatures | recognizer.run.record.get("temperatures", {})
-    return Run(_name(directory), _digest(directory), recognizer, baselines.models, temperatures, baselines.weights)
-
-
-def _name(directory: Path) -> str:
-    directory = named_path(directory)
-    return f"{directory.parent.name}/{directory.name}" if directory.name.startswith("fold-") else directory.name
+    named = named_path(directory)
+    name = f"{named.parent.name}/{named.name}" if named.name.startswith("fold-") else named.name
+    return Run(name, _digest(directory), recognizer, baselines.models, temperatures, baselines.weights)

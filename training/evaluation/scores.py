@@ -18,11 +18,6 @@ from training.evaluation.answers import FrameAnswers, InstancePrediction
 from training.readers.labelled import sequence_of
 
 __all__ = [
-    "BINS",
-    "Coverage",
-    "MAX_MOVE",
-    "MIN_UNMOVED",
-    "Reliability",
     "accuracy_at_coverage",
     "attribute_tables",
     "auroc",
@@ -84,12 +79,12 @@ def reliability(confidence: ArrayLike, correct: ArrayLike, bins: int = BINS) -> 
     return Reliability(count, accuracy, mean)
 
 
-def expected_calibration_error(confidence: ArrayLike, correct: ArrayLike, bins: int = BINS) -> float:
+def expected_calibration_error(confidence: ArrayLike, correct: ArrayLike) -> float:
     """Return the mean over the answers of |accuracy - confidence| of their bin; NaN without answers.
 
     Guo et al., "On Calibration of Modern Neural Networks" (ICML 2017). Arguments and errors are those of `reliability`.
     """
-    values = reliability(confidence, correct, bins)
+    values = reliability(confidence, correct)
     used = values.answers > 0
     if not used.any():
         return math.nan
@@ -174,12 +169,7 @@ def unknown_named(correct: ArrayLike, unknown: ArrayLike, kept: ArrayLike = 0.95
 _ORDER = {"none": 0, "low": 1, "high": 2}
 
 _TABLES: dict[str, tuple[tuple[str, ...], ...]] = {
-    "uwis": (
-        ("environment",),
-        ("environment", "category"),
-        ("environment", "occlusion"),
-        ("environment", "light"),
-    ),
+    "uwis": (("environment",), ("environment", "category"), ("environment", "occlusion"), ("environment", "light")),
     "ocid": (("camera",), ("camera", "place"), ("camera", "type"), ("camera", "place", "type"), ("sequence",)),
 }
 """Attributes of the paper's tables for its two datasets."""

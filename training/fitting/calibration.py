@@ -116,13 +116,12 @@ def fit_temperature(probabilities: Floats, truth: NDArray[np.integer[Any]]) -> f
         raise InputError(
             f"truth has values from {truth.min()} to {truth.max()}; expected 0 to {probabilities.shape[1] - 1}"
         )
-    optimum = minimize_scalar(
-        lambda exponent: negative_log_likelihood(probabilities, truth, math.exp(exponent)),
-        bounds=(math.log(0.01), math.log(100)),
-        method="bounded",
-        options={"xatol": 1e-6},
-    )
-    return math.exp(optimum.x)
+
+    def loss(exponent: float) -> float:
+        return negative_log_likelihood(probabilities, truth, math.exp(exponent))
+
+    bounds = math.log(0.01), math.log(100)
+    return math.exp(minimize_scalar(loss, bounds=bounds, method="bounded", options={"xatol": 1e-6}).x)
 
 
 KEPT = 0.97

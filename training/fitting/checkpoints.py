@@ -41,7 +41,7 @@ BEGUN = "begun.json"
 DIGEST_FILE = "sha256"
 
 
-class Checkpoints:
+class Checkpoints(contextlib.AbstractContextManager["Checkpoints"]):
     """Checkpoints in one directory, which all processes of a training share."""
 
     def __init__(self, directory: str | Path) -> None:
@@ -60,12 +60,7 @@ class Checkpoints:
         )
         self._manager = ocp.CheckpointManager(self.directory, options=options)
 
-    def __enter__(self) -> "Checkpoints":
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._manager.close()
 
     @property
@@ -123,9 +118,8 @@ class Checkpoints:
         target = jax.tree.map(lambda a: np.zeros(a.shape, a.dtype), like)
         try:
             # A process that is killed between checkpoint and digest leaves no digest.
-            if (path / DIGEST_FILE).is_file() and (path / DIGEST_FILE).read_text() != directory_digest(
-                path / "default"
-            ):
+            digest = path / DIGEST_FILE
+            if digest.is_file() and digest.read_text() != directory_digest(path / "default"):
                 raise ValueError("it is damaged")
             with _quiet_orbax():
                 state = self._manager.restore(epoch, args=ocp.args.StandardRestore(_storable(target)))

@@ -54,6 +54,7 @@ def fit(
     held_out: NDArray[np.bool_] | None = None,
     progress: Callable[[int, int, EpochMetrics], object] = lambda done, total, metrics: None,
     epoch_done: Callable[[EpochMetrics], object] = lambda metrics: None,
+    rows: NDArray[np.intp] | None = None,
 ) -> tuple[MLP, int]:
     """Train the MLP of one feature, or resume from the last checkpoint.
 
@@ -67,6 +68,7 @@ def fit(
         held_out: [M], True for samples of the held-out set; by default there is none.
         progress: called with (steps done, total steps, metrics of the epoch so far), for some of the steps.
         epoch_done: called after each epoch, before its checkpoint is written.
+        rows: the samples that take part; by default all.
 
     Returns:
         The classifier of the best epoch, and that epoch's number: the one with the highest held-out accuracy or,
@@ -78,8 +80,9 @@ def fit(
         OSError: A checkpoint cannot be written; the previous one stays.
     """
     context = dataclasses.replace(context, config=dataclasses.replace(context.config, homology="closed_form"))
-    n_devices, rows = context.mesh.devices.size, np.arange(len(samples))
-    train_rows, held_out_rows = (rows, rows[:0]) if held_out is None else (rows[~held_out], rows[held_out])
+    n_devices, rows = context.mesh.devices.size, np.arange(len(samples)) if rows is None else rows
+    is_held_out = np.zeros(len(rows), bool) if held_out is None else held_out[rows]
+    train_rows, held_out_rows = rows[~is_held_out], rows[is_held_out]
     check_batch_size(options.batch_size, context.mesh)
     least = max(2, n_devices)
     if len(train_rows) < least:
@@ -88,7 +91,11 @@ def fit(
         )
     batch_size = min(options.batch_size, len(train_rows) // n_devices * n_devices)
     steps = Steps(options.epochs, len(train_rows) // batch_size, batch_size)
-    graph, initial = initial_state(_create_model(samples, context, options.seed, train_rows))
+    n_inputs = input_size(context.feature, context.config, context.network.n_regions)
+    model = MLP(n_inputs, len(samples.classes), rngs=nnx.Rngs(options.seed))
+    chosen = samples.take(train_rows[:: max(1, len(train_rows) // SCALE_SAMPLES)][:SCALE_SAMPLES])
+    model.input_scale[...] = scale_inputs(chosen, context.feature, context.network, context.config)
+    graph, initial = initial_state(model)
 
     def batches(rows: NDArray[np.intp]) -> Iterator[Batch]:
         """Yield batches on the devices; this process gathers its own chunk of each."""
@@ -131,12 +138,3 @@ def fit(
     )
     best = jax.tree.map(jnp.asarray, checkpoints.best(state))
     return nnx.merge(graph, best.params, best.rest), checkpoints.best_epoch
-
-
-def _create_model(samples: Samples, context: FitContext, seed: int, train_rows: NDArray[np.intp]) -> MLP:
-    """Return the classifier before the first step, with the scaling of its inputs."""
-    n_inputs = input_size(context.feature, context.config, context.network.n_regions)
-    model = MLP(n_inputs, len(samples.classes), rngs=nnx.Rngs(seed))
-    chosen = samples.take(train_rows[:: max(1, len(train_rows) // SCALE_SAMPLES)][:SCALE_SAMPLES])
-    model.input_scale[...] = scale_inputs(chosen, context.feature, context.network, context.config)
-    return model

@@ -44,7 +44,7 @@ from training.fitting.samples import MIRRORS, Samples, build_samples, fold_of_vi
 from training.fitting.steps import FitContext
 from training.reports.plots import draw_curves
 from training.storage.jobs import check_same_job, locked
-from training.storage.progress import Progress
+from training.storage.progress import Progress, of_stage
 from training.views.normalized_views import ViewSource
 
 __all__ = ["VIEWS", "RunSettings", "check_out", "check_trained", "finished_record", "is_finished", "train_run"]
@@ -133,10 +133,8 @@ class RunSettings:
             "folds": self.folds,
             "mirrors": list(self.mirrors),
             "orientation_copies": self.orientations,
-            "epochs": self.options.epochs,
+            **dataclasses.asdict(self.options),
             "learning_rates": list(self.options.learning_rates),
-            "batch_size": self.options.batch_size,
-            "seed": self.options.seed,
         }
 
 
@@ -227,8 +225,13 @@ def train_run(
         first, resumed = jax.process_index() == 0, (out / CHECKPOINTS).is_dir()
         if first and resumed:
             locks.enter_context(locked(out / CHECKPOINTS))
-        # Without classifiers, only the distribution of the views among the folds is needed here.
-        samples = _describe_views(settings, source, progress) if settings.features else _labelled_views(source)
+        samples: Samples | _Views
+        if settings.features:
+            copies = settings.mirrors, settings.orientations, settings.options.seed
+            show = of_stage(progress, DESCRIBE, "views")
+            samples = build_samples(source, settings.network, settings.config, show, *copies)
+        else:  # only the distribution of the views among the folds is needed here
+            samples = _labelled_views(source)
         folds = settings.folds
         is_held_out = folds > 1 or settings.distractors is not None
         parts = _held_out_parts(samples) if folds == 1 and is_held_out else folds
@@ -272,14 +275,6 @@ def _held_out_parts(samples: Samples | _Views) -> int:
     """Return the number of parts of the views of which one is held out; fewer if a class has few views."""
     fewest = min(len(np.unique(samples.view[samples.label == label])) for label in range(len(samples.classes)))
     return max(2, min(HELD_OUT, fewest))
-
-
-def _describe_views(settings: RunSettings, source: ViewSource, progress: Progress) -> Samples:
-    def show(done: int, total: int) -> None:
-        progress(DESCRIBE, done, total, "views")
-
-    copies = settings.mirrors, settings.orientations, settings.options.seed
-    return build_samples(source, settings.network, settings.config, show, *copies)
 
 
 class _Fold(NamedTuple):

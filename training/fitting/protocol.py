@@ -68,10 +68,7 @@ DEFAULT = Protocol(
 )
 """Fewer views than the paper's, each with five augmented copies; an embedding, and none of the paper's classifiers."""
 
-QUICK = dataclasses.replace(
-    DEFAULT,
-    distractors=Distractors(procedural=600, networks=2),
-)
+QUICK = dataclasses.replace(DEFAULT, distractors=Distractors(procedural=600, networks=2))
 """The default with fewer distractors and networks: half of its time."""
 
 PAPER = Protocol(

@@ -108,14 +108,10 @@ class Samples:
         """Return the samples with the given indices, padded to the largest size of all samples."""
         strips, in_strips = _entries(self.strip_start, rows, self._most[0])
         colors, in_colors = _entries(self.color_start, rows, self._most[1])
-        return Batch(
-            strip=np.where(in_strips, self.strip[strips], PADDING),
-            length=self.length[strips],
-            color_strip=np.where(in_colors, self.color_strip[colors], PADDING),
-            color_set=self.color_set[colors],
-            color_count=self.color_count[colors],
-            label=self.label[rows],
-        )
+        strip = np.where(in_strips, self.strip[strips], PADDING)
+        color_strip = np.where(in_colors, self.color_strip[colors], PADDING)
+        counts = self.color_set[colors], self.color_count[colors]
+        return Batch(strip, self.length[strips], color_strip, *counts, self.label[rows])
 
 
 def _entries(
@@ -217,13 +213,8 @@ def expand(batch: Batch, set_weights: jax.Array, config: DescriptorConfig) -> St
         occupied = jnp.zeros(n_strips, bool).at[sample.strip].set(True, mode="drop")
         weights = sample.color_count[:, None] * set_weights[sample.color_set]
         color = jnp.zeros((n_strips, n_regions), jnp.float32).at[sample.color_strip].add(weights, mode="drop")
-        return Strips(
-            low=jnp.zeros(shape, jnp.float32),
-            high=high.reshape(shape),
-            occupied=occupied.reshape(shape),
-            color=color.reshape(*shape, n_regions),
-            overflow=jnp.zeros((), jnp.int32),
-        )
+        low, overflow = jnp.zeros(shape, jnp.float32), jnp.zeros((), jnp.int32)
+        return Strips(low, high.reshape(shape), occupied.reshape(shape), color.reshape(*shape, n_regions), overflow)
 
     return jax.vmap(one)(batch)
 

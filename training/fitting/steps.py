@@ -102,13 +102,7 @@ def _replicated(tree: Any, mesh: Mesh) -> Any:
 
 @partial(jax.jit, static_argnums=(0, 1), donate_argnums=2)
 def train_step(
-    context: FitContext,
-    graph: Any,
-    state: FitState,
-    batch: Batch,
-    rate: ArrayLike,
-    seed: ArrayLike,
-    step: ArrayLike,
+    context: FitContext, graph: Any, state: FitState, batch: Batch, rate: ArrayLike, seed: ArrayLike, step: ArrayLike
 ) -> tuple[FitState, tuple[jax.Array, jax.Array]]:
     """Make one step of Adam.
 

@@ -28,11 +28,7 @@ from training.objects.mesh import (
 
 __all__ = ["COLOR_PAIRS", "SHAPE_PAIRS", "builtin_objects"]
 
-COLOR_PAIRS = (
-    ("soup_can_red", "soup_can_green"),
-    ("mug_blue", "mug_white"),
-    ("cereal_box_yellow", "cereal_box_blue"),
-)
+COLOR_PAIRS = (("soup_can_red", "soup_can_green"), ("mug_blue", "mug_white"), ("cereal_box_yellow", "cereal_box_blue"))
 """Pairs with the same mesh and different colours."""
 
 SHAPE_PAIRS = (("white_bowl", "white_plate"), ("white_bowl", "white_cup"), ("yellow_bottle", "yellow_box"))

@@ -60,11 +60,10 @@ def fetch_ycb(
             mesh is damaged, or another process writes to the directory.
         OSError: The directory cannot be written.
     """
-    if not objects:
-        raise InputError("objects is empty; expected names of YCB objects, such as 003_cracker_box")
-    for name in objects:
-        if not NAME.fullmatch(name):
-            raise InputError(f"objects has {name!r}; expected names of YCB objects, such as 003_cracker_box")
+    wrong = [name for name in objects if not NAME.fullmatch(name)]
+    if wrong or not objects:
+        given = f"has {wrong[0]!r}" if wrong else "is empty"
+        raise InputError(f"objects {given}; expected names of YCB objects, such as 003_cracker_box")
     if not re.match(r"https?://[^/]", url):
         raise InputError(f"url is {url!r}; expected an address that begins with http:// or https://")
     directory = Path(directory)

@@ -111,15 +111,10 @@ def merge_meshes(parts: Sequence[TexturedMesh]) -> TexturedMesh:
     if colors:
         raise InputError("some parts of the mesh have textures and others vertex colours; bake them into one kind")
     first = np.cumsum([0, *(len(part.textures) for part in parts[:-1])])
-    return TexturedMesh(
-        vertices,
-        faces,
-        uv=np.concatenate([part.uv for part in parts if part.uv is not None]),
-        textures=tuple(texture for part in parts for texture in part.textures),
-        face_texture=np.concatenate(
-            [part.face_texture + k for part, k in zip(parts, first, strict=True) if part.face_texture is not None]
-        ).astype(np.int32),
-    )
+    uv = np.concatenate([part.uv for part in parts if part.uv is not None])
+    textures = tuple(texture for part in parts for texture in part.textures)
+    numbers = [part.face_texture + k for part, k in zip(parts, first, strict=True) if part.face_texture is not None]
+    return TexturedMesh(vertices, faces, uv, textures, np.concatenate(numbers).astype(np.int32))
 
 
 def texel_centres(n: int) -> tuple[Array, Array]:
@@ -142,13 +137,7 @@ def _ring_surface(points: Array, v: Array, texture: NDArray[np.uint8]) -> Textur
     uv = np.stack([u.ravel(), v.ravel()], axis=1).astype(np.float32)
     # Clipped, so that the last texel does not wrap around to the first.
     uv = uv.clip(1e-4, 1 - 1e-4)
-    return TexturedMesh(
-        vertices,
-        faces.astype(np.int32),
-        uv=uv[faces],
-        textures=(texture,),
-        face_texture=np.zeros(len(faces), np.int32),
-    )
+    return TexturedMesh(vertices, faces.astype(np.int32), uv[faces], (texture,), np.zeros(len(faces), np.int32))
 
 
 def arc_lengths(points: Array) -> Array:
@@ -213,13 +202,8 @@ def box_surface(size: Sequence[float], textures: Sequence[NDArray[np.uint8]]) ->
     quads.append([[*p, 0] for p in ring[::-1]])
     faces = np.concatenate([[[4 * k, 4 * k + 1, 4 * k + 2], [4 * k, 4 * k + 2, 4 * k + 3]] for k in range(6)])
     corners = np.tile(np.array([[[0, 0], [1, 0], [1, 1]], [[0, 0], [1, 1], [0, 1]]], np.float32), (6, 1, 1))
-    return TexturedMesh(
-        np.asarray(quads, np.float64).reshape(-1, 3),
-        faces.astype(np.int32),
-        uv=corners.clip(1e-4, 1 - 1e-4),
-        textures=tuple(textures),
-        face_texture=np.repeat(np.arange(6, dtype=np.int32), 2),
-    )
+    vertices, uv = np.asarray(quads, np.float64).reshape(-1, 3), corners.clip(1e-4, 1 - 1e-4)
+    return TexturedMesh(vertices, faces.astype(np.int32), uv, tuple(textures), np.arange(12, dtype=np.int32) // 2)
 
 
 def moved(mesh: TexturedMesh, position: ArrayLike = (0, 0, 0), axis: str = "z", degrees: float = 0.0) -> TexturedMesh:

@@ -18,7 +18,6 @@ from training.objects.mesh import TexturedMesh, merge_meshes
 
 __all__ = [
     "MAX_SIDE",
-    "MESH_SUFFIXES",
     "MIN_SIDE",
     "find_meshes",
     "find_object_meshes",
@@ -47,16 +46,6 @@ TEXTURES = (
     "metallicRoughnessTexture",
 )
 """Attributes of trimesh's materials that hold images."""
-
-
-def _solid(vertices: NDArray[np.float64], faces: NDArray[np.int32], color: NDArray[np.uint8]) -> TexturedMesh:
-    return TexturedMesh(
-        vertices,
-        faces,
-        uv=np.zeros((len(faces), 3, 2), np.float32),
-        textures=(color.reshape(1, 1, 3),),
-        face_texture=np.zeros(len(faces), np.int32),
-    )
 
 
 def _check_textures(geometry: Any) -> None:
@@ -100,12 +89,13 @@ def _part(geometry: trimesh.Trimesh) -> TexturedMesh:
         raise InputError(f"unsupported material {type(material).__name__}")
     factor = np.full(3, 255, np.uint8) if factor is None else np.asarray(factor, np.uint8)[:3]
     if image is None or visual.uv is None:
-        return _solid(vertices, faces, factor)
-    texture = np.asarray(image.convert("RGB") if isinstance(image, Image.Image) else image, np.uint8)
-    if (factor < 255).any():
-        texture = np.rint(texture * (factor / 255.0)).astype(np.uint8)
-    uv = np.asarray(visual.uv, np.float32)[faces]
-    return TexturedMesh(vertices, faces, uv=uv, textures=(texture,), face_texture=np.zeros(len(faces), np.int32))
+        uv, texture = np.zeros((len(faces), 3, 2), np.float32), factor.reshape(1, 1, 3)
+    else:
+        uv = np.asarray(visual.uv, np.float32)[faces]
+        texture = np.asarray(image.convert("RGB") if isinstance(image, Image.Image) else image, np.uint8)
+        if (factor < 255).any():
+            texture = np.rint(texture * (factor / 255.0)).astype(np.uint8)
+    return TexturedMesh(vertices, faces, uv, (texture,), np.zeros(len(faces), np.int32))
 
 
 def _check(mesh: TexturedMesh) -> None:
@@ -133,17 +123,6 @@ def _check(mesh: TexturedMesh) -> None:
 
 def _longest(mesh: TexturedMesh) -> float:
     return float(np.ptp(mesh.vertices[np.unique(mesh.faces)], axis=0).max())
-
-
-def _check_size(mesh: TexturedMesh) -> None:
-    """Raise InputError unless the mesh has an object's size in metres."""
-    longest = _longest(mesh)
-    if not MIN_SIDE <= longest <= MAX_SIDE:
-        unit = " (is it in millimetres?)" if longest > MAX_SIDE else ""
-        raise InputError(
-            f"longest side {longest:g}{unit}; expected {MIN_SIDE:g} to {MAX_SIDE:g} metres; scale the mesh, for "
-            "instance by --mesh-scale 0.001"
-        )
 
 
 def _check_obj_references(path: Path) -> None:
@@ -185,10 +164,13 @@ def load_mesh(path: str | Path, scale: float = 1.0) -> TexturedMesh:
     mesh = _parsed(Path(path))
     if scale != 1:
         mesh = mesh.transformed(np.diag([scale, scale, scale, 1.0]))
-    try:
-        _check_size(mesh)
-    except InputError as error:
-        raise InputError(f"mesh {path}: {error}") from None
+    longest = _longest(mesh)
+    if not MIN_SIDE <= longest <= MAX_SIDE:
+        unit = " (is it in millimetres?)" if longest > MAX_SIDE else ""
+        raise InputError(
+            f"mesh {path}: longest side {longest:g}{unit}; expected {MIN_SIDE:g} to {MAX_SIDE:g} metres; scale the "
+            "mesh, for instance by --mesh-scale 0.001"
+        )
     return mesh
 
 
@@ -214,12 +196,10 @@ def _parsed(path: Path) -> TexturedMesh:
         scene = trimesh.load_scene(path, process=False)
         for geometry in scene.geometry.values():
             _check_textures(geometry)
-        geometries = [
-            part for part in scene.dump(concatenate=False) if isinstance(part, trimesh.Trimesh) and len(part.faces)
-        ]
-        if not geometries:
+        parts = [part for part in scene.dump(concatenate=False) if isinstance(part, trimesh.Trimesh)]
+        if not any(len(part.faces) for part in parts):
             raise InputError("no faces")
-        mesh = merge_meshes([_part(geometry) for geometry in geometries])
+        mesh = merge_meshes([_part(part) for part in parts if len(part.faces)])
         _check(mesh)
     except InputError as error:
         raise InputError(f"mesh {path}: {error}") from error

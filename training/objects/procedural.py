@@ -8,10 +8,11 @@ another shape, so that neither shape nor colour alone separates all objects.
 
 import colorsys
 import dataclasses
+import functools
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import zoom
 
 from training.objects.mesh import (
@@ -45,10 +46,9 @@ _PALETTE, _TEXTURE, _SHAPE = range(3)
 def procedural_object(seed: int) -> TexturedMesh:
     """Return the procedural object of a seed, a non-negative integer."""
     shape_seed = seed - (seed % _SIBLINGS == 1)
-    paint = _Paint(seed - (seed % _SIBLINGS == 3))
+    paint = _paint(seed - (seed % _SIBLINGS == 3))
     rng = np.random.default_rng([_SHAPE, shape_seed])
-    family = _FAMILIES[rng.choice(len(_FAMILIES), p=[weight for weight, _ in _FAMILIES])][1]
-    mesh = family(rng, paint.texture)
+    mesh = _FAMILIES[rng.choice(len(_FAMILIES), p=_WEIGHTS)](rng, paint)
     vertices = mesh.vertices - mesh.centre
     if rng.random() < 0.3:
         vertices = vertices * (1 + rng.uniform(-0.2, 0.2, 3))
@@ -69,24 +69,18 @@ def _log_uniform(rng: Rng, low: float, high: float) -> float:
 # ---------------------------------------------------------------------------------------------------------------- paint
 
 
-class _Paint:
-    """Textures of one object in the colours of one palette; `texture(i)` is that of its i-th part."""
+def _paint(seed: int) -> "Paint":
+    """Return the textures of one object's parts, by number, in the colours of one palette."""
+    rng = np.random.default_rng([_PALETTE, seed])
+    palette, is_uniform = _palette(rng), rng.random() < 0.5
 
-    def __init__(self, seed: int) -> None:
-        rng = np.random.default_rng([_PALETTE, seed])
-        self._seed = seed
-        self._palette = _palette(rng)
-        self._uniform = rng.random() < 0.5
-        self._textures: dict[int, Image] = {}
+    @functools.cache
+    def texture(part: int) -> Image:
+        rng = np.random.default_rng([_TEXTURE, seed, part])
+        rotate = part > 0 and rng.random() < 0.5
+        return _texture(rng, palette[1:] + palette[:1] if rotate else palette)
 
-    def texture(self, part: int) -> Image:
-        part = min(part, 1) if self._uniform else part
-        if part not in self._textures:
-            rng = np.random.default_rng([_TEXTURE, self._seed, part])
-            rotate = part > 0 and rng.random() < 0.5
-            palette = self._palette[1:] + self._palette[:1] if rotate else self._palette
-            self._textures[part] = _texture(rng, palette)
-        return self._textures[part]
+    return lambda part: texture(min(part, 1) if is_uniform else part)
 
 
 def _palette(rng: Rng) -> list[Array]:
@@ -181,11 +175,7 @@ Paint = Callable[[int], Image]
 
 
 def _revolved(
-    profile: list[tuple[float, float]] | Array,
-    texture: Image,
-    exponent: float = 2.0,
-    ratio: float = 1.0,
-    sides: int = 40,
+    profile: ArrayLike, texture: Image, exponent: float = 2.0, ratio: float = 1.0, sides: int = 40
 ) -> TexturedMesh:
     return revolved_surface(profile, texture, superellipse(sides, exponent) * [1, ratio])
 
@@ -297,9 +287,8 @@ def _tool(rng: Rng, paint: Paint) -> TexturedMesh:
 def _plate(rng: Rng, paint: Paint) -> TexturedMesh:
     r = _log_uniform(rng, 0.03, 0.13)
     h = r * rng.uniform(0.06, 0.25)
-    return _revolved(
-        _closed([(0.6 * r, 0), (r, 0.7 * h), (r, h), (0.6 * r, h / 2)]), paint(0), ratio=_squashed(rng, 0.5)
-    )
+    profile = _closed([(0.6 * r, 0), (r, 0.7 * h), (r, h), (0.6 * r, h / 2)])
+    return _revolved(profile, paint(0), ratio=_squashed(rng, 0.5))
 
 
 def _scissors(rng: Rng, paint: Paint) -> TexturedMesh:
@@ -324,16 +313,6 @@ def _prism(rng: Rng, paint: Paint) -> TexturedMesh:
     return _revolved(_closed([(r, 0), (r * rng.uniform(0.3, 1), h)]), paint(0), sides=int(rng.choice([3, 5, 6])))
 
 
-_FAMILIES: tuple[tuple[float, Callable[[Rng, Paint], TexturedMesh]], ...] = (
-    (0.26, _box),
-    (0.13, _can),
-    (0.10, _bottle),
-    (0.09, _vessel),
-    (0.07, _ball),
-    (0.12, _rod),
-    (0.10, _tool),
-    (0.05, _plate),
-    (0.05, _scissors),
-    (0.03, _prism),
-)
+_FAMILIES = (_box, _can, _bottle, _vessel, _ball, _rod, _tool, _plate, _scissors, _prism)
+_WEIGHTS = (0.26, 0.13, 0.10, 0.09, 0.07, 0.12, 0.10, 0.05, 0.05, 0.03)
 """Probability of each family of shapes."""

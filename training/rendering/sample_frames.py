@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from thor2_jax.frames.frames import Intrinsics, RGBDFrame
+from thor2_jax.frames.frames import RGBDFrame
 from training.objects.builtin_objects import builtin_objects
 from training.rendering.scenes import compose_scene
 
@@ -44,9 +44,8 @@ def write_sample_frames(directory: str | Path) -> None:
     directory, objects = Path(directory), builtin_objects()
     index = []
     for name, title, seed, n_objects in SAMPLES:
-        scene = compose_scene(
-            objects, np.random.default_rng(seed), n_objects=n_objects, noise=NOISE, light=LIGHT_CHANGE
-        )
+        rng = np.random.default_rng(seed)
+        scene = compose_scene(objects, rng, n_objects=n_objects, noise=NOISE, light=LIGHT_CHANGE)
         _write(_crop(scene.frame), directory / name)
         index.append({"folder": name, "title": title, "objects": sorted(set(scene.truth.values()))})
     (directory / "index.json").write_text(json.dumps(index, indent=1) + "\n")
@@ -61,10 +60,8 @@ def _crop(frame: RGBDFrame) -> RGBDFrame:
     left = int(np.clip((columns[0] + columns[-1] - across) // 2, 0, width - across))
     top = int(np.clip((rows[0] + rows[-1] - down) // 2, 0, height - down))
     camera = dataclasses.replace(frame.intrinsics, cx=frame.intrinsics.cx - left, cy=frame.intrinsics.cy - top)
-    color, depth, labels = (
-        a[top : top + down, left : left + across] for a in (frame.color, frame.depth, frame.label_image)
-    )
-    return RGBDFrame(color, depth, labels, camera)
+    window = slice(top, top + down), slice(left, left + across)
+    return RGBDFrame(frame.color[window], frame.depth[window], frame.label_image[window], camera)
 
 
 def _write(frame: RGBDFrame, directory: Path) -> None:
@@ -72,9 +69,5 @@ def _write(frame: RGBDFrame, directory: Path) -> None:
     Image.fromarray(frame.color).save(directory / "color.jpg", quality=85, subsampling=0)
     Image.fromarray(frame.depth).save(directory / "depth.png", optimize=True)
     Image.fromarray(frame.label_image).save(directory / "labels.png", optimize=True)
-    (directory / "intrinsics.json").write_text(json.dumps(_known(frame.intrinsics)) + "\n")
-
-
-def _known(intrinsics: Intrinsics) -> dict[str, float]:
-    """Return the attributes that are given."""
-    return {name: value for name, value in dataclasses.asdict(intrinsics).items() if value}
+    known = {name: value for name, value in dataclasses.asdict(frame.intrinsics).items() if value}
+    (directory / "intrinsics.json").write_text(json.dumps(known) + "\n")

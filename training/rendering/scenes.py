@@ -16,7 +16,7 @@ from scipy.spatial import ConvexHull
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame
 from training.augmentation.sensor import axial_deviation, depth_edges
-from training.objects.mesh import TexturedMesh
+from training.objects.mesh import TexturedMesh, moved
 from training.rendering.camera import Camera
 from training.rendering.ray_caster import RayCaster, pixel_rays, render_view
 from training.rendering.view_sphere import camera_pose
@@ -77,15 +77,13 @@ class _Placed:
         return float(self.mesh.vertices[:, 2].max())
 
     def moved(self, x: float, y: float) -> "_Placed":
-        matrix = np.eye(4)
-        matrix[:2, 3] = x, y
-        return _Placed(self.mesh.transformed(matrix), self.corners + [x, y], self.normals)
+        return _Placed(moved(self.mesh, (x, y, 0)), self.corners + [x, y], self.normals)
 
     def apart(self, other: "_Placed", x: float, y: float) -> bool:
         """Return whether this object, moved by x and y, is at least `MIN_GAP` from the other (separating axis test)."""
-        moved, fixed = self.corners + [x, y], other.corners
-        gaps = (self.normals @ fixed.T).min(axis=1) - (self.normals @ moved.T).max(axis=1)
-        other_gaps = (other.normals @ moved.T).min(axis=1) - (other.normals @ fixed.T).max(axis=1)
+        here, there = self.corners + [x, y], other.corners
+        gaps = (self.normals @ there.T).min(axis=1) - (self.normals @ here.T).max(axis=1)
+        other_gaps = (other.normals @ here.T).min(axis=1) - (other.normals @ there.T).max(axis=1)
         return bool(max(gaps.max(), other_gaps.max()) >= MIN_GAP)
 
 
@@ -181,7 +179,7 @@ def _table() -> TexturedMesh:
     corner = np.array([[-0.8, -0.8, 0], [0.8, -0.8, 0], [0.8, 0.8, 0], [-0.8, 0.8, 0]])
     uv = np.array([[[0, 0], [1, 0], [1, 1]], [[0, 0], [1, 1], [0, 1]]], np.float32).clip(1e-4, 1 - 1e-4)
     faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
-    return TexturedMesh(corner, faces, uv=uv, textures=(texture,), face_texture=np.zeros(2, np.int32))
+    return TexturedMesh(corner, faces, uv, (texture,), np.zeros(2, np.int32))
 
 
 def _sensed_depth(depth_m: Array, noise: float, rng: np.random.Generator) -> NDArray[np.uint16]:
@@ -321,7 +319,5 @@ def _render(
     color = np.where(hits.mesh[:, None] >= 0, hits.color, np.array([92, 96, 104])).reshape(*shape, 3)
     gain = rng.uniform(1 - light, 1 + light) * rng.uniform(1 - light / 4, 1 + light / 4, 3)
     lit = color * gain + noise * 2 * rng.standard_normal(color.shape, np.float32)
-    frame = RGBDFrame(
-        np.rint(lit).clip(0, 255).astype(np.uint8), _sensed_depth(depth, noise, rng), labels, camera.intrinsics
-    )
-    return Scene(frame, truth, visible)
+    seen = np.rint(lit).clip(0, 255).astype(np.uint8), _sensed_depth(depth, noise, rng)
+    return Scene(RGBDFrame(*seen, labels, camera.intrinsics), truth, visible)

@@ -76,13 +76,9 @@ def write_explanation(explanation: Explanation, frame: RGBDFrame, name: str, dir
             shown = Picture(f"{picture.name}.png", picture.caption, half=not is_slice, third=is_slice)
             sections.setdefault(picture.section, []).append(shown)
         write_text(unfinished / VALUES, json.dumps(explanation.as_json()) + "\n")
-        write_page(
-            unfinished / PAGE,
-            title=f"Why {explanation.title}?",
-            lead=_lead(explanation, name),
-            sections=_page_sections(explanation, sections),
-            embed=True,
-        )
+        title, lead = f"Why {explanation.title}?", _lead(explanation, name)
+        content = _page_sections(explanation, sections)
+        write_page(unfinished / PAGE, title=title, lead=lead, sections=content, embed=True)
         remove_written(directory, _WRITTEN)
 
 
@@ -113,16 +109,13 @@ def _page_sections(explanation: Explanation, pictures: dict[str, list[Picture]])
         f"Without the most attributed tenth of the points the answer loses {check.most_attributed:.2f} of its "
         f"{'log-odds' if is_odds else 'lead'}; without a random tenth, {check.random:.2f} on average."
     )
-    sections = [
+    resembling = [Section("What it resembles", pictures=pictures["nearest"])] if "nearest" in pictures else []
+    return [
         Section("The answer", margin + runner_up, _answer_table(explanation.recognition)),
         Section("What decided", _DECIDED.format(check=comparison), pictures=pictures["decided"]),
         Section("How little would change the answer", _changes_text(explanation), pictures=pictures.get("changes", ())),
-    ]
-    if "nearest" in pictures:
-        sections.append(Section("What it resembles", pictures=pictures["nearest"]))
-    sections.append(Section("If the name is wrong", _advice(explanation)))
-    return [
-        *sections,
+        *resembling,
+        Section("If the name is wrong", _advice(explanation)),
         Section("What the descriptor sees", _SHAPE, pictures=pictures["shape"]),
         Section("Slice by slice", _SLICES, pictures=pictures.get("slices", ())),
         Section("Its colours", pictures=pictures["network"]),

@@ -83,10 +83,6 @@ def _figure(picture: Picture, embedded_from: Path | None) -> str:
     return f'<figure{kind}><img src="{path}" alt="{caption}"><figcaption>{caption}</figcaption></figure>'
 
 
-def _section(section: Section, embedded_from: Path | None) -> str:
-    return f"<h2>{html.escape(section.heading)}</h2>\n{_content(section, embedded_from)}"
-
-
 def _content(section: Section, embedded_from: Path | None) -> str:
     elements = []
     if section.text:
@@ -115,12 +111,13 @@ def write_page(path: str | Path, *, title: str, lead: str, sections: Sequence[Se
         OSError: the file cannot be written, or an embedded picture not be read.
     """
     embedded_from = Path(path).parent if embed else None
+    content = (f"<h2>{html.escape(each.heading)}</h2>\n{_content(each, embedded_from)}" for each in sections)
     write_text(
         path,
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         f"<title>{html.escape(title)}</title><style>{_STYLE}</style></head><body>\n"
         f'<h1>{html.escape(title)}</h1>\n<p class="lead">{html.escape(lead)}</p>\n'
-        + "\n".join(_section(section, embedded_from) for section in sections)
+        + "\n".join(content)
         + "\n</body></html>\n",
     )

@@ -12,13 +12,7 @@ from thor2_jax import plot
 from thor2_jax.figures import name_style, plain_text, save_figure
 from thor2_jax.plot import PALETTE
 
-__all__ = [
-    "draw_accuracy",
-    "draw_confusion",
-    "draw_curves",
-    "draw_known_unknown",
-    "draw_reliability",
-]
+__all__ = ["draw_accuracy", "draw_confusion", "draw_curves", "draw_known_unknown", "draw_reliability"]
 
 
 def draw_accuracy(
@@ -46,9 +40,7 @@ def draw_accuracy(
         axes.bar_label(bars, fmt="%.2f", fontsize=8, padding=2 if crowded else 1, rotation=90 if crowded else 0)
     ticks = [plain_text(f"{subset}\n{counts[subset]} instances") for subset in accuracy]
     axes.set_xticks(range(len(accuracy)), ticks, **name_style())
-    axes.set_ylim(0, 1.15 if crowded else 1.08)
-    axes.set_yticks(np.arange(0, 1.01, 0.2))
-    axes.set_ylabel("accuracy")
+    axes.set(ylim=(0, 1.15 if crowded else 1.08), yticks=np.arange(0, 1.01, 0.2), ylabel="accuracy")
     axes.spines[["top", "right"]].set_visible(False)
     figure.legend(loc="outside right upper", frameon=False)
     save_figure(figure, path)
@@ -113,9 +105,7 @@ def draw_known_unknown(
     axes.plot([0, 1], [0, 1], color="#222222", linewidth=1, linestyle="--", label="confidence tells nothing")
     kept, named = marked
     axes.plot([kept], [named], "o", color=PALETTE[6], label=f"{named:.0%} named where {kept:.0%} are kept")
-    axes.set(xlim=(0, 1.01), ylim=(0, 1.02))
-    axes.set_xlabel(f"correct answers of {name} kept")
-    axes.set_ylabel("unknown objects named")
+    axes.set(xlim=(0, 1.01), ylim=(0, 1.02), xlabel=f"correct answers of {name} kept", ylabel="unknown objects named")
     axes.legend(frameon=False, loc="upper left")
     axes.spines[["top", "right"]].set_visible(False)
     save_figure(figure, path)
@@ -150,10 +140,8 @@ def draw_curves(curves: Mapping[str, Sequence[Mapping[str, Any]]], path: str | P
             if held_out and None not in held_out:
                 lower.plot(epochs, held_out, linestyle="--", **style)
                 dashed = True
-    upper.set_yscale("log")
-    upper.set_ylabel("loss (cross-entropy)")
-    lower.set_ylabel("accuracy" if dashed else "accuracy, with dropout")
-    lower.set_xlabel("epoch")
+    upper.set(yscale="log", ylabel="loss (cross-entropy)")
+    lower.set(xlabel="epoch", ylabel="accuracy" if dashed else "accuracy, with dropout")
     if dashed:
         lower.plot([], [], color="#888888", label="training, with dropout")
         lower.plot([], [], color="#888888", linestyle="--", label="held-out set")

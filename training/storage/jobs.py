@@ -92,14 +92,11 @@ def locked(directory: Path) -> Iterator[None]:
         OSError: if the directory cannot be written, or its file system has no locks.
     """
     # A soft lock, filelock's fallback on file systems without locks, would outlive a killed process.
-    lock = filelock.FileLock(directory / LOCK, blocking=False, fallback_to_soft=False)
     try:
-        lock.acquire()
+        held = filelock.FileLock(directory / LOCK, blocking=False, fallback_to_soft=False).acquire()
     except filelock.Timeout:
         raise InputError(
             f"out: another process is writing to {directory}; wait until it ends, or choose another directory"
         ) from None
-    try:
+    with held:
         yield
-    finally:
-        lock.release()

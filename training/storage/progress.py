@@ -10,11 +10,11 @@ Progress = Callable[[str, int, int, str], object]
 """Called with (stage, done, total, note)."""
 
 
-def of_stage(progress: Progress, stage: str) -> Callable[[int, int], None]:
-    """Return the callback of a stage without notes, called with (done, total)."""
+def of_stage(progress: Progress, stage: str, note: str = "") -> Callable[[int, int], None]:
+    """Return the callback of a stage whose note is always the same, called with (done, total)."""
 
     def show(done: int, total: int) -> None:
-        progress(stage, done, total, "")
+        progress(stage, done, total, note)
 
     return show
 

@@ -9,6 +9,7 @@ is given to another one.
 """
 
 import collections
+import contextlib
 import importlib
 import inspect
 import multiprocessing
@@ -132,13 +133,8 @@ def local_workers(workers: int = 1) -> WorkerPool:
         if workers == 1:
             yield from map(function, items)
             return
-        processes = _Processes(workers)
-        try:
-            yield from _map_ordered(
-                lambda item: processes.submit(function, item), lambda future: future.result(), items, workers
-            )
-        finally:
-            processes.close()
+        with contextlib.closing(_Processes(workers)) as processes:
+            yield from _map_ordered(lambda item: processes.submit(function, item), Future.result, items, workers)
 
     return run
 

@@ -35,7 +35,6 @@ __all__ = [
     "CropManifest",
     "MANIFEST",
     "QuantizedCrop",
-    "RGBDCrop",
     "ViewCrops",
     "crop_file",
     "encode_crops",
@@ -43,7 +42,6 @@ __all__ = [
     "intact_content",
     "quantized",
     "read_crops",
-    "repeated",
     "rgbd_crop",
     "stacked",
     "surface_normals",
@@ -127,9 +125,8 @@ def fill_depth(depth: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[n
     filled = np.where(mask & (depth > 0), depth, np.float32(np.nan))
     rows, columns = np.nonzero(mask & np.isnan(filled))
     while len(rows):
-        windows = np.lib.stride_tricks.sliding_window_view(
-            np.pad(filled, _WINDOW // 2, constant_values=np.nan), (_WINDOW, _WINDOW)
-        )
+        padded = np.pad(filled, _WINDOW // 2, constant_values=np.nan)
+        windows = np.lib.stride_tricks.sliding_window_view(padded, (_WINDOW, _WINDOW))
         around = windows[rows, columns].reshape(len(rows), -1)
         known = ~np.isnan(around).all(axis=1)
         if not known.any():
@@ -223,14 +220,13 @@ class ViewCrops:
         """Return the crops with sides of `size` pixels, area-filtered; the same record if they have this size."""
         if size == self.size:
             return self
-        color = [Image.fromarray(image).resize((size, size), Image.Resampling.BOX) for image in self.color]
-        shifted = (self.normals.astype(np.int16) + 127).astype(np.uint8)
-        normals = [Image.fromarray(image).resize((size, size), Image.Resampling.BOX) for image in shifted]
-        pairs = [
-            (np.asarray(c), (np.asarray(n).astype(np.int16) - 127).astype(np.int8))
-            for c, n in zip(color, normals, strict=True)
-        ]
-        return stacked(pairs, size)
+
+        def smaller(images: NDArray[np.uint8]) -> list[NDArray[np.uint8]]:
+            return [np.asarray(Image.fromarray(each).resize((size, size), Image.Resampling.BOX)) for each in images]
+
+        shifted = smaller((self.normals.astype(np.int16) + 127).astype(np.uint8))
+        normals = [(each.astype(np.int16) - 127).astype(np.int8) for each in shifted]
+        return stacked(list(zip(smaller(self.color), normals, strict=True)), size)
 
 
 def quantized(crop: RGBDCrop) -> QuantizedCrop:
@@ -245,11 +241,6 @@ def stacked(crops: Sequence[QuantizedCrop], size: int) -> ViewCrops:
     for row, (color, normals) in enumerate(crops):
         record.color[row], record.normals[row] = color, normals
     return record
-
-
-def repeated(crops: ViewCrops, times: int) -> ViewCrops:
-    """Return the crops, each `times` times in a row."""
-    return ViewCrops(np.repeat(crops.color, times, axis=0), np.repeat(crops.normals, times, axis=0))
 
 
 def encode_crops(crops: ViewCrops) -> bytes:

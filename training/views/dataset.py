@@ -53,15 +53,8 @@ def remove_views(directory: Path) -> None:
 def encode(views: NormalizedViews) -> bytes:
     """Return the bytes of a shard's file."""
     steps = (views.xyz / np.float32(COORDINATE_STEP)).astype(np.uint16)
-    return safetensors.numpy.save(
-        {"xyz": steps, "rgb": views.rgb, "counts": views.counts, "view": views.view, "copy": views.copy}
-    )
-
-
-def _decode(content: bytes, label: int) -> NormalizedViews:
-    arrays = safetensors.numpy.load(content)
-    xyz = arrays["xyz"].astype(np.float32) * np.float32(COORDINATE_STEP)
-    return NormalizedViews(xyz, arrays["rgb"], arrays["counts"], label, arrays["view"], arrays["copy"])
+    others = {name: getattr(views, name) for name in ("rgb", "counts", "view", "copy")}
+    return safetensors.numpy.save({"xyz": steps, **others})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -259,7 +252,9 @@ class ViewDataset:
             InputError: The shard's file is missing or damaged.
         """
         shard = self.shards[index]
-        return _decode(shard.content(self.directory), shard.label)
+        arrays = safetensors.numpy.load(shard.content(self.directory))
+        xyz = arrays.pop("xyz").astype(np.float32) * np.float32(COORDINATE_STEP)
+        return NormalizedViews(xyz, label=shard.label, **arrays)
 
     def read_crops(self, index: int, size: int) -> ViewCrops:
         """Read the crops of a shard's views, in their order.

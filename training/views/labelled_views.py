@@ -6,7 +6,7 @@ source = WithLabelledViews({"mug": instances}, config, ViewDataset.open("views")
 import functools
 import hashlib
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -15,8 +15,8 @@ from thor2_jax.errors import InputError, with_context
 from thor2_jax.files import content_digest
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery.augment import augmented_view
-from training.views.crops import QuantizedCrop, ViewCrops, repeated, stacked
-from training.views.normalized_views import NormalizedViews, ViewSource, normalize_views
+from training.views.crops import QuantizedCrop, ViewCrops, stacked
+from training.views.normalized_views import NormalizedViews, SourceShard, ViewSource, normalize_views
 
 __all__ = ["MAX_COPIES", "WithLabelledViews", "digest_of_instances"]
 
@@ -28,11 +28,6 @@ CLOUDS = 200
 
 FIRST_VIEW = 1_000_000
 """Number of the first labelled view of a class; rendered views have smaller ones."""
-
-
-class _Shard(NamedTuple):
-    label: int
-    views: int
 
 
 def digest_of_instances(views: Mapping[str, Sequence[PreparedInstance]]) -> str:
@@ -77,7 +72,7 @@ class WithLabelledViews:
         self._wanted = max(clouds) or CLOUDS
         self._first = len(shards)
         sizes = {name: len(each) * (1 + self._copies(name)) for name, each in views.items()}
-        self.shards = (*shards, *(_Shard(self.classes.index(name), size) for name, size in sizes.items()))
+        self.shards = (*shards, *(SourceShard(self.classes.index(name), size) for name, size in sizes.items()))
 
     def _copies(self, name: str) -> int:
         return min(MAX_COPIES, max(self._wanted // len(self._views[name]) - 1, 0))
@@ -121,15 +116,11 @@ class WithLabelledViews:
         views, copies = self._views[name], self._copies(name)
         each = [[view, *(augmented_view(view, copy) for copy in range(copies))] for view in views]
         flat = [view for group in each for view in group]
+        clouds, boundary = [(view.points, view.colors) for view in flat], [view.boundary for view in flat]
+        view = np.repeat(FIRST_VIEW + np.arange(len(views)), 1 + copies).tolist()
+        copy = list(range(1 + copies)) * len(views)
         with with_context(f"frames: {name!r}"):
-            return normalize_views(
-                [(view.points, view.colors) for view in flat],
-                label,
-                np.repeat(FIRST_VIEW + np.arange(len(views)), 1 + copies).tolist(),
-                list(range(1 + copies)) * len(views),
-                self._config,
-                [view.boundary for view in flat],
-            )
+            return normalize_views(clouds, label, view, copy, self._config, boundary)
 
     def read_crops(self, index: int, size: int) -> ViewCrops:
         """Read the crops of a shard of the rendered views, or repeat those of a class's instances for their copies.
@@ -143,5 +134,6 @@ class WithLabelledViews:
         if self._crops is None:
             raise InputError("frames: the instances were read without crops; expected crops for image networks")
         name = list(self._views)[index - self._first]
-        crops = self._crops[name]
-        return repeated(stacked(crops, len(crops[0][0])).reduced(size), 1 + self._copies(name))
+        crops, times = self._crops[name], 1 + self._copies(name)
+        reduced = stacked(crops, len(crops[0][0])).reduced(size)
+        return ViewCrops(reduced.color.repeat(times, axis=0), reduced.normals.repeat(times, axis=0))

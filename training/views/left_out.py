@@ -8,20 +8,14 @@ import functools
 import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from thor2_jax.errors import InputError
 from thor2_jax.tables import read_table
 from training.views.crops import ViewCrops
-from training.views.normalized_views import NormalizedViews, ViewSource
+from training.views.normalized_views import NormalizedViews, SourceShard, ViewSource
 
 __all__ = ["WithoutClasses", "sequence_sources"]
-
-
-class _Shard(NamedTuple):
-    label: int
-    views: int
-    source_index: int
 
 
 class WithoutClasses:
@@ -40,11 +34,9 @@ class WithoutClasses:
             )
         self.classes = tuple(name for name in source.classes if name not in names)
         new = {source.classes.index(name): label for label, name in enumerate(self.classes)}
-        self.shards = tuple(
-            _Shard(new[shard.label], shard.views, index)
-            for index, shard in enumerate(source.shards)
-            if shard.label in new
-        )
+        self._kept = [index for index, shard in enumerate(source.shards) if shard.label in new]
+        kept = (source.shards[index] for index in self._kept)
+        self.shards = tuple(SourceShard(new[shard.label], shard.views) for shard in kept)
         self._source, self._names = source, sorted(set(names))
 
     @functools.cached_property
@@ -60,12 +52,11 @@ class WithoutClasses:
 
     def read(self, index: int) -> NormalizedViews:
         """Read the views of a shard; raises what the source raises."""
-        shard = self.shards[index]
-        return dataclasses.replace(self._source.read(shard.source_index), label=shard.label)
+        return dataclasses.replace(self._source.read(self._kept[index]), label=self.shards[index].label)
 
     def read_crops(self, index: int, size: int) -> ViewCrops:
         """Read the crops of a shard; raises what the source raises."""
-        return self._source.read_crops(self.shards[index].source_index, size)
+        return self._source.read_crops(self._kept[index], size)
 
 
 def sequence_sources(source: ViewSource, table: Path) -> dict[str, ViewSource]:

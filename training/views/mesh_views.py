@@ -25,7 +25,7 @@ from thor2_jax.frames.voxel_grid import downsample_to_fit
 from training.augmentation.augmentations import Augmentations, augment
 from training.objects.mesh import TexturedMesh
 from training.objects.meshes import load_mesh
-from training.rendering.camera import TRAINING_CAMERA, Camera, RenderedView
+from training.rendering.camera import RenderedView
 from training.rendering.ray_caster import RayCaster, render_view
 from training.rendering.view_sphere import camera_pose, random_angles, view_angles
 from training.storage.workers import local_workers
@@ -75,7 +75,7 @@ def cloud_of(view: RenderedView) -> "Cloud":
     return (points / SIGMA_S).astype(np.float32), np.rint(colors).astype(np.uint8)
 
 
-def view_cloud(mesh: TexturedMesh, pose: NDArray[np.float64], camera: Camera = TRAINING_CAMERA) -> "Cloud":
+def view_cloud(mesh: TexturedMesh, pose: NDArray[np.float64]) -> "Cloud":
     """Return the training cloud of one view: depth in steps of 1 mm, back-projected, voxels of 0.01 scaled units.
 
     Each call indexes the mesh; use `render_views` for many views.
@@ -83,7 +83,6 @@ def view_cloud(mesh: TexturedMesh, pose: NDArray[np.float64], camera: Camera = T
     Args:
         mesh: metres, z up.
         pose: [4, 4], camera to object frame, as from `camera_pose`.
-        camera: by default 800 x 600 pixels with a horizontal field of view of 40 degrees.
 
     Returns:
         xyz [n, 3] float32, metres, camera frame; rgb [n, 3] uint8.
@@ -91,7 +90,7 @@ def view_cloud(mesh: TexturedMesh, pose: NDArray[np.float64], camera: Camera = T
     Raises:
         InputError: The mesh is not visible.
     """
-    xyz, rgb = cloud_of(render_view(RayCaster([mesh]), pose, camera))
+    xyz, rgb = cloud_of(render_view(RayCaster([mesh]), pose))
     if len(xyz) == 0:
         raise InputError("pose: the mesh is not visible; expected a camera that looks at it, as from camera_pose")
     return xyz, rgb
@@ -157,13 +156,14 @@ def all_views(task: ViewTask) -> Iterator[tuple[int, int, RenderedView]]:
             yield number, copy, augment(other, task.augmentations, rng)
 
 
-def _all_clouds(task: ViewTask) -> Iterator[ViewCloud]:
-    return (ViewCloud(number, copy, *cloud_of(view)) for number, copy, view in all_views(task))
+def _clouds(task: ViewTask) -> Iterator[ViewCloud]:
+    clouds = (ViewCloud(number, copy, *cloud_of(view)) for number, copy, view in all_views(task))
+    return (cloud for cloud in clouds if len(cloud.xyz) >= MIN_VIEW_POINTS)
 
 
 def render_task(task: ViewTask) -> list[ViewCloud]:
     """Return the clouds of a task that have at least `MIN_VIEW_POINTS` points, ordered by view and copy."""
-    return [cloud for cloud in _all_clouds(task) if len(cloud.xyz) >= MIN_VIEW_POINTS]
+    return list(_clouds(task))
 
 
 def _mesh(source: Path | TexturedMesh) -> TexturedMesh:
@@ -182,7 +182,7 @@ def checked_meshes(
         raise InputError("meshes is empty; expected at least one mesh")
     for name, source in meshes.items():
         mesh = _mesh(source)
-        if not any(len(cloud.xyz) >= MIN_VIEW_POINTS for cloud in _all_clouds(ViewTask(name, mesh, angles))):
+        if next(_clouds(ViewTask(name, mesh, angles)), None) is None:
             raise InputError(
                 f"object {name!r}: none of its {len(angles)} views has at least {MIN_VIEW_POINTS} points; check the "
                 "mesh or leave it out"

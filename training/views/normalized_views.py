@@ -28,6 +28,7 @@ __all__ = [
     "MAX_VIEW_LENGTH",
     "MemoryViews",
     "NormalizedViews",
+    "SourceShard",
     "ViewSource",
     "normalize_views",
     "padded_batches",
@@ -98,6 +99,16 @@ class NormalizedViews:
         return [(self.xyz[end - n : end], self.rgb[end - n : end]) for n, end in zip(self.counts, ends, strict=True)]
 
 
+class SourceShard(NamedTuple):
+    """Class and number of views of a shard that is not on disk."""
+
+    label: int
+    views: int
+
+    def __repr__(self) -> str:
+        return f"_Shard(label={self.label}, views={self.views})"  # part of the digests of views in memory
+
+
 class ViewSource(Protocol):
     """Normalized views in shards of one object each: a `ViewDataset` on disk, or `MemoryViews`."""
 
@@ -162,19 +173,9 @@ def normalize_views(
             f"a view is {points.max():.3g} scaled units long; at most {MAX_VIEW_LENGTH:.3g} can be stored; check the "
             "unit of the mesh, or the mask and the depth scale of the frame"
         )
-    return NormalizedViews(
-        xyz=points,
-        rgb=np.concatenate([np.zeros((0, 3), np.uint8), *(rgb for _, rgb in clouds)]),
-        counts=np.array([len(xyz) for xyz, _ in clouds], np.int64),
-        label=label,
-        view=np.array(view, np.int32),
-        copy=np.array(copy, np.int32),
-    )
-
-
-class _Shard(NamedTuple):
-    label: int
-    views: int
+    colors = np.concatenate([np.zeros((0, 3), np.uint8), *(rgb for _, rgb in clouds)])
+    counts = np.array([len(xyz) for xyz, _ in clouds], np.int64)
+    return NormalizedViews(points, colors, counts, label, np.array(view, np.int32), np.array(copy, np.int32))
 
 
 class MemoryViews:
@@ -188,7 +189,7 @@ class MemoryViews:
             config: descriptor; only `sigma_s` is used.
         """
         self.classes = tuple(views)
-        self.shards = tuple(_Shard(label, len(clouds)) for label, clouds in enumerate(views.values()))
+        self.shards = tuple(SourceShard(label, len(clouds)) for label, clouds in enumerate(views.values()))
         self._clouds = tuple(views.values())
         self._config = config
 

@@ -18,7 +18,7 @@ import hashlib
 import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,39 +30,17 @@ from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.prepared_instance import DESCRIPTOR_VOXEL
 from training.augmentation.augmentations import Augmentations
 from training.objects.mesh import TexturedMesh
-from training.rendering.camera import TRAINING_CAMERA, RenderedView
+from training.rendering.camera import TRAINING_CAMERA
 from training.rendering.view_sphere import DISTANCE, view_angles
 from training.storage.jobs import check_same_job, locked
 from training.storage.workers import IN_PROCESS, WorkerPool
-from training.views.crops import (
-    CROP_SIZE,
-    CROPS,
-    CropManifest,
-    QuantizedCrop,
-    ViewCrops,
-    crop_file,
-    encode_crops,
-    intact_content,
-    quantized,
-    rgbd_crop,
-    stacked,
-)
+from training.views import crops, mesh_views
+from training.views.crops import CROP_SIZE, CropManifest, QuantizedCrop, crop_file, intact_content
 from training.views.dataset import MANIFEST, Manifest, Shard, ViewDataset, encode
-from training.views.mesh_views import (
-    MIN_VIEW_POINTS,
-    SIGMA_S,
-    RenderProgress,
-    ViewCloud,
-    ViewTask,
-    all_views,
-    checked_meshes,
-    clouds_per_view,
-    render_task,
-    view_tasks,
-)
+from training.views.mesh_views import SIGMA_S, RenderProgress, ViewTask, clouds_per_view, view_tasks
 from training.views.normalized_views import COORDINATE_STEP, MAX_VIEW_LENGTH, normalize_views
 
-__all__ = ["ShardPlan", "dataset_job", "mesh_digest", "render_crops", "render_dataset", "view_crop"]
+__all__ = ["dataset_job", "mesh_digest", "render_crops", "render_dataset"]
 
 CLOUDS_PER_SHARD = 256
 """Clouds per shard, rounded down to whole views: a few megabytes, about a second of rendering."""
@@ -81,7 +59,7 @@ def mesh_digest(mesh: TexturedMesh) -> str:
 def _objects(meshes: Mapping[str, Path | TexturedMesh], angles: NDArray[np.float64]) -> list[dict[str, str]]:
     """Check every mesh and return the names and digests of the objects."""
     objects = []
-    for name, mesh in checked_meshes(meshes, angles):
+    for name, mesh in mesh_views.checked_meshes(meshes, angles):
         diameter = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
         if SIGMA_S * diameter > MAX_VIEW_LENGTH:
             raise InputError(
@@ -112,31 +90,21 @@ def _begin(directory: Path, job: Mapping[str, Any]) -> Manifest:
     return manifest
 
 
-def _store(path: Path, label: int, planned: int, rendered: Sequence[ViewCloud]) -> Shard:
+def _store(path: Path, label: int, planned: int, rendered: Sequence[mesh_views.ViewCloud]) -> Shard:
     """Normalize the clouds of a shard and write its file; `planned` counts those left out, too.
 
     Raises:
         InputError: A cloud cannot be normalized or stored.
         OSError: The file cannot be written.
     """
-    views = normalize_views(
-        [(cloud.xyz, cloud.rgb) for cloud in rendered],
-        label,
-        [cloud.view for cloud in rendered],
-        [cloud.copy for cloud in rendered],
-        DescriptorConfig(),
-    )
+    clouds = [(cloud.xyz, cloud.rgb) for cloud in rendered]
+    numbers = [cloud.view for cloud in rendered], [cloud.copy for cloud in rendered]
+    views = normalize_views(clouds, label, *numbers, DescriptorConfig())
     content = encode(views)
     with atomic_write(path) as temporary:
         temporary.write_bytes(content)
-    return Shard(
-        file=path.name,
-        sha256=hashlib.sha256(content).hexdigest(),
-        label=label,
-        views=len(views),
-        left_out=planned - len(views),
-        points=len(views.xyz),
-    )
+    digest, n_views = hashlib.sha256(content).hexdigest(), len(views)
+    return Shard(path.name, digest, label, n_views, left_out=planned - n_views, points=len(views.xyz))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -198,7 +166,7 @@ def dataset_job(
         "sigma_s": SIGMA_S,
         "voxel": DESCRIPTOR_VOXEL,
         "step": COORDINATE_STEP,
-        "min_points": MIN_VIEW_POINTS,
+        "min_points": mesh_views.MIN_VIEW_POINTS,
         "camera": {"width": camera.width, "height": camera.height, "intrinsics": intrinsics, "distance": DISTANCE},
         "azimuth_step": float(azimuth_step),
         "polar_step": float(polar_step),
@@ -250,7 +218,7 @@ def render_dataset(
         missing = [file for file in plan.shards if file not in done]
         starts = [(plan.names[label], first) for label, first in (plan.shards[file] for file in missing)]
         tasks = view_tasks(meshes, angles, starts, plan.size, augmentations, seed)
-        with contextlib.closing(pool(render_task, tasks)) as results:
+        with contextlib.closing(pool(mesh_views.render_task, tasks)) as results:
             for file, rendered in zip(missing, results, strict=True):
                 label, first = plan.shards[file]
                 planned = plan.copies * len(angles[first : first + plan.size])
@@ -265,23 +233,15 @@ def _clouds(shards: Mapping[str, Shard]) -> int:
     return sum(shard.views + shard.left_out for shard in shards.values())
 
 
-class _Crop(NamedTuple):
-    view: int
-    copy: int
-    images: QuantizedCrop
-
-
-def view_crop(view: RenderedView, size: int = CROP_SIZE) -> QuantizedCrop | None:
-    """Return the crop of a rendered view; None if nothing is visible."""
-    labels = (view.depth > 0).astype(np.uint8)
-    if not labels.any():
-        return None
-    return quantized(rgbd_crop(RGBDFrame(view.color, view.depth, labels, view.intrinsics), 1, size))
-
-
-def _crops_of_task(task: ViewTask, size: int) -> list[_Crop]:
-    crops = ((number, copy, view_crop(view, size)) for number, copy, view in all_views(task))
-    return [_Crop(number, copy, images) for number, copy, images in crops if images is not None]
+def _crops_of_task(task: ViewTask, size: int) -> dict[tuple[int, int], QuantizedCrop]:
+    """Return (number of the view, of the copy) -> crop of the views of a task in which something is visible."""
+    of_task = {}
+    for number, copy, view in mesh_views.all_views(task):
+        labels = (view.depth > 0).astype(np.uint8)
+        if labels.any():
+            frame = RGBDFrame(view.color, view.depth, labels, view.intrinsics)
+            of_task[number, copy] = crops.quantized(crops.rgbd_crop(frame, 1, size))
+    return of_task
 
 
 def _begin_crops(directory: Path, dataset: ViewDataset, size: int) -> dict[str, str]:
@@ -293,26 +253,25 @@ def _begin_crops(directory: Path, dataset: ViewDataset, size: int) -> dict[str, 
     check_output_directory(directory, MANIFEST)
     if not (directory / MANIFEST).is_file():
         return {}
-    stored = CropManifest.read(directory)
-    check_same_job(
-        directory, {"crops": stored.size, "dataset": stored.dataset}, {"crops": size, "dataset": dataset.digest}
-    )
+    stored, requested = CropManifest.read(directory), {"crops": size, "dataset": dataset.digest}
+    check_same_job(directory, {"crops": stored.size, "dataset": stored.dataset}, requested)
     remove_leftovers(directory)
     return {name: sha for name, sha in stored.files.items() if intact_content(directory, name, sha) is not None}
 
 
-def _of_shard(dataset: ViewDataset, index: int, rendered: Sequence[_Crop], size: int) -> ViewCrops:
+def _of_shard(
+    dataset: ViewDataset, index: int, rendered: Mapping[tuple[int, int], QuantizedCrop], size: int
+) -> crops.ViewCrops:
     """Return the crops of the clouds of a shard, in their order."""
     views = dataset.read(index)
-    by_view = {(crop.view, crop.copy): crop.images for crop in rendered}
     keys = list(zip(views.view.tolist(), views.copy.tolist(), strict=True))
-    missing = [key for key in keys if key not in by_view]
+    missing = [key for key in keys if key not in rendered]
     if missing:
         raise InputError(
             f"meshes: view {missing[0][0]} of {dataset.classes[views.label]!r} is in {dataset.directory}, but is empty "
             "now; give the meshes of the dataset"
         )
-    return stacked([by_view[key] for key in keys], size)
+    return crops.stacked([rendered[key] for key in keys], size)
 
 
 def render_crops(
@@ -341,7 +300,7 @@ def render_crops(
     """
     if size < 1:
         raise InputError(f"crops is {size}; expected at least 1 pixel")
-    directory = dataset.directory / CROPS
+    directory = dataset.directory / crops.CROPS
     job = dataset.manifest.job
     angles = view_angles(job["azimuth_step"], job["polar_step"])
     plan = ShardPlan(angles, clouds_per_view(augmentations), dataset.classes)
@@ -357,7 +316,7 @@ def render_crops(
         with contextlib.closing(pool(functools.partial(_crops_of_task, size=size), tasks)) as results:
             for index, rendered in zip(missing, results, strict=True):
                 name = crop_file(dataset.shards[index].file)
-                content = encode_crops(_of_shard(dataset, index, rendered, size))
+                content = crops.encode_crops(_of_shard(dataset, index, rendered, size))
                 with atomic_write(directory / name) as temporary:
                     temporary.write_bytes(content)
                 done[name] = hashlib.sha256(content).hexdigest()

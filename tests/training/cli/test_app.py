@@ -12,7 +12,8 @@ import pytest
 from helpers import run_thor2
 
 import thor2_jax as thor2
-from training.cli.app import FrameOptions, finish
+from training.cli.app import finish
+from training.cli.options import FrameOptions
 
 ROOT = Path(__file__).parents[3]
 

@@ -31,7 +31,7 @@ def test_objects_stand_and_have_a_household_size() -> None:
         assert SIZES[0] - 1e-9 <= np.ptp(mesh.vertices, axis=0).max() <= SIZES[1] * 1.0001
 
 
-@pytest.mark.parametrize("family", [family for _, family in _FAMILIES])
+@pytest.mark.parametrize("family", _FAMILIES)
 def test_every_family_is_visible_from_all_sides(family) -> None:
     texture = np.full((4, 4, 3), 90, np.uint8)
     for seed in range(5):

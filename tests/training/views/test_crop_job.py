@@ -78,8 +78,8 @@ def test_interrupted_crops_resume_with_the_same_bytes(
     with pytest.raises(InputError, match="is missing or damaged"):
         dataset.read_crops(0, SIZE)
     written = []
-    encode = render_job.encode_crops
-    monkeypatch.setattr(render_job, "encode_crops", lambda crops: written.append(len(crops)) or encode(crops))
+    encode = render_job.crops.encode_crops
+    monkeypatch.setattr(render_job.crops, "encode_crops", lambda crops: written.append(len(crops)) or encode(crops))
     command = ("--meshes", meshes, "--out", dataset.directory, "--azimuth-step", 180, "--polar-step", 90)
     again = (*command, "--workers", 1, "--illumination", "--copies", 1, "--quiet", "--crops")
     assert run_thor2("render", *again, SIZE) == 0

@@ -48,9 +48,7 @@ _TINY = "vit_tiny_patch16_224"
 
 ARCHITECTURES: dict[str, Architecture] = {
     "rcfusion": Architecture(
-        partial(RCFusion, width=64, projection=512, memory=50),
-        _LARGE,
-        {"color": "resnet18", "normals": "resnet18"},
+        partial(RCFusion, width=64, projection=512, memory=50), _LARGE, {"color": "resnet18", "normals": "resnet18"}
     ),
     "rcfusion-small": Architecture(partial(RCFusion, width=16, projection=64, memory=50), _SMALL, {}),
     "vit-cnn": Architecture(

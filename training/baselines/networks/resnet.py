@@ -20,10 +20,8 @@ def batch_norm(channels: int, rngs: nnx.Rngs) -> nnx.BatchNorm:
 
 def convolution(inputs: int, outputs: int, size: int, stride: int, rngs: nnx.Rngs) -> nnx.Conv:
     """Return a convolution without bias whose output has 1/stride of the input's height and width, as in PyTorch."""
-    padding = ((size - 1) // 2, (size - 1) // 2)
-    return nnx.Conv(
-        inputs, outputs, (size, size), (stride, stride), padding=(padding, padding), use_bias=False, rngs=rngs
-    )
+    margin = (size - 1) // 2
+    return nnx.Conv(inputs, outputs, (size, size), stride, padding=margin, use_bias=False, rngs=rngs)
 
 
 def stem_pool(x: jax.Array) -> jax.Array:
@@ -41,9 +39,8 @@ class BasicBlock(nnx.Module):
         self.conv2 = convolution(outputs, outputs, 3, 1, rngs)
         self.bn2 = batch_norm(outputs, rngs)
         shortcut = stride != 1 or inputs != outputs
-        self.downsample = nnx.List(
-            [convolution(inputs, outputs, 1, stride, rngs), batch_norm(outputs, rngs)] if shortcut else []
-        )
+        layers = [convolution(inputs, outputs, 1, stride, rngs), batch_norm(outputs, rngs)] if shortcut else []
+        self.downsample = nnx.List(layers)
 
     def __call__(self, x: jax.Array) -> jax.Array:
         """Return [B, H/stride, W/stride, outputs] features for [B, H, W, inputs]."""

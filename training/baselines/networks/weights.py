@@ -98,19 +98,14 @@ def load_backbone(model: nnx.Module, path: Path) -> None:
                         f"weights: {name} in {path} has the shape {array.shape}; expected {wanted}: give the "
                         "file of the network's backbone"
                     )
-                loaded[keys] = jnp.asarray(_from_torch(array, keys[-1]))
+                axes = (*range(2, array.ndim), 1, 0) if keys[-1] == "kernel" else range(array.ndim)
+                loaded[keys] = jnp.asarray(array.transpose(*axes))
     except (OSError, safetensors.SafetensorError, TypeError) as error:
         raise InputError(
             f"weights: {path} cannot be read ({error}); expected a safetensors file, see docs/baselines.md"
         ) from None
     nnx.replace_by_pure_dict(state, flax.traverse_util.unflatten_dict(loaded))
     nnx.update(model, state)
-
-
-def _from_torch(array: NDArray[Any], kind: str) -> NDArray[Any]:
-    if kind != "kernel":
-        return array
-    return array.transpose(*range(2, array.ndim), 1, 0)
 
 
 def resampled_positions(positions: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float32]:

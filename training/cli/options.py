@@ -1,0 +1,273 @@
+"""Options that several commands share, by themselves and in groups."""
+
+import dataclasses
+import functools
+import inspect
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+from typer.core import TyperCommand
+
+from thor2_jax.errors import InputError
+from thor2_jax.printable import escape_characters
+from thor2_jax.recordings.pairs import DEFAULT_MAX_GAP
+from thor2_jax.recordings.topics import Topics
+
+__all__ = [
+    "AllowHostOption",
+    "FrameOptions",
+    "GalleryOption",
+    "KnownSegmentOption",
+    "MAX_WORKERS",
+    "ManyFrames",
+    "MeshScaleOption",
+    "ModelOption",
+    "QuietOption",
+    "RECORDINGS",
+    "SegmentOption",
+    "UnknownOption",
+    "WorkerOptions",
+    "WorkersOption",
+    "grouped_options",
+    "split_names",
+]
+
+if TYPE_CHECKING:
+    from thor2_jax.recordings.bags import Bag
+    from thor2_jax.segmentation.segmenters import Segmenter
+    from training.readers.frame_files import FrameSource
+    from training.storage.workers import WorkerPool
+
+UnknownOption = Annotated[
+    float | None,
+    typer.Option(
+        "--unknown-below",
+        help="Instances with a lower confidence are unknown objects (0 to 1). Default: the model's own for trained "
+        "classes; for enrolled objects, it grows with the number of their views.",
+    ),
+]
+ModelOption = Annotated[Path, typer.Option("--model", help="Run directory of a trained model.")]
+SegmentOption = Annotated[
+    str | None,
+    typer.Option("--segment", help="Segment the frames instead of reading labels: table, or another segmenter."),
+]
+KnownSegmentOption = Annotated[
+    str | None,
+    typer.Option(
+        "--segment",
+        help="Segment the frames instead of reading labels: table, model (for piles), or another segmenter.",
+    ),
+]
+GalleryOption = Annotated[
+    Path | None, typer.Option("--gallery", help="Directory of the gallery. Default: gallery in the run directory.")
+]
+MeshScaleOption = Annotated[
+    float, typer.Option("--mesh-scale", help="Factor from the unit of the meshes to metres; 0.001 for millimetres.")
+]
+AllowHostOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--allow-host",
+        metavar="NAME",
+        help="Further name or address by which browsers and clients address this machine, such as robot.local; may be "
+        "repeated. localhost and the address of the connection are always allowed.",
+    ),
+]
+QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress.")]
+
+
+RECORDINGS = "Recordings"
+"""Panel of the options of recordings in the help."""
+
+
+@dataclasses.dataclass(frozen=True)
+class FrameOptions:
+    """The frames that a command is given: folders, the files of one frame, or a recording."""
+
+    frames: Annotated[
+        list[Path] | None,
+        typer.Argument(metavar="FRAME", help="Folders of frames, or frames: color, depth, mask, intrinsics."),
+    ] = None
+    color: Annotated[Path | None, typer.Option(help="Color image, PNG or JPEG, in place of FRAME.")] = None
+    depth: Annotated[Path | None, typer.Option(help="Depth image: 16-bit PNG, float TIFF, NPY or EXR.")] = None
+    labels: Annotated[Path | None, typer.Option(help="Instance labels, PNG; 0 is background.")] = None
+    intrinsics: Annotated[
+        Path | None, typer.Option(help="fx, fy, cx, cy in JSON, ROS camera_info, K, BOP, RealSense or Open3D.")
+    ] = None
+    depth_scale: Annotated[
+        float | None, typer.Option(help="Depth units per metre. Default: that of the intrinsics, or 1000.")
+    ] = None
+    bag: Annotated[
+        Path | None,
+        typer.Option(rich_help_panel=RECORDINGS, help="ROS 1 bag, ROS 2 bag or MCAP, in place of FRAME (extra bags)."),
+    ] = None
+    color_topic: Annotated[
+        str | None, typer.Option(rich_help_panel=RECORDINGS, help="Colour images. Default: the topic that has them.")
+    ] = None
+    depth_topic: Annotated[
+        str | None, typer.Option(rich_help_panel=RECORDINGS, help="Depth that is aligned to colour. Default: likewise.")
+    ] = None
+    camera_topic: Annotated[
+        str | None,
+        typer.Option(rich_help_panel=RECORDINGS, help="camera_info of the colour camera. Default: likewise."),
+    ] = None
+    max_gap: Annotated[
+        float, typer.Option(rich_help_panel=RECORDINGS, help="Longest time between colour and depth, seconds.")
+    ] = DEFAULT_MAX_GAP
+    every: Annotated[
+        int, typer.Option(min=1, max=2**31 - 1, rich_help_panel=RECORDINGS, help="Take the first of so many frames.")
+    ] = 1
+
+    @property
+    def arguments(self) -> list[str]:
+        """The arguments that give the same frames to another command."""
+        options = [(field, getattr(self, field.name)) for field in dataclasses.fields(self)[1:]]
+        given = [(f"--{field.name.replace('_', '-')}", value) for field, value in options if value != field.default]
+        return [*map(str, self.frames or ()), *(str(part) for pair in given for part in pair)]
+
+    def check(self) -> None:
+        """Raise InputError unless exactly one of FRAME, files and a recording is given, with its own options."""
+        if self.bag is not None:
+            for name in ("frames", "color", "depth", "labels"):
+                if getattr(self, name):
+                    raise InputError(f"{name} is {getattr(self, name)} and bag is {self.bag}; give one of them")
+            return
+        for name in ("color_topic", "depth_topic", "camera_topic", "max_gap", "every"):
+            if getattr(self, name) != getattr(FrameOptions, name):
+                raise InputError(f"{name} is {getattr(self, name)}; it belongs to --bag")
+        if bool(self.frames) == any((self.color, self.depth, self.labels, self.intrinsics)):
+            raise InputError("give either FRAME... or --color, --depth, --labels and --intrinsics, or --bag")
+
+    def sources(
+        self, segment: str | None = None, model: "Segmenter | None" = None, *, masks: bool = True
+    ) -> list["FrameSource"]:
+        """Return the frames, of which none is read yet.
+
+        Args:
+            segment: segmenter whose labels replace those of the frames; None reads them, and segments recordings.
+            model: the segmenter "model", where the command has one.
+            masks: whether the frames need labels; without, recordings are not segmented.
+
+        Raises:
+            InputError: the options contradict each other, or a folder or a recording cannot be read.
+            OSError: a recording cannot be opened.
+        """
+        from thor2_jax.segmentation.segmenters import MODEL, TABLE, load_segmenter
+        from training.readers.frame_files import FrameFiles, find_frames, segmented_source
+        from training.readers.recording import recorded_sources
+
+        self.check()
+        if self.labels is not None and segment is not None:
+            raise InputError(f"labels is {self.labels} and segment is {segment}; give one of them")
+        if self.bag is not None:
+            segment = segment or (TABLE if masks else None)
+            sources, notes = recorded_sources(self.open_bag, self.every)
+            for note in notes:
+                print(f"note: {escape_characters(note)}", file=sys.stderr)
+        elif self.frames:
+            sources = find_frames(self.frames, self.depth_scale)
+        else:
+            needed = ["color", "depth", *["labels"] * (masks and segment is None), "intrinsics"]
+            missing = ", ".join(f"--{name}" for name in needed if getattr(self, name) is None)
+            if missing:
+                instead = ", or --segment in place of labels" if "labels" in needed else ""
+                raise InputError(f"{missing} is missing; one frame needs {', '.join(needed)}{instead}")
+            assert self.color and self.depth and self.intrinsics
+            files = FrameFiles(self.color, self.depth, self.labels, self.intrinsics)
+            sources = [files.source(self.color.stem, self.depth_scale)]
+        if segment is None:
+            return sources
+        if model is not None and segment == MODEL:
+            load_segmenter(TABLE)  # it begins with these pieces, and their package may be missing
+        else:
+            model = load_segmenter(segment)
+        return [segmented_source(source, model) for source in sources]
+
+    def open_bag(self) -> "Bag":
+        """Return the recording, which is not opened yet."""
+        from thor2_jax.frames.frames import read_intrinsics
+        from thor2_jax.recordings.bags import Bag
+
+        assert self.bag is not None
+        topics = Topics(self.color_topic, self.depth_topic, self.camera_topic)
+        intrinsics = None if self.intrinsics is None else read_intrinsics(self.intrinsics)
+        return Bag(self.bag, topics, intrinsics=intrinsics, depth_scale=self.depth_scale, max_gap=self.max_gap)
+
+
+def grouped_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Let a command take the fields of its parameters that are dataclasses of options, such as `FrameOptions`."""
+    own = inspect.signature(command).parameters.values()
+    groups: dict[str, Any] = {one.name: one.annotation for one in own if dataclasses.is_dataclass(one.annotation)}
+    fields = {name: inspect.signature(group).parameters for name, group in groups.items()}
+    expanded = [each for one in own for each in (fields[one.name].values() if one.name in fields else (one,))]
+
+    @functools.wraps(command)
+    def with_groups(**values: Any) -> None:
+        made = {name: group(**{each: values.pop(each) for each in fields[name]}) for name, group in groups.items()}
+        command(**made, **values)
+
+    parameters = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in expanded]
+    with_groups.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    return with_groups
+
+
+class ManyFrames(TyperCommand):
+    """A command whose option --frames takes all values up to the next option."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse the arguments, with --frames before each value that follows it."""
+        expanded: list[str] = []
+        taking = False
+        for argument in args:
+            if argument.startswith("-") and argument != "-":
+                taking = argument == "--frames"
+                expanded += [] if taking else [argument]
+            else:
+                expanded += ["--frames", argument] if taking else [argument]
+        return super().parse_args(ctx, expanded)
+
+
+def split_names(names: str) -> list[str]:
+    """Return the entries of a comma-separated option."""
+    return [name.strip() for name in names.split(",")] if names else []
+
+
+Engine = Literal["local", "ray"]
+
+MAX_WORKERS = 1024
+"""Largest number of processes of a command: each needs memory and open files."""
+
+WorkersOption = Annotated[
+    int, typer.Option("--workers", min=1, max=MAX_WORKERS, help="Worker processes; with Ray, concurrent tasks.")
+]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class WorkerOptions:
+    """Where a command computes."""
+
+    workers: WorkersOption = 1
+    engine: Annotated[
+        Engine,
+        typer.Option(help="Work on this machine or on a Ray cluster (extra `cluster`), which has the same paths."),
+    ] = "local"
+    address: Annotated[
+        str | None, typer.Option(help="Address of the Ray cluster. Default: the one on this machine.")
+    ] = None
+
+    def pool(self) -> "WorkerPool | None":
+        """Return the worker pool of these options; None stands for this process alone.
+
+        Raises:
+            InputError: `address` without Ray, or Ray is not installed.
+        """
+        from training.storage.workers import local_workers, ray_workers
+
+        if self.engine == "ray":
+            return ray_workers(self.workers, self.address)
+        if self.address is not None:
+            raise InputError(f"address is {self.address}; it is only used with --engine ray")
+        return local_workers(self.workers) if self.workers > 1 else None
