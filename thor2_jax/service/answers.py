@@ -49,10 +49,8 @@ def why_answer(explanation: Explanation, frame: RGBDFrame) -> schemas.WhyAnswer:
         mean_loss_without_random_tenth=check.random,
         changes=[f"{change_text(change)}: {change.answer}" for change in explanation.changes],
         pictures=[
-            schemas.WhyPicture(
-                title=picture.title, caption=picture.caption, png=base64.b64encode(png_bytes(picture.figure)).decode()
-            )
-            for picture in main_pictures(explanation, frame)
+            schemas.WhyPicture(title=p.title, caption=p.caption, png=base64.b64encode(png_bytes(p.figure)).decode())
+            for p in main_pictures(explanation, frame)
         ],
         timings={},
     )

@@ -17,12 +17,9 @@ from thor2_jax.descriptor.describe import strips
 from thor2_jax.descriptor.looks import aligned_looks, describe_aligned_looks
 from thor2_jax.errors import InputError
 from thor2_jax.explanation.class_scores import padded_points
-from thor2_jax.explanation.explain import Explanation, compile_explanations, explain_instance, explained_kinds
+from thor2_jax.explanation.explain import compile_explanations, explained_kinds
 from thor2_jax.frames.instance_clouds import MIN_POINTS
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
-from thor2_jax.gallery.clouds import CompactClouds
-from thor2_jax.gallery.enrollment import LOOKS, enrolled_object
-from thor2_jax.gallery.gallery import GalleryObject
 from thor2_jax.gallery.objects import ObjectGallery
 from thor2_jax.gallery.store import INDEX_FILE, check_index
 from thor2_jax.model.answers import Recognition
@@ -125,16 +122,6 @@ class InferenceEngine:
         return self.model.answers_by() != "classifiers"
 
     @property
-    def classifiers(self) -> tuple[str, ...]:
-        """Names of the classifiers."""
-        return tuple(self.model.classifiers)
-
-    @property
-    def classes(self) -> tuple[str, ...]:
-        """All names that may be answered."""
-        return self.model.names
-
-    @property
     def objects(self) -> ObjectGallery:
         """The enrolled objects. Change a copy of them in another thread, and call `refresh` in this one."""
         return self._recognizer.objects
@@ -154,11 +141,6 @@ class InferenceEngine:
             if str(error) != self._last_error:
                 log.error("%s", error)
             self._last_error = str(error)
-
-    def enrolled_object(self, clouds: CompactClouds, results: Sequence[CloudResult]) -> GalleryObject:
-        """Return an object to enroll from its clouds and the results of `enrollment.views_to_embed`."""
-        embeddings = np.array([result.inference.embeddings[:LOOKS] for result in results])
-        return enrolled_object(embeddings, clouds, "frames")
 
     @property
     def batch_shapes(self) -> list[tuple[int, int]]:
@@ -207,10 +189,6 @@ class InferenceEngine:
         elif source == "gallery":
             inference = inference._replace(probabilities={})
         return answers(model, instances, inference)
-
-    def explain(self, instance: PreparedInstance) -> Explanation:
-        """Explain the answer for an instance; may be called in another thread. Raises as `explain_instance`."""
-        return explain_instance(self.model, instance)
 
     def explanation_programs(self, n_points: int = 1) -> list[ExplanationPrograms]:
         """Return the programs that explain the answer for a cloud of so many points."""
