@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import softmax
 
 from colornet import ColorNetwork
 from thor2_jax.adaptation.color_transform import ColorTransform
@@ -201,5 +202,4 @@ def estimate_transform(
 def posterior_mean(totals: NDArray[np.floating]) -> NDArray[np.float64]:
     """Return the mean [4] of the posterior from the sums of uncertainties [25] of the transforms of `GRID`."""
     negative_log = EVIDENCE * totals + (GRID[:, 3] / PRIOR) ** 2 / 2
-    weights = np.exp(negative_log.min() - negative_log)
-    return np.asarray(weights @ GRID / weights.sum())
+    return np.asarray(softmax(-negative_log) @ GRID)

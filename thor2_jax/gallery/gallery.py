@@ -229,7 +229,7 @@ def score_odds(scores: NDArray[Any]) -> NDArray[Any]:
     return np.asarray((scores / EVEN) ** STEEPNESS)
 
 
-def shown_names(names: tuple[str, ...], count: int = 5) -> str:
+def shown_names(names: tuple[str, ...]) -> str:
     """Return the first names for an error message."""
-    more = f" and {len(names) - count} more" if len(names) > count else ""
-    return (", ".join(map(repr, names[:count])) or "none") + more
+    more = f" and {len(names) - 5} more" if len(names) > 5 else ""
+    return (", ".join(map(repr, names[:5])) or "none") + more
