@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -82,12 +81,9 @@ def plot_network(axes: Axes, network: ColorNetwork, weights: NDArray[np.float64]
         text_color = _contrasting(255 * faces[r]) if used[r] else "#8a8a8a"
         label: dict[str, Any] = {"ha": "center", "va": "center", "fontweight": "bold" if used[r] else "normal"}
         axes.text(a[r], b[r], str(r), color=text_color, fontsize=9, zorder=3, **label)
-    axes.set_aspect("equal")
+    axes.set(aspect="equal", axisbelow=True, xlabel="a*  (green to red)", ylabel="b*  (blue to yellow)")
     axes.margins(0.08)
-    axes.set_axisbelow(True)
     axes.grid(color="#ececec")
-    axes.set_xlabel("a*  (green to red)")
-    axes.set_ylabel("b*  (blue to yellow)")
 
 
 def draw_similarity(network: ColorNetwork, path: str | Path) -> None:
@@ -103,9 +99,7 @@ def draw_similarity(network: ColorNetwork, path: str | Path) -> None:
     off_diagonal = np.ma.masked_array(network.similarity, np.eye(n, dtype=bool) | (network.similarity == 0))
     axes.set_facecolor("#e4e4e4")
     image = axes.imshow(off_diagonal, cmap="viridis", norm=LogNorm())
-    axes.set_title(f"Similarity of the {n} colour regions (diagonal, grey: 1)")
-    axes.set_xticks([])
-    axes.set_yticks([])
+    axes.set(title=f"Similarity of the {n} colour regions (diagonal, grey: 1)", xticks=[], yticks=[])
     along, down = axes.get_xaxis_transform(), axes.get_yaxis_transform()
     for r, rgb in enumerate(network.mean_rgb):
         label: dict[str, Any] = {
@@ -151,6 +145,5 @@ def _contrasting(rgb: NDArray[np.float64]) -> str:
 
 
 def _save(figure: Figure, path: str | Path) -> None:
-    FigureCanvasAgg(figure)
     with atomic_write(path) as temporary:
         figure.savefig(temporary, format="png", dpi=_DPI)

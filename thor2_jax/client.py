@@ -327,12 +327,8 @@ def _read(file: str | Path | bytes) -> bytes:
 
 
 def _encode_labels(labels: NDArray[Any]) -> bytes:
-    if (
-        labels.ndim != 2
-        or labels.dtype.kind not in "ui"
-        or not labels.size
-        or not 0 <= labels.min() <= labels.max() < 2**16
-    ):
+    is_image = labels.ndim == 2 and labels.size and labels.dtype.kind in "ui"
+    if not is_image or not 0 <= labels.min() <= labels.max() < 2**16:
         raise InputError(
             f"labels has shape {labels.shape} and type {labels.dtype}; expected integers [H, W] from 0 to 65535"
         )
