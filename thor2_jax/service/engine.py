@@ -90,7 +90,7 @@ class InferenceEngine:
         if settings.adapt:
             if not self.model.classifiers:
                 raise InputError(f"adapt: {settings.model} has no classifiers; expected a trained run")
-            self._online = OnlineAdaptation(*adaptation_criterion(self.model), self._set_transform)
+            self._online = OnlineAdaptation(adaptation_criterion(self.model), self._set_transform)
 
     @property
     def model(self) -> Model:
