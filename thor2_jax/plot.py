@@ -84,23 +84,18 @@ def _paint(colors: NDArray[np.float64], values: ArrayLike | None, scale: ScalarM
 
 
 def _scatter(
-    ax: Axes,
-    x: NDArray[Any],
-    y: NDArray[Any],
-    nearness: NDArray[Any],
-    paint: NDArray[Any],
-    values: ArrayLike | None,
-    size: float,
+    ax: Axes, places: NDArray[Any], nearness: NDArray[Any], paint: NDArray[Any], values: ArrayLike | None, size: float
 ) -> PathCollection:
-    """Draw near points over far ones; with values, large ones over small ones and up to three times as large."""
+    """Draw near points [n, 2] over far ones; with values, large ones over small ones and up to three times as large."""
     if values is None:
         ax.set_facecolor("#e4e4e4")  # White points are seen on it.
-        order, areas = np.argsort(nearness, kind="stable"), np.full(len(x), size)
+        order, areas = np.argsort(nearness, kind="stable"), np.full(len(places), size)
     else:
         magnitude = np.abs(np.asarray(values, float))
         order = np.argsort(magnitude, kind="stable")
         areas = size * (1 + 2 * np.clip(magnitude / attribution_colors(magnitude).norm.vmax, 0, 1))
-    return ax.scatter(x[order], y[order], c=paint[order], s=areas[order], linewidths=0)
+    x, y = places[order].T
+    return ax.scatter(x, y, c=paint[order], s=areas[order], linewidths=0)
 
 
 def cloud(
@@ -129,7 +124,7 @@ def cloud(
         InputError: the shapes do not fit.
     """
     xyz, rgb = _check_points(points, colors)
-    drawn = _scatter(ax, xyz[:, 0], xyz[:, 1], -xyz[:, 2], _paint(rgb, values, scale), values, size)
+    drawn = _scatter(ax, xyz[:, :2], -xyz[:, 2], _paint(rgb, values, scale), values, size)
     ax.set(aspect="equal", xlabel="x, to the right (m)", ylabel="y, down (m)")
     if not ax.yaxis_inverted():
         ax.invert_yaxis()
@@ -166,7 +161,7 @@ def slices(
         InputError: the shapes do not fit.
     """
     xyz, rgb = _check_points(points, colors)
-    drawn = _scatter(ax, xyz[:, 0], xyz[:, 2], xyz[:, 1], _paint(rgb, values, scale), values, size)
+    drawn = _scatter(ax, xyz[:, [0, 2]], xyz[:, 1], _paint(rgb, values, scale), values, size)
     right, top = xyz[:, [0, 2]].max(axis=0, initial=0)
     used = min(config.n_slices, int(top / config.sigma_1) + 1)
     for level in np.arange(used + 1) * config.sigma_1:
@@ -298,14 +293,10 @@ def color_matrix(
     cells[..., 3] = np.sqrt(np.clip(color[:, rows].T / top, 0, 1))
     if len(rows):
         ax.imshow(cells, aspect="auto", interpolation="nearest")
+    swatch: dict[str, Any] = {"clip_on": False, "markersize": 7, "markeredgecolor": "#888888", "markeredgewidth": 0.5}
+    beside = ax.get_yaxis_transform()
     for row, region in enumerate(rows):
-        swatch: dict[str, Any] = {
-            "transform": ax.get_yaxis_transform(),
-            "clip_on": False,
-            "markersize": 7,
-            "markeredgecolor": "#888888",
-        }
-        ax.plot([-0.02], [row], "s", color=network.mean_rgb[region] / 255, markeredgewidth=0.5, **swatch)
+        ax.plot([-0.02], [row], "s", color=network.mean_rgb[region] / 255, transform=beside, **swatch)
     ax.set_yticks(range(len(rows)), [str(region) for region in rows], fontsize=7)
     ax.tick_params(axis="y", length=0, pad=12)
     ax.set(xlim=(-0.5, len(color) - 0.5), xlabel="strip", ylabel="colour region")
