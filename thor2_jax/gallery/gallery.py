@@ -181,10 +181,9 @@ class Gallery:
         Its score grows with the logarithm of the object's views between the numbers of `KEPT`.
         """
         views = [len(views.clouds) for views in self.objects.values()]
-        with_references, without = (
-            (KEPT, KEPT_WITHOUT_REFERENCES) if self.balanced else (KEPT_BEFORE, KEPT_BEFORE_WITHOUT_REFERENCES)
-        )
-        kept = without if self.references is None else with_references
+        kept = KEPT if self.balanced else KEPT_BEFORE
+        if self.references is None:
+            kept = KEPT_WITHOUT_REFERENCES if self.balanced else KEPT_BEFORE_WITHOUT_REFERENCES
         odds = score_odds(np.interp(np.log(views), np.log(list(kept)), list(kept.values())))
         return (odds / (1 + odds)).round(3)
 

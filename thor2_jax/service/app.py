@@ -248,11 +248,11 @@ def _add_model_routes(routes: APIRouter, service: Service) -> None:
     async def model() -> schemas.ModelAnswer:
         """Return the classes and the configuration of the model."""
         service.engine.refresh()
-        run = service.engine.run
+        current, run = service.engine.model, service.engine.run
         return schemas.ModelAnswer(
-            classes=list(service.engine.model.names),
-            knows=service.engine.model.union.summary,
-            classifiers=list(service.engine.model.classifiers),
+            classes=list(current.names),
+            knows=current.union.summary,
+            classifiers=list(current.classifiers),
             descriptor_version=DESCRIPTOR_VERSION,
             descriptor=pydantic_core.to_jsonable_python(run.config),
             color_network=run.network.fingerprint,
@@ -264,10 +264,9 @@ def _add_model_routes(routes: APIRouter, service: Service) -> None:
     async def colornet() -> schemas.ColorNetworkAnswer:
         """Return the colour network of the descriptors."""
         network = service.engine.run.network
-        arrays = ("mean_rgb", "member_counts", "edges", "edge_weights", "similarity")
-        return schemas.ColorNetworkAnswer(
-            fingerprint=network.fingerprint, **{name: getattr(network, name).tolist() for name in arrays}
-        )
+        names = ("mean_rgb", "member_counts", "edges", "edge_weights", "similarity")
+        arrays = {name: getattr(network, name).tolist() for name in names}
+        return schemas.ColorNetworkAnswer(fingerprint=network.fingerprint, **arrays)
 
     @routes.get("/metrics", response_class=Response, responses={200: {"content": {"text/plain": {}}}})
     async def metrics() -> Response:

@@ -28,7 +28,8 @@ class Metrics:
     def __init__(self) -> None:
         registry = self._registry = CollectorRegistry()
         gauge = functools.partial(Gauge, registry=registry, multiprocess_mode="livesum")
-        self.requests = Counter("thor2_requests", "Answered requests.", ["path", "status"], registry=registry)
+        counter = functools.partial(Counter, registry=registry)
+        self.requests = counter("thor2_requests", "Answered requests.", ["path", "status"])
         histogram = functools.partial(Histogram, registry=registry)
         self.stages = histogram(
             "thor2_stage_seconds", "Duration of the stages of a request.", ["stage"], buckets=STAGE_BUCKETS
@@ -36,9 +37,7 @@ class Metrics:
         self.batches = histogram("thor2_batch_clouds", "Number of clouds in a batch.", buckets=BATCH_SIZE_BUCKETS)
         self.in_progress = gauge("thor2_requests_waiting", "Requests in progress.")
         self.ready_workers = gauge("thor2_ready_workers", "Processes that accept requests.")
-        self.compilations = Counter(
-            "thor2_compilations_after_warm_up", "Programs compiled after warm-up.", registry=registry
-        )
+        self.compilations = counter("thor2_compilations_after_warm_up", "Programs compiled after warm-up.")
 
     def text(self) -> bytes:
         """Return the metrics in the Prometheus text format."""

@@ -121,10 +121,9 @@ class Service:
 
     def start(self) -> None:
         """Start processes and threads. `state` becomes "ready" when all batch shapes are compiled."""
-        self._pool = PreparationPool(self.settings.processes, self.settings.segmenter)
-        self._batcher = Batcher(
-            self._process_batch, lambda: self._in_progress, self.settings.max_batch, self.settings.window
-        )
+        settings = self.settings
+        self._pool = PreparationPool(settings.processes, settings.segmenter)
+        self._batcher = Batcher(self._process_batch, lambda: self._in_progress, settings.max_batch, settings.window)
         self._explainer = ThreadPoolExecutor(1, thread_name_prefix="explain")
         self._compiler = ThreadPoolExecutor(1, thread_name_prefix=COMPILER_THREAD)
         self._warm_up_thread = threading.Thread(target=self._warm_up, name="warm-up")
