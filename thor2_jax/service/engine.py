@@ -17,7 +17,7 @@ from thor2_jax.descriptor.describe import strips
 from thor2_jax.descriptor.looks import aligned_looks, describe_aligned_looks
 from thor2_jax.errors import InputError
 from thor2_jax.explanation.class_scores import padded_points
-from thor2_jax.explanation.explain import compile_explanations, explained_kinds
+from thor2_jax.explanation.explain import Explanation, compile_explanations, explain_instance, explained_kinds
 from thor2_jax.frames.instance_clouds import MIN_POINTS
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.gallery.objects import ObjectGallery
@@ -189,6 +189,10 @@ class InferenceEngine:
         elif source == "gallery":
             inference = inference._replace(probabilities={})
         return answers(model, instances, inference)
+
+    def explain(self, instance: PreparedInstance) -> Explanation:
+        """Explain the answer for an instance; may be called in another thread. Raises as `explain_instance`."""
+        return explain_instance(self.model, instance)
 
     def explanation_programs(self, n_points: int = 1) -> list[ExplanationPrograms]:
         """Return the programs that explain the answer for a cloud of so many points."""

@@ -16,7 +16,6 @@ import numpy as np
 
 from thor2_jax.capacity import POINT_BUCKETS
 from thor2_jax.errors import InputError
-from thor2_jax.explanation.explain import explain_instance
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery.clouds import CompactClouds
 from thor2_jax.gallery.enrollment import LOOKS, enrolled_object, views_to_embed
@@ -272,7 +271,7 @@ class Service:
         def explained() -> WhyAnswer:
             assert prepared.frame is not None
             (instance,) = self.engine.correct(prepared.instances, observe=False)
-            return why_answer(explain_instance(self.engine.model, instance), prepared.frame)
+            return why_answer(self.engine.explain(instance), prepared.frame)
 
         with request.stage("explain"):
             try:
