@@ -34,7 +34,6 @@ __all__ = [
     "adaptation_criterion",
     "camera_instances",
     "estimate_transform",
-    "gallery_classifier",
 ]
 
 PRIOR = 0.085

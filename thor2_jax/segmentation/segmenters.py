@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thor2_jax.errors import InputError
+from thor2_jax.errors import InputError, needs_extra
 from thor2_jax.frames.frames import RGBDFrame
 
 __all__ = ["ENTRY_POINTS", "MODEL", "TABLE", "Segmenter", "load_segmenter", "segment", "segmented", "segmenter_names"]
@@ -50,12 +50,8 @@ def load_segmenter(name: str) -> Segmenter:
             f"segmenter is {name!r}, which only recognize and explain take; expected {', '.join(segmenter_names())}"
         )
     if name == TABLE:
-        try:
+        with needs_extra(f"segmenter is {name!r}, which", "OpenCV", "segment"):
             return importlib.import_module("thor2_jax.segmentation.table").segment_table
-        except ImportError as error:
-            raise InputError(
-                f"segmenter is {name!r}, which needs OpenCV ({error}); run pip install -c constraints.txt '.[segment]'"
-            ) from None
     points = list(entry_points(group=ENTRY_POINTS, name=name))
     if not points:
         raise InputError(

@@ -3,7 +3,6 @@
 import dataclasses
 import logging
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -69,7 +68,10 @@ class InferenceEngine:
             InputError: the run cannot be read or lacks a classifier of THOR2, or an error of `Recognizer`.
         """
         if settings.cache is not None:
-            _enable_compilation_cache(settings.cache)
+            jax.config.update("jax_compilation_cache_dir", str(settings.cache))
+            # By default JAX caches only large programs that take more than a second to compile.
+            jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+            jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
         recognizer = _load(settings)
         run = recognizer.run
         missing = [name for name in THOR2 if run.classifiers and name not in run.classifiers]
@@ -240,13 +242,6 @@ def _load(settings: Settings) -> Recognizer:
         if recognizer.run.record.get("answer_by") == "classifiers":  # They would never answer by an enrolled object.
             recognizer = Recognizer.load(settings.model, settings.unknown_below, gallery=directory, answer_by="both")
     return recognizer
-
-
-def _enable_compilation_cache(directory: Path) -> None:
-    jax.config.update("jax_compilation_cache_dir", str(directory))
-    # By default JAX caches only large programs that take more than a second to compile.
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-    jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
 
 
 def _padded_batch(n_clouds: int) -> int:

@@ -20,7 +20,6 @@ __all__ = [
     "ChangeAnswer",
     "ColorNetworkAnswer",
     "DescribeAnswer",
-    "DescriptorAnswer",
     "Details",
     "EnrolmentAnswer",
     "ExplainedFrame",
