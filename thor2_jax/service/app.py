@@ -172,13 +172,11 @@ async def _admitted_form(
 
 
 def _add_inference_routes(routes: APIRouter, service: Service) -> None:
-    adapts = service.settings.adapt  # A frame then changes how the next ones are recognized.
-    observing: dict[str, Any] = {"dependencies": [Depends(_check_same_site)]} if adapts else {}
-    frame_errors = FRAME_ERRORS | (error_responses(403) if adapts else {})
+    of_frame: dict[str, Any] = {"responses": FRAME_ERRORS, "openapi_extra": {"requestBody": schemas.FRAME_FORM}}
+    if service.settings.adapt:  # A frame then changes how the next ones are recognized.
+        of_frame |= {"responses": FRAME_ERRORS | error_responses(403), "dependencies": [Depends(_check_same_site)]}
 
-    @routes.post(
-        "/v1/recognize", responses=frame_errors, openapi_extra={"requestBody": schemas.FRAME_FORM}, **observing
-    )
+    @routes.post("/v1/recognize", **of_frame)
     async def recognize(request: Request) -> schemas.FrameAnswer:
         """Recognize every instance of a frame; one without labels is segmented."""
         async with _admitted_form(service, request, schemas.FRAME_FORM) as (admitted, files):
@@ -191,13 +189,7 @@ def _add_inference_routes(routes: APIRouter, service: Service) -> None:
             timings=admitted.milliseconds(),
         )
 
-    @routes.post(
-        "/v1/explain",
-        response_model=schemas.ExplainedFrame,
-        responses=frame_errors,
-        openapi_extra={"requestBody": schemas.FRAME_FORM},
-        **observing,
-    )
+    @routes.post("/v1/explain", response_model=schemas.ExplainedFrame, **of_frame)
     async def explain(request: Request) -> Response:
         """Recognize every instance of a frame and return the evidence: clouds, persistence images and colours."""
         async with _admitted_form(service, request, schemas.FRAME_FORM) as (admitted, files):
@@ -215,15 +207,11 @@ def _add_inference_routes(routes: APIRouter, service: Service) -> None:
         async with _admitted_form(service, request, schemas.WHY_FORM, seconds) as (admitted, files):
             return await service.why(files, parse_number(files, "instance"), admitted)
 
-    @routes.post(
-        "/v1/describe",
-        response_model=schemas.DescribeAnswer,
-        responses={
-            200: {"content": {NPZ: {"schema": {"type": "string", "format": "binary"}}}},
-            **error_responses(408, 413, 415, 422, 429, 503, 504),
-        },
-        openapi_extra={"requestBody": schemas.CLOUDS_BODY},
-    )
+    arrays = {"content": {NPZ: {"schema": {"type": "string", "format": "binary"}}}}
+    responses = {200: arrays, **error_responses(408, 413, 415, 422, 429, 503, 504)}
+    body = {"requestBody": schemas.CLOUDS_BODY}
+
+    @routes.post("/v1/describe", response_model=schemas.DescribeAnswer, responses=responses, openapi_extra=body)
     async def describe(request: Request) -> Response:
         """Compute the descriptors of clouds. The answer has the content type of the body: JSON or npz.
 
@@ -239,8 +227,8 @@ def _add_inference_routes(routes: APIRouter, service: Service) -> None:
             results = await service.describe(content, content_type == NPZ, admitted)
             if content_type == NPZ:
                 return Response(await run_in_threadpool(_encode_npz, results), media_type=NPZ)
-            body = await run_in_threadpool(_encode_json, results, admitted.milliseconds())
-            return Response(body, media_type="application/json")
+            text = await run_in_threadpool(_encode_json, results, admitted.milliseconds())
+            return Response(text, media_type="application/json")
 
 
 def _add_model_routes(routes: APIRouter, service: Service) -> None:
@@ -287,11 +275,8 @@ def _add_teaching_routes(authenticated: APIRouter, service: Service) -> None:
         if not service.settings.teach:
             raise RequestError(403, None, "The service does not teach; start it with `thor2 serve --teach`.")
 
-    routes = APIRouter(
-        dependencies=[Depends(check_teaches), Depends(_check_same_site)],
-        responses=error_responses(403),
-        include_in_schema=service.settings.teach,
-    )
+    guards = [Depends(check_teaches), Depends(_check_same_site)]
+    routes = APIRouter(dependencies=guards, responses=error_responses(403), include_in_schema=service.settings.teach)
 
     @routes.post(
         "/v1/objects",
