@@ -135,12 +135,9 @@ def _check(explanation: Explanation) -> ExplanationPicture:
     used = np.isfinite(left.strips)
     rows, columns = (int(np.flatnonzero(used.any(axis=axis)).max(initial=0)) + 1 for axis in (1, 0))
     figure = Figure(figsize=_SIZE, layout="constrained")
-    for axes, values, title in zip(
-        figure.subplots(2, 1, sharex=True),
-        (left.strips, left.predicted),
-        ("exact: what the answer loses without the strip", "sum of the attributions of the strip"),
-        strict=True,
-    ):
+    panels = figure.subplots(2, 1, sharex=True)
+    titles = ("exact: what the answer loses without the strip", "sum of the attributions of the strip")
+    for axes, values, title in zip(panels, (left.strips, left.predicted), titles, strict=True):
         shown = values[:rows, :columns]
         scale = plot.attribution_colors(shown[np.isfinite(shown)])
         axes.imshow(np.ma.masked_invalid(shown), origin="lower", aspect="auto", cmap=scale.cmap, norm=scale.norm)

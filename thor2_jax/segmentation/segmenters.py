@@ -58,17 +58,14 @@ def load_segmenter(name: str) -> Segmenter:
             f"segmenter is {name!r}; expected one of {', '.join(segmenter_names())}, or install a package that offers "
             f"it in the entry point group {ENTRY_POINTS}"
         )
+    subject = f"segmenter is {name!r}; {points[0].value}"
     # The package is not ours: importing it may raise anything.
     try:
         segmenter = points[0].load()
     except Exception as error:
-        raise InputError(
-            f"segmenter is {name!r}; {points[0].value} cannot be imported ({_reason(error)}); check its package"
-        ) from None
+        raise InputError(f"{subject} cannot be imported ({_reason(error)}); check its package") from None
     if not callable(segmenter):
-        raise InputError(
-            f"segmenter is {name!r}; {points[0].value} is a {type(segmenter).__name__}; expected a function"
-        )
+        raise InputError(f"{subject} is a {type(segmenter).__name__}; expected a function")
     return segmenter
 
 
