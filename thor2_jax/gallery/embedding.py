@@ -90,13 +90,7 @@ class EmbeddingNetwork(nnx.Module):
     """
 
     def __init__(
-        self,
-        config: DescriptorConfig,
-        n_regions: int,
-        sizes: EmbeddingSizes = EmbeddingSizes(),
-        n_proxies: int = 0,
-        *,
-        rngs: nnx.Rngs,
+        self, config: DescriptorConfig, n_regions: int, sizes: EmbeddingSizes, n_proxies: int, *, rngs: nnx.Rngs
     ) -> None:
         """Initialize the weights; the colour basis is zero and the blocks have equal weights.
 
@@ -104,7 +98,7 @@ class EmbeddingNetwork(nnx.Module):
             config: descriptor.
             n_regions: number of colour regions.
             sizes: sizes of the layers.
-            n_proxies: number of proxies, which classify; none by default.
+            n_proxies: number of proxies, which classify; 0 for none.
             rngs: generators of the weights and the dropout.
         """
         self.positions = max(config.image_size, config.n_strips)

@@ -103,10 +103,8 @@ def segment_known(
 def _parts(frame: RGBDFrame, labels: NDArray[np.integer]) -> tuple[NDArray[np.int32], NDArray[np.intp]]:
     """Return the numbers [H, W] of the parts of all pieces, 0 is background, and the piece of each part [n + 1]."""
     lab = np.asarray(cv2.cvtColor(cv2.medianBlur(frame.color, SMOOTH), cv2.COLOR_RGB2LAB), np.float32)
-    features = np.concatenate(
-        [lab * np.array([0.6, 1, 1], np.float32) / CELL[0], backproject(frame.depth_m, frame.intrinsics) / CELL[1]],
-        axis=2,
-    ).astype(np.float32)
+    points = backproject(frame.depth_m, frame.intrinsics)
+    features = np.dstack([lab * np.array([0.6, 1, 1], np.float32) / CELL[0], points / CELL[1]]).astype(np.float32)
     parts, piece_of = np.zeros(labels.shape, np.int32), [0]
     numbers = np.unique(labels)
     for piece, label in enumerate(numbers[numbers > 0], start=1):
