@@ -71,7 +71,7 @@ def measure_camera(
         usable = [each for each in instances if each.reason is None]
         chosen = [usable[k] for k in np.random.default_rng(half).permutation(len(usable))[:count]]
         start = time.perf_counter()
-        adaptation = estimate_transform(chosen, *adaptation_criterion(recognizer.model))
+        adaptation = estimate_transform(chosen, adaptation_criterion(recognizer.model))
         seconds = time.perf_counter() - start
         test = frames[1 - half :: 2]
         seen = [seen_by(camera, item) for item in test]

@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -68,11 +67,9 @@ def plot_network(axes: Axes, network: ColorNetwork, weights: NDArray[np.float64]
     share = None if weights is None else weights / max(float(weights.sum()), 1e-12)
     area = _area(network.member_counts) if share is None else 190 + 2500 * share
     for (i, j), weight, cyclic in zip(network.edges, network.edge_weights, network.cyclic, strict=True):
-        style = "--" if cyclic else "-"
+        color, style = _EDGE_COLOR if used[i] and used[j] else _PALE_EDGE_COLOR, "--" if cyclic else "-"
         line: dict[str, Any] = {"linestyle": style, "linewidth": _width(weight), "solid_capstyle": "butt"}
-        axes.plot(
-            a[[i, j]], b[[i, j]], color=_EDGE_COLOR if used[i] and used[j] else _PALE_EDGE_COLOR, zorder=1, **line
-        )
+        axes.plot(a[[i, j]], b[[i, j]], color=color, zorder=1, **line)
     # Pale regions are opaque, so that no edge is seen through them.
     faces = np.where(used[:, None], network.mean_rgb / 255, 0.75 + 0.25 * network.mean_rgb / 255)
     outlines = [_TEXT_COLOR if one else _PALE_EDGE_COLOR for one in used]
@@ -82,12 +79,9 @@ def plot_network(axes: Axes, network: ColorNetwork, weights: NDArray[np.float64]
         text_color = _contrasting(255 * faces[r]) if used[r] else "#8a8a8a"
         label: dict[str, Any] = {"ha": "center", "va": "center", "fontweight": "bold" if used[r] else "normal"}
         axes.text(a[r], b[r], str(r), color=text_color, fontsize=9, zorder=3, **label)
-    axes.set_aspect("equal")
+    axes.set(aspect="equal", axisbelow=True, xlabel="a*  (green to red)", ylabel="b*  (blue to yellow)")
     axes.margins(0.08)
-    axes.set_axisbelow(True)
     axes.grid(color="#ececec")
-    axes.set_xlabel("a*  (green to red)")
-    axes.set_ylabel("b*  (blue to yellow)")
 
 
 def draw_similarity(network: ColorNetwork, path: str | Path) -> None:
@@ -103,23 +97,15 @@ def draw_similarity(network: ColorNetwork, path: str | Path) -> None:
     off_diagonal = np.ma.masked_array(network.similarity, np.eye(n, dtype=bool) | (network.similarity == 0))
     axes.set_facecolor("#e4e4e4")
     image = axes.imshow(off_diagonal, cmap="viridis", norm=LogNorm())
-    axes.set_title(f"Similarity of the {n} colour regions (diagonal, grey: 1)")
-    axes.set_xticks([])
-    axes.set_yticks([])
+    axes.set(title=f"Similarity of the {n} colour regions (diagonal, grey: 1)", xticks=[], yticks=[])
     along, down = axes.get_xaxis_transform(), axes.get_yaxis_transform()
+    label: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 9, "fontweight": "bold"}
     for r, rgb in enumerate(network.mean_rgb):
-        label: dict[str, Any] = {
-            "color": _contrasting(rgb),
-            "ha": "center",
-            "va": "center",
-            "fontsize": 9,
-            "fontweight": "bold",
-        }
         patch: dict[str, Any] = {"facecolor": rgb / 255, "edgecolor": "white", "linewidth": 1, "clip_on": False}
         axes.add_patch(Rectangle((r - 0.5, -0.055), 1, 0.05, transform=along, **patch))
-        axes.text(r, -0.03, str(r), transform=along, **label)
+        axes.text(r, -0.03, str(r), transform=along, color=_contrasting(rgb), **label)
         axes.add_patch(Rectangle((-0.055, r - 0.5), 0.05, 1, transform=down, **patch))
-        axes.text(-0.03, r, str(r), transform=down, **label)
+        axes.text(-0.03, r, str(r), transform=down, color=_contrasting(rgb), **label)
     axes.set_xlabel("region (swatch: mean colour)", labelpad=36)
     axes.set_ylabel("region (swatch: mean colour)", labelpad=36)
     ticks = LogLocator(subs=(1, 2, 5))
@@ -151,6 +137,5 @@ def _contrasting(rgb: NDArray[np.float64]) -> str:
 
 
 def _save(figure: Figure, path: str | Path) -> None:
-    FigureCanvasAgg(figure)
     with atomic_write(path) as temporary:
         figure.savefig(temporary, format="png", dpi=_DPI)

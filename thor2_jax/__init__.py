@@ -39,22 +39,8 @@ else:
         "types": ("Descriptors", "Diagrams", "PointClouds", "Strips"),
     }
     _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
-    _SUBMODULES = (
-        "adaptation",
-        "capacity",
-        "client",
-        "descriptor",
-        "explanation",
-        "export",
-        "frames",
-        "persistence",
-        "plot",
-        "model",
-        "segmentation",
-        "testing",
-        "tracking",
-        *_MODULES,
-    )
+    _SUBMODULES = {name.partition(".")[0] for name in _MODULES}
+    _SUBMODULES |= {"capacity", "client", "export", "persistence", "plot", "testing"}
 
     def __getattr__(name: str) -> Any:
         if name in _MODULE_OF:

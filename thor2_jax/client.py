@@ -40,6 +40,9 @@ from thor2_jax.types import Descriptors
 
 __all__ = ["AsyncClient", "Client", "EnrolledObject", "KnownObject", "ServiceError", "ServiceModel", "multipart"]
 
+File = str | Path | bytes
+"""A file, as a path or its content."""
+
 P = ParamSpec("P")
 T = TypeVar("T")
 
@@ -146,12 +149,7 @@ class Client(_Connection):
     """Client of one service. It keeps no connection open and is thread-safe."""
 
     def recognize(
-        self,
-        *,
-        color: str | Path | bytes,
-        depth: str | Path | bytes,
-        labels: str | Path | bytes | NDArray[Any] | None = None,
-        intrinsics: Any,
+        self, *, color: File, depth: File, labels: File | NDArray[Any] | None = None, intrinsics: Any
     ) -> list[Recognition]:
         """Recognize every instance of a frame, in the order of the labels.
 
@@ -171,12 +169,7 @@ class Client(_Connection):
         return self._send("POST", "/v1/recognize", lambda content: _recognitions(content)[0], files=files)
 
     def recognize_frame(
-        self,
-        *,
-        color: str | Path | bytes,
-        depth: str | Path | bytes,
-        labels: str | Path | bytes | NDArray[Any] | None = None,
-        intrinsics: Any,
+        self, *, color: File, depth: File, labels: File | NDArray[Any] | None = None, intrinsics: Any
     ) -> tuple[list[Recognition], NDArray[np.int32] | None]:
         """Recognize a frame, and return its recognitions and the labels [H, W] that the service made.
 
@@ -220,9 +213,9 @@ class Client(_Connection):
         self,
         name: str,
         *,
-        color: str | Path | bytes,
-        depth: str | Path | bytes,
-        labels: str | Path | bytes | NDArray[Any],
+        color: File,
+        depth: File,
+        labels: File | NDArray[Any],
         intrinsics: Any,
         instance: int,
         extend: bool = False,
@@ -306,12 +299,7 @@ class AsyncClient(_Connection):
         return parse(_content(response))
 
 
-def _frame_files(
-    color: str | Path | bytes,
-    depth: str | Path | bytes,
-    labels: str | Path | bytes | NDArray[Any] | None,
-    intrinsics: Any,
-) -> dict[str, bytes]:
+def _frame_files(color: File, depth: File, labels: File | NDArray[Any] | None, intrinsics: Any) -> dict[str, bytes]:
     files = {"color": _read(color), "depth": _read(depth)}
     if labels is not None:
         files["labels"] = _encode_labels(labels) if isinstance(labels, np.ndarray) else _read(labels)
@@ -322,17 +310,13 @@ def _frame_files(
     return files
 
 
-def _read(file: str | Path | bytes) -> bytes:
+def _read(file: File) -> bytes:
     return file if isinstance(file, bytes) else Path(file).read_bytes()
 
 
 def _encode_labels(labels: NDArray[Any]) -> bytes:
-    if (
-        labels.ndim != 2
-        or labels.dtype.kind not in "ui"
-        or not labels.size
-        or not 0 <= labels.min() <= labels.max() < 2**16
-    ):
+    is_image = labels.ndim == 2 and labels.size and labels.dtype.kind in "ui"
+    if not is_image or not 0 <= labels.min() <= labels.max() < 2**16:
         raise InputError(
             f"labels has shape {labels.shape} and type {labels.dtype}; expected integers [H, W] from 0 to 65535"
         )

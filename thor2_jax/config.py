@@ -21,11 +21,7 @@ DESCRIPTOR_VERSION = 1
 LOOK_COUNTS = (1, 2, 4)
 """Numbers of looks at a cloud; 1 is the paper's."""
 
-_CHOICES = {
-    "homology": ("gudhi", "closed_form"),
-    "convention": ("paper", "released"),
-    "looks": LOOK_COUNTS,
-}
+_CHOICES = {"homology": ("gudhi", "closed_form"), "convention": ("paper", "released"), "looks": LOOK_COUNTS}
 
 
 def _is_finite(value: object) -> bool:

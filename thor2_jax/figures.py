@@ -5,7 +5,6 @@ import io
 from pathlib import Path
 from typing import Any
 
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.font_manager import fontManager, get_font
 
@@ -31,14 +30,12 @@ def save_figure(figure: Figure, path: str | Path, *, fit: bool = False) -> None:
     Raises:
         OSError: the file cannot be written.
     """
-    FigureCanvasAgg(figure)
     with atomic_write(path) as temporary:
         figure.savefig(temporary, dpi=_DPI, format="png", bbox_inches="tight" if fit else None)
 
 
 def png_bytes(figure: Figure) -> bytes:
     """Return a figure as the content of a PNG file."""
-    FigureCanvasAgg(figure)
     stream = io.BytesIO()
     figure.savefig(stream, dpi=_DPI, format="png")
     return stream.getvalue()

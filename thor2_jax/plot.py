@@ -84,23 +84,18 @@ def _paint(colors: NDArray[np.float64], values: ArrayLike | None, scale: ScalarM
 
 
 def _scatter(
-    ax: Axes,
-    x: NDArray[Any],
-    y: NDArray[Any],
-    nearness: NDArray[Any],
-    paint: NDArray[Any],
-    values: ArrayLike | None,
-    size: float,
+    ax: Axes, places: NDArray[Any], nearness: NDArray[Any], paint: NDArray[Any], values: ArrayLike | None, size: float
 ) -> PathCollection:
-    """Draw near points over far ones; with values, large ones over small ones and up to three times as large."""
+    """Draw near points [n, 2] over far ones; with values, large ones over small ones and up to three times as large."""
     if values is None:
         ax.set_facecolor("#e4e4e4")  # White points are seen on it.
-        order, areas = np.argsort(nearness, kind="stable"), np.full(len(x), size)
+        order, areas = np.argsort(nearness, kind="stable"), np.full(len(places), size)
     else:
         magnitude = np.abs(np.asarray(values, float))
         order = np.argsort(magnitude, kind="stable")
         areas = size * (1 + 2 * np.clip(magnitude / attribution_colors(magnitude).norm.vmax, 0, 1))
-    return ax.scatter(x[order], y[order], c=paint[order], s=areas[order], linewidths=0)
+    x, y = places[order].T
+    return ax.scatter(x, y, c=paint[order], s=areas[order], linewidths=0)
 
 
 def cloud(
@@ -129,12 +124,10 @@ def cloud(
         InputError: the shapes do not fit.
     """
     xyz, rgb = _check_points(points, colors)
-    drawn = _scatter(ax, xyz[:, 0], xyz[:, 1], -xyz[:, 2], _paint(rgb, values, scale), values, size)
-    ax.set_aspect("equal")
+    drawn = _scatter(ax, xyz[:, :2], -xyz[:, 2], _paint(rgb, values, scale), values, size)
+    ax.set(aspect="equal", xlabel="x, to the right (m)", ylabel="y, down (m)")
     if not ax.yaxis_inverted():
         ax.invert_yaxis()
-    ax.set_xlabel("x, to the right (m)")
-    ax.set_ylabel("y, down (m)")
     return drawn
 
 
@@ -168,7 +161,7 @@ def slices(
         InputError: the shapes do not fit.
     """
     xyz, rgb = _check_points(points, colors)
-    drawn = _scatter(ax, xyz[:, 0], xyz[:, 2], xyz[:, 1], _paint(rgb, values, scale), values, size)
+    drawn = _scatter(ax, xyz[:, [0, 2]], xyz[:, 1], _paint(rgb, values, scale), values, size)
     right, top = xyz[:, [0, 2]].max(axis=0, initial=0)
     used = min(config.n_slices, int(top / config.sigma_1) + 1)
     for level in np.arange(used + 1) * config.sigma_1:
@@ -179,9 +172,8 @@ def slices(
     for number in range(used):
         place = (0.01, (number + 0.5) * config.sigma_1)
         ax.text(*place, str(number), transform=ax.get_yaxis_transform(), va="center", fontsize=8, color="#555555")
-    ax.set_aspect("equal")
-    ax.set_xlabel("x (scaled units)" + (", lines between strips" if strips else ""))
-    ax.set_ylabel("z (scaled units), lines between slices")
+    xlabel = "x (scaled units)" + (", lines between strips" if strips else "")
+    ax.set(aspect="equal", xlabel=xlabel, ylabel="z (scaled units), lines between slices")
     return drawn
 
 
@@ -210,11 +202,8 @@ def persistence_diagram(ax: Axes, diagrams: Diagrams, config: DescriptorConfig) 
         ax.plot(births[number, row], deaths[number, row], "o", markersize=4, label=label, color=PALETTE[number % 8])
     if len(mask) > 1 and mask.any():
         ax.legend(frameon=False, fontsize=8, loc="lower right")
-    ax.set_xlim(-config.sigma_2, end)
-    ax.set_ylim(-config.sigma_2, end)
-    ax.set_aspect("equal")
-    ax.set_xlabel("birth (scaled units)")
-    ax.set_ylabel("death (scaled units)")
+    limits = (-config.sigma_2, end)
+    ax.set(xlim=limits, ylim=limits, aspect="equal", xlabel="birth (scaled units)", ylabel="death (scaled units)")
 
 
 def persistence_image(
@@ -242,8 +231,7 @@ def persistence_image(
     window = (-config.sigma_2, config.window) * 2
     top = float(values.max()) if largest is None else largest
     drawn = ax.imshow(values.T, origin="lower", extent=window, cmap="magma", vmin=0, vmax=top or 1.0)
-    ax.set_xlabel("birth")
-    ax.set_ylabel("persistence")
+    ax.set(xlabel="birth", ylabel="persistence")
     return drawn
 
 
@@ -271,9 +259,7 @@ def color_vectors(ax: Axes, matrix: ArrayLike, network: ColorNetwork) -> None:
         if color[:, region].any():
             ax.bar(np.arange(len(low)), color[:, region], 1.0, bottom=low, color=network.mean_rgb[region] / 255)
             low += color[:, region]
-    ax.set_xlim(-0.5, len(low) - 0.5)
-    ax.set_xlabel("strip")
-    ax.set_ylabel("points by colour region")
+    ax.set(xlim=(-0.5, len(low) - 0.5), xlabel="strip", ylabel="points by colour region")
 
 
 def color_matrix(
@@ -307,19 +293,13 @@ def color_matrix(
     cells[..., 3] = np.sqrt(np.clip(color[:, rows].T / top, 0, 1))
     if len(rows):
         ax.imshow(cells, aspect="auto", interpolation="nearest")
+    swatch: dict[str, Any] = {"clip_on": False, "markersize": 7, "markeredgecolor": "#888888", "markeredgewidth": 0.5}
+    beside = ax.get_yaxis_transform()
     for row, region in enumerate(rows):
-        swatch: dict[str, Any] = {
-            "transform": ax.get_yaxis_transform(),
-            "clip_on": False,
-            "markersize": 7,
-            "markeredgecolor": "#888888",
-        }
-        ax.plot([-0.02], [row], "s", color=network.mean_rgb[region] / 255, markeredgewidth=0.5, **swatch)
+        ax.plot([-0.02], [row], "s", color=network.mean_rgb[region] / 255, transform=beside, **swatch)
     ax.set_yticks(range(len(rows)), [str(region) for region in rows], fontsize=7)
     ax.tick_params(axis="y", length=0, pad=12)
-    ax.set_xlim(-0.5, len(color) - 0.5)
-    ax.set_xlabel("strip")
-    ax.set_ylabel("colour region")
+    ax.set(xlim=(-0.5, len(color) - 0.5), xlabel="strip", ylabel="colour region")
 
 
 def color_network(ax: Axes, network: ColorNetwork, weights: ArrayLike | None = None) -> None:
@@ -365,8 +345,7 @@ def confusion(ax: Axes, counts: ArrayLike, classes: Sequence[str]) -> None:
         ax.text(j, i, str(table[i, j]), ha="center", va="center", fontsize=8, color=ink)
     ax.set_xticks(range(len(columns)), columns, rotation=90, fontsize=8, **name_style())
     ax.set_yticks(range(len(classes)), columns[: len(classes)], fontsize=8, **name_style())
-    ax.set_xlabel("recognized as")
-    ax.set_ylabel("object")
+    ax.set(xlabel="recognized as", ylabel="object")
 
 
 def reliability(ax: Axes, bins: Mapping[str, Sequence[Any]], *, counts: Axes | None = None) -> None:

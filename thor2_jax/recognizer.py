@@ -216,7 +216,7 @@ class Recognizer:
                 instances. Nothing changes.
         """
         instances = camera_instances(frames, self.run.config.sigma_s)
-        adaptation = estimate_transform(instances, *adaptation_criterion(self.model), report)
+        adaptation = estimate_transform(instances, adaptation_criterion(self.model), report)
         self.model = dataclasses.replace(self.model, color_transform=adaptation.transform)
         return adaptation
 
@@ -279,10 +279,8 @@ class Recognizer:
         from thor2_jax.segmentation.known_objects import segment_known  # imports OpenCV
 
         def recognize(frames: Sequence[RGBDFrame]) -> list[tuple[str | None, float]]:
-            recognitions = answers(
-                self.model, *self.infer(each for frame in frames for each in self.prepare(frame, [1]))
-            )
-            return [(answer.name, answer.confidence or 0.0) for answer in recognitions]
+            instances = (each for frame in frames for each in self.prepare(frame, [1]))
+            return [(each.name, each.confidence or 0.0) for each in answers(self.model, *self.infer(instances))]
 
         return segment_known(frame, labels, recognize)
 

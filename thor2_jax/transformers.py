@@ -183,10 +183,7 @@ class Tops2Transformer(_CloudTransformer):
     """
 
     def __init__(
-        self,
-        config: DescriptorConfig | None = None,
-        network: ColorNetwork | None = None,
-        capacity: int | None = None,
+        self, config: DescriptorConfig | None = None, network: ColorNetwork | None = None, capacity: int | None = None
     ) -> None:
         self.config = config
         self.network = network

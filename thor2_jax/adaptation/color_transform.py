@@ -13,7 +13,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.model.run_record import stored_value
 
-__all__ = ["MAX_PARAMETER", "ColorTransform", "transform_colors"]
+__all__ = ["LUMA", "MAX_PARAMETER", "ColorTransform", "transform_colors"]
 
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 """Luma coefficients of red, green and blue (ITU-R BT.601)."""

@@ -12,11 +12,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import softmax
 
-from colornet import ColorNetwork
 from thor2_jax.adaptation.color_transform import ColorTransform
-from thor2_jax.adaptation.objective import Objective
-from thor2_jax.config import DescriptorConfig
+from thor2_jax.adaptation.objective import Criterion, Objective
 from thor2_jax.descriptor.looks import LookDescriptors
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import RGBDFrame
@@ -35,7 +34,6 @@ __all__ = [
     "adaptation_criterion",
     "camera_instances",
     "estimate_transform",
-    "gallery_classifier",
 ]
 
 PRIOR = 0.085
@@ -102,7 +100,7 @@ def camera_instances(frames: Iterable[RGBDFrame], sigma_s: float) -> list[Prepar
     return instances
 
 
-def adaptation_criterion(model: Model) -> tuple[ColorNetwork, DescriptorConfig, Classifier]:
+def adaptation_criterion(model: Model) -> Criterion:
     """Return the colour network, the descriptor and the classifier whose certainty an estimate increases.
 
     It is the embedding, which also knows what is none of the classes; in runs without one, the classifiers, fused by
@@ -114,13 +112,14 @@ def adaptation_criterion(model: Model) -> tuple[ColorNetwork, DescriptorConfig, 
     if model.answers_by() == "gallery":
         if not model.gallery.objects:
             raise InputError("model has neither classes nor enrolled objects; enroll some first")
-        return model.embedding.network, model.embedding.config, gallery_classifier(model.gallery, model.embedding)
+        embedding = model.embedding
+        return Criterion(embedding.network, embedding.config, gallery_classifier(model.gallery, embedding))
 
     def fused(oriented: LookDescriptors) -> jax.Array:
         computed: jax.Array = fused_probabilities(infer(model, oriented).probabilities, model.rule)
         return computed
 
-    return model.run.network, model.run.config, model.classifiers.get(EMBEDDING, fused)
+    return Criterion(model.run.network, model.run.config, model.classifiers.get(EMBEDDING, fused))
 
 
 def gallery_classifier(gallery: Gallery, embedding: Embedding) -> Classifier:
@@ -157,9 +156,7 @@ def spread(instances: Sequence[PreparedInstance], count: int = MAX_INSTANCES) ->
 
 def estimate_transform(
     instances: Sequence[PreparedInstance],
-    network: ColorNetwork,
-    config: DescriptorConfig,
-    classify: Classifier,
+    criterion: Criterion,
     report: Report = lambda done, total: None,
     capacity: int | None = None,
 ) -> Adaptation:
@@ -167,9 +164,7 @@ def estimate_transform(
 
     Args:
         instances: unlabelled instances with the camera's colours; those that cannot be used are left out.
-        network: colour network.
-        config: descriptor.
-        classify: the classifier, see `objective`.
+        criterion: what computes the answers, see `adaptation_criterion`.
         report: function that shows the progress.
         capacity: see `Objective`.
 
@@ -183,23 +178,18 @@ def estimate_transform(
             "camera"
         )
     chosen = spread(usable)
-    objective = Objective(chosen, network, config, classify, capacity=capacity)
+    objective = Objective(chosen, criterion, capacity)
     totals = np.zeros(len(GRID))
     for number, parameters in enumerate(GRID):
         report(number, len(GRID))
         totals[number] = objective.total(parameters)
     parameters = posterior_mean(totals)
     report(len(GRID), len(GRID))
-    return Adaptation(
-        ColorTransform(*parameters.round(4).tolist()),
-        len(chosen),
-        float(objective.total(np.zeros(4)) / len(chosen)),
-        float(objective.total(parameters) / len(chosen)),
-    )
+    before, after = (objective.total(each) / len(chosen) for each in (np.zeros(4), parameters))
+    return Adaptation(ColorTransform(*parameters.round(4).tolist()), len(chosen), before, after)
 
 
 def posterior_mean(totals: NDArray[np.floating]) -> NDArray[np.float64]:
     """Return the mean [4] of the posterior from the sums of uncertainties [25] of the transforms of `GRID`."""
     negative_log = EVIDENCE * totals + (GRID[:, 3] / PRIOR) ** 2 / 2
-    weights = np.exp(negative_log.min() - negative_log)
-    return np.asarray(weights @ GRID / weights.sum())
+    return np.asarray(softmax(-negative_log) @ GRID)

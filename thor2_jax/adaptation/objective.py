@@ -8,6 +8,7 @@ before any change.
 
 import dataclasses
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +24,7 @@ from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.model.classifier import Classifier
 from thor2_jax.types import PointClouds
 
-__all__ = ["Objective", "entropy"]
+__all__ = ["Criterion", "Objective", "entropy"]
 
 ROWS = 8
 """Instances that are described in one call."""
@@ -33,6 +34,14 @@ LOOKS = 2
 
 MIN_KNOWN = 1e-3
 """Smallest probability of being known that is distinguished from 0."""
+
+
+class Criterion(NamedTuple):
+    """The colour network, the descriptor and the classifier whose certainty an estimate increases."""
+
+    network: ColorNetwork
+    config: DescriptorConfig
+    classify: Classifier
 
 
 def entropy(probabilities: jax.Array) -> jax.Array:
@@ -57,25 +66,18 @@ class Objective:
     """The uncertainties of instances under colour transforms."""
 
     def __init__(
-        self,
-        instances: Sequence[PreparedInstance],
-        network: ColorNetwork,
-        config: DescriptorConfig,
-        classify: Classifier,
-        capacity: int | None = None,
+        self, instances: Sequence[PreparedInstance], criterion: Criterion, capacity: int | None = None
     ) -> None:
         """Pack the instances, and classify them without a transform.
 
         Args:
             instances: usable instances with the camera's colours.
-            network: colour network.
-            config: descriptor.
-            classify: the classifier.
+            criterion: what computes the answers.
             capacity: N, points in a row, so that only one shape is compiled; larger clouds are left out. By default
                 each chunk has the point bucket of its largest cloud.
         """
-        self._network, self._classify = network, classify
-        self._config = dataclasses.replace(config, homology="closed_form", relaxation=None)
+        config = dataclasses.replace(criterion.config, homology="closed_form", relaxation=None)
+        self._criterion = criterion._replace(config=config)
         fitting = [each for each in instances if capacity is None or len(each.points) <= capacity]
         ordered = sorted(fitting, key=lambda each: len(each.points))
         self._chunks = []
@@ -86,8 +88,8 @@ class Objective:
             self._chunks.append((len(part), clouds, known))
 
     def _probabilities(self, clouds: PointClouds) -> jax.Array:
-        oriented = describe_looks(clouds, self._network, self._config, LOOKS)
-        return self._classify(oriented.with_balanced(clouds))
+        network, config, classify = self._criterion
+        return classify(describe_looks(clouds, network, config, LOOKS).with_balanced(clouds))
 
     def total(self, parameters: NDArray[np.floating]) -> float:
         """Return the sum of the uncertainties for parameters [4] of a colour transform."""

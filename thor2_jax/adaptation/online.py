@@ -7,12 +7,9 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from colornet import ColorNetwork
 from thor2_jax.adaptation.estimate import MAX_INSTANCES, MIN_INSTANCES, Adaptation, estimate_transform
-from thor2_jax.adaptation.objective import Objective
-from thor2_jax.config import DescriptorConfig
+from thor2_jax.adaptation.objective import Criterion, Objective
 from thor2_jax.frames.prepared_instance import PreparedInstance
-from thor2_jax.model.classifier import Classifier
 
 __all__ = ["CAPACITY", "OnlineAdaptation"]
 
@@ -31,23 +28,14 @@ class OnlineAdaptation:
     The estimate runs in one thread at a time; instances that arrive meanwhile are kept for the next one.
     """
 
-    def __init__(
-        self,
-        network: ColorNetwork,
-        config: DescriptorConfig,
-        classify: Classifier,
-        adapted: Callable[[Adaptation], None] = lambda adaptation: None,
-    ) -> None:
-        """Start without instances; the first arguments are those of `estimate_transform`.
+    def __init__(self, criterion: Criterion, adapted: Callable[[Adaptation], None] = lambda adaptation: None) -> None:
+        """Start without instances.
 
         Args:
-            network: colour network.
-            config: descriptor.
-            classify: the classifier.
+            criterion: see `estimate_transform`.
             adapted: called with each new estimate, in the thread that made it.
         """
-        self._criterion = network, config, classify
-        self._adapted = adapted
+        self._criterion, self._adapted = criterion, adapted
         self._recent: deque[PreparedInstance] = deque(maxlen=MAX_INSTANCES)
         self._new = 0
         self._thread: threading.Thread | None = None
@@ -55,7 +43,7 @@ class OnlineAdaptation:
 
     def compile(self, instance: PreparedInstance) -> None:
         """Compile everything that an estimate needs, by evaluating any instance."""
-        Objective([instance], *self._criterion, capacity=CAPACITY).total(np.zeros(4))
+        Objective([instance], self._criterion, CAPACITY).total(np.zeros(4))
 
     def observe(self, instances: Sequence[PreparedInstance]) -> None:
         """Add the instances of a frame, with the camera's colours, and start an estimate if there are enough."""
@@ -76,7 +64,7 @@ class OnlineAdaptation:
 
     def _estimate(self, instances: Sequence[PreparedInstance]) -> None:
         try:
-            adaptation = estimate_transform(instances, *self._criterion, capacity=CAPACITY)
+            adaptation = estimate_transform(instances, self._criterion, capacity=CAPACITY)
         except Exception:
             log.exception("adaptation failed; the colours are corrected as before")
             return

@@ -4,6 +4,9 @@ Every point has a weight in the relaxed descriptor. The attribution of a point i
 with respect to its weight, averaged while the weights of all points increase together to 1 (integrated gradients); the
 frames of the looks, and the histogram of balanced colours that galleries compare, are held constant. To first order, it
 is the decrease of the margin when the point is removed.
+
+`leave_out` is their exact check: the decrease of the margin without each slice and strip of the first look. Its
+points are removed from all looks, and the frames remain those of the whole cloud, as for the attributions.
 """
 
 import dataclasses
@@ -14,15 +17,17 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
+from scipy.stats import spearmanr
 
 from thor2_jax.config import DescriptorConfig, Relaxation
 from thor2_jax.descriptor.color_membership import RegionSets, region_sets
 from thor2_jax.descriptor.relaxation import relaxed_strips
+from thor2_jax.descriptor.slicing import slices_and_strips
 from thor2_jax.explanation.class_scores import ClassScores, OrientedCloud, repeat_cloud
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.types import PointClouds, Strips
 
-__all__ = ["Attributions", "Faithfulness", "attribute_points", "select_points", "tenth_of"]
+__all__ = ["Attributions", "Faithfulness", "LeftOut", "attribute_points", "leave_out", "select_points", "tenth_of"]
 
 RELAXATION = Relaxation(slice=0.001, strip=0.00025, extremum=0.005, color=0.1)
 """Weights of points have gradients in hard slices, strips and colour regions too; only the extremes need a temperature.
@@ -146,9 +151,7 @@ def smooth(points: NDArray[np.float32], values: NDArray[np.float32], deviation: 
     return (sums[:, :-1] / sums[:, -1:]).T.astype(np.float32)
 
 
-def attribute_points(
-    scores: ClassScores, cloud: OrientedCloud, instance: PreparedInstance, index: int, seed: int = 0
-) -> Attributions:
+def attribute_points(scores: ClassScores, cloud: OrientedCloud, instance: PreparedInstance, index: int) -> Attributions:
     """Attribute the margin of a name to the points of an instance.
 
     Args:
@@ -156,7 +159,6 @@ def attribute_points(
         cloud: the looks at the instance, see `ClassScores.orient`.
         instance: the instance.
         index: number of the name in `scores.names`.
-        seed: seed of the random tenths.
     """
     n = len(instance.points)
     gradients = path_gradients(scores, cloud, index)[:, :n]
@@ -165,7 +167,7 @@ def attribute_points(
     kept = np.ones((1 + len(candidates) + RANDOM_TENTHS, n), bool)
     for row, values in enumerate(candidates, 1):
         kept[row, np.argsort(-values, kind="stable")[: tenth_of(n)]] = False
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     for row in range(1 + len(candidates), len(kept)):
         kept[row, rng.choice(n, tenth_of(n), replace=False)] = False
     exact = scores.of_instances([select_points(instance, row) for row in kept])
@@ -179,3 +181,56 @@ def attribute_points(
         SMOOTHING[best // len(PATHS)],
         Faithfulness(float(margins[0]), float(losses[best]), random),
     )
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class LeftOut:
+    """Losses of the exact margin of an answer without each slice and each strip.
+
+    Attributes:
+        slice_of: [n] int, slice of each point in the first look.
+        strip_of: [n] int, strip of each point.
+        slices: [S] float32, loss without the slice; NaN if it is empty.
+        strips: [S, J] float32, loss without the strip; NaN if it is empty.
+        predicted: [S, J] float32, sum of the attributions of the strip; NaN if it is empty.
+        agreement: rank correlation (Spearman) of the losses of the strips with their predictions; None if
+            there are fewer than three strips or all are equal.
+    """
+
+    slice_of: NDArray[np.intp]
+    strip_of: NDArray[np.intp]
+    slices: NDArray[np.float32]
+    strips: NDArray[np.float32]
+    predicted: NDArray[np.float32]
+    agreement: float | None
+
+
+def leave_out(scores: ClassScores, cloud: OrientedCloud, index: int, attributions: NDArray[np.float32]) -> LeftOut:
+    """Leave out each slice and each strip of an instance in turn.
+
+    Args:
+        scores: class scores.
+        cloud: the looks at the instance.
+        index: number of the answer in `scores.names`.
+        attributions: [n] attributions of the points.
+    """
+    config, n = scores.config, len(attributions)
+    points = cloud.aligned.points[0, :n]
+    numbers = slices_and_strips(points[:, 0], points[:, 2], cloud.aligned.mask[0, :n], config)
+    slice_of, strip_of = (np.asarray(number).astype(np.intp) for number in numbers)
+    inside = (slice_of < config.n_slices) & (strip_of < config.n_strips)
+    cell_of = np.where(inside, slice_of * config.n_strips + strip_of, -1)
+    cells, used_slices = np.unique(cell_of[inside]), np.unique(slice_of[inside])
+    masks = [np.ones(n, bool), *(slice_of != k for k in used_slices), *(cell_of != k for k in cells)]
+    margins = np.asarray(scores.margin(jnp.asarray(scores.of_masks(cloud, np.array(masks))), index))
+    losses = (margins[0] - margins[1:]).astype(np.float32)
+
+    slices = np.full(config.n_slices, np.nan, np.float32)
+    slices[used_slices] = losses[: len(used_slices)]
+    strips, predicted = np.full((2, config.n_slices * config.n_strips), np.nan, np.float32)
+    strips[cells] = losses[len(used_slices) :]
+    predicted[cells] = [attributions[cell_of == k].sum() for k in cells]
+    varies = len(cells) > 2 and np.ptp(predicted[cells]) > 0 and np.ptp(strips[cells]) > 0
+    agreement = float(spearmanr(predicted[cells], strips[cells]).statistic) if varies else None
+    grid = config.n_slices, config.n_strips
+    return LeftOut(slice_of, strip_of, slices, strips.reshape(grid), predicted.reshape(grid), agreement)

@@ -119,9 +119,8 @@ class ClassScores:
         self, aligned: PointClouds, weights: jax.Array, cut: Strips, config: DescriptorConfig
     ) -> LookDescriptors:
         """Return the descriptors for `of_descriptors`; the arguments are those of `describe_aligned_looks`."""
-        oriented = describe_aligned_looks(aligned, weights, cut, self.network, config)
         first: PointClouds = jax.tree.map(lambda a: a[:: self.count], aligned)
-        return self._with_colors(oriented, first)
+        return self._with_colors(describe_aligned_looks(aligned, weights, cut, self.network, config), first)
 
     def _with_colors(self, oriented: LookDescriptors, clouds: PointClouds) -> LookDescriptors:
         return oriented.with_balanced(clouds) if self.unit == "similarity" else oriented

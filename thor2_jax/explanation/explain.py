@@ -21,10 +21,9 @@ from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.describe import describe_strips, strips
 from thor2_jax.descriptor.persistence import diagrams_of_strips
 from thor2_jax.errors import InputError
-from thor2_jax.explanation.attributions import Attributions, attribute_points
+from thor2_jax.explanation.attributions import Attributions, LeftOut, attribute_points, leave_out
 from thor2_jax.explanation.changes import CHANGES, Change, smallest_change
 from thor2_jax.explanation.class_scores import ClassScores, OrientedCloud, classifier_scores, gallery_scores, packed
-from thor2_jax.explanation.leave_out import LeftOut, leave_out
 from thor2_jax.frames.frames import RGBDFrame, pixel_rays
 from thor2_jax.frames.prepared_instance import DESCRIPTOR_VOXEL, PreparedInstance, prepare_instance
 from thor2_jax.gallery.enrollment import embed_looks
@@ -141,9 +140,7 @@ class Explanation:
                 "mean_loss_without_random_tenth": check.random,
                 "holds": check.holds,
             },
-            "slices": [
-                {"slice": int(i), "loss": float(left.slices[i])} for i in np.flatnonzero(np.isfinite(left.slices))
-            ],
+            "slices": [{"slice": i, "loss": float(loss)} for i, loss in enumerate(left.slices) if np.isfinite(loss)],
             "strips": [{"slice": int(i), "strip": int(j), "loss": float(left.strips[i, j])} for i, j in cells],
             "agreement": left.agreement,
             "changes": [dataclasses.asdict(change) for change in self.changes],

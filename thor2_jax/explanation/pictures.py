@@ -135,29 +135,22 @@ def _check(explanation: Explanation) -> ExplanationPicture:
     used = np.isfinite(left.strips)
     rows, columns = (int(np.flatnonzero(used.any(axis=axis)).max(initial=0)) + 1 for axis in (1, 0))
     figure = Figure(figsize=_SIZE, layout="constrained")
-    for axes, values, title in zip(
-        figure.subplots(2, 1, sharex=True),
-        (left.strips, left.predicted),
-        ("exact: what the answer loses without the strip", "sum of the attributions of the strip"),
-        strict=True,
-    ):
+    panels = figure.subplots(2, 1, sharex=True)
+    titles = ("exact: what the answer loses without the strip", "sum of the attributions of the strip")
+    for axes, values, title in zip(panels, (left.strips, left.predicted), titles, strict=True):
         shown = values[:rows, :columns]
         scale = plot.attribution_colors(shown[np.isfinite(shown)])
         axes.imshow(np.ma.masked_invalid(shown), origin="lower", aspect="auto", cmap=scale.cmap, norm=scale.norm)
         figure.colorbar(scale, ax=axes)
         axes.set_title(title, fontsize=10)
-        axes.set_ylabel("slice")
-        axes.set_yticks(range(rows))
+        axes.set(ylabel="slice", yticks=range(rows))
     axes.set_xlabel("strip")
-    agreement = (
-        ""
-        if left.agreement is None
-        else f" The rank correlation of both is {left.agreement:.2f} (1: the same order, 0: unrelated)."
-    )
     caption = (
         f"Above, each strip is left out in turn and the answer is computed again ({_unit(explanation)}). Below, what "
-        f"the attributions predict for it.{agreement}"
+        "the attributions predict for it."
     )
+    if left.agreement is not None:
+        caption += f" The rank correlation of both is {left.agreement:.2f} (1: the same order, 0: unrelated)."
     return ExplanationPicture("check", "decided", "Exact check: strips left out", caption, figure)
 
 
@@ -171,12 +164,10 @@ def change_text(change: Change) -> str:
     >>> change_text(Change("extent", (0.9, 1.0, 1.25), 0.25, "bowl", -0.1))
     'longest side -10 %, middle side +0 %, shortest side +25 %'
     """
-    if change.kind == "extent":
-        sides = ("longest", "middle", "shortest")
-        parts = [f"{side} side {100 * (factor - 1):+.0f} %" for side, factor in zip(sides, change.values, strict=True)]
-        return ", ".join(parts)
-    names = ("red", "green", "blue")
-    return ", ".join(f"{name} {value:+.0f}" for name, value in zip(names, change.values, strict=True)) + " (of 255)"
+    if change.kind == "color":
+        return "red {:+.0f}, green {:+.0f}, blue {:+.0f} (of 255)".format(*change.values)
+    percent = [100 * (factor - 1) for factor in change.values]
+    return "longest side {:+.0f} %, middle side {:+.0f} %, shortest side {:+.0f} %".format(*percent)
 
 
 def _changes(explanation: Explanation) -> ExplanationPicture:
@@ -229,10 +220,10 @@ def _slices(explanation: Explanation, decided: bool) -> ExplanationPicture:
     plot.slices(axes, explanation.described.points, instance.colors, config, values, strips=True, size=size)
     if decided:
         _color_bar(figure, axes, explanation)
+        title = "What decided, in slices and strips"
         caption = (
             "The same points, turned as the descriptor sees them, with slices (numbered rows) and strips (columns)."
         )
-        title = "What decided, in slices and strips"
         return ExplanationPicture("slices-attributions", "decided", title, caption, figure)
     slice_mm, strip_mm = (1000 * width / config.sigma_s for width in (config.sigma_1, config.sigma_2))
     caption = (
@@ -257,12 +248,10 @@ def _slice(explanation: Explanation, number: int) -> ExplanationPicture:
     described, network = explanation.described, explanation.scores.network
     regions = np.flatnonzero(described.colors.any(axis=(0, 1)))
     figure = Figure(figsize=(3.6, 6.6), layout="constrained")
-    upper, lower = figure.subplots(2, 1, height_ratios=[1, 1])
-    largest = float(described.images.max())
-    plot.persistence_image(upper, described.images[number], explanation.config, largest=largest)
-    plot.color_matrix(
-        lower, described.colors[number], network, regions=regions.tolist(), largest=float(described.colors.max())
-    )
+    upper, lower = figure.subplots(2, 1)
+    image, colors = described.images[number], described.colors[number]
+    plot.persistence_image(upper, image, explanation.config, largest=float(described.images.max()))
+    plot.color_matrix(lower, colors, network, regions=regions.tolist(), largest=float(described.colors.max()))
     upper.set_title(f"slice {number}: persistence image", fontsize=10)
     lower.set_title(f"slice {number}: colour matrix", fontsize=10)
     loss = float(explanation.left_out.slices[number])

@@ -273,10 +273,7 @@ def read_frame(
     """
     label_image = None if labels is None else read_labels(labels)
     return RGBDFrame(
-        read_color(color),
-        read_depth(depth),
-        label_image,
-        frame_intrinsics(intrinsics, color, depth_scale),
+        read_color(color), read_depth(depth), label_image, frame_intrinsics(intrinsics, color, depth_scale)
     )
 
 

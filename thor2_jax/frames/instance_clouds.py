@@ -77,8 +77,10 @@ def instance_cloud(frame: RGBDFrame, label: int) -> InstanceCloud:
     if len(points) < MIN_POINTS:
         reason = (
             f"{len(points)} points ({len(pixels)} pixels, {len(valid)} of them with depth "
-            f"from {MIN_DEPTH} to {MAX_DEPTH} m); expected at least {MIN_POINTS}{_unit_question(frame)}"
+            f"from {MIN_DEPTH} to {MAX_DEPTH} m); expected at least {MIN_POINTS}"
         )
+        if not frame.has_usable_depth:
+            reason += f"; no instance has such depth: {unit_question(frame)}"
         return InstanceCloud(label, points, colors, len(pixels), rim, reason=reason)
     kept, relaxed = remove_outliers(points)
     return InstanceCloud(
@@ -94,11 +96,6 @@ def _near_contour(frame: RGBDFrame, label: int, pixels: NDArray[np.intp]) -> NDA
     window = frame.label_image[top : row.max() + RIM + 1, left : column.max() + RIM + 1] == label
     inside = ndimage.minimum_filter(window, 2 * RIM + 1, mode="nearest")
     return ~inside[row - top, column - left]
-
-
-def _unit_question(frame: RGBDFrame) -> str:
-    """Ask whether the unit of depth is right if no instance of the frame has usable depth."""
-    return "" if frame.has_usable_depth else f"; no instance has such depth: {unit_question(frame)}"
 
 
 def unit_question(frame: RGBDFrame) -> str:

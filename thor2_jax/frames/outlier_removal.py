@@ -55,12 +55,8 @@ def flying_pixels(frame: RGBDFrame, pixels: NDArray[np.intp]) -> NDArray[np.bool
     # A pixel is a flying pixel if a neighbour is closer than this. At the image border, a pixel is its own neighbour.
     nearest = here - MAX_SLOPE / frame.intrinsics.fx * here
     flying = np.zeros(len(pixels), bool)
-    for beside in (
-        pixels + (column < width - 1),
-        pixels - (column > 0),
-        pixels + width * (row < height - 1),
-        pixels - width * (row > 0),
-    ):
+    right, left, down, up = column < width - 1, column > 0, row < height - 1, row > 0
+    for beside in (pixels + right, pixels - left, pixels + width * down, pixels - width * up):
         there = depth[beside]
         flying |= (there < nearest) & (there > 0) & (labels[beside] == instance)
     return flying

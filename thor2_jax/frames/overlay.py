@@ -149,7 +149,19 @@ def draw_instances(color: NDArray[np.uint8], labels: NDArray[Any], annotations: 
     for mask, annotation in zip(masks, annotations, strict=True):
         _draw_outline(pixels, mask, annotation.paint, thickness)
     picture = Image.fromarray(pixels)
-    _draw_labels(picture, labels != 0, masks, annotations, size)
+    draw = ImageDraw.Draw(picture)
+    covered = np.pad(labels != 0, ((1, 0), (1, 0))).cumsum(axis=0, dtype=np.int32).cumsum(axis=1, dtype=np.int32)
+    placed: list[tuple[_Box, _Lettering, Paint]] = []
+    for mask, annotation in zip(masks, annotations, strict=True):
+        lettering = _fit(draw, annotation.text, size, picture.size) if annotation.text else None
+        if lettering is not None:
+            box = _place(lettering, mask.box, [other for other, _, _ in placed], covered)
+            placed.append((box, lettering, annotation.paint))
+            _draw_leader(draw, box, mask, annotation.paint, max(1, size // 7))
+    for box, lettering, paint in placed:  # after all leaders, which may cross a label
+        draw.rectangle((box.left, box.top, box.right - 1, box.bottom - 1), fill=paint)
+        start = box.left + lettering.start[0], box.top + lettering.start[1]
+        draw.multiline_text(start, lettering.text, _ink(paint), lettering.font, spacing=lettering.spacing)
     return picture
 
 
@@ -192,28 +204,6 @@ def _ink(paint: Paint) -> Paint:
     """Return black or white, whichever has more contrast with a colour."""
     red, green, blue = paint
     return (0, 0, 0) if 0.299 * red + 0.587 * green + 0.114 * blue > 100 else (255, 255, 255)
-
-
-def _draw_labels(
-    picture: Image.Image,
-    instances: NDArray[np.bool_],
-    masks: Sequence[_Mask],
-    annotations: Sequence[Annotation],
-    size: int,
-) -> None:
-    draw = ImageDraw.Draw(picture)
-    covered = np.pad(instances, ((1, 0), (1, 0))).cumsum(axis=0, dtype=np.int32).cumsum(axis=1, dtype=np.int32)
-    placed: list[tuple[_Box, _Lettering, Paint]] = []
-    for mask, annotation in zip(masks, annotations, strict=True):
-        lettering = _fit(draw, annotation.text, size, picture.size) if annotation.text else None
-        if lettering is not None:
-            box = _place(lettering, mask.box, [other for other, _, _ in placed], covered)
-            placed.append((box, lettering, annotation.paint))
-            _draw_leader(draw, box, mask, annotation.paint, max(1, size // 7))
-    for box, lettering, paint in placed:  # after all leaders, which may cross a label
-        draw.rectangle((box.left, box.top, box.right - 1, box.bottom - 1), fill=paint)
-        start = box.left + lettering.start[0], box.top + lettering.start[1]
-        draw.multiline_text(start, lettering.text, _ink(paint), lettering.font, spacing=lettering.spacing)
 
 
 def _fit(draw: ImageDraw.ImageDraw, text: str, size: int, space: tuple[int, int]) -> _Lettering | None:

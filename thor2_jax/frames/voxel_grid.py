@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thor2_jax.capacity import point_bucket
+from thor2_jax.capacity import POINT_BUCKETS
 from thor2_jax.errors import InputError
 
 __all__ = ["downsample_to_fit", "voxel_downsample"]
@@ -66,11 +66,8 @@ def downsample_to_fit(
     points: NDArray[np.floating[Any]], colors: NDArray[Any], size: float
 ) -> tuple[NDArray[Any], NDArray[Any]]:
     """Call `voxel_downsample` with the size doubled until the cloud fits into the largest bucket."""
-    while True:
+    downsampled = voxel_downsample(points, colors, size)
+    while len(downsampled[0]) > POINT_BUCKETS[-1]:
+        size *= 2
         downsampled = voxel_downsample(points, colors, size)
-        try:
-            point_bucket(len(downsampled[0]))
-        except InputError:
-            size *= 2
-        else:
-            return downsampled
+    return downsampled

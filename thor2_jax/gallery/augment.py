@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from thor2_jax.adaptation.color_transform import LUMA
 from thor2_jax.frames.instance_clouds import MIN_POINTS
 from thor2_jax.frames.prepared_instance import PreparedInstance
 
@@ -21,9 +22,6 @@ MAX_COPIES = 8
 
 MESH_COPIES = 5
 """Copies of each view from a mesh, as rendered or augmented."""
-
-LUMA = np.array([0.299, 0.587, 0.114], np.float32)
-"""Luma coefficients of red, green and blue (ITU-R BT.601)."""
 
 
 def augmented_copies(views: Sequence[PreparedInstance], source: str) -> list[PreparedInstance]:

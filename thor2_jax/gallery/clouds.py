@@ -69,12 +69,8 @@ class CompactClouds:
         return len(self.counts)
 
     def __add__(self, other: "CompactClouds") -> "CompactClouds":
-        return CompactClouds(
-            *(
-                np.concatenate([getattr(self, field.name), getattr(other, field.name)])
-                for field in dataclasses.fields(self)
-            )
-        )
+        pairs = zip(vars(self).values(), vars(other).values(), strict=True)
+        return CompactClouds(*(np.concatenate(pair) for pair in pairs))
 
     def views(self) -> Iterator[PreparedInstance]:
         """Yield each view as a prepared instance, in metres."""

@@ -12,6 +12,7 @@ further ones, whose class probabilities are averaged. `training.embedding` fits 
 
 import dataclasses
 import functools
+import itertools
 import json
 from pathlib import Path
 from typing import Any
@@ -33,14 +34,7 @@ from thor2_jax.gallery.references import REFERENCES_FILE, References
 from thor2_jax.model.classifier import model_arrays, model_from_arrays
 from thor2_jax.types import Descriptors, PointClouds
 
-__all__ = [
-    "MAX_EMBEDDING_SIZE",
-    "Embedding",
-    "EmbeddingNetwork",
-    "EmbeddingSizes",
-    "class_cosines",
-    "load_default",
-]
+__all__ = ["MAX_EMBEDDING_SIZE", "Embedding", "EmbeddingNetwork", "EmbeddingSizes", "class_cosines", "load_default"]
 
 EMBEDDING_FORMAT, FORMAT_WITH_FURTHER = 1, 2
 """Version of the file: float16 arrays of one network, or of several, and JSON metadata."""
@@ -96,13 +90,7 @@ class EmbeddingNetwork(nnx.Module):
     """
 
     def __init__(
-        self,
-        config: DescriptorConfig,
-        n_regions: int,
-        sizes: EmbeddingSizes = EmbeddingSizes(),
-        n_proxies: int = 0,
-        *,
-        rngs: nnx.Rngs,
+        self, config: DescriptorConfig, n_regions: int, sizes: EmbeddingSizes, n_proxies: int, *, rngs: nnx.Rngs
     ) -> None:
         """Initialize the weights; the colour basis is zero and the blocks have equal weights.
 
@@ -110,7 +98,7 @@ class EmbeddingNetwork(nnx.Module):
             config: descriptor.
             n_regions: number of colour regions.
             sizes: sizes of the layers.
-            n_proxies: number of proxies, which classify; none by default.
+            n_proxies: number of proxies, which classify; 0 for none.
             rngs: generators of the weights and the dropout.
         """
         self.positions = max(config.image_size, config.n_strips)
@@ -119,12 +107,8 @@ class EmbeddingNetwork(nnx.Module):
         widths = (n_cells * sizes.cell + N_SCALARS + n_regions, *sizes.hidden)
         he = nnx.initializers.he_normal()
         self.cell = nnx.Linear(config.image_size + n_regions, sizes.cell, kernel_init=he, rngs=rngs)
-        self.layers = nnx.List(
-            [
-                nnx.Linear(a, b, use_bias=False, kernel_init=he, rngs=rngs)
-                for a, b in zip(widths[:-1], widths[1:], strict=True)
-            ]
-        )
+        layers = [nnx.Linear(a, b, use_bias=False, kernel_init=he, rngs=rngs) for a, b in itertools.pairwise(widths)]
+        self.layers = nnx.List(layers)
         self.norms = nnx.List([nnx.BatchNorm(n, momentum=0.9, rngs=rngs) for n in sizes.hidden])
         self.dropout = nnx.Dropout(0.15)
         self.head = nnx.Linear(sizes.hidden[-1], sizes.learned, use_bias=False, kernel_init=he, rngs=rngs)

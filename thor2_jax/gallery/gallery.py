@@ -181,10 +181,9 @@ class Gallery:
         Its score grows with the logarithm of the object's views between the numbers of `KEPT`.
         """
         views = [len(views.clouds) for views in self.objects.values()]
-        with_references, without = (
-            (KEPT, KEPT_WITHOUT_REFERENCES) if self.balanced else (KEPT_BEFORE, KEPT_BEFORE_WITHOUT_REFERENCES)
-        )
-        kept = without if self.references is None else with_references
+        kept = KEPT if self.balanced else KEPT_BEFORE
+        if self.references is None:
+            kept = KEPT_WITHOUT_REFERENCES if self.balanced else KEPT_BEFORE_WITHOUT_REFERENCES
         odds = score_odds(np.interp(np.log(views), np.log(list(kept)), list(kept.values())))
         return (odds / (1 + odds)).round(3)
 
@@ -229,7 +228,7 @@ def score_odds(scores: NDArray[Any]) -> NDArray[Any]:
     return np.asarray((scores / EVEN) ** STEEPNESS)
 
 
-def shown_names(names: tuple[str, ...], count: int = 5) -> str:
+def shown_names(names: tuple[str, ...]) -> str:
     """Return the first names for an error message."""
-    more = f" and {len(names) - count} more" if len(names) > count else ""
-    return (", ".join(map(repr, names[:count])) or "none") + more
+    more = f" and {len(names) - 5} more" if len(names) > 5 else ""
+    return (", ".join(map(repr, names[:5])) or "none") + more

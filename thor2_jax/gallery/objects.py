@@ -31,6 +31,7 @@ class ObjectGallery:
     shallow copy shares the gallery, and neither sees what is changed through the other one before it is refreshed.
 
     Attributes:
+        directory: directory of the gallery; None if it is in memory. `open` sets it.
         lock_seconds: time that a change waits for another process that writes to the gallery; None is the default of
             `store`.
     """
@@ -49,7 +50,7 @@ class ObjectGallery:
         self._trained = trained
         self._search = search
         self._embedding = embedding
-        self._directory: Path | None = None
+        self.directory: Path | None = None
         self._stored = StoredGallery(Gallery("", search=search), {}, 0)
         self.lock_seconds: float | None = None
 
@@ -65,7 +66,7 @@ class ObjectGallery:
             InputError: see `refresh`.
             OSError: the gallery cannot be written; it is as before.
         """
-        self._directory, self._stored = directory, dataclasses.replace(self._stored, stamp=None)
+        self.directory, self._stored = directory, dataclasses.replace(self._stored, stamp=None)
         if reembed and directory.exists():
             embed = functools.partial(embed_views, self.embedding)
             self._change(lambda gallery: gallery.reembed(self.embedding.fingerprint, embed), rebuild=True)
@@ -84,11 +85,6 @@ class ObjectGallery:
     def gallery(self) -> Gallery:
         """The gallery."""
         return self._stored.gallery
-
-    @property
-    def directory(self) -> Path | None:
-        """Directory of the gallery; None if it is in memory."""
-        return self._directory
 
     @property
     def generation(self) -> int:
@@ -117,18 +113,18 @@ class ObjectGallery:
         Raises:
             InputError: it cannot be read, or has another embedding; the gallery in memory stays.
         """
-        if self._directory is None or gallery_stamp(self._directory) == self._stored.stamp:
+        if self.directory is None or gallery_stamp(self.directory) == self._stored.stamp:
             return False
-        self._set(load_gallery(self._directory, self.embedding.fingerprint, self._stored))
+        self._set(load_gallery(self.directory, self.embedding.fingerprint, self._stored))
         return True
 
     def _change(
         self, change: Callable[[Gallery], Gallery], embedding: str | None = None, rebuild: bool = False
     ) -> None:
-        if self._directory is None:
+        if self.directory is None:
             self._set(dataclasses.replace(self._stored, gallery=change(self.gallery)))
         else:
-            self._set(update_gallery(self._directory, change, embedding, self._stored, self.lock_seconds, rebuild))
+            self._set(update_gallery(self.directory, change, embedding, self._stored, self.lock_seconds, rebuild))
 
     def _set(self, stored: StoredGallery) -> None:
         """Keep a state, with what the embedding and the options add to it; references only once it has objects."""
@@ -139,15 +135,15 @@ class ObjectGallery:
 
     def check_writable(self) -> None:
         """Raise InputError unless changes can be written to the directory, which is created if it is missing."""
-        if self._directory is None:
+        if self.directory is None:
             return
         try:
-            self._directory.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryFile(dir=self._directory):
+            self.directory.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=self.directory):
                 pass
         except OSError as error:
             raise InputError(
-                f"gallery: {self._directory} cannot be written ({error.strerror}); choose another directory (--gallery)"
+                f"gallery: {self.directory} cannot be written ({error.strerror}); choose another directory (--gallery)"
             ) from None
 
     def check(self, name: str, *, extend: bool = False, replace: bool = False) -> str:
@@ -180,13 +176,7 @@ class ObjectGallery:
         return gallery
 
     def enroll(
-        self,
-        name: str,
-        views: Sequence[PreparedInstance],
-        source: str,
-        *,
-        extend: bool = False,
-        replace: bool = False,
+        self, name: str, views: Sequence[PreparedInstance], source: str, *, extend: bool = False, replace: bool = False
     ) -> None:
         """Enroll an object from prepared views.
 
@@ -208,12 +198,11 @@ class ObjectGallery:
     def add(self, objects: Mapping[str, GalleryObject], *, extend: bool = False, replace: bool = False) -> None:
         """Add embedded objects in one change; the arguments and errors are those of `enroll`."""
         fingerprint = self.embedding.fingerprint
-        self._change(
-            lambda gallery: dataclasses.replace(
-                self._with_objects(gallery, objects, extend, replace), embedding=fingerprint
-            ),
-            fingerprint,
-        )
+
+        def change(gallery: Gallery) -> Gallery:
+            return dataclasses.replace(self._with_objects(gallery, objects, extend, replace), embedding=fingerprint)
+
+        self._change(change, fingerprint)
 
     def forget(self, name: str) -> None:
         """Remove the views of an object, and never answer its trained class again.
@@ -227,7 +216,7 @@ class ObjectGallery:
             known = self._found(gallery, name) or name
             return gallery.without(known, hide=known in self._trained and known not in gallery.hidden)
 
-        if self._directory is not None and not self._directory.exists():
+        if self.directory is not None and not self.directory.exists():
             change(self.gallery)  # a name that is refused leaves no directory behind
         self._change(change, self.embedding.fingerprint)
 
@@ -238,7 +227,7 @@ class ObjectGallery:
             InputError: the gallery is in memory, or as `store.undo_change`.
             OSError: the gallery cannot be written; it is as before.
         """
-        if self._directory is None:
+        if self.directory is None:
             raise InputError("undo needs a gallery on disk; open one")
         fingerprint = self.embedding.fingerprint
-        self._set(undo_change(self._directory, generation, fingerprint, self._stored, self.lock_seconds))
+        self._set(undo_change(self.directory, generation, fingerprint, self._stored, self.lock_seconds))

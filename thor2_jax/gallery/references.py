@@ -44,9 +44,8 @@ class References:
     def save(self, path: Path, fingerprint: str) -> None:
         """Write the references of the embedding with this fingerprint, atomically; raises OSError if that fails."""
         about = {"embedding": fingerprint, "classes": list(self.classes)}
-        content = safetensors.numpy.save(
-            {"embeddings": self.embeddings, "label": self.label}, {_METADATA: json.dumps(about, sort_keys=True)}
-        )
+        metadata = {_METADATA: json.dumps(about, sort_keys=True)}
+        content = safetensors.numpy.save({"embeddings": self.embeddings, "label": self.label}, metadata)
         with atomic_write(path) as temporary:
             temporary.write_bytes(content)
 

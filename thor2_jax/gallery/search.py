@@ -31,9 +31,7 @@ FAST_VIEWS = 2**17
 """Largest number of views that are also kept as float32 (134 MB): their conversion takes half of a query."""
 
 
-@functools.cache
-def _thread_pools() -> Any:
-    return threadpoolctl.ThreadpoolController()
+_thread_pools = functools.cache(threadpoolctl.ThreadpoolController)
 
 
 def one_blas_thread() -> contextlib.AbstractContextManager[Any]:
@@ -95,12 +93,8 @@ def _largest(values: NDArray[np.float32], count: int) -> NDArray[np.intp]:
 class IndexSearch:
     """Approximate search by a graph of views (HNSW) from the package usearch, for galleries of many objects."""
 
-    def __init__(self, embeddings: NDArray[np.float16], threads: int = 0) -> None:
-        """Build the index of embeddings [N, D] of unit length.
-
-        Args:
-            embeddings: embeddings of the views.
-            threads: threads that build the index; 0 uses all cores.
+    def __init__(self, embeddings: NDArray[np.float16]) -> None:
+        """Build the index of embeddings [N, D] of unit length, on all cores.
 
         Raises:
             InputError: usearch is not installed.
@@ -119,7 +113,7 @@ class IndexSearch:
             expansion_add=BUILD_CANDIDATES,
             expansion_search=SEARCH_CANDIDATES,
         )
-        self._index.add(np.arange(len(embeddings)), embeddings, threads=threads)
+        self._index.add(np.arange(len(embeddings)), embeddings)
 
     def nearest(self, queries: NDArray[np.float32], count: int) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
         """See `ViewSearch.nearest`; some of the nearest views may be missed, and others returned in their place."""

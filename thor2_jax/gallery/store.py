@@ -23,7 +23,6 @@ import filelock
 import numpy as np
 import safetensors
 import safetensors.numpy
-from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
 from thor2_jax.files import atomic_write, content_digest, remove_leftovers, safetensors_metadata, write_text
@@ -193,10 +192,9 @@ def _with_origin(views: GalleryObject, entry: Mapping[str, Any]) -> GalleryObjec
 
 
 def _object_content(name: str, views: GalleryObject) -> bytes:
-    arrays: dict[str, NDArray[Any]] = {"embeddings": np.ascontiguousarray(views.embeddings, np.float16)}
-    for field in dataclasses.fields(CompactClouds):
-        arrays[field.name] = np.ascontiguousarray(getattr(views.clouds, field.name))
-    return safetensors.numpy.save(arrays, {_METADATA: json.dumps({"name": name, **_origin(views)})})
+    arrays = {"embeddings": views.embeddings.astype(np.float16, copy=False), **vars(views.clouds)}
+    contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+    return safetensors.numpy.save(contiguous, {_METADATA: json.dumps({"name": name, **_origin(views)})})
 
 
 def _read_object(path: Path) -> tuple[str | None, GalleryObject]:

@@ -61,9 +61,8 @@ class ClassUnion:
         own = [name for name in self.names if name not in toys]
         listed = ", ".join(own[:MAX_LISTED]) + (", ..." if len(own) > MAX_LISTED else "")
         if toys:
-            return f"{len(toys)} toy objects of the demo" + (
-                f", and {listed}" if own else "; it knows nothing of yours"
-            )
+            others = f", and {listed}" if own else "; it knows nothing of yours"
+            return f"{len(toys)} toy objects of the demo{others}"
         return f"{len(own)} {'objects' if len(own) != 1 else 'object'}: {listed}" if own else "no object yet"
 
     def of_classifiers(self, probabilities: Values) -> Values:

@@ -9,13 +9,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.types import Descriptors, PointClouds
 
-__all__ = [
-    "MAX_OVERFLOW",
-    "AnswerBy",
-    "DescribedFrame",
-    "Recognition",
-    "check_answer_by",
-]
+__all__ = ["MAX_OVERFLOW", "AnswerBy", "DescribedFrame", "Recognition", "check_answer_by"]
 
 AnswerBy = Literal["classifiers", "gallery", "both"]
 """Sources of answers."""

@@ -3,7 +3,7 @@
 JAX dispatches asynchronously: the device computes one chunk while the host prepares the next.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from typing import Any, TypeVar
 
 import jax
@@ -53,8 +53,13 @@ def compute_by_chunks(
                 compute_chunk()
     if chunk or not results:
         compute_chunk()
-    n_usable = sum(instance.reason is None for instance in prepared)
-    return prepared, _concatenate_padded(results, padded_rows(n_usable, size))
+    n_rows = padded_rows(sum(instance.reason is None for instance in prepared), size)
+
+    def concatenate(*arrays: jax.Array) -> NDArray[Any]:
+        padding = np.zeros((n_rows - sum(map(len, arrays)), *arrays[0].shape[1:]), arrays[0].dtype)
+        return np.concatenate([*arrays, padding])
+
+    return prepared, jax.tree.map(concatenate, *results)
 
 
 def padded_rows(n: int, size: int) -> int:
@@ -64,14 +69,3 @@ def padded_rows(n: int, size: int) -> int:
     """
     whole = n // BATCH_BUCKETS[-1] * BATCH_BUCKETS[-1]
     return n if n == whole > 0 else whole + batch_bucket(max(n - whole, size // MIN_PART, 1))
-
-
-def _concatenate_padded(batches: Sequence[T], n_rows: int) -> T:
-    """Concatenate batches (pytrees of arrays) along the first axis, on the host, with zeros up to `n_rows`."""
-
-    def concatenate(*arrays: jax.Array) -> NDArray[Any]:
-        padding = np.zeros((n_rows - sum(map(len, arrays)), *arrays[0].shape[1:]), arrays[0].dtype)
-        return np.concatenate([*arrays, padding])
-
-    concatenated: T = jax.tree.map(concatenate, *batches)
-    return concatenated

@@ -71,14 +71,9 @@ class Model:
             InputError: `unknown_below` is not between 0 and 1, or `rule` or `answer_by` is unknown.
         """
         wanted = check_answer_by(answer_by) or check_answer_by(run.record.get("answer_by"))
-        return cls(
-            run,
-            RunClassifiers.compiled(run.classifiers, run.embedding_classifier),
-            unknown_below=unknown_below,
-            rule=rule,
-            answer_by=wanted,
-            color_transform=ColorTransform.of_record(run.record),
-        )
+        classifiers = RunClassifiers.compiled(run.classifiers, run.embedding_classifier)
+        transform = ColorTransform.of_record(run.record)
+        return cls(run, classifiers, Gallery(""), unknown_below, rule, wanted, transform)
 
     @functools.cached_property
     def calibration(self) -> Calibration | None:

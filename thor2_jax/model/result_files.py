@@ -30,7 +30,6 @@ __all__ = [
     "instances_as_json",
     "is_bop_file",
     "is_coco_file",
-    "run_length_encoding",
     "write_recognitions",
 ]
 

@@ -9,12 +9,12 @@ division has objects of different names, and two pieces are merged if they are r
 
 import dataclasses
 import functools
-import math
 from collections.abc import Callable, Sequence
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import logit
 
 from thor2_jax.frames.frames import RGBDFrame, backproject
 from thor2_jax.segmentation.pixels import Mask, components, label_sizes, nearest_known
@@ -62,9 +62,7 @@ MERGED = 3.0
 
 
 def segment_known(
-    frame: RGBDFrame,
-    labels: NDArray[np.integer],
-    recognize: Callable[[Sequence[RGBDFrame]], Sequence[Answer]],
+    frame: RGBDFrame, labels: NDArray[np.integer], recognize: Callable[[Sequence[RGBDFrame]], Sequence[Answer]]
 ) -> NDArray[np.int32]:
     """Return labels whose pieces are divided and merged where known objects result.
 
@@ -84,7 +82,7 @@ def segment_known(
     sizes = np.bincount(parts.ravel(), minlength=len(piece_of))
     area = {candidate: int(sizes[list(candidate)].sum()) for candidate in candidates}
     named = dict(zip(candidates, answers, strict=True))
-    odds = {candidate: _log_odds(named[candidate]) for candidate in candidates}
+    odds = {candidate: _log_odds(*named[candidate]) for candidate in candidates}
     divided = {piece: _best_division(piece, each, area, odds) for piece, each in zip(pieces, inside, strict=True)}
     for piece, division in divided.items():
         known = [part for part in division if odds[part] > 0]
@@ -105,10 +103,8 @@ def segment_known(
 def _parts(frame: RGBDFrame, labels: NDArray[np.integer]) -> tuple[NDArray[np.int32], NDArray[np.intp]]:
     """Return the numbers [H, W] of the parts of all pieces, 0 is background, and the piece of each part [n + 1]."""
     lab = np.asarray(cv2.cvtColor(cv2.medianBlur(frame.color, SMOOTH), cv2.COLOR_RGB2LAB), np.float32)
-    features = np.concatenate(
-        [lab * np.array([0.6, 1, 1], np.float32) / CELL[0], backproject(frame.depth_m, frame.intrinsics) / CELL[1]],
-        axis=2,
-    ).astype(np.float32)
+    points = backproject(frame.depth_m, frame.intrinsics)
+    features = np.dstack([lab * np.array([0.6, 1, 1], np.float32) / CELL[0], points / CELL[1]]).astype(np.float32)
     parts, piece_of = np.zeros(labels.shape, np.int32), [0]
     numbers = np.unique(labels)
     for piece, label in enumerate(numbers[numbers > 0], start=1):
@@ -190,12 +186,9 @@ def _shown(frame: RGBDFrame, parts: NDArray[np.int32], candidate: Parts) -> RGBD
     return RGBDFrame(frame.color[here], frame.depth[here], labels, moved)
 
 
-def _log_odds(answer: Answer) -> float:
+def _log_odds(name: str | None, confidence: float) -> float:
     """Return the log-odds of the confidence of an answer, 0 if it does not count."""
-    name, confidence = answer
-    if name is None or confidence < LEAST:
-        return 0.0
-    return math.log(min(confidence, MOST) / (1 - min(confidence, MOST)))
+    return 0.0 if name is None or confidence < LEAST else float(logit(min(confidence, MOST)))
 
 
 def _best_division(

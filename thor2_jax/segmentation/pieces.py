@@ -97,11 +97,10 @@ def flood(
     near = grow(body, 5)
     numbers, n_colored = _colored_markers(colored & ~near, near, depth.valid)
     markers = np.where(numbers > 0, numbers + n_bodies, markers)
-    unknown = (
-        (near & ~(like_plane & ~evidence.high))
-        | colored
-        | _unknown_without_depth(depth, evidence, body, near | colored, like_plane)
-    )
+    # Pixels without depth may belong to a thing beside them, or to one that is found by its colour.
+    clearly_colored = (evidence.contrast > UNIT) & ~evidence.plain & evidence.region
+    beside = (grow(near | colored, 5) & ~like_plane) | (~evidence.region & grow(body, OUTSIDE))
+    unknown = (near & ~(like_plane & ~evidence.high)) | colored | (~depth.valid & (beside | clearly_colored))
     markers += 1  # the background is 1, and 0 is flooded
     markers[(markers == 1) & unknown] = 0
     labels = watershed(color, markers) - 1
@@ -142,14 +141,6 @@ def _colored_markers(colored: Mask, near: Mask, valid: Mask) -> tuple[NDArray[np
     beside[numbers[grow(near, 3)]] = True
     kept = (sizes >= LEAST_MARKER) & (~beside | (n_valid > 0.5 * sizes))
     return (np.cumsum(kept) * kept).astype(np.int32)[numbers], int(kept.sum())
-
-
-def _unknown_without_depth(depth: DepthImage, evidence: Evidence, body: Mask, things: Mask, like_plane: Mask) -> Mask:
-    """Return pixels without depth that may belong to a thing."""
-    wide = grow(body, OUTSIDE)
-    beside = grow(things, 5) & ~like_plane
-    colored = (evidence.contrast > UNIT) & ~evidence.plain & evidence.region
-    return ~depth.valid & ((~evidence.region & wide) | beside | colored)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -290,9 +281,8 @@ def _find_borders(
 ) -> _Borders:
     flat, pixels = labels.ravel(), color.reshape(-1, 3)
     z, heights = depth.z.ravel(), evidence.heights.ravel()
-    near_step = grow(evidence.steps, 5)
-    near_edge = (near_step | grow(evidence.folds, 3)).ravel()
-    near_step = near_step.ravel()
+    near_step = grow(evidence.steps, 5).ravel()
+    near_edge = near_step | grow(evidence.folds, 3).ravel()
     parts = []
     for step in (1, labels.shape[1]):
         here = np.flatnonzero(flat[:-step] != flat[step:])

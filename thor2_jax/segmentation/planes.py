@@ -185,10 +185,8 @@ def _best_hypothesis(points: _Points, left: NDArray[np.intp], rng: np.random.Gen
         return None
     planes = np.linalg.solve(matrices[usable], points.inverse[triples[usable]][..., None])[..., 0]
     scored = left[:: max(1, len(left) // SCORED_POINTS)]
-    x, y, inverse, tolerance = (
-        values[scored].astype(np.float32)
-        for values in (points.terms[:, 0], points.terms[:, 1], points.inverse, points.tolerance)
-    )
+    fields = points.terms[:, 0], points.terms[:, 1], points.inverse, points.tolerance
+    x, y, inverse, tolerance = (values[scored].astype(np.float32) for values in fields)
     # Not a matrix product, for which threads would be started.
     single = planes.astype(np.float32)
     misses = single[:, :1] * x
@@ -205,7 +203,6 @@ def _refine(
     """Return the inliers of `left` and the coefficients [6] that fit them by least squares."""
     coefficients = np.concatenate([hypothesis, np.zeros(3)])
     terms, inverse, tolerance = points.terms[left], points.inverse[left], points.tolerance[left]
-    near = np.ones(len(left), bool)
     for n_terms in (3, 3, 3, 6, 6):
         near = np.abs(terms @ coefficients - inverse) < tolerance
         if near.sum() < LEAST_POINTS // 2:

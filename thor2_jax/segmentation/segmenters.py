@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thor2_jax.errors import InputError
+from thor2_jax.errors import InputError, needs_extra
 from thor2_jax.frames.frames import RGBDFrame
 
 __all__ = ["ENTRY_POINTS", "MODEL", "TABLE", "Segmenter", "load_segmenter", "segment", "segmented", "segmenter_names"]
@@ -50,29 +50,22 @@ def load_segmenter(name: str) -> Segmenter:
             f"segmenter is {name!r}, which only recognize and explain take; expected {', '.join(segmenter_names())}"
         )
     if name == TABLE:
-        try:
+        with needs_extra(f"segmenter is {name!r}, which", "OpenCV", "segment"):
             return importlib.import_module("thor2_jax.segmentation.table").segment_table
-        except ImportError as error:
-            raise InputError(
-                f"segmenter is {name!r}, which needs OpenCV ({error}); run pip install -c constraints.txt '.[segment]'"
-            ) from None
     points = list(entry_points(group=ENTRY_POINTS, name=name))
     if not points:
         raise InputError(
             f"segmenter is {name!r}; expected one of {', '.join(segmenter_names())}, or install a package that offers "
             f"it in the entry point group {ENTRY_POINTS}"
         )
+    subject = f"segmenter is {name!r}; {points[0].value}"
     # The package is not ours: importing it may raise anything.
     try:
         segmenter = points[0].load()
     except Exception as error:
-        raise InputError(
-            f"segmenter is {name!r}; {points[0].value} cannot be imported ({_reason(error)}); check its package"
-        ) from None
+        raise InputError(f"{subject} cannot be imported ({_reason(error)}); check its package") from None
     if not callable(segmenter):
-        raise InputError(
-            f"segmenter is {name!r}; {points[0].value} is a {type(segmenter).__name__}; expected a function"
-        )
+        raise InputError(f"{subject} is a {type(segmenter).__name__}; expected a function")
     return segmenter
 
 

@@ -58,23 +58,17 @@ def segment_table(frame: RGBDFrame) -> NDArray[np.int32]:
     stride = max(1, round(max(frame.depth.shape) / WORKING_SIZE))
     height, width = (-(-side // stride) for side in frame.depth.shape)
     color = np.asarray(cv2.resize(frame.color, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
-    depth = DepthImage(np.ascontiguousarray(frame.depth_m[::stride, ::stride]), _subsampled(frame.intrinsics, stride))
-    labels = _segment(color, depth)
-    return _refined(labels, frame.color, stride) if stride > 1 else labels
-
-
-def _subsampled(camera: Intrinsics, stride: int) -> Intrinsics:
-    """Return the camera of every `stride`-th pixel; the planes' second-order terms absorb lens distortion."""
-    return Intrinsics(camera.fx / stride, camera.fy / stride, camera.cx / stride, camera.cy / stride)
-
-
-def _segment(color: NDArray[np.uint8], depth: DepthImage) -> NDArray[np.int32]:
+    camera = frame.intrinsics
+    # The planes' second-order terms absorb lens distortion.
+    subsampled = Intrinsics(camera.fx / stride, camera.fy / stride, camera.cx / stride, camera.cy / stride)
+    depth = DepthImage(np.ascontiguousarray(frame.depth_m[::stride, ::stride]), subsampled)
     planes = dominant_planes(depth)
     if not planes:
-        return np.zeros(depth.z.shape, np.int32)
+        return np.zeros(frame.depth.shape, np.int32)
     evidence = find_foreground(color, depth, planes)
-    labels = merge_pieces(*flood(color, depth, evidence), color, depth, evidence)
-    return _cleaned(labels, depth, planes)
+    pieces = merge_pieces(*flood(color, depth, evidence), color, depth, evidence)
+    labels = _cleaned(pieces, depth, planes)
+    return _refined(labels, frame.color, stride) if stride > 1 else labels
 
 
 def _refined(labels: NDArray[np.int32], color: NDArray[np.uint8], stride: int) -> NDArray[np.int32]:
@@ -85,10 +79,8 @@ def _refined(labels: NDArray[np.int32], color: NDArray[np.uint8], stride: int) -
     rows, columns = (np.flatnonzero(labels.any(axis=axis)) for axis in (1, 0))
     top, left = max(rows[0] - MARGIN, 0), max(columns[0] - MARGIN, 0)
     labels = labels[top : rows[-1] + 1 + MARGIN, left : columns[-1] + 1 + MARGIN]
-    here = np.s_[
-        stride * top : stride * (top + labels.shape[0]),
-        stride * left : stride * (left + labels.shape[1]),
-    ]
+    height, width = labels.shape
+    here = np.s_[stride * top : stride * (top + height), stride * left : stride * (left + width)]
     markers = np.where(label_borders(labels, BAND), 0, labels + 1)
     height, width = refined[here].shape
     markers = markers.repeat(stride, axis=0).repeat(stride, axis=1)[:height, :width]
@@ -113,12 +105,8 @@ def _trimmed(labels: NDArray[np.int32], size: int) -> NDArray[np.int32]:
 
 def _cleaned(labels: NDArray[np.int32], depth: DepthImage, planes: list[Plane]) -> NDArray[np.int32]:
     """Return the things among the pieces, without holes and numbered from 1."""
-    region = np.zeros(labels.shape, bool)
-    for plane in planes:
-        region |= plane.region(labels.shape)
-    region = grow(region, 5)
-    cleaned = np.zeros_like(labels)
-    count = 0
+    region = grow(np.any([plane.region(labels.shape) for plane in planes], axis=0), 5)
+    cleaned, count = np.zeros_like(labels), 0
     for label, place in enumerate(ndimage.find_objects(labels), start=1):
         if place is None:
             continue
@@ -134,8 +122,7 @@ def _is_thing(mask: Mask, z: NDArray[np.float32], depth: DepthImage, region: Mas
     size = int(mask.sum())
     if not LEAST_PIXELS <= size <= LARGEST_SHARE * n_pixels or region[mask].mean() < LEAST_SUPPORT:
         return False
-    z = z[mask]
-    z = z[z > 0]
+    z = z[mask & (z > 0)]
     distance = median_high(z) if len(z) else 1.0
     return LEAST_AREA <= size * (distance * depth.pixel_size) ** 2 <= LARGEST_AREA
 

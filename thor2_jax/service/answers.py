@@ -3,6 +3,7 @@
 import base64
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,10 +50,8 @@ def why_answer(explanation: Explanation, frame: RGBDFrame) -> schemas.WhyAnswer:
         mean_loss_without_random_tenth=check.random,
         changes=[f"{change_text(change)}: {change.answer}" for change in explanation.changes],
         pictures=[
-            schemas.WhyPicture(
-                title=picture.title, caption=picture.caption, png=base64.b64encode(png_bytes(picture.figure)).decode()
-            )
-            for picture in main_pictures(explanation, frame)
+            schemas.WhyPicture(title=p.title, caption=p.caption, png=base64.b64encode(png_bytes(p.figure)).decode())
+            for p in main_pictures(explanation, frame)
         ],
         timings={},
     )
@@ -70,16 +69,10 @@ def object_answers(objects: ObjectGallery) -> list[schemas.ObjectAnswer]:
     union, enrolled = objects.union, objects.gallery.objects
     answers = []
     for name, is_trained in zip(union.names, union.has_output, strict=True):
-        views = enrolled.get(name)
-        answers.append(
-            schemas.ObjectAnswer(
-                name=name,
-                trained=bool(is_trained),
-                views=0 if views is None else len(views.clouds),
-                source=None if views is None else views.source,
-                date=None if views is None else views.date,
-            )
-        )
+        about: dict[str, Any] = {"views": 0, "source": None, "date": None}
+        if (views := enrolled.get(name)) is not None:
+            about = {"views": len(views.clouds), "source": views.source, "date": views.date}
+        answers.append(schemas.ObjectAnswer(name=name, trained=bool(is_trained), **about))
     return answers
 
 

@@ -28,7 +28,7 @@ from thor2_jax.service.answers import adaptation_answer, instance_answer, object
 from thor2_jax.service.engine import CloudResult
 from thor2_jax.service.forms import parse_enrolment, parse_number, read_body, read_form
 from thor2_jax.service.metrics import RequestCounter
-from thor2_jax.service.pipeline import Service, gallery_errors
+from thor2_jax.service.pipeline import AdmittedRequest, Service, gallery_errors
 from thor2_jax.service.problem import RequestError, error_responses
 from thor2_jax.service.schemas import NPZ
 from thor2_jax.service.settings import Settings
@@ -84,11 +84,10 @@ def create_app(settings: Settings, workers: int = 1) -> FastAPI:
     app.state.service = service
     app.add_middleware(AllowedHosts, names=settings.allow_host)
     app.add_middleware(RequestCounter, metrics=service.metrics)
-    app.include_router(_health_routes(service, workers))
-    token = settings.token
-    authenticated = (
-        APIRouter(dependencies=[Depends(_token_check(token))], responses=error_responses(401)) if token else APIRouter()
-    )
+    _add_health_routes(app, service, workers)
+    authenticated = APIRouter()
+    if settings.token:
+        authenticated = APIRouter(dependencies=[Depends(_token_check(settings.token))], responses=error_responses(401))
     _add_inference_routes(authenticated, service)
     _add_model_routes(authenticated, service)
     _add_teaching_routes(authenticated, service)
@@ -148,36 +147,39 @@ def _stop_accepting_on_signal(service: Service) -> Iterator[None]:
         yield
 
 
-def _health_routes(service: Service, workers: int) -> APIRouter:
-    routes = APIRouter()
-
-    @routes.get("/healthz")
+def _add_health_routes(app: FastAPI, service: Service, workers: int) -> None:
+    @app.get("/healthz")
     async def healthz() -> schemas.Health:
         """Report that the process is alive."""
         return schemas.Health(status="alive")
 
-    @routes.get("/readyz", responses=error_responses(503))
+    @app.get("/readyz", responses=error_responses(503))
     async def readyz() -> schemas.Readiness:
         """Report whether requests are accepted, and by how many processes: only ready ones receive requests."""
         service.check_ready()
         return schemas.Readiness(status="ready", ready_workers=service.metrics.count_ready_workers(), workers=workers)
 
-    return routes
+
+@contextlib.asynccontextmanager
+async def _admitted_form(
+    service: Service, request: Request, form: dict[str, Any], seconds: float | None = None
+) -> AsyncIterator[tuple[AdmittedRequest, dict[str, bytes]]]:
+    """Admit a request as `Service.admit`, and read the fields of its form."""
+    async with service.admit(seconds) as admitted:
+        with admitted.stage("upload"):
+            files = await read_form(request, form)
+        yield admitted, files
 
 
 def _add_inference_routes(routes: APIRouter, service: Service) -> None:
-    adapts = service.settings.adapt  # A frame then changes how the next ones are recognized.
-    observing: dict[str, Any] = {"dependencies": [Depends(_check_same_site)]} if adapts else {}
-    frame_errors = FRAME_ERRORS | (error_responses(403) if adapts else {})
+    of_frame: dict[str, Any] = {"responses": FRAME_ERRORS, "openapi_extra": {"requestBody": schemas.FRAME_FORM}}
+    if service.settings.adapt:  # A frame then changes how the next ones are recognized.
+        of_frame |= {"responses": FRAME_ERRORS | error_responses(403), "dependencies": [Depends(_check_same_site)]}
 
-    @routes.post(
-        "/v1/recognize", responses=frame_errors, openapi_extra={"requestBody": schemas.FRAME_FORM}, **observing
-    )
+    @routes.post("/v1/recognize", **of_frame)
     async def recognize(request: Request) -> schemas.FrameAnswer:
         """Recognize every instance of a frame; one without labels is segmented."""
-        async with service.admit() as admitted:
-            with admitted.stage("upload"):
-                files = await read_form(request, schemas.FRAME_FORM)
+        async with _admitted_form(service, request, schemas.FRAME_FORM) as (admitted, files):
             recognitions, label_map = await service.recognize(files, admitted)
         return schemas.FrameAnswer(
             instances=[instance_answer(recognition) for recognition in recognitions],
@@ -187,18 +189,10 @@ def _add_inference_routes(routes: APIRouter, service: Service) -> None:
             timings=admitted.milliseconds(),
         )
 
-    @routes.post(
-        "/v1/explain",
-        response_model=schemas.ExplainedFrame,
-        responses=frame_errors,
-        openapi_extra={"requestBody": schemas.FRAME_FORM},
-        **observing,
-    )
+    @routes.post("/v1/explain", response_model=schemas.ExplainedFrame, **of_frame)
     async def explain(request: Request) -> Response:
         """Recognize every instance of a frame and return the evidence: clouds, persistence images and colours."""
-        async with service.admit() as admitted:
-            with admitted.stage("upload"):
-                files = await read_form(request, schemas.FRAME_FORM)
+        async with _admitted_form(service, request, schemas.FRAME_FORM) as (admitted, files):
             answer = await service.explain(files, admitted)
             content = await run_in_threadpool(answer.model_dump_json)
         return Response(content, media_type="application/json")
@@ -209,20 +203,15 @@ def _add_inference_routes(routes: APIRouter, service: Service) -> None:
 
         Until explanations of clouds of this size are compiled, which begins after the start, the status is 503.
         """
-        async with service.admit(max(service.settings.deadline, WHY_SECONDS)) as admitted:
-            with admitted.stage("upload"):
-                files = await read_form(request, schemas.WHY_FORM)
+        seconds = max(service.settings.deadline, WHY_SECONDS)
+        async with _admitted_form(service, request, schemas.WHY_FORM, seconds) as (admitted, files):
             return await service.why(files, parse_number(files, "instance"), admitted)
 
-    @routes.post(
-        "/v1/describe",
-        response_model=schemas.DescribeAnswer,
-        responses={
-            200: {"content": {NPZ: {"schema": {"type": "string", "format": "binary"}}}},
-            **error_responses(408, 413, 415, 422, 429, 503, 504),
-        },
-        openapi_extra={"requestBody": schemas.CLOUDS_BODY},
-    )
+    arrays = {"content": {NPZ: {"schema": {"type": "string", "format": "binary"}}}}
+    responses = {200: arrays, **error_responses(408, 413, 415, 422, 429, 503, 504)}
+    body = {"requestBody": schemas.CLOUDS_BODY}
+
+    @routes.post("/v1/describe", response_model=schemas.DescribeAnswer, responses=responses, openapi_extra=body)
     async def describe(request: Request) -> Response:
         """Compute the descriptors of clouds. The answer has the content type of the body: JSON or npz.
 
@@ -238,8 +227,8 @@ def _add_inference_routes(routes: APIRouter, service: Service) -> None:
             results = await service.describe(content, content_type == NPZ, admitted)
             if content_type == NPZ:
                 return Response(await run_in_threadpool(_encode_npz, results), media_type=NPZ)
-            body = await run_in_threadpool(_encode_json, results, admitted.milliseconds())
-            return Response(body, media_type="application/json")
+            text = await run_in_threadpool(_encode_json, results, admitted.milliseconds())
+            return Response(text, media_type="application/json")
 
 
 def _add_model_routes(routes: APIRouter, service: Service) -> None:
@@ -247,11 +236,11 @@ def _add_model_routes(routes: APIRouter, service: Service) -> None:
     async def model() -> schemas.ModelAnswer:
         """Return the classes and the configuration of the model."""
         service.engine.refresh()
-        run = service.engine.run
+        current, run = service.engine.model, service.engine.run
         return schemas.ModelAnswer(
-            classes=list(service.engine.classes),
-            knows=service.engine.model.union.summary,
-            classifiers=list(service.engine.classifiers),
+            classes=list(current.names),
+            knows=current.union.summary,
+            classifiers=list(current.classifiers),
             descriptor_version=DESCRIPTOR_VERSION,
             descriptor=pydantic_core.to_jsonable_python(run.config),
             color_network=run.network.fingerprint,
@@ -263,10 +252,9 @@ def _add_model_routes(routes: APIRouter, service: Service) -> None:
     async def colornet() -> schemas.ColorNetworkAnswer:
         """Return the colour network of the descriptors."""
         network = service.engine.run.network
-        arrays = ("mean_rgb", "member_counts", "edges", "edge_weights", "similarity")
-        return schemas.ColorNetworkAnswer(
-            fingerprint=network.fingerprint, **{name: getattr(network, name).tolist() for name in arrays}
-        )
+        names = ("mean_rgb", "member_counts", "edges", "edge_weights", "similarity")
+        arrays = {name: getattr(network, name).tolist() for name in names}
+        return schemas.ColorNetworkAnswer(fingerprint=network.fingerprint, **arrays)
 
     @routes.get("/metrics", response_class=Response, responses={200: {"content": {"text/plain": {}}}})
     async def metrics() -> Response:
@@ -287,11 +275,8 @@ def _add_teaching_routes(authenticated: APIRouter, service: Service) -> None:
         if not service.settings.teach:
             raise RequestError(403, None, "The service does not teach; start it with `thor2 serve --teach`.")
 
-    routes = APIRouter(
-        dependencies=[Depends(check_teaches), Depends(_check_same_site)],
-        responses=error_responses(403),
-        include_in_schema=service.settings.teach,
-    )
+    guards = [Depends(check_teaches), Depends(_check_same_site)]
+    routes = APIRouter(dependencies=guards, responses=error_responses(403), include_in_schema=service.settings.teach)
 
     @routes.post(
         "/v1/objects",
@@ -303,9 +288,7 @@ def _add_teaching_routes(authenticated: APIRouter, service: Service) -> None:
 
         A name that exists needs extend or replace.
         """
-        async with service.admit() as admitted:
-            with admitted.stage("upload"):
-                files = await read_form(request, schemas.ENROLMENT_FORM)
+        async with _admitted_form(service, request, schemas.ENROLMENT_FORM) as (admitted, files):
             name, label, flags = parse_enrolment(files)
             known = await service.enroll(files, name, label, flags, admitted)
         (enrolled,) = [answer for answer in object_answers(known) if answer.name == name]
@@ -318,9 +301,8 @@ def _add_teaching_routes(authenticated: APIRouter, service: Service) -> None:
     )
     async def undo(request: Request) -> schemas.ChangeAnswer:
         """Take back the last change of the gallery, unless another one was made since."""
-        async with service.admit() as admitted:
-            with admitted.stage("upload"):
-                generation = parse_number(await read_form(request, schemas.UNDO_FORM), "generation")
+        async with _admitted_form(service, request, schemas.UNDO_FORM) as (admitted, files):
+            generation = parse_number(files, "generation")
             known = await service.change(lambda objects: objects.undo(generation), 409, "generation", admitted)
         return schemas.ChangeAnswer(generation=known.generation)
 

@@ -20,16 +20,18 @@ from thor2_jax.frames.image_files import has_16_bit_channels, read_npy
 from thor2_jax.frames.intrinsics import Intrinsics, parse_intrinsics
 from thor2_jax.service.problem import RequestError
 from thor2_jax.service.schemas import CloudsBody
-from thor2_jax.service.settings import (
-    MAX_BODY,
-    MAX_CLOUD_COORDINATE,
-    MAX_CLOUDS,
-    MAX_INSTANCES,
-    MAX_INTRINSICS_BYTES,
-    MAX_UPLOAD_PIXELS,
-)
+from thor2_jax.service.settings import MAX_BODY, MAX_CLOUD_COORDINATE, MAX_CLOUDS
 
 __all__ = ["CloudArrays", "check_instances", "decode_frame", "decode_json_clouds", "decode_npz_clouds"]
+
+MAX_UPLOAD_PIXELS = 1920 * 1080
+"""Maximum number of pixels of an image."""
+
+MAX_INSTANCES = 256
+"""Maximum number of instances in a frame."""
+
+MAX_INTRINSICS_BYTES = 4096
+"""Maximum size of the intrinsics file."""
 
 CloudArrays = list[tuple[NDArray[np.float32], NDArray[np.uint8]]]
 """Points [n, 3] in metres and sRGB colours [n, 3] of each cloud."""
@@ -80,9 +82,8 @@ def check_instances(frame: RGBDFrame) -> None:
 
 def _decode_intrinsics(content: bytes) -> Intrinsics:
     if len(content) > MAX_INTRINSICS_BYTES:
-        raise RequestError(
-            413, "intrinsics", f"intrinsics has {len(content)} bytes; expected at most {MAX_INTRINSICS_BYTES}."
-        )
+        message = f"intrinsics has {len(content)} bytes; expected at most {MAX_INTRINSICS_BYTES}."
+        raise RequestError(413, "intrinsics", message)
     try:
         return parse_intrinsics(content)
     except InputError as error:
@@ -152,13 +153,12 @@ def decode_npz_clouds(content: bytes) -> CloudArrays:
         if not is_valid:
             array = arrays[name]
             raise RequestError(422, name, f"{name} is {array.dtype} {list(array.shape)}; expected {expected}.")
-    counts = [int(n) for n in sizes[: MAX_CLOUDS + 1]]
+    counts = sizes[: MAX_CLOUDS + 1].tolist()
     if not 1 <= len(counts) <= MAX_CLOUDS:
         raise RequestError(422, "sizes", f"sizes has {len(sizes)} entries; expected 1 to {MAX_CLOUDS}.")
     if min(counts) < 0 or max(counts) > POINT_BUCKETS[-1] or sum(counts) != len(points):
-        raise RequestError(
-            422, "sizes", f"sizes must lie between 0 and {POINT_BUCKETS[-1]} and sum to the {len(points)} points."
-        )
+        message = f"sizes must lie between 0 and {POINT_BUCKETS[-1]} and sum to the {len(points)} points."
+        raise RequestError(422, "sizes", message)
     if not (np.abs(points) <= MAX_CLOUD_COORDINATE).all():
         raise RequestError(422, "points", f"points has coordinates that are not within {MAX_CLOUD_COORDINATE} m.")
     starts = np.cumsum(counts)[:-1]

@@ -3,7 +3,6 @@
 import dataclasses
 import logging
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -20,9 +19,6 @@ from thor2_jax.explanation.class_scores import padded_points
 from thor2_jax.explanation.explain import Explanation, compile_explanations, explain_instance, explained_kinds
 from thor2_jax.frames.instance_clouds import MIN_POINTS
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
-from thor2_jax.gallery.clouds import CompactClouds
-from thor2_jax.gallery.enrollment import LOOKS, enrolled_object
-from thor2_jax.gallery.gallery import GalleryObject
 from thor2_jax.gallery.objects import ObjectGallery
 from thor2_jax.gallery.store import INDEX_FILE, check_index
 from thor2_jax.model.answers import Recognition
@@ -72,7 +68,10 @@ class InferenceEngine:
             InputError: the run cannot be read or lacks a classifier of THOR2, or an error of `Recognizer`.
         """
         if settings.cache is not None:
-            _enable_compilation_cache(settings.cache)
+            jax.config.update("jax_compilation_cache_dir", str(settings.cache))
+            # By default JAX caches only large programs that take more than a second to compile.
+            jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+            jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
         recognizer = _load(settings)
         run = recognizer.run
         missing = [name for name in THOR2 if run.classifiers and name not in run.classifiers]
@@ -93,7 +92,7 @@ class InferenceEngine:
         if settings.adapt:
             if not self.model.classifiers:
                 raise InputError(f"adapt: {settings.model} has no classifiers; expected a trained run")
-            self._online = OnlineAdaptation(*adaptation_criterion(self.model), self._set_transform)
+            self._online = OnlineAdaptation(adaptation_criterion(self.model), self._set_transform)
 
     @property
     def model(self) -> Model:
@@ -125,16 +124,6 @@ class InferenceEngine:
         return self.model.answers_by() != "classifiers"
 
     @property
-    def classifiers(self) -> tuple[str, ...]:
-        """Names of the classifiers."""
-        return tuple(self.model.classifiers)
-
-    @property
-    def classes(self) -> tuple[str, ...]:
-        """All names that may be answered."""
-        return self.model.names
-
-    @property
     def objects(self) -> ObjectGallery:
         """The enrolled objects. Change a copy of them in another thread, and call `refresh` in this one."""
         return self._recognizer.objects
@@ -154,11 +143,6 @@ class InferenceEngine:
             if str(error) != self._last_error:
                 log.error("%s", error)
             self._last_error = str(error)
-
-    def enrolled_object(self, clouds: CompactClouds, results: Sequence[CloudResult]) -> GalleryObject:
-        """Return an object to enroll from its clouds and the results of `enrollment.views_to_embed`."""
-        embeddings = np.array([result.inference.embeddings[:LOOKS] for result in results])
-        return enrolled_object(embeddings, clouds, "frames")
 
     @property
     def batch_shapes(self) -> list[tuple[int, int]]:
@@ -258,13 +242,6 @@ def _load(settings: Settings) -> Recognizer:
         if recognizer.run.record.get("answer_by") == "classifiers":  # They would never answer by an enrolled object.
             recognizer = Recognizer.load(settings.model, settings.unknown_below, gallery=directory, answer_by="both")
     return recognizer
-
-
-def _enable_compilation_cache(directory: Path) -> None:
-    jax.config.update("jax_compilation_cache_dir", str(directory))
-    # By default JAX caches only large programs that take more than a second to compile.
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-    jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
 
 
 def _padded_batch(n_clouds: int) -> int:

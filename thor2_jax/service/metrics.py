@@ -1,6 +1,7 @@
 """Prometheus metrics of the service, including the number of compilations after warm-up (expected to be zero)."""
 
 import contextlib
+import functools
 import os
 import threading
 from pathlib import Path
@@ -26,26 +27,17 @@ class Metrics:
 
     def __init__(self) -> None:
         registry = self._registry = CollectorRegistry()
-        self.requests = Counter("thor2_requests", "Answered requests.", ["path", "status"], registry=registry)
-        self.stages = Histogram(
-            "thor2_stage_seconds",
-            "Duration of the stages of a request.",
-            ["stage"],
-            registry=registry,
-            buckets=STAGE_BUCKETS,
+        gauge = functools.partial(Gauge, registry=registry, multiprocess_mode="livesum")
+        counter = functools.partial(Counter, registry=registry)
+        self.requests = counter("thor2_requests", "Answered requests.", ["path", "status"])
+        histogram = functools.partial(Histogram, registry=registry)
+        self.stages = histogram(
+            "thor2_stage_seconds", "Duration of the stages of a request.", ["stage"], buckets=STAGE_BUCKETS
         )
-        self.batches = Histogram(
-            "thor2_batch_clouds", "Number of clouds in a batch.", registry=registry, buckets=BATCH_SIZE_BUCKETS
-        )
-        self.in_progress = Gauge(
-            "thor2_requests_waiting", "Requests in progress.", registry=registry, multiprocess_mode="livesum"
-        )
-        self.ready_workers = Gauge(
-            "thor2_ready_workers", "Processes that accept requests.", registry=registry, multiprocess_mode="livesum"
-        )
-        self.compilations = Counter(
-            "thor2_compilations_after_warm_up", "Programs compiled after warm-up.", registry=registry
-        )
+        self.batches = histogram("thor2_batch_clouds", "Number of clouds in a batch.", buckets=BATCH_SIZE_BUCKETS)
+        self.in_progress = gauge("thor2_requests_waiting", "Requests in progress.")
+        self.ready_workers = gauge("thor2_ready_workers", "Processes that accept requests.")
+        self.compilations = counter("thor2_compilations_after_warm_up", "Programs compiled after warm-up.")
 
     def text(self) -> bytes:
         """Return the metrics in the Prometheus text format."""

@@ -12,11 +12,13 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from thor2_jax.capacity import POINT_BUCKETS
 from thor2_jax.errors import InputError
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery.clouds import CompactClouds
-from thor2_jax.gallery.enrollment import views_to_embed
+from thor2_jax.gallery.enrollment import LOOKS, enrolled_object, views_to_embed
 from thor2_jax.gallery.objects import ObjectGallery
 from thor2_jax.gallery.store import GalleryBusyError, GalleryError
 from thor2_jax.model.answers import Recognition
@@ -118,10 +120,9 @@ class Service:
 
     def start(self) -> None:
         """Start processes and threads. `state` becomes "ready" when all batch shapes are compiled."""
-        self._pool = PreparationPool(self.settings.processes, self.settings.segmenter)
-        self._batcher = Batcher(
-            self._process_batch, lambda: self._in_progress, self.settings.max_batch, self.settings.window
-        )
+        settings = self.settings
+        self._pool = PreparationPool(settings.processes, settings.segmenter)
+        self._batcher = Batcher(self._process_batch, lambda: self._in_progress, settings.max_batch, settings.window)
         self._explainer = ThreadPoolExecutor(1, thread_name_prefix="explain")
         self._compiler = ThreadPoolExecutor(1, thread_name_prefix=COMPILER_THREAD)
         self._warm_up_thread = threading.Thread(target=self._warm_up, name="warm-up")
@@ -248,11 +249,9 @@ class Service:
         prepared, results = await self._infer_frame(files, True, request)
         self.engine.refresh()
         recognitions = self.engine.recognize(prepared.instances, results)
-        confidences = self.engine.calibrated_confidences(results)
-        config = self.engine.run.config
-        return await asyncio.to_thread(
-            explained_frame, prepared, recognitions, results, confidences, config, request.milliseconds()
-        )
+        confidences, config = self.engine.calibrated_confidences(results), self.engine.run.config
+        arguments = prepared, recognitions, results, confidences, config, request.milliseconds()
+        return await asyncio.to_thread(explained_frame, *arguments)
 
     async def why(self, files: dict[str, bytes], label: int, request: AdmittedRequest) -> WhyAnswer:
         """Explain the answer for one instance of a frame, one request after the other.
@@ -271,9 +270,8 @@ class Service:
 
         def explained() -> WhyAnswer:
             assert prepared.frame is not None
-            return why_answer(
-                self.engine.explain(self.engine.correct(prepared.instances, observe=False)[0]), prepared.frame
-            )
+            (instance,) = self.engine.correct(prepared.instances, observe=False)
+            return why_answer(self.engine.explain(instance), prepared.frame)
 
         with request.stage("explain"):
             try:
@@ -309,7 +307,8 @@ class Service:
             message = str(error).replace("views[0]", f"instance {label}")
             raise RequestError(422, "instance", f"{message}.") from None
         views = await asyncio.to_thread(views_to_embed, clouds, "frames")
-        added = {name: self.engine.enrolled_object(clouds, await self._infer(views, request))}
+        embeddings = np.array([result.inference.embeddings[:LOOKS] for result in await self._infer(views, request)])
+        added = {name: enrolled_object(embeddings, clouds, "frames")}
         return await self.change(lambda objects: objects.add(added, **flags), 409, "name", request)
 
     async def change(

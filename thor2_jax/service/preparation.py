@@ -27,10 +27,12 @@ from thor2_jax.segmentation.segmenters import load_segmenter, segmented
 from thor2_jax.service.decoding import check_instances, decode_frame, decode_json_clouds, decode_npz_clouds
 from thor2_jax.service.problem import RequestError, deadline_exceeded
 from thor2_jax.service.schemas import LabelMap
-from thor2_jax.service.settings import MAX_LABEL_RUNS
 from thor2_jax.service.signals import signals_blocked
 
 __all__ = ["PreparationPool", "PreparedRequest", "prepare_clouds", "prepare_frame", "prepare_view", "timed"]
+
+MAX_LABEL_RUNS = 50_000
+"""Maximum number of runs in the label map of an explained frame."""
 
 MIN_SECONDS = 1.0
 """Minimum time that a process has for a request, so that only exceptionally slow requests are interrupted."""
@@ -134,9 +136,8 @@ def _prepare_instances(frame: RGBDFrame, labels: Sequence[int], sigma_s: float) 
     try:
         return [prepare_instance(frame, label, sigma_s) for label in labels]
     except InputError:  # The images and the intrinsics are valid, but their combination exceeds the voxel grid.
-        raise RequestError(
-            422, "intrinsics", "intrinsics place the points of an instance too far apart; check fx, fy and depth_scale."
-        ) from None
+        message = "intrinsics place the points of an instance too far apart; check fx, fy and depth_scale."
+        raise RequestError(422, "intrinsics", message) from None
 
 
 def _encode_label_map(labels: NDArray[Any]) -> LabelMap:
@@ -157,9 +158,7 @@ def prepare_clouds(content: bytes, is_npz: bool) -> PreparedRequest:
     seconds: dict[str, float] = {}
     with timed(seconds, "decode"):
         clouds = (decode_npz_clouds if is_npz else decode_json_clouds)(content)
-    instances = [
-        PreparedInstance(k, points, colors, np.zeros(len(points), bool)) for k, (points, colors) in enumerate(clouds)
-    ]
+    instances = [PreparedInstance(k, *cloud, np.zeros(len(cloud[0]), bool)) for k, cloud in enumerate(clouds)]
     return PreparedRequest(instances, seconds)
 
 

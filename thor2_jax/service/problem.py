@@ -70,13 +70,9 @@ class RequestError(Exception):
 
 def error_responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
     """Return the OpenAPI `responses` of a route for these error statuses."""
-    retry_after = {"Retry-After": {"description": "Seconds.", "schema": {"type": "integer"}}}
+    retry = {"headers": {"Retry-After": {"description": "Seconds.", "schema": {"type": "integer"}}}}
     return {
-        status: {
-            "model": Problem,
-            "description": _DESCRIPTIONS[status],
-            **({"headers": retry_after} if status in (429, 503) else {}),
-        }
+        status: {"model": Problem, "description": _DESCRIPTIONS[status], **(retry if status in (429, 503) else {})}
         for status in statuses
     }
 

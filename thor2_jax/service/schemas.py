@@ -20,7 +20,6 @@ __all__ = [
     "ChangeAnswer",
     "ColorNetworkAnswer",
     "DescribeAnswer",
-    "DescriptorAnswer",
     "Details",
     "EnrolmentAnswer",
     "ExplainedFrame",
@@ -47,6 +46,8 @@ NPZ = "application/octet-stream"
 """Content type of npz files."""
 
 FRAME_STAGES = "Milliseconds per stage: upload, decode, segment (without labels), clouds, device, total."
+
+MAX_POINTS = POINT_BUCKETS[-1]
 
 Milliseconds = dict[str, float]
 Coordinate = Annotated[float, Field(ge=-MAX_CLOUD_COORDINATE, le=MAX_CLOUD_COORDINATE, allow_inf_nan=False)]
@@ -189,11 +190,9 @@ class CloudBody(BaseModel):
     """A coloured point cloud in the camera frame (x right, y down, z forward)."""
 
     model_config = ConfigDict(extra="forbid")
-    points: Annotated[list[tuple[Coordinate, Coordinate, Coordinate]], Field(max_length=POINT_BUCKETS[-1])] = Field(
-        description="Metres."
-    )
-    colors: Annotated[list[tuple[Channel, Channel, Channel]], Field(max_length=POINT_BUCKETS[-1])] = Field(
-        description="sRGB, 0 to 255, one per point."
+    points: list[tuple[Coordinate, Coordinate, Coordinate]] = Field(max_length=MAX_POINTS, description="Metres.")
+    colors: list[tuple[Channel, Channel, Channel]] = Field(
+        max_length=MAX_POINTS, description="sRGB, 0 to 255, one per point."
     )
 
 
@@ -315,17 +314,15 @@ FRAME_FORM = _form(_FRAME, "labels")
 WHY_FORM = _form({**_FRAME, "instance": _INSTANCE})
 """OpenAPI schema of the body of /v1/why."""
 
-ENROLMENT_FORM = _form(
-    {
-        **_FRAME,
-        "name": {"type": "string", "minLength": 1, "maxLength": 200, "description": "Name of the object."},
-        "instance": _INSTANCE,
-        "extend": {"type": "boolean", "description": "Add the view to those of an object that exists."},
-        "replace": {"type": "boolean", "description": "Discard the views of an object that exists."},
-    },
-    "extend",
-    "replace",
-)
+_ENROLMENT: dict[str, Any] = {
+    **_FRAME,
+    "name": {"type": "string", "minLength": 1, "maxLength": 200, "description": "Name of the object."},
+    "instance": _INSTANCE,
+    "extend": {"type": "boolean", "description": "Add the view to those of an object that exists."},
+    "replace": {"type": "boolean", "description": "Discard the views of an object that exists."},
+}
+
+ENROLMENT_FORM = _form(_ENROLMENT, "extend", "replace")
 """OpenAPI schema of the body of POST /v1/objects."""
 
 UNDO_FORM = _form(
@@ -334,12 +331,9 @@ UNDO_FORM = _form(
 """OpenAPI schema of the body of POST /v1/objects/undo."""
 
 
-def _clouds_body() -> dict[str, Any]:
-    schema = CloudsBody.model_json_schema()
-    schema["properties"]["clouds"]["items"] = schema.pop("$defs")["CloudBody"]  # References cannot be resolved.
-    binary = {"type": "string", "format": "binary"}
-    return {"required": True, "content": {"application/json": {"schema": schema}, NPZ: {"schema": binary}}}
+_CLOUDS = CloudsBody.model_json_schema()
+_CLOUDS["properties"]["clouds"]["items"] = _CLOUDS.pop("$defs")["CloudBody"]  # References cannot be resolved.
+_ARRAYS = {"type": "string", "format": "binary"}
 
-
-CLOUDS_BODY = _clouds_body()
+CLOUDS_BODY = {"required": True, "content": {"application/json": {"schema": _CLOUDS}, NPZ: {"schema": _ARRAYS}}}
 """OpenAPI schema of the body of /v1/describe."""

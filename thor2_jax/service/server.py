@@ -77,9 +77,8 @@ def serve(settings: Settings, host: str = "127.0.0.1", port: int = 8080, workers
     try:
         server = socket.create_server((host, port), family=family, backlog=config.backlog)
     except OSError as error:
-        raise InputError(
-            f"port is {port} and host {host}, which cannot be used ({error.strerror}); choose others"
-        ) from None
+        message = f"port is {port} and host {host}, which cannot be used ({error.strerror}); choose others"
+        raise InputError(message) from None
     with server as listener:
         url_host = f"[{host}]" if ":" in host else host
         url = f"http://{url_host}:{listener.getsockname()[1]}"

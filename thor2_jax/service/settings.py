@@ -9,18 +9,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.hosts import check_host_names
 from thor2_jax.segmentation.segmenters import TABLE, load_segmenter
 
-__all__ = [
-    "MAX_BODY",
-    "MAX_CLOUDS",
-    "MAX_CLOUD_COORDINATE",
-    "MAX_EXPLAINED",
-    "MAX_UPLOAD_PIXELS",
-    "MAX_INSTANCES",
-    "MAX_INTRINSICS_BYTES",
-    "MAX_LABEL_RUNS",
-    "Settings",
-    "default_segmenter",
-]
+__all__ = ["MAX_BODY", "MAX_CLOUDS", "MAX_CLOUD_COORDINATE", "MAX_EXPLAINED", "Settings", "default_segmenter"]
 
 MAX_CLOUD_COORDINATE = 100.0
 """Largest absolute value of a coordinate of a cloud, in metres."""
@@ -28,26 +17,14 @@ MAX_CLOUD_COORDINATE = 100.0
 MAX_BODY = 16 * 2**20
 """Maximum size of a request body, and of the arrays it decompresses to, in bytes."""
 
-MAX_UPLOAD_PIXELS = 1920 * 1080
-"""Maximum number of pixels of an image."""
-
-MAX_INSTANCES = 256
-"""Maximum number of instances in a frame."""
-
 MAX_EXPLAINED = 32
 """Maximum number of instances of a frame that are explained."""
-
-MAX_LABEL_RUNS = 50_000
-"""Maximum number of runs in the label map of an explained frame."""
 
 MAX_CLOUDS = 32
 """Maximum number of clouds in a request."""
 
 MAX_DEADLINE = 86_400
 """Largest deadline of a request, in seconds."""
-
-MAX_INTRINSICS_BYTES = 4096
-"""Maximum size of the intrinsics file."""
 
 
 def default_segmenter() -> str | None:

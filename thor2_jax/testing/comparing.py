@@ -8,6 +8,7 @@ order in u (Higham, Accuracy and Stability of Numerical Algorithms, chapter 4).
 
 import dataclasses
 import math
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -29,6 +30,7 @@ __all__ = [
     "image_lipschitz",
     "image_rounding",
     "joined",
+    "map_points",
     "taken",
     "with_points",
 ]
@@ -158,20 +160,17 @@ def assert_near(actual: Descriptors, expected: Descriptors, config: DescriptorCo
     assert_within("embeddings", actual.embeddings, colors, 2 * embedding_rounding(colors.shape[-2]) * np.abs(colors))
 
 
+def map_points(function: Callable[..., jax.Array], *batches: PointClouds) -> PointClouds:
+    """Return the first batch with the result of a function of each array that has an entry for every point."""
+    names = ("points", "colors", "mask", "boundary")
+    return dataclasses.replace(batches[0], **{name: function(*(getattr(b, name) for b in batches)) for name in names})
+
+
 def joined(*batches: PointClouds) -> PointClouds:
     """Unite the points of batches: cloud b has the points of cloud b of each batch."""
-    names = ("points", "colors", "mask", "boundary")
-    together = {name: jnp.concatenate([getattr(b, name) for b in batches], axis=1) for name in names}
-    return dataclasses.replace(batches[0], **together)
+    return map_points(lambda *arrays: jnp.concatenate(arrays, axis=1), *batches)
 
 
 def taken(clouds: PointClouds, order: NDArray[np.intp]) -> PointClouds:
     """Select the points of each cloud with the indices `order`, [M] or [B, M]; cameras are unchanged."""
-    rows = np.broadcast_to(order, (len(clouds.mask), order.shape[-1]))
-
-    def reorder(a: jax.Array) -> jax.Array:
-        index = rows if a.ndim == 2 else rows[..., None]
-        return jnp.take_along_axis(a, jnp.asarray(index), axis=1)
-
-    per_point = {name: reorder(getattr(clouds, name)) for name in ("points", "colors", "mask", "boundary")}
-    return dataclasses.replace(clouds, **per_point)
+    return map_points(lambda a: a[np.arange(len(a))[:, None], order], clouds)

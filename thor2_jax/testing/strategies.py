@@ -8,6 +8,7 @@ number of points and the kind of the cloud.
 >>> batches = packed(camera_clouds(kinds=("balls", "thin")), size=4, capacity=512)
 """
 
+import functools
 import math
 from collections.abc import Sequence
 
@@ -196,12 +197,8 @@ def aligned_clouds(
         margin: the margin of `settled`.
         reach: longest side as a share of the extent of the descriptor; above 1, some clouds overflow.
     """
-    return st.builds(
-        lambda seed, kind, n: _aligned_cloud(seed, kind, n, config, margin, reach),
-        seeds(),
-        st.sampled_from(kinds),
-        st.integers(0, max_points),
-    )
+    make = functools.partial(_aligned_cloud, config=config, margin=margin, reach=reach)
+    return st.builds(make, seeds(), st.sampled_from(kinds), st.integers(0, max_points))
 
 
 def _decided_cloud(seed: int, n_body: int, config: DescriptorConfig) -> Cloud:
@@ -262,11 +259,8 @@ def decided_clouds(config: DescriptorConfig, max_points: int = 488) -> st.Search
         raise ValueError(
             f"alpha is {config.alpha}, max_points {max_points}; expected pi/4 and at least {17 * BODY_COPIES}"
         )
-    return st.builds(
-        lambda seed, n_body: _decided_cloud(seed, n_body, config),
-        seeds(),
-        st.integers(16, max_points // BODY_COPIES - 1),
-    )
+    make = functools.partial(_decided_cloud, config=config)
+    return st.builds(make, seeds(), st.integers(16, max_points // BODY_COPIES - 1))
 
 
 def packed(clouds: st.SearchStrategy[Cloud], size: int, capacity: int) -> st.SearchStrategy[PointClouds]:

@@ -8,6 +8,7 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
@@ -21,7 +22,7 @@ from thor2_jax.testing.comparing import (
     embedding_rounding,
     image_lipschitz,
     image_rounding,
-    joined,
+    map_points,
     with_points,
 )
 from thor2_jax.types import Descriptors, Diagrams, PointClouds, Strips
@@ -175,11 +176,8 @@ def assert_embedding_additive(describe: Describe, first: PointClouds, second: Po
         second: as many clouds of the same capacity, at most half full.
     """
     half = first.mask.shape[1] // 2
-    halves = [
-        dataclasses.replace(c, **{n: getattr(c, n)[:, :half] for n in ("points", "colors", "mask", "boundary")})
-        for c in (first, second)
-    ]
-    a, b, both = (np.asarray(describe(c).embeddings, np.float64) for c in (first, second, joined(*halves)))
+    union = map_points(lambda a, b: jnp.concatenate([a[:, :half], b[:, :half]], axis=1), first, second)
+    a, b, both = (np.asarray(describe(c).embeddings, np.float64) for c in (first, second, union))
     assert_within("embeddings", a + b, both, 2 * embedding_rounding(both.shape[-2]) * both)
 
 
@@ -188,11 +186,9 @@ def moved_within_strips(aligned: PointClouds, config: DescriptorConfig, seed: in
     rng = np.random.default_rng(seed)
     points = np.asarray(aligned.points, np.float64)
     # The worst case, drawn half of the time, moves all points outwards.
-    step = (
-        rng.uniform(-eps, eps, points.shape)
-        if rng.random() < 0.5
-        else eps * np.sign(points - points.mean(axis=1, keepdims=True))
-    )
+    step = eps * np.sign(points - points.mean(axis=1, keepdims=True))
+    if rng.random() < 0.5:
+        step = rng.uniform(-eps, eps, points.shape)
     for axis, width in ((0, config.sigma_2), (2, config.sigma_1)):
         low = np.floor(points[..., axis] / width) * width
         least = np.where(points[..., axis] == 0, 0, low + 0.02 * width)

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import softmax
 
 from thor2_jax.frames.prepared_instance import PreparedInstance
 
@@ -76,11 +77,7 @@ class FusedEvidence:
     def fused(self) -> tuple[dict[str, NDArray[np.float64]], dict[str, float] | None]:
         """Return classifier -> fused class probabilities [C], and object -> fused score; None without a gallery."""
         tiny = np.finfo(np.float64).tiny
-        probabilities = {}
-        for name, logs in self.logs.items():
-            mean = logs / max(self.weight, tiny)
-            values = np.exp(mean - mean.max())
-            probabilities[name] = (values / values.sum())[:-1]
+        probabilities = {name: softmax(logs / max(self.weight, tiny))[:-1] for name, logs in self.logs.items()}
         if self.scores is None:
             return probabilities, None
         return probabilities, {name: value / max(self.score_weight, tiny) for name, value in self.scores.items()}

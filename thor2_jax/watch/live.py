@@ -13,8 +13,6 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
-from PIL import Image
-
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.overlay import COLORS, UNRECOGNIZED, Annotation, Paint, draw_instances
@@ -104,13 +102,10 @@ class LiveView:
             self._last = {**values, "milliseconds": milliseconds, "image": _picture(frame, detections, paints)}
             self.n_frames += 1
         self._times.append(time.perf_counter())
-        self._last |= {"number": self.n_frames, "fps": self._frames_per_second()}
+        steps = len(self._times) - 1
+        fps = steps / (self._times[-1] - self._times[0]) if steps else None
+        self._last |= {"number": self.n_frames, "fps": fps}
         self.publish_state("live", "")
-
-    def _frames_per_second(self) -> float | None:
-        if len(self._times) < 2:
-            return None
-        return (len(self._times) - 1) / (self._times[-1] - self._times[0])
 
 
 def _order(detection: Detection) -> tuple[bool, int]:
@@ -140,7 +135,6 @@ def _picture(frame: RGBDFrame, detections: Sequence[Detection], paints: Sequence
         Annotation(one.recognition.label, paint, one.recognition.name or "unknown")
         for one, paint in zip(detections, paints, strict=True)
     ]
-    picture: Image.Image = draw_instances(frame.color, frame.label_image, annotations)
     stream = io.BytesIO()
-    picture.save(stream, "JPEG", quality=_JPEG_QUALITY)
+    draw_instances(frame.color, frame.label_image, annotations).save(stream, "JPEG", quality=_JPEG_QUALITY)
     return base64.b64encode(stream.getvalue()).decode("ascii")

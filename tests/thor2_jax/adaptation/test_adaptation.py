@@ -22,7 +22,7 @@ from thor2_jax.adaptation.estimate import (
     posterior_mean,
     spread,
 )
-from thor2_jax.adaptation.objective import Objective, entropy
+from thor2_jax.adaptation.objective import Criterion, Objective, entropy
 from thor2_jax.descriptor.looks import LookDescriptors, describe_looks
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.model.fusion import FUSION_RULES, FusionRule
@@ -73,11 +73,11 @@ def test_entropy_counts_what_the_classes_lack() -> None:
 def test_the_objective_is_the_entropy_of_the_answers() -> None:
     made = instances(11)  # two chunks, one with padding
     recognizer = Recognizer(RUN)
-    network, config, classify = adaptation_criterion(recognizer.model)
-    objective = Objective(made, network, config, classify)
+    criterion = adaptation_criterion(recognizer.model)
+    objective = Objective(made, criterion)
     for transform in (ColorTransform(), WARM):
         corrected = [transform.corrected(each) for each in made]
-        oriented = describe_looks(pack_instances(corrected, 16), network, config, 2)
+        oriented = describe_looks(pack_instances(corrected, 16), criterion.network, criterion.config, 2)
         fused = recognizer.model.fused(class_probabilities(recognizer, oriented, ("tops", "tops2")))[: len(made)]
         expected = sum(scipy_entropy(row) for row in fused)
         # Colours are rounded to 8 bits before a camera's correction, not in between.
@@ -97,11 +97,11 @@ def none_is_known(oriented: LookDescriptors) -> jax.Array:
 def test_warm_colors_are_cooled_and_unknown_objects_change_nothing() -> None:
     warm = np.array([150, 110, 90], np.uint8)
     made = [dataclasses.replace(each, colors=np.full_like(each.colors, warm)) for each in instances(40)]
-    adaptation = estimate_transform(made, RUN.network, RUN.config, grey_is_known)
+    adaptation = estimate_transform(made, Criterion(RUN.network, RUN.config, grey_is_known))
     assert -0.36 < adaptation.transform.warmth < -0.1
     assert adaptation.transform == ColorTransform(warmth=adaptation.transform.warmth)
     assert adaptation.uncertainty_after < adaptation.uncertainty_before and adaptation.instances == 40
-    unchanged = estimate_transform(made, RUN.network, RUN.config, none_is_known).transform
+    unchanged = estimate_transform(made, Criterion(RUN.network, RUN.config, none_is_known)).transform
     np.testing.assert_allclose(dataclasses.astuple(unchanged), 0, atol=1e-6)
 
 
@@ -119,7 +119,7 @@ def test_too_few_instances_are_refused_with_their_number() -> None:
     unusable = PreparedInstance(1, *(getattr(instances(1)[0], n)[:0] for n in ("points", "colors", "boundary")))
     few = [*instances(MIN_INSTANCES - 1), dataclasses.replace(unusable, reason="too few points")]
     with pytest.raises(thor2.InputError, match=f"9 usable instances; expected at least {MIN_INSTANCES}"):
-        estimate_transform(few, RUN.network, RUN.config, none_is_known)
+        estimate_transform(few, Criterion(RUN.network, RUN.config, none_is_known))
 
 
 def test_instances_are_spread_evenly() -> None:

@@ -21,6 +21,7 @@ from thor2_jax.explanation import class_scores
 from thor2_jax.explanation.attributions import (
     RELAXATION,
     attribute_points,
+    leave_out,
     path_gradients,
     select_points,
     smooth,
@@ -29,7 +30,6 @@ from thor2_jax.explanation.attributions import (
 from thor2_jax.explanation.changes import apply_change, changed_instance, smallest_change
 from thor2_jax.explanation.class_scores import ClassScores, classifier_scores, gallery_scores
 from thor2_jax.explanation.explain import Explanation, explain, pixel_attributions
-from thor2_jax.explanation.leave_out import leave_out
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances, prepare_instance
 from thor2_jax.model.confidence import Calibration
 from thor2_jax.model.run_directory import TrainedRun

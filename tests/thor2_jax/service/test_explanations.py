@@ -19,9 +19,9 @@ from thor2_jax.model.confidence import Calibration
 from thor2_jax.model.inference import Inference
 from thor2_jax.service.answers import explained_frame
 from thor2_jax.service.engine import CloudResult, InferenceEngine
-from thor2_jax.service.preparation import PreparedRequest, prepare_frame
+from thor2_jax.service.preparation import MAX_LABEL_RUNS, PreparedRequest, prepare_frame
 from thor2_jax.service.schemas import LabelMap
-from thor2_jax.service.settings import MAX_EXPLAINED, MAX_LABEL_RUNS, Settings
+from thor2_jax.service.settings import MAX_EXPLAINED, Settings
 
 Files = dict[str, bytes]
 

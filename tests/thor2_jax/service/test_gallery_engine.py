@@ -31,7 +31,7 @@ def test_the_engine_answers_as_the_recognizer(
     recognizer.enroll("tall", [(frame, 200)])
     recognizer.enroll("wide", [(frame, 7)])
     engine = InferenceEngine(Settings(tmp_path / "run", max_batch=8))
-    assert engine.classes == (*trained, "tall", "wide")
+    assert engine.model.names == (*trained, "tall", "wide")
     instances = [prepare_instance(frame, label, engine.run.config.sigma_s) for label in frame.instances]
     results = engine.infer([instance for instance in instances if instance.reason is None])
     answers = engine.recognize(instances, results)
@@ -50,7 +50,7 @@ def test_an_embedding_alone_answers(calibration: Calibration | None, frame: thor
     run = untrained_embedding_run(("a", "b", "c"), config=dataclasses.replace(SMALL_CONFIG, looks=2), record=record)
     save_run(run, tmp_path / "run")
     engine = InferenceEngine(Settings(tmp_path / "run", max_batch=8))
-    assert engine.classes == ("a", "b", "c") and engine.classifiers == ("embedding",)
+    assert engine.model.names == ("a", "b", "c") and tuple(engine.model.classifiers) == ("embedding",)
     instances = [prepare_instance(frame, label, engine.run.config.sigma_s) for label in frame.instances]
     results = engine.infer([instance for instance in instances if instance.reason is None])
     recognizer = thor2.Recognizer.load(tmp_path / "run")

@@ -179,7 +179,7 @@ def test_another_process_sees_a_change_and_is_seen(
     other = InferenceEngine(Settings(teaching_run, max_batch=8, gallery=gallery, teach=True))
     enroll(http, files, "tall")
     other.refresh()
-    assert other.classes == ("a", "b", "tall")
+    assert other.model.names == ("a", "b", "tall")
     library = thor2.Recognizer.load(teaching_run, gallery=gallery)
     library.enroll("wide", [(frame, 7)])
     assert recognized(http, files)[2:] == ["wide", "tall"]
