@@ -76,6 +76,12 @@ def test_a_missing_gallery_is_empty(tmp_path: Path) -> None:
     assert gallery_stamp(tmp_path / "none") is None and list(tmp_path.iterdir()) == []
 
 
+def test_a_file_is_no_gallery(tmp_path: Path) -> None:
+    (tmp_path / "gallery").write_text("mine")
+    with pytest.raises(GalleryError, match="is a file"):
+        load_gallery(tmp_path / "gallery")
+
+
 def test_forgetting_restores_the_gallery_and_removes_the_file(directory: Path) -> None:
     before, stamp = content(directory), gallery_stamp(directory)
     update_gallery(directory, add("new", 5), FINGERPRINT)
