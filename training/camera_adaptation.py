@@ -7,8 +7,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from thor2_jax.adaptation.estimate import Adaptation, Report
-from thor2_jax.errors import with_context
-from thor2_jax.files import check_output_directory, temporary_directory
+from thor2_jax.errors import InputError, with_context
+from thor2_jax.files import check_output_directory, read_file, temporary_directory
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.model.run_record import RUN_FILE
 from thor2_jax.recognizer import Recognizer
@@ -48,21 +48,32 @@ def adapt_run(model: Path, sources: Sequence[FrameSource], out: Path, report: Re
     return adaptation
 
 
+def _copy(source: str, target: str) -> None:
+    Path(target).write_bytes(read_file(source))
+
+
 def write_adapted_run(model: Path, adaptation: Adaptation, out: Path) -> None:
     """Copy a run directory and store a colour transform in the copy's record.
 
     The copy appears under its name when it is complete.
 
     Raises:
-        InputError: `out` is not empty.
-        OSError: a file cannot be read or written; nothing is left behind.
+        InputError: `out` is not empty, or a file of the run cannot be read.
+        OSError: a file cannot be written; nothing is left behind.
     """
     check_output_directory(out)
     out = out.resolve()
     out.parent.mkdir(parents=True, exist_ok=True)
     with temporary_directory(out.parent) as unfinished:
         run = unfinished / "run"
-        shutil.copytree(model, run, ignore=shutil.ignore_patterns(*UNFINISHED))
+        try:
+            shutil.copytree(model, run, ignore=shutil.ignore_patterns(*UNFINISHED), copy_function=_copy)
+        except shutil.Error as error:
+            source, _, reason = error.args[0][0]
+            raise InputError(
+                f"model: {source} cannot be copied ({reason}); expected a readable run directory"
+            ) from None
+        run.chmod(0o755)  # that of a read-only run could not be renamed
         description = json.loads((run / RUN_FILE).read_bytes())
         description["record"] |= {
             "color_transform": dataclasses.asdict(adaptation.transform),
