@@ -5,10 +5,11 @@ import errno
 import io
 import os
 import shutil
+import stat
 import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,9 @@ __all__ = [
     "atomic_write",
     "check_replaceable",
     "errors_name",
+    "open_file",
     "read_arrays",
+    "read_file",
     "remove_leftovers",
     "temporary_directory",
     "write_arrays",
@@ -42,6 +45,21 @@ def errors_name(path: str | Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise OSError(error.errno, error.strerror or str(error), str(path)) from None
+
+
+def open_file(path: str | Path) -> BinaryIO:
+    """Open a file to read; raise OSError also for a device, pipe or socket: reading it may never end."""
+    stream = open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))
+    if not stat.S_ISREG(os.fstat(stream.fileno()).st_mode):
+        stream.close()
+        raise OSError(errno.EINVAL, "a device, pipe or socket; expected a file", str(path))
+    return stream
+
+
+def read_file(path: str | Path) -> bytes:
+    """Return the content of a file; raise OSError as `open_file`."""
+    with open_file(path) as stream:
+        return stream.read()
 
 
 def check_replaceable(path: Path) -> None:
@@ -115,7 +133,7 @@ def read_arrays(path: str | Path) -> dict[str, NDArray[Any]]:
         OSError: the file cannot be read.
         ValueError: the file is damaged or is not a file of arrays.
     """
-    data = Path(path).read_bytes()
+    data = read_file(path)
     try:
         with np.load(io.BytesIO(data), allow_pickle=False) as archive:
             if sum(member.file_size for member in archive.zip.infolist()) > MAX_ARRAY_BYTES:

@@ -11,7 +11,15 @@ from collections.abc import Callable, Collection, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-from colornet.files import atomic_write, check_replaceable, errors_name, remove_leftovers, temporary_directory
+from colornet.files import (
+    atomic_write,
+    check_replaceable,
+    errors_name,
+    open_file,
+    read_file,
+    remove_leftovers,
+    temporary_directory,
+)
 from thor2_jax.errors import InputError
 
 __all__ = [
@@ -25,6 +33,8 @@ __all__ = [
     "file_digest",
     "has_json",
     "json_digest",
+    "open_file",
+    "read_file",
     "remove_leftovers",
     "remove_written",
     "temporary_directory",
@@ -94,7 +104,7 @@ def check_output_file(name: str, path: Path | None, is_own: Callable[[Path], boo
 def has_json(path: Path, keys: Collection[str]) -> bool:
     """Return whether a file is JSON: an object with these keys, or a list of such objects."""
     try:
-        content = json.loads(path.read_bytes())
+        content = json.loads(read_file(path))
     except (OSError, ValueError, RecursionError):
         return False
     rows = content if isinstance(content, list) else [content]

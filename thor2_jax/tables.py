@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from thor2_jax.errors import InputError
+from thor2_jax.files import read_file
 
 __all__ = ["parse_json", "parse_yaml", "read_table"]
 
@@ -67,7 +68,7 @@ def read_table(path: Path) -> dict[Any, Any]:
         InputError: if the file is damaged or holds something else; the message names the file.
         OSError: if the file cannot be opened.
     """
-    content = path.read_bytes()
+    content = read_file(path)
     try:
         table = parse_json(content) if path.suffix.lower() == ".json" else parse_yaml(content)
     except ValueError as error:

@@ -7,8 +7,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from thor2_jax.adaptation.estimate import Adaptation, Report
-from thor2_jax.errors import with_context
-from thor2_jax.files import check_output_directory, temporary_directory
+from thor2_jax.errors import InputError, with_context
+from thor2_jax.files import check_output_directory, read_file, temporary_directory
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.model.run_record import RUN_FILE
 from thor2_jax.recognizer import Recognizer
@@ -51,7 +51,14 @@ def adapt_run(model: Path, sources: Sequence[FrameSource], out: Path, report: Re
     out.parent.mkdir(parents=True, exist_ok=True)
     with temporary_directory(out.parent) as unfinished:
         run = unfinished / "run"
-        shutil.copytree(model, run, ignore=shutil.ignore_patterns(*UNFINISHED))
+        try:
+            shutil.copytree(model, run, ignore=shutil.ignore_patterns(*UNFINISHED), copy_function=_copy)
+        except shutil.Error as error:
+            source, _, reason = error.args[0][0]
+            raise InputError(
+                f"model: {source} cannot be copied ({reason}); expected a readable run directory"
+            ) from None
+        run.chmod(0o755)  # that of a read-only run could not be renamed
         description = json.loads((run / RUN_FILE).read_bytes())
         description["record"] |= {
             "color_transform": dataclasses.asdict(adaptation.transform),
@@ -60,3 +67,7 @@ def adapt_run(model: Path, sources: Sequence[FrameSource], out: Path, report: Re
         (run / RUN_FILE).write_text(json.dumps(description, indent=2) + "\n")
         run.rename(out)
     return adaptation
+
+
+def _copy(source: str, target: str) -> None:
+    Path(target).write_bytes(read_file(source))

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import colornet
-from colornet.files import MAX_ARRAY_BYTES, read_arrays, write_arrays
+from colornet.files import MAX_ARRAY_BYTES, read_arrays, read_file, write_arrays
 
 # Changes with the contents of the network, and with nothing else.
 FINGERPRINT = "96981396ff3bc1ce0b440c5b781da4d2a5784b271f72967140e5b4b1bb6c593c"
@@ -184,6 +184,14 @@ def test_pipes_and_devices_are_not_replaced(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="pipe"):
         write_arrays(tmp_path / "pipe", {"a": np.zeros(1)})
     assert (tmp_path / "pipe").is_fifo() and len(os.listdir(tmp_path)) == 1
+
+
+def test_pipes_and_devices_are_not_read(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "link").symlink_to("/dev/zero")
+    for name in ("pipe", "link"):
+        with pytest.raises(OSError, match=name):
+            read_file(tmp_path / name)
 
 
 def test_saving_to_a_missing_directory_is_an_error(network: colornet.ColorNetwork, tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageFile
 
 from thor2_jax.errors import InputError
+from thor2_jax.files import open_file
 
 __all__ = ["MAX_IMAGE_PIXELS", "has_16_bit_channels", "read_depth", "read_image", "read_npy"]
 
@@ -50,7 +51,7 @@ def read_image(path: str | Path, argument: str, lossless: bool = False) -> tuple
         OSError: the file cannot be opened.
     """
     expected = "PNG or TIFF without JPEG compression" if lossless else ", ".join(IMAGE_FORMATS)
-    with open(path, "rb") as stream, _damage_named(f"{argument}: {path} is damaged or no image", expected):
+    with open_file(path) as stream, _damage_named(f"{argument}: {path} is damaged or no image", expected):
         with Image.open(stream, formats=IMAGE_FORMATS) as image:
             if image.width * image.height > MAX_IMAGE_PIXELS:
                 raise ValueError(f"{image.width} x {image.height} pixels; expected at most {MAX_IMAGE_PIXELS}")
@@ -78,7 +79,7 @@ def read_depth(path: str | Path) -> NDArray[Any]:
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix == ".npy":
-        with open(path, "rb") as stream, _damage_named(f"depth: {path} is a damaged NPY file", _EXPECTED):
+        with open_file(path) as stream, _damage_named(f"depth: {path} is a damaged NPY file", _EXPECTED):
             pixels = read_npy(stream, 8 * MAX_IMAGE_PIXELS)
     else:
         pixels = _read_exr(path) if suffix == ".exr" else read_image(path, "depth")[0]
@@ -116,7 +117,7 @@ def read_npy(stream: BinaryIO, max_bytes: int) -> NDArray[Any]:
 
 def _read_exr(path: Path) -> NDArray[Any]:
     """Read the depth channel of an EXR file."""
-    with open(path, "rb"):  # an OSError if it cannot be opened: OpenEXR raises others
+    with open_file(path):  # an OSError if it cannot be opened: OpenEXR raises others
         pass
     try:
         import OpenEXR

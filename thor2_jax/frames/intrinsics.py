@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from thor2_jax.errors import InputError, with_context
+from thor2_jax.files import read_file
 from thor2_jax.tables import parse_json, parse_yaml
 
 __all__ = ["DEFAULT_DEPTH_SCALE", "Intrinsics", "parse_intrinsics", "read_intrinsics"]
@@ -358,6 +359,6 @@ def read_intrinsics(path: str | Path, image: int | None = None) -> Intrinsics:
         InputError: as `parse_intrinsics`; names the file.
         OSError: the file cannot be opened.
     """
-    content = Path(path).read_bytes()
+    content = read_file(path)
     with with_context(str(path)):
         return parse_intrinsics(content, image)

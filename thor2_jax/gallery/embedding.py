@@ -29,7 +29,7 @@ from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
 from thor2_jax.descriptor.cloud_statistics import N_BALANCED, N_SCALARS, is_color, square_root
 from thor2_jax.descriptor.looks import LookDescriptors, describe_looks
 from thor2_jax.errors import InputError
-from thor2_jax.files import atomic_write, content_digest, safetensors_metadata
+from thor2_jax.files import atomic_write, content_digest, read_file, safetensors_metadata
 from thor2_jax.gallery.references import REFERENCES_FILE, References
 from thor2_jax.model.classifier import model_arrays, model_from_arrays
 from thor2_jax.types import Descriptors, PointClouds
@@ -369,7 +369,7 @@ class Embedding:
         """
         path, network = Path(path), network or colornet.load_default()
         try:
-            content = path.read_bytes()
+            content = read_file(path)
             about = json.loads(safetensors_metadata(content)[_METADATA])
             arrays = {name: array.astype(np.float32) for name, array in safetensors.numpy.load(content).items()}
             count = int(about.get("further", 0))

@@ -216,8 +216,8 @@ class ObjectGallery:
             known = self._found(gallery, name) or name
             return gallery.without(known, hide=known in self._trained and known not in gallery.hidden)
 
-        if self.directory is not None and not self.directory.exists():
-            change(self.gallery)  # a name that is refused leaves no directory behind
+        if self.directory is not None and gallery_stamp(self.directory) is None:
+            change(self.gallery)  # a name that is refused leaves nothing behind
         self._change(change, self.embedding.fingerprint)
 
     def undo(self, generation: int) -> None:

@@ -25,7 +25,7 @@ import safetensors
 import safetensors.numpy
 
 from thor2_jax.errors import InputError
-from thor2_jax.files import atomic_write, content_digest, remove_leftovers, safetensors_metadata, write_text
+from thor2_jax.files import atomic_write, content_digest, read_file, remove_leftovers, safetensors_metadata, write_text
 from thor2_jax.gallery.clouds import CompactClouds
 from thor2_jax.gallery.gallery import Gallery, GalleryObject
 
@@ -97,7 +97,9 @@ def gallery_stamp(directory: Path) -> tuple[int, int, int] | None:
 
 
 def check_index(directory: Path) -> None:
-    """Raise GalleryError if a directory has objects, but no index; the message says how to rebuild it."""
+    """Raise GalleryError for a file, and for a directory that has objects, but no index: says how to rebuild it."""
+    if directory.exists() and not directory.is_dir():
+        raise GalleryError(f"gallery: {directory} is a file; expected the directory of a gallery; choose another one")
     if gallery_stamp(directory) is None and any(_own_objects(directory)):
         raise GalleryError(
             f"gallery: {directory} has objects, but no {INDEX_FILE}; restore it from a copy, or rebuild it: "
@@ -140,7 +142,7 @@ class _Replaced(Exception):
 
 def _read_index(path: Path) -> dict[str, Any] | None:
     try:
-        index = json.loads(path.read_bytes())
+        index = json.loads(read_file(path))
         fields = {"format": int, "generation": int, "embedding": str, "objects": list, "hidden": list}
         if not all(isinstance(index[field], kind) for field, kind in fields.items()):
             raise TypeError("a field has another type")
@@ -200,7 +202,7 @@ def _object_content(name: str, views: GalleryObject) -> bytes:
 def _read_object(path: Path) -> tuple[str | None, GalleryObject]:
     """Return the name of an object, which files of version 0.2 and before do not have, and the object."""
     try:
-        content = path.read_bytes()
+        content = read_file(path)
     except FileNotFoundError:
         raise _Replaced from None
     except OSError as error:

@@ -32,7 +32,7 @@ from flax import nnx
 import colornet
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
 from thor2_jax.errors import InputError
-from thor2_jax.files import atomic_directory, check_output_directory, content_digest
+from thor2_jax.files import atomic_directory, check_output_directory, content_digest, read_file
 from thor2_jax.gallery.embedding import Embedding
 from thor2_jax.gallery.references import REFERENCES_FILE
 from thor2_jax.model.classifier import MLP, Classifier, Feature, check_features, model_arrays, model_from_arrays
@@ -164,7 +164,7 @@ def weights_file(run: Path, name: str) -> Path:
 
 def _load_classifier(path: Path, n_inputs: int, n_classes: int, digest: str) -> MLP:
     try:
-        content = path.read_bytes()
+        content = read_file(path)
     except FileNotFoundError:
         raise InputError(f"model: {path} is missing; copy the whole run directory") from None
     except OSError as error:

@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 
 from thor2_jax.config import DESCRIPTOR_VERSION
 from thor2_jax.errors import InputError
+from thor2_jax.files import read_file
 
 __all__ = ["RUN_FILE", "RUN_FORMAT", "read_description", "stored_value"]
 
@@ -26,7 +27,7 @@ def read_description(path: Path) -> dict[str, Any]:
         InputError: the path is not a run directory, or its format or descriptor version is another one.
     """
     try:
-        description = json.loads((path / RUN_FILE).read_text())
+        description = json.loads(read_file(path / RUN_FILE))
     except FileNotFoundError:
         raise InputError(f"model: {path} is not a run directory; expected one with run.json") from None
     except (OSError, ValueError, RecursionError) as error:

@@ -9,6 +9,8 @@ import os
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from thor2_jax.files import open_file
+
 __all__ = ["CompleteRecords", "is_truncated"]
 
 _MAGIC = b"\x89MCAP0\r\n"
@@ -20,7 +22,7 @@ _TAIL = bytes([_FOOTER]) + (20).to_bytes(8, "little") + bytes(20) + _MAGIC
 
 def is_truncated(path: Path) -> bool:
     """Return whether a file begins as MCAP and does not end so; raises OSError."""
-    with path.open("rb") as stream:
+    with open_file(path) as stream:
         if stream.read(len(_MAGIC)) != _MAGIC:
             return False
         stream.seek(-len(_MAGIC), os.SEEK_END)

@@ -11,6 +11,7 @@ from PIL import Image
 from trimesh.visual.material import PBRMaterial, SimpleMaterial, empty_material
 
 from thor2_jax.errors import InputError, with_context
+from thor2_jax.files import read_file
 from thor2_jax.frames.image_files import MAX_IMAGE_PIXELS
 from thor2_jax.printable import check_name
 from thor2_jax.tables import parse_json, parse_yaml
@@ -318,7 +319,7 @@ def read_names(path: str | Path) -> dict[str, str]:
     if suffix not in (".json", ".yaml", ".yml"):
         raise InputError(f"names file {path}: the extension must be .json, .yaml or .yml")
     try:
-        content = path.read_bytes()
+        content = read_file(path)
         table = parse_json(content) if suffix == ".json" else parse_yaml(content)
     except OSError as error:
         raise InputError(f"names file {path}: {error.strerror}") from error

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
+from thor2_jax.files import read_file
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, read_frame
 from thor2_jax.segmentation.segmenters import Segmenter, segmented
 from training.readers.bop import BOP
@@ -185,7 +186,7 @@ def read_poses(path: Path, names: Sequence[str]) -> list[NDArray[np.float64]]:
     from thor2_jax.tracking.poses import check_pose  # imports SciPy
 
     try:
-        stored = json.loads(path.read_bytes())
+        stored = json.loads(read_file(path))
     except (ValueError, RecursionError):
         stored = None
     if not isinstance(stored, (dict, list)):

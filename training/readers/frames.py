@@ -8,6 +8,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from thor2_jax.errors import InputError, with_context
+from thor2_jax.files import read_file
 from training.readers.frame_files import FILE_NAMES, FrameFiles, FrameSource, find_frames
 from training.readers.labelled import LabelledFrame, LabelledFrames
 
@@ -91,7 +92,7 @@ def _listed(labels: Iterable[int]) -> str:
 def read_names(path: Path) -> dict[int, str]:
     """Read `labels.json`: label -> name of the object; raises InputError and OSError."""
     try:
-        entries = [(int(label), name) for label, name in json.loads(path.read_bytes())["labels"].items()]
+        entries = [(int(label), name) for label, name in json.loads(read_file(path))["labels"].items()]
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         raise InputError(f'{path} is invalid; expected {{"labels": {{"<number>": "<name>", ...}}}}') from None
     truth: dict[int, str] = {}

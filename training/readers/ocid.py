@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError, with_context
+from thor2_jax.files import read_file
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, read_color, read_depth, read_labels
 from thor2_jax.tables import parse_json, read_table
 from training.readers.labelled import LabelledFrame, LabelledFrames, path_ends
@@ -105,7 +106,7 @@ def _read_names(path: Path) -> dict[Any, Any] | list[Any]:
     if path.suffix.lower() != ".json":
         return read_table(path)
     try:
-        value = parse_json(path.read_bytes())
+        value = parse_json(read_file(path))
     except ValueError as error:
         raise InputError(f"{path} is damaged ({error})") from None
     if not isinstance(value, (dict, list)):
@@ -233,7 +234,7 @@ def read_organized_points(path: str | Path) -> NDArray[np.float64]:
         OSError: the file cannot be opened.
     """
     path = Path(path)
-    content = path.read_bytes()
+    content = read_file(path)
     header, start = _header(content, path)
     try:
         fields = header["FIELDS"]

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from thor2_jax.errors import InputError, with_context
+from thor2_jax.files import read_file
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, read_color, read_depth, read_labels
 from thor2_jax.tables import parse_yaml
 from training.readers.labelled import LabelledFrame, LabelledFrames
@@ -103,7 +104,7 @@ def _stem(color: Path) -> str:
 
 def _truth(path: Path) -> dict[int, str]:
     try:
-        objects = parse_yaml(path.read_bytes())
+        objects = parse_yaml(read_file(path))
         entries = [(entry["label"], name) for name, entry in objects.items() if name not in NOT_SCORED]
     except (KeyError, TypeError, AttributeError, ValueError):
         raise InputError(f"{path} does not hold <name>: {{label: <number>, ...}}") from None

@@ -32,7 +32,7 @@ import safetensors.numpy
 
 from thor2_jax.config import DESCRIPTOR_VERSION
 from thor2_jax.errors import InputError
-from thor2_jax.files import remove_written, write_text
+from thor2_jax.files import read_file, remove_written, write_text
 from training.views.crops import CROPS, ViewCrops, read_crops
 from training.views.normalized_views import COORDINATE_STEP, NormalizedViews
 
@@ -45,7 +45,7 @@ MANIFEST = "manifest.json"
 def remove_views(directory: Path) -> None:
     """Remove a dataset of views and their crops; files that `thor2 render` has not written stay."""
     with contextlib.suppress(OSError, InputError):
-        Manifest.parse((directory / MANIFEST).read_bytes(), directory / MANIFEST)
+        Manifest.parse(read_file(directory / MANIFEST), directory / MANIFEST)
         names = r"(manifest\.json|\.lock|[0-9]{4,}-[0-9]{4,}\.(safetensors|npz))"
         remove_written(directory, rf"({CROPS}/)?{names}")
 
@@ -92,7 +92,7 @@ class Shard:
         """
         path = directory / self.file
         try:
-            content = path.read_bytes()
+            content = read_file(path)
         except OSError as error:
             raise InputError(
                 f"dataset: {path} cannot be read ({error.strerror}); repeat `thor2 render` to restore it"
@@ -203,7 +203,7 @@ class ViewDataset:
         if not directory.is_dir():
             raise InputError(f"dataset: {directory} is not a directory; expected the output of `thor2 render`")
         try:
-            content = (directory / MANIFEST).read_bytes()
+            content = read_file(directory / MANIFEST)
         except OSError as error:
             raise InputError(
                 f"dataset: {directory / MANIFEST} cannot be read ({error.strerror}); expected output of `thor2 render`"

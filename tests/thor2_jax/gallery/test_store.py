@@ -20,7 +20,7 @@ from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery import store
 from thor2_jax.gallery.clouds import CompactClouds
 from thor2_jax.gallery.gallery import Gallery, GalleryObject
-from thor2_jax.gallery.store import GalleryError, gallery_stamp, load_gallery, undo_change, update_gallery
+from thor2_jax.gallery.store import GalleryError, check_index, gallery_stamp, load_gallery, undo_change, update_gallery
 
 FINGERPRINT = "f" * 64
 
@@ -74,6 +74,12 @@ def test_what_is_loaded_is_what_was_stored(directory: Path) -> None:
 def test_a_missing_gallery_is_empty(tmp_path: Path) -> None:
     assert load_gallery(tmp_path / "none", FINGERPRINT).gallery.names == ()
     assert gallery_stamp(tmp_path / "none") is None and list(tmp_path.iterdir()) == []
+
+
+def test_a_file_is_no_gallery(tmp_path: Path) -> None:
+    (tmp_path / "gallery").write_text("mine")
+    with pytest.raises(GalleryError, match="is a file"):
+        check_index(tmp_path / "gallery")
 
 
 def test_forgetting_restores_the_gallery_and_removes_the_file(directory: Path) -> None:

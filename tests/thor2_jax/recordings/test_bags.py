@@ -1,5 +1,6 @@
 """Recordings of ROS 1, ROS 2 and MCAP."""
 
+import os
 import sys
 from pathlib import Path
 from typing import Any
@@ -130,6 +131,15 @@ def test_damaged_recordings(tmp_path: Path, name: str, kept: float) -> None:
         assert str(path) in str(error) and "\n" not in str(error)
     else:
         assert kept == 1, "a truncated recording was read without an error"
+
+
+@pytest.mark.parametrize("name", ["a.bag", "a.db3", "a.mcap", "folder/folder.db3"])
+def test_pipes_are_refused(tmp_path: Path, name: str) -> None:
+    write_recording(tmp_path / "folder", FRAMES[:1])
+    (tmp_path / name).unlink(missing_ok=True)
+    os.mkfifo(tmp_path / name)
+    with pytest.raises(OSError, match="pipe"):
+        Bag(tmp_path / name.removesuffix("/folder.db3")).__enter__()
 
 
 @pytest.mark.parametrize(

@@ -8,10 +8,13 @@ import numpy as np
 import pytest
 from helpers import SMALL_CONFIG, json_lines, run_thor2, untrained_embedding_run, untrained_run, write_frame
 
+from thor2_jax.adaptation.color_transform import ColorTransform
+from thor2_jax.adaptation.estimate import Adaptation
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import read_frame
 from thor2_jax.model.run_directory import load_run, save_run
 from thor2_jax.recognizer import Recognizer
+from training.camera_adaptation import write_adapted_run
 from training.evaluation.runs import load_runs
 
 OBJECTS = {1: "brick", 2: "book", 3: "leaf"}
@@ -127,3 +130,12 @@ def test_bad_input_writes_nothing(model: Path, video: Path, tmp_path: Path, capf
     assert run_thor2("adapt", "--model", model, video, "--out", model) == 2
     assert "already contains" in capfd.readouterr().err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["few", "unlabelled"]
+
+
+def test_a_device_in_a_run_is_not_copied(tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "metrics.jsonl").symlink_to("/dev/zero")
+    adaptation = Adaptation(ColorTransform(), 12, 0.5, 0.4)
+    with pytest.raises(InputError, match="metrics"):
+        write_adapted_run(tmp_path / "run", adaptation, tmp_path / "out")
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
