@@ -80,7 +80,7 @@ class RayCaster:
 
 
 def pixel_rays(intrinsics: Intrinsics, height: int, width: int, pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return rays through the pixels [height * width, 3] float64 of a camera with this pose [4, 4], in its object frame.
+    """Return rays through the pixels [height * width, 3] float64, object frame, of a camera with this pose [4, 4].
 
     Along the optical axis their length is 1, so that hit distances are depths.
     """
