@@ -14,7 +14,7 @@ from thor2_jax.model.run_record import RUN_FILE
 from thor2_jax.recognizer import Recognizer
 from training.readers.frame_files import FrameSource
 
-__all__ = ["adapt_run"]
+__all__ = ["adapt_run", "write_adapted_run"]
 
 UNFINISHED = ("checkpoints", "views", ".*")
 """Names in a run directory that are not copied."""
@@ -46,7 +46,20 @@ def adapt_run(model: Path, sources: Sequence[FrameSource], out: Path, report: Re
             yield frame
 
     adaptation = recognizer.adapt(frames(), report)
-    check_output_directory(out)  # another process may have been quicker
+    write_adapted_run(model, adaptation, out)
+    return adaptation
+
+
+def write_adapted_run(model: Path, adaptation: Adaptation, out: Path) -> None:
+    """Copy a run directory and store a colour transform in the copy's record.
+
+    The copy appears under its name when it is complete.
+
+    Raises:
+        InputError: `out` is not empty, or a file of the run cannot be read.
+        OSError: a file cannot be written; nothing is left behind.
+    """
+    check_output_directory(out)
     out = out.resolve()
     out.parent.mkdir(parents=True, exist_ok=True)
     with temporary_directory(out.parent) as unfinished:
@@ -66,7 +79,6 @@ def adapt_run(model: Path, sources: Sequence[FrameSource], out: Path, report: Re
         }
         (run / RUN_FILE).write_text(json.dumps(description, indent=2) + "\n")
         run.rename(out)
-    return adaptation
 
 
 def _copy(source: str, target: str) -> None:
