@@ -1,6 +1,7 @@
 """Helpers of several test files: untrained runs, small clouds and images, the command line, programs, HTML pages."""
 
 import dataclasses
+import functools
 import io
 import json
 import os
@@ -47,10 +48,16 @@ def untrained_run(
     """Return a run whose classifiers have random weights, other ones for each feature."""
     network = colornet.load_default()
     classifiers = {
-        name: MLP(input_size(name, config, network.n_regions), len(classes), rngs=nnx.Rngs(seed + k))
+        name: random_classifier(input_size(name, config, network.n_regions), len(classes), seed + k)
         for k, name in enumerate(features)
     }
     return TrainedRun(config, network, tuple(classes), classifiers, record or {})
+
+
+@functools.cache
+def random_classifier(n_inputs: int, n_classes: int, seed: int) -> MLP:
+    """Return a classifier with random weights."""
+    return MLP(n_inputs, n_classes, rngs=nnx.Rngs(seed))
 
 
 def untrained_embedding_run(

@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers import untrained_run
+from matplotlib.figure import Figure
+from PIL import Image
 
 import colornet
 import thor2_jax as thor2
-from colornet import draw
 from colornet.draw import draw_similarity
 from thor2_jax.files import write_text
 from thor2_jax.frames.overlay import draw_overlay
@@ -43,7 +44,7 @@ WRITERS: dict[str, Callable[[Path], Any]] = {
 def test_files_are_written_atomically(
     name: str, number: int, tmp_path: Path, disk: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(draw, "_DPI", 30)
+    monkeypatch.setattr(Figure, "savefig", lambda _, file, **options: Image.fromarray(PHOTO).save(file, "PNG"))
     path = tmp_path / name
     path.write_bytes(b"old")
     for step in range(1, 100) if number == errno.ENOSPC else (1, 2, 99):

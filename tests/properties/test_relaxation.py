@@ -18,6 +18,7 @@ from thor2_jax.descriptor.relaxation import hyab, interval_log_weights, soft_reg
 NETWORK = colornet.load_default()
 HARD = thor2.DescriptorConfig(homology="closed_form")
 SETS = region_sets(NETWORK)
+shares_of = jax.jit(lambda colors, temperature: soft_regions(colors, SETS, temperature))
 
 
 def relaxed(factor: float) -> thor2.DescriptorConfig:
@@ -66,25 +67,27 @@ def test_lab_and_hyab_against_colour_science() -> None:
     rng = np.random.default_rng(0)
     rgb = np.concatenate([rng.integers(0, 256, (2000, 3)), np.repeat(np.arange(256)[:, None], 3, axis=1)])
     expected = exact_lab(rgb, GRID_WHITE)
-    lab = to_lab(jnp.asarray(rgb / 255, jnp.float32))
+    lab = np.asarray(jax.jit(to_lab)(np.asarray(rgb / 255, np.float32)))
     np.testing.assert_allclose(lab, expected, atol=2e-4)
-    np.testing.assert_allclose(hyab(lab, lab[::-1]), exact_hyab(expected, expected[::-1]), atol=1e-3)
+    np.testing.assert_allclose(jax.jit(hyab)(lab, lab[::-1]), exact_hyab(expected, expected[::-1]), atol=1e-3)
 
 
 def test_cold_colours_are_in_the_hard_regions() -> None:
     """Includes colours with another grid colour nearer by HyAB, and the ends of the channels."""
     rgb = np.random.default_rng(0).integers(0, 256, (4000, 3), dtype=np.uint8)
     rgb[:1000] = np.random.default_rng(1).choice([0, 1, 2, 253, 254, 255], (1000, 3))
-    colors = jnp.asarray(rgb / 255, jnp.float32)
+    colors = np.asarray(rgb / 255, np.float32)
     for temperature in (0.05, 0.001, 1e-6):
-        np.testing.assert_allclose(soft_regions(colors, SETS, temperature), NETWORK.membership(rgb), atol=1e-5)
+        np.testing.assert_allclose(shares_of(colors, temperature), NETWORK.membership(rgb), atol=1e-5)
 
 
 def test_warm_colours_are_shared_by_the_softmax() -> None:
     """Compare grid colours with a loop in float64 over their 27 neighbours."""
     temperature, reach = 4.0, 0.5 + 4 / 5
     ends = np.random.default_rng(0).choice([0, 5, 10, 245, 250, 255], (12, 3)).tolist()
-    for rgb in ([120, 35, 200], [0, 255, 5], [0, 0, 0], *ends):
+    colors = [[120, 35, 200], [0, 255, 5], [0, 0, 0], *ends]
+    shares = shares_of(np.array(colors, np.float32) / np.float32(255), temperature)
+    for rgb, weights in zip(colors, shares, strict=True):
         total, expected = 0.0, np.zeros(NETWORK.n_regions)
         for offset in np.ndindex(3, 3, 3):
             steps = np.array(offset) - 1
@@ -94,14 +97,13 @@ def test_warm_colours_are_shared_by_the_softmax() -> None:
                 share = np.exp(-float(distance) / temperature) * np.prod((1 - (steps / reach) ** 2) ** 2)
                 total += share
                 expected += share * NETWORK.membership(other.astype(np.uint8))
-        weights = soft_regions(jnp.asarray([rgb], jnp.float32) / 255, SETS, temperature)[0]
         np.testing.assert_allclose(weights, expected / total, atol=1e-5)
 
 
 @pytest.mark.parametrize("temperature", [0.3, 2.0, 30.0])
 def test_regions_change_without_a_jump_along_a_path_of_colours(temperature: float) -> None:
-    path = jnp.linspace(0, 1, 40_001)[:, None] * jnp.array([1.1, 0.7, -0.8]) + jnp.array([-0.05, 0.1, 0.9])
-    weights = np.asarray(jax.jit(lambda colors: soft_regions(colors, SETS, temperature))(path))
+    path = np.linspace(0, 1, 40_001)[:, None] * [1.1, 0.7, -0.8] + [-0.05, 0.1, 0.9]
+    weights = np.asarray(shares_of(path.astype(np.float32), temperature))
     np.testing.assert_allclose(weights.sum(axis=1), 1, atol=1e-5)
     assert 0 < np.abs(np.diff(weights, axis=0)).max() < 0.03
 

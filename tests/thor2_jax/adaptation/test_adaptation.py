@@ -1,6 +1,7 @@
 """The colour transform of a camera, its estimate, and recognizers that use it."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +29,7 @@ from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.model.fusion import FUSION_RULES, FusionRule
 from thor2_jax.recognizer import Recognizer
 
-RUN = untrained_run(("a", "b", "c"))
+run = functools.cache(lambda: untrained_run(("a", "b", "c"), ("tops", "tops2"), seed=1))
 WARM = ColorTransform(gamma=0.2, gain=-0.1, saturation=0.3, warmth=0.1)
 
 
@@ -61,7 +62,7 @@ def test_a_transform_follows_its_formula() -> None:
 @pytest.mark.parametrize("stored", [{"gamma": float("nan")}, {"gain": 9.0}, {"gamma": "x"}, {"hue": 1.0}, [1]])
 def test_a_damaged_transform_is_refused(stored: object) -> None:
     with pytest.raises(thor2.InputError, match="color_transform"):
-        Recognizer(dataclasses.replace(RUN, record={"color_transform": stored}))
+        Recognizer(dataclasses.replace(run(), record={"color_transform": stored}))
 
 
 def test_entropy_counts_what_the_classes_lack() -> None:
@@ -72,7 +73,7 @@ def test_entropy_counts_what_the_classes_lack() -> None:
 
 def test_the_objective_is_the_entropy_of_the_answers() -> None:
     made = instances(11)  # two chunks, one with padding
-    recognizer = Recognizer(RUN)
+    recognizer = Recognizer(run())
     criterion = adaptation_criterion(recognizer.model)
     objective = Objective(made, criterion)
     for transform in (ColorTransform(), WARM):
@@ -97,11 +98,11 @@ def none_is_known(oriented: LookDescriptors) -> jax.Array:
 def test_warm_colors_are_cooled_and_unknown_objects_change_nothing() -> None:
     warm = np.array([150, 110, 90], np.uint8)
     made = [dataclasses.replace(each, colors=np.full_like(each.colors, warm)) for each in instances(40)]
-    adaptation = estimate_transform(made, Criterion(RUN.network, RUN.config, grey_is_known))
+    adaptation = estimate_transform(made, Criterion(run().network, run().config, grey_is_known))
     assert -0.36 < adaptation.transform.warmth < -0.1
     assert adaptation.transform == ColorTransform(warmth=adaptation.transform.warmth)
     assert adaptation.uncertainty_after < adaptation.uncertainty_before and adaptation.instances == 40
-    unchanged = estimate_transform(made, Criterion(RUN.network, RUN.config, none_is_known)).transform
+    unchanged = estimate_transform(made, Criterion(run().network, run().config, none_is_known)).transform
     np.testing.assert_allclose(dataclasses.astuple(unchanged), 0, atol=1e-6)
 
 
@@ -119,7 +120,7 @@ def test_too_few_instances_are_refused_with_their_number() -> None:
     unusable = PreparedInstance(1, *(getattr(instances(1)[0], n)[:0] for n in ("points", "colors", "boundary")))
     few = [*instances(MIN_INSTANCES - 1), dataclasses.replace(unusable, reason="too few points")]
     with pytest.raises(thor2.InputError, match=f"9 usable instances; expected at least {MIN_INSTANCES}"):
-        estimate_transform(few, Criterion(RUN.network, RUN.config, none_is_known))
+        estimate_transform(few, Criterion(run().network, run().config, none_is_known))
 
 
 def test_instances_are_spread_evenly() -> None:
@@ -140,19 +141,19 @@ def frame(seed: int, size: tuple[int, int] = (120, 160)) -> thor2.RGBDFrame:
 
 
 def test_an_adapted_recognizer_sees_corrected_colors() -> None:
-    recognizer = Recognizer(RUN)
+    recognizer = Recognizer(run())
     adaptation = recognizer.adapt([frame(seed) for seed in range(2)])
     assert recognizer.model.color_transform == adaptation.transform != ColorTransform()
     image = frame(7)
     by_hand = dataclasses.replace(image, color=adaptation.transform(image.color))
-    assert recognizer.recognize(image) == Recognizer(RUN).recognize(by_hand)
+    assert recognizer.recognize(image) == Recognizer(run()).recognize(by_hand)
     recognizer.enroll("mug", [(image, 2)])
     stored = next(iter(recognizer.gallery.objects["mug"].clouds.views()))
     np.testing.assert_array_equal(np.unique(stored.colors, axis=0), [by_hand.color[40, 40]])
 
 
 def test_frames_of_another_size_or_too_few_change_nothing() -> None:
-    recognizer = Recognizer(RUN)
+    recognizer = Recognizer(run())
     with pytest.raises(thor2.InputError, match=r"frames\[1\] has 160 x 110 pixels; expected 160 x 120"):
         recognizer.adapt([frame(0), frame(1, (110, 160)), frame(2)])
     with pytest.raises(thor2.InputError, match="5 usable instances"):
@@ -161,7 +162,7 @@ def test_frames_of_another_size_or_too_few_change_nothing() -> None:
 
 
 def test_gallery_answers_are_its_scores() -> None:
-    recognizer = Recognizer(RUN)
+    recognizer = Recognizer(run())
     for name, seed in (("mug", 0), ("bowl", 1)):
         recognizer.enroll(name, [(frame(seed), 2), (frame(seed), 3)])
     embedding = recognizer.objects.embedding
@@ -175,7 +176,7 @@ def test_gallery_answers_are_its_scores() -> None:
 
 @pytest.mark.parametrize("rule", FUSION_RULES)
 def test_the_criterion_obeys_the_fusion_rule(rule: FusionRule) -> None:
-    recognizer = Recognizer(RUN, rule=rule)
+    recognizer = Recognizer(run(), rule=rule)
     network, config, classify = adaptation_criterion(recognizer.model)
     oriented = describe_looks(pack_instances(instances(4), 4), network, config, 2)
     p, q = (
@@ -191,7 +192,7 @@ def test_the_criterion_obeys_the_fusion_rule(rule: FusionRule) -> None:
 
 
 def test_an_embedding_alone_is_the_criterion() -> None:
-    recognizer = Recognizer(untrained_embedding_run(("a", "b", "c"), config=dataclasses.replace(RUN.config, looks=4)))
+    recognizer = Recognizer(untrained_embedding_run(("a", "b", "c"), config=dataclasses.replace(run().config, looks=4)))
     adaptation = recognizer.adapt([frame(seed) for seed in range(2)])
     assert recognizer.model.color_transform == adaptation.transform and adaptation.instances == 10
     network, config, classify = adaptation_criterion(recognizer.model)

@@ -120,13 +120,15 @@ def test_batches_in_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("images", "embeddings", "overflow"):
         np.testing.assert_allclose(getattr(descriptors, name), np.asarray(getattr(expected, name))[order], atol=1e-6)
 
-    def mass(points: jax.Array, clouds: thor2.PointClouds) -> jax.Array:
+    @jax.jit
+    @jax.grad
+    def gradient_of_mass(points: jax.Array, clouds: thor2.PointClouds) -> jax.Array:
         return thor2.describe_aligned(dataclasses.replace(clouds, points=points), NETWORK, config).images.sum()
 
     few = thor2.PointClouds.pack([aligned_cloud(seed, 300) for seed in range(2)], 512)
     many = jax.tree.map(lambda a: a[order], few)
-    gradient = jax.grad(mass)(many.points, many)
-    np.testing.assert_allclose(gradient, np.asarray(jax.grad(mass)(few.points, few))[order], atol=1e-5)
+    gradient = gradient_of_mass(many.points, many)
+    np.testing.assert_allclose(gradient, np.asarray(gradient_of_mass(few.points, few))[order], atol=1e-5)
 
 
 @pytest.mark.parametrize("homology", ["gudhi", "closed_form"])
@@ -138,7 +140,7 @@ def test_inside_a_callers_jit_and_vmap(homology: str) -> None:
     jitted = jax.jit(lambda clouds: thor2.describe_aligned(clouds, network, config))(packed)
     plain = thor2.describe_aligned(packed, network, config)
     pairs = jax.tree.map(lambda a: a.reshape(2, 2, *a.shape[1:]), packed)
-    mapped = jax.vmap(lambda clouds: thor2.describe_aligned(clouds, network, config))(pairs)
+    mapped = jax.jit(jax.vmap(lambda clouds: thor2.describe_aligned(clouds, network, config)))(pairs)
     for descriptors in (jitted, mapped):
         np.testing.assert_allclose(descriptors.tops2.reshape(4, -1), plain.tops2, rtol=1e-6, atol=1e-6)
         np.testing.assert_array_equal(descriptors.overflow.reshape(4), plain.overflow)

@@ -97,7 +97,7 @@ def strips_of(n_clouds: int) -> thor2.Strips:
 @pytest.mark.parametrize("n_clouds", [0, 1, 5])
 def test_with_and_without_jit_and_vmap(n_clouds: int) -> None:
     strips = strips_of(n_clouds)
-    expected = diagrams_of_strips(strips, CLOSED)
+    expected = jax.jit(diagrams_of_strips, static_argnums=1)(strips, CLOSED)
     for config in (GUDHI, CLOSED):
         plain = partial(diagrams_of_strips, config=config)
         functions = [plain, jax.jit(plain), jax.jit(jax.vmap(plain)), jax.jit(jax.vmap(jax.vmap(plain)))]

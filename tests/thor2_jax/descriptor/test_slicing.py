@@ -3,7 +3,6 @@
 import dataclasses
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import aligned_cloud
@@ -15,6 +14,12 @@ from thor2_jax.descriptor.slicing import slices_and_strips, strip_births
 NETWORK = colornet.load_default()
 PAPER, RELEASED = thor2.DescriptorConfig(), thor2.DescriptorConfig.released()
 Cloud = tuple[np.ndarray, np.ndarray]
+
+
+@jax.jit
+def released_indices(points: np.ndarray, mask: np.ndarray) -> tuple[jax.Array, jax.Array]:
+    """Return the slices and the strips of points [N, 3] by the released rule."""
+    return slices_and_strips(points[:, 0], points[:, 2], mask, RELEASED)
 
 
 def paper_rule(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -61,7 +66,7 @@ def test_the_released_rule_on_many_random_clouds() -> None:
     rng = np.random.default_rng(0)
     points = (rng.random((300, 512, 3)) * [0.8, 0.4, 1.2]).astype(np.float32)
     mask = np.ones((300, 512), bool)
-    i, j = jax.jit(jax.vmap(lambda p, m: slices_and_strips(p[:, 0], p[:, 2], m, RELEASED)))(points, mask)
+    i, j = jax.jit(jax.vmap(released_indices))(points, mask)
     for b in range(300):
         slices, strips = released_rule(points[b].astype(np.float64))
         np.testing.assert_array_equal(i[b], slices)
@@ -76,7 +81,7 @@ def test_the_released_rounding_at_every_half() -> None:
         near = [values, np.nextafter(values, np.float32(9)), np.nextafter(values, np.float32(-9))]
         points = np.zeros((3 * len(values), 3), np.float32)
         points[:, column] = np.maximum(np.concatenate(near), 0)
-        indices = jax.jit(lambda p: slices_and_strips(p[:, 0], p[:, 2], jnp.ones(len(p), bool), RELEASED))(points)
+        indices = released_indices(points, np.ones(len(points), bool))
         slices, strips = released_rule(points.astype(np.float64))
         np.testing.assert_array_equal(indices[0], slices)
         np.testing.assert_array_equal(np.minimum(indices[1], 31), strips)
@@ -84,15 +89,14 @@ def test_the_released_rounding_at_every_half() -> None:
 
 def test_padding_does_not_occupy_levels_in_the_released_rule() -> None:
     points = np.array([[0.1, 0.1, 0.4], [0.2, 0.2, 0.6], [0, 0, 0]], np.float32)
-    i, _ = slices_and_strips(points[:, 0], points[:, 2], jnp.array([True, True, False]), RELEASED)
+    i, _ = released_indices(points, np.array([True, True, False]))
     np.testing.assert_array_equal(i[:2], [0, 1])
 
 
 def test_levels_past_twice_the_slices_overflow_if_released() -> None:
     """For any rank, 1.3 is the last level that counts, and 1.4 the first that does not."""
     for far, number in ((1.3, 1), (1.4, 14)):
-        points = jnp.array([[0.1, 0.1, 0], [0.1, 0.1, far]], jnp.float32)
-        i, _ = slices_and_strips(points[:, 0], points[:, 2], jnp.ones(2, bool), RELEASED)
+        i, _ = released_indices(np.array([[0.1, 0.1, 0], [0.1, 0.1, far]], np.float32), np.ones(2, bool))
         np.testing.assert_array_equal(i, [0, number])
 
 
@@ -127,7 +131,7 @@ def test_gradients_reach_one_point_per_extreme() -> None:
         strips = thor2.strips(dataclasses.replace(clouds, points=x), NETWORK, PAPER)
         return (strips.high - strips.low).sum()
 
-    gradient = np.asarray(jax.grad(span)(clouds.points))[0]
+    gradient = np.asarray(jax.jit(jax.grad(span))(clouds.points))[0]
     expected = np.zeros((400, 3))
     i, j = paper_rule(points.astype(np.float64))
     for strip in set(zip(i.tolist(), j.tolist(), strict=True)):

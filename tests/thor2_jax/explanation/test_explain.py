@@ -81,8 +81,10 @@ def small_clouds(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(class_scores, "MIN_CAPACITY", 512)
 
 
-@pytest.mark.parametrize("make_run", [untrained_run, untrained_embedding_run])
-@pytest.mark.parametrize("rule", ["max", "mean", "log-mean"])
+@pytest.mark.parametrize(
+    ("rule", "make_run"),
+    [*((rule, untrained_run) for rule in ("max", "mean", "log-mean")), ("log-mean", untrained_embedding_run)],
+)
 def test_margin_is_the_log_odds_of_the_answer(
     rule: str, make_run: Callable[..., TrainedRun], frame: thor2.RGBDFrame, instance: PreparedInstance
 ) -> None:
@@ -95,7 +97,7 @@ def test_margin_is_the_log_odds_of_the_answer(
     assert float(scores.margin(jnp.asarray(values), index)[0]) == pytest.approx(logit(answer.confidence), abs=1e-3)
 
 
-@pytest.mark.parametrize("looks", [1, 2, 4])
+@pytest.mark.parametrize("looks", [1, 4])
 def test_a_gallery_is_explained_by_the_looks_of_recognition(looks: int, frame: thor2.RGBDFrame) -> None:
     run = untrained_embedding_run(CLASSES, config=dataclasses.replace(SMALL_CONFIG, looks=looks))
     recognizer = Recognizer(run)
@@ -155,13 +157,15 @@ def test_a_left_out_slice_is_an_empty_slice(instance: PreparedInstance) -> None:
     cloud = scores.orient(instance)
     left = leave_out(scores, cloud, index, np.zeros(len(instance.points), np.float32))
     oriented = describe_looks(pack_instances([instance], 1), NETWORK, SMALL_CONFIG)
-    margin = lambda o: float(scores.margin(scores.of_descriptors(o), index)[0])  # noqa: E731
+    margin = jax.jit(lambda o: scores.margin(scores.of_descriptors(o), index)[0])
     for number in range(2):
-        blank = lambda a, number=number: a.at[:, :, number].set(0)  # noqa: E731
+        blank = lambda a, number=number: a * (np.arange(2) != number).reshape(2, *[1] * (a.ndim - 3))  # noqa: E731
         each = dataclasses.replace(
-            oriented.each, images=blank(oriented.each.images), embeddings=blank(oriented.each.embeddings)
+            oriented.each,
+            images=blank(np.asarray(oriented.each.images)),
+            embeddings=blank(np.asarray(oriented.each.embeddings)),
         )
-        expected = margin(oriented) - margin(dataclasses.replace(oriented, each=each))
+        expected = float(margin(oriented) - margin(dataclasses.replace(oriented, each=each)))
         assert left.slices[number] == pytest.approx(expected, abs=1e-3)
     aligned = np.asarray(thor2.align(pack_instances([instance], 1), SMALL_CONFIG).points[0])[: len(instance.points)]
     np.testing.assert_array_equal(left.slice_of, np.floor(aligned[:, 2] / 0.1))

@@ -100,7 +100,8 @@ def test_embeddings_have_gradients(embedding: Embedding, clouds: thor2.PointClou
     """Most strips have no point of most colours: their colour embeddings are 0, where a square root has no slope."""
     oriented = describe_looks(clouds, embedding.network, embedding.config, 2)
     assert not np.asarray(oriented.each.embeddings).all()
-    gradients = jax.grad(lambda looks: embedding.embed_oriented(looks, clouds)[..., 0].sum(), allow_int=True)(oriented)
+    total = lambda looks: embedding.embed_oriented(looks, clouds)[..., 0].sum()  # noqa: E731
+    gradients = jax.jit(jax.grad(total, allow_int=True))(oriented)
     for gradient in (gradients.each.images, gradients.each.embeddings, gradients.statistics):
         assert np.isfinite(gradient).all() and np.asarray(gradient).any()
 

@@ -1,6 +1,7 @@
 """Trackers with a toy recognizer that reads an instance's probabilities from its colour."""
 
 import dataclasses
+import functools
 from collections.abc import Iterable
 
 import numpy as np
@@ -17,14 +18,14 @@ from thor2_jax.tracking.tracker import Tracker
 from training.rendering.view_sphere import camera_pose
 
 CAMERA = thor2.Intrinsics(600.0, 600.0, 79.5, 59.5)
-RUN = untrained_run(("a", "b", "c"))
+run = functools.cache(lambda: untrained_run(("a", "b", "c"), ("tops", "tops2"), seed=1))
 
 
 class ToyRecognizer:
     """Answers by the mean colour of an instance, whose channels are class probabilities in 1/255."""
 
     def __init__(self) -> None:
-        self._recognizer = Recognizer(RUN)
+        self._recognizer = Recognizer(run())
         self.model = self._recognizer.model
         self.described: list[PreparedInstance] = []
 
@@ -67,7 +68,7 @@ def test_a_track_keeps_its_number_and_fuses_the_answers() -> None:
 
 def test_the_first_answer_is_that_of_the_frame_alone() -> None:
     rng = np.random.default_rng(0)
-    recognizer = Recognizer(RUN)
+    recognizer = Recognizer(run())
     image = frame({1: (10, 10, SURE_A), 2: (60, 100, UNSURE_B)})
     image = dataclasses.replace(image, color=rng.integers(0, 256, image.color.shape, dtype=np.uint8))
     tracker = recognizer.track()

@@ -1,5 +1,6 @@
 """THOR: the rules that select classifiers, and the predictions of the library."""
 
+import functools
 import itertools
 from typing import Any
 
@@ -48,6 +49,7 @@ def test_view_types_by_face_areas(areas: tuple[float, float, float], types: tupl
     assert view_types(*areas) == types
 
 
+@functools.cache
 def library() -> dict[Any, MLP]:
     return {
         (name, k): MLP(16 * k, 4, rngs=nnx.Rngs(10 * number + k))
@@ -91,8 +93,9 @@ def test_most_confident_selected_classifier_decides() -> None:
         (("front",), 3),
     ]
     probabilities = THOR(models, CONFIG).probabilities(clouds)
+    apply = nnx.jit(lambda model, tops: nnx.softmax(model(tops)))
     for row, (types, k) in enumerate(expected):
-        rows = [np.asarray(nnx.softmax(models[name, k](clouds.tops[row : row + 1, : 16 * k])))[0] for name in types]
+        rows = [np.asarray(apply(models[name, k], clouds.tops[row : row + 1, : 16 * k]))[0] for name in types]
         np.testing.assert_allclose(probabilities[row], max(rows, key=np.max), atol=1e-6)
 
 

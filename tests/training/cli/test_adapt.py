@@ -24,7 +24,7 @@ FILES = {"color": "color.png", "depth": "depth.png", "labels": "mask.png", "intr
 @pytest.fixture(scope="module")
 def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     directory = tmp_path_factory.mktemp("model") / "run"
-    save_run(untrained_run(tuple(OBJECTS.values())), directory)
+    save_run(untrained_run(tuple(OBJECTS.values()), ("tops", "tops2"), seed=1), directory)
     (directory / "metrics.jsonl").write_text("{}\n")
     (directory / "checkpoints").mkdir()
     return directory

@@ -2,7 +2,8 @@
 
 import json
 import re
-from collections.abc import Callable
+import shutil
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -22,26 +23,35 @@ from thor2_jax.recognizer import Recognizer
 from training import enrollment
 
 
-@pytest.fixture(autouse=True)
-def small_embedding(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(scope="module", autouse=True)
+def small_embedding() -> Iterator[None]:
     """Replace the packaged embedding by a small one with random weights, which compiles quickly."""
     small = Embedding.create(SMALL_CONFIG, sizes=EmbeddingSizes(4, (16,), 8, 4))
-    for module in (embeddings, gallery_objects, models):
-        monkeypatch.setattr(module, "load_default", lambda: small)
-    monkeypatch.setattr(enrollment, "MESH_VIEWS", 3)
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (embeddings, gallery_objects, models):
+            patch.setattr(module, "load_default", lambda: small)
+        patch.setattr(enrollment, "MESH_VIEWS", 3)
+        yield
 
 
-@pytest.fixture
-def frames(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def enrolled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a directory with two frames and a run in which their objects are enrolled."""
+    folder = tmp_path_factory.mktemp("enrolled")
     for number in range(2):
-        write_frame(tmp_path / "frames" / f"00{number}", {1: "brick", 5: "book"}, number)
-    return tmp_path / "frames"
+        write_frame(folder / "frames" / f"00{number}", {1: "brick", 5: "book"}, number)
+    assert run_thor2("enroll", "--frames", folder / "frames", "--model", folder / "run") == 0
+    return folder
 
 
 @pytest.fixture
-def model(frames: Path, tmp_path: Path) -> Path:
-    assert run_thor2("enroll", "--frames", frames, "--model", tmp_path / "run") == 0
-    return tmp_path / "run"
+def frames(enrolled: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(enrolled / "frames", tmp_path / "frames"))
+
+
+@pytest.fixture
+def model(enrolled: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(enrolled / "run", tmp_path / "run"))
 
 
 def error_of(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:

@@ -194,7 +194,8 @@ def test_an_embedding_alone_is_evaluated(tmp_path: Path, calibrated: bool) -> No
     assert "Confidence" in page.text and "reliability.png" in {p["src"] for p in page.pictures}
 
 
-@pytest.mark.parametrize("n", [1, 2, 15])
+@pytest.mark.usefixtures("drawn_pictures")
+@pytest.mark.parametrize("n", [1, 15])
 def test_page_for_datasets_of_any_size(tmp_path: Path, n: int) -> None:
     report = evaluate_toys(tmp_path, n)
     directory = tmp_path / "report"

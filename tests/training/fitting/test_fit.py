@@ -6,7 +6,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import nnx
@@ -18,7 +17,7 @@ from thor2_jax.model.classifier import MLP, Feature, feature_of
 from training.fitting.checkpoints import Checkpoints
 from training.fitting.fit import fit
 from training.fitting.options import EpochMetrics, FitOptions
-from training.fitting.samples import Samples, expand
+from training.fitting.samples import Batch, Samples, expand
 from training.fitting.steps import FitContext
 
 NETWORK = colornet.load_default()
@@ -43,13 +42,17 @@ def fitted(tmp_path: Path, separable: Samples) -> Fit:
     return run
 
 
-def described(samples: Samples) -> thor2.Descriptors:
-    batch = jax.tree.map(jnp.asarray, samples.take(np.arange(len(samples))))
+@jax.jit
+def describe_batch(batch: Batch) -> thor2.Descriptors:
     return thor2.describe_strips(expand(batch, region_sets(NETWORK).weights, CONFIG), NETWORK, CONFIG)
 
 
+def described(samples: Samples) -> thor2.Descriptors:
+    return describe_batch(samples.take(np.arange(len(samples))))
+
+
 def answers(model: MLP, samples: Samples, feature: Feature) -> np.ndarray:
-    return np.asarray(model(feature_of(described(samples), feature)).argmax(axis=1))
+    return np.asarray(jax.jit(model)(feature_of(described(samples), feature)).argmax(axis=1))
 
 
 def leaves(model: MLP) -> list[np.ndarray]:

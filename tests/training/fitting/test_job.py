@@ -92,6 +92,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, TrainedRun]:
     return out, train(out, ("tops", "ce"))
 
 
+@pytest.mark.usefixtures("drawn_pictures")
 def test_a_run_is_written_and_its_progress_is_reported(tmp_path: Path) -> None:
     stages: list[tuple[str, int, int]] = []
 

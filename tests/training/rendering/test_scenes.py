@@ -78,7 +78,7 @@ def test_objects_lie_on_a_plane_in_front_of_the_camera() -> None:
 
 
 def test_visible_share_is_that_of_the_object_alone() -> None:
-    for seed in range(30):
+    for seed in range(10):
         scene = compose_scene(OBJECTS, np.random.default_rng(seed), n_objects=1, camera=SMALL)
         assert scene.visible == {1: 1.0} and scene.occlusion(1) == "none"
 

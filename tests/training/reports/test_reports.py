@@ -24,6 +24,8 @@ from training.reports.plots import (
     draw_reliability,
 )
 
+pytestmark = pytest.mark.usefixtures("drawn_pictures")
+
 
 def test_page_escapes_its_content(tmp_path: Path) -> None:
     folded = Section("more & more", table=(["all"], [["<i>"]]))

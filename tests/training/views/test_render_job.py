@@ -33,13 +33,13 @@ from training.views.render_job import render_dataset
 
 NAMES = ("screwdriver", "tennis_ball")
 OBJECTS = {name: builtin_objects()[name] for name in NAMES}
-STEPS = (60, 45)
-"""30 views an object: of 16 and 14 with the shards of these tests."""
+STEPS = (120, 45)
+"""15 views an object: of 8 and 7 with the shards of these tests."""
 
 
 @pytest.fixture(autouse=True)
 def small_shards(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(render_job, "CLOUDS_PER_SHARD", 16)
+    monkeypatch.setattr(render_job, "CLOUDS_PER_SHARD", 8)
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The dataset of a job that nothing interrupted."""
     out = tmp_path_factory.mktemp("whole") / "deep" / "views"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(render_job, "CLOUDS_PER_SHARD", 16)
+        patch.setattr(render_job, "CLOUDS_PER_SHARD", 8)
         render_dataset(OBJECTS, out, *STEPS)
     return out
 
@@ -78,12 +78,12 @@ def test_files_of_a_dataset(whole: Path) -> None:
     ]
     dataset = ViewDataset.open(whole)
     assert [(shard.file[:9], shard.label, shard.views, shard.left_out) for shard in dataset.shards] == [
-        ("0000-0000", 0, 16, 0),
-        ("0000-0001", 0, 14, 0),
-        ("0001-0000", 1, 16, 0),
-        ("0001-0001", 1, 14, 0),
+        ("0000-0000", 0, 8, 0),
+        ("0000-0001", 0, 7, 0),
+        ("0001-0000", 1, 8, 0),
+        ("0001-0001", 1, 7, 0),
     ]
-    assert np.array_equal(np.concatenate([dataset.read(k).view for k in (0, 1)]), np.arange(30))
+    assert np.array_equal(np.concatenate([dataset.read(k).view for k in (0, 1)]), np.arange(15))
     assert "time" not in (whole / MANIFEST).read_text()
 
 
@@ -126,7 +126,7 @@ def test_rendering_interrupted_at_any_write_resumes(
         assert contents(out) == contents(whole)
         # Shards that were listed are not rendered again.
         listed = json.loads(before[MANIFEST])["views"] if MANIFEST in before else 0
-        assert seen == [(done, 60) for done in (0, 16, 30, 46, 60) if done >= listed]
+        assert seen == [(done, 30) for done in (0, 8, 15, 23, 30) if done >= listed]
         assert left == -2 * (2 * (len(seen) - 1) + (MANIFEST not in before))
 
 
@@ -136,7 +136,7 @@ from training.views import render_job
 from training.objects.builtin_objects import builtin_objects
 from training.storage.workers import local_workers
 
-render_job.CLOUDS_PER_SHARD = 16
+render_job.CLOUDS_PER_SHARD = 8
 replace, left = os.replace, int(sys.argv[2])
 
 def killing(source, target):
@@ -149,7 +149,7 @@ def killing(source, target):
 
 os.replace = killing
 objects = {name: builtin_objects()[name] for name in ("screwdriver", "tennis_ball")}
-render_job.render_dataset(objects, sys.argv[1], 60, 45, local_workers(int(sys.argv[3])))
+render_job.render_dataset(objects, sys.argv[1], 120, 45, local_workers(int(sys.argv[3])))
 """
 
 
@@ -190,7 +190,7 @@ def changed(folder: Path) -> dict[str, int]:
 
 def test_a_finished_dataset_is_not_changed(copied: Path) -> None:
     before = changed(copied)
-    assert len(render_dataset(OBJECTS, copied, *STEPS)) == 60
+    assert len(render_dataset(OBJECTS, copied, *STEPS)) == 30
     assert changed(copied) == before | {".lock": changed(copied)[".lock"]}
 
 
@@ -214,8 +214,8 @@ def test_another_job_is_refused(copied: Path) -> None:
     painted = dataclasses.replace(screwdriver, textures=tuple(texture ^ 1 for texture in screwdriver.textures))
     light = Augmentations(illumination=Illumination())
     for meshes, steps, options, message in [
-        (OBJECTS, (90, 45), {}, "azimuth_step 60.0, not 90.0"),
-        (OBJECTS, (60, 90), {}, "polar_step 45.0, not 90.0"),
+        (OBJECTS, (90, 45), {}, "azimuth_step 120.0, not 90.0"),
+        (OBJECTS, (120, 90), {}, "polar_step 45.0, not 90.0"),
         (OBJECTS, STEPS, {"augmentations": light}, "variations null, not {"),
         (OBJECTS | {"tennis_ball": moved}, STEPS, {}, r"objects\[\d\].mesh "),
         (OBJECTS | {"screwdriver": painted}, STEPS, {}, r"objects\[\d\].mesh "),
@@ -233,9 +233,9 @@ def test_augmentations_are_part_of_the_job(tmp_path: Path) -> None:
     out, light = tmp_path / "views", Augmentations(illumination=Illumination(), copies=2)
     dataset = render_dataset({"ball": sphere(0.03)}, out, 90, 90, augmentations=light, seed=1)
     assert len(dataset) == 36 and dataset.record["job"]["variations"]["seed"] == 1
-    assert [shard.views for shard in dataset.shards] == [15, 15, 6]
+    assert [shard.views for shard in dataset.shards] == [6] * 6
     views = dataset.read(1)
-    assert views.view.tolist() == list(np.repeat(range(5, 10), 3)) and views.copy.tolist() == [0, 1, 2] * 5
+    assert views.view.tolist() == [2, 2, 2, 3, 3, 3] and views.copy.tolist() == [0, 1, 2] * 2
     for options in ({}, {"augmentations": light, "seed": 2}, {"augmentations": dataclasses.replace(light, copies=3)}):
         with pytest.raises(InputError, match="variations"):
             render_dataset({"ball": sphere(0.03)}, out, 90, 90, **options)
@@ -305,9 +305,9 @@ def test_two_processes_in_one_directory(whole: Path, copied: Path) -> None:
 
 @contextlib.contextmanager
 def full_disk() -> Iterator[None]:
-    """Limit files of this process to 20 kB, which suffices for a manifest but not for a shard."""
+    """Limit files of this process to 10 kB, which suffices for a manifest but not for a shard."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, hard))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, hard))
     try:
         yield
     finally:
