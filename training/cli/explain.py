@@ -23,6 +23,8 @@ def explain(
         list[int] | None, typer.Option(help="Number of an object in the label image; repeatable. Default: all.")
     ] = None,
     segment: options.KnownSegmentOption = None,
+    unknown_below: options.UnknownOption = None,
+    answer_by: options.AnswerByOption = None,
     gallery: options.GalleryOption = None,
 ) -> None:
     """Explain answers: the points that decided, slices, colours, smallest changes, nearest views.
@@ -35,7 +37,7 @@ def explain(
     from thor2_jax.segmentation.segmenters import MODEL
     from training.reports.explanation_page import PAGE, check_no_foreign_files, write_explanation
 
-    load = functools.cache(lambda: Recognizer.load(model, gallery=gallery))
+    load = functools.cache(lambda: Recognizer.load(model, unknown_below, gallery=gallery, answer_by=answer_by))
     sources = given.sources(segment, lambda frame: load().segment(frame))
     check_output_directory(out, resumable={source.name.split("/")[0] for source in sources})
     recognizer = load()

@@ -17,6 +17,7 @@ from thor2_jax.recordings.pairs import DEFAULT_MAX_GAP
 from thor2_jax.recordings.topics import Topics
 
 __all__ = [
+    "AnswerByOption",
     "AllowHostOption",
     "FrameOptions",
     "GalleryOption",
@@ -48,6 +49,9 @@ UnknownOption = Annotated[
         help="Instances with a lower confidence are unknown objects (0 to 1). Default: the model's own for trained "
         "classes; for enrolled objects, it grows with the number of their views.",
     ),
+]
+AnswerByOption = Annotated[
+    str | None, typer.Option("--answer-by", help="classifiers, gallery or both. Default: what the run has.")
 ]
 ModelOption = Annotated[Path, typer.Option("--model", help="Run directory of a trained model.")]
 SegmentOption = Annotated[

@@ -33,9 +33,7 @@ def recognize(
     processes: options.WorkerOptions,
     segment: options.KnownSegmentOption = None,
     unknown_below: options.UnknownOption = None,
-    answer_by: Annotated[
-        str | None, typer.Option(help="classifiers, gallery or both. Default: what the run has.")
-    ] = None,
+    answer_by: options.AnswerByOption = None,
     track: Annotated[
         bool, typer.Option("--track", help="The frames are a sequence: follow the objects and fuse their answers.")
     ] = False,
@@ -150,7 +148,7 @@ def recognize(
     notes = sys.stderr if as_json else None
     if unknown:
         print(escape_characters(f"{model} knows {recognizer.model.union.summary}"), file=notes)
-    next_command = ("explain", *given.arguments, *segmented, "--model", model, "--out", "why")
+    next_command = ("explain", *given.arguments, *segmented, *arguments.options, "--out", "why")
     finish(result, "see why", *next_command, file=notes)
     if tables.n_without_number and (coco or bop):
         print(f"{tables.n_without_number} instances have a name that {names} does not number", file=sys.stderr)

@@ -8,8 +8,11 @@ from typing import Any
 import pytest
 from helpers import SMALL_CONFIG, ParsedPage, run_thor2, untrained_run, write_frame
 
+from thor2_jax.errors import InputError
 from thor2_jax.explanation import class_scores
 from thor2_jax.model.run_directory import save_run
+from thor2_jax.recognizer import Recognizer
+from training.frame_recognition import RecognizerArguments
 from training.reports import explanation_page
 
 
@@ -119,3 +122,20 @@ def test_wrong_arguments_are_one_line(
     (out / "mine.txt").write_text("x")
     assert run_thor2("explain", "--model", model, frame, "--out", out) == 2
     assert "mine.txt" in capfd.readouterr().err
+
+
+def test_options_of_recognition_hold_for_its_explanation(
+    model: Path, frame: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen = []
+
+    def explain(recognizer: Recognizer, *_: Any) -> None:
+        seen.append((recognizer.model.unknown_below, recognizer.model.answer_by))
+        raise InputError("seen")
+
+    monkeypatch.setattr("thor2_jax.explanation.explain.explain", explain)
+    given = RecognizerArguments(model, 0.9, "classifiers").options
+    assert given == ["--model", str(model), "--unknown-below", "0.9", "--answer-by", "classifiers"]
+    assert RecognizerArguments(model).options == ["--model", str(model)]
+    assert run_thor2("explain", *given, frame, "--out", tmp_path / "out") == 2
+    assert seen == [(0.9, "classifiers")] * 2
