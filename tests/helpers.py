@@ -55,9 +55,14 @@ def untrained_run(
 
 
 @functools.cache
+def _drawn(n_inputs: int, n_classes: int, seed: int) -> MLP:
+    return MLP(n_inputs, n_classes, rngs=nnx.Rngs(seed))
+
+
 def random_classifier(n_inputs: int, n_classes: int, seed: int) -> MLP:
     """Return a classifier with random weights."""
-    return MLP(n_inputs, n_classes, rngs=nnx.Rngs(seed))
+    classifier: MLP = nnx.clone(_drawn(n_inputs, n_classes, seed))
+    return classifier
 
 
 def untrained_embedding_run(

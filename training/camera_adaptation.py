@@ -1,8 +1,10 @@
 """Run directories that are adapted to a camera: a copy whose record has the camera's colour transform."""
 
 import dataclasses
+import errno
 import json
 import shutil
+import stat
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -22,8 +24,6 @@ UNFINISHED = ("checkpoints", "views", ".*")
 
 def adapt_run(model: Path, sources: Sequence[FrameSource], out: Path, report: Report) -> Adaptation:
     """Estimate a camera's colour transform and write a run directory that corrects colours by it.
-
-    It is a copy of the run with the transform in its record, and appears under its name when it is complete.
 
     Args:
         model: run directory; a colour transform that it has is replaced.
@@ -67,11 +67,10 @@ def write_adapted_run(model: Path, adaptation: Adaptation, out: Path) -> None:
         try:
             shutil.copytree(model, run, ignore=shutil.ignore_patterns(*UNFINISHED), copy_function=_copy)
         except shutil.Error as error:
-            source, _, reason = error.args[0][0]
-            raise InputError(
-                f"model: {source} cannot be copied ({reason}); expected a readable run directory"
-            ) from None
-        run.chmod(0o755)  # that of a read-only run could not be renamed
+            raise OSError(errno.EIO, error.args[0][0][2], str(out)) from None
+        finally:
+            for directory in [run, *(path for path in run.rglob("*") if path.is_dir())]:
+                directory.chmod(directory.stat().st_mode | stat.S_IRWXU)  # those of a read-only run cannot be moved
         description = json.loads((run / RUN_FILE).read_bytes())
         description["record"] |= {
             "color_transform": dataclasses.asdict(adaptation.transform),
@@ -82,4 +81,10 @@ def write_adapted_run(model: Path, adaptation: Adaptation, out: Path) -> None:
 
 
 def _copy(source: str, target: str) -> None:
-    Path(target).write_bytes(read_file(source))
+    try:
+        content = read_file(source)
+    except OSError as error:
+        reason = f"model: {source} cannot be copied ({error.strerror}); expected a readable run directory"
+        raise InputError(reason) from None
+    Path(target).write_bytes(content)
+    shutil.copymode(source, target)

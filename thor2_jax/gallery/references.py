@@ -14,7 +14,7 @@ import safetensors.numpy
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
-from thor2_jax.files import atomic_write
+from thor2_jax.files import atomic_write, open_file
 
 __all__ = ["BACKGROUND", "REFERENCES_FILE", "References"]
 
@@ -57,6 +57,7 @@ class References:
             InputError: the file is missing or damaged, or of another embedding. The message names the file.
         """
         try:
+            open_file(path).close()
             with safetensors.safe_open(path, "numpy") as stored:
                 about = json.loads(stored.metadata()[_METADATA])
                 embeddings, label = stored.get_tensor("embeddings"), stored.get_tensor("label")

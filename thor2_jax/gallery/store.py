@@ -97,9 +97,9 @@ def gallery_stamp(directory: Path) -> tuple[int, int, int] | None:
 
 
 def check_index(directory: Path) -> None:
-    """Raise GalleryError for a file, and for a directory that has objects, but no index: says how to rebuild it."""
+    """Raise GalleryError if the path is no directory, or a directory with objects but no index."""
     if directory.exists() and not directory.is_dir():
-        raise GalleryError(f"gallery: {directory} is a file; expected the directory of a gallery; choose another one")
+        raise GalleryError(f"gallery: {directory} is no directory; expected that of a gallery; choose another one")
     if gallery_stamp(directory) is None and any(_own_objects(directory)):
         raise GalleryError(
             f"gallery: {directory} has objects, but no {INDEX_FILE}; restore it from a copy, or rebuild it: "

@@ -73,7 +73,9 @@ class Model:
         wanted = check_answer_by(answer_by) or check_answer_by(run.record.get("answer_by"))
         classifiers = RunClassifiers.compiled(run.classifiers, run.embedding_classifier)
         transform = ColorTransform.of_record(run.record)
-        return cls(run, classifiers, Gallery(""), unknown_below, rule, wanted, transform)
+        return cls(
+            run, classifiers, unknown_below=unknown_below, rule=rule, answer_by=wanted, color_transform=transform
+        )
 
     @functools.cached_property
     def calibration(self) -> Calibration | None:

@@ -7,6 +7,7 @@ with Bag("table.mcap") as bag:
 
 import contextlib
 import dataclasses
+import errno
 import functools
 from collections import Counter
 from collections.abc import Iterator
@@ -16,7 +17,6 @@ from typing import Any
 import numpy as np
 
 from thor2_jax.errors import InputError, needs_extra, with_context
-from thor2_jax.files import open_file
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.intrinsics import Intrinsics
 from thor2_jax.recordings.decompression import limit_decompression
@@ -98,9 +98,9 @@ class Bag:
             raise InputError(
                 f"bag: {self.path} has no metadata.yaml; expected a ROS 2 bag; repair it: ros2 bag reindex"
             )
-        for file in self.path.glob("*.*") if self.path.is_dir() else (self.path,):
-            if not file.is_dir():
-                open_file(file).close()  # refuses pipes and devices, which rosbags would read forever
+        for file in [self.path, *self.path.glob("*.db3"), *self.path.glob("*.mcap")]:
+            if file.exists() and not (file.is_file() or file.is_dir()):  # rosbags would read it forever
+                raise OSError(errno.EINVAL, "a device, pipe or socket; expected a file", str(file))
         with self._damage_named():
             # ROS 2 before Iron stores no message definitions; those of images have not changed.
             self.is_truncated = self.path.suffix == ".mcap" and is_truncated(self.path)

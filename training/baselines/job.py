@@ -72,13 +72,16 @@ def train_baselines(
                 f"dataset: the views with digest {source.digest[:12]} are not those that {directory} was trained on; "
                 "give the dataset of that run"
             )
-        record, rates = run.record, tuple(run.record["learning_rates"])
-        own = FitOptions(record["epochs"], rates, record["batch_size"], record["seed"])
         for name in names:
             if not baseline_file(directory, name).is_file():
-                _train(FitTask(name, source, run, options or own, directory, weights, progress))
+                _train(FitTask(name, source, run, options or _options_of(run), directory, weights, progress))
             elif weights is not None and pretrained_files(name):
                 _check_pretrained(directory, run, name, weights)
+
+
+def _options_of(run: TrainedRun) -> FitOptions:
+    record, rates = run.record, tuple(run.record["learning_rates"])
+    return FitOptions(record["epochs"], rates, record["batch_size"], record["seed"])
 
 
 def _check_pretrained(directory: Path, run: TrainedRun, name: str, weights: Path) -> None:
@@ -131,7 +134,10 @@ def _build(name: str, arrays: Mapping[str, Any], run: TrainedRun) -> Baseline:
         return Forest(arrays, run.network, run.config)
     if name in NETWORKS:
         return ImageNetwork.with_arrays(name, arrays, n_classes)
-    return (Templates if name == TEMPLATES else ColoredPointNet).with_arrays(arrays, n_classes)
+    if name == TEMPLATES:
+        return Templates.with_arrays(arrays, n_classes)
+    assert name == "pointnet"
+    return ColoredPointNet.with_arrays(arrays, n_classes)
 
 
 def load_baselines(path: Path, run: TrainedRun) -> LoadedBaselines:

@@ -18,6 +18,7 @@ from thor2_jax.recordings.topics import Topics
 
 __all__ = [
     "AnswerByOption",
+    "Engine",
     "AllowHostOption",
     "FrameOptions",
     "GalleryOption",

@@ -243,7 +243,17 @@ def load_sequence_runs(directory: Path, frames: Iterable[str]) -> list[SequenceR
         of_sequence = {sequence: loaded[path][fold] for sequence, path in paths.items() if path is not None}
         digest = json_digest({sequence: each.digest for sequence, each in of_sequence.items()})
         name = f"{named_path(directory).name}/*" + (f"/fold-{fold}" if len(first) > 1 else "")
-        result.append(SequenceRun(name, digest, run.recognizer, run.baselines, {}, run.weights, of_sequence))
+        result.append(
+            SequenceRun(
+                name,
+                digest,
+                run.recognizer,
+                run.baselines,
+                temperatures={},
+                weights=run.weights,
+                of_sequence=of_sequence,
+            )
+        )
     return result
 
 

@@ -82,7 +82,8 @@ def reliability(confidence: ArrayLike, correct: ArrayLike, bins: int = BINS) -> 
 def expected_calibration_error(confidence: ArrayLike, correct: ArrayLike) -> float:
     """Return the mean over the answers of |accuracy - confidence| of their bin; NaN without answers.
 
-    Guo et al., "On Calibration of Modern Neural Networks" (ICML 2017). Arguments and errors are those of `reliability`.
+    Guo et al., "On Calibration of Modern Neural Networks" (ICML 2017). The arguments and errors are those of
+    `reliability`.
     """
     values = reliability(confidence, correct)
     used = values.answers > 0

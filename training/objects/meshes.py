@@ -134,7 +134,7 @@ def _check_obj_references(path: Path) -> None:
     """
 
     def arguments(file: Path, keyword: str) -> list[str]:
-        lines = file.read_text(encoding="utf-8", errors="replace").splitlines()
+        lines = read_file(file).decode("utf-8", "replace").splitlines()
         return [line.split(None, 1)[1].strip() for line in lines if line.lower().startswith(keyword + " ")]
 
     for library in arguments(path, "mtllib"):

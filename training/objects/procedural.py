@@ -48,7 +48,8 @@ def procedural_object(seed: int) -> TexturedMesh:
     shape_seed = seed - (seed % _SIBLINGS == 1)
     paint = _paint(seed - (seed % _SIBLINGS == 3))
     rng = np.random.default_rng([_SHAPE, shape_seed])
-    mesh = _FAMILIES[rng.choice(len(_FAMILIES), p=_WEIGHTS)](rng, paint)
+    family = rng.choice(len(_FAMILIES), p=[*_FAMILIES.values()])
+    mesh = [*_FAMILIES][family](rng, paint)
     vertices = mesh.vertices - mesh.centre
     if rng.random() < 0.3:
         vertices = vertices * (1 + rng.uniform(-0.2, 0.2, 3))
@@ -313,6 +314,16 @@ def _prism(rng: Rng, paint: Paint) -> TexturedMesh:
     return _revolved(_closed([(r, 0), (r * rng.uniform(0.3, 1), h)]), paint(0), sides=int(rng.choice([3, 5, 6])))
 
 
-_FAMILIES = (_box, _can, _bottle, _vessel, _ball, _rod, _tool, _plate, _scissors, _prism)
-_WEIGHTS = (0.26, 0.13, 0.10, 0.09, 0.07, 0.12, 0.10, 0.05, 0.05, 0.03)
-"""Probability of each family of shapes."""
+_FAMILIES = {
+    _box: 0.26,
+    _can: 0.13,
+    _bottle: 0.10,
+    _vessel: 0.09,
+    _ball: 0.07,
+    _rod: 0.12,
+    _tool: 0.10,
+    _plate: 0.05,
+    _scissors: 0.05,
+    _prism: 0.03,
+}
+"""Family of shapes -> its probability."""

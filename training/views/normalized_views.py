@@ -105,9 +105,6 @@ class SourceShard(NamedTuple):
     label: int
     views: int
 
-    def __repr__(self) -> str:
-        return f"_Shard(label={self.label}, views={self.views})"  # part of the digests of views in memory
-
 
 class ViewSource(Protocol):
     """Normalized views in shards of one object each: a `ViewDataset` on disk, or `MemoryViews`."""
@@ -197,7 +194,8 @@ class MemoryViews:
     def digest(self) -> str:
         """SHA-256 of the class names and clouds."""
         arrays = (array for clouds in self._clouds for cloud in clouds for array in cloud)
-        return content_digest(itertools.chain([repr((self.classes, self.shards))], (a.tobytes() for a in arrays)))
+        shards = repr(self.shards).replace("SourceShard", "_Shard")  # their name in the digests of runs that exist
+        return content_digest(itertools.chain([f"({self.classes!r}, {shards})"], (a.tobytes() for a in arrays)))
 
     @property
     def record(self) -> Mapping[str, Any]:

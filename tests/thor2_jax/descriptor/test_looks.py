@@ -111,11 +111,12 @@ def test_tiny_clouds_have_finite_looks(n: int, all_rim: bool) -> None:
     assert all(np.isfinite(values).all() for values in jax.tree.leaves((described, aligned)))
 
 
-def test_looks_are_the_same_when_compiled_and_mapped() -> None:
-    expected = aligned_looks(PACKED, CONFIG, 4)
-    compiled = jax.jit(lambda clouds: aligned_looks(clouds, CONFIG, 4))(PACKED)
+@pytest.mark.parametrize("count", [pytest.param(2, marks=pytest.mark.slow), 4])
+def test_looks_are_the_same_when_compiled_and_mapped(count: int) -> None:
+    expected = aligned_looks(PACKED, CONFIG, count)
+    compiled = jax.jit(lambda clouds: aligned_looks(clouds, CONFIG, count))(PACKED)
     one_by_one = jax.tree.map(lambda a: a[:, None], PACKED)
-    mapped, weights = jax.jit(jax.vmap(lambda clouds: aligned_looks(clouds, CONFIG, 4)))(one_by_one)
+    mapped, weights = jax.jit(jax.vmap(lambda clouds: aligned_looks(clouds, CONFIG, count)))(one_by_one)
     flat = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), mapped), weights[:, 0]
     for actual in (compiled, flat):
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=2e-6), actual, expected)

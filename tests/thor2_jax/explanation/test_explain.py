@@ -97,7 +97,7 @@ def test_margin_is_the_log_odds_of_the_answer(
     assert float(scores.margin(jnp.asarray(values), index)[0]) == pytest.approx(logit(answer.confidence), abs=1e-3)
 
 
-@pytest.mark.parametrize("looks", [1, 4])
+@pytest.mark.parametrize("looks", [1, pytest.param(2, marks=pytest.mark.slow), 4])
 def test_a_gallery_is_explained_by_the_looks_of_recognition(looks: int, frame: thor2.RGBDFrame) -> None:
     run = untrained_embedding_run(CLASSES, config=dataclasses.replace(SMALL_CONFIG, looks=looks))
     recognizer = Recognizer(run)

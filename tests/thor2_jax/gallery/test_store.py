@@ -78,7 +78,7 @@ def test_a_missing_gallery_is_empty(tmp_path: Path) -> None:
 
 def test_a_file_is_no_gallery(tmp_path: Path) -> None:
     (tmp_path / "gallery").write_text("mine")
-    with pytest.raises(GalleryError, match="is a file"):
+    with pytest.raises(GalleryError, match="is no directory"):
         check_index(tmp_path / "gallery")
 
 

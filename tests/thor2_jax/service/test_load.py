@@ -54,11 +54,10 @@ def count_answered(url: str) -> int:
     return int(float(match[1])) if match else 0
 
 
-@pytest.mark.parametrize("count", [40, pytest.param(100, marks=pytest.mark.slow)])
-def test_soak_without_errors_or_memory_growth(server: Any, files: Files, count: int) -> None:
-    send_many(server.url, files, 24, 8)
+def test_soak_without_errors_or_memory_growth(server: Any, files: Files) -> None:
+    send_many(server.url, files, 40, 8)
     before = memory(server.process.pid)
-    assert send_many(server.url, files, count, 8) == {200: count}
+    assert send_many(server.url, files, 100, 8) == {200: 100}
     assert memory(server.process.pid) - before < 20 * 1024
 
 

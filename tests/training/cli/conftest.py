@@ -28,8 +28,16 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def unfitted(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let trainings end without a step: their classifiers have random weights, and nothing is compiled for them."""
 
-    def fit(samples: Samples, context: FitContext, *arguments: Any) -> tuple[MLP, int]:
-        arguments[-1](EpochMetrics(1, loss=1.0, accuracy=0.5, samples_per_second=1.0))
+    def fit(
+        samples: Samples,
+        context: FitContext,
+        options: Any,
+        checkpoints: Any,
+        held_out: Any,
+        progress: Any,
+        epoch_done: Any,
+    ) -> tuple[MLP, int]:
+        epoch_done(EpochMetrics(1, loss=1.0, accuracy=0.5, samples_per_second=1.0))
         inputs = input_size(context.feature, context.config, context.network.n_regions)
         return random_classifier(inputs, len(samples.classes), 0), 1
 

@@ -34,6 +34,7 @@ def frame(tmp_path: Path) -> Path:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("drawn_pictures")
 def test_a_page_for_every_instance(model: Path, frame: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
     assert run_thor2("explain", "--model", model, frame, "--out", out) == 0

@@ -195,7 +195,7 @@ def test_an_embedding_alone_is_evaluated(tmp_path: Path, calibrated: bool) -> No
 
 
 @pytest.mark.usefixtures("drawn_pictures")
-@pytest.mark.parametrize("n", [1, 15])
+@pytest.mark.parametrize("n", [1, pytest.param(2, marks=pytest.mark.slow), 15])
 def test_page_for_datasets_of_any_size(tmp_path: Path, n: int) -> None:
     report = evaluate_toys(tmp_path, n)
     directory = tmp_path / "report"

@@ -17,6 +17,7 @@ from flax import nnx
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
+from thor2_jax.files import open_file
 
 __all__ = ["load_backbone", "load_weights", "resampled_positions", "tensor_shapes", "weights_file"]
 
@@ -81,6 +82,7 @@ def load_backbone(model: nnx.Module, path: Path) -> None:
     prefix = getattr(model, "PREFIX", "")
     loaded = {}
     try:
+        open_file(path).close()
         with safetensors.safe_open(path, "numpy") as file:
             names = set(file.keys())
             for keys, value in values.items():
