@@ -33,6 +33,8 @@ os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"  # as the command line sets it; importi
 EXAMPLES = {"properties": (4, 60), "fuzz": (150, 3000)}
 """Directory of tests -> number of Hypothesis examples for each test, by default and with --thorough."""
 
+settings.register_profile("default", deadline=None)  # no test may depend on the speed of the machine
+settings.load_profile("default")
 for folder, numbers in EXAMPLES.items():
     for tier, number in zip(("quick", "thorough"), numbers, strict=True):
         settings.register_profile(
