@@ -3,6 +3,7 @@
 import dataclasses
 import errno
 import json
+import os
 import shutil
 import stat
 from collections.abc import Iterator, Sequence
@@ -69,8 +70,8 @@ def write_adapted_run(model: Path, adaptation: Adaptation, out: Path) -> None:
         except shutil.Error as error:
             raise OSError(errno.EIO, error.args[0][0][2], str(out)) from None
         finally:
-            for directory in [run, *(path for path in run.rglob("*") if path.is_dir())]:
-                directory.chmod(directory.stat().st_mode | stat.S_IRWXU)  # those of a read-only run cannot be moved
+            for directory, _, _ in os.walk(run):  # those of a read-only run could be neither moved nor removed
+                os.chmod(directory, os.stat(directory).st_mode | stat.S_IRWXU)
         description = json.loads((run / RUN_FILE).read_bytes())
         description["record"] |= {
             "color_transform": dataclasses.asdict(adaptation.transform),

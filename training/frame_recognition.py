@@ -104,12 +104,6 @@ class RecognizerArguments:
     unknown_below: float | None = None
     answer_by: str | None = None
 
-    @property
-    def options(self) -> list[str]:
-        """The options of a command that gives these arguments."""
-        given = {"--model": self.model, "--unknown-below": self.unknown_below, "--answer-by": self.answer_by}
-        return [str(part) for option in given.items() if option[1] is not None for part in option]
-
     def load(self) -> Recognizer:
         """Load a recognizer of single frames; raises as `Recognizer.load`."""
         return Recognizer.load(self.model, self.unknown_below, answer_by=self.answer_by, chunk=BATCH_BUCKETS[-1])

@@ -79,8 +79,8 @@ def _refined(labels: NDArray[np.int32], color: NDArray[np.uint8], stride: int) -
     rows, columns = (np.flatnonzero(labels.any(axis=axis)) for axis in (1, 0))
     top, left = max(rows[0] - MARGIN, 0), max(columns[0] - MARGIN, 0)
     labels = labels[top : rows[-1] + 1 + MARGIN, left : columns[-1] + 1 + MARGIN]
-    height, width = labels.shape
-    here = np.s_[stride * top : stride * (top + height), stride * left : stride * (left + width)]
+    bottom, right = top + labels.shape[0], left + labels.shape[1]
+    here = np.s_[stride * top : stride * bottom, stride * left : stride * right]
     markers = np.where(label_borders(labels, BAND), 0, labels + 1)
     height, width = refined[here].shape
     markers = markers.repeat(stride, axis=0).repeat(stride, axis=1)[:height, :width]

@@ -48,6 +48,7 @@ NPZ = "application/octet-stream"
 FRAME_STAGES = "Milliseconds per stage: upload, decode, segment (without labels), clouds, device, total."
 
 MAX_POINTS = POINT_BUCKETS[-1]
+"""Maximum number of points of a cloud."""
 
 Milliseconds = dict[str, float]
 Coordinate = Annotated[float, Field(ge=-MAX_CLOUD_COORDINATE, le=MAX_CLOUD_COORDINATE, allow_inf_nan=False)]

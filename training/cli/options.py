@@ -33,6 +33,7 @@ __all__ = [
     "UnknownOption",
     "WorkerOptions",
     "WorkersOption",
+    "given_options",
     "grouped_options",
     "split_names",
 ]
@@ -88,6 +89,18 @@ RECORDINGS = "Recordings"
 """Panel of the options of recordings in the help."""
 
 
+def given_options(record: Any, without: str = "") -> list[str]:
+    """Return the options that give another command the fields of a record that do not have their defaults.
+
+    Args:
+        record: a dataclass, such as `FrameOptions` or `RecognizerArguments`.
+        without: name of a field that is no option.
+    """
+    values = [(field, getattr(record, field.name)) for field in dataclasses.fields(record) if field.name != without]
+    given = [(f"--{field.name.replace('_', '-')}", value) for field, value in values if value != field.default]
+    return [str(part) for pair in given for part in pair]
+
+
 @dataclasses.dataclass(frozen=True)
 class FrameOptions:
     """The frames that a command is given: folders, the files of one frame, or a recording."""
@@ -129,9 +142,7 @@ class FrameOptions:
     @property
     def arguments(self) -> list[str]:
         """The arguments that give the same frames to another command."""
-        options = [(field, getattr(self, field.name)) for field in dataclasses.fields(self)[1:]]
-        given = [(f"--{field.name.replace('_', '-')}", value) for field, value in options if value != field.default]
-        return [*map(str, self.frames or ()), *(str(part) for pair in given for part in pair)]
+        return [*map(str, self.frames or ()), *given_options(self, without="frames")]
 
     def check(self) -> None:
         """Raise InputError unless exactly one of FRAME, files and a recording is given, with its own options."""

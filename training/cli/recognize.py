@@ -148,7 +148,7 @@ def recognize(
     notes = sys.stderr if as_json else None
     if unknown:
         print(escape_characters(f"{model} knows {recognizer.model.union.summary}"), file=notes)
-    next_command = ("explain", *given.arguments, *segmented, *arguments.options, "--out", "why")
+    next_command = ("explain", *given.arguments, *segmented, *options.given_options(arguments), "--out", "why")
     finish(result, "see why", *next_command, file=notes)
     if tables.n_without_number and (coco or bop):
         print(f"{tables.n_without_number} instances have a name that {names} does not number", file=sys.stderr)

@@ -93,7 +93,7 @@ def recognize_bag(
         )
     result = f"written to {', '.join(written)}" if written else f"frames recognized: {n_answers}"
     segmented = ["--segment", segment] if segment else []
-    again = ["explain", *given.arguments, *segmented, *arguments.options, "--out", "why"]
+    again = ["explain", *given.arguments, *segmented, *options.given_options(arguments), "--out", "why"]
     finish(result, "see why", *again, file=sys.stderr)
     if failed:
         raise InputError(f"{len(failed)} of {n_answers + len(failed)} frames could not be recognized; see above")

@@ -1,7 +1,6 @@
 """`thor2 render`: render a dataset of training views."""
 
 import dataclasses
-import itertools
 from pathlib import Path
 from typing import Annotated
 
@@ -66,9 +65,15 @@ def render(
     if crops is not None and not 1 <= crops <= MAX_CROP:
         raise InputError(f"crops is {crops}; expected 1 to {MAX_CROP} pixels")
     pool = processes.pool() or IN_PROCESS
-    kinds = "illumination", "sensor", "occlusion", "segmentation", "registration", "base"
-    are_chosen = illumination, sensor, occlusion, segmentation, registration, base
-    augmentations = Augmentations.of_names(itertools.compress(kinds, are_chosen), copies) or None
+    chosen = {
+        "illumination": illumination,
+        "sensor": sensor,
+        "occlusion": occlusion,
+        "segmentation": segmentation,
+        "registration": registration,
+        "base": base,
+    }
+    augmentations = Augmentations.of_names([name for name, on in chosen.items() if on], copies) or None
     sources = scaled_meshes(find_meshes(meshes, read_names(names) if names else None), mesh_scale)
     with show_progress(quiet) as progress:
         shown = of_stage(progress, "render")

@@ -59,7 +59,8 @@ class FramePictures:
 
     def restore(self, answers: FrameAnswers) -> None:
         """Take into account a frame that was drawn before the evaluation was interrupted."""
-        list(self._most_confident(answers))
+        for _ in self._most_confident(answers):  # iterating records the confidences
+            pass
 
     def draw(self, number: int, item: LabelledFrame, answers: FrameAnswers) -> None:
         """Draw the frame if it is shown, and those of its wrong names that are the most confident so far.

@@ -12,6 +12,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.explanation import class_scores
 from thor2_jax.model.run_directory import save_run
 from thor2_jax.recognizer import Recognizer
+from training.cli import options
 from training.frame_recognition import RecognizerArguments
 from training.reports import explanation_page
 
@@ -135,8 +136,8 @@ def test_options_of_recognition_hold_for_its_explanation(
         raise InputError("seen")
 
     monkeypatch.setattr("thor2_jax.explanation.explain.explain", explain)
-    given = RecognizerArguments(model, 0.9, "classifiers").options
+    given = options.given_options(RecognizerArguments(model, 0.9, "classifiers"))
     assert given == ["--model", str(model), "--unknown-below", "0.9", "--answer-by", "classifiers"]
-    assert RecognizerArguments(model).options == ["--model", str(model)]
+    assert options.given_options(RecognizerArguments(model)) == ["--model", str(model)]
     assert run_thor2("explain", *given, frame, "--out", tmp_path / "out") == 2
     assert seen == [(0.9, "classifiers")] * 2
