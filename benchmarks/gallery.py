@@ -27,9 +27,9 @@ from thor2_jax.gallery.objects import ObjectGallery
 from thor2_jax.gallery.search import ExactSearch, IndexSearch, ViewSearch
 from thor2_jax.model.run_directory import EMBEDDING_FILE, TrainedRun, save_run
 from thor2_jax.recognizer import Recognizer
-from training.enrollment import mesh_views
 from training.objects.builtin_objects import builtin_objects
 from training.rendering.scenes import compose_scene
+from training.views.enrolled_meshes import mesh_views
 
 SIZE = 256
 QUERIES = 16

@@ -41,12 +41,12 @@ from benchmarks.cameras import (
 from thor2_jax.errors import InputError
 from thor2_jax.files import write_text
 from thor2_jax.model.fusion import DEFAULT_RULE
-from training.enrollment import mesh_views
 from training.evaluation.answers import ALL_CLASSIFIERS, BOTH, EMBEDDED, GALLERY, Rule
 from training.evaluation.runs import Run, load_runs
 from training.objects.meshes import find_meshes, read_names
 from training.readers.labelled import LabelledFrame
 from training.storage.jobs import begin_job
+from training.views.enrolled_meshes import mesh_views
 
 RENDER = "--azimuth-step 20 --polar-step 15 --copies 2 --illumination --occlusion --sensor --segmentation"
 """Default options of all renderings: the cameras and the first four augmentations of the default protocol."""

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from benchmarks.paired import paired_difference
 from thor2_jax.files import json_digest
-from thor2_jax.model.answers import DescribedFrame
 from thor2_jax.model.fusion import DEFAULT_RULE
 from thor2_jax.model.inference import infer
+from thor2_jax.model.recognition import DescribedFrame
 from training.baselines.baseline import baseline_inputs
 from training.baselines.names import CLOUD_BASELINES, NETWORKS, TITLES
 from training.evaluation.answers import FrameAnswers, Rule, read_answers

@@ -8,13 +8,15 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import jax
 import pytest
 from hypothesis import HealthCheck, settings
 from processes import UNOPTIMIZED, end_descendants_with_this_process
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
+
+os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"  # as the command line sets it; JAX reads it when it is imported
+import jax  # noqa: E402
 
 # Most of the time of the tests is compilation, which takes a third of it without optimization. For the slow tests, CI
 # sets XLA_FLAGS to nothing: they run what users run.
@@ -28,7 +30,6 @@ jax.config.update(
     "jax_persistent_cache_min_compile_time_secs", float(os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"])
 )
 os.environ.setdefault("THOR2_CACHE", "off")  # commands keep no programs in the home directory
-os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"  # as the command line sets it; importing jax has set 1
 
 EXAMPLES = {"properties": (4, 60), "fuzz": (150, 3000)}
 """Directory of tests -> number of Hypothesis examples for each test, by default and with --thorough."""
@@ -109,6 +110,23 @@ def browser() -> "Iterator[Browser]":
         pytest.skip("chromium is not installed (apt-get install chromium)")
     with sync_playwright() as playwright:
         yield playwright.chromium.launch(executable_path=chromium)
+
+
+@pytest.fixture(scope="module")
+def small_classifiers() -> Iterator[None]:
+    """Let classifiers have two small hidden layers: a training and its checkpoints take a third of the time.
+
+    Other processes have to be given the layers, since they do not see the change.
+    """
+    import helpers
+
+    from thor2_jax.model import classifier
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(classifier, "HIDDEN", (32, 16))
+        helpers._drawn.cache_clear()
+        yield
+    helpers._drawn.cache_clear()
 
 
 @pytest.fixture(scope="session")

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from thor2_jax.descriptor.view_normalization import align, mirror, turn, view_normalize
     from thor2_jax.explanation.explain import Explanation, explain
     from thor2_jax.frames.frames import Intrinsics, RGBDFrame, read_frame
-    from thor2_jax.model.answers import Recognition
+    from thor2_jax.model.recognition import Recognition
     from thor2_jax.parameters import Parameters
     from thor2_jax.recognizer import Recognizer
     from thor2_jax.segmentation.segmenters import segment, segmented
@@ -31,7 +31,7 @@ else:
         "explanation.explain": ("Explanation", "explain"),
         "parameters": ("Parameters",),
         "frames.frames": ("Intrinsics", "RGBDFrame", "read_frame"),
-        "model.answers": ("Recognition",),
+        "model.recognition": ("Recognition",),
         "recognizer": ("Recognizer",),
         "segmentation.segmenters": ("segment", "segmented"),
         "tracking.tracker": ("TrackedRecognition", "Tracker"),

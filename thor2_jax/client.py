@@ -35,7 +35,7 @@ from PIL import Image
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
 from thor2_jax.frames.intrinsics import Intrinsics
-from thor2_jax.model.answers import Recognition
+from thor2_jax.model.recognition import Recognition
 from thor2_jax.types import Descriptors
 
 __all__ = ["AsyncClient", "Client", "EnrolledObject", "KnownObject", "ServiceError", "ServiceModel", "multipart"]

@@ -38,6 +38,10 @@ def parse_yaml(content: bytes) -> Any:
     if len(content) > MAX_YAML_BYTES:
         raise ValueError(f"it has {len(content)} bytes; expected at most {MAX_YAML_BYTES}")
     try:
+        if b"<<" in content and any(
+            isinstance(token, yaml.ScalarToken) and token.value == "<<" for token in yaml.scan(content)
+        ):
+            raise ValueError("it has a merge key (<<), which can repeat its entries without a limit")
         value = yaml.safe_load(content)
         size = _expanded_size(value, {})
     # The constructors of YAML's tags raise several kinds of exception, all of them caused by the content.

@@ -1,16 +1,13 @@
 """Enrolling objects in the gallery of a run directory: from meshes, and from folders of labelled frames.
 
+from training.views.enrolled_meshes import mesh_views
 enroll_objects(Path("run"), lambda sigma_s: {"mug": lambda: mesh_views(Path("mug.glb"))}, "mesh")
 """
 
 import contextlib
-import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-
-import numpy as np
-from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError, with_context
 from thor2_jax.files import temporary_directory
@@ -23,45 +20,14 @@ from thor2_jax.gallery.store import GALLERY_DIRECTORY
 from thor2_jax.model.run_directory import TrainedRun, save_run
 from thor2_jax.printable import check_name, normal_name
 from thor2_jax.recognizer import Recognizer
-from training.embedding.sampling import AUGMENTATIONS
-from training.objects.mesh import TexturedMesh
-from training.objects.meshes import load_mesh
 from training.readers.frames import FrameFolder
 from training.storage.progress import Progress
-from training.views.mesh_views import ViewTask, render_task
 
-__all__ = ["enroll_objects", "labelled_views", "mesh_views"]
-
-MESH_VIEWS = 60
-"""Cameras around a mesh. Each gives two views: the mesh as rendered, and an augmented rendering from another camera."""
+__all__ = ["enroll_objects", "labelled_views"]
 
 
 def _show_nothing(stage: str, done: int, total: int, note: str) -> None:
     """Show nothing."""
-
-
-def _evenly_spread(count: int) -> NDArray[np.float64]:
-    """Return azimuth and polar angle [count, 2] of directions that cover the sphere evenly (a Fibonacci spiral)."""
-    index = np.arange(count)
-    golden_angle = np.pi * (3 - np.sqrt(5))
-    return np.stack([index * golden_angle % (2 * np.pi), np.arccos(1 - (2 * index + 1) / count)], axis=1)
-
-
-def mesh_views(mesh: Path | TexturedMesh, mesh_scale: float = 1.0) -> list[PreparedInstance]:
-    """Render a mesh from all sides; `mesh_scale` converts the unit of a file to metres.
-
-    Raises:
-        InputError: the mesh cannot be read, is too large or too small to be in metres, or has no usable view.
-        OSError: the file cannot be opened.
-    """
-    name, loaded = (mesh.name, load_mesh(mesh, mesh_scale)) if isinstance(mesh, Path) else ("mesh", mesh)
-    augmentations = dataclasses.replace(AUGMENTATIONS, copies=1)
-    task = ViewTask(name, loaded, _evenly_spread(MESH_VIEWS), augmentations=augmentations)
-    clouds = enumerate(render_task(task))
-    views = [PreparedInstance(k, cloud.xyz, cloud.rgb, np.zeros(len(cloud.xyz), bool)) for k, cloud in clouds]
-    if not views:
-        raise InputError(f"mesh: {name} has too few points in every view; expected an object of a few centimetres")
-    return views
 
 
 def labelled_views(

@@ -10,7 +10,7 @@ import pytest
 import thor2_jax
 from benchmarks.doctor import DAMAGES, run, sound
 from thor2_jax.frames.frames import RGBDFrame
-from thor2_jax.model.answers import Recognition
+from thor2_jax.model.recognition import Recognition
 from training.readers.frame_files import frame_files
 
 SAMPLES = Path(thor2_jax.__file__).parent / "service" / "page" / "samples"

@@ -20,7 +20,7 @@ from rosbags.interfaces import Nodetype
 import thor2_jax as thor2
 from thor2_jax.client import Client, ServiceError
 from thor2_jax.errors import InputError
-from thor2_jax.model.answers import Recognition
+from thor2_jax.model.recognition import Recognition
 from thor2_jax.recordings.bag_writer import DETECTION_ARRAY, detection_types, ros_message
 from thor2_jax.recordings.messages import stamp_of
 from thor2_jax.segmentation.segmenters import segment

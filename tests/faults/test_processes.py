@@ -15,6 +15,8 @@ from training.views.normalized_views import MemoryViews
 CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=3, n_strips=8, image_size=8)
 OPTIONS = FitOptions(epochs=2, batch_size=4)
 
+pytestmark = pytest.mark.usefixtures("small_classifiers")
+
 
 def source() -> MemoryViews:
     rng = np.random.default_rng(0)

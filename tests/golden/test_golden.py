@@ -76,7 +76,7 @@ def test_paper_convention(golden_files: tuple[Path, ...], homology: str) -> None
         close(strips.color[row], golden["paper_color"], atol=TOLERANCE)
 
 
-@pytest.mark.parametrize("homology", BACKENDS)
+@pytest.mark.parametrize("homology", ["gudhi", pytest.param("closed_form", marks=pytest.mark.slow)])
 def test_released_convention(golden_files: tuple[Path, ...], homology: str) -> None:
     descriptors, strips, diagrams = described(golden_files, thor2.DescriptorConfig.released(homology=homology))
     assert not np.asarray(descriptors.overflow).any()

@@ -55,10 +55,12 @@ def assert_finite(tree: Any) -> None:
         assert np.isfinite(np.asarray(leaf)).all(), jax.tree_util.keystr(path)
 
 
-QUICK = [*[(name, True) for name in ("closed_form", "gudhi", "cold")], ("closed_form", False), ("relaxed", False)]
+QUICK = [("gudhi", True), ("cold", True), ("closed_form", False), ("relaxed", False)]
 SLOW = [
     pytest.param(name, aligned, marks=pytest.mark.slow)
-    for name, aligned in (("relaxed", True), ("warm", True), ("gudhi", False), ("cold", False), ("warm", False))
+    for name in CONFIGS
+    for aligned in (True, False)
+    if (name, aligned) not in QUICK
 ]
 
 

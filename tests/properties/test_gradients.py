@@ -94,7 +94,7 @@ def assert_differences_agree(loss: Loss, *arguments: Any, step: float = 1e-6) ->
 
 
 @pytest.mark.usefixtures("x64")
-@pytest.mark.parametrize("name", ["closed_form", "gudhi", "relaxed"])
+@pytest.mark.parametrize("name", ["closed_form", "gudhi", pytest.param("relaxed", marks=pytest.mark.slow)])
 def test_aligned_clouds_against_finite_differences(name: str) -> None:
     config, aligned = CONFIGS[name], clouds_of(in_cells)
     loss = loss_of(thor2.describe_aligned, aligned, config)
@@ -105,7 +105,7 @@ def test_aligned_clouds_against_finite_differences(name: str) -> None:
 
 
 @pytest.mark.usefixtures("x64")
-@pytest.mark.parametrize("name", ["closed_form", "relaxed"])
+@pytest.mark.parametrize("name", [pytest.param("closed_form", marks=pytest.mark.slow), "relaxed"])
 def test_describe_against_finite_differences(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The frame is fixed, since no gradient goes through it."""
     config, clouds = CONFIGS[name], clouds_of(in_metres, 1)

@@ -69,12 +69,10 @@ def test_an_embedding_of_other_classes_is_not_exported() -> None:
     run = untrained_embedding_run("abc", ("tops",))
     assert run.embedding is not None
     other = dataclasses.replace(run, embedding=dataclasses.replace(run.embedding, classes=("a",)))
-    calls = []
-    for each in (run, other):
-        exported = jax.export.deserialize(bytearray(export_recognizer(each, n_points=512, n_clouds=1)))
-        packed = thor2.PointClouds.pack([(np.zeros((0, 3)),) * 2], 512, rim=[None])
-        calls.append(set(exported.call(*(getattr(packed, field.name) for field in dataclasses.fields(packed)))))
-    assert calls == [{"tops", "embedding", "overflow"}, {"tops", "overflow"}]
+    exported = jax.export.deserialize(bytearray(export_recognizer(other, n_points=512, n_clouds=1)))
+    packed = thor2.PointClouds.pack([(np.zeros((0, 3)),) * 2], 512, rim=[None])
+    outputs = exported.call(*(getattr(packed, field.name) for field in dataclasses.fields(packed)))
+    assert set(outputs) == {"tops", "overflow"}
 
 
 @pytest.mark.parametrize(

@@ -116,7 +116,9 @@ def test_half_of_the_points_may_overflow_with_a_name(recognizer: Recognizer) -> 
     assert refused.reason is not None and "overflow" in refused.reason
 
 
-@pytest.mark.parametrize("change", [{"fx": 1e-9}, {"cx": 1e8}, {"fx": 20.0, "fy": 20.0}])
+@pytest.mark.parametrize(
+    "change", [{"fx": 1e-9}, pytest.param({"cx": 1e8}, marks=pytest.mark.slow), {"fx": 20.0, "fy": 20.0}]
+)
 def test_no_names_with_absurd_intrinsics(recognizer: Recognizer, change: dict[str, float]) -> None:
     frame = tilted(patches())
     answers = recognizer.recognize(dataclasses.replace(frame, intrinsics=dataclasses.replace(INTRINSICS, **change)))
@@ -213,10 +215,10 @@ def test_nothing_compiles_after_warm_up(run: TrainedRun) -> None:
     fresh = Recognizer(run)
     jax.monitoring.register_event_duration_secs_listener(listen)
     try:
-        assert fresh.warm_up(max_points=1000, max_instances=5) == 2 * 3
+        assert fresh.warm_up(max_points=1000, max_instances=2) == 2 * 2
         assert compiled
         compiled.clear()
-        for count in range(1, 6):
+        for count in (1, 2):
             assert len(fresh.recognize(tilted(squares(count)))) == count
         assert compiled == []
     finally:

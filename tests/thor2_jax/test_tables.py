@@ -13,8 +13,8 @@ def test_shared_and_nested_yaml_values_are_read() -> None:
 
 @pytest.mark.parametrize(
     "content",
-    [b"[" * 5000, b"a: &b [*b]", b"? &b [x]\n: [*b, *c]", b"!!int ''", b"a: 0x" + b"f" * 5000],
-    ids=["deep", "cycle", "alias", "int", "digits"],
+    [b"[" * 5000, b"a: &b [*b]", b"? &b [x]\n: [*b, *c]", b"!!int ''", b"a: 0x" + b"f" * 5000, b"<<: {a: 1}"],
+    ids=["deep", "cycle", "alias", "int", "digits", "merge"],
 )
 def test_damaged_yaml_is_a_value_error(content: bytes) -> None:
     with pytest.raises(ValueError):

@@ -140,8 +140,9 @@ def _eigenvectors(moments: jax.Array) -> jax.Array:
 def _moments(points: jax.Array) -> jax.Array:
     """Return `points @ points.T` [3, 3] of centred points [3, N]; N is a multiple of 16."""
     # Row by row, because XLA would store the products of whole coordinates first.
-    rows = points.reshape(3, ROWS, -1)
-    products = (rows[np.array([0, 0, 0, 1, 1, 2]), k] * rows[np.array([0, 1, 2, 1, 2, 2]), k] for k in range(ROWS))
+    folded = points.reshape(3, ROWS, -1)
+    first, second = (rows_of(folded[np.array(k)]) for k in ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]))
+    products = [a * b for a, b in zip(first, second, strict=True)]
     return functools.reduce(jnp.add, products).sum(axis=-1)[np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])]
 
 
@@ -170,21 +171,22 @@ def _minimum_area_angle(xy: jax.Array) -> jax.Array:
     return best
 
 
-def _search(support: jax.Array, axes: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Alternate minimum-area rectangles, starting from `axes` [3, 3].
+def _search(support: jax.Array, starts: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Alternate minimum-area rectangles, starting from each of `starts` [K, 3, 3].
 
-    Returns the axes of the box [3, 3] as rows and its volume over `support` [3, M]; M is a multiple of 16.
+    Returns the axes of the boxes [K, 3, 3] as rows and their volumes [K] over `support` [3, M]; M is a multiple of 16.
     """
 
-    def sweep(_: int, axes: jax.Array) -> jax.Array:
+    def sweep(axes: jax.Array) -> jax.Array:
         angle = _minimum_area_angle(rotate(axes, support)[:2])
         c, s = jnp.cos(angle), jnp.sin(angle)
         # The cyclic shift of the rows moves the next axis to the last row, which the rotation keeps.
         return jnp.stack([c * axes[1] - s * axes[0], axes[2], c * axes[0] + s * axes[1]])
 
-    axes = jax.lax.fori_loop(0, SWEEPS, sweep, axes)
-    rotated = rotate(axes, support)
-    return axes, jnp.prod(rotated.max(axis=1) - rotated.min(axis=1))
+    # A loop inside `vmap` would be traced again for it.
+    axes = jax.lax.fori_loop(0, SWEEPS, lambda _, axes: jax.vmap(sweep)(axes), starts)
+    rotated = jax.vmap(lambda each: rotate(each, support))(axes)
+    return axes, jnp.prod(rotated.max(axis=2) - rotated.min(axis=2), axis=1)
 
 
 def minimal_box(points: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -209,7 +211,7 @@ def minimal_box(points: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     support_axes = _eigenvectors(jnp.matmul(centred, centred.T, precision=HIGHEST))
     support = jnp.pad(support, ((0, 0), (0, -support.shape[1] % LANES)), mode="edge")
     starts = jnp.stack([jnp.eye(3, dtype=points.dtype), support_axes])
-    candidates, volumes = jax.vmap(lambda start: _search(support, start))(starts)
+    candidates, volumes = _search(support, starts)
     axes = candidates[jnp.argmin(volumes)]
     rotated = rotate(axes, principal)
     low, high = rotated.min(axis=1), rotated.max(axis=1)

@@ -96,32 +96,31 @@ def _looks(clouds: PointClouds, sigma_s: ArrayLike, alpha: ArrayLike, count: int
     half_turn = jnp.diag(jnp.array([-1, -1, 1], jnp.float32))
     warmer = jnp.array([WARMTH, 1, 1 / WARMTH], jnp.float32)
 
-    def one(cloud: PointClouds) -> tuple[PointClouds, jax.Array]:
-        def placed(mask: jax.Array) -> tuple[jax.Array, jax.Array]:
-            """Return points [2, N, 3] and cameras [2, 3], as they are and after a half turn."""
-            normalization = boxed(dataclasses.replace(cloud, mask=mask), sigma_s)
-            rotation, end_is_occluded = oriented(normalization)
-            # Where the occlusion boundary decides which end comes first, there is no half turn.
-            both = jnp.stack([rotation, jnp.where(end_is_occluded, rotation, half_turn @ rotation)])
-            return jax.vmap(lambda each: place_aligned(each, normalization, alpha))(both)
+    def placed(cloud: PointClouds) -> tuple[jax.Array, jax.Array]:
+        """Return points [2, N, 3] and cameras [2, 3], as they are and after a half turn."""
+        normalization = boxed(cloud, sigma_s)
+        rotation, end_is_occluded = oriented(normalization)
+        # Where the occlusion boundary decides which end comes first, there is no half turn.
+        both = jnp.stack([rotation, jnp.where(end_is_occluded, rotation, half_turn @ rotation)])
+        return jax.vmap(lambda each: place_aligned(each, normalization, alpha))(both)
 
-        masks, colors = [cloud.mask], cloud.colors
-        looks = [(0, 0, colors), (0, 1, colors)]  # number of the mask, half turn, colours
-        if count == 4:
-            masks += [] if cloud.rim is None else [cloud.mask & ~cloud.rim]
-            warm, cool = (colors * warmer).clip(0, 1), (colors / warmer).clip(0, 1)
-            looks[1:] = (len(masks) - 1, 1, colors), (0, 1, warm), (0, 0, cool)
-        points, cameras = jax.vmap(placed)(jnp.stack(masks))
-        rows = [
-            dataclasses.replace(
-                cloud, points=points[m, k, : len(masks[m])], camera=cameras[m, k], colors=color, mask=masks[m]
-            )
-            for m, k, color in looks
-        ]
-        return jax.tree.map(lambda *a: jnp.stack(a), *rows), jnp.full(count, 1 / count)
-
-    each, weights = jax.vmap(one)(clouds)
-    return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), each), weights
+    masks, colors = [clouds.mask], clouds.colors
+    looks = [(0, 0, colors), (0, 1, colors)]  # number of the mask, half turn, colours
+    if count == 4:
+        masks += [] if clouds.rim is None else [clouds.mask & ~clouds.rim]
+        warm, cool = (colors * warmer).clip(0, 1), (colors / warmer).clip(0, 1)
+        looks[1:] = (len(masks) - 1, 1, colors), (0, 1, warm), (0, 0, cool)
+    # One batch of all masks: tracing takes a fourth longer for a further `vmap` over the masks.
+    masked = [dataclasses.replace(clouds, mask=mask) for mask in masks]
+    batch = jax.tree.map(lambda *a: jnp.concatenate(a), *masked)
+    n_clouds, n_points = clouds.mask.shape
+    points, cameras = (a.reshape(len(masks), n_clouds, *a.shape[1:]) for a in jax.vmap(placed)(batch))
+    rows = [
+        dataclasses.replace(masked[m], points=points[m, :, k, :n_points], camera=cameras[m, :, k], colors=color)
+        for m, k, color in looks
+    ]
+    each = jax.tree.map(lambda *a: jnp.stack(a, axis=1).reshape(-1, *a[0].shape[1:]), *rows)
+    return each, jnp.full((n_clouds, count), 1 / count)
 
 
 def aligned_looks(clouds: PointClouds, config: DescriptorConfig, count: int) -> tuple[PointClouds, jax.Array]:

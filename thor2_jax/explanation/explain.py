@@ -27,9 +27,9 @@ from thor2_jax.explanation.class_scores import ClassScores, OrientedCloud, class
 from thor2_jax.frames.frames import RGBDFrame, pixel_rays
 from thor2_jax.frames.prepared_instance import DESCRIPTOR_VOXEL, PreparedInstance, prepare_instance
 from thor2_jax.gallery.enrollment import embed_looks
-from thor2_jax.model.answers import Recognition
 from thor2_jax.model.inference import answers, infer_clouds, values
 from thor2_jax.model.model import Model
+from thor2_jax.model.recognition import Recognition
 from thor2_jax.recognizer import Recognizer
 from thor2_jax.types import Diagrams
 

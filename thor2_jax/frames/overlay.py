@@ -23,7 +23,7 @@ from thor2_jax.frames.frames import check_images
 from thor2_jax.printable import escape_characters
 
 if TYPE_CHECKING:
-    from thor2_jax.model.answers import Recognition
+    from thor2_jax.model.recognition import Recognition
 
 __all__ = [
     "COLORS",

@@ -20,7 +20,7 @@ __all__ = ["augmented_copies", "augmented_view"]
 MAX_COPIES = 8
 """Copies of all views from frames together."""
 
-MESH_COPIES = 5
+MESH_COPIES = 2
 """Copies of each view from a mesh, as rendered or augmented."""
 
 

@@ -196,7 +196,9 @@ def _split(model: EmbeddingNetwork) -> tuple[Any, Any]:
     """Return the graph and the state of a network, with its values as the file stores them."""
     with jax.ensure_compile_time_eval():  # the result is kept, also if the first call is inside a compiled function
         graph, state = nnx.split(model)
-        return graph, jax.tree.map(lambda a: a.astype(jnp.float16).astype(jnp.float32), state)
+        # By NumPy: JAX would compile a program for each shape.
+        with np.errstate(over="ignore"):
+            return graph, jax.tree.map(lambda a: jax.device_put(np.asarray(a, np.float16).astype(np.float32)), state)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -213,7 +213,7 @@ def model_from_arrays(create: Callable[[], Module], arrays: Mapping[str, NDArray
         name = _name(path)
         if name not in arrays or arrays[name].shape != like.shape:
             raise ValueError(f"{name} is missing or does not have the shape {like.shape}")
-        loaded[path] = jnp.asarray(arrays[name])
+        loaded[path] = jax.device_put(arrays[name])  # `asarray` compiles a program for each shape
     nnx.replace_by_pure_dict(state, flax.traverse_util.unflatten_dict(loaded))
     nnx.update(model, state)
     return model

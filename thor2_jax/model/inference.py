@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from thor2_jax.descriptor.looks import LookDescriptors, describe_looks
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery.enrollment import LOOKS
-from thor2_jax.model.answers import MAX_OVERFLOW, Recognition
 from thor2_jax.model.model import Model
+from thor2_jax.model.recognition import MAX_OVERFLOW, Recognition
 from thor2_jax.types import PointClouds
 
 __all__ = ["Inference", "answers", "gallery_scores", "infer", "infer_clouds", "values"]

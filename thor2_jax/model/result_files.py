@@ -17,7 +17,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.files import has_json, write_text
 from thor2_jax.frames.frames import RGBDFrame, pixel_rays
 from thor2_jax.frames.overlay import draw_overlay
-from thor2_jax.model.answers import Recognition
+from thor2_jax.model.recognition import Recognition
 
 __all__ = [
     "BOP_HEADER",

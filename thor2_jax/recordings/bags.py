@@ -17,19 +17,24 @@ from typing import Any
 import numpy as np
 
 from thor2_jax.errors import InputError, needs_extra, with_context
+from thor2_jax.files import read_file
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.intrinsics import Intrinsics
-from thor2_jax.recordings.decompression import limit_decompression
+from thor2_jax.recordings.decompression import MAX_OVERLAPPING, largest_overlap, limit_decompression
 from thor2_jax.recordings.messages import color_image, depth_image, image_kind, stamp_of
 from thor2_jax.recordings.pairs import DEFAULT_MAX_GAP, ImagePair, PairCounts, StampedImage, nearest_pairs
 from thor2_jax.recordings.recorded_frames import RecordedFrame, stamp_name
 from thor2_jax.recordings.topics import CAMERA_TYPE, IMAGE_TYPES, Topics, choose_topics
 from thor2_jax.recordings.truncated_mcap import CompleteRecords, is_truncated
+from thor2_jax.tables import parse_yaml
 
 __all__ = ["Bag"]
 
 MAX_GAP = 1e9
 """Largest `max_gap`, seconds."""
+
+MAX_TOPICS = 1000
+"""Largest number of image and camera topics: finding the first message of each may read the whole recording."""
 
 _REPAIR = {".bag": "rosbag reindex", ".mcap": "mcap recover", ".db3": "ros2 bag reindex", "": "ros2 bag reindex"}
 """Suffix of a recording (a directory has none) -> the command that repairs it."""
@@ -88,7 +93,8 @@ class Bag:
             OSError: it cannot be opened.
         """
         with needs_extra(f"bag is {self.path}, which", "rosbags", "bags"):
-            from rosbags.highlevel import AnyReader
+            from rosbags.rosbag1 import Reader as Reader1
+            from rosbags.rosbag2 import Reader as Reader2
             from rosbags.typesys import Stores, get_typestore
 
             limit_decompression()
@@ -98,15 +104,26 @@ class Bag:
             raise InputError(
                 f"bag: {self.path} has no metadata.yaml; expected a ROS 2 bag; repair it: ros2 bag reindex"
             )
-        for file in [self.path, *self.path.glob("*.db3"), *self.path.glob("*.mcap")]:
+        for file in [self.path, *self.path.glob("*")]:
             if file.exists() and not (file.is_file() or file.is_dir()):  # rosbags would read it forever
                 raise OSError(errno.EINVAL, "a device, pipe or socket; expected a file", str(file))
         with self._damage_named():
-            # ROS 2 before Iron stores no message definitions; those of images have not changed.
+            if self.path.is_dir():
+                # rosbags would expand aliases without a limit, and fail to close other values of "files".
+                files = parse_yaml(read_file(self.path / "metadata.yaml"))["rosbag2_bagfile_information"].get("files")
+                if not isinstance(files, list | None):
+                    raise ValueError("files of metadata.yaml is no list")
             self.is_truncated = self.path.suffix == ".mcap" and is_truncated(self.path)
             source: Any = CompleteRecords(self.path) if self.is_truncated else self.path
-            self._reader = AnyReader([source], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
-            self._reader.open()
+            # ROS's own definitions of images are used, which have not changed: rosbags would compile those of the file.
+            if self.path.suffix == ".bag":
+                reader: Any = Reader1(source)
+                self._deserialize = get_typestore(Stores.ROS1_NOETIC).deserialize_ros1
+            else:
+                reader = Reader2(source)
+                self._deserialize = get_typestore(Stores.ROS2_HUMBLE).deserialize_cdr
+            reader.open()
+            self._reader = reader
         try:
             self._choose()
         except BaseException:
@@ -116,7 +133,7 @@ class Bag:
 
     def __exit__(self, *_: object) -> None:
         """Close the recording."""
-        if self._reader is not None and self._reader.stack is not None:
+        if self._reader is not None:
             self._reader.close()
         self._reader = None
 
@@ -170,7 +187,7 @@ class Bag:
                 if item is None:
                     return
                 connection, arrival, content = item
-                message = self._reader.deserialize(content, connection.msgtype)
+                message, arrival = self._deserialize(content, connection.msgtype), int(arrival)
                 image = StampedImage(
                     connection.topic == self.topics.color, stamp_of(message) or arrival, arrival, message
                 )
@@ -178,11 +195,24 @@ class Bag:
 
     def _choose(self) -> None:
         """Choose the topics by their first messages, and read the camera."""
-        types = {connection.topic: connection.msgtype for connection in self._reader.connections}
+        with self._damage_named():
+            types = {connection.topic: connection.msgtype for connection in self._reader.connections}
+            if not all(isinstance(name, str) for name in (*types, *types.values())):
+                raise ValueError("a topic has a name that is no text")
+            images = [topic for topic, kind in types.items() if kind in (*IMAGE_TYPES, CAMERA_TYPE)]
+            if len(images) > MAX_TOPICS:
+                raise InputError(
+                    f"bag: {self.path} has {len(images)} topics of images and cameras; expected at most {MAX_TOPICS}"
+                )
+            overlap = largest_overlap(self._reader, {c.id for c in self._reader.connections if c.topic in images})
+            if overlap > MAX_OVERLAPPING:
+                raise InputError(
+                    f"bag: {self.path} has {overlap} bytes of images in chunks of the same time; expected at most "
+                    f"{MAX_OVERLAPPING}; record it with smaller chunks"
+                )
         if self.is_truncated and not types:
             raise self._truncation()
-        first = {topic: self._first(topic) for topic, kind in types.items() if kind in (*IMAGE_TYPES, CAMERA_TYPE)}
-        first = {topic: message for topic, message in first.items() if message is not None}
+        first = {topic: message for topic in images if (message := self._first(topic)) is not None}
         kinds = {t: "camera" if types[t] == CAMERA_TYPE else image_kind(message) for t, message in first.items()}
         with with_context(f"bag: {self.path}"):
             self.topics = choose_topics(self._wanted, kinds, types, needs_camera=self.intrinsics is None)
@@ -204,7 +234,7 @@ class Bag:
         connections = [connection for connection in self._reader.connections if connection.topic == topic]
         with self._damage_named():
             for connection, _, content in self._reader.messages(connections):
-                return self._reader.deserialize(content, connection.msgtype)
+                return self._deserialize(content, connection.msgtype)
         return None
 
     @contextlib.contextmanager

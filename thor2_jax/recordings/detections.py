@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from thor2_jax.frames.frames import RGBDFrame, pixel_rays
-from thor2_jax.model.answers import Recognition
+from thor2_jax.model.recognition import Recognition
 
 __all__ = ["Box", "Detection", "detection_array", "detections_as_json", "detections_of", "ros_time"]
 

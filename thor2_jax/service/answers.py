@@ -16,7 +16,7 @@ from thor2_jax.figures import png_bytes
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery.objects import ObjectGallery
-from thor2_jax.model.answers import Recognition
+from thor2_jax.model.recognition import Recognition
 from thor2_jax.service import schemas
 from thor2_jax.service.engine import CloudResult
 from thor2_jax.service.preparation import PreparedRequest

@@ -32,7 +32,7 @@ from thor2_jax.service.pipeline import AdmittedRequest, Service, gallery_errors
 from thor2_jax.service.problem import RequestError, error_responses
 from thor2_jax.service.schemas import NPZ
 from thor2_jax.service.settings import Settings
-from thor2_jax.service.signals import handlers_replaced
+from thor2_jax.signals import handlers_replaced
 
 __all__ = ["PageFiles", "create_app"]
 

@@ -21,10 +21,10 @@ from thor2_jax.frames.instance_clouds import MIN_POINTS
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.gallery.objects import ObjectGallery
 from thor2_jax.gallery.store import INDEX_FILE, check_index
-from thor2_jax.model.answers import Recognition
 from thor2_jax.model.fusion import fuse, fused_probabilities, with_temperature
 from thor2_jax.model.inference import Inference, answers, infer
 from thor2_jax.model.model import Model
+from thor2_jax.model.recognition import Recognition
 from thor2_jax.recognizer import THOR2, Recognizer
 from thor2_jax.service.settings import Settings
 

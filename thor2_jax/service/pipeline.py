@@ -21,7 +21,7 @@ from thor2_jax.gallery.clouds import CompactClouds
 from thor2_jax.gallery.enrollment import LOOKS, enrolled_object, views_to_embed
 from thor2_jax.gallery.objects import ObjectGallery
 from thor2_jax.gallery.store import GalleryBusyError, GalleryError
-from thor2_jax.model.answers import Recognition
+from thor2_jax.model.recognition import Recognition
 from thor2_jax.service.answers import explained_frame, why_answer
 from thor2_jax.service.batching import Batcher
 from thor2_jax.service.engine import CloudResult, ExplanationPrograms, InferenceEngine

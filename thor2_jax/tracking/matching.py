@@ -8,7 +8,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 
 __all__ = ["MIN_OVERLAP", "OccupiedVoxels", "match", "occupied_voxels", "overlap"]
 
@@ -48,6 +47,8 @@ def match(first: Sequence[OccupiedVoxels], second: Sequence[OccupiedVoxels]) -> 
 
     Pairs with an overlap below `MIN_OVERLAP` are left out.
     """
+    from scipy.optimize import linear_sum_assignment  # takes .1 s to import, and one frame needs no matches
+
     overlaps = np.array([[overlap(a, b) for b in second] for a in first]).reshape(len(first), len(second))
     overlaps[overlaps < MIN_OVERLAP] = 0
     rows, columns = linear_sum_assignment(overlaps, maximize=True)

@@ -20,9 +20,9 @@ from numpy.typing import ArrayLike, NDArray
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.prepared_instance import EMPTY_INSTANCE, PreparedInstance
-from thor2_jax.model.answers import MAX_OVERFLOW, Recognition
 from thor2_jax.model.inference import Inference, answers, gallery_scores
 from thor2_jax.model.model import Model
+from thor2_jax.model.recognition import MAX_OVERFLOW, Recognition
 from thor2_jax.tracking.fusion import FusedEvidence, view_weight
 from thor2_jax.tracking.matching import OccupiedVoxels, match, occupied_voxels
 from thor2_jax.tracking.next_view import NextView, ViewTable, next_view

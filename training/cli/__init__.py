@@ -6,8 +6,6 @@ import os
 # XLA reports the features it expects of cached programs as errors. The variable is read when JAX is imported.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
-from training.cli.app import app, main  # noqa: E402
-
 __all__ = ["app", "main"]
 
 COMMANDS = (
@@ -16,5 +14,10 @@ COMMANDS = (
 )
 """The modules of the commands, in the order of the help; importing one adds its command."""
 
-for _name in COMMANDS:
-    importlib.import_module(f"training.cli.{_name}")
+try:
+    from training.cli.app import app, main
+
+    for _name in COMMANDS:
+        importlib.import_module(f"training.cli.{_name}")
+except KeyboardInterrupt:  # Typer ends a command without a traceback, too.
+    raise SystemExit(130) from None

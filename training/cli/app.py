@@ -4,8 +4,12 @@ Invalid input ends a command with one line on standard error and exit code 2.
 """
 
 import itertools
+import os
 import shlex
+import signal
 import sys
+import threading
+from types import FrameType
 from typing import Annotated, NoReturn, TextIO
 
 import typer
@@ -62,8 +66,18 @@ def thor2(
     show_help(context)
 
 
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    """Handle Ctrl-C as Python does, but not in JAX's callback of the garbage collection, where exceptions get lost."""
+    if frame is None or frame.f_code.co_name != "_xla_gc_callback":
+        raise KeyboardInterrupt
+    threading.Timer(0.01, os.kill, [os.getpid(), number]).start()
+
+
 def main() -> None:
     """Run the command line (entry point of the console script)."""
+    handler = signal.getsignal(signal.SIGINT)
+    if handler is signal.default_int_handler:  # Background jobs ignore it.
+        signal.signal(signal.SIGINT, _interrupt)
     try:
         _check_not_empty(sys.argv[1:])
         enable_compilation_cache()
@@ -86,6 +100,8 @@ def main() -> None:
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
         _exit_with(f"{where}{error.strerror or error}")
+    finally:
+        signal.signal(signal.SIGINT, handler)
     raise SystemExit(status)
 
 

@@ -24,7 +24,9 @@ def demo(
     An interrupted demo resumes.
     """
     from training.demo import run_demo
+    from training.storage.workers import keep_freed_memory
 
+    keep_freed_memory()
     with show_progress(quiet) as progress:
         figures = run_demo(out, seed, progress, workers=2)
     table = Table("", *figures.names)

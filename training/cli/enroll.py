@@ -1,7 +1,9 @@
 """`thor2 enroll`: teach a run new objects, without training."""
 
+import contextlib
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -70,37 +72,36 @@ def enroll(
     from training.readers.frames import FrameFolder
 
     meshes = {} if mesh is None else find_object_meshes(mesh, name)
-    for file in meshes.values():
-        load_mesh(file, mesh_scale)
-    for path in (given.color, given.depth, given.labels, given.intrinsics):
-        if path is not None and not path.is_file():
-            raise FileNotFoundError(2, "No such file", str(path))
-    frames = None if meshes else FrameFolder(given.sources(segment), named=name is None)
-
-    # These take seconds to import.
-    from training.enrollment import enroll_objects, labelled_views, mesh_views
-
     skipped: list[str] = []
+    with _rendered(meshes, mesh_scale) as views_of_meshes:
+        for file in meshes.values():
+            load_mesh(file, mesh_scale)
+        for path in (given.color, given.depth, given.labels, given.intrinsics):
+            if path is not None and not path.is_file():
+                raise FileNotFoundError(2, "No such file", str(path))
+        frames = None if meshes else FrameFolder(given.sources(segment), named=name is None)
 
-    def read(sigma_s: float) -> Mapping[str, Callable[[], Sequence["PreparedInstance"]]]:
-        if frames is None:
-            return {each: partial(mesh_views, path, mesh_scale) for each, path in meshes.items()}
-        views, unusable = labelled_views(frames, sigma_s, label_name or name, instance)
-        skipped.extend(f"skipped: {reason}" for _, reason in unusable)
-        views = views if name is None else {name: [view for each in views.values() for view in each]}
-        return {each: partial(list, of_object) for each, of_object in views.items()}
+        # These take seconds to import.
+        from training.enrollment import enroll_objects, labelled_views
 
-    source = "frames" if mesh is None else "mesh"
-    counts, known = enroll_objects(
-        model,
-        read,
-        source,
-        name=name,
-        extend=extend,
-        replace=replace,
-        gallery=gallery,
-        progress=partial(show_progress, quiet),
-    )
+        def read(sigma_s: float) -> Mapping[str, Callable[[], Sequence["PreparedInstance"]]]:
+            if frames is None:
+                return views_of_meshes
+            views, unusable = labelled_views(frames, sigma_s, label_name or name, instance)
+            skipped.extend(f"skipped: {reason}" for _, reason in unusable)
+            views = views if name is None else {name: [view for each in views.values() for view in each]}
+            return {each: partial(list, of_object) for each, of_object in views.items()}
+
+        counts, known = enroll_objects(
+            model,
+            read,
+            "frames" if mesh is None else "mesh",
+            name=name,
+            extend=extend,
+            replace=replace,
+            gallery=gallery,
+            progress=partial(show_progress, quiet),
+        )
     for line in skipped:
         console.print(line)
     for each, count in counts.items():
@@ -109,3 +110,24 @@ def enroll(
         console.print(f"warning: unknown objects are hardly rejected: {known.weak_rejection}")
     enrolled = f"enrolled in {gallery or model}, which knows {known.union.summary}"
     finish(enrolled, "recognize a frame", "recognize", "FRAME", "--model", model)
+
+
+@contextlib.contextmanager
+def _rendered(
+    meshes: Mapping[str, Path], mesh_scale: float
+) -> Iterator[Mapping[str, Callable[[], Sequence["PreparedInstance"]]]]:
+    """Yield object -> function that returns its views, to be called in this order; the first ones are rendered now.
+
+    Several meshes are rendered by two processes, which start while this one imports JAX.
+    """
+    if not meshes:
+        yield {}
+        return
+    from training.storage.workers import local_workers
+    from training.views import enrolled_meshes
+
+    render = partial(enrolled_meshes.mesh_views, mesh_scale=mesh_scale, cameras=enrolled_meshes.MESH_VIEWS)
+    views = local_workers(2 if len(meshes) > 1 else 1)(render, meshes.values())
+    with contextlib.closing(views), ThreadPoolExecutor(1) as thread:
+        first = thread.submit(next, views)
+        yield {name: partial(next, views) if number else first.result for number, name in enumerate(meshes)}

@@ -53,7 +53,7 @@ def explain(
             except InputError as error:
                 if instance is not None:
                     raise InputError(f"{source.name}: {error}") from None
-                print(f"skipped: {escape_characters(source.name)}: {error}", file=sys.stderr)
+                print(escape_characters(f"skipped: {source.name}: {error}"), file=sys.stderr)
                 continue
             write_explanation(explanation, frame, source.name, directory)
             explained += 1

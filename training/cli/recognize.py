@@ -17,7 +17,7 @@ from training.cli.app import app, console, finish
 from training.cli.recognize_bag import recognize_bag
 
 if TYPE_CHECKING:
-    from thor2_jax.model.answers import Recognition
+    from thor2_jax.model.recognition import Recognition
     from thor2_jax.recordings.rerun_file import RerunFile
     from training.frame_recognition import FrameAnswer
 
@@ -129,7 +129,7 @@ def recognize(
             failed.append(answer.name)
             if not frames:
                 raise InputError(str(answer.error))
-            print(f"failed: {answer.name}: {answer.error}", file=sys.stderr)
+            print(escape_characters(f"failed: {answer.name}: {answer.error}"), file=sys.stderr)
         if as_json:
             print(json.dumps(answer.as_json()), flush=True)
         if answer.frame is None:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from thor2_jax.errors import InputError
+from thor2_jax.printable import escape_characters
 from training.cli import options
 from training.cli.app import finish
 
@@ -65,7 +66,7 @@ def recognize_bag(
     n_answers, failed, without_depth, damage = 0, [], [], None
     with bag:
         for note in bag.notes:
-            print(f"note: {note}", file=sys.stderr)
+            print(escape_characters(f"note: {note}"), file=sys.stderr)
         recognizer = arguments.load()
         recognize = recognizer.track().update if track else recognizer.recognize
         with detection_bag or contextlib.nullcontext(), rerun_file or contextlib.nullcontext():
@@ -75,7 +76,7 @@ def recognize_bag(
                     n_answers += answer.error is None
                     if answer.error is not None:
                         failed.append(recorded.name)
-                        print(f"failed: {answer.name}: {answer.error}", file=sys.stderr)
+                        print(escape_characters(f"failed: {answer.name}: {answer.error}"), file=sys.stderr)
                     else:
                         without_depth.append(segmentation_failure(answer))
                     write(recorded, answer)
@@ -87,10 +88,8 @@ def recognize_bag(
         raise InputError(damage + (kept if n_answers else ""))
     unpaired = bag.counts.color - bag.counts.pairs
     if unpaired:
-        print(
-            f"{unpaired} of {bag.counts.color} images of {bag.topics.color} have no depth within {given.max_gap:g} s",
-            file=sys.stderr,
-        )
+        without = f"images of {bag.topics.color} have no depth within {given.max_gap:g} s"
+        print(escape_characters(f"{unpaired} of {bag.counts.color} {without}"), file=sys.stderr)
     result = f"written to {', '.join(written)}" if written else f"frames recognized: {n_answers}"
     segmented = ["--segment", segment] if segment else []
     again = ["explain", *given.arguments, *segmented, *options.given_options(arguments), "--out", "why"]

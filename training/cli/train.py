@@ -178,8 +178,10 @@ def train(
         jax.distributed.initialize(coordinator, processes, process)
     from thor2_jax.model.run_record import RUN_FILE
     from training.fitting.protocol import DEFAULT, PAPER, QUICK
+    from training.storage.workers import keep_freed_memory
     from training.train_job import TrainJob, run_train_job
 
+    keep_freed_memory()
     protocol = PAPER if paper else QUICK if quick else DEFAULT
     protocol = protocol.replace(epochs=epochs, batch_size=batch_size, seed=seed, orientation_copies=orientation_copies)
     protocol = protocol.replace(azimuth_step=azimuth_step, polar_step=polar_step)

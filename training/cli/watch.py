@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from thor2_jax.errors import InputError
+from thor2_jax.printable import escape_characters
 from thor2_jax.recordings.topics import Topics
 from training.cli import options
 from training.cli.app import app, finish
@@ -74,7 +75,7 @@ def watch(
         else:
             opened = stack.enter_context(Bag(bag, topics))
             for note in opened.notes:
-                print(f"note: {note}", file=sys.stderr)
+                print(escape_characters(f"note: {note}"), file=sys.stderr)
             frames = paced(opened.frames(), sleep=wait)
         recognizer = Recognizer.load(model, unknown_below, answer_by=answer_by, chunk=BATCH_BUCKETS[-1])
         broadcast = Broadcast()

@@ -1,4 +1,4 @@
-"""Checks of depth: its unit, its range, and how much of it there is."""
+"""Checks of depth: its unit, its range, how much of it there is, and the focal length by the sizes of known meshes."""
 
 import math
 from collections.abc import Mapping

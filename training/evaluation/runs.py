@@ -17,10 +17,10 @@ from thor2_jax.capacity import BATCH_BUCKETS
 from thor2_jax.errors import InputError
 from thor2_jax.files import content_digest, json_digest
 from thor2_jax.gallery.store import GALLERY_DIRECTORY, INDEX_FILE
-from thor2_jax.model.answers import DescribedFrame
 from thor2_jax.model.classifier import EMBEDDING
 from thor2_jax.model.inference import gallery_scores, infer
 from thor2_jax.model.model import Model
+from thor2_jax.model.recognition import DescribedFrame
 from thor2_jax.model.run_directory import EMBEDDING_FILE
 from thor2_jax.model.run_record import RUN_FILE
 from thor2_jax.recognizer import Recognizer

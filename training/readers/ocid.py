@@ -279,7 +279,8 @@ def _binary(data: bytes, record: np.dtype[Any], n: int, axes: list[int], path: P
     if len(data) < n * record.itemsize:
         raise InputError(f"{path} is cut off: {len(data)} bytes of data; {n * record.itemsize} expected")
     records = np.frombuffer(data, record, count=n)
-    return np.stack([records[f"{axis}"][:, 0].astype(np.float64) for axis in axes], axis=-1)
+    with np.errstate(invalid="ignore"):  # of signalling NaN
+        return np.stack([records[f"{axis}"][:, 0].astype(np.float64) for axis in axes], axis=-1)
 
 
 def _ascii(data: bytes, counts: list[int], n: int, axes: list[int], path: Path) -> NDArray[np.float64]:

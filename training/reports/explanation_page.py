@@ -10,7 +10,7 @@ from thor2_jax.explanation.pictures import change_text, pictures
 from thor2_jax.figures import save_figure
 from thor2_jax.files import atomic_directory, has_json, remove_written, write_text
 from thor2_jax.frames.frames import RGBDFrame
-from thor2_jax.model.answers import Recognition
+from thor2_jax.model.recognition import Recognition
 from training.reports.html import Picture, Section, Table, write_page
 
 __all__ = ["PAGE", "check_no_foreign_files", "write_explanation"]

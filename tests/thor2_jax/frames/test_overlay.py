@@ -11,7 +11,7 @@ from scipy import ndimage
 from thor2_jax.errors import InputError
 from thor2_jax.frames import overlay
 from thor2_jax.frames.overlay import COLORS, UNRECOGNIZED, draw_overlay
-from thor2_jax.model.answers import Recognition
+from thor2_jax.model.recognition import Recognition
 
 GREY = 90
 

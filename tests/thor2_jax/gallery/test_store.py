@@ -4,10 +4,10 @@ import dataclasses
 import hashlib
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
-import textwrap
 from collections.abc import Callable
 from pathlib import Path
 
@@ -296,61 +296,78 @@ def test_damage_is_refused_in_one_line(damage: str, directory: Path) -> None:
 
 
 PROGRAM = """
-    import os, signal, sys
-    from pathlib import Path
-    sys.path.insert(0, {tests!r})
-    from test_store import FINGERPRINT, add
-    from thor2_jax.gallery import store
-    directory, step = Path({directory!r}), {step!r}
+import json, os, signal, sys
+sys.path.insert(0, sys.argv[1])
+from pathlib import Path
+from test_store import FINGERPRINT, add
+from thor2_jax.gallery import store
+
+def write(directory, names, step, after):
     if step:
         original = getattr(store, step)
         def killed(*arguments):
-            if step == "_remove_orphans" or {after}:
+            if step == "_remove_orphans" or after:
                 original(*arguments)
             os.kill(os.getpid(), signal.SIGKILL)
         setattr(store, step, killed)
-    for name in {names!r}:
-        store.update_gallery(directory, add(name, len(name)), FINGERPRINT)
+    for name in names:
+        store.update_gallery(Path(directory), add(name, len(name)), FINGERPRINT)
+
+writers = []
+for writer in json.loads(sys.argv[2]):
+    writers.append(os.fork())
+    if not writers[-1]:
+        write(*writer)
+        os._exit(0)
+print(json.dumps([os.waitstatus_to_exitcode(os.waitpid(writer, 0)[1]) for writer in writers]))
 """
 
 
-def writer(directory: Path, names: list[str], step: str = "", after: bool = False) -> subprocess.Popen[bytes]:
-    program = PROGRAM.format(
-        tests=str(Path(__file__).parent), directory=str(directory), step=step, names=names, after=after
+def write_at_once(*writers: tuple[Path, list[str], str, bool]) -> list[int]:
+    """Enrol the names in each directory, each in its own process, and return their exit codes.
+
+    A process with the name of a function of the store is killed before that step, or after it.
+    """
+    from processes import HANG  # the program imports this file, and cannot import that one
+
+    tests = str(Path(__file__).parent)
+    command = [sys.executable, "-c", PROGRAM, tests, json.dumps(writers, default=str)]
+    done = subprocess.run(
+        command, env={**os.environ, "JAX_PLATFORMS": "cpu"}, capture_output=True, check=True, timeout=HANG
     )
-    return subprocess.Popen(
-        [sys.executable, "-c", textwrap.dedent(program)], env={**os.environ, "JAX_PLATFORMS": "cpu"}
-    )
+    exits: list[int] = json.loads(done.stdout)
+    return exits
 
 
-@pytest.mark.parametrize(
-    ("step", "after"),
-    [("_remove_orphans", True), ("_write_durably", True), ("write_text", False), ("write_text", True)],
-)
-def test_a_killed_writer_leaves_the_gallery_before_or_after(step: str, after: bool, directory: Path) -> None:
+STEPS = [("_write_durably", True), ("write_text", False), ("write_text", True)]
+
+
+def test_a_killed_writer_leaves_the_gallery_before_or_after(directory: Path, tmp_path: Path) -> None:
     before = load_gallery(directory).gallery.names
-    assert writer(directory, ["new"], step, after).wait() == -signal.SIGKILL
-    finished = step == "write_text" and after
-    assert load_gallery(directory).gallery.names == (*before, *(["new"] if finished else []))
-    update_gallery(directory, lambda gallery: gallery, FINGERPRINT)
-    assert len(list((directory / "objects").iterdir())) == 2 + finished
+    steps = [("_remove_orphans", True), *STEPS]
+    copies = [shutil.copytree(directory, tmp_path / str(k)) for k in range(len(steps))]
+    exits = write_at_once(*((copy, ["new"], *step) for copy, step in zip(copies, steps, strict=True)))
+    assert exits == [-signal.SIGKILL] * len(steps)
+    for copy, step in zip(copies, steps, strict=True):
+        finished = step == ("write_text", True)
+        assert load_gallery(copy).gallery.names == (*before, *(["new"] if finished else [])), step
+        update_gallery(copy, lambda gallery: gallery, FINGERPRINT)
+        assert len(list((copy / "objects").iterdir())) == 2 + finished, step
 
 
-@pytest.mark.parametrize(
-    ("step", "after"),
-    [("_write_durably", False), ("_write_durably", True), ("write_text", False), ("write_text", True)],
-)
-def test_a_killed_first_enrolment_leaves_an_empty_gallery(step: str, after: bool, tmp_path: Path) -> None:
-    assert writer(tmp_path, ["mug"], step, after).wait() == -signal.SIGKILL
-    assert load_gallery(tmp_path, FINGERPRINT).gallery.names == ()
-    assert update_gallery(tmp_path, add("bowl", 1), FINGERPRINT).gallery.names == ("bowl",)
-    assert len(list((tmp_path / "objects").iterdir())) == 1
+def test_a_killed_first_enrolment_leaves_an_empty_gallery(tmp_path: Path) -> None:
+    steps = {tmp_path / str(k): step for k, step in enumerate([("_write_durably", False), *STEPS])}
+    exits = write_at_once(*((path, ["mug"], *step) for path, step in steps.items()))
+    assert exits == [-signal.SIGKILL] * len(steps)
+    for path, step in steps.items():
+        assert load_gallery(path, FINGERPRINT).gallery.names == (), step
+        assert update_gallery(path, add("bowl", 1), FINGERPRINT).gallery.names == ("bowl",), step
+        assert len(list((path / "objects").iterdir())) == 1, step
 
 
 def test_two_writers_at_once_both_succeed(directory: Path) -> None:
     names = [[f"a{k}" for k in range(12)], [f"b{k}" for k in range(12)]]
-    writers = [writer(directory, each) for each in names]
-    assert [process.wait() for process in writers] == [0, 0]
+    assert write_at_once(*((directory, each, "", False) for each in names)) == [0, 0]
     assert set(load_gallery(directory).gallery.names) == {"mug", "bowl", *names[0], *names[1]}
 
 

@@ -9,7 +9,7 @@ from pycocotools import mask as coco_mask
 from pycocotools.coco import COCO
 
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, backproject
-from thor2_jax.model.answers import Recognition
+from thor2_jax.model.recognition import Recognition
 from thor2_jax.model.result_files import (
     BOP_HEADER,
     bop_lines,

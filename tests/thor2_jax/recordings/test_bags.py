@@ -1,8 +1,11 @@
 """Recordings of ROS 1, ROS 2 and MCAP."""
 
 import os
+import re
+import sqlite3
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -21,7 +24,7 @@ from recording_files import (
 
 import thor2_jax as thor2
 from thor2_jax.errors import InputError
-from thor2_jax.recordings import decompression
+from thor2_jax.recordings import bags, decompression
 from thor2_jax.recordings.bags import Bag
 from thor2_jax.recordings.topics import Topics, choose_topics
 
@@ -133,17 +136,18 @@ def test_damaged_recordings(tmp_path: Path, name: str, kept: float) -> None:
         assert kept == 1, "a truncated recording was read without an error"
 
 
-@pytest.mark.parametrize("name", ["a.bag", "a.db3", "a.mcap", "folder/folder.db3"])
+@pytest.mark.parametrize("name", ["a.bag", "a.db3", "a.mcap", "folder/folder.db3", "folder/other"])
 def test_pipes_are_refused(tmp_path: Path, name: str) -> None:
     write_recording(tmp_path / "folder", FRAMES[:1])
     (tmp_path / name).unlink(missing_ok=True)
     os.mkfifo(tmp_path / name)
     with pytest.raises(OSError, match="pipe"):
-        Bag(tmp_path / name.removesuffix("/folder.db3")).__enter__()
+        Bag(tmp_path / name.partition("/")[0]).__enter__()
 
 
 @pytest.mark.parametrize(
-    ("name", "compression"), [("a.bag", "bz2"), ("a.bag", "lz4"), ("a.mcap", "storage"), ("folder", "message")]
+    ("name", "compression"),
+    [("a.bag", "bz2"), ("a.bag", "lz4"), ("a.mcap", "storage"), ("folder", "message"), ("folder", "file")],
 )
 def test_decompression_has_a_limit(
     tmp_path: Path, name: str, compression: str, monkeypatch: pytest.MonkeyPatch
@@ -152,7 +156,95 @@ def test_decompression_has_a_limit(
     with Bag(path) as bag:
         np.testing.assert_array_equal(next(bag.frames()).read().depth, FRAMES[0].depth)
     monkeypatch.setattr(decompression, "MAX_DECOMPRESSED", 2**16)
+    monkeypatch.setattr(decompression, "MAX_RATIO", 1)
     with pytest.raises(InputError, match="more than 65536 bytes"), Bag(path) as bag:
+        list(bag.frames())
+
+
+def test_the_largest_overlap_of_chunks() -> None:
+    def overlap(*chunks: tuple[int, int, int, int]) -> int:
+        names = "message_start_time", "message_end_time", "uncompressed_size"
+        of_storage = [
+            SimpleNamespace(**dict(zip(names, chunk, strict=True)), channel_count={channel: 1})
+            for *chunk, channel in chunks
+        ]
+        return decompression.largest_overlap(SimpleNamespace(storage=SimpleNamespace(chunks=of_storage)), {1, 2})
+
+    assert overlap() == 0
+    assert overlap((0, 9, 5, 1), (5, 12, 5, 2), (10, 20, 5, 1), (13, 30, 5, 1)) == 10
+    assert overlap((0, 9, 5, 1), (5, 9, 5, 1), (9, 20, 5, 1)) == 15
+    assert overlap((0, 5, 7, 1), (9, 1, 50, 2), (3, 4, 1, 1), (0, 20, 100, 3)) == 50
+
+
+def test_chunks_of_the_same_time_have_a_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write_recording(tmp_path / "a.mcap", FRAMES[:1])
+    monkeypatch.setattr(bags, "MAX_OVERLAPPING", 1000)
+    with pytest.raises(InputError, match="chunks of the same time; expected at most 1000"), Bag(path):
+        pass
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_definitions_of_messages_are_not_compiled(tmp_path: Path, name: str) -> None:
+    path = write_recording(tmp_path / name, FRAMES[:1])
+    file = next(path.glob("*.db3")) if path.is_dir() else path
+    content = file.read_bytes()
+    assert b"uint32 height" in content
+    file.write_bytes(content.replace(b"uint32 height", b"import height"))
+    with Bag(path) as bag:
+        np.testing.assert_array_equal(next(bag.frames()).read().depth, FRAMES[0].depth)
+
+
+@pytest.mark.parametrize("value", ["[x]", "5", "*many"], ids=["list", "number", "aliases"])
+def test_damaged_metadata(tmp_path: Path, value: str) -> None:
+    path = write_recording(tmp_path / "folder", FRAMES[:1])
+    metadata = (path / "metadata.yaml").read_text()
+    aliases = [f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 8)}]" for k in range(1, 12)]
+    text = metadata.replace(f"name: {COLOR}", f"name: {value}").replace("*many", "*a11")
+    assert text != metadata
+    (path / "metadata.yaml").write_text("\n".join(["a0: &a0 [x]", *aliases, text]) if "*" in value else text)
+    with pytest.raises(InputError, match="damaged"), Bag(path):
+        pass
+
+
+def test_topics_have_a_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write_recording(tmp_path / "a.mcap", FRAMES[:1])
+    monkeypatch.setattr(bags, "MAX_TOPICS", 2)
+    with pytest.raises(InputError, match="3 topics of images"), Bag(path):
+        pass
+
+
+def test_files_of_metadata_are_a_list(tmp_path: Path) -> None:
+    path = write_recording(tmp_path / "folder", FRAMES[:1])
+    metadata = (path / "metadata.yaml").read_text()
+    (path / "metadata.yaml").write_text(re.sub(r"(?s)  files:.*?(?=\n  \w)", "  files: x", metadata))
+    assert "files: x" in (path / "metadata.yaml").read_text()
+    with pytest.raises(InputError, match="no list"), Bag(path):
+        pass
+
+
+@pytest.mark.parametrize("change", ["timestamp = 'x'", "timestamp = NULL", "data = 'x'"])
+def test_columns_of_other_types(tmp_path: Path, change: str) -> None:
+    path = write_recording(tmp_path / "folder", FRAMES[:1])
+    with sqlite3.connect(path / "folder.db3") as database:
+        database.execute("CREATE TABLE copy AS SELECT * FROM messages")
+        database.execute(f"UPDATE copy SET {change}")
+        database.execute("DROP TABLE messages")
+        database.execute("ALTER TABLE copy RENAME TO messages")
+    database.close()
+    with pytest.raises(InputError, match="damaged"), Bag(path) as bag:
+        list(bag.frames())
+
+
+def test_a_computed_column_has_a_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write_recording(tmp_path / "folder", FRAMES[:1])
+    with sqlite3.connect(path / "folder.db3") as database:
+        database.execute("ALTER TABLE messages RENAME TO old")
+        columns = "topic_id, timestamp, data GENERATED ALWAYS AS (zeroblob(1000000)) VIRTUAL"
+        database.execute(f"CREATE TABLE messages(id INTEGER PRIMARY KEY, {columns})")
+        database.execute("INSERT INTO messages(topic_id, timestamp) SELECT topic_id, timestamp FROM old")
+    database.close()
+    monkeypatch.setattr(decompression, "MAX_DECOMPRESSED", 2**18)
+    with pytest.raises(InputError, match="too big"), Bag(path) as bag:
         list(bag.frames())
 
 
@@ -187,7 +279,7 @@ def test_no_recording(tmp_path: Path, write: Any, message: str) -> None:
 
 
 def test_without_rosbags(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
+    monkeypatch.setitem(sys.modules, "rosbags.rosbag1", None)
     with pytest.raises(InputError, match=r"\.\[bags\]"), Bag(tmp_path):
         pass
 

@@ -11,7 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
 import httpx
 import numpy as np
@@ -46,11 +46,6 @@ def one_tls_context() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ssl, "create_default_context", functools.cache(ssl.create_default_context))
         yield
-
-
-@pytest.fixture(scope="session")
-def encode() -> Callable[..., bytes]:
-    return encode_image
 
 
 @pytest.fixture(scope="session")
@@ -221,21 +216,55 @@ def http(server: Server) -> Iterator[httpx.Client]:
         yield client
 
 
-@pytest.fixture
-def open_page(browser: Browser, request: pytest.FixtureRequest) -> Iterator[Callable[..., Page]]:
-    """Open the page in a new profile; afterwards, check that no other server was contacted and no script failed."""
-    contexts, sources, urls, errors = [], [], [], []
+@pytest.fixture(scope="module")
+def blank_page(browser: Browser) -> Callable[[bool], Page]:
+    """Return a page of a computer or of a phone: one of each for the tests of a file, as a page takes a second."""
 
-    def open_one(route: Callable[[Route], None] | None = None, samples: int = 4, url: str = "", **options: Any) -> Page:
+    @functools.cache
+    def page(is_phone: bool) -> Page:
+        made = browser.new_context(is_mobile=is_phone, has_touch=is_phone).new_page()
+        made.set_default_timeout(1000 * HANG)
+        return made
+
+    return page
+
+
+@pytest.fixture
+def open_page(blank_page: Callable[[bool], Page], request: pytest.FixtureRequest) -> Iterator[Callable[..., Page]]:
+    """Load the page anew; afterwards, check that no other server was contacted and no script failed."""
+    opened, sources, urls, errors = [], [], [], []
+    record = {
+        "request": lambda request: urls.append(request.url),
+        "pageerror": lambda error: errors.append(str(error)),
+        # Error statuses also appear in the console; tests check how the page shows them.
+        "console": lambda line: errors.append(line.text) if "status of" not in line.text else None,
+    }
+
+    def close(page: Page) -> None:
+        page.unroute_all(behavior="ignoreErrors")
+        page.goto("about:blank")
+        for event, listener in record.items():
+            page.remove_listener(event, listener)
+
+    def open_one(
+        route: Callable[[Route], None] | None = None,
+        samples: int = 4,
+        url: str = "",
+        size: tuple[int, int] = (1280, 720),
+        phone: bool = False,
+        scheme: Literal["light", "dark"] = "light",
+    ) -> Page:
         url = url or request.getfixturevalue("server").url
         sources.append(f"{url}/")
-        contexts.append(browser.new_context(**options))
-        page = contexts[-1].new_page()
-        page.set_default_timeout(1000 * HANG)
-        page.on("request", lambda request: urls.append(request.url))
-        page.on("pageerror", lambda error: errors.append(str(error)))
-        # Error statuses also appear in the console; tests check how the page shows them.
-        page.on("console", lambda line: errors.append(line.text) if "status of" not in line.text else None)
+        page = blank_page(phone)
+        if page in opened:
+            close(page)
+        else:
+            opened.append(page)
+        page.set_viewport_size({"width": size[0], "height": size[1]})
+        page.emulate_media(color_scheme=scheme)
+        for event, listener in record.items():
+            page.on(event, listener)
         if route is not None:
             page.route("**/v1/**", route)
         page.goto(url)
@@ -243,7 +272,7 @@ def open_page(browser: Browser, request: pytest.FixtureRequest) -> Iterator[Call
         return page
 
     yield open_one
-    for context in contexts:
-        context.close()
+    for page in opened:
+        close(page)
     assert urls and all(url.startswith(tuple(sources)) for url in urls)
     assert errors == []

@@ -3,13 +3,13 @@
 import asyncio
 import io
 import socket
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import httpx
 import numpy as np
 import pytest
+from helpers import encode_image
 from PIL import Image
 
 import colornet
@@ -58,12 +58,10 @@ def test_jpeg_color_and_plain_intrinsics_field(
     assert answer.status_code == 200 and len(answer.json()["instances"]) == 4
 
 
-def test_frames_without_instances_or_depth(
-    http: httpx.Client, files: dict[str, bytes], encode: Callable[..., bytes]
-) -> None:
-    empty = encode(np.zeros((240, 320), np.uint8))
+def test_frames_without_instances_or_depth(http: httpx.Client, files: dict[str, bytes]) -> None:
+    empty = encode_image(np.zeros((240, 320), np.uint8))
     assert http.post("/v1/recognize", files=files | {"labels": empty}).json()["instances"] == []
-    blind = encode(np.zeros((240, 320), np.uint16))
+    blind = encode_image(np.zeros((240, 320), np.uint16))
     instances = http.post("/v1/recognize", files=files | {"depth": blind}).json()["instances"]
     assert len(instances) == 4 and all(one["unrecognized"] for one in instances)
 

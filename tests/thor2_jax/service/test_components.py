@@ -334,15 +334,24 @@ def test_large_files_stay_in_memory(app: FastAPI, files: dict[str, bytes], monke
 
 def test_dead_worker_has_no_requests_in_progress(tmp_path: Path) -> None:
     """Its other counts are kept."""
-    worker = "from thor2_jax.service.metrics import Metrics; import os; metrics = Metrics(); "
-    died = "metrics.in_progress.inc(3); metrics.compilations.inc(2); os._exit(0)"
-    text = ""
-    for code in (died, "metrics.in_progress.inc(1); print(metrics.text().decode())"):
-        environment = os.environ | {"PROMETHEUS_MULTIPROC_DIR": str(tmp_path)}
-        text = subprocess.run(
-            [sys.executable, "-c", worker + code],
-            cwd=Path(__file__).parents[3], env=environment, check=True, capture_output=True, text=True,
-        ).stdout  # fmt: skip
+    code = """if True:
+        import os
+        from thor2_jax.service.metrics import Metrics
+        died = os.fork()
+        metrics = Metrics()
+        if not died:
+            metrics.in_progress.inc(3)
+            metrics.compilations.inc(2)
+            os._exit(0)
+        os.waitpid(died, 0)
+        metrics.in_progress.inc(1)
+        print(metrics.text().decode())
+    """
+    environment = os.environ | {"PROMETHEUS_MULTIPROC_DIR": str(tmp_path)}
+    text = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=Path(__file__).parents[3], env=environment, check=True, capture_output=True, text=True,
+    ).stdout  # fmt: skip
     assert "thor2_requests_waiting 1.0" in text and "thor2_compilations_after_warm_up_total 2.0" in text
 
 

@@ -2,21 +2,21 @@
 
 import dataclasses
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import httpx
 import numpy as np
 import pytest
+from helpers import encode_image
 
 import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.describe import strips
-from thor2_jax.model.answers import DescribedFrame
 from thor2_jax.model.classifier import RunClassifiers
 from thor2_jax.model.confidence import Calibration
 from thor2_jax.model.inference import Inference
+from thor2_jax.model.recognition import DescribedFrame
 from thor2_jax.service.answers import explained_frame
 from thor2_jax.service.engine import CloudResult, InferenceEngine
 from thor2_jax.service.preparation import MAX_LABEL_RUNS, PreparedRequest, prepare_frame
@@ -121,15 +121,15 @@ def test_label_map_decodes_to_the_label_image(answer: Any, frame: thor2.RGBDFram
     assert set(answer["timings"]) >= {"upload", "decode", "clouds", "device", "total"}
 
 
-def test_label_map_with_many_runs_is_subsampled(files: Files, encode: Callable[..., bytes]) -> None:
+def test_label_map_with_many_runs_is_subsampled(files: Files) -> None:
     labels = np.random.default_rng(0).integers(0, 3, (240, 320)).astype(np.uint8)  # 51,000 runs
     assert (np.diff(labels.ravel()) != 0).sum() > MAX_LABEL_RUNS
-    label_map = prepare_frame(files | {"labels": encode(labels)}, 2.5, True, None).label_map
+    label_map = prepare_frame(files | {"labels": encode_image(labels)}, 2.5, True, None).label_map
     assert label_map is not None and len(label_map.labels) <= MAX_LABEL_RUNS
     np.testing.assert_array_equal(decoded(label_map), labels[::2, ::2])
     for shape in ((1, 1), (1, 3)):
-        one = files | {name: encode(np.ones(shape, kind)) for name, kind in (("labels", "u1"), ("depth", "u2"))}
-        one["color"] = encode(np.zeros((*shape, 3), np.uint8))
+        one = files | {name: encode_image(np.ones(shape, kind)) for name, kind in (("labels", "u1"), ("depth", "u2"))}
+        one["color"] = encode_image(np.zeros((*shape, 3), np.uint8))
         small = prepare_frame(one, 2.5, True, None).label_map
         assert small is not None and (small.labels, small.lengths) == ([1], [shape[1]])
     assert prepare_frame(files, 2.5, False, None).label_map is None

@@ -18,9 +18,7 @@ from thor2_jax.service.settings import Settings
 pytestmark = pytest.mark.usefixtures("small_buckets")
 
 
-@pytest.mark.parametrize(
-    ("trained", "answer_by"), [((), None), (("a", "b"), None), (("a", "b"), "gallery"), (("a", "b"), "classifiers")]
-)
+@pytest.mark.parametrize(("trained", "answer_by"), [((), None), (("a", "b"), None), (("a", "b"), "classifiers")])
 def test_the_engine_answers_as_the_recognizer(
     trained: tuple[str, ...], answer_by: str | None, frame: thor2.RGBDFrame, tmp_path: Path
 ) -> None:

@@ -2,20 +2,21 @@
 
 import contextlib
 import dataclasses
+import functools
 import io
 import json
 import socket
 import struct
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import httpx
 import numpy as np
 import pytest
 from fastapi import FastAPI
-from helpers import deep_png
+from helpers import deep_png, encode_image, png_file, with_checksums
 from PIL import Image
 from processes import HANG
 
@@ -56,15 +57,12 @@ def test_incomplete_heads_time_out(server: Any) -> None:
             assert answer.count(b"HTTP/1.1 200") == sent.count(b"\r\n\r\n")
 
 
+@functools.cache
 def png_bomb(width: int, height: int, kind: int = 2, bits: int = 8) -> bytes:
     """PNG whose header declares a large image, with a deflated run of zeros."""
-
-    def chunk(name: bytes, content: bytes) -> bytes:
-        return struct.pack(">I", len(content)) + name + content + struct.pack(">I", zlib.crc32(name + content))
-
     header = struct.pack(">IIBBBBB", width, height, bits, kind, 0, 0, 0)
     data = zlib.compress(bytes(10**7), 9)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
+    return png_file(with_checksums((b"IHDR", header), (b"IDAT", data), (b"IEND", b"")))
 
 
 @pytest.mark.parametrize("field", ["color", "depth", "labels"])
@@ -81,9 +79,7 @@ def test_damaged_truncated_or_large_images(http: httpx.Client, files: Files, fie
         assert answer.status_code in (413, 422) and answer.json()["field"] == field
 
 
-def test_images_of_other_modes_and_formats(
-    http: httpx.Client, files: Files, frame: Any, encode: Callable[..., bytes]
-) -> None:
+def test_images_of_other_modes_and_formats(http: httpx.Client, files: Files, frame: Any) -> None:
     gif = io.BytesIO()
     Image.fromarray(frame.labels).save(gif, "GIF")
     for field, content in (
@@ -117,15 +113,17 @@ def test_absurd_intrinsics_give_no_names(http: httpx.Client, files: Files) -> No
         assert all(one["unrecognized"] for one in instances)
 
 
-def test_images_of_different_sizes(http: httpx.Client, files: Files, encode: Callable[..., bytes]) -> None:
+def test_images_of_different_sizes(http: httpx.Client, files: Files) -> None:
     for field, kind in (("depth", np.uint16), ("labels", np.uint8)):
-        small = encode(np.ones((120, 160), kind))
+        small = encode_image(np.ones((120, 160), kind))
         check_refused(http.post("/v1/recognize", files=files | {field: small}), 422, field, "(120, 160)", "(240, 320)")
 
 
-def test_too_many_instances(http: httpx.Client, files: Files, encode: Callable[..., bytes]) -> None:
+def test_too_many_instances(http: httpx.Client, files: Files) -> None:
     many = np.arange(240 * 320).astype(np.uint16).reshape(240, 320)  # 65,535 labels and background.
-    check_refused(http.post("/v1/recognize", files=files | {"labels": encode(many)}), 422, "labels", "65535 instances")
+    check_refused(
+        http.post("/v1/recognize", files=files | {"labels": encode_image(many)}), 422, "labels", "65535 instances"
+    )
 
 
 def test_invalid_intrinsics(http: httpx.Client, files: Files) -> None:
@@ -299,14 +297,14 @@ def test_unsupported_content_types(http: httpx.Client) -> None:
         assert http.post("/v1/describe", content=b"{}", headers={"content-type": kind}).status_code == 415
 
 
-def test_slow_frame_is_answered_or_cut_off(short_deadline: str, files: Files, encode: Callable[..., bytes]) -> None:
+def test_slow_frame_is_answered_or_cut_off(short_deadline: str, files: Files) -> None:
     """Noise over the largest image, where every point is a voxel, takes more than a second on most machines."""
     rng = np.random.default_rng(0)
     shape = (1080, 1920)
     images = {
-        "color": encode(np.zeros((*shape, 3), np.uint8)),
-        "depth": encode(rng.integers(260, 2500, shape).astype(np.uint16)),
-        "labels": encode(np.ones(shape, np.uint8)),
+        "color": encode_image(np.zeros((*shape, 3), np.uint8)),
+        "depth": encode_image(rng.integers(260, 2500, shape).astype(np.uint16)),
+        "labels": encode_image(np.ones(shape, np.uint8)),
     }
     answer = httpx.post(f"{short_deadline}/v1/recognize", files=files | images, timeout=HANG)
     assert answer.status_code in (200, 504)

@@ -9,6 +9,7 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
+from helpers import encode_image
 from page_actions import FIELDS, upload
 from PIL import Image
 from playwright.sync_api import Locator, Page, Route, expect
@@ -16,6 +17,7 @@ from playwright.sync_api import Locator, Page, Route, expect
 import thor2_jax
 
 Files = dict[str, bytes]
+Open = Callable[..., Page]
 SAMPLES = Path(thor2_jax.__file__).parent / "service" / "page" / "samples"
 
 
@@ -54,8 +56,8 @@ def pixels(canvas: Locator) -> np.ndarray:
     return np.asarray(Image.open(io.BytesIO(canvas.screenshot())).convert("RGB")).astype(int)
 
 
-def test_sample_is_outlined_and_named(open_page: Callable[..., Page], classes: tuple[str, ...]) -> None:
-    page = open_page(viewport={"width": 1280, "height": 900})
+def test_sample_is_outlined_and_named(open_page: Open, classes: tuple[str, ...]) -> None:
+    page = open_page(size=(1280, 900))
     expect(page.locator("#ready")).to_have_text("Ready")
     labels = choose_sample(page)
     count = len(np.unique(labels)) - 1
@@ -78,8 +80,8 @@ def test_sample_is_outlined_and_named(open_page: Callable[..., Page], classes: t
         assert around > 2 * (high - low).max(), f"object {k} has no outline"
 
 
-def test_click_shows_the_details_of_an_object(open_page: Callable[..., Page]) -> None:
-    page = open_page(viewport={"width": 1280, "height": 900})
+def test_click_shows_the_details_of_an_object(open_page: Open) -> None:
+    page = open_page(size=(1280, 900))
     labels = choose_sample(page)
     overlay = page.locator("#overlay")
     box = overlay.bounding_box()
@@ -116,7 +118,7 @@ def test_click_shows_the_details_of_an_object(open_page: Callable[..., Page]) ->
     expect(page.locator("#help")).to_contain_text("Higher probability")
 
 
-def test_keyboard_navigation(open_page: Callable[..., Page], classes: tuple[str, ...]) -> None:
+def test_keyboard_navigation(open_page: Open, classes: tuple[str, ...]) -> None:
     page = open_page()
 
     def tab_to(selector: str) -> None:
@@ -141,7 +143,7 @@ def test_keyboard_navigation(open_page: Callable[..., Page], classes: tuple[str,
     expect(page.locator("#classes li")).to_have_count(len(classes))
 
 
-def test_uploaded_frame(open_page: Callable[..., Page], files: Files) -> None:
+def test_uploaded_frame(open_page: Open, files: Files) -> None:
     page = open_page()
     upload(page, files, color_name="<b>x</b>.png")
     status = page.get_by_role("status")
@@ -157,14 +159,14 @@ def test_uploaded_frame(open_page: Callable[..., Page], files: Files) -> None:
     expect(page.locator("#evidence")).to_be_visible()
 
 
-def test_frame_without_objects(open_page: Callable[..., Page], files: Files, encode: Callable[..., bytes]) -> None:
+def test_frame_without_objects(open_page: Open, files: Files) -> None:
     page = open_page()
-    upload(page, files | {"labels": encode(np.zeros((240, 320), np.uint8))})
+    upload(page, files | {"labels": encode_image(np.zeros((240, 320), np.uint8))})
     expect(page.get_by_role("status")).to_contain_text("no objects")
     expect(page.locator("#details")).to_be_hidden()
 
 
-def test_errors_appear_beside_their_fields(open_page: Callable[..., Page], http: httpx.Client, files: Files) -> None:
+def test_errors_appear_beside_their_fields(open_page: Open, http: httpx.Client, files: Files) -> None:
     page = open_page()
     page.get_by_text("Upload your own frame").click()
     page.get_by_role("button", name="Recognize", exact=True).click()
@@ -188,7 +190,7 @@ def test_errors_appear_beside_their_fields(open_page: Callable[..., Page], http:
     expect(page.locator(".error:not(:empty), [aria-invalid]")).to_have_count(0)
 
 
-def test_all_field_errors_are_shown(open_page: Callable[..., Page], files: Files) -> None:
+def test_all_field_errors_are_shown(open_page: Open, files: Files) -> None:
     page = open_page()
     upload(page, files | {"color": b"damaged", "depth": files["color"], "intrinsics": b"{}"})
     for field in ("color", "depth", "intrinsics"):
@@ -197,9 +199,7 @@ def test_all_field_errors_are_shown(open_page: Callable[..., Page], files: Files
     expect(page.locator("#color")).to_be_focused()
 
 
-def test_samples_need_a_model_that_knows_their_objects(
-    open_page: Callable[..., Page], classes: tuple[str, ...]
-) -> None:
+def test_samples_need_a_model_that_knows_their_objects(open_page: Open, classes: tuple[str, ...]) -> None:
     def with_classes(*names: str) -> Callable[[Route], None]:
         def route(route: Route) -> None:
             if "/v1/model" not in route.request.url:
@@ -221,7 +221,7 @@ def test_samples_need_a_model_that_knows_their_objects(
     expect(page.locator("#no-samples")).to_be_hidden()
 
 
-def test_page_retries_while_the_service_starts(open_page: Callable[..., Page]) -> None:
+def test_page_retries_while_the_service_starts(open_page: Open) -> None:
     attempts = {"model": 0, "explain": 0}
 
     def starting(route: Route) -> None:
@@ -242,21 +242,20 @@ def test_page_retries_while_the_service_starts(open_page: Callable[..., Page]) -
     assert attempts == {"model": 3, "explain": 3}
 
 
-def test_details_are_visible_without_scrolling(open_page: Callable[..., Page]) -> None:
-    page = open_page(viewport={"width": 1280, "height": 800})
+def test_details_are_visible_without_scrolling(open_page: Open) -> None:
+    page = open_page(size=(1280, 800))
     choose_sample(page)
     assert page.evaluate("scrollY") == 0
     for selector in ("#overlay", "#details-facts", "#cloud", "#classifiers"):
         expect(page.locator(selector)).to_be_in_viewport(ratio=1)
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_a_phone_scrolls_little_and_keeps_the_picture(open_page: Callable[..., Page], scheme: str) -> None:
-    size = {"width": 390, "height": 844}
-    phone = open_page(viewport=size, is_mobile=True, has_touch=True, color_scheme=scheme)
+def test_a_phone_scrolls_little_and_keeps_the_picture(open_page: Open) -> None:
+    size = (390, 844)
+    phone = open_page(size=size, phone=True, scheme="dark")
     choose_sample(phone)
     phone.locator("#objects button").nth(1).tap()
-    assert phone.evaluate("document.documentElement.scrollHeight") - size["height"] <= 800
+    assert phone.evaluate("document.documentElement.scrollHeight") - size[1] <= 800
     expect(phone.locator("#details-facts")).to_be_in_viewport(ratio=1)
     expect(phone.locator("#answer")).to_contain_text(phone.locator("#details-title").inner_text())
     phone.evaluate("scrollTo(0, document.documentElement.scrollHeight)")
@@ -268,18 +267,16 @@ def test_a_phone_scrolls_little_and_keeps_the_picture(open_page: Callable[..., P
     assert len(np.unique(pixels(phone.locator("#cloud")).reshape(-1, 3), axis=0)) > 20
 
 
-def test_sixteen_objects_have_different_colors(
-    open_page: Callable[..., Page], files: Files, encode: Callable[..., bytes]
-) -> None:
+def test_sixteen_objects_have_different_colors(open_page: Open, files: Files) -> None:
     page = open_page()
     rows, columns = np.indices((240, 320))
-    upload(page, files | {"labels": encode((4 * (rows // 60) + columns // 80 + 1).astype(np.uint8))})
+    upload(page, files | {"labels": encode_image((4 * (rows // 60) + columns // 80 + 1).astype(np.uint8))})
     expect(page.locator("#objects button")).to_have_count(16)
     script = "all => all.map(one => one.style.backgroundColor)"
     assert len(set(page.locator("#objects .swatch").evaluate_all(script))) == 16
 
 
-def test_persistence_images_have_axes(open_page: Callable[..., Page]) -> None:
+def test_persistence_images_have_axes(open_page: Open) -> None:
     page = open_page()
     page.evaluate(
         """() => {
@@ -295,7 +292,7 @@ def test_persistence_images_have_axes(open_page: Callable[..., Page]) -> None:
     assert set(page.evaluate("[...window.texts]")) == {"0", "30", "birth (cm)", "persistence (cm)"}
 
 
-def test_confidence_is_calibrated_or_said_not_to_be(open_page: Callable[..., Page]) -> None:
+def test_confidence_is_calibrated_or_said_not_to_be(open_page: Open) -> None:
     def with_confidence(calibrated: float | None) -> Callable[[Route], None]:
         def change(answer: Any) -> None:
             for one in answer["instances"]:
@@ -317,7 +314,7 @@ def test_confidence_is_calibrated_or_said_not_to_be(open_page: Callable[..., Pag
         expect(page.locator("#confidence-help")).to_contain_text(words)
 
 
-def test_details_of_an_embedding_alone(open_page: Callable[..., Page]) -> None:
+def test_details_of_an_embedding_alone(open_page: Open) -> None:
     def with_confidence(calibrated: float | None) -> Callable[[Route], None]:
         def change(answer: Any) -> None:
             for one in answer["instances"]:
@@ -334,7 +331,7 @@ def test_details_of_an_embedding_alone(open_page: Callable[..., Page]) -> None:
         expect(page.locator("#confidence-help")).to_contain_text(words)
 
 
-def test_bidirectional_controls_in_names_are_escaped(open_page: Callable[..., Page], files: Files) -> None:
+def test_bidirectional_controls_in_names_are_escaped(open_page: Open, files: Files) -> None:
     def change(answer: Any) -> None:
         for one in answer["instances"]:
             one["name"] = one["name"] and "mug\u202egpj"
@@ -346,7 +343,7 @@ def test_bidirectional_controls_in_names_are_escaped(open_page: Callable[..., Pa
     assert "\u202e" not in page.content()
 
 
-def test_page_asks_for_the_token(open_page: Callable[..., Page]) -> None:
+def test_page_asks_for_the_token(open_page: Open) -> None:
     def guard(route: Route) -> None:
         if route.request.headers.get("authorization") == "Bearer secret":
             route.continue_()
@@ -367,28 +364,33 @@ def test_page_asks_for_the_token(open_page: Callable[..., Page]) -> None:
     choose_sample(page)
 
 
-@pytest.mark.parametrize(
-    ("response", "message"),
-    [
-        (
-            {"status": 429, "headers": {"Retry-After": "1"}, "json": {"field": None, "message": "Too many wait."}},
-            "Too many wait. Try again in a moment.",
-        ),
-        ({"status": 502, "body": "<html>"}, "The service answered with status 502."),
-        ({"status": 413, "json": {"field": "body", "message": "The body is too large."}}, "The body is too large."),
-    ],
-)
-def test_error_responses_are_shown(open_page: Callable[..., Page], response: Any, message: str) -> None:
-    page = open_page(lambda route: route.fulfill(**response) if "explain" in route.request.url else route.continue_())
-    page.locator("#samples button").first.click()
-    expect(page.get_by_role("alert")).to_have_text(message)
-    expect(page.locator("#result")).to_be_hidden()
-    page.unroute("**/v1/**")
+ERRORS: list[tuple[Any, str]] = [
+    (
+        {"status": 429, "headers": {"Retry-After": "1"}, "json": {"field": None, "message": "Too many wait."}},
+        "Too many wait. Try again in a moment.",
+    ),
+    ({"status": 502, "body": "<html>"}, "The service answered with status 502."),
+    ({"status": 413, "json": {"field": "body", "message": "The body is too large."}}, "The body is too large."),
+]
+
+
+def test_error_responses_are_shown(open_page: Open) -> None:
+    answers = iter(ERRORS)
+
+    def fail(route: Route) -> None:
+        route.fulfill(**next(answers)[0])
+
+    page = open_page()
+    page.route("**/v1/explain*", fail, times=len(ERRORS))
+    for _, message in ERRORS:
+        page.locator("#samples button").first.click()
+        expect(page.get_by_role("alert")).to_have_text(message)
+        expect(page.locator("#result")).to_be_hidden()
     choose_sample(page)
     expect(page.get_by_role("alert")).to_be_hidden()
 
 
-def test_files_over_the_size_limit(open_page: Callable[..., Page], files: Files, tmp_path: Path) -> None:
+def test_files_over_the_size_limit(open_page: Open, files: Files, tmp_path: Path) -> None:
     page = open_page()
     upload(page, files)
     expect(page.locator("#objects button")).to_have_count(4)
@@ -399,8 +401,8 @@ def test_files_over_the_size_limit(open_page: Callable[..., Page], files: Files,
     expect(page.get_by_role("alert")).to_contain_text("bytes")
 
 
-def test_phone_width(open_page: Callable[..., Page], files: Files) -> None:
-    page = open_page(viewport={"width": 360, "height": 740}, is_mobile=True, has_touch=True)
+def test_phone_width(open_page: Open, files: Files) -> None:
+    page = open_page(size=(360, 740), phone=True)
 
     def fits() -> None:
         assert page.evaluate("document.documentElement.scrollWidth") <= 360
@@ -464,12 +466,8 @@ def with_long_names(answer: Any) -> None:
         one["name"] = one["name"] and LONG
 
 
-def test_tags_of_a_narrow_image_do_not_overlap(
-    open_page: Callable[..., Page], files: Files, encode: Callable[..., bytes]
-) -> None:
-    page = open_page(
-        changed_answers(with_long_names), viewport={"width": 360, "height": 740}, is_mobile=True, has_touch=True
-    )
+def test_tags_of_a_narrow_image_do_not_overlap(open_page: Open, files: Files) -> None:
+    page = open_page(changed_answers(with_long_names), size=(360, 740), phone=True)
     page.evaluate(RECORD_TAGS)
     for k, sample in enumerate(json.loads((SAMPLES / "index.json").read_text())):
         page.locator("#samples button").nth(k).tap()
@@ -482,7 +480,7 @@ def test_tags_of_a_narrow_image_do_not_overlap(
     for number in range(48):
         y, x = divmod(number, 8)
         labels[40 * y + 5 : 40 * y + 35, 40 * x + 5 : 40 * x + 35] = number + 1
-    upload(page, files | {"labels": encode(labels)})
+    upload(page, files | {"labels": encode_image(labels)})
     expect(page.locator("#objects button")).to_have_count(48)
     tags = tags_of(page)
     numbers = [tag for tag in tags if tag[0].isdigit()]
@@ -494,16 +492,14 @@ def test_tags_of_a_narrow_image_do_not_overlap(
         expect(chosen.locator(".swatch")).to_have_text(number)
 
 
-def test_tags_do_not_hide_small_objects(
-    open_page: Callable[..., Page], files: Files, encode: Callable[..., bytes]
-) -> None:
-    page = open_page(viewport={"width": 360, "height": 740}, is_mobile=True, has_touch=True)
+def test_tags_do_not_hide_small_objects(open_page: Open, files: Files) -> None:
+    page = open_page(size=(360, 740), phone=True)
     page.evaluate(RECORD_TAGS)
     labels = np.zeros((240, 320), np.uint8)
     places = {1: (20, 20), 2: (20, 150), 3: (100, 60), 4: (100, 230), 5: (180, 150)}
     for label, (y, x) in places.items():
         labels[y : y + 16, x : x + 20] = label
-    upload(page, files | {"labels": encode(labels)})
+    upload(page, files | {"labels": encode_image(labels)})
     expect(page.locator("#objects button")).to_have_count(5)
     scale = page.evaluate("overlay.clientWidth") / 320
     tags = tags_of(page)
@@ -516,20 +512,18 @@ def test_tags_do_not_hide_small_objects(
             assert covered <= 0.34, f"{text} hides an object"
 
 
-def test_object_lost_in_the_subsampled_label_map(
-    open_page: Callable[..., Page], files: Files, encode: Callable[..., bytes]
-) -> None:
+def test_object_lost_in_the_subsampled_label_map(open_page: Open, files: Files) -> None:
     """The label map of this image is subsampled so that the second object disappears."""
     page = open_page()
-    upload(page, files | {"labels": encode(np.tile(np.array([1, 2], np.uint8), (240, 160)))})
+    upload(page, files | {"labels": encode_image(np.tile(np.array([1, 2], np.uint8), (240, 160)))})
     expect(page.locator("#objects button")).to_have_count(2)
     page.locator('#objects button[data-label="2"]').click()
     expect(page.locator("#details-facts")).to_contain_text("Label 2 ")
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_text_contrast_in_both_color_schemes(open_page: Callable[..., Page], scheme: str) -> None:
-    page = open_page(color_scheme=scheme)
+def test_text_contrast_in_both_color_schemes(open_page: Open, scheme: str) -> None:
+    page = open_page(scheme=scheme)
     values = page.evaluate(
         "(() => { const style = getComputedStyle(document.documentElement);"
         " return Object.fromEntries(['text', 'muted', 'accent', 'on-accent', 'error', 'page', 'card', 'chosen',"

@@ -87,7 +87,7 @@ def test_pieces_are_merged(open_page: Open, unlabelled: Files, labels: np.ndarra
 
 def test_a_piece_is_split_along_a_cut(open_page: Open, unlabelled: Files, labels: np.ndarray) -> None:
     sent = SentLabels()
-    page = open_page(sent, viewport={"width": 1280, "height": 900})
+    page = open_page(sent, size=(1280, 900))
     upload(page, unlabelled)
     count(page, 3)
     label = 1
@@ -147,7 +147,7 @@ def test_a_failing_segmenter_is_reported_beside_the_labels(open_page: Open, unla
 
 
 def test_the_tools_fit_a_phone(open_page: Open, unlabelled: Files) -> None:
-    page = open_page(viewport={"width": 390, "height": 800}, is_mobile=True, has_touch=True)
+    page = open_page(size=(390, 800), phone=True)
     upload(page, unlabelled)
     count(page, 3)
     assert page.evaluate("document.documentElement.scrollWidth") <= 390

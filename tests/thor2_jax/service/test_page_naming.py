@@ -45,7 +45,7 @@ def name_object(page: Page, label: int, name: str) -> None:
 
 
 def test_a_named_object_is_known_until_undo(open_teaching: Open, files: Files, teaching_url: str) -> None:
-    page = open_teaching(without_trained_classes, viewport={"width": 1280, "height": 900})
+    page = open_teaching(without_trained_classes, size=(1280, 900))
     recognize(page, files)
     invitations = page.locator("#objects .facts").filter(has_text="Name this object")
     expect(invitations).to_have_count(3)  # The fourth has too few points.
@@ -160,7 +160,7 @@ def test_a_service_that_does_not_teach_has_no_form(open_page: Open, files: Files
 
 
 def test_the_form_fits_a_phone(open_teaching: Open, files: Files) -> None:
-    page = open_teaching(without_trained_classes, viewport={"width": 360, "height": 740})
+    page = open_teaching(without_trained_classes, size=(360, 740))
     recognize(page, files)
     name_object(page, 200, "an_object_with_a_long_name_that_has_no_spaces_and_does_not_end_soon_" + "x" * 60)
     expect(page.locator("#notice-text")).to_be_visible()

@@ -258,14 +258,13 @@ BAD_FIELDS: dict[str, tuple[dict[str, Any], str]] = {
 }
 
 
-@pytest.mark.parametrize("case", BAD_FIELDS)
-def test_bad_fields_are_refused_in_one_line(case: str, http: httpx.Client, files: Files, gallery: Path) -> None:
+def test_bad_fields_are_refused_in_one_line(http: httpx.Client, files: Files, gallery: Path) -> None:
     enroll(http, files, "tall")
     before = content(gallery)
-    change, field = BAD_FIELDS[case]
-    answer = http.post("/v1/objects", files=files, data={"name": "new", "instance": "200", **change})
-    check_refused(answer, 422, field)
-    assert content(gallery) == before and known(http) == {"tall": 1}
+    for case, (change, field) in BAD_FIELDS.items():
+        answer = http.post("/v1/objects", files=files, data={"name": "new", "instance": "200", **change})
+        check_refused(answer, 422, field)
+        assert content(gallery) == before and known(http) == {"tall": 1}, case
 
 
 def check_refused(answer: httpx.Response, status: int, field: str | None) -> None:

@@ -153,7 +153,7 @@ def test_page_shows_why(open_page: Open, teaching_url: str, files: Files, width:
         forms.append(route.request.post_data_buffer)
         route.fulfill(json=ANSWER)
 
-    page = ask_why(open_page, teaching_url, files, answer_why, viewport={"width": width, "height": 900})
+    page = ask_why(open_page, teaching_url, files, answer_why, size=(width, 900))
     expect(page.locator("#why-status")).to_contain_text("2.5")
     expect(page.locator("#why-status")).to_contain_text("red +20")
     shown = page.locator("#why-pictures canvas")

@@ -17,18 +17,21 @@ from thor2_jax.errors import InputError
 from thor2_jax.model.classifier import MLP
 from thor2_jax.model.run_directory import TrainedRun, load_run, save_run
 from training.baselines import baseline as module
+from training.baselines import templates
 from training.baselines.baseline import BaselineInputs
 from training.baselines.files import read_baseline
 from training.baselines.job import load_baselines, pretrained_files, train_baselines
 from training.baselines.names import NETWORKS, crop_size
 from training.baselines.networks.architectures import ARCHITECTURES, Architecture, network_inputs
-from training.baselines.networks.vit import VIT_TINY, RGBDViT
+from training.baselines.networks.vit import VIT_DINOV2_SMALL, VIT_TINY, RGBDViT
 from training.baselines.networks.weights import tensor_shapes
 from training.baselines.templates import BACKBONES, Templates, create_backbone
 from training.fitting.options import FitOptions
 from training.train_job import TrainJob, run_train_job
 from training.views.crops import ViewCrops
 from training.views.normalized_views import MemoryViews
+
+pytestmark = pytest.mark.usefixtures("small_classifiers")
 
 CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=1, image_size=8)
 NAMES = ("red", "blue")
@@ -84,11 +87,12 @@ def frame_inputs(seed: int, rows: int = 4) -> BaselineInputs:
 
 @pytest.fixture(scope="module", autouse=True)
 def quick_network() -> Iterator[None]:
-    """Give the small RGB-D ViT one block and images of 32 pixels, to compile and train in seconds."""
-    vit = dataclasses.replace(VIT_TINY, depth=1)
+    """Give the vision transformers one block, and the small RGB-D ViT narrow tokens and images of 32 pixels."""
+    vit = dataclasses.replace(VIT_TINY, width=96, depth=1)
     architecture = Architecture(partial(RGBDViT, vit=vit, size=32), 32, ARCHITECTURES[SMALL].weights)
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(ARCHITECTURES, SMALL, architecture)
+        patch.setattr(templates, "VIT_DINOV2_SMALL", dataclasses.replace(VIT_DINOV2_SMALL, depth=1))
         yield
 
 
@@ -177,7 +181,7 @@ def test_weights_of_another_architecture_are_refused(tmp_path: Path) -> None:
     path = weights / f"{pretrained_files(SMALL)[0]}.safetensors"
     tensors = load_file(path)
     cases = [
-        ({**tensors, "norm.weight": np.zeros(384, np.float32)}, r"norm\.weight in .* has the shape \(384,\).*\(192,\)"),
+        ({**tensors, "norm.weight": np.zeros(384, np.float32)}, r"norm\.weight in .* has the shape \(384,\).*\(96,\)"),
         (
             {k: a for k, a in tensors.items() if k != "blocks.0.attn.qkv.weight"},
             r"no tensor blocks\.0\.attn\.qkv\.weight",
@@ -233,10 +237,10 @@ def test_clouds_without_images_are_refused(tmp_path: Path) -> None:
 def test_nearest_template_has_the_largest_cosine() -> None:
     """Against the formula, with two classes and features by hand."""
     features = np.array([[1, 0], [0, 1], [0.6, 0.8]], np.float16)
-    templates = Templates(2, create_backbone(BACKBONES[2]), features, np.array([0, 1, 1], np.int16), 2)
+    library = Templates(2, create_backbone(BACKBONES[2]), features, np.array([0, 1, 1], np.int16), 2)
     similarity = np.array([[0.8, 0.96], [-1.0, -0.6]])
     expected = np.exp(20 * similarity) / np.exp(20 * similarity).sum(axis=1, keepdims=True)
-    np.testing.assert_allclose(templates.compare(np.array([[0.8, 0.6], [-1, 0]], np.float32)), expected, atol=1e-3)
+    np.testing.assert_allclose(library.compare(np.array([[0.8, 0.6], [-1, 0]], np.float32)), expected, atol=1e-3)
 
 
 def test_inputs_are_scaled_and_the_background_is_zero() -> None:

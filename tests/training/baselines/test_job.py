@@ -19,7 +19,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.model.classifier import MLP
 from thor2_jax.model.run_directory import TrainedRun, load_run, save_run
 from thor2_jax.types import Cloud
-from training.baselines import job
+from training.baselines import forest, job
 from training.baselines.baseline import baseline_inputs
 from training.baselines.job import load_baselines, train_baselines
 from training.baselines.names import CLOUD_BASELINES, check_baselines
@@ -29,6 +29,8 @@ from training.fitting.job import is_finished
 from training.fitting.samples import fold_of_views
 from training.views.left_out import WithoutClasses
 from training.views.normalized_views import MemoryViews, normalize_views
+
+pytestmark = pytest.mark.usefixtures("small_classifiers")
 
 CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=1, image_size=8)
 NAMES = ("plank", "cube")
@@ -74,7 +76,9 @@ def write_run(folder: Path, folds: int = 2, fold: int = 1) -> Path:
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = write_run(tmp_path_factory.mktemp("baselines") / "run")
-    train_baselines(folder, SOURCE)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(forest, "TREES", 20)
+        train_baselines(folder, SOURCE)
     return folder
 
 

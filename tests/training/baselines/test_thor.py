@@ -13,6 +13,8 @@ from thor2_jax.model.classifier import MLP
 from training.baselines.baseline import BaselineInputs
 from training.baselines.thor import THOR, VIEW_TYPES, camera_types, view_types
 
+pytestmark = pytest.mark.usefixtures("small_classifiers")
+
 CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=3, image_size=4)
 
 

@@ -1,18 +1,28 @@
 """Fixtures shared by the tests of the command line."""
 
+import dataclasses
+import functools
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers import random_classifier, untrained_run
+from helpers import SMALL_CONFIG, random_classifier, untrained_run
 
 from thor2_jax.config import DescriptorConfig
+from thor2_jax.gallery import embedding, objects
+from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
+from thor2_jax.model import model as models
 from thor2_jax.model.classifier import MLP
 from thor2_jax.model.run_directory import input_size, save_run
-from training.fitting import job
+from training.embedding import run_embedding
+from training.embedding.fit import EmbeddingFit
+from training.fitting import job, protocol
 from training.fitting.options import EpochMetrics
+from training.fitting.protocol import DEFAULT, PAPER
 from training.fitting.samples import Samples
 from training.fitting.steps import FitContext
+from training.views import enrolled_meshes
 
 
 @pytest.fixture(scope="session")
@@ -42,3 +52,27 @@ def unfitted(monkeypatch: pytest.MonkeyPatch) -> None:
         return random_classifier(inputs, len(samples.classes), 0), 1
 
     monkeypatch.setattr(job, "fit", fit)
+
+
+@pytest.fixture(scope="module")
+def small_descriptors() -> Iterator[None]:
+    """Let the protocols describe views by small descriptors, and fit one small network on few views."""
+    with pytest.MonkeyPatch.context() as patch:
+        config = dataclasses.replace(SMALL_CONFIG, sigma_1=0.4, sigma_2=0.2)  # covers the objects
+        networks = dataclasses.replace(DEFAULT.distractors, networks=1, views=2)
+        patch.setattr(run_embedding, "SIZES", EmbeddingSizes(cell=4, hidden=(16,), learned=8, color=4))
+        patch.setattr(run_embedding, "EmbeddingFit", functools.partial(EmbeddingFit, batch_size=64))
+        patch.setattr(protocol, "DEFAULT", dataclasses.replace(DEFAULT, config=config, distractors=networks))
+        patch.setattr(protocol, "PAPER", dataclasses.replace(PAPER, config=config))
+        yield
+
+
+@pytest.fixture(scope="module")
+def small_embedding() -> Iterator[None]:
+    """Replace the packaged embedding by a small one with random weights, which compiles quickly."""
+    small = Embedding.create(SMALL_CONFIG, sizes=EmbeddingSizes(4, (16,), 8, 4))
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (embedding, objects, models):
+            patch.setattr(module, "load_default", lambda: small)
+        patch.setattr(enrolled_meshes, "MESH_VIEWS", 3)
+        yield

@@ -1,12 +1,11 @@
 """`thor2 adapt`, and the commands that use the adapted run; the run's weights are random."""
 
-import dataclasses
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import SMALL_CONFIG, json_lines, run_thor2, untrained_embedding_run, untrained_run, write_frame
+from helpers import json_lines, run_thor2, untrained_embedding_run, untrained_run, write_frame
 
 from thor2_jax.adaptation.color_transform import ColorTransform
 from thor2_jax.adaptation.estimate import Adaptation
@@ -16,6 +15,8 @@ from thor2_jax.model.run_directory import load_run, save_run
 from thor2_jax.recognizer import Recognizer
 from training.camera_adaptation import write_adapted_run
 from training.evaluation.runs import load_runs
+
+pytestmark = pytest.mark.usefixtures("small_classifiers", "small_embedding")
 
 OBJECTS = {1: "brick", 2: "book", 3: "leaf"}
 FILES = {"color": "color.png", "depth": "depth.png", "labels": "mask.png", "intrinsics": "intrinsics.json"}
@@ -78,7 +79,7 @@ def test_commands_use_a_run_whose_embedding_alone_answers(
     video: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     model, out, names = tmp_path / "run", tmp_path / "adapted", tuple(OBJECTS.values())
-    save_run(untrained_embedding_run(names, config=dataclasses.replace(SMALL_CONFIG, looks=4)), model)
+    save_run(untrained_embedding_run(names), model)
     assert run_thor2("adapt", "--model", model, video, "--out", out, "--quiet") == 0
     recognizer = Recognizer.load(out)
     assert recognizer.model.color_transform is not None and set(recognizer.model.classifiers) == {"embedding"}

@@ -1,18 +1,23 @@
 """Options of all commands, and usage errors."""
 
+import gc
 import json
 import os
 import re
 import shlex
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
+import jax  # noqa: F401  (its callback of the garbage collection)
 import pytest
 from helpers import run_thor2
+from processes import HANG
 
 import thor2_jax as thor2
-from training.cli.app import finish
+from training.cli.app import _interrupt, finish
 from training.cli.options import FrameOptions
 
 ROOT = Path(__file__).parents[3]
@@ -187,3 +192,38 @@ def test_install_commands_are_those_of_the_documentation() -> None:
         for match in re.findall(r"pip install [^`\n]*?'[^']*\[\w+\]'", path.read_text())
     }
     assert commands and all(re.fullmatch(r"pip install -c constraints.txt (-e )?'\.\[\w+\]'", c) for c in commands)
+
+
+def test_ctrl_c_while_commands_are_imported() -> None:
+    code = """
+import sys
+
+class Interrupt:
+    def find_spec(self, name, *_):
+        if name == "training.cli.doctor":
+            raise KeyboardInterrupt
+
+sys.meta_path.insert(0, Interrupt())
+import training.cli
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=HANG)
+    assert (done.returncode, done.stderr) == (130, "")
+
+
+def test_ctrl_c_in_a_callback_of_jax(capsys: pytest.CaptureFixture[str]) -> None:
+    """JAX ignores exceptions there, so Ctrl-C takes effect after it."""
+    reached = []
+
+    def _xla_gc_callback() -> None:
+        signal.raise_signal(signal.SIGINT)
+        reached.append(True)
+
+    assert "_xla_gc_callback" in {callback.__name__ for callback in gc.callbacks}
+    previous = signal.signal(signal.SIGINT, _interrupt)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            _xla_gc_callback()
+            time.sleep(HANG)
+    finally:
+        signal.signal(signal.SIGINT, previous)
+    assert reached

@@ -1,36 +1,37 @@
 """The command line: every command and invalid input, with a small model that is trained once."""
 
-import contextlib
 import dataclasses
 import json
 import shlex
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import SMALL_CONFIG, frame_options, run_thor2, write_frame_files, write_meshes
+from helpers import frame_options, run_thor2, write_frame_files, write_meshes
 from PIL import Image
 
 import colornet
 from thor2_jax.files import temporary_directory
-from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes, load_default
+from thor2_jax.gallery.embedding import Embedding, load_default
 from thor2_jax.model.classifier import FEATURES
 from thor2_jax.model.run_directory import load_run, save_run
 from thor2_jax.recognizer import Recognizer
 from training import train_job
-from training.embedding import run_embedding
 from training.fitting import protocol
 from training.fitting.protocol import DEFAULT, PAPER, QUICK
 from training.objects.builtin_objects import builtin_objects
 from training.rendering.scenes import Scene, compose_scene
 from training.train_job import TrainJob
 
+pytestmark = pytest.mark.usefixtures("small_classifiers")
+
 Run = Callable[..., tuple[int, str, str]]
-SMALL = pytest.mark.usefixtures("small_descriptors")
 UNFITTED = pytest.mark.usefixtures("unfitted")
 NAMES = ("soup_can_red", "cereal_box_blue", "mug_white")
+STEPS = ("--azimuth-step", 180, "--polar-step", 90, "--workers", 1)
+FEW_STEPS = ("--epochs", 1, "--batch-size", 64, "--classifiers", "tops,tops2", "--embedding", 0)
 
 
 @pytest.fixture(scope="module")
@@ -63,31 +64,20 @@ def run(capsys: pytest.CaptureFixture[str]) -> Run:
     return run
 
 
-@contextlib.contextmanager
-def smaller_descriptors() -> Iterator[None]:
-    """Let the protocols describe views by small descriptors, and fit two networks."""
-    with pytest.MonkeyPatch.context() as patch:
-        config = dataclasses.replace(SMALL_CONFIG, sigma_1=0.4, sigma_2=0.2)  # covers the objects
-        networks = dataclasses.replace(DEFAULT.distractors, networks=2)
-        patch.setattr(protocol, "DEFAULT", dataclasses.replace(DEFAULT, config=config, distractors=networks))
-        patch.setattr(protocol, "PAPER", dataclasses.replace(PAPER, config=config))
-        yield
-
-
-@pytest.fixture
-def small_descriptors() -> Iterator[None]:
-    with smaller_descriptors():
-        yield
+@pytest.fixture(scope="module")
+def model(meshes: Path, small_descriptors: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the run directory of a model of three objects, trained for one epoch."""
+    out = tmp_path_factory.mktemp("model") / "run"
+    assert run_thor2("train", "--meshes", meshes, "--out", out, *STEPS, *FEW_STEPS) == 0
+    return out
 
 
 @pytest.fixture(scope="module")
-def model(meshes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the run directory of a model of three objects, trained for two epochs."""
-    out = tmp_path_factory.mktemp("model") / "run"
-    steps = ("--azimuth-step", 120, "--polar-step", 90, "--workers", 1)
-    options = ("--epochs", 2, "--batch-size", 16, "--classifiers", "tops,tops2", "--embedding", 0)
-    with smaller_descriptors():
-        assert run_thor2("train", "--meshes", meshes, "--out", out, *steps, *options) == 0
+def views(meshes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a dataset of the views that the default protocol renders, by `render`."""
+    out = tmp_path_factory.mktemp("rendered") / "views"
+    augmentations = ("--illumination", "--sensor", "--occlusion", "--segmentation", "--registration", "--base")
+    assert run_thor2("render", "--meshes", meshes, "--out", out, *STEPS, *augmentations) == 0
     return out
 
 
@@ -101,7 +91,7 @@ def one_line(err: str) -> str:
 def test_files_of_a_run_directory(model: Path) -> None:
     files = ["curves.png", "metrics.jsonl", "network.npz", "run.json", "weights"]
     assert sorted(p.name for p in model.iterdir()) == files
-    assert len((model / "metrics.jsonl").read_text().splitlines()) == 4
+    assert len((model / "metrics.jsonl").read_text().splitlines()) == 2
     description = json.loads((model / "run.json").read_text())
     assert sorted(description["classes"]) == sorted(NAMES)
     assert description["descriptor_version"] == 1
@@ -116,9 +106,6 @@ def test_recognize(model: Path, images: Path, scene: Scene, tmp_path: Path, run:
     assert all(a["name"] in NAMES and a["classifier"] in ("tops", "tops2") and a["name"] in out for a in answers)
     with Image.open(tmp_path / "answer" / "overlay.png") as overlay:
         assert overlay.size == scene.frame.color.shape[1::-1]
-
-
-def test_unknown_below_makes_objects_unknown(model: Path, images: Path, run: Run) -> None:
     code, out, _ = run("recognize", "--model", model, *frame_options(images), "--unknown-below", 1)
     assert code == 0 and "unrecognized" in out and "unknown" in out
     code, _, err = run("recognize", "--model", model, *frame_options(images), "--unknown-below", 1.5)
@@ -223,29 +210,22 @@ def test_options_without_effect_are_refused(meshes: Path, tmp_path: Path, run: R
     assert code == 2 and "azimuth_step" in one_line(err) and not out.exists()
 
 
-@SMALL
-def test_train_on_rendered_dataset_equals_train_on_meshes(meshes: Path, model: Path, tmp_path: Path) -> None:
+def test_train_on_rendered_dataset_equals_train_on_meshes(views: Path, model: Path, tmp_path: Path) -> None:
     """Views written by `render` and read back train the same model as views rendered by `train`."""
-    steps = ("--azimuth-step", 120, "--polar-step", 90, "--workers", 1)
-    options = ("--epochs", 2, "--batch-size", 16, "--classifiers", "tops,tops2", "--embedding", 0)
-    augmentations = ("--illumination", "--sensor", "--occlusion", "--segmentation", "--registration", "--base")
-    assert run_thor2("render", "--meshes", meshes, "--out", tmp_path / "views", *steps, *augmentations) == 0
-    assert run_thor2("train", "--dataset", tmp_path / "views", "--out", tmp_path / "run", *options) == 0
+    assert run_thor2("train", "--dataset", views, "--out", tmp_path / "run", *FEW_STEPS) == 0
     assert not (model / "views").exists()
     first, second = (json.loads((f / "run.json").read_text()) for f in (model, tmp_path / "run"))
     assert first["record"]["curves"] == second["record"]["curves"]
 
 
-@SMALL
 def test_a_default_training_recognizes_and_is_evaluated(
-    meshes: Path, images: Path, scene: Scene, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+    meshes: Path, views: Path, images: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Without --classifiers, a run has an embedding alone; the command that is printed recognizes with it."""
-    monkeypatch.setattr(run_embedding, "SIZES", EmbeddingSizes(cell=4, hidden=(16,), learned=8, color=4))
     monkeypatch.setenv("THOR2_CACHE", str(tmp_path / "cache"))
     out = tmp_path / "my run"
-    steps = ("--azimuth-step", 120, "--polar-step", 90, "--workers", 1, "--epochs", 1, "--embedding", 10)
-    command = ("train", "--meshes", meshes, "--out", out, *steps)
+    shutil.copytree(views, out / "views")  # of an interrupted training
+    command = ("train", "--meshes", meshes, "--out", out, *STEPS, "--epochs", 1, "--embedding", 10)
     code, printed, err = run(*command)
     assert code == 0 and "embedding has a held-out accuracy of 0." in printed.replace("1.000", "0.")
     stages = [line.split(":")[0] for line in err.splitlines() if line.startswith("stage ")]
@@ -274,6 +254,8 @@ def test_options_replace_values_of_the_protocols(
     meshes: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     jobs: list[TrainJob] = []
+    monkeypatch.setattr(protocol, "DEFAULT", DEFAULT)
+    monkeypatch.setattr(protocol, "PAPER", PAPER)
     monkeypatch.setattr(train_job, "run_train_job", lambda job, display: jobs.append(job) or {})
 
     def job(*options: object) -> TrainJob:
@@ -320,7 +302,7 @@ def test_train_with_distractors(meshes: Path, images: Path, tmp_path: Path, run:
     assert recognizer.objects.embedding.fingerprint == embedding.fingerprint != load_default().fingerprint
     assert recognizer.model.classifiers.default == ("tops", "tops2", "embedding")
     record = recognizer.run.record
-    assert record["distractors"]["networks"] == DEFAULT.distractors.networks == 1 + len(embedding.further)
+    assert record["distractors"]["networks"] == protocol.DEFAULT.distractors.networks == 1 + len(embedding.further)
     assert record["distractors"]["epochs"] == record["epochs"] == 4
     assert record["distractors"]["procedural"] == 30 and record["orientation_copies"] == 1
     own = record["calibration"]["unknown_below"]
@@ -334,11 +316,10 @@ def test_train_with_distractors(meshes: Path, images: Path, tmp_path: Path, run:
     assert code == 2 and "orientation_copies" in one_line(err)
 
 
-@SMALL
-def test_train_by_folds(meshes: Path, tmp_path: Path, run: Run) -> None:
-    steps = ("--azimuth-step", 180, "--polar-step", 90, "--workers", 1)
+def test_train_by_folds(meshes: Path, views: Path, tmp_path: Path, run: Run) -> None:
     options = ("--epochs", 1, "--batch-size", 16, "--classifiers", "tops", "--folds", 2, "--embedding", 0)
-    arguments = ("train", "--meshes", meshes, "--out", tmp_path / "run", *steps, *options)
+    arguments = ("train", "--meshes", meshes, "--out", tmp_path / "run", *STEPS, *options)
+    shutil.copytree(views, tmp_path / "run" / "views")
     code, out, _ = run(*arguments)
     assert code == 0 and "fold 0: tops" in out and "fold 1: tops" in out
     assert sorted(p.name for p in (tmp_path / "run" / "fold-1").iterdir()) == ["network.npz", "run.json", "weights"]
@@ -358,22 +339,18 @@ def test_train_by_folds(meshes: Path, tmp_path: Path, run: Run) -> None:
     assert {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()} == before
     # A training that is killed at the very end leaves its own views.
     shutil.rmtree(tmp_path / "run" / "views")
-    switches = ("--illumination", "--sensor", "--occlusion", "--segmentation", "--registration", "--base")
-    assert run("render", "--meshes", meshes, "--out", tmp_path / "run" / "views", *steps, *switches)[0] == 0
+    shutil.copytree(views, tmp_path / "run" / "views")
     assert run(*arguments)[0] == 0
     assert not [path for path in (tmp_path / "run").iterdir() if path.name[0] == "." or path.name == "views"]
 
 
-@SMALL
 @UNFITTED
-def test_train_by_sequences(meshes: Path, tmp_path: Path, run: Run) -> None:
+def test_train_by_sequences(meshes: Path, views: Path, tmp_path: Path, run: Run) -> None:
     """Each run has the objects of its sequence; a repeated command trains only missing runs."""
     soup, cereal, mug = NAMES
     table, out = tmp_path / "table.yaml", tmp_path / "runs"
-    steps = ("--azimuth-step", 180, "--polar-step", 90, "--workers", 1)
-    assert run_thor2("render", "--meshes", meshes, "--out", tmp_path / "views", *steps) == 0
     options = ("--sequences", table, "--epochs", 1, "--batch-size", 16, "--classifiers", "ce", "--embedding", 0)
-    arguments = ("train", "--dataset", tmp_path / "views", "--out", out, *options)
+    arguments = ("train", "--dataset", views, "--out", out, *options)
     table.write_text(json.dumps({"table/a": [soup, mug]}))
     assert run(*arguments)[0] == 0
     first = (out / "table/a/run.json").read_bytes()
@@ -422,97 +399,45 @@ def test_one_invalid_instance_leaves_the_others_recognized(
     assert all(answers[label]["name"] is not None for label in scene.frame.instances)
 
 
-def invalid_inputs(folder: Path, source: Path) -> dict[str, tuple[str, Path, str]]:
-    """Return for each case the argument, the invalid file, and a part of the expected message."""
-    truncated = folder / "truncated.png"
-    truncated.write_bytes((source / "depth.png").read_bytes()[:2000])
-    text = folder / "text.png"
-    text.write_text("no image")
-    half = folder / "half.png"
-    with Image.open(source / "mask.png") as mask:
-        mask.crop((0, 0, 100, 100)).save(half)
-        mask.save(lossy := folder / "lossy.jpg")
-    eight = folder / "eight.png"
-    Image.fromarray(np.zeros((480, 640), np.uint8)).save(eight)
-    cases = {
-        "no such file": ("color", folder / "absent.png", "absent.png"),
-        "no image": ("color", text, "text.png"),
-        "truncated": ("depth", truncated, "truncated.png"),
-        "other size": ("labels", half, "(100, 100)"),
-        "8-bit depth": ("depth", eight, "uint8"),
-        "lossy labels": ("labels", lossy, "JPEG"),
-        "colour is grey": ("color", eight, "RGB"),
-        "intrinsics are an image": ("intrinsics", eight, "JSON"),
-    }
-    good = json.loads((source / "intrinsics.json").read_text())
-    for name, values, expected in (
-        ("without fx", {k: v for k, v in good.items() if k != "fx"}, "fx"),
-        ("negative fy", good | {"fy": -1.0}, "-1.0"),
-        ("zero scale", good | {"depth_scale": 0}, "depth_scale"),
-        ("not a number", good | {"cx": float("nan")}, "nan"),
-        ("a word", good | {"cx": "left"}, "'left'"),
-    ):
-        path = folder / f"{name}.json"
-        path.write_text(json.dumps(values))
-        cases[name] = ("intrinsics", path, expected)
-    return cases
+def test_invalid_images_and_models_are_refused(model: Path, images: Path, tmp_path: Path, run: Run) -> None:
+    """One case of each argument; the tests of `read_frame` and of `load_run` have the others."""
+    (tmp_path / "cut.png").write_bytes((images / "depth.png").read_bytes()[:2000])
+    (tmp_path / "word.json").write_text('{"fx": 1, "fy": 1, "cx": "left", "cy": 1}')
+    with Image.open(images / "mask.png") as mask:
+        mask.crop((0, 0, 100, 100)).save(tmp_path / "half.png")
+    damaged = Path(shutil.copytree(model, tmp_path / "damaged"))
+    (damaged / "weights" / "tops.safetensors").unlink()
+    cases: tuple[tuple[Path, dict[str, Path], str], ...] = (
+        (model, {"color": tmp_path / "absent.png"}, "absent.png"),
+        (model, {"depth": tmp_path / "cut.png"}, "cut.png"),
+        (model, {"labels": tmp_path / "half.png"}, "(100, 100)"),
+        (model, {"intrinsics": tmp_path / "word.json"}, "'left'"),
+        (tmp_path / "absent", {}, "absent"),
+        (tmp_path, {}, "run.json"),
+        (damaged, {}, "tops"),
+    )
+    for path, changes, expected in cases:
+        code, _, err = run("recognize", "--model", path, *frame_options(images, **changes), "--out", tmp_path / "out")
+        assert code == 2 and expected in one_line(err), expected
+        assert not (tmp_path / "out").exists(), expected
 
 
-def test_invalid_images_are_refused(model: Path, images: Path, tmp_path: Path, run: Run) -> None:
-    for case, (argument, path, expected) in invalid_inputs(tmp_path, images).items():
-        changed = frame_options(images, **{argument: path})
-        code, _, err = run("recognize", "--model", model, *changed, "--out", tmp_path / "answer")
-        assert code == 2, case
-        assert expected in one_line(err), case
-        assert not (tmp_path / "answer").exists(), case
-
-
-def test_invalid_models_are_refused(model: Path, images: Path, tmp_path: Path, run: Run) -> None:
-    def damaged_copy(name: str, change: Callable[[Path], object]) -> Path:
-        folder = tmp_path / name
-        shutil.copytree(model, folder)
-        change(folder)
-        return folder
-
-    def other_version(folder: Path) -> None:
-        text = (folder / "run.json").read_text()
-        (folder / "run.json").write_text(text.replace('"descriptor_version": 1', '"descriptor_version": 99'))
-
-    cases = {
-        tmp_path / "absent": "absent",
-        tmp_path: "run.json",
-        damaged_copy("version", other_version): "99",
-        damaged_copy("json", lambda f: (f / "run.json").write_text("{")): "run.json",
-        damaged_copy("network", lambda f: (f / "network.npz").write_bytes(b"PK")): "network.npz",
-        damaged_copy("weights", lambda f: (f / "weights" / "tops.safetensors").unlink()): "tops",
-    }
-    for path, expected in cases.items():
-        code, _, err = run("recognize", "--model", path, *frame_options(images))
-        assert code == 2, path
-        assert expected in one_line(err), path
-
-
-@SMALL
 @UNFITTED
 def test_invalid_training_input_is_refused(meshes: Path, tmp_path: Path, run: Run) -> None:
     unknown = tmp_path / "names.json"
     unknown.write_text(json.dumps({"mug": "no_such_scan"}))
-    broken = tmp_path / "broken"
-    broken.mkdir()
+    broken, bare, full = (tmp_path / name for name in ("broken", "bare", "full"))
+    for folder in (broken, bare, full):
+        folder.mkdir()
     (broken / "can.ply").write_bytes((meshes / "soup_can_red.ply").read_bytes()[:500])
-    bare = tmp_path / "bare"
-    bare.mkdir()
     (bare / "can.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
-    full = tmp_path / "full"
-    full.mkdir()
     (full / "file").touch()
     out = tmp_path / "run"
-    coarse = ("--azimuth-step", 90, "--polar-step", 90, "--workers", 1)
     cases = {
         "no folder": (["--meshes", tmp_path / "absent", "--out", out], "absent"),
         "unknown name": (["--meshes", meshes, "--names", unknown, "--out", out], "no_such_scan"),
-        "broken mesh": (["--meshes", broken, "--out", out, *coarse], "can.ply"),
-        "no colour": (["--meshes", bare, "--out", out, *coarse], "can.obj"),
+        "broken mesh": (["--meshes", broken, "--out", out, *STEPS], "can.ply"),
+        "no colour": (["--meshes", bare, "--out", out, *STEPS], "can.obj"),
         "step zero": (["--meshes", meshes, "--out", out, "--azimuth-step", 0], "0"),
         "no source": (["--out", out], "--meshes"),
         "unknown classifier": (["--meshes", meshes, "--out", out, "--classifiers", "shape"], "shape"),
@@ -526,22 +451,21 @@ def test_invalid_training_input_is_refused(meshes: Path, tmp_path: Path, run: Ru
         assert expected in one_line(err), case
         assert not out.exists(), case
     # Rendered views are kept for another attempt.
-    code, _, err = run("train", "--meshes", meshes, "--out", out, *coarse, "--folds", 99)
+    code, _, err = run("train", "--meshes", meshes, "--out", out, *STEPS, "--folds", 99)
     assert code == 2 and "99" in one_line(err)
-    code, _, err = run("train", "--meshes", meshes, "--out", out, *coarse, "--batch-size", 100_000)
+    code, _, err = run("train", "--meshes", meshes, "--out", out, *STEPS, "--batch-size", 100_000)
     assert code == 2 and "batch_size is 100000" in one_line(err)
     assert [p.name for p in out.iterdir()] == ["views"]
     last = ("--epochs", 1, "--batch-size", 16, "--classifiers", "tops", "--embedding", 0)
-    assert run("train", "--meshes", meshes, "--out", out, *coarse, *last)[0] == 0
+    assert run("train", "--meshes", meshes, "--out", out, *STEPS, *last)[0] == 0
 
 
-@SMALL
 @UNFITTED
-def test_paper_protocol(meshes: Path, tmp_path: Path) -> None:
+def test_paper_protocol(meshes: Path, views: Path, tmp_path: Path) -> None:
     """The paper's protocol uses plain views in four mirrors; options replace values of the protocol."""
-    options = ("--azimuth-step", 180, "--polar-step", 90, "--workers", 1, "--epochs", 1, "--classifiers", "ce")
-    for name, paper in (("paper", ["--paper"]), ("default", ["--embedding", 0])):
-        assert run_thor2("train", "--meshes", meshes, "--out", tmp_path / name, *options, *paper) == 0
+    cases = {"paper": ("--meshes", meshes, "--paper", *STEPS), "default": ("--dataset", views, "--embedding", 0)}
+    for name, options in cases.items():
+        assert run_thor2("train", *options, "--out", tmp_path / name, "--epochs", 1, "--classifiers", "ce") == 0
     of = {name: json.loads((tmp_path / name / "run.json").read_text())["record"] for name in ("paper", "default")}
     assert of["paper"]["samples"] == 4 * of["paper"]["dataset"]["views"] == 4 * 3 * 2 * 3
     assert of["paper"]["batch_size"] == 128 and of["default"]["batch_size"] > 100
@@ -550,18 +474,12 @@ def test_paper_protocol(meshes: Path, tmp_path: Path) -> None:
     assert of["default"]["samples"] == 2 * of["default"]["dataset"]["views"]
 
 
-def test_missing_evaluation_datasets_are_refused(model: Path, tmp_path: Path, run: Run) -> None:
+def test_missing_datasets_and_usage_errors(model: Path, tmp_path: Path, run: Run) -> None:
     for kind in ("uwis", "frames"):
         for path in (tmp_path / "absent", tmp_path):
             code, _, err = run("evaluate", kind, path, "--model", model)
-            assert code == 2
-            assert str(path) in one_line(err)
-
-
-def test_usage_errors_have_exit_code_2(run: Run) -> None:
-    assert run("recognize")[0] == 2
-    assert run("no-such-command")[0] == 2
-    assert run("--help")[0] == 0
+            assert code == 2 and str(path) in one_line(err)
+    assert [run(command)[0] for command in ("recognize", "no-such-command", "--help")] == [2, 2, 0]
 
 
 def test_colornet(tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:

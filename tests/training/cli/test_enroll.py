@@ -3,35 +3,23 @@
 import json
 import re
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
-from helpers import SMALL_CONFIG, run_thor2, untrained_run, write_frame
+from helpers import run_thor2, untrained_run, write_frame
 from PIL import Image
 from recording_files import table_frame, write_recording
 
-from thor2_jax.gallery import embedding as embeddings
 from thor2_jax.gallery import objects as gallery_objects
 from thor2_jax.gallery import store
-from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
-from thor2_jax.model import model as models
 from thor2_jax.model.run_directory import load_run, save_run
 from thor2_jax.recognizer import Recognizer
-from training import enrollment
+from training.views import enrolled_meshes
 
-
-@pytest.fixture(scope="module", autouse=True)
-def small_embedding() -> Iterator[None]:
-    """Replace the packaged embedding by a small one with random weights, which compiles quickly."""
-    small = Embedding.create(SMALL_CONFIG, sizes=EmbeddingSizes(4, (16,), 8, 4))
-    with pytest.MonkeyPatch.context() as patch:
-        for module in (embeddings, gallery_objects, models):
-            patch.setattr(module, "load_default", lambda: small)
-        patch.setattr(enrollment, "MESH_VIEWS", 3)
-        yield
+pytestmark = pytest.mark.usefixtures("small_classifiers", "small_embedding")
 
 
 @pytest.fixture(scope="module")
@@ -162,15 +150,15 @@ def test_a_mesh_is_enrolled_from_all_sides(model: Path, tmp_path: Path) -> None:
     box.export(tmp_path / "box.ply")
     assert run_thor2("enroll", "box", "--model", model, "--mesh", tmp_path / "box.ply") == 0
     views = Recognizer.load(model).gallery.objects["box"]
-    assert views.source == "mesh" and len(views.clouds) == 6 and len(views.embeddings) == 72
+    assert views.source == "mesh" and len(views.clouds) == 6 and len(views.embeddings) == 36
     box.apply_scale(1000)
     box.export(tmp_path / "large.ply")
     assert run_thor2("enroll", "large", "--model", model, "--mesh", tmp_path / "large.ply", "--mesh-scale", 0.001) == 0
 
 
-def write_mesh(path: Path) -> None:
+def write_mesh(path: Path, color: tuple[int, int, int] = (200, 100, 50)) -> None:
     box = trimesh.creation.box((0.1, 0.2, 0.15))
-    box.visual.vertex_colors = [[200, 100, 50, 255]] * len(box.vertices)
+    box.visual.vertex_colors = [[*color, 255]] * len(box.vertices)
     path.parent.mkdir(parents=True, exist_ok=True)
     box.export(path)
 
@@ -188,12 +176,17 @@ def write_mesh(path: Path) -> None:
 def test_a_folder_of_meshes_is_enrolled(
     arguments: tuple[str | None, str], names: set[str], model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(enrollment, "MESH_VIEWS", 1)
-    for name in ("025_mug/textured.ply", "can.ply", "cafe\u0301/a.ply"):
-        write_mesh(tmp_path / "meshes" / name)
+    monkeypatch.setattr(enrolled_meshes, "MESH_VIEWS", 1)
+    files = {"025_mug/textured.ply": (200, 0, 0), "can.ply": (0, 200, 0), "cafe\u0301/a.ply": (0, 0, 200)}
+    for file, color in files.items():
+        write_mesh(tmp_path / "meshes" / file, color)
     name, folder = arguments
     assert run_thor2("enroll", *filter(None, [name]), "--mesh", tmp_path / folder, "--model", model) == 0
-    assert set(Recognizer.load(model).gallery.names) == {"brick", "book"} | names
+    objects = Recognizer.load(model).gallery.objects
+    assert set(objects) == {"brick", "book"} | names
+    for each in names:  # has the views of its own mesh
+        view = next(iter(objects[each].clouds.views()))
+        assert view.colors.mean(axis=0).argmax() == {"can": 1, "caf\u00e9": 2}.get(each, 0)
 
 
 def test_arguments_are_checked_before_anything_is_loaded(
@@ -310,14 +303,10 @@ BAD: dict[str, tuple[Callable[[Path, Path], list[object]], str]] = {
     "no source": (lambda tmp, frames: ["new"], "--mesh"),
     "two sources": (lambda tmp, frames: ["new", "--frames", frames, "--mesh", tmp / "a.ply"], "--mesh"),
     "half a frame": (lambda tmp, frames: ["new", *one_frame(frames / "000", 5)[:-2]], "--instance"),
-    "mesh without a name": (lambda tmp, frames: ["--mesh", in_millimetres(tmp)], "name"),
     "millimetres": (lambda tmp, frames: ["new", "--mesh", in_millimetres(tmp)], "mm.ply"),
-    "no mesh": (lambda tmp, frames: ["new", "--mesh", tmp / "none.glb"], "none.glb"),
-    "no folder": (lambda tmp, frames: ["new", "--frames", tmp / "none"], "none"),
     "another label name": (lambda tmp, frames: ["new", "--frames", frames], "'new'"),
     "no such instance": (lambda tmp, frames: ["new", *one_frame(frames / "000", 4)], "instance is 4"),
     "empty name": (lambda tmp, frames: ["", *one_frame(frames / "000", 5)], "the argument after enroll is empty"),
-    "extend and replace": (lambda tmp, frames: ["--frames", frames, "--extend", "--replace"], "extend and replace"),
 }
 
 
@@ -329,7 +318,7 @@ def test_bad_input_changes_nothing(
     given, before = arguments(tmp_path, frames), files(model)
     assert words in error_of(capsys, "enroll", *given, "--model", model)
     assert files(model) == before
-    if case not in ("existing name", "extend and replace"):
+    if case != "existing name":
         error_of(capsys, "enroll", *given, "--model", tmp_path / "other")
         assert not (tmp_path / "other").exists()
 

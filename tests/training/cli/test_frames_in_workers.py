@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers import run_thor2, small_frame, untrained_run, write_frame_files
+from recording_files import table_frame
 
-import thor2_jax as thor2
 from thor2_jax.errors import InputError
 from thor2_jax.model.run_directory import save_run
 from training.evaluation.answering import RunArguments, answer_frames, answer_frames_in_pool
@@ -53,17 +53,14 @@ def test_folders_may_hold_links_to_frames(folder: Path, tmp_path: Path) -> None:
     assert [source.name for source in find_frames([tmp_path])] == ["000", "002"]
 
 
-def halves(frame: thor2.RGBDFrame) -> np.ndarray:
-    return (np.arange(frame.depth.size).reshape(frame.depth.shape) > frame.depth.size // 2).astype(np.uint8)
-
-
-@pytest.mark.parametrize("segmenter", [None, "halves", "model"])
-def test_chunks_of_frames_have_the_same_answers(model: Path, folder: Path, segmenter: str | None) -> None:
-    arguments = RecognizerArguments(model)
-    sources = find_frames([folder])
-    if segmenter is not None:
-        function = halves if segmenter == "halves" else pickle.loads(pickle.dumps(arguments.segment))
-        sources = [segmented_source(source, function) for source in sources]
+@pytest.mark.parametrize("is_segmented", [False, True])
+def test_chunks_of_frames_have_the_same_answers(model: Path, folder: Path, tmp_path: Path, is_segmented: bool) -> None:
+    arguments, sources = RecognizerArguments(model), find_frames([folder])
+    if is_segmented:  # frames of the size that other tests of this folder segment
+        for number in range(2):
+            write_frame_files(tmp_path / f"{number}", table_frame(3 * number))
+        function = pickle.loads(pickle.dumps(arguments.segment))
+        sources = [segmented_source(source, function) for source in find_frames([tmp_path])]
     expected = list(recognize_frames(arguments.load(), sources))
     answers = list(recognize_frames_in_pool(arguments, sources, IN_PROCESS))
     assert [answer.as_json() for answer in answers] == [answer.as_json() for answer in expected]

@@ -56,26 +56,29 @@ def test_other_formats_give_the_same_answers(model: Path, tmp_path: Path, capfd:
 def test_one_failing_frame_does_not_lose_the_others(
     model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    for number in range(1, 5):
+    for number in range(1, 6):
         write_frame_files(tmp_path / "frames" / f"00000{number}", small_frame(number))
     (tmp_path / "frames" / "000002" / "depth.png").write_bytes(b"damaged")
     (tmp_path / "frames" / "000003" / "intrinsics.json").unlink()
-    outputs = ("--out", tmp_path / "out", "--coco", tmp_path / "coco.json", "--bop", tmp_path / "bop.csv")
+    (tmp_path / "frames" / "000005" / "color.png").unlink()
+    coco_file, bop_file = tmp_path / "new" / "a" / "coco.json", tmp_path / "new" / "b" / "bop.csv"
+    outputs = ("--out", tmp_path / "out", "--coco", coco_file, "--bop", bop_file)
     command = ("recognize", "--model", model, tmp_path / "frames", "--json", *outputs)
     for _ in range(2):  # it may be repeated
         assert run_thor2(*command) == 2
         out, err = capfd.readouterr()
         answers = {line["frame"]: line for line in json_lines(out)}
-        assert list(answers) == ["000001", "000002", "000003", "000004"]
-        assert "depth" in answers["000002"]["error"] and "intrinsics.json" in answers["000003"]["error"]
+        assert list(answers) == [f"00000{number}" for number in range(1, 6)]
+        for number, file in ((2, "depth"), (3, "intrinsics.json"), (5, "color.png")):
+            assert file in answers[f"00000{number}"]["error"]
         assert all([one["label"] for one in answers[n]["instances"]] == [1, 4] for n in ("000001", "000004"))
-        assert "2 of 4 frames" in err and "000002, 000003" in err
+        assert "3 of 5 frames" in err and "000002, 000003, 000005" in err
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["000001", "000004"]
-    coco = json.loads((tmp_path / "coco.json").read_text())
+    coco = json.loads(coco_file.read_text())
     assert sorted((entry["image_id"], entry["bbox"]) for entry in coco) == [
         (image, box) for image in (1, 4) for box in ([10, 10, 40, 40], [60, 30, 50, 50])
     ]
-    with (tmp_path / "bop.csv").open() as stream:
+    with bop_file.open() as stream:
         rows = list(csv.DictReader(stream))
     assert [(row["scene_id"], row["im_id"]) for row in rows] == [("1", "1")] * 2 + [("1", "4")] * 2
     numbers = {"bowl": 1, "mug": 2, "plate": 3}
@@ -115,6 +118,8 @@ def test_several_folders_and_tables(model: Path, tmp_path: Path, capfd: pytest.C
         (["{frames}", "--coco", "{empty}/c.json", "--names", "{frames}/one/intrinsics.json"], "expected an obj_id"),
         (["{frames}", "--out", "{frames}"], "expected a new or empty directory"),
         (["{frames}", "--depth-scale", "1e-300"], "depth_scale is 1e-300"),
+        (["{files}", "--segment", "table", "--out", "{out}"], "error: labels is "),
+        (["{frames}", "--segment", "sam", "--out", "{out}"], "error: segmenter is 'sam'"),
     ],
 )
 def test_invalid_arguments(
@@ -123,10 +128,13 @@ def test_invalid_arguments(
     (tmp_path / "empty").mkdir()
     write_frame_files(tmp_path / "frames" / "one", small_frame())
     (tmp_path / "frames" / "names.json").write_text("{}")
-    given = [text.format(frames=tmp_path / "frames", empty=tmp_path / "empty") for text in arguments]
-    assert run_thor2("recognize", "--model", model, *given) == 2
+    if arguments[:1] == ["{files}"]:
+        arguments = [*map(str, frame_options(tmp_path / "frames" / "one")), *arguments[1:]]
+    places = {name: tmp_path / name for name in ("frames", "empty", "out")}
+    assert run_thor2("recognize", "--model", model, *(text.format(**places) for text in arguments)) == 2
     err = capfd.readouterr().err
     assert expected in err and err.startswith("error: ") and err.count("\n") == 1
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(
@@ -170,23 +178,6 @@ def test_frames_without_labels_are_segmented(
     assert "--segment" in capfd.readouterr().err
     assert run_thor2("recognize", "--model", model, tmp_path / "frames") == 2
     assert "--segment" in capfd.readouterr().err
-
-
-def test_a_frame_without_colour_fails(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    for name in ("a", "b"):
-        write_frame_files(tmp_path / "frames" / name, small_frame())
-    (tmp_path / "frames" / "b" / "color.png").unlink()
-    assert run_thor2("recognize", "--model", model, tmp_path / "frames", "--json") == 2
-    out, err = capfd.readouterr()
-    assert ["error" in line for line in json_lines(out)] == [False, True]
-    assert "1 of 2 frames" in err and "b/color.png" in err
-
-
-def test_tables_in_directories_that_do_not_exist(model: Path, tmp_path: Path) -> None:
-    folder, new = write_frame_files(tmp_path / "one", small_frame()), tmp_path / "new"
-    files = ("--coco", new / "a" / "coco.json", "--bop", new / "b" / "bop.csv")
-    assert run_thor2("recognize", "--model", model, folder, *files) == 0
-    assert all(file.is_file() for file in files[1::2])
 
 
 @pytest.mark.parametrize("option", ["--coco", "--bop"])
@@ -233,25 +224,6 @@ def test_labels_are_replaced_where_a_folder_is_segmented(
     assert run_thor2("recognize", "--model", model, folder, "--segment", "table", "--json") == 0
     (answer,) = json_lines(capfd.readouterr().out)
     assert [one["label"] for one in answer["instances"]] == [1, 2]
-
-
-def test_labels_and_segment_together(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    folder = write_frame_files(tmp_path / "one", small_frame())
-    assert (
-        run_thor2("recognize", "--model", model, *frame_options(folder), "--segment", "table", "--out", tmp_path / "o")
-        == 2
-    )
-    error = capfd.readouterr().err
-    assert error.startswith("error: labels is ") and error.count("\n") == 1
-    assert not (tmp_path / "o").exists()
-
-
-def test_an_unknown_segmenter(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    folder = write_frame_files(tmp_path / "one", small_frame())
-    assert run_thor2("recognize", "--model", model, folder, "--segment", "sam", "--out", tmp_path / "o") == 2
-    error = capfd.readouterr().err
-    assert error.startswith("error: segmenter is 'sam'") and error.count("\n") == 1
-    assert not (tmp_path / "o").exists()
 
 
 def test_track_gives_an_object_one_name(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

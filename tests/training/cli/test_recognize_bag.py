@@ -152,6 +152,17 @@ def test_frames_with_one_stamp_and_before_1970(model: Path, tmp_path: Path, capf
     assert (messages[0][1].header.stamp.sec, messages[0][1].header.stamp.nanosec) == (-1, 10**9 - 1)
 
 
+def test_texts_of_recordings_are_escaped(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "a.mcap"
+    with bag_writer(path) as write:
+        write(CAMERA, camera_info(FRAMES[0].intrinsics, FRAMES[0].depth.shape), START)
+        write(COLOR, image(FRAMES[0].color, "rgb8", frame_id="a\n\x1b[2J"), START)
+        write(DEPTH, image(FRAMES[0].depth, "16UC1"), START)
+    assert run_thor2("recognize", "--model", model, "--bag", path) == 0
+    (note,) = [line for line in capfd.readouterr().err.splitlines() if line.startswith("note: ")]
+    assert r"color in a\n\x1b[2J" in note
+
+
 def test_a_wrong_unit_of_depth(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     path = write_recording(tmp_path / "a.mcap", FRAMES[:2])
     assert run_thor2("recognize", "--model", model, "--bag", path, "--depth-scale", 10) == 2

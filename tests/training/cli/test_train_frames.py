@@ -14,6 +14,7 @@ from PIL import Image
 from thor2_jax.model.run_directory import load_run
 from thor2_jax.recognizer import Recognizer
 
+pytestmark = pytest.mark.usefixtures("small_classifiers", "small_descriptors")
 TINY = ("--embedding", 0, "--orientation-copies", 0, "--classifiers", "ce", "--epochs", 1, "--batch-size", 4, "--quiet")
 STEPS = ("--azimuth-step", 180, "--polar-step", 90, "--workers", 1)
 

@@ -127,6 +127,7 @@ def test_realsense_without_its_package(
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("messages")  # with its handler of Ctrl-C, which the process inherits
 def test_a_recording_in_its_own_process(model: Path, tmp_path: Path) -> None:
     path = write_recording(tmp_path / "a.bag", FRAMES * 4)
     command = [sys.executable, "-m", "training.cli", "watch", "--model", str(model), "--bag", str(path), "--port", "0"]

@@ -17,7 +17,7 @@ from PIL import Image
 import thor2_jax
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, backproject
-from thor2_jax.model.answers import Recognition
+from thor2_jax.model.recognition import Recognition
 from training.diagnosis import registration
 from training.diagnosis.checks import Diagnosis, check_camera, check_labels, check_meshes
 from training.diagnosis.colors import check_channel_order, check_light

@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Generator
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -26,8 +27,9 @@ from training.embedding.sampling import ViewTask, build_samples, render_clouds
 from training.storage.workers import IN_PROCESS
 
 NETWORK = colornet.load_default()
-SIZES = EmbeddingSizes(cell=6, hidden=(32, 32), learned=16, color=10)
+SIZES = EmbeddingSizes(cell=6, hidden=(32,), learned=16, color=10)
 OBJECTS = range(0, 40, 5)
+CLASSES = ("a", "b")
 OPTIONS = EmbeddingFit(epochs=12, batch_size=32, rate=5e-3)
 
 whole_embedding = nnx.jit(lambda model, *inputs: model(*inputs))
@@ -124,41 +126,39 @@ def test_an_interrupted_sampling_resumes(
         build_samples(OBJECTS, tmp_path / "one", NETWORK, SMALL_CONFIG, 3)
 
 
-def test_views_of_one_object_become_more_similar(views: Samples) -> None:
-    losses = []
-    fitted = fit_embedding(views, NETWORK, SMALL_CONFIG, OPTIONS, SIZES, lambda *numbers: losses.append(numbers))
-    again = fit_embedding(views, NETWORK, SMALL_CONFIG, OPTIONS, SIZES)
+@pytest.fixture(scope="module")
+def fitted(views: Samples) -> tuple[Embedding, list[Any]]:
+    """A fit of one network, and its progress."""
+    losses: list[Any] = []
+    show = lambda *numbers: losses.append(numbers)  # noqa: E731
+    return fit_embedding(views, NETWORK, SMALL_CONFIG, OPTIONS, SIZES, show, CLASSES), losses
+
+
+def test_views_of_one_object_become_more_similar(views: Samples, fitted: tuple[Embedding, list[Any]]) -> None:
+    embedding, losses = fitted
+    again = fit_embedding(views, NETWORK, SMALL_CONFIG, OPTIONS, SIZES, classes=CLASSES)
     assert losses[11][:2] == (36, 36) and losses[11][2].loss < 0.5 * losses[0][2].loss
-    assert fitted.fingerprint == again.fingerprint
+    assert embedding.fingerprint == again.fingerprint
     batch = views.take(np.arange(len(views)))
-    descriptors = fit.batch_descriptors(jnp.asarray(batch.length), jnp.asarray(batch.color), NETWORK, fitted.config)
+    descriptors = fit.batch_descriptors(jnp.asarray(batch.length), jnp.asarray(batch.color), NETWORK, embedding.config)
     same = batch.label[:, None] == batch.label
     gaps = []
-    for embedding in (Embedding.create(SMALL_CONFIG, sizes=SIZES), fitted):
-        learned = np.asarray(learned_block(embedding.model, descriptors, batch.statistics))
+    for one in (Embedding.create(SMALL_CONFIG, sizes=SIZES), embedding):
+        learned = np.asarray(learned_block(one.model, descriptors, batch.statistics))
         similarity = learned @ learned.T
         gaps.append(similarity[same].mean() - similarity[~same].mean())
     assert gaps[1] > 1.5 * gaps[0]
-    basis = np.asarray(fitted.model.color_basis[...])
+    basis = np.asarray(embedding.model.color_basis[...])
     np.testing.assert_allclose(basis.T @ basis, np.eye(10), atol=1e-3)
 
 
-def test_further_networks_leave_the_first_as_it_is(views: Samples) -> None:
-    classes, short = ("a", "b"), dataclasses.replace(OPTIONS, epochs=2)
-    done = []
-    one = fit_embedding(views, NETWORK, SMALL_CONFIG, short, SIZES, classes=classes)
-    two = fit_embedding(
-        views,
-        NETWORK,
-        SMALL_CONFIG,
-        dataclasses.replace(short, networks=2),
-        SIZES,
-        lambda *numbers: done.append(numbers[:2]),
-        classes,
-    )
-    assert done == [(3, 6), (6, 6)]
+def test_further_networks_leave_the_first_as_it_is(views: Samples, fitted: tuple[Embedding, list[Any]]) -> None:
+    done, options = [], dataclasses.replace(OPTIONS, networks=2)
+    show = lambda *numbers: done.append(numbers[:2])  # noqa: E731
+    two = fit_embedding(views, NETWORK, SMALL_CONFIG, options, SIZES, show, CLASSES)
+    assert done == [(3 * epoch, 36) for epoch in range(1, 13)]
     (second,) = two.further
-    first, same = model_arrays(one.model), model_arrays(two.model)
+    first, same = model_arrays(fitted[0].model), model_arrays(two.model)
     assert first.keys() == same.keys() and all(np.array_equal(first[name], same[name]) for name in first)
     assert second.proxies[...].shape == two.model.proxies[...].shape
     assert np.abs(second.proxies[...] - two.model.proxies[...]).max() > 0.1

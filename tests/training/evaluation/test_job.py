@@ -67,14 +67,16 @@ class OneFrame(LabelledFrames):
 class ToyRecognizer(UntaughtRecognizer):
     """Returns random probabilities, seeded by run and frame, and logs each frame that it describes."""
 
-    def __init__(self, seed: int, log: Path, features: tuple[str, ...], kill_at: int | None = None) -> None:
-        self.seed, self.log, self.kill_at = seed, log, kill_at
+    def __init__(self, seed: int, log: Path, features: tuple[str, ...], stop_at: int | None = None) -> None:
+        self.seed, self.log, self.stop_at = seed, log, stop_at
         self.run = SimpleNamespace(classes=CLASSES, classifiers=dict.fromkeys(features), record={})
 
     def describe(self, frame: Any) -> Any:
         number = int(frame.color[0, 0, 0])
-        if number == self.kill_at:
-            os.kill(os.getpid(), signal.SIGKILL)
+        if number == self.stop_at:
+            if "TO_BE_KILLED" in os.environ:
+                os.kill(os.getpid(), signal.SIGKILL)
+            raise KeyboardInterrupt
         with self.log.open("a") as file:
             file.write(f"{number}\n")
         instances = [SimpleNamespace(label=label, reason=None, occluded=False) for label in frame.instances]
@@ -85,44 +87,49 @@ class ToyRecognizer(UntaughtRecognizer):
         return {name: rng.dirichlet(np.ones(3), 4).astype(np.float32) for name in self.run.classifiers}
 
 
-def toys(log: Path, kill_at: int | None = None) -> list[Run]:
+def toys(log: Path, stop_at: int | None = None) -> list[Run]:
     """Return two runs; the second has no CE."""
     features = (("ce", "tops", "tops2"), ("tops", "tops2"))
-    return [Run(f"run{k}", f"digest{k}", ToyRecognizer(k, log, f, kill_at)) for k, f in enumerate(features)]  # type: ignore[arg-type]
+    return [Run(f"run{k}", f"digest{k}", ToyRecognizer(k, log, f, stop_at)) for k, f in enumerate(features)]  # type: ignore[arg-type]
 
 
-def evaluate_toys(folder: Path, n: int, kill_at: int | None = None) -> dict[str, Any]:
+def evaluate_toys(folder: Path, n: int, stop_at: int | None = None) -> dict[str, Any]:
     description = {"kind": "frames", "path": "toys"}
-    return evaluate_dataset(toys(folder / "log", kill_at), ToyDataset(n), description, folder / "report")
+    return evaluate_dataset(toys(folder / "log", stop_at), ToyDataset(n), description, folder / "report")
 
 
 def without_times(report: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in report.items() if name != "speed"}
 
 
-def test_killed_evaluation_resumes_with_the_same_result(tmp_path: Path) -> None:
-    for name in ("whole", "killed"):
+@pytest.mark.parametrize("killed", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_stopped_evaluation_resumes_with_the_same_result(tmp_path: Path, killed: bool) -> None:
+    for name in ("whole", "stopped"):
         (tmp_path / name).mkdir()
     whole = evaluate_toys(tmp_path / "whole", 9)
-    program = f"import runpy; from pathlib import Path; m = runpy.run_path({__file__!r}); "
-    program += f"m['evaluate_toys'](Path({str(tmp_path / 'killed')!r}), 9, kill_at=5)"
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    killed = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, timeout=HANG)
-    assert killed.returncode == -signal.SIGKILL, killed.stderr.decode()[-500:]
-    report = tmp_path / "killed" / "report"
+    if killed:
+        program = f"import runpy; from pathlib import Path; m = runpy.run_path({__file__!r}); "
+        program += f"m['evaluate_toys'](Path({str(tmp_path / 'stopped')!r}), 9, stop_at=5)"
+        environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "TO_BE_KILLED": ""}
+        done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, timeout=HANG)
+        assert done.returncode == -signal.SIGKILL, done.stderr.decode()[-500:]
+    else:
+        with pytest.raises(KeyboardInterrupt):
+            evaluate_toys(tmp_path / "stopped", 9, stop_at=5)
+    report = tmp_path / "stopped" / "report"
     assert not (report / "report.json").exists()
     assert len((report / "answers.jsonl").read_text().splitlines()) == 1 + 5
     with (report / "answers.jsonl").open("a") as file:
         file.write('{"frame": "frame5", "attrib')  # as after a kill during a write
-    resumed = evaluate_toys(tmp_path / "killed", 9)
-    assert (tmp_path / "killed" / "log").read_text().split() == [str(k) for k in range(9)]
+    resumed = evaluate_toys(tmp_path / "stopped", 9)
+    assert (tmp_path / "stopped" / "log").read_text().split() == [str(k) for k in range(9)]
     assert without_times(resumed) == without_times(whole)
     pictures = {p.relative_to(report): p.read_bytes() for p in report.rglob("*.jpg")}
     other = tmp_path / "whole" / "report"
     assert pictures == {p.relative_to(other): p.read_bytes() for p in other.rglob("*.jpg")}
 
-    assert without_times(evaluate_toys(tmp_path / "killed", 9)) == without_times(whole)
-    assert len((tmp_path / "killed" / "log").read_text().split()) == 9
+    assert without_times(evaluate_toys(tmp_path / "stopped", 9)) == without_times(whole)
+    assert len((tmp_path / "stopped" / "log").read_text().split()) == 9
     assert [p.name for p in report.rglob(".*")] == [LOCK]
 
 

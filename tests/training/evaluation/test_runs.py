@@ -18,6 +18,8 @@ from thor2_jax.types import PointClouds
 from training.baselines.files import baseline_file
 from training.evaluation.runs import load_runs, load_sequence_runs
 
+pytestmark = pytest.mark.usefixtures("small_classifiers")
+
 CONFIG = DescriptorConfig(homology="closed_form", n_slices=1, n_strips=3)
 
 Maker = Callable[..., Path]

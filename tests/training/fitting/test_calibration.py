@@ -20,6 +20,8 @@ from training.fitting.samples import MIRRORS, build_samples
 from training.fitting.steps import FitContext
 from training.views.normalized_views import MemoryViews, padded_batches
 
+pytestmark = pytest.mark.usefixtures("small_classifiers")
+
 CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=2, n_strips=8, image_size=8)
 NETWORK = colornet.load_default()
 

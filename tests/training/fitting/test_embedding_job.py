@@ -1,6 +1,7 @@
 """Trainings of an embedding alone: what a run has, interruptions, folds, and the user's cache."""
 
 import dataclasses
+import functools
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from thor2_jax.model.run_directory import TrainedRun, load_run
 from thor2_jax.recognizer import Recognizer
 from thor2_jax.types import Cloud
 from training.embedding import run_embedding
+from training.embedding.fit import EmbeddingFit
 from training.embedding.run_embedding import Distractors
 from training.fitting.job import RunSettings, check_trained, train_run
 from training.fitting.options import FitOptions, read_metrics
@@ -22,7 +24,7 @@ from training.views.normalized_views import MemoryViews
 
 CLASSES = ("red brick", "stick")
 OPTIONS = FitOptions()
-DISTRACTORS = Distractors(procedural=10, views=14, epochs=3, networks=2)
+DISTRACTORS = Distractors(procedural=10, views=4, epochs=3, networks=2)
 
 
 def source() -> MemoryViews:
@@ -38,11 +40,12 @@ def source() -> MemoryViews:
 
 @pytest.fixture(scope="module", autouse=True)
 def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """A user's cache, in which the first training keeps the samples of the distractors; and small networks."""
+    """A user's cache, in which the first training keeps the samples of the distractors; small networks and batches."""
     directory = tmp_path_factory.mktemp("cache")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("THOR2_CACHE", str(directory))
         patch.setattr(run_embedding, "SIZES", EmbeddingSizes(cell=4, hidden=(16,), learned=8, color=4))
+        patch.setattr(run_embedding, "EmbeddingFit", functools.partial(EmbeddingFit, batch_size=64))
         yield directory
 
 
@@ -118,7 +121,7 @@ def test_an_interrupted_joint_fit_resumes_to_the_same_bytes(
         return render(*arguments)
 
     monkeypatch.setattr(run_embedding, "build_samples", counted)
-    for stage, step in (("describe for the embedding", 1), ("fit networks", 1), ("fit networks", 3)):
+    for stage, step in (("describe for the embedding", 1), ("fit networks", 2)):
         with pytest.raises(Interrupted):
             train(out, progress=stop_when(stage, step))
         with pytest.raises(InputError, match=r"run\.json"):
@@ -126,7 +129,7 @@ def test_an_interrupted_joint_fit_resumes_to_the_same_bytes(
     with pytest.raises(InputError, match="networks"):
         train(out, dataclasses.replace(SETTINGS, distractors=dataclasses.replace(DISTRACTORS, networks=3)))
     (run,) = train(out)
-    assert rendered == [0, 1, 1, 1]
+    assert rendered == [0, 1, 1]
     assert (out / "embedding.safetensors").read_bytes() == (whole[0] / "embedding.safetensors").read_bytes()
     assert run.record == whole[1].record and rows(out) == rows(whole[0])
     assert not (out / "checkpoints").exists()

@@ -19,6 +19,7 @@ from flax import nnx
 from PIL import Image
 
 import thor2_jax as thor2
+from thor2_jax.model import classifier
 from thor2_jax.model.run_directory import TrainedRun, load_run
 from thor2_jax.types import Cloud
 from training.fitting import job as module
@@ -29,8 +30,10 @@ from training.fitting.job import RunSettings, train_run
 from training.fitting.options import FitOptions
 from training.views.normalized_views import MemoryViews
 
+pytestmark = pytest.mark.usefixtures("small_classifiers")
+
 CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=3, n_strips=8, image_size=8)
-OPTIONS = FitOptions(epochs=3, batch_size=4)
+OPTIONS = FitOptions(epochs=3, batch_size=8)
 FINISHED = ["curves.png", "metrics.jsonl", "network.npz", "run.json", "weights"]
 
 
@@ -62,7 +65,7 @@ def same_weights(a: TrainedRun, b: TrainedRun) -> None:
     first, second = weights(a), weights(b)
     assert first.keys() == second.keys()
     for name in first:
-        assert len(first[name]) > 20
+        assert len(first[name]) > 10
         for (path, one), (other_path, other) in zip(first[name], second[name], strict=True):
             assert path == other_path
             np.testing.assert_array_equal(one[...], other[...])
@@ -104,13 +107,13 @@ def test_a_run_is_written_and_its_progress_is_reported(tmp_path: Path) -> None:
     out = tmp_path / "run"
     run = train(out, progress=progress)
     assert run.classes == ("red brick", "stick") and tuple(run.classifiers) == ("tops",)
-    fit_steps = [("fit tops", done, 18) for done in range(1, 19)]
+    fit_steps = [("fit tops", done, 9) for done in range(1, 10)]
     assert stages == [("describe", 6, 12), ("describe", 12, 12), *fit_steps]
     assert names(out) == FINISHED
     loaded = load_run(out)
     assert (loaded.classes, loaded.config, loaded.record) == (run.classes, CONFIG, run.record)
     record = loaded.record
-    assert (record["samples"], record["batch_size"], record["folds"], record["held_out_accuracy"]) == (24, 4, 1, {})
+    assert (record["samples"], record["batch_size"], record["folds"], record["held_out_accuracy"]) == (24, 8, 1, {})
     assert record["dataset"] == source().record and record["dataset"]["views"] == 12
     curve = record["curves"]["tops"]
     assert [row["epoch"] for row in curve] == [1, 2, 3]
@@ -163,24 +166,9 @@ def stop_when(stage: str, step: int) -> Any:
     return progress
 
 
-@pytest.fixture(scope="module")
-def fitted(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run directory of a training that was interrupted before its run was published."""
-    out = tmp_path_factory.mktemp("fitted") / "run"
-
-    def interrupted(*_: Any, **__: Any) -> None:
-        raise Interrupted
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "save_run", interrupted)
-        with pytest.raises(Interrupted):
-            train(out, ("tops", "ce"))
-    return out
-
-
 def test_an_interrupted_run_resumes_to_the_same_result(whole: tuple[Path, TrainedRun], tmp_path: Path) -> None:
     out = tmp_path / "run"
-    for stage, step in (("fit ce", 2), ("fit ce", 9), ("fit ce", 14), ("fit tops", 1), ("fit tops", 18)):
+    for stage, step in (("fit ce", 2), ("fit ce", 8), ("fit tops", 9)):
         with pytest.raises(Interrupted):
             train(out, ("tops", "ce"), progress=stop_when(stage, step))
         with pytest.raises(thor2.InputError, match=r"run\.json"):
@@ -194,55 +182,39 @@ def test_an_interrupted_run_resumes_to_the_same_result(whole: tuple[Path, Traine
         train(out, ("tops", "ce"))
 
 
-@pytest.mark.parametrize("moved", ["nothing", "tops.safetensors", "network.npz", "run.json"])
 def test_interrupted_while_the_run_is_published(
-    moved: str, whole: tuple[Path, TrainedRun], fitted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    whole: tuple[Path, TrainedRun], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    out = Path(shutil.copytree(fitted, tmp_path / "run"))
-    rename = Path.rename
+    """Interrupts before the first file is moved to its name, and after some of them are."""
+    out, rename = tmp_path / "run", Path.rename
+    for moved in (None, "tops.safetensors", "network.npz", "run.json"):
 
-    def stopping(self: Path, target: Path) -> Path:
-        if target.suffix == ".safetensors" and moved == "nothing":
-            raise Interrupted
-        renamed = rename(self, target)
-        if self.name == moved and target.parent in (out, out / "weights"):
-            raise Interrupted
-        return renamed
+        def stopping(self: Path, target: Path) -> Path:
+            if target.suffix == ".safetensors" and moved is None:  # noqa: B023
+                raise Interrupted
+            renamed = rename(self, target)
+            if self.name == moved and target.parent in (out, out / "weights"):  # noqa: B023
+                raise Interrupted
+            return renamed
 
-    with monkeypatch.context() as patch:
-        patch.setattr(Path, "rename", stopping)
-        with pytest.raises(Interrupted):
-            train(out, ("tops", "ce"))
-    assert (out / "run.json").exists() == (moved == "run.json")
+        with monkeypatch.context() as patch:
+            patch.setattr(Path, "rename", stopping)
+            with pytest.raises(Interrupted):
+                train(out, ("tops", "ce"))
+        assert (out / "run.json").exists() == (moved == "run.json")
     same_weights(train(out, ("tops", "ce")), whole[1])
     assert names(out) == FINISHED
-
-
-def test_interrupted_while_checkpoints_are_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Checkpoints are removed after the last fold is finished."""
-    rmdir = os.rmdir
-
-    def stopping(path: Any, **options: Any) -> None:
-        if Path(path).name.endswith("checkpoints"):
-            raise Interrupted
-        rmdir(path, **options)
-
-    monkeypatch.setattr(os, "rmdir", stopping)
-    with pytest.raises(Interrupted):
-        train_run(source(), tmp_path / "run", RunSettings(["tops"], OPTIONS, CONFIG, 2))
-    assert module.is_finished(tmp_path / "run")
-    assert [load_run(folder).record["fold"] for folder in find_run_directories([tmp_path / "run"])] == [0, 1]
 
 
 def test_other_options_or_views_are_refused(tmp_path: Path) -> None:
     out = tmp_path / "run"
     with pytest.raises(Interrupted):
-        train(out, progress=stop_when("fit tops", 8))
+        train(out, progress=stop_when("fit tops", 4))
     before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
     cases: list[tuple[str, dict[str, Any]]] = [
-        ("batch_size 4, not 6", {"options": FitOptions(epochs=3, batch_size=6)}),
-        ("epochs 3, not 4", {"options": FitOptions(epochs=4, batch_size=4)}),
-        ("seed 0, not 1", {"options": FitOptions(epochs=3, batch_size=4, seed=1)}),
+        ("batch_size 8, not 6", {"options": dataclasses.replace(OPTIONS, batch_size=6)}),
+        ("epochs 3, not 4", {"options": dataclasses.replace(OPTIONS, epochs=4)}),
+        ("seed 0, not 1", {"options": dataclasses.replace(OPTIONS, seed=1)}),
         (r"classifiers\[0\] \"tops\", not \"ce\"", {"features": ("tops", "ce")}),
         ("folds 1, not 3", {"folds": 3}),
     ]
@@ -268,7 +240,7 @@ def test_files_of_the_user_stay_in_a_run_directory(tmp_path: Path) -> None:
         train(out)
     (out / "checkpoints" / "epoch1.pt").rename(tmp_path / "epoch1.pt")
     with pytest.raises(Interrupted):
-        train(out, progress=stop_when("fit tops", 8))
+        train(out, progress=stop_when("fit tops", 4))
     users = [
         out / name
         for name in ("checkpoints/notes.txt", "weights/pretrained.npz", ".checkpoints/a", ".curves.12345678.png")
@@ -284,7 +256,7 @@ def test_files_of_the_user_stay_in_a_run_directory(tmp_path: Path) -> None:
 def test_a_damaged_checkpoint_is_refused(tmp_path: Path) -> None:
     out = tmp_path / "run"
     with pytest.raises(Interrupted):
-        train(out, progress=stop_when("fit tops", 8))
+        train(out, progress=stop_when("fit tops", 4))
     last = out / "checkpoints" / "fold-0" / "tops" / "1"
     largest = max((path for path in last.rglob("*") if path.is_file()), key=lambda path: path.stat().st_size)
     largest.write_bytes(largest.read_bytes()[:-1])
@@ -331,24 +303,30 @@ def test_an_unwritable_run_directory_is_refused(tmp_path: Path) -> None:
         train(tmp_path / "file" / "run")
 
 
-def test_folds(tmp_path: Path) -> None:
-    out = tmp_path / "run"
-    interrupted: list[str] = []
+def test_folds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Interrupted in the second fold, and while the checkpoints are removed after the last one is finished."""
+    out, rmdir = tmp_path / "run", os.rmdir
 
-    def progress(stage: str, done: int, total: int, note: str) -> None:
-        if stage == "fold 1: fit tops" and done == 9 and not interrupted:
-            interrupted.append(stage)
+    def run(progress: Any = lambda *_: None) -> None:
+        train_run(source(), out, RunSettings(["tops"], OPTIONS, CONFIG, 3), progress)
+
+    def stopping(path: Any, **options: Any) -> None:
+        if Path(path).name.endswith("checkpoints"):
             raise Interrupted
-
-    def run() -> list[TrainedRun]:
-        return train_run(source(views=6), out, RunSettings(["tops"], OPTIONS, CONFIG, 3), progress)
+        rmdir(path, **options)
 
     with pytest.raises(Interrupted):
-        run()
+        run(stop_when("fold 1: fit tops", 4))
     first = load_run(out / "fold-0")
     assert names(out) == ["checkpoints", "curves.png", "fold-0", "metrics.jsonl"]
-    runs = run()
-    assert names(out) == ["curves.png", "fold-0", "fold-1", "fold-2", "metrics.jsonl"]
+    monkeypatch.setattr(os, "rmdir", stopping)
+    with pytest.raises(Interrupted):
+        run()
+    assert module.is_finished(out)
+    runs = [load_run(folder) for folder in find_run_directories([out])]
+    assert [name for name in names(out) if name[0] != "."] == [
+        "curves.png", "fold-0", "fold-1", "fold-2", "metrics.jsonl",
+    ]  # fmt: skip
     assert names(out / "fold-2") == ["network.npz", "run.json", "weights"]
     same_weights(runs[0], first)
     assert [run.record["fold"] for run in runs] == [0, 1, 2]
@@ -372,6 +350,8 @@ _PROGRAM = """
 import sys
 sys.path.insert(0, sys.argv[1])
 import test_job
+from thor2_jax.model import classifier
+classifier.HIDDEN = tuple(map(int, sys.argv[3].split(",")))
 test_job.train(test_job.Path(sys.argv[2]), ("tops", "ce"))
 """
 
@@ -379,7 +359,14 @@ test_job.train(test_job.Path(sys.argv[2]), ("tops", "ce"))
 @pytest.mark.slow
 def test_a_killed_training_resumes_to_the_same_bytes(whole: tuple[Path, TrainedRun], tmp_path: Path) -> None:
     out = tmp_path / "run"
-    command = [sys.executable, "-c", _PROGRAM, str(Path(__file__).parent), str(out)]
+    command = [
+        sys.executable,
+        "-c",
+        _PROGRAM,
+        str(Path(__file__).parent),
+        str(out),
+        ",".join(map(str, classifier.HIDDEN)),
+    ]
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
     killed = 0
     # At once after lines appear: while a checkpoint is being written, or the next epoch is under way.

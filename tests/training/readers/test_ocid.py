@@ -19,7 +19,7 @@ from training.evaluation.answering import answer_frames
 from training.evaluation.results import compute_results
 from training.evaluation.runs import Run as EvaluatedRun
 from training.readers import OCID, FrameFolder
-from training.readers.ocid import fit_intrinsics
+from training.readers.ocid import fit_intrinsics, read_organized_points
 
 CAMERA = Intrinsics(570.34, 565.21, 4.3, 2.6)
 SHAPE = (6, 9)
@@ -278,6 +278,12 @@ def test_files_that_are_cut_off(tmp_path: Path, file: str, kept: int) -> None:
     path = write_frame(tmp_path) / file
     path.write_bytes(path.read_bytes()[:kept])
     assert str(path) in error_message(tmp_path, write_names(tmp_path))
+
+
+def test_signalling_nan(tmp_path: Path) -> None:
+    header = "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 1\nHEIGHT 1\nDATA binary\n"
+    (tmp_path / "a.pcd").write_bytes(header.encode() + struct.pack("<3I", *[0x7F800001] * 3))
+    assert np.isnan(read_organized_points(tmp_path / "a.pcd")).all()
 
 
 def test_frames_are_read_one_at_a_time(tmp_path: Path) -> None:

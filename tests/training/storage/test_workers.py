@@ -1,5 +1,6 @@
 """Worker pools: order of the results, memory, and processes that die."""
 
+import platform
 import signal
 import subprocess
 import sys
@@ -39,6 +40,12 @@ def test_results_keep_the_order_of_lazily_drawn_items(workers: int) -> None:
 
 def test_no_items_give_no_results() -> None:
     assert list(IN_PROCESS(eval, [])) == list(local_workers(2)(eval, [])) == []
+
+
+@pytest.mark.slow
+def test_ctrl_c_is_blocked_from_the_start_of_a_worker() -> None:
+    (blocked,) = local_workers(2)(eval, ["__import__('signal').pthread_sigmask(0, ())"])
+    assert signal.SIGINT in blocked and signal.SIGTERM not in blocked
 
 
 @pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
@@ -100,3 +107,24 @@ def test_invalid_arguments_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(worker_pools.importlib, "import_module", absent)
     with pytest.raises(InputError, match=r"engine is ray"):
         ray_workers(2)
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another C library has no such options")
+def test_freed_memory_is_used_again() -> None:
+    script = """
+from concurrent.futures import ThreadPoolExecutor
+from resource import RUSAGE_SELF, getrusage
+from training.storage.workers import keep_freed_memory
+
+def new_pages():
+    before = getrusage(RUSAGE_SELF).ru_minflt
+    for _ in range(10):
+        bytearray(2**27)
+    return getrusage(RUSAGE_SELF).ru_minflt - before
+
+returned = new_pages()
+keep_freed_memory()
+print(returned / new_pages(), returned / ThreadPoolExecutor(1).submit(new_pages).result())
+"""
+    run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=HANG, check=True)
+    assert all(float(ratio) > 5 for ratio in run.stdout.split())

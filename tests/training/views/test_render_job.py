@@ -11,7 +11,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -33,13 +33,13 @@ from training.views.render_job import render_dataset
 
 NAMES = ("screwdriver", "tennis_ball")
 OBJECTS = {name: builtin_objects()[name] for name in NAMES}
-STEPS = (120, 45)
-"""15 views an object: of 8 and 7 with the shards of these tests."""
+STEPS = (180, 90)
+"""6 views an object: of 4 and 2 with the shards of these tests."""
 
 
 @pytest.fixture(autouse=True)
 def small_shards(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(render_job, "CLOUDS_PER_SHARD", 8)
+    monkeypatch.setattr(render_job, "CLOUDS_PER_SHARD", 4)
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The dataset of a job that nothing interrupted."""
     out = tmp_path_factory.mktemp("whole") / "deep" / "views"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(render_job, "CLOUDS_PER_SHARD", 8)
+        patch.setattr(render_job, "CLOUDS_PER_SHARD", 4)
         render_dataset(OBJECTS, out, *STEPS)
     return out
 
@@ -78,12 +78,12 @@ def test_files_of_a_dataset(whole: Path) -> None:
     ]
     dataset = ViewDataset.open(whole)
     assert [(shard.file[:9], shard.label, shard.views, shard.left_out) for shard in dataset.shards] == [
-        ("0000-0000", 0, 8, 0),
-        ("0000-0001", 0, 7, 0),
-        ("0001-0000", 1, 8, 0),
-        ("0001-0001", 1, 7, 0),
+        ("0000-0000", 0, 4, 0),
+        ("0000-0001", 0, 2, 0),
+        ("0001-0000", 1, 4, 0),
+        ("0001-0001", 1, 2, 0),
     ]
-    assert np.array_equal(np.concatenate([dataset.read(k).view for k in (0, 1)]), np.arange(15))
+    assert np.array_equal(np.concatenate([dataset.read(k).view for k in (0, 1)]), np.arange(6))
     assert "time" not in (whole / MANIFEST).read_text()
 
 
@@ -97,10 +97,14 @@ class Stop(BaseException):
     """Like KeyboardInterrupt, not an Exception."""
 
 
+@pytest.mark.parametrize("stops", [(1, 2, 3, 4, 5, 18), pytest.param(range(6, 18), marks=pytest.mark.slow)], ids=str)
 def test_rendering_interrupted_at_any_write_resumes(
-    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    stops: Sequence[int], whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Interrupts before and after each of the nine files of a job is moved to its name."""
+    """Interrupts before and after each of the nine files of a job is moved to its name.
+
+    The quick ones are those of the first manifest, the first shard and its manifest, and the last one.
+    """
     replace, left = os.replace, 0
 
     def stopping(source: Path, target: Path) -> None:
@@ -114,7 +118,7 @@ def test_rendering_interrupted_at_any_write_resumes(
             raise Stop
 
     monkeypatch.setattr(os, "replace", stopping)
-    for stop in range(1, 19):
+    for stop in stops:
         out, left = tmp_path / str(stop), stop
         with pytest.raises(Stop):
             render_dataset(OBJECTS, out, *STEPS)
@@ -126,7 +130,7 @@ def test_rendering_interrupted_at_any_write_resumes(
         assert contents(out) == contents(whole)
         # Shards that were listed are not rendered again.
         listed = json.loads(before[MANIFEST])["views"] if MANIFEST in before else 0
-        assert seen == [(done, 30) for done in (0, 8, 15, 23, 30) if done >= listed]
+        assert seen == [(done, 12) for done in (0, 4, 6, 10, 12) if done >= listed]
         assert left == -2 * (2 * (len(seen) - 1) + (MANIFEST not in before))
 
 
@@ -136,7 +140,7 @@ from training.views import render_job
 from training.objects.builtin_objects import builtin_objects
 from training.storage.workers import local_workers
 
-render_job.CLOUDS_PER_SHARD = 8
+render_job.CLOUDS_PER_SHARD = 4
 replace, left = os.replace, int(sys.argv[2])
 
 def killing(source, target):
@@ -149,7 +153,7 @@ def killing(source, target):
 
 os.replace = killing
 objects = {name: builtin_objects()[name] for name in ("screwdriver", "tennis_ball")}
-render_job.render_dataset(objects, sys.argv[1], 120, 45, local_workers(int(sys.argv[3])))
+render_job.render_dataset(objects, sys.argv[1], 180, 90, local_workers(int(sys.argv[3])))
 """
 
 
@@ -190,7 +194,7 @@ def changed(folder: Path) -> dict[str, int]:
 
 def test_a_finished_dataset_is_not_changed(copied: Path) -> None:
     before = changed(copied)
-    assert len(render_dataset(OBJECTS, copied, *STEPS)) == 30
+    assert len(render_dataset(OBJECTS, copied, *STEPS)) == 12
     assert changed(copied) == before | {".lock": changed(copied)[".lock"]}
 
 
@@ -214,8 +218,8 @@ def test_another_job_is_refused(copied: Path) -> None:
     painted = dataclasses.replace(screwdriver, textures=tuple(texture ^ 1 for texture in screwdriver.textures))
     light = Augmentations(illumination=Illumination())
     for meshes, steps, options, message in [
-        (OBJECTS, (90, 45), {}, "azimuth_step 120.0, not 90.0"),
-        (OBJECTS, (120, 90), {}, "polar_step 45.0, not 90.0"),
+        (OBJECTS, (90, 90), {}, "azimuth_step 180.0, not 90.0"),
+        (OBJECTS, (180, 45), {}, "polar_step 90.0, not 45.0"),
         (OBJECTS, STEPS, {"augmentations": light}, "variations null, not {"),
         (OBJECTS | {"tennis_ball": moved}, STEPS, {}, r"objects\[\d\].mesh "),
         (OBJECTS | {"screwdriver": painted}, STEPS, {}, r"objects\[\d\].mesh "),
@@ -229,7 +233,8 @@ def test_another_job_is_refused(copied: Path) -> None:
         assert contents(copied) == before
 
 
-def test_augmentations_are_part_of_the_job(tmp_path: Path) -> None:
+def test_augmentations_are_part_of_the_job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(render_job, "CLOUDS_PER_SHARD", 8)
     out, light = tmp_path / "views", Augmentations(illumination=Illumination(), copies=2)
     dataset = render_dataset({"ball": sphere(0.03)}, out, 90, 90, augmentations=light, seed=1)
     assert len(dataset) == 36 and dataset.record["job"]["variations"]["seed"] == 1
@@ -248,7 +253,7 @@ def test_views_of_few_points_are_left_out_and_counted(tmp_path: Path) -> None:
     sheet.vertices[:, 2] *= 0.005  # seen edge on from the side
     dataset = render_dataset({"sheet": sheet}, tmp_path / "views", 180, 90)
     assert len(dataset) == 4 and dataset.record["left_out"] == 2
-    assert dataset.read(0).view.tolist() == [0, 1, 4, 5]
+    assert [dataset.read(k).view.tolist() for k in (0, 1)] == [[0, 1], [4, 5]]
 
 
 def test_a_shard_without_views(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

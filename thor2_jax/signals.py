@@ -1,4 +1,4 @@
-"""Handlers of Ctrl-C and SIGTERM, also while processes of the service start."""
+"""Handlers of Ctrl-C and SIGTERM, also while processes of the service and of worker pools start."""
 
 import contextlib
 import signal
