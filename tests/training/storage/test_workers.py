@@ -113,18 +113,24 @@ def test_invalid_arguments_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_freed_memory_is_used_again() -> None:
     script = """
 from concurrent.futures import ThreadPoolExecutor
-from resource import RUSAGE_SELF, getrusage
+from pathlib import Path
+from resource import getpagesize
 from training.storage.workers import keep_freed_memory
 
-def new_pages():
-    before = getrusage(RUSAGE_SELF).ru_minflt
-    for _ in range(10):
-        bytearray(2**27)
-    return getrusage(RUSAGE_SELF).ru_minflt - before
+def resident():
+    return int(Path("/proc/self/statm").read_text().split()[1]) * getpagesize()
 
-returned = new_pages()
+def kept():
+    before = resident()
+    bytearray(2**27)
+    return resident() - before
+
+print(kept())
 keep_freed_memory()
-print(returned / new_pages(), returned / ThreadPoolExecutor(1).submit(new_pages).result())
+print(kept(), ThreadPoolExecutor(1).submit(kept).result())
 """
-    run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=HANG, check=True)
-    assert all(float(ratio) > 5 for ratio in run.stdout.split())
+    run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=HANG)
+    assert run.returncode == 0, run.stderr
+    returned, kept, kept_again = map(int, run.stdout.split())
+    # The second block of 128 MB is where the first one was, though another thread asks for it.
+    assert returned < 2**25 and kept > 2**26 and kept_again < 2**25
