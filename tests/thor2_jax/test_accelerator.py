@@ -103,10 +103,13 @@ def test_probabilities_are_those_of_a_cpu(accelerator: jax.Device, clouds: thor2
     np.testing.assert_allclose(probabilities, expected, atol=0.02)
 
 
+@pytest.mark.parametrize("describes", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_the_benchmark_runs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], describes: bool
 ) -> None:
     """Runs on any device; its figures are not checked."""
+    if not describes:  # but a function that compiles at once
+        monkeypatch.setattr(thor2, "describe", lambda clouds, *_: clouds.points * 2)
     monkeypatch.setattr(sys, "argv", ["run_gpu", "--any-device", "--clouds", "4", "--out", str(tmp_path)])
     monkeypatch.setattr(run_gpu, "N_POINTS", 512)
     monkeypatch.setattr(run_gpu, "time_calls", partial(time_calls, seconds=0))

@@ -117,12 +117,20 @@ def unlabelled(scene: thor2.RGBDFrame) -> Files:
     return {**images, "intrinsics": json.dumps(intrinsics).encode()}
 
 
+SERVE = """
+from thor2_jax.service import engine
+engine.POINT_BUCKETS = (engine.MIN_POINTS_BUCKET,)  # the tests send no larger clouds
+from training.cli import main
+main()
+"""
+
+
 class Server:
-    """`thor2 serve` in a subprocess."""
+    """`thor2 serve` in a subprocess, which compiles programs for one padded size of clouds."""
 
     def __init__(self, run: Path, log: Path, cache: Path, *options: str) -> None:
         self.log = log
-        command = [sys.executable, "-m", "training.cli", "serve", "--model", str(run), "--port", "0"]
+        command = [sys.executable, "-c", SERVE, "serve", "--model", str(run), "--port", "0"]
         with log.open("wb") as stream:
             self.process = subprocess.Popen(
                 [

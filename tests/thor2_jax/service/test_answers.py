@@ -70,12 +70,12 @@ def clouds(count: int) -> list[tuple[np.ndarray, np.ndarray]]:
     rng = np.random.default_rng(1)
     return [
         ((rng.random((n, 3)) * (0.2, 0.1, 0.05)).astype(np.float32), rng.integers(0, 256, (n, 3), dtype=np.uint8))
-        for n in (100 + 700 * np.arange(count)).tolist()
+        for n in (100 + 150 * np.arange(count)).tolist()
     ]
 
 
 def test_describe_matches_the_library(server: Any, http: httpx.Client) -> None:
-    inputs = clouds(11)  # More than a batch, with up to 7,100 points.
+    inputs = clouds(11)  # More than a batch, with up to 1,600 points.
     config = thor2.DescriptorConfig(homology="closed_form")
     expected = thor2.describe(thor2.PointClouds.pack(inputs), colornet.load_default(), config)
     answer = Client(server.url).describe(inputs)

@@ -41,6 +41,7 @@ def check_refused(answer: httpx.Response, status: int, field: str | None, *words
         assert internal not in problem["message"].replace("application/json", "").replace("multipart/form-data", "")
 
 
+@pytest.mark.slow  # It waits for the time limit of `thor2 serve`; test_connections.py has the same with short limits.
 def test_incomplete_heads_time_out(server: Any) -> None:
     host, port = server.url.removeprefix("http://").split(":")
     whole = b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n"
