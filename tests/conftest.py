@@ -15,9 +15,8 @@ from processes import UNOPTIMIZED, end_descendants_with_this_process
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
 
-os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"  # as the command line sets it; JAX reads it when it is imported
-import jax  # noqa: E402
-
+# JAX reads these variables when it is imported, which only the processes do that run tests.
+os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"  # as the command line sets it
 # Most of the time of the tests is compilation, which takes a third of it without optimization. For the slow tests, CI
 # sets XLA_FLAGS to nothing: they run what users run.
 os.environ.setdefault("XLA_FLAGS", UNOPTIMIZED)
@@ -25,10 +24,6 @@ gc.set_threshold(100_000, 50, 100)  # tracing allocates much that is kept; colle
 # Subprocesses inherit these: the processes of a run share their compiled programs, and the next run finds them.
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", f"{tempfile.gettempdir()}/thor2-jax-tests-{os.getuid()}")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
-jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE_DIR"])
-jax.config.update(
-    "jax_persistent_cache_min_compile_time_secs", float(os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"])
-)
 os.environ.setdefault("THOR2_CACHE", "off")  # commands keep no programs in the home directory
 
 EXAMPLES = {"properties": (4, 60), "fuzz": (150, 3000)}
@@ -89,6 +84,11 @@ def pytest_collectstart(collector: pytest.Collector) -> None:
         settings.load_profile(f"{folder}-{'thorough' if collector.config.getoption('thorough') else 'quick'}")
 
 
+def pytest_collection_finish() -> None:
+    """Spare later garbage collections all that was imported: it stays, and is half of the objects."""
+    gc.freeze()
+
+
 def pytest_collectreport() -> None:
     """Restore the default settings of Hypothesis for other directories."""
     settings.load_profile("default")
@@ -96,6 +96,8 @@ def pytest_collectreport() -> None:
 
 @pytest.fixture(autouse=True)
 def strict_dtype_promotion(request: pytest.FixtureRequest) -> Iterator[None]:
+    import jax
+
     with jax.numpy_dtype_promotion("strict" if request.path.parent.name in STRICT else "standard"):
         yield
 
