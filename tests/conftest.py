@@ -20,7 +20,7 @@ os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"  # as the command line sets it
 # Most of the time of the tests is compilation, which takes a third of it without optimization. For the slow tests, CI
 # sets XLA_FLAGS to nothing: they run what users run.
 os.environ.setdefault("XLA_FLAGS", UNOPTIMIZED)
-gc.disable()  # tracing allocates much that is kept; collections took a tenth of the time, and free next to nothing
+gc.set_threshold(100_000, 1000, 1000)  # tracing allocates much that is kept: only young objects are worth a look
 # Subprocesses inherit these: the processes of a run share their compiled programs, and the next run finds them.
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", f"{tempfile.gettempdir()}/thor2-jax-tests-{os.getuid()}")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
