@@ -45,18 +45,26 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return directory
 
 
-def test_recognition_and_the_service_need_no_package_of_training(model: Path, tmp_path: Path) -> None:
+RECOGNITION = (
+    "import thor2_jax.service.server, thor2_jax.client, thor2_jax.segmentation.table, thor2_jax.export, "
+    "thor2_jax.recordings.bags, thor2_jax.recordings.bag_writer, thor2_jax.watch.live, training.frame_recognition"
+)
+
+
+def test_recognition_and_the_service_import_no_package_of_training(model: Path) -> None:
+    ended = run_without("objects", "--model", model, before=RECOGNITION)
+    assert ended.returncode == 0 and "bowl" in ended.stdout, ended.stderr
+
+
+@pytest.mark.slow
+def test_recognition_needs_no_package_of_training(model: Path, tmp_path: Path) -> None:
     labels = np.zeros((90, 120), np.uint8)
     labels[10:50, 10:50] = 1
     (tmp_path / "color.png").write_bytes(encode_image(np.full((90, 120, 3), 99, np.uint8)))
     (tmp_path / "depth.png").write_bytes(encode_image(np.full((90, 120), 700, np.uint16)))
     (tmp_path / "mask.png").write_bytes(encode_image(labels))
     (tmp_path / "intrinsics.json").write_text(json.dumps({"fx": 120.0, "fy": 120.0, "cx": 60.0, "cy": 45.0}))
-    service = (
-        "import thor2_jax.service.server, thor2_jax.client, thor2_jax.segmentation.table, thor2_jax.export, "
-        "thor2_jax.recordings.bags, thor2_jax.recordings.bag_writer, thor2_jax.watch.live, training.frame_recognition"
-    )
-    ended = run_without("recognize", "--model", model, tmp_path, "--json", before=service)
+    ended = run_without("recognize", "--model", model, tmp_path, "--json")
     assert ended.returncode == 0, ended.stderr
     assert [one["label"] for one in json.loads(ended.stdout)["instances"]] == [1]
 
