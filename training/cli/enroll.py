@@ -69,7 +69,6 @@ def enroll(
     if mesh is None and mesh_scale != 1:
         raise InputError(f"mesh_scale is {mesh_scale:g}; it belongs to --mesh")
     from training.objects.meshes import find_object_meshes, load_mesh
-    from training.readers.frames import FrameFolder
 
     meshes = {} if mesh is None else find_object_meshes(mesh, name)
     skipped: list[str] = []
@@ -79,9 +78,11 @@ def enroll(
         for path in (given.color, given.depth, given.labels, given.intrinsics):
             if path is not None and not path.is_file():
                 raise FileNotFoundError(2, "No such file", str(path))
-        frames = None if meshes else FrameFolder(given.sources(segment), named=name is None)
 
         # These take seconds to import.
+        from training.readers.frames import FrameFolder
+
+        frames = None if meshes else FrameFolder(given.sources(segment), named=name is None)
         from training.enrollment import enroll_objects, labelled_views
 
         def read(sigma_s: float) -> Mapping[str, Callable[[], Sequence["PreparedInstance"]]]:
@@ -126,8 +127,8 @@ def _rendered(
     from training.storage.workers import local_workers
     from training.views import enrolled_meshes
 
-    render = partial(enrolled_meshes.mesh_views, mesh_scale=mesh_scale, cameras=enrolled_meshes.MESH_VIEWS)
-    views = local_workers(2 if len(meshes) > 1 else 1)(render, meshes.values())
+    tasks = (enrolled_meshes.views_of_mesh(file, mesh_scale, enrolled_meshes.MESH_VIEWS) for file in meshes.values())
+    views = local_workers(2 if len(meshes) > 1 else 1)(enrolled_meshes.rendered_views, tasks)
     with contextlib.closing(views), ThreadPoolExecutor(1) as thread:
         first = thread.submit(next, views)
         yield {name: partial(next, views) if number else first.result for number, name in enumerate(meshes)}
