@@ -15,7 +15,7 @@ from thor2_jax.printable import check_name
 from thor2_jax.tables import parse_json, parse_yaml
 from training.objects.mesh import TexturedMesh, merge_meshes
 
-if TYPE_CHECKING:  # takes .2 s to import, and processes that render are given loaded meshes
+if TYPE_CHECKING:  # takes .2 s to import, and is needed where meshes are read
     import trimesh
 
 __all__ = [

@@ -12,7 +12,7 @@ from training.objects.mesh import TexturedMesh
 from training.objects.meshes import load_mesh
 from training.views.mesh_views import ViewTask, render_task
 
-__all__ = ["MESH_VIEWS", "mesh_views", "rendered_views", "views_of_mesh"]
+__all__ = ["MESH_VIEWS", "check_mesh", "mesh_views"]
 
 MESH_VIEWS = 60
 """Cameras around a mesh. Each gives two views: the mesh as rendered, and an augmented rendering from another camera."""
@@ -25,6 +25,11 @@ def _evenly_spread(count: int) -> NDArray[np.float64]:
     return np.stack([index * golden_angle % (2 * np.pi), np.arccos(1 - (2 * index + 1) / count)], axis=1)
 
 
+def check_mesh(mesh: Path, mesh_scale: float) -> None:
+    """Raise the errors of `mesh_views`, but for those of its views."""
+    load_mesh(mesh, mesh_scale)
+
+
 def mesh_views(mesh: Path | TexturedMesh, mesh_scale: float = 1.0, cameras: int = MESH_VIEWS) -> list[PreparedInstance]:
     """Render a mesh from all sides: two views for each of `cameras`. `mesh_scale` converts a file's unit to metres.
 
@@ -32,19 +37,11 @@ def mesh_views(mesh: Path | TexturedMesh, mesh_scale: float = 1.0, cameras: int 
         InputError: the mesh cannot be read, is too large or too small to be in metres, or has no usable view.
         OSError: the file cannot be opened.
     """
-    return rendered_views(views_of_mesh(mesh, mesh_scale, cameras))
-
-
-def views_of_mesh(mesh: Path | TexturedMesh, mesh_scale: float, cameras: int) -> ViewTask:
-    """Return the views of a mesh to render; the arguments and errors are those of `mesh_views`."""
     name, loaded = (mesh.name, load_mesh(mesh, mesh_scale)) if isinstance(mesh, Path) else ("mesh", mesh)
-    return ViewTask(name, loaded, _evenly_spread(cameras), augmentations=Augmentations.of_names(KINDS, copies=1))
-
-
-def rendered_views(task: ViewTask) -> list[PreparedInstance]:
-    """Render the views of a mesh; raises InputError if none of them is usable."""
+    augmentations = Augmentations.of_names(KINDS, copies=1)
+    task = ViewTask(name, loaded, _evenly_spread(cameras), augmentations=augmentations)
     clouds = enumerate(render_task(task))
     views = [PreparedInstance(k, cloud.xyz, cloud.rgb, np.zeros(len(cloud.xyz), bool)) for k, cloud in clouds]
     if not views:
-        raise InputError(f"mesh: {task.name} has too few points in every view; expected an object of a few centimetres")
+        raise InputError(f"mesh: {name} has too few points in every view; expected an object of a few centimetres")
     return views
