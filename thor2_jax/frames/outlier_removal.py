@@ -107,7 +107,7 @@ def _among_others(points: NDArray[np.float64], cell: NDArray[np.int64], shape: t
     among = _surrounded(points, cell, shape)
     rest = np.flatnonzero(~among)
     if len(rest):
-        from scipy.spatial import KDTree  # takes .1 s to import, and processes that render need none
+        from scipy.spatial import KDTree  # takes .1 s to import, and rendering needs none
 
         tree = KDTree(points.T, leafsize=32, balanced_tree=False, compact_nodes=False)  # quick to build
         distances = tree.query(points[:, rest].T, k=NEIGHBORS + 1)[0][:, 1:]

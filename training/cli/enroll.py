@@ -2,13 +2,11 @@
 
 import contextlib
 import dataclasses
-import itertools
-import operator
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -70,19 +68,20 @@ def enroll(
             raise InputError(f"{option} is {value}; it belongs to frames")
     if mesh is None and mesh_scale != 1:
         raise InputError(f"mesh_scale is {mesh_scale:g}; it belongs to --mesh")
-    from training.objects.meshes import find_object_meshes
+    from training.objects.meshes import find_object_meshes, load_mesh
+    from training.readers.frames import FrameFolder
 
     meshes = {} if mesh is None else find_object_meshes(mesh, name)
     skipped: list[str] = []
     with _rendered(meshes, mesh_scale) as views_of_meshes:
+        for file in meshes.values():
+            load_mesh(file, mesh_scale)
         for path in (given.color, given.depth, given.labels, given.intrinsics):
             if path is not None and not path.is_file():
                 raise FileNotFoundError(2, "No such file", str(path))
+        frames = None if meshes else FrameFolder(given.sources(segment), named=name is None)
 
         # These take seconds to import.
-        from training.readers.frames import FrameFolder
-
-        frames = None if meshes else FrameFolder(given.sources(segment), named=name is None)
         from training.enrollment import enroll_objects, labelled_views
 
         def read(sigma_s: float) -> Mapping[str, Callable[[], Sequence["PreparedInstance"]]]:
@@ -119,7 +118,7 @@ def _rendered(
 ) -> Iterator[Mapping[str, Callable[[], Sequence["PreparedInstance"]]]]:
     """Yield object -> function that returns its views, to be called in this order; the first ones are rendered now.
 
-    All meshes are checked before. Several meshes are rendered by two processes, which start while this one imports JAX.
+    Several meshes are rendered by two processes, which start while this one imports JAX.
     """
     if not meshes:
         yield {}
@@ -127,11 +126,8 @@ def _rendered(
     from training.storage.workers import local_workers
     from training.views import enrolled_meshes
 
-    checks = [partial(enrolled_meshes.check_mesh, file, mesh_scale) for file in meshes.values()]
-    cameras = enrolled_meshes.MESH_VIEWS
-    renderings = [partial(enrolled_meshes.mesh_views, file, mesh_scale, cameras) for file in meshes.values()]
-    call: Callable[[Any], Any] = operator.call
-    results = local_workers(2 if len(meshes) > 1 else 1)(call, [*checks, *renderings])
-    with contextlib.closing(results), ThreadPoolExecutor(1) as thread:
-        first = thread.submit(lambda: next(itertools.islice(results, len(checks), None)))
-        yield {name: partial(next, results) if number else first.result for number, name in enumerate(meshes)}
+    render = partial(enrolled_meshes.mesh_views, mesh_scale=mesh_scale, cameras=enrolled_meshes.MESH_VIEWS)
+    views = local_workers(2 if len(meshes) > 1 else 1)(render, meshes.values())
+    with contextlib.closing(views), ThreadPoolExecutor(1) as thread:
+        first = thread.submit(next, views)
+        yield {name: partial(next, views) if number else first.result for number, name in enumerate(meshes)}

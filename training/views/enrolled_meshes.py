@@ -12,7 +12,7 @@ from training.objects.mesh import TexturedMesh
 from training.objects.meshes import load_mesh
 from training.views.mesh_views import ViewTask, render_task
 
-__all__ = ["MESH_VIEWS", "check_mesh", "mesh_views"]
+__all__ = ["MESH_VIEWS", "mesh_views"]
 
 MESH_VIEWS = 60
 """Cameras around a mesh. Each gives two views: the mesh as rendered, and an augmented rendering from another camera."""
@@ -23,11 +23,6 @@ def _evenly_spread(count: int) -> NDArray[np.float64]:
     index = np.arange(count)
     golden_angle = np.pi * (3 - np.sqrt(5))
     return np.stack([index * golden_angle % (2 * np.pi), np.arccos(1 - (2 * index + 1) / count)], axis=1)
-
-
-def check_mesh(mesh: Path, mesh_scale: float) -> None:
-    """Raise the errors of `mesh_views`, but for those of its views."""
-    load_mesh(mesh, mesh_scale)
 
 
 def mesh_views(mesh: Path | TexturedMesh, mesh_scale: float = 1.0, cameras: int = MESH_VIEWS) -> list[PreparedInstance]:
