@@ -36,7 +36,7 @@ TRAINING_PACKAGES = ("colour", "embreex", "gudhi", "kmapper", "sklearn")
 
 
 COLLECTION_THRESHOLD = 5_000
-"""New objects from which Python collects garbage: with its default of 700, that takes a seventh of a short command."""
+"""New objects from which Python collects garbage: with its default of 700, that takes an eighth of a short command."""
 
 
 MAY_BE_EMPTY = ("--baselines", "--leave-out", "--token")
