@@ -10,7 +10,7 @@ Compiled functions take them as arguments, so that other values need no compilat
 import dataclasses
 
 import jax
-import jax.numpy as jnp
+import numpy as np
 
 from colornet import ColorNetwork
 from thor2_jax.config import DescriptorConfig
@@ -44,4 +44,5 @@ class Parameters:
         # Concrete arrays even while a caller's function is traced, so that they can be cached.
         with jax.ensure_compile_time_eval():
             values = config.alpha, config.sigma_s, config.image_variance, config.persistence_weight
-            return cls(*(jnp.asarray(value, jnp.float32) for value in (network.similarity, *values)))
+            # By NumPy: JAX would compile a program for each conversion.
+            return cls(*(jax.device_put(np.asarray(value, np.float32)) for value in (network.similarity, *values)))

@@ -36,7 +36,10 @@ def region_sets(network: ColorNetwork) -> RegionSets:
     bits, of_color = np.unique(network.region_bits, return_inverse=True)
     member = (bits[:, None] >> np.arange(network.n_regions, dtype=np.uint32)) & 1
     weights = member / member.sum(axis=1, keepdims=True)
-    return RegionSets(jnp.asarray(of_color, np.min_scalar_type(len(bits))), jnp.asarray(weights, jnp.float32))
+    # By NumPy: JAX would compile a program for each conversion.
+    return RegionSets(
+        jax.device_put(of_color.astype(np.min_scalar_type(len(bits)))), jax.device_put(weights.astype(np.float32))
+    )
 
 
 def color_sets(colors: jax.Array, sets: RegionSets) -> jax.Array:

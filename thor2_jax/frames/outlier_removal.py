@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
-from scipy.spatial import KDTree
 
 from thor2_jax.frames.frames import RGBDFrame
 
@@ -108,6 +107,8 @@ def _among_others(points: NDArray[np.float64], cell: NDArray[np.int64], shape: t
     among = _surrounded(points, cell, shape)
     rest = np.flatnonzero(~among)
     if len(rest):
+        from scipy.spatial import KDTree  # takes .1 s to import, and rendering needs none
+
         tree = KDTree(points.T, leafsize=32, balanced_tree=False, compact_nodes=False)  # quick to build
         distances = tree.query(points[:, rest].T, k=NEIGHBORS + 1)[0][:, 1:]
         among[rest] = distances.mean(axis=1) <= MAX_NEIGHBOR_DISTANCE

@@ -20,8 +20,8 @@ __all__ = ["augmented_copies", "augmented_view"]
 MAX_COPIES = 8
 """Copies of all views from frames together."""
 
-MESH_COPIES = 2
-"""Copies of each view from a mesh, as rendered or augmented."""
+MESH_COPIES = 1
+"""Copies of each view from a mesh."""
 
 
 def augmented_copies(views: Sequence[PreparedInstance], source: str) -> list[PreparedInstance]:

@@ -138,9 +138,9 @@ def misregistered(view: RenderedView, registration: Registration, rng: np.random
         weight = np.maximum(gaussian_filter(seen.astype(np.float32), blur), 1e-3)[..., None]
         color = gaussian_filter(color.astype(np.float32), (blur, blur, 0)) / weight
         color = color.clip(0, 255).astype(np.uint8)
-    color = np.where(seen[..., None], color, background)
     margin = int(abs(shift).max())
-    padded = np.pad(color - background, ((margin, margin), (margin, margin), (0, 0))) + background
     (row, column), (height, width) = margin + shift, seen.shape
+    padded = np.full((height + 2 * margin, width + 2 * margin, 3), background)
+    np.copyto(padded[margin : margin + height, margin : margin + width], color, where=seen[..., None])
     moved = padded[row : row + height, column : column + width]
     return dataclasses.replace(view, color=np.where(seen[..., None], moved, 0).astype(np.uint8))

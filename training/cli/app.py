@@ -3,6 +3,7 @@
 Invalid input ends a command with one line on standard error and exit code 2.
 """
 
+import gc
 import itertools
 import os
 import shlex
@@ -32,6 +33,10 @@ console = Console(width=None if sys.stdout.isatty() else 160, markup=False, emoj
 
 TRAINING_PACKAGES = ("colour", "embreex", "gudhi", "kmapper", "sklearn")
 """Packages that recognition and the service do not import (docs/install.md)."""
+
+
+COLLECTION_THRESHOLD = 5_000
+"""New objects from which Python collects garbage: with its default of 700, that takes an eighth of a short command."""
 
 
 MAY_BE_EMPTY = ("--baselines", "--leave-out", "--token")
@@ -81,6 +86,7 @@ def main() -> None:
     try:
         _check_not_empty(sys.argv[1:])
         enable_compilation_cache()
+        gc.set_threshold(COLLECTION_THRESHOLD)
         status = app(standalone_mode=False)
     except typer.TyperException as error:
         context = getattr(error, "ctx", None)

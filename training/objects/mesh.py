@@ -75,23 +75,25 @@ class TexturedMesh:
             a, b, c = np.moveaxis(self.corner_colors[face].astype(np.float32), 1, 0)
             return np.rint(a + second * (b - a) + third * (c - a)).clip(0, 255).astype(np.uint8)
         assert self.uv is not None and self.face_texture is not None
-        a, b, c = np.moveaxis(self.uv.take(face, axis=0), 1, 0)
-        uv = a + second * (b - a) + third * (c - a)
+        # Coordinates in contiguous rows, with which NumPy calculates faster.
+        a, b, c = self.uv.take(face, axis=0).reshape(-1, 6).T.copy().reshape(3, 2, -1)
+        uv = a + second.T * (b - a) + third.T * (c - a)
         if len(self.textures) == 1:
             return _nearest_texel(self.textures[0], uv)
         colors = np.zeros((len(face), 3), np.uint8)
         texture = self.face_texture[face]
         for index in np.unique(texture):
             here = texture == index
-            colors[here] = _nearest_texel(self.textures[index], uv[here])
+            colors[here] = _nearest_texel(self.textures[index], uv[:, here])
         return colors
 
 
 def _nearest_texel(image: NDArray[np.uint8], uv: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """Return the colours [n, 3] at texture coordinates [2, n]."""
     height, width = image.shape[:2]
-    column = np.floor(uv[:, 0] * width).astype(np.int64) % width
-    row = np.floor((1 - uv[:, 1]) * height).astype(np.int64) % height
-    return image[row, column]
+    column = np.floor(uv[0] * width).astype(np.int64) % width
+    row = np.floor((1 - uv[1]) * height).astype(np.int64) % height
+    return image.reshape(-1, 3).take(row * width + column, axis=0)
 
 
 def merge_meshes(parts: Sequence[TexturedMesh]) -> TexturedMesh:

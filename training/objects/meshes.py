@@ -2,13 +2,11 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 from PIL import Image
-from trimesh.visual.material import PBRMaterial, SimpleMaterial, empty_material
 
 from thor2_jax.errors import InputError, with_context
 from thor2_jax.files import read_file
@@ -16,6 +14,9 @@ from thor2_jax.frames.image_files import MAX_IMAGE_PIXELS
 from thor2_jax.printable import check_name
 from thor2_jax.tables import parse_json, parse_yaml
 from training.objects.mesh import TexturedMesh, merge_meshes
+
+if TYPE_CHECKING:  # takes .2 s to import, and is needed where meshes are read
+    import trimesh
 
 __all__ = [
     "MAX_SIDE",
@@ -62,12 +63,14 @@ def _check_textures(geometry: Any) -> None:
             raise InputError(f"a texture of {image.width} x {image.height} pixels; at most {MAX_IMAGE_PIXELS} are read")
 
 
-def _part(geometry: trimesh.Trimesh) -> TexturedMesh:
+def _part(geometry: "trimesh.Trimesh") -> TexturedMesh:
     """Convert one geometry of a file.
 
     Raises:
         InputError: The geometry has no colour, or faces with invalid vertex indices.
     """
+    from trimesh.visual.material import PBRMaterial, SimpleMaterial, empty_material
+
     vertices, faces = np.asarray(geometry.vertices, np.float64), np.asarray(geometry.faces, np.int32)
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise InputError("faces with invalid vertex indices; repair the mesh")
@@ -190,6 +193,8 @@ def _parsed(path: Path) -> TexturedMesh:
         raise InputError(f"mesh {path}: the extension must be one of {', '.join(MESH_SUFFIXES)}")
     if not path.is_file():
         raise InputError(f"mesh {path}: no such file")
+    import trimesh
+
     try:
         if path.suffix.lower() == ".obj":
             _check_obj_references(path)

@@ -71,11 +71,11 @@ class RayCaster:
         mesh_index = np.full(len(directions), -1, np.int32)
         mesh_index[hit] = result["geomID"][hit]
         color = np.zeros((len(directions), 3), np.uint8)
-        barycentric = np.stack([result["u"], result["v"]], axis=1)
         for index, mesh in enumerate(self.meshes):
             here = hit[mesh_index[hit] == index]
             if len(here):
-                color[here] = mesh.colors_at(result["primID"].take(here), barycentric.take(here, axis=0))
+                barycentric = np.stack([result["u"].take(here), result["v"].take(here)]).T
+                color[here] = mesh.colors_at(result["primID"].take(here), barycentric)
         return Hits(distance, mesh_index, color)
 
 
