@@ -86,7 +86,7 @@ def main() -> None:
     try:
         _check_not_empty(sys.argv[1:])
         enable_compilation_cache()
-        gc.set_threshold(COLLECTION_THRESHOLD)
+        gc.set_threshold(max(COLLECTION_THRESHOLD, gc.get_threshold()[0]))  # tests have a higher one
         status = app(standalone_mode=False)
     except typer.TyperException as error:
         context = getattr(error, "ctx", None)
