@@ -194,9 +194,10 @@ def _classify(
 ) -> jax.Array:
     models = [nnx.merge(graph, state) for graph, state in zip(graphs, states, strict=True)]
     logits = jnp.stack([model.class_logits(*oriented.flat) for model in models])
-    if n_classes is not None:  # every distractor counts as much as the nearest one
-        nearest = logits[..., n_classes:].max(axis=-1, keepdims=True)
-        logits = jnp.where(jnp.arange(logits.shape[-1]) < n_classes, logits, nearest)
+    if n_classes is not None:  # every distractor counts as much as the nearest one: their sum is one logit
+        count = logits.shape[-1] - n_classes
+        nearest = logits[..., n_classes:].max(axis=-1, keepdims=True) + np.log(count)
+        logits = jnp.concatenate([logits[..., :n_classes], nearest], axis=-1)
     # `fuse` normalizes: the mean logits give the geometric mean of the networks' probabilities.
     return oriented.fuse(logits.mean(axis=0))
 
