@@ -52,7 +52,7 @@ _FURTHER = "further/{}/"
 
 @dataclasses.dataclass(frozen=True)
 class EmbeddingSizes:
-    """Sizes of the network of an embedding.
+    """Sizes of the network of an embedding, and what its outputs are made of.
 
     Attributes:
         cell: outputs of the layer that is shared by all strip positions.
@@ -60,6 +60,8 @@ class EmbeddingSizes:
         learned: length of the network's block of the embedding.
         color: length of the block of projected colours.
         balanced: whether that has the histogram of balanced colours; False in embeddings of earlier versions.
+        nearest: whether every distractor has the logit of the nearest one, for each network and look; False in
+            embeddings of earlier versions, where each has its own.
 
     Raises:
         InputError: a size is not a positive integer (`color` may be 0).
@@ -70,11 +72,12 @@ class EmbeddingSizes:
     learned: int = 128
     color: int = 120
     balanced: bool = True
+    nearest: bool = True
 
     def __post_init__(self) -> None:
-        values = (self.cell, *self.hidden, self.learned, self.color + 1)
-        if not all(type(value) is int and value > 0 for value in values) or type(self.balanced) is not bool:
-            raise InputError(f"EmbeddingSizes is {dataclasses.asdict(self)}; expected positive integers and a bool")
+        values, flags = (self.cell, *self.hidden, self.learned, self.color + 1), (self.balanced, self.nearest)
+        if not all(type(each) is int and each > 0 for each in values) or any(type(each) is not bool for each in flags):
+            raise InputError(f"EmbeddingSizes is {dataclasses.asdict(self)}; expected positive integers and booleans")
 
 
 def _unit(x: jax.Array) -> jax.Array:
@@ -185,11 +188,18 @@ def _embed_oriented(graph: Any, state: Any, oriented: LookDescriptors) -> jax.Ar
     return embeddings.reshape(*oriented.weights.shape, -1)
 
 
-@functools.partial(jax.jit, static_argnums=0)
-def _classify(graphs: tuple[Any, ...], states: tuple[Any, ...], oriented: LookDescriptors) -> jax.Array:
+@functools.partial(jax.jit, static_argnums=(0, 3))
+def _classify(
+    graphs: tuple[Any, ...], states: tuple[Any, ...], oriented: LookDescriptors, n_classes: int | None
+) -> jax.Array:
     models = [nnx.merge(graph, state) for graph, state in zip(graphs, states, strict=True)]
+    logits = jnp.stack([model.class_logits(*oriented.flat) for model in models])
+    if n_classes is not None:  # every distractor counts as much as the nearest one: their sum is one logit
+        count = logits.shape[-1] - n_classes
+        nearest = logits[..., n_classes:].max(axis=-1, keepdims=True) + np.log(count)
+        logits = jnp.concatenate([logits[..., :n_classes], nearest], axis=-1)
     # `fuse` normalizes: the mean logits give the geometric mean of the networks' probabilities.
-    return oriented.fuse(jnp.stack([model.class_logits(*oriented.flat) for model in models]).mean(axis=0))
+    return oriented.fuse(logits.mean(axis=0))
 
 
 def _split(model: EmbeddingNetwork) -> tuple[Any, Any]:
@@ -315,12 +325,15 @@ class Embedding:
     def class_probabilities(self, oriented: LookDescriptors) -> jax.Array:
         """Return the probabilities [B, C] of the classes; what they lack to 1 is that of the distractors.
 
-        They are the geometric mean over the networks and over the looks, by their weights.
+        They are the geometric mean over the networks and over the looks, by their weights. With `sizes.nearest`, every
+        distractor has the logit of the nearest one, for each network and look.
 
         Args:
             oriented: K looks at clouds, described by this embedding's descriptor.
         """
-        return _classify(*self._classifiers, oriented)[:, : len(self.classes)]
+        n_classes = len(self.classes)
+        nearest = self.sizes.nearest and self.distractors > 0
+        return _classify(*self._classifiers, oriented, n_classes if nearest else None)[:, :n_classes]
 
     @functools.cached_property
     def _content(self) -> bytes:
@@ -381,7 +394,9 @@ class Embedding:
                 if about[field] != expected:
                     raise InputError(f"{field} is {about[field]!r}; expected {expected!r}; fit the embedding again")
             config = DescriptorConfig.of_record(about["descriptor_config"])
-            sizes = EmbeddingSizes(**{"balanced": False, **about["sizes"], "hidden": tuple(about["sizes"]["hidden"])})
+            sizes = EmbeddingSizes(
+                **{"balanced": False, "nearest": False, **about["sizes"], "hidden": tuple(about["sizes"]["hidden"])}
+            )
             classes, distractors = tuple(map(str, about.get("classes", ()))), int(about.get("distractors", 0))
             model = model_from_arrays(lambda: cls.create(config, network, sizes, 0, classes, distractors).model, arrays)
             embedding = cls(config, network, sizes, model, classes, distractors)

@@ -17,9 +17,17 @@ from colornet import ColorNetwork
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
 from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
+from thor2_jax.types import Cloud
 from training.embedding.fit import EmbeddingFit, fit_embedding, reference_views
 from training.embedding.samples import Samples, joined_samples, sample_clouds
-from training.embedding.sampling import ObjectSource, build_samples, cached_samples, sampling_job
+from training.embedding.sampling import (
+    ObjectSource,
+    ViewTask,
+    build_samples,
+    cached_samples,
+    render_clouds,
+    sampling_job,
+)
 from training.fitting.checkpoints import Checkpoints
 from training.fitting.options import EpochMetrics
 from training.objects.meshes import load_mesh
@@ -128,7 +136,7 @@ def fit_run_embedding(
     progress: Progress,
     checkpoints: Checkpoints | None = None,
     epoch_done: Callable[[EpochMetrics], object] = lambda metrics: None,
-) -> tuple[Embedding, Samples]:
+) -> tuple[Embedding, list[tuple[int, Cloud]]]:
     """Fit the embedding of a run.
 
     Args:
@@ -145,8 +153,8 @@ def fit_run_embedding(
         epoch_done: likewise.
 
     Returns:
-        The embedding, which recognizes the classes, and the samples of the held-out set: those of distractors have
-        labels from the number of classes on.
+        The embedding, which recognizes the classes, and label and cloud, in metres, of each view of the held-out set:
+        those of distractors have labels from the number of classes on.
 
     Raises:
         InputError: a mesh of a distractor is unreadable, or the loss is not finite.
@@ -155,22 +163,25 @@ def fit_run_embedding(
     config, classes = dataclasses.replace(config, homology="closed_form"), tuple(source.classes)
     others = _distractor_samples(distractors, directory, network, config, progress)
     fitted: list[dict[str, NDArray[Any]]] = []
-    kept: list[dict[str, NDArray[Any]]] = []
+    kept: list[tuple[int, Cloud]] = []
     for index, shard in enumerate(source.shards):
         views, rng = source.read(index), np.random.default_rng([seed, index])
-        mask = np.isin(views.view, held_out.get(shard.label, []))
-        for is_kept, chunks in ((False, fitted), (True, kept)):
-            clouds = list(itertools.compress(views.clouds(), mask == is_kept))
-            if clouds:
-                labels = [views.label] * len(clouds)
-                chunks.append(sample_clouds(clouds, labels, network, config, COPIES, rng, are_normal=True))
+        is_kept = np.isin(views.view, held_out.get(shard.label, []))
+        clouds = list(itertools.compress(views.clouds(), ~is_kept))
+        if clouds:
+            labels = [views.label] * len(clouds)
+            fitted.append(sample_clouds(clouds, labels, network, config, COPIES, rng, are_normal=True))
+        for xyz, rgb in itertools.compress(views.clouds(), is_kept):
+            # A copy, since a slice would keep all views of the shard in memory.
+            kept.append((views.label, (xyz / np.float32(config.sigma_s), rgb.copy())))
         progress(DESCRIBE, index + 1, len(source.shards), "")
-    is_held_out = others.label % HELD_OUT == 0
-    # Labels of fitted distractors are consecutive.
-    label = others.label - (others.label // HELD_OUT + 1) * ~is_held_out + len(classes)
-    others = dataclasses.replace(others, label=label.astype(np.int32))
-    fitted.append(others.fields(np.flatnonzero(~is_held_out)))
-    kept.append(others.fields(np.flatnonzero(is_held_out)))
+    fitted.append(others.fields(np.flatnonzero(others.label % HELD_OUT)))
+    label = fitted[-1]["label"]
+    fitted[-1]["label"] = (len(classes) + label - label // HELD_OUT - 1).astype(np.int32)  # consecutive
+    # Those that are held out are rendered again, since samples have lost the looks of recognition.
+    sources = {index: source for index, source in enumerate(distractors.sources) if index % HELD_OUT == 0}
+    rendered = render_clouds(ViewTask(sources, distractors.views, SEED))
+    kept += [(len(classes) + index, cloud) for index, cloud in rendered]
 
     def show(done: int, total: int, metrics: EpochMetrics) -> None:
         progress(FIT, done, total, metrics.describe(distractors.epochs))
@@ -179,4 +190,4 @@ def fit_run_embedding(
     options = EmbeddingFit(epochs=distractors.epochs, seed=seed, networks=distractors.networks)
     embedding = fit_embedding(samples, network, config, options, SIZES, show, classes, checkpoints, epoch_done)
     embedding = dataclasses.replace(embedding, references=reference_views(embedding, samples, seed))
-    return embedding, joined_samples(kept, config)
+    return embedding, kept

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -20,13 +20,13 @@ from thor2_jax.errors import InputError
 from thor2_jax.gallery.embedding import Embedding
 from thor2_jax.model.classifier import EMBEDDING, MLP, Feature, class_probabilities
 from thor2_jax.model.confidence import MAX_ODDS, Calibration, answer_features
-from thor2_jax.model.inference import infer
+from thor2_jax.model.inference import infer_clouds
 from thor2_jax.model.model import Model
 from thor2_jax.model.run_directory import TrainedRun
-from training.embedding.fit import batch_looks
-from training.embedding.samples import Samples as EmbeddingSamples
+from thor2_jax.types import Cloud
 from training.fitting.samples import Batch, Samples
 from training.fitting.steps import FitContext, describe_batch
+from training.views.normalized_views import padded_batches
 
 __all__ = [
     "KEPT",
@@ -130,31 +130,35 @@ KEPT = 0.97
 Cameras are harder than held-out renderings: under them, about .95 reach it (docs/decisions.md).
 """
 
-BATCH = 128
+BATCH = 64
 
 
 def fit_calibration(
-    run: TrainedRun, embedding: Embedding, held_out: EmbeddingSamples
+    run: TrainedRun, embedding: Embedding, held_out: Sequence[tuple[int, Cloud]]
 ) -> tuple[Calibration | None, float]:
     """Fit the confidence of a run; None if no held-out answer is correct, or no object is unknown.
 
-    Known and unknown objects have equal weights in the score, whatever their numbers.
+    The clouds are recognized in the looks of the run. Known and unknown objects have equal weights in the score,
+    whatever their numbers.
 
     Args:
         run: run with its classifiers, which are fused as recognition does by default.
         embedding: embedding of the run.
-        held_out: samples of the held-out set; labels from the number of classes on are of unknown objects.
+        held_out: label and cloud, in metres, of each view of the held-out set; labels from the number of classes on are
+            of unknown objects.
 
     Returns:
         The calibration, and the accuracy on known objects.
     """
     model = Model.of_run(dataclasses.replace(run, embedding=embedding))
-    batches = held_out.batches(np.arange(len(held_out)), BATCH)
-    chunks = [infer(model, batch_looks(batch, run.network, embedding.config)).probabilities for batch in batches]
-    probabilities = {name: np.concatenate([c[name] for c in chunks])[: len(held_out)] for name in chunks[0]}
+    held_out = sorted(held_out, key=lambda view: len(view[1][0]))  # so that little of a batch is padding
+    label = np.array([label for label, _ in held_out])
+    batches = padded_batches([cloud for _, cloud in held_out], BATCH)
+    chunks = [infer_clouds(model, clouds).probabilities for _, clouds in batches]
+    probabilities = {name: np.concatenate([c[name] for c in chunks])[: len(label)] for name in chunks[0]}
     fused = model.fused(probabilities)  # not calibrated yet
     features = answer_features(fused, probabilities[EMBEDDING])
-    correct, known = fused.argmax(axis=1) == held_out.label, held_out.label < len(run.classes)
+    correct, known = fused.argmax(axis=1) == label, label < len(run.classes)
     accuracy = float(correct.sum() / max(known.sum(), 1))  # correct answers are to known objects
     if known.all() or not correct.any():
         return None, accuracy

@@ -62,8 +62,9 @@ def ensemble() -> Embedding:
     return dataclasses.replace(first, further=(first.create_further(1), first.create_further(2)))
 
 
-def test_class_probabilities_are_geometric_means(clouds: thor2.PointClouds) -> None:
-    embedding = ensemble()
+@pytest.mark.parametrize("nearest", [True, False])
+def test_class_probabilities_are_geometric_means(nearest: bool, clouds: thor2.PointClouds) -> None:
+    embedding = dataclasses.replace(ensemble(), sizes=dataclasses.replace(SIZES, nearest=nearest))
     oriented = describe_looks(clouds, embedding.network, embedding.config, 2)
     weights = np.array([[1, 0], [0.25, 0.75], [0.5, 0.5]], np.float32)
     actual = embedding.class_probabilities(dataclasses.replace(oriented, weights=jnp.asarray(weights)))
@@ -75,6 +76,8 @@ def test_class_probabilities_are_geometric_means(clouds: thor2.PointClouds) -> N
         proxies = np.asarray(model.proxies[...], np.float16).astype(np.float64)
         scale = np.exp(np.float16(model.log_scale[...]).astype(np.float64))
         logits = scale * unit @ (proxies / np.linalg.norm(proxies, axis=0))
+        if nearest:
+            logits[..., 2:] = logits[..., 2:].max(axis=-1, keepdims=True)
         means.append(np.einsum("bk,bkc->bc", weights, scipy.special.log_softmax(logits, axis=-1)))
     assert np.abs(means[0] - means[1]).max() > 0.1
     expected = scipy.special.softmax(np.mean(means, axis=0), axis=1)[:, :2]
@@ -173,6 +176,23 @@ def test_files_of_earlier_versions_have_a_block_of_regions(tmp_path: Path, cloud
     np.testing.assert_allclose(values[:, 14:], statistics / np.sqrt(2), atol=1e-4)
     learned = Embedding.create(SMALL_CONFIG, sizes=SIZES).embed(clouds)[:, :8]
     np.testing.assert_allclose(learned, values[:, :8] * np.sqrt(2), atol=1e-3)
+
+
+def test_files_of_earlier_versions_sum_the_distractors(tmp_path: Path, clouds: thor2.PointClouds) -> None:
+    path, sizes = tmp_path / "embedding.safetensors", dataclasses.asdict(SIZES)
+    embedding = ensemble()
+    summed = dataclasses.replace(embedding, sizes=dataclasses.replace(SIZES, nearest=False))
+    summed.save(path)
+    del sizes["nearest"]
+    rewritten(path, sizes=sizes)
+    oriented = describe_looks(clouds, embedding.network, embedding.config, 2)
+    loaded, expected, nearest = (
+        np.asarray(each.class_probabilities(oriented)) for each in (Embedding.load(path), summed, embedding)
+    )
+    assert np.array_equal(loaded, expected)
+    assert np.abs(nearest.sum(axis=1) - expected.sum(axis=1)).min() > 1e-3
+    # The shares of the classes, and therefore the answers, are the same.
+    np.testing.assert_allclose(*(p / p.sum(axis=1, keepdims=True) for p in (nearest, expected)), rtol=1e-4)
 
 
 @pytest.mark.parametrize(

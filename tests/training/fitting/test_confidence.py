@@ -4,36 +4,40 @@ import dataclasses
 
 import numpy as np
 import pytest
-from helpers import SMALL_CONFIG, untrained_run
+from helpers import SMALL_CONFIG, untrained_embedding_run, untrained_run
 
 import colornet
+from thor2_jax.descriptor.looks import describe_looks
 from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
 from thor2_jax.model.inference import Inference
-from training.embedding.samples import Samples, joined_samples, sample_clouds
+from thor2_jax.types import Cloud, PointClouds
 from training.fitting import calibration
 from training.fitting.calibration import fit_calibration
 
 NETWORK = colornet.load_default()
 
+Views = list[tuple[int, Cloud]]
+
+LABEL = np.arange(40) % 4
+
 
 @pytest.fixture(scope="module")
-def held_out() -> Samples:
+def held_out() -> Views:
     rng = np.random.default_rng(0)
     clouds = [
         ((rng.random((200, 3)) * (0.2, 0.1, 0.05)).astype(np.float32), rng.integers(0, 256, (200, 3), np.uint8))
         for _ in range(40)
     ]
-    labels = [k % 4 for k in range(40)]
-    return joined_samples([sample_clouds(clouds, labels, NETWORK, SMALL_CONFIG, 1, rng)], SMALL_CONFIG)
+    return list(zip(LABEL.tolist(), clouds, strict=True))
 
 
-def test_confidence_separates_and_keeps_its_share(held_out: Samples, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_confidence_separates_and_keeps_its_share(held_out: Views, monkeypatch: pytest.MonkeyPatch) -> None:
     """Known objects (labels 0 and 1) with high odds, unknown ones with low odds; a tenth of the known are wrong."""
     run = untrained_run(("a", "b"), ("tops", "tops2"), SMALL_CONFIG)
     sizes = EmbeddingSizes(cell=4, hidden=(8,), learned=4, color=2)
     embedding = Embedding.create(SMALL_CONFIG, NETWORK, sizes, classes=("a", "b"), distractors=2)
-    known = held_out.label < 2
-    right = np.where(known, held_out.label, 0)
+    known = LABEL < 2
+    right = np.where(known, LABEL, 0)
     rng = np.random.default_rng(1)
     top = np.where(known, rng.uniform(0.8, 0.99, 40), rng.uniform(0.5, 0.9, 40))
     wrong = known & (np.arange(40) % 10 == 1)
@@ -42,37 +46,58 @@ def test_confidence_separates_and_keeps_its_share(held_out: Samples, monkeypatch
     embedded = fused * np.where(known, 0.9, 0.1)[:, None]
     values = {"tops": fused, "tops2": fused, "embedding": embedded}
     inference = Inference(0, {k: np.resize(v, (128, 2)) for k, v in values.items()})
-    monkeypatch.setattr(calibration, "infer", lambda *_: inference)
+    monkeypatch.setattr(calibration, "infer_clouds", lambda *_: inference)
     fitted, accuracy = fit_calibration(run, embedding, held_out)
     assert fitted is not None and min(fitted.known_factor, fitted.correct_factor, fitted.score_factor) > 0
-    scores, correct = fitted.confidence(fused, embedded), answer == held_out.label
+    scores, correct = fitted.confidence(fused, embedded), answer == LABEL
     assert np.min(scores[known & ~wrong]) > 0.7 > np.max(scores[~known])
     assert accuracy == correct[known].mean() < 1
     assert np.mean(scores[known]) == pytest.approx(correct[known].mean(), abs=0.05)  # most instances are known
     assert fitted.unknown_below == pytest.approx(np.quantile(scores[correct], 1 - calibration.KEPT))
 
 
-def test_without_correct_answers_there_is_no_confidence(held_out: Samples) -> None:
+def test_without_correct_answers_there_is_no_confidence(held_out: Views) -> None:
     run = untrained_run(("a", "b"), ("tops", "tops2"), SMALL_CONFIG)
     sizes = EmbeddingSizes(cell=4, hidden=(8,), learned=4, color=2)
     embedding = Embedding.create(SMALL_CONFIG, NETWORK, sizes, classes=("a", "b"), distractors=2)
-    unknown = dataclasses.replace(held_out, label=held_out.label + 2)
+    unknown = [(label + 2, cloud) for label, cloud in held_out]
     assert fit_calibration(run, embedding, unknown)[0] is None
 
 
 def test_unknown_objects_are_told_apart_without_incorrect_answers(
-    held_out: Samples, monkeypatch: pytest.MonkeyPatch
+    held_out: Views, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = untrained_run(("a", "b"), ("tops", "tops2"), SMALL_CONFIG)
     sizes = EmbeddingSizes(cell=4, hidden=(8,), learned=4, color=2)
     embedding = Embedding.create(SMALL_CONFIG, NETWORK, sizes, classes=("a", "b"), distractors=2)
-    known = held_out.label < 2
-    fused = np.stack([np.where(np.where(known, held_out.label, 0) == k, 0.9, 0.1) for k in (0, 1)], axis=1)
+    known = LABEL < 2
+    fused = np.stack([np.where(np.where(known, LABEL, 0) == k, 0.9, 0.1) for k in (0, 1)], axis=1)
     embedded = fused * np.where(known, 0.9, 0.1)[:, None]
     values = {"tops": fused, "tops2": fused, "embedding": embedded}
     inference = Inference(0, {k: np.resize(v, (128, 2)) for k, v in values.items()})
-    monkeypatch.setattr(calibration, "infer", lambda *_: inference)
+    monkeypatch.setattr(calibration, "infer_clouds", lambda *_: inference)
     fitted, accuracy = fit_calibration(run, embedding, held_out)
     assert fitted is not None and accuracy == 1
     scores = fitted.confidence(fused, embedded)
     assert np.max(scores[~known]) < fitted.unknown_below <= np.min(scores[known]) + 1e-9
+
+
+def test_held_out_views_are_recognized_in_the_looks_of_the_run(held_out: Views) -> None:
+    """The threshold is that of the answers to all clouds in one batch, in their own order."""
+    run = untrained_embedding_run(("a", "b"), config=dataclasses.replace(SMALL_CONFIG, looks=4))
+    assert run.embedding is not None
+    sizes = np.random.default_rng(2).permutation(np.arange(100, 140))
+    views = [(label, (xyz[:n], rgb[:n])) for n, (label, (xyz, rgb)) in zip(sizes, held_out, strict=True)]
+    fitted, accuracy = fit_calibration(run, run.embedding, views)
+    assert fitted is not None
+    clouds = PointClouds.pack([cloud for _, cloud in views], 256)
+    thresholds = []
+    for looks in (4, 1):
+        embedded = np.asarray(run.embedding.class_probabilities(describe_looks(clouds, NETWORK, SMALL_CONFIG, looks)))
+        fused = embedded.astype(np.float64) / embedded.sum(axis=1, keepdims=True, dtype=np.float64)
+        correct = fused.argmax(axis=1) == LABEL
+        thresholds.append(np.quantile(fitted.confidence(fused, embedded)[correct], 1 - calibration.KEPT))
+        if looks == 4:
+            assert accuracy == correct.sum() / (LABEL < 2).sum()
+    assert fitted.unknown_below == pytest.approx(thresholds[0], abs=1e-6)
+    assert abs(thresholds[0] - thresholds[1]) > 1e-5

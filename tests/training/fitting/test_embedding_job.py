@@ -10,14 +10,17 @@ import numpy as np
 import pytest
 from helpers import SMALL_CONFIG
 
+from thor2_jax.descriptor.looks import describe_looks
 from thor2_jax.errors import InputError
 from thor2_jax.gallery.embedding import EmbeddingSizes
 from thor2_jax.model.run_directory import TrainedRun, load_run
 from thor2_jax.recognizer import Recognizer
-from thor2_jax.types import Cloud
+from thor2_jax.types import Cloud, PointClouds
 from training.embedding import run_embedding
 from training.embedding.fit import EmbeddingFit
 from training.embedding.run_embedding import Distractors
+from training.embedding.sampling import ViewTask, render_clouds
+from training.fitting import job
 from training.fitting.job import RunSettings, check_trained, train_run
 from training.fitting.options import FitOptions, read_metrics
 from training.views.normalized_views import MemoryViews
@@ -27,7 +30,7 @@ OPTIONS = FitOptions()
 DISTRACTORS = Distractors(procedural=10, views=4, epochs=3, networks=2)
 
 
-def source() -> MemoryViews:
+def clouds_of_classes() -> dict[str, list[Cloud]]:
     rng = np.random.default_rng(0)
     clouds: dict[str, list[Cloud]] = {}
     for name, size, level in zip(CLASSES, ((0.1, 0.05, 0.03), (0.2, 0.01, 0.01)), (0, 255), strict=True):
@@ -35,7 +38,11 @@ def source() -> MemoryViews:
             ((rng.random((200, 3)) * size + [0, 0, 0.5]).astype(np.float32), np.full((200, 3), level, np.uint8))
             for _ in range(8)
         ]
-    return MemoryViews(clouds, SMALL_CONFIG)
+    return clouds
+
+
+def source() -> MemoryViews:
+    return MemoryViews(clouds_of_classes(), SMALL_CONFIG)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -94,6 +101,26 @@ def test_a_run_without_classifiers(whole: tuple[Path, TrainedRun, list[str]], ca
     recognizer = Recognizer.load(out)
     assert recognizer.model.classifiers.default == ("embedding",) and recognizer.model.answers_by() == "classifiers"
     assert len(list(cache.glob("distractors-*.safetensors"))) == 1
+
+
+def test_the_confidence_is_fitted_on_held_out_clouds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are those of the views and of each tenth distractor, in metres."""
+    views: list[tuple[int, Cloud]] = []
+    monkeypatch.setattr(job, "fit_calibration", lambda run, embedding, held_out: (views.extend(held_out), (None, 0))[1])
+    (run,) = train(tmp_path / "run")
+    assert run.embedding is not None and run.embedding.distractors == 9 and run.embedding.sizes.nearest
+    assert sorted(label for label, _ in views) == [0, 1, 2, 2, 2, 2]
+    (held_out,) = {index: object_ for index, object_ in enumerate(DISTRACTORS.sources) if index % 10 == 0}.items()
+    expected = render_clouds(ViewTask(dict([held_out]), 4, run_embedding.SEED))
+    for (label, (xyz, rgb)), (_, (points, colors)) in zip(views[2:], expected, strict=True):
+        assert label == 2 and np.array_equal(xyz, points) and np.array_equal(rgb, colors)
+    for name, (label, cloud) in zip(CLASSES, views, strict=False):  # normalized before, but described as they were
+        looks, before = (
+            np.asarray(describe_looks(PointClouds.pack(clouds), run.network, SMALL_CONFIG, 4).each.images)
+            for clouds in ([cloud], clouds_of_classes()[name])
+        )
+        assert label == CLASSES.index(name)
+        assert np.abs(before - looks).max(axis=(1, 2, 3, 4)).min() < 0.03 * looks.max()  # of another view: above 0.25
 
 
 class Interrupted(BaseException):
