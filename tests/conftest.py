@@ -15,12 +15,13 @@ from processes import UNOPTIMIZED, end_descendants_with_this_process
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
 
-# JAX reads these variables when it is imported, which only the processes do that run tests.
+# JAX reads these variables when it is imported. The process that distributes the tests does not import it.
 os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"  # as the command line sets it
 # Most of the time of the tests is compilation, which takes a third of it without optimization. For the slow tests, CI
 # sets XLA_FLAGS to nothing: they run what users run.
 os.environ.setdefault("XLA_FLAGS", UNOPTIMIZED)
-gc.set_threshold(100_000, 1000, 1000)  # tracing allocates much that is kept: only young objects are worth a look
+# Tracing allocates many objects that stay, so that older generations are practically never collected.
+gc.set_threshold(100_000, 1000, 1000)
 # Subprocesses inherit these: the processes of a run share their compiled programs, and the next run finds them.
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", f"{tempfile.gettempdir()}/thor2-jax-tests-{os.getuid()}")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
@@ -85,7 +86,7 @@ def pytest_collectstart(collector: pytest.Collector) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Spare later garbage collections all that was imported: it stays, and is half of the objects."""
+    """Exclude imported objects from garbage collections: they stay, and are half of all objects."""
     gc.freeze()
 
 

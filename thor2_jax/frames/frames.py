@@ -27,6 +27,7 @@ __all__ = [
     "check_images",
     "distort",
     "frame_intrinsics",
+    "pixel_points",
     "pixel_rays",
     "read_color",
     "read_depth",
@@ -225,8 +226,15 @@ def backproject(depth_m: NDArray[Any], intrinsics: Intrinsics) -> NDArray[Any]:
     The frame is OpenCV's camera frame (x right, y down, z forward).
     """
     height, width = depth_m.shape
-    rays = pixel_rays(np.arange(height * width), width, intrinsics)
-    return (rays * depth_m.reshape(-1, 1)).astype(depth_m.dtype).reshape(height, width, 3)
+    return pixel_points(np.arange(height * width), depth_m.ravel(), width, intrinsics).reshape(height, width, 3)
+
+
+def pixel_points(pixels: NDArray[np.intp], depth_m: NDArray[Any], width: int, intrinsics: Intrinsics) -> NDArray[Any]:
+    """Return the points [n, 3] of pixels (flat indices [n] of an image of this width) with depths [n] in metres.
+
+    They are computed in float64 and have the type of the depths. The frame is that of `backproject`.
+    """
+    return (pixel_rays(pixels, width, intrinsics) * depth_m[:, None]).astype(depth_m.dtype)
 
 
 def read_color(path: str | Path) -> NDArray[np.uint8]:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from thor2_jax.frames.frames import MAX_DEPTH, MIN_DEPTH, RGBDFrame, pixel_rays
+from thor2_jax.frames.frames import MAX_DEPTH, MIN_DEPTH, RGBDFrame, pixel_points
 from thor2_jax.frames.outlier_removal import flying_pixels, remove_outliers
 from thor2_jax.frames.voxel_grid import voxel_downsample
 
@@ -69,7 +69,7 @@ def instance_cloud(frame: RGBDFrame, label: int) -> InstanceCloud:
     if not steep:
         trusted &= ~flying
     valid, depth = pixels[trusted], depth[trusted]
-    points = (pixel_rays(valid, frame.depth.shape[1], frame.intrinsics) * depth[:, None]).astype(np.float32)
+    points = pixel_points(valid, depth, frame.depth.shape[1], frame.intrinsics)
     flags = _near_contour(frame, label, pixels)[trusted] * np.uint8(255)
     channels = np.column_stack([frame.color.reshape(-1, 3).take(valid, axis=0), flags])
     points, channels = voxel_downsample(points, channels, CLOUD_VOXEL)

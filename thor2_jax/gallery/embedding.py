@@ -14,6 +14,7 @@ import dataclasses
 import functools
 import itertools
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -60,8 +61,8 @@ class EmbeddingSizes:
         learned: length of the network's block of the embedding.
         color: length of the block of projected colours.
         balanced: whether that has the histogram of balanced colours; False in embeddings of earlier versions.
-        nearest: whether every distractor has the logit of the nearest one, for each network and look; False in
-            embeddings of earlier versions, where each has its own.
+        nearest: whether every distractor counts with the logit of the nearest one, for each network and look; False in
+            embeddings of earlier versions, where each counts with its own.
 
     Raises:
         InputError: a size is not a positive integer (`color` may be 0).
@@ -192,11 +193,15 @@ def _embed_oriented(graph: Any, state: Any, oriented: LookDescriptors) -> jax.Ar
 def _classify(
     graphs: tuple[Any, ...], states: tuple[Any, ...], oriented: LookDescriptors, n_classes: int | None
 ) -> jax.Array:
+    """Return the probabilities [B, proxies]; with `n_classes`, all proxies after those of the classes are one column.
+
+    It has the sum that they would have if each had the logit of the nearest one.
+    """
     models = [nnx.merge(graph, state) for graph, state in zip(graphs, states, strict=True)]
     logits = jnp.stack([model.class_logits(*oriented.flat) for model in models])
-    if n_classes is not None:  # every distractor counts as much as the nearest one: their sum is one logit
-        count = logits.shape[-1] - n_classes
-        nearest = logits[..., n_classes:].max(axis=-1, keepdims=True) + np.log(count)
+    if n_classes is not None:
+        n_distractors = logits.shape[-1] - n_classes
+        nearest = logits[..., n_classes:].max(axis=-1, keepdims=True) + math.log(n_distractors)
         logits = jnp.concatenate([logits[..., :n_classes], nearest], axis=-1)
     # `fuse` normalizes: the mean logits give the geometric mean of the networks' probabilities.
     return oriented.fuse(logits.mean(axis=0))

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, binary_erosion, maximum_filter
 
-from thor2_jax.frames.frames import Intrinsics, pixel_rays
+from thor2_jax.frames.frames import Intrinsics, pixel_points
 from thor2_jax.frames.outlier_removal import PIECE_CELL
 from training.augmentation.pixels import FRAME_PIXEL, pixel_width, without
 from training.augmentation.settings import Range, Settings, limited
@@ -129,7 +129,7 @@ def without_base(view: RenderedView, base: Base, rng: np.random.Generator) -> Re
     up = np.array([0.0, 0.0, 1.0]) if rng.random() < base.upright else rng.standard_normal(3)
     up /= np.linalg.norm(up)
     depth = view.depth.take(pixels).astype(np.float32) / 1000
-    points = (pixel_rays(pixels, view.depth.shape[1], view.intrinsics) * depth[:, None]).astype(np.float32)
+    points = pixel_points(pixels, depth, view.depth.shape[1], view.intrinsics)
     height = points @ (view.pose[:3, :3].T @ up).astype(np.float32)
     low = height - height.min() < rng.uniform(*base.height)
     return view if low.mean() > MAX_CUT else without(view, pixels[low])

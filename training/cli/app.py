@@ -34,10 +34,9 @@ console = Console(width=None if sys.stdout.isatty() else 160, markup=False, emoj
 TRAINING_PACKAGES = ("colour", "embreex", "gudhi", "kmapper", "sklearn")
 """Packages that recognition and the service do not import (docs/install.md)."""
 
-
 COLLECTION_THRESHOLD = 5_000
-"""New objects from which Python collects garbage: with its default of 700, that takes an eighth of a short command."""
-
+"""Number of new objects after which Python collects garbage. With 700, the default of Python 3.11, collections take an
+eighth of a short command."""
 
 MAY_BE_EMPTY = ("--baselines", "--leave-out", "--token")
 """Options whose value may be empty, or that check it themselves."""
@@ -86,7 +85,8 @@ def main() -> None:
     try:
         _check_not_empty(sys.argv[1:])
         enable_compilation_cache()
-        gc.set_threshold(max(COLLECTION_THRESHOLD, gc.get_threshold()[0]))  # tests have a higher one
+        if 0 < gc.get_threshold()[0] < COLLECTION_THRESHOLD:  # tests set a higher one
+            gc.set_threshold(COLLECTION_THRESHOLD)
         status = app(standalone_mode=False)
     except typer.TyperException as error:
         context = getattr(error, "ctx", None)

@@ -52,7 +52,7 @@ RENDER, DESCRIBE, FIT = STAGES = ("render distractors", "describe for the embedd
 """Names of the stages, for the progress."""
 
 HELD_OUT = 10
-"""One distractor of so many is held out."""
+"""One in this many distractors is held out."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -154,7 +154,7 @@ def fit_run_embedding(
 
     Returns:
         The embedding, which recognizes the classes, and label and cloud, in metres, of each view of the held-out set:
-        those of distractors have labels from the number of classes on.
+        those of distractors have labels from the number of classes on. The clouds have no rim and no boundary.
 
     Raises:
         InputError: a mesh of a distractor is unreadable, or the loss is not finite.
@@ -174,14 +174,16 @@ def fit_run_embedding(
         for xyz, rgb in itertools.compress(views.clouds(), is_kept):
             # A copy, since a slice would keep all views of the shard in memory.
             kept.append((views.label, (xyz / np.float32(config.sigma_s), rgb.copy())))
-        progress(DESCRIBE, index + 1, len(source.shards), "")
+        progress(DESCRIBE, index + 1, len(source.shards) + 1, "")
     fitted.append(others.fields(np.flatnonzero(others.label % HELD_OUT)))
     label = fitted[-1]["label"]
-    fitted[-1]["label"] = (len(classes) + label - label // HELD_OUT - 1).astype(np.int32)  # consecutive
-    # Those that are held out are rendered again, since samples have lost the looks of recognition.
-    sources = {index: source for index, source in enumerate(distractors.sources) if index % HELD_OUT == 0}
-    rendered = render_clouds(ViewTask(sources, distractors.views, SEED))
+    # The labels of the fitted distractors follow those of the classes without gaps.
+    fitted[-1]["label"] = (len(classes) + label - label // HELD_OUT - 1).astype(np.int32)
+    # Samples are strips in random orientations, without points: the looks need the clouds, which are rendered again.
+    objects = dict(list(enumerate(distractors.sources))[::HELD_OUT])
+    rendered = render_clouds(ViewTask(objects, distractors.views, SEED))
     kept += [(len(classes) + index, cloud) for index, cloud in rendered]
+    progress(DESCRIBE, len(source.shards) + 1, len(source.shards) + 1, "")
 
     def show(done: int, total: int, metrics: EpochMetrics) -> None:
         progress(FIT, done, total, metrics.describe(distractors.epochs))

@@ -26,7 +26,7 @@ from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.types import Cloud
 from training.fitting.samples import Batch, Samples
 from training.fitting.steps import FitContext, describe_batch
-from training.views.normalized_views import padded_batches
+from training.views.normalized_views import CLOUDS_PER_BATCH, padded_batches
 
 __all__ = [
     "KEPT",
@@ -130,8 +130,6 @@ KEPT = 0.97
 Cameras are harder than held-out renderings: under them, about .95 reach it (docs/decisions.md).
 """
 
-BATCH = 64
-
 
 def fit_calibration(
     run: TrainedRun, embedding: Embedding, held_out: Sequence[tuple[int, Cloud]]
@@ -153,7 +151,7 @@ def fit_calibration(
     model = Model.of_run(dataclasses.replace(run, embedding=embedding))
     held_out = sorted(held_out, key=lambda view: len(view[1][0]))  # so that little of a batch is padding
     label = np.array([label for label, _ in held_out])
-    batches = padded_batches([cloud for _, cloud in held_out], BATCH)
+    batches = padded_batches([cloud for _, cloud in held_out], CLOUDS_PER_BATCH)
     chunks = [infer_clouds(model, clouds).probabilities for _, clouds in batches]
     probabilities = {name: np.concatenate([c[name] for c in chunks])[: len(label)] for name in chunks[0]}
     fused = model.fused(probabilities)  # not calibrated yet

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
-from thor2_jax.frames.frames import pixel_rays
+from thor2_jax.frames.frames import pixel_points
 from thor2_jax.frames.prepared_instance import DESCRIPTOR_VOXEL
 from thor2_jax.frames.voxel_grid import downsample_to_fit
 from training.augmentation.augmentations import Augmentations, augment
@@ -70,7 +70,7 @@ def cloud_of(view: RenderedView) -> "Cloud":
     # border, and rounding decides on which side.
     pixels = np.flatnonzero(view.depth)
     depth = view.depth.take(pixels).astype(np.float32) / np.float32(1000)
-    points = (pixel_rays(pixels, view.depth.shape[1], view.intrinsics) * depth[:, None]).astype(np.float32)
+    points = pixel_points(pixels, depth, view.depth.shape[1], view.intrinsics)
     colors = view.color.reshape(-1, 3).take(pixels, axis=0).astype(np.float64)
     points, colors = downsample_to_fit(points.astype(np.float64) * SIGMA_S, colors, DESCRIPTOR_VOXEL)
     return (points / SIGMA_S).astype(np.float32), np.rint(colors).astype(np.uint8)

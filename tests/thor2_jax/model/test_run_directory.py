@@ -5,7 +5,7 @@ import gc
 import hashlib
 import json
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -206,12 +206,10 @@ DAMAGES: dict[str, tuple[Callable[[Path], Any], str]] = {
 
 
 @pytest.fixture(scope="module")
-def small_heap() -> Iterator[None]:
-    """Freeze the objects that exist, so that a garbage collection takes milliseconds."""
+def small_heap() -> None:
+    """Freeze the objects that exist, for the rest of the process, so that a garbage collection takes milliseconds."""
     gc.collect()
     gc.freeze()
-    yield
-    gc.unfreeze()
 
 
 @pytest.mark.usefixtures("small_heap")
