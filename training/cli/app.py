@@ -72,7 +72,9 @@ def thor2(
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
     """Handle Ctrl-C as Python does, but not in JAX's callback of the garbage collection, where exceptions get lost."""
-    if frame is None or frame.f_code.co_name != "_xla_gc_callback":
+    while frame is not None and frame.f_code.co_name != "_xla_gc_callback":
+        frame = frame.f_back  # of this function, too, which a second signal may interrupt
+    if frame is None:
         raise KeyboardInterrupt
     threading.Timer(0.01, os.kill, [os.getpid(), number]).start()
 

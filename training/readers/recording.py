@@ -38,6 +38,12 @@ def recorded_sources(open_bag: Callable[[], Bag], every: int = 1) -> tuple[list[
     return sources, recording.notes
 
 
+def _every(bag: Bag, every: int) -> Iterator[RecordedFrame]:
+    """Yield the first of so many frames; the recording is closed when the iterator is."""
+    with bag:
+        yield from itertools.islice(bag.frames(), 0, None, every)
+
+
 class _Recording:
     """Reads frames by their number; a number below the last one starts from the beginning."""
 
@@ -48,9 +54,9 @@ class _Recording:
         self.notes: list[str] = []
 
     def frames(self) -> Iterator[RecordedFrame]:
-        with self._open() as bag:
-            self.notes = bag.notes
-            yield from itertools.islice(bag.frames(), 0, None, self._every)
+        bag = self._open()
+        self.notes = bag.notes
+        return _every(bag, self._every)
 
     def read(self, number: int) -> RGBDFrame:
         if self._last is None or self._last[0] > number:

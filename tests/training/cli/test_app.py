@@ -215,8 +215,11 @@ def test_ctrl_c_in_a_callback_of_jax(capsys: pytest.CaptureFixture[str]) -> None
     reached = []
 
     def _xla_gc_callback() -> None:
-        signal.raise_signal(signal.SIGINT)
+        something_called()
         reached.append(True)
+
+    def something_called() -> None:
+        signal.raise_signal(signal.SIGINT)
 
     assert "_xla_gc_callback" in {callback.__name__ for callback in gc.callbacks}
     previous = signal.signal(signal.SIGINT, _interrupt)

@@ -1,6 +1,7 @@
 """Recordings as sources of frames."""
 
 import functools
+import weakref
 from pathlib import Path
 
 import numpy as np
@@ -17,13 +18,22 @@ FRAMES = [table_frame(k) for k in range(3)]
 @pytest.mark.parametrize("every", [1, 2])
 def test_frames_are_read_in_any_order(tmp_path: Path, every: int) -> None:
     path = write_recording(tmp_path / "a.mcap", FRAMES)
-    sources, notes = recorded_sources(functools.partial(Bag, path), every)
+    opened: list[weakref.ref[Bag]] = []
+
+    def open_bag() -> Bag:
+        bag = Bag(path)
+        opened.append(weakref.ref(bag))
+        return bag
+
+    sources, notes = recorded_sources(open_bag, every)
     assert not notes
     assert len({source.name for source in sources}) == len(sources) == len(FRAMES[::every])
     for number in (0, 1, 1, 0, len(sources) - 1):
         frame, expected = sources[number].read(), FRAMES[::every][number]
         np.testing.assert_array_equal(frame.color, expected.color)
         assert frame.labels is None
+    del sources
+    assert opened and all(bag() is None for bag in opened)  # closed at once, not by a later garbage collection
 
 
 def test_a_damaged_recording_has_the_frames_before(tmp_path: Path) -> None:
