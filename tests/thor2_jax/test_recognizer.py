@@ -204,7 +204,8 @@ def test_a_missing_classifier_is_named(run: TrainedRun) -> None:
         shape_only.recognize(tilted(patches()), classifiers=("shape",))  # type: ignore[arg-type]
 
 
-def test_nothing_compiles_after_warm_up(run: TrainedRun) -> None:
+@pytest.mark.parametrize(("max_points", "sizes"), [(500, 1), pytest.param(1000, 2, marks=pytest.mark.slow)])
+def test_nothing_compiles_after_warm_up(run: TrainedRun, max_points: int, sizes: int) -> None:
     """JAX's monitoring counts the compilations of a recognizer that no other test uses."""
     compiled: list[str] = []
 
@@ -215,7 +216,7 @@ def test_nothing_compiles_after_warm_up(run: TrainedRun) -> None:
     fresh = Recognizer(run)
     jax.monitoring.register_event_duration_secs_listener(listen)
     try:
-        assert fresh.warm_up(max_points=1000, max_instances=2) == 2 * 2
+        assert fresh.warm_up(max_points=max_points, max_instances=2) == 2 * sizes
         assert compiled
         compiled.clear()
         for count in (1, 2):

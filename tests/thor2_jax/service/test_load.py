@@ -61,8 +61,10 @@ def test_soak_without_errors_or_memory_growth(server: Any, files: Files) -> None
     assert memory(server.process.pid) - before < 20 * 1024
 
 
-def test_sigterm_under_load_answers_accepted_requests(start_server: Callable[..., Any], files: Files) -> None:
-    server = start_server("--processes", "1")
+def test_sigterm_under_load_answers_accepted_requests(
+    start_server: Callable[..., Any], teaching_run: Path, files: Files
+) -> None:
+    server = start_server("--processes", "1", run=teaching_run)
     answered: list[int] = []
     broken: list[httpx.TransportError] = []
     stop = threading.Event()
