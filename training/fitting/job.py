@@ -59,6 +59,9 @@ CURVES = "curves.png"
 DESCRIBE = "describe"
 """Name of the first stage."""
 
+CALIBRATE = "fit the confidence"
+"""Name of the last stage, with an embedding."""
+
 DESCRIBE_SHARE = 0.3
 """Time of describing the views, divided by that of rendering them; for the time left."""
 
@@ -112,7 +115,7 @@ class RunSettings:
         if self.distractors is not None:
             fit_share = EPOCH_SHARES[EMBEDDING] * self.distractors.networks * self.distractors.epochs
             # Rendering distractors takes no time if they are in the cache.
-            of_fold |= dict(zip(STAGES, (0.0, DESCRIBE_SHARE, fit_share), strict=True))
+            of_fold |= dict(zip((*STAGES, CALIBRATE), (0.0, DESCRIBE_SHARE, fit_share, 0.1), strict=True))
         folds = range(self.folds)
         described = {DESCRIBE: DESCRIBE_SHARE} if self.features else {}
         return described | {self.of_fold(stage, fold): share for fold in folds for stage, share in of_fold.items()}
@@ -351,6 +354,10 @@ class _Fold(NamedTuple):
         if settings.distractors is None or held_out is None:
             return None, None
         metrics_file, several = self.out / METRICS, jax.process_count() > 1
+
+        def report(stage: str, done: int, total: int, note: str = "") -> None:
+            self.progress(settings.of_fold(stage, self.number), done, total, note)
+
         # One of several processes fits the embedding, and checkpoints are written by all of them together.
         with contextlib.nullcontext() if several else Checkpoints(self.scratch / EMBEDDING) as checkpoints:
             done = checkpoints.last_epoch if checkpoints is not None else 0
@@ -364,11 +371,14 @@ class _Fold(NamedTuple):
                 settings.network,
                 settings.config,
                 settings.options.seed,
-                lambda stage, *values: self.progress(settings.of_fold(stage, self.number), *values),
+                report,
                 checkpoints,
                 lambda metrics: append_metrics(metrics_file, self.number, EMBEDDING, metrics),
             )
-        return embedding, fit_calibration(run, embedding, kept)
+        report(CALIBRATE, 0, 1)
+        calibration = fit_calibration(run, embedding, kept)
+        report(CALIBRATE, 1, 1)
+        return embedding, calibration
 
 
 def _outcome(rows: Sequence[Mapping[str, Any]], best_epochs: Mapping[Feature, int]) -> dict[str, Any]:

@@ -229,7 +229,7 @@ def test_a_default_training_recognizes_and_is_evaluated(
     code, printed, err = run(*command)
     assert code == 0 and "embedding has a held-out accuracy of 0." in printed.replace("1.000", "0.")
     stages = [line.split(":")[0] for line in err.splitlines() if line.startswith("stage ")]
-    assert list(dict.fromkeys(stages)) == [f"stage {number} of 4" for number in (1, 2, 3, 4)]
+    assert list(dict.fromkeys(stages)) == [f"stage {number} of 5" for number in (1, 2, 3, 4, 5)]
     assert load_run(out).record["classifiers"] == [] and list(load_run(out).record["curves"]) == ["embedding"]
     assert Recognizer.load(out).model.classifiers.default == ("embedding",)
     assert len(list((tmp_path / "cache").glob("distractors-*"))) == 1

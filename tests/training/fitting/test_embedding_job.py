@@ -86,7 +86,7 @@ def test_a_run_without_classifiers(whole: tuple[Path, TrainedRun, list[str]], ca
         "references.safetensors",
         "run.json",
     ]
-    assert stages == [*SETTINGS.stages] and len(stages) == 3
+    assert stages == [*SETTINGS.stages] and len(stages) == 4
     assert run.classifiers == {} and run.embedding is not None
     assert run.embedding.classes == run.classes == CLASSES and len(run.embedding.further) == 1
     assert [(row["fold"], row["classifier"], row["epoch"]) for row in rows(out)] == [
