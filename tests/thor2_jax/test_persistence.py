@@ -54,7 +54,7 @@ def assert_as_gudhi(heights: np.ndarray, edges: np.ndarray | None = None) -> Non
         np.testing.assert_array_equal(one.births[one.mask], heights[b][one.mask])
 
 
-@pytest.mark.parametrize("n", [1, 9, 100])
+@pytest.mark.parametrize("n", [1, pytest.param(2, marks=pytest.mark.slow), 9, 100])
 def test_random_heights(n: int) -> None:
     rng = np.random.default_rng(n)
     assert_as_gudhi(rng.normal(size=(20, n)).astype(np.float32))

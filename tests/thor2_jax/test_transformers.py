@@ -57,7 +57,7 @@ def test_checks_of_scikit_learn(check: str, transformer: Any) -> None:
     getattr(estimator_checks, check)(transformer.__name__, transformer())
 
 
-@pytest.mark.parametrize("count", [1, 5])
+@pytest.mark.parametrize("count", [1, pytest.param(3, marks=pytest.mark.slow), 5])
 def test_values_are_those_of_describe(count: int) -> None:
     clouds = random_clouds(5)
     expected = described(clouds)

@@ -65,6 +65,9 @@ CALIBRATE = "fit the confidence"
 DESCRIBE_SHARE = 0.3
 """Time of describing the views, divided by that of rendering them; for the time left."""
 
+CALIBRATE_SHARE = 0.1
+"""The same of fitting the confidence."""
+
 EPOCH_SHARES = {"ce": 0.05, "tops": 0.08, "tops2": 0.15, EMBEDDING: 0.044}
 """The same of an epoch of a classifier, or of one network of the embedding."""
 
@@ -115,7 +118,7 @@ class RunSettings:
         if self.distractors is not None:
             fit_share = EPOCH_SHARES[EMBEDDING] * self.distractors.networks * self.distractors.epochs
             # Rendering distractors takes no time if they are in the cache.
-            of_fold |= dict(zip((*STAGES, CALIBRATE), (0.0, DESCRIBE_SHARE, fit_share, 0.1), strict=True))
+            of_fold |= dict(zip(STAGES, (0.0, DESCRIBE_SHARE, fit_share), strict=True)) | {CALIBRATE: CALIBRATE_SHARE}
         folds = range(self.folds)
         described = {DESCRIBE: DESCRIBE_SHARE} if self.features else {}
         return described | {self.of_fold(stage, fold): share for fold in folds for stage, share in of_fold.items()}

@@ -38,8 +38,8 @@ def recorded_sources(open_bag: Callable[[], Bag], every: int = 1) -> tuple[list[
     return sources, recording.notes
 
 
-def _every(bag: Bag, every: int) -> Iterator[RecordedFrame]:
-    """Yield the first of so many frames; the recording is closed when the iterator is."""
+def _frames(bag: Bag, every: int) -> Iterator[RecordedFrame]:
+    """Open the recording and yield every `every`-th frame; the recording is closed with the iterator."""
     with bag:
         yield from itertools.islice(bag.frames(), 0, None, every)
 
@@ -56,7 +56,7 @@ class _Recording:
     def frames(self) -> Iterator[RecordedFrame]:
         bag = self._open()
         self.notes = bag.notes
-        return _every(bag, self._every)
+        return _frames(bag, self._every)
 
     def read(self, number: int) -> RGBDFrame:
         if self._last is None or self._last[0] > number:

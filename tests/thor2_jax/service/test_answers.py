@@ -66,21 +66,27 @@ def test_frames_without_instances_or_depth(http: httpx.Client, files: dict[str, 
     assert len(instances) == 4 and all(one["unrecognized"] for one in instances)
 
 
-def clouds(count: int) -> list[tuple[np.ndarray, np.ndarray]]:
+def clouds(count: int, step: int = 150) -> list[tuple[np.ndarray, np.ndarray]]:
     rng = np.random.default_rng(1)
     return [
         ((rng.random((n, 3)) * (0.2, 0.1, 0.05)).astype(np.float32), rng.integers(0, 256, (n, 3), dtype=np.uint8))
-        for n in (100 + 150 * np.arange(count)).tolist()
+        for n in (100 + step * np.arange(count)).tolist()
     ]
 
 
-def test_describe_matches_the_library(server: Any, http: httpx.Client) -> None:
-    inputs = clouds(11)  # More than a batch, with up to 1,600 points.
+def check_described(server: Any, inputs: list[tuple[np.ndarray, np.ndarray]]) -> thor2.Descriptors:
+    """Compare the service's descriptors with those of the library, and return the latter."""
     config = thor2.DescriptorConfig(homology="closed_form")
     expected = thor2.describe(thor2.PointClouds.pack(inputs), colornet.load_default(), config)
     answer = Client(server.url).describe(inputs)
     np.testing.assert_allclose(answer.tops2, expected.tops2, rtol=1e-5, atol=1e-4)
     np.testing.assert_array_equal(answer.overflow, expected.overflow)
+    return expected
+
+
+def test_describe_matches_the_library(server: Any, http: httpx.Client) -> None:
+    inputs = clouds(11)  # More than a batch, with up to 1,600 points.
+    expected = check_described(server, inputs)
     body = {"clouds": [{"points": xyz.tolist(), "colors": rgb.tolist()} for xyz, rgb in inputs[:2]]}
     answer = http.post("/v1/describe", json=body).json()
     assert set(answer["timings"]) == {"upload", "decode", "device", "total"}
@@ -196,3 +202,8 @@ def test_no_compilation_after_warm_up(http: httpx.Client, files: dict[str, bytes
     assert float(values["thor2_compilations_after_warm_up_total"]) == 0
     assert float(values['thor2_requests_total{path="/v1/recognize",status="200"}']) >= 1
     assert float(values["thor2_batch_clouds_count"]) >= 1
+
+
+@pytest.mark.slow  # The last test of the file: the server of the tests compiles such sizes at their first request.
+def test_clouds_of_all_sizes_match_the_library(server: Any) -> None:
+    check_described(server, clouds(11, 700))  # up to 7,100 points

@@ -261,9 +261,10 @@ def test_details_are_visible_without_scrolling(open_page: Open) -> None:
         expect(page.locator(selector)).to_be_in_viewport(ratio=1)
 
 
-def test_a_phone_scrolls_little_and_keeps_the_picture(open_page: Open) -> None:
+@pytest.mark.parametrize("scheme", [pytest.param("light", marks=pytest.mark.slow), "dark"])
+def test_a_phone_scrolls_little_and_keeps_the_picture(open_page: Open, scheme: str) -> None:
     size = (390, 844)
-    phone = open_page(size=size, phone=True, scheme="dark")
+    phone = open_page(size=size, phone=True, scheme=scheme)
     choose_sample(phone)
     phone.locator("#objects button").nth(1).tap()
     assert phone.evaluate("document.documentElement.scrollHeight") - size[1] <= 800
