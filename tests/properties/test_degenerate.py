@@ -55,7 +55,7 @@ def assert_finite(tree: Any) -> None:
         assert np.isfinite(np.asarray(leaf)).all(), jax.tree_util.keystr(path)
 
 
-QUICK = [("gudhi", True), ("cold", True), ("closed_form", False), ("relaxed", False)]
+QUICK = [("cold", True), ("closed_form", False)]
 SLOW = [
     pytest.param(name, aligned, marks=pytest.mark.slow)
     for name in CONFIGS

@@ -94,7 +94,9 @@ def assert_differences_agree(loss: Loss, *arguments: Any, step: float = 1e-6) ->
 
 
 @pytest.mark.usefixtures("x64")
-@pytest.mark.parametrize("name", ["closed_form", "gudhi", pytest.param("relaxed", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "name", ["gudhi", *(pytest.param(n, marks=pytest.mark.slow) for n in ("closed_form", "relaxed"))]
+)
 def test_aligned_clouds_against_finite_differences(name: str) -> None:
     config, aligned = CONFIGS[name], clouds_of(in_cells)
     loss = loss_of(thor2.describe_aligned, aligned, config)
@@ -133,6 +135,7 @@ def test_describe_against_finite_differences(name: str, monkeypatch: pytest.Monk
         assert (value != 0) == (config.relaxation is not None)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("x64")
 def test_points_and_scale_agree_on_scaling() -> None:
     """Scaling all points about the camera keeps the frame and has the same effect as scaling sigma_s."""

@@ -35,6 +35,7 @@ np.savez(sys.argv[3], **outputs)
 """
 
 
+@pytest.mark.slow
 def test_an_exported_recognizer_runs_without_this_package(run: TrainedRun, tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
     sizes = [(0.2, 0.1, 0.06), (0.1, 0.1, 0.02), (0.3, 0.05, 0.05)]
@@ -70,9 +71,14 @@ def test_an_embedding_of_other_classes_is_not_exported() -> None:
     assert run.embedding is not None
     other = dataclasses.replace(run, embedding=dataclasses.replace(run.embedding, classes=("a",)))
     exported = jax.export.deserialize(bytearray(export_recognizer(other, n_points=512, n_clouds=1)))
-    packed = thor2.PointClouds.pack([(np.zeros((0, 3)),) * 2], 512, rim=[None])
+    points = np.random.default_rng(0).uniform(0, (0.2, 0.1, 0.06), (300, 3))
+    packed = thor2.PointClouds.pack([(points, points / 0.2)], 512, rim=[points[:, 0] < 0.05])
     outputs = exported.call(*(getattr(packed, field.name) for field in dataclasses.fields(packed)))
     assert set(outputs) == {"tops", "overflow"}
+    described = describe_looks(packed, run.network, run.config)
+    expected = class_probabilities(thor2.Recognizer(run), described, ("tops",))["tops"]
+    np.testing.assert_allclose(outputs["tops"], expected, atol=1e-5)
+    np.testing.assert_array_equal(outputs["overflow"], described.first.overflow)
 
 
 @pytest.mark.parametrize(

@@ -57,7 +57,7 @@ def test_checks_of_scikit_learn(check: str, transformer: Any) -> None:
     getattr(estimator_checks, check)(transformer.__name__, transformer())
 
 
-@pytest.mark.parametrize("count", [1, pytest.param(3, marks=pytest.mark.slow), 5])
+@pytest.mark.parametrize("count", [5, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 3))])
 def test_values_are_those_of_describe(count: int) -> None:
     clouds = random_clouds(5)
     expected = described(clouds)
@@ -132,6 +132,7 @@ def test_clones_and_pickles_give_equal_values(transformer: Any) -> None:
     assert changed.transform(clouds).shape[1] == expected.shape[1] // 2
 
 
+@pytest.mark.slow
 def test_grid_search_finds_that_colors_tell_mugs_apart() -> None:
     rng = np.random.default_rng(0)
     objects, labels, clouds = builtin_objects(), ["mug_blue", "mug_white"] * 8, []

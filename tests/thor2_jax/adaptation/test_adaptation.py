@@ -95,6 +95,7 @@ def none_is_known(oriented: LookDescriptors) -> jax.Array:
     return jnp.zeros((len(oriented.weights), 3))
 
 
+@pytest.mark.slow
 def test_warm_colors_are_cooled_and_unknown_objects_change_nothing() -> None:
     warm = np.array([150, 110, 90], np.uint8)
     made = [dataclasses.replace(each, colors=np.full_like(each.colors, warm)) for each in instances(40)]
@@ -174,7 +175,9 @@ def test_gallery_answers_are_its_scores() -> None:
     np.testing.assert_allclose(gallery_classifier(recognizer.gallery, embedding)(oriented), expected, atol=2e-3)
 
 
-@pytest.mark.parametrize("rule", ["max", pytest.param("mean", marks=pytest.mark.slow), "log-mean"])
+@pytest.mark.parametrize(
+    "rule", ["max", *(pytest.param(rule, marks=pytest.mark.slow) for rule in ("mean", "log-mean"))]
+)
 def test_the_criterion_obeys_the_fusion_rule(rule: FusionRule) -> None:
     recognizer = Recognizer(run(), rule=rule)
     network, config, classify = adaptation_criterion(recognizer.model)

@@ -87,7 +87,7 @@ def test_persistence_beyond_the_image_is_counted() -> None:
 
 
 def test_describe_equals_its_steps() -> None:
-    clouds = thor2.PointClouds.pack([camera_cloud(0), camera_cloud(1)])
+    clouds = thor2.PointClouds.pack([camera_cloud(k) for k in range(3)])
     whole = thor2.describe(clouds, NETWORK, CLOSED)
     aligned = thor2.align(clouds, CLOSED)
     for by_steps in (

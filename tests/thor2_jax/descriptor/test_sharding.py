@@ -3,9 +3,15 @@
 import json
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
-from helpers import finish_programs, free_port, start_program
+from helpers import SMALL_CONFIG, aligned_cloud, finish_programs, free_port, start_program
+from jax.sharding import Mesh
+
+import colornet
+import thor2_jax as thor2
+from thor2_jax.descriptor.sharding import batch_mesh, describe_sharded, shard_clouds
 
 _CLOUDS = """
 import json, sys
@@ -60,7 +66,18 @@ np.save(sys.argv[1], np.asarray(thor2.describe(packed, network, thor2.Descriptor
 """
 
 
-@pytest.mark.parametrize("homology", ["gudhi", pytest.param("closed_form", marks=pytest.mark.slow)])
+def test_one_device() -> None:
+    network, packed = colornet.load_default(), thor2.PointClouds.pack([aligned_cloud(k, 100) for k in range(3)])
+    sharded = describe_sharded(shard_clouds(packed, batch_mesh()), network, SMALL_CONFIG)
+    np.testing.assert_array_equal(sharded.tops2, thor2.describe(packed, network, SMALL_CONFIG).tops2)
+    with pytest.raises(thor2.InputError, match="shard_clouds"):
+        describe_sharded(packed, network, SMALL_CONFIG)
+    with pytest.raises(thor2.InputError, match="multiple of 2"):
+        shard_clouds(packed, Mesh(np.array(jax.devices() * 2), ("batch",)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("homology", ["gudhi", "closed_form"])
 def test_eight_devices_equal_one(homology: str) -> None:
     output = json.loads(finish_programs(start_program(_CLOUDS + _DEVICES, homology, devices=8))[0].splitlines()[-1])
     assert output["worst"] <= 1e-6

@@ -84,10 +84,9 @@ def small_clouds(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("rule", "make_run"),
     [
-        ("max", untrained_run),
-        pytest.param("mean", untrained_run, marks=pytest.mark.slow),
         ("log-mean", untrained_run),
-        ("log-mean", untrained_embedding_run),
+        *(pytest.param(rule, untrained_run, marks=pytest.mark.slow) for rule in ("max", "mean")),
+        pytest.param("log-mean", untrained_embedding_run, marks=pytest.mark.slow),
     ],
 )
 def test_margin_is_the_log_odds_of_the_answer(

@@ -123,6 +123,7 @@ def test_padding_and_batch_do_not_matter(embedding: Embedding, clouds: thor2.Poi
     np.testing.assert_allclose(padded, np.asarray(embedding.embed(clouds))[[1, 0]], atol=1e-5)
 
 
+@pytest.mark.slow
 def test_large_batches_are_computed_in_chunks(embedding: Embedding) -> None:
     clouds = [box_cloud(k % 3) for k in range(66)]
     values = np.asarray(embedding.embed(thor2.PointClouds.pack(clouds)))
