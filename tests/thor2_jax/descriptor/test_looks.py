@@ -111,7 +111,8 @@ def test_tiny_clouds_have_finite_looks(n: int, all_rim: bool) -> None:
     assert all(np.isfinite(values).all() for values in jax.tree.leaves((described, aligned)))
 
 
-@pytest.mark.parametrize("count", [pytest.param(2, marks=pytest.mark.slow), 4])
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [2, 4])
 def test_looks_are_the_same_when_compiled_and_mapped(count: int) -> None:
     expected = aligned_looks(PACKED, CONFIG, count)
     compiled = jax.jit(lambda clouds: aligned_looks(clouds, CONFIG, count))(PACKED)

@@ -136,7 +136,9 @@ def test_a_mirrored_frame_has_mirrored_labels() -> None:
     assert (best_overlaps(again, labels) > 0.9).all()
 
 
-@pytest.mark.parametrize("size", [(480, 640), (481, 641), (720, 1280)])
+@pytest.mark.parametrize(
+    "size", [(481, 641), *(pytest.param(s, marks=pytest.mark.slow) for s in ((480, 640), (720, 1280)))]
+)
 def test_larger_images_have_labels_of_their_size(size: tuple[int, int]) -> None:
     frame = render(APART, size=size)
     labels = segment_table(frame)
