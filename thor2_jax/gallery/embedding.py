@@ -121,7 +121,7 @@ class EmbeddingNetwork(nnx.Module):
         self.block_weights = nnx.BatchStat(jnp.array([1.0, 2.0]) if sizes.balanced else jnp.ones(3))
         if n_proxies:
             self.proxies = nnx.Param(jax.random.normal(rngs.params(), (sizes.learned, n_proxies)))
-            self.log_scale = nnx.Param(jnp.log(16.0))
+            self.log_scale = nnx.Param(jnp.log(jnp.float32(16)))  # a weak type would compile the first steps anew
 
     def learned(
         self, descriptors: Descriptors, statistics: jax.Array, *, train: bool = False, rngs: nnx.Rngs | None = None
