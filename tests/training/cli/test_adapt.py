@@ -75,6 +75,7 @@ def test_runs_of_different_cameras_are_not_evaluated_together(model: Path, adapt
         load_runs([model, adapted])
 
 
+@pytest.mark.slow
 def test_commands_use_a_run_whose_embedding_alone_answers(
     video: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -179,7 +179,7 @@ def test_samples_are_not_modified_and_few_make_one_batch(separable: Samples, fit
     arrays = [getattr(few, field.name) for field in dataclasses.fields(few)]
     before = [np.copy(a) for a in arrays]
     steps: list[int] = []
-    fitted("tops", FitOptions(epochs=1), few, progress=lambda done, total, metrics: steps.append(done))
+    fitted("ce", FitOptions(epochs=1), few, progress=lambda done, total, metrics: steps.append(done))
     assert steps == [1]
     for a, b in zip(arrays, before, strict=True):
         np.testing.assert_array_equal(a, b)

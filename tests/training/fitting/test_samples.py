@@ -41,7 +41,7 @@ def expanded(samples: Samples, rows: Any, config: thor2.DescriptorConfig = CONFI
     "config",
     [
         CONFIG,
-        thor2.DescriptorConfig.released(homology="closed_form"),
+        pytest.param(thor2.DescriptorConfig.released(homology="closed_form"), marks=pytest.mark.slow),
         thor2.DescriptorConfig(n_slices=2, n_strips=6, relaxation=thor2.Relaxation()),
     ],
     ids=["paper", "released", "relaxed"],

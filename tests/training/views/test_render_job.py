@@ -157,13 +157,11 @@ render_job.render_dataset(objects, sys.argv[1], 180, 90, local_workers(int(sys.a
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kills",
-    [
-        # Odd steps leave a temporary file, and even ones a complete file.
-        [(4, 1)],
-        pytest.param([(1, 1), (5, 2), (3, 2), (2, 1)], marks=pytest.mark.slow),
-    ],
+    # Odd steps leave a temporary file, and even ones a complete file.
+    [[(4, 1)], [(1, 1), (5, 2), (3, 2), (2, 1)]],
 )
 def test_repeatedly_killed_rendering_resumes(whole: Path, tmp_path: Path, kills: list[tuple[int, int]]) -> None:
     out = tmp_path / "views"
