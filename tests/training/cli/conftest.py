@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 from helpers import SMALL_CONFIG, untrained_run
 
-from thor2_jax.config import DescriptorConfig
 from thor2_jax.gallery import embedding, objects
 from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
 from thor2_jax.model import model as models
@@ -19,13 +18,15 @@ from training.fitting import protocol
 from training.fitting.protocol import DEFAULT, PAPER
 from training.views import enrolled_meshes
 
+COVERING = dataclasses.replace(SMALL_CONFIG, sigma_1=0.4, sigma_2=0.2)
+"""A small descriptor whose grid covers the objects: if it overflowed, nothing would have a name."""
+
 
 @pytest.fixture(scope="session")
 def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Run directory with random weights."""
     directory = tmp_path_factory.mktemp("run")
-    config = DescriptorConfig(homology="closed_form")  # a small grid would overflow, so that nothing has a name
-    save_run(untrained_run(("bowl", "mug", "plate"), ("tops", "tops2"), config, seed=1), directory)
+    save_run(untrained_run(("bowl", "mug", "plate"), ("tops", "tops2"), COVERING, seed=1), directory)
     return directory
 
 
@@ -33,12 +34,11 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def small_descriptors() -> Iterator[None]:
     """Let the protocols describe views by small descriptors, and fit one small network on few views."""
     with pytest.MonkeyPatch.context() as patch:
-        config = dataclasses.replace(SMALL_CONFIG, sigma_1=0.4, sigma_2=0.2)  # covers the objects
         networks = dataclasses.replace(DEFAULT.distractors, networks=1, views=2)
         patch.setattr(run_embedding, "SIZES", EmbeddingSizes(cell=4, hidden=(16,), learned=8, color=4))
         patch.setattr(run_embedding, "EmbeddingFit", functools.partial(EmbeddingFit, batch_size=64))
-        patch.setattr(protocol, "DEFAULT", dataclasses.replace(DEFAULT, config=config, distractors=networks))
-        patch.setattr(protocol, "PAPER", dataclasses.replace(PAPER, config=config))
+        patch.setattr(protocol, "DEFAULT", dataclasses.replace(DEFAULT, config=COVERING, distractors=networks))
+        patch.setattr(protocol, "PAPER", dataclasses.replace(PAPER, config=COVERING))
         yield
 
 
@@ -49,5 +49,5 @@ def small_embedding() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         for module in (embedding, objects, models):
             patch.setattr(module, "load_default", lambda: small)
-        patch.setattr(enrolled_meshes, "MESH_VIEWS", 3)
+        patch.setattr(enrolled_meshes, "MESH_VIEWS", 1)
         yield

@@ -17,7 +17,6 @@ from thor2_jax.gallery import objects as gallery_objects
 from thor2_jax.gallery import store
 from thor2_jax.model.run_directory import load_run, save_run
 from thor2_jax.recognizer import Recognizer
-from training.views import enrolled_meshes
 
 pytestmark = pytest.mark.usefixtures("small_classifiers", "small_embedding")
 
@@ -150,7 +149,7 @@ def test_a_mesh_is_enrolled_from_all_sides(model: Path, tmp_path: Path) -> None:
     box.export(tmp_path / "box.ply")
     assert run_thor2("enroll", "box", "--model", model, "--mesh", tmp_path / "box.ply") == 0
     views = Recognizer.load(model).gallery.objects["box"]
-    assert views.source == "mesh" and len(views.clouds) == 6 and len(views.embeddings) == 24
+    assert views.source == "mesh" and len(views.clouds) == 2 and len(views.embeddings) == 8
     box.apply_scale(1000)
     box.export(tmp_path / "large.ply")
     assert run_thor2("enroll", "large", "--model", model, "--mesh", tmp_path / "large.ply", "--mesh-scale", 0.001) == 0
@@ -174,9 +173,8 @@ def write_mesh(path: Path, color: tuple[int, int, int] = (200, 100, 50)) -> None
     ],
 )
 def test_a_folder_of_meshes_is_enrolled(
-    arguments: tuple[str | None, str], names: set[str], model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    arguments: tuple[str | None, str], names: set[str], model: Path, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(enrolled_meshes, "MESH_VIEWS", 1)
     files = {"025_mug/textured.ply": (200, 0, 0), "can.ply": (0, 200, 0), "cafe\u0301/a.ply": (0, 0, 200)}
     for file, color in files.items():
         write_mesh(tmp_path / "meshes" / file, color)

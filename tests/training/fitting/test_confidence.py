@@ -10,9 +10,10 @@ import colornet
 from thor2_jax.descriptor.looks import describe_looks
 from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
 from thor2_jax.model.inference import Inference
-from thor2_jax.types import Cloud, PointClouds
+from thor2_jax.types import Cloud
 from training.fitting import calibration
 from training.fitting.calibration import fit_calibration
+from training.views.normalized_views import CLOUDS_PER_BATCH, padded_batches
 
 NETWORK = colornet.load_default()
 
@@ -84,10 +85,11 @@ def test_held_out_views_are_recognized_in_the_looks_of_the_run(held_out: Views) 
     views = [(label, (xyz[:n], rgb[:n])) for n, (label, (xyz, rgb)) in zip(sizes, held_out, strict=True)]
     fitted, accuracy = fit_calibration(run, run.embedding, views)
     assert fitted is not None
-    clouds = PointClouds.pack([cloud for _, cloud in views], 256)
+    ((_, clouds),) = padded_batches([cloud for _, cloud in views], CLOUDS_PER_BATCH)
     thresholds = []
     for looks in (4, 1):
-        embedded = np.asarray(run.embedding.class_probabilities(describe_looks(clouds, NETWORK, SMALL_CONFIG, looks)))
+        described = describe_looks(clouds, NETWORK, SMALL_CONFIG, looks)
+        embedded = np.asarray(run.embedding.class_probabilities(described))[:40]
         fused = embedded.astype(np.float64) / embedded.sum(axis=1, keepdims=True, dtype=np.float64)
         correct = fused.argmax(axis=1) == LABEL
         thresholds.append(np.quantile(fitted.confidence(fused, embedded)[correct], 1 - calibration.KEPT))

@@ -114,6 +114,7 @@ class Interrupted(Exception):
     pass
 
 
+@pytest.mark.slow
 def test_a_resumed_fit_gives_bit_identical_weights(separable: Samples, fitted: Fit, tmp_path: Path) -> None:
     held_out = np.arange(48) % 4 == 0
     expected: list[EpochMetrics] = []

@@ -253,6 +253,7 @@ def test_files_of_the_user_stay_in_a_run_directory(tmp_path: Path) -> None:
     assert names(out / "checkpoints") == ["notes.txt"] and load_run(out).classes == ("red brick", "stick")
 
 
+@pytest.mark.slow
 def test_a_damaged_checkpoint_is_refused(tmp_path: Path) -> None:
     out = tmp_path / "run"
     with pytest.raises(Interrupted):

@@ -68,7 +68,7 @@ def test_every_plot_is_drawn(tmp_path: Path) -> None:
         points,
         np.full((200, 3), 200, np.uint8),
         colornet.load_default(),
-        thor2.DescriptorConfig(homology="closed_form"),
+        SMALL_CONFIG,
         "box",
         tmp_path / "descriptor.png",
     )
