@@ -31,7 +31,7 @@ def source() -> MemoryViews:
 
 
 def train(out: Path, **more: Any) -> TrainedRun:
-    (run,) = train_run(source(), out, RunSettings(("ce",), OPTIONS, CONFIG), **more)
+    (run,) = train_run(source(), out, RunSettings(("tops",), OPTIONS, CONFIG), **more)
     return run
 
 
@@ -75,7 +75,7 @@ def test_a_training_that_another_one_overtakes(tmp_path: Path) -> None:
         pass
 
     def stopped(stage: str, count: int, total: int, note: str) -> None:
-        if stage == "fit ce":
+        if stage == "fit tops":
             raise Stopped
 
     def dies(stage: str, count: int, total: int, note: str) -> None:

@@ -144,9 +144,7 @@ def test_frames_without_names(model: Path, frames: Path, tmp_path: Path, capsys:
 
 
 def test_a_mesh_is_enrolled_from_all_sides(model: Path, tmp_path: Path) -> None:
-    box = trimesh.creation.box((0.1, 0.2, 0.15))
-    box.visual.vertex_colors = [[200, 100, 50, 255]] * len(box.vertices)
-    box.export(tmp_path / "box.ply")
+    box = write_mesh(tmp_path / "box.ply")
     assert run_thor2("enroll", "box", "--model", model, "--mesh", tmp_path / "box.ply") == 0
     views = Recognizer.load(model).gallery.objects["box"]
     assert views.source == "mesh" and len(views.clouds) == 2 and len(views.embeddings) == 8
@@ -155,11 +153,12 @@ def test_a_mesh_is_enrolled_from_all_sides(model: Path, tmp_path: Path) -> None:
     assert run_thor2("enroll", "large", "--model", model, "--mesh", tmp_path / "large.ply", "--mesh-scale", 0.001) == 0
 
 
-def write_mesh(path: Path, color: tuple[int, int, int] = (200, 100, 50)) -> None:
-    box = trimesh.creation.box((0.1, 0.2, 0.15))
+def write_mesh(path: Path, color: tuple[int, int, int] = (200, 100, 50)) -> trimesh.Trimesh:
+    box = trimesh.creation.box((0.04, 0.08, 0.06))  # has few points, like the objects of the frames
     box.visual.vertex_colors = [[*color, 255]] * len(box.vertices)
     path.parent.mkdir(parents=True, exist_ok=True)
     box.export(path)
+    return box
 
 
 @pytest.mark.parametrize(
