@@ -4,7 +4,6 @@ import contextlib
 import dataclasses
 import functools
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
 from typing import Any
 
 import numpy as np
@@ -45,7 +44,7 @@ def drawn_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture(scope="session")
-def without_steps() -> Callable[[], AbstractContextManager[None]]:
+def without_steps() -> Callable[[], contextlib.AbstractContextManager[None]]:
     """Return a context in which trainings end without a step: they have random weights, and nothing is compiled."""
     metrics = functools.partial(EpochMetrics, 1, loss=1.0, accuracy=0.5, samples_per_second=1.0)
 
@@ -76,7 +75,7 @@ def without_steps() -> Callable[[], AbstractContextManager[None]]:
 
 
 @pytest.fixture
-def unfitted(without_steps: Callable[[], AbstractContextManager[None]]) -> Iterator[None]:
+def unfitted(without_steps: Callable[[], contextlib.AbstractContextManager[None]]) -> Iterator[None]:
     with without_steps():
         yield
 

@@ -111,23 +111,19 @@ def check_baseline(folder: Path, name: str) -> None:
     assert loaded.weights[name] == [] and loaded.temperatures[name] > 0
 
 
+@pytest.mark.slow
 def test_a_network_learns(trained: Path) -> None:
     check_baseline(trained, SMALL)
 
 
 @pytest.mark.slow
-def test_templates_learn(trained: Path) -> None:
-    train_baselines(trained, SOURCE, ["templates"], options=OPTIONS)
-    check_baseline(trained, "templates")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["rcfusion-small", "vit-cnn-small"])
+@pytest.mark.parametrize("name", ["rcfusion-small", "vit-cnn-small", "templates"])
 def test_other_networks_learn(tmp_path: Path, name: str) -> None:
     train_baselines(write_run(tmp_path / "run"), SOURCE, [name], options=dataclasses.replace(OPTIONS, epochs=12))
     check_baseline(tmp_path / "run", name)
 
 
+@pytest.mark.slow
 def test_interrupted_fit_resumes_to_the_same_weights(
     trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

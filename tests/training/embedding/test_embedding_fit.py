@@ -37,13 +37,8 @@ learned_block = nnx.jit(lambda model, *inputs: model.learned(*inputs))
 
 
 @pytest.fixture(scope="module")
-def directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("embedding") / "samples"
-
-
-@pytest.fixture(scope="module")
-def views(directory: Path) -> Samples:
-    return build_samples(OBJECTS, directory, NETWORK, SMALL_CONFIG, views=6)
+def views(tmp_path_factory: pytest.TempPathFactory) -> Samples:
+    return build_samples(OBJECTS, tmp_path_factory.mktemp("embedding") / "samples", NETWORK, SMALL_CONFIG, views=6)
 
 
 def test_views_depend_on_seed_and_object_only() -> None:
@@ -101,9 +96,7 @@ def aligned(clouds: thor2.PointClouds, mirror: str) -> thor2.PointClouds:
     return thor2.turn(thor2.mirror(thor2.view_normalize(clouds, SMALL_CONFIG), mirror), SMALL_CONFIG)
 
 
-def test_an_interrupted_sampling_resumes(
-    directory: Path, views: Samples, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_an_interrupted_sampling_resumes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(sampling, "OBJECTS_PER_SHARD", 3)
 
     def interrupted(function, items) -> Generator:

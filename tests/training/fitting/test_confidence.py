@@ -4,11 +4,10 @@ import dataclasses
 
 import numpy as np
 import pytest
-from helpers import SMALL_CONFIG, untrained_embedding_run, untrained_run
+from helpers import SMALL_CONFIG, untrained_embedding_run
 
 import colornet
 from thor2_jax.descriptor.looks import describe_looks
-from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
 from thor2_jax.model.inference import Inference
 from thor2_jax.types import Cloud
 from training.fitting import calibration
@@ -34,9 +33,8 @@ def held_out() -> Views:
 
 def test_confidence_separates_and_keeps_its_share(held_out: Views, monkeypatch: pytest.MonkeyPatch) -> None:
     """Known objects (labels 0 and 1) with high odds, unknown ones with low odds; a tenth of the known are wrong."""
-    run = untrained_run(("a", "b"), ("tops", "tops2"), SMALL_CONFIG)
-    sizes = EmbeddingSizes(cell=4, hidden=(8,), learned=4, color=2)
-    embedding = Embedding.create(SMALL_CONFIG, NETWORK, sizes, classes=("a", "b"), distractors=2)
+    run = untrained_embedding_run(("a", "b"), ("tops", "tops2"))
+    assert run.embedding is not None
     known = LABEL < 2
     right = np.where(known, LABEL, 0)
     rng = np.random.default_rng(1)
@@ -48,7 +46,7 @@ def test_confidence_separates_and_keeps_its_share(held_out: Views, monkeypatch: 
     values = {"tops": fused, "tops2": fused, "embedding": embedded}
     inference = Inference(0, {k: np.resize(v, (128, 2)) for k, v in values.items()})
     monkeypatch.setattr(calibration, "infer_clouds", lambda *_: inference)
-    fitted, accuracy = fit_calibration(run, embedding, held_out)
+    fitted, accuracy = fit_calibration(run, run.embedding, held_out)
     assert fitted is not None and min(fitted.known_factor, fitted.correct_factor, fitted.score_factor) > 0
     scores, correct = fitted.confidence(fused, embedded), answer == LABEL
     assert np.min(scores[known & ~wrong]) > 0.7 > np.max(scores[~known])
@@ -56,22 +54,21 @@ def test_confidence_separates_and_keeps_its_share(held_out: Views, monkeypatch: 
     assert np.mean(scores[known]) == pytest.approx(correct[known].mean(), abs=0.05)  # most instances are known
     assert fitted.unknown_below == pytest.approx(np.quantile(scores[correct], 1 - calibration.KEPT))
     unknown = [(label + 2, cloud) for label, cloud in held_out]  # without correct answers, there is no confidence
-    assert fit_calibration(run, embedding, unknown)[0] is None
+    assert fit_calibration(run, run.embedding, unknown)[0] is None
 
 
 def test_unknown_objects_are_told_apart_without_incorrect_answers(
     held_out: Views, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run = untrained_run(("a", "b"), ("tops", "tops2"), SMALL_CONFIG)
-    sizes = EmbeddingSizes(cell=4, hidden=(8,), learned=4, color=2)
-    embedding = Embedding.create(SMALL_CONFIG, NETWORK, sizes, classes=("a", "b"), distractors=2)
+    run = untrained_embedding_run(("a", "b"), ("tops", "tops2"))
+    assert run.embedding is not None
     known = LABEL < 2
     fused = np.stack([np.where(np.where(known, LABEL, 0) == k, 0.9, 0.1) for k in (0, 1)], axis=1)
     embedded = fused * np.where(known, 0.9, 0.1)[:, None]
     values = {"tops": fused, "tops2": fused, "embedding": embedded}
     inference = Inference(0, {k: np.resize(v, (128, 2)) for k, v in values.items()})
     monkeypatch.setattr(calibration, "infer_clouds", lambda *_: inference)
-    fitted, accuracy = fit_calibration(run, embedding, held_out)
+    fitted, accuracy = fit_calibration(run, run.embedding, held_out)
     assert fitted is not None and accuracy == 1
     scores = fitted.confidence(fused, embedded)
     assert np.max(scores[~known]) < fitted.unknown_below <= np.min(scores[known]) + 1e-9
