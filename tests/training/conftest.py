@@ -46,7 +46,7 @@ def drawn_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(scope="session")
 def without_steps() -> Callable[[], contextlib.AbstractContextManager[None]]:
     """Return a context in which trainings end without a step: they have random weights, and nothing is compiled."""
-    metrics = functools.partial(EpochMetrics, 1, loss=1.0, accuracy=0.5, samples_per_second=1.0)
+    metrics = functools.partial(EpochMetrics, 1, 1.0, 0.5, 1.0)
 
     def fit(samples: Samples, context: FitContext, *others: Any) -> tuple[MLP, int]:
         _, _, held_out, _, epoch_done = others

@@ -112,12 +112,14 @@ def check_baseline(folder: Path, name: str) -> None:
 
 
 @pytest.mark.slow
-def test_a_network_learns(trained: Path) -> None:
-    check_baseline(trained, SMALL)
+@pytest.mark.parametrize("name", [SMALL, "templates"])
+def test_network_and_templates_learn(trained: Path, name: str) -> None:
+    train_baselines(trained, SOURCE, [name], options=OPTIONS)
+    check_baseline(trained, name)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["rcfusion-small", "vit-cnn-small", "templates"])
+@pytest.mark.parametrize("name", ["rcfusion-small", "vit-cnn-small"])
 def test_other_networks_learn(tmp_path: Path, name: str) -> None:
     train_baselines(write_run(tmp_path / "run"), SOURCE, [name], options=dataclasses.replace(OPTIONS, epochs=12))
     check_baseline(tmp_path / "run", name)

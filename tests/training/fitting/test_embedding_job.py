@@ -65,8 +65,6 @@ def train(out: Path, settings: RunSettings = SETTINGS, **more: Any) -> list[Trai
 
 
 class Whole(NamedTuple):
-    """An uninterrupted training: its directory, its run, the stages of its progress, and the held-out clouds."""
-
     out: Path
     run: TrainedRun
     stages: list[str]
@@ -75,6 +73,7 @@ class Whole(NamedTuple):
 
 @pytest.fixture(scope="module")
 def whole(cache: Path, tmp_path_factory: pytest.TempPathFactory) -> Whole:
+    """An uninterrupted training."""
     out, stages, views = tmp_path_factory.mktemp("whole") / "run", dict[str, int](), list[tuple[int, Cloud]]()
 
     def fit(run: TrainedRun, embedding: Embedding, held_out: list[tuple[int, Cloud]]) -> Any:

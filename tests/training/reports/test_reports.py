@@ -79,8 +79,8 @@ def test_plots_draw_any_name(tmp_path: Path) -> None:
     mug = builtin_objects()["mug_blue"]
     draw_objects(dict.fromkeys(names, mug), tmp_path / "objects.png")
     points, colors = np.random.default_rng(0).random((200, 3)) * (0.2, 0.1, 0.05) + (0, 0, 1), np.full((200, 3), 200)
-    network = colornet.load_default()
-    draw_descriptor(points, colors.astype(np.uint8), network, SMALL_CONFIG, names[0], tmp_path / "descriptor.png")
+    drawn = points, colors.astype(np.uint8), colornet.load_default(), SMALL_CONFIG, names[0]
+    draw_descriptor(*drawn, tmp_path / "descriptor.png")
     assert all(colors_in(path) > 10 for path in tmp_path.iterdir())
     assert plain_text("$x$ a\u202eb") == r"\$x\$ a\u202eb"
 
