@@ -58,6 +58,7 @@ def test_descriptors() -> None:
     assert result.tops.shape == (1, 7168) and result.tops2.shape == (1, 11942) and result.overflow.shape == (1,)
 
 
+@pytest.mark.slow
 def test_gradients_of_colours() -> None:
     names = run_section("Descriptors as a library", xyz=random_cloud(0)[0], rgb=random_cloud(0)[1])
     names = run_section("Gradients", **names)
@@ -88,6 +89,7 @@ def test_pages_that_use_pandas_say_how_to_install_it() -> None:
         assert 'set_output(transform="pandas")' in text and "pip install -c constraints.txt pandas" in text
 
 
+@pytest.mark.slow
 def test_persistence() -> None:
     names = run_section("Persistence of functions on lines")
     assert names["images"].shape == (2, 16, 16) and len(names["pairs"]) == int(names["diagrams"].mask[0].sum()) > 0

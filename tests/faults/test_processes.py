@@ -57,6 +57,7 @@ def test_a_second_training_is_refused(tmp_path: Path) -> None:
     assert not list(out.rglob(".lock"))
 
 
+@pytest.mark.slow
 def test_a_training_that_another_one_overtakes(tmp_path: Path) -> None:
     """Both start with a new directory, and the slower one is refused or resumes the other one."""
     out, done = tmp_path / "run", []

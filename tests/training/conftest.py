@@ -1,16 +1,29 @@
 """Fixtures shared by the tests of training."""
 
-from collections.abc import Iterator
+import contextlib
+import dataclasses
+import functools
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 import pytest
+from helpers import random_classifier
 from matplotlib.figure import Figure
 from PIL import Image
 
 import colornet
 from thor2_jax import figures
 from thor2_jax.descriptor.color_membership import region_sets
+from thor2_jax.gallery.embedding import Embedding
+from thor2_jax.gallery.references import BACKGROUND, References
+from thor2_jax.model.classifier import MLP
+from thor2_jax.model.run_directory import input_size
+from training.embedding import run_embedding
+from training.fitting import job
+from training.fitting.options import EpochMetrics
 from training.fitting.samples import Samples
+from training.fitting.steps import FitContext
 
 SAVEFIG = Figure.savefig
 
@@ -28,6 +41,51 @@ def drawn_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let figures be drawn, with a fifth of their pixels."""
     monkeypatch.setattr(Figure, "savefig", SAVEFIG)
     monkeypatch.setattr(figures, "_DPI", 60)
+
+
+@pytest.fixture(scope="session")
+def without_steps() -> Callable[[], contextlib.AbstractContextManager[None]]:
+    """Return a context in which trainings end without a step: they have random weights, and nothing is compiled."""
+    metrics = functools.partial(EpochMetrics, 1, 1.0, 0.5, 1.0)
+
+    def fit(samples: Samples, context: FitContext, *others: Any) -> tuple[MLP, int]:
+        _, _, held_out, _, epoch_done = others
+        epoch_done(metrics(held_out_accuracy=None if held_out is None else 0.5))
+        inputs = input_size(context.feature, context.config, context.network.n_regions)
+        return random_classifier(inputs, len(samples.classes), 0), 1
+
+    def fit_embedding(source: Any, *others: Any) -> tuple[Embedding, list[Any]]:
+        _, _, _, network, config, _, report, _, epoch_done = others
+        for stage in run_embedding.STAGES:
+            report(stage, 1, 1)
+        epoch_done(metrics())
+        created = Embedding.create(config, network, run_embedding.SIZES, classes=tuple(source.classes), distractors=9)
+        views = References(np.zeros((1, created.size), np.float16), np.full(1, BACKGROUND, np.int32))
+        return dataclasses.replace(created, references=views), []
+
+    @contextlib.contextmanager
+    def patched() -> Iterator[None]:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(job, "fit", fit)
+            patch.setattr(job, "fit_run_embedding", fit_embedding)
+            patch.setattr(job, "fit_calibration", lambda *_: (None, 0.5))
+            yield
+
+    return patched
+
+
+@pytest.fixture
+def unfitted(without_steps: Callable[[], contextlib.AbstractContextManager[None]]) -> Iterator[None]:
+    with without_steps():
+        yield
+
+
+@pytest.fixture(params=["random", pytest.param("fitted", marks=pytest.mark.slow)])
+def weights(request: pytest.FixtureRequest) -> str:
+    """Let the trainings of a test end without a step; those of the slow test have all steps."""
+    if request.param == "random":
+        request.getfixturevalue("unfitted")
+    return str(request.param)
 
 
 @pytest.fixture

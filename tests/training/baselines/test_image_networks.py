@@ -99,7 +99,7 @@ def quick_network() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = write_run(tmp_path_factory.mktemp("networks") / "run")
-    train_baselines(folder, SOURCE, [SMALL, "templates"], options=OPTIONS)
+    train_baselines(folder, SOURCE, [SMALL], options=OPTIONS)
     return folder
 
 
@@ -111,8 +111,10 @@ def check_baseline(folder: Path, name: str) -> None:
     assert loaded.weights[name] == [] and loaded.temperatures[name] > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [SMALL, "templates"])
 def test_network_and_templates_learn(trained: Path, name: str) -> None:
+    train_baselines(trained, SOURCE, [name], options=OPTIONS)
     check_baseline(trained, name)
 
 
@@ -123,6 +125,7 @@ def test_other_networks_learn(tmp_path: Path, name: str) -> None:
     check_baseline(tmp_path / "run", name)
 
 
+@pytest.mark.slow
 def test_interrupted_fit_resumes_to_the_same_weights(
     trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -158,6 +161,7 @@ def write_weights(folder: Path, name: str = SMALL, seed: int = 0) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_pretrained_weights_are_used_and_recorded(tmp_path: Path) -> None:
     weights = write_weights(tmp_path / "weights")
     (file,) = pretrained_files(SMALL)

@@ -4,66 +4,41 @@ import dataclasses
 import functools
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
-from helpers import SMALL_CONFIG, random_classifier, untrained_run
+from helpers import SMALL_CONFIG, untrained_run
 
-from thor2_jax.config import DescriptorConfig
 from thor2_jax.gallery import embedding, objects
 from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
 from thor2_jax.model import model as models
-from thor2_jax.model.classifier import MLP
-from thor2_jax.model.run_directory import input_size, save_run
+from thor2_jax.model.run_directory import save_run
 from training.embedding import run_embedding
 from training.embedding.fit import EmbeddingFit
-from training.fitting import job, protocol
-from training.fitting.options import EpochMetrics
+from training.fitting import protocol
 from training.fitting.protocol import DEFAULT, PAPER
-from training.fitting.samples import Samples
-from training.fitting.steps import FitContext
 from training.views import enrolled_meshes
+
+COVERING = dataclasses.replace(SMALL_CONFIG, sigma_1=0.4, sigma_2=0.2)
+"""A small descriptor whose grid covers the objects: if it overflowed, nothing would have a name."""
 
 
 @pytest.fixture(scope="session")
 def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Run directory with random weights."""
     directory = tmp_path_factory.mktemp("run")
-    config = DescriptorConfig(homology="closed_form")  # a small grid would overflow, so that nothing has a name
-    save_run(untrained_run(("bowl", "mug", "plate"), ("tops", "tops2"), config, seed=1), directory)
+    save_run(untrained_run(("bowl", "mug", "plate"), ("tops", "tops2"), COVERING, seed=1), directory)
     return directory
-
-
-@pytest.fixture
-def unfitted(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let trainings end without a step: their classifiers have random weights, and nothing is compiled for them."""
-
-    def fit(
-        samples: Samples,
-        context: FitContext,
-        options: Any,
-        checkpoints: Any,
-        held_out: Any,
-        progress: Any,
-        epoch_done: Any,
-    ) -> tuple[MLP, int]:
-        epoch_done(EpochMetrics(1, loss=1.0, accuracy=0.5, samples_per_second=1.0))
-        inputs = input_size(context.feature, context.config, context.network.n_regions)
-        return random_classifier(inputs, len(samples.classes), 0), 1
-
-    monkeypatch.setattr(job, "fit", fit)
 
 
 @pytest.fixture(scope="module")
 def small_descriptors() -> Iterator[None]:
     """Let the protocols describe views by small descriptors, and fit one small network on few views."""
     with pytest.MonkeyPatch.context() as patch:
-        config = dataclasses.replace(SMALL_CONFIG, sigma_1=0.4, sigma_2=0.2)  # covers the objects
         networks = dataclasses.replace(DEFAULT.distractors, networks=1, views=2)
         patch.setattr(run_embedding, "SIZES", EmbeddingSizes(cell=4, hidden=(16,), learned=8, color=4))
         patch.setattr(run_embedding, "EmbeddingFit", functools.partial(EmbeddingFit, batch_size=64))
-        patch.setattr(protocol, "DEFAULT", dataclasses.replace(DEFAULT, config=config, distractors=networks))
-        patch.setattr(protocol, "PAPER", dataclasses.replace(PAPER, config=config))
+        patch.setattr(protocol, "DEFAULT", dataclasses.replace(DEFAULT, config=COVERING, distractors=networks))
+        patch.setattr(protocol, "PAPER", dataclasses.replace(PAPER, config=COVERING))
         yield
 
 
@@ -74,5 +49,5 @@ def small_embedding() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         for module in (embedding, objects, models):
             patch.setattr(module, "load_default", lambda: small)
-        patch.setattr(enrolled_meshes, "MESH_VIEWS", 3)
+        patch.setattr(enrolled_meshes, "MESH_VIEWS", 1)
         yield

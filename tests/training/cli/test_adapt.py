@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from helpers import json_lines, run_thor2, untrained_embedding_run, untrained_run, write_frame
 
+from thor2_jax import recognizer as module
 from thor2_jax.adaptation.color_transform import ColorTransform
 from thor2_jax.adaptation.estimate import Adaptation
 from thor2_jax.errors import InputError
@@ -40,10 +41,15 @@ def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return directory
 
 
-@pytest.fixture(scope="module")
-def adapted(model: Path, video: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+@pytest.fixture(scope="module", params=["given", pytest.param("estimated", marks=pytest.mark.slow)])
+def adapted(request: pytest.FixtureRequest, model: Path, video: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("adapted") / "run"
-    assert run_thor2("adapt", "--model", model, video, "--out", out, "--quiet") == 0
+    with pytest.MonkeyPatch.context() as patch:
+        if request.param == "given":  # tests/thor2_jax/adaptation has those of the estimate
+            transform = ColorTransform(warmth=0.2)
+            given = lambda instances, *_: Adaptation(transform, len(instances), 0.5, 0.4)  # noqa: E731
+            patch.setattr(module, "estimate_transform", given)
+        assert run_thor2("adapt", "--model", model, video, "--out", out, "--quiet") == 0
     return out
 
 
@@ -75,6 +81,7 @@ def test_runs_of_different_cameras_are_not_evaluated_together(model: Path, adapt
         load_runs([model, adapted])
 
 
+@pytest.mark.slow
 def test_commands_use_a_run_whose_embedding_alone_answers(
     video: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -1,4 +1,4 @@
-"""The command line: every command and invalid input, with a small model that is trained once."""
+"""The command line: every command and invalid input, with a small model of random weights."""
 
 import dataclasses
 import json
@@ -6,6 +6,7 @@ import shlex
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -65,10 +66,14 @@ def run(capsys: pytest.CaptureFixture[str]) -> Run:
 
 
 @pytest.fixture(scope="module")
-def model(meshes: Path, small_descriptors: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the run directory of a model of three objects, trained for one epoch."""
+def model(
+    meshes: Path, views: Path, small_descriptors: None, without_steps: Any, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    """Return the run directory of a model of three objects with random weights; its views have been rendered before."""
     out = tmp_path_factory.mktemp("model") / "run"
-    assert run_thor2("train", "--meshes", meshes, "--out", out, *STEPS, *FEW_STEPS) == 0
+    shutil.copytree(views, out / "views")
+    with without_steps():
+        assert run_thor2("train", "--meshes", meshes, "--out", out, *STEPS, *FEW_STEPS) == 0
     return out
 
 
@@ -210,16 +215,19 @@ def test_options_without_effect_are_refused(meshes: Path, tmp_path: Path, run: R
     assert code == 2 and "azimuth_step" in one_line(err) and not out.exists()
 
 
-def test_train_on_rendered_dataset_equals_train_on_meshes(views: Path, model: Path, tmp_path: Path) -> None:
+@pytest.mark.slow
+@pytest.mark.usefixtures("small_descriptors")
+def test_train_on_rendered_dataset_equals_train_on_meshes(meshes: Path, views: Path, tmp_path: Path) -> None:
     """Views written by `render` and read back train the same model as views rendered by `train`."""
-    assert run_thor2("train", "--dataset", views, "--out", tmp_path / "run", *FEW_STEPS) == 0
-    assert not (model / "views").exists()
-    first, second = (json.loads((f / "run.json").read_text()) for f in (model, tmp_path / "run"))
+    for name, options in {"first": ("--meshes", meshes, *STEPS), "second": ("--dataset", views)}.items():
+        assert run_thor2("train", *options, "--out", tmp_path / name, *FEW_STEPS) == 0
+    first, second = (json.loads((tmp_path / name / "run.json").read_text()) for name in ("first", "second"))
     assert first["record"]["curves"] == second["record"]["curves"]
 
 
+@pytest.mark.usefixtures("small_descriptors")
 def test_a_default_training_recognizes_and_is_evaluated(
-    meshes: Path, views: Path, images: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+    weights: str, meshes: Path, views: Path, images: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Without --classifiers, a run has an embedding alone; the command that is printed recognizes with it."""
     monkeypatch.setenv("THOR2_CACHE", str(tmp_path / "cache"))
@@ -232,7 +240,7 @@ def test_a_default_training_recognizes_and_is_evaluated(
     assert list(dict.fromkeys(stages)) == [f"stage {number} of 5" for number in (1, 2, 3, 4, 5)]
     assert load_run(out).record["classifiers"] == [] and list(load_run(out).record["curves"]) == ["embedding"]
     assert Recognizer.load(out).model.classifiers.default == ("embedding",)
-    assert len(list((tmp_path / "cache").glob("distractors-*"))) == 1
+    assert len(list((tmp_path / "cache").glob("distractors-*"))) == (weights == "fitted")
 
     (line,) = [line for line in printed.splitlines() if "thor2 recognize" in line]
     program, *arguments = shlex.split(line.split(" with: ")[1])
@@ -316,6 +324,7 @@ def test_train_with_distractors(meshes: Path, images: Path, tmp_path: Path, run:
     assert code == 2 and "orientation_copies" in one_line(err)
 
 
+@pytest.mark.usefixtures("small_descriptors", "weights")
 def test_train_by_folds(meshes: Path, views: Path, tmp_path: Path, run: Run) -> None:
     options = ("--epochs", 1, "--batch-size", 16, "--classifiers", "tops", "--folds", 2, "--embedding", 0)
     arguments = ("train", "--meshes", meshes, "--out", tmp_path / "run", *STEPS, *options)

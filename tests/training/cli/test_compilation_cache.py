@@ -34,6 +34,7 @@ def environment(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     return tmp_path / "home" / "thor2-jax" / "xla"
 
 
+@pytest.mark.slow
 def test_programs_are_kept_for_the_next_process(environment: Path) -> None:
     def run() -> set[str]:
         variables = os.environ | {"PYTHONPATH": str(ROOT), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}

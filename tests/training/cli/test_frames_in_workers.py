@@ -13,11 +13,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import run_thor2, small_frame, untrained_run, write_frame_files
+from helpers import run_thor2, small_frame, write_frame_files
 from recording_files import table_frame
 
 from thor2_jax.errors import InputError
-from thor2_jax.model.run_directory import save_run
 from training.evaluation.answering import RunArguments, answer_frames, answer_frames_in_pool
 from training.frame_recognition import (
     FRAMES_PER_CHUNK,
@@ -30,13 +29,6 @@ from training.readers.frames import FrameFolder
 from training.storage.workers import IN_PROCESS
 
 N_FRAMES = 2 * FRAMES_PER_CHUNK + 1
-
-
-@pytest.fixture(scope="module")
-def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    directory = tmp_path_factory.mktemp("run")
-    save_run(untrained_run(("bowl", "mug", "plate"), ("tops", "tops2")), directory)
-    return directory
 
 
 @pytest.fixture(scope="module")

@@ -38,7 +38,10 @@ def messages_of(path: Path) -> dict[str, list[tuple[int, Any]]]:
     return messages
 
 
-@pytest.mark.parametrize(("name", "out"), [("a.bag", "out.mcap"), ("folder", "out"), ("a.mcap", "out.mcap")])
+@pytest.mark.parametrize(
+    ("name", "out"),
+    [pytest.param("a.bag", "out.mcap", marks=pytest.mark.slow), ("folder", "out"), ("a.mcap", "out.mcap")],
+)
 def test_detections_are_read_back(
     model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], name: str, out: str
 ) -> None:
@@ -71,7 +74,7 @@ def test_detections_are_read_back(
     assert not [one for one in tmp_path.iterdir() if one.name.startswith(".")]
 
 
-@pytest.mark.parametrize("segment", [(), ("--segment", "model")])
+@pytest.mark.parametrize("segment", [(), pytest.param(("--segment", "model"), marks=pytest.mark.slow)])
 def test_every_second_frame_and_pictures(
     segment: tuple[str, ...], model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -219,10 +222,9 @@ def test_options_of_bags_need_a_bag(model: Path, tmp_path: Path, capfd: pytest.C
         assert f"{option} is {value}; it belongs to --bag" in capfd.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not REAL.is_dir(), reason="no real frames beside the repository (shared/data/frames)")
-@pytest.mark.parametrize(
-    "name", ["a.mcap", *(pytest.param(one, marks=pytest.mark.slow) for one in ("a.bag", "folder"))]
-)
+@pytest.mark.parametrize("name", ["a.mcap", "a.bag", "folder"])
 def test_recordings_of_real_frames(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], name: str) -> None:
     folders = sorted(one for one in REAL.iterdir() if one.is_dir())[:2]
     files = [

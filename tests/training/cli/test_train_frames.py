@@ -69,6 +69,7 @@ def test_train_on_frames_alone(frames: Path, tmp_path: Path, capsys: pytest.Capt
     assert "out: " in message and "dataset" in message
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("unfitted")
 def test_frames_join_the_views_of_meshes(
     meshes: Path, frames: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -1,6 +1,4 @@
-"""Temperatures of the classifiers of a fold: the samples that they are fitted to, and where they are stored."""
-
-from pathlib import Path
+"""Temperatures of the classifiers of a fold, and the samples that they are fitted to."""
 
 import jax
 import numpy as np
@@ -11,11 +9,8 @@ import colornet
 import thor2_jax as thor2
 from thor2_jax.model.classifier import MLP, Feature, class_probabilities
 from thor2_jax.model.run_directory import input_size
-from training.evaluation.runs import load_runs
 from training.fitting import calibration
 from training.fitting.calibration import fit_temperature, sample_probabilities, temperatures
-from training.fitting.job import RunSettings, train_run
-from training.fitting.options import FitOptions
 from training.fitting.samples import MIRRORS, build_samples
 from training.fitting.steps import FitContext
 from training.views.normalized_views import MemoryViews, padded_batches
@@ -44,7 +39,7 @@ def source(views: int) -> MemoryViews:
     )
 
 
-@pytest.mark.parametrize("feature", ["ce", "tops2"])
+@pytest.mark.parametrize("feature", ["ce", pytest.param("tops2", marks=pytest.mark.slow)])
 def test_sample_probabilities_equal_those_of_the_clouds(feature: Feature, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(calibration, "SAMPLES_PER_BATCH", 3)
     views = source(2)
@@ -73,11 +68,3 @@ def test_temperatures_are_fitted_to_the_held_out_set() -> None:
     probabilities = sample_probabilities(model, samples, np.flatnonzero(held_out), FitContext("tops", NETWORK, CONFIG))
     assert fitted == {"tops": fit_temperature(probabilities, samples.label[held_out])}
     assert temperatures({"tops": model}, samples, None, NETWORK, CONFIG) == {}
-
-
-def test_runs_of_several_folds_keep_their_temperatures(tmp_path: Path) -> None:
-    options = FitOptions(epochs=2, batch_size=4)
-    train_run(source(4), tmp_path / "run", RunSettings(("tops",), options, CONFIG, 2))
-    for run in load_runs([tmp_path / "run"]):
-        assert set(run.temperatures) == {"tops"} and 0.01 <= run.temperatures["tops"] <= 100
-        assert run.recognizer.run.record["temperatures"] == run.temperatures

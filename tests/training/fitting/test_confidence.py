@@ -4,15 +4,15 @@ import dataclasses
 
 import numpy as np
 import pytest
-from helpers import SMALL_CONFIG, untrained_embedding_run, untrained_run
+from helpers import SMALL_CONFIG, untrained_embedding_run
 
 import colornet
 from thor2_jax.descriptor.looks import describe_looks
-from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
 from thor2_jax.model.inference import Inference
-from thor2_jax.types import Cloud, PointClouds
+from thor2_jax.types import Cloud
 from training.fitting import calibration
 from training.fitting.calibration import fit_calibration
+from training.views.normalized_views import CLOUDS_PER_BATCH, padded_batches
 
 NETWORK = colornet.load_default()
 
@@ -33,9 +33,8 @@ def held_out() -> Views:
 
 def test_confidence_separates_and_keeps_its_share(held_out: Views, monkeypatch: pytest.MonkeyPatch) -> None:
     """Known objects (labels 0 and 1) with high odds, unknown ones with low odds; a tenth of the known are wrong."""
-    run = untrained_run(("a", "b"), ("tops", "tops2"), SMALL_CONFIG)
-    sizes = EmbeddingSizes(cell=4, hidden=(8,), learned=4, color=2)
-    embedding = Embedding.create(SMALL_CONFIG, NETWORK, sizes, classes=("a", "b"), distractors=2)
+    run = untrained_embedding_run(("a", "b"), ("tops", "tops2"))
+    assert run.embedding is not None
     known = LABEL < 2
     right = np.where(known, LABEL, 0)
     rng = np.random.default_rng(1)
@@ -47,36 +46,29 @@ def test_confidence_separates_and_keeps_its_share(held_out: Views, monkeypatch: 
     values = {"tops": fused, "tops2": fused, "embedding": embedded}
     inference = Inference(0, {k: np.resize(v, (128, 2)) for k, v in values.items()})
     monkeypatch.setattr(calibration, "infer_clouds", lambda *_: inference)
-    fitted, accuracy = fit_calibration(run, embedding, held_out)
+    fitted, accuracy = fit_calibration(run, run.embedding, held_out)
     assert fitted is not None and min(fitted.known_factor, fitted.correct_factor, fitted.score_factor) > 0
     scores, correct = fitted.confidence(fused, embedded), answer == LABEL
     assert np.min(scores[known & ~wrong]) > 0.7 > np.max(scores[~known])
     assert accuracy == correct[known].mean() < 1
     assert np.mean(scores[known]) == pytest.approx(correct[known].mean(), abs=0.05)  # most instances are known
     assert fitted.unknown_below == pytest.approx(np.quantile(scores[correct], 1 - calibration.KEPT))
-
-
-def test_without_correct_answers_there_is_no_confidence(held_out: Views) -> None:
-    run = untrained_run(("a", "b"), ("tops", "tops2"), SMALL_CONFIG)
-    sizes = EmbeddingSizes(cell=4, hidden=(8,), learned=4, color=2)
-    embedding = Embedding.create(SMALL_CONFIG, NETWORK, sizes, classes=("a", "b"), distractors=2)
-    unknown = [(label + 2, cloud) for label, cloud in held_out]
-    assert fit_calibration(run, embedding, unknown)[0] is None
+    unknown = [(label + 2, cloud) for label, cloud in held_out]  # without correct answers, there is no confidence
+    assert fit_calibration(run, run.embedding, unknown)[0] is None
 
 
 def test_unknown_objects_are_told_apart_without_incorrect_answers(
     held_out: Views, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run = untrained_run(("a", "b"), ("tops", "tops2"), SMALL_CONFIG)
-    sizes = EmbeddingSizes(cell=4, hidden=(8,), learned=4, color=2)
-    embedding = Embedding.create(SMALL_CONFIG, NETWORK, sizes, classes=("a", "b"), distractors=2)
+    run = untrained_embedding_run(("a", "b"), ("tops", "tops2"))
+    assert run.embedding is not None
     known = LABEL < 2
     fused = np.stack([np.where(np.where(known, LABEL, 0) == k, 0.9, 0.1) for k in (0, 1)], axis=1)
     embedded = fused * np.where(known, 0.9, 0.1)[:, None]
     values = {"tops": fused, "tops2": fused, "embedding": embedded}
     inference = Inference(0, {k: np.resize(v, (128, 2)) for k, v in values.items()})
     monkeypatch.setattr(calibration, "infer_clouds", lambda *_: inference)
-    fitted, accuracy = fit_calibration(run, embedding, held_out)
+    fitted, accuracy = fit_calibration(run, run.embedding, held_out)
     assert fitted is not None and accuracy == 1
     scores = fitted.confidence(fused, embedded)
     assert np.max(scores[~known]) < fitted.unknown_below <= np.min(scores[known]) + 1e-9
@@ -90,10 +82,11 @@ def test_held_out_views_are_recognized_in_the_looks_of_the_run(held_out: Views) 
     views = [(label, (xyz[:n], rgb[:n])) for n, (label, (xyz, rgb)) in zip(sizes, held_out, strict=True)]
     fitted, accuracy = fit_calibration(run, run.embedding, views)
     assert fitted is not None
-    clouds = PointClouds.pack([cloud for _, cloud in views], 256)
+    ((_, clouds),) = padded_batches([cloud for _, cloud in views], CLOUDS_PER_BATCH)
     thresholds = []
     for looks in (4, 1):
-        embedded = np.asarray(run.embedding.class_probabilities(describe_looks(clouds, NETWORK, SMALL_CONFIG, looks)))
+        described = describe_looks(clouds, NETWORK, SMALL_CONFIG, looks)
+        embedded = np.asarray(run.embedding.class_probabilities(described))[:40]
         fused = embedded.astype(np.float64) / embedded.sum(axis=1, keepdims=True, dtype=np.float64)
         correct = fused.argmax(axis=1) == LABEL
         thresholds.append(np.quantile(fitted.confidence(fused, embedded)[correct], 1 - calibration.KEPT))

@@ -4,7 +4,7 @@ import dataclasses
 import functools
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -21,6 +21,7 @@ from training.embedding.fit import EmbeddingFit
 from training.embedding.run_embedding import Distractors
 from training.embedding.sampling import ViewTask, render_clouds
 from training.fitting import job
+from training.fitting.calibration import fit_calibration
 from training.fitting.job import RunSettings, check_trained, train_run
 from training.fitting.options import FitOptions, read_metrics
 from training.views.normalized_views import MemoryViews
@@ -63,21 +64,35 @@ def train(out: Path, settings: RunSettings = SETTINGS, **more: Any) -> list[Trai
     return train_run(source(), out, settings, **more)
 
 
+class Whole(NamedTuple):
+    out: Path
+    run: TrainedRun
+    stages: list[str]
+    held_out: list[tuple[int, Cloud]]
+
+
 @pytest.fixture(scope="module")
-def whole(cache: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, TrainedRun, list[str]]:
-    """A run of an uninterrupted training, and the stages of its progress."""
-    out, stages = tmp_path_factory.mktemp("whole") / "run", dict[str, int]()
-    (run,) = train(out, progress=lambda stage, done, total, note: stages.__setitem__(stage, done - total))
+def whole(cache: Path, tmp_path_factory: pytest.TempPathFactory) -> Whole:
+    """An uninterrupted training."""
+    out, stages, views = tmp_path_factory.mktemp("whole") / "run", dict[str, int](), list[tuple[int, Cloud]]()
+
+    def fit(run: TrainedRun, embedding: Embedding, held_out: list[tuple[int, Cloud]]) -> Any:
+        views.extend(held_out)
+        return fit_calibration(run, embedding, held_out)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(job, "fit_calibration", fit)
+        (run,) = train(out, progress=lambda stage, done, total, note: stages.__setitem__(stage, done - total))
     assert set(stages.values()) == {0}
-    return out, run, list(stages)
+    return Whole(out, run, list(stages), views)
 
 
 def rows(out: Path) -> list[dict[str, Any]]:
     return [{**row, "samples_per_second": None} for row in read_metrics(out / "metrics.jsonl")]
 
 
-def test_a_run_without_classifiers(whole: tuple[Path, TrainedRun, list[str]], cache: Path) -> None:
-    out, run, stages = whole
+def test_a_run_without_classifiers(whole: Whole, cache: Path) -> None:
+    out, run, stages, _ = whole
     assert sorted(path.name for path in out.iterdir() if path.name != "weights") == [
         "curves.png",
         "embedding.safetensors",
@@ -103,26 +118,18 @@ def test_a_run_without_classifiers(whole: tuple[Path, TrainedRun, list[str]], ca
     assert len(list(cache.glob("distractors-*.safetensors"))) == 1
 
 
-def test_the_confidence_is_fitted_on_held_out_clouds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_confidence_is_fitted_on_held_out_clouds(whole: Whole) -> None:
     """They are those of the views and of each tenth distractor, in metres."""
-    views: list[tuple[int, Cloud]] = []
-
-    def fit_calibration(run: TrainedRun, embedding: Embedding, held_out: list[tuple[int, Cloud]]) -> tuple[None, float]:
-        views.extend(held_out)
-        return None, 0.0
-
-    monkeypatch.setattr(job, "fit_calibration", fit_calibration)
-    (run,) = train(tmp_path / "run")
+    _, run, _, views = whole
     assert run.embedding is not None and run.embedding.distractors == 9 and run.embedding.sizes.nearest
     assert sorted(label for label, _ in views) == [0, 1, 2, 2, 2, 2]
     expected = render_clouds(ViewTask({0: DISTRACTORS.sources[0]}, 4, run_embedding.SEED))
     for (label, (xyz, rgb)), (_, (points, colors)) in zip(views[2:], expected, strict=True):
         assert label == 2 and np.array_equal(xyz, points) and np.array_equal(rgb, colors)
     for name, (label, cloud) in zip(CLASSES, views, strict=False):  # normalized before, but described as they were
-        looks, before = (
-            np.asarray(describe_looks(PointClouds.pack(clouds), run.network, SMALL_CONFIG, 4).each.images)
-            for clouds in ([cloud], clouds_of_classes()[name])
-        )
+        clouds = PointClouds.pack([*clouds_of_classes()[name], cloud])
+        images = np.asarray(describe_looks(clouds, run.network, SMALL_CONFIG, 4).each.images)
+        before, looks = images[:-1], images[-1:]
         assert label == CLASSES.index(name)
         assert np.abs(before - looks).max(axis=(1, 2, 3, 4)).min() < 0.03 * looks.max()  # of another view: above 0.25
 
@@ -139,8 +146,9 @@ def stop_when(stage: str, step: int) -> Callable[[str, int, int, str], None]:
     return progress
 
 
+@pytest.mark.slow
 def test_an_interrupted_joint_fit_resumes_to_the_same_bytes(
-    whole: tuple[Path, TrainedRun, list[str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    whole: Whole, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Without a cache, the samples of the distractors are those of the run's own directory."""
     monkeypatch.setenv("THOR2_CACHE", "off")
@@ -166,7 +174,7 @@ def test_an_interrupted_joint_fit_resumes_to_the_same_bytes(
     assert not (out / "checkpoints").exists()
 
 
-def test_other_distractors_are_refused_for_a_finished_run(whole: tuple[Path, TrainedRun, list[str]]) -> None:
+def test_other_distractors_are_refused_for_a_finished_run(whole: Whole) -> None:
     check_trained(source().digest, whole[0], SETTINGS)
     for change in ({"networks": 3}, {"epochs": 4}, {"procedural": 11}):
         other = dataclasses.replace(DISTRACTORS, **change)
@@ -174,6 +182,7 @@ def test_other_distractors_are_refused_for_a_finished_run(whole: tuple[Path, Tra
             check_trained(source().digest, whole[0], dataclasses.replace(SETTINGS, distractors=other))
 
 
+@pytest.mark.usefixtures("weights")
 def test_folds_of_embeddings(tmp_path: Path) -> None:
     stages: dict[str, None] = {}
     short = dataclasses.replace(SETTINGS, distractors=dataclasses.replace(DISTRACTORS, epochs=1), folds=2)

@@ -114,6 +114,7 @@ class Interrupted(Exception):
     pass
 
 
+@pytest.mark.slow
 def test_a_resumed_fit_gives_bit_identical_weights(separable: Samples, fitted: Fit, tmp_path: Path) -> None:
     held_out = np.arange(48) % 4 == 0
     expected: list[EpochMetrics] = []
@@ -154,9 +155,9 @@ def test_a_finished_fit_returns_its_classifier_without_steps(separable: Samples,
 
     options = dataclasses.replace(QUICK, epochs=2)
     with Checkpoints(tmp_path) as checkpoints:
-        first = fit(separable, FitContext("ce", NETWORK, CONFIG), options, checkpoints)
+        first = fit(separable, FitContext("tops2", NETWORK, CONFIG), options, checkpoints)
     with Checkpoints(tmp_path) as checkpoints:
-        second = fit(separable, FitContext("ce", NETWORK, CONFIG), options, checkpoints, None, refuse, refuse)
+        second = fit(separable, FitContext("tops2", NETWORK, CONFIG), options, checkpoints, None, refuse, refuse)
     same_bits(first[0], second[0])
     assert first[1] == second[1]
 
@@ -189,16 +190,16 @@ def test_infinite_loss_is_refused_and_the_last_checkpoint_stays(
     separable: Samples, fitted: Fit, tmp_path: Path
 ) -> None:
     broken = dataclasses.replace(separable, color_count=separable.color_count * np.nan)
-    with pytest.raises(thor2.InputError, match="loss of ce is nan .*1"):
-        fitted("ce", samples=broken)
+    with pytest.raises(thor2.InputError, match="loss of tops2 is nan .*1"):
+        fitted("tops2", samples=broken)
     with Checkpoints(tmp_path / "c") as checkpoints:
-        fit(separable, FitContext("ce", NETWORK, CONFIG), dataclasses.replace(QUICK, epochs=2), checkpoints)
+        fit(separable, FitContext("tops2", NETWORK, CONFIG), dataclasses.replace(QUICK, epochs=2), checkpoints)
     with Checkpoints(tmp_path / "c") as checkpoints:
-        with pytest.raises(thor2.InputError, match="loss of ce is nan .*3"):
-            fit(broken, FitContext("ce", NETWORK, CONFIG), QUICK, checkpoints)
+        with pytest.raises(thor2.InputError, match="loss of tops2 is nan .*3"):
+            fit(broken, FitContext("tops2", NETWORK, CONFIG), QUICK, checkpoints)
     with Checkpoints(tmp_path / "c") as checkpoints:
         assert checkpoints.last_epoch == 2
-        fit(separable, FitContext("ce", NETWORK, CONFIG), QUICK, checkpoints)
+        fit(separable, FitContext("tops2", NETWORK, CONFIG), QUICK, checkpoints)
 
 
 def test_too_few_training_samples_are_refused(separable: Samples, fitted: Fit) -> None:

@@ -41,8 +41,10 @@ def expanded(samples: Samples, rows: Any, config: thor2.DescriptorConfig = CONFI
     "config",
     [
         CONFIG,
-        thor2.DescriptorConfig.released(homology="closed_form"),
-        thor2.DescriptorConfig(n_slices=2, n_strips=6, relaxation=thor2.Relaxation()),
+        pytest.param(thor2.DescriptorConfig.released(homology="closed_form"), marks=pytest.mark.slow),
+        pytest.param(
+            thor2.DescriptorConfig(n_slices=2, n_strips=6, relaxation=thor2.Relaxation()), marks=pytest.mark.slow
+        ),
     ],
     ids=["paper", "released", "relaxed"],
 )
