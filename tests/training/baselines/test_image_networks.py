@@ -125,7 +125,6 @@ def test_other_networks_learn(tmp_path: Path, name: str) -> None:
     check_baseline(tmp_path / "run", name)
 
 
-@pytest.mark.slow
 def test_interrupted_fit_resumes_to_the_same_weights(
     trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

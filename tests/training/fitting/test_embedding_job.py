@@ -146,7 +146,6 @@ def stop_when(stage: str, step: int) -> Callable[[str, int, int, str], None]:
     return progress
 
 
-@pytest.mark.slow
 def test_an_interrupted_joint_fit_resumes_to_the_same_bytes(
     whole: Whole, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
