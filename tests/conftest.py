@@ -1,5 +1,6 @@
 """Fixtures shared by all tests, the tiers of tests, and the compilation cache."""
 
+import asyncio
 import gc
 import os
 import shutil
@@ -103,7 +104,19 @@ def strict_dtype_promotion(request: pytest.FixtureRequest) -> Iterator[None]:
         yield
 
 
-@pytest.fixture(scope="module")  # While it is open, other tests cannot call asyncio.run.
+@pytest.fixture(autouse=True)
+def no_running_loop(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Let tests without the browser call asyncio.run: the event loop of Playwright counts as running until it ends."""
+    loop = asyncio._get_running_loop()
+    if loop is not None and "browser" not in request.fixturenames:
+        asyncio._set_running_loop(None)
+        yield
+        asyncio._set_running_loop(loop)
+    else:
+        yield
+
+
+@pytest.fixture(scope="session")
 def browser() -> "Iterator[Browser]":
     """Headless Chromium, for the tests of the pages."""
     from playwright.sync_api import sync_playwright

@@ -1,6 +1,10 @@
 """Actions on the web page of the service that several test files use."""
 
+import time
+from collections.abc import Callable
+
 from playwright.sync_api import Page
+from processes import HANG
 
 FIELDS = {"color": "image/png", "depth": "image/png", "labels": "image/png", "intrinsics": "application/json"}
 
@@ -13,3 +17,11 @@ def upload(page: Page, files: dict[str, bytes], color_name: str = "color.png") -
         name = color_name if field == "color" else field
         page.locator(f"#{field}").set_input_files({"name": name, "mimeType": FIELDS[field], "buffer": content})
     page.get_by_role("button", name="Recognize", exact=True).click()
+
+
+def wait_until(page: Page, condition: Callable[[], bool]) -> None:
+    """Wait for something that the handler of a request does."""
+    deadline = time.monotonic() + HANG
+    while not condition():
+        assert time.monotonic() < deadline
+        page.wait_for_timeout(10)

@@ -224,13 +224,14 @@ def http(server: Server) -> Iterator[httpx.Client]:
         yield client
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def blank_page(browser: Browser) -> Callable[[bool], Page]:
-    """Return a page of a computer or of a phone: one of each for the tests of a file, as a page takes a second."""
+    """Return a page of a computer or of a phone, one of each for all tests; it waits for a tenth of the time."""
 
     @functools.cache
     def page(is_phone: bool) -> Page:
-        made = browser.new_context(is_mobile=is_phone, has_touch=is_phone).new_page()
+        made = browser.new_context(is_mobile=is_phone, has_touch=is_phone, reduced_motion="reduce").new_page()
+        made.add_init_script("const wait = setTimeout; window.setTimeout = (call, ms) => wait(call, ms / 10)")
         made.set_default_timeout(1000 * HANG)
         return made
 

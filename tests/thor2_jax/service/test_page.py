@@ -2,7 +2,6 @@
 
 import io
 import json
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,10 +10,9 @@ import httpx
 import numpy as np
 import pytest
 from helpers import encode_image
-from page_actions import FIELDS, upload
+from page_actions import FIELDS, upload, wait_until
 from PIL import Image
 from playwright.sync_api import Locator, Page, Route, expect
-from processes import HANG
 
 import thor2_jax
 
@@ -244,9 +242,7 @@ def test_page_retries_while_the_service_starts(open_page: Open) -> None:
     page.locator("#samples button").first.click()
     expect(page.get_by_role("status")).to_contain_text("3 of 9")
     expect(page.get_by_role("alert")).to_be_hidden()
-    deadline = time.monotonic() + HANG
-    while not held and time.monotonic() < deadline:  # the retry is held, so that the message stays for the checks
-        page.wait_for_timeout(10)
+    wait_until(page, lambda: bool(held))  # the retry is held, so that the message stays for the checks
     (route,) = held
     route.continue_()
     expect(page.locator("#objects button").first).to_be_visible()

@@ -22,6 +22,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.model.recognition import Recognition
 from thor2_jax.recordings.recorded_frames import RecordedFrame
 from thor2_jax.segmentation.table import segment_table
+from thor2_jax.watch import server
 from thor2_jax.watch.live import LONGEST_PAUSE, LiveView, paced
 from thor2_jax.watch.server import Broadcast, serve_live
 
@@ -199,7 +200,8 @@ def test_page_shows_frames_and_states(browser: Browser, width: int) -> None:
     context.close()
 
 
-def test_page_says_that_the_server_is_gone(browser: Browser) -> None:
+def test_page_says_that_the_server_is_gone(browser: Browser, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(server, "KEEP_ALIVE", 0.05)
     broadcast = Broadcast()
     LiveView(recognize, segment_table, broadcast).show(recorded(1))
     context = browser.new_context()
