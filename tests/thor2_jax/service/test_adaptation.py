@@ -3,13 +3,14 @@
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
+from unittest.mock import create_autospec
 
 import numpy as np
 import pytest
 
 from thor2_jax.adaptation import online
 from thor2_jax.adaptation.color_transform import ColorTransform
-from thor2_jax.adaptation.estimate import Adaptation
+from thor2_jax.adaptation.estimate import Adaptation, estimate_transform
 from thor2_jax.adaptation.online import EVERY, OnlineAdaptation
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.service.answers import adaptation_answer
@@ -43,8 +44,8 @@ def test_the_service_adapts_after_enough_instances(
     teaching_run: Path, is_estimated: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if not is_estimated:  # The tests of thor2_jax.adaptation estimate transforms.
-        monkeypatch.setattr(OnlineAdaptation, "compile", lambda *_: None)
-        monkeypatch.setattr(online, "estimate_transform", estimated)
+        monkeypatch.setattr(online, "Objective", create_autospec(online.Objective))
+        monkeypatch.setattr(online, "estimate_transform", create_autospec(estimate_transform, side_effect=estimated))
     engine = InferenceEngine(Settings(teaching_run, adapt=True))
     engine.compile_adaptation()
     first, second = views(EVERY - 1), views(3)

@@ -300,29 +300,26 @@ def test_label_images_with_many_lost_and_no_objects(open_page: Open, files: File
 
 
 def test_confidence_is_calibrated_or_said_not_to_be(open_page: Open) -> None:
-    calibrated: float | None = None
-    alone = False
+    calibrated: list[float | None] = [None, 0.87, None, 0.5]  # the last two by an embedding alone
 
     def change(answer: Any) -> None:
         for one in answer["instances"]:
-            one["confidence"] = 0.99999
-            one["details"]["calibrated_confidence"] = calibrated
-            if alone:
+            one["confidence"], one["details"]["calibrated_confidence"] = 0.99999, calibrated[0]
+            if len(calibrated) <= 2:
                 one["top"], one["classifier"] = {"embedding": one["top"]["tops"]}, "embedding"
+        del calibrated[0]
 
     page = open_page(changed_answers(change))
     choose_sample(page)
     page.get_by_text("How to read this").click()
     expect(page.locator("#details-facts")).to_contain_text(">99.9\xa0% (not calibrated)")
     expect(page.locator("#objects .confidence").first).to_have_text(">99.9\xa0%")
-    calibrated = 0.87
     choose_sample(page)
     expect(page.locator("#details-facts")).to_contain_text("87\xa0%")
     expect(page.locator("#objects .confidence").first).to_have_text("87\xa0%")
     for words in ("calibrated", "geometric mean"):
         expect(page.locator("#confidence-help")).to_contain_text(words)
-    alone = True
-    for calibrated, text in ((None, "highest probability; divided by"), (0.5, "highest probability. The embedding")):
+    for text in ("highest probability; divided by", "highest probability. The embedding"):
         choose_sample(page)
         expect(page.locator("#classifiers h3")).to_have_text(["Embedding: shape and colour"])
         expect(page.locator("#confidence-help")).to_contain_text(text)

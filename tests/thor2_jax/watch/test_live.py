@@ -168,11 +168,10 @@ def test_server_serves_its_files_and_events_only() -> None:
             pass
 
 
-@pytest.mark.parametrize("width", [1280, 390])
-def test_page_shows_frames_and_states(browser: Browser, width: int) -> None:
+def test_page_shows_frames_and_states(browser: Browser) -> None:
     broadcast, errors = Broadcast(), []
     view = LiveView(recognize, segment_table, broadcast)
-    context = browser.new_context(viewport={"width": width, "height": 800})
+    context = browser.new_context()
     page = context.new_page()
     page.on("pageerror", lambda error: errors.append(str(error)))
     page.on("console", lambda line: errors.append(line.text))
@@ -189,7 +188,9 @@ def test_page_shows_frames_and_states(browser: Browser, width: int) -> None:
         expect(page.locator("#objects .confidence")).to_have_text(["90 %", "90 %"])
         assert page.locator("#picture").evaluate("image => image.decode().then(() => image.naturalWidth)") == 320
         assert float(page.locator("#fps").inner_text()) > 0
-        assert page.evaluate("document.documentElement.scrollWidth") == width
+        for width in (1280, 390):
+            page.set_viewport_size({"width": width, "height": 800})
+            assert page.evaluate("document.documentElement.scrollWidth") == width
         view.show(recorded(2, fail))
         expect(page.locator("#problem")).to_have_text("depth is missing")
         expect(page.locator("#none")).to_be_visible()
