@@ -107,13 +107,12 @@ def strict_dtype_promotion(request: pytest.FixtureRequest) -> Iterator[None]:
 @pytest.fixture(autouse=True)
 def no_running_loop(request: pytest.FixtureRequest) -> Iterator[None]:
     """Let tests without the browser call asyncio.run: the event loop of Playwright counts as running until it ends."""
-    loop = asyncio._get_running_loop()
-    if loop is not None and "browser" not in request.fixturenames:
+    loop = None if "browser" in request.fixturenames else asyncio._get_running_loop()
+    if loop is not None:
         asyncio._set_running_loop(None)
-        yield
+    yield
+    if loop is not None:
         asyncio._set_running_loop(loop)
-    else:
-        yield
 
 
 @pytest.fixture(scope="session")

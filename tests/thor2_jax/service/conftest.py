@@ -186,15 +186,15 @@ def server(start_server: Callable[..., Server]) -> Server:
 
 
 @pytest.fixture(scope="session")
-def teaching_gallery(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def gallery(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("teaching") / "gallery"
 
 
 @pytest.fixture(scope="session")
-def teaching_app(teaching_run: Path, teaching_gallery: Path) -> FastAPI:
+def teaching_app(teaching_run: Path, gallery: Path) -> FastAPI:
     """A service that teaches, with a gallery outside of the run directory."""
     settings = Settings(
-        teaching_run, max_batch=8, processes=1, gallery=teaching_gallery, teach=True, deadline=HANG, warm_why=False
+        teaching_run, max_batch=8, processes=1, gallery=gallery, teach=True, deadline=HANG, warm_why=False
     )
     return create_app(settings)
 

@@ -57,10 +57,25 @@ def pixels(canvas: Locator) -> np.ndarray:
     return np.asarray(Image.open(io.BytesIO(canvas.screenshot())).convert("RGB")).astype(int)
 
 
-def test_sample_is_outlined_and_named(open_page: Open, classes: tuple[str, ...]) -> None:
-    page = open_page(size=(1280, 900))
+def test_sample_is_outlined_and_named_with_details(open_page: Open, classes: tuple[str, ...]) -> None:
+    """Details are visible without scrolling, and those of another object after a click on it."""
+    page = open_page(size=(1280, 800))
     expect(page.locator("#ready")).to_have_text("Ready")
+    page.evaluate(
+        """() => {
+          const { fillText } = CanvasRenderingContext2D.prototype;
+          window.texts = new Set();
+          CanvasRenderingContext2D.prototype.fillText = function (text, ...args) {
+            if (this.canvas.className === "image") window.texts.add(`${text}`);
+            return fillText.call(this, text, ...args);
+          };
+        }"""
+    )
     labels = choose_sample(page)
+    assert page.evaluate("scrollY") == 0
+    for selector in ("#overlay", "#details-facts", "#cloud", "#classifiers"):
+        expect(page.locator(selector)).to_be_in_viewport(ratio=1)
+    assert set(page.evaluate("[...window.texts]")) == {"0", "30", "birth (cm)", "persistence (cm)"}
     count = len(np.unique(labels)) - 1
     buttons = page.locator("#objects button")
     expect(buttons).to_have_count(count)
@@ -79,26 +94,6 @@ def test_sample_is_outlined_and_named(open_page: Open, classes: tuple[str, ...])
         low, high = inside.min(axis=0) - 4, inside.max(axis=0) + 5
         around = ((painted >= low) & (painted <= high)).all(axis=1).sum() * across**2
         assert around > 2 * (high - low).max(), f"object {k} has no outline"
-
-
-def test_details_of_an_object(open_page: Open) -> None:
-    """They are visible without scrolling, and those of another object after a click on it."""
-    page = open_page(size=(1280, 800))
-    page.evaluate(
-        """() => {
-          const { fillText } = CanvasRenderingContext2D.prototype;
-          window.texts = new Set();
-          CanvasRenderingContext2D.prototype.fillText = function (text, ...args) {
-            if (this.canvas.className === "image") window.texts.add(`${text}`);
-            return fillText.call(this, text, ...args);
-          };
-        }"""
-    )
-    labels = choose_sample(page)
-    assert page.evaluate("scrollY") == 0
-    for selector in ("#overlay", "#details-facts", "#cloud", "#classifiers"):
-        expect(page.locator(selector)).to_be_in_viewport(ratio=1)
-    assert set(page.evaluate("[...window.texts]")) == {"0", "30", "birth (cm)", "persistence (cm)"}
     overlay = page.locator("#overlay")
     box = overlay.bounding_box()
     assert box is not None

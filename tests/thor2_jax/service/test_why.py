@@ -117,16 +117,12 @@ def test_why_returns_pictures(teaching_url: str, teaching_app: FastAPI, files: F
 
 
 def test_why_errors_name_the_field(teaching_url: str, files: Files) -> None:
-    for data, field in (
-        ({"instance": "4"}, "instance"),
-        ({"instance": "5"}, "instance"),
-        ({"instance": "x"}, "instance"),
-    ):
-        response = httpx.post(f"{teaching_url}/v1/why", files=files, data=data, timeout=HANG)
-        assert response.status_code == 422 and response.json()["field"] == field
     damaged = files | {"depth": b"damaged"}
-    response = httpx.post(f"{teaching_url}/v1/why", files=damaged, data={"instance": "3"}, timeout=HANG)
-    assert response.status_code == 422 and response.json()["field"] == "depth"
+    for sent, instance, field in ((files, 4, "instance"), (files, 5, "instance"), (damaged, 3, "depth")):
+        response = ask(teaching_url, sent, instance)
+        assert response.status_code == 422 and response.json()["field"] == field
+    response = httpx.post(f"{teaching_url}/v1/why", files=files, data={"instance": "x"}, timeout=HANG)
+    assert response.status_code == 422 and response.json()["field"] == "instance"
 
 
 def ask_why(open_page: Open, url: str, files: Files, answer: Callable[[Route], None], **options: Any) -> Page:

@@ -171,8 +171,7 @@ def test_server_serves_its_files_and_events_only() -> None:
 def test_page_shows_frames_and_states(browser: Browser) -> None:
     broadcast, errors = Broadcast(), []
     view = LiveView(recognize, segment_table, broadcast)
-    context = browser.new_context()
-    page = context.new_page()
+    page = browser.new_page()
     page.on("pageerror", lambda error: errors.append(str(error)))
     page.on("console", lambda line: errors.append(line.text))
     with serve_live(broadcast, port=0) as url:
@@ -198,21 +197,20 @@ def test_page_shows_frames_and_states(browser: Browser) -> None:
         expect(page.locator("#ready")).to_have_text("Stopped")
         expect(page.locator("#problem")).to_have_text("the camera was unplugged")
         assert errors == []
-    context.close()
+    page.close()
 
 
 def test_page_says_that_the_server_is_gone(browser: Browser, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(server, "KEEP_ALIVE", 0.05)
     broadcast = Broadcast()
     LiveView(recognize, segment_table, broadcast).show(recorded(1))
-    context = browser.new_context()
-    page = context.new_page()
+    page = browser.new_page()
     with serve_live(broadcast, port=0) as url:
         page.goto(url)
         expect(page.locator("#ready")).to_have_text("Live")
     expect(page.locator("#ready")).to_have_text("Disconnected")
     expect(page.locator("#picture")).to_be_visible()
-    context.close()
+    page.close()
 
 
 def test_files_of_the_page_are_in_the_package() -> None:
