@@ -17,8 +17,7 @@ from processes import HANG
 from thor2_jax.service import server as serving
 from thor2_jax.service.app import PageFiles
 
-HEAD_SECONDS = 0.25
-WORK = 2 * HEAD_SECONDS
+WORK = 0.5
 HEAD = b"%s /%s HTTP/1.1\r\nHost: localhost\r\n%s\r\n"
 SLOW, QUICK = HEAD % (b"GET", b"slow", b""), HEAD % (b"GET", b"", b"")
 LAST = HEAD % (b"GET", b"", b"Connection: close\r\n")
@@ -56,7 +55,7 @@ def serve(app: Any, *sent: bytes) -> Iterator[tuple[Any, list[socket.socket]]]:
 
 @pytest.fixture
 def short_limits(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(serving, "HEAD_SECONDS", HEAD_SECONDS)
+    monkeypatch.setattr(serving, "HEAD_SECONDS", WORK / 2)
     monkeypatch.setattr(serving, "EARLY_ANSWER_SECONDS", WORK)
 
 

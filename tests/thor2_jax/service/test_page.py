@@ -252,8 +252,7 @@ def test_page_retries_while_the_service_starts(open_page: Open) -> None:
     expect(page.get_by_role("status")).to_contain_text("3 of 9")
     expect(page.get_by_role("alert")).to_be_hidden()
     wait_until(page, lambda: bool(held))  # the retry is held, so that the message stays for the checks
-    (route,) = held
-    route.continue_()
+    held.pop().continue_()
     wait_for_answer(page)
     expect(page.locator("#objects button").first).to_be_visible()
     assert attempts == {"model": 3, "explain": 2}
