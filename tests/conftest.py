@@ -1,5 +1,6 @@
 """Fixtures shared by all tests, the tiers of tests, and the compilation cache."""
 
+import asyncio
 import gc
 import os
 import shutil
@@ -103,7 +104,18 @@ def strict_dtype_promotion(request: pytest.FixtureRequest) -> Iterator[None]:
         yield
 
 
-@pytest.fixture(scope="module")  # While it is open, other tests cannot call asyncio.run.
+@pytest.fixture(autouse=True)
+def no_running_loop(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Let tests without the browser call asyncio.run: the event loop of Playwright counts as running until it ends."""
+    loop = None if "browser" in request.fixturenames else asyncio._get_running_loop()
+    if loop is not None:
+        asyncio._set_running_loop(None)
+    yield
+    if loop is not None:
+        asyncio._set_running_loop(loop)
+
+
+@pytest.fixture(scope="session")
 def browser() -> "Iterator[Browser]":
     """Headless Chromium, for the tests of the pages."""
     from playwright.sync_api import sync_playwright

@@ -186,15 +186,15 @@ def server(start_server: Callable[..., Server]) -> Server:
 
 
 @pytest.fixture(scope="session")
-def teaching_gallery(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def gallery(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("teaching") / "gallery"
 
 
 @pytest.fixture(scope="session")
-def teaching_app(teaching_run: Path, teaching_gallery: Path) -> FastAPI:
+def teaching_app(teaching_run: Path, gallery: Path) -> FastAPI:
     """A service that teaches, with a gallery outside of the run directory."""
     settings = Settings(
-        teaching_run, max_batch=8, processes=1, gallery=teaching_gallery, teach=True, deadline=HANG, warm_why=False
+        teaching_run, max_batch=8, processes=1, gallery=gallery, teach=True, deadline=HANG, warm_why=False
     )
     return create_app(settings)
 
@@ -224,13 +224,14 @@ def http(server: Server) -> Iterator[httpx.Client]:
         yield client
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def blank_page(browser: Browser) -> Callable[[bool], Page]:
-    """Return a page of a computer or of a phone: one of each for the tests of a file, as a page takes a second."""
+    """Return a page of a computer or of a phone, one of each for all tests; it waits for a tenth of the time."""
 
     @functools.cache
     def page(is_phone: bool) -> Page:
-        made = browser.new_context(is_mobile=is_phone, has_touch=is_phone).new_page()
+        made = browser.new_context(is_mobile=is_phone, has_touch=is_phone, reduced_motion="reduce").new_page()
+        made.add_init_script("const wait = setTimeout; window.setTimeout = (call, ms) => wait(call, ms / 10)")
         made.set_default_timeout(1000 * HANG)
         return made
 

@@ -1,11 +1,16 @@
 """A service that adapts to its camera, without HTTP."""
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
+from unittest.mock import create_autospec
 
 import numpy as np
 import pytest
 
+from thor2_jax.adaptation import online
+from thor2_jax.adaptation.color_transform import ColorTransform
+from thor2_jax.adaptation.estimate import Adaptation, estimate_transform
 from thor2_jax.adaptation.online import EVERY, OnlineAdaptation
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.service.answers import adaptation_answer
@@ -25,12 +30,22 @@ def views(count: int) -> list[PreparedInstance]:
     return made
 
 
-def online(engine: InferenceEngine) -> OnlineAdaptation:
+def adaptation_of(engine: InferenceEngine) -> OnlineAdaptation:
     assert engine._online is not None
     return engine._online
 
 
-def test_the_service_adapts_after_enough_instances(teaching_run: Path) -> None:
+def estimated(instances: Sequence[PreparedInstance], *_: object, **__: object) -> Adaptation:
+    return Adaptation(ColorTransform(0.1, -0.1, 0.2, 0.05), len(instances), 1.0, 0.5)
+
+
+@pytest.mark.parametrize("is_estimated", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_the_service_adapts_after_enough_instances(
+    teaching_run: Path, is_estimated: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if not is_estimated:  # The tests of thor2_jax.adaptation estimate transforms.
+        monkeypatch.setattr(online, "Objective", create_autospec(online.Objective))
+        monkeypatch.setattr(online, "estimate_transform", create_autospec(estimate_transform, side_effect=estimated))
     engine = InferenceEngine(Settings(teaching_run, adapt=True))
     engine.compile_adaptation()
     first, second = views(EVERY - 1), views(3)
@@ -41,7 +56,7 @@ def test_the_service_adapts_after_enough_instances(teaching_run: Path) -> None:
     engine.correct(second, observe=False)
     assert engine.adaptation is None and adaptation_answer(None) is None
     engine.correct(second, observe=True)
-    online(engine).join()
+    adaptation_of(engine).join()
     adaptation = engine.adaptation
     assert adaptation is not None and adaptation.instances == EVERY + 2
     (corrected,) = engine.correct(second[:1], observe=False)

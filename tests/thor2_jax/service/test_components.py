@@ -24,6 +24,7 @@ from prometheus_client import CollectorRegistry, Counter
 
 from thor2_jax.client import multipart
 from thor2_jax.errors import InputError
+from thor2_jax.service import preparation
 from thor2_jax.service.app import create_app
 from thor2_jax.service.batching import Batcher
 from thor2_jax.service.metrics import CompilationCounter
@@ -126,10 +127,11 @@ def test_process_returns_results_and_errors(pool: PreparationPool) -> None:
         pool.submit(deadline_in(), math.sqrt, -1.0).result(HANG)
 
 
-def test_slow_process_is_replaced(pool: PreparationPool) -> None:
+def test_slow_process_is_replaced(pool: PreparationPool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(preparation, "MIN_SECONDS", 0.1)
     before = pool.submit(deadline_in(), os.getpid).result(HANG)
     with pytest.raises(RequestError) as late:
-        pool.submit(deadline_in(0.5), time.sleep, 10 * HANG).result(HANG)
+        pool.submit(deadline_in(0.1), time.sleep, 10 * HANG).result(HANG)
     assert late.value.status == 504
     after = pool.submit(deadline_in(), os.getpid).result(HANG)
     assert after != before

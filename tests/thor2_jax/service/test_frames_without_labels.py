@@ -134,15 +134,12 @@ def test_a_segmenter_that_fails_ends_one_request(
 
 
 def test_a_segmenter_that_cannot_be_loaded_stops_the_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert Settings(tmp_path).segmenter == "table"
     with pytest.raises(InputError, match="segmenter is 'sam'; expected one of table"):
         Settings(tmp_path, segmenter="sam")
     monkeypatch.setitem(sys.modules, "thor2_jax.segmentation.table", None)
     with pytest.raises(InputError, match=r"OpenCV.*\[segment\]"):
         Settings(tmp_path, segmenter="table")
-
-
-def test_the_default_segmenter_needs_opencv(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert Settings(tmp_path).segmenter == "table"
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     assert Settings(tmp_path).segmenter is None
 

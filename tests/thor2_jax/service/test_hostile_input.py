@@ -92,9 +92,6 @@ def test_images_of_other_modes_and_formats(http: httpx.Client, files: Files, fra
         ("labels", gif.getvalue()),
     ):
         check_refused(http.post("/v1/recognize", files=files | {field: content}), 422, field)
-
-
-def test_color_of_16_bits_per_channel(http: httpx.Client, files: Files) -> None:
     check_refused(http.post("/v1/recognize", files=files | {"color": deep_png(240, 320)}), 422, "color", "16", "8")
 
 
@@ -156,6 +153,8 @@ def test_invalid_forms(http: httpx.Client, files: Files) -> None:
     for charset in ("punycode", "idna", "undefined", "raw_unicode_escape", "utf-16", "none"):
         headers = {"content-type": f"multipart/form-data; boundary=x; charset={charset}"}
         check_refused(http.post("/v1/recognize", content=b"--x--\r\n", headers=headers), 415, "body", "utf-8")
+    for kind in ("text/plain", "application/x-www-form-urlencoded", ""):
+        assert http.post("/v1/describe", content=b"{}", headers={"content-type": kind}).status_code == 415
     many = [(f"part{k}", b"") for k in range(1000)]
     check_refused(http.post("/v1/recognize", files=many), 400, "body")
 
@@ -237,7 +236,7 @@ def test_damaged_npz_and_decompression_bombs(http: httpx.Client) -> None:
         http.post("/v1/describe", content=npz(points=POINTS, colors=COLORS), headers=NPZ), 422, "sizes", "missing"
     )
 
-    bomb = npz(points=np.zeros((20_000_000, 3), np.float32), colors=COLORS, sizes=np.array([4]))
+    bomb = npz(points=np.zeros((MAX_BODY // 12 + 1, 3), np.float32), colors=COLORS, sizes=np.array([4]))
     assert len(bomb) < 10**6
     check_refused(http.post("/v1/describe", content=bomb, headers=NPZ), 413, "body")
 
@@ -259,7 +258,7 @@ def test_damaged_npz_and_decompression_bombs(http: httpx.Client) -> None:
     check_refused(http.post("/v1/describe", content=archive(b"", zipfile.ZIP_LZMA), headers=NPZ), 422, "body")
 
     # The directory declares fewer bytes than the entry decompresses to.
-    lying = bytearray(archive(bytes(50_000_000)))
+    lying = bytearray(archive(bytes(MAX_BODY + 1)))
     place = lying.rindex(b"PK\x01\x02", 0, lying.rindex(b"points.npy"))
     lying[place + 24 : place + 28] = struct.pack("<I", 1000)
     check_refused(http.post("/v1/describe", content=bytes(lying), headers=NPZ), 422, "points")
@@ -291,11 +290,6 @@ def test_damaged_npz_and_decompression_bombs(http: httpx.Client) -> None:
 def test_invalid_json_clouds(http: httpx.Client, body: bytes, field: str) -> None:
     answer = http.post("/v1/describe", content=body, headers={"content-type": "application/json"})
     check_refused(answer, 422, field)
-
-
-def test_unsupported_content_types(http: httpx.Client) -> None:
-    for kind in ("text/plain", "application/x-www-form-urlencoded", ""):
-        assert http.post("/v1/describe", content=b"{}", headers={"content-type": kind}).status_code == 415
 
 
 def test_slow_frame_is_answered_or_cut_off(short_deadline: str, files: Files) -> None:

@@ -15,6 +15,8 @@ import httpx
 import hypothesis
 import pytest
 import schemathesis
+import uvicorn
+from fastapi import FastAPI
 from hypothesis import HealthCheck
 from processes import HANG
 from schemathesis.checks import not_a_server_error
@@ -23,6 +25,9 @@ from schemathesis.specs.openapi.checks import (
     response_schema_conformance,
     status_code_conformance,
 )
+
+from thor2_jax.service import engine, pipeline
+from thor2_jax.service import server as serving
 
 Files = dict[str, bytes]
 
@@ -62,37 +67,50 @@ def test_soak_without_errors_or_memory_growth(server: Any, files: Files) -> None
 
 
 def test_sigterm_under_load_answers_accepted_requests(
-    start_server: Callable[..., Any], teaching_run: Path, files: Files
+    teaching_app: FastAPI,
+    teaching_url: str,
+    files: Files,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
-    server = start_server("--processes", "1", run=teaching_run)
+    """The service runs in this process, with the compiled programs of another one."""
+    monkeypatch.setattr(pipeline, "InferenceEngine", lambda _: teaching_app.state.service.engine)
+    monkeypatch.setattr(uvicorn.Config, "configure_logging", lambda _: None)
+    monkeypatch.setattr(engine, "POINT_BUCKETS", (engine.MIN_POINTS_BUCKET,))
     answered: list[int] = []
     broken: list[httpx.TransportError] = []
-    stop = threading.Event()
+    is_busy = threading.Event()
 
-    def caller() -> None:
-        while not stop.is_set():
+    def call() -> None:
+        until = time.monotonic() + HANG
+        while not (match := re.search(r"listening at (\S+)", caplog.text)):
+            assert time.monotonic() < until
+            time.sleep(0.01)
+        while True:
             try:
-                answered.append(httpx.post(f"{server.url}/v1/recognize", files=files, timeout=HANG).status_code)
+                answered.append(httpx.post(f"{match[1]}/v1/recognize", files=files, timeout=HANG).status_code)
             except httpx.ConnectError:  # The socket is closed: the request was not accepted.
                 return
             except httpx.TransportError as error:
                 broken.append(error)
                 return
+            if answered.count(200) >= 10:
+                is_busy.set()
 
-    callers = [threading.Thread(target=caller) for _ in range(8)]
-    for one in callers:
-        one.start()
-    while answered.count(200) < 10:
-        time.sleep(0.01)
-    assert server.terminate() == 0
-    stop.set()
-    for one in callers:
-        one.join(HANG)
-    log = server.log.read_text()
-    assert set(answered) <= {200, 503}
+    def terminate() -> None:
+        assert is_busy.wait(HANG)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    handler = signal.getsignal(signal.SIGTERM)
+    with caplog.at_level("INFO"), ThreadPoolExecutor(9) as threads, pytest.raises(SystemExit) as end:
+        for function in (terminate, *[call] * 8):
+            threads.submit(function)
+        serving.serve(teaching_app.state.service.settings, port=0)
+    signal.signal(signal.SIGTERM, handler)
+    assert end.value.code == 0 and set(answered) <= {200, 503}
     accepted = answered.count(200)
-    assert accepted >= 10 and f"stopped: {accepted} requests accepted, {accepted} finished" in log, (broken, log)
-    assert "Traceback" not in log
+    assert accepted >= 10 and f"stopped: {accepted} requests accepted, {accepted} finished" in caplog.text, broken
+    assert "ERROR" not in {record.levelname for record in caplog.records}
 
 
 @pytest.mark.slow

@@ -2,7 +2,6 @@
 
 import io
 import json
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,10 +10,9 @@ import httpx
 import numpy as np
 import pytest
 from helpers import encode_image
-from page_actions import FIELDS, upload
+from page_actions import FIELDS, upload, wait_for_answer, wait_until
 from PIL import Image
 from playwright.sync_api import Locator, Page, Route, expect
-from processes import HANG
 
 import thor2_jax
 
@@ -26,6 +24,7 @@ SAMPLES = Path(thor2_jax.__file__).parent / "service" / "page" / "samples"
 def choose_sample(page: Page) -> np.ndarray:
     """Recognize the first sample and return its labels."""
     page.locator("#samples button").first.click()
+    wait_for_answer(page)
     expect(page.locator("#objects button").first).to_be_visible()
     folder = json.loads((SAMPLES / "index.json").read_text())[0]["folder"]
     return np.asarray(Image.open(SAMPLES / folder / "labels.png"))
@@ -58,10 +57,25 @@ def pixels(canvas: Locator) -> np.ndarray:
     return np.asarray(Image.open(io.BytesIO(canvas.screenshot())).convert("RGB")).astype(int)
 
 
-def test_sample_is_outlined_and_named(open_page: Open, classes: tuple[str, ...]) -> None:
-    page = open_page(size=(1280, 900))
+def test_sample_is_outlined_and_named_with_details(open_page: Open, classes: tuple[str, ...]) -> None:
+    """Details are visible without scrolling, and those of another object after a click on it."""
+    page = open_page(size=(1280, 800))
     expect(page.locator("#ready")).to_have_text("Ready")
+    page.evaluate(
+        """() => {
+          const { fillText } = CanvasRenderingContext2D.prototype;
+          window.texts = new Set();
+          CanvasRenderingContext2D.prototype.fillText = function (text, ...args) {
+            if (this.canvas.className === "image") window.texts.add(`${text}`);
+            return fillText.call(this, text, ...args);
+          };
+        }"""
+    )
     labels = choose_sample(page)
+    assert page.evaluate("scrollY") == 0
+    for selector in ("#overlay", "#details-facts", "#cloud", "#classifiers"):
+        expect(page.locator(selector)).to_be_in_viewport(ratio=1)
+    assert set(page.evaluate("[...window.texts]")) == {"0", "30", "birth (cm)", "persistence (cm)"}
     count = len(np.unique(labels)) - 1
     buttons = page.locator("#objects button")
     expect(buttons).to_have_count(count)
@@ -80,11 +94,6 @@ def test_sample_is_outlined_and_named(open_page: Open, classes: tuple[str, ...])
         low, high = inside.min(axis=0) - 4, inside.max(axis=0) + 5
         around = ((painted >= low) & (painted <= high)).all(axis=1).sum() * across**2
         assert around > 2 * (high - low).max(), f"object {k} has no outline"
-
-
-def test_click_shows_the_details_of_an_object(open_page: Open) -> None:
-    page = open_page(size=(1280, 900))
-    labels = choose_sample(page)
     overlay = page.locator("#overlay")
     box = overlay.bounding_box()
     assert box is not None
@@ -135,6 +144,7 @@ def test_keyboard_navigation(open_page: Open, classes: tuple[str, ...]) -> None:
 
     tab_to("#samples button:nth-child(2)")
     page.keyboard.press("Enter")
+    wait_for_answer(page)
     expect(page.locator("#objects button").first).to_be_visible()
     tab_to("#objects li:nth-child(3) button")
     page.keyboard.press("Space")
@@ -145,7 +155,7 @@ def test_keyboard_navigation(open_page: Open, classes: tuple[str, ...]) -> None:
     expect(page.locator("#classes li")).to_have_count(len(classes))
 
 
-def test_uploaded_frame(open_page: Open, files: Files) -> None:
+def test_uploaded_frame(open_page: Open, files: Files, tmp_path: Path) -> None:
     page = open_page()
     upload(page, files, color_name="<b>x</b>.png")
     status = page.get_by_role("status")
@@ -159,13 +169,14 @@ def test_uploaded_frame(open_page: Open, files: Files) -> None:
     expect(page.locator("#evidence")).to_be_hidden()
     page.locator('#objects button[data-label="7"]').click()
     expect(page.locator("#evidence")).to_be_visible()
-
-
-def test_frame_without_objects(open_page: Open, files: Files) -> None:
-    page = open_page()
-    upload(page, files | {"labels": encode_image(np.zeros((240, 320), np.uint8))})
-    expect(page.get_by_role("status")).to_contain_text("no objects")
-    expect(page.locator("#details")).to_be_hidden()
+    expect(page.locator("#masks")).to_be_hidden()  # The frame came with masks.
+    expect(page.locator("#naming")).to_be_hidden()  # The service does not teach.
+    expect(page.locator("#objects")).not_to_contain_text("Name this object")
+    (tmp_path / "large").write_bytes(bytes(20 * 2**20))
+    page.get_by_text("Upload your own frame").click()
+    page.locator("#color").set_input_files(tmp_path / "large")
+    page.get_by_role("button", name="Recognize", exact=True).click()
+    expect(page.get_by_role("alert")).to_contain_text("bytes")
 
 
 def test_errors_appear_beside_their_fields(open_page: Open, http: httpx.Client, files: Files) -> None:
@@ -187,18 +198,14 @@ def test_errors_appear_beside_their_fields(open_page: Open, http: httpx.Client, 
         assert f"{field}-error" in (page.locator(f"#{field}").get_attribute("aria-describedby") or "")
         expect(page.locator(".error:not(:empty)")).to_have_count(1)
         expect(page.locator("#result")).to_be_hidden()
-    upload(page, files)
-    expect(page.locator("#objects button")).to_have_count(4)
-    expect(page.locator(".error:not(:empty), [aria-invalid]")).to_have_count(0)
-
-
-def test_all_field_errors_are_shown(open_page: Open, files: Files) -> None:
-    page = open_page()
     upload(page, files | {"color": b"damaged", "depth": files["color"], "intrinsics": b"{}"})
     for field in ("color", "depth", "intrinsics"):
         expect(page.locator(f"#{field}-error")).to_contain_text(field)
     expect(page.locator("#labels-error")).to_be_empty()
     expect(page.locator("#color")).to_be_focused()
+    upload(page, files)
+    expect(page.locator("#objects button")).to_have_count(4)
+    expect(page.locator(".error:not(:empty), [aria-invalid]")).to_have_count(0)
 
 
 def test_samples_need_a_model_that_knows_their_objects(open_page: Open, classes: tuple[str, ...]) -> None:
@@ -244,21 +251,11 @@ def test_page_retries_while_the_service_starts(open_page: Open) -> None:
     page.locator("#samples button").first.click()
     expect(page.get_by_role("status")).to_contain_text("3 of 9")
     expect(page.get_by_role("alert")).to_be_hidden()
-    deadline = time.monotonic() + HANG
-    while not held and time.monotonic() < deadline:  # the retry is held, so that the message stays for the checks
-        page.wait_for_timeout(10)
-    (route,) = held
-    route.continue_()
+    wait_until(page, lambda: bool(held))  # the retry is held, so that the message stays for the checks
+    held.pop().continue_()
+    wait_for_answer(page)
     expect(page.locator("#objects button").first).to_be_visible()
     assert attempts == {"model": 3, "explain": 2}
-
-
-def test_details_are_visible_without_scrolling(open_page: Open) -> None:
-    page = open_page(size=(1280, 800))
-    choose_sample(page)
-    assert page.evaluate("scrollY") == 0
-    for selector in ("#overlay", "#details-facts", "#cloud", "#classifiers"):
-        expect(page.locator(selector)).to_be_in_viewport(ratio=1)
 
 
 @pytest.mark.parametrize("scheme", [pytest.param("light", marks=pytest.mark.slow), "dark"])
@@ -279,68 +276,47 @@ def test_a_phone_scrolls_little_and_keeps_the_picture(open_page: Open, scheme: s
     assert len(np.unique(pixels(phone.locator("#cloud")).reshape(-1, 3), axis=0)) > 20
 
 
-def test_sixteen_objects_have_different_colors(open_page: Open, files: Files) -> None:
+def test_label_images_with_many_lost_and_no_objects(open_page: Open, files: Files) -> None:
     page = open_page()
     rows, columns = np.indices((240, 320))
     upload(page, files | {"labels": encode_image((4 * (rows // 60) + columns // 80 + 1).astype(np.uint8))})
     expect(page.locator("#objects button")).to_have_count(16)
     script = "all => all.map(one => one.style.backgroundColor)"
     assert len(set(page.locator("#objects .swatch").evaluate_all(script))) == 16
-
-
-def test_persistence_images_have_axes(open_page: Open) -> None:
-    page = open_page()
-    page.evaluate(
-        """() => {
-          const { fillText } = CanvasRenderingContext2D.prototype;
-          window.texts = new Set();
-          CanvasRenderingContext2D.prototype.fillText = function (text, ...args) {
-            if (this.canvas.className === "image") window.texts.add(`${text}`);
-            return fillText.call(this, text, ...args);
-          };
-        }"""
-    )
-    choose_sample(page)
-    assert set(page.evaluate("[...window.texts]")) == {"0", "30", "birth (cm)", "persistence (cm)"}
+    # The label map of this image is subsampled so that the second object disappears.
+    upload(page, files | {"labels": encode_image(np.tile(np.array([1, 2], np.uint8), (240, 160)))})
+    expect(page.locator("#objects button")).to_have_count(2)
+    page.locator('#objects button[data-label="2"]').click()
+    expect(page.locator("#details-facts")).to_contain_text("Label 2 ")
+    upload(page, files | {"labels": encode_image(np.zeros((240, 320), np.uint8))})
+    expect(page.get_by_role("status")).to_contain_text("no objects")
+    expect(page.locator("#details")).to_be_hidden()
 
 
 def test_confidence_is_calibrated_or_said_not_to_be(open_page: Open) -> None:
-    def with_confidence(calibrated: float | None) -> Callable[[Route], None]:
-        def change(answer: Any) -> None:
-            for one in answer["instances"]:
-                one["confidence"] = 0.99999
-                one["details"]["calibrated_confidence"] = calibrated
+    calibrated: list[float | None] = [None, 0.87, None, 0.5]  # the last two by an embedding alone
 
-        return changed_answers(change)
+    def change(answer: Any) -> None:
+        for one in answer["instances"]:
+            one["confidence"], one["details"]["calibrated_confidence"] = 0.99999, calibrated[0]
+            if len(calibrated) <= 2:
+                one["top"], one["classifier"] = {"embedding": one["top"]["tops"]}, "embedding"
+        del calibrated[0]
 
-    page = open_page(with_confidence(None))
+    page = open_page(changed_answers(change))
     choose_sample(page)
+    page.get_by_text("How to read this").click()
     expect(page.locator("#details-facts")).to_contain_text(">99.9\xa0% (not calibrated)")
     expect(page.locator("#objects .confidence").first).to_have_text(">99.9\xa0%")
-    page = open_page(with_confidence(0.87))
     choose_sample(page)
     expect(page.locator("#details-facts")).to_contain_text("87\xa0%")
     expect(page.locator("#objects .confidence").first).to_have_text("87\xa0%")
-    page.get_by_text("How to read this").click()
     for words in ("calibrated", "geometric mean"):
         expect(page.locator("#confidence-help")).to_contain_text(words)
-
-
-def test_details_of_an_embedding_alone(open_page: Open) -> None:
-    def with_confidence(calibrated: float | None) -> Callable[[Route], None]:
-        def change(answer: Any) -> None:
-            for one in answer["instances"]:
-                one["top"], one["classifier"] = {"embedding": one["top"]["tops"]}, "embedding"
-                one["details"]["calibrated_confidence"] = calibrated
-
-        return changed_answers(change)
-
-    for calibrated, words in ((None, "highest probability; divided by"), (0.5, "highest probability. The embedding")):
-        page = open_page(with_confidence(calibrated))
+    for text in ("highest probability; divided by", "highest probability. The embedding"):
         choose_sample(page)
         expect(page.locator("#classifiers h3")).to_have_text(["Embedding: shape and colour"])
-        page.get_by_text("How to read this").click()
-        expect(page.locator("#confidence-help")).to_contain_text(words)
+        expect(page.locator("#confidence-help")).to_contain_text(text)
 
 
 def test_bidirectional_controls_in_names_are_escaped(open_page: Open, files: Files) -> None:
@@ -400,17 +376,6 @@ def test_error_responses_are_shown(open_page: Open) -> None:
         expect(page.locator("#result")).to_be_hidden()
     choose_sample(page)
     expect(page.get_by_role("alert")).to_be_hidden()
-
-
-def test_files_over_the_size_limit(open_page: Open, files: Files, tmp_path: Path) -> None:
-    page = open_page()
-    upload(page, files)
-    expect(page.locator("#objects button")).to_have_count(4)
-    (tmp_path / "large").write_bytes(bytes(20 * 2**20))
-    page.get_by_text("Upload your own frame").click()
-    page.locator("#color").set_input_files(tmp_path / "large")
-    page.get_by_role("button", name="Recognize", exact=True).click()
-    expect(page.get_by_role("alert")).to_contain_text("bytes")
 
 
 def test_phone_width(open_page: Open, files: Files) -> None:
@@ -478,16 +443,22 @@ def with_long_names(answer: Any) -> None:
         one["name"] = one["name"] and LONG
 
 
-def test_tags_of_a_narrow_image_do_not_overlap(open_page: Open, files: Files) -> None:
+@pytest.mark.slow
+def test_tags_of_samples_do_not_overlap(open_page: Open) -> None:
     page = open_page(changed_answers(with_long_names), size=(360, 740), phone=True)
     page.evaluate(RECORD_TAGS)
     for k, sample in enumerate(json.loads((SAMPLES / "index.json").read_text())):
         page.locator("#samples button").nth(k).tap()
+        wait_for_answer(page)
         expect(page.get_by_role("status")).to_contain_text(f"{sample['title']}: ")
         tags = tags_of(page)
         assert len(tags) == page.locator("#objects button").count()
         assert sum(text == LONG for text, _ in tags) > len(tags) / 2
 
+
+def test_tags_of_a_narrow_image_do_not_overlap(open_page: Open, files: Files) -> None:
+    page = open_page(changed_answers(with_long_names), size=(360, 740), phone=True)
+    page.evaluate(RECORD_TAGS)
     labels = np.zeros((240, 320), np.uint8)
     for number in range(48):
         y, x = divmod(number, 8)
@@ -496,7 +467,7 @@ def test_tags_of_a_narrow_image_do_not_overlap(open_page: Open, files: Files) ->
     expect(page.locator("#objects button")).to_have_count(48)
     tags = tags_of(page)
     numbers = [tag for tag in tags if tag[0].isdigit()]
-    assert len(tags) == 48 and len(numbers) > 24
+    assert len(tags) == 48 and len(numbers) > 24 and LONG in {text for text, _ in tags}
     for number, (left, top, right, bottom) in numbers[::10]:
         page.locator("#overlay").tap(position={"x": (left + right) / 2, "y": (top + bottom) / 2})
         chosen = page.locator('#objects button[aria-pressed="true"]')
@@ -522,15 +493,6 @@ def test_tags_do_not_hide_small_objects(open_page: Open, files: Files) -> None:
             sides = np.minimum(box[2:], region[2:]) - np.maximum(box[:2], region[:2])
             covered = np.clip(sides, 0, None).prod() / (region[2:] - region[:2]).prod()
             assert covered <= 0.34, f"{text} hides an object"
-
-
-def test_object_lost_in_the_subsampled_label_map(open_page: Open, files: Files) -> None:
-    """The label map of this image is subsampled so that the second object disappears."""
-    page = open_page()
-    upload(page, files | {"labels": encode_image(np.tile(np.array([1, 2], np.uint8), (240, 160)))})
-    expect(page.locator("#objects button")).to_have_count(2)
-    page.locator('#objects button[data-label="2"]').click()
-    expect(page.locator("#details-facts")).to_contain_text("Label 2 ")
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])

@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from page_actions import upload
+from page_actions import upload, wait_for_answer
 from PIL import Image
 from playwright.sync_api import Page, Route, expect
 
@@ -43,6 +43,7 @@ def click(page: Page, x: float, y: float) -> None:
 
 
 def count(page: Page, objects: int) -> None:
+    wait_for_answer(page)
     expect(page.locator("#objects button")).to_have_count(objects)
 
 
@@ -109,13 +110,6 @@ def test_a_piece_is_split_along_a_cut(open_page: Open, unlabelled: Files, labels
     page.get_by_role("button", name="Split").click()
     page.keyboard.press("Escape")
     expect(page.locator("#split")).to_have_attribute("aria-pressed", "false")
-
-
-def test_frames_with_masks_have_no_tools(open_page: Open, files: Files) -> None:
-    page = open_page()
-    upload(page, files)
-    count(page, 4)
-    expect(page.locator("#masks")).to_be_hidden()
 
 
 def test_labels_are_required_where_the_service_does_not_segment(open_page: Open, unlabelled: Files) -> None:

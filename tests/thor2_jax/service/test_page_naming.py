@@ -71,6 +71,7 @@ def test_a_named_object_is_known_until_undo(open_teaching: Open, files: Files, t
     expect(page.locator("#classes li")).to_have_count(2)
 
 
+@pytest.mark.slow  # quick ones are the test above, and of the next frame one in test_teaching.py
 def test_the_next_frame_knows_a_named_object(open_teaching: Open, files: Files) -> None:
     page = open_teaching(without_trained_classes)
     recognize(page, files)
@@ -82,7 +83,7 @@ def test_the_next_frame_knows_a_named_object(open_teaching: Open, files: Files) 
     expect(second.locator("#notice")).to_be_hidden()
 
 
-def test_a_known_name_gets_another_view(open_teaching: Open, files: Files, teaching_url: str) -> None:
+def test_a_known_name_gets_another_view_until_undo(open_teaching: Open, files: Files, teaching_url: str) -> None:
     page = open_teaching()
     recognize(page, files)
     name_object(page, 200, "teapot")
@@ -93,6 +94,12 @@ def test_a_known_name_gets_another_view(open_teaching: Open, files: Files, teach
     expect(page.locator("#notice-text")).to_contain_text("taken back")
     listed = httpx.get(f"{teaching_url}/v1/objects").json()["objects"]
     assert [each["views"] for each in listed if each["name"] == "teapot"] == [1]
+    name_object(page, 7, "teapot")
+    expect(page.locator("#notice-text")).to_contain_text("“teapot” has 2 views")
+    httpx.delete(f"{teaching_url}/v1/objects/teapot")
+    page.get_by_role("button", name="Undo").click()
+    expect(page.locator("#notice-text")).to_contain_text("Another change")
+    expect(page.get_by_role("button", name="Undo")).to_be_hidden()
 
 
 def test_what_is_typed_while_the_frame_is_recognized_again_stays(open_teaching: Open, files: Files) -> None:
@@ -108,17 +115,6 @@ def test_what_is_typed_while_the_frame_is_recognized_again_stays(open_teaching: 
     expect(page.locator("#status")).not_to_contain_text("Recognizing")
     expect(page.locator('#objects button[aria-pressed="true"]')).to_have_attribute("data-label", "7")
     expect(page.locator("#name")).to_have_value("cup")
-
-
-def test_undo_after_another_change_is_refused(open_teaching: Open, files: Files, teaching_url: str) -> None:
-    page = open_teaching()
-    recognize(page, files)
-    name_object(page, 200, "teapot")
-    expect(page.locator("#notice-text")).to_contain_text("is enrolled")
-    httpx.delete(f"{teaching_url}/v1/objects/teapot")
-    page.get_by_role("button", name="Undo").click()
-    expect(page.locator("#notice-text")).to_contain_text("Another change")
-    expect(page.get_by_role("button", name="Undo")).to_be_hidden()
 
 
 def test_problems_of_a_name_appear_beside_it(open_teaching: Open, files: Files) -> None:
@@ -149,14 +145,6 @@ def test_errors_of_the_gallery_are_shown(open_teaching: Open, files: Files) -> N
     name_object(page, 200, "mug")
     expect(page.locator("#name-error")).to_have_text("The gallery cannot be written; it is as before.")
     expect(page.locator("#objects button").first).to_be_visible()
-
-
-def test_a_service_that_does_not_teach_has_no_form(open_page: Open, files: Files) -> None:
-    page = open_page()
-    recognize(page, files)
-    expect(page.locator("#details-title")).to_be_visible()
-    expect(page.locator("#naming")).to_be_hidden()
-    expect(page.locator("#objects")).not_to_contain_text("Name this object")
 
 
 def test_the_form_fits_a_phone(open_teaching: Open, files: Files) -> None:

@@ -40,11 +40,6 @@ Files = dict[str, bytes]
 
 
 @pytest.fixture
-def gallery(teaching_gallery: Path) -> Path:
-    return teaching_gallery
-
-
-@pytest.fixture
 def http(teaching_url: str, gallery: Path, files: Files) -> Iterator[httpx.Client]:
     """The service with an empty gallery; it still answers after the test."""
     shutil.rmtree(gallery, ignore_errors=True)

@@ -9,7 +9,7 @@ from typing import Any
 import httpx
 import pytest
 from fastapi import FastAPI
-from page_actions import upload
+from page_actions import upload, wait_until
 from PIL import Image
 from playwright.sync_api import Page, Route, expect
 from processes import HANG
@@ -117,16 +117,12 @@ def test_why_returns_pictures(teaching_url: str, teaching_app: FastAPI, files: F
 
 
 def test_why_errors_name_the_field(teaching_url: str, files: Files) -> None:
-    for data, field in (
-        ({"instance": "4"}, "instance"),
-        ({"instance": "5"}, "instance"),
-        ({"instance": "x"}, "instance"),
-    ):
-        response = httpx.post(f"{teaching_url}/v1/why", files=files, data=data, timeout=HANG)
-        assert response.status_code == 422 and response.json()["field"] == field
     damaged = files | {"depth": b"damaged"}
-    response = httpx.post(f"{teaching_url}/v1/why", files=damaged, data={"instance": "3"}, timeout=HANG)
-    assert response.status_code == 422 and response.json()["field"] == "depth"
+    for sent, instance, field in ((files, 4, "instance"), (files, 5, "instance"), (damaged, 3, "depth")):
+        response = ask(teaching_url, sent, instance)
+        assert response.status_code == 422 and response.json()["field"] == field
+    response = httpx.post(f"{teaching_url}/v1/why", files=files, data={"instance": "x"}, timeout=HANG)
+    assert response.status_code == 422 and response.json()["field"] == "instance"
 
 
 def ask_why(open_page: Open, url: str, files: Files, answer: Callable[[Route], None], **options: Any) -> Page:
@@ -145,15 +141,14 @@ def ask_why(open_page: Open, url: str, files: Files, answer: Callable[[Route], N
     return page
 
 
-@pytest.mark.parametrize("width", [1280, 390])
-def test_page_shows_why(open_page: Open, teaching_url: str, files: Files, width: int) -> None:
+def test_page_shows_why(open_page: Open, teaching_url: str, files: Files) -> None:
     forms = []
 
     def answer_why(route: Route) -> None:
         forms.append(route.request.post_data_buffer)
         route.fulfill(json=ANSWER)
 
-    page = ask_why(open_page, teaching_url, files, answer_why, size=(width, 900))
+    page = ask_why(open_page, teaching_url, files, answer_why)
     expect(page.locator("#why-status")).to_contain_text("2.5")
     expect(page.locator("#why-status")).to_contain_text("red +20")
     shown = page.locator("#why-pictures canvas")
@@ -161,7 +156,9 @@ def test_page_shows_why(open_page: Open, teaching_url: str, files: Files, width:
     assert [shown.nth(k).evaluate("canvas => canvas.width") for k in (0, 1)] == [600, 300]
     expect(shown.first).to_have_attribute("aria-label", "What decided, on the photo. Orange speaks for a.")
     assert b'name="instance"\r\n\r\n3\r\n' in forms[0]
-    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    assert page.evaluate("document.documentElement.scrollWidth") <= 1280
+    page.set_viewport_size({"width": 390, "height": 900})
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
     page.locator('#objects button[data-label="7"]').click()  # the explanation belonged to the other object
     expect(shown).to_have_count(0)
     expect(page.locator("#why-status")).to_have_text("")
@@ -175,13 +172,13 @@ def test_page_waits_while_explanations_are_compiled(open_page: Open, teaching_ur
         if len(requests) == 1:
             problem = {"field": None, "message": "Explanations are still being compiled."}
             route.fulfill(status=503, json=problem, headers={"Retry-After": "1"})
-        else:
-            route.fulfill(json=ANSWER)
 
     page = ask_why(open_page, teaching_url, files, compile_first)
     expect(page.locator("#why-status")).to_contain_text("still being compiled")
     expect(page.get_by_role("button", name="Why?")).to_be_disabled()
-    expect(page.locator("#why-status")).to_contain_text("2.5", timeout=60_000)
+    wait_until(page, lambda: len(requests) == 2)  # the message stays until it is answered
+    requests[1].fulfill(json=ANSWER)
+    expect(page.locator("#why-status")).to_contain_text("2.5")
     expect(page.locator("#why-pictures canvas")).to_have_count(2)
 
 

@@ -22,6 +22,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.model.recognition import Recognition
 from thor2_jax.recordings.recorded_frames import RecordedFrame
 from thor2_jax.segmentation.table import segment_table
+from thor2_jax.watch import server
 from thor2_jax.watch.live import LONGEST_PAUSE, LiveView, paced
 from thor2_jax.watch.server import Broadcast, serve_live
 
@@ -167,12 +168,10 @@ def test_server_serves_its_files_and_events_only() -> None:
             pass
 
 
-@pytest.mark.parametrize("width", [1280, 390])
-def test_page_shows_frames_and_states(browser: Browser, width: int) -> None:
+def test_page_shows_frames_and_states(browser: Browser) -> None:
     broadcast, errors = Broadcast(), []
     view = LiveView(recognize, segment_table, broadcast)
-    context = browser.new_context(viewport={"width": width, "height": 800})
-    page = context.new_page()
+    page = browser.new_page()
     page.on("pageerror", lambda error: errors.append(str(error)))
     page.on("console", lambda line: errors.append(line.text))
     with serve_live(broadcast, port=0) as url:
@@ -188,7 +187,9 @@ def test_page_shows_frames_and_states(browser: Browser, width: int) -> None:
         expect(page.locator("#objects .confidence")).to_have_text(["90 %", "90 %"])
         assert page.locator("#picture").evaluate("image => image.decode().then(() => image.naturalWidth)") == 320
         assert float(page.locator("#fps").inner_text()) > 0
-        assert page.evaluate("document.documentElement.scrollWidth") == width
+        for width in (1280, 390):
+            page.set_viewport_size({"width": width, "height": 800})
+            assert page.evaluate("document.documentElement.scrollWidth") == width
         view.show(recorded(2, fail))
         expect(page.locator("#problem")).to_have_text("depth is missing")
         expect(page.locator("#none")).to_be_visible()
@@ -196,20 +197,20 @@ def test_page_shows_frames_and_states(browser: Browser, width: int) -> None:
         expect(page.locator("#ready")).to_have_text("Stopped")
         expect(page.locator("#problem")).to_have_text("the camera was unplugged")
         assert errors == []
-    context.close()
+    page.close()
 
 
-def test_page_says_that_the_server_is_gone(browser: Browser) -> None:
+def test_page_says_that_the_server_is_gone(browser: Browser, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(server, "KEEP_ALIVE", 0.05)
     broadcast = Broadcast()
     LiveView(recognize, segment_table, broadcast).show(recorded(1))
-    context = browser.new_context()
-    page = context.new_page()
+    page = browser.new_page()
     with serve_live(broadcast, port=0) as url:
         page.goto(url)
         expect(page.locator("#ready")).to_have_text("Live")
     expect(page.locator("#ready")).to_have_text("Disconnected")
     expect(page.locator("#picture")).to_be_visible()
-    context.close()
+    page.close()
 
 
 def test_files_of_the_page_are_in_the_package() -> None:
