@@ -121,6 +121,7 @@ def run_command(monkeypatch: pytest.MonkeyPatch, *arguments: Any) -> None:
     cameras.main()
 
 
+@pytest.mark.slow
 def test_command_writes_all_cameras(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -100,7 +100,7 @@ def test_warm_colours_are_shared_by_the_softmax() -> None:
         np.testing.assert_allclose(weights, expected / total, atol=1e-5)
 
 
-@pytest.mark.parametrize("temperature", [0.3, 2.0, 30.0])
+@pytest.mark.parametrize("temperature", [2.0, *(pytest.param(t, marks=pytest.mark.slow) for t in (0.3, 30.0))])
 def test_regions_change_without_a_jump_along_a_path_of_colours(temperature: float) -> None:
     path = np.linspace(0, 1, 40_001)[:, None] * [1.1, 0.7, -0.8] + [-0.05, 0.1, 0.9]
     weights = np.asarray(shares_of(path.astype(np.float32), temperature))
@@ -122,6 +122,7 @@ def test_a_strip_that_is_left_vanishes_without_a_jump() -> None:
         assert (steps.max() > 0.1) == (config.relaxation is None)
 
 
+@pytest.mark.slow
 def test_gradients_flow_where_the_hard_ones_are_zero() -> None:
     points, rgb = cloud_in_cells(3, 200)
     normal = thor2.PointClouds.pack([(points[:, [2, 1, 0]], rgb)], 208)

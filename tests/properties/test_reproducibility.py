@@ -16,6 +16,7 @@ NETWORK = colornet.load_default()
 CONFIG = thor2.DescriptorConfig()
 
 
+@pytest.mark.slow
 @given(
     aligned=laws.packed(laws.aligned_clouds(CONFIG), 4, 512), clouds=laws.packed(laws.decided_clouds(CONFIG), 4, 512)
 )

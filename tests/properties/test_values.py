@@ -23,6 +23,7 @@ def aligned_batches(max_points: int = 512, margin: float = 0.1, reach: float = 1
     return laws.packed(laws.aligned_clouds(CONFIG, max_points=max_points, margin=margin, reach=reach), SIZE, 512)
 
 
+@pytest.mark.slow
 @given(clouds=laws.packed(laws.camera_clouds(), SIZE, 512), aligned=aligned_batches(reach=1.5))
 def test_gudhi_is_the_closed_form(clouds: thor2.PointClouds, aligned: thor2.PointClouds) -> None:
     for function, batch in ((thor2.describe, clouds), (thor2.describe_aligned, aligned)):

@@ -67,7 +67,7 @@ def test_an_exported_recognizer_runs_without_this_package(run: TrainedRun, tmp_p
 
 
 def test_an_embedding_of_other_classes_is_not_exported() -> None:
-    run = untrained_embedding_run("abc", ("tops",))
+    run = untrained_embedding_run("abc", ("tops",), dataclasses.replace(SMALL_CONFIG, looks=1))
     assert run.embedding is not None
     other = dataclasses.replace(run, embedding=dataclasses.replace(run.embedding, classes=("a",)))
     exported = jax.export.deserialize(bytearray(export_recognizer(other, n_points=512, n_clouds=1)))

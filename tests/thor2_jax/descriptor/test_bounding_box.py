@@ -125,6 +125,7 @@ def test_support_points_of_an_empty_cloud() -> None:
     np.testing.assert_array_equal(compiled_support(np.zeros((3, 16), np.float32)), np.zeros((3, 66)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("capacity", [528, 1024])
 def test_padding_does_not_change_the_box(capacity: int) -> None:
     points = shapes()[1]

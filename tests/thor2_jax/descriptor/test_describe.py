@@ -131,7 +131,8 @@ def test_batches_in_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
         jax.tree.map(lambda a, b, same=same: same(a, b[order]), actual[k], expected[k])
 
 
-@pytest.mark.parametrize("homology", ["gudhi", pytest.param("closed_form", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("homology", ["gudhi", "closed_form"])
 def test_inside_a_callers_jit_and_vmap(homology: str) -> None:
     """Uses a new network, so that no result of an earlier trace can be reused."""
     network = dataclasses.replace(NETWORK, n_raw_nodes={"gudhi": 24, "closed_form": 25}[homology])

@@ -1,5 +1,6 @@
 """One batch on eight devices and in two processes against one device, each in separate processes."""
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from jax.sharding import Mesh
 
 import colornet
 import thor2_jax as thor2
+from thor2_jax.descriptor import sharding
 from thor2_jax.descriptor.sharding import batch_mesh, describe_sharded, shard_clouds
 
 _CLOUDS = """
@@ -66,12 +68,16 @@ np.save(sys.argv[1], np.asarray(thor2.describe(packed, network, thor2.Descriptor
 """
 
 
-def test_one_device() -> None:
+def test_each_device_describes_its_clouds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a function that compiles at once in place of `describe`, and one device."""
+    monkeypatch.setattr(sharding, "describe", lambda clouds, network, config: (clouds.points * config.alpha, clouds))
+    config = dataclasses.replace(SMALL_CONFIG, alpha=0.3)  # of no other test
     network, packed = colornet.load_default(), thor2.PointClouds.pack([aligned_cloud(k, 100) for k in range(3)])
-    sharded = describe_sharded(shard_clouds(packed, batch_mesh()), network, SMALL_CONFIG)
-    np.testing.assert_array_equal(sharded.tops2, thor2.describe(packed, network, SMALL_CONFIG).tops2)
+    turned, clouds = describe_sharded(shard_clouds(packed, batch_mesh()), network, config)
+    np.testing.assert_allclose(turned, packed.points * config.alpha)
+    jax.tree.map(np.testing.assert_array_equal, clouds, packed)
     with pytest.raises(thor2.InputError, match="shard_clouds"):
-        describe_sharded(packed, network, SMALL_CONFIG)
+        describe_sharded(packed, network, config)
     with pytest.raises(thor2.InputError, match="multiple of 2"):
         shard_clouds(packed, Mesh(np.array(jax.devices() * 2), ("batch",)))
 

@@ -118,6 +118,7 @@ def test_a_missing_network_is_reported(prefix: str, tmp_path: Path) -> None:
         Embedding.load(path)
 
 
+@pytest.mark.slow
 def test_padding_and_batch_do_not_matter(embedding: Embedding, clouds: thor2.PointClouds) -> None:
     padded = embedding.embed(thor2.PointClouds.pack([box_cloud(1), box_cloud(0)], capacity=1024))
     np.testing.assert_allclose(padded, np.asarray(embedding.embed(clouds))[[1, 0]], atol=1e-5)

@@ -18,7 +18,14 @@ from thor2_jax.service.settings import Settings
 pytestmark = pytest.mark.usefixtures("small_buckets")
 
 
-@pytest.mark.parametrize(("trained", "answer_by"), [((), None), (("a", "b"), None), (("a", "b"), "classifiers")])
+@pytest.mark.parametrize(
+    ("trained", "answer_by"),
+    [
+        (("a", "b"), None),
+        pytest.param((), None, marks=pytest.mark.slow),
+        pytest.param(("a", "b"), "classifiers", marks=pytest.mark.slow),
+    ],
+)
 def test_the_engine_answers_as_the_recognizer(
     trained: tuple[str, ...], answer_by: str | None, frame: thor2.RGBDFrame, tmp_path: Path
 ) -> None:

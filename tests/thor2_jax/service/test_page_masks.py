@@ -51,7 +51,7 @@ def select(page: Page, label: int) -> None:
     page.locator(f'#objects button[data-label="{label}"]').click()
 
 
-def test_pieces_are_dropped_and_restored(open_page: Open, unlabelled: Files, labels: np.ndarray) -> None:
+def test_pieces_are_dropped_restored_and_merged(open_page: Open, unlabelled: Files, labels: np.ndarray) -> None:
     sent = SentLabels()
     page = open_page(sent)
     upload(page, unlabelled)
@@ -66,13 +66,6 @@ def test_pieces_are_dropped_and_restored(open_page: Open, unlabelled: Files, lab
     count(page, 3)
     np.testing.assert_array_equal(sent.images[-1], labels)
     expect(page.locator("#undo-mask")).to_be_disabled()
-
-
-def test_pieces_are_merged(open_page: Open, unlabelled: Files, labels: np.ndarray) -> None:
-    sent = SentLabels()
-    page = open_page(sent)
-    upload(page, unlabelled)
-    count(page, 3)
     select(page, 3)
     page.get_by_role("button", name="Merge").click()
     expect(page.locator("#merge")).to_have_attribute("aria-pressed", "true")
@@ -140,6 +133,7 @@ def test_a_failing_segmenter_is_reported_beside_the_labels(open_page: Open, unla
     expect(page.locator("#labels-error")).to_have_text(message)
 
 
+@pytest.mark.slow
 def test_the_tools_fit_a_phone(open_page: Open, unlabelled: Files) -> None:
     page = open_page(size=(390, 800), phone=True)
     upload(page, unlabelled)

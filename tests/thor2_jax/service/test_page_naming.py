@@ -147,6 +147,7 @@ def test_errors_of_the_gallery_are_shown(open_teaching: Open, files: Files) -> N
     expect(page.locator("#objects button").first).to_be_visible()
 
 
+@pytest.mark.slow
 def test_the_form_fits_a_phone(open_teaching: Open, files: Files) -> None:
     page = open_teaching(without_trained_classes, size=(360, 740))
     recognize(page, files)

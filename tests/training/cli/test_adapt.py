@@ -107,6 +107,7 @@ def test_commands_use_a_run_whose_embedding_alone_answers(
     assert report["main"] == "embedding" and report["instances"]["scored"] == 3
 
 
+@pytest.mark.slow
 def test_enrolled_frames_are_corrected(adapted: Path, tmp_path: Path) -> None:
     folder = write_frame(tmp_path / "labelled", {1: "brick"})
     frame = read_frame(**{name: folder / file for name, file in FILES.items()})  # type: ignore[arg-type]

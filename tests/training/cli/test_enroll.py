@@ -91,6 +91,7 @@ def test_evaluation_has_a_gallery_column(model: Path, tmp_path: Path) -> None:
     assert "<td>" in page and "<tbody></tbody>" not in page and "THOR2 is the fusion" not in page
 
 
+@pytest.mark.slow
 def test_a_trained_run_answers_by_both(frames: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     model = tmp_path / "run"
     save_run(untrained_run(("brick", "mug"), ("tops", "tops2")), model)

@@ -45,7 +45,8 @@ def test_folders_may_hold_links_to_frames(folder: Path, tmp_path: Path) -> None:
     assert [source.name for source in find_frames([tmp_path])] == ["000", "002"]
 
 
-@pytest.mark.parametrize("is_segmented", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("is_segmented", [False, True])
 def test_chunks_of_frames_have_the_same_answers(model: Path, folder: Path, tmp_path: Path, is_segmented: bool) -> None:
     arguments, sources = RecognizerArguments(model), find_frames([folder])
     if is_segmented:  # frames of the size that other tests of this folder segment

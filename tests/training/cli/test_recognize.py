@@ -163,7 +163,7 @@ def test_no_file_of_the_user_is_replaced(
     assert {path: path.read_bytes() for path in frames.rglob("*") if path.is_file()} == before
 
 
-@pytest.mark.parametrize("segmenter", ["table", "model"])
+@pytest.mark.parametrize("segmenter", ["table", pytest.param("model", marks=pytest.mark.slow)])
 def test_frames_without_labels_are_segmented(
     model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], segmenter: str
 ) -> None:
