@@ -111,8 +111,7 @@ def check_baseline(folder: Path, name: str) -> None:
     assert loaded.weights[name] == [] and loaded.temperatures[name] > 0
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", [SMALL, "templates"])
+@pytest.mark.parametrize("name", [SMALL, pytest.param("templates", marks=pytest.mark.slow)])
 def test_network_and_templates_learn(trained: Path, name: str) -> None:
     train_baselines(trained, SOURCE, [name], options=OPTIONS)
     check_baseline(trained, name)
@@ -160,7 +159,6 @@ def write_weights(folder: Path, name: str = SMALL, seed: int = 0) -> Path:
     return folder
 
 
-@pytest.mark.slow
 def test_pretrained_weights_are_used_and_recorded(tmp_path: Path) -> None:
     weights = write_weights(tmp_path / "weights")
     (file,) = pretrained_files(SMALL)

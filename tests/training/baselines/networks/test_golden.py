@@ -38,7 +38,6 @@ def assert_golden(name: str, outputs: list[Any]) -> None:
     np.testing.assert_allclose(actual, expected, rtol=2e-3, atol=2e-4 * np.abs(expected).max())
 
 
-@pytest.mark.slow
 def test_resnet_matches_timm(tmp_path: Path) -> None:
     model = loaded(lambda: ResNet18(rngs=nnx.Rngs(0)), tmp_path)
     assert_golden("resnet18", nnx.jit(model)(jnp.asarray(random_images("resnet18", 2, 64))))
