@@ -146,7 +146,9 @@ def test_views_of_one_object_become_more_similar(views: Samples, fitted: tuple[E
 def test_further_networks_leave_the_first_as_it_is(views: Samples, fitted: tuple[Embedding, list[Any]]) -> None:
     done, options = [], dataclasses.replace(OPTIONS, networks=2)
     show = lambda *numbers: done.append(numbers[:2])  # noqa: E731
+    programs = fit._step._cache_size()
     two = fit_embedding(views, NETWORK, SMALL_CONFIG, options, SIZES, show, CLASSES)
+    assert fit._step._cache_size() == programs + 1  # all steps share one
     assert done == [(3 * epoch, 36) for epoch in range(1, 13)]
     (second,) = two.further
     assert dataclasses.replace(two, further=()).fingerprint == fitted[0].fingerprint
