@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 from unittest import mock
 
 import numpy as np
+import pytest
 from flax import nnx
 from numpy.typing import NDArray
 from PIL import Image
@@ -36,6 +37,11 @@ from training.rendering.scenes import compose_scene
 
 SMALL_CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=2, n_strips=5, image_size=8)
 """A descriptor that compiles quickly."""
+
+
+def slow(*values: Any) -> list[Any]:
+    """Return values of a test's parameter that only the slow tier takes."""
+    return [pytest.param(value, marks=pytest.mark.slow) for value in values]
 
 
 def untrained_run(

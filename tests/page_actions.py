@@ -1,10 +1,9 @@
 """Actions on the web page of the service that several test files use."""
 
-import time
 from collections.abc import Callable
 
+import processes
 from playwright.sync_api import Page
-from processes import HANG
 
 FIELDS = {"color": "image/png", "depth": "image/png", "labels": "image/png", "intrinsics": "application/json"}
 
@@ -27,7 +26,4 @@ def wait_for_answer(page: Page) -> None:
 
 def wait_until(page: Page, condition: Callable[[], bool]) -> None:
     """Wait for something that the handler of a request does."""
-    deadline = time.monotonic() + HANG
-    while not condition():
-        assert time.monotonic() < deadline
-        page.wait_for_timeout(10)
+    processes.wait_until(condition, pause=lambda seconds: page.wait_for_timeout(1000 * seconds))

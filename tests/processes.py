@@ -3,6 +3,7 @@
 import os
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +46,18 @@ def end_descendants_with_this_process() -> None:
     os.posix_spawn(command[0], command, os.environ, file_actions=[(os.POSIX_SPAWN_DUP2, read, 0)], setsid=True)
     os.close(read)
     os.environ[MARK] = value
+
+
+def wait_until(
+    condition: Callable[[], object],
+    explain: Callable[[], str] = str,
+    pause: Callable[[float], object] = time.sleep,
+) -> None:
+    """Wait until a condition holds, at most `HANG` seconds; `explain` gives the message of the failure."""
+    until = time.monotonic() + HANG
+    while not condition():
+        assert time.monotonic() < until, explain()
+        pause(0.02)
 
 
 def is_running(pid: int) -> bool:

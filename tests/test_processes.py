@@ -4,11 +4,10 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
-from processes import HANG, is_running
+from processes import is_running, wait_until
 
 PROGRAM = """
 import subprocess, sys
@@ -31,7 +30,4 @@ def test_a_server_ends_with_the_tests_that_started_it(end: str) -> None:
         server = int(tests.stdout.readline())
         if end == "wait":
             tests.send_signal(signal.SIGKILL)
-    until = time.monotonic() + HANG
-    while is_running(server):
-        assert time.monotonic() < until
-        time.sleep(0.01)
+    wait_until(lambda: not is_running(server))

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import slow
 
 import colornet
 import thor2_jax as thor2
@@ -94,9 +95,7 @@ def assert_differences_agree(loss: Loss, *arguments: Any, step: float = 1e-6) ->
 
 
 @pytest.mark.usefixtures("x64")
-@pytest.mark.parametrize(
-    "name", ["gudhi", *(pytest.param(n, marks=pytest.mark.slow) for n in ("closed_form", "relaxed"))]
-)
+@pytest.mark.parametrize("name", ["gudhi", *slow("closed_form", "relaxed")])
 def test_aligned_clouds_against_finite_differences(name: str) -> None:
     config, aligned = CONFIGS[name], clouds_of(in_cells)
     loss = loss_of(thor2.describe_aligned, aligned, config)

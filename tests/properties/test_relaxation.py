@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import slow
 
 import colornet
 import thor2_jax as thor2
@@ -100,7 +101,7 @@ def test_warm_colours_are_shared_by_the_softmax() -> None:
         np.testing.assert_allclose(weights, expected / total, atol=1e-5)
 
 
-@pytest.mark.parametrize("temperature", [2.0, *(pytest.param(t, marks=pytest.mark.slow) for t in (0.3, 30.0))])
+@pytest.mark.parametrize("temperature", [2.0, *slow(0.3, 30.0)])
 def test_regions_change_without_a_jump_along_a_path_of_colours(temperature: float) -> None:
     path = np.linspace(0, 1, 40_001)[:, None] * [1.1, 0.7, -0.8] + [-0.05, 0.1, 0.9]
     weights = np.asarray(shares_of(path.astype(np.float32), temperature))

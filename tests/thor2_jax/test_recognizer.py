@@ -5,7 +5,7 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
-from helpers import class_probabilities, untrained_run
+from helpers import class_probabilities, slow, untrained_run
 
 import thor2_jax as thor2
 from thor2_jax.frames.prepared_instance import PreparedInstance
@@ -118,7 +118,7 @@ def test_half_of_the_points_may_overflow_with_a_name(recognizer: Recognizer) -> 
 
 @pytest.mark.parametrize(
     "change",
-    [{"fx": 1e-9}, *(pytest.param(k, marks=pytest.mark.slow) for k in ({"cx": 1e8}, {"fx": 20.0, "fy": 20.0}))],
+    [{"fx": 1e-9}, *slow({"cx": 1e8}, {"fx": 20.0, "fy": 20.0})],
 )
 def test_no_names_with_absurd_intrinsics(recognizer: Recognizer, change: dict[str, float]) -> None:
     frame = tilted(patches())

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from helpers import SMALL_CONFIG
+from helpers import SMALL_CONFIG, slow
 from sklearn.base import clone
 from sklearn.linear_model import LogisticRegression
 from sklearn.model_selection import GridSearchCV
@@ -57,7 +57,7 @@ def test_checks_of_scikit_learn(check: str, transformer: Any) -> None:
     getattr(estimator_checks, check)(transformer.__name__, transformer())
 
 
-@pytest.mark.parametrize("count", [5, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 3))])
+@pytest.mark.parametrize("count", [5, *slow(1, 3)])
 def test_values_are_those_of_describe(count: int) -> None:
     clouds = random_clouds(5)
     expected = described(clouds)

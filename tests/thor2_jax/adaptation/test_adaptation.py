@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import class_probabilities, untrained_embedding_run, untrained_run
+from helpers import class_probabilities, slow, untrained_embedding_run, untrained_run
 from scipy.stats import entropy as scipy_entropy
 
 import thor2_jax as thor2
@@ -175,9 +175,7 @@ def test_gallery_answers_are_its_scores() -> None:
     np.testing.assert_allclose(gallery_classifier(recognizer.gallery, embedding)(oriented), expected, atol=2e-3)
 
 
-@pytest.mark.parametrize(
-    "rule", ["max", *(pytest.param(rule, marks=pytest.mark.slow) for rule in ("mean", "log-mean"))]
-)
+@pytest.mark.parametrize("rule", ["max", *slow("mean", "log-mean")])
 def test_the_criterion_obeys_the_fusion_rule(rule: FusionRule) -> None:
     recognizer = Recognizer(run(), rule=rule)
     network, config, classify = adaptation_criterion(recognizer.model)

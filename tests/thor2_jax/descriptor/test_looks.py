@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import slow
 
 import colornet
 import thor2_jax as thor2
@@ -51,7 +52,7 @@ def look(aligned: thor2.PointClouds, number: int, which: int, count: int) -> Clo
     return np.asarray(aligned.points)[row][mask], np.asarray(aligned.colors)[row][mask]
 
 
-@pytest.mark.parametrize("count", [4, *(pytest.param(n, marks=pytest.mark.slow) for n in LOOK_COUNTS[:-1])])
+@pytest.mark.parametrize("count", [4, *slow(*LOOK_COUNTS[:-1])])
 def test_the_first_look_is_that_of_align(count: int) -> None:
     (aligned, weights), expected = aligned_looks(PACKED, CONFIG, count), thor2.align(PACKED, CONFIG)
     assert aligned.points.shape == (2 * count, *PACKED.points.shape[1:])

@@ -95,7 +95,7 @@ def strips_of(n_clouds: int) -> thor2.Strips:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("n_clouds", [0, pytest.param(1, marks=pytest.mark.slow), 5])
+@pytest.mark.parametrize("n_clouds", [0, 1, 5])
 def test_with_and_without_jit_and_vmap(n_clouds: int) -> None:
     strips = strips_of(n_clouds)
     expected = jax.jit(diagrams_of_strips, static_argnums=1)(strips, CLOSED)

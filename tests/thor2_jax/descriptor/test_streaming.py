@@ -4,6 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from helpers import slow
 
 import colornet
 import thor2_jax as thor2
@@ -20,7 +21,7 @@ def clouds(count: int, seed: int = 0) -> Iterator[tuple[np.ndarray, np.ndarray]]
         yield rng.random((n, 3)) * (0.2, 0.1, 0.05), rng.integers(0, 256, (n, 3), dtype=np.uint8)
 
 
-@pytest.mark.parametrize("count", [8, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 4, 9))])
+@pytest.mark.parametrize("count", [8, *slow(1, 4, 9)])
 def test_against_one_batch(count: int) -> None:
     batches = list(describe_stream(clouds(count), NETWORK, CONFIG, capacity=512, batch=4))
     assert [len(p.overflow) for p in batches] == [4] * (count // 4) + ([count % 4] if count % 4 else [])

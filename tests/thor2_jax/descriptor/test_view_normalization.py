@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
+from helpers import slow
 from scipy.spatial.transform import Rotation
 
 import thor2_jax as thor2
@@ -70,7 +71,7 @@ def test_a_rigid_motion_of_cloud_and_camera_changes_nothing(seed: int) -> None:
     np.testing.assert_allclose(moved, normalized(points, camera=camera), atol=5e-6)
 
 
-@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2, 3))])
+@pytest.mark.parametrize("seed", [0, *slow(1, 2, 3)])
 def test_order_duplicates_and_other_clouds_change_nothing(seed: int) -> None:
     points = object_cloud(seed)
     expected = normalized(points)

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import SMALL_CONFIG, class_probabilities, untrained_embedding_run, untrained_run
+from helpers import SMALL_CONFIG, class_probabilities, slow, untrained_embedding_run, untrained_run
 from scipy.special import logit
 
 import colornet
@@ -101,7 +101,7 @@ def test_margin_is_the_log_odds_of_the_answer(
     assert float(scores.margin(jnp.asarray(values), index)[0]) == pytest.approx(logit(answer.confidence), abs=1e-3)
 
 
-@pytest.mark.parametrize("looks", [*(pytest.param(n, marks=pytest.mark.slow) for n in (1, 2)), 4])
+@pytest.mark.parametrize("looks", [*slow(1, 2), 4])
 def test_a_gallery_is_explained_by_the_looks_of_recognition(looks: int, frame: thor2.RGBDFrame) -> None:
     run = untrained_embedding_run(CLASSES, config=dataclasses.replace(SMALL_CONFIG, looks=looks))
     recognizer = Recognizer(run)

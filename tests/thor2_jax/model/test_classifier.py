@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import nnx
+from helpers import slow
 
 import thor2_jax as thor2
 from thor2_jax.model.classifier import FEATURES, HIDDEN, MLP, SPARSE_BATCH, check_features, feature_of
@@ -59,7 +60,7 @@ def test_logits_against_numpy(n: int, model: MLP) -> None:
     np.testing.assert_allclose(logits, numpy_logits(model, x, own_statistics=False), rtol=1e-4, atol=1e-4)
 
 
-@pytest.mark.parametrize("n", [SPARSE_BATCH, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, SPARSE_BATCH + 1))])
+@pytest.mark.parametrize("n", [SPARSE_BATCH, *slow(1, SPARSE_BATCH + 1)])
 @pytest.mark.parametrize(
     "n_used", [0, 1, 4, 5, 9, 10, 33]
 )  # a tenth of 33 inputs, rounded up, is 4, and a quarter is 9

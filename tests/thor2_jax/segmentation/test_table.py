@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from helpers import slow
 from segmentation_scenes import Box, best_overlaps, render
 
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame
@@ -136,9 +137,7 @@ def test_a_mirrored_frame_has_mirrored_labels() -> None:
     assert (best_overlaps(again, labels) > 0.9).all()
 
 
-@pytest.mark.parametrize(
-    "size", [(481, 641), *(pytest.param(s, marks=pytest.mark.slow) for s in ((480, 640), (720, 1280)))]
-)
+@pytest.mark.parametrize("size", [(481, 641), *slow((480, 640), (720, 1280))])
 def test_larger_images_have_labels_of_their_size(size: tuple[int, int]) -> None:
     frame = render(APART, size=size)
     labels = segment_table(frame)

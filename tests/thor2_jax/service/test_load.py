@@ -4,7 +4,6 @@ import os
 import re
 import signal
 import threading
-import time
 from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -18,7 +17,7 @@ import schemathesis
 import uvicorn
 from fastapi import FastAPI
 from hypothesis import HealthCheck
-from processes import HANG
+from processes import HANG, wait_until
 from schemathesis.checks import not_a_server_error
 from schemathesis.specs.openapi.checks import (
     content_type_conformance,
@@ -82,13 +81,11 @@ def test_sigterm_under_load_answers_accepted_requests(
     is_busy = threading.Event()
 
     def call() -> None:
-        until = time.monotonic() + HANG
-        while not (match := re.search(r"listening at (\S+)", caplog.text)):
-            assert time.monotonic() < until
-            time.sleep(0.01)
+        wait_until(lambda: "listening at " in caplog.text)
+        url = re.findall(r"listening at (\S+)", caplog.text)[0]
         while True:
             try:
-                answered.append(httpx.post(f"{match[1]}/v1/recognize", files=files, timeout=HANG).status_code)
+                answered.append(httpx.post(f"{url}/v1/recognize", files=files, timeout=HANG).status_code)
             except httpx.ConnectError:  # The socket is closed: the request was not accepted.
                 return
             except httpx.TransportError as error:
@@ -116,10 +113,7 @@ def test_sigterm_under_load_answers_accepted_requests(
 @pytest.mark.slow
 def test_workers_share_a_port_and_metrics(start_server: Callable[..., Any], files: Files) -> None:
     server = start_server("--workers", "2", "--processes", "1")
-    until = time.monotonic() + HANG
-    while server.log.read_text().count("ready:") < 2:
-        assert time.monotonic() < until
-        time.sleep(0.1)
+    wait_until(lambda: server.log.read_text().count("ready:") >= 2)
     assert send_many(server.url, files, 60, 8) == {200: 60}
     assert count_answered(server.url) == 60
     assert "thor2_compilations_after_warm_up_total 0.0" in httpx.get(f"{server.url}/metrics").text.splitlines()
@@ -132,12 +126,6 @@ def test_workers_share_a_port_and_metrics(start_server: Callable[..., Any], file
 def test_only_ready_workers_answer_and_end_with_their_parent(start_server: Callable[..., Any], files: Files) -> None:
     server = start_server("--workers", "2", "--processes", "1")
 
-    def wait_for(condition: Callable[[], bool]) -> None:
-        until = time.monotonic() + HANG
-        while not condition():
-            assert time.monotonic() < until, server.log.read_text()
-            time.sleep(0.1)
-
     def readiness() -> Any:
         answer = httpx.get(f"{server.url}/readyz", timeout=HANG)
         assert answer.status_code == 200
@@ -146,20 +134,20 @@ def test_only_ready_workers_answer_and_end_with_their_parent(start_server: Calla
     def count_ready() -> int:
         return server.log.read_text().count("ready: ")
 
-    wait_for(lambda: count_ready() == 2)
+    wait_until(lambda: count_ready() == 2, server.log.read_text)
     assert readiness() == {"status": "ready", "ready_workers": 2, "workers": 2}
     workers = re.findall(r"Started server process \[(\d+)\]", server.log.read_text())
     os.kill(int(workers[0]), signal.SIGKILL)
-    wait_for(lambda: len(re.findall("Started server process", server.log.read_text())) == 3)
+    wait_until(lambda: len(re.findall("Started server process", server.log.read_text())) == 3, server.log.read_text)
     rounds = 0
     while count_ready() < 3:
         assert readiness()["ready_workers"] == 1 or count_ready() == 3
         assert send_many(server.url, files, 8, 4) == {200: 8}
         rounds += 1
     assert rounds > 0
-    wait_for(lambda: readiness()["ready_workers"] == 2)
+    wait_until(lambda: readiness()["ready_workers"] == 2, server.log.read_text)
     server.process.kill()  # the workers do not outlive the process that started them
-    wait_for(lambda: server.log.read_text().count("stopped: ") == 2)
+    wait_until(lambda: server.log.read_text().count("stopped: ") == 2, server.log.read_text)
     with pytest.raises(httpx.TransportError):
         httpx.get(f"{server.url}/healthz")
     assert "Traceback" not in server.log.read_text()

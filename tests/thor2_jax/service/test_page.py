@@ -259,7 +259,7 @@ def test_page_retries_while_the_service_starts(open_page: Open) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scheme", [pytest.param("light", marks=pytest.mark.slow), "dark"])
+@pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_a_phone_scrolls_little_and_keeps_the_picture(open_page: Open, scheme: str) -> None:
     size = (390, 844)
     phone = open_page(size=size, phone=True, scheme=scheme)

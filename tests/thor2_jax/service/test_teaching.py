@@ -20,7 +20,7 @@ import schemathesis
 from fastapi import FastAPI
 from helpers import encode_image
 from hypothesis import HealthCheck
-from processes import HANG
+from processes import HANG, wait_until
 from schemathesis.checks import not_a_server_error
 from schemathesis.specs.openapi.checks import response_schema_conformance, status_code_conformance
 
@@ -469,10 +469,7 @@ def test_all_workers_know_an_object_within_a_second(
 ) -> None:
     options = ("--teach", "--gallery", str(tmp_path / "gallery"), "--workers", "2", "--processes", "1")
     server = start_server(*options, run=teaching_run)
-    until = time.monotonic() + HANG
-    while server.log.read_text().count("ready:") < 2:
-        assert time.monotonic() < until
-        time.sleep(0.1)
+    wait_until(lambda: server.log.read_text().count("ready:") >= 2)
     with httpx.Client(base_url=server.url, timeout=HANG) as client:
         for name in ("tall", "high"):
             assert enroll(client, files, name).status_code == 200

@@ -167,7 +167,7 @@ def test_runs_may_have_different_classifiers(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("calibrated", [True, pytest.param(False, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("calibrated", [True, False])
 def test_an_embedding_alone_is_evaluated(tmp_path: Path, calibrated: bool) -> None:
     record: dict[str, object] = {"calibration": vars(Calibration(0.0, 1.0, 1.0, 0.5, 0.1))} if calibrated else {}
     config = dataclasses.replace(SMALL_CONFIG, looks=2)

@@ -4,13 +4,12 @@ import platform
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 
 import pytest
-from processes import HANG, is_running
+from processes import HANG, is_running, wait_until
 
 from thor2_jax.errors import InputError
 from training.storage import workers as worker_pools
@@ -90,10 +89,7 @@ time.sleep(10_000)
         workers = [int(pid) for pid in parent.stdout.readline().split()]
         assert workers and all(is_running(pid) for pid in workers)
         parent.send_signal(signal.SIGKILL)
-    end = time.monotonic() + HANG
-    while any(map(is_running, workers)) and time.monotonic() < end:
-        time.sleep(0.05)
-    assert not any(map(is_running, workers))
+    wait_until(lambda: not any(map(is_running, workers)))
 
 
 def test_invalid_arguments_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
