@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageFile
 
-from thor2_jax.errors import InputError
+from thor2_jax.errors import InputError, needs_extra
 from thor2_jax.files import open_file
 
 __all__ = ["MAX_IMAGE_PIXELS", "has_16_bit_channels", "read_depth", "read_image", "read_npy"]
@@ -119,12 +119,8 @@ def _read_exr(path: Path) -> NDArray[Any]:
     """Read the depth channel of an EXR file."""
     with open_file(path):  # an OSError if it cannot be opened: OpenEXR raises others
         pass
-    try:
+    with needs_extra(f"depth: {path} is an EXR file; expected PNG, TIFF or NPY; EXR", "OpenEXR", "exr"):
         import OpenEXR
-    except ImportError:
-        raise InputError(
-            f"depth: {path} is an EXR file; expected PNG, TIFF or NPY, or the package OpenEXR (pip install OpenEXR)"
-        ) from None
     with _damage_named(f"depth: {path} is a damaged EXR file", _EXPECTED):
         with OpenEXR.File(str(path), separate_channels=True, header_only=True) as header:
             low, high = header.header()["dataWindow"]
