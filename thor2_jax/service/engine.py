@@ -20,7 +20,7 @@ from thor2_jax.explanation.explain import explained_kinds
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.gallery.objects import ObjectGallery
 from thor2_jax.gallery.store import INDEX_FILE, check_index
-from thor2_jax.model.fusion import fuse, fused_probabilities, with_temperature
+from thor2_jax.model.fusion import fused_probabilities, with_temperature
 from thor2_jax.model.inference import Inference, answers, infer
 from thor2_jax.model.model import Model
 from thor2_jax.model.recognition import Recognition
@@ -210,7 +210,7 @@ class InferenceEngine:
             return [float(p) for p in model.fused(probabilities).max(axis=1)]
         if not set(THOR2) <= set(temperatures):
             return [None] * len(results)
-        index = fuse({name: probabilities[name] for name in THOR2}).class_index
+        index = fused_probabilities({name: probabilities[name] for name in THOR2}).argmax(axis=1)
         calibrated = fused_probabilities({n: with_temperature(probabilities[n], temperatures[n]) for n in THOR2})
         return [float(p) for p in calibrated[np.arange(len(results)), index]]
 
