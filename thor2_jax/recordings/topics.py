@@ -50,15 +50,9 @@ def choose_topics(
     if camera is None:
         if not needs_camera:
             return Topics(color, depth)
-        siblings = [_camera_of(topic) for topic in (color, depth)]
+        siblings = [f"{_uncompressed(topic).rpartition('/')[0]}/camera_info" for topic in (color, depth)]
         camera = next((topic for topic in siblings if kinds.get(topic) == "camera"), None)
     return Topics(color, depth, _choose("camera", camera, kinds, types))
-
-
-def _camera_of(topic: str) -> str:
-    """Return the topic with the intrinsics of an image topic: camera_info beside the images."""
-    base = _uncompressed(topic)
-    return f"{base.rpartition('/')[0]}/camera_info"
 
 
 def _uncompressed(topic: str) -> str:
