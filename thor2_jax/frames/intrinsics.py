@@ -208,7 +208,7 @@ def _pinhole_matrix(values: Mapping[Any, Any], *names: str) -> list[Any]:
 
 
 def _of_pinhole(values: Mapping[Any, Any]) -> _Parts:
-    scale = values.get("depth_scale")
+    scale: Any = values.get("depth_scale")
     has_size = None not in (_entry(values, "width", "image_width"), _entry(values, "height", "image_height"))
     if has_size and _is_number(scale) and 0 < scale <= MAX_BOP_CAMERA_SCALE:
         scale = 1000 / scale  # BOP's camera.json

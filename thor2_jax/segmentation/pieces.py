@@ -6,6 +6,7 @@ between them, and both sides of hollow things, are then merged.
 """
 
 import dataclasses
+from typing import Any
 
 import cv2
 import numpy as np
@@ -214,7 +215,7 @@ def _belong_together(borders: _Borders, shapes: _Shapes, colored: NDArray[np.boo
     part_by_color = (colored[a] != colored[b]) & (shapes.tall[a] | shapes.tall[b])
     apart = borders.length < LEAST_CONTACT * np.minimum(borders.perimeter[a], borders.perimeter[b])
     cases = [enclosed, part_by_color, shapes.low[a] & shapes.low[b], apart]
-    answers = [True, borders.contrast < PART, True, False]
+    answers: list[Any] = [True, borders.contrast < PART, True, False]
     is_border = (borders.step >= EDGE) | ((borders.fold > FOLD) & (borders.contrast > CONTRAST))
     return np.select(cases, answers, ~is_border)
 
