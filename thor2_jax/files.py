@@ -187,11 +187,10 @@ def content_digest(parts: Iterable[str | bytes]) -> str:
     return digest.hexdigest()
 
 
-def directory_digest(directory: Path, prefix: str = "") -> str:
-    """Return the SHA-256 of `prefix` and of the names, sizes and contents of all files in a directory."""
+def directory_digest(directory: Path) -> str:
+    """Return the SHA-256 of the names, sizes and contents of all files in a directory."""
 
     def parts() -> Iterator[str | bytes]:
-        yield prefix
         for path in sorted(path for path in directory.rglob("*") if path.is_file()):
             content = path.read_bytes()
             yield f"{path.relative_to(directory).as_posix()} {len(content)}"

@@ -83,9 +83,8 @@ class PointClouds:
             points[i, : sizes[i]], colors[i, : sizes[i]] = xyz, rgb
         on_boundary = _padded_flags("boundary", [None] * len(arrays) if boundary is None else boundary, sizes, n)
         on_rim = None if rim is None else _padded_flags("rim", rim, sizes, n)
-        position = np.zeros(3, np.float32) if camera is None else _camera_positions(camera, len(arrays))
+        position = _camera_positions((0, 0, 0) if camera is None else camera, len(arrays))
         mask = np.arange(n) < np.array(sizes)[:, None]
-        position = np.broadcast_to(position, (len(arrays), 3))
         fields: Any = points, colors, mask, position, on_boundary, on_rim
         return cls(*(fields if on_host else jax.device_put(fields)))
 
@@ -131,7 +130,7 @@ def _camera_positions(camera: ArrayLike, n_clouds: int) -> NDArray[np.float32]:
         raise InputError(f"camera is {camera!r}; expected numbers, [3] or [{n_clouds}, 3]") from None
     if position.shape not in ((3,), (n_clouds, 3)) or not np.isfinite(position).all():
         raise InputError(f"camera is {position.tolist()}; expected finite [3] or [{n_clouds}, 3]")
-    return position
+    return np.broadcast_to(position, (n_clouds, 3))
 
 
 def _as_float32(values: NDArray[Any]) -> NDArray[np.float32]:

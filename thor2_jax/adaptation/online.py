@@ -9,7 +9,7 @@ import numpy as np
 
 from thor2_jax.adaptation.estimate import MAX_INSTANCES, MIN_INSTANCES, Adaptation, estimate_transform
 from thor2_jax.adaptation.objective import Criterion, Objective
-from thor2_jax.frames.prepared_instance import PreparedInstance
+from thor2_jax.frames.prepared_instance import EMPTY_INSTANCE, PreparedInstance
 
 __all__ = ["CAPACITY", "OnlineAdaptation"]
 
@@ -41,9 +41,9 @@ class OnlineAdaptation:
         self._thread: threading.Thread | None = None
         self.latest: Adaptation | None = None
 
-    def compile(self, instance: PreparedInstance) -> None:
-        """Compile everything that an estimate needs, by evaluating any instance."""
-        Objective([instance], self._criterion, CAPACITY).total(np.zeros(4))
+    def compile(self) -> None:
+        """Compile everything that an estimate needs, by evaluating an instance."""
+        Objective([EMPTY_INSTANCE], self._criterion, CAPACITY).total(np.zeros(4))
 
     def observe(self, instances: Sequence[PreparedInstance]) -> None:
         """Add the instances of a frame, with the camera's colours, and start an estimate if there are enough."""

@@ -25,8 +25,8 @@ from thor2_jax.explanation.attributions import Attributions, LeftOut, attribute_
 from thor2_jax.explanation.changes import CHANGES, Change, smallest_change
 from thor2_jax.explanation.class_scores import ClassScores, OrientedCloud, classifier_scores, gallery_scores, packed
 from thor2_jax.frames.frames import RGBDFrame, pixel_rays
-from thor2_jax.frames.prepared_instance import DESCRIPTOR_VOXEL, PreparedInstance, prepare_instance
-from thor2_jax.gallery.enrollment import embed_looks
+from thor2_jax.frames.prepared_instance import DESCRIPTOR_VOXEL, PreparedInstance
+from thor2_jax.gallery.enrollment import embed_looks, instance_view
 from thor2_jax.model.inference import answers, infer_clouds, values
 from thor2_jax.model.model import Model
 from thor2_jax.model.recognition import Recognition
@@ -165,16 +165,12 @@ def explain(recognizer: Recognizer, frame: RGBDFrame, label: int) -> Explanation
         InputError: there is no such instance, it cannot be described, no object is known, or the run's descriptor has
             the convention of the released code.
     """
-    if label not in frame.instances:
-        raise InputError(f"instance is {label}; expected one of {', '.join(map(str, frame.instances)) or 'none'}")
     model = recognizer.model
-    return explain_instance(model, model.corrected(prepare_instance(frame, label, model.run.config.sigma_s)))
+    return explain_instance(model, model.corrected(instance_view(frame, label, model.run.config.sigma_s)))
 
 
 def explain_instance(model: Model, instance: PreparedInstance) -> Explanation:
-    """Explain the answer for a prepared instance; see `explain`."""
-    if instance.reason is not None:
-        raise InputError(f"instance {instance.label} cannot be explained: {instance.reason}")
+    """Explain the answer for a usable instance; see `explain`."""
     recognition, name = _answer(model, instance)
     scores = _scores_of(model, name)
     parts = dict(_parts(model, scores, instance, scores.names.index(name)))

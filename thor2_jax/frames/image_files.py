@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageFile
 
-from thor2_jax.errors import InputError
+from thor2_jax.errors import InputError, needs_extra
 from thor2_jax.files import open_file
 
-__all__ = ["MAX_IMAGE_PIXELS", "has_16_bit_channels", "read_depth", "read_image", "read_npy"]
+__all__ = ["MAX_IMAGE_PIXELS", "check_size", "decoding", "has_16_bit_channels", "read_depth", "read_image", "read_npy"]
 
 IMAGE_FORMATS = ("PNG", "JPEG", "TIFF")
 """Image formats that are read. For some of its other formats, Pillow runs external programs."""
@@ -28,13 +28,19 @@ _EXR_CHANNELS = ("Z", "Y", "R", "V", "depth")
 
 
 @contextlib.contextmanager
-def _damage_named(message: str, expected: str) -> Iterator[None]:
+def decoding(message: str, expected: str) -> Iterator[None]:
     """Turn what decoders raise on damaged files, many kinds of exception, into an InputError."""
     try:
         yield
     except Exception as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise InputError(f"{message} ({reason}); expected {expected}") from None
+
+
+def check_size(width: int, height: int) -> None:
+    """Raise ValueError unless an image has 1 to `MAX_IMAGE_PIXELS` pixels."""
+    if not 0 < width * height <= MAX_IMAGE_PIXELS:
+        raise ValueError(f"{width} x {height} pixels; expected at most {MAX_IMAGE_PIXELS}")
 
 
 def has_16_bit_channels(image: ImageFile.ImageFile) -> bool:
@@ -51,10 +57,9 @@ def read_image(path: str | Path, argument: str, lossless: bool = False) -> tuple
         OSError: the file cannot be opened.
     """
     expected = "PNG or TIFF without JPEG compression" if lossless else ", ".join(IMAGE_FORMATS)
-    with open_file(path) as stream, _damage_named(f"{argument}: {path} is damaged or no image", expected):
+    with open_file(path) as stream, decoding(f"{argument}: {path} is damaged or no image", expected):
         with Image.open(stream, formats=IMAGE_FORMATS) as image:
-            if image.width * image.height > MAX_IMAGE_PIXELS:
-                raise ValueError(f"{image.width} x {image.height} pixels; expected at most {MAX_IMAGE_PIXELS}")
+            check_size(*image.size)
             if lossless and "JPEG" in (image.format, str(image.info.get("compression")).upper()):
                 raise ValueError("JPEG compression changes label numbers")
             image.verify()  # decoding does not check the checksums of a PNG
@@ -79,7 +84,7 @@ def read_depth(path: str | Path) -> NDArray[Any]:
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix == ".npy":
-        with open_file(path) as stream, _damage_named(f"depth: {path} is a damaged NPY file", _EXPECTED):
+        with open_file(path) as stream, decoding(f"depth: {path} is a damaged NPY file", _EXPECTED):
             pixels = read_npy(stream, 8 * MAX_IMAGE_PIXELS)
     else:
         pixels = _read_exr(path) if suffix == ".exr" else read_image(path, "depth")[0]
@@ -119,18 +124,12 @@ def _read_exr(path: Path) -> NDArray[Any]:
     """Read the depth channel of an EXR file."""
     with open_file(path):  # an OSError if it cannot be opened: OpenEXR raises others
         pass
-    try:
+    with needs_extra(f"depth: {path} is an EXR file; expected PNG, TIFF or NPY; EXR", "OpenEXR", "exr"):
         import OpenEXR
-    except ImportError:
-        raise InputError(
-            f"depth: {path} is an EXR file; expected PNG, TIFF or NPY, or the package OpenEXR (pip install OpenEXR)"
-        ) from None
-    with _damage_named(f"depth: {path} is a damaged EXR file", _EXPECTED):
+    with decoding(f"depth: {path} is a damaged EXR file", _EXPECTED):
         with OpenEXR.File(str(path), separate_channels=True, header_only=True) as header:
             low, high = header.header()["dataWindow"]
-        width, height = (int(b) - int(a) + 1 for a, b in zip(low, high, strict=True))
-        if not 0 < width * height <= MAX_IMAGE_PIXELS:
-            raise ValueError(f"{width} x {height} pixels; expected at most {MAX_IMAGE_PIXELS}")
+        check_size(*(int(b) - int(a) + 1 for a, b in zip(low, high, strict=True)))
         with OpenEXR.File(str(path), separate_channels=True) as file:
             channels = {name: channel.pixels for name, channel in file.channels().items()}
     names = [name for name in channels if len(channels) == 1 or name in _EXR_CHANNELS]

@@ -124,6 +124,7 @@ class Intrinsics:
         for names, convert in _FORMATS:
             if any(name in values for name in names):
                 matrix, scale, distortion = convert(values)
+                scale = DEFAULT_DEPTH_SCALE if scale is None else scale
                 width, height = _entry(values, "width", "image_width"), _entry(values, "height", "image_height")
                 return cls.of_matrix(matrix, scale, width=width, height=height, distortion=distortion)
         shown = ", ".join(map(str, list(values)[:8])) or "no entry"
@@ -167,7 +168,7 @@ def _coefficients(distortion: Any) -> tuple[float, ...]:
             raise InputError(f"intrinsics.distortion has the coefficient {value!r}; expected finite numbers")
     if not any(values):
         return ()
-    if len(values) > DISTORTION_LENGTHS[-1] and not any(values[DISTORTION_LENGTHS[-1] :]):
+    if not any(values[DISTORTION_LENGTHS[-1] :]):
         values = values[: DISTORTION_LENGTHS[-1]]
     if len(values) not in DISTORTION_LENGTHS:
         raise InputError(
@@ -194,8 +195,8 @@ def _supported(model: Any, distortion: Any) -> Any:
     return distortion
 
 
-_Parts = tuple[Any, float, Any]
-"""A camera matrix row by row, depth units per metre, and coefficients of a lens distortion."""
+_Parts = tuple[Any, Any, Any]
+"""A camera matrix row by row, depth units per metre or None, and coefficients of a lens distortion."""
 
 
 def _pinhole_matrix(values: Mapping[Any, Any], *names: str) -> list[Any]:
@@ -207,7 +208,7 @@ def _pinhole_matrix(values: Mapping[Any, Any], *names: str) -> list[Any]:
 
 
 def _of_pinhole(values: Mapping[Any, Any]) -> _Parts:
-    scale = _given(values, "depth_scale", DEFAULT_DEPTH_SCALE)
+    scale: Any = values.get("depth_scale")
     has_size = None not in (_entry(values, "width", "image_width"), _entry(values, "height", "image_height"))
     if has_size and _is_number(scale) and 0 < scale <= MAX_BOP_CAMERA_SCALE:
         scale = 1000 / scale  # BOP's camera.json
@@ -217,25 +218,25 @@ def _of_pinhole(values: Mapping[Any, Any]) -> _Parts:
 
 def _of_realsense(values: Mapping[Any, Any]) -> _Parts:
     matrix = _pinhole_matrix(values, "fx", "fy", "ppx", "ppy")
-    scale = _given(values, "depth_scale", 1 / DEFAULT_DEPTH_SCALE)
-    if not _is_number(scale) or not 0 < scale < 1:
+    scale = values.get("depth_scale")
+    if scale is not None and not (_is_number(scale) and 0 < scale < 1):
         raise InputError(
             f"intrinsics.depth_scale is {scale!r} beside ppx and ppy; expected metres per depth unit, such as 0.001"
         )
-    return matrix, 1 / scale, _supported(values.get("model"), values.get("coeffs"))
+    return matrix, None if scale is None else 1 / scale, _supported(values.get("model"), values.get("coeffs"))
 
 
 def _of_camera_info(values: Mapping[Any, Any]) -> _Parts:
     coefficients = _supported(values.get("distortion_model"), _entry(values, "distortion_coefficients", "D", "d"))
     matrix = _entry(values, "camera_matrix", "K", "k")
-    return matrix, _given(values, "depth_scale", DEFAULT_DEPTH_SCALE), coefficients
+    return matrix, values.get("depth_scale"), coefficients
 
 
 def _of_bop(values: Mapping[Any, Any]) -> _Parts:
-    scale = _given(values, "depth_scale", 1.0)
-    if not _is_number(scale) or scale <= 0:
+    scale = values.get("depth_scale")
+    if scale is not None and not (_is_number(scale) and scale > 0):
         raise InputError(f"intrinsics.depth_scale is {scale!r}; expected a positive number")
-    return values["cam_K"], 1000 / scale, ()
+    return values["cam_K"], None if scale is None else 1000 / scale, ()
 
 
 def _of_open3d(values: Mapping[Any, Any]) -> _Parts:
@@ -246,7 +247,7 @@ def _of_open3d(values: Mapping[Any, Any]) -> _Parts:
         raise InputError(
             f"intrinsics.intrinsic_matrix is {str(matrix)[:200]}; expected fx, 0, 0, 0, fy, 0, cx, cy, 1"
         ) from None
-    return transposed, _given(values, "depth_scale", DEFAULT_DEPTH_SCALE), ()
+    return transposed, values.get("depth_scale"), ()
 
 
 def _of_matrix_alone(matrix: Any) -> Intrinsics:
@@ -255,11 +256,6 @@ def _of_matrix_alone(matrix: Any) -> Intrinsics:
     if array.shape not in ((3, 3), (9,)):
         raise InputError(f"intrinsics is a {type(matrix).__name__} of shape {array.shape}; expected a 3 x 3 matrix")
     return Intrinsics.of_matrix(array)
-
-
-def _given(values: Mapping[Any, Any], name: str, default: Any) -> Any:
-    value = values.get(name)
-    return default if value is None else value
 
 
 def _entry(values: Mapping[Any, Any], *names: str) -> Any:

@@ -74,7 +74,7 @@ class _Box(NamedTuple):
 
 
 class _Mask(NamedTuple):
-    """An instance's mask, cropped with a margin of one pixel: `pixels[1, 1]` is the corner (left, top) of `box`."""
+    """An instance's mask within its box."""
 
     box: _Box
     pixels: NDArray[np.bool_]
@@ -185,9 +185,8 @@ def _text(answer: Recognition) -> str:
 
 def _crop(labels: NDArray[Any], label: int) -> _Mask:
     mask = labels == label
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    box = _Box(int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1)
-    return _Mask(box, np.pad(mask[box.top : box.bottom, box.left : box.right], 1))
+    rows, columns = ndimage.find_objects(mask.view(np.uint8))[0]
+    return _Mask(_Box(columns.start, rows.start, columns.stop, rows.stop), mask[rows, columns])
 
 
 def _draw_outline(pixels: NDArray[np.uint8], mask: _Mask, paint: Paint, thickness: int) -> None:
@@ -196,8 +195,8 @@ def _draw_outline(pixels: NDArray[np.uint8], mask: _Mask, paint: Paint, thicknes
     within = ndimage.binary_erosion(mask.pixels, iterations=thickness)
     core = ndimage.binary_erosion(within, iterations=max(1, thickness // 3))
     target = pixels[top:bottom, left:right]
-    target[(mask.pixels & ~within)[1:-1, 1:-1]] = paint
-    target[(within & ~core)[1:-1, 1:-1]] = _ink(paint)
+    target[mask.pixels & ~within] = paint
+    target[within & ~core] = _ink(paint)
 
 
 def _ink(paint: Paint) -> Paint:
@@ -267,7 +266,7 @@ def _place(lettering: _Lettering, target: _Box, placed: Sequence[_Box], covered:
 def _draw_leader(draw: ImageDraw.ImageDraw, box: _Box, mask: _Mask, paint: Paint, thickness: int) -> None:
     """Draw a line from a label that lies beside its instance to the nearest pixel of the instance."""
     row, column = np.nonzero(mask.pixels)
-    row, column = row + mask.box.top - 1, column + mask.box.left - 1
+    row, column = row + mask.box.top, column + mask.box.left
     from_row, from_column = np.clip(row, box.top, box.bottom - 1), np.clip(column, box.left, box.right - 1)
     nearest = np.argmin((row - from_row) ** 2 + (column - from_column) ** 2)
     start = int(from_column[nearest]), int(from_row[nearest])

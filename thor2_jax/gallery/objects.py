@@ -229,5 +229,4 @@ class ObjectGallery:
         """
         if self.directory is None:
             raise InputError("undo needs a gallery on disk; open one")
-        fingerprint = self.embedding.fingerprint
-        self._set(undo_change(self.directory, generation, fingerprint, self._stored, self.lock_seconds))
+        self._change(undo_change(self.directory, generation, self._stored), self.embedding.fingerprint)

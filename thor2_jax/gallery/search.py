@@ -14,7 +14,7 @@ import numpy as np
 import threadpoolctl
 from numpy.typing import NDArray
 
-from thor2_jax.errors import InputError
+from thor2_jax.errors import needs_extra
 
 __all__ = ["ExactSearch", "IndexSearch", "ViewSearch", "one_blas_thread"]
 
@@ -99,12 +99,8 @@ class IndexSearch:
         Raises:
             InputError: usearch is not installed.
         """
-        try:
+        with needs_extra("index is usearch, which", "usearch", "index"):
             usearch: Any = importlib.import_module("usearch.index")
-        except ModuleNotFoundError:
-            raise InputError(
-                "index is usearch, which is not installed; run pip install -c constraints.txt '.[index]'"
-            ) from None
         self._embeddings = embeddings
         self._index = usearch.Index(
             ndim=embeddings.shape[1],

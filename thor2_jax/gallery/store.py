@@ -293,29 +293,19 @@ def update_gallery(
         return dataclasses.replace(changed, stamp=gallery_stamp(directory))
 
 
-def undo_change(
-    directory: Path,
-    generation: int,
-    embedding: str | None = None,
-    known: StoredGallery | None = None,
-    lock_seconds: float | None = None,
-) -> StoredGallery:
-    """Take back the last change of a gallery on disk. That is a change, too: taking it back restores the first one.
+def undo_change(directory: Path, generation: int, known: StoredGallery | None = None) -> Callable[[Gallery], Gallery]:
+    """Return the change for `update_gallery` that takes back the last one of a gallery on disk.
+
+    Taking that back, in turn, restores the first change.
 
     Args:
         directory: directory of the gallery.
         generation: generation of the gallery after the change that is taken back.
-        embedding: see `update_gallery`.
         known: see `update_gallery`.
-        lock_seconds: see `update_gallery`.
 
     Returns:
-        The gallery as it was before that change, with a new generation.
-
-    Raises:
-        InputError: the gallery has been changed since, or the state before the change is not known.
-        GalleryError: see `update_gallery`.
-        OSError: see `update_gallery`.
+        A function that raises InputError if the gallery has been changed since, or the state before the change is not
+        known.
     """
 
     def previous(gallery: Gallery) -> Gallery:
@@ -331,7 +321,7 @@ def undo_change(
             return _load_objects(directory, index, known).gallery
         raise InputError(f"generation is {generation}, and files of the gallery before it are missing")
 
-    return update_gallery(directory, previous, embedding, known, lock_seconds)
+    return previous
 
 
 def _write_durably(path: Path, content: bytes) -> None:

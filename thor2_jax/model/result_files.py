@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
 from thor2_jax.files import has_json, write_text
-from thor2_jax.frames.frames import RGBDFrame, pixel_rays
+from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.overlay import draw_overlay
 from thor2_jax.model.recognition import Recognition
+from thor2_jax.recordings.detections import Detection, detections_of
 
 __all__ = [
     "BOP_HEADER",
@@ -131,12 +132,11 @@ def run_length_encoding(mask: NDArray[np.bool_]) -> dict[str, Any]:
 
 
 def _with_category(
-    recognitions: Iterable[Recognition], categories: Mapping[str, int]
-) -> Iterator[tuple[Recognition, int]]:
-    """Yield the answers whose names have numbers, with their numbers."""
-    for recognition in recognitions:
-        if recognition.name is not None and recognition.name in categories:
-            yield recognition, categories[recognition.name]
+    frame: RGBDFrame, recognitions: Iterable[Recognition], categories: Mapping[str, int]
+) -> Iterator[tuple[Detection, int]]:
+    """Return the detections whose names have numbers, with their numbers."""
+    named = [each for each in recognitions if each.name in categories]
+    return zip(detections_of(frame, named), [categories[str(each.name)] for each in named], strict=True)
 
 
 def coco_results(
@@ -154,14 +154,13 @@ def coco_results(
         categories: name -> category_id.
     """
     entries = []
-    for recognition, category in _with_category(recognitions, categories):
-        rows, columns = np.divmod(frame.instance_pixels[recognition.label], frame.depth.shape[1])
-        left, top = int(columns.min()), int(rows.min())
+    for detection, category in _with_category(frame, recognitions, categories):
+        recognition = detection.recognition
         entries.append(
             {
                 "image_id": image_id,
                 "category_id": category,
-                "bbox": [left, top, int(columns.max()) + 1 - left, int(rows.max()) + 1 - top],
+                "bbox": list(detection.box),
                 "score": recognition.confidence,
                 "segmentation": run_length_encoding(frame.label_image == recognition.label),
                 "frame": name,
@@ -193,12 +192,9 @@ def bop_lines(
         seconds: time for the whole frame.
     """
     lines = []
-    for recognition, category in _with_category(recognitions, categories):
-        pixels = frame.instance_pixels[recognition.label]
-        depth = frame.depth_m.ravel()[pixels]
-        rays = pixel_rays(pixels[depth > 0], frame.depth.shape[1], frame.intrinsics)
-        centre = 1000 * (rays * depth[depth > 0, None]).mean(axis=0)
-        translation = " ".join(f"{value:.3f}" for value in centre)
-        score = recognition.confidence
+    for detection, category in _with_category(frame, recognitions, categories):
+        assert detection.position is not None  # An object with a name has points.
+        translation = " ".join(f"{1000 * value:.3f}" for value in detection.position)
+        score = detection.recognition.confidence
         lines.append(f"{scene_id},{image_id},{category},{score},{_IDENTITY},{translation},{seconds:.4f}")
     return lines

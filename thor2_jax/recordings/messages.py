@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from thor2_jax.errors import InputError
-from thor2_jax.frames.image_files import MAX_IMAGE_PIXELS
+from thor2_jax.frames.image_files import MAX_IMAGE_PIXELS, check_size, decoding
 
 __all__ = ["color_image", "depth_image", "image_kind", "stamp_of"]
 
@@ -115,14 +115,10 @@ def _rows(message: Any, dtype: np.dtype[Any], channels: int) -> NDArray[Any]:
 
 def _decoded(content: bytes, described: str) -> NDArray[Any]:
     """Return the pixels of a PNG or JPEG whose content is not trusted."""
-    try:
+    with decoding(f"a compressed image ({described}) is damaged", "PNG or JPEG"):
         with Image.open(io.BytesIO(content), formats=("PNG", "JPEG")) as image:
-            if image.width * image.height > MAX_IMAGE_PIXELS:
-                raise ValueError(f"{image.width} x {image.height} pixels; expected at most {MAX_IMAGE_PIXELS}")
+            check_size(*image.size)
             return np.asarray(image)
-    except Exception as error:  # Decoders raise many kinds of exception on damaged images.
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(f"a compressed image ({described}) is damaged ({reason}); expected PNG or JPEG") from None
 
 
 def _compressed_depth(content: bytes, described: str) -> NDArray[Any]:

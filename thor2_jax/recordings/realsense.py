@@ -5,6 +5,7 @@ with RealSenseCamera() as camera:
         frame = segmented(recorded.read())
 """
 
+import contextlib
 import functools
 from collections.abc import Iterator
 from typing import Any
@@ -66,11 +67,9 @@ class RealSenseCamera:
     def __exit__(self, *_: object) -> None:
         """Stop the camera."""
         if self._pipeline is not None:
-            pipeline, self._pipeline = self._pipeline, None
-            try:
-                pipeline.stop()
-            except RuntimeError:  # It is unplugged.
-                pass
+            with contextlib.suppress(RuntimeError):  # It is unplugged.
+                self._pipeline.stop()
+            self._pipeline = None
 
     def frames(self) -> Iterator[RecordedFrame]:
         """Yield the newest frame, again and again.

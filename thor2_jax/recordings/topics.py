@@ -46,20 +46,13 @@ def choose_topics(
     """
     color = _choose("color", wanted.color, kinds, types)
     depth = _choose("depth", wanted.depth, kinds, types)
-    if not needs_camera and wanted.camera is None:
-        return Topics(color, depth)
-    if wanted.camera is None:
-        siblings = [_camera_of(topic) for topic in (color, depth)]
+    camera = wanted.camera
+    if camera is None:
+        if not needs_camera:
+            return Topics(color, depth)
+        siblings = [f"{_uncompressed(topic).rpartition('/')[0]}/camera_info" for topic in (color, depth)]
         camera = next((topic for topic in siblings if kinds.get(topic) == "camera"), None)
-        if camera is not None:
-            return Topics(color, depth, camera)
-    return Topics(color, depth, _choose("camera", wanted.camera, kinds, types))
-
-
-def _camera_of(topic: str) -> str:
-    """Return the topic with the intrinsics of an image topic: camera_info beside the images."""
-    base = _uncompressed(topic)
-    return f"{base.rpartition('/')[0]}/camera_info"
+    return Topics(color, depth, _choose("camera", camera, kinds, types))
 
 
 def _uncompressed(topic: str) -> str:

@@ -29,35 +29,12 @@ def is_truncated(path: Path) -> bool:
         return stream.read() != _MAGIC or stream.tell() == len(_MAGIC)
 
 
-class CompleteRecords:
-    """A path to a truncated MCAP file that opens as one with all its complete records, and without an index.
-
-    It has those members of `pathlib.Path` that rosbags uses.
-
-    Attributes:
-        path: the file.
-        suffix: that of MCAP files.
-    """
-
-    suffix = ".mcap"
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def __str__(self) -> str:
-        return str(self.path)
-
-    def exists(self) -> bool:
-        """Return whether the file exists."""
-        return self.path.exists()
-
-    def is_dir(self) -> bool:
-        """Return that it is no directory."""
-        return False
+class CompleteRecords(type(Path())):  # type: ignore[misc]  # Path itself cannot be derived from before Python 3.12
+    """A path to a truncated MCAP file that opens as one with all its complete records, and without an index."""
 
     def open(self, mode: str = "rb") -> BinaryIO:
         """Open the complete records for reading."""
-        stream = self.path.open(mode)
+        stream = super().open(mode)
         return io.BufferedReader(_View(stream, _complete_bytes(stream)))
 
 

@@ -6,10 +6,13 @@ between them, and both sides of hollow things, are then merged.
 """
 
 import dataclasses
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from thor2_jax.segmentation.foreground import FLAT, UNIT, Evidence
 from thor2_jax.segmentation.pixels import Mask, close, components, grow, nearest_known, shrink, watershed
@@ -190,45 +193,31 @@ def merge_pieces(
     depth: DepthImage,
     evidence: Evidence,
 ) -> NDArray[np.int32]:
-    """Return the labels [H, W] of the pieces of `flood` after merging, not consecutive; the arguments are as there."""
+    """Return the labels [H, W] of the pieces of `flood` after merging; the arguments are as there."""
     n = len(colored)
     borders = _find_borders(labels, n, color, depth, evidence)
     shapes = _measure(labels, n, color, evidence)
-    parent = list(range(n))
-
-    def root(piece: int) -> int:
-        while parent[piece] != piece:
-            piece = parent[piece]
-        return piece
-
+    together = _belong_together(borders, shapes, colored)
     for k, (a, b) in enumerate(borders.pairs.tolist()):
-        if a == 0:
-            continue
-        if _belong_together(k, a, b, borders, shapes, colored) or (
-            shapes.tall[a] and shapes.tall[b] and _is_hollow(k, a, b, borders, shapes, labels, evidence)
-        ):
-            parent[max(root(a), root(b))] = min(root(a), root(b))
-    return np.array([root(piece) for piece in range(n)], np.int32)[labels]
+        if not together[k] and a > 0 and shapes.tall[a] and shapes.tall[b]:
+            together[k] = _is_hollow(k, a, b, borders, shapes, labels, evidence)
+    merged = borders.pairs[together & (borders.pairs[:, 0] > 0)]
+    graph = coo_matrix((np.ones(len(merged)), merged.T), (n, n))
+    return np.asarray(connected_components(graph, directed=False)[1], np.int32)[labels]
 
 
-def _belong_together(k: int, a: int, b: int, borders: _Borders, shapes: _Shapes, colored: NDArray[np.bool_]) -> bool:
-    if _is_enclosed(k, a, b, borders):
-        return True
-    if colored[a] != colored[b] and (shapes.tall[a] or shapes.tall[b]):
-        return bool(borders.contrast[k] < PART)
-    if shapes.low[a] and shapes.low[b]:
-        return True
-    if borders.length[k] < LEAST_CONTACT * min(borders.perimeter[a], borders.perimeter[b]):
-        return False
-    return bool(borders.step[k] < EDGE and not (borders.fold[k] > FOLD and borders.contrast[k] > CONTRAST))
-
-
-def _is_enclosed(k: int, a: int, b: int, borders: _Borders) -> bool:
-    """Return whether one piece surrounds the other, which is not nearer to the camera: the bottom of a bowl."""
-    for inner, nearer in ((a, borders.behind[k]), (b, -borders.behind[k])):
-        if borders.length[k] > ENCLOSED * borders.perimeter[inner] and nearer < 0.1:
-            return True
-    return False
+def _belong_together(borders: _Borders, shapes: _Shapes, colored: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return which pairs [N] are of one thing, but for hollow things."""
+    a, b = borders.pairs.T
+    # One piece surrounds the other, which is not nearer to the camera: the bottom of a bowl.
+    most_of_a, most_of_b = (borders.length > ENCLOSED * borders.perimeter[piece] for piece in (a, b))
+    enclosed = (most_of_a & (borders.behind < 0.1)) | (most_of_b & (borders.behind > -0.1))
+    part_by_color = (colored[a] != colored[b]) & (shapes.tall[a] | shapes.tall[b])
+    apart = borders.length < LEAST_CONTACT * np.minimum(borders.perimeter[a], borders.perimeter[b])
+    cases = [enclosed, part_by_color, shapes.low[a] & shapes.low[b], apart]
+    answers: list[Any] = [True, borders.contrast < PART, True, False]
+    is_border = (borders.step >= EDGE) | ((borders.fold > FOLD) & (borders.contrast > CONTRAST))
+    return np.select(cases, answers, ~is_border)
 
 
 def _is_hollow(

@@ -2,7 +2,7 @@
 
 import dataclasses
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -16,12 +16,11 @@ from thor2_jax.descriptor.describe import strips
 from thor2_jax.descriptor.looks import aligned_looks, describe_aligned_looks
 from thor2_jax.errors import InputError
 from thor2_jax.explanation.class_scores import padded_points
-from thor2_jax.explanation.explain import Explanation, compile_explanations, explain_instance, explained_kinds
-from thor2_jax.frames.instance_clouds import MIN_POINTS
+from thor2_jax.explanation.explain import explained_kinds
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.gallery.objects import ObjectGallery
 from thor2_jax.gallery.store import INDEX_FILE, check_index
-from thor2_jax.model.fusion import fuse, fused_probabilities, with_temperature
+from thor2_jax.model.fusion import fused_probabilities, with_temperature
 from thor2_jax.model.inference import Inference, answers, infer
 from thor2_jax.model.model import Model
 from thor2_jax.model.recognition import Recognition
@@ -157,9 +156,7 @@ class InferenceEngine:
     def compile_adaptation(self) -> None:
         """Compile the programs of the adaptation, if the service adapts."""
         if self._online is not None:
-            points = np.random.default_rng(0).uniform(0, 0.1, (MIN_POINTS, 3)).astype(np.float32)
-            colors = np.zeros((MIN_POINTS, 3), np.uint8)
-            self._online.compile(PreparedInstance(1, points, colors, np.zeros(MIN_POINTS, bool)))
+            self._online.compile()
 
     def infer(self, instances: Sequence[PreparedInstance]) -> list[CloudResult]:
         """Describe and classify at most `max_batch` clouds."""
@@ -192,17 +189,9 @@ class InferenceEngine:
             inference = inference._replace(probabilities={})
         return answers(model, instances, inference)
 
-    def explain(self, instance: PreparedInstance) -> Explanation:
-        """Explain the answer for an instance; may be called in another thread. Raises as `explain_instance`."""
-        return explain_instance(self.model, instance)
-
     def explanation_programs(self, n_points: int = 1) -> list[ExplanationPrograms]:
         """Return the programs that explain the answer for a cloud of so many points."""
         return [(padded_points(n_points), by_classifiers) for by_classifiers in explained_kinds(self.model)]
-
-    def compile_explanations(self, programs: ExplanationPrograms, is_stopped: Callable[[], bool]) -> None:
-        """Compile one of `explanation_programs`, unless stopped; may be called in another thread."""
-        compile_explanations(self.model, *programs, is_stopped)
 
     def calibrated_confidences(self, results: Sequence[CloudResult]) -> list[float | None]:
         """Return the calibrated confidence of the most probable class of each cloud.
@@ -221,7 +210,7 @@ class InferenceEngine:
             return [float(p) for p in model.fused(probabilities).max(axis=1)]
         if not set(THOR2) <= set(temperatures):
             return [None] * len(results)
-        index = fuse({name: probabilities[name] for name in THOR2}).class_index
+        index = fused_probabilities({name: probabilities[name] for name in THOR2}).argmax(axis=1)
         calibrated = fused_probabilities({n: with_temperature(probabilities[n], temperatures[n]) for n in THOR2})
         return [float(p) for p in calibrated[np.arange(len(results)), index]]
 

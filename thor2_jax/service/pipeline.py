@@ -16,6 +16,7 @@ import numpy as np
 
 from thor2_jax.capacity import POINT_BUCKETS
 from thor2_jax.errors import InputError
+from thor2_jax.explanation.explain import compile_explanations, explain_instance
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery.clouds import CompactClouds
 from thor2_jax.gallery.enrollment import LOOKS, enrolled_object, views_to_embed
@@ -160,7 +161,7 @@ class Service:
 
         def compile_all() -> None:
             try:
-                self.engine.compile_explanations(programs, lambda: self.state != "ready")
+                compile_explanations(self.engine.model, *programs, lambda: self.state != "ready")
             except Exception:  # Requests compile what is missing, and report the error.
                 log.exception("compiling explanations failed")
             log.info("explanations of clouds of %d points are compiled", programs[0])
@@ -240,15 +241,12 @@ class Service:
         Raises:
             RequestError: as `preparation.prepare_frame`.
         """
-        prepared, results = await self._infer_frame(files, False, request)
-        self.engine.refresh()
-        return self.engine.recognize(prepared.instances, results), prepared.label_map
+        prepared, _, recognitions = await self._recognize_frame(files, False, request)
+        return recognitions, prepared.label_map
 
     async def explain(self, files: dict[str, bytes], request: AdmittedRequest) -> ExplainedFrame:
         """Recognize a frame and return the evidence as well. Raises RequestError."""
-        prepared, results = await self._infer_frame(files, True, request)
-        self.engine.refresh()
-        recognitions = self.engine.recognize(prepared.instances, results)
+        prepared, results, recognitions = await self._recognize_frame(files, True, request)
         confidences, config = self.engine.calibrated_confidences(results), self.engine.run.config
         arguments = prepared, recognitions, results, confidences, config, request.milliseconds()
         return await asyncio.to_thread(explained_frame, *arguments)
@@ -271,7 +269,7 @@ class Service:
         def explained() -> WhyAnswer:
             assert prepared.frame is not None
             (instance,) = self.engine.correct(prepared.instances, observe=False)
-            return why_answer(self.engine.explain(instance), prepared.frame)
+            return why_answer(explain_instance(self.engine.model, instance), prepared.frame)
 
         with request.stage("explain"):
             try:
@@ -331,13 +329,16 @@ class Service:
         self.engine.refresh()
         return copied
 
-    async def _infer_frame(
+    async def _recognize_frame(
         self, files: dict[str, bytes], with_label_map: bool, request: AdmittedRequest
-    ) -> tuple[PreparedRequest, list[CloudResult]]:
+    ) -> tuple[PreparedRequest, list[CloudResult], list[Recognition]]:
         arguments = files, self.engine.run.config.sigma_s, with_label_map, self.settings.segmenter
         prepared = await self._prepare(request, prepare_frame, *arguments)
         corrected = self.engine.correct(prepared.instances, observe=True)
-        return dataclasses.replace(prepared, instances=corrected), await self._infer(corrected, request)
+        results = await self._infer(corrected, request)
+        self.engine.refresh()
+        recognitions = self.engine.recognize(corrected, results)
+        return dataclasses.replace(prepared, instances=corrected), results, recognitions
 
     async def _prepare(
         self, request: AdmittedRequest, function: Callable[..., PreparedRequest], *arguments: Any

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from thor2_jax.errors import InputError
 from thor2_jax.files import errors_name, write_text
 from thor2_jax.model.classifier import FEATURES
-from thor2_jax.model.fusion import FUSION_RULES, FusionRule, fuse, with_temperature
+from thor2_jax.model.fusion import FUSION_RULES, FusionRule, fused_probabilities, with_temperature
 from training.baselines.names import TITLES
 from training.storage.jobs import check_same_job
 
@@ -247,4 +247,5 @@ def fuse_by(
         assert temperatures is not None
         probabilities = {name: with_temperature(values, temperatures[name]) for name, values in probabilities.items()}
         rule = "max"
-    return Predictions(*fuse(probabilities, rule)[:2])
+    fused = fused_probabilities(probabilities, rule)
+    return Predictions(fused.argmax(axis=1), fused.max(axis=1))

@@ -363,7 +363,7 @@ def test_gallery_answers_are_explained(frame: thor2.RGBDFrame) -> None:
 
 
 def test_errors_name_the_argument(recognizer: Recognizer, frame: thor2.RGBDFrame) -> None:
-    for label, match in ((4, "^instance is 4; expected one of 3, 5, 7"), (5, "^instance 5 cannot be explained: ")):
+    for label, match in ((4, "^instance is 4; expected one of 3, 5, 7"), (5, "^instance 5 cannot be used: ")):
         with pytest.raises(thor2.InputError, match=match):
             explain(recognizer, frame, label)
     with pytest.raises(thor2.InputError, match="no object"):

@@ -96,18 +96,19 @@ def test_forgetting_restores_the_gallery_and_removes_the_file(directory: Path) -
 def test_undo_restores_the_gallery_and_its_files(directory: Path) -> None:
     before = load_gallery(directory)
     changed = update_gallery(directory, add("mug", 5, replace=True), FINGERPRINT)
-    undone = undo_change(directory, changed.generation, FINGERPRINT, changed)
+    undone = update_gallery(directory, undo_change(directory, changed.generation, changed), FINGERPRINT, changed)
     again = load_gallery(directory)
     assert undone.generation == again.generation == changed.generation + 1
     assert undone.files == again.files == before.files and undone.stamp == gallery_stamp(directory)
     np.testing.assert_array_equal(again.gallery.objects["mug"].embeddings, enrolled(0).embeddings)
-    undo_change(directory, undone.generation)  # restores the change
+    update_gallery(directory, undo_change(directory, undone.generation))  # restores the change
     assert load_gallery(directory).files == changed.files
 
 
 def test_undo_of_the_first_change_empties_the_gallery(tmp_path: Path) -> None:
     changed = update_gallery(tmp_path, add("mug", 0), FINGERPRINT)
-    assert undo_change(tmp_path, changed.generation, FINGERPRINT).gallery.names == ()
+    undone = update_gallery(tmp_path, undo_change(tmp_path, changed.generation), FINGERPRINT)
+    assert undone.gallery.names == ()
     assert update_gallery(tmp_path, add("mug", 0), FINGERPRINT).gallery.names == ("mug",)
 
 
@@ -127,7 +128,7 @@ def test_undo_refuses_in_one_line_and_changes_nothing(fault: str, directory: Pat
     UNDO_FAULTS[fault](directory)
     before = content(directory)
     with pytest.raises(InputError, match="generation is 2") as caught:
-        undo_change(directory, 2, FINGERPRINT)
+        update_gallery(directory, undo_change(directory, 2), FINGERPRINT)
     assert "\n" not in str(caught.value) and content(directory) == before
 
 

@@ -24,7 +24,7 @@ from prometheus_client import CollectorRegistry, Counter
 
 from thor2_jax.client import multipart
 from thor2_jax.errors import InputError
-from thor2_jax.service import preparation
+from thor2_jax.service import pipeline, preparation
 from thor2_jax.service.app import create_app
 from thor2_jax.service.batching import Batcher
 from thor2_jax.service.metrics import CompilationCounter
@@ -231,7 +231,7 @@ def test_progress_of_the_warm_up_is_reported(
 
     monkeypatch.setattr(service.engine, "compile", compile_shape)
     explained: queue.Queue[tuple[int, bool]] = queue.Queue()
-    monkeypatch.setattr(service.engine, "compile_explanations", lambda programs, _: explained.put(programs))
+    monkeypatch.setattr(pipeline, "compile_explanations", lambda _, *programs: explained.put(programs[:2]))
     with caplog.at_level("INFO"):
         service.start()
         service.wait_until_ready()

@@ -8,6 +8,7 @@ import pytest
 from helpers import SMALL_CONFIG, untrained_embedding_run, untrained_run
 
 import thor2_jax as thor2
+from thor2_jax.explanation.explain import explain_instance
 from thor2_jax.frames.prepared_instance import prepare_instance
 from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
 from thor2_jax.model.confidence import Calibration
@@ -82,4 +83,4 @@ def test_an_embedding_alone_adapts_and_is_explained(frame: thor2.RGBDFrame, tmp_
     instance = prepare_instance(frame, frame.instances[-1], engine.run.config.sigma_s)
     (result,) = engine.infer(engine.correct([instance], observe=True))
     (answer,) = engine.recognize([instance], [result])
-    assert engine.explain(instance).name == max(answer.top["embedding"], key=lambda pair: pair[1])[0]
+    assert explain_instance(engine.model, instance).name == max(answer.top["embedding"], key=lambda pair: pair[1])[0]

@@ -16,7 +16,8 @@ from processes import HANG
 
 from thor2_jax.errors import InputError
 from thor2_jax.explanation import class_scores
-from thor2_jax.service.engine import ExplanationPrograms
+from thor2_jax.model.model import Model
+from thor2_jax.service import pipeline
 
 Open = Callable[..., Page]
 Files = dict[str, bytes]
@@ -59,16 +60,16 @@ def test_why_is_503_until_explanations_are_compiled(
 ) -> None:
     service, is_compiled, compiled = teaching_app.state.service, threading.Event(), []
 
-    def compile_explanations(programs: ExplanationPrograms, is_stopped: Callable[[], bool]) -> None:
+    def compile_explanations(_: Model, n_points: int, by_classifiers: bool, is_stopped: Callable[[], bool]) -> None:
         assert is_compiled.wait(300) and not is_stopped()
-        compiled.append(programs)
+        compiled.append((n_points, by_classifiers))
 
-    def explain(_: object) -> None:
+    def explain(*_: object) -> None:
         raise InputError("instance is explained")
 
     monkeypatch.setattr(service, "_compiled", {})
-    monkeypatch.setattr(service.engine, "compile_explanations", compile_explanations)
-    monkeypatch.setattr(service.engine, "explain", explain)
+    monkeypatch.setattr(pipeline, "compile_explanations", compile_explanations)
+    monkeypatch.setattr(pipeline, "explain_instance", explain)
     for _ in range(2):
         response = ask(teaching_url, files, 3)
         assert response.status_code == 503 and int(response.headers["retry-after"]) >= 1
@@ -90,8 +91,8 @@ def test_failed_compilation_leaves_the_error_to_requests(
 
     service = teaching_app.state.service
     monkeypatch.setattr(service, "_compiled", {})
-    monkeypatch.setattr(service.engine, "compile_explanations", fail)
-    monkeypatch.setattr(service.engine, "explain", fail)
+    monkeypatch.setattr(pipeline, "compile_explanations", fail)
+    monkeypatch.setattr(pipeline, "explain_instance", fail)
     service._compile_explanations(*service.engine.explanation_programs()).result(300)
     response = ask(teaching_url, files, 3)
     assert response.status_code == 422 and "convention" in response.json()["message"]
