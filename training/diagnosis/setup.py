@@ -95,25 +95,30 @@ def _check(
         depth = None
     if labels is not None and color is not None and labels.shape != color.shape[:2]:
         labels = None
-    camera_is_right = camera is not None and shape is not None and check_camera(diagnosis, camera, shape[1], shape[0])
-    if labels is not None and not check_labels(diagnosis, labels):
+    camera_is_right = (
+        camera is not None and shape is not None and _passes(diagnosis, check_camera, camera, shape[1], shape[0])
+    )
+    if labels is not None and not _passes(diagnosis, check_labels, labels):
         labels = None
-    light_is_right = color is not None and check_light(diagnosis, color, labels)
+    light_is_right = color is not None and _passes(diagnosis, check_light, color, labels)
     if color is not None and labels is not None:
         check_labels_alignment(diagnosis, color, labels)
     if depth is None or camera is None:
         return diagnosis
     pinhole = Intrinsics(camera.fx, camera.fy, camera.cx, camera.cy, camera.depth_scale)  # its size was checked
     frame = RGBDFrame(np.zeros((*depth.shape, 3), np.uint8) if color is None else color, depth, labels, pinhole)
-    n_findings = len(diagnosis.findings)
-    if color is not None:
-        check_registration(diagnosis, color, frame.depth_m)
-    # Without registration the labels are of other pixels.
-    trust_camera = camera_is_right and len(diagnosis.findings) == n_findings
-    check_depth(diagnosis, frame, sides, names, trust_camera=trust_camera)
-    depth_is_right = len(diagnosis.findings) == n_findings and camera_is_right
-    _check_order(diagnosis, frame, recognizer, light_is_right and depth_is_right and color is not None)
+    is_registered = color is None or _passes(diagnosis, check_registration, color, frame.depth_m)
+    trust_camera = camera_is_right and is_registered  # Without registration the labels are of other pixels.
+    depth_is_right = _passes(diagnosis, check_depth, frame, sides, names, trust_camera=trust_camera)
+    _check_order(diagnosis, frame, recognizer, light_is_right and trust_camera and depth_is_right)
     return diagnosis
+
+
+def _passes(diagnosis: Diagnosis, check: Callable[..., None], *arguments: Any, **options: Any) -> bool:
+    """Return whether a check finds nothing."""
+    n_findings = len(diagnosis.findings)
+    check(diagnosis, *arguments, **options)
+    return len(diagnosis.findings) == n_findings
 
 
 def _check_order(diagnosis: Diagnosis, frame: RGBDFrame, recognizer: Recognizer | None, is_sound: bool) -> None:

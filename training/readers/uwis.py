@@ -10,7 +10,7 @@ from thor2_jax.errors import InputError, with_context
 from thor2_jax.files import read_file
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, read_color, read_depth, read_labels
 from thor2_jax.tables import parse_yaml
-from training.readers.labelled import LabelledFrame, LabelledFrames
+from training.readers.labelled import LabelledFrame, LabelledFrames, dataset_folder
 
 __all__ = ["INTRINSICS", "NOT_SCORED", "UWISOccluded", "Video", "video_attributes"]
 
@@ -72,9 +72,7 @@ class UWISOccluded(LabelledFrames):
         Raises:
             InputError: the folder holds no frame.
         """
-        path = Path(path)
-        if not path.is_dir():
-            raise InputError(f"dataset: {path} is not a directory; expected a dataset")
+        path = dataset_folder(path)
         videos = sorted((f for f in path.iterdir() if f.name.isdecimal()), key=lambda f: int(f.name))
         self._frames = [(video, c) for video in videos for c in sorted((video / "images").glob("*_rgb.png"))]
         if not self._frames:
