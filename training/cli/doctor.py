@@ -36,18 +36,14 @@ def doctor(
     The exit code is 0 if nothing is found, 1 if something is likely wrong, and 2 if a file is missing.
     """
     from training.diagnosis.setup import diagnose
+    from training.frame_recognition import RecognizerArguments
     from training.objects.meshes import find_meshes
 
     if meshes is None and mesh_scale != 1:
         raise InputError(f"mesh_scale is {mesh_scale:g}; it belongs to --meshes")
     sources = given.sources(masks=False)
     paths = {} if meshes is None else find_meshes(meshes) if meshes.is_dir() else {meshes.stem: meshes}
-    recognizer = None
-    if model is not None:
-        from thor2_jax.capacity import BATCH_BUCKETS
-        from thor2_jax.recognizer import Recognizer
-
-        recognizer = Recognizer.load(model, chunk=BATCH_BUCKETS[-1])
+    recognizer = None if model is None else RecognizerArguments(model).load()
     known: dict[str, Any] = {"recognizer": recognizer, "meshes": paths, "mesh_scale": mesh_scale}
     is_sound, failed = True, []
     for source in sources:

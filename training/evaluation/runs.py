@@ -244,15 +244,7 @@ def load_sequence_runs(directory: Path, frames: Iterable[str]) -> list[SequenceR
         digest = json_digest({sequence: each.digest for sequence, each in of_sequence.items()})
         name = f"{named_path(directory).name}/*" + (f"/fold-{fold}" if len(first) > 1 else "")
         result.append(
-            SequenceRun(
-                name,
-                digest,
-                run.recognizer,
-                run.baselines,
-                temperatures={},
-                weights=run.weights,
-                of_sequence=of_sequence,
-            )
+            SequenceRun(name, digest, run.recognizer, run.baselines, weights=run.weights, of_sequence=of_sequence)
         )
     return result
 
