@@ -21,13 +21,9 @@ from thor2_jax.model.run_directory import TrainedRun, save_run
 from thor2_jax.printable import check_name, normal_name
 from thor2_jax.recognizer import Recognizer
 from training.readers.frames import FrameFolder
-from training.storage.progress import Progress
+from training.storage.progress import Display
 
 __all__ = ["enroll_objects", "labelled_views"]
-
-
-def _show_nothing(stage: str, done: int, total: int, note: str) -> None:
-    """Show nothing."""
 
 
 def labelled_views(
@@ -90,7 +86,7 @@ def enroll_objects(
     extend: bool = False,
     replace: bool = False,
     gallery: Path | None = None,
-    progress: Callable[[], contextlib.AbstractContextManager[Progress]] = lambda: contextlib.nullcontext(_show_nothing),
+    progress: Display = lambda: contextlib.nullcontext(lambda stage, done, total, note: None),
 ) -> tuple[dict[str, int], ObjectGallery]:
     """Enroll objects in the gallery of a run directory, in one change; one that does not exist is created.
 
@@ -103,8 +99,7 @@ def enroll_objects(
         extend: add the views to those of objects that exist.
         replace: discard the views of objects that exist.
         gallery: directory of the gallery, of a run directory that exists; by default `gallery` in the run directory.
-        progress: function that shows the progress, like `show_progress` of the command line; its context
-            is called with ("enroll", objects done, number of objects, name).
+        progress: opens the display, which is called with ("enroll", objects done, number of objects, name).
 
     Returns:
         Object -> number of its views in the gallery, and the gallery.

@@ -2,8 +2,7 @@
 
 import contextlib
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -27,7 +26,7 @@ from training.objects.meshes import find_meshes, read_names, scaled_meshes
 from training.readers.frame_files import find_frames
 from training.readers.frames import FrameFolder
 from training.storage.jobs import check_same_job
-from training.storage.progress import Progress, numbered, of_stage
+from training.storage.progress import Display, numbered, of_stage
 from training.storage.workers import local_workers
 from training.views.crops import QuantizedCrop, quantized, rgbd_crop
 from training.views.dataset import ViewDataset, remove_views
@@ -54,10 +53,6 @@ class LabelledInstances(NamedTuple):
     views: Mapping[str, Sequence[PreparedInstance]]
     skipped: Sequence[tuple[str, str]]
     crops: Mapping[str, Sequence[QuantizedCrop]] | None
-
-
-Display = Callable[[], AbstractContextManager[Progress]]
-"""Opens a progress display, such as `training.cli.progress.show_progress`."""
 
 
 @dataclasses.dataclass(frozen=True)

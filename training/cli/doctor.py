@@ -55,7 +55,8 @@ def doctor(
             failed.append(source.name)
             print(f"failed: {escape_characters(f'{source.name}: {error}')}", file=sys.stderr)
         else:
-            is_sound &= _report(diagnosis, as_json, None if given.color else source.name)
+            _report(diagnosis, as_json, None if given.color else source.name)
+            is_sound &= not diagnosis.findings
     if failed:
         raise InputError(f"{len(failed)} of {len(sources)} frames cannot be read; see above")
     again = ["doctor", *given.arguments]
@@ -70,11 +71,11 @@ def doctor(
         raise typer.Exit(1)
 
 
-def _report(diagnosis: "Diagnosis", as_json: bool, frame: str | None = None) -> bool:
-    """Print a diagnosis; return whether nothing was found."""
+def _report(diagnosis: "Diagnosis", as_json: bool, frame: str | None) -> None:
+    """Print a diagnosis."""
     if as_json:
         print(json.dumps(({} if frame is None else {"frame": frame}) | dataclasses.asdict(diagnosis)), flush=True)
-        return not diagnosis.findings
+        return
     if frame is not None:
         print(f"{escape_characters(frame)}:")
     for finding in diagnosis.findings:
@@ -83,4 +84,3 @@ def _report(diagnosis: "Diagnosis", as_json: bool, frame: str | None = None) -> 
         print(escape_characters(f"note: {note}"))
     if not diagnosis.findings:
         print("nothing found", flush=True)
-    return not diagnosis.findings

@@ -13,7 +13,6 @@ An interrupted training resumes when it is called again. run.json is written las
 
 import contextlib
 import dataclasses
-import json
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -27,8 +26,7 @@ from numpy.typing import NDArray
 import colornet
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
 from thor2_jax.descriptor.sharding import batch_mesh
-from thor2_jax.errors import InputError
-from thor2_jax.files import check_output_directory, remove_leftovers, remove_written, write_text
+from thor2_jax.files import check_output_directory, remove_leftovers, remove_written
 from thor2_jax.gallery.embedding import Embedding
 from thor2_jax.gallery.references import REFERENCES_FILE
 from thor2_jax.model.classifier import EMBEDDING, MLP, Feature, check_features
@@ -43,13 +41,14 @@ from training.fitting.options import EpochMetrics, FitOptions, append_metrics, d
 from training.fitting.samples import MIRRORS, Samples, build_samples, fold_of_views
 from training.fitting.steps import FitContext
 from training.reports.plots import draw_curves
-from training.storage.jobs import check_same_job, locked
+from training.storage.jobs import begin_job, check_begun, check_same_job, locked
 from training.storage.progress import Progress, of_stage
 from training.views.normalized_views import ViewSource
 
 __all__ = ["VIEWS", "RunSettings", "check_out", "check_trained", "finished_record", "is_finished", "train_run"]
 
 VIEWS = "views"
+JOB = f"{CHECKPOINTS}/{BEGUN}"
 METRICS = "metrics.jsonl"
 HELD_OUT = 12
 """One view of so many is held out to calibrate the confidence of a run without folds."""
@@ -144,27 +143,16 @@ class RunSettings:
         }
 
 
-def _check_begun(out: Path, job: Mapping[str, Any]) -> None:
-    """Raise InputError if a directory holds an interrupted training of another job."""
-    path = out / CHECKPOINTS / BEGUN
-    if path.is_file():
-        try:
-            begun = dict(json.loads(path.read_bytes()))
-        except (OSError, ValueError, TypeError, RecursionError) as error:
-            raise InputError(f"out: {path} cannot be read ({error}); delete {path.parent} to start anew") from None
-        check_same_job(out, begun, job)
-
-
 def check_out(out: str | Path) -> None:
     """Raise InputError unless `out` is new, empty, or the directory of an interrupted training."""
-    check_output_directory(out, f"{CHECKPOINTS}/{BEGUN}", (VIEWS, CHECKPOINTS))
+    check_output_directory(out, JOB, (VIEWS, CHECKPOINTS))
     check_output_directory(Path(out) / CHECKPOINTS, BEGUN)
 
 
 def is_finished(out: Path) -> bool:
     """Return whether a directory holds a trained run, or all folds of one."""
     trained = any((directory / RUN_FILE).is_file() for directory in (out, *out.glob("fold-*")))
-    return trained and not (out / CHECKPOINTS / BEGUN).exists()
+    return trained and not (out / JOB).exists()
 
 
 def check_trained(digest: str, out: Path, settings: RunSettings) -> None:
@@ -225,7 +213,7 @@ def train_run(
         settings.distractors.check(source.classes)
     check_out(out)
     job = settings.record(source.digest)
-    _check_begun(out, job)
+    check_begun(out, job, JOB)
     check_batch_size(settings.options.batch_size, batch_mesh())
     with contextlib.ExitStack() as locks:
         first, resumed = jax.process_index() == 0, (out / CHECKPOINTS).is_dir()
@@ -248,9 +236,7 @@ def train_run(
                 check_out(out)  # another process may have been quicker
                 (out / CHECKPOINTS).mkdir(parents=True, exist_ok=True)
                 locks.enter_context(locked(out / CHECKPOINTS))
-                _check_begun(out, job)
-            if not (out / CHECKPOINTS / BEGUN).is_file():
-                write_text(out / CHECKPOINTS / BEGUN, json.dumps(job, indent=1) + "\n")
+            begin_job(out, job, JOB)
             remove_leftovers(out)
         _wait_for_all("begun")
         runs = [

@@ -12,7 +12,7 @@ import filelock
 from thor2_jax.errors import InputError
 from thor2_jax.files import write_text
 
-__all__ = ["JOB_FILE", "LOCK", "begin_job", "check_same_job", "locked"]
+__all__ = ["JOB_FILE", "LOCK", "begin_job", "check_begun", "check_same_job", "locked"]
 
 JOB_FILE = "job.json"
 
@@ -20,23 +20,34 @@ MAX_SHOWN = 100
 """Characters of a value that an error message shows."""
 
 
-def begin_job(directory: Path, job: Mapping[str, Any]) -> None:
+def begin_job(directory: Path, job: Mapping[str, Any], name: str = JOB_FILE) -> None:
     """Write the record of a job to a directory, or check that the directory is of this job.
 
     Args:
         directory: output directory; it is created unless it exists.
         job: the record, as JSON can hold it.
+        name: path of the record in the directory.
 
     Raises:
-        InputError: the directory is of another job.
-        OSError: the record cannot be read or written.
+        InputError: the directory is of another job, or its record is damaged.
+        OSError: the record cannot be written.
     """
-    file = directory / JOB_FILE
+    check_begun(directory, job, name)
+    file = directory / name
+    if not file.is_file():
+        file.parent.mkdir(parents=True, exist_ok=True)
+        write_text(file, json.dumps(job, indent=1) + "\n")
+
+
+def check_begun(directory: Path, job: Mapping[str, Any], name: str = JOB_FILE) -> None:
+    """Raise InputError if a directory has the record of another job, or a damaged one; arguments as `begin_job`."""
+    file = directory / name
     if file.is_file():
-        check_same_job(directory, json.loads(file.read_bytes()), job)
-        return
-    directory.mkdir(parents=True, exist_ok=True)
-    write_text(file, json.dumps(job, indent=1) + "\n")
+        try:
+            begun = dict(json.loads(file.read_bytes()))
+        except (OSError, ValueError, TypeError, RecursionError) as error:
+            raise InputError(f"out: {file} cannot be read ({error}); delete {file.parent} to start anew") from None
+        check_same_job(directory, begun, job)
 
 
 def check_same_job(directory: Path, stored: Mapping[str, Any], requested: Mapping[str, Any]) -> None:

@@ -33,13 +33,12 @@ import safetensors.numpy
 from thor2_jax.config import DESCRIPTOR_VERSION
 from thor2_jax.errors import InputError
 from thor2_jax.files import read_file, remove_written, write_text
-from training.views.crops import CROPS, ViewCrops, read_crops
+from training.views.crops import CROPS, MANIFEST, ViewCrops, read_crops
 from training.views.normalized_views import COORDINATE_STEP, NormalizedViews
 
 __all__ = ["MANIFEST", "Manifest", "NormalizedViews", "Shard", "ViewDataset", "encode", "remove_views"]
 
 MANIFEST_FORMAT = 2
-MANIFEST = "manifest.json"
 
 
 def remove_views(directory: Path) -> None:
