@@ -32,10 +32,8 @@ def labelled_views(
     label_name: str | None = None,
     instance: int | None = None,
     on_view: Callable[[RGBDFrame, int, str], object] = lambda frame, label, name: None,
-) -> tuple[dict[str, list[PreparedInstance]], list[tuple[str, str]]]:
-    """Return object -> its views in frames, and (object, reason) of each instance that cannot be used.
-
-    The object is empty for frames without labels.
+) -> tuple[dict[str, list[PreparedInstance]], list[str]]:
+    """Return object -> its views in frames, and why each of the other instances cannot be used.
 
     Args:
         frames: the frames.
@@ -74,7 +72,7 @@ def labelled_views(
             raise InputError(f"frames: {skipped[0][1]}")
         wanted = "an object" if label_name is None else repr(label_name)
         raise InputError(f"frames: no frame has a label for {wanted}; see labels.json, or give --instance")
-    return views, skipped
+    return views, [reason for _, reason in skipped]
 
 
 def enroll_objects(

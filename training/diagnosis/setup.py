@@ -53,10 +53,7 @@ def diagnose(
     diagnosis = Diagnosis()
     sides = check_meshes(diagnosis, meshes, mesh_scale)
     names: Mapping[int, str] = {}
-    color: NDArray[np.uint8] | None
-    if isinstance(files, RGBDFrame):
-        color, depth, labels, camera = files.color, files.depth, files.labels, files.intrinsics
-    else:
+    if isinstance(files, FrameFiles):
         missing = [path for path in vars(files).values() if path and not path.exists()]
         if missing:
             raise InputError(f"{missing[0]} is missing; expected the files of a frame")
@@ -68,6 +65,8 @@ def diagnose(
             diagnosis.notes.append("labels: none are given, so the sizes of the objects were not checked")
         elif files.names.is_file():
             names = _read(diagnosis, "names", lambda: read_names(files.names)) or {}
+    else:
+        color, depth, labels, camera = files.color, files.depth, files.labels, files.intrinsics
     depth, labels = _aligned(diagnosis, "depth", depth, color), _aligned(diagnosis, "labels", labels, color)
     shape = next((image.shape[:2] for image in (color, depth, labels) if image is not None), None)
     camera_is_right = (
