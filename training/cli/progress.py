@@ -4,6 +4,7 @@ import contextlib
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import AbstractContextManager
 
 from rich import progress
 from rich.console import Console
@@ -15,16 +16,11 @@ __all__ = ["show_progress"]
 SECONDS_PER_LINE = 5.0
 
 
-@contextlib.contextmanager
-def show_progress(quiet: bool = False) -> Iterator[Progress]:
-    """Yield a callback that shows the progress of each stage; with `quiet`, it shows nothing."""
+def show_progress(quiet: bool = False) -> AbstractContextManager[Progress]:
+    """Return a context whose callback shows the progress of each stage; with `quiet`, it shows nothing."""
     if quiet:
-        yield lambda stage, done, total, note: None
-    elif sys.stderr.isatty():
-        with _bars() as bars:
-            yield bars
-    else:
-        yield _Lines()
+        return contextlib.nullcontext(lambda stage, done, total, note: None)
+    return _bars() if sys.stderr.isatty() else contextlib.nullcontext(_Lines())
 
 
 @contextlib.contextmanager

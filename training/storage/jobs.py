@@ -1,9 +1,8 @@
 """Job records, which tell whether an output directory is that of the requested job, and exclusive locks on it."""
 
-import contextlib
 import itertools
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -92,9 +91,8 @@ def _shown(value: Any) -> str:
 LOCK = ".lock"
 
 
-@contextlib.contextmanager
-def locked(directory: Path) -> Iterator[None]:
-    """Hold an exclusive lock on an output directory, which is created if it is missing.
+def locked(directory: Path) -> filelock.AcquireReturnProxy:
+    """Acquire an exclusive lock on an output directory, which is created if it is missing; return its context.
 
     The operating system releases the lock when the process ends, even if it is killed. The lock file stays.
 
@@ -104,10 +102,8 @@ def locked(directory: Path) -> Iterator[None]:
     """
     # A soft lock, filelock's fallback on file systems without locks, would outlive a killed process.
     try:
-        held = filelock.FileLock(directory / LOCK, blocking=False, fallback_to_soft=False).acquire()
+        return filelock.FileLock(directory / LOCK, blocking=False, fallback_to_soft=False).acquire()
     except filelock.Timeout:
         raise InputError(
             f"out: another process is writing to {directory}; wait until it ends, or choose another directory"
         ) from None
-    with held:
-        yield

@@ -119,11 +119,6 @@ class Manifest:
     shards: tuple[Shard, ...] = ()
 
     @property
-    def finished(self) -> bool:
-        """Whether all shards are finished."""
-        return len(self.shards) == self.job["shards"]
-
-    @property
     def views(self) -> int:
         """Number of clouds in all shards."""
         return sum(shard.views for shard in self.shards)
@@ -214,7 +209,7 @@ class ViewDataset:
                 f"dataset: {directory / MANIFEST} has views for descriptor version {version}; expected version "
                 f"{DESCRIPTOR_VERSION}; render the views again"
             )
-        if not manifest.finished:
+        if len(manifest.shards) != manifest.job["shards"]:
             raise InputError(
                 f"dataset: {directory / MANIFEST} lists {len(manifest.shards)} of {manifest.job['shards']} shards; "
                 "repeat the `thor2 render` command to finish it"
