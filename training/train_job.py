@@ -55,7 +55,7 @@ class LabelledInstances(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class TrainJob:
-    """A training and its views: at most one of `meshes` and `dataset` is given, `frames`, or both.
+    """A training and its views: one of `meshes` and `dataset` is given, `frames`, or both.
 
     Attributes:
         out: run directory, or with `sequences` the directory of the run directories.
@@ -201,8 +201,6 @@ def _read_frames(job: TrainJob, baselines: Sequence[str]) -> LabelledInstances |
         InputError: a frame cannot be read, or has no usable instance of an object; or the job cannot use frames.
     """
     if not job.frames:
-        if job.meshes is None and job.dataset is None:
-            raise InputError("meshes, dataset and frames are missing; expected one of them")
         return None
     if job.sequences is not None:
         raise InputError(

@@ -15,7 +15,7 @@ from training.baselines.baseline import Baseline, FitTask, FittedBaseline
 from training.baselines.files import StoredBaseline, baseline_file, read_baseline, write_baseline
 from training.baselines.forest import Forest, fit_forest
 from training.baselines.image_network import ImageNetwork, fit_image_network
-from training.baselines.names import BASELINES, CLOUD_BASELINES, NETWORKS, TEMPLATES, check_baselines
+from training.baselines.names import BASELINES, CLOUD_BASELINES, NETWORKS, TEMPLATES
 from training.baselines.networks.architectures import ARCHITECTURES
 from training.baselines.networks.weights import load_weights, weights_file
 from training.baselines.pointnet import ColoredPointNet, fit_pointnet
@@ -61,19 +61,18 @@ def train_baselines(
     Args:
         path: run directory, or a directory with the folds of a training: then for each fold.
         source: the views that the run was trained on; those that its fold holds out are held out here too.
-        names: any of BASELINES.
+        names: any of BASELINES, in their order.
         progress: called with (stage, done, total, note).
         options: options of the fits; by default those of the run.
         weights: directory of pretrained weights for the image networks and the templates, see docs/baselines.md; None
             trains the networks from scratch.
 
     Raises:
-        InputError: A baseline is unknown, `path` is not a run directory, the views are not those of the run, or a
-            baseline cannot be trained on them; or `weights` lacks a file, or has one of another architecture, or a
-            network of the run was trained without it.
+        InputError: `path` is not a run directory, the views are not those of the run, or a baseline cannot be trained
+            on them; or `weights` lacks a file, or has one of another architecture, or a network of the run was trained
+            without it.
         OSError: A file cannot be written.
     """
-    names = check_baselines(names)
     for directory in find_run_directories([Path(path)]):
         run = load_run(directory)
         if run.record["dataset"]["digest"] != source.digest:

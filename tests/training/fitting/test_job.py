@@ -269,7 +269,7 @@ def test_a_full_disk(whole: tuple[Path, TrainedRun], tmp_path: Path, monkeypatch
         full() if calls == 2 else save(self, *arguments)
 
     for where, name, replacement in (
-        (module, "write_text", full),
+        (module, "begin_job", full),
         (Checkpoints, "save", second_fails),
         (module, "append_metrics", full),
         (module, "draw_curves", full),
