@@ -3,6 +3,7 @@
 import itertools
 import json
 from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -91,7 +92,7 @@ def _shown(value: Any) -> str:
 LOCK = ".lock"
 
 
-def locked(directory: Path) -> filelock.AcquireReturnProxy:
+def locked(directory: Path) -> AbstractContextManager[object]:
     """Acquire an exclusive lock on an output directory, which is created if it is missing; return its context.
 
     The operating system releases the lock when the process ends, even if it is killed. The lock file stays.
