@@ -167,9 +167,9 @@ def recognition_seconds(run: Run, dataset: Dataset) -> dict[str, float]:
 
     describing = timed(lambda number: recognizer.describe(frames[number]))
     seconds = {"THOR2": describing + timed(lambda number: classify(described[number]))}
-    for name, model in run.baselines.items():
+    for name, baseline in run.baselines.items():
 
-        def predict(number: int, model: Any = model) -> object:
+        def predict(number: int, model: Any = baseline.model) -> object:
             return model.probabilities(baseline_inputs(described[number], config, frames[number]))
 
         seconds[name] = timed(predict) + (describing if name in CLOUD_BASELINES else 0)

@@ -37,7 +37,6 @@ from training.reports.plots import draw_accuracy, draw_confusion, draw_curves
 from training.storage.jobs import check_same_job
 from training.storage.progress import Progress, of_stage
 from training.storage.workers import local_workers
-from training.train_job import TrainJob
 from training.views.dataset import remove_views
 from training.views.mesh_views import view_cloud
 from training.views.render_job import render_dataset
@@ -46,6 +45,8 @@ __all__ = ["DemoSummary", "run_demo"]
 
 PROTOCOL = dataclasses.replace(
     DEFAULT,
+    classifiers=FEATURES,
+    distractors=None,
     azimuth_step=30.0,
     polar_step=20.0,
     augmentations=dataclasses.replace(AUGMENTATIONS, copies=2),
@@ -142,8 +143,7 @@ def _train(objects: Mapping[str, TexturedMesh], out: Path, seed: int, progress: 
         steps, show = (PROTOCOL.azimuth_step, PROTOCOL.polar_step), of_stage(progress, "render views")
         pool = local_workers(workers)
         dataset = render_dataset(objects, out / VIEWS, *steps, pool, show, PROTOCOL.augmentations, seed)
-        settings = TrainJob(out, PROTOCOL.replace(seed=seed), classifiers=FEATURES).settings
-        (run,) = train_run(dataset, out, settings, progress)
+        (run,) = train_run(dataset, out, PROTOCOL.replace(seed=seed), progress)
     remove_views(out / VIEWS)
     return run
 

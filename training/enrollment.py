@@ -21,13 +21,9 @@ from thor2_jax.model.run_directory import TrainedRun, save_run
 from thor2_jax.printable import check_name, normal_name
 from thor2_jax.recognizer import Recognizer
 from training.readers.frames import FrameFolder
-from training.storage.progress import Progress
+from training.storage.progress import Display
 
 __all__ = ["enroll_objects", "labelled_views"]
-
-
-def _show_nothing(stage: str, done: int, total: int, note: str) -> None:
-    """Show nothing."""
 
 
 def labelled_views(
@@ -36,10 +32,8 @@ def labelled_views(
     label_name: str | None = None,
     instance: int | None = None,
     on_view: Callable[[RGBDFrame, int, str], object] = lambda frame, label, name: None,
-) -> tuple[dict[str, list[PreparedInstance]], list[tuple[str, str]]]:
-    """Return object -> its views in frames, and (object, reason) of each instance that cannot be used.
-
-    The object is empty for frames without labels.
+) -> tuple[dict[str, list[PreparedInstance]], list[str]]:
+    """Return object -> its views in frames, and why each of the other instances cannot be used.
 
     Args:
         frames: the frames.
@@ -78,7 +72,7 @@ def labelled_views(
             raise InputError(f"frames: {skipped[0][1]}")
         wanted = "an object" if label_name is None else repr(label_name)
         raise InputError(f"frames: no frame has a label for {wanted}; see labels.json, or give --instance")
-    return views, skipped
+    return views, [reason for _, reason in skipped]
 
 
 def enroll_objects(
@@ -90,7 +84,7 @@ def enroll_objects(
     extend: bool = False,
     replace: bool = False,
     gallery: Path | None = None,
-    progress: Callable[[], contextlib.AbstractContextManager[Progress]] = lambda: contextlib.nullcontext(_show_nothing),
+    progress: Display = lambda: contextlib.nullcontext(lambda stage, done, total, note: None),
 ) -> tuple[dict[str, int], ObjectGallery]:
     """Enroll objects in the gallery of a run directory, in one change; one that does not exist is created.
 
@@ -103,8 +97,7 @@ def enroll_objects(
         extend: add the views to those of objects that exist.
         replace: discard the views of objects that exist.
         gallery: directory of the gallery, of a run directory that exists; by default `gallery` in the run directory.
-        progress: function that shows the progress, like `show_progress` of the command line; its context
-            is called with ("enroll", objects done, number of objects, name).
+        progress: opens the display, which is called with ("enroll", objects done, number of objects, name).
 
     Returns:
         Object -> number of its views in the gallery, and the gallery.

@@ -72,17 +72,22 @@ class FrameAnswer:
 
 def recognize_frames(recognizer: Recognizer, sources: Iterable[FrameSource]) -> Iterator[FrameAnswer]:
     """Read and recognize frames; one that fails has an `error` and does not stop the others."""
-    for source in sources:
-        try:
-            frame = source.read()
-            start = time.perf_counter()
-            recognitions = recognizer.recognize(frame)
-        except InputError as error:
-            yield FrameAnswer(source.name, error=str(error))
-        except OSError as error:
-            yield FrameAnswer(source.name, error=f"{error.filename}: {error.strerror or error}")
-        else:
-            yield FrameAnswer(source.name, frame, recognitions, time.perf_counter() - start)
+    return (_answer(source.name, source.read, recognizer.recognize) for source in sources)
+
+
+def _answer(
+    name: str, read: Callable[[], RGBDFrame], recognize: Callable[[RGBDFrame], Sequence[Recognition]]
+) -> FrameAnswer:
+    """Read and recognize a frame; the answer has an `error` if that fails."""
+    try:
+        frame = read()
+        start = time.perf_counter()
+        recognitions = recognize(frame)
+    except InputError as error:
+        return FrameAnswer(name, error=str(error))
+    except OSError as error:
+        return FrameAnswer(name, error=f"{error.filename}: {error.strerror or error}")
+    return FrameAnswer(name, frame, recognitions, time.perf_counter() - start)
 
 
 def segmentation_failure(answer: FrameAnswer) -> str:
@@ -235,12 +240,8 @@ def recognize_recorded(
     Raises:
         InputError: as `frames`.
     """
-    for recorded in itertools.islice(frames, 0, None, every):
-        try:
-            frame = segmented(recorded.read(), segmenter)
-            start = time.perf_counter()
-            recognitions = recognize(frame)
-        except InputError as error:
-            yield recorded, FrameAnswer(recorded.name, error=str(error))
-        else:
-            yield recorded, FrameAnswer(recorded.name, frame, recognitions, time.perf_counter() - start)
+
+    def answer(recorded: RecordedFrame) -> FrameAnswer:
+        return _answer(recorded.name, lambda: segmented(recorded.read(), segmenter), recognize)
+
+    return ((recorded, answer(recorded)) for recorded in itertools.islice(frames, 0, None, every))

@@ -2,8 +2,7 @@
 
 import contextlib
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,21 +12,19 @@ from thor2_jax.errors import InputError
 from thor2_jax.files import remove_leftovers
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.prepared_instance import PreparedInstance
-from thor2_jax.model.classifier import FEATURES, Feature, check_features
 from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.printable import normal_name
 from training.baselines.job import check_weights, pretrained_files, train_baselines
 from training.baselines.names import check_baselines, crop_size
-from training.embedding.run_embedding import Distractors
 from training.enrollment import labelled_views
-from training.fitting.job import VIEWS, RunSettings, check_out, check_trained, finished_record, is_finished, train_run
+from training.fitting.job import VIEWS, check_out, check_trained, finished_record, is_finished, train_run
 from training.fitting.protocol import DEFAULT, PAPER, Protocol
 from training.objects.mesh import TexturedMesh
 from training.objects.meshes import find_meshes, read_names, scaled_meshes
 from training.readers.frame_files import find_frames
 from training.readers.frames import FrameFolder
 from training.storage.jobs import check_same_job
-from training.storage.progress import Progress, numbered, of_stage
+from training.storage.progress import Display, numbered, of_stage
 from training.storage.workers import local_workers
 from training.views.crops import QuantizedCrop, quantized, rgbd_crop
 from training.views.dataset import ViewDataset, remove_views
@@ -47,37 +44,30 @@ class LabelledInstances(NamedTuple):
 
     Attributes:
         views: object -> its usable instances.
-        skipped: object and reason of each of the others.
+        skipped: why each of the others cannot be used.
         crops: object -> the crops of its usable instances; None if no baseline reads them.
     """
 
     views: Mapping[str, Sequence[PreparedInstance]]
-    skipped: Sequence[tuple[str, str]]
+    skipped: Sequence[str]
     crops: Mapping[str, Sequence[QuantizedCrop]] | None
-
-
-Display = Callable[[], AbstractContextManager[Progress]]
-"""Opens a progress display, such as `training.cli.progress.show_progress`."""
 
 
 @dataclasses.dataclass(frozen=True)
 class TrainJob:
-    """A training and its views: at most one of `meshes` and `dataset` is given, `frames`, or both.
+    """A training and its views: one of `meshes` and `dataset` is given, `frames`, or both.
 
     Attributes:
         out: run directory, or with `sequences` the directory of the run directories.
-        protocol: camera steps, augmentations, mirrors and fit options.
+        protocol: the settings of the runs and of their views.
         meshes: directory of meshes; their views are rendered for this run and removed afterwards.
         dataset: directory written by `thor2 render`.
         frames: folders of labelled frames, see `FrameFolder`, whose instances are views of their classes, too.
         names: table of object name -> mesh in `meshes`; None uses all meshes.
-        classifiers: any of "tops", "tops2", "ce"; None for those of the protocol, or without an embedding all.
-        folds: number of folds; with more than one, each gets a model and is its held-out set.
         baselines: any of `BASELINES`.
         weights: directory of pretrained weights for the image networks; None trains them from scratch.
         leave_out: objects to train without.
         sequences: table of sequence -> its objects; one run is trained for each sequence.
-        distractors: other objects that the embedding of the run is fitted on, too; None fits no embedding.
         workers: rendering processes.
         mesh_scale: factor from the unit of the meshes to metres.
     """
@@ -88,29 +78,12 @@ class TrainJob:
     dataset: Path | None = None
     frames: Sequence[Path] = ()
     names: Path | None = None
-    classifiers: Sequence[str] | None = None
-    folds: int = 1
     baselines: Sequence[str] = ()
     weights: Path | None = None
     leave_out: Sequence[str] = ()
     sequences: Path | None = None
-    distractors: Distractors | None = None
     workers: int = 1
     mesh_scale: float = 1.0
-
-    @property
-    def features(self) -> tuple[Feature, ...]:
-        """The classifiers that the job trains; raises InputError if one is unknown."""
-        if self.classifiers is not None:
-            return check_features(self.classifiers, "classifiers")
-        return FEATURES if self.distractors is None else self.protocol.classifiers
-
-    @property
-    def settings(self) -> RunSettings:
-        """What determines its runs beside the views; raises InputError if a classifier is unknown."""
-        protocol = self.protocol
-        mirrors, copies = protocol.mirrors, protocol.orientation_copies
-        return RunSettings(self.features, protocol.fit, protocol.config, self.folds, mirrors, copies, self.distractors)
 
 
 def run_train_job(job: TrainJob, display: Display) -> dict[Path, list[TrainedRun]]:
@@ -125,7 +98,6 @@ def run_train_job(job: TrainJob, display: Display) -> dict[Path, list[TrainedRun
     """
     baselines = check_baselines(job.baselines)
     _check_weights(job, baselines)
-    settings = job.settings
     labelled = _read_frames(job, baselines)
     if job.sequences is None:
         if not is_finished(job.out):
@@ -145,14 +117,14 @@ def run_train_job(job: TrainJob, display: Display) -> dict[Path, list[TrainedRun
         if not is_finished(directory):
             check_out(directory)
         elif not baselines or job.sequences is not None:
-            check_trained(views.digest, directory, settings)
+            check_trained(views.digest, directory, job.protocol)
     runs: dict[Path, list[TrainedRun]] = {}
     for directory, views in sources.items():
         runs[directory] = []
         with display() as shown:
             progress = numbered(shown, _stages(job))
             if not is_finished(directory):
-                runs[directory] = train_run(views, directory, settings, progress)
+                runs[directory] = train_run(views, directory, job.protocol, progress)
             if baselines and jax.process_index() == 0:
                 train_baselines(directory, views, baselines, progress, weights=job.weights)
     if job.meshes is not None and jax.process_index() == 0:
@@ -174,8 +146,8 @@ def _check_weights(job: TrainJob, baselines: Sequence[str]) -> None:
 def _stages(job: TrainJob) -> dict[str, float]:
     """Return the stages of the training of a run, see `RunSettings.stages`; those of baselines are none of them."""
     if job.meshes is None:
-        return job.settings.stages
-    return {RENDER: 1.0} | ({RENDER_CROPS: 1.0} if _crop_size(job) is not None else {}) | job.settings.stages
+        return job.protocol.stages
+    return {RENDER: 1.0} | ({RENDER_CROPS: 1.0} if _crop_size(job) is not None else {}) | job.protocol.stages
 
 
 def _crop_size(job: TrainJob) -> int | None:
@@ -210,7 +182,7 @@ def _check_finished_views(job: TrainJob, labelled: LabelledInstances | None) -> 
     check_same_job(job.out, trained, requested)
     if job.baselines:
         return
-    check_trained(stored["digest"], job.out, job.settings)
+    check_trained(stored["digest"], job.out, job.protocol)
     remove_leftovers(job.out)
     with contextlib.suppress(InputError):
         if ViewDataset.open(job.out / VIEWS).manifest.job == stored["job"]:
@@ -229,8 +201,6 @@ def _read_frames(job: TrainJob, baselines: Sequence[str]) -> LabelledInstances |
         InputError: a frame cannot be read, or has no usable instance of an object; or the job cannot use frames.
     """
     if not job.frames:
-        if job.meshes is None and job.dataset is None:
-            raise InputError("meshes, dataset and frames are missing; expected one of them")
         return None
     if job.sequences is not None:
         raise InputError(
@@ -263,8 +233,8 @@ def _check_names(job: TrainJob, names: Sequence[str], labelled: LabelledInstance
     if missing:
         raise InputError(f"leave_out has {', '.join(map(repr, missing))}; expected some of {', '.join(known)}")
     classes = [name for name in known if name not in job.leave_out]
-    if job.distractors is not None:
-        job.distractors.check(classes)
+    if job.protocol.distractors is not None:
+        job.protocol.distractors.check(classes)
     if labelled is None:
         return
     folded: dict[str, str] = {}
@@ -297,7 +267,6 @@ def _open_views(job: TrainJob, labelled: LabelledInstances | None, display: Disp
             if size is not None:
                 render_crops(meshes, source, size, workers, of_stage(progress, RENDER_CROPS), *drawn)
     if labelled is not None:
-        reasons = [reason for _, reason in labelled.skipped]
-        source = WithLabelledViews(labelled.views, job.protocol.config, source, reasons, labelled.crops)
+        source = WithLabelledViews(labelled.views, job.protocol.config, source, labelled.skipped, labelled.crops)
     assert source is not None
     return source

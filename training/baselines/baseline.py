@@ -61,6 +61,16 @@ class BaselineInputs(NamedTuple):
     tops: NDArray[np.float32]
     crops: Callable[[int], ViewCrops] = _no_crops
 
+    def predicted(
+        self, size: int, n_classes: int, predict: Callable[[ViewCrops], NDArray[np.float32]]
+    ) -> NDArray[np.float32]:
+        """Return class probabilities [B, C] of the crops of a size, from `predict`; equal ones for padding rows."""
+        values = np.full((len(self.tops), n_classes), 1 / n_classes, np.float32)
+        crops = self.crops(size)
+        if len(crops):
+            values[: len(crops)] = predict(crops)
+        return values
+
 
 def baseline_inputs(described: DescribedFrame, config: DescriptorConfig, frame: RGBDFrame) -> BaselineInputs:
     """Return the instances of a frame, in the row order of `described.packed`; crops are made when a baseline asks."""

@@ -16,7 +16,7 @@ import safetensors.numpy
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
-from thor2_jax.files import atomic_write, content_digest, json_digest, open_file
+from thor2_jax.files import atomic_write, content_digest, json_digest, read_file, safetensors_metadata
 
 __all__ = ["StoredBaseline", "baseline_file", "read_baseline", "write_baseline"]
 
@@ -84,10 +84,9 @@ def read_baseline(path: Path, classes: Sequence[str]) -> StoredBaseline:
         InputError: if the file is damaged or has another format or other classes; the message names the file.
     """
     try:
-        open_file(path).close()
-        with safetensors.safe_open(path, "numpy") as file:
-            about = json.loads(file.metadata()["about"])
-            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        content = read_file(path)
+        arrays = safetensors.numpy.load(content)
+        about = json.loads(safetensors_metadata(content)["about"])
         if about["format"] != BASELINE_FORMAT:
             raise InputError(
                 f"model: {path} has format {about['format']!r}; expected {BASELINE_FORMAT}; train the baseline again"

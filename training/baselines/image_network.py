@@ -57,11 +57,7 @@ class ImageNetwork:
 
     def probabilities(self, inputs: BaselineInputs) -> NDArray[np.float32]:
         """Return class probabilities [B, C]; equal ones for padding rows."""
-        values = np.full((len(inputs.tops), self._n_classes), 1 / self._n_classes, np.float32)
-        crops = inputs.crops(self._size)
-        if len(crops):
-            values[: len(crops)] = self.predict(crops)
-        return values
+        return inputs.predicted(self._size, self._n_classes, self.predict)
 
     def predict(self, crops: ViewCrops) -> NDArray[np.float32]:
         """Return class probabilities [V, C] of crops of the network's size; V is at least 1."""

@@ -4,7 +4,7 @@ import contextlib
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from flax import nnx
 
@@ -15,7 +15,7 @@ from training.baselines.baseline import Baseline, FitTask, FittedBaseline
 from training.baselines.files import StoredBaseline, baseline_file, read_baseline, write_baseline
 from training.baselines.forest import Forest, fit_forest
 from training.baselines.image_network import ImageNetwork, fit_image_network
-from training.baselines.names import BASELINES, CLOUD_BASELINES, NETWORKS, TEMPLATES, check_baselines
+from training.baselines.names import BASELINES, CLOUD_BASELINES, NETWORKS, TEMPLATES
 from training.baselines.networks.architectures import ARCHITECTURES
 from training.baselines.networks.weights import load_weights, weights_file
 from training.baselines.pointnet import ColoredPointNet, fit_pointnet
@@ -36,6 +36,15 @@ _FIT: dict[str, Callable[[FitTask], FittedBaseline]] = {
     TEMPLATES: fit_templates,
 }
 
+_BUILD: dict[str, Callable[[str, Mapping[str, Any], TrainedRun], Baseline]] = {
+    "thor": lambda _, arrays, run: THOR.with_arrays(arrays, run.config, len(run.classes)),
+    "forest": lambda _, arrays, run: Forest(arrays, run.network, run.config),
+    "pointnet": lambda _, arrays, run: ColoredPointNet.with_arrays(arrays, len(run.classes)),
+    **dict.fromkeys(NETWORKS, lambda name, arrays, run: ImageNetwork.with_arrays(name, arrays, len(run.classes))),
+    TEMPLATES: lambda _, arrays, run: Templates.with_arrays(arrays, len(run.classes)),
+}
+"""Functions of a name, arrays and the run that build a trained baseline; they raise ValueError for unfit arrays."""
+
 
 def train_baselines(
     path: str | Path,
@@ -52,19 +61,18 @@ def train_baselines(
     Args:
         path: run directory, or a directory with the folds of a training: then for each fold.
         source: the views that the run was trained on; those that its fold holds out are held out here too.
-        names: any of BASELINES.
+        names: any of BASELINES, in their order.
         progress: called with (stage, done, total, note).
         options: options of the fits; by default those of the run.
         weights: directory of pretrained weights for the image networks and the templates, see docs/baselines.md; None
             trains the networks from scratch.
 
     Raises:
-        InputError: A baseline is unknown, `path` is not a run directory, the views are not those of the run, or a
-            baseline cannot be trained on them; or `weights` lacks a file, or has one of another architecture, or a
-            network of the run was trained without it.
+        InputError: `path` is not a run directory, the views are not those of the run, or a baseline cannot be trained
+            on them; or `weights` lacks a file, or has one of another architecture, or a network of the run was trained
+            without it.
         OSError: A file cannot be written.
     """
-    names = check_baselines(names)
     for directory in find_run_directories([Path(path)]):
         run = load_run(directory)
         if run.record["dataset"]["digest"] != source.digest:
@@ -112,54 +120,24 @@ def _train(task: FitTask) -> None:
     remove_written(task.scratch, r"[^/]+/(.*/)?[0-9]+/.*")  # checkpoints
 
 
-class LoadedBaselines(NamedTuple):
-    """The baselines of a run directory.
-
-    Attributes:
-        models: name -> baseline.
-        temperatures: temperatures of those that were calibrated.
-        weights: the files of pretrained weights that each was fitted from; empty if it was trained from scratch.
-    """
-
-    models: dict[str, Baseline]
-    temperatures: dict[str, float]
-    weights: dict[str, list[str]]
-
-
-def _build(name: str, arrays: Mapping[str, Any], run: TrainedRun) -> Baseline:
-    n_classes = len(run.classes)
-    if name == "thor":
-        return THOR.with_arrays(arrays, run.config, n_classes)
-    if name == "forest":
-        return Forest(arrays, run.network, run.config)
-    if name in NETWORKS:
-        return ImageNetwork.with_arrays(name, arrays, n_classes)
-    if name == TEMPLATES:
-        return Templates.with_arrays(arrays, n_classes)
-    assert name == "pointnet"
-    return ColoredPointNet.with_arrays(arrays, n_classes)
-
-
-def load_baselines(path: Path, run: TrainedRun) -> LoadedBaselines:
-    """Return the baselines of a run directory.
+def load_baselines(path: Path, run: TrainedRun) -> dict[str, FittedBaseline]:
+    """Return name -> baseline of a run directory.
 
     Raises:
         InputError: a file is damaged or does not match the run.
     """
-    loaded = LoadedBaselines({}, {}, {})
+    loaded = {}
     for name, file in ((name, baseline_file(path, name)) for name in BASELINES):
         if not file.is_file():
             continue
         stored = read_baseline(file, run.classes)
         try:
-            loaded.models[name] = _build(name, stored.arrays, run)
+            model = _BUILD[name](name, stored.arrays, run)
         except ValueError as error:
             raise InputError(
                 f"model: {file} does not match its run ({error}); delete it and train the baseline again"
             ) from None
-        if stored.temperature is not None:
-            loaded.temperatures[name] = stored.temperature
-        loaded.weights[name] = sorted(stored.weights)
+        loaded[name] = FittedBaseline(model, stored.temperature, stored.weights)
     return loaded
 
 

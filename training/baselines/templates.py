@@ -107,11 +107,8 @@ class Templates:
 
     def probabilities(self, inputs: BaselineInputs) -> NDArray[np.float32]:
         """Return class probabilities [B, C]; equal ones for padding rows."""
-        values = np.full((len(inputs.tops), self._n_classes), 1 / self._n_classes, np.float32)
-        crops = inputs.crops(backbone_size(BACKBONES[self._number]))
-        if len(crops):
-            values[: len(crops)] = self.compare(self.embed(crops))
-        return values
+        size = backbone_size(BACKBONES[self._number])
+        return inputs.predicted(size, self._n_classes, lambda crops: self.compare(self.embed(crops)))
 
     def compare(self, features: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return class probabilities [V, C] for unit features [V, D]: a softmax of the largest similarities."""

@@ -19,7 +19,6 @@ def enable_compilation_cache() -> None:
     Raises:
         InputError: THOR2_CACHE names a file.
     """
-    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # XLA logs each program of the cache as an error
     root = cache_directory("xla")
     if root is None or os.environ.get("JAX_COMPILATION_CACHE_DIR"):
         return

@@ -36,18 +36,14 @@ def doctor(
     The exit code is 0 if nothing is found, 1 if something is likely wrong, and 2 if a file is missing.
     """
     from training.diagnosis.setup import diagnose
+    from training.frame_recognition import RecognizerArguments
     from training.objects.meshes import find_meshes
 
     if meshes is None and mesh_scale != 1:
         raise InputError(f"mesh_scale is {mesh_scale:g}; it belongs to --meshes")
     sources = given.sources(masks=False)
     paths = {} if meshes is None else find_meshes(meshes) if meshes.is_dir() else {meshes.stem: meshes}
-    recognizer = None
-    if model is not None:
-        from thor2_jax.capacity import BATCH_BUCKETS
-        from thor2_jax.recognizer import Recognizer
-
-        recognizer = Recognizer.load(model, chunk=BATCH_BUCKETS[-1])
+    recognizer = None if model is None else RecognizerArguments(model).load()
     known: dict[str, Any] = {"recognizer": recognizer, "meshes": paths, "mesh_scale": mesh_scale}
     is_sound, failed = True, []
     for source in sources:
@@ -59,7 +55,8 @@ def doctor(
             failed.append(source.name)
             print(f"failed: {escape_characters(f'{source.name}: {error}')}", file=sys.stderr)
         else:
-            is_sound &= _report(diagnosis, as_json, None if given.color else source.name)
+            _report(diagnosis, as_json, None if given.color else source.name)
+            is_sound &= not diagnosis.findings
     if failed:
         raise InputError(f"{len(failed)} of {len(sources)} frames cannot be read; see above")
     again = ["doctor", *given.arguments]
@@ -74,11 +71,11 @@ def doctor(
         raise typer.Exit(1)
 
 
-def _report(diagnosis: "Diagnosis", as_json: bool, frame: str | None = None) -> bool:
-    """Print a diagnosis; return whether nothing was found."""
+def _report(diagnosis: "Diagnosis", as_json: bool, frame: str | None) -> None:
+    """Print a diagnosis."""
     if as_json:
         print(json.dumps(({} if frame is None else {"frame": frame}) | dataclasses.asdict(diagnosis)), flush=True)
-        return not diagnosis.findings
+        return
     if frame is not None:
         print(f"{escape_characters(frame)}:")
     for finding in diagnosis.findings:
@@ -87,4 +84,3 @@ def _report(diagnosis: "Diagnosis", as_json: bool, frame: str | None = None) -> 
         print(escape_characters(f"note: {note}"))
     if not diagnosis.findings:
         print("nothing found", flush=True)
-    return not diagnosis.findings

@@ -88,7 +88,7 @@ def enroll(
             if frames is None:
                 return views_of_meshes
             views, unusable = labelled_views(frames, sigma_s, label_name or name, instance)
-            skipped.extend(f"skipped: {reason}" for _, reason in unusable)
+            skipped.extend(f"skipped: {reason}" for reason in unusable)
             views = views if name is None else {name: [view for each in views.values() for view in each]}
             return {each: partial(list, of_object) for each, of_object in views.items()}
 

@@ -125,7 +125,7 @@ def _evaluate(
         description["names"] = hashlib.sha256(names.read_bytes()).hexdigest()
     finished = out is not None and (out / "report.json").is_file()
     with tempfile.TemporaryDirectory() as temporary, show_progress(job.quiet) as progress:
-        loaded = arguments.load(frames)
+        loaded = arguments.load(tuple(frames.identifiers))
         answering = functools.partial(answer_frames_in_pool, arguments, frames, pool) if pool else None
         report = evaluate_dataset(loaded, frames, description, out or Path(temporary) / "report", progress, answering)
     _print_report(report)

@@ -18,7 +18,6 @@ from thor2_jax.recordings.topics import Topics
 
 __all__ = [
     "AnswerByOption",
-    "Engine",
     "AllowHostOption",
     "FrameOptions",
     "GalleryOption",
@@ -251,8 +250,6 @@ def split_names(names: str) -> list[str]:
     return [name.strip() for name in names.split(",")] if names else []
 
 
-Engine = Literal["local", "ray"]
-
 MAX_WORKERS = 1024
 """Largest number of processes of a command: each needs memory and open files."""
 
@@ -267,7 +264,7 @@ class WorkerOptions:
 
     workers: WorkersOption = 1
     engine: Annotated[
-        Engine,
+        Literal["local", "ray"],
         typer.Option(help="Work on this machine or on a Ray cluster (extra `cluster`), which has the same paths."),
     ] = "local"
     address: Annotated[

@@ -3,33 +3,28 @@
 import contextlib
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from contextlib import AbstractContextManager
 
 from rich import progress
 from rich.console import Console
+
+from training.storage.progress import Progress
 
 __all__ = ["show_progress"]
 
 SECONDS_PER_LINE = 5.0
 
-Callback = Callable[[str, int, int, str], None]
-"""Called with (stage, done, total, note)."""
 
-
-@contextlib.contextmanager
-def show_progress(quiet: bool = False) -> Iterator[Callback]:
-    """Yield a callback that shows the progress of each stage; with `quiet`, it shows nothing."""
+def show_progress(quiet: bool = False) -> AbstractContextManager[Progress]:
+    """Return a context whose callback shows the progress of each stage; with `quiet`, it shows nothing."""
     if quiet:
-        yield lambda stage, done, total, note: None
-    elif sys.stderr.isatty():
-        with _bars() as bars:
-            yield bars
-    else:
-        yield _Lines()
+        return contextlib.nullcontext(lambda stage, done, total, note: None)
+    return _bars() if sys.stderr.isatty() else contextlib.nullcontext(_Lines())
 
 
 @contextlib.contextmanager
-def _bars() -> Iterator[Callback]:
+def _bars() -> Iterator[Progress]:
     tasks: dict[str, progress.TaskID] = {}
     name = progress.TextColumn("{task.description}", markup=False)
     note = progress.TextColumn("{task.fields[note]}", markup=False)

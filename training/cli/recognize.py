@@ -1,9 +1,10 @@
 """`thor2 recognize`: recognize the instances of frames."""
 
+import contextlib
 import functools
 import json
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -18,8 +19,6 @@ from training.cli.recognize_bag import recognize_bag
 
 if TYPE_CHECKING:
     from thor2_jax.model.recognition import Recognition
-    from thor2_jax.recordings.rerun_file import RerunFile
-    from training.frame_recognition import FrameAnswer
 
 MAX_LISTED = 5
 """Failed frames that the last line lists."""
@@ -66,6 +65,7 @@ def recognize(
     """
     from thor2_jax.files import check_output_directory, check_output_file, remove_leftovers
     from thor2_jax.model import result_files
+    from thor2_jax.recordings.detections import detections_of
     from thor2_jax.recordings.rerun_file import RerunFile
     from training.frame_recognition import (
         RecognizerArguments,
@@ -124,24 +124,27 @@ def recognize(
         answers = recognize_frames_in_pool(arguments, sources, pool)
     else:
         answers = track_frames(recognizer, sources, of_frames) if track else recognize_frames(recognizer, sources)
-    for answer in answers if rerun_file is None else _written(answers, rerun_file):
-        if answer.error is not None or answer.frame is None:
-            failed.append(answer.name)
-            if not frames:
-                raise InputError(str(answer.error))
-            print(escape_characters(f"failed: {answer.name}: {answer.error}"), file=sys.stderr)
-        if as_json:
-            print(json.dumps(answer.as_json()), flush=True)
-        if answer.frame is None:
-            continue
-        without_depth.append(segment and segmentation_failure(answer))
-        if not as_json:
-            _print_table(answer.name if frames else None, answer.recognitions)
-        unknown |= any(each.name is None for each in answer.recognitions)
-        tables.add(answer)
-        if out is not None:
-            directory = out / answer.name if frames else out
-            result_files.write_recognitions(directory, answer.frame, answer.recognitions)
+    with rerun_file or contextlib.nullcontext():
+        for answer in answers:
+            if answer.frame is None:
+                failed.append(answer.name)
+                if not frames:
+                    raise InputError(str(answer.error))
+                print(escape_characters(f"failed: {answer.name}: {answer.error}"), file=sys.stderr)
+            if as_json:
+                print(json.dumps(answer.as_json()), flush=True)
+            if answer.frame is None:
+                continue
+            if rerun_file is not None:
+                rerun_file.write(answer.frame, detections_of(answer.frame, answer.recognitions), name=answer.name)
+            without_depth.append(segment and segmentation_failure(answer))
+            if not as_json:
+                _print_table(answer.name if frames else None, answer.recognitions)
+            unknown |= any(each.name is None for each in answer.recognitions)
+            tables.add(answer)
+            if out is not None:
+                directory = out / answer.name if frames else out
+                result_files.write_recognitions(directory, answer.frame, answer.recognitions)
     tables.write(coco, bop)
     written = ", ".join(str(path) for path in (out, coco, bop, rerun) if path)
     result = f"written to {written}" if written else f"frames recognized: {len(sources) - len(failed)}"
@@ -157,17 +160,6 @@ def recognize(
         raise InputError(f"{len(failed)} of {len(sources)} frames could not be recognized: {listed}; see above")
     if all(without_depth):
         raise InputError(str(without_depth[0]))
-
-
-def _written(answers: Iterator["FrameAnswer"], file: "RerunFile") -> Iterator["FrameAnswer"]:
-    """Pass answers on, and write each to a file for the Rerun viewer."""
-    from thor2_jax.recordings.detections import detections_of
-
-    with file:
-        for answer in answers:
-            if answer.frame is not None:
-                file.write(answer.frame, detections_of(answer.frame, answer.recognitions), name=answer.name)
-            yield answer
 
 
 def _print_table(frame: str | None, recognitions: Sequence["Recognition"]) -> None:

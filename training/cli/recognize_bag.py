@@ -12,8 +12,7 @@ from training.cli import options
 from training.cli.app import finish
 
 if TYPE_CHECKING:
-    from thor2_jax.recordings.recorded_frames import RecordedFrame
-    from training.frame_recognition import FrameAnswer, RecognizerArguments
+    from training.frame_recognition import RecognizerArguments
 
 __all__ = ["recognize_bag"]
 
@@ -49,21 +48,7 @@ def recognize_bag(
     if out is not None:
         check_output_directory(out)
 
-    def write(recorded: "RecordedFrame", answer: "FrameAnswer") -> None:
-        line = {"frame": recorded.name, "depth_gap": recorded.gap / 1e9}
-        if answer.frame is None:
-            print(json.dumps({**line, "error": answer.error}), flush=True)
-            return
-        detections = detections_of(answer.frame, answer.recognitions)
-        print(json.dumps({**line, "instances": detections_as_json(detections)}), flush=True)
-        if out is not None:
-            write_recognitions(out / recorded.name, answer.frame, answer.recognitions)
-        if detection_bag is not None:
-            detection_bag.write(answer.frame, detections, stamp=recorded.stamp, frame_id=recorded.frame_id)
-        if rerun_file is not None:
-            rerun_file.write(answer.frame, detections, name=recorded.name, stamp=recorded.stamp)
-
-    n_answers, failed, without_depth, damage = 0, [], [], None
+    n_answers, n_failed, without_depth, damage = 0, 0, [], None
     with bag:
         for note in bag.notes:
             print(escape_characters(f"note: {note}"), file=sys.stderr)
@@ -73,13 +58,22 @@ def recognize_bag(
             try:
                 by = segmenter or recognizer.segment
                 for recorded, answer in recognize_recorded(recognize, bag.frames(), by, given.every):
-                    n_answers += answer.error is None
-                    if answer.error is not None:
-                        failed.append(recorded.name)
+                    line, frame = {"frame": recorded.name, "depth_gap": recorded.gap / 1e9}, answer.frame
+                    if frame is None:
+                        n_failed += 1
                         print(escape_characters(f"failed: {answer.name}: {answer.error}"), file=sys.stderr)
-                    else:
-                        without_depth.append(segmentation_failure(answer))
-                    write(recorded, answer)
+                        print(json.dumps({**line, "error": answer.error}), flush=True)
+                        continue
+                    n_answers += 1
+                    without_depth.append(segmentation_failure(answer))
+                    detections = detections_of(frame, answer.recognitions)
+                    print(json.dumps({**line, "instances": detections_as_json(detections)}), flush=True)
+                    if out is not None:
+                        write_recognitions(out / recorded.name, frame, answer.recognitions)
+                    if detection_bag is not None:
+                        detection_bag.write(frame, detections, stamp=recorded.stamp, frame_id=recorded.frame_id)
+                    if rerun_file is not None:
+                        rerun_file.write(frame, detections, name=recorded.name, stamp=recorded.stamp)
             except InputError as error:
                 damage = str(error)
     written = [str(path) for path in (out, out_bag, rerun) if path is not None and n_answers and path.exists()]
@@ -94,7 +88,7 @@ def recognize_bag(
     segmented = ["--segment", segment] if segment else []
     again = ["explain", *given.arguments, *segmented, *options.given_options(arguments), "--out", "why"]
     finish(result, "see why", *again, file=sys.stderr)
-    if failed:
-        raise InputError(f"{len(failed)} of {n_answers + len(failed)} frames could not be recognized; see above")
+    if n_failed:
+        raise InputError(f"{n_failed} of {n_answers + n_failed} frames could not be recognized; see above")
     if without_depth and all(without_depth):
         raise InputError(without_depth[0])

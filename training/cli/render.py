@@ -22,6 +22,20 @@ class RenderWorkers(options.WorkerOptions):
     workers: options.WorkersOption = 2
 
 
+@dataclasses.dataclass(frozen=True)
+class AugmentationOptions:
+    """The augmentations of the copies."""
+
+    illumination: Annotated[bool, typer.Option("--illumination", help="Augment: light and camera response.")] = False
+    sensor: Annotated[bool, typer.Option("--sensor", help="Augment: noise and faults of the depth sensor.")] = False
+    occlusion: Annotated[bool, typer.Option("--occlusion", help="Augment: another object in front.")] = False
+    segmentation: Annotated[bool, typer.Option("--segmentation", help="Augment: inexact masks.")] = False
+    registration: Annotated[
+        bool, typer.Option("--registration", help="Augment: colour that is blurred and shifted against depth.")
+    ] = False
+    base: Annotated[bool, typer.Option("--base", help="Augment: masks without the lowest part.")] = False
+
+
 @app.command()
 @options.grouped_options
 def render(
@@ -34,14 +48,7 @@ def render(
     ] = None,
     azimuth_step: Annotated[float, typer.Option(help="Degrees between cameras around the object.")] = 5.0,
     polar_step: Annotated[float, typer.Option(help="Degrees between cameras from pole to pole.")] = 5.0,
-    illumination: Annotated[bool, typer.Option("--illumination", help="Augment: light and camera response.")] = False,
-    sensor: Annotated[bool, typer.Option("--sensor", help="Augment: noise and faults of the depth sensor.")] = False,
-    occlusion: Annotated[bool, typer.Option("--occlusion", help="Augment: another object in front.")] = False,
-    segmentation: Annotated[bool, typer.Option("--segmentation", help="Augment: inexact masks.")] = False,
-    registration: Annotated[
-        bool, typer.Option("--registration", help="Augment: colour that is blurred and shifted against depth.")
-    ] = False,
-    base: Annotated[bool, typer.Option("--base", help="Augment: masks without the lowest part.")] = False,
+    kinds: AugmentationOptions,
     copies: Annotated[int, typer.Option(help="Augmented copies of each view, if there are augmentations.")] = 5,
     seed: Annotated[int, typer.Option(help="Seed for the augmentations.")] = 0,
     crops: Annotated[
@@ -65,15 +72,7 @@ def render(
     if crops is not None and not 1 <= crops <= MAX_CROP:
         raise InputError(f"crops is {crops}; expected 1 to {MAX_CROP} pixels")
     pool = processes.pool() or IN_PROCESS
-    chosen = {
-        "illumination": illumination,
-        "sensor": sensor,
-        "occlusion": occlusion,
-        "segmentation": segmentation,
-        "registration": registration,
-        "base": base,
-    }
-    augmentations = Augmentations.of_names([name for name, on in chosen.items() if on], copies) or None
+    augmentations = Augmentations.of_names([name for name, on in vars(kinds).items() if on], copies) or None
     sources = scaled_meshes(find_meshes(meshes, read_names(names) if names else None), mesh_scale)
     with show_progress(quiet) as progress:
         shown = of_stage(progress, "render")

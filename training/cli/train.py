@@ -176,6 +176,7 @@ def train(
                 "coordinator: several processes need a --dataset that all of them can read, not --meshes or --frames"
             )
         jax.distributed.initialize(coordinator, processes, process)
+    from thor2_jax.model.classifier import FEATURES, check_features
     from thor2_jax.model.run_record import RUN_FILE
     from training.fitting.protocol import DEFAULT, PAPER, QUICK
     from training.storage.workers import keep_freed_memory
@@ -184,21 +185,22 @@ def train(
     keep_freed_memory()
     protocol = PAPER if paper else QUICK if quick else DEFAULT
     protocol = protocol.replace(epochs=epochs, batch_size=batch_size, seed=seed, orientation_copies=orientation_copies)
-    protocol = protocol.replace(azimuth_step=azimuth_step, polar_step=polar_step)
+    protocol = protocol.replace(azimuth_step=azimuth_step, polar_step=polar_step, folds=folds)
+    others = _distractors(protocol, embedding, distractors, epochs, workers)
+    features = protocol.classifiers if others is not None else FEATURES
+    if classifiers is not None:
+        features = check_features(options.split_names(classifiers), "classifiers")
     job = TrainJob(
         out=out,
-        protocol=protocol,
+        protocol=dataclasses.replace(protocol, classifiers=features, distractors=others),
         meshes=meshes,
         dataset=dataset,
         frames=frames or (),
         names=names,
-        classifiers=None if classifiers is None else options.split_names(classifiers),
-        folds=folds,
         baselines=options.split_names(baselines),
         weights=weights,
         leave_out=options.split_names(leave_out),
         sequences=sequences,
-        distractors=_distractors(protocol, embedding, distractors, epochs, workers),
         workers=workers,
         mesh_scale=mesh_scale,
     )

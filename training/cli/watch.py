@@ -52,13 +52,12 @@ def watch(
     """
     with contextlib.ExitStack() as stack:
         wait = stack.enter_context(_ctrl_c())
-        from thor2_jax.capacity import BATCH_BUCKETS
-        from thor2_jax.recognizer import Recognizer
         from thor2_jax.recordings.bags import Bag
         from thor2_jax.recordings.realsense import RealSenseCamera
         from thor2_jax.segmentation.segmenters import TABLE, load_segmenter
         from thor2_jax.watch.live import LiveView, paced
         from thor2_jax.watch.server import Broadcast, serve_live
+        from training.frame_recognition import RecognizerArguments
 
         sources = {"--bag": bag, "--folder": folder, "--realsense": realsense or None}
         given = [name for name, value in sources.items() if value is not None]
@@ -77,7 +76,7 @@ def watch(
             for note in opened.notes:
                 print(escape_characters(f"note: {note}"), file=sys.stderr)
             frames = paced(opened.frames(), sleep=wait)
-        recognizer = Recognizer.load(model, unknown_below, answer_by=answer_by, chunk=BATCH_BUCKETS[-1])
+        recognizer = RecognizerArguments(model, unknown_below, answer_by).load()
         broadcast = Broadcast()
         url = stack.enter_context(serve_live(broadcast, host, port, allow_host or ()))
         print(f"watch at {url}", file=sys.stderr, flush=True)

@@ -61,9 +61,8 @@ MIN_VIEW, MAX_VIEW = 20.0, 120.0
 ADVICE = "Give the intrinsics of these images: after resizing by a factor, fx, fy, cx and cy are multiplied by it."
 
 
-def check_camera(diagnosis: Diagnosis, intrinsics: Intrinsics, width: int, height: int) -> bool:
-    """Check intrinsics against the size of the colour image in pixels; return whether nothing was found."""
-    n_before = len(diagnosis.findings)
+def check_camera(diagnosis: Diagnosis, intrinsics: Intrinsics, width: int, height: int) -> None:
+    """Check intrinsics against the size of the colour image in pixels."""
     size = intrinsics.width or width, intrinsics.height or height
     fx, fy, cx, cy = intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy
     if size != (width, height):
@@ -97,7 +96,6 @@ def check_camera(diagnosis: Diagnosis, intrinsics: Intrinsics, width: int, heigh
             f"{MIN_VIEW:.0f} to {MAX_VIEW:.0f}.",
             "fx and fy are in pixels of these images, not in millimetres. " + ADVICE,
         )
-    return len(diagnosis.findings) == n_before
 
 
 MAX_INSTANCES = 150
@@ -116,14 +114,13 @@ MIN_PIECES, MIN_PIECE_SHARE = 3, 0.08
 """Pieces of the only instance of a frame, each with this share of its pixels, that show a mask of the foreground."""
 
 
-def check_labels(diagnosis: Diagnosis, labels: NDArray[Any]) -> bool:
-    """Check whether an image [H, W] of integers numbers instances; return whether nothing was found."""
+def check_labels(diagnosis: Diagnosis, labels: NDArray[Any]) -> None:
+    """Check whether an image [H, W] of integers numbers instances."""
     values, counts = np.unique(labels[labels != 0], return_counts=True)
-    n_before = len(diagnosis.findings)
     advice = "Give an image in which 0 is background and each object has a number of its own; see docs/frames.md."
     if not len(values):
         diagnosis.add("labels-empty", "The label image has no instance: all of it is 0, which is background.", advice)
-        return False
+        return
     # A pixel is inside if its eight neighbours have its label.
     inside = (ndimage.minimum_filter(labels, 3) == labels) & (ndimage.maximum_filter(labels, 3) == labels)
     thick = np.isin(values, labels[inside & (labels != 0)])
@@ -153,7 +150,6 @@ def check_labels(diagnosis: Diagnosis, labels: NDArray[Any]) -> bool:
                 "foreground, not of instances.",
                 advice,
             )
-    return len(diagnosis.findings) == n_before
 
 
 USUAL_SIDE = (0.03, 0.6)

@@ -50,9 +50,8 @@ LIGHTS = {
 """Factors of red, green and blue that are tried."""
 
 
-def check_light(diagnosis: Diagnosis, color: NDArray[np.uint8], labels: NDArray[Any] | None) -> bool:
-    """Check the light in a colour image [H, W, 3]; return whether nothing was found."""
-    n_before = len(diagnosis.findings)
+def check_light(diagnosis: Diagnosis, color: NDArray[np.uint8], labels: NDArray[Any] | None) -> None:
+    """Check the light in a colour image [H, W, 3]."""
     pixels = color[labels != 0] if labels is not None and (labels != 0).any() else color.reshape(-1, 3)
     brightness, saturated = float(pixels.mean()), float((pixels.max(axis=1) == 255).mean())
     contrasts = [_contrast(color[..., channel]) for channel in range(3)]
@@ -74,7 +73,6 @@ def check_light(diagnosis: Diagnosis, color: NDArray[np.uint8], labels: NDArray[
         ratio = max(contrasts) / max(min(contrasts), 1e-9)
         message = f"{FAR}: {strongest} has {ratio:.1f} times the contrast of {weakest}, a strong colour cast."
         diagnosis.add("color-cast", message, "Set the white balance of the camera.")
-    return len(diagnosis.findings) == n_before
 
 
 def _contrast(channel: NDArray[np.uint8]) -> float:

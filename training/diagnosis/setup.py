@@ -51,69 +51,64 @@ def diagnose(
         OSError: a file cannot be opened.
     """
     diagnosis = Diagnosis()
-    if isinstance(files, RGBDFrame):
-        sides = check_meshes(diagnosis, meshes, mesh_scale)
-        return _check(diagnosis, files.color, files.depth, files.labels, files.intrinsics, {}, sides, recognizer)
-    paths = files.color, files.depth, files.labels, files.intrinsics
-    missing = [path for path in paths if path and not path.exists()]
-    if missing:
-        raise InputError(f"{missing[0]} is missing; expected the files of a frame")
     sides = check_meshes(diagnosis, meshes, mesh_scale)
-    color = _read(diagnosis, "color", lambda: read_color(files.color))
-    depth = _read(diagnosis, "depth", lambda: read_depth(files.depth))
-    labels = _read(diagnosis, "labels", lambda: None if files.labels is None else read_labels(files.labels))
-    camera = _read(diagnosis, "intrinsics", lambda: frame_intrinsics(files.intrinsics, files.color, depth_scale))
-    table = files.names
-    names = _read(diagnosis, "names", lambda: read_names(table)) if files.labels and table.is_file() else None
-    if files.labels is None:
-        diagnosis.notes.append("labels: none are given, so the sizes of the objects were not checked")
-    return _check(diagnosis, color, depth, labels, camera, names or {}, sides, recognizer)
-
-
-def _check(
-    diagnosis: Diagnosis,
-    color: NDArray[np.uint8] | None,
-    depth: NDArray[Any] | None,
-    labels: NDArray[Any] | None,
-    camera: Intrinsics | None,
-    names: Mapping[int, str],
-    sides: Mapping[str, float],
-    recognizer: Recognizer | None,
-) -> Diagnosis:
-    """Check what could be read of a frame."""
+    names: Mapping[int, str] = {}
+    if isinstance(files, FrameFiles):
+        missing = [path for path in vars(files).values() if path and not path.exists()]
+        if missing:
+            raise InputError(f"{missing[0]} is missing; expected the files of a frame")
+        color = _read(diagnosis, "color", lambda: read_color(files.color))
+        depth = _read(diagnosis, "depth", lambda: read_depth(files.depth))
+        labels = _read(diagnosis, "labels", lambda: None if files.labels is None else read_labels(files.labels))
+        camera = _read(diagnosis, "intrinsics", lambda: frame_intrinsics(files.intrinsics, files.color, depth_scale))
+        if files.labels is None:
+            diagnosis.notes.append("labels: none are given, so the sizes of the objects were not checked")
+        elif files.names.is_file():
+            names = _read(diagnosis, "names", lambda: read_names(files.names)) or {}
+    else:
+        color, depth, labels, camera = files.color, files.depth, files.labels, files.intrinsics
+    depth, labels = _aligned(diagnosis, "depth", depth, color), _aligned(diagnosis, "labels", labels, color)
     shape = next((image.shape[:2] for image in (color, depth, labels) if image is not None), None)
-    for name, image in (("depth", depth), ("labels", labels)):
-        if color is not None and image is not None and image.shape != color.shape[:2]:
-            size, color_size = (f"{each.shape[1]} x {each.shape[0]}" for each in (image, color))
-            diagnosis.add(
-                "size",
-                f"{name} has {size} pixels, but color has {color_size}.",
-                "Colour, depth and labels must have the same size, pixel for pixel: use the depth image that the "
-                "driver aligns to colour.",
-            )
-    if depth is not None and color is not None and depth.shape != color.shape[:2]:
-        depth = None
-    if labels is not None and color is not None and labels.shape != color.shape[:2]:
+    camera_is_right = (
+        camera is not None and shape is not None and _passes(diagnosis, check_camera, camera, shape[1], shape[0])
+    )
+    if labels is not None and not _passes(diagnosis, check_labels, labels):
         labels = None
-    camera_is_right = camera is not None and shape is not None and check_camera(diagnosis, camera, shape[1], shape[0])
-    if labels is not None and not check_labels(diagnosis, labels):
-        labels = None
-    light_is_right = color is not None and check_light(diagnosis, color, labels)
+    light_is_right = color is not None and _passes(diagnosis, check_light, color, labels)
     if color is not None and labels is not None:
         check_labels_alignment(diagnosis, color, labels)
     if depth is None or camera is None:
         return diagnosis
     pinhole = Intrinsics(camera.fx, camera.fy, camera.cx, camera.cy, camera.depth_scale)  # its size was checked
     frame = RGBDFrame(np.zeros((*depth.shape, 3), np.uint8) if color is None else color, depth, labels, pinhole)
-    n_findings = len(diagnosis.findings)
-    if color is not None:
-        check_registration(diagnosis, color, frame.depth_m)
-    # Without registration the labels are of other pixels.
-    trust_camera = camera_is_right and len(diagnosis.findings) == n_findings
-    check_depth(diagnosis, frame, sides, names, trust_camera=trust_camera)
-    depth_is_right = len(diagnosis.findings) == n_findings and camera_is_right
-    _check_order(diagnosis, frame, recognizer, light_is_right and depth_is_right and color is not None)
+    is_registered = color is None or _passes(diagnosis, check_registration, color, frame.depth_m)
+    trust_camera = camera_is_right and is_registered  # Without registration the labels are of other pixels.
+    depth_is_right = _passes(diagnosis, check_depth, frame, sides, names, trust_camera=trust_camera)
+    _check_order(diagnosis, frame, recognizer, light_is_right and trust_camera and depth_is_right)
     return diagnosis
+
+
+def _aligned(
+    diagnosis: Diagnosis, name: str, image: NDArray[Any] | None, color: NDArray[np.uint8] | None
+) -> NDArray[Any] | None:
+    """Return an image that has the size of the colour image; another size is a finding."""
+    if image is None or color is None or image.shape == color.shape[:2]:
+        return image
+    size, color_size = (f"{each.shape[1]} x {each.shape[0]}" for each in (image, color))
+    diagnosis.add(
+        "size",
+        f"{name} has {size} pixels, but color has {color_size}.",
+        "Colour, depth and labels must have the same size, pixel for pixel: use the depth image that the driver aligns "
+        "to colour.",
+    )
+    return None
+
+
+def _passes(diagnosis: Diagnosis, check: Callable[..., None], *arguments: Any, **options: Any) -> bool:
+    """Return whether a check finds nothing."""
+    n_findings = len(diagnosis.findings)
+    check(diagnosis, *arguments, **options)
+    return len(diagnosis.findings) == n_findings
 
 
 def _check_order(diagnosis: Diagnosis, frame: RGBDFrame, recognizer: Recognizer | None, is_sound: bool) -> None:

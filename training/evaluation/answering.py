@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import functools
 import time
 from collections.abc import Generator, Iterable, Sequence
 from pathlib import Path
@@ -57,15 +58,19 @@ class RunArguments:
     models: tuple[Path, ...]
     per_sequence: bool = False
 
-    def load(self, frames: LabelledFrames) -> Sequence[Run]:
-        """Load the runs; raises InputError as these functions do, or for several directories of sequences."""
+    def load(self, identifiers: tuple[str, ...]) -> Sequence[Run]:
+        """Load the runs for the frames with these identifiers.
+
+        Raises:
+            InputError: as these functions, or for several directories of sequences.
+        """
         if not self.per_sequence:
             return load_runs(self.models)
         if len(self.models) != 1:
             raise InputError(
                 f"per_sequence: {len(self.models)} models are given; expected one directory with a run per sequence"
             )
-        return load_sequence_runs(self.models[0], frames.identifiers)
+        return load_sequence_runs(self.models[0], identifiers)
 
 
 def answer_frames_in_pool(
@@ -88,20 +93,17 @@ def answer_frames_in_pool(
                 raise error
 
 
-_loaded: dict[RunArguments, Sequence[Run]] = {}
-"""The runs that this worker process has loaded."""
+_loaded = functools.lru_cache(1)(RunArguments.load)
+"""Loads the runs once in a worker process."""
 
 
 def _answer_chunk(
     chunk: tuple[RunArguments, LabelledFrames, range],
 ) -> tuple[list[tuple[LabelledFrame, FrameAnswers]], Exception | None]:
     arguments, frames, numbers = chunk
-    if arguments not in _loaded:
-        _loaded.clear()
-        _loaded[arguments] = arguments.load(frames)
-    answered = []
+    runs, answered = _loaded(arguments, tuple(frames.identifiers)), []
     try:
-        for item, answers in answer_frames(_loaded[arguments], (frames[n] for n in numbers)):
+        for item, answers in answer_frames(runs, (frames[n] for n in numbers)):
             frame = dataclasses.replace(item.frame)  # without its cached properties
             answered.append((dataclasses.replace(item, frame=frame), answers))
     except (InputError, OSError) as error:

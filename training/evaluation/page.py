@@ -106,29 +106,28 @@ def write_report_page(report: Mapping[str, Any], pictures: FramePictures, out: P
     """Draw the plots and write the page.
 
     Args:
-        report: content of report.json.
+        report: content of report.json, with scored instances.
         pictures: pictures of the frames.
         out: directory of the report.
 
     Raises:
         OSError: a file cannot be written.
     """
-    sections: list[Section] = []
-    if report["fusions"]:
-        main = report["main"]
-        sections = [
-            _answer_section(report, pictures, out),
-            *_accuracy_sections(report, out),
-            *(
-                Section(comparison_title(table), comparison_text(table), marked(comparison_table(table, main), main))
-                for table in report["published_tables"]
-            ),
-            *_fusion_sections(report),
-            *_placement_sections(report),
-            _confidence_section(report, out),
-            *_unknown_sections(report, out),
-        ]
-    sections += [_frame_section(report, pictures, out), _measurement_section(report)]
+    main = report["main"]
+    sections = [
+        _answer_section(report, pictures, out),
+        *_accuracy_sections(report, out),
+        *(
+            Section(comparison_title(table), comparison_text(table), marked(comparison_table(table, main), main))
+            for table in report["published_tables"]
+        ),
+        *_fusion_sections(report),
+        *_placement_sections(report),
+        _confidence_section(report, out),
+        *_unknown_sections(report, out),
+        _frame_section(report, pictures, out),
+        _measurement_section(report),
+    ]
     dataset, runs = report["dataset"], len(report["runs"])
     lead = (
         f"{report['speed']['frames']:,} frames, {report['instances']['scored']:,} instances of known objects, "

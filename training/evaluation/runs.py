@@ -24,7 +24,7 @@ from thor2_jax.model.recognition import DescribedFrame
 from thor2_jax.model.run_directory import EMBEDDING_FILE
 from thor2_jax.model.run_record import RUN_FILE
 from thor2_jax.recognizer import Recognizer
-from training.baselines.baseline import Baseline, BaselineInputs
+from training.baselines.baseline import BaselineInputs, FittedBaseline
 from training.baselines.files import baseline_file
 from training.baselines.job import load_baselines
 from training.baselines.names import NETWORKS, TEMPLATES, TITLES
@@ -45,15 +45,13 @@ class Run:
         recognizer: recognizer with the run's classifiers.
         baselines: baselines in the run directory.
         temperatures: temperatures of the classifiers and baselines that were calibrated on a held-out set.
-        weights: the files of pretrained weights that each baseline was fitted from; empty without any.
     """
 
     name: str
     digest: str
     recognizer: Recognizer
-    baselines: Mapping[str, Baseline] = dataclasses.field(default_factory=dict)
+    baselines: Mapping[str, FittedBaseline] = dataclasses.field(default_factory=dict)
     temperatures: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    weights: Mapping[str, Sequence[str]] = dataclasses.field(default_factory=dict)
 
     @property
     def model(self) -> Model:
@@ -105,7 +103,7 @@ class Run:
             column = ALL_CLASSIFIERS if ALL_CLASSIFIERS in self.predictors else EMBEDDED
             values[column] = np.asarray(model.fused(default), np.float32)
         if inputs is not None:
-            values |= {name: baseline.probabilities(inputs) for name, baseline in self.baselines.items()}
+            values |= {name: baseline.model.probabilities(inputs) for name, baseline in self.baselines.items()}
         values = {name: model.union.of_classifiers(p) for name, p in values.items()}
         if GALLERY in self.predictors:
             scores = gallery_scores(model, inference)
@@ -243,17 +241,7 @@ def load_sequence_runs(directory: Path, frames: Iterable[str]) -> list[SequenceR
         of_sequence = {sequence: loaded[path][fold] for sequence, path in paths.items() if path is not None}
         digest = json_digest({sequence: each.digest for sequence, each in of_sequence.items()})
         name = f"{named_path(directory).name}/*" + (f"/fold-{fold}" if len(first) > 1 else "")
-        result.append(
-            SequenceRun(
-                name,
-                digest,
-                run.recognizer,
-                run.baselines,
-                temperatures={},
-                weights=run.weights,
-                of_sequence=of_sequence,
-            )
-        )
+        result.append(SequenceRun(name, digest, run.recognizer, run.baselines, of_sequence=of_sequence))
     return result
 
 
@@ -264,14 +252,15 @@ def has_real_views(runs: Sequence[Run]) -> bool:
 
 def scratch_networks(runs: Sequence[Run]) -> list[str]:
     """Return the titles of the image networks without pretrained weights, and of templates with such a backbone."""
-    names = {name for run in runs for name, files in run.weights.items() if not files}
+    names = {name for run in runs for name, baseline in run.baselines.items() if not baseline.weights}
     return [TITLES[name] for name in (*NETWORKS, TEMPLATES) if name in names]
 
 
 def _load(directory: Path) -> Run:
     recognizer = Recognizer.load(directory, chunk=BATCH_BUCKETS[-1])
     baselines = load_baselines(directory, recognizer.run)
-    temperatures = baselines.temperatures | recognizer.run.record.get("temperatures", {})
+    temperatures = {name: each.temperature for name, each in baselines.items() if each.temperature is not None}
+    temperatures |= recognizer.run.record.get("temperatures", {})
     named = named_path(directory)
     name = f"{named.parent.name}/{named.name}" if named.name.startswith("fold-") else named.name
-    return Run(name, _digest(directory), recognizer, baselines.models, temperatures, baselines.weights)
+    return Run(name, _digest(directory), recognizer, baselines, temperatures)

@@ -13,7 +13,6 @@ An interrupted training resumes when it is called again. run.json is written las
 
 import contextlib
 import dataclasses
-import json
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -24,147 +23,52 @@ import numpy as np
 from jax.experimental import multihost_utils
 from numpy.typing import NDArray
 
-import colornet
-from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
+from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.sharding import batch_mesh
-from thor2_jax.errors import InputError
-from thor2_jax.files import check_output_directory, remove_leftovers, remove_written, write_text
+from thor2_jax.files import check_output_directory, remove_leftovers, remove_written
 from thor2_jax.gallery.embedding import Embedding
 from thor2_jax.gallery.references import REFERENCES_FILE
-from thor2_jax.model.classifier import EMBEDDING, MLP, Feature, check_features
+from thor2_jax.model.classifier import EMBEDDING, MLP, Feature
 from thor2_jax.model.confidence import Calibration
 from thor2_jax.model.run_directory import EMBEDDING_FILE, TrainedRun, load_run, save_run, weights_file
 from thor2_jax.model.run_record import RUN_FILE
-from training.embedding.run_embedding import STAGES, Distractors, fit_run_embedding
+from training.embedding.run_embedding import fit_run_embedding
 from training.fitting.calibration import fit_calibration, temperatures
 from training.fitting.checkpoints import BEGUN, CHECKPOINTS, Checkpoints
 from training.fitting.fit import check_batch_size, fit
-from training.fitting.options import EpochMetrics, FitOptions, append_metrics, discard_later_epochs, read_metrics
-from training.fitting.samples import MIRRORS, Samples, build_samples, fold_of_views
+from training.fitting.options import EpochMetrics, append_metrics, discard_later_epochs, read_metrics
+from training.fitting.protocol import CALIBRATE, DESCRIBE, RunSettings
+from training.fitting.samples import Samples, build_samples, fold_of_views
 from training.fitting.steps import FitContext
 from training.reports.plots import draw_curves
-from training.storage.jobs import check_same_job, locked
+from training.storage.jobs import begin_job, check_begun, check_same_job, locked
 from training.storage.progress import Progress, of_stage
 from training.views.normalized_views import ViewSource
 
 __all__ = ["VIEWS", "RunSettings", "check_out", "check_trained", "finished_record", "is_finished", "train_run"]
 
 VIEWS = "views"
+JOB = f"{CHECKPOINTS}/{BEGUN}"
 METRICS = "metrics.jsonl"
 HELD_OUT = 12
 """One view of so many is held out to calibrate the confidence of a run without folds."""
 
 CURVES = "curves.png"
 
-DESCRIBE = "describe"
-"""Name of the first stage."""
-
-CALIBRATE = "fit the confidence"
-"""Name of the last stage, with an embedding."""
-
-DESCRIBE_SHARE = 0.3
-"""Time of describing the views, divided by that of rendering them; for the time left."""
-
-CALIBRATE_SHARE = 0.1
-"""The same of fitting the confidence."""
-
-EPOCH_SHARES = {"ce": 0.05, "tops": 0.08, "tops2": 0.15, EMBEDDING: 0.044}
-"""The same of an epoch of a classifier, or of one network of the embedding."""
-
 CURVE = ("epoch", "loss", "accuracy", "held_out_accuracy")
 """Metrics of an epoch that the record keeps: those that a repeated training reproduces."""
 
 
-@dataclasses.dataclass(frozen=True)
-class RunSettings:
-    """Everything beside the views that determines a trained run.
-
-    Attributes:
-        features: descriptors that the classifiers read, any of "ce", "tops", "tops2"; with distractors, there may be
-            none.
-        options: fit options of every classifier; the seed is also that of the embedding.
-        config: descriptor; by default the paper's, with diagrams in closed form.
-        folds: with more than one, one model per fold, with the fold as its held-out set.
-        mirrors: mirrors in which the classifiers use each view.
-        orientations: further samples of each view for the classifiers, in random orientations.
-        distractors: fit an embedding on the views and on these objects, and calibrate the confidence; without folds,
-            one view of `HELD_OUT` is held out for it. None fits none.
-
-    Raises:
-        InputError: a feature is unknown.
-    """
-
-    features: Sequence[Feature]
-    options: FitOptions
-    config: DescriptorConfig = DescriptorConfig(homology="closed_form")
-    folds: int = 1
-    mirrors: Sequence[str] = MIRRORS
-    orientations: int = 0
-    distractors: Distractors | None = None
-
-    def __post_init__(self) -> None:
-        if self.features or self.distractors is None:
-            object.__setattr__(self, "features", check_features(self.features, "classifiers"))
-
-    @property
-    def network(self) -> colornet.ColorNetwork:
-        """The packaged colour network."""
-        return colornet.load_default()
-
-    @property
-    def stages(self) -> dict[str, float]:
-        """The stages of the training, in their order, with their times, divided by that of rendering the views."""
-        of_fold = {f"fit {name}": EPOCH_SHARES[name] * self.options.epochs for name in self.features}
-        if self.distractors is not None:
-            fit_share = EPOCH_SHARES[EMBEDDING] * self.distractors.networks * self.distractors.epochs
-            # Rendering distractors takes no time if they are in the cache.
-            of_fold |= dict(zip(STAGES, (0.0, DESCRIBE_SHARE, fit_share), strict=True)) | {CALIBRATE: CALIBRATE_SHARE}
-        folds = range(self.folds)
-        described = {DESCRIBE: DESCRIBE_SHARE} if self.features else {}
-        return described | {self.of_fold(stage, fold): share for fold in folds for stage, share in of_fold.items()}
-
-    def of_fold(self, stage: str, fold: int) -> str:
-        """Return the name of a stage of a fold."""
-        return stage if self.folds == 1 else f"fold {fold}: {stage}"
-
-    def record(self, digest: str) -> dict[str, Any]:
-        """Return everything that determines the run as JSON holds it; `digest` is that of the labelled views."""
-        added = {} if self.distractors is None else {"distractors": self.distractors.record}
-        return added | {
-            "descriptor_version": DESCRIPTOR_VERSION,
-            "descriptor_config": dataclasses.asdict(self.config),
-            "color_network": self.network.fingerprint,
-            "dataset": digest,
-            "classifiers": list(self.features),
-            "folds": self.folds,
-            "mirrors": list(self.mirrors),
-            "orientation_copies": self.orientations,
-            **dataclasses.asdict(self.options),
-            "learning_rates": list(self.options.learning_rates),
-        }
-
-
-def _check_begun(out: Path, job: Mapping[str, Any]) -> None:
-    """Raise InputError if a directory holds an interrupted training of another job."""
-    path = out / CHECKPOINTS / BEGUN
-    if path.is_file():
-        try:
-            begun = dict(json.loads(path.read_bytes()))
-        except (OSError, ValueError, TypeError, RecursionError) as error:
-            raise InputError(f"out: {path} cannot be read ({error}); delete {path.parent} to start anew") from None
-        check_same_job(out, begun, job)
-
-
 def check_out(out: str | Path) -> None:
     """Raise InputError unless `out` is new, empty, or the directory of an interrupted training."""
-    check_output_directory(out, f"{CHECKPOINTS}/{BEGUN}", (VIEWS, CHECKPOINTS))
+    check_output_directory(out, JOB, (VIEWS, CHECKPOINTS))
     check_output_directory(Path(out) / CHECKPOINTS, BEGUN)
 
 
 def is_finished(out: Path) -> bool:
     """Return whether a directory holds a trained run, or all folds of one."""
     trained = any((directory / RUN_FILE).is_file() for directory in (out, *out.glob("fold-*")))
-    return trained and not (out / CHECKPOINTS / BEGUN).exists()
+    return trained and not (out / JOB).exists()
 
 
 def check_trained(digest: str, out: Path, settings: RunSettings) -> None:
@@ -225,15 +129,15 @@ def train_run(
         settings.distractors.check(source.classes)
     check_out(out)
     job = settings.record(source.digest)
-    _check_begun(out, job)
-    check_batch_size(settings.options.batch_size, batch_mesh())
+    check_begun(out, job, JOB)
+    check_batch_size(settings.fit.batch_size, batch_mesh())
     with contextlib.ExitStack() as locks:
         first, resumed = jax.process_index() == 0, (out / CHECKPOINTS).is_dir()
         if first and resumed:
             locks.enter_context(locked(out / CHECKPOINTS))
         samples: Samples | _Views
-        if settings.features:
-            copies = settings.mirrors, settings.orientations, settings.options.seed
+        if settings.classifiers:
+            copies = settings.mirrors, settings.orientation_copies, settings.fit.seed
             show = of_stage(progress, DESCRIBE, "views")
             samples = build_samples(source, settings.network, settings.config, show, *copies)
         else:  # only the distribution of the views among the folds is needed here
@@ -241,16 +145,14 @@ def train_run(
         folds = settings.folds
         is_held_out = folds > 1 or settings.distractors is not None
         parts = _held_out_parts(samples) if folds == 1 and is_held_out else folds
-        fold_of = fold_of_views(samples.label, samples.view, samples.classes, parts, settings.options.seed)
+        fold_of = fold_of_views(samples.label, samples.view, samples.classes, parts, settings.fit.seed)
         _wait_for_all("checked")
         if first:
             if not resumed:
                 check_out(out)  # another process may have been quicker
                 (out / CHECKPOINTS).mkdir(parents=True, exist_ok=True)
                 locks.enter_context(locked(out / CHECKPOINTS))
-                _check_begun(out, job)
-            if not (out / CHECKPOINTS / BEGUN).is_file():
-                write_text(out / CHECKPOINTS / BEGUN, json.dumps(job, indent=1) + "\n")
+            begin_job(out, job, JOB)
             remove_leftovers(out)
         _wait_for_all("begun")
         runs = [
@@ -332,11 +234,11 @@ class _Fold(NamedTuple):
             return {}, {}
         classifiers: dict[Feature, MLP] = {}
         best_epochs: dict[Feature, int] = {}
-        for name in settings.features:
+        for name in settings.classifiers:
             stage = settings.of_fold(f"fit {name}", self.number)
 
             def show(done: int, total: int, metrics: EpochMetrics, stage: str = stage) -> None:
-                self.progress(stage, done, total, metrics.describe(settings.options.epochs))
+                self.progress(stage, done, total, metrics.describe(settings.fit.epochs))
 
             def epoch_done(metrics: EpochMetrics, name: Feature = name) -> None:
                 if first:
@@ -347,7 +249,7 @@ class _Fold(NamedTuple):
                 if first:
                     discard_later_epochs(self.out / METRICS, self.number, name, checkpoints.last_epoch)
                 classifiers[name], best_epochs[name] = fit(
-                    samples, context, settings.options, checkpoints, self.held_out, show, epoch_done
+                    samples, context, settings.fit, checkpoints, self.held_out, show, epoch_done
                 )
         return classifiers, best_epochs
 
@@ -373,7 +275,7 @@ class _Fold(NamedTuple):
                 self.out / CHECKPOINTS / "distractors",
                 settings.network,
                 settings.config,
-                settings.options.seed,
+                settings.fit.seed,
                 report,
                 checkpoints,
                 lambda metrics: append_metrics(metrics_file, self.number, EMBEDDING, metrics),

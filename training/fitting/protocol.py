@@ -1,44 +1,118 @@
 """Training protocols, from camera steps to learning rates: the paper's, the more accurate default, and a quick one."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
-from thor2_jax.config import DescriptorConfig
-from thor2_jax.model.classifier import FEATURES, Feature
+import colornet
+from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
+from thor2_jax.model.classifier import EMBEDDING, FEATURES, Feature, check_features
 from training.augmentation.augmentations import Augmentations
-from training.embedding.run_embedding import Distractors
+from training.embedding.run_embedding import STAGES, Distractors
 from training.embedding.sampling import AUGMENTATIONS
 from training.fitting.options import FitOptions
 from training.fitting.samples import MIRRORS, PAPER_MIRRORS
 
-__all__ = ["DEFAULT", "PAPER", "QUICK", "Protocol"]
+__all__ = ["CALIBRATE", "DEFAULT", "DESCRIBE", "PAPER", "QUICK", "Protocol", "RunSettings"]
+
+DESCRIBE = "describe"
+"""Name of the first stage."""
+
+CALIBRATE = "fit the confidence"
+"""Name of the last stage, with an embedding."""
+
+DESCRIBE_SHARE = 0.3
+"""Time of describing the views, divided by that of rendering them; for the time left."""
+
+CALIBRATE_SHARE = 0.1
+"""The same of fitting the confidence."""
+
+EPOCH_SHARES = {"ce": 0.05, "tops": 0.08, "tops2": 0.15, EMBEDDING: 0.044}
+"""The same of an epoch of a classifier, or of one network of the embedding."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Protocol:
-    """A training protocol.
+class RunSettings:
+    """Everything beside the views that determines a trained run.
+
+    Attributes:
+        classifiers: descriptors that the classifiers read, any of "ce", "tops", "tops2"; with distractors, there may be
+            none.
+        fit: fit options of every classifier; the seed is also that of the embedding.
+        config: descriptor, with the number of looks in recognition; by default the paper's, in closed form.
+        folds: with more than one, one model per fold, with the fold as its held-out set.
+        mirrors: mirrors in which the classifiers use each view.
+        orientation_copies: further samples of each view for the classifiers, in random orientations.
+        distractors: fit an embedding on the views and on these objects, and calibrate the confidence; without folds,
+            some views are held out for it. None fits none.
+
+    Raises:
+        InputError: a classifier is unknown.
+    """
+
+    classifiers: Sequence[Feature]
+    fit: FitOptions
+    config: DescriptorConfig = DescriptorConfig(homology="closed_form")
+    folds: int = 1
+    mirrors: Sequence[str] = MIRRORS
+    orientation_copies: int = 0
+    distractors: Distractors | None = None
+
+    def __post_init__(self) -> None:
+        if self.classifiers or self.distractors is None:
+            object.__setattr__(self, "classifiers", check_features(self.classifiers, "classifiers"))
+
+    @property
+    def network(self) -> colornet.ColorNetwork:
+        """The packaged colour network."""
+        return colornet.load_default()
+
+    @property
+    def stages(self) -> dict[str, float]:
+        """The stages of the training, in their order, with their times, divided by that of rendering the views."""
+        of_fold = {f"fit {name}": EPOCH_SHARES[name] * self.fit.epochs for name in self.classifiers}
+        if self.distractors is not None:
+            fit_share = EPOCH_SHARES[EMBEDDING] * self.distractors.networks * self.distractors.epochs
+            # Rendering distractors takes no time if they are in the cache.
+            of_fold |= dict(zip(STAGES, (0.0, DESCRIBE_SHARE, fit_share), strict=True)) | {CALIBRATE: CALIBRATE_SHARE}
+        folds = range(self.folds)
+        described = {DESCRIBE: DESCRIBE_SHARE} if self.classifiers else {}
+        return described | {self.of_fold(stage, fold): share for fold in folds for stage, share in of_fold.items()}
+
+    def of_fold(self, stage: str, fold: int) -> str:
+        """Return the name of a stage of a fold."""
+        return stage if self.folds == 1 else f"fold {fold}: {stage}"
+
+    def record(self, digest: str) -> dict[str, Any]:
+        """Return everything that determines the run as JSON holds it; `digest` is that of the labelled views."""
+        added = {} if self.distractors is None else {"distractors": self.distractors.record}
+        return added | {
+            "descriptor_version": DESCRIPTOR_VERSION,
+            "descriptor_config": dataclasses.asdict(self.config),
+            "color_network": self.network.fingerprint,
+            "dataset": digest,
+            "classifiers": list(self.classifiers),
+            "folds": self.folds,
+            "mirrors": list(self.mirrors),
+            "orientation_copies": self.orientation_copies,
+            **dataclasses.asdict(self.fit),
+            "learning_rates": list(self.fit.learning_rates),
+        }
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Protocol(RunSettings):
+    """A training protocol: the settings of a run, and its views.
 
     Attributes:
         azimuth_step: degrees between cameras around the object.
         polar_step: degrees between cameras from pole to pole.
         augmentations: augmented copies of each view; None adds none.
-        mirrors: mirrors in which the classifiers use each view.
-        orientation_copies: further samples of each view for the classifiers, in random orientations.
-        config: descriptor, with the number of looks in recognition.
-        fit: fit options of every classifier.
-        classifiers: the paper's classifiers to fit beside the embedding.
-        distractors: distractors and options of the embedding; None fits no embedding.
     """
 
     azimuth_step: float
     polar_step: float
-    augmentations: Augmentations | None
-    mirrors: tuple[str, ...]
-    orientation_copies: int
-    config: DescriptorConfig
-    fit: FitOptions
-    classifiers: tuple[Feature, ...] = ()
-    distractors: Distractors | None = None
+    augmentations: Augmentations | None = None
 
     def replace(self, **values: Any) -> "Protocol":
         """Return the protocol with the given values of its own fields or of `fit`; None keeps the protocol's own.
@@ -57,14 +131,15 @@ class Protocol:
 
 
 DEFAULT = Protocol(
+    (),
+    FitOptions(epochs=16, batch_size=256),
+    DescriptorConfig(homology="closed_form", looks=4),
+    mirrors=("",),
+    orientation_copies=1,
+    distractors=Distractors(),
     azimuth_step=20.0,
     polar_step=15.0,
     augmentations=AUGMENTATIONS,
-    mirrors=("",),
-    orientation_copies=1,
-    config=DescriptorConfig(homology="closed_form", looks=4),
-    fit=FitOptions(epochs=16, batch_size=256),
-    distractors=Distractors(),
 )
 """Fewer views than the paper's, each with five augmented copies; an embedding, and none of the paper's classifiers."""
 
@@ -72,13 +147,6 @@ QUICK = dataclasses.replace(DEFAULT, distractors=Distractors(procedural=600, net
 """The default with fewer distractors and networks: half of its time."""
 
 PAPER = Protocol(
-    azimuth_step=5.0,
-    polar_step=5.0,
-    augmentations=None,
-    mirrors=PAPER_MIRRORS,
-    orientation_copies=0,
-    config=DescriptorConfig(homology="closed_form"),
-    fit=FitOptions(epochs=100, batch_size=128),
-    classifiers=FEATURES,
+    FEATURES, FitOptions(epochs=100, batch_size=128), mirrors=PAPER_MIRRORS, azimuth_step=5.0, polar_step=5.0
 )
 """The paper's protocol (section "Training"): 72 x 37 views per object, four mirrors, 100 epochs."""

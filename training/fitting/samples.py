@@ -95,11 +95,6 @@ class Samples:
     def __len__(self) -> int:
         return len(self.label)
 
-    @property
-    def nbytes(self) -> int:
-        """Memory of all arrays, bytes."""
-        return sum(a.nbytes for a in vars(self).values() if isinstance(a, np.ndarray))
-
     @functools.cached_property
     def _most(self) -> tuple[int, int]:
         return int(np.diff(self.strip_start).max()), int(np.diff(self.color_start).max())

@@ -52,8 +52,7 @@ TEXELS = 192
 
 def _texture(base: Color, marks: Sequence[Mark], *coordinates: Array) -> NDArray[np.uint8]:
     """Return an image [TEXELS, TEXELS, 3] of `base` and marks; coordinates are [TEXELS, TEXELS], bottom row first."""
-    image = np.empty((TEXELS, TEXELS, 3), np.uint8)
-    image[:] = base
+    image = np.full((TEXELS, TEXELS, 3), base, np.uint8)
     for color, where in marks:
         image[np.broadcast_to(where(*coordinates), image.shape[:2])] = color
     return image[::-1]

@@ -12,7 +12,7 @@ from thor2_jax.errors import InputError, with_context
 from thor2_jax.files import read_file
 from thor2_jax.frames.image_files import MAX_IMAGE_PIXELS
 from thor2_jax.printable import check_name
-from thor2_jax.tables import parse_json, parse_yaml
+from thor2_jax.tables import read_table
 from training.objects.mesh import TexturedMesh, merge_meshes
 
 if TYPE_CHECKING:  # takes .2 s to import, and is needed where meshes are read
@@ -318,21 +318,16 @@ def read_names(path: str | Path) -> dict[str, str]:
 
     Raises:
         InputError: The file is missing, neither JSON nor YAML, empty, or not a flat table of strings.
+        OSError: The file cannot be opened.
     """
     path = Path(path)
-    suffix = path.suffix.lower()
-    if suffix not in (".json", ".yaml", ".yml"):
-        raise InputError(f"names file {path}: the extension must be .json, .yaml or .yml")
-    try:
-        content = read_file(path)
-        table = parse_json(content) if suffix == ".json" else parse_yaml(content)
-    except OSError as error:
-        raise InputError(f"names file {path}: {error.strerror}") from error
-    except ValueError as error:
-        raise InputError(f"names file {path}: {error}") from error
-    if not isinstance(table, dict) or not table:
-        raise InputError(f"names file {path}: expected a table of object name: scan")
-    for name, scan in table.items():
-        if not (isinstance(name, str) and name and isinstance(scan, str) and scan):
-            raise InputError(f"names file {path}: expected a name and a scan, both strings, not {name!r}: {scan!r}")
-    return dict(table)
+    with with_context(f"names file {path}"):
+        if path.suffix.lower() not in (".json", ".yaml", ".yml"):
+            raise InputError("the extension must be .json, .yaml or .yml")
+        table = read_table(path)
+        if not table:
+            raise InputError("it is empty; expected a table of object name: scan")
+        for name, scan in table.items():
+            if not (isinstance(name, str) and name and isinstance(scan, str) and scan):
+                raise InputError(f"expected a name and a scan, both strings, not {name!r}: {scan!r}")
+    return table

@@ -112,8 +112,7 @@ def _noise(rng: Rng, cells: int) -> Array:
 
 def _texture(rng: Rng, palette: list[Array]) -> Image:
     """Return an image of the first colour with up to five patterns in colours of the palette."""
-    image = np.empty((TEXELS, TEXELS, 3))
-    image[:] = palette[0]
+    image = np.full((TEXELS, TEXELS, 3), palette[0])
     u, v = texel_centres(TEXELS)
     for _ in range(rng.integers(0, 6) if rng.random() > 0.2 else 0):
         color = palette[rng.integers(len(palette))]

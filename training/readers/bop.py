@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from thor2_jax.errors import InputError, with_context
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, read_color, read_depth, read_labels
 from thor2_jax.tables import read_table
-from training.readers.labelled import LabelledFrame, LabelledFrames, named_path
+from training.readers.labelled import LabelledFrame, LabelledFrames, dataset_folder, named_path
 
 __all__ = ["BOP", "SMALLEST_VISIBLE", "read_object_names"]
 
@@ -44,9 +44,7 @@ class BOP(LabelledFrames):
             InputError: There are no frames, or `names` is damaged.
             OSError: `names` cannot be opened.
         """
-        path = named_path(path)
-        if not path.is_dir():
-            raise InputError(f"dataset: {path} is not a directory; expected a dataset")
+        path = dataset_folder(named_path(path))
         scenes = sorted(f.parent for f in [*path.glob("scene_camera.json"), *path.glob("*/scene_camera.json")])
         self._images = [(scene, image) for scene in scenes for image in _images(scene / "rgb")]
         self.identifiers = [f"{scene.name}/{image.stem}" for scene, image in self._images]

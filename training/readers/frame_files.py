@@ -56,13 +56,7 @@ class FrameFiles:
 
     def read(self, depth_scale: float | None = None) -> RGBDFrame:
         """Read the frame; arguments and exceptions as `read_frame`."""
-        return read_frame(
-            color=self.color,
-            depth=self.depth,
-            labels=self.labels,
-            intrinsics=self.intrinsics,
-            depth_scale=depth_scale,
-        )
+        return read_frame(**vars(self), depth_scale=depth_scale)
 
     @property
     def names(self) -> Path:
@@ -195,7 +189,7 @@ def read_poses(path: Path, names: Sequence[str]) -> list[NDArray[np.float64]]:
         missing = [name for name in names if name not in stored]
         if missing:
             raise InputError(f"poses: {path} has no pose of frame {missing[0]}; expected one for each frame")
-        return [check_pose(stored[name], f"poses: {path}: the pose of frame {name}") for name in names]
+        stored = [stored[name] for name in names]
     if len(stored) != len(names):
         raise InputError(f"poses: {path} has {len(stored)} poses for {len(names)} frames; expected one for each frame")
     return [

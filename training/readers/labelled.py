@@ -5,9 +5,10 @@ import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
+from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import RGBDFrame
 
-__all__ = ["LabelledFrame", "LabelledFrames", "named_path", "path_ends", "sequence_of"]
+__all__ = ["LabelledFrame", "LabelledFrames", "dataset_folder", "named_path", "path_ends", "sequence_of"]
 
 
 def sequence_of(identifier: str) -> str:
@@ -19,6 +20,14 @@ def named_path(path: str | Path) -> Path:
     """Return the absolute path of a folder, of "." and "x/.." too, so that its last part is a name."""
     path = Path(path)
     return path.resolve() if ".." in path.parts else path.absolute()
+
+
+def dataset_folder(path: str | Path) -> Path:
+    """Return the path of a dataset; raises InputError if it is no directory."""
+    path = Path(path)
+    if not path.is_dir():
+        raise InputError(f"dataset: {path} is not a directory; expected a dataset")
+    return path
 
 
 def path_ends(sequence: str) -> list[str]:

@@ -27,7 +27,7 @@ from thor2_jax.errors import InputError, with_context
 from thor2_jax.files import read_file
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, read_color, read_depth, read_labels
 from thor2_jax.tables import parse_json, read_table
-from training.readers.labelled import LabelledFrame, LabelledFrames, path_ends
+from training.readers.labelled import LabelledFrame, LabelledFrames, dataset_folder, path_ends
 
 __all__ = ["OCID", "fit_intrinsics", "read_organized_points"]
 
@@ -35,8 +35,6 @@ _FIRST_OBJECT = {"table": 3, "floor": 2}
 """Label of the object placed first. 0 is a pixel without depth, 1 the surroundings; on a table 2 is the table."""
 
 _CAMERAS = {"bottom": "lower", "top": "upper"}
-
-_Sequence = tuple[str, str, str, str]  # place, camera, type, name: its folder
 
 _LARGEST_RESIDUAL = 5.0
 """Largest root mean square residual of the fit, pixels: sensor noise makes about 1, another kind of cloud hundreds."""
@@ -60,35 +58,36 @@ class OCID(LabelledFrames):
                 table of OCID-VLG that lists none of the frames.
             OSError: `names` cannot be opened.
         """
-        path = Path(path)
-        if not path.is_dir():
-            raise InputError(f"dataset: {path} is not a directory; expected a dataset")
+        path = dataset_folder(path)
         self._root = path / "YCB10" if (path / "YCB10").is_dir() else path
-        self._images: list[tuple[_Sequence, Path]] = []
+        self._images: list[tuple[str, Path]] = []  # <place>/<camera>/<type>/<sequence>, image
         for place, camera in itertools.product(_FIRST_OBJECT, _CAMERAS):
             for folder in sorted((self._root / place / camera).glob("*/*")):
-                sequence = place, camera, folder.parent.name, folder.name
+                sequence = folder.relative_to(self._root).as_posix()
                 self._images += [(sequence, image) for image in sorted((folder / "rgb").glob("*.png"))]
         if not self._images:
             raise InputError(f"dataset: {path} has no {{table,floor}}/{{bottom,top}}/<type>/<sequence>/rgb/*.png")
         value = _read_names(Path(names))
         self._is_complete = not isinstance(value, list)
         if isinstance(value, list):
-            by_sequence, listed = _names_of_vlg(Path(names), value)
-            self._images = [(s, image) for s, image in self._images if _find(s, listed, image.stem) is not None]
+            self._names, listed = _names_of_vlg(Path(names), value)
+            self._images = [
+                (sequence, image)
+                for sequence, image in self._images
+                if any(image.stem in listed.get(end, ()) for end in path_ends(sequence))
+            ]
             if not self._images:
                 raise InputError(f"{names} lists no frame of {path}; expected image_filename <sequence>,<image>")
         else:
-            by_sequence = _names_in_order(Path(names), value, dict.fromkeys(s for s, _ in self._images))
-        self._names = by_sequence
-        self.identifiers = ["/".join((*sequence, image.stem)) for sequence, image in self._images]
+            self._names = _names_in_order(Path(names), value, dict.fromkeys(sequence for sequence, _ in self._images))
+        self.identifiers = [f"{sequence}/{image.stem}" for sequence, image in self._images]
 
     def __getitem__(self, number: int) -> LabelledFrame:
         """Read a frame; also raises InputError for a cloud without a pinhole camera and a label without a name."""
         sequence, _ = self._images[number]
-        place, camera, kind, _ = sequence
+        place, camera, kind, _ = sequence.split("/")
         with with_context(self.identifiers[number]):
-            names = next(self._names[end] for end in path_ends("/".join(sequence)) if end in self._names)
+            names = next(self._names[end] for end in path_ends(sequence) if end in self._names)
             frame, truth = _read(self.files(number), _FIRST_OBJECT[place], names, self._is_complete)
         attributes = {"place": place, "camera": _CAMERAS[camera], "type": kind}
         return LabelledFrame(self.identifiers[number], frame, truth, attributes)
@@ -114,19 +113,19 @@ def _read_names(path: Path) -> dict[Any, Any] | list[Any]:
     return value
 
 
-def _names_in_order(path: Path, table: Mapping[Any, Any], sequences: Iterable[_Sequence]) -> dict[str, dict[int, str]]:
+def _names_in_order(path: Path, table: Mapping[Any, Any], sequences: Iterable[str]) -> dict[str, dict[int, str]]:
     """Return label -> name of each sequence, whose key is the longest end of its path in the table."""
     named: dict[str, dict[int, str]] = {}
     lacking = []
     for sequence in sequences:
-        key = next((end for end in path_ends("/".join(sequence)) if end in table), None)
+        key = next((end for end in path_ends(sequence) if end in table), None)
         if key is None:
-            lacking.append("/".join(sequence))
+            lacking.append(sequence)
             continue
         names = table[key]
         if not isinstance(names, list) or not all(isinstance(name, str) and name for name in names):
             raise InputError(f"{path}: {key} is {names!r}; expected a list of names")
-        named["/".join(sequence)] = dict(enumerate(names, start=_FIRST_OBJECT[sequence[0]]))
+        named[sequence] = dict(enumerate(names, start=_FIRST_OBJECT[sequence.split("/")[0]]))
     if lacking:
         raise InputError(f"{path} lacks the sequences {', '.join(lacking)}")
     return named
@@ -159,11 +158,6 @@ def _names_of_vlg(path: Path, items: Sequence[Any]) -> tuple[dict[str, dict[int,
             )
         images.setdefault(sequence, set()).add(Path(image.strip()).stem)
     return names, images
-
-
-def _find(sequence: _Sequence, images: Mapping[str, set[str]], stem: str) -> str | None:
-    """Return the end of a sequence's path under which an image is listed."""
-    return next((end for end in path_ends("/".join(sequence)) if stem in images.get(end, ())), None)
 
 
 def _read(

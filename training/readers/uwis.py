@@ -4,15 +4,14 @@
 """
 
 from pathlib import Path
-from typing import NamedTuple
 
 from thor2_jax.errors import InputError, with_context
 from thor2_jax.files import read_file
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, read_color, read_depth, read_labels
 from thor2_jax.tables import parse_yaml
-from training.readers.labelled import LabelledFrame, LabelledFrames
+from training.readers.labelled import LabelledFrame, LabelledFrames, dataset_folder
 
-__all__ = ["INTRINSICS", "NOT_SCORED", "UWISOccluded", "Video", "video_attributes"]
+__all__ = ["INTRINSICS", "NOT_SCORED", "UWISOccluded", "video_attributes"]
 
 INTRINSICS = Intrinsics(920.458618164062, 921.807800292969, 626.486083984375, 358.848205566406)
 """The camera of all videos."""
@@ -23,43 +22,35 @@ NOT_SCORED = frozenset({"ice_cream", "hot_sauce", "chips_can"})
 _FIRST_LOUNGE = 167
 
 
-class Video(NamedTuple):
-    """A row of the dataset's table: conditions, and the numbers of the videos under them."""
-
-    category: str
-    occlusion: str
-    light: str
-    numbers: tuple[int, ...]
-
-
-_VIDEOS = (
-    Video("kitchen", "none", "1", (41, 42, 176, 177)),
-    Video("food", "none", "1", (32, 33, 167, 168)),
-    Video("tools", "none", "1", (50, 51, 185, 186)),
-    Video("kitchen", "low", "1", (44, 45, 179, 180)),
-    Video("food", "low", "1", (35, 36, 170, 171)),
-    Video("tools", "low", "1", (53, 54, 188, 189)),
-    Video("kitchen", "high", "1", (46, 48, 182, 183)),
-    Video("food", "high", "1", (38, 39, 173, 174)),
-    Video("tools", "high", "1", (56, 57, 191, 192)),
-    Video("kitchen", "none", "2", (68, 69, 203, 204)),
-    Video("food", "none", "2", (77, 78, 212, 213)),
-    Video("tools", "none", "2", (59, 60, 194, 195)),
-    Video("kitchen", "low", "2", (71, 72, 206, 207)),
-    Video("food", "low", "2", (80, 81, 215, 216)),
-    Video("tools", "low", "2", (62, 63, 197, 198)),
-    Video("kitchen", "high", "2", (74, 75, 209, 210)),
-    Video("food", "high", "2", (83, 84, 218, 219)),
-    Video("tools", "high", "2", (65, 66, 200, 201)),
-)
+_VIDEOS = {
+    ("kitchen", "none", "1"): (41, 42, 176, 177),
+    ("food", "none", "1"): (32, 33, 167, 168),
+    ("tools", "none", "1"): (50, 51, 185, 186),
+    ("kitchen", "low", "1"): (44, 45, 179, 180),
+    ("food", "low", "1"): (35, 36, 170, 171),
+    ("tools", "low", "1"): (53, 54, 188, 189),
+    ("kitchen", "high", "1"): (46, 48, 182, 183),
+    ("food", "high", "1"): (38, 39, 173, 174),
+    ("tools", "high", "1"): (56, 57, 191, 192),
+    ("kitchen", "none", "2"): (68, 69, 203, 204),
+    ("food", "none", "2"): (77, 78, 212, 213),
+    ("tools", "none", "2"): (59, 60, 194, 195),
+    ("kitchen", "low", "2"): (71, 72, 206, 207),
+    ("food", "low", "2"): (80, 81, 215, 216),
+    ("tools", "low", "2"): (62, 63, 197, 198),
+    ("kitchen", "high", "2"): (74, 75, 209, 210),
+    ("food", "high", "2"): (83, 84, 218, 219),
+    ("tools", "high", "2"): (65, 66, 200, 201),
+}
+"""Category of the objects, occlusion and light -> numbers of the videos, as in the dataset's table."""
 
 
 def video_attributes(number: int) -> dict[str, str]:
     """Return the environment of a video and, if the dataset's table lists it, object category, occlusion and light."""
     attributes = {"environment": "lounge" if number >= _FIRST_LOUNGE else "warehouse"}
-    for video in _VIDEOS:
-        if number in video.numbers:
-            attributes |= {"category": video.category, "occlusion": video.occlusion, "light": video.light}
+    for (category, occlusion, light), numbers in _VIDEOS.items():
+        if number in numbers:
+            attributes |= {"category": category, "occlusion": occlusion, "light": light}
     return attributes
 
 
@@ -72,9 +63,7 @@ class UWISOccluded(LabelledFrames):
         Raises:
             InputError: the folder holds no frame.
         """
-        path = Path(path)
-        if not path.is_dir():
-            raise InputError(f"dataset: {path} is not a directory; expected a dataset")
+        path = dataset_folder(path)
         videos = sorted((f for f in path.iterdir() if f.name.isdecimal()), key=lambda f: int(f.name))
         self._frames = [(video, c) for video in videos for c in sorted((video / "images").glob("*_rgb.png"))]
         if not self._frames:

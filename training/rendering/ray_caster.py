@@ -62,8 +62,7 @@ class RayCaster:
             directions: [n, 3], of any length.
         """
         directions = np.ascontiguousarray(directions, np.float32)
-        origins = np.empty_like(directions)
-        origins[:] = origin
+        origins = np.full_like(directions, origin)
         result = self._scene.run(origins, directions, output=True)
         hit = np.flatnonzero(result["primID"] >= 0)
         distance = np.full(len(directions), np.inf, np.float32)

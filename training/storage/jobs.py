@@ -1,9 +1,9 @@
 """Job records, which tell whether an output directory is that of the requested job, and exclusive locks on it."""
 
-import contextlib
 import itertools
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ import filelock
 from thor2_jax.errors import InputError
 from thor2_jax.files import write_text
 
-__all__ = ["JOB_FILE", "LOCK", "begin_job", "check_same_job", "locked"]
+__all__ = ["JOB_FILE", "LOCK", "begin_job", "check_begun", "check_same_job", "locked"]
 
 JOB_FILE = "job.json"
 
@@ -20,23 +20,34 @@ MAX_SHOWN = 100
 """Characters of a value that an error message shows."""
 
 
-def begin_job(directory: Path, job: Mapping[str, Any]) -> None:
+def begin_job(directory: Path, job: Mapping[str, Any], name: str = JOB_FILE) -> None:
     """Write the record of a job to a directory, or check that the directory is of this job.
 
     Args:
         directory: output directory; it is created unless it exists.
         job: the record, as JSON can hold it.
+        name: path of the record in the directory.
 
     Raises:
-        InputError: the directory is of another job.
-        OSError: the record cannot be read or written.
+        InputError: the directory is of another job, or its record is damaged.
+        OSError: the record cannot be written.
     """
-    file = directory / JOB_FILE
+    check_begun(directory, job, name)
+    file = directory / name
+    if not file.is_file():
+        file.parent.mkdir(parents=True, exist_ok=True)
+        write_text(file, json.dumps(job, indent=1) + "\n")
+
+
+def check_begun(directory: Path, job: Mapping[str, Any], name: str = JOB_FILE) -> None:
+    """Raise InputError if a directory has the record of another job, or a damaged one; arguments as `begin_job`."""
+    file = directory / name
     if file.is_file():
-        check_same_job(directory, json.loads(file.read_bytes()), job)
-        return
-    directory.mkdir(parents=True, exist_ok=True)
-    write_text(file, json.dumps(job, indent=1) + "\n")
+        try:
+            begun = dict(json.loads(file.read_bytes()))
+        except (OSError, ValueError, TypeError, RecursionError) as error:
+            raise InputError(f"out: {file} cannot be read ({error}); delete {file.parent} to start anew") from None
+        check_same_job(directory, begun, job)
 
 
 def check_same_job(directory: Path, stored: Mapping[str, Any], requested: Mapping[str, Any]) -> None:
@@ -81,9 +92,8 @@ def _shown(value: Any) -> str:
 LOCK = ".lock"
 
 
-@contextlib.contextmanager
-def locked(directory: Path) -> Iterator[None]:
-    """Hold an exclusive lock on an output directory, which is created if it is missing.
+def locked(directory: Path) -> AbstractContextManager[object]:
+    """Acquire an exclusive lock on an output directory, which is created if it is missing; return its context.
 
     The operating system releases the lock when the process ends, even if it is killed. The lock file stays.
 
@@ -93,10 +103,8 @@ def locked(directory: Path) -> Iterator[None]:
     """
     # A soft lock, filelock's fallback on file systems without locks, would outlive a killed process.
     try:
-        held = filelock.FileLock(directory / LOCK, blocking=False, fallback_to_soft=False).acquire()
+        return filelock.FileLock(directory / LOCK, blocking=False, fallback_to_soft=False).acquire()
     except filelock.Timeout:
         raise InputError(
             f"out: another process is writing to {directory}; wait until it ends, or choose another directory"
         ) from None
-    with held:
-        yield

@@ -3,11 +3,15 @@
 import itertools
 import time
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
 
-__all__ = ["Progress", "numbered", "of_stage"]
+__all__ = ["Display", "Progress", "numbered", "of_stage"]
 
 Progress = Callable[[str, int, int, str], object]
 """Called with (stage, done, total, note)."""
+
+Display = Callable[[], AbstractContextManager[Progress]]
+"""Opens a progress display, such as `training.cli.progress.show_progress`."""
 
 
 def of_stage(progress: Progress, stage: str, note: str = "") -> Callable[[int, int], None]:

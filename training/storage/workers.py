@@ -24,7 +24,7 @@ from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from typing import Any, Protocol, TypeVar
 
-from thor2_jax.errors import InputError
+from thor2_jax.errors import InputError, needs_extra
 from thor2_jax.signals import signals_blocked
 
 __all__ = ["IN_PROCESS", "WorkerPool", "keep_freed_memory", "local_workers", "ray_workers"]
@@ -173,12 +173,8 @@ def ray_workers(workers: int, address: str | None = None) -> WorkerPool:
         InputError: if `workers` is not positive, or Ray is not installed.
     """
     _check_workers(workers)
-    try:
+    with needs_extra("engine is ray, which", "ray", "cluster"):
         ray: Any = importlib.import_module("ray")
-    except ModuleNotFoundError:
-        raise InputError(
-            "engine is ray, which is not installed; install it: pip install -c constraints.txt '.[cluster]'"
-        ) from None
 
     def fetch(result: Any) -> Any:
         try:

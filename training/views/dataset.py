@@ -33,13 +33,12 @@ import safetensors.numpy
 from thor2_jax.config import DESCRIPTOR_VERSION
 from thor2_jax.errors import InputError
 from thor2_jax.files import read_file, remove_written, write_text
-from training.views.crops import CROPS, ViewCrops, read_crops
+from training.views.crops import CROPS, MANIFEST, ViewCrops, read_crops
 from training.views.normalized_views import COORDINATE_STEP, NormalizedViews
 
 __all__ = ["MANIFEST", "Manifest", "NormalizedViews", "Shard", "ViewDataset", "encode", "remove_views"]
 
 MANIFEST_FORMAT = 2
-MANIFEST = "manifest.json"
 
 
 def remove_views(directory: Path) -> None:
@@ -118,11 +117,6 @@ class Manifest:
 
     job: Mapping[str, Any]
     shards: tuple[Shard, ...] = ()
-
-    @property
-    def finished(self) -> bool:
-        """Whether all shards are finished."""
-        return len(self.shards) == self.job["shards"]
 
     @property
     def views(self) -> int:
@@ -215,7 +209,7 @@ class ViewDataset:
                 f"dataset: {directory / MANIFEST} has views for descriptor version {version}; expected version "
                 f"{DESCRIPTOR_VERSION}; render the views again"
             )
-        if not manifest.finished:
+        if len(manifest.shards) != manifest.job["shards"]:
             raise InputError(
                 f"dataset: {directory / MANIFEST} lists {len(manifest.shards)} of {manifest.job['shards']} shards; "
                 "repeat the `thor2 render` command to finish it"

@@ -288,18 +288,16 @@ def render_crops(
     Args:
         meshes: the meshes of the dataset.
         dataset: the dataset.
-        size: side of the crops, pixels.
+        size: side of the crops, pixels, at least 1.
         pool: worker processes that render; does not affect the result.
         progress: called with (crops done, total crops) at the start and after each shard.
         augmentations: those of the dataset.
         seed: seed of the dataset.
 
     Raises:
-        InputError: `size` is less than 1, or the dataset has crops of another size or views of other meshes.
+        InputError: the dataset has crops of another size or views of other meshes.
         OSError: a file cannot be written; the rendering can be resumed.
     """
-    if size < 1:
-        raise InputError(f"crops is {size}; expected at least 1 pixel")
     directory = dataset.directory / crops.CROPS
     job = dataset.manifest.job
     angles = view_angles(job["azimuth_step"], job["polar_step"])

@@ -104,11 +104,11 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def check_baseline(folder: Path, name: str) -> None:
-    loaded = load_baselines(folder, load_run(folder))
-    probabilities = loaded.models[name].probabilities(frame_inputs(5))
+    loaded = load_baselines(folder, load_run(folder))[name]
+    probabilities = loaded.model.probabilities(frame_inputs(5))
     np.testing.assert_allclose(probabilities.sum(axis=1), 1, atol=1e-5)
     assert probabilities[:2].argmax(axis=1).tolist() == [0, 1] and (probabilities[2:] == 0.5).all()
-    assert loaded.weights[name] == [] and loaded.temperatures[name] > 0
+    assert loaded.weights == {} and loaded.temperature is not None and loaded.temperature > 0
 
 
 @pytest.mark.parametrize("name", [SMALL, pytest.param("templates", marks=pytest.mark.slow)])

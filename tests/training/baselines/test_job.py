@@ -96,8 +96,8 @@ def test_baselines_learn_and_are_calibrated(trained: Path, names: tuple[str, ...
     assert run.predictors == ("tops", *names)
     assert set(run.temperatures) == {"tops", *names} and run.temperatures["tops"] == 1.5
     inputs = baseline_inputs(described(5), CONFIG, None)
-    for name, model in run.baselines.items():
-        probabilities = model.probabilities(inputs)
+    for name, baseline in run.baselines.items():
+        probabilities = baseline.model.probabilities(inputs)
         np.testing.assert_allclose(probabilities.sum(axis=1), 1, atol=1e-5)
         assert (probabilities.argmax(axis=1) == np.repeat([0, 1], 4)).mean() == 1, name
 
@@ -132,7 +132,7 @@ def test_no_held_out_set_gives_no_temperatures(tmp_path: Path) -> None:
     folder = write_run(tmp_path / "run", 1, 0)
     train_baselines(folder, SOURCE, ["forest"])
     loaded = load_baselines(folder, load_run(folder))
-    assert list(loaded.models) == ["forest"] and loaded.temperatures == {}
+    assert list(loaded) == ["forest"] and loaded["forest"].temperature is None
 
 
 def test_invalid_arguments_are_refused(trained: Path, tmp_path: Path) -> None:
@@ -188,8 +188,6 @@ def test_left_out_classes_are_not_in_the_views() -> None:
     views = remaining.read(1)
     assert views.label == 1
     np.testing.assert_array_equal(views.xyz, normalize_views(clouds()["cube"][3:4], 1, [0], [0], CONFIG).xyz)
-    with pytest.raises(InputError, match=r"\bd\b"):
-        WithoutClasses(source, ["a", "d"])
 
 
 def test_command_refuses_unknown_baseline_before_any_work(tmp_path: Path) -> None:

@@ -270,19 +270,20 @@ def test_options_replace_values_of_the_protocols(
         assert run("train", "--meshes", meshes, "--out", tmp_path / "run", *options)[0] == 0
         return jobs[-1]
 
-    default = dataclasses.replace(DEFAULT.distractors, workers=2)
-    assert (job().protocol, jobs[-1].distractors, jobs[-1].features) == (DEFAULT, default, ())
-    quick = dataclasses.replace(QUICK.distractors, workers=2)
-    assert (job("--quick").protocol, jobs[-1].distractors, jobs[-1].features) == (QUICK, quick, ())
-    changed = job("--quick", "--embedding", 50, "--epochs", 2, "--azimuth-step", 40)
-    assert changed.distractors == dataclasses.replace(quick, procedural=50, epochs=2)
-    assert (changed.protocol.azimuth_step, changed.protocol.polar_step) == (40, QUICK.polar_step)
-    assert job("--classifiers", "ce").features == ("ce",) and jobs[-1].distractors == default
-    assert (job("--embedding", 0).features, jobs[-1].distractors) == (FEATURES, None)
-    assert (job("--paper").protocol, jobs[-1].distractors, jobs[-1].features) == (PAPER, None, FEATURES)
-    assert job("--paper", "--embedding", 20, "--epochs", 3).distractors == dataclasses.replace(
-        default, procedural=20, epochs=3
-    )
+    replace = dataclasses.replace
+    distractors, quick = (replace(each.distractors, workers=2) for each in (DEFAULT, QUICK))
+    default = replace(DEFAULT, distractors=distractors)
+    assert job().protocol == default and default.classifiers == ()
+    assert job("--quick").protocol == replace(QUICK, distractors=quick)
+    changed = job("--quick", "--embedding", 50, "--epochs", 2, "--azimuth-step", 40).protocol
+    assert changed.distractors == replace(quick, procedural=50, epochs=2)
+    assert (changed.azimuth_step, changed.polar_step) == (40, QUICK.polar_step)
+    assert job("--classifiers", "ce").protocol == replace(default, classifiers=("ce",))
+    assert job("--embedding", 0).protocol == replace(DEFAULT, classifiers=FEATURES, distractors=None)
+    assert job("--paper").protocol == PAPER and PAPER.classifiers == FEATURES and PAPER.distractors is None
+    paper = job("--paper", "--embedding", 20, "--epochs", 3).protocol
+    assert paper.distractors == replace(distractors, procedural=20, epochs=3) and paper.classifiers == FEATURES
+    assert job("--folds", 3).protocol == replace(default, folds=3)
     code, _, err = run("train", "--meshes", meshes, "--out", tmp_path / "run", "--quick", "--paper")
     assert code == 2 and "quick" in one_line(err)
 

@@ -66,7 +66,7 @@ def test_answers_before_an_unreadable_frame_are_kept(
     model: Path, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     frames, arguments = FrameFolder(folder), RunArguments((model,))
-    expected = list(answer_frames(arguments.load(frames), frames))
+    expected = list(answer_frames(arguments.load(tuple(frames.identifiers)), frames))
     broken, read = FRAMES_PER_CHUNK + 2, FrameFolder.__getitem__
 
     def damaged(self: FrameFolder, number: int) -> Any:

@@ -211,10 +211,10 @@ def test_other_options_or_views_are_refused(tmp_path: Path) -> None:
         train(out, progress=stop_when("fit tops", 4))
     before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
     cases: list[tuple[str, dict[str, Any]]] = [
-        ("batch_size 8, not 6", {"options": dataclasses.replace(OPTIONS, batch_size=6)}),
-        ("epochs 3, not 4", {"options": dataclasses.replace(OPTIONS, epochs=4)}),
-        ("seed 0, not 1", {"options": dataclasses.replace(OPTIONS, seed=1)}),
-        (r"classifiers\[0\] \"tops\", not \"ce\"", {"features": ("tops", "ce")}),
+        ("batch_size 8, not 6", {"fit": dataclasses.replace(OPTIONS, batch_size=6)}),
+        ("epochs 3, not 4", {"fit": dataclasses.replace(OPTIONS, epochs=4)}),
+        ("seed 0, not 1", {"fit": dataclasses.replace(OPTIONS, seed=1)}),
+        (r"classifiers\[0\] \"tops\", not \"ce\"", {"classifiers": ("tops", "ce")}),
         ("folds 1, not 3", {"folds": 3}),
     ]
     begun = RunSettings(("tops",), OPTIONS, CONFIG)
@@ -269,7 +269,7 @@ def test_a_full_disk(whole: tuple[Path, TrainedRun], tmp_path: Path, monkeypatch
         full() if calls == 2 else save(self, *arguments)
 
     for where, name, replacement in (
-        (module, "write_text", full),
+        (module, "begin_job", full),
         (Checkpoints, "save", second_fails),
         (module, "append_metrics", full),
         (module, "draw_curves", full),

@@ -306,7 +306,7 @@ def test_invalid_names_files_are_refused(tmp_path: Path, file: str, content: str
     with pytest.raises(InputError, match=message) as caught:
         read_names(tmp_path / file)
     assert "\n" not in str(caught.value)
-    with pytest.raises(InputError, match="No such file"):
+    with pytest.raises(InputError, match=r"absent\.json is missing"):
         read_names(tmp_path / "absent.json")
 
 
