@@ -10,7 +10,7 @@ import struct
 import subprocess
 import sys
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -31,6 +31,7 @@ from thor2_jax.model.classifier import FEATURES, MLP, RunClassifiers
 from thor2_jax.model.inference import infer
 from thor2_jax.model.model import Model
 from thor2_jax.model.run_directory import TrainedRun, input_size
+from thor2_jax.types import Cloud
 from training.objects.builtin_objects import builtin_objects
 from training.rendering.camera import Camera, RenderedView
 from training.rendering.scenes import compose_scene
@@ -119,6 +120,28 @@ def aligned_cloud(
         border = np.round(points[:, axis] / width) * width
         points[np.abs(points[:, axis] - border) < 1e-5, axis] += np.float32(1e-3)
     return points, rng.integers(0, 256, (n, 3), dtype=np.uint8)
+
+
+def random_clouds(
+    seed: int, sizes: Iterable[int], extent: Sequence[float] = (0.2, 0.1, 0.05), color: object = None
+) -> list[Cloud]:
+    """Return boxes of random points, half a metre before the camera, in random colours or all in one colour."""
+    rng = np.random.default_rng(seed)
+    return [
+        (
+            (rng.random((n, 3)) * extent + [0, 0, 0.5]).astype(np.float32),
+            rng.integers(0, 256, (n, 3), np.uint8) if color is None else np.full((n, 3), color, np.uint8),
+        )
+        for n in sizes
+    ]
+
+
+def brick_and_stick(views: int, seed: int = 0) -> dict[str, list[Cloud]]:
+    """Return views of two objects that differ in shape and colour."""
+    return {
+        "red brick": random_clouds(seed, [200] * views, (0.1, 0.05, 0.03), 0),
+        "stick": random_clouds(seed + 1, [200] * views, (0.2, 0.01, 0.01), 255),
+    }
 
 
 def as_8_bit(colors: np.ndarray) -> np.ndarray:

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from helpers import SMALL_CONFIG, untrained_embedding_run
+from helpers import SMALL_CONFIG, random_clouds, untrained_embedding_run
 
 import colornet
 from thor2_jax.descriptor.looks import describe_looks
@@ -23,12 +23,7 @@ LABEL = np.arange(40) % 4
 
 @pytest.fixture(scope="module")
 def held_out() -> Views:
-    rng = np.random.default_rng(0)
-    clouds = [
-        ((rng.random((200, 3)) * (0.2, 0.1, 0.05)).astype(np.float32), rng.integers(0, 256, (200, 3), np.uint8))
-        for _ in range(40)
-    ]
-    return list(zip(LABEL.tolist(), clouds, strict=True))
+    return list(zip(LABEL.tolist(), random_clouds(0, [200] * 40), strict=True))
 
 
 def test_confidence_separates_and_keeps_its_share(held_out: Views, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from flax import nnx
+from helpers import brick_and_stick
 from PIL import Image
 
 import thor2_jax as thor2
@@ -37,19 +38,11 @@ OPTIONS = FitOptions(epochs=3, batch_size=8)
 FINISHED = ["curves.png", "metrics.jsonl", "network.npz", "run.json", "weights"]
 
 
-def clouds(seed: int = 0, views: int = 6) -> dict[str, list[Cloud]]:
-    rng = np.random.default_rng(seed)
-    out: dict[str, list[Cloud]] = {}
-    for name, size, level in (("red brick", (0.1, 0.05, 0.03), 0), ("stick", (0.2, 0.01, 0.01), 255)):
-        out[name] = [
-            ((rng.random((200, 3)) * size + [0, 0, 0.5]).astype(np.float32), np.full((200, 3), level, np.uint8))
-            for _ in range(views)
-        ]
-    return out
+STICK = brick_and_stick(6)["stick"]
 
 
-def source(seed: int = 0, views: int = 6) -> MemoryViews:
-    return MemoryViews(clouds(seed, views), CONFIG)
+def source(seed: int = 0) -> MemoryViews:
+    return MemoryViews(brick_and_stick(6, seed), CONFIG)
 
 
 def train(out: Path, features: tuple[str, ...] = ("tops",), options: FitOptions = OPTIONS, **more: Any) -> TrainedRun:
@@ -141,9 +134,9 @@ def test_invalid_input_is_refused_before_any_work(tmp_path: Path, monkeypatch: p
     ("bad", "folds", "message"),
     [
         ({}, 1, "views of 0 classes"),
-        ({"mug": [], "box": clouds()["stick"]}, 1, "class 'mug' has no views"),
-        ({"mug": clouds()["stick"]}, 1, "views of 1 classes"),
-        (clouds(views=3), 4, "folds is 4.*'red brick'"),
+        ({"mug": [], "box": STICK}, 1, "class 'mug' has no views"),
+        ({"mug": STICK}, 1, "views of 1 classes"),
+        (brick_and_stick(3), 4, "folds is 4.*'red brick'"),
     ],
 )
 def test_nothing_is_written_for_bad_views(
