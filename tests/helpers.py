@@ -10,7 +10,7 @@ import struct
 import subprocess
 import sys
 import zlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -35,6 +35,12 @@ from thor2_jax.types import Cloud
 from training.objects.builtin_objects import builtin_objects
 from training.rendering.camera import Camera, RenderedView
 from training.rendering.scenes import compose_scene
+
+Command = Callable[..., str]
+"""Type of the fixtures `printed` and `refused`, which run the command line."""
+
+Recognize = Callable[..., list[dict[str, Any]]]
+"""Type of the fixture `recognize`, which recognizes frames on the command line."""
 
 SMALL_CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=2, n_strips=5, image_size=8)
 """A descriptor that compiles quickly."""

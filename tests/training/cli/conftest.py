@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from helpers import SMALL_CONFIG, untrained_run
+from helpers import SMALL_CONFIG, Command, Recognize, json_lines, untrained_run
 
 from thor2_jax.gallery import embedding, objects
 from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
@@ -28,6 +28,12 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     directory = tmp_path_factory.mktemp("run")
     save_run(untrained_run(("bowl", "mug", "plate"), ("tops", "tops2"), COVERING, seed=1), directory)
     return directory
+
+
+@pytest.fixture
+def recognize(model: Path, printed: Command) -> Recognize:
+    """Return a function that recognizes frames with the model and returns what it prints, an object for each frame."""
+    return lambda *options: json_lines(printed("recognize", "--model", model, *options))
 
 
 @pytest.fixture(scope="module")

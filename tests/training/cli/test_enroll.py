@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from helpers import run_thor2, untrained_run, write_frame
+from helpers import Command, run_thor2, untrained_run, write_frame
 from PIL import Image
 from recording_files import table_frame, write_recording
 
@@ -41,14 +41,6 @@ def model(enrolled: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(enrolled / "run", tmp_path / "run"))
 
 
-def error_of(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
-    capsys.readouterr()
-    assert run_thor2(*arguments) == 2
-    error = capsys.readouterr().err
-    assert error.startswith("error: ") and error.count("\n") == 1
-    return error
-
-
 def files(directory: Path) -> dict[str, bytes]:
     return {str(p.relative_to(directory)): p.read_bytes() for p in sorted(directory.rglob("*")) if p.is_file()}
 
@@ -70,11 +62,10 @@ def test_every_labelled_object_is_enrolled_in_a_new_run(model: Path, frames: Pat
     assert [(answer["label"], answer["name"]) for answer in answers] == [(1, "brick"), (5, "book")]
 
 
-def test_frames_without_labels_are_listed(model: Path, frames: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_frames_without_labels_are_listed(model: Path, frames: Path, printed: Command) -> None:
     (frames / "001" / "labels.json").unlink()
     for command in (("enroll", "--replace", "--frames", frames), ("evaluate", "frames", frames)):
-        assert run_thor2(*command, "--model", model) == 0
-        assert "1 frames without labels.json: 001" in capsys.readouterr().out.replace("\n", " ")
+        assert "1 frames without labels.json: 001" in printed(*command, "--model", model).replace("\n", " ")
 
 
 def test_evaluation_has_a_gallery_column(model: Path, tmp_path: Path) -> None:
@@ -92,10 +83,10 @@ def test_evaluation_has_a_gallery_column(model: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_trained_run_answers_by_both(frames: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_trained_run_answers_by_both(frames: Path, tmp_path: Path, refused: Command) -> None:
     model = tmp_path / "run"
     save_run(untrained_run(("brick", "mug"), ("tops", "tops2")), model)
-    assert "'brick' is a trained class" in error_of(capsys, "enroll", "--frames", frames, "--model", model)
+    assert "'brick' is a trained class" in refused("enroll", "--frames", frames, "--model", model)
     assert run_thor2("enroll", "book", "--model", model, "--frames", frames) == 0
     assert run_thor2("evaluate", "frames", frames, "--model", model, "--out", tmp_path / "report") == 0
     report = json.loads((tmp_path / "report" / "report.json").read_text())
@@ -103,7 +94,7 @@ def test_a_trained_run_answers_by_both(frames: Path, tmp_path: Path, capsys: pyt
     assert report["classes"] == ["brick", "mug", "book"]
     assert run_thor2("forget", "mug", "--model", model) == 0
     assert Recognizer.load(model).classes == ("brick", "book")
-    assert "'mug'" in error_of(capsys, "forget", "mug", "--model", model)
+    assert "'mug'" in refused("forget", "mug", "--model", model)
 
 
 def test_several_folders_follow_one_option(frames: Path, tmp_path: Path) -> None:
@@ -124,11 +115,11 @@ def test_a_named_object_comes_from_its_label_name(model: Path, frames: Path) -> 
     assert len(Recognizer.load(model).gallery.objects["brick"].clouds) == 1
 
 
-def test_frames_without_names(model: Path, frames: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_frames_without_names(model: Path, frames: Path, tmp_path: Path, refused: Command) -> None:
     """They have the object as their only instance, or --instance names it; so do the segments of a recording."""
     for folder in ("000", "001"):
         (frames / folder / "labels.json").unlink()
-    assert "2 instances" in error_of(capsys, "enroll", "new", frames, "--model", model)
+    assert "2 instances" in refused("enroll", "new", frames, "--model", model)
     assert run_thor2("enroll", "new", frames, "--instance", 5, "--model", model) == 0
     (write_frame(tmp_path / "one", {3: "leaf"}) / "labels.json").unlink()
     assert run_thor2("enroll", "only", *one_frame(tmp_path / "one", 3)[:-2], "--model", model) == 0
@@ -136,7 +127,7 @@ def test_frames_without_names(model: Path, frames: Path, tmp_path: Path, capsys:
     assert run_thor2("enroll", "box", "--bag", bag, "--instance", 1, "--model", model) == 0
     counts = {name: len(v.clouds) for name, v in Recognizer.load(model).gallery.objects.items()}
     assert counts == {"brick": 2, "book": 2, "new": 2, "only": 1, "box": 2}
-    assert "no labels.json" in error_of(capsys, "evaluate", "frames", "--bag", bag, "--model", model)
+    assert "no labels.json" in refused("evaluate", "frames", "--bag", bag, "--model", model)
 
 
 def test_a_mesh_is_enrolled_from_all_sides(model: Path, tmp_path: Path) -> None:
@@ -183,7 +174,7 @@ def test_a_folder_of_meshes_is_enrolled(
 
 
 def test_arguments_are_checked_before_anything_is_loaded(
-    model: Path, frames: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    model: Path, frames: Path, tmp_path: Path, refused: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def load(*_: object, **__: object) -> None:
         raise AssertionError("the run was loaded")
@@ -207,50 +198,44 @@ def test_arguments_are_checked_before_anything_is_loaded(
         (("mug", "--frames", tmp_path / "absent"), "absent"),
         (("mug", *one_frame(tmp_path / "absent", 1)), "absent"),
     ):
-        assert text in error_of(capsys, "enroll", "--model", model, *arguments)
+        assert text in refused("enroll", "--model", model, *arguments)
 
 
-def test_few_views_give_a_warning(
-    model: Path, frames: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_few_views_give_a_warning(model: Path, frames: Path, printed: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     again = ("enroll", "--frames", frames, "--extend", "--model", model)
     for few, warned in ((10, True), (1, False)):
         monkeypatch.setattr(gallery_objects, "FEW", few)
-        assert run_thor2(*again) == 0
-        printed = capsys.readouterr().out
-        assert ("unknown objects are hardly rejected" in printed) is warned
-        assert f"thor2 recognize FRAME --model {model}" in printed and "2 objects: " in printed
+        text = printed(*again)
+        assert ("unknown objects are hardly rejected" in text) is warned
+        assert f"thor2 recognize FRAME --model {model}" in text and "2 objects: " in text
 
 
-def test_labels_that_are_no_names_are_skipped(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_labels_that_are_no_names_are_skipped(tmp_path: Path, printed: Command) -> None:
     frame = write_frame(tmp_path / "frame", {1: "brick", 5: "book"})
     (frame / "labels.json").write_text('{"labels": {"1": "mug ", "5": "unknown"}}')
-    assert run_thor2("enroll", "--frames", frame, "--model", tmp_path / "run") == 0
-    assert "skipped: frame: name is 'unknown'" in capsys.readouterr().out
+    assert "skipped: frame: name is 'unknown'" in printed("enroll", "--frames", frame, "--model", tmp_path / "run")
     assert Recognizer.load(tmp_path / "run").gallery.names == ("mug",)
     assert run_thor2("evaluate", "frames", frame, "--model", tmp_path / "run", "--out", tmp_path / "report") == 0
     report = json.loads((tmp_path / "report" / "report.json").read_text())
     assert report["instances"]["no_class"] == {"unknown": 1} and report["instances"]["scored"] == 1
 
 
-def test_a_lost_index_is_rebuilt_by_the_command(model: Path, frames: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_lost_index_is_rebuilt_by_the_command(model: Path, frames: Path, printed: Command, refused: Command) -> None:
     gallery = model / "gallery"
     (gallery / "index.json").unlink()
     before = files(gallery)
     for command in (("enroll", "new", *one_frame(frames / "000", 5)), ("objects",), ("forget", "brick")):
-        error = error_of(capsys, *command, "--model", model)
+        error = refused(*command, "--model", model)
         assert f"thor2 objects --reembed --model RUN --gallery {gallery}" in error and files(gallery) == before
-    assert run_thor2("objects", "--reembed", "--model", model, "--gallery", gallery) == 0
-    table = capsys.readouterr().out
+    table = printed("objects", "--reembed", "--model", model, "--gallery", gallery)
     assert all(re.search(rf"{name}\W+2\W+frames\W+20\d\d-", table) for name in ("brick", "book"))
     assert run_thor2("enroll", "new", "--model", model, *one_frame(frames / "000", 5)) == 0
     objects = Recognizer.load(model).gallery.objects
     assert set(objects) == {"brick", "book", "new"} and len(objects["new"].clouds) == 1
 
 
-def test_objects_lists_views_source_and_date(model: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_thor2("objects", "--model", model) == 0
-    table = capsys.readouterr().out
+def test_objects_lists_views_source_and_date(model: Path, printed: Command) -> None:
+    table = printed("objects", "--model", model)
     for name in ("brick", "book"):
         assert re.search(rf"{name}\W+2\W+frames\W+20\d\d-\d\d-\d\dT", table)
     before = files(model / "gallery" / "objects")
@@ -258,29 +243,27 @@ def test_objects_lists_views_source_and_date(model: Path, capsys: pytest.Capture
     assert files(model / "gallery" / "objects") == before
 
 
-def test_forgetting_an_object(model: Path, frames: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_forgetting_an_object(model: Path, frames: Path, refused: Command) -> None:
     before = json.loads((model / "gallery" / "index.json").read_text())
     write = ("enroll", "new", "--model", model, *one_frame(frames / "000", 5))
     assert run_thor2(*write) == 0 and run_thor2("forget", "new", "--model", model) == 0
     after = json.loads((model / "gallery" / "index.json").read_text())
     assert after["objects"] == before["objects"] and after["generation"] == before["generation"] + 2
-    assert "'new'" in error_of(capsys, "forget", "new", "--model", model)
+    assert "'new'" in refused("forget", "new", "--model", model)
 
 
 def test_a_gallery_outside_the_run_directory(
-    model: Path, frames: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    model: Path, frames: Path, tmp_path: Path, printed: Command, refused: Command
 ) -> None:
     """The run directory does not change, and each gallery has its own objects."""
     before, other = files(model), ("--gallery", tmp_path / "other")
-    assert "index.json" in error_of(capsys, "objects", "--model", model, *other)
-    assert "run directory" in error_of(capsys, "enroll", "--frames", frames, "--model", tmp_path / "none", *other)
+    assert "index.json" in refused("objects", "--model", model, *other)
+    assert "run directory" in refused("enroll", "--frames", frames, "--model", tmp_path / "none", *other)
     assert not (tmp_path / "none").exists() and not (tmp_path / "other").exists()
     for name, label in (("new", 1), ("old", 5)):
         assert run_thor2("enroll", name, "--model", model, *one_frame(frames / "000", label), *other) == 0
     assert run_thor2("forget", "old", "--model", model, *other) == 0
-    capsys.readouterr()
-    assert run_thor2("objects", "--model", model, *other) == 0
-    lines = capsys.readouterr().out
+    lines = printed("objects", "--model", model, *other)
     assert "new" in lines and "old" not in lines and "brick" not in lines
     assert files(model) == before and Recognizer.load(model, gallery=tmp_path / "other").classes == ("new",)
 
@@ -305,25 +288,23 @@ BAD: dict[str, tuple[Callable[[Path, Path], list[object]], str]] = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_bad_input_changes_nothing(
-    case: str, model: Path, frames: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_bad_input_changes_nothing(case: str, model: Path, frames: Path, tmp_path: Path, refused: Command) -> None:
     arguments, words = BAD[case]
     given, before = arguments(tmp_path, frames), files(model)
-    assert words in error_of(capsys, "enroll", *given, "--model", model)
+    assert words in refused("enroll", *given, "--model", model)
     assert files(model) == before
     if case != "existing name":
-        error_of(capsys, "enroll", *given, "--model", tmp_path / "other")
+        refused("enroll", *given, "--model", tmp_path / "other")
         assert not (tmp_path / "other").exists()
 
 
-def test_too_few_points_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_too_few_points_are_refused(tmp_path: Path, refused: Command) -> None:
     frame = write_frame(tmp_path / "frame", {1: "brick"})
     mask = np.zeros((240, 320), np.uint8)
     mask[10:13, 10:13] = 1
     Image.fromarray(mask).save(frame / "mask.png")
     for given in (["--frames", frame], ["new", *one_frame(frame, 1)]):
-        assert "points" in error_of(capsys, "enroll", *given, "--model", tmp_path / "run")
+        assert "points" in refused("enroll", *given, "--model", tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
 

@@ -331,26 +331,18 @@ def test_folds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 _PROGRAM = """
 import sys
-sys.path.insert(0, sys.argv[1])
 import test_job
 from thor2_jax.model import classifier
-classifier.HIDDEN = tuple(map(int, sys.argv[3].split(",")))
-test_job.train(test_job.Path(sys.argv[2]), ("tops", "ce"))
+classifier.HIDDEN = tuple(map(int, sys.argv[2].split(",")))
+test_job.train(test_job.Path(sys.argv[1]), ("tops", "ce"))
 """
 
 
 @pytest.mark.slow
 def test_a_killed_training_resumes_to_the_same_bytes(whole: tuple[Path, TrainedRun], tmp_path: Path) -> None:
     out = tmp_path / "run"
-    command = [
-        sys.executable,
-        "-c",
-        _PROGRAM,
-        str(Path(__file__).parent),
-        str(out),
-        ",".join(map(str, classifier.HIDDEN)),
-    ]
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
+    command = [sys.executable, "-c", _PROGRAM, str(out), ",".join(map(str, classifier.HIDDEN))]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
     killed = 0
     # At once after lines appear: while a checkpoint is being written, or the next epoch is under way.
     for lines in (1, 5):

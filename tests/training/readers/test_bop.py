@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from helpers import ToyDescriptors, UntaughtRecognizer, run_thor2
+from helpers import Command, ToyDescriptors, UntaughtRecognizer
 from PIL import Image
 
 from thor2_jax.errors import InputError
@@ -409,15 +409,14 @@ def test_accuracy_by_scene(tmp_path: Path) -> None:
     assert {cell["where"]["scene"]: cell["instances"] for cell in by_scene["cells"]} == {"000048": 3, "000049": 2}
 
 
-def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: Command, refused: Command) -> None:
     runs = [EvaluatedRun("run", "0", LabelIsClass())]
     monkeypatch.setattr("training.evaluation.answering.load_runs", lambda paths: runs)
     dataset, model = write_dataset(tmp_path), ("--model", tmp_path / "run")
     options = ("--names", tmp_path / "names.yaml", "--out", tmp_path / "report")
-    assert run_thor2("evaluate", "bop", dataset, *model, *options) == 0
-    assert "5 instances scored" in capsys.readouterr().out
+    assert "5 instances scored" in printed("evaluate", "bop", dataset, *model, *options)
     assert json.loads((tmp_path / "report" / "report.json").read_text())["instances"]["scored"] == 5
-    assert run_thor2("evaluate", "bop", dataset, *model) == 2  # without names, all objects are unknown
-    assert "obj_000013, obj_000014, the runs know bowl, mug" in capsys.readouterr().err
-    assert run_thor2("evaluate", "bop", tmp_path / "absent", *model) == 2
-    assert capsys.readouterr().err == f"error: dataset: {tmp_path / 'absent'} is not a directory; expected a dataset\n"
+    error = refused("evaluate", "bop", dataset, *model, at_once=False)  # without names, all objects are unknown
+    assert "obj_000013, obj_000014, the runs know bowl, mug" in error
+    error = refused("evaluate", "bop", tmp_path / "absent", *model)
+    assert error == f"error: dataset: {tmp_path / 'absent'} is not a directory; expected a dataset"

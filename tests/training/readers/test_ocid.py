@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from helpers import ToyDescriptors, UntaughtRecognizer, run_thor2
+from helpers import Command, ToyDescriptors, UntaughtRecognizer
 from PIL import Image
 
 from thor2_jax.errors import InputError
@@ -423,14 +423,13 @@ def test_accuracy_by_condition(tmp_path: Path) -> None:
     assert accuracy["type", "curved"] == (2, 1.0) and accuracy["type", "mixed"] == (2, 0.5)
 
 
-def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: Command, refused: Command) -> None:
     write_frame(tmp_path / "YCB10")
     names = write_names(tmp_path)
     runs = [EvaluatedRun("run", "0", NamesInOrder())]
     monkeypatch.setattr("training.evaluation.answering.load_runs", lambda paths: runs)
     options = ("--model", tmp_path / "run", "--names", names)
-    assert run_thor2("evaluate", "ocid", tmp_path, *options, "--out", tmp_path / "report") == 0
-    output = capsys.readouterr().out
+    output = printed("evaluate", "ocid", tmp_path, *options, "--out", tmp_path / "report")
     assert "2 instances scored" in output
     assert "Published table 3" in output and "Published table 1" not in output
     report = json.loads((tmp_path / "report" / "report.json").read_text())
@@ -440,12 +439,11 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     cell = report["accuracy"]["max"][0]["cells"][0]
     assert cell["instances"] == 2 and cell["accuracy"]["TOPS"]["mean"] == 1.0
     names.unlink()
-    assert run_thor2("evaluate", "ocid", tmp_path, *options) == 2
-    assert capsys.readouterr().err == f"error: {names}: No such file or directory\n"
+    assert refused("evaluate", "ocid", tmp_path, *options) == f"error: {names}: No such file or directory"
 
 
 def test_each_sequence_has_its_own_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: Command, refused: Command
 ) -> None:
     """Each run has its own classes; one run serves both cameras."""
     sequences = {"seq36": ["mug", "bowl", "bowl"], "table/top/mixed/seq08": ["banana", "apple", "mug"]}
@@ -462,11 +460,10 @@ def test_each_sequence_has_its_own_run(
     models = tmp_path / "runs"
     (models / "seq36").mkdir(parents=True)
     options = ("--model", models, "--names", names, "--per-sequence")
-    assert run_thor2("evaluate", "ocid", tmp_path, *options) == 2
-    assert f"error: model: {models} has no run for table/top/mixed/seq08; " in capsys.readouterr().err
+    error = refused("evaluate", "ocid", tmp_path, *options)
+    assert f"error: model: {models} has no run for table/top/mixed/seq08; " in error
     (models / "table/top/mixed/seq08").mkdir(parents=True)
-    assert run_thor2("evaluate", "ocid", tmp_path, *options, "--out", tmp_path / "report") == 0
-    output = capsys.readouterr().out
+    output = printed("evaluate", "ocid", tmp_path, *options, "--out", tmp_path / "report")
     assert [number for number in range(1, 10) if f"Published table {number}:" in output] == [1, 2, 8]
     assert "63.33 ±\u00a00.98" in output  # THOR2 in S-36, lower camera
     report = json.loads((tmp_path / "report" / "report.json").read_text())
@@ -474,5 +471,4 @@ def test_each_sequence_has_its_own_run(
     by = {tuple(table["by"]): table["cells"] for table in report["accuracy"]["max"]}
     shares = {cell["where"]["sequence"]: cell["accuracy"]["TOPS"]["mean"] for cell in by["sequence",]}
     assert [round(share, 3) for share in shares.values()] == [1.0, 1.0, 0.667]
-    assert run_thor2("evaluate", "ocid", tmp_path, *options, tmp_path) == 2
-    assert "2 models are given" in capsys.readouterr().err
+    assert "2 models are given" in refused("evaluate", "ocid", tmp_path, *options, tmp_path)
