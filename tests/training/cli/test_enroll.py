@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from helpers import Command, run_thor2, untrained_run, write_frame
+from helpers import Command, frame_options, run_thor2, untrained_run, write_frame
 from PIL import Image
 from recording_files import table_frame, write_recording
 
@@ -46,19 +46,15 @@ def files(directory: Path) -> dict[str, bytes]:
 
 
 def one_frame(frame: Path, instance: int) -> list[object]:
-    names = {"color": "color.png", "depth": "depth.png", "labels": "mask.png", "intrinsics": "intrinsics.json"}
-    return [*(v for option, file in names.items() for v in (f"--{option}", frame / file)), "--instance", instance]
+    return [*frame_options(frame), "--instance", instance]
 
 
 def test_every_labelled_object_is_enrolled_in_a_new_run(model: Path, frames: Path, tmp_path: Path) -> None:
     assert load_run(model).classes == () and load_run(model).classifiers == {}
     gallery = Recognizer.load(model).gallery
     assert {name: len(views.clouds) for name, views in gallery.objects.items()} == {"brick": 2, "book": 2}
-    out = tmp_path / "answers"
-    frame = frames / "001"
-    arguments = [str(value) for value in one_frame(frame, 1)[:-2]]
-    assert run_thor2("recognize", "--model", model, *arguments, "--out", out) == 0
-    answers = json.loads((out / "recognition.json").read_text())
+    assert run_thor2("recognize", "--model", model, *frame_options(frames / "001"), "--out", tmp_path / "out") == 0
+    answers = json.loads((tmp_path / "out" / "recognition.json").read_text())
     assert [(answer["label"], answer["name"]) for answer in answers] == [(1, "brick"), (5, "book")]
 
 
@@ -78,7 +74,7 @@ def test_evaluation_has_a_gallery_column(model: Path, tmp_path: Path) -> None:
     assert cell["instances"] == 2 and cell["accuracy"]["gallery"]["mean"] == 1.0
     assert report["instances"]["no_class"] == {"leaf": 1}
     page = (tmp_path / "report" / "report.html").read_text()
-    assert run_thor2("evaluate", "frames", *one_frame(frames / "a", 2)[:-2], "--model", model) == 0
+    assert run_thor2("evaluate", "frames", *frame_options(frames / "a"), "--model", model) == 0
     assert "<td>" in page and "<tbody></tbody>" not in page and "THOR2 is the fusion" not in page
 
 
@@ -122,7 +118,7 @@ def test_frames_without_names(model: Path, frames: Path, tmp_path: Path, refused
     assert "2 instances" in refused("enroll", "new", frames, "--model", model)
     assert run_thor2("enroll", "new", frames, "--instance", 5, "--model", model) == 0
     (write_frame(tmp_path / "one", {3: "leaf"}) / "labels.json").unlink()
-    assert run_thor2("enroll", "only", *one_frame(tmp_path / "one", 3)[:-2], "--model", model) == 0
+    assert run_thor2("enroll", "only", *frame_options(tmp_path / "one"), "--model", model) == 0
     bag = write_recording(tmp_path / "a.mcap", [table_frame(0), table_frame(3)])
     assert run_thor2("enroll", "box", "--bag", bag, "--instance", 1, "--model", model) == 0
     counts = {name: len(v.clouds) for name, v in Recognizer.load(model).gallery.objects.items()}
@@ -279,7 +275,7 @@ BAD: dict[str, tuple[Callable[[Path, Path], list[object]], str]] = {
     "existing name": (lambda tmp, frames: ["--frames", frames], "'brick'"),
     "no source": (lambda tmp, frames: ["new"], "--mesh"),
     "two sources": (lambda tmp, frames: ["new", "--frames", frames, "--mesh", tmp / "a.ply"], "--mesh"),
-    "half a frame": (lambda tmp, frames: ["new", *one_frame(frames / "000", 5)[:-2]], "--instance"),
+    "half a frame": (lambda tmp, frames: ["new", *frame_options(frames / "000")], "--instance"),
     "millimetres": (lambda tmp, frames: ["new", "--mesh", in_millimetres(tmp)], "mm.ply"),
     "another label name": (lambda tmp, frames: ["new", "--frames", frames], "'new'"),
     "no such instance": (lambda tmp, frames: ["new", *one_frame(frames / "000", 4)], "instance is 4"),
