@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -68,8 +67,8 @@ class ToyRecognizer(UntaughtRecognizer):
     """Returns random probabilities, seeded by run and frame, and logs each frame that it describes."""
 
     def __init__(self, seed: int, log: Path, features: tuple[str, ...], stop_at: int | None = None) -> None:
+        super().__init__(CLASSES, features)
         self.seed, self.log, self.stop_at = seed, log, stop_at
-        self.run = SimpleNamespace(classes=CLASSES, classifiers=dict.fromkeys(features), record={})
 
     def describe(self, frame: Any) -> Any:
         number = int(frame.color[0, 0, 0])
@@ -79,8 +78,9 @@ class ToyRecognizer(UntaughtRecognizer):
             raise KeyboardInterrupt
         with self.log.open("a") as file:
             file.write(f"{number}\n")
-        instances = [SimpleNamespace(label=label, reason=None, occluded=False) for label in frame.instances]
-        return SimpleNamespace(instances=instances, usable=instances, oriented=ToyDescriptors(number))
+        described = super().describe(frame)
+        described.oriented = ToyDescriptors(number)
+        return described
 
     def probabilities(self, oriented: int) -> dict[str, np.ndarray]:
         rng = np.random.default_rng([self.seed, oriented])

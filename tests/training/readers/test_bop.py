@@ -3,18 +3,17 @@
 import json
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 import yaml
-from helpers import Command, ToyDescriptors, UntaughtRecognizer
+from helpers import Command, NamesInOrder
 from PIL import Image
 
 from thor2_jax.errors import InputError
-from thor2_jax.frames.frames import backproject
+from thor2_jax.frames.frames import RGBDFrame, backproject
 from training.evaluation.answering import answer_frames
 from training.evaluation.results import compute_results
 from training.evaluation.runs import Run as EvaluatedRun
@@ -363,23 +362,11 @@ def test_a_real_frame(shared: Path, tmp_path: Path) -> None:
 # To the end
 
 
-class LabelIsClass(UntaughtRecognizer):
-    """Stands in for a trained recognizer: instance 1 is a mug, every other a bowl, the last of a frame too small."""
+class LastIsSmall(NamesInOrder):
+    """The last instance of a frame is too small."""
 
-    run = SimpleNamespace(classes=("mug", "bowl"), classifiers={"tops": None}, record={})
-
-    def describe(self, frame: Any) -> Any:
-        last = frame.instances[-1]
-        instances = [
-            SimpleNamespace(label=k, reason="too few points" if k == last else None, occluded=False)
-            for k in frame.instances
-        ]
-        return SimpleNamespace(
-            instances=instances, usable=instances[:-1], oriented=ToyDescriptors(range(len(instances) - 1))
-        )
-
-    def probabilities(self, usable: range) -> dict[str, np.ndarray]:
-        return {"tops": np.array([[0.9, 0.1] if k == 0 else [0.2, 0.8] for k in usable]).reshape(-1, 2)}
+    def reason(self, label: int, frame: RGBDFrame) -> str | None:
+        return "too few points" if label == frame.instances[-1] else None
 
 
 def write_dataset(root: Path) -> Path:
@@ -393,7 +380,7 @@ def write_dataset(root: Path) -> Path:
 
 def test_accuracy_by_scene(tmp_path: Path) -> None:
     dataset = BOP(write_dataset(tmp_path), tmp_path / "names.yaml")
-    run = EvaluatedRun("run", "", LabelIsClass())  # type: ignore[arg-type]
+    run = EvaluatedRun("run", "", LastIsSmall())  # type: ignore[arg-type]
     answers = [answers for _, answers in answer_frames([run], dataset)]
     assert [(frame.frame, i.label, i.truth) for frame in answers for i in frame.instances] == [
         ("000048/000001", 1, "mug"),
@@ -410,7 +397,7 @@ def test_accuracy_by_scene(tmp_path: Path) -> None:
 
 
 def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: Command, refused: Command) -> None:
-    runs = [EvaluatedRun("run", "0", LabelIsClass())]
+    runs = [EvaluatedRun("run", "0", LastIsSmall())]
     monkeypatch.setattr("training.evaluation.answering.load_runs", lambda paths: runs)
     dataset, model = write_dataset(tmp_path), ("--model", tmp_path / "run")
     options = ("--names", tmp_path / "names.yaml", "--out", tmp_path / "report")

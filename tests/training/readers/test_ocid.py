@@ -4,13 +4,12 @@ import json
 import struct
 from collections.abc import Sequence
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import yaml
-from helpers import Command, ToyDescriptors, UntaughtRecognizer
+from helpers import Command, NamesInOrder
 from PIL import Image
 
 from thor2_jax.errors import InputError
@@ -386,21 +385,6 @@ def test_the_camera_of_real_depth(shared: Path) -> None:
 
 
 # Evaluation
-
-
-class NamesInOrder(UntaughtRecognizer):
-    """Stand-in for a recognizer that predicts the first class for the first instance and the second for all others."""
-
-    def __init__(self, classes: tuple[str, ...] = ("mug", "bowl")) -> None:
-        network = SimpleNamespace(fingerprint="")
-        self.run = SimpleNamespace(classes=classes, classifiers={"tops": None}, config=None, network=network, record={})
-
-    def describe(self, frame: Any) -> Any:
-        instances = [SimpleNamespace(label=label, reason=None, occluded=False) for label in frame.instances]
-        return SimpleNamespace(instances=instances, usable=instances, oriented=ToyDescriptors(instances))
-
-    def probabilities(self, clouds: Sequence[Any]) -> dict[str, np.ndarray]:
-        return {"tops": np.array([[0.9, 0.1] if k == 0 else [0.2, 0.8] for k in range(len(clouds))]).reshape(-1, 2)}
 
 
 def test_accuracy_by_condition(tmp_path: Path) -> None:
