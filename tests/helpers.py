@@ -220,6 +220,20 @@ def run_thor2(*arguments: object) -> int:
     return 0
 
 
+class Interrupted(BaseException):
+    """Like KeyboardInterrupt, not an Exception."""
+
+
+def stop_when(stage: str, step: int) -> Callable[[str, int, int, str], None]:
+    """Return a display of progress that interrupts a training at a step of a stage."""
+
+    def progress(now: str, done: int, total: int, note: str) -> None:
+        if (now, done) == (stage, step):
+            raise Interrupted
+
+    return progress
+
+
 def json_lines(text: str) -> list[dict[str, Any]]:
     """Return the values of a JSON Lines text."""
     return [json.loads(line) for line in text.splitlines()]

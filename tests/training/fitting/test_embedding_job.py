@@ -2,13 +2,13 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from helpers import SMALL_CONFIG, brick_and_stick
+from helpers import SMALL_CONFIG, Interrupted, brick_and_stick, stop_when
 
 from thor2_jax.descriptor.looks import describe_looks
 from thor2_jax.errors import InputError
@@ -124,18 +124,6 @@ def test_the_confidence_is_fitted_on_held_out_clouds(whole: Whole) -> None:
         before, looks = images[:-1], images[-1:]
         assert label == CLASSES.index(name)
         assert np.abs(before - looks).max(axis=(1, 2, 3, 4)).min() < 0.03 * looks.max()  # of another view: above 0.25
-
-
-class Interrupted(BaseException):
-    """Like KeyboardInterrupt, not an Exception."""
-
-
-def stop_when(stage: str, step: int) -> Callable[[str, int, int, str], None]:
-    def progress(now: str, done: int, total: int, note: str) -> None:
-        if (now, done) == (stage, step):
-            raise Interrupted
-
-    return progress
 
 
 def test_an_interrupted_joint_fit_resumes_to_the_same_bytes(

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from flax import nnx
-from helpers import brick_and_stick
+from helpers import Interrupted, brick_and_stick, stop_when
 from PIL import Image
 
 import thor2_jax as thor2
@@ -145,18 +145,6 @@ def test_nothing_is_written_for_bad_views(
     with pytest.raises(thor2.InputError, match=message):
         train_run(MemoryViews(bad, CONFIG), tmp_path / "run", RunSettings(["tops"], OPTIONS, CONFIG, folds))
     assert names(tmp_path) == []
-
-
-class Interrupted(BaseException):
-    """Like KeyboardInterrupt, not an Exception."""
-
-
-def stop_when(stage: str, step: int) -> Any:
-    def progress(now: str, done: int, total: int, note: str) -> None:
-        if (now, done) == (stage, step):
-            raise Interrupted
-
-    return progress
 
 
 def test_an_interrupted_run_resumes_to_the_same_result(whole: tuple[Path, TrainedRun], tmp_path: Path) -> None:
