@@ -1,5 +1,6 @@
 """Helpers of several test files: untrained runs, small clouds and images, the command line, programs, HTML pages."""
 
+import contextlib
 import dataclasses
 import functools
 import io
@@ -10,7 +11,7 @@ import struct
 import subprocess
 import sys
 import zlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from html.parser import HTMLParser
 from pathlib import Path
 from types import SimpleNamespace
@@ -27,6 +28,7 @@ from processes import HANG
 import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.looks import LookDescriptors
+from thor2_jax.errors import InputError
 from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
 from thor2_jax.model.classifier import FEATURES, MLP, RunClassifiers
 from thor2_jax.model.inference import infer
@@ -218,6 +220,14 @@ def run_thor2(*arguments: object) -> int:
         except SystemExit as stop:
             return int(stop.code or 0)
     return 0
+
+
+@contextlib.contextmanager
+def input_error(*words: object, match: str | None = None) -> Iterator[None]:
+    """Expect an InputError whose message matches a pattern and contains some words."""
+    with pytest.raises(InputError, match=match) as caught:
+        yield
+    assert [word for word in words if str(word) not in str(caught.value)] == [], caught.value
 
 
 class Interrupted(BaseException):

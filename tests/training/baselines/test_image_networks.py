@@ -188,9 +188,8 @@ def test_weights_of_another_architecture_are_refused(tmp_path: Path) -> None:
     ]
     for changed, message in cases:
         save_file(changed, path)
-        with pytest.raises(InputError, match=f"^weights: .*{message}") as caught:
+        with pytest.raises(InputError, match=f"^weights: .*{message}"):
             train_baselines(folder, SOURCE, [SMALL], options=OPTIONS, weights=weights)
-        assert "\n" not in str(caught.value)
     path.write_bytes(b"no tensors")
     with pytest.raises(InputError, match="^weights: .* cannot be read"):
         train_baselines(folder, SOURCE, [SMALL], options=OPTIONS, weights=weights)

@@ -158,9 +158,8 @@ def test_damaged_files_are_refused(trained: Path, tmp_path: Path, damage: str) -
         file.write_bytes(content)
         about = {"format": 1, "classes": ["a", "b"], "temperature": None, "seconds": 1.0, "digest": ""}
         save_file({} if damage == "lacking" else load_file(file), file, {"about": json.dumps(about)})
-    with pytest.raises(InputError, match="forest.safetensors") as caught:
+    with pytest.raises(InputError, match="forest.safetensors"):
         load_baselines(folder, load_run(folder))
-    assert "\n" not in str(caught.value)
 
 
 def test_run_with_checkpoints_is_not_finished(tmp_path: Path) -> None:

@@ -114,8 +114,7 @@ def test_invalid_arguments(model: Path, tmp_path: Path, refused: Command, argume
 
 def test_realsense_without_its_package(model: Path, refused: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyrealsense2", None)
-    err = refused("watch", "--model", model, "--realsense")
-    assert err.startswith("error: realsense needs pyrealsense2") and err.count("\n") == 1
+    assert "error: realsense needs pyrealsense2" in refused("watch", "--model", model, "--realsense")
 
 
 @pytest.mark.slow

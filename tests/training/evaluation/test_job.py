@@ -12,7 +12,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import SMALL_CONFIG, ParsedPage, ToyDescriptors, UntaughtRecognizer, untrained_embedding_run
+from helpers import (
+    SMALL_CONFIG,
+    ParsedPage,
+    ToyDescriptors,
+    UntaughtRecognizer,
+    input_error,
+    untrained_embedding_run,
+)
 from PIL import Image
 from processes import HANG
 
@@ -346,9 +353,8 @@ def test_answers_of_another_evaluation_are_refused(tmp_path: Path) -> None:
         "digest1": (runs[:1], ToyDataset(3), DESCRIPTION),
     }
     for value, (evaluated, dataset, description) in cases.items():
-        with pytest.raises(InputError, match="^out: ") as caught:
+        with input_error(value, match="^out: "):
             evaluate_dataset(evaluated, dataset, description, report)
-        assert value in str(caught.value) and "\n" not in str(caught.value)
     assert (report / "answers.jsonl").read_bytes() == before
 
 

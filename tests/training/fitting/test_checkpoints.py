@@ -107,9 +107,8 @@ def test_a_damaged_checkpoint_is_refused(tmp_path: Path, capfd: pytest.CaptureFi
         for damaged in (content[:middle], content[:middle] + bytes([content[middle] ^ 255]) + content[middle + 1 :]):
             file.write_bytes(damaged)
             with Checkpoints(tmp_path) as checkpoints:
-                with pytest.raises(thor2.InputError, match=f"checkpoint: {tmp_path / '1'} ") as caught:
+                with pytest.raises(thor2.InputError, match=f"checkpoint: {tmp_path / '1'} "):
                     checkpoints.last(state(0))
-                assert "\n" not in str(caught.value)
         file.write_bytes(content)
     with Checkpoints(tmp_path) as checkpoints:
         assert_equal(checkpoints.last(state(0)), state(1))

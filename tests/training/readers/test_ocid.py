@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from helpers import Command, NamesInOrder
+from helpers import Command, NamesInOrder, input_error
 from PIL import Image
 
 from thor2_jax.errors import InputError
@@ -88,7 +88,6 @@ def write_names(root: Path, table: Any = ALL, name: str = "names.yaml") -> Path:
 def error_message(root: Path, names: Path) -> str:
     with pytest.raises(InputError) as caught:
         list(OCID(root, names))
-    assert "\n" not in str(caught.value)
     return str(caught.value)
 
 
@@ -253,9 +252,8 @@ def test_invalid_names_of_vlg(tmp_path: Path, items: Any, expected: str) -> None
     write_frame(tmp_path)
     names = tmp_path / "names.json"
     names.write_text(json.dumps(items))
-    with pytest.raises(InputError) as caught:
+    with input_error(expected, names):
         OCID(tmp_path, names)
-    assert expected in str(caught.value) and str(names) in str(caught.value)
 
 
 # Files
@@ -311,9 +309,8 @@ def test_paths_that_are_not_a_dataset(tmp_path: Path) -> None:
         (names, "is not a directory"),
         (tmp_path, "has no {table,floor}"),
     ):
-        with pytest.raises(InputError, match=r"^dataset: ") as caught:
+        with input_error(f"{path} {expected}", match=r"^dataset: "):
             OCID(path, names)
-        assert f"{path} {expected}" in str(caught.value)
 
 
 # The camera
@@ -366,9 +363,8 @@ def test_the_camera_against_least_squares_of_numpy() -> None:
 @pytest.mark.filterwarnings("error")
 def test_clouds_without_a_pinhole_camera(change: Any, expected: str) -> None:
     depth = np.random.default_rng(0).uniform(0.5, 1.5, SHAPE)
-    with pytest.raises(InputError) as caught:
+    with input_error(expected):
         fit_intrinsics(change(backproject(depth, CAMERA)))
-    assert expected in str(caught.value)
 
 
 def test_the_camera_of_real_depth(shared: Path) -> None:
