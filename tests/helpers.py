@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import errno
 import functools
 import io
 import json
@@ -79,6 +80,11 @@ def random_classifier(n_inputs: int, n_classes: int, seed: int) -> MLP:
     """Return a classifier with random weights."""
     classifier: MLP = nnx.clone(_drawn(n_inputs, n_classes, seed))
     return classifier
+
+
+def small_embedding(seed: int = 0) -> Embedding:
+    """Return an embedding with random weights, which compiles quickly."""
+    return Embedding.create(SMALL_CONFIG, sizes=EmbeddingSizes(4, (16,), 8, 4), seed=seed)
 
 
 def untrained_embedding_run(
@@ -244,6 +250,17 @@ def stop_when(stage: str, step: int) -> Callable[[str, int, int, str], None]:
     return progress
 
 
+def files_of(folder: Path) -> dict[str, bytes]:
+    """Return the contents of all files of a folder but locks, by relative paths."""
+    paths = (path for path in sorted(folder.rglob("*")) if path.is_file() and path.name != ".lock")
+    return {str(path.relative_to(folder)): path.read_bytes() for path in paths}
+
+
+def full_disk(*_: Any, **__: Any) -> None:
+    """Fail as a function that writes does on a full disk."""
+    raise OSError(errno.ENOSPC, "No space left on device", "/tmp/secret")
+
+
 def json_lines(text: str) -> list[dict[str, Any]]:
     """Return the values of a JSON Lines text."""
     return [json.loads(line) for line in text.splitlines()]
@@ -316,6 +333,16 @@ def full_image(view: RenderedView, camera: Camera) -> tuple[NDArray[np.uint8], N
     return color, depth
 
 
+def assert_same_answers(
+    answers: Iterable[thor2.Recognition], expected: Iterable[thor2.Recognition], tolerance: float
+) -> None:
+    """Assert that answers are equal, up to a tolerance of the confidences."""
+    for one, other in zip(answers, expected, strict=True):
+        assert (one.label, one.name, one.classifier) == (other.label, other.name, other.classifier)
+        assert (one.reason, one.points_used) == (other.reason, other.points_used)
+        assert one.confidence == pytest.approx(other.confidence, abs=tolerance) and one.top.keys() == other.top.keys()
+
+
 def write_frame_files(folder: Path, frame: thor2.RGBDFrame, names: Mapping[int, str] | None = None) -> Path:
     """Write a frame as `FrameFolder` reads it: its mask if it has labels, and labels.json if names are given."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -383,6 +410,17 @@ def class_probabilities(
     names = tuple(recognizer.model.classifiers) if classifiers is None else classifiers
     computed = infer(recognizer.model, oriented, classifiers=names).probabilities
     return {name: np.asarray(values) for name, values in computed.items()}
+
+
+def write_box(path: Path, sides: Sequence[float], color: Sequence[int] = (200, 100, 50)) -> Path:
+    """Write a mesh of a box of one colour."""
+    import trimesh
+
+    box = trimesh.creation.box(sides)
+    box.visual.vertex_colors = [[*color, 255]] * len(box.vertices)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    box.export(path)
+    return path
 
 
 def write_meshes(directory: Path, names: Sequence[str]) -> Path:

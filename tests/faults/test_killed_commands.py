@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from flax import nnx
-from helpers import run_thor2, untrained_run
-from PIL import Image
+from helpers import frame_options, run_thor2, small_frame, untrained_run, write_box, write_frame_files
 from processes import HANG
 
 import colornet
@@ -90,31 +89,18 @@ def files(folder: Path) -> dict[str, bytes]:
 @pytest.fixture(scope="module")
 def meshes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Directory of two boxes with vertex colors."""
-    import trimesh
-
     folder = tmp_path_factory.mktemp("meshes")
     for name, sides, level in (("brick", (0.1, 0.05, 0.03), 40), ("stick", (0.2, 0.02, 0.02), 220)):
-        box = trimesh.creation.box(sides)
-        colors = np.full((len(box.vertices), 3), level, np.uint8)
-        trimesh.Trimesh(box.vertices, box.faces, vertex_colors=colors, process=False).export(folder / f"{name}.ply")
+        write_box(folder / f"{name}.ply", sides, (level, level, level))
     return folder
 
 
 @pytest.fixture(scope="module")
 def frames(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Directory of two frames of a slanted plane with two labelled patches."""
+    """Directory of two frames of a brick and a stick."""
     folder = tmp_path_factory.mktemp("frames")
-    rng = np.random.default_rng(0)
-    labels = np.zeros((240, 320), np.uint8)
-    labels[20:100, 20:90], labels[120:220, 100:150] = 1, 2
-    for name in ("one", "two"):
-        (folder / name).mkdir()
-        Image.fromarray(rng.integers(0, 256, (240, 320, 3), dtype=np.uint8)).save(folder / name / "color.png")
-        depth = np.broadcast_to(600 + np.arange(320) // 2, (240, 320)).astype(np.uint16)
-        Image.fromarray(depth).save(folder / name / "depth.png")
-        Image.fromarray(labels).save(folder / name / "mask.png")
-        (folder / name / "intrinsics.json").write_text('{"fx": 600, "fy": 600, "cx": 159.5, "cy": 119.5}')
-        (folder / name / "labels.json").write_text('{"labels": {"1": "brick", "2": "stick"}}')
+    for seed, name in enumerate(("one", "two")):
+        write_frame_files(folder / name, small_frame(seed), {1: "brick", 4: "stick"})
     return folder
 
 
@@ -239,8 +225,7 @@ def test_evaluate(frames: Path, model: Path, environment: Any, call: Any, tmp_pa
 
 
 def test_recognize(frames: Path, model: Path, environment: Any, call: Any, tmp_path: Path) -> None:
-    names = {"color": "color.png", "depth": "depth.png", "labels": "mask.png", "intrinsics": "intrinsics.json"}
-    images = [part for option, name in names.items() for part in (f"--{option}", frames / "one" / name)]
+    images = frame_options(frames / "one")
     command, whole, out = ("recognize", "--model", model, *images, "--out"), tmp_path / "whole", tmp_path / "out"
     assert call(*command, whole)[0] == 0
     kill("before recognition.json", (*command, out), environment)

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers import brick_and_stick
+from helpers import brick_and_stick, files_of
 
 import thor2_jax as thor2
 from thor2_jax.model.run_directory import TrainedRun, load_run
@@ -27,10 +27,6 @@ def train(out: Path, **more: Any) -> TrainedRun:
     return run
 
 
-def contents(folder: Path) -> dict[Path, bytes]:
-    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-
 def test_a_second_training_is_refused(tmp_path: Path) -> None:
     """At every stage of the first training, a second one is refused and changes nothing."""
     out, refusals = tmp_path / "run", []
@@ -38,11 +34,11 @@ def test_a_second_training_is_refused(tmp_path: Path) -> None:
     def meanwhile(stage: str, done: int, total: int, note: str) -> None:
         if stage == "describe" or done not in (1, total):
             return
-        before = contents(out)
+        before = files_of(out)
         with pytest.raises(thor2.InputError, match=str(out)) as caught:
             train(out)
         refusals.append(str(caught.value))
-        assert contents(out) == before
+        assert files_of(out) == before
 
     train(out, progress=meanwhile)
     assert refusals and load_run(out).classes == ("red brick", "stick")

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 import uvicorn
 from fastapi import FastAPI
-from helpers import SMALL_CONFIG, encode_image, untrained_run
+from helpers import encode_image, small_embedding, untrained_run
 from playwright.sync_api import Browser, Page, Route, expect
 from processes import HANG
 from segmentation_scenes import Box, render
@@ -26,7 +26,6 @@ from segmentation_scenes import Box, render
 import thor2_jax as thor2
 from thor2_jax.adaptation import online
 from thor2_jax.explanation import class_scores
-from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
 from thor2_jax.model.run_directory import EMBEDDING_FILE, save_run
 from thor2_jax.service import engine
 from thor2_jax.service.app import create_app
@@ -69,7 +68,7 @@ def teaching_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run with two classes and a small embedding, which compiles quickly."""
     folder = tmp_path_factory.mktemp("teaching") / "run"
     save_run(untrained_run(("a", "b"), ("tops", "tops2")), folder)
-    Embedding.create(SMALL_CONFIG, sizes=EmbeddingSizes(4, (16,), 8, 4)).save(folder / EMBEDDING_FILE)
+    small_embedding().save(folder / EMBEDDING_FILE)
     return folder
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import Command, frame_options, run_thor2, write_frame_files, write_meshes
+from helpers import Command, files_of, frame_options, run_thor2, write_frame_files, write_meshes
 from PIL import Image
 
 import colornet
@@ -314,7 +314,7 @@ def test_train_by_folds(meshes: Path, views: Path, tmp_path: Path, printed: Comm
     # Views in a finished run directory may be a dataset of the user, and are kept.
     (tmp_path / "run" / "views").mkdir()
     (tmp_path / "run" / "views" / "manifest.json").write_bytes(bytes(9))
-    before = {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()}
+    before = files_of(tmp_path / "run")
     with temporary_directory(tmp_path / "run") as temporary:
         shutil.copytree(temporary, tmp_path / "run" / ".thor2-killed")
     assert "nothing was trained" in printed(*arguments)
@@ -322,7 +322,7 @@ def test_train_by_folds(meshes: Path, views: Path, tmp_path: Path, printed: Comm
     assert "manifest.json" in refused("train", *own_views)
     for change in (("--epochs", 2), ("--seed", 1), ("--polar-step", 45), ("--leave-out", NAMES[0])):
         assert "was written with" in refused(*arguments, *change)
-    assert {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()} == before
+    assert files_of(tmp_path / "run") == before
     # A training that is killed at the very end leaves its own views.
     shutil.rmtree(tmp_path / "run" / "views")
     shutil.copytree(views, tmp_path / "run" / "views")

@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import trimesh
-from helpers import Command, frame_options, run_thor2, untrained_run, write_frame
+from helpers import Command, files_of, frame_options, full_disk, run_thor2, untrained_run, write_box, write_frame
 from PIL import Image
 from recording_files import table_frame, write_recording
 
@@ -19,6 +18,9 @@ from thor2_jax.model.run_directory import load_run, save_run
 from thor2_jax.recognizer import Recognizer
 
 pytestmark = pytest.mark.usefixtures("small_classifiers", "small_embedding")
+
+BOX = (0.04, 0.08, 0.06)
+"""Sides of a box that has few points, like the objects of the frames."""
 
 
 @pytest.fixture(scope="module")
@@ -39,10 +41,6 @@ def frames(enrolled: Path, tmp_path: Path) -> Path:
 @pytest.fixture
 def model(enrolled: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(enrolled / "run", tmp_path / "run"))
-
-
-def files(directory: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(directory)): p.read_bytes() for p in sorted(directory.rglob("*")) if p.is_file()}
 
 
 def one_frame(frame: Path, instance: int) -> list[object]:
@@ -127,21 +125,12 @@ def test_frames_without_names(model: Path, frames: Path, tmp_path: Path, refused
 
 
 def test_a_mesh_is_enrolled_from_all_sides(model: Path, tmp_path: Path) -> None:
-    box = write_mesh(tmp_path / "box.ply")
+    write_box(tmp_path / "box.ply", BOX)
     assert run_thor2("enroll", "box", "--model", model, "--mesh", tmp_path / "box.ply") == 0
     views = Recognizer.load(model).gallery.objects["box"]
     assert views.source == "mesh" and len(views.clouds) == 2 and len(views.embeddings) == 8
-    box.apply_scale(1000)
-    box.export(tmp_path / "large.ply")
+    write_box(tmp_path / "large.ply", [1000 * side for side in BOX])
     assert run_thor2("enroll", "large", "--model", model, "--mesh", tmp_path / "large.ply", "--mesh-scale", 0.001) == 0
-
-
-def write_mesh(path: Path, color: tuple[int, int, int] = (200, 100, 50)) -> trimesh.Trimesh:
-    box = trimesh.creation.box((0.04, 0.08, 0.06))  # has few points, like the objects of the frames
-    box.visual.vertex_colors = [[*color, 255]] * len(box.vertices)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    box.export(path)
-    return box
 
 
 @pytest.mark.parametrize(
@@ -159,7 +148,7 @@ def test_a_folder_of_meshes_is_enrolled(
 ) -> None:
     files = {"025_mug/textured.ply": (200, 0, 0), "can.ply": (0, 200, 0), "cafe\u0301/a.ply": (0, 0, 200)}
     for file, color in files.items():
-        write_mesh(tmp_path / "meshes" / file, color)
+        write_box(tmp_path / "meshes" / file, BOX, color)
     name, folder = arguments
     assert run_thor2("enroll", *filter(None, [name]), "--mesh", tmp_path / folder, "--model", model) == 0
     objects = Recognizer.load(model).gallery.objects
@@ -172,12 +161,9 @@ def test_a_folder_of_meshes_is_enrolled(
 def test_arguments_are_checked_before_anything_is_loaded(
     model: Path, frames: Path, tmp_path: Path, refused: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def load(*_: object, **__: object) -> None:
-        raise AssertionError("the run was loaded")
-
-    monkeypatch.setattr(Recognizer, "load", load)
+    monkeypatch.setattr(Recognizer, "load", lambda *_, **__: pytest.fail("the run was loaded"))
     for name in ("two/a.ply", "two/b.ply", "one.ply"):
-        write_mesh(tmp_path / name)
+        write_box(tmp_path / name, BOX)
     (tmp_path / "empty").mkdir()
     (tmp_path / "damaged.ply").write_text("ply")
     for arguments, text in (
@@ -219,10 +205,10 @@ def test_labels_that_are_no_names_are_skipped(tmp_path: Path, printed: Command) 
 def test_a_lost_index_is_rebuilt_by_the_command(model: Path, frames: Path, printed: Command, refused: Command) -> None:
     gallery = model / "gallery"
     (gallery / "index.json").unlink()
-    before = files(gallery)
+    before = files_of(gallery)
     for command in (("enroll", "new", *one_frame(frames / "000", 5)), ("objects",), ("forget", "brick")):
         error = refused(*command, "--model", model)
-        assert f"thor2 objects --reembed --model RUN --gallery {gallery}" in error and files(gallery) == before
+        assert f"thor2 objects --reembed --model RUN --gallery {gallery}" in error and files_of(gallery) == before
     table = printed("objects", "--reembed", "--model", model, "--gallery", gallery)
     assert all(re.search(rf"{name}\W+2\W+frames\W+20\d\d-", table) for name in ("brick", "book"))
     assert run_thor2("enroll", "new", "--model", model, *one_frame(frames / "000", 5)) == 0
@@ -234,9 +220,9 @@ def test_objects_lists_views_source_and_date(model: Path, printed: Command) -> N
     table = printed("objects", "--model", model)
     for name in ("brick", "book"):
         assert re.search(rf"{name}\W+2\W+frames\W+20\d\d-\d\d-\d\dT", table)
-    before = files(model / "gallery" / "objects")
+    before = files_of(model / "gallery" / "objects")
     assert run_thor2("objects", "--model", model, "--reembed") == 0
-    assert files(model / "gallery" / "objects") == before
+    assert files_of(model / "gallery" / "objects") == before
 
 
 def test_forgetting_an_object(model: Path, frames: Path, refused: Command) -> None:
@@ -252,7 +238,7 @@ def test_a_gallery_outside_the_run_directory(
     model: Path, frames: Path, tmp_path: Path, printed: Command, refused: Command
 ) -> None:
     """The run directory does not change, and each gallery has its own objects."""
-    before, other = files(model), ("--gallery", tmp_path / "other")
+    before, other = files_of(model), ("--gallery", tmp_path / "other")
     assert "index.json" in refused("objects", "--model", model, *other)
     assert "run directory" in refused("enroll", "--frames", frames, "--model", tmp_path / "none", *other)
     assert not (tmp_path / "none").exists() and not (tmp_path / "other").exists()
@@ -261,14 +247,7 @@ def test_a_gallery_outside_the_run_directory(
     assert run_thor2("forget", "old", "--model", model, *other) == 0
     lines = printed("objects", "--model", model, *other)
     assert "new" in lines and "old" not in lines and "brick" not in lines
-    assert files(model) == before and Recognizer.load(model, gallery=tmp_path / "other").classes == ("new",)
-
-
-def in_millimetres(tmp_path: Path) -> Path:
-    box = trimesh.creation.box((100, 200, 150))
-    box.visual.vertex_colors = [[200, 100, 50, 255]] * len(box.vertices)
-    box.export(tmp_path / "mm.ply")
-    return tmp_path / "mm.ply"
+    assert files_of(model) == before and Recognizer.load(model, gallery=tmp_path / "other").classes == ("new",)
 
 
 BAD: dict[str, tuple[Callable[[Path, Path], list[object]], str]] = {
@@ -276,7 +255,7 @@ BAD: dict[str, tuple[Callable[[Path, Path], list[object]], str]] = {
     "no source": (lambda tmp, frames: ["new"], "--mesh"),
     "two sources": (lambda tmp, frames: ["new", "--frames", frames, "--mesh", tmp / "a.ply"], "--mesh"),
     "half a frame": (lambda tmp, frames: ["new", *frame_options(frames / "000")], "--instance"),
-    "millimetres": (lambda tmp, frames: ["new", "--mesh", in_millimetres(tmp)], "mm.ply"),
+    "millimetres": (lambda tmp, frames: ["new", "--mesh", write_box(tmp / "mm.ply", (100, 200, 150))], "mm.ply"),
     "another label name": (lambda tmp, frames: ["new", "--frames", frames], "'new'"),
     "no such instance": (lambda tmp, frames: ["new", *one_frame(frames / "000", 4)], "instance is 4"),
     "empty name": (lambda tmp, frames: ["", *one_frame(frames / "000", 5)], "the argument after enroll is empty"),
@@ -286,9 +265,9 @@ BAD: dict[str, tuple[Callable[[Path, Path], list[object]], str]] = {
 @pytest.mark.parametrize("case", BAD)
 def test_bad_input_changes_nothing(case: str, model: Path, frames: Path, tmp_path: Path, refused: Command) -> None:
     arguments, words = BAD[case]
-    given, before = arguments(tmp_path, frames), files(model)
+    given, before = arguments(tmp_path, frames), files_of(model)
     assert words in refused("enroll", *given, "--model", model)
-    assert files(model) == before
+    assert files_of(model) == before
     if case != "existing name":
         refused("enroll", *given, "--model", tmp_path / "other")
         assert not (tmp_path / "other").exists()
@@ -314,14 +293,11 @@ def test_a_full_disk_leaves_no_run_behind(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    def fail(*_: object) -> None:
-        raise OSError(28, "No space left on device", "index.json")
-
     model = tmp_path / "run"
     if exists:
         model.mkdir()
     before = sorted(tmp_path.iterdir())
-    monkeypatch.setattr(store, step, fail)
+    monkeypatch.setattr(store, step, full_disk)
     assert run_thor2("enroll", "--frames", frames, "--model", model) != 0
     assert "No space left" in capsys.readouterr().err
     assert sorted(tmp_path.iterdir()) == before and (not exists or not any(model.iterdir()))

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from helpers import Command, ParsedPage, run_thor2, write_frame
+from helpers import Command, ParsedPage, full_disk, run_thor2, write_frame
 
 from thor2_jax.errors import InputError
 from thor2_jax.explanation import class_scores
@@ -50,10 +50,7 @@ def test_a_page_for_every_instance(model: Path, frame: Path, tmp_path: Path, pri
 def test_nothing_is_left_after_an_error(
     model: Path, frame: Path, tmp_path: Path, refused: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fail(*_: Any, **__: Any) -> None:
-        raise OSError(28, "No space left on device", "explanation.html")
-
-    monkeypatch.setattr(explanation_page, "write_page", fail)
+    monkeypatch.setattr(explanation_page, "write_page", full_disk)
     error = refused("explain", "--model", model, frame, "--instance", 1, "--out", tmp_path / "deep" / "out")
     assert "No space left" in error and not (tmp_path / "deep").exists()
 

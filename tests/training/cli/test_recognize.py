@@ -13,6 +13,7 @@ from helpers import (
     Command,
     Recognize,
     encode_image,
+    files_of,
     frame_options,
     json_lines,
     run_thor2,
@@ -159,9 +160,9 @@ def test_no_file_of_the_user_is_replaced(
     frames = tmp_path / "frames"
     write_frame_files(frames / "f", small_frame())
     (frames / name).write_text(content)
-    before = {path: path.read_bytes() for path in frames.rglob("*") if path.is_file()}
+    before = files_of(frames)
     assert Path(name).name in refused("recognize", "--model", model, frames, options[0], frames / options[1])
-    assert {path: path.read_bytes() for path in frames.rglob("*") if path.is_file()} == before
+    assert files_of(frames) == before
 
 
 @pytest.mark.parametrize("segmenter", ["table", pytest.param("model", marks=pytest.mark.slow)])

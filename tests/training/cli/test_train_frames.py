@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-import trimesh
-from helpers import Command, run_thor2, write_frame
+from helpers import Command, run_thor2, write_box, write_frame
 from PIL import Image
 
 from thor2_jax.model.run_directory import load_run
@@ -36,9 +35,7 @@ def frames(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def meshes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("meshes")
     for name, size in (("brick", (0.1, 0.06, 0.2)), ("box", (0.1, 0.1, 0.1))):
-        mesh = trimesh.creation.box(size)
-        mesh.visual.vertex_colors = np.tile(np.array([[200, 40, 40, 255]], np.uint8), (8, 1))
-        mesh.export(folder / f"{name}.ply")
+        write_box(folder / f"{name}.ply", size)
     return folder
 
 

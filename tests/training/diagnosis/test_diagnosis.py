@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-import trimesh
-from helpers import Command, encode_image, json_lines, run_thor2
+from helpers import Command, encode_image, json_lines, run_thor2, write_box
 from PIL import Image
 
 import thor2_jax
@@ -328,11 +327,8 @@ def test_exchanged_channels_are_found_by_a_model(frame: RGBDFrame) -> None:
     ],
 )
 def test_units_of_meshes(tmp_path: Path, side: float, scale: float, expected: list[str], factor: str) -> None:
-    mesh = trimesh.creation.box((side, side / 2, side / 3))
-    mesh.visual = trimesh.visual.ColorVisuals(mesh, vertex_colors=np.full((8, 4), 200, np.uint8))
-    mesh.export(tmp_path / "box.ply")
-    diagnosis = Diagnosis()
-    sides = check_meshes(diagnosis, {"box": tmp_path / "box.ply"}, scale)
+    diagnosis, path = Diagnosis(), write_box(tmp_path / "box.ply", (side, side / 2, side / 3))
+    sides = check_meshes(diagnosis, {"box": path}, scale)
     assert [finding.code for finding in diagnosis.findings] == expected
     assert all(factor in finding.advice for finding in diagnosis.findings)
     assert sides == ({} if expected else {"box": pytest.approx(0.2)})
@@ -401,10 +397,8 @@ def test_folders_of_frames(tmp_path: Path, capfd: pytest.CaptureFixture[str], pr
     names = {label: f"object{label}" for label in frame.instances}
     (tmp_path / "frames" / "tools" / "labels.json").write_text(json.dumps({"labels": names}))
     for label, extent in {**instance_extents(frame), 99: 0.6}.items():
-        mesh = trimesh.creation.box((extent, extent / 2, extent / 3))
-        mesh.visual = trimesh.visual.ColorVisuals(mesh, vertex_colors=np.full((8, 4), 200, np.uint8))
-        (tmp_path / "meshes").mkdir(exist_ok=True)
-        mesh.export(tmp_path / "meshes" / f"{names.get(label, 'large')}.ply")
+        path = tmp_path / "meshes" / f"{names.get(label, 'large')}.ply"
+        write_box(path, (extent, extent / 2, extent / 3))
     command = ("doctor", tmp_path / "frames", "--meshes", tmp_path / "meshes", "--json")
     assert [line["frame"] for line in json_lines(printed(*command))] == ["breakfast", "tools"]
     camera = tmp_path / "frames" / "tools" / "intrinsics.json"

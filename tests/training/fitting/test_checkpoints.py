@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import full_disk
 
 import thor2_jax as thor2
 from training.fitting.checkpoints import Checkpoints, _quiet_orbax
@@ -68,10 +69,6 @@ def test_incomplete_checkpoints_are_removed(tmp_path: Path) -> None:
         assert checkpoints.last_epoch == 1
         checkpoints.save(2, state(2), 1.0)
     assert epochs(tmp_path) == {"2"}
-
-
-def full_disk(*_: Any, **__: Any) -> None:
-    raise OSError(errno.ENOSPC, "No space left on device")
 
 
 def full_file_system(*_: Any, **__: Any) -> None:

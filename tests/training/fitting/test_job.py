@@ -1,7 +1,6 @@
 """Trainings: uninterrupted, interrupted and resumed, and with several folds."""
 
 import dataclasses
-import errno
 import json
 import os
 import signal
@@ -15,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from flax import nnx
-from helpers import Interrupted, brick_and_stick, stop_when
+from helpers import Interrupted, brick_and_stick, files_of, full_disk, stop_when
 from PIL import Image
 
 import thor2_jax as thor2
@@ -117,10 +116,7 @@ def test_a_run_is_written_and_its_progress_is_reported(tmp_path: Path) -> None:
 
 
 def test_invalid_input_is_refused_before_any_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def work(*_: Any, **__: Any) -> None:
-        raise AssertionError("the training started")
-
-    monkeypatch.setattr(module, "build_samples", work)
+    monkeypatch.setattr(module, "build_samples", lambda *_, **__: pytest.fail("the training started"))
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "kept").write_text("x")
     with pytest.raises(thor2.InputError, match=f"out: {tmp_path / 'run'} already contains kept"):
@@ -190,7 +186,7 @@ def test_other_options_or_views_are_refused(tmp_path: Path) -> None:
     out = tmp_path / "run"
     with pytest.raises(Interrupted):
         train(out, progress=stop_when("fit tops", 4))
-    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    before = files_of(out)
     cases: list[tuple[str, dict[str, Any]]] = [
         ("batch_size 8, not 6", {"options": dataclasses.replace(OPTIONS, batch_size=6)}),
         ("epochs 3, not 4", {"options": dataclasses.replace(OPTIONS, epochs=4)}),
@@ -206,7 +202,7 @@ def test_other_options_or_views_are_refused(tmp_path: Path) -> None:
         train_run(source(1), out, RunSettings(["tops"], OPTIONS, CONFIG))
     with pytest.raises(thor2.InputError, match=r"was written with descriptor_config\.\w+ "):
         train_run(source(), out, RunSettings(["tops"], OPTIONS))
-    assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
+    assert files_of(out) == before
     (out / "checkpoints" / "begun.json").write_text("{")
     with pytest.raises(thor2.InputError, match=r"begun\.json cannot be read"):
         train(out)
@@ -237,24 +233,20 @@ def test_files_of_the_user_stay_in_a_run_directory(tmp_path: Path) -> None:
 def test_a_full_disk(whole: tuple[Path, TrainedRun], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A training that could not write any of its files resumes from the last checkpoint."""
     out = tmp_path / "run"
-
-    def full(*_: Any, **__: Any) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
     save = Checkpoints.save
     calls = 0
 
     def second_fails(self: Checkpoints, *arguments: Any) -> None:
         nonlocal calls
         calls += 1
-        full() if calls == 2 else save(self, *arguments)
+        full_disk() if calls == 2 else save(self, *arguments)
 
     for where, name, replacement in (
-        (module, "write_text", full),
+        (module, "write_text", full_disk),
         (Checkpoints, "save", second_fails),
-        (module, "append_metrics", full),
-        (module, "draw_curves", full),
-        (module, "save_run", full),
+        (module, "append_metrics", full_disk),
+        (module, "draw_curves", full_disk),
+        (module, "save_run", full_disk),
     ):
         with monkeypatch.context() as patch:
             patch.setattr(where, name, replacement)
