@@ -164,6 +164,18 @@ def aligned_cloud(
     return points, rng.integers(0, 256, (n, 3), dtype=np.uint8)
 
 
+DEGENERATE = {
+    "nothing": np.zeros((0, 3)),
+    "one point": np.array([[0.1, 0.2, 0.9]]),
+    "two points": np.array([[0.1, 0.2, 0.9], [0.2, 0.2, 0.8]]),
+    "all equal": np.full((101, 3), 0.7),
+    "line": np.linspace(0, 0.2, 101)[:, None] * [1.0, 2.0, -1.0] + 0.5,
+    "plane": np.random.default_rng(0).random((101, 2)) @ [[0.1, 0, 0.1], [0, 0.1, 0]] + 0.5,
+    "cube": np.stack(np.meshgrid(*[[-0.1, 0.0, 0.1]] * 3), axis=-1).reshape(-1, 3),
+}
+"""Points of clouds whose frame is ambiguous."""
+
+
 def random_clouds(
     seed: int, sizes: Iterable[int], extent: Sequence[float] = (0.2, 0.1, 0.05), color: object = None
 ) -> list[Cloud]:

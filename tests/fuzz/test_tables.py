@@ -3,7 +3,6 @@
 import hashlib
 import io
 import json
-import shutil
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -272,7 +271,3 @@ def test_networks_round_trip(network: colornet.ColorNetwork, tmp_path_factory: A
     path = tmp_path_factory.getbasetemp() / "network.npz"
     network.save(path)
     assert colornet.load(path).fingerprint == network.fingerprint
-
-
-def test_copies(views: Path, tmp_path: Path) -> None:
-    assert len(read_views(Path(shutil.copytree(views, tmp_path / "views")))) == 3
