@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from dataset_files import TWO, K, band, color_and_depth, update, write_bop
 from helpers import Command, NamesInOrder
 from PIL import Image
 
@@ -18,55 +19,6 @@ from training.evaluation.answering import answer_frames
 from training.evaluation.results import compute_results
 from training.evaluation.runs import Run as EvaluatedRun
 from training.readers import BOP, FrameFolder
-
-SHAPE = (6, 9)
-K = [1066.778, 0.0, 4.9869, 0.0, 1067.487, 2.3109, 0.0, 0.0, 1.0]
-"""Intrinsics of YCB-Video with the principal point moved into the small images."""
-
-
-def images(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    rng = np.random.default_rng(seed)
-    return rng.integers(0, 256, (*SHAPE, 3), dtype=np.uint8), rng.integers(5000, 15000, SHAPE, dtype=np.uint16)
-
-
-def band(start: int, stop: int) -> np.ndarray:
-    """Return the mask of a range of columns."""
-    mask = np.zeros(SHAPE, bool)
-    mask[:, start:stop] = True
-    return mask
-
-
-TWO = {8: band(0, 3), 14: band(4, 7)}
-
-
-def update(path: Path, number: int, entry: Any) -> None:
-    table = json.loads(path.read_text()) if path.exists() else {}
-    path.write_text(json.dumps({**table, str(number): entry}))
-
-
-def write_image(
-    scene: Path,
-    number: int = 1,
-    objects: dict[int, np.ndarray] | list[tuple[int, np.ndarray]] = TWO,
-    visible: list[float] | None = None,
-    suffix: str = "png",
-    seed: int = 0,
-) -> Path:
-    for kind in ("rgb", "depth", "mask_visib"):
-        (scene / kind).mkdir(parents=True, exist_ok=True)
-    color, depth = images(seed)
-    Image.fromarray(color).save(scene / "rgb" / f"{number:06d}.{suffix}")
-    Image.fromarray(depth).save(scene / "depth" / f"{number:06d}.png")
-    pairs = list(objects.items()) if isinstance(objects, dict) else objects
-    for k, (_, mask) in enumerate(pairs):
-        Image.fromarray(255 * mask.astype(np.uint8)).save(scene / "mask_visib" / f"{number:06d}_{k:06d}.png")
-    update(scene / "scene_camera.json", number, {"cam_K": K, "depth_scale": 0.1, "cam_t_w2c": [0, 0, 1]})
-    pose = {"cam_R_m2c": [1, 0, 0, 0, 1, 0, 0, 0, 1], "cam_t_m2c": [0, 0, 800]}
-    update(scene / "scene_gt.json", number, [{**pose, "obj_id": obj_id} for obj_id, _ in pairs])
-    if visible is not None:
-        info = [{"visib_fract": v, "px_count_visib": 3, "bbox_visib": [0, 0, 1, 1]} for v in visible]
-        update(scene / "scene_gt_info.json", number, info)
-    return scene
 
 
 def error_message(root: Path, names: Path | None = None) -> str:
@@ -79,7 +31,7 @@ def error_message(root: Path, names: Path | None = None) -> str:
 
 
 def test_a_frame(tmp_path: Path) -> None:
-    scene = write_image(tmp_path / "000048")
+    scene = write_bop(tmp_path / "000048")
     (item,) = BOP(tmp_path)
     assert item.identifier == "000048/000001" and item.attributes == {"scene": "000048"}
     assert item.truth == {1: "obj_000008", 2: "obj_000014"}
@@ -96,8 +48,8 @@ def test_a_frame(tmp_path: Path) -> None:
 
 def test_the_order_of_the_images(tmp_path: Path) -> None:
     for number in (10, 2):
-        write_image(tmp_path / "000050", number, seed=number)
-    write_image(tmp_path / "000048", 1000000, suffix="jpg")
+        write_bop(tmp_path / "000050", number, seed=number)
+    write_bop(tmp_path / "000048", 1000000, suffix="jpg")
     (tmp_path / "000050" / "rgb" / "notes.txt").write_text("")
     (tmp_path / "000050" / "rgb" / "cover.png").write_bytes(b"")
     (tmp_path / "models").mkdir()
@@ -107,19 +59,19 @@ def test_the_order_of_the_images(tmp_path: Path) -> None:
     assert [item.identifier for item in items] == ["000048/1000000", "000050/000002", "000050/000010"]
     assert [item.identifier for item in dataset] == [item.identifier for item in items]
     for item, seed in zip(items[1:], (2, 10), strict=True):
-        np.testing.assert_array_equal(item.frame.color, images(seed)[0])
-        np.testing.assert_array_equal(item.frame.depth, images(seed)[1])
+        np.testing.assert_array_equal(item.frame.color, color_and_depth(seed)[0])
+        np.testing.assert_array_equal(item.frame.depth, color_and_depth(seed)[1])
     jpeg = cv2.cvtColor(cv2.imread(str(tmp_path / "000048" / "rgb" / "1000000.jpg")), cv2.COLOR_BGR2RGB)
     np.testing.assert_allclose(items[0].frame.color.astype(int), jpeg.astype(int), atol=2)
 
 
 def test_one_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(write_image(tmp_path / "000048"))
+    monkeypatch.chdir(write_bop(tmp_path / "000048"))
     assert [item.identifier for item in BOP(".")] == ["000048/000001"]
 
 
 def test_images_without_objects(tmp_path: Path) -> None:
-    write_image(tmp_path / "000048", objects={}, visible=[])
+    write_bop(tmp_path / "000048", objects={}, visible=[])
     (item,) = BOP(tmp_path)
     assert item.truth == {} and item.frame.instances == ()
 
@@ -130,7 +82,7 @@ def test_images_without_objects(tmp_path: Path) -> None:
 def test_pixels_of_several_masks_belong_to_the_smallest(tmp_path: Path) -> None:
     """Pixels belong to the smallest mask, and among equal ones to the last."""
     objects = [(1, band(0, 6)), (2, band(2, 4)), (3, band(3, 8)), (4, band(6, 7)), (4, band(6, 7))]
-    write_image(tmp_path / "000048", objects=objects)
+    write_bop(tmp_path / "000048", objects=objects)
     (item,) = BOP(tmp_path)
     np.testing.assert_array_equal(item.frame.labels[0], [1, 1, 2, 2, 3, 3, 5, 3, 0])
     assert item.truth == {k + 1: f"obj_{obj_id:06d}" for k, (obj_id, _) in enumerate(objects)}
@@ -138,16 +90,14 @@ def test_pixels_of_several_masks_belong_to_the_smallest(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("visible", [None, [0.5, 0.0]])
 def test_masks_without_pixels_are_not_scored(tmp_path: Path, visible: list[float] | None) -> None:
-    write_image(tmp_path / "000048", objects={8: band(0, 3), 14: band(0, 0)}, visible=visible)
+    write_bop(tmp_path / "000048", objects={8: band(0, 3), 14: band(0, 0)}, visible=visible)
     (item,) = BOP(tmp_path)
     assert item.truth == {1: "obj_000008"} and item.frame.instances == (1,)
 
 
 def test_objects_that_are_hardly_visible_are_not_scored(tmp_path: Path) -> None:
     """As in BOP's evaluation, objects with less than a tenth visible are not scored; they still occlude others."""
-    write_image(
-        tmp_path / "000048", objects={8: band(0, 3), 14: band(3, 4), 21: band(5, 6)}, visible=[0.8, 0.0999, 0.1]
-    )
+    write_bop(tmp_path / "000048", objects={8: band(0, 3), 14: band(3, 4), 21: band(5, 6)}, visible=[0.8, 0.0999, 0.1])
     (item,) = BOP(tmp_path)
     assert item.truth == {1: "obj_000008", 3: "obj_000021"}
     assert item.frame.instances == (1, 2, 3)
@@ -158,7 +108,7 @@ def test_objects_that_are_hardly_visible_are_not_scored(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["names.yaml", "names.json"])
 def test_names(tmp_path: Path, name: str) -> None:
-    write_image(tmp_path / "test" / "000048", objects=[(8, band(0, 2)), (14, band(3, 5)), (8, band(6, 8))])
+    write_bop(tmp_path / "test" / "000048", objects=[(8, band(0, 2)), (14, band(3, 5)), (8, band(6, 8))])
     table = {8: "gelatin_box", 14: "mug", 21: "foam_brick"}
     (tmp_path / name).write_text(json.dumps(table) if name.endswith("json") else yaml.safe_dump(table))
     (item,) = BOP(tmp_path / "test", tmp_path / name)
@@ -168,9 +118,9 @@ def test_names(tmp_path: Path, name: str) -> None:
 def test_objects_without_a_name(tmp_path: Path) -> None:
     names = tmp_path / "names.yaml"
     names.write_text("8: gelatin_box\n")
-    write_image(tmp_path / "000048", objects={8: band(0, 3), 14: band(0, 0)})
+    write_bop(tmp_path / "000048", objects={8: band(0, 3), 14: band(0, 0)})
     assert [item.truth for item in BOP(tmp_path, names)] == [{1: "gelatin_box"}]  # 14 is not scored
-    write_image(tmp_path / "000048")
+    write_bop(tmp_path / "000048")
     assert f"000048/000001: {names} " in (message := error_message(tmp_path, names)) and "obj_id 14" in message
 
 
@@ -179,7 +129,7 @@ def test_objects_without_a_name(tmp_path: Path) -> None:
     ["[mug]", "", "8: [mug", "8: 7", "8: ''", "8: null", "mug: 8", "true: mug", "8.0: mug", "-8: mug", "8: !!bool x"],
 )
 def test_invalid_names(tmp_path: Path, text: str) -> None:
-    write_image(tmp_path / "000048")
+    write_bop(tmp_path / "000048")
     names = tmp_path / "names.yaml"
     names.write_text(text)
     assert error_message(tmp_path, names).startswith(str(names))
@@ -197,7 +147,7 @@ def test_invalid_names(tmp_path: Path, text: str) -> None:
     ],
 )
 def test_files_that_are_missing(tmp_path: Path, file: str, whose: str) -> None:
-    path = write_image(tmp_path / "000048") / file
+    path = write_bop(tmp_path / "000048") / file
     path.unlink()
     assert error_message(tmp_path) == f"{whose}: {path} is missing"
 
@@ -215,14 +165,14 @@ def test_files_that_are_missing(tmp_path: Path, file: str, whose: str) -> None:
 )
 @pytest.mark.parametrize("kept", [0, 50])
 def test_files_that_are_cut_off(tmp_path: Path, file: str, kept: int) -> None:
-    path = write_image(tmp_path / "000048", visible=[1.0, 1.0]) / file
+    path = write_bop(tmp_path / "000048", visible=[1.0, 1.0]) / file
     path.write_bytes(path.read_bytes()[:kept])
     assert str(path) in error_message(tmp_path)
 
 
 def test_frames_are_read_one_at_a_time(tmp_path: Path) -> None:
-    write_image(tmp_path / "000048")
-    (write_image(tmp_path / "000049") / "scene_gt.json").write_text("damaged")
+    write_bop(tmp_path / "000048")
+    (write_bop(tmp_path / "000049") / "scene_gt.json").write_text("damaged")
     frames = iter(BOP(tmp_path))
     assert next(frames).identifier == "000048/000001"
     with pytest.raises(InputError, match="^000049: "):
@@ -231,15 +181,15 @@ def test_frames_are_read_one_at_a_time(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("file", "name"), [("depth/000001.png", "depth"), ("mask_visib/000001_000000.png", "depth")])
 def test_images_of_different_sizes(tmp_path: Path, file: str, name: str) -> None:
-    path = write_image(tmp_path / "000048") / file
+    path = write_bop(tmp_path / "000048") / file
     Image.fromarray(np.zeros((5, 9), np.uint16 if name in file else np.uint8)).save(path)
     message = error_message(tmp_path)
     assert "(5, 9)" in message and "(6, 9)" in message
 
 
 def test_color_images_as_masks_are_refused(tmp_path: Path) -> None:
-    path = write_image(tmp_path / "000048") / "mask_visib" / "000001_000000.png"
-    Image.fromarray(images()[0]).save(path)
+    path = write_bop(tmp_path / "000048") / "mask_visib" / "000001_000000.png"
+    Image.fromarray(color_and_depth()[0]).save(path)
     assert f"{path} has shape (6, 9, 3)" in error_message(tmp_path)
 
 
@@ -248,14 +198,14 @@ def test_color_images_as_masks_are_refused(tmp_path: Path) -> None:
     "table", [None, [], {}, {"000001": []}, {"2": []}, {"1": None}, {"1": 7}, {"1": [7]}, {"1": [{}]}]
 )
 def test_invalid_tables(tmp_path: Path, file: str, table: Any) -> None:
-    path = write_image(tmp_path / "000048", visible=[1.0, 1.0]) / file
+    path = write_bop(tmp_path / "000048", visible=[1.0, 1.0]) / file
     path.write_text(json.dumps(table))
     assert str(path) in error_message(tmp_path)
 
 
 @pytest.mark.parametrize("text", ["[" * 100_000, "\xff", '{"1": [], }'])
 def test_tables_that_are_not_json(tmp_path: Path, text: str) -> None:
-    path = write_image(tmp_path / "000048") / "scene_gt.json"
+    path = write_bop(tmp_path / "000048") / "scene_gt.json"
     path.write_bytes(text.encode("latin-1"))
     assert error_message(tmp_path).startswith(f"000048: {path} is damaged (")
 
@@ -280,7 +230,7 @@ def test_tables_that_are_not_json(tmp_path: Path, text: str) -> None:
     ],
 )
 def test_invalid_cameras(tmp_path: Path, change: dict[str, Any], expected: str) -> None:
-    path = write_image(tmp_path / "000048") / "scene_camera.json"
+    path = write_bop(tmp_path / "000048") / "scene_camera.json"
     path.write_text(json.dumps({"1": {"cam_K": K, "depth_scale": 0.1, **change}}))
     message = error_message(tmp_path)
     assert message.startswith(f"000048/000001: {path}: ") and expected in message
@@ -297,7 +247,7 @@ def test_invalid_cameras(tmp_path: Path, change: dict[str, Any], expected: str) 
     ],
 )
 def test_invalid_instances(tmp_path: Path, file: str, entry: Any, expected: str) -> None:
-    path = write_image(tmp_path / "000048", visible=[1.0, 1.0]) / file
+    path = write_bop(tmp_path / "000048", visible=[1.0, 1.0]) / file
     path.write_text(json.dumps({"1": entry}))
     message = error_message(tmp_path)
     assert str(path) in message and expected in message
@@ -312,7 +262,7 @@ def test_invalid_instances(tmp_path: Path, file: str, entry: Any, expected: str)
     ],
 )
 def test_directories_that_are_not_a_dataset(tmp_path: Path, damage: Callable[[Path], object]) -> None:
-    damage(write_image(tmp_path / "000048"))
+    damage(write_bop(tmp_path / "000048"))
     for path, expected in ((tmp_path, "has no scene_camera.json"), (tmp_path / "absent", "is not a directory")):
         assert error_message(path).startswith(f"dataset: {path} {expected}")
 
@@ -330,7 +280,7 @@ def test_a_real_frame(shared: Path, tmp_path: Path) -> None:
         pytest.skip("no real frames beside the checkout")
     real = next(iter(FrameFolder(folder)))
     poses = json.loads((folder / real.identifier / "labels.json").read_text())["poses_cam_from_ycbv_model"]
-    scene = write_image(tmp_path / "000000", objects={label: real.frame.labels == label for label in real.truth})
+    scene = write_bop(tmp_path / "000000", objects={label: real.frame.labels == label for label in real.truth})
     k = real.frame.intrinsics
     matrix = [k.fx, 0, k.cx, 0, k.fy, k.cy, 0, 0, 1]
     update(scene / "scene_camera.json", 1, {"cam_K": matrix, "depth_scale": 0.1})
@@ -364,8 +314,8 @@ class LastIsSmall(NamesInOrder):
 def write_dataset(root: Path) -> Path:
     """Two scenes of three objects; in the second the first object is almost hidden."""
     objects = [(14, band(0, 2)), (13, band(3, 5)), (14, band(6, 8))]
-    write_image(root / "test" / "000048", objects=objects, visible=[1, 1, 1])
-    write_image(root / "test" / "000049", objects=objects, visible=[0.05, 1, 1])
+    write_bop(root / "test" / "000048", objects=objects, visible=[1, 1, 1])
+    write_bop(root / "test" / "000049", objects=objects, visible=[0.05, 1, 1])
     (root / "names.yaml").write_text("13: bowl\n14: mug\n")
     return root / "test"
 
