@@ -387,6 +387,23 @@ def small_frame(seed: int = 0) -> thor2.RGBDFrame:
     return thor2.RGBDFrame(color, depth, labels, thor2.Intrinsics(120.0, 120.0, 60.0, 45.0))
 
 
+def patches() -> NDArray[np.uint8]:
+    """Return label images of three usable instances and one that is too small."""
+    labels = np.zeros((240, 320), np.uint8)
+    labels[20:100, 20:90] = 3
+    labels[200:203, 10:13] = 5
+    labels[20:60, 150:250] = 7
+    labels[120:220, 100:150] = 200
+    return labels
+
+
+def tilted(labels: np.ndarray, seed: int = 0, nearest: int = 600) -> thor2.RGBDFrame:
+    """Return a frame of a tilted plane with random colours; depth grows to the right."""
+    depth = np.broadcast_to(nearest + np.arange(320) // 2, (240, 320)).astype(np.uint16)
+    color = np.random.default_rng(seed).integers(0, 256, (240, 320, 3), dtype=np.uint8)
+    return thor2.RGBDFrame(color, depth, labels, thor2.Intrinsics(600.0, 600.0, 159.5, 119.5))
+
+
 FRAME_COLORS = {"brick": (220, 30, 30), "book": (30, 40, 220), "leaf": (60, 200, 60)}
 
 

@@ -114,6 +114,16 @@ def bag_writer(path: Path, compression: str = "") -> Iterator[Any]:
         next(folder.glob("*.mcap")).rename(path)
 
 
+def write_images(
+    write: Any, frame: thor2.RGBDFrame, arrival: int = START, stamp: int = START, camera: bool = True, **color: Any
+) -> None:
+    """Write the messages of one frame, uncompressed; `color` has further fields of the colour image."""
+    write(COLOR, image(frame.color, "rgb8", stamp, **color), arrival)
+    write(DEPTH, image(frame.depth, "16UC1", stamp), arrival)
+    if camera:
+        write(CAMERA, camera_info(frame.intrinsics, frame.depth.shape, stamp), arrival)
+
+
 def write_recording(
     path: Path,
     frames: Sequence[thor2.RGBDFrame],

@@ -81,19 +81,6 @@ def test_files_of_a_run_directory(model: Path) -> None:
     assert description["descriptor_version"] == 1
 
 
-def test_recognize(model: Path, images: Path, scene: Scene, tmp_path: Path, printed: Command, refused: Command) -> None:
-    command = ("recognize", "--model", model, *frame_options(images), "--unknown-below")
-    out = printed(*command, 0, "--out", tmp_path / "answer")
-    answers = json.loads((tmp_path / "answer" / "recognition.json").read_text())
-    assert [a["label"] for a in answers] == list(scene.frame.instances)
-    assert all(a["name"] in NAMES and a["classifier"] in ("tops", "tops2") and a["name"] in out for a in answers)
-    with Image.open(tmp_path / "answer" / "overlay.png") as overlay:
-        assert overlay.size == scene.frame.color.shape[1::-1]
-    out = printed(*command, 1)
-    assert "unrecognized" in out and "unknown" in out
-    assert "unknown_below is 1.5" in refused(*command, 1.5)
-
-
 def test_evaluate_frames(
     model: Path, images: Path, scene: Scene, tmp_path: Path, printed: Command, refused: Command
 ) -> None:
@@ -453,11 +440,10 @@ def test_paper_protocol(meshes: Path, views: Path, tmp_path: Path) -> None:
     assert of["default"]["samples"] == 2 * of["default"]["dataset"]["views"]
 
 
-def test_missing_datasets_and_usage_errors(model: Path, tmp_path: Path, refused: Command) -> None:
+def test_missing_datasets_are_refused(model: Path, tmp_path: Path, refused: Command) -> None:
     for kind in ("uwis", "frames"):
         for path in (tmp_path / "absent", tmp_path):
             assert str(path) in refused("evaluate", kind, path, "--model", model)
-    assert [run_thor2(command) for command in ("recognize", "no-such-command", "--help")] == [2, 2, 0]
 
 
 def test_colornet(tmp_path: Path, printed: Command, refused: Command, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -103,7 +103,8 @@ def test_several_folders_and_tables(model: Path, tmp_path: Path, capfd: pytest.C
     assert run_thor2("recognize", "--model", model, one, tmp_path / "more", *outputs) == 0
     out, err = capfd.readouterr()
     assert out.index("one:") < out.index("deep/two:") and out.count("confidence") == 2
-    assert (tmp_path / "out" / "deep" / "two" / "overlay.png").is_file()
+    with Image.open(tmp_path / "out" / "deep" / "two" / "overlay.png") as overlay:
+        assert overlay.size == (120, 90)
     results = [tmp_path / "out" / name / "recognition.json" for name in ("one", "deep/two")]
     answers = [{"instances": json.loads(path.read_text())} for path in results]
     coco = json.loads((tmp_path / "coco.json").read_text())
@@ -126,6 +127,7 @@ def test_several_folders_and_tables(model: Path, tmp_path: Path, capfd: pytest.C
         (["{frames}", "--coco", "{empty}/c.json", "--names", "{frames}/one/intrinsics.json"], "expected an obj_id"),
         (["{frames}", "--out", "{frames}"], "expected a new or empty directory"),
         (["{frames}", "--depth-scale", "1e-300"], "depth_scale is 1e-300"),
+        (["{frames}", "--unknown-below", "1.5"], "unknown_below is 1.5"),
         (["{files}", "--segment", "table", "--out", "{out}"], "error: labels is "),
         (["{frames}", "--segment", "sam", "--out", "{out}"], "error: segmenter is 'sam'"),
     ],

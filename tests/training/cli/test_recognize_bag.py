@@ -9,15 +9,13 @@ import pytest
 from helpers import Command, Recognize, json_lines, run_thor2, write_frame_files
 from PIL import Image
 from recording_files import (
-    CAMERA,
     COLOR,
-    DEPTH,
     PERIOD,
     START,
     bag_writer,
-    camera_info,
     image,
     table_frame,
+    write_images,
     write_recording,
 )
 from rosbags.highlevel import AnyReader
@@ -132,9 +130,7 @@ def test_frames_with_one_stamp_and_before_1970(recognize: Recognize, tmp_path: P
     path = tmp_path / "a.mcap"
     with bag_writer(path) as write:
         for arrival, stamp in enumerate((-1, START, START, START)):
-            write(CAMERA, camera_info(FRAMES[0].intrinsics, FRAMES[0].depth.shape, stamp), arrival)
-            write(COLOR, image(FRAMES[0].color, "rgb8", stamp), arrival)
-            write(DEPTH, image(FRAMES[0].depth, "16UC1", stamp), arrival)
+            write_images(write, FRAMES[0], arrival, stamp)
     lines = recognize("--bag", path, "--out", tmp_path / "out", "--out-bag", tmp_path / "out.mcap")
     names = [line["frame"] for line in lines]
     assert names == ["-0.000000001", *(f"1700000000.000000000{end}" for end in ("", "-2", "-3"))]
@@ -147,9 +143,7 @@ def test_frames_with_one_stamp_and_before_1970(recognize: Recognize, tmp_path: P
 def test_texts_of_recordings_are_escaped(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "a.mcap"
     with bag_writer(path) as write:
-        write(CAMERA, camera_info(FRAMES[0].intrinsics, FRAMES[0].depth.shape), START)
-        write(COLOR, image(FRAMES[0].color, "rgb8", frame_id="a\n\x1b[2J"), START)
-        write(DEPTH, image(FRAMES[0].depth, "16UC1"), START)
+        write_images(write, FRAMES[0], frame_id="a\n\x1b[2J")
     assert run_thor2("recognize", "--model", model, "--bag", path) == 0
     (note,) = [line for line in capfd.readouterr().err.splitlines() if line.startswith("note: ")]
     assert r"color in a\n\x1b[2J" in note
@@ -164,9 +158,7 @@ def test_a_wrong_unit_of_depth(model: Path, tmp_path: Path, refused: Command) ->
 def test_a_time_out_of_the_range_of_ros_2(model: Path, tmp_path: Path, refused: Command) -> None:
     path, late = tmp_path / "a.mcap", 2**31 * 10**9
     with bag_writer(path) as write:  # images without a time stamp have the time at which they were recorded
-        write(CAMERA, camera_info(FRAMES[0].intrinsics, FRAMES[0].depth.shape, 0), late)
-        write(COLOR, image(FRAMES[0].color, "rgb8", 0), late)
-        write(DEPTH, image(FRAMES[0].depth, "16UC1", 0), late)
+        write_images(write, FRAMES[0], late, 0)
     error = refused("recognize", "--model", model, "--bag", path, "--out-bag", tmp_path / "out.mcap", at_once=False)
     assert "error: out_bag: a frame has the time 2147483648 s" in error
     assert str(tmp_path / "out.mcap") not in error and not (tmp_path / "out.mcap").exists()
