@@ -8,13 +8,19 @@ import pytest
 from helpers import SMALL_CONFIG, assert_same_answers, small_embedding, untrained_embedding_run, untrained_run
 
 import thor2_jax as thor2
-from thor2_jax.frames.prepared_instance import prepare_instance
+from thor2_jax.frames.prepared_instance import PreparedInstance, prepare_instance
 from thor2_jax.model.confidence import Calibration
 from thor2_jax.model.run_directory import EMBEDDING_FILE, save_run
-from thor2_jax.service.engine import InferenceEngine
+from thor2_jax.service.engine import CloudResult, InferenceEngine
 from thor2_jax.service.settings import Settings
 
 pytestmark = pytest.mark.usefixtures("small_buckets")
+
+
+def inferred(engine: InferenceEngine, frame: thor2.RGBDFrame) -> tuple[list[PreparedInstance], list[CloudResult]]:
+    """Return the instances of a frame, and the results of those that can be used."""
+    instances = [prepare_instance(frame, label, engine.run.config.sigma_s) for label in frame.instances]
+    return instances, engine.infer([instance for instance in instances if instance.reason is None])
 
 
 @pytest.mark.parametrize(
@@ -36,10 +42,8 @@ def test_the_engine_answers_as_the_recognizer(
     recognizer.enroll("wide", [(frame, 7)])
     engine = InferenceEngine(Settings(tmp_path / "run", max_batch=8))
     assert engine.model.names == (*trained, "tall", "wide")
-    instances = [prepare_instance(frame, label, engine.run.config.sigma_s) for label in frame.instances]
-    results = engine.infer([instance for instance in instances if instance.reason is None])
-    answers = engine.recognize(instances, results)
-    assert_same_answers(answers, recognizer.recognize(frame), 1e-4)
+    instances, results = inferred(engine, frame)
+    assert_same_answers(engine.recognize(instances, results), recognizer.recognize(frame), 1e-4)
     assert engine.calibrated_confidences(results) == [None] * 3
     unusable = [instance for instance in instances if instance.reason is not None]
     assert [answer.name for answer in engine.recognize(unusable, [])] == [None]
@@ -52,8 +56,7 @@ def test_an_embedding_alone_answers(calibration: Calibration | None, frame: thor
     save_run(run, tmp_path / "run")
     engine = InferenceEngine(Settings(tmp_path / "run", max_batch=8))
     assert engine.model.names == ("a", "b", "c") and tuple(engine.model.classifiers) == ("embedding",)
-    instances = [prepare_instance(frame, label, engine.run.config.sigma_s) for label in frame.instances]
-    results = engine.infer([instance for instance in instances if instance.reason is None])
+    instances, results = inferred(engine, frame)
     recognizer = thor2.Recognizer.load(tmp_path / "run")
     answers, expected = engine.recognize(instances, results), recognizer.recognize(frame)
     assert_same_answers(answers, expected, 1e-4)
