@@ -5,7 +5,7 @@ import gc
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -96,6 +96,22 @@ def pytest_collectreport() -> None:
     settings.load_profile("default")
 
 
+@pytest.fixture(scope="session", autouse=True)
+def one_line_errors() -> Iterator[None]:
+    """Check that the message of each InputError is one line."""
+    from thor2_jax.errors import InputError
+
+    create = InputError.__init__
+
+    def create_checked(self: InputError, message: str) -> None:
+        assert "\n" not in message, message
+        create(self, message)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(InputError, "__init__", create_checked)
+        yield
+
+
 @pytest.fixture(autouse=True)
 def strict_dtype_promotion(request: pytest.FixtureRequest) -> Iterator[None]:
     import jax
@@ -125,6 +141,37 @@ def browser() -> "Iterator[Browser]":
         pytest.skip("chromium is not installed (apt-get install chromium)")
     with sync_playwright() as playwright:
         yield playwright.chromium.launch(executable_path=chromium)
+
+
+def _run_command(capfd: pytest.CaptureFixture[str], status: int, arguments: tuple[object, ...]) -> tuple[str, str]:
+    from helpers import run_thor2
+
+    capfd.readouterr()
+    assert run_thor2(*arguments) == status
+    return capfd.readouterr()
+
+
+@pytest.fixture
+def printed(capfd: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """Return a function that runs a command, which must succeed, and returns what it prints."""
+    return lambda *arguments: _run_command(capfd, 0, arguments)[0]
+
+
+@pytest.fixture
+def refused(capfd: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """Return a function that runs a command, which must fail, and returns the line that says why.
+
+    Commands that fail before they begin their work print nothing else; others do if `at_once` is False.
+    """
+
+    def run(*arguments: object, at_once: bool = True) -> str:
+        out, error = _run_command(capfd, 2, arguments)
+        *others, line = error.splitlines()
+        assert line.startswith("error: ") and not any("error: " in other or "Traceback" in other for other in others)
+        assert not at_once or (out, others) == ("", []), error
+        return line
+
+    return run
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,8 @@
 """Helpers of several test files: untrained runs, small clouds and images, the command line, programs, HTML pages."""
 
+import contextlib
 import dataclasses
+import errno
 import functools
 import io
 import json
@@ -10,9 +12,10 @@ import struct
 import subprocess
 import sys
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from html.parser import HTMLParser
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 from unittest import mock
 
@@ -26,14 +29,22 @@ from processes import HANG
 import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.looks import LookDescriptors
+from thor2_jax.errors import InputError
 from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
 from thor2_jax.model.classifier import FEATURES, MLP, RunClassifiers
 from thor2_jax.model.inference import infer
 from thor2_jax.model.model import Model
 from thor2_jax.model.run_directory import TrainedRun, input_size
+from thor2_jax.types import Cloud
 from training.objects.builtin_objects import builtin_objects
 from training.rendering.camera import Camera, RenderedView
 from training.rendering.scenes import compose_scene
+
+Command = Callable[..., str]
+"""Type of the fixtures `printed` and `refused`, which run the command line."""
+
+Recognize = Callable[..., list[dict[str, Any]]]
+"""Type of the fixture `recognize`, which recognizes frames on the command line."""
 
 SMALL_CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=2, n_strips=5, image_size=8)
 """A descriptor that compiles quickly."""
@@ -71,6 +82,11 @@ def random_classifier(n_inputs: int, n_classes: int, seed: int) -> MLP:
     return classifier
 
 
+def small_embedding(seed: int = 0) -> Embedding:
+    """Return an embedding with random weights, which compiles quickly."""
+    return Embedding.create(SMALL_CONFIG, sizes=EmbeddingSizes(4, (16,), 8, 4), seed=seed)
+
+
 def untrained_embedding_run(
     classes: Sequence[str],
     features: Sequence[str] = (),
@@ -94,8 +110,14 @@ class ToyDescriptors(NamedTuple):
 class UntaughtRecognizer:
     """Base of toy recognizers, whose `probabilities` maps the content of `ToyDescriptors`; no object is enrolled."""
 
-    run: Any
     unknown_below: float | None = None
+
+    def __init__(self, classes: Sequence[str], features: Sequence[str] = ("tops",)) -> None:
+        network = SimpleNamespace(fingerprint="")
+        classifiers = dict.fromkeys(features)
+        self.run: Any = SimpleNamespace(
+            classes=tuple(classes), classifiers=classifiers, config=None, network=network, record={}
+        )
 
     @property
     def model(self) -> Model:
@@ -105,8 +127,29 @@ class UntaughtRecognizer:
         }
         return Model(self.run, RunClassifiers(classifiers), unknown_below=self.unknown_below)
 
+    def describe(self, frame: thor2.RGBDFrame) -> Any:
+        instances = [
+            SimpleNamespace(label=label, reason=self.reason(label, frame), occluded=False) for label in frame.instances
+        ]
+        usable = [instance for instance in instances if instance.reason is None]
+        return SimpleNamespace(instances=instances, usable=usable, oriented=ToyDescriptors(usable))
+
+    def reason(self, label: int, frame: thor2.RGBDFrame) -> str | None:
+        """Return why an instance cannot be used."""
+        return None
+
     def probabilities(self, content: Any) -> dict[str, np.ndarray]:
         raise NotImplementedError
+
+
+class NamesInOrder(UntaughtRecognizer):
+    """Predicts the first class for the first usable instance of a frame and the second for all others."""
+
+    def __init__(self, classes: Sequence[str] = ("mug", "bowl")) -> None:
+        super().__init__(classes)
+
+    def probabilities(self, usable: Sequence[Any]) -> dict[str, np.ndarray]:
+        return {"tops": np.array([[0.9, 0.1] if k == 0 else [0.2, 0.8] for k in range(len(usable))]).reshape(-1, 2)}
 
 
 def aligned_cloud(
@@ -119,6 +162,40 @@ def aligned_cloud(
         border = np.round(points[:, axis] / width) * width
         points[np.abs(points[:, axis] - border) < 1e-5, axis] += np.float32(1e-3)
     return points, rng.integers(0, 256, (n, 3), dtype=np.uint8)
+
+
+DEGENERATE = {
+    "nothing": np.zeros((0, 3)),
+    "one point": np.array([[0.1, 0.2, 0.9]]),
+    "two points": np.array([[0.1, 0.2, 0.9], [0.2, 0.2, 0.8]]),
+    "all equal": np.full((101, 3), 0.7),
+    "line": np.linspace(0, 0.2, 101)[:, None] * [1.0, 2.0, -1.0] + 0.5,
+    "plane": np.random.default_rng(0).random((101, 2)) @ [[0.1, 0, 0.1], [0, 0.1, 0]] + 0.5,
+    "cube": np.stack(np.meshgrid(*[[-0.1, 0.0, 0.1]] * 3), axis=-1).reshape(-1, 3),
+}
+"""Points of clouds whose frame is ambiguous."""
+
+
+def random_clouds(
+    seed: int, sizes: Iterable[int], extent: Sequence[float] = (0.2, 0.1, 0.05), color: object = None
+) -> list[Cloud]:
+    """Return boxes of random points, half a metre before the camera, in random colours or all in one colour."""
+    rng = np.random.default_rng(seed)
+    return [
+        (
+            (rng.random((n, 3)) * extent + [0, 0, 0.5]).astype(np.float32),
+            rng.integers(0, 256, (n, 3), np.uint8) if color is None else np.full((n, 3), color, np.uint8),
+        )
+        for n in sizes
+    ]
+
+
+def brick_and_stick(views: int, seed: int = 0) -> dict[str, list[Cloud]]:
+    """Return views of two objects that differ in shape and colour."""
+    return {
+        "red brick": random_clouds(seed, [200] * views, (0.1, 0.05, 0.03), 0),
+        "stick": random_clouds(seed + 1, [200] * views, (0.2, 0.01, 0.01), 255),
+    }
 
 
 def as_8_bit(colors: np.ndarray) -> np.ndarray:
@@ -161,6 +238,39 @@ def run_thor2(*arguments: object) -> int:
         except SystemExit as stop:
             return int(stop.code or 0)
     return 0
+
+
+@contextlib.contextmanager
+def input_error(*words: object, match: str | None = None) -> Iterator[None]:
+    """Expect an InputError whose message matches a pattern and contains some words."""
+    with pytest.raises(InputError, match=match) as caught:
+        yield
+    assert [word for word in words if str(word) not in str(caught.value)] == [], caught.value
+
+
+class Interrupted(BaseException):
+    """Like KeyboardInterrupt, not an Exception."""
+
+
+def stop_when(stage: str, step: int) -> Callable[[str, int, int, str], None]:
+    """Return a display of progress that interrupts a training at a step of a stage."""
+
+    def progress(now: str, done: int, total: int, note: str) -> None:
+        if (now, done) == (stage, step):
+            raise Interrupted
+
+    return progress
+
+
+def files_of(folder: Path) -> dict[str, bytes]:
+    """Return the contents of all files of a folder but locks, by relative paths."""
+    paths = (path for path in sorted(folder.rglob("*")) if path.is_file() and path.name != ".lock")
+    return {str(path.relative_to(folder)): path.read_bytes() for path in paths}
+
+
+def full_disk(*_: Any, **__: Any) -> None:
+    """Fail as a function that writes does on a full disk."""
+    raise OSError(errno.ENOSPC, "No space left on device", "/tmp/secret")
 
 
 def json_lines(text: str) -> list[dict[str, Any]]:
@@ -235,6 +345,16 @@ def full_image(view: RenderedView, camera: Camera) -> tuple[NDArray[np.uint8], N
     return color, depth
 
 
+def assert_same_answers(
+    answers: Iterable[thor2.Recognition], expected: Iterable[thor2.Recognition], tolerance: float
+) -> None:
+    """Assert that answers are equal, up to a tolerance of the confidences."""
+    for one, other in zip(answers, expected, strict=True):
+        assert (one.label, one.name, one.classifier) == (other.label, other.name, other.classifier)
+        assert (one.reason, one.points_used) == (other.reason, other.points_used)
+        assert one.confidence == pytest.approx(other.confidence, abs=tolerance) and one.top.keys() == other.top.keys()
+
+
 def write_frame_files(folder: Path, frame: thor2.RGBDFrame, names: Mapping[int, str] | None = None) -> Path:
     """Write a frame as `FrameFolder` reads it: its mask if it has labels, and labels.json if names are given."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -265,6 +385,23 @@ def small_frame(seed: int = 0) -> thor2.RGBDFrame:
     depth[labels > 0] = 700 + rng.integers(0, 30, (labels > 0).sum())
     color = rng.integers(0, 256, (90, 120, 3), dtype=np.uint8)
     return thor2.RGBDFrame(color, depth, labels, thor2.Intrinsics(120.0, 120.0, 60.0, 45.0))
+
+
+def patches() -> NDArray[np.uint8]:
+    """Return label images of three usable instances and one that is too small."""
+    labels = np.zeros((240, 320), np.uint8)
+    labels[20:100, 20:90] = 3
+    labels[200:203, 10:13] = 5
+    labels[20:60, 150:250] = 7
+    labels[120:220, 100:150] = 200
+    return labels
+
+
+def tilted(labels: np.ndarray, seed: int = 0, nearest: int = 600) -> thor2.RGBDFrame:
+    """Return a frame of a tilted plane with random colours; depth grows to the right."""
+    depth = np.broadcast_to(nearest + np.arange(320) // 2, (240, 320)).astype(np.uint16)
+    color = np.random.default_rng(seed).integers(0, 256, (240, 320, 3), dtype=np.uint8)
+    return thor2.RGBDFrame(color, depth, labels, thor2.Intrinsics(600.0, 600.0, 159.5, 119.5))
 
 
 FRAME_COLORS = {"brick": (220, 30, 30), "book": (30, 40, 220), "leaf": (60, 200, 60)}
@@ -302,6 +439,17 @@ def class_probabilities(
     names = tuple(recognizer.model.classifiers) if classifiers is None else classifiers
     computed = infer(recognizer.model, oriented, classifiers=names).probabilities
     return {name: np.asarray(values) for name, values in computed.items()}
+
+
+def write_box(path: Path, sides: Sequence[float], color: Sequence[int] = (200, 100, 50)) -> Path:
+    """Write a mesh of a box of one colour."""
+    import trimesh
+
+    box = trimesh.creation.box(sides)
+    box.visual.vertex_colors = [[*color, 255]] * len(box.vertices)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    box.export(path)
+    return path
 
 
 def write_meshes(directory: Path, names: Sequence[str]) -> Path:

@@ -1,11 +1,32 @@
 """Actions on the web page of the service that several test files use."""
 
 from collections.abc import Callable
+from typing import Any
 
 import processes
-from playwright.sync_api import Page
+from playwright.sync_api import Page, Route
 
 FIELDS = {"color": "image/png", "depth": "image/png", "labels": "image/png", "intrinsics": "application/json"}
+
+
+def changed_answers(change: Callable[[Any], None], path: str = "/v1/explain") -> Callable[[Route], None]:
+    """Return a route that changes the answers of a path."""
+
+    def handle(route: Route) -> None:
+        if path not in route.request.url:
+            route.continue_()
+            return
+        response = route.fetch()
+        answer = response.json()
+        change(answer)
+        route.fulfill(response=response, json=answer)
+
+    return handle
+
+
+def answered(path: str, **answer: Any) -> Callable[[Route], None]:
+    """Return a route that answers the requests of a path in place of the service."""
+    return lambda route: route.fulfill(**answer) if route.request.url.endswith(path) else route.continue_()
 
 
 def upload(page: Page, files: dict[str, bytes], color_name: str = "color.png") -> None:

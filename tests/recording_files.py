@@ -1,14 +1,13 @@
 """Recordings that tests write: ROS 1 bags, ROS 2 bags and MCAP files of RGB-D frames."""
 
 import contextlib
-import io
 import struct
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
+from helpers import encode_image
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
@@ -54,15 +53,9 @@ def compressed(content: bytes, described: str, stamp: int = START, ros: int = 2)
     )
 
 
-def encoded(pixels: np.ndarray, kind: str, **options: Any) -> bytes:
-    stream = io.BytesIO()
-    Image.fromarray(pixels).save(stream, kind, **options)
-    return stream.getvalue()
-
-
 def compressed_depth(depth: np.ndarray, stamp: int = START, ros: int = 2) -> Any:
     """Return depth as compressed_depth_image_transport writes it: a header of 12 bytes, then a PNG."""
-    content = struct.pack("<iff", 0, 0.0, 0.0) + encoded(depth, "PNG")
+    content = struct.pack("<iff", 0, 0.0, 0.0) + encode_image(depth, "PNG")
     return compressed(content, "16UC1; compressedDepth png", stamp, ros)
 
 
@@ -114,6 +107,16 @@ def bag_writer(path: Path, compression: str = "") -> Iterator[Any]:
         next(folder.glob("*.mcap")).rename(path)
 
 
+def write_images(
+    write: Any, frame: thor2.RGBDFrame, arrival: int = START, stamp: int = START, camera: bool = True, **color: Any
+) -> None:
+    """Write the messages of one frame, uncompressed; `color` has further fields of the colour image."""
+    write(COLOR, image(frame.color, "rgb8", stamp, **color), arrival)
+    write(DEPTH, image(frame.depth, "16UC1", stamp), arrival)
+    if camera:
+        write(CAMERA, camera_info(frame.intrinsics, frame.depth.shape, stamp), arrival)
+
+
 def write_recording(
     path: Path,
     frames: Sequence[thor2.RGBDFrame],
@@ -128,7 +131,7 @@ def write_recording(
         for number, frame in enumerate(frames):
             stamp = START + number * PERIOD
             if is_compressed:
-                jpeg = encoded(frame.color, "JPEG", quality=95)
+                jpeg = encode_image(frame.color, "JPEG", quality=95)
                 write(f"{COLOR}/compressed", compressed(jpeg, "rgb8; jpeg compressed bgr8", stamp, ros), stamp)
                 write(f"{DEPTH}/compressedDepth", compressed_depth(frame.depth, stamp + gap, ros), stamp + gap)
             else:

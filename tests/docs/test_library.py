@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from doc_pages import python_blocks
-from helpers import untrained_run
+from helpers import random_clouds, untrained_run
 
 import thor2_jax as thor2
 from thor2_jax import recognizer
@@ -31,10 +31,7 @@ def run_section(section: str, **names: Any) -> dict[str, Any]:
     return names
 
 
-def random_cloud(seed: int, size: tuple[float, float, float] = (0.2, 0.1, 0.05)) -> tuple[np.ndarray, np.ndarray]:
-    rng = np.random.default_rng(seed)
-    return rng.random((400, 3)) * size, rng.integers(0, 256, (400, 3), np.uint8)
-
+((XYZ, RGB),) = random_clouds(0, [400])
 
 SECTIONS = {
     "Descriptors as a library": 1,
@@ -53,14 +50,13 @@ def test_every_block_belongs_to_a_tested_section() -> None:
 
 
 def test_descriptors() -> None:
-    xyz, rgb = random_cloud(0)
-    result = run_section("Descriptors as a library", xyz=xyz, rgb=rgb)["descriptors"]
+    result = run_section("Descriptors as a library", xyz=XYZ, rgb=RGB)["descriptors"]
     assert result.tops.shape == (1, 7168) and result.tops2.shape == (1, 11942) and result.overflow.shape == (1,)
 
 
 @pytest.mark.slow
 def test_gradients_of_colours() -> None:
-    names = run_section("Descriptors as a library", xyz=random_cloud(0)[0], rgb=random_cloud(0)[1])
+    names = run_section("Descriptors as a library", xyz=XYZ, rgb=RGB)
     names = run_section("Gradients", **names)
     gradient, colors = names["jax"].grad(names["largest"]), names["clouds"].colors
     assert np.abs(gradient(colors, names["soft"])).max() > 0.01
@@ -69,7 +65,7 @@ def test_gradients_of_colours() -> None:
 
 def test_plots(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MPLBACKEND", "agg")
-    names = run_section("Descriptors as a library", xyz=random_cloud(0)[0], rgb=random_cloud(0)[1])
+    names = run_section("Descriptors as a library", xyz=XYZ, rgb=RGB)
     names = run_section("Plots", **names)
     assert all(axes.collections for axes in names["figure"].axes)
     names["plt"].close(names["figure"])
@@ -77,7 +73,8 @@ def test_plots(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.slow
 def test_scikit_learn() -> None:
-    clouds = [random_cloud(i, (0.2, 0.1, 0.05) if i % 2 else (0.05, 0.05, 0.05)) for i in range(8)]
+    cubes, bricks = random_clouds(0, [400] * 4, (0.05, 0.05, 0.05)), random_clouds(1, [400] * 4)
+    clouds = [cloud for pair in zip(cubes, bricks, strict=True) for cloud in pair]
     names = run_section("scikit-learn", clouds=clouds, labels=["cube", "brick"] * 4)
     assert names["search"].predict(clouds[:2]).tolist() == ["cube", "brick"]
     assert names["frame"].shape == (8, 7168)

@@ -12,9 +12,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers import encode_image
 from PIL import Image
 from processes import HANG
-from recording_files import START, camera_info, compressed, encoded, image, table_frame
+from recording_files import START, camera_info, compressed, image, table_frame
 from rosbags.interfaces import Nodetype
 
 import thor2_jax as thor2
@@ -74,7 +75,7 @@ def test_messages_become_detections(conversion: Any, step: int) -> None:
 
 
 def test_compressed_images_and_refused_ones(conversion: Any) -> None:
-    jpeg = compressed(encoded(FRAME.color, "JPEG"), "jpeg")
+    jpeg = compressed(encode_image(FRAME.color, "JPEG"), "jpeg")
     frame = conversion.frame_of(jpeg, image(FRAME.depth, "16UC1"), CAMERA)
     assert frame.color.shape == (240, 320, 3)
     with pytest.raises(InputError, match="depth has shape"):

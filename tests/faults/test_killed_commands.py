@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from flax import nnx
-from helpers import run_thor2, untrained_run
-from PIL import Image
+from helpers import Command, frame_options, run_thor2, small_frame, untrained_run, write_box, write_frame_files
 from processes import HANG
 
 import colornet
@@ -65,22 +64,6 @@ def kill(place: str, command: tuple[object, ...], environment: dict[str, str]) -
     assert done.returncode == -signal.SIGKILL, done.stderr[-3000:]
 
 
-@pytest.fixture
-def call(capsys: pytest.CaptureFixture[str]) -> Any:
-    """Run a command without a kill; return its exit status and standard error."""
-
-    def run(*command: object) -> tuple[int, str]:
-        return run_thor2(*command), capsys.readouterr().err
-
-    return run
-
-
-def check_refused(result: tuple[int, str], message: str) -> None:
-    status, err = result
-    lines = [line for line in err.splitlines() if line.startswith("error: ")]
-    assert status == 2 and len(lines) == 1 and message in lines[0], err
-
-
 def files(folder: Path) -> dict[str, bytes]:
     """Return the contents of all files but temporary ones, whose names begin with a dot."""
     paths = (path.relative_to(folder) for path in folder.rglob("*") if path.is_file())
@@ -90,31 +73,18 @@ def files(folder: Path) -> dict[str, bytes]:
 @pytest.fixture(scope="module")
 def meshes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Directory of two boxes with vertex colors."""
-    import trimesh
-
     folder = tmp_path_factory.mktemp("meshes")
     for name, sides, level in (("brick", (0.1, 0.05, 0.03), 40), ("stick", (0.2, 0.02, 0.02), 220)):
-        box = trimesh.creation.box(sides)
-        colors = np.full((len(box.vertices), 3), level, np.uint8)
-        trimesh.Trimesh(box.vertices, box.faces, vertex_colors=colors, process=False).export(folder / f"{name}.ply")
+        write_box(folder / f"{name}.ply", sides, (level, level, level))
     return folder
 
 
 @pytest.fixture(scope="module")
 def frames(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Directory of two frames of a slanted plane with two labelled patches."""
+    """Directory of two frames of a brick and a stick."""
     folder = tmp_path_factory.mktemp("frames")
-    rng = np.random.default_rng(0)
-    labels = np.zeros((240, 320), np.uint8)
-    labels[20:100, 20:90], labels[120:220, 100:150] = 1, 2
-    for name in ("one", "two"):
-        (folder / name).mkdir()
-        Image.fromarray(rng.integers(0, 256, (240, 320, 3), dtype=np.uint8)).save(folder / name / "color.png")
-        depth = np.broadcast_to(600 + np.arange(320) // 2, (240, 320)).astype(np.uint16)
-        Image.fromarray(depth).save(folder / name / "depth.png")
-        Image.fromarray(labels).save(folder / name / "mask.png")
-        (folder / name / "intrinsics.json").write_text('{"fx": 600, "fy": 600, "cx": 159.5, "cy": 119.5}')
-        (folder / name / "labels.json").write_text('{"labels": {"1": "brick", "2": "stick"}}')
+    for seed, name in enumerate(("one", "two")):
+        write_frame_files(folder / name, small_frame(seed), {1: "brick", 4: "stick"})
     return folder
 
 
@@ -130,17 +100,17 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 # Colour network
 
 
-def test_colornet(environment: Any, call: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_colornet(environment: Any, refused: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The command does not resume: a partial output is refused."""
     monkeypatch.setattr(colornet, "build", colornet.load_default)
     command, whole = ("colornet", "--out"), tmp_path / "whole"
-    assert call(*command, whole)[0] == 0
+    assert run_thor2(*command, whole) == 0
     assert files(whole).keys() == {"network.npz", "network.png", "similarity.png"}
     for place, left in (("before network.npz", []), ("after network.png", ["network.npz", "network.png"])):
         out = tmp_path / place
         kill(place, (*command, out), environment)
         assert files(out) == {name: files(whole)[name] for name in left}
-        check_refused(call(*command, out), f"out: {out} already contains")
+        assert f"out: {out} already contains" in refused(*command, out)
 
 
 # Views and training
@@ -148,9 +118,9 @@ def test_colornet(environment: Any, call: Any, tmp_path: Path, monkeypatch: pyte
 STEPS = ("--azimuth-step", 90, "--polar-step", 90, "--workers", 1)
 
 
-def test_render(meshes: Path, environment: Any, call: Any, tmp_path: Path) -> None:
+def test_render(meshes: Path, environment: Any, refused: Command, tmp_path: Path) -> None:
     command, whole, out = ("render", "--meshes", meshes, *STEPS, "--out"), tmp_path / "whole", tmp_path / "views"
-    assert call(*command, whole)[0] == 0
+    assert run_thor2(*command, whole) == 0
     expected = files(whole)
     for place in (f"before {MANIFEST}", "before 0001-0000.safetensors"):
         kill(place, (*command, out), environment)
@@ -160,9 +130,9 @@ def test_render(meshes: Path, environment: Any, call: Any, tmp_path: Path) -> No
             assert len(manifest.shards) < manifest.job["shards"]
             assert {shard.file for shard in manifest.shards} <= written.keys()
         assert written.items() <= expected.items()
-        check_refused(call("train", "--dataset", out, "--out", tmp_path / "run"), str(out / MANIFEST))
-    check_refused(call(*command, out, "--seed", 1, "--sensor"), f"out: {out} was written with variations null")
-    assert call(*command, out)[0] == 0
+        assert str(out / MANIFEST) in refused("train", "--dataset", out, "--out", tmp_path / "run")
+    assert f"out: {out} was written with variations null" in refused(*command, out, "--seed", 1, "--sensor")
+    assert run_thor2(*command, out) == 0
     assert files(out) == expected and files(out).keys() | {".lock"} == {path.name for path in out.iterdir()}
 
 
@@ -177,10 +147,10 @@ def equal_models(one: TrainedRun, other: TrainedRun) -> bool:
     return same and (one.classes, one.config, one.record) == (other.classes, other.config, other.record)
 
 
-def test_train(meshes: Path, frames: Path, environment: Any, call: Any, tmp_path: Path) -> None:
+def test_train(meshes: Path, frames: Path, environment: Any, refused: Command, tmp_path: Path) -> None:
     options = (*STEPS, "--paper", "--batch-size", 16, "--classifiers", "ce", "--baselines", "forest", "--epochs", 2)
     command, whole, out = ("train", "--meshes", meshes, *options, "--out"), tmp_path / "whole", tmp_path / "run"
-    assert call(*command, whole)[0] == 0
+    assert run_thor2(*command, whole) == 0
     expected, run = files(whole), load_run(whole)
     places = "checkpoints/fold-0/ce/1", "curves.png", "run.json", "baselines/forest.safetensors", ".thor2-*/views"
     for place in (f"{'after' if place == places[0] else 'before'} {place}" for place in places):
@@ -191,10 +161,10 @@ def test_train(meshes: Path, frames: Path, environment: Any, call: Any, tmp_path
         if "run.json" in written:
             assert equal_models(load_run(out), run)
         else:
-            check_refused(call("evaluate", "frames", frames, "--model", out), f"{out} is not a run directory")
+            assert f"{out} is not a run directory" in refused("evaluate", "frames", frames, "--model", out)
         if "checkpoints/begun.json" in written:
-            check_refused(call(*command, out, "--epochs", 3), f"{out} was written with epochs 2, not 3")
-    assert call(*command, out)[0] == 0
+            assert f"{out} was written with epochs 2, not 3" in refused(*command, out, "--epochs", 3, at_once=False)
+    assert run_thor2(*command, out) == 0
     assert equal_models(load_run(out), run)
     assert not list(out.glob(".*")) and not (out / "views").exists()
     written = files(out)
@@ -219,32 +189,30 @@ def without_times(contents: dict[str, bytes]) -> dict[str, Any]:
     return kept
 
 
-def test_evaluate(frames: Path, model: Path, environment: Any, call: Any, tmp_path: Path) -> None:
+def test_evaluate(frames: Path, model: Path, environment: Any, refused: Command, tmp_path: Path) -> None:
     command, whole, out = (
         ("evaluate", "frames", frames, "--model", model, "--out"),
         tmp_path / "whole",
         tmp_path / "out",
     )
-    assert call(*command, whole)[0] == 0
+    assert run_thor2(*command, whole) == 0
     expected = without_times(files(whole))
     kill("before frames/1.jpg", (*command, out), environment)
     written = without_times(files(out))
     kept = {"frames/0.jpg", "answers.jsonl one"}  # confusions may change with later frames
     assert {name for name in written if "confusions" not in name} == kept
     assert all(written[name] == expected[name] for name in kept)
-    check_refused(
-        call("evaluate", "frames", frames / "one", *command[3:], out), f"out: {out} was written with dataset.path "
-    )
-    assert call(*command, out)[0] == 0
+    error = refused("evaluate", "frames", frames / "one", *command[3:], out)
+    assert f"out: {out} was written with dataset.path " in error
+    assert run_thor2(*command, out) == 0
     assert without_times(files(out)) == expected and files(out).keys() == files(whole).keys()
 
 
-def test_recognize(frames: Path, model: Path, environment: Any, call: Any, tmp_path: Path) -> None:
-    names = {"color": "color.png", "depth": "depth.png", "labels": "mask.png", "intrinsics": "intrinsics.json"}
-    images = [part for option, name in names.items() for part in (f"--{option}", frames / "one" / name)]
+def test_recognize(frames: Path, model: Path, environment: Any, tmp_path: Path) -> None:
+    images = frame_options(frames / "one")
     command, whole, out = ("recognize", "--model", model, *images, "--out"), tmp_path / "whole", tmp_path / "out"
-    assert call(*command, whole)[0] == 0
+    assert run_thor2(*command, whole) == 0
     kill("before recognition.json", (*command, out), environment)
     assert files(out) == {}  # recognition.json is written first: it marks the results as those of the command
-    assert call(*command, out)[0] == 0
+    assert run_thor2(*command, out) == 0
     assert files(out) == files(whole)

@@ -3,8 +3,8 @@
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
+from helpers import brick_and_stick, files_of
 
 import thor2_jax as thor2
 from thor2_jax.model.run_directory import TrainedRun, load_run
@@ -19,24 +19,12 @@ pytestmark = pytest.mark.usefixtures("small_classifiers")
 
 
 def source() -> MemoryViews:
-    rng = np.random.default_rng(0)
-    clouds = {
-        name: [
-            ((rng.random((200, 3)) * size + [0, 0, 0.5]).astype(np.float32), np.full((200, 3), level, np.uint8))
-            for _ in range(3)
-        ]
-        for name, size, level in (("brick", (0.1, 0.05, 0.03), 0), ("stick", (0.2, 0.01, 0.01), 255))
-    }
-    return MemoryViews(clouds, CONFIG)
+    return MemoryViews(brick_and_stick(3), CONFIG)
 
 
 def train(out: Path, **more: Any) -> TrainedRun:
     (run,) = train_run(source(), out, RunSettings(("tops",), OPTIONS, CONFIG), **more)
     return run
-
-
-def contents(folder: Path) -> dict[Path, bytes]:
-    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def test_a_second_training_is_refused(tmp_path: Path) -> None:
@@ -46,14 +34,14 @@ def test_a_second_training_is_refused(tmp_path: Path) -> None:
     def meanwhile(stage: str, done: int, total: int, note: str) -> None:
         if stage == "describe" or done not in (1, total):
             return
-        before = contents(out)
+        before = files_of(out)
         with pytest.raises(thor2.InputError, match=str(out)) as caught:
             train(out)
         refusals.append(str(caught.value))
-        assert contents(out) == before
+        assert files_of(out) == before
 
     train(out, progress=meanwhile)
-    assert refusals and load_run(out).classes == ("brick", "stick")
+    assert refusals and load_run(out).classes == ("red brick", "stick")
     assert not list(out.rglob(".lock"))
 
 

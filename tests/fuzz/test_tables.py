@@ -3,16 +3,15 @@
 import hashlib
 import io
 import json
-import shutil
 import zipfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from dataset_files import band, ocid_scene, pack_pcd, points_of, write_bop, write_folder, write_ocid, write_uwis
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from PIL import Image
 
 import colornet
 from thor2_jax.tables import read_table
@@ -25,81 +24,32 @@ from training.readers.uwis import UWISOccluded
 from training.views.dataset import MANIFEST, Manifest, Shard, ViewDataset, encode
 from training.views.normalized_views import NormalizedViews
 
-HEIGHT, WIDTH = 6, 8
 YAML_BOMB = "\n".join(
     ["a0: &a0 [x, x, x, x, x, x, x, x]"] + [f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 8)}]" for k in range(1, 12)]
 ).encode()
 """A few hundred bytes of YAML that expand to 8^12 words."""
 
 
-def save(path: Path, pixels: np.ndarray) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(pixels).save(path)
-
-
-def images(labels: int = 2) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    rng = np.random.default_rng(0)
-    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
-    mask[2:5, 2:6] = labels
-    return rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8), np.full((HEIGHT, WIDTH), 700, np.uint16), mask
-
-
-def pcd(kind: str) -> bytes:
-    row, column = np.mgrid[:HEIGHT, :WIDTH]
-    z = np.full((HEIGHT, WIDTH), 0.7)
-    points = np.stack([(column - 3.5) / 9 * z, (row - 2.5) / 9 * z, z, np.zeros_like(z)], axis=-1).reshape(-1, 4)
-    header = (
-        "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z rgb\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\n"
-        f"WIDTH {WIDTH}\nHEIGHT {HEIGHT}\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {HEIGHT * WIDTH}\nDATA {kind}\n"
-    ).encode()
-    text = "".join(" ".join(f"{v:.6g}" for v in point) + "\n" for point in points)
-    return header + (points.astype("<f4").tobytes() if kind == "binary" else text.encode())
-
-
 def bop(path: Path) -> tuple[Any, list[str]]:
-    color, depth, mask = images()
-    save(path / "rgb" / "000001.png", color)
-    save(path / "depth" / "000001.png", depth)
-    save(path / "mask_visib" / "000001_000000.png", mask)
-    tables = {
-        "scene_camera.json": {"1": {"cam_K": [9.0, 0, 3.5, 0, 9.0, 2.5, 0, 0, 1], "depth_scale": 1.0}},
-        "scene_gt.json": {"1": [{"obj_id": 3, "cam_t_m2c": [0, 0, 700.5]}]},
-        "scene_gt_info.json": {"1": [{"visib_fract": 0.75}]},
-    }
-    for name, table in tables.items():
-        (path / name).write_text(json.dumps(table))
+    write_bop(path, objects={3: band(2, 6)}, visible=[0.75])
     (path / "names.yaml").write_text("3: mug\n4: bowl\n")
-    return (lambda: list(BOP(path, path / "names.yaml"))), [*tables, "names.yaml"]
+    tables = ["scene_camera.json", "scene_gt.json", "scene_gt_info.json", "names.yaml"]
+    return (lambda: list(BOP(path, path / "names.yaml"))), tables
 
 
 def ocid(path: Path) -> tuple[Any, list[str]]:
-    folder = path / "table" / "top" / "mixed" / "seq01"
-    color, depth, mask = images(3)
-    for name, pixels in (("rgb", color), ("depth", depth), ("label", mask)):
-        save(folder / name / "a.png", pixels)
-    (folder / "pcd").mkdir()
-    (folder / "pcd" / "a.pcd").write_bytes(pcd("binary"))
+    write_ocid(path, "table/top/mixed/seq01", "a", objects=2)
     (path / "names.yaml").write_text("seq01: [mug, bowl]\n")
-    return (lambda: list(OCID(path, path / "names.yaml"))), [
-        "names.yaml",
-        str((folder / "pcd/a.pcd").relative_to(path)),
-    ]
+    return (lambda: list(OCID(path, path / "names.yaml"))), ["names.yaml", "table/top/mixed/seq01/pcd/a.pcd"]
 
 
 def uwis(path: Path) -> tuple[Any, list[str]]:
-    for name, pixels in zip(("rgb", "depth", "labels"), images(), strict=True):
-        save(path / "41" / "images" / f"000001_{name}.png", pixels)
-    (path / "41" / "images" / "000001_poses.yaml").write_text(
-        "mug:\n  label: 2\n  pose: [[1.0, 0, 0], [0, 1, 0]]\nbowl:\n  label: 4\n"
-    )
+    write_uwis(path, "41", "000001", "mug:\n  label: 2\n  pose: [[1.0, 0, 0], [0, 1, 0]]\nbowl:\n  label: 4\n")
     return (lambda: list(UWISOccluded(path))), ["41/images/000001_poses.yaml"]
 
 
 def folders(path: Path) -> tuple[Any, list[str]]:
-    for name, pixels in zip(("color", "depth", "mask"), images(), strict=True):
-        save(path / "one" / f"{name}.png", pixels)
-    (path / "one" / "intrinsics.json").write_text('{"fx": 9.0, "fy": 9.5, "cx": 3.5, "cy": 2.5}')
-    (path / "one" / "labels.json").write_text('{"labels": {"2": "mug"}, "light": 1}')
+    write_folder(path / "one", {"labels": {"2": "mug"}, "light": 1})
     return (lambda: list(FrameFolder(path))), ["one/labels.json", "one/intrinsics.json"]
 
 
@@ -137,11 +87,15 @@ def test_odd_yaml(content: bytes, attempt: Any, tmp_path: Path) -> None:
     attempt(lambda: read_table(path))
 
 
-@pytest.mark.parametrize("kind", ["ascii", "binary"])
+COLOR, DEPTH, LABELS = ocid_scene()
+CLOUDS = {kind: pack_pcd(points_of(DEPTH), COLOR, LABELS, kind) for kind in ("ascii", "binary")}
+
+
+@pytest.mark.parametrize("kind", CLOUDS)
 @given(data=st.data())
 def test_point_clouds(kind: str, data: st.DataObject, attempt: Any, tmp_path_factory: Any) -> None:
     path = tmp_path_factory.getbasetemp() / "a.pcd"
-    path.write_bytes(data.draw(damaged(pcd(kind))))
+    path.write_bytes(data.draw(damaged(CLOUDS[kind])))
     points = attempt(lambda: read_organized_points(path))
     assert points is None or (points.ndim == 3 and points.shape[2] == 3)
 
@@ -272,7 +226,3 @@ def test_networks_round_trip(network: colornet.ColorNetwork, tmp_path_factory: A
     path = tmp_path_factory.getbasetemp() / "network.npz"
     network.save(path)
     assert colornet.load(path).fingerprint == network.fingerprint
-
-
-def test_copies(views: Path, tmp_path: Path) -> None:
-    assert len(read_views(Path(shutil.copytree(views, tmp_path / "views")))) == 3

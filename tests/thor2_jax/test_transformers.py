@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from helpers import SMALL_CONFIG, slow
+from helpers import SMALL_CONFIG, random_clouds, slow
 from sklearn.base import clone
 from sklearn.linear_model import LogisticRegression
 from sklearn.model_selection import GridSearchCV
@@ -25,10 +25,7 @@ NETWORK = colornet.load_default()
 TRANSFORMERS = (thor2.TopsTransformer, thor2.Tops2Transformer)
 
 
-def random_clouds(count: int, seed: int = 0) -> list[tuple[np.ndarray, np.ndarray]]:
-    rng = np.random.default_rng(seed)
-    sizes = rng.integers(1, 300, count)
-    return [(rng.random((n, 3)) * (0.2, 0.1, 0.05), rng.integers(0, 256, (n, 3), np.uint8)) for n in sizes]
+SIZES = (256, 191, 153, 81, 92)
 
 
 def described(clouds: list[Any], config: thor2.DescriptorConfig = SMALL_CONFIG) -> thor2.Descriptors:
@@ -59,7 +56,7 @@ def test_checks_of_scikit_learn(check: str, transformer: Any) -> None:
 
 @pytest.mark.parametrize("count", [5, *slow(1, 3)])
 def test_values_are_those_of_describe(count: int) -> None:
-    clouds = random_clouds(5)
+    clouds = random_clouds(0, SIZES)
     expected = described(clouds)
     for transformer, values in zip(TRANSFORMERS, (expected.tops, expected.tops2), strict=True):
         rows = transformer(config=SMALL_CONFIG).fit_transform(clouds[:count])
@@ -68,7 +65,7 @@ def test_values_are_those_of_describe(count: int) -> None:
 
 
 def test_defaults_are_those_of_the_paper() -> None:
-    clouds = random_clouds(2)
+    clouds = random_clouds(0, SIZES[:2])
     expected = described(clouds, thor2.DescriptorConfig(homology="closed_form"))
     np.testing.assert_allclose(thor2.TopsTransformer().transform(clouds), expected.tops, atol=1e-6)
     np.testing.assert_allclose(thor2.Tops2Transformer().transform(clouds), expected.tops2, atol=1e-6)
@@ -76,13 +73,13 @@ def test_defaults_are_those_of_the_paper() -> None:
 
 def test_more_clouds_than_the_largest_batch(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(transformers, "BATCH_BUCKETS", (1, 2, 4))
-    one = random_clouds(5)
+    one = random_clouds(0, SIZES)
     rows = thor2.Tops2Transformer(config=SMALL_CONFIG).transform(one * 3)
     np.testing.assert_allclose(rows, np.tile(described(one).tops2, (3, 1)), atol=1e-6)
 
 
 def test_shape_needs_no_colors() -> None:
-    clouds = random_clouds(3)
+    clouds = random_clouds(0, SIZES[:3])
     transformer = thor2.TopsTransformer(config=SMALL_CONFIG)
     expected = transformer.transform(clouds)
     np.testing.assert_array_equal(transformer.transform([xyz for xyz, _ in clouds]), expected)
@@ -92,7 +89,7 @@ def test_shape_needs_no_colors() -> None:
 
 def test_another_network() -> None:
     network = dataclasses.replace(NETWORK, similarity=np.eye(NETWORK.n_regions))
-    clouds = random_clouds(2)
+    clouds = random_clouds(0, SIZES[:2])
     expected = thor2.describe(thor2.PointClouds.pack(clouds), network, SMALL_CONFIG).tops2
     transformer = thor2.Tops2Transformer(config=SMALL_CONFIG, network=network)
     np.testing.assert_allclose(transformer.transform(clouds), expected, atol=1e-6)
@@ -113,7 +110,7 @@ def test_names_follow_the_layout(transformer: Any) -> None:
 
 @pytest.mark.parametrize("transformer", TRANSFORMERS)
 def test_data_frames(transformer: Any) -> None:
-    clouds = random_clouds(3)
+    clouds = random_clouds(0, SIZES[:3])
     plain = transformer(config=SMALL_CONFIG)
     frame = clone(plain).set_output(transform="pandas").fit_transform(clouds)
     assert isinstance(frame, pd.DataFrame) and list(frame.columns) == list(plain.get_feature_names_out())
@@ -122,7 +119,7 @@ def test_data_frames(transformer: Any) -> None:
 
 @pytest.mark.parametrize("transformer", TRANSFORMERS)
 def test_clones_and_pickles_give_equal_values(transformer: Any) -> None:
-    clouds = random_clouds(2)
+    clouds = random_clouds(0, SIZES[:2])
     original = transformer(config=SMALL_CONFIG, capacity=1024).fit(clouds)
     expected = original.transform(clouds)
     for copy in (clone(original), pickle.loads(pickle.dumps(original))):
@@ -172,16 +169,15 @@ INVALID = {
 
 
 @pytest.mark.parametrize("message", INVALID)
-def test_bad_input_is_one_line(message: str) -> None:
+def test_bad_input_is_refused(message: str) -> None:
     for method in ("fit", "transform"):
-        with pytest.raises(thor2.InputError, match=re.escape(message)) as error:
+        with pytest.raises(thor2.InputError, match=re.escape(message)):
             getattr(thor2.Tops2Transformer(config=SMALL_CONFIG), method)(INVALID[message])
-        assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize("cloud", [7, "cloud", np.zeros(3), [[0.0, 1.0, 2.0], [0.0], [1.0]], np.full((2, 3), np.inf)])
-def test_bad_shapes_are_one_line(cloud: Any) -> None:
-    with pytest.raises(thor2.InputError, match=r"^X\[1\]: xyz[^\n]*$"):
+def test_bad_shapes_are_refused(cloud: Any) -> None:
+    with pytest.raises(thor2.InputError, match=r"^X\[1\]: xyz"):
         thor2.TopsTransformer(config=SMALL_CONFIG).transform([XYZ, cloud])
 
 
@@ -196,11 +192,11 @@ def test_bad_parameters_are_named(parameters: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize("transformer", TRANSFORMERS)
 def test_millimetres_give_a_warning(transformer: Any) -> None:
-    clouds = random_clouds(2)
+    clouds = random_clouds(0, SIZES[:2])
     with pytest.warns(UserWarning, match=r"^X\[1\] is .* millimetres"):
         transformer(config=SMALL_CONFIG).transform([clouds[0], (clouds[1][0] * 1000, clouds[1][1])])
 
 
 def test_empty_clouds_are_rows_of_zeros() -> None:
-    rows = thor2.TopsTransformer(config=SMALL_CONFIG).transform([np.zeros((0, 3)), random_clouds(1)[0]])
+    rows = thor2.TopsTransformer(config=SMALL_CONFIG).transform([np.zeros((0, 3)), random_clouds(0, SIZES[:1])[0]])
     assert not rows[0].any() and rows[1].any()

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
+from helpers import DEGENERATE
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
@@ -50,31 +51,25 @@ def shapes() -> list[np.ndarray]:
     return clouds
 
 
-DEGENERATE = {
-    "empty": np.zeros((0, 3)),
-    "one point": np.array([[0.3, -0.2, 1.5]]),
-    "two points": np.array([[0.3, -0.2, 1.5], [0.4, 0.1, 1.2]]),
+CLOUDS = {
+    **DEGENERATE,
     "three points": np.array([[0, 0, 0], [1.0, 0, 0], [0, 2.0, 0]]),
-    "all equal": np.full((101, 3), 0.7),
-    "line": np.linspace(0, 1, 101)[:, None] * [1.0, 2.0, -1.0],
-    "plane": np.random.default_rng(0).random((101, 2)) @ [[1.0, 0, 1.0], [0, 1.0, 0]],
-    "cube": np.array(list(itertools.product((-1.0, 1.0), repeat=3))),
     "ball": trimesh.creation.icosphere(2).vertices,
 }
 
 
-@pytest.mark.parametrize("name", DEGENERATE)
+@pytest.mark.parametrize("name", CLOUDS)
 def test_axes_of_degenerate_clouds_are_orthonormal(name: str) -> None:
-    axes, sides = box_of(DEGENERATE[name])
+    axes, sides = box_of(CLOUDS[name])
     np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-5)
     assert sides[0] >= sides[1] - 1e-5 and sides[1] >= sides[2] - 1e-5
 
 
 def test_the_boxes_of_a_line_a_plane_and_a_cube() -> None:
-    np.testing.assert_allclose(box_of(DEGENERATE["line"])[1], [np.sqrt(6), 0, 0], atol=1e-5)
+    np.testing.assert_allclose(box_of(DEGENERATE["line"])[1], [0.2 * np.sqrt(6), 0, 0], atol=1e-5)
     assert box_of(DEGENERATE["plane"])[1][2] < 1e-5
     turned = DEGENERATE["cube"] @ Rotation.from_euler("xyz", [0.3, 0.5, 0.7]).as_matrix().T
-    assert np.prod(box_of(turned)[1]) <= 8 * 1.05
+    assert np.prod(box_of(turned)[1]) <= 0.2**3 * 1.05
 
 
 @pytest.mark.parametrize("seed", range(10))

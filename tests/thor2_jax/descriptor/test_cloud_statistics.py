@@ -5,6 +5,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+from helpers import random_clouds
 
 import colornet
 import thor2_jax as thor2
@@ -23,9 +24,8 @@ CONFIG = thor2.DescriptorConfig(homology="closed_form")
 
 
 def test_statistics_of_a_cloud() -> None:
-    rng = np.random.default_rng(0)
-    points, colors = rng.random((300, 3)) * (0.2, 0.1, 0.05), rng.integers(0, 256, (300, 3), np.uint8)
-    clouds = thor2.PointClouds.pack([(points.astype(np.float32), colors)])
+    ((points, colors),) = random_clouds(0, [300])
+    clouds = thor2.PointClouds.pack([(points, colors)])
     aligned, network = thor2.align(clouds, CONFIG), colornet.load_default()
     described = strips(aligned, network, CONFIG)
     values = np.asarray(cloud_statistics(jnp.asarray([[0.5, 0.25, 0.125]]), aligned, described))[0]

@@ -131,33 +131,6 @@ def test_batches_in_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
         jax.tree.map(lambda a, b, same=same: same(a, b[order]), actual[k], expected[k])
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("homology", ["gudhi", "closed_form"])
-def test_inside_a_callers_jit_and_vmap(homology: str) -> None:
-    """Uses a new network, so that no result of an earlier trace can be reused."""
-    network = dataclasses.replace(NETWORK, n_raw_nodes={"gudhi": 24, "closed_form": 25}[homology])
-    config = thor2.DescriptorConfig(homology=homology)
-    packed = thor2.PointClouds.pack([aligned_cloud(k, n) for k, n in enumerate((512, 0, 33, 1))])
-    jitted = jax.jit(lambda clouds: thor2.describe_aligned(clouds, network, config))(packed)
-    plain = thor2.describe_aligned(packed, network, config)
-    pairs = jax.tree.map(lambda a: a.reshape(2, 2, *a.shape[1:]), packed)
-    mapped = jax.jit(jax.vmap(lambda clouds: thor2.describe_aligned(clouds, network, config)))(pairs)
-    for descriptors in (jitted, mapped):
-        np.testing.assert_allclose(descriptors.tops2.reshape(4, -1), plain.tops2, rtol=1e-6, atol=1e-6)
-        np.testing.assert_array_equal(descriptors.overflow.reshape(4), plain.overflow)
-
-
-def test_both_backends_give_the_same_floats() -> None:
-    rng = np.random.default_rng(0)
-    packed = thor2.PointClouds.pack([aligned_cloud(k, int(n)) for k, n in enumerate(rng.integers(0, 513, 128))])
-    first, second = (
-        thor2.describe_aligned(packed, NETWORK, thor2.DescriptorConfig(homology=homology))
-        for homology in ("gudhi", "closed_form")
-    )
-    np.testing.assert_array_equal(first.tops2, second.tops2)
-    np.testing.assert_array_equal(first.overflow, second.overflow)
-
-
 def test_input_that_is_no_batch_of_clouds_is_refused() -> None:
     packed = thor2.PointClouds.pack([aligned_cloud(0, 5)])
     one, batches = jax.tree.map(lambda a: a[0], packed), jax.tree.map(lambda a: a[None], packed)

@@ -16,6 +16,7 @@ from thor2_jax.frames.instance_clouds import instance_cloud
 
 METRES = np.random.default_rng(0).uniform(0.3, 2.5, (5, 7)).astype(np.float32)
 UNITS = (METRES * 1000).astype(np.uint16)
+UNITS[0, :2] = 0, 65_535
 
 
 def write_exr(path: Path, **channels: np.ndarray) -> None:
@@ -82,9 +83,8 @@ def test_invalid_exr_files(tmp_path: Path) -> None:
     whole = (tmp_path / "two.exr").read_bytes()
     for content in (b"", b"no EXR", whole[:50], whole[: len(whole) // 2]):
         (tmp_path / "bad.exr").write_bytes(content)
-        with pytest.raises(InputError, match=r"^depth: .*bad\.exr is a damaged EXR file") as caught:
+        with pytest.raises(InputError, match=r"^depth: .*bad\.exr is a damaged EXR file"):
             read_depth(tmp_path / "bad.exr")
-        assert "\n" not in str(caught.value)
     with pytest.raises(FileNotFoundError):
         read_depth(tmp_path / "absent.exr")
 
@@ -125,9 +125,8 @@ def test_damaged_npy_files(tmp_path: Path) -> None:
     huge = whole.replace(b"(5, 7), }  ", b"(65536, 65536), }"[:11].ljust(11))
     for content in (b"", b"text", whole[:20], whole[:-3], objects.getvalue(), huge):
         (tmp_path / "d.npy").write_bytes(content)
-        with pytest.raises(InputError, match=r"^depth: .*d\.npy ") as caught:
+        with pytest.raises(InputError, match=r"^depth: .*d\.npy "):
             read_depth(tmp_path / "d.npy")
-        assert "\n" not in str(caught.value)
 
 
 def test_an_array_that_would_fill_memory(tmp_path: Path) -> None:

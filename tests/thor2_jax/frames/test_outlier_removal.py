@@ -146,21 +146,6 @@ def test_a_point_that_leaves_a_block_along_its_diagonal(start: float) -> None:
     assert counts[0] == 65 and counts[-1] == 64
 
 
-def test_small_clusters_stay_from_31_points() -> None:
-    plane, cube = grid(15, 15), np.argwhere(np.ones((4, 3, 3))) * 0.003 + [0.1, 0.1, 0.8]
-    sizes = np.arange(22, 36)
-    counts = [assert_equals_loops(np.concatenate([plane, cube[:size]])) - 225 for size in sizes]
-    np.testing.assert_array_equal(counts, np.where(sizes > 30, sizes, 0))
-
-
-def test_isolated_points_are_removed() -> None:
-    plane = grid(40, 40)
-    strays = np.array([[0.06, 0.06, -0.05], [0.2, 0.06, 0], [-0.03, -0.03, 0], [0.06, 0.06, 0.4]])
-    kept, relaxed = remove_outliers(np.concatenate([strays, plane]))
-    np.testing.assert_array_equal(kept, np.arange(4, 1604))
-    assert not relaxed
-
-
 @pytest.mark.parametrize(("size", "stays"), [(99, False), (100, True), (101, True)])
 def test_pieces_stay_from_a_tenth_of_the_largest(size: int, stays: bool) -> None:
     plane = grid(25, 40) + 0.001

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import SMALL_CONFIG, untrained_run
+from helpers import small_embedding, untrained_run
 
 import thor2_jax as thor2
 from thor2_jax.gallery.augment import augmented_copies
-from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
+from thor2_jax.gallery.embedding import Embedding
 from thor2_jax.gallery.enrollment import LOOKS, instance_view
 from thor2_jax.gallery.objects import ObjectGallery
 from thor2_jax.gallery.union import ClassUnion
@@ -21,12 +21,11 @@ from thor2_jax.model.run_directory import EMBEDDING_FILE, TrainedRun, load_run, 
 from training.objects.builtin_objects import builtin_objects
 
 INTRINSICS = thor2.Intrinsics(600.0, 600.0, 159.5, 119.5)
-SIZES = EmbeddingSizes(4, (16,), 8, 4)
 
 
 @pytest.fixture(scope="module")
 def embedding() -> Embedding:
-    return Embedding.create(SMALL_CONFIG, sizes=SIZES)
+    return small_embedding()
 
 
 @pytest.fixture(scope="module")
@@ -242,7 +241,7 @@ def test_a_run_directory_keeps_its_gallery(embedding: Embedding, tmp_path: Path)
 
 
 def test_another_embedding_embeds_the_views_again(embedding: Embedding, tmp_path: Path) -> None:
-    path, other = tmp_path / "run", Embedding.create(SMALL_CONFIG, sizes=SIZES, seed=1)
+    path, other = tmp_path / "run", small_embedding(1)
     save_run(untrained_run((), ()), path)
     embedding.save(path / EMBEDDING_FILE)
     thor2.Recognizer.load(path).enroll("brick", [(CLUTTER, 1)])

@@ -19,6 +19,7 @@ from recording_files import (
     camera_info,
     image,
     table_frame,
+    write_images,
     write_recording,
 )
 
@@ -58,8 +59,7 @@ def test_a_single_database_file(tmp_path: Path) -> None:
 def test_the_file_of_intrinsics_replaces_the_topic(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     with bag_writer(path) as write:
-        write(COLOR, image(FRAMES[0].color, "rgb8"), START)
-        write(DEPTH, image(FRAMES[0].depth, "16UC1"), START)
+        write_images(write, FRAMES[0], camera=False)
     with pytest.raises(InputError, match="camera_topic"), Bag(path):
         pass
     with Bag(path, intrinsics=thor2.Intrinsics(300, 300, 160, 120), depth_scale=5000) as bag:
@@ -131,7 +131,7 @@ def test_damaged_recordings(tmp_path: Path, name: str, kept: float) -> None:
             for recorded in bag.frames():
                 recorded.read()
     except InputError as error:
-        assert str(path) in str(error) and "\n" not in str(error)
+        assert str(path) in str(error)
     else:
         assert kept == 1, "a truncated recording was read without an error"
 

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from recording_files import camera_info, compressed, compressed_depth, encoded, image
+from helpers import encode_image
+from recording_files import camera_info, compressed, compressed_depth, image
 
 import thor2_jax as thor2
 from thor2_jax.errors import InputError
@@ -62,14 +63,14 @@ def test_raw_images_of_too_many_pixels(encoding: str, read: Callable[[Any], Any]
 
 
 def test_compressed_images() -> None:
-    png = compressed(encoded(COLOR, "PNG"), "bgr8; png compressed bgr8")
+    png = compressed(encode_image(COLOR, "PNG"), "bgr8; png compressed bgr8")
     np.testing.assert_array_equal(color_image(png), COLOR)
     smooth = np.broadcast_to(np.array([200, 60, 20], np.uint8), (16, 16, 3))
-    jpeg = compressed(encoded(smooth, "JPEG", quality=95), "jpeg")
+    jpeg = compressed(encode_image(smooth, "JPEG", quality=95), "jpeg")
     assert np.abs(color_image(jpeg).astype(int) - smooth).max() < 6
     depth = compressed_depth(DEPTH)
     np.testing.assert_array_equal(depth_image(depth), DEPTH)
-    plain = compressed(encoded(DEPTH, "PNG"), "png")
+    plain = compressed(encode_image(DEPTH, "PNG"), "png")
     np.testing.assert_array_equal(depth_image(plain), DEPTH)
     assert [image_kind(one) for one in (png, jpeg, depth, plain)] == ["color", "color", "depth", "depth"]
 
@@ -80,7 +81,7 @@ def test_compressed_float_depth() -> None:
     scale, offset = 100 * 101.0, 1 - 100 * 101.0 / 10
     quantized = np.round(scale / metres + offset).astype(np.uint16)
     quantized[0, 0] = 0
-    content = struct.pack("<iff", 0, scale, offset) + encoded(quantized, "PNG")
+    content = struct.pack("<iff", 0, scale, offset) + encode_image(quantized, "PNG")
     read = depth_image(compressed(content, "32FC1; compressedDepth png"))
     assert read[0, 0] == 0
     np.testing.assert_allclose(read.ravel()[1:], metres.ravel()[1:], rtol=2e-4)
@@ -92,9 +93,9 @@ def test_compressed_float_depth() -> None:
         (color_image, image(DEPTH.astype(np.uint8), "mono8")),
         (color_image, image(COLOR, "bayer_rggb8")),
         (depth_image, image(COLOR, "rgb8")),
-        (color_image, compressed(encoded(COLOR, "PNG")[:40], "png")),
-        (color_image, compressed(encoded(DEPTH, "PNG"), "png")),
-        (depth_image, compressed(encoded(COLOR, "PNG"), "16UC1; png compressed")),
+        (color_image, compressed(encode_image(COLOR, "PNG")[:40], "png")),
+        (color_image, compressed(encode_image(DEPTH, "PNG"), "png")),
+        (depth_image, compressed(encode_image(COLOR, "PNG"), "16UC1; png compressed")),
         (depth_image, compressed(b"123", "16UC1; compressedDepth png")),
         (depth_image, compressed(b"0" * 99, "16UC1; compressedDepth rvl")),
     ],

@@ -11,22 +11,29 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import httpx
-import numpy as np
+import hypothesis
 import pytest
+import schemathesis
 import uvicorn
 from fastapi import FastAPI
-from helpers import SMALL_CONFIG, encode_image, untrained_run
+from helpers import encode_image, patches, small_embedding, tilted, untrained_run
+from hypothesis import HealthCheck
 from playwright.sync_api import Browser, Page, Route, expect
 from processes import HANG
+from schemathesis.checks import not_a_server_error
+from schemathesis.specs.openapi.checks import (
+    content_type_conformance,
+    response_schema_conformance,
+    status_code_conformance,
+)
 from segmentation_scenes import Box, render
 
 import thor2_jax as thor2
 from thor2_jax.adaptation import online
 from thor2_jax.explanation import class_scores
-from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
 from thor2_jax.model.run_directory import EMBEDDING_FILE, save_run
 from thor2_jax.service import engine
 from thor2_jax.service.app import create_app
@@ -37,7 +44,6 @@ expect.set_options(timeout=1000 * HANG)
 Files = dict[str, bytes]
 SAMPLE_INDEX = Path(thor2.__file__).parent / "service" / "page" / "samples" / "index.json"
 CLASSES = tuple(sorted({name for sample in json.loads(SAMPLE_INDEX.read_text()) for name in sample["objects"]}))
-CAMERA = {"fx": 600.0, "fy": 600.0, "cx": 159.5, "cy": 119.5}
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -69,7 +75,7 @@ def teaching_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run with two classes and a small embedding, which compiles quickly."""
     folder = tmp_path_factory.mktemp("teaching") / "run"
     save_run(untrained_run(("a", "b"), ("tops", "tops2")), folder)
-    Embedding.create(SMALL_CONFIG, sizes=EmbeddingSizes(4, (16,), 8, 4)).save(folder / EMBEDDING_FILE)
+    small_embedding().save(folder / EMBEDDING_FILE)
     return folder
 
 
@@ -82,20 +88,17 @@ def classes() -> tuple[str, ...]:
 @pytest.fixture(scope="session")
 def frame() -> thor2.RGBDFrame:
     """A coloured plane with three usable instances and one that is too small."""
-    labels = np.zeros((240, 320), np.uint8)
-    labels[20:100, 20:90] = 3
-    labels[200:203, 10:13] = 5
-    labels[20:60, 150:250] = 7
-    labels[120:220, 100:150] = 200
-    depth = np.broadcast_to(600 + np.arange(320) // 2, (240, 320)).astype(np.uint16)
-    color = np.random.default_rng(0).integers(0, 256, (240, 320, 3), dtype=np.uint8)
-    return thor2.RGBDFrame(color, depth, labels, thor2.Intrinsics(**CAMERA))
+    return tilted(patches())
+
+
+def camera_file(frame: thor2.RGBDFrame) -> bytes:
+    return json.dumps({name: getattr(frame.intrinsics, name) for name in ("fx", "fy", "cx", "cy")}).encode()
 
 
 @pytest.fixture(scope="session")
 def files(frame: thor2.RGBDFrame) -> Files:
     images = {name: encode_image(getattr(frame, name)) for name in ("color", "depth", "labels")}
-    return {**images, "intrinsics": json.dumps(CAMERA).encode()}
+    return {**images, "intrinsics": camera_file(frame)}
 
 
 @pytest.fixture(scope="session")
@@ -112,9 +115,8 @@ def scene() -> thor2.RGBDFrame:
 @pytest.fixture(scope="session")
 def unlabelled(scene: thor2.RGBDFrame) -> Files:
     """The files of the scene, without labels."""
-    intrinsics = {name: getattr(scene.intrinsics, name) for name in ("fx", "fy", "cx", "cy")}
     images = {name: encode_image(getattr(scene, name)) for name in ("color", "depth")}
-    return {**images, "intrinsics": json.dumps(intrinsics).encode()}
+    return {**images, "intrinsics": camera_file(scene)}
 
 
 SERVE = """
@@ -216,6 +218,24 @@ def teaching_url(teaching_app: FastAPI) -> Iterator[str]:
     finally:
         server.should_exit = True
         thread.join()
+
+
+@pytest.fixture(scope="session")
+def assert_conforms() -> Callable[..., None]:
+    """Return a function that sends generated requests for an operation and checks the answers against the document."""
+    checks = [not_a_server_error, status_code_conformance, content_type_conformance, response_schema_conformance]
+
+    def assert_operation_conforms(document: Any, path: str, method: str, examples: int) -> None:
+        everything = list(HealthCheck)
+
+        @hypothesis.settings(max_examples=examples, deadline=None, derandomize=True, suppress_health_check=everything)
+        @hypothesis.given(case=document[path][method].as_strategy())
+        def call(case: schemathesis.Case) -> None:
+            case.call_and_validate(checks=checks)
+
+        call()
+
+    return assert_operation_conforms
 
 
 @pytest.fixture

@@ -5,18 +5,23 @@ from pathlib import Path
 
 import jax
 import pytest
-from helpers import SMALL_CONFIG, untrained_embedding_run, untrained_run
+from helpers import SMALL_CONFIG, assert_same_answers, small_embedding, untrained_embedding_run, untrained_run
 
 import thor2_jax as thor2
 from thor2_jax.explanation.explain import explain_instance
-from thor2_jax.frames.prepared_instance import prepare_instance
-from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
+from thor2_jax.frames.prepared_instance import PreparedInstance, prepare_instance
 from thor2_jax.model.confidence import Calibration
 from thor2_jax.model.run_directory import EMBEDDING_FILE, save_run
-from thor2_jax.service.engine import InferenceEngine
+from thor2_jax.service.engine import CloudResult, InferenceEngine
 from thor2_jax.service.settings import Settings
 
 pytestmark = pytest.mark.usefixtures("small_buckets")
+
+
+def inferred(engine: InferenceEngine, frame: thor2.RGBDFrame) -> tuple[list[PreparedInstance], list[CloudResult]]:
+    """Return the instances of a frame, and the results of those that can be used."""
+    instances = [prepare_instance(frame, label, engine.run.config.sigma_s) for label in frame.instances]
+    return instances, engine.infer([instance for instance in instances if instance.reason is None])
 
 
 @pytest.mark.parametrize(
@@ -32,19 +37,14 @@ def test_the_engine_answers_as_the_recognizer(
 ) -> None:
     record: dict[str, object] = {} if answer_by is None else {"answer_by": answer_by}
     save_run(untrained_run(trained, ("tops", "tops2") if trained else (), record=record), tmp_path / "run")
-    Embedding.create(SMALL_CONFIG, sizes=EmbeddingSizes(4, (16,), 8, 4)).save(tmp_path / "run" / EMBEDDING_FILE)
+    small_embedding().save(tmp_path / "run" / EMBEDDING_FILE)
     recognizer = thor2.Recognizer.load(tmp_path / "run")
     recognizer.enroll("tall", [(frame, 200)])
     recognizer.enroll("wide", [(frame, 7)])
     engine = InferenceEngine(Settings(tmp_path / "run", max_batch=8))
     assert engine.model.names == (*trained, "tall", "wide")
-    instances = [prepare_instance(frame, label, engine.run.config.sigma_s) for label in frame.instances]
-    results = engine.infer([instance for instance in instances if instance.reason is None])
-    answers = engine.recognize(instances, results)
-    for answer, expected in zip(answers, recognizer.recognize(frame), strict=True):
-        assert (answer.label, answer.name, answer.reason) == (expected.label, expected.name, expected.reason)
-        assert answer.confidence == pytest.approx(expected.confidence, abs=1e-4)
-        assert answer.classifier == expected.classifier and answer.top.keys() == expected.top.keys()
+    instances, results = inferred(engine, frame)
+    assert_same_answers(engine.recognize(instances, results), recognizer.recognize(frame), 1e-4)
     assert engine.calibrated_confidences(results) == [None] * 3
     unusable = [instance for instance in instances if instance.reason is not None]
     assert [answer.name for answer in engine.recognize(unusable, [])] == [None]
@@ -57,14 +57,10 @@ def test_an_embedding_alone_answers(calibration: Calibration | None, frame: thor
     save_run(run, tmp_path / "run")
     engine = InferenceEngine(Settings(tmp_path / "run", max_batch=8))
     assert engine.model.names == ("a", "b", "c") and tuple(engine.model.classifiers) == ("embedding",)
-    instances = [prepare_instance(frame, label, engine.run.config.sigma_s) for label in frame.instances]
-    results = engine.infer([instance for instance in instances if instance.reason is None])
+    instances, results = inferred(engine, frame)
     recognizer = thor2.Recognizer.load(tmp_path / "run")
     answers, expected = engine.recognize(instances, results), recognizer.recognize(frame)
-    for answer, one in zip(answers, expected, strict=True):
-        assert (answer.label, answer.name, answer.reason) == (one.label, one.name, one.reason)
-        assert answer.confidence == pytest.approx(one.confidence, abs=1e-4)
-        assert answer.classifier == one.classifier and answer.top.keys() == one.top.keys()
+    assert_same_answers(answers, expected, 1e-4)
     calibrated = engine.calibrated_confidences(results)
     of_usable = [one.confidence for one in expected if one.confidence is not None]
     assert len(of_usable) == len(results) and {one.classifier for one in answers} <= {"embedding", None}

@@ -10,7 +10,7 @@ import httpx
 import numpy as np
 import pytest
 from helpers import encode_image
-from page_actions import FIELDS, upload, wait_for_answer, wait_until
+from page_actions import FIELDS, changed_answers, upload, wait_for_answer, wait_until
 from PIL import Image
 from playwright.sync_api import Locator, Page, Route, expect
 
@@ -34,21 +34,6 @@ def unfold(page: Page) -> None:
     """Open the details, which are folded on a phone."""
     for summary in page.locator("#evidence .fold > summary").all():
         summary.tap()
-
-
-def changed_answers(change: Callable[[Any], None]) -> Callable[[Route], None]:
-    """Return a route that changes the answers of /v1/explain."""
-
-    def handle(route: Route) -> None:
-        if "explain" not in route.request.url:
-            route.continue_()
-            return
-        response = route.fetch()
-        answer = response.json()
-        change(answer)
-        route.fulfill(response=response, json=answer)
-
-    return handle
 
 
 def pixels(canvas: Locator) -> np.ndarray:
@@ -210,16 +195,8 @@ def test_errors_appear_beside_their_fields(open_page: Open, http: httpx.Client, 
 
 def test_samples_need_a_model_that_knows_their_objects(open_page: Open, classes: tuple[str, ...]) -> None:
     def with_classes(*names: str) -> Callable[[Route], None]:
-        def route(route: Route) -> None:
-            if "/v1/model" not in route.request.url:
-                route.continue_()
-                return
-            response = route.fetch()
-            route.fulfill(
-                response=response, json=response.json() | {"classes": names, "knows": f"{len(names)} objects"}
-            )
-
-        return route
+        changes = {"classes": names, "knows": f"{len(names)} objects"}
+        return changed_answers(lambda model: model.update(changes), "/v1/model")
 
     page = open_page(with_classes("camera", "lamp"), samples=0)
     expect(page.locator("#no-samples")).to_be_visible()

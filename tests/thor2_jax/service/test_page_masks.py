@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from page_actions import upload, wait_for_answer
+from page_actions import answered, changed_answers, upload, wait_for_answer
 from PIL import Image
 from playwright.sync_api import Page, Route, expect
 
@@ -106,14 +106,7 @@ def test_a_piece_is_split_along_a_cut(open_page: Open, unlabelled: Files, labels
 
 
 def test_labels_are_required_where_the_service_does_not_segment(open_page: Open, unlabelled: Files) -> None:
-    def refusing(route: Route) -> None:
-        if "/v1/model" not in route.request.url:
-            route.continue_()
-            return
-        response = route.fetch()
-        route.fulfill(response=response, json=response.json() | {"segmenter": None})
-
-    page = open_page(refusing)
+    page = open_page(changed_answers(lambda model: model.update(segmenter=None), "/v1/model"))
     upload(page, unlabelled)
     expect(page.locator("#labels-error")).to_have_text("Choose a file.")
     expect(page.locator("#labels-hint")).not_to_contain_text("segmented")
@@ -121,14 +114,7 @@ def test_labels_are_required_where_the_service_does_not_segment(open_page: Open,
 
 def test_a_failing_segmenter_is_reported_beside_the_labels(open_page: Open, unlabelled: Files) -> None:
     message = "segmenter sam failed on the frame (RuntimeError: no weights); check its package, or send labels."
-
-    def failing(route: Route) -> None:
-        if "explain" not in route.request.url:
-            route.continue_()
-        else:
-            route.fulfill(status=500, json={"field": "labels", "message": message})
-
-    page = open_page(failing)
+    page = open_page(answered("/v1/explain", status=500, json={"field": "labels", "message": message}))
     upload(page, unlabelled)
     expect(page.locator("#labels-error")).to_have_text(message)
 

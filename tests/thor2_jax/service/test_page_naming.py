@@ -1,10 +1,11 @@
 """Naming objects on the web page of a service that teaches."""
 
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import httpx
 import pytest
-from page_actions import upload
+from page_actions import answered, changed_answers, upload
 from playwright.sync_api import Page, Route, expect
 
 Open = Callable[..., Page]
@@ -20,17 +21,12 @@ def open_teaching(open_page: Open, teaching_url: str) -> Iterator[Open]:
             httpx.delete(f"{teaching_url}/v1/objects/{each['name']}")
 
 
-def without_trained_classes(route: Route) -> None:
+@changed_answers
+def without_trained_classes(answer: Any) -> None:
     """Answer that objects of trained classes, whose weights are random, are unknown."""
-    if "explain" not in route.request.url:
-        route.continue_()
-        return
-    response = route.fetch()
-    answer = response.json()
     for one in answer["instances"]:
         if one["name"] in ("a", "b"):
             one.update(name=None, unrecognized="unknown: a confidence of 0.100, below 0.5")
-    route.fulfill(response=response, json=answer)
 
 
 def recognize(page: Page, files: Files) -> None:
@@ -132,15 +128,8 @@ def test_problems_of_a_name_appear_beside_it(open_teaching: Open, files: Files) 
 
 
 def test_errors_of_the_gallery_are_shown(open_teaching: Open, files: Files) -> None:
-    def full(route: Route) -> None:
-        if route.request.url.endswith("/v1/objects"):
-            route.fulfill(
-                status=507, json={"field": None, "message": "The gallery cannot be written; it is as before."}
-            )
-        else:
-            route.continue_()
-
-    page = open_teaching(full)
+    problem = {"field": None, "message": "The gallery cannot be written; it is as before."}
+    page = open_teaching(answered("/v1/objects", status=507, json=problem))
     recognize(page, files)
     name_object(page, 200, "mug")
     expect(page.locator("#name-error")).to_have_text("The gallery cannot be written; it is as before.")

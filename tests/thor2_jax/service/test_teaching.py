@@ -13,16 +13,12 @@ from typing import Any
 
 import filelock
 import httpx
-import hypothesis
 import numpy as np
 import pytest
 import schemathesis
 from fastapi import FastAPI
-from helpers import encode_image
-from hypothesis import HealthCheck
+from helpers import encode_image, files_of, full_disk
 from processes import HANG, wait_until
-from schemathesis.checks import not_a_server_error
-from schemathesis.specs.openapi.checks import response_schema_conformance, status_code_conformance
 
 import thor2_jax as thor2
 from thor2_jax.client import Client, ServiceError
@@ -72,14 +68,6 @@ def compilations(http: httpx.Client) -> float:
     match = re.search(r"^thor2_compilations_after_warm_up_total (.*)$", http.get("/metrics").text, re.M)
     assert match is not None
     return float(match[1])
-
-
-def content(directory: Path) -> dict[str, bytes]:
-    return {
-        str(path.relative_to(directory)): path.read_bytes()
-        for path in directory.rglob("*")
-        if path.is_file() and path.name != ".lock"
-    }
 
 
 def test_the_next_frame_knows_an_enrolled_object(http: httpx.Client, files: Files) -> None:
@@ -255,11 +243,11 @@ BAD_FIELDS: dict[str, tuple[dict[str, Any], str]] = {
 
 def test_bad_fields_are_refused_in_one_line(http: httpx.Client, files: Files, gallery: Path) -> None:
     enroll(http, files, "tall")
-    before = content(gallery)
+    before = files_of(gallery)
     for case, (change, field) in BAD_FIELDS.items():
         answer = http.post("/v1/objects", files=files, data={"name": "new", "instance": "200", **change})
         check_refused(answer, 422, field)
-        assert content(gallery) == before and known(http) == {"tall": 1}, case
+        assert files_of(gallery) == before and known(http) == {"tall": 1}, case
 
 
 def check_refused(answer: httpx.Response, status: int, field: str | None) -> None:
@@ -292,19 +280,15 @@ def test_a_full_disk_leaves_the_gallery(
     http: httpx.Client, files: Files, gallery: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     generation = enroll(http, files, "tall").json()["generation"]
-    before = content(gallery)
-
-    def fail(*_: object) -> None:
-        raise OSError(28, "No space left on device", "/tmp/secret")
-
+    before = files_of(gallery)
     for step in ("_write_durably", "write_text"):
         with monkeypatch.context() as patch:
-            patch.setattr(store, step, fail)
+            patch.setattr(store, step, full_disk)
             check_refused(enroll(http, files, "wide", 7), 507, None)
             if step == "write_text":
                 check_refused(http.delete("/v1/objects/tall"), 507, None)
                 check_refused(http.post("/v1/objects/undo", files={"generation": str(generation).encode()}), 507, None)
-        assert content(gallery) == before and known(http) == {"tall": 1}
+        assert files_of(gallery) == before and known(http) == {"tall": 1}
     assert enroll(http, files, "wide", 7).status_code == 200
 
 
@@ -361,14 +345,14 @@ def test_a_change_waits_for_another_writer(
             answer = enroll(http, files, "wide", 7)
     assert answer.status_code == 200 and answer.json()["timings"]["gallery"] > 100
     monkeypatch.setattr(pipeline, "LOCK_SHARE", 1e-3)
-    before = content(gallery)
+    before = files_of(gallery)
     with lock:
         refused = enroll(http, files, "other")
         assert refused.headers["retry-after"] == "1"
         check_refused(refused, 503, None)
         assert recognized(http, files)[2:] == ["wide", "tall"]
     monkeypatch.undo()
-    assert content(gallery) == before and enroll(http, files, "other").status_code == 200
+    assert files_of(gallery) == before and enroll(http, files, "other").status_code == 200
 
 
 @pytest.mark.parametrize(
@@ -422,15 +406,10 @@ def test_two_clients_at_once_lose_no_change(http: httpx.Client, files: Files) ->
 @pytest.mark.parametrize(
     ("method", "path"), [("POST", "/v1/objects"), ("DELETE", "/v1/objects/{name}"), ("POST", "/v1/objects/undo")]
 )
-def test_openapi_requests_conform(method: str, path: str, http: httpx.Client) -> None:
-    document = schemathesis.openapi.from_url(f"{http.base_url}/openapi.json")
-
-    @hypothesis.settings(max_examples=25, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
-    @hypothesis.given(case=document[path][method].as_strategy())
-    def call(case: schemathesis.Case) -> None:
-        case.call_and_validate(checks=[not_a_server_error, status_code_conformance, response_schema_conformance])
-
-    call()
+def test_openapi_requests_conform(
+    method: str, path: str, http: httpx.Client, assert_conforms: Callable[..., None]
+) -> None:
+    assert_conforms(schemathesis.openapi.from_url(f"{http.base_url}/openapi.json"), path, method, 25)
 
 
 def test_a_run_that_answers_by_classifiers_answers_by_both(teaching_run: Path, tmp_path: Path) -> None:

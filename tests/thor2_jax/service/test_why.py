@@ -184,10 +184,8 @@ def test_page_waits_while_explanations_are_compiled(open_page: Open, teaching_ur
 
 
 def test_page_shows_why_there_is_no_explanation(open_page: Open, teaching_url: str, files: Files) -> None:
-    def refuse(route: Route) -> None:
-        route.fulfill(status=422, json={"field": "instance", "message": "instance 3 cannot be explained."})
-
-    page = ask_why(open_page, teaching_url, files, refuse)
+    problem = {"field": "instance", "message": "instance 3 cannot be explained."}
+    page = ask_why(open_page, teaching_url, files, lambda route: route.fulfill(status=422, json=problem))
     expect(page.locator("#why-status")).to_have_text("instance 3 cannot be explained.")
     expect(page.get_by_role("button", name="Why?")).to_be_enabled()
     page.locator('#objects button[data-label="5"]').click()  # too few points to be described

@@ -67,6 +67,5 @@ def test_poses_move_points() -> None:
     ],
 )
 def test_a_pose_that_is_no_rigid_motion_is_refused(pose: object) -> None:
-    with pytest.raises(InputError, match="camera_pose") as error:
+    with pytest.raises(InputError, match="camera_pose"):
         check_pose(pose, "camera_pose")  # type: ignore[arg-type]
-    assert "\n" not in str(error.value)

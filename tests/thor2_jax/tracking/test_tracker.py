@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 import numpy as np
 import pytest
-from helpers import untrained_run
+from helpers import assert_same_answers, untrained_run
 
 import thor2_jax as thor2
 from thor2_jax.frames.prepared_instance import PreparedInstance
@@ -74,10 +74,8 @@ def test_the_first_answer_is_that_of_the_frame_alone() -> None:
     tracker = recognizer.track()
     alone, tracked = recognizer.recognize(image), tracker.update(image, np.eye(4))
     again = tracker.update(image, np.eye(4))  # merged with an equal cloud
-    for one, *others in zip(alone, tracked, again, strict=True):
-        for other in others:
-            assert (one.label, one.name, one.points_used) == (other.label, other.name, other.points_used)
-            assert one.confidence == pytest.approx(other.confidence, abs=1e-3)
+    for answers in (tracked, again):
+        assert_same_answers(answers, alone, 1e-3)
 
 
 def test_poses_match_objects_of_a_camera_that_moved() -> None:

@@ -1,6 +1,7 @@
 """Augmentation of orientation: the axes, and what a reoriented cloud keeps."""
 
 import numpy as np
+from helpers import random_clouds
 
 import thor2_jax as thor2
 from training.augmentation.orientation import _random_axes, reorient
@@ -18,8 +19,7 @@ def test_random_axes_are_rotations_that_swap_nearly_equal_sides() -> None:
 
 def test_reoriented_clouds_are_rigid_and_in_the_first_octant() -> None:
     rng = np.random.default_rng(3)
-    points = (rng.random((200, 3)) * (0.2, 0.19, 0.1)).astype(np.float32)
-    clouds = thor2.PointClouds.pack([(points, rng.integers(0, 256, (200, 3), np.uint8))] * 8)
+    clouds = thor2.PointClouds.pack(random_clouds(3, [200], (0.2, 0.19, 0.1)) * 8)
     normal = thor2.view_normalize(clouds, CONFIG)
     turned = reorient(normal, rng)
     assert len({np.asarray(cloud).tobytes() for cloud in turned.points}) == 8

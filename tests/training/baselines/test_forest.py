@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from helpers import random_clouds
 from sklearn.ensemble import RandomForestClassifier
 
 import colornet
@@ -14,12 +15,7 @@ CONFIG = thor2.DescriptorConfig(homology="closed_form")
 
 
 def normal(sizes: tuple[int, ...]) -> thor2.PointClouds:
-    rng = np.random.default_rng(1)
-    clouds = [
-        ((rng.random((n, 3)) * [0.2, 0.1, 0.05]).astype(np.float32), rng.integers(0, 256, (n, 3), dtype=np.uint8))
-        for n in sizes
-    ]
-    clouds = [(xyz - xyz.min(axis=0) if len(xyz) else xyz, rgb) for xyz, rgb in clouds]
+    clouds = [(xyz - xyz.min(axis=0) if len(xyz) else xyz, rgb) for xyz, rgb in random_clouds(1, sizes)]
     return thor2.view_normalize(thor2.PointClouds.pack(clouds, camera=[0, 0, -3]), CONFIG)
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from flax import nnx
+from helpers import random_clouds
 from safetensors.numpy import load_file, save_file
 
 import colornet
@@ -56,12 +57,8 @@ class Views(MemoryViews):
         return crops_of(index, self.shards[index].views, size)
 
 
-def cloud(seed: int) -> Any:
-    points = np.random.default_rng(seed).random((40, 3)) * 0.1 + [0, 0, 0.5]
-    return points.astype(np.float32), np.full((40, 3), 99, np.uint8)
-
-
-SOURCE = Views({name: [cloud(number) for number in range(N_VIEWS)] for name in NAMES}, CONFIG)
+CLOUDS = random_clouds(0, [40] * N_VIEWS)
+SOURCE = Views(dict.fromkeys(NAMES, CLOUDS), CONFIG)
 
 
 def write_run(folder: Path, folds: int = 4) -> Path:
@@ -76,7 +73,7 @@ def write_run(folder: Path, folds: int = 4) -> Path:
 
 def frame_inputs(seed: int, rows: int = 4) -> BaselineInputs:
     """Return the inputs of a red and a blue instance, and padding."""
-    packed = thor2.PointClouds.pack([cloud(0)] * rows)
+    packed = thor2.PointClouds.pack(CLOUDS[:1] * rows)
 
     def crops(size: int) -> ViewCrops:
         both = [crops_of(label, 1, size, seed) for label in (0, 1)]
@@ -191,9 +188,8 @@ def test_weights_of_another_architecture_are_refused(tmp_path: Path) -> None:
     ]
     for changed, message in cases:
         save_file(changed, path)
-        with pytest.raises(InputError, match=f"^weights: .*{message}") as caught:
+        with pytest.raises(InputError, match=f"^weights: .*{message}"):
             train_baselines(folder, SOURCE, [SMALL], options=OPTIONS, weights=weights)
-        assert "\n" not in str(caught.value)
     path.write_bytes(b"no tensors")
     with pytest.raises(InputError, match="^weights: .* cannot be read"):
         train_baselines(folder, SOURCE, [SMALL], options=OPTIONS, weights=weights)
@@ -226,11 +222,11 @@ def test_templates_need_a_backbone(tmp_path: Path) -> None:
 
 
 def test_clouds_without_images_are_refused(tmp_path: Path) -> None:
-    source = MemoryViews({name: [cloud(number) for number in range(N_VIEWS)] for name in NAMES}, CONFIG)
+    source = MemoryViews(dict.fromkeys(NAMES, CLOUDS), CONFIG)
     assert source.digest == SOURCE.digest
     with pytest.raises(InputError, match="no crops"):
         train_baselines(write_run(tmp_path / "run"), source, [SMALL], options=OPTIONS)
-    inputs = BaselineInputs(thor2.PointClouds.pack([cloud(0)]), np.zeros((1, 1), np.float32))
+    inputs = BaselineInputs(thor2.PointClouds.pack(CLOUDS[:1]), np.zeros((1, 1), np.float32))
     with pytest.raises(InputError, match="^frame is missing"):
         inputs.crops(96)
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from flax import nnx
+from helpers import random_clouds
 from safetensors.numpy import load_file, save_file
 from typer.testing import CliRunner
 
@@ -37,18 +38,9 @@ NAMES = ("plank", "cube")
 
 
 def clouds(seed: int = 0, views: int = 20) -> dict[str, list[Cloud]]:
-    rng = np.random.default_rng(seed)
-    sizes = {"plank": (0.2, 0.03, 0.02), "cube": (0.06, 0.06, 0.06)}
-    levels = {"plank": (200, 30, 30), "cube": (30, 30, 200)}
     return {
-        name: [
-            (
-                (rng.random((120, 3)) * sizes[name] + [0, 0, 0.5]).astype(np.float32),
-                np.full((120, 3), levels[name], np.uint8),
-            )
-            for _ in range(views)
-        ]
-        for name in NAMES
+        "plank": random_clouds(seed, [120] * views, (0.2, 0.03, 0.02), (200, 30, 30)),
+        "cube": random_clouds(seed, [120] * views, (0.06, 0.06, 0.06), (30, 30, 200)),
     }
 
 
@@ -166,9 +158,8 @@ def test_damaged_files_are_refused(trained: Path, tmp_path: Path, damage: str) -
         file.write_bytes(content)
         about = {"format": 1, "classes": ["a", "b"], "temperature": None, "seconds": 1.0, "digest": ""}
         save_file({} if damage == "lacking" else load_file(file), file, {"about": json.dumps(about)})
-    with pytest.raises(InputError, match="forest.safetensors") as caught:
+    with pytest.raises(InputError, match="forest.safetensors"):
         load_baselines(folder, load_run(folder))
-    assert "\n" not in str(caught.value)
 
 
 def test_run_with_checkpoints_is_not_finished(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from flax import nnx
+from helpers import random_clouds
 
 import thor2_jax as thor2
 from training.baselines.baseline import BaselineInputs
@@ -14,9 +15,7 @@ def model() -> ColoredPointNet:
 
 
 def inputs(sizes: tuple[int, ...], seed: int = 0) -> BaselineInputs:
-    rng = np.random.default_rng(seed)
-    clouds = [(rng.random((n, 3)).astype(np.float32), rng.random((n, 3)).astype(np.float32)) for n in sizes]
-    return BaselineInputs(thor2.PointClouds.pack(clouds), np.zeros((len(sizes), 1), np.float32))
+    return BaselineInputs(thor2.PointClouds.pack(random_clouds(seed, sizes)), np.zeros((len(sizes), 1), np.float32))
 
 
 def test_probabilities_match_numpy() -> None:

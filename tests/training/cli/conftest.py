@@ -6,10 +6,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from helpers import SMALL_CONFIG, untrained_run
+from helpers import SMALL_CONFIG, Command, Recognize, json_lines, untrained_run
+from helpers import small_embedding as embedding_of_tests
 
 from thor2_jax.gallery import embedding, objects
-from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
+from thor2_jax.gallery.embedding import EmbeddingSizes
 from thor2_jax.model import model as models
 from thor2_jax.model.run_directory import save_run
 from training.embedding import run_embedding
@@ -30,6 +31,12 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return directory
 
 
+@pytest.fixture
+def recognize(model: Path, printed: Command) -> Recognize:
+    """Return a function that recognizes frames with the model and returns what it prints, an object for each frame."""
+    return lambda *options: json_lines(printed("recognize", "--model", model, *options))
+
+
 @pytest.fixture(scope="module")
 def small_descriptors() -> Iterator[None]:
     """Let the protocols describe views by small descriptors, and fit one small network on few views."""
@@ -45,7 +52,7 @@ def small_descriptors() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def small_embedding() -> Iterator[None]:
     """Replace the packaged embedding by a small one with random weights, which compiles quickly."""
-    small = Embedding.create(SMALL_CONFIG, sizes=EmbeddingSizes(4, (16,), 8, 4))
+    small = embedding_of_tests()
     with pytest.MonkeyPatch.context() as patch:
         for module in (embedding, objects, models):
             patch.setattr(module, "load_default", lambda: small)

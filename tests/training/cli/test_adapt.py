@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import json_lines, run_thor2, untrained_embedding_run, untrained_run, write_frame
+from helpers import Command, json_lines, run_thor2, untrained_embedding_run, untrained_run, write_frame
 
 from thor2_jax import recognizer as module
 from thor2_jax.adaptation.color_transform import ColorTransform
@@ -65,13 +65,10 @@ def test_the_copy_differs_in_its_record_only(model: Path, adapted: Path) -> None
     assert load_run(adapted).classes == load_run(model).classes
 
 
-def test_recognize_corrects_the_colors(
-    model: Path, adapted: Path, video: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_recognize_corrects_the_colors(model: Path, adapted: Path, video: Path, printed: Command) -> None:
     answers = {}
     for run in (model, adapted):
-        assert run_thor2("recognize", "--model", run, video / "0", "--json") == 0
-        answers[run] = json.loads(capfd.readouterr().out)["instances"]
+        answers[run] = json.loads(printed("recognize", "--model", run, video / "0", "--json"))["instances"]
     confidences = [[one["confidence"] for one in answers[run]] for run in (model, adapted)]
     assert np.abs(np.subtract(*confidences)).max() > 1e-4
 
@@ -82,18 +79,15 @@ def test_runs_of_different_cameras_are_not_evaluated_together(model: Path, adapt
 
 
 @pytest.mark.slow
-def test_commands_use_a_run_whose_embedding_alone_answers(
-    video: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_commands_use_a_run_whose_embedding_alone_answers(video: Path, tmp_path: Path, printed: Command) -> None:
     model, out, names = tmp_path / "run", tmp_path / "adapted", tuple(OBJECTS.values())
     save_run(untrained_embedding_run(names), model)
     assert run_thor2("adapt", "--model", model, video, "--out", out, "--quiet") == 0
     recognizer = Recognizer.load(out)
     assert recognizer.model.color_transform is not None and set(recognizer.model.classifiers) == {"embedding"}
-    capfd.readouterr()
     for options in ((), ("--track",)):
-        assert run_thor2("recognize", "--model", out, video, "--json", *options) == 0
-        frames = [line["instances"] for line in json_lines(capfd.readouterr().out)]
+        lines = json_lines(printed("recognize", "--model", out, video, "--json", *options))
+        frames = [line["instances"] for line in lines]
         assert len(frames) == 4 and all(set(one["top"]) == {"embedding"} for frame in frames for one in frame)
         if options:  # one answer for the objects of all frames
             assert [one["confidence"] for one in frames[0]] == [one["confidence"] for one in frames[3]]
@@ -126,18 +120,15 @@ def test_enrolled_frames_are_corrected(adapted: Path, tmp_path: Path) -> None:
     np.testing.assert_allclose(stored.colors.mean(axis=0), expected, atol=4)
 
 
-def test_bad_input_writes_nothing(model: Path, video: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_bad_input_writes_nothing(model: Path, video: Path, tmp_path: Path, refused: Command) -> None:
     few, unlabelled = tmp_path / "few", tmp_path / "unlabelled"
     write_frame(few, OBJECTS)
     for number in range(4):
         (write_frame(unlabelled / f"{number}", OBJECTS, number) / "mask.png").unlink()
     cases = [((few,), "3 usable instances; expected at least 10"), ((unlabelled,), "0: labels is None")]
     for arguments, message in cases:
-        assert run_thor2("adapt", "--model", model, *arguments, "--out", tmp_path / "out", "--quiet") == 2
-        error = capfd.readouterr().err
-        assert message in error and error.count("\n") == 1
-    assert run_thor2("adapt", "--model", model, video, "--out", model) == 2
-    assert "already contains" in capfd.readouterr().err
+        assert message in refused("adapt", "--model", model, *arguments, "--out", tmp_path / "out", "--quiet")
+    assert "already contains" in refused("adapt", "--model", model, video, "--out", model)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["few", "unlabelled"]
 
 

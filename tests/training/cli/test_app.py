@@ -13,7 +13,7 @@ from pathlib import Path
 
 import jax  # noqa: F401  (its callback of the garbage collection)
 import pytest
-from helpers import run_thor2
+from helpers import Command
 from processes import HANG
 
 import thor2_jax as thor2
@@ -44,17 +44,13 @@ def output(*arguments: str, **environment: str) -> str:
         ("render", "--meshes", "m", "--out", "o", "--engine", "slurm"),
     ],
 )
-def test_a_usage_error_is_one_line(arguments: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_thor2(*arguments) == 2
-    out, err = capsys.readouterr()
-    assert out == "" and len(err.splitlines()) == 1
-    assert err.startswith("error: ") and err.endswith("--help\n")
+def test_a_usage_error_is_one_line(arguments: tuple[str, ...], refused: Command) -> None:
+    assert refused(*arguments).endswith("--help")
 
 
 @pytest.mark.parametrize("arguments", [("--workers", "0"), ("--workers=0",), ("--depth-scale", "0x10")])
-def test_a_usage_error_states_the_value(arguments: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_thor2("recognize", "--model", "m", "f", *arguments) == 2
-    assert f"(given: {arguments[-1].rpartition('=')[2]})" in capsys.readouterr().err
+def test_a_usage_error_states_the_value(arguments: tuple[str, ...], refused: Command) -> None:
+    assert f"(given: {arguments[-1].rpartition('=')[2]})" in refused("recognize", "--model", "m", "f", *arguments)
 
 
 @pytest.mark.parametrize(
@@ -66,16 +62,12 @@ def test_a_usage_error_states_the_value(arguments: tuple[str, ...], capsys: pyte
         (("explain", "", "--model", "m", "--out", "o"), "the argument after explain is empty"),
     ],
 )
-def test_an_empty_argument_is_no_directory(
-    arguments: tuple[str, ...], named: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run_thor2(*arguments) == 2
-    error = capsys.readouterr().err
-    assert named in error and error.count("\n") == 1
+def test_an_empty_argument_is_no_directory(arguments: tuple[str, ...], named: str, refused: Command) -> None:
+    assert named in refused(*arguments)
 
 
 @pytest.mark.parametrize("command", ["recognize", "explain", "evaluate frames", "enroll mug", "doctor", "adapt"])
-def test_frames_are_named_in_one_way(command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_frames_are_named_in_one_way(command: str, tmp_path: Path, refused: Command) -> None:
     out = ("--out", tmp_path / "out") if command in ("explain", "adapt") else ()
     for given, expected in (
         (("--bag", "absent.mcap"), "absent.mcap"),
@@ -84,9 +76,7 @@ def test_frames_are_named_in_one_way(command: str, tmp_path: Path, capsys: pytes
         (("absent",), "absent"),
         (("--color", "c.png"), "c.png" if command == "enroll mug" else "--depth"),
     ):
-        assert run_thor2(*command.split(), *given, "--model", tmp_path / "run", *out) == 2
-        error = capsys.readouterr().err
-        assert expected in error and error.count("\n") == 1
+        assert expected in refused(*command.split(), *given, "--model", tmp_path / "run", *out)
 
 
 def test_the_next_command_has_the_same_frames(capsys: pytest.CaptureFixture[str]) -> None:
@@ -98,48 +88,41 @@ def test_the_next_command_has_the_same_frames(capsys: pytest.CaptureFixture[str]
 
 
 @pytest.mark.parametrize(("option", "value"), [("copies", 10**20), ("copies", 0), ("crops", 99_999_999), ("crops", 0)])
-def test_impossible_renderings_are_refused(option: str, value: int, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_thor2("render", "--meshes", "m", "--out", "o", f"--{option}", value, "--sensor") == 2
-    assert f"{option} is {value}; expected" in capsys.readouterr().err
+def test_impossible_renderings_are_refused(option: str, value: int, refused: Command) -> None:
+    command = ("render", "--meshes", "m", "--out", "o", "--sensor")
+    assert f"{option} is {value}; expected" in refused(*command, f"--{option}", value)
 
 
-def test_a_loop_of_links_is_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_loop_of_links_is_an_error(tmp_path: Path, refused: Command) -> None:
     (tmp_path / "a").symlink_to("b")
     (tmp_path / "b").symlink_to("a")
-    assert run_thor2("forget", "mug", "--model", tmp_path / "a") == 2
-    error = capsys.readouterr().err
-    assert str(tmp_path / "a") in error and error.count("\n") == 1
+    assert str(tmp_path / "a") in refused("forget", "mug", "--model", tmp_path / "a")
 
 
-def test_version(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_thor2("--version") == 0
-    assert capsys.readouterr().out == f"thor2 {thor2.__version__}\n"
+def test_version(printed: Command) -> None:
+    assert printed("--version") == f"thor2 {thor2.__version__}\n"
     assert re.search(r"path = \"thor2_jax/__init__.py\"", (ROOT / "pyproject.toml").read_text())
 
 
 @pytest.mark.parametrize("arguments", [(), ("-h",), ("evaluate",), ("evaluate", "-h"), ("train", "-h")])
-def test_short_help(arguments: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_thor2(*arguments) == 0
-    assert "Usage:" in capsys.readouterr().out
+def test_short_help(arguments: tuple[str, ...], printed: Command) -> None:
+    assert "Usage:" in printed(*arguments)
 
 
 @pytest.mark.parametrize("command", ["recognize", "serve", "watch"])
-def test_help_states_no_threshold_of_the_gallery(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_states_no_threshold_of_the_gallery(command: str, printed: Command) -> None:
     """It depends on the number of views, and its numbers are measured anew from time to time."""
-    assert run_thor2(command, "--help") == 0
-    printed = capsys.readouterr().out.partition("--unknown-below")[2].partition("--")[0]
-    assert "0." not in printed and "views" in printed
+    text = printed(command, "--help").partition("--unknown-below")[2].partition("--")[0]
+    assert "0." not in text and "views" in text
 
 
 @pytest.mark.parametrize("command", ["train", "render", "demo", "evaluate frames", "evaluate uwis", "evaluate bop"])
-def test_long_commands_can_be_quiet(command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_thor2(*command.split(), "--help") == 0
-    assert "--quiet" in capsys.readouterr().out
+def test_long_commands_can_be_quiet(command: str, printed: Command) -> None:
+    assert "--quiet" in printed(*command.split(), "--help")
 
 
-def test_the_demo_has_a_default_directory(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_thor2("demo", "--help") == 0
-    assert "demo-report" in capsys.readouterr().out
+def test_the_demo_has_a_default_directory(printed: Command) -> None:
+    assert "demo-report" in printed("demo", "--help")
 
 
 def test_the_shell_completes_commands() -> None:
@@ -179,9 +162,8 @@ def test_public_names_are_imported_when_used() -> None:
         _ = thor2.no_such_name
 
 
-def test_errors_show_control_characters_escaped(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_thor2("train", "--meshes", tmp_path / "a\x1b[2Jb\u202ec", "--out", tmp_path / "run") == 2
-    err = capsys.readouterr().err
+def test_errors_show_control_characters_escaped(tmp_path: Path, refused: Command) -> None:
+    err = refused("train", "--meshes", tmp_path / "a\x1b[2Jb\u202ec", "--out", tmp_path / "run")
     assert "\x1b" not in err and "\u202e" not in err and r"a\x1b[2Jb\u202ec" in err
 
 
@@ -210,7 +192,7 @@ import training.cli
     assert (done.returncode, done.stderr) == (130, "")
 
 
-def test_ctrl_c_in_a_callback_of_jax(capsys: pytest.CaptureFixture[str]) -> None:
+def test_ctrl_c_in_a_callback_of_jax() -> None:
     """JAX ignores exceptions there, so Ctrl-C takes effect after it."""
     reached = []
 

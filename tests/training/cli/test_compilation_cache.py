@@ -5,9 +5,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
-from helpers import encode_image, untrained_run
+from helpers import untrained_run, write_frame
 
 from thor2_jax.errors import InputError
 from thor2_jax.model.run_directory import save_run
@@ -34,16 +33,19 @@ def environment(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     return tmp_path / "home" / "thor2-jax" / "xla"
 
 
+def run(cache: Path, *arguments: object) -> tuple[set[str], str]:
+    """Run Python in a process, and return the names of the cached programs and what it printed."""
+    variables = os.environ | {"PYTHONPATH": str(ROOT), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
+    command = [sys.executable, *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, env=variables)
+    assert done.returncode == 0 and done.stderr == ""
+    return {path.name for path in cache.glob("*/*-cache")}, done.stdout
+
+
 @pytest.mark.slow
 def test_programs_are_kept_for_the_next_process(environment: Path) -> None:
-    def run() -> set[str]:
-        variables = os.environ | {"PYTHONPATH": str(ROOT), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
-        done = subprocess.run([sys.executable, "-c", COMPILES], capture_output=True, text=True, env=variables)
-        assert done.returncode == 0 and done.stderr == ""
-        return {path.name for path in environment.glob("*/*-cache")}
-
-    first = run()
-    assert first and run() == first
+    first = run(environment, "-c", COMPILES)
+    assert first[0] and run(environment, "-c", COMPILES) == first
 
 
 def test_the_cache_can_be_moved_or_disabled(environment: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -76,24 +78,8 @@ def test_an_unusable_cache_directory(environment: Path, tmp_path: Path, monkeypa
 
 @pytest.mark.slow
 def test_a_second_recognition_compiles_nothing(environment: Path, tmp_path: Path) -> None:
-    rng = np.random.default_rng(0)
-    labels = np.zeros((240, 320), np.uint8)
-    labels[20:100, 20:90] = 1
-    depth = np.broadcast_to(600 + np.arange(320) // 2, labels.shape).astype(np.uint16)
-    color = rng.integers(0, 256, (*labels.shape, 3), dtype=np.uint8)
-    for name, image in (("color", color), ("depth", depth), ("labels", labels)):
-        (tmp_path / f"{name}.png").write_bytes(encode_image(image))
-    (tmp_path / "intrinsics.json").write_text('{"fx": 600, "fy": 600, "cx": 159.5, "cy": 119.5}')
+    frame = write_frame(tmp_path / "frame", {1: "brick"})
     save_run(untrained_run(("brick", "stick"), ("tops", "tops2")), tmp_path / "run")
-    files = [part for name in ("color", "depth", "labels") for part in (f"--{name}", tmp_path / f"{name}.png")]
-    command = ["recognize", "--model", tmp_path / "run", *files, "--intrinsics", tmp_path / "intrinsics.json"]
-
-    def run() -> tuple[set[str], str]:
-        variables = os.environ | {"PYTHONPATH": str(ROOT), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
-        program = [sys.executable, "-m", "training.cli", *map(str, command)]
-        done = subprocess.run(program, capture_output=True, text=True, env=variables)
-        assert done.returncode == 0 and done.stderr == ""
-        return {path.name for path in environment.glob("*/*-cache")}, done.stdout
-
-    first = run()
-    assert len(first[0]) > 5 and run() == first
+    command = ("-m", "training.cli", "recognize", "--model", tmp_path / "run", frame)
+    first = run(environment, *command)
+    assert len(first[0]) > 5 and run(environment, *command) == first

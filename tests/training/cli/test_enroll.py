@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import trimesh
-from helpers import run_thor2, untrained_run, write_frame
+from helpers import Command, files_of, frame_options, full_disk, run_thor2, untrained_run, write_box, write_frame
 from PIL import Image
 from recording_files import table_frame, write_recording
 
@@ -19,6 +18,9 @@ from thor2_jax.model.run_directory import load_run, save_run
 from thor2_jax.recognizer import Recognizer
 
 pytestmark = pytest.mark.usefixtures("small_classifiers", "small_embedding")
+
+BOX = (0.04, 0.08, 0.06)
+"""Sides of a box that has few points, like the objects of the frames."""
 
 
 @pytest.fixture(scope="module")
@@ -41,40 +43,23 @@ def model(enrolled: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(enrolled / "run", tmp_path / "run"))
 
 
-def error_of(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
-    capsys.readouterr()
-    assert run_thor2(*arguments) == 2
-    error = capsys.readouterr().err
-    assert error.startswith("error: ") and error.count("\n") == 1
-    return error
-
-
-def files(directory: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(directory)): p.read_bytes() for p in sorted(directory.rglob("*")) if p.is_file()}
-
-
 def one_frame(frame: Path, instance: int) -> list[object]:
-    names = {"color": "color.png", "depth": "depth.png", "labels": "mask.png", "intrinsics": "intrinsics.json"}
-    return [*(v for option, file in names.items() for v in (f"--{option}", frame / file)), "--instance", instance]
+    return [*frame_options(frame), "--instance", instance]
 
 
 def test_every_labelled_object_is_enrolled_in_a_new_run(model: Path, frames: Path, tmp_path: Path) -> None:
     assert load_run(model).classes == () and load_run(model).classifiers == {}
     gallery = Recognizer.load(model).gallery
     assert {name: len(views.clouds) for name, views in gallery.objects.items()} == {"brick": 2, "book": 2}
-    out = tmp_path / "answers"
-    frame = frames / "001"
-    arguments = [str(value) for value in one_frame(frame, 1)[:-2]]
-    assert run_thor2("recognize", "--model", model, *arguments, "--out", out) == 0
-    answers = json.loads((out / "recognition.json").read_text())
+    assert run_thor2("recognize", "--model", model, *frame_options(frames / "001"), "--out", tmp_path / "out") == 0
+    answers = json.loads((tmp_path / "out" / "recognition.json").read_text())
     assert [(answer["label"], answer["name"]) for answer in answers] == [(1, "brick"), (5, "book")]
 
 
-def test_frames_without_labels_are_listed(model: Path, frames: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_frames_without_labels_are_listed(model: Path, frames: Path, printed: Command) -> None:
     (frames / "001" / "labels.json").unlink()
     for command in (("enroll", "--replace", "--frames", frames), ("evaluate", "frames", frames)):
-        assert run_thor2(*command, "--model", model) == 0
-        assert "1 frames without labels.json: 001" in capsys.readouterr().out.replace("\n", " ")
+        assert "1 frames without labels.json: 001" in printed(*command, "--model", model).replace("\n", " ")
 
 
 def test_evaluation_has_a_gallery_column(model: Path, tmp_path: Path) -> None:
@@ -87,15 +72,15 @@ def test_evaluation_has_a_gallery_column(model: Path, tmp_path: Path) -> None:
     assert cell["instances"] == 2 and cell["accuracy"]["gallery"]["mean"] == 1.0
     assert report["instances"]["no_class"] == {"leaf": 1}
     page = (tmp_path / "report" / "report.html").read_text()
-    assert run_thor2("evaluate", "frames", *one_frame(frames / "a", 2)[:-2], "--model", model) == 0
+    assert run_thor2("evaluate", "frames", *frame_options(frames / "a"), "--model", model) == 0
     assert "<td>" in page and "<tbody></tbody>" not in page and "THOR2 is the fusion" not in page
 
 
 @pytest.mark.slow
-def test_a_trained_run_answers_by_both(frames: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_trained_run_answers_by_both(frames: Path, tmp_path: Path, refused: Command) -> None:
     model = tmp_path / "run"
     save_run(untrained_run(("brick", "mug"), ("tops", "tops2")), model)
-    assert "'brick' is a trained class" in error_of(capsys, "enroll", "--frames", frames, "--model", model)
+    assert "'brick' is a trained class" in refused("enroll", "--frames", frames, "--model", model)
     assert run_thor2("enroll", "book", "--model", model, "--frames", frames) == 0
     assert run_thor2("evaluate", "frames", frames, "--model", model, "--out", tmp_path / "report") == 0
     report = json.loads((tmp_path / "report" / "report.json").read_text())
@@ -103,7 +88,7 @@ def test_a_trained_run_answers_by_both(frames: Path, tmp_path: Path, capsys: pyt
     assert report["classes"] == ["brick", "mug", "book"]
     assert run_thor2("forget", "mug", "--model", model) == 0
     assert Recognizer.load(model).classes == ("brick", "book")
-    assert "'mug'" in error_of(capsys, "forget", "mug", "--model", model)
+    assert "'mug'" in refused("forget", "mug", "--model", model)
 
 
 def test_several_folders_follow_one_option(frames: Path, tmp_path: Path) -> None:
@@ -124,37 +109,28 @@ def test_a_named_object_comes_from_its_label_name(model: Path, frames: Path) -> 
     assert len(Recognizer.load(model).gallery.objects["brick"].clouds) == 1
 
 
-def test_frames_without_names(model: Path, frames: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_frames_without_names(model: Path, frames: Path, tmp_path: Path, refused: Command) -> None:
     """They have the object as their only instance, or --instance names it; so do the segments of a recording."""
     for folder in ("000", "001"):
         (frames / folder / "labels.json").unlink()
-    assert "2 instances" in error_of(capsys, "enroll", "new", frames, "--model", model)
+    assert "2 instances" in refused("enroll", "new", frames, "--model", model)
     assert run_thor2("enroll", "new", frames, "--instance", 5, "--model", model) == 0
     (write_frame(tmp_path / "one", {3: "leaf"}) / "labels.json").unlink()
-    assert run_thor2("enroll", "only", *one_frame(tmp_path / "one", 3)[:-2], "--model", model) == 0
+    assert run_thor2("enroll", "only", *frame_options(tmp_path / "one"), "--model", model) == 0
     bag = write_recording(tmp_path / "a.mcap", [table_frame(0), table_frame(3)])
     assert run_thor2("enroll", "box", "--bag", bag, "--instance", 1, "--model", model) == 0
     counts = {name: len(v.clouds) for name, v in Recognizer.load(model).gallery.objects.items()}
     assert counts == {"brick": 2, "book": 2, "new": 2, "only": 1, "box": 2}
-    assert "no labels.json" in error_of(capsys, "evaluate", "frames", "--bag", bag, "--model", model)
+    assert "no labels.json" in refused("evaluate", "frames", "--bag", bag, "--model", model)
 
 
 def test_a_mesh_is_enrolled_from_all_sides(model: Path, tmp_path: Path) -> None:
-    box = write_mesh(tmp_path / "box.ply")
+    write_box(tmp_path / "box.ply", BOX)
     assert run_thor2("enroll", "box", "--model", model, "--mesh", tmp_path / "box.ply") == 0
     views = Recognizer.load(model).gallery.objects["box"]
     assert views.source == "mesh" and len(views.clouds) == 2 and len(views.embeddings) == 8
-    box.apply_scale(1000)
-    box.export(tmp_path / "large.ply")
+    write_box(tmp_path / "large.ply", [1000 * side for side in BOX])
     assert run_thor2("enroll", "large", "--model", model, "--mesh", tmp_path / "large.ply", "--mesh-scale", 0.001) == 0
-
-
-def write_mesh(path: Path, color: tuple[int, int, int] = (200, 100, 50)) -> trimesh.Trimesh:
-    box = trimesh.creation.box((0.04, 0.08, 0.06))  # has few points, like the objects of the frames
-    box.visual.vertex_colors = [[*color, 255]] * len(box.vertices)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    box.export(path)
-    return box
 
 
 @pytest.mark.parametrize(
@@ -172,7 +148,7 @@ def test_a_folder_of_meshes_is_enrolled(
 ) -> None:
     files = {"025_mug/textured.ply": (200, 0, 0), "can.ply": (0, 200, 0), "cafe\u0301/a.ply": (0, 0, 200)}
     for file, color in files.items():
-        write_mesh(tmp_path / "meshes" / file, color)
+        write_box(tmp_path / "meshes" / file, BOX, color)
     name, folder = arguments
     assert run_thor2("enroll", *filter(None, [name]), "--mesh", tmp_path / folder, "--model", model) == 0
     objects = Recognizer.load(model).gallery.objects
@@ -183,14 +159,11 @@ def test_a_folder_of_meshes_is_enrolled(
 
 
 def test_arguments_are_checked_before_anything_is_loaded(
-    model: Path, frames: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    model: Path, frames: Path, tmp_path: Path, refused: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def load(*_: object, **__: object) -> None:
-        raise AssertionError("the run was loaded")
-
-    monkeypatch.setattr(Recognizer, "load", load)
+    monkeypatch.setattr(Recognizer, "load", lambda *_, **__: pytest.fail("the run was loaded"))
     for name in ("two/a.ply", "two/b.ply", "one.ply"):
-        write_mesh(tmp_path / name)
+        write_box(tmp_path / name, BOX)
     (tmp_path / "empty").mkdir()
     (tmp_path / "damaged.ply").write_text("ply")
     for arguments, text in (
@@ -207,97 +180,82 @@ def test_arguments_are_checked_before_anything_is_loaded(
         (("mug", "--frames", tmp_path / "absent"), "absent"),
         (("mug", *one_frame(tmp_path / "absent", 1)), "absent"),
     ):
-        assert text in error_of(capsys, "enroll", "--model", model, *arguments)
+        assert text in refused("enroll", "--model", model, *arguments)
 
 
-def test_few_views_give_a_warning(
-    model: Path, frames: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_few_views_give_a_warning(model: Path, frames: Path, printed: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     again = ("enroll", "--frames", frames, "--extend", "--model", model)
     for few, warned in ((10, True), (1, False)):
         monkeypatch.setattr(gallery_objects, "FEW", few)
-        assert run_thor2(*again) == 0
-        printed = capsys.readouterr().out
-        assert ("unknown objects are hardly rejected" in printed) is warned
-        assert f"thor2 recognize FRAME --model {model}" in printed and "2 objects: " in printed
+        text = printed(*again)
+        assert ("unknown objects are hardly rejected" in text) is warned
+        assert f"thor2 recognize FRAME --model {model}" in text and "2 objects: " in text
 
 
-def test_labels_that_are_no_names_are_skipped(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_labels_that_are_no_names_are_skipped(tmp_path: Path, printed: Command) -> None:
     frame = write_frame(tmp_path / "frame", {1: "brick", 5: "book"})
     (frame / "labels.json").write_text('{"labels": {"1": "mug ", "5": "unknown"}}')
-    assert run_thor2("enroll", "--frames", frame, "--model", tmp_path / "run") == 0
-    assert "skipped: frame: name is 'unknown'" in capsys.readouterr().out
+    assert "skipped: frame: name is 'unknown'" in printed("enroll", "--frames", frame, "--model", tmp_path / "run")
     assert Recognizer.load(tmp_path / "run").gallery.names == ("mug",)
     assert run_thor2("evaluate", "frames", frame, "--model", tmp_path / "run", "--out", tmp_path / "report") == 0
     report = json.loads((tmp_path / "report" / "report.json").read_text())
     assert report["instances"]["no_class"] == {"unknown": 1} and report["instances"]["scored"] == 1
 
 
-def test_a_lost_index_is_rebuilt_by_the_command(model: Path, frames: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_lost_index_is_rebuilt_by_the_command(model: Path, frames: Path, printed: Command, refused: Command) -> None:
     gallery = model / "gallery"
     (gallery / "index.json").unlink()
-    before = files(gallery)
+    before = files_of(gallery)
     for command in (("enroll", "new", *one_frame(frames / "000", 5)), ("objects",), ("forget", "brick")):
-        error = error_of(capsys, *command, "--model", model)
-        assert f"thor2 objects --reembed --model RUN --gallery {gallery}" in error and files(gallery) == before
-    assert run_thor2("objects", "--reembed", "--model", model, "--gallery", gallery) == 0
-    table = capsys.readouterr().out
+        error = refused(*command, "--model", model)
+        assert f"thor2 objects --reembed --model RUN --gallery {gallery}" in error and files_of(gallery) == before
+    table = printed("objects", "--reembed", "--model", model, "--gallery", gallery)
     assert all(re.search(rf"{name}\W+2\W+frames\W+20\d\d-", table) for name in ("brick", "book"))
     assert run_thor2("enroll", "new", "--model", model, *one_frame(frames / "000", 5)) == 0
     objects = Recognizer.load(model).gallery.objects
     assert set(objects) == {"brick", "book", "new"} and len(objects["new"].clouds) == 1
 
 
-def test_objects_lists_views_source_and_date(model: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_thor2("objects", "--model", model) == 0
-    table = capsys.readouterr().out
+def test_objects_lists_views_source_and_date(model: Path, printed: Command) -> None:
+    table = printed("objects", "--model", model)
     for name in ("brick", "book"):
         assert re.search(rf"{name}\W+2\W+frames\W+20\d\d-\d\d-\d\dT", table)
-    before = files(model / "gallery" / "objects")
+    before = files_of(model / "gallery" / "objects")
     assert run_thor2("objects", "--model", model, "--reembed") == 0
-    assert files(model / "gallery" / "objects") == before
+    assert files_of(model / "gallery" / "objects") == before
 
 
-def test_forgetting_an_object(model: Path, frames: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_forgetting_an_object(model: Path, frames: Path, refused: Command) -> None:
     before = json.loads((model / "gallery" / "index.json").read_text())
     write = ("enroll", "new", "--model", model, *one_frame(frames / "000", 5))
     assert run_thor2(*write) == 0 and run_thor2("forget", "new", "--model", model) == 0
     after = json.loads((model / "gallery" / "index.json").read_text())
     assert after["objects"] == before["objects"] and after["generation"] == before["generation"] + 2
-    assert "'new'" in error_of(capsys, "forget", "new", "--model", model)
+    assert "'new'" in refused("forget", "new", "--model", model)
 
 
 def test_a_gallery_outside_the_run_directory(
-    model: Path, frames: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    model: Path, frames: Path, tmp_path: Path, printed: Command, refused: Command
 ) -> None:
     """The run directory does not change, and each gallery has its own objects."""
-    before, other = files(model), ("--gallery", tmp_path / "other")
-    assert "index.json" in error_of(capsys, "objects", "--model", model, *other)
-    assert "run directory" in error_of(capsys, "enroll", "--frames", frames, "--model", tmp_path / "none", *other)
+    before, other = files_of(model), ("--gallery", tmp_path / "other")
+    assert "index.json" in refused("objects", "--model", model, *other)
+    assert "run directory" in refused("enroll", "--frames", frames, "--model", tmp_path / "none", *other)
     assert not (tmp_path / "none").exists() and not (tmp_path / "other").exists()
     for name, label in (("new", 1), ("old", 5)):
         assert run_thor2("enroll", name, "--model", model, *one_frame(frames / "000", label), *other) == 0
     assert run_thor2("forget", "old", "--model", model, *other) == 0
-    capsys.readouterr()
-    assert run_thor2("objects", "--model", model, *other) == 0
-    lines = capsys.readouterr().out
+    lines = printed("objects", "--model", model, *other)
     assert "new" in lines and "old" not in lines and "brick" not in lines
-    assert files(model) == before and Recognizer.load(model, gallery=tmp_path / "other").classes == ("new",)
-
-
-def in_millimetres(tmp_path: Path) -> Path:
-    box = trimesh.creation.box((100, 200, 150))
-    box.visual.vertex_colors = [[200, 100, 50, 255]] * len(box.vertices)
-    box.export(tmp_path / "mm.ply")
-    return tmp_path / "mm.ply"
+    assert files_of(model) == before and Recognizer.load(model, gallery=tmp_path / "other").classes == ("new",)
 
 
 BAD: dict[str, tuple[Callable[[Path, Path], list[object]], str]] = {
     "existing name": (lambda tmp, frames: ["--frames", frames], "'brick'"),
     "no source": (lambda tmp, frames: ["new"], "--mesh"),
     "two sources": (lambda tmp, frames: ["new", "--frames", frames, "--mesh", tmp / "a.ply"], "--mesh"),
-    "half a frame": (lambda tmp, frames: ["new", *one_frame(frames / "000", 5)[:-2]], "--instance"),
-    "millimetres": (lambda tmp, frames: ["new", "--mesh", in_millimetres(tmp)], "mm.ply"),
+    "half a frame": (lambda tmp, frames: ["new", *frame_options(frames / "000")], "--instance"),
+    "millimetres": (lambda tmp, frames: ["new", "--mesh", write_box(tmp / "mm.ply", (100, 200, 150))], "mm.ply"),
     "another label name": (lambda tmp, frames: ["new", "--frames", frames], "'new'"),
     "no such instance": (lambda tmp, frames: ["new", *one_frame(frames / "000", 4)], "instance is 4"),
     "empty name": (lambda tmp, frames: ["", *one_frame(frames / "000", 5)], "the argument after enroll is empty"),
@@ -305,25 +263,23 @@ BAD: dict[str, tuple[Callable[[Path, Path], list[object]], str]] = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_bad_input_changes_nothing(
-    case: str, model: Path, frames: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_bad_input_changes_nothing(case: str, model: Path, frames: Path, tmp_path: Path, refused: Command) -> None:
     arguments, words = BAD[case]
-    given, before = arguments(tmp_path, frames), files(model)
-    assert words in error_of(capsys, "enroll", *given, "--model", model)
-    assert files(model) == before
+    given, before = arguments(tmp_path, frames), files_of(model)
+    assert words in refused("enroll", *given, "--model", model)
+    assert files_of(model) == before
     if case != "existing name":
-        error_of(capsys, "enroll", *given, "--model", tmp_path / "other")
+        refused("enroll", *given, "--model", tmp_path / "other")
         assert not (tmp_path / "other").exists()
 
 
-def test_too_few_points_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_too_few_points_are_refused(tmp_path: Path, refused: Command) -> None:
     frame = write_frame(tmp_path / "frame", {1: "brick"})
     mask = np.zeros((240, 320), np.uint8)
     mask[10:13, 10:13] = 1
     Image.fromarray(mask).save(frame / "mask.png")
     for given in (["--frames", frame], ["new", *one_frame(frame, 1)]):
-        assert "points" in error_of(capsys, "enroll", *given, "--model", tmp_path / "run")
+        assert "points" in refused("enroll", *given, "--model", tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
 
@@ -337,14 +293,11 @@ def test_a_full_disk_leaves_no_run_behind(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    def fail(*_: object) -> None:
-        raise OSError(28, "No space left on device", "index.json")
-
     model = tmp_path / "run"
     if exists:
         model.mkdir()
     before = sorted(tmp_path.iterdir())
-    monkeypatch.setattr(store, step, fail)
+    monkeypatch.setattr(store, step, full_disk)
     assert run_thor2("enroll", "--frames", frames, "--model", model) != 0
     assert "No space left" in capsys.readouterr().err
     assert sorted(tmp_path.iterdir()) == before and (not exists or not any(model.iterdir()))

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from helpers import ParsedPage, run_thor2, write_frame
+from helpers import Command, ParsedPage, full_disk, run_thor2, write_frame
 
 from thor2_jax.errors import InputError
 from thor2_jax.explanation import class_scores
@@ -28,10 +28,9 @@ def frame(tmp_path: Path) -> Path:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("drawn_pictures")
-def test_a_page_for_every_instance(model: Path, frame: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_page_for_every_instance(model: Path, frame: Path, tmp_path: Path, printed: Command) -> None:
     out = tmp_path / "out"
-    assert run_thor2("explain", "--model", model, frame, "--out", out) == 0
-    *pages, last = capfd.readouterr().out.splitlines()
+    *pages, last = printed("explain", "--model", model, frame, "--out", out).splitlines()
     assert sorted(path.name for path in (out / "table").iterdir()) == ["1", "4"] and len(pages) == 2
     assert "thor2 enroll" in last
     for label in (1, 4):
@@ -49,19 +48,15 @@ def test_a_page_for_every_instance(model: Path, frame: Path, tmp_path: Path, cap
 
 @pytest.mark.slow
 def test_nothing_is_left_after_an_error(
-    model: Path, frame: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    model: Path, frame: Path, tmp_path: Path, refused: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fail(*_: Any, **__: Any) -> None:
-        raise OSError(28, "No space left on device", "explanation.html")
-
-    monkeypatch.setattr(explanation_page, "write_page", fail)
-    assert run_thor2("explain", "--model", model, frame, "--instance", 1, "--out", tmp_path / "deep" / "out") == 2
-    assert not (tmp_path / "deep").exists()
-    assert "No space left" in capfd.readouterr().err
+    monkeypatch.setattr(explanation_page, "write_page", full_disk)
+    error = refused("explain", "--model", model, frame, "--instance", 1, "--out", tmp_path / "deep" / "out")
+    assert "No space left" in error and not (tmp_path / "deep").exists()
 
 
 def test_folders_of_the_user_are_not_replaced(
-    model: Path, frame: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    model: Path, frame: Path, refused: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("1/scan.ply", "4/photo.png"):
         (frame / name).parent.mkdir()
@@ -85,8 +80,7 @@ def test_folders_of_the_user_are_not_replaced(
             "explanation.json",
             "scan.ply",
         ]
-    assert run_thor2(*command, 4) == 2
-    assert "photo.png" in capfd.readouterr().err
+    assert "photo.png" in refused(*command, 4)
     assert {(frame / name).read_text() for name in ("1/scan.ply", "4/photo.png")} == {"a user's"}
 
 
@@ -101,21 +95,17 @@ def test_advice_on_a_wrong_name() -> None:
         assert [part in advice for part in ("mug and bowl", "thor2 adapt", "--track")] == [occluded] * 3
 
 
-def test_wrong_arguments_are_one_line(
-    model: Path, frame: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_wrong_arguments_are_one_line(model: Path, frame: Path, tmp_path: Path, refused: Command) -> None:
     out = tmp_path / "out"
     for arguments, text in (
         ((frame, "--instance", 9), "table: instance is 9; expected one of 1, 4"),
         ((tmp_path / "absent",), "is not a directory"),
     ):
-        assert run_thor2("explain", "--model", model, *arguments, "--out", out) == 2
-        error = capfd.readouterr().err.strip()
-        assert text in error and "\n" not in error and not out.exists()
+        assert text in refused("explain", "--model", model, *arguments, "--out", out)
+        assert not out.exists()
     out.mkdir()
     (out / "mine.txt").write_text("x")
-    assert run_thor2("explain", "--model", model, frame, "--out", out) == 2
-    assert "mine.txt" in capfd.readouterr().err
+    assert "mine.txt" in refused("explain", "--model", model, frame, "--out", out)
 
 
 def test_options_of_recognition_hold_for_its_explanation(

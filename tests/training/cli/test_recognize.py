@@ -9,26 +9,34 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import encode_image, frame_options, json_lines, run_thor2, small_frame, write_frame_files
+from helpers import (
+    Command,
+    Recognize,
+    encode_image,
+    files_of,
+    frame_options,
+    json_lines,
+    run_thor2,
+    small_frame,
+    write_frame_files,
+)
 from PIL import Image
 from recording_files import table_frame
 
 CAMERA = {"fx": 120.0, "fy": 120.0, "cx": 60.0, "cy": 45.0}
 
 
-def test_json_of_one_frame(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_json_of_one_frame(recognize: Recognize, tmp_path: Path) -> None:
     folder = write_frame_files(tmp_path / "one", small_frame())
-    assert run_thor2("recognize", "--model", model, *frame_options(folder), "--json", "--out", tmp_path / "out") == 0
-    (answer,) = json_lines(capfd.readouterr().out)
+    (answer,) = recognize(*frame_options(folder), "--json", "--out", tmp_path / "out")
     assert [one["label"] for one in answer["instances"]] == [1, 4]
     assert all(one["name"] in ("bowl", "mug", "plate") for one in answer["instances"])
     assert answer["instances"] == json.loads((tmp_path / "out" / "recognition.json").read_text())
-    assert run_thor2("recognize", "--model", model, *frame_options(folder), "--json", "--unknown-below", 1) == 0
-    (answer,) = json_lines(capfd.readouterr().out)
+    (answer,) = recognize(*frame_options(folder), "--json", "--unknown-below", 1)
     assert [one["name"] for one in answer["instances"]] == [None, None]
 
 
-def test_other_formats_give_the_same_answers(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_other_formats_give_the_same_answers(recognize: Recognize, tmp_path: Path) -> None:
     folder = write_frame_files(tmp_path / "one", small_frame())
     matrix = np.array([[120, 0, 60], [0, 120, 45], [0, 0, 1.0]])
     np.savetxt(tmp_path / "K.txt", matrix)
@@ -45,8 +53,8 @@ def test_other_formats_give_the_same_answers(model: Path, tmp_path: Path, capfd:
         ({"intrinsics": tmp_path / "camera_info.yaml", "depth": tmp_path / "metres.npy"}, []),
         ({"depth": tmp_path / "tenths.png"}, ["--depth-scale", 10_000]),
     ):
-        assert run_thor2("recognize", "--model", model, *frame_options(folder, **changes), *options, "--json") == 0
-        answers += [line["instances"] for line in json_lines(capfd.readouterr().out)]
+        (answer,) = recognize(*frame_options(folder, **changes), *options, "--json")
+        answers.append(answer["instances"])
     for other in answers[1:]:
         for one, expected in zip(other, answers[0], strict=True):
             assert one["name"] == expected["name"] and one["points_used"] == expected["points_used"]
@@ -95,7 +103,8 @@ def test_several_folders_and_tables(model: Path, tmp_path: Path, capfd: pytest.C
     assert run_thor2("recognize", "--model", model, one, tmp_path / "more", *outputs) == 0
     out, err = capfd.readouterr()
     assert out.index("one:") < out.index("deep/two:") and out.count("confidence") == 2
-    assert (tmp_path / "out" / "deep" / "two" / "overlay.png").is_file()
+    with Image.open(tmp_path / "out" / "deep" / "two" / "overlay.png") as overlay:
+        assert overlay.size == (120, 90)
     results = [tmp_path / "out" / name / "recognition.json" for name in ("one", "deep/two")]
     answers = [{"instances": json.loads(path.read_text())} for path in results]
     coco = json.loads((tmp_path / "coco.json").read_text())
@@ -118,22 +127,19 @@ def test_several_folders_and_tables(model: Path, tmp_path: Path, capfd: pytest.C
         (["{frames}", "--coco", "{empty}/c.json", "--names", "{frames}/one/intrinsics.json"], "expected an obj_id"),
         (["{frames}", "--out", "{frames}"], "expected a new or empty directory"),
         (["{frames}", "--depth-scale", "1e-300"], "depth_scale is 1e-300"),
+        (["{frames}", "--unknown-below", "1.5"], "unknown_below is 1.5"),
         (["{files}", "--segment", "table", "--out", "{out}"], "error: labels is "),
         (["{frames}", "--segment", "sam", "--out", "{out}"], "error: segmenter is 'sam'"),
     ],
 )
-def test_invalid_arguments(
-    model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], arguments: list[str], expected: str
-) -> None:
+def test_invalid_arguments(model: Path, tmp_path: Path, refused: Command, arguments: list[str], expected: str) -> None:
     (tmp_path / "empty").mkdir()
     write_frame_files(tmp_path / "frames" / "one", small_frame())
     (tmp_path / "frames" / "names.json").write_text("{}")
     if arguments[:1] == ["{files}"]:
         arguments = [*map(str, frame_options(tmp_path / "frames" / "one")), *arguments[1:]]
     places = {name: tmp_path / name for name in ("frames", "empty", "out")}
-    assert run_thor2("recognize", "--model", model, *(text.format(**places) for text in arguments)) == 2
-    err = capfd.readouterr().err
-    assert expected in err and err.startswith("error: ") and err.count("\n") == 1
+    assert expected in refused("recognize", "--model", model, *(text.format(**places) for text in arguments))
     assert not (tmp_path / "out").exists()
 
 
@@ -151,48 +157,44 @@ def test_invalid_arguments(
     ],
 )
 def test_no_file_of_the_user_is_replaced(
-    model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], name: str, content: str, options: tuple[str, str]
+    model: Path, tmp_path: Path, refused: Command, name: str, content: str, options: tuple[str, str]
 ) -> None:
     frames = tmp_path / "frames"
     write_frame_files(frames / "f", small_frame())
     (frames / name).write_text(content)
-    before = {path: path.read_bytes() for path in frames.rglob("*") if path.is_file()}
-    assert run_thor2("recognize", "--model", model, frames, options[0], frames / options[1]) == 2
-    err = capfd.readouterr().err
-    assert Path(name).name in err and err.startswith("error: ") and err.count("\n") == 1
-    assert {path: path.read_bytes() for path in frames.rglob("*") if path.is_file()} == before
+    before = files_of(frames)
+    assert Path(name).name in refused("recognize", "--model", model, frames, options[0], frames / options[1])
+    assert files_of(frames) == before
 
 
 @pytest.mark.parametrize("segmenter", ["table", pytest.param("model", marks=pytest.mark.slow)])
 def test_frames_without_labels_are_segmented(
-    model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], segmenter: str
+    model: Path,
+    recognize: Recognize,
+    tmp_path: Path,
+    refused: Command,
+    capfd: pytest.CaptureFixture[str],
+    segmenter: str,
 ) -> None:
     folder = write_frame_files(tmp_path / "frames" / "a", table_frame())
     files = frame_options(folder)
     del files[files.index("--labels") : files.index("--labels") + 2]
     for given in (files, [tmp_path / "frames"]):
-        assert run_thor2("recognize", "--model", model, *given, "--segment", segmenter, "--json") == 0
-        (answer,) = json_lines(capfd.readouterr().out)
+        (answer,) = recognize(*given, "--segment", segmenter, "--json")
         assert [one["label"] for one in answer["instances"]] == [1, 2]
-    assert run_thor2("recognize", "--model", model, *files) == 2
-    assert "--segment" in capfd.readouterr().err
+    assert "--segment" in refused("recognize", "--model", model, *files)
     assert run_thor2("recognize", "--model", model, tmp_path / "frames") == 2
     assert "--segment" in capfd.readouterr().err
 
 
 @pytest.mark.parametrize("option", ["--coco", "--bop"])
-def test_tables_that_cannot_be_written(
-    model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], option: str
-) -> None:
+def test_tables_that_cannot_be_written(model: Path, tmp_path: Path, refused: Command, option: str) -> None:
     """They are refused before the frames are recognized."""
     folder, other = write_frame_files(tmp_path / "one", small_frame()), "--bop" if option == "--coco" else "--coco"
     os.mkfifo(tmp_path / "pipe")
     for path in (tmp_path, folder / "color.png" / "results", tmp_path / "pipe"):
-        assert run_thor2("recognize", "--model", model, folder, option, path) == 2
-        out, err = capfd.readouterr()
-        assert out == "" and f"{option[2:]}: {path} is not a file" in err and err.count("\n") == 1
-    assert run_thor2("recognize", "--model", model, folder, option, "x", other, "x") == 2
-    assert "coco and bop are x" in capfd.readouterr().err
+        assert f"{option[2:]}: {path} is not a file" in refused("recognize", "--model", model, folder, option, path)
+    assert "coco and bop are x" in refused("recognize", "--model", model, folder, option, "x", other, "x")
     assert (tmp_path / "pipe").is_fifo()
 
 
@@ -203,47 +205,41 @@ def test_outputs_stay_in_out(model: Path, tmp_path: Path) -> None:
     assert [path.name for path in out.parent.iterdir()] == ["out"] and (out / "one" / "overlay.png").is_file()
 
 
-def test_a_wrong_unit_of_depth(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_wrong_unit_of_depth(model: Path, tmp_path: Path, refused: Command) -> None:
     """Without usable depth, the segmenter finds nothing: that is an error if it is so in all frames."""
     frame = table_frame()
     write_frame_files(tmp_path / "a", frame)
     command = ("recognize", "--model", model, tmp_path / "a", "--segment", "table", "--out", tmp_path / "out")
-    assert run_thor2(*command, "--depth-scale", 1, "--coco", tmp_path / "coco.json") == 2
-    error = capfd.readouterr().err
-    assert "depth_scale" in error and "It is 1 units" in error and error.count("\n") == 1
+    error = refused(*command, "--depth-scale", 1, "--coco", tmp_path / "coco.json", at_once=False)
+    assert "depth_scale" in error and "It is 1 units" in error
     assert json.loads((tmp_path / "coco.json").read_text()) == []
     write_frame_files(tmp_path / "b", dataclasses.replace(frame, depth=frame.depth * 0))
     assert run_thor2("recognize", "--model", model, tmp_path / "a", tmp_path / "b", "--segment", "table") == 0
 
 
-def test_labels_are_replaced_where_a_folder_is_segmented(
-    model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_labels_are_replaced_where_a_folder_is_segmented(recognize: Recognize, tmp_path: Path) -> None:
     folder = write_frame_files(tmp_path / "one", table_frame())
     (folder / "mask.png").write_bytes(encode_image(np.full((240, 320), 9, np.uint8)))
-    assert run_thor2("recognize", "--model", model, folder, "--segment", "table", "--json") == 0
-    (answer,) = json_lines(capfd.readouterr().out)
+    (answer,) = recognize(folder, "--segment", "table", "--json")
     assert [one["label"] for one in answer["instances"]] == [1, 2]
 
 
-def test_track_gives_an_object_one_name(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_track_gives_an_object_one_name(model: Path, recognize: Recognize, tmp_path: Path, printed: Command) -> None:
     frames = [write_frame_files(tmp_path / "video" / f"{number}", small_frame(number)) for number in range(3)]
     poses = tmp_path / "poses.json"
     poses.write_text(json.dumps({frame.name: np.eye(4).tolist() for frame in frames}))
-    command = ("recognize", "--model", model, tmp_path / "video", "--track", "--poses", poses)
-    assert run_thor2(*command, "--json", "--out", tmp_path / "out") == 0
-    answers = json_lines(capfd.readouterr().out)
+    command = (tmp_path / "video", "--track", "--poses", poses)
+    answers = recognize(*command, "--json", "--out", tmp_path / "out")
     assert [answer["frame"] for answer in answers] == ["0", "1", "2"]
     assert [[one["track"] for one in answer["instances"]] for answer in answers] == [[1, 2]] * 3
     for index in range(2):
         assert len({(a["instances"][index]["name"], a["instances"][index]["confidence"]) for a in answers}) == 1
         assert [a["instances"][index]["frames"] for a in answers] == [3, 3, 3]
     assert (tmp_path / "out" / "2" / "overlay.png").is_file()
-    assert run_thor2(*command) == 0
-    assert "track" in capfd.readouterr().out
+    assert "track" in printed("recognize", "--model", model, *command)
 
 
-def test_bad_sequences_write_nothing(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_bad_sequences_write_nothing(model: Path, tmp_path: Path, refused: Command) -> None:
     frames = [write_frame_files(tmp_path / "video" / f"{number}", small_frame(number)) for number in range(2)]
     poses, out = tmp_path / "poses.json", tmp_path / "out"
     command = ("recognize", "--model", model, tmp_path / "video", "--out", out)
@@ -255,13 +251,9 @@ def test_bad_sequences_write_nothing(model: Path, tmp_path: Path, capfd: pytest.
     ]
     for content, message in cases:
         poses.write_text(content if isinstance(content, str) else json.dumps(content))
-        assert run_thor2(*command, "--track", "--poses", poses) == 2
-        assert message in capfd.readouterr().err
-    assert run_thor2(*command, "--poses", poses) == 2
-    assert "--track" in capfd.readouterr().err
+        assert message in refused(*command, "--track", "--poses", poses)
+    assert "--track" in refused(*command, "--poses", poses)
     for name in ("color.png", "depth.png", "mask.png"):
         Image.open(frames[1] / name).crop((0, 0, 100, 90)).save(frames[1] / name)
-    assert run_thor2(*command, "--track") == 2
-    error = capfd.readouterr().err
-    assert "1: frame has 100 x 90 pixels" in error and error.count("\n") == 1
+    assert "1: frame has 100 x 90 pixels" in refused(*command, "--track")
     assert not out.exists()

@@ -6,18 +6,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import json_lines, run_thor2, write_frame_files
+from helpers import Command, Recognize, json_lines, run_thor2, write_frame_files
 from PIL import Image
 from recording_files import (
-    CAMERA,
     COLOR,
-    DEPTH,
     PERIOD,
     START,
     bag_writer,
-    camera_info,
     image,
     table_frame,
+    write_images,
     write_recording,
 )
 from rosbags.highlevel import AnyReader
@@ -42,12 +40,9 @@ def messages_of(path: Path) -> dict[str, list[tuple[int, Any]]]:
     ("name", "out"),
     [pytest.param("a.bag", "out.mcap", marks=pytest.mark.slow), ("folder", "out"), ("a.mcap", "out.mcap")],
 )
-def test_detections_are_read_back(
-    model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], name: str, out: str
-) -> None:
+def test_detections_are_read_back(recognize: Recognize, tmp_path: Path, name: str, out: str) -> None:
     path = write_recording(tmp_path / name, FRAMES, is_compressed=name == "a.mcap")
-    assert run_thor2("recognize", "--model", model, "--bag", path, "--out-bag", tmp_path / out) == 0
-    lines = json_lines(capfd.readouterr().out)
+    lines = recognize("--bag", path, "--out-bag", tmp_path / out)
     assert [line["frame"] for line in lines] == [f"1700000000.{k * PERIOD:09d}" for k in range(3)]
     messages = messages_of(tmp_path / out)
     assert set(messages) == {"/thor2/detections", "/thor2/overlay/compressed"}
@@ -75,37 +70,30 @@ def test_detections_are_read_back(
 
 
 @pytest.mark.parametrize("segment", [(), pytest.param(("--segment", "model"), marks=pytest.mark.slow)])
-def test_every_second_frame_and_pictures(
-    segment: tuple[str, ...], model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_every_second_frame_and_pictures(recognize: Recognize, segment: tuple[str, ...], tmp_path: Path) -> None:
     path = write_recording(tmp_path / "a.mcap", FRAMES)
-    command = ("recognize", "--model", model, "--bag", path, "--every", 2, "--out", tmp_path / "out")
-    assert run_thor2(*command, "--unknown-below", 1, *segment) == 0
-    lines = json_lines(capfd.readouterr().out)
+    lines = recognize("--bag", path, "--every", 2, "--out", tmp_path / "out", "--unknown-below", 1, *segment)
     assert [line["frame"] for line in lines] == ["1700000000.000000000", "1700000000.066666666"]
     assert all(one["name"] is None for line in lines for one in line["instances"])
     assert sorted(one.name for one in (tmp_path / "out").iterdir()) == [line["frame"] for line in lines]
 
 
-def test_tracks_are_the_ids_of_detections(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_tracks_are_the_ids_of_detections(recognize: Recognize, tmp_path: Path) -> None:
     path = write_recording(tmp_path / "a.mcap", FRAMES)
-    command = ("recognize", "--model", model, "--bag", path, "--track", "--out-bag", tmp_path / "out")
-    assert run_thor2(*command) == 0
-    lines = json_lines(capfd.readouterr().out)
+    lines = recognize("--bag", path, "--track", "--out-bag", tmp_path / "out")
     assert [[one["track"] for one in line["instances"]] for line in lines] == [[1, 2]] * 3
     assert [one["frames"] for one in lines[2]["instances"]] == [3, 3]
     for _, array in messages_of(tmp_path / "out")["/thor2/detections"]:
         assert [detection.id for detection in array.detections] == ["1", "2"]
 
 
-def test_rerun_files_of_bags_and_folders(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_rerun_files_of_bags_and_folders(model: Path, tmp_path: Path, printed: Command) -> None:
     pytest.importorskip("rerun", reason="rerun-sdk is not installed (pip install rerun-sdk; 660 MB)")
     path = write_recording(tmp_path / "a.mcap", FRAMES)
     assert run_thor2("recognize", "--model", model, "--bag", path, "--rerun", tmp_path / "bag.rrd") == 0
     write_frame_files(tmp_path / "frames" / "0", FRAMES[0])
     command = ("recognize", "--model", model, tmp_path / "frames", "--segment", "table")
-    assert run_thor2(*command, "--rerun", tmp_path / "folder.rrd") == 0
-    assert f"written to {tmp_path / 'folder.rrd'}" in capfd.readouterr().out
+    assert f"written to {tmp_path / 'folder.rrd'}" in printed(*command, "--rerun", tmp_path / "folder.rrd")
     for name in ("bag.rrd", "folder.rrd"):
         assert (tmp_path / name).read_bytes().startswith(b"RRF2")
 
@@ -138,16 +126,13 @@ def test_what_was_done_before_the_end_is_kept(model: Path, tmp_path: Path, capfd
     assert len(messages_of(tmp_path / "out.mcap")["/thor2/detections"]) == n_frames
 
 
-def test_frames_with_one_stamp_and_before_1970(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_frames_with_one_stamp_and_before_1970(recognize: Recognize, tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     with bag_writer(path) as write:
         for arrival, stamp in enumerate((-1, START, START, START)):
-            write(CAMERA, camera_info(FRAMES[0].intrinsics, FRAMES[0].depth.shape, stamp), arrival)
-            write(COLOR, image(FRAMES[0].color, "rgb8", stamp), arrival)
-            write(DEPTH, image(FRAMES[0].depth, "16UC1", stamp), arrival)
-    command = ("recognize", "--model", model, "--bag", path, "--out", tmp_path / "out")
-    assert run_thor2(*command, "--out-bag", tmp_path / "out.mcap") == 0
-    names = [line["frame"] for line in json_lines(capfd.readouterr().out)]
+            write_images(write, FRAMES[0], arrival, stamp)
+    lines = recognize("--bag", path, "--out", tmp_path / "out", "--out-bag", tmp_path / "out.mcap")
+    names = [line["frame"] for line in lines]
     assert names == ["-0.000000001", *(f"1700000000.000000000{end}" for end in ("", "-2", "-3"))]
     assert sorted(one.name for one in (tmp_path / "out").iterdir()) == sorted(names)
     messages = messages_of(tmp_path / "out.mcap")["/thor2/detections"]
@@ -158,28 +143,24 @@ def test_frames_with_one_stamp_and_before_1970(model: Path, tmp_path: Path, capf
 def test_texts_of_recordings_are_escaped(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "a.mcap"
     with bag_writer(path) as write:
-        write(CAMERA, camera_info(FRAMES[0].intrinsics, FRAMES[0].depth.shape), START)
-        write(COLOR, image(FRAMES[0].color, "rgb8", frame_id="a\n\x1b[2J"), START)
-        write(DEPTH, image(FRAMES[0].depth, "16UC1"), START)
+        write_images(write, FRAMES[0], frame_id="a\n\x1b[2J")
     assert run_thor2("recognize", "--model", model, "--bag", path) == 0
     (note,) = [line for line in capfd.readouterr().err.splitlines() if line.startswith("note: ")]
     assert r"color in a\n\x1b[2J" in note
 
 
-def test_a_wrong_unit_of_depth(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_wrong_unit_of_depth(model: Path, tmp_path: Path, refused: Command) -> None:
     path = write_recording(tmp_path / "a.mcap", FRAMES[:2])
-    assert run_thor2("recognize", "--model", model, "--bag", path, "--depth-scale", 10) == 2
-    assert "is depth_scale right? It is 10 units" in capfd.readouterr().err
+    error = refused("recognize", "--model", model, "--bag", path, "--depth-scale", 10, at_once=False)
+    assert "is depth_scale right? It is 10 units" in error
 
 
-def test_a_time_out_of_the_range_of_ros_2(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_time_out_of_the_range_of_ros_2(model: Path, tmp_path: Path, refused: Command) -> None:
     path, late = tmp_path / "a.mcap", 2**31 * 10**9
     with bag_writer(path) as write:  # images without a time stamp have the time at which they were recorded
-        write(CAMERA, camera_info(FRAMES[0].intrinsics, FRAMES[0].depth.shape, 0), late)
-        write(COLOR, image(FRAMES[0].color, "rgb8", 0), late)
-        write(DEPTH, image(FRAMES[0].depth, "16UC1", 0), late)
-    assert run_thor2("recognize", "--model", model, "--bag", path, "--out-bag", tmp_path / "out.mcap") == 2
-    assert "error: out_bag: a frame has the time 2147483648 s" in (error := capfd.readouterr().err)
+        write_images(write, FRAMES[0], late, 0)
+    error = refused("recognize", "--model", model, "--bag", path, "--out-bag", tmp_path / "out.mcap", at_once=False)
+    assert "error: out_bag: a frame has the time 2147483648 s" in error
     assert str(tmp_path / "out.mcap") not in error and not (tmp_path / "out.mcap").exists()
 
 
@@ -204,38 +185,32 @@ def test_a_time_out_of_the_range_of_ros_2(model: Path, tmp_path: Path, capfd: py
         (["--rerun", "{there}/a.mcap"], "the suffix .rrd"),
     ],
 )
-def test_invalid_arguments(
-    model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], arguments: list[str], expected: str
-) -> None:
+def test_invalid_arguments(model: Path, tmp_path: Path, refused: Command, arguments: list[str], expected: str) -> None:
     path = write_recording(tmp_path / "in.mcap", FRAMES[:1])
     given = [text.format(there=tmp_path) for text in arguments]
     before = sorted(tmp_path.iterdir())
-    assert run_thor2("recognize", "--model", model, "--bag", path, *given) == 2
-    out, err = capfd.readouterr()
-    assert out == "" and expected in err and err.startswith("error: ") and err.count("\n") == 1
+    assert expected in refused("recognize", "--model", model, "--bag", path, *given)
     assert sorted(tmp_path.iterdir()) == before
 
 
-def test_options_of_bags_need_a_bag(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_options_of_bags_need_a_bag(model: Path, tmp_path: Path, refused: Command) -> None:
     for option, value in (("depth_topic", "/d"), ("max_gap", 0.1), ("every", 2), ("out_bag", "a.mcap")):
-        assert run_thor2("recognize", "--model", model, tmp_path, f"--{option.replace('_', '-')}", value) == 2
-        assert f"{option} is {value}; it belongs to --bag" in capfd.readouterr().err
+        error = refused("recognize", "--model", model, tmp_path, f"--{option.replace('_', '-')}", value)
+        assert f"{option} is {value}; it belongs to --bag" in error
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(not REAL.is_dir(), reason="no real frames beside the repository (shared/data/frames)")
 @pytest.mark.parametrize("name", ["a.mcap", "a.bag", "folder"])
-def test_recordings_of_real_frames(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], name: str) -> None:
+def test_recordings_of_real_frames(recognize: Recognize, tmp_path: Path, name: str) -> None:
     folders = sorted(one for one in REAL.iterdir() if one.is_dir())[:2]
     files = [
         dict(color=one / "color.png", depth=one / "depth.png", intrinsics=one / "intrinsics.json") for one in folders
     ]
     frames = [read_frame(**one) for one in files]
     path = write_recording(tmp_path / name, frames)
-    assert run_thor2("recognize", "--model", model, "--bag", path, "--out-bag", tmp_path / "out.mcap") == 0
-    from_bag = [line["instances"] for line in json_lines(capfd.readouterr().out)]
-    assert run_thor2("recognize", "--model", model, *folders, "--segment", "table", "--json") == 0
-    from_files = [line["instances"] for line in json_lines(capfd.readouterr().out)]
+    from_bag = [line["instances"] for line in recognize("--bag", path, "--out-bag", tmp_path / "out.mcap")]
+    from_files = [line["instances"] for line in recognize(*folders, "--segment", "table", "--json")]
     assert [[one["label"] for one in answer] for answer in from_bag] == [
         sorted(set(np.unique(segment(frame)).tolist()) - {0}) for frame in frames
     ]

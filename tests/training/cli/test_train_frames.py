@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-import trimesh
-from helpers import run_thor2, write_frame
+from helpers import Command, run_thor2, write_box, write_frame
 from PIL import Image
 
 from thor2_jax.model.run_directory import load_run
@@ -36,9 +35,7 @@ def frames(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def meshes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("meshes")
     for name, size in (("brick", (0.1, 0.06, 0.2)), ("box", (0.1, 0.1, 0.1))):
-        mesh = trimesh.creation.box(size)
-        mesh.visual.vertex_colors = np.tile(np.array([[200, 40, 40, 255]], np.uint8), (8, 1))
-        mesh.export(folder / f"{name}.ply")
+        write_box(folder / f"{name}.ply", size)
     return folder
 
 
@@ -46,33 +43,24 @@ def record_of(run: Path) -> dict[str, Any]:
     return dict(load_run(run).record["dataset"])
 
 
-def error_of(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
-    capsys.readouterr()
-    assert run_thor2("train", *arguments) == 2
-    error = capsys.readouterr().err.splitlines()[-1]
-    assert error.startswith("error: ")
-    return error
-
-
-def test_train_on_frames_alone(frames: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_train_on_frames_alone(frames: Path, tmp_path: Path, printed: Command, refused: Command) -> None:
     run = tmp_path / "run"
     command = ("train", "--frames", frames / "0", frames / "1", "--out", run, *TINY)
-    assert run_thor2(*command) == 0
-    out = capsys.readouterr().out
+    out = printed(*command)
     assert out.count("skipped: ") == 1 and "1: instance 7" in out
     record = record_of(run)
     assert record["views"] == 4 * 9 and record["frames"]["instances"] == {"brick": 2, "book": 2}
     recognizer = Recognizer.load(run)
     assert recognizer.classes == ("brick", "book") and recognizer.model.answers_by() == "classifiers"
-    assert run_thor2(*command) == 0 and "finished already" in capsys.readouterr().out
-    message = error_of(capsys, "--frames", frames / "0", frames / "0", "--out", run, *TINY)
+    assert "finished already" in printed(*command)
+    message = refused("train", "--frames", frames / "0", frames / "0", "--out", run, *TINY)
     assert "out: " in message and "dataset" in message
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("unfitted")
 def test_frames_join_the_views_of_meshes(
-    meshes: Path, frames: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    meshes: Path, frames: Path, tmp_path: Path, printed: Command, refused: Command
 ) -> None:
     """The brick has a mesh and frames, the box a mesh, the book frames."""
     run = tmp_path / "run"
@@ -82,14 +70,14 @@ def test_frames_join_the_views_of_meshes(
     assert {entry["name"] for entry in record["job"]["objects"]} == {"box", "brick"}
     assert record["frames"]["instances"] == {"brick": 2, "book": 2}
     assert Recognizer.load(run).classes == ("box", "brick", "book") and not (run / "views").exists()
-    assert run_thor2("train", *command) == 0 and "finished already" in capsys.readouterr().out
-    assert "with frames " in error_of(capsys, "--meshes", meshes, "--out", run, *STEPS, *TINY)
+    assert "finished already" in printed("train", *command)
+    assert "with frames " in refused("train", "--meshes", meshes, "--out", run, *STEPS, *TINY)
     other = ("--meshes", meshes, "--frames", frames / "0", "--out", run, *STEPS, *TINY)
-    assert "with frames " in error_of(capsys, *other)
+    assert "with frames " in refused("train", *other)
 
 
 def test_frames_that_cannot_be_trained_on_are_refused(
-    meshes: Path, frames: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    meshes: Path, frames: Path, tmp_path: Path, refused: Command
 ) -> None:
     empty = tmp_path / "empty"
     empty.mkdir()
@@ -124,5 +112,5 @@ def test_frames_that_cannot_be_trained_on_are_refused(
         ("also a class", ("--frames", frames, frames / "0", "--distractors", meshes)),
     ):
         distractors = () if "--distractors" in options else TINY[:2]
-        assert words in error_of(capsys, *options, "--out", out, *distractors), options
+        assert words in refused("train", *options, "--out", out, *distractors), options
         assert not out.exists()

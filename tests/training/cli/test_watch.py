@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers import run_thor2, write_frame_files
+from helpers import Command, run_thor2, write_frame_files
 from processes import HANG
 from recording_files import table_frame, write_recording
 
@@ -85,7 +85,7 @@ def test_ctrl_c_is_not_lost_during_compilation(
 
 
 def test_a_damaged_recording_ends_with_its_line(
-    model: Path, tmp_path: Path, messages: list[dict[str, Any]], capfd: pytest.CaptureFixture[str]
+    model: Path, tmp_path: Path, messages: list[dict[str, Any]], capfd: pytest.CaptureFixture[str], refused: Command
 ) -> None:
     path = write_recording(tmp_path / "a.mcap", FRAMES, gap=5 * 10**9)
     assert run_thor2("watch", "--model", model, "--bag", path, "--port", 0) == 2
@@ -93,8 +93,7 @@ def test_a_damaged_recording_ends_with_its_line(
     assert error.startswith("error: bag: ") and "expected at most" in error
     assert messages[-1]["state"] == "failed" and "expected at most" in messages[-1]["message"]
     path.write_bytes(path.read_bytes()[:1000])
-    assert run_thor2("watch", "--model", model, "--bag", path, "--port", 0) == 2
-    assert "mcap recover" in capfd.readouterr().err
+    assert "mcap recover" in refused("watch", "--model", model, "--bag", path, "--port", 0)
 
 
 @pytest.mark.parametrize(
@@ -108,22 +107,14 @@ def test_a_damaged_recording_ends_with_its_line(
         (["--folder", "a", "--segment", "sam"], "segmenter is 'sam'"),
     ],
 )
-def test_invalid_arguments(
-    model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], arguments: list[str], expected: str
-) -> None:
+def test_invalid_arguments(model: Path, tmp_path: Path, refused: Command, arguments: list[str], expected: str) -> None:
     given = [text.format(none=tmp_path / "none") for text in arguments]
-    assert run_thor2("watch", "--model", model, *given) == 2
-    err = capfd.readouterr().err
-    assert expected in err and err.startswith("error: ") and err.count("\n") == 1
+    assert expected in refused("watch", "--model", model, *given)
 
 
-def test_realsense_without_its_package(
-    model: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_realsense_without_its_package(model: Path, refused: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyrealsense2", None)
-    assert run_thor2("watch", "--model", model, "--realsense") == 2
-    err = capfd.readouterr().err
-    assert err.startswith("error: realsense needs pyrealsense2") and err.count("\n") == 1
+    assert "error: realsense needs pyrealsense2" in refused("watch", "--model", model, "--realsense")
 
 
 @pytest.mark.slow

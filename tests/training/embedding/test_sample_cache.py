@@ -1,6 +1,5 @@
 """Samples of distractors in the user's cache: kept, renewed, bounded, and unusable caches."""
 
-import errno
 import logging
 import os
 from collections.abc import Callable
@@ -9,8 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-import trimesh
-from helpers import SMALL_CONFIG
+from helpers import SMALL_CONFIG, full_disk, write_box
 
 import colornet
 import thor2_jax as thor2
@@ -131,11 +129,8 @@ def test_a_damaged_file_costs_one_warning(
 def test_a_full_or_unwritable_disk_costs_one_warning(
     cache: Path, counted: Callable[..., int], caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(path: Path) -> Any:
-        raise OSError(errno.ENOSPC, "No space left on device", str(path))
-
     with monkeypatch.context() as patch:
-        patch.setattr(sampling, "atomic_write", full)
+        patch.setattr(sampling, "atomic_write", full_disk)
         assert counted() == 1
     assert files(cache) == [] and "No space left" in caplog.records[-1].getMessage()
     monkeypatch.setenv("THOR2_CACHE", "/proc/no-such-directory")
@@ -166,10 +161,7 @@ def test_what_determines_the_samples(monkeypatch: pytest.MonkeyPatch, tmp_path: 
         return SAMPLES
 
     def mesh(extent: float) -> dict[str, Path]:
-        box = trimesh.creation.box((extent, 0.1, 0.1))
-        box.visual.vertex_colors = np.full((8, 4), 255, np.uint8)
-        box.export(tmp_path / "box.ply")
-        return {"box": tmp_path / "box.ply"}
+        return {"box": write_box(tmp_path / "box.ply", (extent, 0.1, 0.1))}
 
     def key(distractors: Distractors, config: thor2.DescriptorConfig = SMALL_CONFIG) -> dict[str, Any]:
         monkeypatch.setattr(run_embedding, "cached_samples", record)

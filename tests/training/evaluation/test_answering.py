@@ -17,11 +17,10 @@ from training.readers.labelled import LabelledFrame
 class ToyRecognizer(UntaughtRecognizer):
     """Stand-in for a recognizer: the k-th usable instance of a frame has row k of the given probabilities."""
 
-    run = SimpleNamespace(classes=("mug", "bowl", "can"), classifiers={"tops": None, "tops2": None}, record={})
-
     def __init__(
         self, labels: list[int], unusable: dict[int, str], probabilities: dict[str, list[list[float]]]
     ) -> None:
+        super().__init__(("mug", "bowl", "can"), ("tops", "tops2"))
         self.instances = [
             SimpleNamespace(label=label, reason=unusable.get(label), occluded=label == 4) for label in labels
         ]

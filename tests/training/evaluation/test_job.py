@@ -8,12 +8,18 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from helpers import SMALL_CONFIG, ParsedPage, ToyDescriptors, UntaughtRecognizer, untrained_embedding_run
+from helpers import (
+    SMALL_CONFIG,
+    ParsedPage,
+    ToyDescriptors,
+    UntaughtRecognizer,
+    input_error,
+    untrained_embedding_run,
+)
 from PIL import Image
 from processes import HANG
 
@@ -68,8 +74,8 @@ class ToyRecognizer(UntaughtRecognizer):
     """Returns random probabilities, seeded by run and frame, and logs each frame that it describes."""
 
     def __init__(self, seed: int, log: Path, features: tuple[str, ...], stop_at: int | None = None) -> None:
+        super().__init__(CLASSES, features)
         self.seed, self.log, self.stop_at = seed, log, stop_at
-        self.run = SimpleNamespace(classes=CLASSES, classifiers=dict.fromkeys(features), record={})
 
     def describe(self, frame: Any) -> Any:
         number = int(frame.color[0, 0, 0])
@@ -79,8 +85,9 @@ class ToyRecognizer(UntaughtRecognizer):
             raise KeyboardInterrupt
         with self.log.open("a") as file:
             file.write(f"{number}\n")
-        instances = [SimpleNamespace(label=label, reason=None, occluded=False) for label in frame.instances]
-        return SimpleNamespace(instances=instances, usable=instances, oriented=ToyDescriptors(number))
+        described = super().describe(frame)
+        described.oriented = ToyDescriptors(number)
+        return described
 
     def probabilities(self, oriented: int) -> dict[str, np.ndarray]:
         rng = np.random.default_rng([self.seed, oriented])
@@ -93,9 +100,13 @@ def toys(log: Path, stop_at: int | None = None) -> list[Run]:
     return [Run(f"run{k}", f"digest{k}", ToyRecognizer(k, log, f, stop_at)) for k, f in enumerate(features)]  # type: ignore[arg-type]
 
 
-def evaluate_toys(folder: Path, n: int, stop_at: int | None = None) -> dict[str, Any]:
-    description = {"kind": "frames", "path": "toys"}
-    return evaluate_dataset(toys(folder / "log", stop_at), ToyDataset(n), description, folder / "report")
+DESCRIPTION = {"kind": "frames", "path": "toys"}
+
+
+def evaluate_toys(folder: Path, dataset: int | LabelledFrames, stop_at: int | None = None) -> dict[str, Any]:
+    """Evaluate two runs on a dataset, or on a number of frames, and return the report."""
+    frames = ToyDataset(dataset) if isinstance(dataset, int) else dataset
+    return evaluate_dataset(toys(folder / "log", stop_at), frames, DESCRIPTION, folder / "report")
 
 
 def without_times(report: dict[str, Any]) -> dict[str, Any]:
@@ -138,21 +149,16 @@ def test_answered_frames_are_not_read_again(tmp_path: Path) -> None:
     answers = tmp_path / "report" / "answers.jsonl"
     answers.write_text("".join(answers.read_text().splitlines(keepends=True)[: 1 + 4]))
     dataset = ToyDataset(6)
-    evaluate_dataset(toys(tmp_path / "log"), dataset, {"kind": "frames", "path": "toys"}, tmp_path / "report")
+    evaluate_toys(tmp_path, dataset)
     assert dataset.read == [4, 5]
 
 
 def test_runs_may_have_different_classifiers(tmp_path: Path) -> None:
     stages: list[tuple[str, int, int, str]] = []
-    report = evaluate_dataset(
-        toys(tmp_path / "log"),
-        ToyDataset(5),
-        {"kind": "frames", "path": "toys"},
-        tmp_path / "report",
-        lambda *stage: stages.append(stage),
-    )
+    runs, out = toys(tmp_path / "log"), tmp_path / "report"
+    report = evaluate_dataset(runs, ToyDataset(5), DESCRIPTION, out, lambda *stage: stages.append(stage))
     assert [done for _, done, _, _ in stages] == list(range(6)) and "frames/s" in stages[-1][3]
-    assert report == json.loads((tmp_path / "report" / "report.json").read_text())
+    assert report == json.loads((out / "report.json").read_text())
     accuracy = report["accuracy"]["max"][0]["cells"][0]["accuracy"]
     assert {name: figure["runs"] for name, figure in accuracy.items()} == {
         "CE": 1, "TOPS": 2, "TOPS2": 2, "CE+TOPS": 1, "CE+TOPS2": 1, "THOR2": 2, "CE+TOPS+TOPS2": 1,
@@ -174,8 +180,8 @@ def test_an_embedding_alone_is_evaluated(tmp_path: Path, calibrated: bool) -> No
     save_run(untrained_embedding_run(CLASSES, config=config, record=record), tmp_path / "run")
     (run,) = load_runs([tmp_path / "run"])
     assert run.predictors == ("embedding",) and run.answer_by == "classifiers"
-    dataset, path = ToyDataset(5), {"kind": "frames", "path": "toys"}
-    report = evaluate_dataset([run], dataset, path, tmp_path / "report")
+    dataset = ToyDataset(5)
+    report = evaluate_dataset([run], dataset, DESCRIPTION, tmp_path / "report")
     assert report["main"] == "embedding" and report["fusions"] == ["embedding"]
     assert report["temperatures"]["embedding"]["runs"] == 0
     confusion, confidences = np.zeros((3, 4), int), []
@@ -227,9 +233,8 @@ def test_page_for_datasets_of_any_size(tmp_path: Path, n: int) -> None:
 
 def test_page_shows_published_tables(tmp_path: Path) -> None:
     """The toys have no environment, so only rows on the whole dataset match: of tables 4, 7, 9 and of THOR's paper."""
-    report = evaluate_dataset(
-        toys(tmp_path / "log"), ToyDataset(2), {"kind": "uwis", "path": "toys"}, tmp_path / "report"
-    )
+    runs, description = toys(tmp_path / "log"), {"kind": "uwis", "path": "toys"}
+    report = evaluate_dataset(runs, ToyDataset(2), description, tmp_path / "report")
     assert [table["number"] for table in report["published_tables"]] == [4, 7, 9, None]
     page = ParsedPage((tmp_path / "report" / "report.html").read_text())
     assert page.open == []
@@ -242,29 +247,25 @@ def test_page_shows_published_tables(tmp_path: Path) -> None:
     assert any("2408.01579" in text and "8,456 frames" in text for text in page.text)
 
 
-def evaluate_empty_frame(tmp_path: Path, name: str) -> Path:
-    """Evaluate a frame without pixels of its only object, which has this name."""
+def empty_frame(name: str) -> OneFrame:
+    """Return a frame without pixels of its only object, which has this name."""
+    image = np.zeros((8, 8), np.uint8)
     frame = thor2.RGBDFrame(
-        np.zeros((8, 8, 3), np.uint8),
-        np.zeros((8, 8), np.uint16),
-        np.zeros((8, 8), np.uint8),
-        thor2.Intrinsics(1.0, 1.0, 0.0, 0.0),
+        np.dstack([image] * 3), image.astype(np.uint16), image, thor2.Intrinsics(1.0, 1.0, 0.0, 0.0)
     )
-    dataset = OneFrame(LabelledFrame("f", frame, {1: name}, {}))
-    evaluate_dataset(toys(tmp_path / "log"), dataset, {"kind": "frames", "path": name}, tmp_path / name)
-    return tmp_path / name
+    return OneFrame(LabelledFrame("f", frame, {1: name}, {}))
 
 
 def test_page_without_described_instances(tmp_path: Path) -> None:
-    report = evaluate_empty_frame(tmp_path, "mug")
-    assert ParsedPage((report / "report.html").read_text()).open == []
+    evaluate_toys(tmp_path, empty_frame("mug"))
+    assert ParsedPage((tmp_path / "report" / "report.html").read_text()).open == []
 
 
 def test_an_evaluation_without_known_objects_is_refused(tmp_path: Path) -> None:
     """The message has the names of the dataset and of the runs."""
     with pytest.raises(InputError, match="dragon.*bowl, can, mug"):
-        evaluate_empty_frame(tmp_path, "dragon")
-    assert not (tmp_path / "dragon" / "report.json").exists()
+        evaluate_toys(tmp_path, empty_frame("dragon"))
+    assert not (tmp_path / "report" / "report.json").exists()
 
 
 class FileDataset(ToyDataset):
@@ -282,24 +283,23 @@ class FileDataset(ToyDataset):
 
 def test_answers_for_changed_files_are_refused(tmp_path: Path) -> None:
     """The message names the file; unchanged files are no reason to recompute anything."""
-    dataset, description, log = FileDataset(tmp_path, 3), {"kind": "frames", "path": "toys"}, tmp_path / "log"
-    report = tmp_path / "report"
-    first = evaluate_dataset(toys(log), dataset, description, report)
+    dataset, report = FileDataset(tmp_path, 3), tmp_path / "report"
+    first = evaluate_toys(tmp_path, dataset)
     answers = (report / "answers.jsonl").read_bytes()
-    assert without_times(evaluate_dataset(toys(log), dataset, description, report)) == without_times(first)
+    assert without_times(evaluate_toys(tmp_path, dataset)) == without_times(first)
     for content in (b"changed", None):
         if content is None:
             (tmp_path / "1.png").unlink()
         else:
             (tmp_path / "1.png").write_bytes(content)
         with pytest.raises(InputError, match=r"^out: .*1\.png"):
-            evaluate_dataset(toys(log), dataset, description, report)
+            evaluate_toys(tmp_path, dataset)
     (tmp_path / "1.png").write_bytes(bytes([1]))
     lines = [json.loads(line) for line in answers.splitlines()]
     for line in lines[1:]:
         del line["files"]  # as version 0.1.0 wrote them
     (report / "answers.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    evaluate_dataset(toys(log), dataset, description, report)
+    evaluate_toys(tmp_path, dataset)
 
 
 def test_leftovers_of_a_kill_are_removed(tmp_path: Path) -> None:
@@ -317,7 +317,7 @@ def test_an_unreadable_first_frame_leaves_no_directory(tmp_path: Path) -> None:
             raise InputError("color.png is damaged")
 
     with pytest.raises(InputError, match="damaged"):
-        evaluate_dataset(toys(tmp_path / "log"), Unreadable(2), {"kind": "frames", "path": "t"}, tmp_path / "report")
+        evaluate_toys(tmp_path, Unreadable(2))
     assert not (tmp_path / "report").exists()
 
 
@@ -345,18 +345,16 @@ def test_answers_of_another_evaluation_are_refused(tmp_path: Path) -> None:
     evaluate_toys(tmp_path, 3)
     runs, report = toys(tmp_path / "log"), tmp_path / "report"
     before = (report / "answers.jsonl").read_bytes()
-    same = {"kind": "frames", "path": "toys"}
     other = [Run("run0", "another digest", runs[0].recognizer), runs[1]]
     cases: dict[str, tuple[Any, Any, Any]] = {
-        "another digest": (other, ToyDataset(3), same),
-        "elsewhere": (runs, ToyDataset(3), same | {"path": "elsewhere"}),
-        "frames 3, not 4": (runs, ToyDataset(4), same),
-        "digest1": (runs[:1], ToyDataset(3), same),
+        "another digest": (other, ToyDataset(3), DESCRIPTION),
+        "elsewhere": (runs, ToyDataset(3), DESCRIPTION | {"path": "elsewhere"}),
+        "frames 3, not 4": (runs, ToyDataset(4), DESCRIPTION),
+        "digest1": (runs[:1], ToyDataset(3), DESCRIPTION),
     }
     for value, (evaluated, dataset, description) in cases.items():
-        with pytest.raises(InputError, match="^out: ") as caught:
+        with input_error(value, match="^out: "):
             evaluate_dataset(evaluated, dataset, description, report)
-        assert value in str(caught.value) and "\n" not in str(caught.value)
     assert (report / "answers.jsonl").read_bytes() == before
 
 
@@ -365,9 +363,7 @@ def test_dataset_with_other_frames_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "report" / "answers.jsonl"
     path.write_text("".join(path.read_text().splitlines(keepends=True)[:3]))
     with pytest.raises(InputError, match="'frame0'.*'photo0'"):
-        evaluate_dataset(
-            toys(tmp_path / "log"), ToyDataset(3, "photo"), {"kind": "frames", "path": "toys"}, tmp_path / "report"
-        )
+        evaluate_toys(tmp_path, ToyDataset(3, "photo"))
 
 
 @pytest.mark.parametrize("content", ["", "[1]\n", "[" * 100_000 + "\n", "{}\n{}\n", '{"a": 1}\nnonsense\n'])
@@ -414,7 +410,7 @@ def test_page_of_a_video_and_of_stored_thresholds(tmp_path: Path) -> None:
     runs = toys(tmp_path / "log")
     for run in runs:
         run.recognizer.unknown_below = 0.5  # type: ignore[attr-defined]
-    report = evaluate_dataset(runs, Video(), {"kind": "frames", "path": "v"}, tmp_path / "report")
+    report = evaluate_dataset(runs, Video(), DESCRIPTION, tmp_path / "report")
     page = ParsedPage((tmp_path / "report" / "report.html").read_text())
     assert report["placements"]["count"] == 1 and report["placements"]["steadiness"]["THOR2"]["mean"] == 1
     assert page.open == [] and {"Placements", "Unknown objects"} <= set(page.text) and "details" in page.tags

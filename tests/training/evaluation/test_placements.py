@@ -3,6 +3,7 @@
 import json
 import math
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -88,24 +89,14 @@ def test_accuracy_and_steadiness_by_hand() -> None:
 class Unable(UntaughtRecognizer):
     """Describes nothing, so that only positions are computed."""
 
-    class run:
-        classes = ("mug",)
-        classifiers = {"tops": None}
-        record: dict[str, Any] = {}
-
     def describe(self, frame: Any) -> Any:
-        class Described:
-            instances: list[Any] = []
-            usable: list[Any] = []
-            oriented = ToyDescriptors(None)
-
-        return Described()
+        return SimpleNamespace(instances=[], usable=[], oriented=ToyDescriptors(None))
 
     def probabilities(self, oriented: Any) -> dict[str, np.ndarray]:
         return {"tops": np.zeros((0, 1), np.float32)}
 
 
-UNABLE = [Run("run", "", Unable())]  # type: ignore[arg-type]
+UNABLE = [Run("run", "", Unable(["mug"]))]  # type: ignore[arg-type]
 
 
 def test_position_is_the_median_of_the_points() -> None:

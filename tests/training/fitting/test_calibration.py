@@ -4,6 +4,7 @@ import jax
 import numpy as np
 import pytest
 from flax import nnx
+from helpers import random_clouds
 
 import colornet
 import thor2_jax as thor2
@@ -22,21 +23,7 @@ NETWORK = colornet.load_default()
 
 
 def source(views: int) -> MemoryViews:
-    rng = np.random.default_rng(0)
-    sizes = {"brick": (0.1, 0.05, 0.03), "stick": (0.2, 0.01, 0.01)}
-    return MemoryViews(
-        {
-            name: [
-                (
-                    (rng.random((90, 3)) * size + [0, 0, 0.5]).astype(np.float32),
-                    rng.integers(0, 256, (90, 3), dtype=np.uint8),
-                )
-                for _ in range(views)
-            ]
-            for name, size in sizes.items()
-        },
-        CONFIG,
-    )
+    return MemoryViews({name: random_clouds(k, [90] * views) for k, name in enumerate(("brick", "stick"))}, CONFIG)
 
 
 @pytest.mark.parametrize("feature", ["ce", pytest.param("tops2", marks=pytest.mark.slow)])

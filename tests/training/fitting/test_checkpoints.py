@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import full_disk
 
 import thor2_jax as thor2
 from training.fitting.checkpoints import Checkpoints, _quiet_orbax
@@ -70,10 +71,6 @@ def test_incomplete_checkpoints_are_removed(tmp_path: Path) -> None:
     assert epochs(tmp_path) == {"2"}
 
 
-def full_disk(*_: Any, **__: Any) -> None:
-    raise OSError(errno.ENOSPC, "No space left on device")
-
-
 def full_file_system(*_: Any, **__: Any) -> None:
     raise ValueError("RESOURCE_EXHAUSTED: Error writing: No space left on device [os_error_code='28']\n[more='x']")
 
@@ -107,9 +104,8 @@ def test_a_damaged_checkpoint_is_refused(tmp_path: Path, capfd: pytest.CaptureFi
         for damaged in (content[:middle], content[:middle] + bytes([content[middle] ^ 255]) + content[middle + 1 :]):
             file.write_bytes(damaged)
             with Checkpoints(tmp_path) as checkpoints:
-                with pytest.raises(thor2.InputError, match=f"checkpoint: {tmp_path / '1'} ") as caught:
+                with pytest.raises(thor2.InputError, match=f"checkpoint: {tmp_path / '1'} "):
                     checkpoints.last(state(0))
-                assert "\n" not in str(caught.value)
         file.write_bytes(content)
     with Checkpoints(tmp_path) as checkpoints:
         assert_equal(checkpoints.last(state(0)), state(1))

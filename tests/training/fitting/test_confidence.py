@@ -4,10 +4,11 @@ import dataclasses
 
 import numpy as np
 import pytest
-from helpers import SMALL_CONFIG, untrained_embedding_run
+from helpers import SMALL_CONFIG, random_clouds, untrained_embedding_run
 
 import colornet
 from thor2_jax.descriptor.looks import describe_looks
+from thor2_jax.model.confidence import Calibration
 from thor2_jax.model.inference import Inference
 from thor2_jax.types import Cloud
 from training.fitting import calibration
@@ -23,18 +24,21 @@ LABEL = np.arange(40) % 4
 
 @pytest.fixture(scope="module")
 def held_out() -> Views:
-    rng = np.random.default_rng(0)
-    clouds = [
-        ((rng.random((200, 3)) * (0.2, 0.1, 0.05)).astype(np.float32), rng.integers(0, 256, (200, 3), np.uint8))
-        for _ in range(40)
-    ]
-    return list(zip(LABEL.tolist(), clouds, strict=True))
+    return list(zip(LABEL.tolist(), random_clouds(0, [200] * 40), strict=True))
 
 
-def test_confidence_separates_and_keeps_its_share(held_out: Views, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Known objects (labels 0 and 1) with high odds, unknown ones with low odds; a tenth of the known are wrong."""
+def fit(fused: np.ndarray, embedded: np.ndarray, held_out: Views) -> tuple[Calibration | None, float]:
+    """Fit the confidence of a run whose classifiers and embedding answer with these probabilities."""
     run = untrained_embedding_run(("a", "b"), ("tops", "tops2"))
-    assert run.embedding is not None
+    values = {"tops": fused, "tops2": fused, "embedding": embedded}
+    inference = Inference(0, {k: np.resize(v, (128, 2)) for k, v in values.items()})
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(calibration, "infer_clouds", lambda *_: inference)
+        return fit_calibration(run, run.embedding, held_out)
+
+
+def test_confidence_separates_and_keeps_its_share(held_out: Views) -> None:
+    """Known objects (labels 0 and 1) with high odds, unknown ones with low odds; a tenth of the known are wrong."""
     known = LABEL < 2
     right = np.where(known, LABEL, 0)
     rng = np.random.default_rng(1)
@@ -43,10 +47,7 @@ def test_confidence_separates_and_keeps_its_share(held_out: Views, monkeypatch: 
     top, answer = np.where(wrong, 0.55, top), np.where(wrong, 1 - right, right)
     fused = np.stack([np.where(answer == k, top, 1 - top) for k in (0, 1)], axis=1)
     embedded = fused * np.where(known, 0.9, 0.1)[:, None]
-    values = {"tops": fused, "tops2": fused, "embedding": embedded}
-    inference = Inference(0, {k: np.resize(v, (128, 2)) for k, v in values.items()})
-    monkeypatch.setattr(calibration, "infer_clouds", lambda *_: inference)
-    fitted, accuracy = fit_calibration(run, run.embedding, held_out)
+    fitted, accuracy = fit(fused, embedded, held_out)
     assert fitted is not None and min(fitted.known_factor, fitted.correct_factor, fitted.score_factor) > 0
     scores, correct = fitted.confidence(fused, embedded), answer == LABEL
     assert np.min(scores[known & ~wrong]) > 0.7 > np.max(scores[~known])
@@ -54,21 +55,14 @@ def test_confidence_separates_and_keeps_its_share(held_out: Views, monkeypatch: 
     assert np.mean(scores[known]) == pytest.approx(correct[known].mean(), abs=0.05)  # most instances are known
     assert fitted.unknown_below == pytest.approx(np.quantile(scores[correct], 1 - calibration.KEPT))
     unknown = [(label + 2, cloud) for label, cloud in held_out]  # without correct answers, there is no confidence
-    assert fit_calibration(run, run.embedding, unknown)[0] is None
+    assert fit(fused, embedded, unknown)[0] is None
 
 
-def test_unknown_objects_are_told_apart_without_incorrect_answers(
-    held_out: Views, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    run = untrained_embedding_run(("a", "b"), ("tops", "tops2"))
-    assert run.embedding is not None
+def test_unknown_objects_are_told_apart_without_incorrect_answers(held_out: Views) -> None:
     known = LABEL < 2
     fused = np.stack([np.where(np.where(known, LABEL, 0) == k, 0.9, 0.1) for k in (0, 1)], axis=1)
     embedded = fused * np.where(known, 0.9, 0.1)[:, None]
-    values = {"tops": fused, "tops2": fused, "embedding": embedded}
-    inference = Inference(0, {k: np.resize(v, (128, 2)) for k, v in values.items()})
-    monkeypatch.setattr(calibration, "infer_clouds", lambda *_: inference)
-    fitted, accuracy = fit_calibration(run, run.embedding, held_out)
+    fitted, accuracy = fit(fused, embedded, held_out)
     assert fitted is not None and accuracy == 1
     scores = fitted.confidence(fused, embedded)
     assert np.max(scores[~known]) < fitted.unknown_below <= np.min(scores[known]) + 1e-9

@@ -2,13 +2,13 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from helpers import SMALL_CONFIG
+from helpers import SMALL_CONFIG, Interrupted, brick_and_stick, stop_when
 
 from thor2_jax.descriptor.looks import describe_looks
 from thor2_jax.errors import InputError
@@ -26,24 +26,16 @@ from training.fitting.job import RunSettings, check_trained, train_run
 from training.fitting.options import FitOptions, read_metrics
 from training.views.normalized_views import MemoryViews
 
-CLASSES = ("red brick", "stick")
 OPTIONS = FitOptions()
 DISTRACTORS = Distractors(procedural=10, views=4, epochs=3, networks=2)
 
 
-def clouds_of_classes() -> dict[str, list[Cloud]]:
-    rng = np.random.default_rng(0)
-    clouds: dict[str, list[Cloud]] = {}
-    for name, size, level in zip(CLASSES, ((0.1, 0.05, 0.03), (0.2, 0.01, 0.01)), (0, 255), strict=True):
-        clouds[name] = [
-            ((rng.random((200, 3)) * size + [0, 0, 0.5]).astype(np.float32), np.full((200, 3), level, np.uint8))
-            for _ in range(8)
-        ]
-    return clouds
+CLOUDS = brick_and_stick(8)
+CLASSES = tuple(CLOUDS)
 
 
 def source() -> MemoryViews:
-    return MemoryViews(clouds_of_classes(), SMALL_CONFIG)
+    return MemoryViews(CLOUDS, SMALL_CONFIG)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -127,23 +119,11 @@ def test_the_confidence_is_fitted_on_held_out_clouds(whole: Whole) -> None:
     for (label, (xyz, rgb)), (_, (points, colors)) in zip(views[2:], expected, strict=True):
         assert label == 2 and np.array_equal(xyz, points) and np.array_equal(rgb, colors)
     for name, (label, cloud) in zip(CLASSES, views, strict=False):  # normalized before, but described as they were
-        clouds = PointClouds.pack([*clouds_of_classes()[name], cloud])
+        clouds = PointClouds.pack([*CLOUDS[name], cloud])
         images = np.asarray(describe_looks(clouds, run.network, SMALL_CONFIG, 4).each.images)
         before, looks = images[:-1], images[-1:]
         assert label == CLASSES.index(name)
         assert np.abs(before - looks).max(axis=(1, 2, 3, 4)).min() < 0.03 * looks.max()  # of another view: above 0.25
-
-
-class Interrupted(BaseException):
-    """Like KeyboardInterrupt, not an Exception."""
-
-
-def stop_when(stage: str, step: int) -> Callable[[str, int, int, str], None]:
-    def progress(now: str, done: int, total: int, note: str) -> None:
-        if (now, done) == (stage, step):
-            raise Interrupted
-
-    return progress
 
 
 def test_an_interrupted_joint_fit_resumes_to_the_same_bytes(

@@ -1,7 +1,6 @@
 """Trainings: uninterrupted, interrupted and resumed, and with several folds."""
 
 import dataclasses
-import errno
 import json
 import os
 import signal
@@ -15,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from flax import nnx
+from helpers import Interrupted, brick_and_stick, files_of, full_disk, stop_when
 from PIL import Image
 
 import thor2_jax as thor2
@@ -37,19 +37,11 @@ OPTIONS = FitOptions(epochs=3, batch_size=8)
 FINISHED = ["curves.png", "metrics.jsonl", "network.npz", "run.json", "weights"]
 
 
-def clouds(seed: int = 0, views: int = 6) -> dict[str, list[Cloud]]:
-    rng = np.random.default_rng(seed)
-    out: dict[str, list[Cloud]] = {}
-    for name, size, level in (("red brick", (0.1, 0.05, 0.03), 0), ("stick", (0.2, 0.01, 0.01), 255)):
-        out[name] = [
-            ((rng.random((200, 3)) * size + [0, 0, 0.5]).astype(np.float32), np.full((200, 3), level, np.uint8))
-            for _ in range(views)
-        ]
-    return out
+STICK = brick_and_stick(6)["stick"]
 
 
-def source(seed: int = 0, views: int = 6) -> MemoryViews:
-    return MemoryViews(clouds(seed, views), CONFIG)
+def source(seed: int = 0) -> MemoryViews:
+    return MemoryViews(brick_and_stick(6, seed), CONFIG)
 
 
 def train(out: Path, features: tuple[str, ...] = ("tops",), options: FitOptions = OPTIONS, **more: Any) -> TrainedRun:
@@ -124,10 +116,7 @@ def test_a_run_is_written_and_its_progress_is_reported(tmp_path: Path) -> None:
 
 
 def test_invalid_input_is_refused_before_any_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def work(*_: Any, **__: Any) -> None:
-        raise AssertionError("the training started")
-
-    monkeypatch.setattr(module, "build_samples", work)
+    monkeypatch.setattr(module, "build_samples", lambda *_, **__: pytest.fail("the training started"))
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "kept").write_text("x")
     with pytest.raises(thor2.InputError, match=f"out: {tmp_path / 'run'} already contains kept"):
@@ -141,9 +130,9 @@ def test_invalid_input_is_refused_before_any_work(tmp_path: Path, monkeypatch: p
     ("bad", "folds", "message"),
     [
         ({}, 1, "views of 0 classes"),
-        ({"mug": [], "box": clouds()["stick"]}, 1, "class 'mug' has no views"),
-        ({"mug": clouds()["stick"]}, 1, "views of 1 classes"),
-        (clouds(views=3), 4, "folds is 4.*'red brick'"),
+        ({"mug": [], "box": STICK}, 1, "class 'mug' has no views"),
+        ({"mug": STICK}, 1, "views of 1 classes"),
+        (brick_and_stick(3), 4, "folds is 4.*'red brick'"),
     ],
 )
 def test_nothing_is_written_for_bad_views(
@@ -152,18 +141,6 @@ def test_nothing_is_written_for_bad_views(
     with pytest.raises(thor2.InputError, match=message):
         train_run(MemoryViews(bad, CONFIG), tmp_path / "run", RunSettings(["tops"], OPTIONS, CONFIG, folds))
     assert names(tmp_path) == []
-
-
-class Interrupted(BaseException):
-    """Like KeyboardInterrupt, not an Exception."""
-
-
-def stop_when(stage: str, step: int) -> Any:
-    def progress(now: str, done: int, total: int, note: str) -> None:
-        if (now, done) == (stage, step):
-            raise Interrupted
-
-    return progress
 
 
 def test_an_interrupted_run_resumes_to_the_same_result(whole: tuple[Path, TrainedRun], tmp_path: Path) -> None:
@@ -209,7 +186,7 @@ def test_other_options_or_views_are_refused(tmp_path: Path) -> None:
     out = tmp_path / "run"
     with pytest.raises(Interrupted):
         train(out, progress=stop_when("fit tops", 4))
-    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    before = files_of(out)
     cases: list[tuple[str, dict[str, Any]]] = [
         ("batch_size 8, not 6", {"fit": dataclasses.replace(OPTIONS, batch_size=6)}),
         ("epochs 3, not 4", {"fit": dataclasses.replace(OPTIONS, epochs=4)}),
@@ -225,7 +202,7 @@ def test_other_options_or_views_are_refused(tmp_path: Path) -> None:
         train_run(source(1), out, RunSettings(["tops"], OPTIONS, CONFIG))
     with pytest.raises(thor2.InputError, match=r"was written with descriptor_config\.\w+ "):
         train_run(source(), out, RunSettings(["tops"], OPTIONS))
-    assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
+    assert files_of(out) == before
     (out / "checkpoints" / "begun.json").write_text("{")
     with pytest.raises(thor2.InputError, match=r"begun\.json cannot be read"):
         train(out)
@@ -256,24 +233,20 @@ def test_files_of_the_user_stay_in_a_run_directory(tmp_path: Path) -> None:
 def test_a_full_disk(whole: tuple[Path, TrainedRun], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A training that could not write any of its files resumes from the last checkpoint."""
     out = tmp_path / "run"
-
-    def full(*_: Any, **__: Any) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
     save = Checkpoints.save
     calls = 0
 
     def second_fails(self: Checkpoints, *arguments: Any) -> None:
         nonlocal calls
         calls += 1
-        full() if calls == 2 else save(self, *arguments)
+        full_disk() if calls == 2 else save(self, *arguments)
 
     for where, name, replacement in (
-        (module, "begin_job", full),
+        (module, "begin_job", full_disk),
         (Checkpoints, "save", second_fails),
-        (module, "append_metrics", full),
-        (module, "draw_curves", full),
-        (module, "save_run", full),
+        (module, "append_metrics", full_disk),
+        (module, "draw_curves", full_disk),
+        (module, "save_run", full_disk),
     ):
         with monkeypatch.context() as patch:
             patch.setattr(where, name, replacement)
@@ -338,26 +311,18 @@ def test_folds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 _PROGRAM = """
 import sys
-sys.path.insert(0, sys.argv[1])
 import test_job
 from thor2_jax.model import classifier
-classifier.HIDDEN = tuple(map(int, sys.argv[3].split(",")))
-test_job.train(test_job.Path(sys.argv[2]), ("tops", "ce"))
+classifier.HIDDEN = tuple(map(int, sys.argv[2].split(",")))
+test_job.train(test_job.Path(sys.argv[1]), ("tops", "ce"))
 """
 
 
 @pytest.mark.slow
 def test_a_killed_training_resumes_to_the_same_bytes(whole: tuple[Path, TrainedRun], tmp_path: Path) -> None:
     out = tmp_path / "run"
-    command = [
-        sys.executable,
-        "-c",
-        _PROGRAM,
-        str(Path(__file__).parent),
-        str(out),
-        ",".join(map(str, classifier.HIDDEN)),
-    ]
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
+    command = [sys.executable, "-c", _PROGRAM, str(out), ",".join(map(str, classifier.HIDDEN))]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
     killed = 0
     # At once after lines appear: while a checkpoint is being written, or the next epoch is under way.
     for lines in (1, 5):

@@ -6,6 +6,7 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+from helpers import random_clouds as views
 
 import colornet
 import thor2_jax as thor2
@@ -17,17 +18,6 @@ from training.views.normalized_views import MemoryViews, NormalizedViews
 
 NETWORK = colornet.load_default()
 CONFIG = thor2.DescriptorConfig(homology="closed_form")
-
-
-def views(seed: int, sizes: tuple[int, ...]) -> list[Cloud]:
-    rng = np.random.default_rng(seed)
-    return [
-        (
-            (rng.random((n, 3)) * [0.2, 0.1, 0.05] + [0, 0, 0.5]).astype(np.float32),
-            rng.integers(0, 256, (n, 3), np.uint8),
-        )
-        for n in sizes
-    ]
 
 
 expand_batch = jax.jit(lambda batch, config: expand(batch, region_sets(NETWORK).weights, config), static_argnums=1)

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from helpers import input_error
 from PIL import Image
 from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
@@ -123,9 +124,8 @@ def colored(vertices: np.ndarray) -> trimesh.Trimesh:
 
 
 def check_refused(path: Path, message: str) -> None:
-    with pytest.raises(InputError, match=message) as caught:
+    with input_error(path.name, match=message):
         load_mesh(path)
-    assert path.name in str(caught.value) and "\n" not in str(caught.value)
 
 
 def test_inconsistent_meshes_are_refused(tmp_path: Path) -> None:
@@ -303,9 +303,8 @@ def test_reading_names(tmp_path: Path) -> None:
 )
 def test_invalid_names_files_are_refused(tmp_path: Path, file: str, content: str, message: str) -> None:
     (tmp_path / file).write_text(content)
-    with pytest.raises(InputError, match=message) as caught:
+    with pytest.raises(InputError, match=message):
         read_names(tmp_path / file)
-    assert "\n" not in str(caught.value)
     with pytest.raises(InputError, match=r"absent\.json is missing"):
         read_names(tmp_path / "absent.json")
 

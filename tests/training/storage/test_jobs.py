@@ -29,9 +29,8 @@ def test_equal_jobs_are_accepted_as_json() -> None:
     ],
 )
 def test_the_first_difference_is_named(changes: dict[str, Any], difference: str) -> None:
-    with pytest.raises(InputError, match=f"out: run was written with {difference}") as caught:
+    with pytest.raises(InputError, match=f"out: run was written with {difference}"):
         check_same_job(Path("run"), JOB, JOB | changes)
-    assert "\n" not in str(caught.value)
 
 
 def test_a_missing_field_is_a_difference() -> None:

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import trimesh
-from helpers import run_thor2
+from helpers import run_thor2, write_box
 
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import RGBDFrame
@@ -29,9 +28,7 @@ SIZE = 24
 def meshes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("meshes")
     for name, size, color in (("brick", (0.1, 0.06, 0.2), (200, 40, 40)), ("box", (0.1, 0.1, 0.1), (40, 200, 90))):
-        mesh = trimesh.creation.box(size)
-        mesh.visual.vertex_colors = np.tile(np.array([[*color, 255]], np.uint8), (8, 1))
-        mesh.export(folder / f"{name}.ply")
+        write_box(folder / f"{name}.ply", size, color)
     return folder
 
 

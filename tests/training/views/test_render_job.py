@@ -17,10 +17,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from helpers import Command, Interrupted, input_error
 from processes import HANG
 
 from thor2_jax.errors import InputError
-from training import cli
 from training.augmentation.augmentations import Augmentations
 from training.augmentation.illumination import Illumination
 from training.objects.builtin_objects import builtin_objects
@@ -93,10 +93,6 @@ def test_workers_give_equal_files(whole: Path, tmp_path: Path) -> None:
     assert contents(tmp_path / "views") == contents(whole)
 
 
-class Stop(BaseException):
-    """Like KeyboardInterrupt, not an Exception."""
-
-
 @pytest.mark.parametrize("stops", [(1, 4, 18), pytest.param((2, 3, *range(5, 18)), marks=pytest.mark.slow)], ids=str)
 def test_rendering_interrupted_at_any_write_resumes(
     stops: Sequence[int], whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -111,16 +107,16 @@ def test_rendering_interrupted_at_any_write_resumes(
         nonlocal left
         left -= 1
         if left == 0:
-            raise Stop
+            raise Interrupted
         replace(source, target)
         left -= 1
         if left == 0:
-            raise Stop
+            raise Interrupted
 
     monkeypatch.setattr(os, "replace", stopping)
     for stop in stops:
         out, left = tmp_path / str(stop), stop
-        with pytest.raises(Stop):
+        with pytest.raises(Interrupted):
             render_dataset(OBJECTS, out, *STEPS)
         with pytest.raises(InputError, match=MANIFEST) if stop < 18 else contextlib.nullcontext():
             ViewDataset.open(out)
@@ -225,9 +221,8 @@ def test_another_job_is_refused(copied: Path) -> None:
         (OBJECTS | {"apple": moved}, STEPS, {}, r"objects\[2\] null, not \{"),
         (dict(reversed(OBJECTS.items())), STEPS, {}, r"objects\[0\].name "),
     ]:
-        with pytest.raises(InputError, match=message) as caught:
+        with input_error(copied, match=message):
             render_dataset(meshes, copied, *steps, **options)
-        assert str(copied) in str(caught.value) and "\n" not in str(caught.value)
         assert contents(copied) == before
 
 
@@ -334,34 +329,33 @@ def test_an_unwritable_output_path_is_refused(tmp_path: Path) -> None:
         render_dataset(OBJECTS, tmp_path / "file" / "views", *STEPS)
 
 
-def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: Command, refused: Command) -> None:
     """Repeats a job, changes its steps, and selects a cluster that is not available."""
     mesh = sphere(0.03)
     (tmp_path / "meshes").mkdir()
     colors = np.full((len(mesh.faces), 4), 99, np.uint8)
     trimesh.Trimesh(mesh.vertices, mesh.faces, face_colors=colors).export(tmp_path / "meshes" / "ball.ply")
 
-    def run(*options: str) -> tuple[int, str, str]:
-        folders = ["--meshes", str(tmp_path / "meshes"), "--out", str(tmp_path / "views")]
-        monkeypatch.setattr(
-            sys, "argv", ["thor2", "render", *folders, "--workers", "1", "--polar-step", "90", *options]
-        )
-        with pytest.raises(SystemExit) as stop:
-            cli.main()
-        return int(stop.value.code or 0), *capsys.readouterr()
-
+    command = (
+        "render",
+        "--meshes",
+        tmp_path / "meshes",
+        "--out",
+        tmp_path / "views",
+        "--workers",
+        1,
+        "--polar-step",
+        90,
+    )
     for _ in range(2):
-        code, out, _ = run("--azimuth-step", "180")
-        assert code == 0 and "6 views of 1 objects (0 left out)" in out
+        assert "6 views of 1 objects (0 left out)" in printed(*command, "--azimuth-step", 180)
     before = contents(tmp_path / "views")
-    code, _, err = run("--azimuth-step", "90")
-    assert code == 2 and "azimuth_step 180.0, not 90.0" in err and "Traceback" not in err
+    assert "azimuth_step 180.0, not 90.0" in refused(*command, "--azimuth-step", 90)
     assert contents(tmp_path / "views") == before
     monkeypatch.setitem(sys.modules, "ray", None)
-    code, _, err = run("--azimuth-step", "180", "--engine", "ray")
-    assert code == 2 and "'.[cluster]'" in err
-    assert run("--engine", "cloud")[0] == 2
-    assert run("--address", "head:6379")[0] == 2
+    assert "'.[cluster]'" in refused(*command, "--azimuth-step", 180, "--engine", "ray")
+    refused(*command, "--engine", "cloud")
+    refused(*command, "--address", "head:6379")
 
 
 def children() -> set[int]:
