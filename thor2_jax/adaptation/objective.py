@@ -89,7 +89,7 @@ class Objective:
 
     def _probabilities(self, clouds: PointClouds) -> jax.Array:
         network, config, classify = self._criterion
-        return classify(describe_looks(clouds, network, config, LOOKS))
+        return classify(describe_looks(clouds, network, config, LOOKS).with_balanced(clouds))
 
     def total(self, parameters: NDArray[np.floating]) -> float:
         """Return the sum of the uncertainties for parameters [4] of a colour transform."""

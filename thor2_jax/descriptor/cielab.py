@@ -21,6 +21,6 @@ def to_lab(colors: jax.Array) -> jax.Array:
     linear = jnp.where(dark, colors / 12.92, ((jnp.where(dark, 1, colors) + 0.055) / 1.055) ** 2.4)
     xyz = jnp.matmul(linear, jnp.asarray((_TO_XYZ / _WHITE[:, None]).T, linear.dtype), precision=HIGHEST)
     small = xyz <= (6 / 29) ** 3
-    root = jnp.where(small, xyz * (29 / 6) ** 2 / 3 + 4 / 29, jnp.where(small, 1, xyz) ** (1 / 3))
+    root = jnp.where(small, xyz * (29 / 6) ** 2 / 3 + 4 / 29, jnp.cbrt(jnp.where(small, 1, xyz)))
     fx, fy, fz = root[..., 0], root[..., 1], root[..., 2]
     return jnp.stack([116 * fy - 16, 500 * (fx - fy), 200 * (fy - fz)], axis=-1)

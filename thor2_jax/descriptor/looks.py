@@ -39,8 +39,7 @@ class LookDescriptors:
 
     Attributes:
         each: descriptors, fields [B, K, ...].
-        statistics: [B, K, 12 + R + N_BALANCED] float32, from `cloud_statistics`, and the `balanced_histogram` of the
-            first look.
+        statistics: [B, K, 12 + R] float32, from `cloud_statistics`; `with_balanced` appends `N_BALANCED` values.
         weights: [B, K] float32, weight of each look in the fused answer; they sum to 1.
     """
 
@@ -69,11 +68,22 @@ class LookDescriptors:
 
     @property
     def flat(self) -> tuple[Descriptors, jax.Array]:
-        """The descriptors [B * K, ...] and statistics [B * K, ...]; those of a cloud are consecutive."""
+        """The descriptors [B * K, ...] and statistics [B * K, 12 + R]; those of a cloud are consecutive."""
         flat: tuple[Descriptors, jax.Array] = jax.tree.map(
             lambda a: a.reshape(-1, *a.shape[2:]), (self.each, self.statistics)
         )
         return flat
+
+    @jax.jit
+    def with_balanced(self, clouds: PointClouds) -> "LookDescriptors":
+        """Return descriptors whose statistics end with the `balanced_histogram` of the first look, for a gallery.
+
+        Args:
+            clouds: [B, N] the clouds, in metres or aligned.
+        """
+        histogram = map_chunks(lambda chunk: balanced_histogram(chunk.colors, chunk.mask), clouds)
+        repeated = jnp.broadcast_to(histogram[:, None], (*self.weights.shape, N_BALANCED))
+        return dataclasses.replace(self, statistics=jnp.concatenate([self.statistics, repeated], axis=-1))
 
 
 def _check_count(count: int) -> None:
@@ -158,10 +168,7 @@ def _group_by_cloud(
     """Group the descriptors [B * K, ...] of looks by cloud, and add the statistics of the clouds."""
     statistics = cloud_statistics(side_lengths(aligned, config.alpha), aligned, strips)
     each, grouped = jax.tree.map(lambda a: a.reshape(*weights.shape, *a.shape[1:]), (descriptors, statistics))
-    first = jax.tree.map(lambda a: a[:: weights.shape[1]], aligned)
-    histogram = map_chunks(lambda chunk: balanced_histogram(chunk.colors, chunk.mask), first)
-    repeated = jnp.broadcast_to(histogram[:, None], (*weights.shape, N_BALANCED))
-    return LookDescriptors(each, jnp.concatenate([grouped, repeated], axis=-1), weights)
+    return LookDescriptors(each, grouped, weights)
 
 
 def describe_looks(

@@ -21,7 +21,6 @@ from scipy.stats import spearmanr
 
 from thor2_jax.config import DescriptorConfig, Relaxation
 from thor2_jax.descriptor.color_membership import RegionSets, region_sets
-from thor2_jax.descriptor.looks import describe_aligned_looks
 from thor2_jax.descriptor.relaxation import relaxed_strips
 from thor2_jax.descriptor.slicing import slices_and_strips
 from thor2_jax.explanation.class_scores import ClassScores, OrientedCloud, repeat_cloud
@@ -126,7 +125,7 @@ def path_gradients(scores: ClassScores, cloud: OrientedCloud, index: int) -> NDA
 
     def total(weights: jax.Array) -> jax.Array:
         cut = _weighted_strips(cloud.aligned, weights, sets, config)
-        oriented = describe_aligned_looks(aligned, look_weights, cut, scores.network, config)
+        oriented = scores.describe(aligned, look_weights, cut, config)
         return scores.margin(scores.of_descriptors(oriented), index).sum()
 
     levels = (1 + (np.arange(STEPS) + 0.5) / STEPS) / 2

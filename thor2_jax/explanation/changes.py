@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from thor2_jax.config import DescriptorConfig, Relaxation
 from thor2_jax.descriptor.describe import strips
-from thor2_jax.descriptor.looks import aligned_looks, describe_aligned_looks
+from thor2_jax.descriptor.looks import aligned_looks
 from thor2_jax.descriptor.view_normalization import boxed, oriented
 from thor2_jax.explanation.class_scores import ClassScores, packed
 from thor2_jax.frames.prepared_instance import PreparedInstance
@@ -115,7 +115,7 @@ def _gradient_directions(
     def lead(parameters: jax.Array) -> jax.Array:
         aligned, weights = aligned_looks(_changed(clouds, axes, parameters, kind), config, scores.count)
         cut = strips(aligned, scores.network, config)
-        values = scores.of_descriptors(describe_aligned_looks(aligned, weights, cut, scores.network, config))[0]
+        values = scores.of_descriptors(scores.describe(aligned, weights, cut, config))[0]
         return values[index] - jnp.delete(values, index, assume_unique_indices=True).max()
 
     parameters, path = np.zeros(3), []

@@ -26,7 +26,7 @@ from thor2_jax.model.classifier import EMBEDDING
 from thor2_jax.model.fusion import fused_probabilities
 from thor2_jax.model.inference import infer
 from thor2_jax.model.model import Model
-from thor2_jax.types import PointClouds
+from thor2_jax.types import PointClouds, Strips
 
 __all__ = ["ClassScores", "OrientedCloud", "Unit", "classifier_scores", "gallery_scores"]
 
@@ -95,7 +95,7 @@ class ClassScores:
 
         def describe(rows: Sequence[PreparedInstance]) -> LookDescriptors:
             clouds = pack_instances(rows, ROWS, capacity)
-            return describe_looks(clouds, self.network, self.config, self.count)
+            return self._with_colors(describe_looks(clouds, self.network, self.config, self.count), clouds)
 
         return self._of_rows(instances, describe)
 
@@ -111,10 +111,19 @@ class ClassScores:
         def describe(rows: NDArray[np.bool_]) -> LookDescriptors:
             padded = np.pad(rows, ((0, ROWS - len(rows)), (0, repeated.mask.shape[1] - rows.shape[1])))
             part = dataclasses.replace(repeated, mask=repeated.mask & jnp.repeat(padded, self.count, axis=0))
-            cut = strips(part, self.network, self.config)
-            return describe_aligned_looks(part, weights, cut, self.network, self.config)
+            return self.describe(part, weights, strips(part, self.network, self.config), self.config)
 
         return self._of_rows(masks, describe)
+
+    def describe(
+        self, aligned: PointClouds, weights: jax.Array, cut: Strips, config: DescriptorConfig
+    ) -> LookDescriptors:
+        """Return the descriptors for `of_descriptors`; the arguments are those of `describe_aligned_looks`."""
+        first: PointClouds = jax.tree.map(lambda a: a[:: self.count], aligned)
+        return self._with_colors(describe_aligned_looks(aligned, weights, cut, self.network, config), first)
+
+    def _with_colors(self, oriented: LookDescriptors, clouds: PointClouds) -> LookDescriptors:
+        return oriented.with_balanced(clouds) if self.unit == "similarity" else oriented
 
     def _of_rows(self, items: Any, describe: Callable[[Any], LookDescriptors]) -> NDArray[np.float32]:
         """Return the scores [B, n] of items, described `ROWS` at a time."""

@@ -27,7 +27,7 @@ from flax import nnx
 
 import colornet
 from thor2_jax.config import DESCRIPTOR_VERSION, DescriptorConfig
-from thor2_jax.descriptor.cloud_statistics import N_BALANCED, N_SCALARS, square_root
+from thor2_jax.descriptor.cloud_statistics import N_BALANCED, N_SCALARS, is_color, square_root
 from thor2_jax.descriptor.looks import LookDescriptors, describe_looks
 from thor2_jax.errors import InputError
 from thor2_jax.files import atomic_write, content_digest, read_file, safetensors_metadata
@@ -63,7 +63,6 @@ class EmbeddingSizes:
         balanced: whether that has the histogram of balanced colours; False in embeddings of earlier versions.
         nearest: whether every distractor counts with the logit of the nearest one, for each network and look; False in
             embeddings of earlier versions, where each counts with its own.
-        reads_balanced: whether the networks have inputs for the histogram of balanced colours.
 
     Raises:
         InputError: a size is not a positive integer (`color` may be 0).
@@ -75,11 +74,9 @@ class EmbeddingSizes:
     color: int = 120
     balanced: bool = True
     nearest: bool = True
-    reads_balanced: bool = False
 
     def __post_init__(self) -> None:
-        values = (self.cell, *self.hidden, self.learned, self.color + 1)
-        flags = (self.balanced, self.nearest, self.reads_balanced)
+        values, flags = (self.cell, *self.hidden, self.learned, self.color + 1), (self.balanced, self.nearest)
         if not all(type(each) is int and each > 0 for each in values) or any(type(each) is not bool for each in flags):
             raise InputError(f"EmbeddingSizes is {dataclasses.asdict(self)}; expected positive integers and booleans")
 
@@ -110,9 +107,8 @@ class EmbeddingNetwork(nnx.Module):
         """
         self.positions = max(config.image_size, config.n_strips)
         self.n_regions, self.balanced = n_regions, sizes.balanced
-        self.n_read = N_SCALARS + n_regions + (N_BALANCED if sizes.reads_balanced else 0)
         n_cells = config.n_slices * self.positions
-        widths = (n_cells * sizes.cell + self.n_read, *sizes.hidden)
+        widths = (n_cells * sizes.cell + N_SCALARS + n_regions, *sizes.hidden)
         he = nnx.initializers.he_normal()
         self.cell = nnx.Linear(config.image_size + n_regions, sizes.cell, kernel_init=he, rngs=rngs)
         layers = [nnx.Linear(a, b, use_bias=False, kernel_init=he, rngs=rngs) for a, b in itertools.pairwise(widths)]
@@ -134,8 +130,7 @@ class EmbeddingNetwork(nnx.Module):
 
         Args:
             descriptors: of B clouds.
-            statistics: [B, 12 + R + N_BALANCED], see `LookDescriptors`; the last ones are not read without
-                `reads_balanced`.
+            statistics: [B, 12 + R] or more, from `cloud_statistics`; those after the first 12 + R are not read.
             train: normalize by the statistics of the batch, and drop units.
             rngs: generators of the dropout.
         """
@@ -144,7 +139,7 @@ class EmbeddingNetwork(nnx.Module):
         padded = [jnp.pad(a, ((0, 0), (0, 0), (0, self.positions - a.shape[2]), (0, 0))) for a in cells]
         bias = jnp.asarray(self.cell.bias)
         x = nnx.relu(self.cell(jnp.concatenate(padded, axis=-1))) - nnx.relu(bias)
-        read = statistics[:, : self.n_read]
+        read = statistics[:, : N_SCALARS + self.n_regions]
         scale = jnp.where(jnp.arange(read.shape[1]) < N_SCALARS, 1, 2)
         x = jnp.concatenate([x.reshape(len(x), -1), read * scale], axis=1)
         for layer, norm in zip(self.layers, self.norms, strict=True):
@@ -160,7 +155,7 @@ class EmbeddingNetwork(nnx.Module):
     def __call__(self, descriptors: Descriptors, statistics: jax.Array) -> jax.Array:
         """Return the embeddings [B, D], of unit length.
 
-        The arguments are those of `learned`.
+        The arguments are those of `learned`; if the colours are balanced, `balanced_histogram` ends the statistics.
         """
         features = color_features(descriptors.embeddings, statistics if self.balanced else None)
         blocks = [self.learned(descriptors, statistics), _unit(features @ self.color_basis[...])]
@@ -282,10 +277,17 @@ class Embedding:
         return cls(config, network, sizes, model, classes, distractors)
 
     def create_further(self, seed: int = 0) -> EmbeddingNetwork:
-        """Return a network for `further` with random weights; without a colour block, since it does not embed."""
+        """Return a network for `further` with random weights; without a colour block, since it does not embed.
+
+        Its weights of the statistics of colours are zero, as they stay if it is fitted on statistics without them.
+        """
         sizes = dataclasses.replace(self.sizes, color=0)
         n_regions, n_proxies = self.network.n_regions, len(self.classes) + self.distractors
-        return EmbeddingNetwork(self.config, n_regions, sizes, n_proxies, rngs=nnx.Rngs(seed))
+        model = EmbeddingNetwork(self.config, n_regions, sizes, n_proxies, rngs=nnx.Rngs(seed))
+        kernel = model.layers[0].kernel
+        is_used = np.concatenate([np.ones(kernel.shape[0] - N_SCALARS - n_regions, bool), ~is_color(n_regions)])
+        kernel[...] = jnp.where(is_used[:, None], kernel[...], 0)
+        return model
 
     def without_proxies(self) -> "Embedding":
         """Return the same embedding without classes and distractors."""
@@ -312,10 +314,17 @@ class Embedding:
 
         Each shape [B, N] of the batch compiles once for all embeddings of the same sizes and descriptor.
         """
-        return self.embed_oriented(describe_looks(clouds, self.network, self.config, 1))[:, 0]
+        return self.embed_oriented(describe_looks(clouds, self.network, self.config, 1), clouds)[:, 0]
 
-    def embed_oriented(self, oriented: LookDescriptors) -> jax.Array:
-        """Return the embeddings [B, K, D] of K looks at clouds, described by this descriptor."""
+    def embed_oriented(self, oriented: LookDescriptors, clouds: PointClouds | None = None) -> jax.Array:
+        """Return the embeddings [B, K, D] of K looks at clouds.
+
+        Args:
+            oriented: described by this descriptor.
+            clouds: [B, N] the clouds, whose colours are compared too; None if `oriented` is `with_balanced`.
+        """
+        if self.sizes.balanced and clouds is not None:
+            oriented = oriented.with_balanced(clouds)
         return _embed_oriented(*self._embedder, oriented)
 
     def class_probabilities(self, oriented: LookDescriptors) -> jax.Array:

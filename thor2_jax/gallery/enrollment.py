@@ -47,7 +47,7 @@ def embed_looks(embedding: Embedding, views: Sequence[PreparedInstance]) -> NDAr
         chunk = views[start : start + rows]
         clouds = pack_instances(chunk, rows, batch_points(len(view.points) for view in chunk) if many else None)
         looks = describe_looks(clouds, embedding.network, embedding.config, LOOKS)
-        batches.append(embedding.embed_oriented(looks))
+        batches.append(embedding.embed_oriented(looks, clouds))
     return np.concatenate(batches)[: len(views)]
 
 

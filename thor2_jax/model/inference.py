@@ -68,7 +68,7 @@ def infer(
         first = describe_looks(clouds, model.embedding.network, ours, LOOKS)
     first = jax.tree.map(lambda a: a[:, :LOOKS], first)
     weights = first.weights / first.weights.sum(axis=1, keepdims=True)
-    return Inference(oriented.overflow, probabilities, model.embedding.embed_oriented(first), weights)
+    return Inference(oriented.overflow, probabilities, model.embedding.embed_oriented(first, clouds), weights)
 
 
 def infer_clouds(

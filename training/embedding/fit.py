@@ -163,20 +163,6 @@ def _step(
     return after, jnp.stack(metrics).mean(axis=0)
 
 
-def _seen(embedding: Embedding, networks: int) -> NDArray[np.float32]:
-    """Return which statistics each network reads, [networks, number of inputs], 1 or 0.
-
-    Statistics of colours differ most between renderings and cameras. Where the networks may read the histogram of
-    balanced colours, a third of them does, and none reads the other statistics of colours.
-    """
-    n_regions = embedding.network.n_regions
-    seen = np.ones((networks, embedding.model.n_read), np.float32)
-    if embedding.sizes.reads_balanced:
-        seen[:, : N_SCALARS + n_regions][:, is_color(n_regions)] = 0
-        seen[(networks + 1) // 3 :, N_SCALARS + n_regions :] = 0
-    return seen
-
-
 def fit_embedding(
     samples: Samples,
     network: ColorNetwork,
@@ -218,16 +204,14 @@ def fit_embedding(
         embedding.create_further(int(np.random.SeedSequence([options.seed, number]).generate_state(1)[0]))
         for number in range(1, options.networks)
     ]
-    seen = _seen(embedding, options.networks)
-    for model, each in zip((embedding.model, *further), seen, strict=True):
-        kernel = np.array(model.layers[0].kernel)
-        kernel[-len(each) :] *= each[:, None]  # weights of unseen statistics are zero, and stay so
-        model.layers[0].kernel[...] = jnp.asarray(kernel)
     n_steps = len(samples) // options.batch_size
     optimizer = _adamw(options.rate, n_steps * options.epochs)
     split: Any = [nnx.split(model, nnx.Param, ...) for model in (embedding.model, *further)]
     graphs = tuple(graph for graph, _, _ in split)
     states = tuple(NetworkState(weights, rest, optimizer.init(weights)) for _, weights, rest in split)
+    # The further networks do not read the statistics of colours, which differ most between renderings and cameras.
+    seen = np.ones((options.networks, N_SCALARS + network.n_regions), np.float32)
+    seen[1:, is_color(embedding.network.n_regions)] = 0
 
     def epoch(number: int) -> Iterator[Batch]:
         # Order and dropout are drawn from seed and step, so that a resumed fit needs no generator state.

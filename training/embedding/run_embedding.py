@@ -1,8 +1,7 @@
 """The embedding of a run, fitted on views of its classes and of distractors: objects that are none of them.
 
 Distractors are procedural objects, or meshes of other objects. They teach the embedding what is unknown; a tenth of
-them is held out, so that the confidence is calibrated on unknown objects that no network was fitted on. Look-alikes of
-the classes are further distractors.
+them is held out, so that the confidence is calibrated on unknown objects that no network was fitted on.
 """
 
 import dataclasses
@@ -20,7 +19,6 @@ from thor2_jax.errors import InputError
 from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
 from thor2_jax.types import Cloud
 from training.embedding.fit import EmbeddingFit, fit_embedding, reference_views
-from training.embedding.look_alikes import look_alike
 from training.embedding.samples import Samples, joined_samples, sample_clouds
 from training.embedding.sampling import (
     ObjectSource,
@@ -47,7 +45,7 @@ COPIES = 2
 SEED = 0
 """Seed of the distractors of all runs, which therefore share their samples in the user's cache."""
 
-SIZES = EmbeddingSizes(cell=12, hidden=(256, 192), reads_balanced=True)
+SIZES = EmbeddingSizes(cell=12, hidden=(256, 192))
 """Sizes of each network; several small networks are steadier than fewer large ones."""
 
 RENDER, DESCRIBE, FIT = STAGES = ("render distractors", "describe for the embedding", "fit networks")
@@ -55,12 +53,6 @@ RENDER, DESCRIBE, FIT = STAGES = ("render distractors", "describe for the embedd
 
 HELD_OUT = 10
 """One in this many distractors is held out."""
-
-PER_LOOK_ALIKE = 5
-"""Distractors for each look-alike."""
-
-POOL = 6
-"""Views of each shard from which look-alikes are made."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,11 +92,6 @@ class Distractors:
         mixed: list[ObjectSource] = [*self.meshes.values(), *range(self.procedural)]
         return [mixed[k] for k in np.random.default_rng(0).permutation(len(mixed))]
 
-    @property
-    def look_alikes(self) -> int:
-        """Number of further distractors, with the shape of a class and other colours."""
-        return (self.procedural + len(self.meshes)) // PER_LOOK_ALIKE
-
     def check(self, classes: Sequence[str]) -> None:
         """Raise InputError if a distractor has the name of a class."""
         shared = sorted(set(self.meshes) & set(classes))
@@ -118,7 +105,7 @@ class Distractors:
     def record(self) -> dict[str, Any]:
         """All that determines the embedding, as JSON holds it."""
         named = {field.name: getattr(self, field.name) for field in dataclasses.fields(self) if field.name != "workers"}
-        return named | {"meshes": sorted(self.meshes), "look_alikes": self.look_alikes}
+        return named | {"meshes": sorted(self.meshes)}
 
 
 def _distractor_samples(
@@ -177,7 +164,6 @@ def fit_run_embedding(
     others = _distractor_samples(distractors, directory, network, config, progress)
     fitted: list[dict[str, NDArray[Any]]] = []
     kept: list[tuple[int, Cloud]] = []
-    pool: list[list[Cloud]] = [[] for _ in classes]
     for index, shard in enumerate(source.shards):
         views, rng = source.read(index), np.random.default_rng([seed, index])
         is_kept = np.isin(views.view, held_out.get(shard.label, []))
@@ -185,25 +171,14 @@ def fit_run_embedding(
         if clouds:
             labels = [views.label] * len(clouds)
             fitted.append(sample_clouds(clouds, labels, network, config, COPIES, rng, are_normal=True))
-            # Copies, since slices would keep all views of the shard in memory.
-            chosen = rng.permutation(len(clouds))[:POOL]
-            pool[views.label] += [(clouds[k][0].copy(), clouds[k][1].copy()) for k in chosen]
         for xyz, rgb in itertools.compress(views.clouds(), is_kept):
+            # A copy, since a slice would keep all views of the shard in memory.
             kept.append((views.label, (xyz / np.float32(config.sigma_s), rgb.copy())))
         progress(DESCRIBE, index + 1, len(source.shards) + 1, "")
     fitted.append(others.fields(np.flatnonzero(others.label % HELD_OUT)))
     label = fitted[-1]["label"]
     # The labels of the fitted distractors follow those of the classes without gaps.
     fitted[-1]["label"] = (len(classes) + label - label // HELD_OUT - 1).astype(np.int32)
-    rng, first = np.random.default_rng([seed, len(source.shards)]), int(fitted[-1]["label"].max()) + 1
-    made = [
-        (first + number, cloud)
-        for number in range(distractors.look_alikes)
-        for cloud in look_alike(pool[number % len(pool)], pool[rng.integers(len(pool))], distractors.views, rng)
-    ]
-    made.sort(key=lambda each: len(each[1][0]))  # so that little of a batch is padding
-    labels, clouds = [label for label, _ in made], [cloud for _, cloud in made]
-    fitted.append(sample_clouds(clouds, labels, network, config, COPIES, rng, are_normal=True))
     # Samples are strips in random orientations, without points: the looks need the clouds, which are rendered again.
     objects = dict(list(enumerate(distractors.sources))[::HELD_OUT])
     rendered = render_clouds(ViewTask(objects, distractors.views, SEED))

@@ -168,7 +168,7 @@ def test_gallery_answers_are_its_scores() -> None:
         recognizer.enroll(name, [(frame(seed), 2), (frame(seed), 3)])
     embedding = recognizer.objects.embedding
     clouds = pack_instances(instances(4), 4)
-    oriented = describe_looks(clouds, embedding.network, embedding.config, 2)
+    oriented = describe_looks(clouds, embedding.network, embedding.config, 2).with_balanced(clouds)
     gallery = dataclasses.replace(recognizer.gallery, references=None)
     scores = gallery.scores(embedding.embed_oriented(oriented), oriented.weights)
     expected = scores / np.maximum(scores.sum(axis=1, keepdims=True), 1)

@@ -53,7 +53,7 @@ def test_embeddings_have_unit_length(embedding: Embedding, clouds: thor2.PointCl
 
 def test_described_clouds_give_the_same_embedding(embedding: Embedding, clouds: thor2.PointClouds) -> None:
     oriented = describe_looks(clouds, embedding.network, embedding.config, 2)
-    np.testing.assert_allclose(embedding.embed_oriented(oriented)[:, 0], embedding.embed(clouds), atol=1e-5)
+    np.testing.assert_allclose(embedding.embed_oriented(oriented, clouds)[:, 0], embedding.embed(clouds), atol=1e-5)
 
 
 def ensemble() -> Embedding:
@@ -71,7 +71,7 @@ def test_class_probabilities_are_geometric_means(nearest: bool, clouds: thor2.Po
     means = []
     for model in (embedding.model, *embedding.further):
         one = dataclasses.replace(embedding, model=model, further=())  # its first block is the learned one
-        unit = np.asarray(one.embed_oriented(oriented)[..., : SIZES.learned], np.float64)
+        unit = np.asarray(one.embed_oriented(oriented, clouds)[..., : SIZES.learned], np.float64)
         unit /= np.linalg.norm(unit, axis=-1, keepdims=True)
         proxies = np.asarray(model.proxies[...], np.float16).astype(np.float64)
         scale = np.exp(np.float16(model.log_scale[...]).astype(np.float64))
@@ -103,7 +103,7 @@ def test_embeddings_have_gradients(embedding: Embedding, clouds: thor2.PointClou
     """Most strips have no point of most colours: their colour embeddings are 0, where a square root has no slope."""
     oriented = describe_looks(clouds, embedding.network, embedding.config, 2)
     assert not np.asarray(oriented.each.embeddings).all()
-    total = lambda looks: embedding.embed_oriented(looks)[..., 0].sum()  # noqa: E731
+    total = lambda looks: embedding.embed_oriented(looks, clouds)[..., 0].sum()  # noqa: E731
     gradients = jax.jit(jax.grad(total, allow_int=True))(oriented)
     for gradient in (gradients.each.images, gradients.each.embeddings, gradients.statistics):
         assert np.isfinite(gradient).all() and np.asarray(gradient).any()
@@ -178,14 +178,6 @@ def test_files_of_earlier_versions_have_a_block_of_regions(tmp_path: Path, cloud
     np.testing.assert_allclose(values[:, 14:], statistics / np.sqrt(2), atol=1e-4)
     learned = Embedding.create(SMALL_CONFIG, sizes=SIZES).embed(clouds)[:, :8]
     np.testing.assert_allclose(learned, values[:, :8] * np.sqrt(2), atol=1e-3)
-
-
-def test_files_of_earlier_versions_do_not_read_the_histogram(tmp_path: Path) -> None:
-    path, sizes = tmp_path / "embedding.safetensors", dataclasses.asdict(SIZES)
-    Embedding.create(SMALL_CONFIG, sizes=SIZES).save(path)
-    del sizes["reads_balanced"]
-    rewritten(path, sizes=sizes)
-    assert Embedding.load(path).sizes == SIZES
 
 
 def test_files_of_earlier_versions_sum_the_distractors(tmp_path: Path, clouds: thor2.PointClouds) -> None:

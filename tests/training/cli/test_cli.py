@@ -274,7 +274,7 @@ def test_train_with_distractors(meshes: Path, images: Path, tmp_path: Path, refu
     assert run_thor2(*command) == 0
     content = (out / "embedding.safetensors").read_bytes()
     embedding, recognizer = Embedding.load(out / "embedding.safetensors"), Recognizer.load(out)
-    assert embedding.classes == recognizer.run.classes and embedding.distractors == 27 + 30 // 5
+    assert embedding.classes == recognizer.run.classes and embedding.distractors == 27
     assert recognizer.objects.embedding.fingerprint == embedding.fingerprint != load_default().fingerprint
     assert recognizer.model.classifiers.default == ("tops", "tops2", "embedding")
     record = recognizer.run.record

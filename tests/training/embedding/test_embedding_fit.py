@@ -13,7 +13,6 @@ from helpers import SMALL_CONFIG
 
 import colornet
 import thor2_jax as thor2
-from thor2_jax.descriptor.cloud_statistics import N_BALANCED, is_color
 from thor2_jax.descriptor.describe import strips
 from thor2_jax.descriptor.looks import describe_aligned_looks
 from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
@@ -22,7 +21,7 @@ from thor2_jax.model.classifier import model_arrays
 from training.augmentation import orientation
 from training.embedding import fit, sampling
 from training.embedding.build import main
-from training.embedding.fit import EmbeddingFit, batch_looks, fit_embedding
+from training.embedding.fit import EmbeddingFit, fit_embedding
 from training.embedding.samples import Samples, sample_clouds
 from training.embedding.sampling import ViewTask, build_samples, render_clouds
 from training.storage.workers import IN_PROCESS
@@ -90,7 +89,7 @@ def embedded(embedding: Embedding, aligned: thor2.PointClouds) -> np.ndarray:
     described = strips(aligned, NETWORK, embedding.config)
     weights = jnp.ones((len(aligned.mask), 1))
     oriented = describe_aligned_looks(aligned, weights, described, NETWORK, embedding.config)
-    return np.asarray(embedding.embed_oriented(oriented))[:, 0]
+    return np.asarray(embedding.embed_oriented(oriented, aligned))[:, 0]
 
 
 def aligned(clouds: thor2.PointClouds, mirror: str) -> thor2.PointClouds:
@@ -157,22 +156,6 @@ def test_further_networks_leave_the_first_as_it_is(views: Samples, fitted: tuple
     assert first.keys() == same.keys() and all(np.array_equal(first[name], same[name]) for name in first)
     assert second.proxies[...].shape == two.model.proxies[...].shape
     assert np.abs(second.proxies[...] - two.model.proxies[...]).max() > 0.1
-
-
-def test_which_networks_read_which_colours(views: Samples) -> None:
-    """A third of the networks reads the histogram of balanced colours, and none the other statistics of colours."""
-    sizes = dataclasses.replace(SIZES, reads_balanced=True)
-    options = EmbeddingFit(epochs=1, batch_size=32, networks=3)
-    embedding = fit_embedding(views, NETWORK, SMALL_CONFIG, options, sizes, classes=CLASSES)
-    looks = batch_looks(views.take(np.arange(4)), NETWORK, embedding.config)
-    colors = np.append(is_color(NETWORK.n_regions), np.zeros(N_BALANCED, bool))
-    histogram = np.arange(len(colors)) >= len(colors) - N_BALANCED
-    for model, reads in zip((embedding.model, *embedding.further), (True, False, False), strict=True):
-        of = lambda statistics, model=model: np.asarray(model.class_logits(looks.flat[0], statistics))  # noqa: E731
-        statistics = looks.flat[1]
-        assert np.array_equal(of(jnp.where(colors, 7.0, statistics)), of(statistics))
-        assert np.array_equal(of(jnp.where(histogram, 7.0, statistics)), of(statistics)) != reads
-        assert not np.array_equal(of(jnp.where(~colors & ~histogram, 7.0, statistics)), of(statistics))
 
 
 @pytest.mark.parametrize(
