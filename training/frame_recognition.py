@@ -72,21 +72,26 @@ class FrameAnswer:
 
 def recognize_frames(recognizer: Recognizer, sources: Iterable[FrameSource]) -> Iterator[FrameAnswer]:
     """Read and recognize frames; one that fails has an `error` and does not stop the others."""
-    return (_answer(source.name, source.read, recognizer.recognize) for source in sources)
+
+    def read(source: FrameSource) -> RGBDFrame:
+        try:
+            return source.read()
+        except OSError as error:
+            raise InputError(f"{error.filename}: {error.strerror or error}") from None
+
+    return (_answer(source.name, functools.partial(read, source), recognizer.recognize) for source in sources)
 
 
 def _answer(
     name: str, read: Callable[[], RGBDFrame], recognize: Callable[[RGBDFrame], Sequence[Recognition]]
 ) -> FrameAnswer:
-    """Read and recognize a frame; the answer has an `error` if that fails."""
+    """Read and recognize a frame; the answer has an `error` if that raises InputError."""
     try:
         frame = read()
         start = time.perf_counter()
         recognitions = recognize(frame)
     except InputError as error:
         return FrameAnswer(name, error=str(error))
-    except OSError as error:
-        return FrameAnswer(name, error=f"{error.filename}: {error.strerror or error}")
     return FrameAnswer(name, frame, recognitions, time.perf_counter() - start)
 
 

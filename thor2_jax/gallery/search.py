@@ -99,7 +99,7 @@ class IndexSearch:
         Raises:
             InputError: usearch is not installed.
         """
-        with needs_extra("index is usearch, which", "usearch", "index"):
+        with needs_extra("index is usearch, which", "the package usearch", "index"):
             usearch: Any = importlib.import_module("usearch.index")
         self._embeddings = embeddings
         self._index = usearch.Index(

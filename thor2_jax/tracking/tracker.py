@@ -10,8 +10,8 @@
 
 import dataclasses
 from collections import deque
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Self
+from collections.abc import Iterable, Sequence
+from typing import Protocol, Self
 
 import jax
 import numpy as np
@@ -21,14 +21,12 @@ from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.prepared_instance import EMPTY_INSTANCE, PreparedInstance
 from thor2_jax.model.inference import Inference, answers, gallery_scores
+from thor2_jax.model.model import Model
 from thor2_jax.model.recognition import MAX_OVERFLOW, Recognition
 from thor2_jax.tracking.fusion import FusedEvidence, view_weight
 from thor2_jax.tracking.matching import OccupiedVoxels, match, occupied_voxels
 from thor2_jax.tracking.next_view import NextView, ViewTable, next_view
 from thor2_jax.tracking.poses import PosedInstance, check_pose, merge_views, transform
-
-if TYPE_CHECKING:
-    from thor2_jax.recognizer import Recognizer
 
 __all__ = ["TrackedRecognition", "Tracker"]
 
@@ -55,6 +53,17 @@ class TrackedRecognition(Recognition):
         """Return this answer with the name, the confidence and the number of frames of another one of its track."""
         changed = ("name", "confidence", "classifier", "top", "reason", "frames")
         return dataclasses.replace(self, **{name: getattr(other, name) for name in changed})
+
+
+class FrameRecognizer(Protocol):
+    """The part of a recognizer that a tracker uses, see `Recognizer`."""
+
+    @property
+    def model(self) -> Model: ...
+
+    def prepare(self, frame: RGBDFrame) -> Iterable[PreparedInstance]: ...
+
+    def infer(self, instances: Iterable[PreparedInstance]) -> tuple[list[PreparedInstance], Inference]: ...
 
 
 class _Track:
@@ -86,7 +95,7 @@ class Tracker:
     With poses, each view of an object is described alone and as one cloud with those before it.
     """
 
-    def __init__(self, recognizer: "Recognizer") -> None:
+    def __init__(self, recognizer: FrameRecognizer) -> None:
         """Start without tracks; `Recognizer.track` calls this."""
         self._recognizer = recognizer
         self._tracks: list[_Track] = []

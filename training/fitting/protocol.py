@@ -131,9 +131,9 @@ class Protocol(RunSettings):
 
 
 DEFAULT = Protocol(
-    (),
-    FitOptions(epochs=16, batch_size=256),
-    DescriptorConfig(homology="closed_form", looks=4),
+    classifiers=(),
+    fit=FitOptions(epochs=16, batch_size=256),
+    config=DescriptorConfig(homology="closed_form", looks=4),
     mirrors=("",),
     orientation_copies=1,
     distractors=Distractors(),
@@ -147,6 +147,10 @@ QUICK = dataclasses.replace(DEFAULT, distractors=Distractors(procedural=600, net
 """The default with fewer distractors and networks: half of its time."""
 
 PAPER = Protocol(
-    FEATURES, FitOptions(epochs=100, batch_size=128), mirrors=PAPER_MIRRORS, azimuth_step=5.0, polar_step=5.0
+    classifiers=FEATURES,
+    fit=FitOptions(epochs=100, batch_size=128),
+    mirrors=PAPER_MIRRORS,
+    azimuth_step=5.0,
+    polar_step=5.0,
 )
 """The paper's protocol (section "Training"): 72 x 37 views per object, four mirrors, 100 epochs."""

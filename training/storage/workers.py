@@ -173,7 +173,7 @@ def ray_workers(workers: int, address: str | None = None) -> WorkerPool:
         InputError: if `workers` is not positive, or Ray is not installed.
     """
     _check_workers(workers)
-    with needs_extra("engine is ray, which", "ray", "cluster"):
+    with needs_extra("engine is ray, which", "the package ray", "cluster"):
         ray: Any = importlib.import_module("ray")
 
     def fetch(result: Any) -> Any:
