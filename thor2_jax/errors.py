@@ -8,9 +8,6 @@ __all__ = ["InputError", "needs_extra", "with_context"]
 MAX_MESSAGE = 1000
 """Characters of a message that are kept: a damaged file may have a name or a number of millions."""
 
-OWN_PACKAGES = "colornet", "thor2_jax", "training"
-"""Packages of this distribution."""
-
 
 class InputError(ValueError):
     """Invalid input from the user; its message names the argument or the file and the offending value, in one line.
@@ -51,13 +48,10 @@ def needs_extra(subject: str, package: str, extra: str) -> Iterator[None]:
 
     Raises:
         InputError: the package is missing.
-        ImportError: the import of a module of this distribution fails for another reason.
     """
     try:
         yield
     except ImportError as error:
-        if (error.name or "").partition(".")[0] in OWN_PACKAGES:
-            raise
         raise InputError(
             f"{subject} needs {package} ({error}); run pip install -c constraints.txt '.[{extra}]'"
         ) from None

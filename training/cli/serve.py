@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from thor2_jax.errors import needs_extra
+from thor2_jax.errors import InputError
 from thor2_jax.signals import ended_by_signals
 from training.cli import options
 from training.cli.app import app
@@ -54,8 +54,14 @@ def serve(
 ) -> None:
     """Serve recognition over HTTP (extra `serve`); see /openapi.json."""
     with ended_by_signals():
-        with needs_extra("thor2 serve", "FastAPI and uvicorn", "serve"):
+        try:
             from thor2_jax.service.server import serve as serve_forever
+        except ModuleNotFoundError as error:
+            if (error.name or "").startswith("thor2_jax"):
+                raise
+            raise InputError(
+                f"{error.name} is not installed; install it: pip install -c constraints.txt '.[serve]'"
+            ) from None
         from thor2_jax.service.settings import Settings, default_segmenter
 
         settings = Settings(
