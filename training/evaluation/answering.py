@@ -13,8 +13,8 @@ from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import RGBDFrame, pixel_rays
 from thor2_jax.printable import find_name
 from training.baselines.baseline import baseline_inputs
-from training.evaluation.answers import FrameAnswers, InstancePrediction, all_predictors
-from training.evaluation.runs import Run, load_runs, load_sequence_runs
+from training.evaluation.answers import FrameAnswers, InstancePrediction
+from training.evaluation.runs import Run, all_predictors, load_runs, load_sequence_runs
 from training.readers.labelled import LabelledFrame, LabelledFrames
 from training.storage.workers import WorkerPool
 

@@ -10,7 +10,7 @@ import itertools
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,20 +34,11 @@ __all__ = [
     "RULES",
     "Rule",
     "WHOLE",
-    "all_predictors",
     "fuse_by",
     "fusions",
     "main_fusion",
     "read_answers",
 ]
-
-if TYPE_CHECKING:
-    from training.evaluation.runs import Run
-
-
-def all_predictors(runs: Sequence["Run"]) -> tuple[tuple[int, str], ...]:
-    """Return (index of the run, name) of every classifier and baseline of all runs."""
-    return tuple((index, name) for index, run in enumerate(runs) for name in run.predictors)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -59,7 +50,7 @@ class InstancePrediction:
         truth: name of the object, which may be none of the classes.
         occluded: the recognizer found the instance to be occluded.
         reason: why the instance could not be described; None if it was.
-        probabilities: [M, C] float32, one row for each of `all_predictors`; None if the instance was not described.
+        probabilities: [M, C] float32, one row for each predictor of the runs; None if the instance was not described.
         position: median x, y and z of its points in the camera frame, metres; None if no pixel has depth, and in
             answers of earlier versions.
     """

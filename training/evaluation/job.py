@@ -16,11 +16,11 @@ from thor2_jax.config import DESCRIPTOR_VERSION
 from thor2_jax.errors import InputError
 from thor2_jax.files import check_output_directory, file_digest, remove_leftovers, write_text
 from training.evaluation.answering import NO_PIXELS, answer_frames
-from training.evaluation.answers import AnswerFile, FrameAnswers, all_predictors
+from training.evaluation.answers import AnswerFile, FrameAnswers
 from training.evaluation.frame_pictures import FramePictures
 from training.evaluation.page import write_report_page
 from training.evaluation.results import compute_results
-from training.evaluation.runs import Run, SequenceRun, has_real_views, scratch_networks
+from training.evaluation.runs import Run, SequenceRun, all_predictors, has_real_views, scratch_networks
 from training.readers.labelled import LabelledFrame, LabelledFrames
 from training.storage.jobs import locked
 from training.storage.progress import Progress

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,17 +15,14 @@ from training.evaluation.answers import (
     InstancePrediction,
     Predictions,
     Rule,
-    all_predictors,
     fuse_by,
     fusions,
     main_fusion,
 )
 from training.evaluation.published import EvaluationConditions, compare_with_published, published_means
+from training.evaluation.runs import Run, all_predictors
 from training.evaluation.scores import summarize_rows, summarize_runs
 from training.readers.labelled import sequence_of
-
-if TYPE_CHECKING:
-    from training.evaluation.runs import Run
 
 __all__ = ["COVERAGE", "compute_results", "fuse_answers", "named_answers"]
 
@@ -47,7 +44,7 @@ Fused = Mapping[str, Mapping[int, Predictions]]
 
 
 def fuse_answers(
-    instances: Sequence[InstancePrediction], runs: Sequence["Run"], rule: Rule = DEFAULT_RULE
+    instances: Sequence[InstancePrediction], runs: Sequence[Run], rule: Rule = DEFAULT_RULE
 ) -> dict[str, dict[int, Predictions]]:
     """Return fusion -> index of the run -> predictions for those of `instances` that were described.
 
@@ -70,7 +67,7 @@ def fuse_answers(
 
 
 def named_answers(
-    instances: Sequence[InstancePrediction], runs: Sequence["Run"]
+    instances: Sequence[InstancePrediction], runs: Sequence[Run]
 ) -> Iterator[tuple[int, InstancePrediction, str | None, float]]:
     """Yield what `recognize` answers with each run: index of the run, described instance, name or None, confidence.
 
@@ -87,7 +84,7 @@ def named_answers(
 
 def compute_results(
     kind: str,
-    runs: Sequence["Run"],
+    runs: Sequence[Run],
     frames: Sequence[FrameAnswers],
     own_objects: bool = False,
     real_views: bool = False,
@@ -286,7 +283,7 @@ def _reliability(predictions: Sequence[Predictions], truth: Integers) -> dict[st
     }
 
 
-def _answers(instances: Sequence[InstancePrediction], runs: Sequence["Run"]) -> dict[str, Any]:
+def _answers(instances: Sequence[InstancePrediction], runs: Sequence[Run]) -> dict[str, Any]:
     """Return the numbers of answers over all runs, and the most frequent wrong names, of unknown objects first."""
     classes, count, wrong = runs[0].classes, Counter[str](), Counter[tuple[str, str]]()
     for _, instance, name, _ in named_answers(instances, runs):

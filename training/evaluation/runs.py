@@ -32,7 +32,15 @@ from training.evaluation.answers import ALL_CLASSIFIERS, BOTH, EMBEDDED, GALLERY
 from training.fitting.checkpoints import find_run_directories
 from training.readers.labelled import named_path, path_ends, sequence_of
 
-__all__ = ["Run", "SequenceRun", "has_real_views", "load_runs", "load_sequence_runs", "scratch_networks"]
+__all__ = [
+    "Run",
+    "SequenceRun",
+    "all_predictors",
+    "has_real_views",
+    "load_runs",
+    "load_sequence_runs",
+    "scratch_networks",
+]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -166,6 +174,11 @@ def _check_same_descriptor(run: Run, first: Run, directory: Path, first_director
         raise InputError(
             f"model: {first_directory} and {directory} are adapted to different cameras; evaluate them separately"
         )
+
+
+def all_predictors(runs: Sequence[Run]) -> tuple[tuple[int, str], ...]:
+    """Return (index of the run, name) of every classifier and baseline of all runs."""
+    return tuple((index, name) for index, run in enumerate(runs) for name in run.predictors)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
