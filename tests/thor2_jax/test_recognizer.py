@@ -6,6 +6,7 @@ import jax
 import numpy as np
 import pytest
 from helpers import assert_same_answers, class_probabilities, patches, tilted, untrained_run
+from scipy.stats import gmean
 
 import thor2_jax as thor2
 from thor2_jax.frames.prepared_instance import PreparedInstance
@@ -46,31 +47,25 @@ def test_every_instance_is_answered_in_the_order_of_labels(recognizer: Recognize
     assert recognizer.recognize(tilted(np.zeros((240, 320), np.uint8))) == []
 
 
-def test_fusion_is_the_mean_log_probability(recognizer: Recognizer) -> None:
+@pytest.mark.parametrize("rule", [None, "max"])
+def test_answers_are_those_of_the_fused_classifiers(run: TrainedRun, rule: str | None) -> None:
+    """By default, the probabilities are fused by the mean of their logarithms."""
+    recognizer = Recognizer(run) if rule is None else Recognizer(run, rule=rule)  # type: ignore[arg-type]
     described = recognizer.describe(tilted(patches()))
-    probabilities = class_probabilities(recognizer, described.oriented, ("tops", "tops2"))
+    probabilities = class_probabilities(recognizer, described.oriented, THOR2)
     recognized = [answer for answer in recognizer.recognize(tilted(patches())) if answer.reason is None]
-    assert len(recognized) == 3
     for row, answer in enumerate(recognized):
-        fused = np.sqrt(probabilities["tops"][row].astype(np.float64) * probabilities["tops2"][row])
+        pair = np.array([probabilities[name][row] for name in THOR2], np.float64)
+        fused = pair[pair.max(axis=1).argmax()] if rule == "max" else gmean(pair) / gmean(pair).sum()
         best = int(fused.argmax())
-        assert answer.name == CLASSES[best]
-        assert answer.confidence == pytest.approx(fused[best] / fused.sum(), rel=1e-6)
-        assert answer.classifier == max(("tops", "tops2"), key=lambda name: probabilities[name][row][best])
-
-
-def test_the_max_rule_takes_the_more_confident_classifier(run: TrainedRun) -> None:
+        assert answer.name == CLASSES[best] and answer.confidence == pytest.approx(fused[best], rel=1e-6)
+        assert answer.classifier == THOR2[pair[:, best].argmax()] and tuple(answer.top) == THOR2
+        for shares, top in zip(pair, answer.top.values(), strict=True):
+            assert dict(top) == pytest.approx(dict(zip(CLASSES, shares, strict=True)))
+            assert [share for _, share in top] == sorted(shares, reverse=True)
+    assert len(recognized) == 3
     with pytest.raises(thor2.InputError, match="rule is 'least'"):
         Recognizer(run, rule="least")  # type: ignore[arg-type]
-    for answer in Recognizer(run, rule="max").recognize(tilted(patches())):
-        if answer.reason is None:
-            first = {name: top[0] for name, top in answer.top.items()}
-            assert set(first) == {"tops", "tops2"}
-            winner = max(first, key=lambda name: first[name][1])
-            assert (answer.classifier, answer.name, answer.confidence) == (winner, *first[winner])
-            for top in answer.top.values():
-                shares = [share for _, share in top]
-                assert shares == sorted(shares, reverse=True) and sum(shares) == pytest.approx(1, abs=1e-5)
 
 
 def test_answers_below_the_threshold_have_no_name(recognizer: Recognizer, run: TrainedRun) -> None:
