@@ -21,9 +21,9 @@ import pytest
 from fastapi import FastAPI
 from processes import HANG
 from prometheus_client import CollectorRegistry, Counter
+from service_requests import calls
 
 from thor2_jax.client import multipart
-from thor2_jax.errors import InputError
 from thor2_jax.service import pipeline, preparation
 from thor2_jax.service.app import create_app
 from thor2_jax.service.batching import Batcher
@@ -55,17 +55,16 @@ def deadline_in(seconds: float = HANG) -> float:
     return time.monotonic() + seconds
 
 
-def test_waiting_jobs_share_batches() -> None:
+def test_waiting_jobs_share_batches_and_close_finishes_them() -> None:
     device = Device()
     batcher = Batcher(device, lambda: 0, max_batch=4, window=0.0)
     first = batcher.submit([1], deadline_in())
     assert device.called.wait(HANG)  # The device is now processing it.
     others = [batcher.submit(numbers, deadline_in()) for numbers in ([2, 3], [], [4], [5, 6, 7, 8, 9, 10])]
     device.permits.release(10)
-    assert first.result(HANG) == [2]
-    assert [other.result(HANG) for other in others] == [[4, 6], [], [8], [10, 12, 14, 16, 18, 20]]
-    assert device.batches == [[1], [2, 3, 4, 5], [6, 7, 8, 9], [10]]
     batcher.close()
+    assert [job.result(0) for job in (first, *others)] == [[2], [4, 6], [], [8], [10, 12, 14, 16, 18, 20]]
+    assert device.batches == [[1], [2, 3, 4, 5], [6, 7, 8, 9], [10]]
 
 
 def test_batch_waits_briefly_for_expected_jobs() -> None:
@@ -102,15 +101,6 @@ def test_late_cancelled_and_failing_jobs_are_isolated() -> None:
     batcher.close()
 
 
-def test_close_finishes_submitted_jobs() -> None:
-    device = Device()
-    batcher = Batcher(device, lambda: 0, max_batch=2, window=0.0)
-    jobs = [batcher.submit([n], deadline_in()) for n in range(7)]
-    device.permits.release(10)
-    batcher.close()
-    assert [job.result(0) for job in jobs] == [[2 * n] for n in range(7)]
-
-
 @pytest.fixture(scope="module")
 def pool() -> Iterator[PreparationPool]:
     pool = PreparationPool(1)
@@ -127,22 +117,19 @@ def test_process_returns_results_and_errors(pool: PreparationPool) -> None:
         pool.submit(deadline_in(), math.sqrt, -1.0).result(HANG)
 
 
-def test_slow_process_is_replaced(pool: PreparationPool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_slow_and_dead_processes_are_replaced(pool: PreparationPool, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(preparation, "MIN_SECONDS", 0.1)
     before = pool.submit(deadline_in(), os.getpid).result(HANG)
-    with pytest.raises(RequestError) as late:
-        pool.submit(deadline_in(0.1), time.sleep, 10 * HANG).result(HANG)
-    assert late.value.status == 504
-    after = pool.submit(deadline_in(), os.getpid).result(HANG)
-    assert after != before
-    with pytest.raises(ProcessLookupError):
-        os.kill(before, 0)
-
-
-def test_crashed_process_is_replaced(pool: PreparationPool) -> None:
-    with pytest.raises(RequestError) as died:
-        pool.submit(deadline_in(), os._exit, 3).result(HANG)
-    assert died.value.status == 422
+    calls_that_fail = [(0.1, time.sleep, 10 * HANG, 504), (HANG, os._exit, 3, 422)]
+    for seconds, function, argument, status in calls_that_fail:
+        with pytest.raises(RequestError) as error:
+            pool.submit(deadline_in(seconds), function, argument).result(HANG)
+        assert error.value.status == status
+        after = pool.submit(deadline_in(), os.getpid).result(HANG)
+        with pytest.raises(ProcessLookupError):
+            os.kill(before, 0)
+        assert after != before
+        before = after
     idle = pool._idle.get()
     idle.process.kill()
     idle.process.join()
@@ -166,19 +153,7 @@ def test_compilations_are_counted_until_stop() -> None:
 
 @pytest.fixture(scope="module")
 def app(run_dir: Path) -> FastAPI:
-    return create_app(Settings(run_dir, token="secret", queue=2, deadline=HANG))
-
-
-def calls(app: FastAPI, *requests: Callable[[httpx.AsyncClient], Any]) -> list[httpx.Response]:
-    """Send requests concurrently and return their responses."""
-
-    async def send_all() -> list[httpx.Response]:
-        transport = httpx.ASGITransport(app)
-        async with httpx.AsyncClient(transport=transport, base_url="http://x") as client:
-            client.headers["Authorization"] = "Bearer secret"
-            return await asyncio.gather(*(request(client) for request in requests))
-
-    return asyncio.run(send_all())
+    return create_app(Settings(run_dir, token="secret", queue=2, deadline=HANG, teach=True))
 
 
 def frame_request(files: dict[str, bytes], *then: Callable[[httpx.Response], None]) -> Callable[..., Any]:
@@ -193,19 +168,22 @@ def frame_request(files: dict[str, bytes], *then: Callable[[httpx.Response], Non
     return send
 
 
+PUBLIC = ("/healthz", "/readyz", "/openapi.json", "/", "/app.js", "/samples/index.json", "/samples/clutter/depth.png")
+
+
 def test_token_is_required_except_for_health_and_page(app: FastAPI) -> None:
-    guarded = [("POST", f"/v1/{name}") for name in ("recognize", "explain", "describe")]
-    guarded += [("GET", "/v1/model"), ("GET", "/v1/colornet")]
-    for method, path in [*guarded, ("GET", "/metrics")]:
+    paths = app.openapi()["paths"]
+    guarded = {(method.upper(), path) for path in paths if path not in PUBLIC for method in paths[path]}
+    assert guarded > {("POST", "/v1/recognize"), ("DELETE", "/v1/objects/{name}")} and len(guarded) == 11
+    for method, path in guarded:
         for value in ("", "Bearer", "Bearer wrong", "Basic secret", "Bearer s\xe9cret", "Bearer secret secret"):
             headers = {"Authorization": value.encode("latin-1")}
             (answer,) = calls(app, lambda c, m=method, p=path, h=headers: c.request(m, p, headers=h))
             assert answer.status_code == 401 and answer.headers["www-authenticate"] == "Bearer"
             assert answer.json()["field"] == "Authorization"
     assert calls(app, lambda c: c.get("/v1/model"))[0].status_code == 200
-    public = ("/healthz", "/openapi.json", "/", "/app.js", "/samples/index.json", "/samples/clutter/depth.png")
-    for answer in calls(app, *(lambda c, p=path: c.get(p, headers={"Authorization": ""}) for path in public)):
-        assert answer.status_code == 200
+    for answer in calls(app, *(lambda c, p=path: c.get(p) for path in PUBLIC), token=""):
+        assert answer.status_code == (503 if answer.url.path == "/readyz" else 200)
 
 
 def test_requests_are_refused_unless_ready(
@@ -305,12 +283,7 @@ def test_internal_error_hides_its_traceback(
     monkeypatch.setattr(app.state.service, "state", "ready")
     monkeypatch.setattr(app.state.service, "recognize", broken)
 
-    async def ask() -> httpx.Response:
-        transport = httpx.ASGITransport(app, raise_app_exceptions=False)
-        async with httpx.AsyncClient(transport=transport, base_url="http://x") as client:
-            return await client.post("/v1/recognize", files=files, headers={"Authorization": "Bearer secret"})
-
-    answer = asyncio.run(ask())
+    (answer,) = calls(app, frame_request(files))
     assert answer.status_code == 500 and answer.json()["field"] is None and "/some/path" not in answer.text
     assert 'thor2_requests_total{path="/v1/recognize",status="500"} 1.0' in app.state.service.metrics.text().decode()
 
@@ -353,17 +326,3 @@ def test_dead_worker_has_no_requests_in_progress(tmp_path: Path) -> None:
         cwd=Path(__file__).parents[3], env=environment, check=True, capture_output=True, text=True,
     ).stdout  # fmt: skip
     assert "thor2_requests_waiting 1.0" in text and "thor2_compilations_after_warm_up_total 2.0" in text
-
-
-def test_settings_out_of_range() -> None:
-    cache = Path(__file__)
-    for invalid in (
-        {"cache": cache},
-        {"queue": 0},
-        {"deadline": 0.0},
-        {"deadline": float("nan")},
-        {"processes": 0},
-        {"token": "é"},
-    ):
-        with pytest.raises(InputError, match=next(iter(invalid))):
-            Settings(Path("run"), **invalid)
