@@ -4,14 +4,13 @@ import base64
 import io
 import threading
 from collections.abc import Callable
-from typing import Any
 
 import httpx
 import numpy as np
 import pytest
 from fastapi import FastAPI
 from helpers import encode_image
-from page_actions import upload, wait_until
+from page_actions import assert_fits, upload, wait_until
 from PIL import Image
 from playwright.sync_api import Page, Route, expect
 from processes import HANG
@@ -154,8 +153,7 @@ def test_page_waits_for_an_explanation_and_shows_it(open_page: Open, teaching_ur
     assert [shown.nth(k).evaluate("canvas => canvas.width") for k in (0, 1)] == [600, 300]
     expect(shown.first).to_have_attribute("aria-label", "What decided, on the photo. Orange speaks for a.")
     for width in (1280, 390):
-        page.set_viewport_size({"width": width, "height": 900})
-        assert page.evaluate("document.documentElement.scrollWidth") <= width
+        assert_fits(page, width)
     page.locator('#objects button[data-label="7"]').click()  # the explanation belonged to the other object
     expect(shown).to_have_count(0)
     expect(page.locator("#why-status")).to_have_text("")
