@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from page_actions import answered, assert_fits, changed_answers, upload, wait_for_answer
+from page_actions import assert_fits, changed_answers, upload, wait_for_answer
 from PIL import Image
 from playwright.sync_api import Page, Route, expect
 
@@ -112,10 +112,3 @@ def test_labels_are_required_where_the_service_does_not_segment(open_page: Open,
     upload(page, unlabelled)
     expect(page.locator("#labels-error")).to_have_text("Choose a file.")
     expect(page.locator("#labels-hint")).not_to_contain_text("segmented")
-
-
-def test_a_failing_segmenter_is_reported_beside_the_labels(open_page: Open, unlabelled: Files) -> None:
-    message = "segmenter sam failed on the frame (RuntimeError: no weights); check its package, or send labels."
-    page = open_page(answered("/v1/explain", status=500, json={"field": "labels", "message": message}))
-    upload(page, unlabelled)
-    expect(page.locator("#labels-error")).to_have_text(message)
