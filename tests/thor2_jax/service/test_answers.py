@@ -9,6 +9,7 @@ import httpx
 import numpy as np
 import pytest
 from helpers import assert_same_answers, encode_image, random_clouds
+from service_requests import check_refused
 
 import colornet
 import thor2_jax as thor2
@@ -104,6 +105,8 @@ def test_health_page_and_unknown_paths(http: httpx.Client) -> None:
         assert "default-src 'none'" in policy and "unsafe" not in policy and "http" not in policy
     for path in ("/", "/healthz", "/v1/model", "/metrics", "/openapi.json", "/missing"):
         assert http.get(path).headers.get_list("x-content-type-options") == ["nosniff"]
+    for path in ("/", "/v1/objects", "/v1/recognize"):
+        check_refused(http.get(path, headers={"Host": "evil.example"}), 403, "Host", "evil.example")
     for path in ("/nothing", "/../app.py", "/%2e%2e/app.py"):
         missing = http.get(path)
         assert missing.status_code == 404 and set(missing.json()) == {"field", "message"}
