@@ -48,3 +48,18 @@ def wait_for_answer(page: Page) -> None:
 def wait_until(page: Page, condition: Callable[[], bool]) -> None:
     """Wait for something that the handler of a request does."""
     processes.wait_until(condition, pause=lambda seconds: page.wait_for_timeout(1000 * seconds))
+
+
+def assert_fits(page: Page, width: int) -> None:
+    """Assert that nothing is wider than a page of some width, and that fingers can hit what can be pressed."""
+    page.set_viewport_size({"width": width, "height": 740})
+    widest, lefts, rights, heights = page.evaluate(
+        """() => {
+          const boxes = all => [...document.querySelectorAll(all)].map(one => one.getBoundingClientRect());
+          const shown = boxes("button, input, canvas, td, p, #notice");
+          const heights = boxes("button, input, summary").map(box => box.height).filter(Boolean);
+          const { scrollWidth } = document.documentElement;
+          return [scrollWidth, shown.map(box => box.left), shown.map(box => box.right), heights];
+        }"""
+    )
+    assert widest <= width and min(lefts) >= 0 and max(rights) <= width and min(heights) >= 24

@@ -9,6 +9,7 @@ import jax
 import numpy as np
 import persim
 import pytest
+from helpers import slow
 
 import thor2_jax as thor2
 from thor2_jax import persistence
@@ -54,23 +55,15 @@ def assert_as_gudhi(heights: np.ndarray, edges: np.ndarray | None = None) -> Non
         np.testing.assert_array_equal(one.births[one.mask], heights[b][one.mask])
 
 
-@pytest.mark.parametrize("n", [1, pytest.param(2, marks=pytest.mark.slow), 9, 100])
-def test_random_heights(n: int) -> None:
+@pytest.mark.parametrize("n", [1, *slow(2), 9, 100])
+def test_heights_of_vertices_and_edges(n: int) -> None:
     rng = np.random.default_rng(n)
-    assert_as_gudhi(rng.normal(size=(20, n)).astype(np.float32))
-
-
-def test_equal_heights() -> None:
-    rng = np.random.default_rng(0)
-    heights = rng.integers(0, 3, (200, 9)).astype(np.float32)
-    assert_as_gudhi(heights)
-    assert_as_gudhi(heights, rng.integers(0, 5, (200, 8)).astype(np.float32))
-
-
-def test_heights_of_edges() -> None:
-    rng = np.random.default_rng(0)
-    heights = rng.normal(size=(200, 9)).astype(np.float32)
-    assert_as_gudhi(heights, (rng.normal(size=(200, 8)) + 1).astype(np.float32))
+    heights = rng.normal(size=(40, n)).astype(np.float32)
+    equal = rng.integers(0, 3, (40, n)).astype(np.float32)
+    for each in (heights, equal):
+        assert_as_gudhi(each)
+    assert_as_gudhi(heights, (rng.normal(size=(40, n - 1)) + 1).astype(np.float32))
+    assert_as_gudhi(equal, rng.integers(0, 5, (40, n - 1)).astype(np.float32))
 
 
 def test_absent_vertices_and_edges() -> None:
@@ -90,15 +83,6 @@ def test_absent_vertices_and_edges() -> None:
     short = np.where(np.arange(17) < 9, expected[0], np.inf)
     assert_as_gudhi(short)
     assert len(gudhi_pairs(short[0])) == len(gudhi_pairs(expected[0][0, :9]))
-
-
-def test_strips_of_a_slice_are_paths_of_two_vertices() -> None:
-    rng = np.random.default_rng(0)
-    births = np.repeat(np.arange(31) * 0.025, 2).astype(np.float32)
-    edges = np.full(61, np.inf, np.float32)
-    edges[::2] = births[::2] + rng.random(31).astype(np.float32)
-    diagrams = persistence.sublevel_diagrams(births, edges)
-    np.testing.assert_array_equal(pairs_of(diagrams), np.stack([births[::2], edges[::2]], axis=1))
 
 
 @pytest.mark.parametrize("shape", [(0,), (1,), (0, 5), (4, 5, 9)])
@@ -152,42 +136,27 @@ def test_the_image_of_no_pairs_is_zero_with_zero_gradients() -> None:
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize("with_edges", [False, True])
 def test_gradients_against_differences_of_gudhi_and_persim(with_edges: bool) -> None:
+    """Gradients of heights, edges, variance and exponent, which one array holds in this order."""
     rng = np.random.default_rng(2)
-    heights, edges = rng.normal(size=12), rng.normal(size=11) + 1.5
+    arguments = np.concatenate([rng.normal(size=12), rng.normal(size=11) + 1.5, [0.1, 1.5]])
     probe = rng.random(IMAGE["pixels"])
 
     def expected(values: np.ndarray) -> float:
-        pairs = gudhi_pairs(values[:12], values[12:] if with_edges else None)
-        return float((persim_image(pairs, 0.1, 1.0) * probe).sum())
+        pairs = gudhi_pairs(values[:12], values[12:23] if with_edges else None)
+        return float((persim_image(pairs, *values[23:]) * probe).sum())
 
+    @jax.value_and_grad
     def actual(values: jax.Array) -> jax.Array:
-        diagrams = persistence.sublevel_diagrams(values[:12], values[12:] if with_edges else None)
-        return (persistence.images(diagrams, **IMAGE, variance=0.1) * probe).sum()
+        diagrams = persistence.sublevel_diagrams(values[:12], values[12:23] if with_edges else None)
+        return (persistence.images(diagrams, **IMAGE, variance=values[23], exponent=values[24]) * probe).sum()
 
-    values = np.concatenate([heights, edges])
-    assert len(gudhi_pairs(heights, edges if with_edges else None)) >= 3
-    np.testing.assert_allclose(jax.jit(actual)(values), expected(values), rtol=1e-9)
-    steps = np.eye(len(values)) * 1e-5
-    differences = [(expected(values + step) - expected(values - step)) / 2e-5 for step in steps]
-    gradient = jax.jit(jax.grad(actual))(values)
+    assert len(gudhi_pairs(arguments[:12], arguments[12:23] if with_edges else None)) >= 3
+    value, gradient = jax.jit(actual)(arguments)
+    np.testing.assert_allclose(value, expected(arguments), rtol=1e-9)
+    steps = np.eye(len(arguments)) * 1e-5
+    differences = [(expected(arguments + step) - expected(arguments - step)) / 2e-5 for step in steps]
     assert gradient.dtype == np.float64
     np.testing.assert_allclose(gradient, differences, rtol=1e-5, atol=1e-7)
-
-
-@pytest.mark.usefixtures("x64")
-def test_gradients_of_variance_and_exponent() -> None:
-    heights = np.random.default_rng(3).normal(size=30)
-    pairs = gudhi_pairs(heights)
-
-    def actual(variance: jax.Array, exponent: jax.Array) -> jax.Array:
-        diagrams = persistence.sublevel_diagrams(heights)
-        return persistence.images(diagrams, **IMAGE, variance=variance, exponent=exponent)[3, 1]
-
-    gradient = jax.jit(jax.grad(actual, argnums=(0, 1)))(0.1, 1.5)
-    step = 1e-5
-    by_variance = (persim_image(pairs, 0.1 + step, 1.5) - persim_image(pairs, 0.1 - step, 1.5)) / (2 * step)
-    by_exponent = (persim_image(pairs, 0.1, 1.5 + step) - persim_image(pairs, 0.1, 1.5 - step)) / (2 * step)
-    np.testing.assert_allclose(gradient, (by_variance[3, 1], by_exponent[3, 1]), rtol=1e-5)
 
 
 @pytest.mark.parametrize(

@@ -50,9 +50,6 @@ def test_values_replace_the_colors(ax) -> None:
     assert np.ptp(faces[150, :3]) < 0.03
     with pytest.raises(thor2.InputError, match="values"):
         plot.cloud(ax, POINTS, COLORS, values[:-1])
-
-
-def test_attribution_colors_are_symmetric() -> None:
     scale = plot.attribution_colors([0.0] * 97 + [1.0, 2.0, 1000.0])
     assert scale.norm.vmin == -scale.norm.vmax and 0 < scale.norm.vmax < 1000
     assert plot.attribution_colors([0.0, 0.0]).norm.vmax > 0 and plot.attribution_colors([]).norm.vmax > 0
@@ -66,13 +63,6 @@ def test_slices_have_their_borders(ax) -> None:
     np.testing.assert_allclose(levels, np.arange(int(top / 0.1) + 2) * 0.1)
     assert [text.get_text() for text in ax.texts] == [str(i) for i in range(len(levels) - 1)]
     draw(ax)
-
-
-def test_unpack_undoes_pack() -> None:
-    clouds = [(POINTS[:7], COLORS[:7]), (POINTS[:0], COLORS[:0]), (POINTS, COLORS)]
-    for (xyz, rgb), (points, colors) in zip(clouds, thor2.PointClouds.pack(clouds).unpack(), strict=True):
-        np.testing.assert_array_equal(points, xyz)
-        np.testing.assert_allclose(colors, rgb / 255, atol=1e-6)
 
 
 def test_diagram_has_every_pair(ax) -> None:

@@ -5,7 +5,8 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
-from helpers import assert_same_answers, class_probabilities, patches, slow, tilted, untrained_run
+from helpers import assert_same_answers, class_probabilities, patches, tilted, untrained_run
+from scipy.stats import gmean
 
 import thor2_jax as thor2
 from thor2_jax.frames.prepared_instance import PreparedInstance
@@ -43,33 +44,28 @@ def test_every_instance_is_answered_in_the_order_of_labels(recognizer: Recognize
     for answer in (answers[0], answers[2], answers[3]):
         assert answer.name in CLASSES and answer.reason is None and not answer.occluded
         assert answer.points_used > 30 and answer.overflow >= 0
+    assert recognizer.recognize(tilted(np.zeros((240, 320), np.uint8))) == []
 
 
-def test_fusion_is_the_mean_log_probability(recognizer: Recognizer) -> None:
+@pytest.mark.parametrize("rule", [None, "max"])
+def test_answers_are_those_of_the_fused_classifiers(run: TrainedRun, rule: str | None) -> None:
+    """By default, the probabilities are fused by the mean of their logarithms."""
+    recognizer = Recognizer(run) if rule is None else Recognizer(run, rule=rule)  # type: ignore[arg-type]
     described = recognizer.describe(tilted(patches()))
-    probabilities = class_probabilities(recognizer, described.oriented, ("tops", "tops2"))
+    probabilities = class_probabilities(recognizer, described.oriented, THOR2)
     recognized = [answer for answer in recognizer.recognize(tilted(patches())) if answer.reason is None]
-    assert len(recognized) == 3
     for row, answer in enumerate(recognized):
-        fused = np.sqrt(probabilities["tops"][row].astype(np.float64) * probabilities["tops2"][row])
+        pair = np.array([probabilities[name][row] for name in THOR2], np.float64)
+        fused = pair[pair.max(axis=1).argmax()] if rule == "max" else gmean(pair) / gmean(pair).sum()
         best = int(fused.argmax())
-        assert answer.name == CLASSES[best]
-        assert answer.confidence == pytest.approx(fused[best] / fused.sum(), rel=1e-6)
-        assert answer.classifier == max(("tops", "tops2"), key=lambda name: probabilities[name][row][best])
-
-
-def test_the_max_rule_takes_the_more_confident_classifier(run: TrainedRun) -> None:
+        assert answer.name == CLASSES[best] and answer.confidence == pytest.approx(fused[best], rel=1e-6)
+        assert answer.classifier == THOR2[pair[:, best].argmax()] and tuple(answer.top) == THOR2
+        for shares, top in zip(pair, answer.top.values(), strict=True):
+            assert dict(top) == pytest.approx(dict(zip(CLASSES, shares, strict=True)))
+            assert [share for _, share in top] == sorted(shares, reverse=True)
+    assert len(recognized) == 3
     with pytest.raises(thor2.InputError, match="rule is 'least'"):
         Recognizer(run, rule="least")  # type: ignore[arg-type]
-    for answer in Recognizer(run, rule="max").recognize(tilted(patches())):
-        if answer.reason is None:
-            first = {name: top[0] for name, top in answer.top.items()}
-            assert set(first) == {"tops", "tops2"}
-            winner = max(first, key=lambda name: first[name][1])
-            assert (answer.classifier, answer.name, answer.confidence) == (winner, *first[winner])
-            for top in answer.top.values():
-                shares = [share for _, share in top]
-                assert shares == sorted(shares, reverse=True) and sum(shares) == pytest.approx(1, abs=1e-5)
 
 
 def test_answers_below_the_threshold_have_no_name(recognizer: Recognizer, run: TrainedRun) -> None:
@@ -98,16 +94,9 @@ def test_half_of_the_points_may_overflow_with_a_name(recognizer: Recognizer) -> 
     assert refused.reason is not None and "overflow" in refused.reason
 
 
-@pytest.mark.parametrize(
-    "change",
-    [{"fx": 1e-9}, *slow({"cx": 1e8}, {"fx": 20.0, "fy": 20.0})],
-)
-def test_no_names_with_absurd_intrinsics(recognizer: Recognizer, change: dict[str, float]) -> None:
-    frame = tilted(patches())
-    answers = recognizer.recognize(
-        dataclasses.replace(frame, intrinsics=dataclasses.replace(frame.intrinsics, **change))
-    )
-    assert [answer.name for answer in answers] == [None] * 4
+def test_no_names_with_absurd_intrinsics(recognizer: Recognizer) -> None:
+    absurd = dataclasses.replace(tilted(patches()), intrinsics=thor2.Intrinsics(1e-9, 600.0, 159.5, 119.5))
+    assert [answer.name for answer in recognizer.recognize(absurd)] == [None] * 4
 
 
 def test_probabilities_are_the_classifiers_on_the_descriptors(recognizer: Recognizer, run: TrainedRun) -> None:
@@ -125,56 +114,13 @@ def test_probabilities_are_the_classifiers_on_the_descriptors(recognizer: Recogn
         np.testing.assert_allclose(probabilities, expected / expected.sum(axis=1, keepdims=True), atol=1e-5)
 
 
-def test_an_instance_does_not_depend_on_the_others(recognizer: Recognizer) -> None:
-    labels = patches()
-    for answer in recognizer.recognize(tilted(labels)):
-        alone = tilted(np.where(labels == answer.label, labels, 0).astype(np.uint8))
-        assert_same_answers(recognizer.recognize(alone), [answer], 1e-5)
-
-
-def test_a_frame_without_instances_has_no_answers(recognizer: Recognizer) -> None:
-    assert recognizer.recognize(tilted(np.zeros((240, 320), np.uint8))) == []
-
-
-@pytest.mark.slow
-def test_clouds_beyond_the_largest_bucket_are_coarser(recognizer: Recognizer) -> None:
-    # A plane of 3 m x 2 m has far more voxels than the largest bucket has points.
-    n = 300
-    depth = np.full((n, n), 2400, np.uint16)
-    wide = thor2.Intrinsics(200.0, 200.0, n / 2, n / 2)
-    frame = thor2.RGBDFrame(np.full((n, n, 3), 90, np.uint8), depth, np.ones((n, n), np.uint8), wide)
-    (answer,) = recognizer.recognize(frame)
-    assert answer.reason is not None and "overflow" in answer.reason
-    assert 1000 < answer.points_used <= 8192
-    assert answer.overflow > 0
-
-
 def test_more_instances_than_are_described_at_once(recognizer: Recognizer) -> None:
     labels = squares(9)  # two batches of four and one of one
-    parts = [np.where((labels >= first) & (labels < first + 4), labels, 0) for first in (1, 5, 9)]
-    expected = [answer for part in parts for answer in recognizer.recognize(tilted(part))]
+    alone = [np.where(labels == number, labels, 0) for number in range(1, 10)]
+    expected = [answer for part in alone for answer in recognizer.recognize(tilted(part))]
     answers = recognizer.recognize(tilted(labels))
     assert [a.label for a in answers] == list(range(1, 10)) and all(a.reason is None for a in answers)
     assert_same_answers(answers, expected, 1e-5)
-
-
-@pytest.mark.slow
-def test_more_instances_than_the_largest_batch(recognizer: Recognizer) -> None:
-    labels = np.zeros((240, 320), np.uint16)
-    side = 12
-    number = 0
-    for row in range(0, 240 - side, side):
-        for column in range(0, 320 - side, side):
-            number += 1
-            labels[row : row + side - 1, column : column + side - 1] = number
-    assert number > 256
-    # At 2 m, a pixel is 3 mm wide and a patch 3 cm.
-    answers = recognizer.recognize(tilted(labels, nearest=2000))
-    assert [a.label for a in answers] == list(range(1, number + 1))
-    assert all(a.reason is None for a in answers)
-    only_last = np.where(labels == number, labels, 0).astype(np.uint16)
-    (alone,) = recognizer.recognize(tilted(only_last, nearest=2000))
-    assert alone.confidence == pytest.approx(answers[-1].confidence, abs=1e-5)
 
 
 def test_a_missing_classifier_is_named(run: TrainedRun) -> None:

@@ -18,10 +18,13 @@ from thor2_jax.frames.occlusion import OcclusionBoundary
 RNG = np.random.default_rng(0)
 
 
-def test_pack_pads_every_size() -> None:
+def test_pack_pads_copies_of_every_size() -> None:
     sizes = (0, 1, 2, 7, 513)
-    clouds = random_clouds(0, sizes)
-    packed = thor2.PointClouds.pack(clouds)
+    clouds, given = random_clouds(0, sizes), random_clouds(0, sizes)
+    packed = thor2.PointClouds.pack(given)
+    np.testing.assert_equal(given, clouds)
+    for xyz, rgb in given:
+        xyz[:], rgb[:] = 9, 9
     assert packed.points.shape == packed.colors.shape == (5, 1024, 3)
     assert packed.points.dtype == packed.colors.dtype == jnp.float32
     assert packed.mask.dtype == packed.boundary.dtype == jnp.bool_
@@ -30,8 +33,7 @@ def test_pack_pads_every_size() -> None:
         np.testing.assert_array_equal(packed.points[i, :n], xyz)
         np.testing.assert_array_equal(packed.points[i, n:], 0)
         np.testing.assert_allclose(packed.colors[i, :n], rgb / 255.0, atol=1e-7)
-    np.testing.assert_array_equal(packed.camera, np.zeros((5, 3)))
-    assert not np.asarray(packed.boundary).any()
+    assert not packed.camera.any() and not packed.boundary.any() and packed.rim is None
 
 
 def test_packing_on_the_host_gives_equal_numpy_arrays() -> None:
@@ -45,34 +47,25 @@ def test_packing_on_the_host_gives_equal_numpy_arrays() -> None:
         np.testing.assert_array_equal(actual, expected)
 
 
-def test_pack_takes_colors_capacity_camera_and_boundary() -> None:
-    xyz, rgb = RNG.random((5, 3)), RNG.random((5, 3))
-    boundary = np.array([True, False, True, False, False])
-    packed = thor2.PointClouds.pack([(xyz, rgb), (xyz, rgb)], capacity=9, camera=[1, 2, 3], boundary=[None, boundary])
+def test_pack_takes_colors_capacity_camera_boundary_and_rim() -> None:
+    cloud = RNG.random((5, 3)), RNG.random((5, 3))
+    marks = np.array([True, False, True, False, False])
+    padded = [[False] * 9, [*marks, *[False] * 4]]
+    packed = thor2.PointClouds.pack([cloud] * 2, 9, camera=[1, 2, 3], boundary=[None, marks], rim=[None, marks])
     assert packed.points.shape == (2, 9, 3)
-    np.testing.assert_array_equal(packed.colors[0, :5], rgb.astype(np.float32))
+    np.testing.assert_array_equal(packed.colors[0, :5], cloud[1].astype(np.float32))
     np.testing.assert_array_equal(packed.camera, [[1, 2, 3]] * 2)
-    np.testing.assert_array_equal(packed.boundary, [[False] * 9, [*boundary, *[False] * 4]])
-    each = thor2.PointClouds.pack([(xyz, rgb), (xyz, rgb)], camera=[[1, 2, 3], [4, 5, 6]])
+    np.testing.assert_array_equal(packed.boundary, padded)
+    np.testing.assert_array_equal(packed.rim, padded)
+    each = thor2.PointClouds.pack([cloud] * 2, camera=[[1, 2, 3], [4, 5, 6]])
     np.testing.assert_array_equal(each.camera, [[1, 2, 3], [4, 5, 6]])
 
 
-@pytest.mark.parametrize("on_host", [False, True])
-def test_pack_pads_the_rim_if_it_is_given(on_host: bool) -> None:
-    clouds, rim = random_clouds(0, (5, 0, 3)), np.array([True, False, True, False, False])
-    packed = thor2.PointClouds.pack(clouds, 8, rim=[rim, np.zeros(0, bool), None], on_host=on_host)
-    np.testing.assert_array_equal(packed.rim, [[*rim, *[False] * 3], [False] * 8, [False] * 8])
-    assert packed.rim is not None and packed.rim.dtype == bool
-    assert thor2.PointClouds.pack(clouds, on_host=on_host).rim is None
-
-
-def test_pack_does_not_modify_its_arguments() -> None:
-    ((xyz, rgb),) = random_clouds(0, [4])
-    before = xyz.copy(), rgb.copy()
-    packed = thor2.PointClouds.pack([(xyz, rgb)])
-    xyz[:] = 9
-    np.testing.assert_array_equal(packed.points[0, :4], before[0])
-    np.testing.assert_array_equal(rgb, before[1])
+def test_unpack_undoes_pack() -> None:
+    clouds = random_clouds(0, (7, 0, 300))
+    for (xyz, rgb), (points, colors) in zip(clouds, thor2.PointClouds.pack(clouds).unpack(), strict=True):
+        np.testing.assert_array_equal(points, xyz)
+        np.testing.assert_allclose(colors, rgb / 255, atol=1e-6)
 
 
 POINTS, COLORS = np.zeros((3, 3)), np.zeros((3, 3))
@@ -123,31 +116,15 @@ def test_pack_rejects(arguments: dict, expected: list[str]) -> None:
         thor2.PointClouds.pack(**{"clouds": [(POINTS, COLORS)], **arguments})
 
 
-def test_records_are_frozen_pytrees() -> None:
-    packed = thor2.PointClouds.pack(random_clouds(0, [2]))
-    with pytest.raises(AttributeError):
-        packed.points = packed.colors  # type: ignore[misc]
-    leaves, tree = jax.tree.flatten(packed)
-    assert len(leaves) == 5
-    assert isinstance(jax.tree.unflatten(tree, leaves), thor2.PointClouds)
-
-
 def test_layout_of_the_flat_descriptors() -> None:
     """TOPS2 has a block [image | embedding] for each slice, both flattened in C order."""
     images = RNG.random((2, 7, 32, 32)).astype(np.float32)
     embeddings = RNG.random((2, 7, 22, 31)).astype(np.float32)
     descriptors = thor2.Descriptors(jnp.asarray(images), jnp.asarray(embeddings), jnp.zeros(2, jnp.int32))
-    assert (
-        descriptors.tops.shape == (2, 7168)
-        and descriptors.color.shape == (2, 4774)
-        and descriptors.tops2.shape == (2, 11942)
-    )
-    for b, s, p, q in [(0, 0, 0, 0), (1, 0, 31, 31), (0, 3, 4, 17), (1, 6, 31, 0)]:
-        assert descriptors.tops[b, s * 1024 + p * 32 + q] == images[b, s, p, q]
-        assert descriptors.tops2[b, s * 1706 + p * 32 + q] == images[b, s, p, q]
-    for b, s, r, j in [(0, 0, 0, 0), (1, 0, 21, 30), (0, 3, 4, 17), (1, 6, 21, 0)]:
-        assert descriptors.color[b, s * 682 + r * 31 + j] == embeddings[b, s, r, j]
-        assert descriptors.tops2[b, s * 1706 + 1024 + r * 31 + j] == embeddings[b, s, r, j]
+    blocks = [images.reshape(2, 7, 32 * 32), embeddings.reshape(2, 7, 22 * 31)]
+    np.testing.assert_array_equal(descriptors.tops, blocks[0].reshape(2, -1))
+    np.testing.assert_array_equal(descriptors.color, blocks[1].reshape(2, -1))
+    np.testing.assert_array_equal(descriptors.tops2, np.concatenate(blocks, axis=2).reshape(2, -1))
 
 
 def test_records_are_frozen() -> None:

@@ -1,5 +1,6 @@
 """Runs with random weights, a frame, running services that tests share, and their page in headless Chromium."""
 
+import contextlib
 import functools
 import json
 import re
@@ -22,7 +23,7 @@ from fastapi import FastAPI
 from helpers import encode_image, patches, small_embedding, tilted, untrained_run
 from hypothesis import HealthCheck
 from playwright.sync_api import Browser, Page, Route, expect
-from processes import HANG
+from processes import HANG, wait_until
 from schemathesis.checks import not_a_server_error
 from schemathesis.specs.openapi.checks import (
     content_type_conformance,
@@ -91,14 +92,17 @@ def frame() -> thor2.RGBDFrame:
     return tilted(patches())
 
 
-def camera_file(frame: thor2.RGBDFrame) -> bytes:
-    return json.dumps({name: getattr(frame.intrinsics, name) for name in ("fx", "fy", "cx", "cy")}).encode()
+def frame_files(frame: thor2.RGBDFrame, *images: str) -> Files:
+    intrinsics = {name: getattr(frame.intrinsics, name) for name in ("fx", "fy", "cx", "cy")}
+    return {
+        **{name: encode_image(getattr(frame, name)) for name in images},
+        "intrinsics": json.dumps(intrinsics).encode(),
+    }
 
 
 @pytest.fixture(scope="session")
 def files(frame: thor2.RGBDFrame) -> Files:
-    images = {name: encode_image(getattr(frame, name)) for name in ("color", "depth", "labels")}
-    return {**images, "intrinsics": camera_file(frame)}
+    return frame_files(frame, "color", "depth", "labels")
 
 
 @pytest.fixture(scope="session")
@@ -115,8 +119,7 @@ def scene() -> thor2.RGBDFrame:
 @pytest.fixture(scope="session")
 def unlabelled(scene: thor2.RGBDFrame) -> Files:
     """The files of the scene, without labels."""
-    images = {name: encode_image(getattr(scene, name)) for name in ("color", "depth")}
-    return {**images, "intrinsics": camera_file(scene)}
+    return frame_files(scene, "color", "depth")
 
 
 SERVE = """
@@ -131,36 +134,20 @@ class Server:
     """`thor2 serve` in a subprocess, which compiles programs for one padded size of clouds."""
 
     def __init__(self, run: Path, log: Path, cache: Path, *options: str) -> None:
-        self.log = log
-        command = [sys.executable, "-c", SERVE, "serve", "--model", str(run), "--port", "0"]
+        self.log, self.url = log, ""
+        options = ("--port", "0", "--max-batch", "8", "--deadline", str(HANG), "--no-warm-why", *options)
+        command = [sys.executable, "-c", SERVE, "serve", "--model", str(run), "--cache", str(cache), *options]
         with log.open("wb") as stream:
-            self.process = subprocess.Popen(
-                [
-                    *(*command, "--max-batch", "8", "--cache", str(cache), "--deadline", str(HANG)),
-                    *("--no-warm-why", *options),
-                ],
-                cwd=Path(__file__).parents[3],
-                stdout=stream,
-                stderr=stream,
-            )
-        self.url = self._wait_for(lambda: re.search(r"http://127\.0\.0\.1:\d+", log.read_text()))[0]
-        self._wait_for(self._ready)
+            self.process = subprocess.Popen(command, cwd=Path(__file__).parents[3], stdout=stream, stderr=stream)
+        wait_until(self._is_ready, log.read_text, lambda _: time.sleep(0.05))
 
-    def _wait_for(self, condition: Callable[[], re.Match[str] | None]) -> re.Match[str]:
-        start = time.monotonic()
-        while time.monotonic() - start < HANG:
-            match = condition()
-            if match:
-                return match
-            assert self.process.poll() is None, self.log.read_text()
-            time.sleep(0.05)
-        raise AssertionError(self.log.read_text())
-
-    def _ready(self) -> re.Match[str] | None:
-        try:
-            return re.match("200", str(httpx.get(f"{self.url}/readyz").status_code))
-        except httpx.TransportError:
-            return None
+    def _is_ready(self) -> bool:
+        text = self.log.read_text()
+        assert self.process.poll() is None, text
+        self.url = "".join(re.findall(r"http://127\.0\.0\.1:\d+", text)[:1])
+        with contextlib.suppress(httpx.TransportError):
+            return bool(self.url) and httpx.get(f"{self.url}/readyz").status_code == 200
+        return False
 
     def terminate(self) -> int:
         self.process.send_signal(signal.SIGTERM)

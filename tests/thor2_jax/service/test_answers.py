@@ -1,7 +1,6 @@
 """Answers of a running service to valid requests, compared with the library on the same run."""
 
 import asyncio
-import io
 import socket
 from pathlib import Path
 from typing import Any
@@ -10,53 +9,45 @@ import httpx
 import numpy as np
 import pytest
 from helpers import assert_same_answers, encode_image, random_clouds
-from PIL import Image
+from service_requests import check_refused
 
 import colornet
 import thor2_jax as thor2
 from thor2_jax.client import AsyncClient, Client, ServiceError
 from thor2_jax.errors import InputError
 
-
-@pytest.fixture(scope="module")
-def expected(run_dir: Path, frame: thor2.RGBDFrame) -> list[thor2.Recognition]:
-    return thor2.Recognizer.load(run_dir).recognize(frame)
+Files = dict[str, bytes]
 
 
 def test_recognize_matches_the_library(
-    server: Any, frame: thor2.RGBDFrame, files: dict[str, bytes], expected: list[thor2.Recognition]
+    server: Any, http: httpx.Client, frame: thor2.RGBDFrame, files: Files, run_dir: Path, tmp_path: Path
 ) -> None:
-    recognitions = Client(server.url).recognize(**files)
+    for name, content in files.items():
+        (tmp_path / name).write_bytes(content)
+    recognitions = Client(server.url).recognize(**{name: tmp_path / name for name in files})
+    expected = thor2.Recognizer.load(run_dir).recognize(frame)
     assert [r.label for r in recognitions] == [3, 5, 7, 200]
     assert_same_answers(recognitions, expected, 1e-5)
     for one, other in zip(recognitions, expected, strict=True):
         assert (one.occluded, one.overflow) == (other.occluded, other.overflow)
         assert one.kept_by_fallback == other.kept_by_fallback
         for name, best in one.top.items():
-            assert len(best) == 5
-            assert [name for name, _ in best] == [name for name, _ in other.top[name]]
+            assert [name for name, _ in best] == [name for name, _ in other.top[name]] and len(best) == 5
             assert [p for _, p in best] == pytest.approx([p for _, p in other.top[name]], abs=1e-5)
-
-
-def test_recognize_returns_reasons_and_timings(http: httpx.Client, files: dict[str, bytes]) -> None:
     answer = http.post("/v1/recognize", files=files).json()
-    small = answer["instances"][1]
-    assert small["label"] == 5 and small["name"] is None and "30" in small["unrecognized"]
+    assert "30" in answer["instances"][1]["unrecognized"] and answer["label_map"] is None
     assert set(answer["timings"]) == {"upload", "decode", "clouds", "device", "total"}
     assert answer["timings"]["total"] >= answer["timings"]["decode"] + answer["timings"]["clouds"] > 0
+    camera = {"fx": 600, "fy": 600, "cx": 159.5, "cy": 119.5}
+    again = Client(server.url).recognize(**files | {"intrinsics": camera})
+    assert [one.confidence for one in again] == [one.confidence for one in recognitions]
+    images = {**files, "color": encode_image(frame.color, "JPEG")}
+    text = {"intrinsics": images.pop("intrinsics").decode()}
+    of_jpeg = http.post("/v1/recognize", files=images, data=text)
+    assert of_jpeg.status_code == 200 and len(of_jpeg.json()["instances"]) == 4
 
 
-def test_jpeg_color_and_plain_intrinsics_field(
-    http: httpx.Client, frame: thor2.RGBDFrame, files: dict[str, bytes]
-) -> None:
-    stream = io.BytesIO()
-    Image.fromarray(frame.color).save(stream, "JPEG")
-    images = {"color": stream.getvalue(), "depth": files["depth"], "labels": files["labels"]}
-    answer = http.post("/v1/recognize", files=images, data={"intrinsics": files["intrinsics"].decode()})
-    assert answer.status_code == 200 and len(answer.json()["instances"]) == 4
-
-
-def test_frames_without_instances_or_depth(http: httpx.Client, files: dict[str, bytes]) -> None:
+def test_frames_without_instances_or_depth(http: httpx.Client, files: Files) -> None:
     empty = encode_image(np.zeros((240, 320), np.uint8))
     assert http.post("/v1/recognize", files=files | {"labels": empty}).json()["instances"] == []
     blind = encode_image(np.zeros((240, 320), np.uint16))
@@ -84,14 +75,11 @@ def test_describe_matches_the_library(server: Any, http: httpx.Client) -> None:
         np.testing.assert_allclose(one["images"], expected.images[k], atol=1e-5)
         np.testing.assert_allclose(one["embeddings"], expected.embeddings[k], rtol=1e-5, atol=1e-4)
         assert one["overflow"] == expected.overflow[k]
-
-
-def test_empty_and_degenerate_clouds(server: Any, http: httpx.Client) -> None:
     empty = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
     one_point = np.ones((1, 3), np.float32), np.zeros((1, 3), np.uint8)
     far_apart = np.array([[-100, 0, 0], [100, 0, 0], [0, 100, 1e-30]], np.float32), np.zeros((3, 3), np.uint8)
-    answer = Client(server.url).describe([empty, one_point, far_apart])
-    assert not answer.tops2[0].any() and np.isfinite(answer.tops2).all()
+    degenerate = Client(server.url).describe([empty, one_point, far_apart])
+    assert not degenerate.tops2[0].any() and np.isfinite(degenerate.tops2).all()
     assert http.post("/v1/describe", json={"clouds": [{"points": [], "colors": []}]}).status_code == 200
 
 
@@ -108,14 +96,17 @@ def test_model_and_color_network(server: Any, http: httpx.Client, classes: tuple
     assert len(answer["edges"]) == len(answer["edge_weights"]) == len(network.edges)
 
 
-READY = {"status": "ready", "ready_workers": 1, "workers": 1}
-
-
 def test_health_page_and_unknown_paths(http: httpx.Client) -> None:
-    assert http.get("/healthz").json() == {"status": "alive"} and http.get("/readyz").json() == READY
+    assert http.get("/healthz").json() == {"status": "alive"}
+    assert http.get("/readyz").json() == {"status": "ready", "ready_workers": 1, "workers": 1}
     assert http.get("/").headers["content-type"].startswith("text/html")
+    for path in ("/", "/app.js", "/style.css", "/samples/index.json"):
+        policy = http.get(path).headers["content-security-policy"]
+        assert "default-src 'none'" in policy and "unsafe" not in policy and "http" not in policy
     for path in ("/", "/healthz", "/v1/model", "/metrics", "/openapi.json", "/missing"):
         assert http.get(path).headers.get_list("x-content-type-options") == ["nosniff"]
+    for path in ("/", "/v1/objects", "/v1/recognize"):
+        check_refused(http.get(path, headers={"Host": "evil.example"}), 403, "Host", "evil.example")
     for path in ("/nothing", "/../app.py", "/%2e%2e/app.py"):
         missing = http.get(path)
         assert missing.status_code == 404 and set(missing.json()) == {"field", "message"}
@@ -123,19 +114,14 @@ def test_health_page_and_unknown_paths(http: httpx.Client) -> None:
     assert wrong_method.status_code == 405 and wrong_method.headers["allow"] == "POST"
 
 
-def test_client_raises_service_error(server: Any, files: dict[str, bytes]) -> None:
-    with pytest.raises(ServiceError, match="depth") as error:
-        Client(server.url).recognize(**files | {"depth": b"not an image"})
-    assert (error.value.status, error.value.field, error.value.retry_after) == (422, "depth", None)
-
-
-def test_the_asynchronous_client_gives_the_same_answers(server: Any, files: dict[str, bytes]) -> None:
+def test_the_asynchronous_client_gives_the_same_answers(server: Any, files: Files) -> None:
     two = random_clouds(1, (100, 250))
 
     async def ask() -> Any:
         client = AsyncClient(server.url)
-        with pytest.raises(ServiceError, match="depth"):
+        with pytest.raises(ServiceError, match="depth") as error:
             await client.recognize(**files | {"depth": b"not an image"})
+        assert (error.value.status, error.value.field, error.value.retry_after) == (422, "depth", None)
         return await asyncio.gather(
             client.recognize(**files), client.recognize_frame(**files), client.model(), client.objects(),
             client.describe(two),
@@ -153,7 +139,7 @@ def test_the_asynchronous_client_gives_the_same_answers(server: Any, files: dict
     assert methods == {name for name in vars(AsyncClient) if not name.startswith("_")}
 
 
-def test_services_that_give_no_answer() -> None:
+def test_no_answer_and_arguments_that_the_client_refuses() -> None:
     with socket.create_server(("127.0.0.1", 0)) as listening:
         url = f"http://127.0.0.1:{listening.getsockname()[1]}"
         with pytest.raises(TimeoutError, match="127.0.0.1"):
@@ -163,28 +149,17 @@ def test_services_that_give_no_answer() -> None:
     for wrong in ("127.0.0.1:8080", "http://", "ftp://a", "http://[", ""):
         with pytest.raises(ConnectionError, match="gives no answer"):
             Client(wrong).model()
-
-
-def test_client_refuses_an_empty_list_of_clouds() -> None:
     with pytest.raises(InputError, match="clouds"):
-        Client("http://127.0.0.1:1").describe([])
+        Client(url).describe([])
+    for labels in (np.zeros((2, 2)), np.zeros(4, int), np.full((2, 2), -1), np.full((2, 2), 2**16)):
+        with pytest.raises(InputError, match=r"labels has .* from 0 to 65535"):
+            Client(url).recognize(color=b"", depth=b"", labels=labels, intrinsics=b"")
 
 
-def test_client_reads_files(server: Any, files: dict[str, bytes], tmp_path: Path) -> None:
-    for name, content in files.items():
-        (tmp_path / name).write_bytes(content)
-    recognitions = Client(server.url).recognize(**{name: tmp_path / name for name in files})
-    assert len(recognitions) == 4
-    camera = {"fx": 600, "fy": 600, "cx": 159.5, "cy": 119.5}
-    again = Client(server.url).recognize(
-        **{name: files[name] for name in ("color", "depth", "labels")}, intrinsics=camera
-    )
-    assert [one.confidence for one in again] == [one.confidence for one in recognitions]
-
-
-def test_no_compilation_after_warm_up(http: httpx.Client, files: dict[str, bytes]) -> None:
+def test_no_compilation_after_warm_up(http: httpx.Client, files: Files) -> None:
     """This test comes last in the module: the requests above use all batch shapes."""
-    assert http.post("/v1/recognize", files=files).status_code == 200
+    for path in ("/v1/recognize", "/v1/explain"):
+        assert http.post(path, files=files).status_code == 200
     lines = http.get("/metrics").text.splitlines()
     values = dict(line.rsplit(" ", 1) for line in lines if not line.startswith("#"))
     assert float(values["thor2_compilations_after_warm_up_total"]) == 0

@@ -84,6 +84,11 @@ def until_closed(connection: socket.socket, then: bytes) -> int:
     raise AssertionError("the connection is still open")
 
 
+def receive_all(connection: socket.socket) -> bytes:
+    """Return what the server sends until it closes a connection."""
+    return b"".join(iter(lambda: connection.recv(2**16), b""))
+
+
 @pytest.mark.usefixtures("short_limits")
 def test_truncated_heads_and_slow_bytes_do_not_keep_a_connection_open() -> None:
     cases = {
@@ -99,13 +104,11 @@ def test_body_may_arrive_after_its_answer(address: Any, monkeypatch: pytest.Monk
     monkeypatch.setattr(serving, "EARLY_ANSWER_SECONDS", HANG)
     with socket.create_connection(address, timeout=HANG) as connection:
         connection.sendall(UPLOAD)
-        answers = b""
-        while not answers.endswith(b"done"):
-            answers += connection.recv(4096)
+        answer = b""
+        while not answer.endswith(b"done"):
+            answer += connection.recv(4096)
         connection.sendall(bytes(1000) + QUICK)
-        while received := connection.recv(4096):
-            answers += received
-    assert answers.count(b"done") == 2
+        assert receive_all(connection).count(b"done") == 1
 
 
 @pytest.mark.parametrize("start", [b"GET /", CUT + b"\r\nX: "])
@@ -124,10 +127,7 @@ def test_many_pipelined_requests(address: Any, monkeypatch: pytest.MonkeyPatch) 
     count = serving.MAX_HEAD // len(QUICK) + 1000
     with socket.create_connection(address, timeout=HANG) as connection:
         threading.Thread(target=connection.sendall, args=(QUICK * (count - 1) + LAST,)).start()
-        answers = b""
-        while received := connection.recv(2**16):
-            answers += received
-    assert answers.count(b"done") == count
+        assert receive_all(connection).count(b"done") == count
 
 
 def test_reset_connections_leave_no_traceback(caplog: pytest.LogCaptureFixture) -> None:
@@ -140,8 +140,5 @@ def test_reset_connections_leave_no_traceback(caplog: pytest.LogCaptureFixture) 
                 time.sleep(0.002 * count)
         with socket.create_connection(address, timeout=HANG) as connection:
             connection.sendall(HEAD % (b"GET", b"style.css", b"") * 20 + LAST)
-            answers = b""
-            while received := connection.recv(2**16):
-                answers += received
-    assert answers.count(b"HTTP/1.1 200") == 21
+            assert receive_all(connection).count(b"HTTP/1.1 200") == 21
     assert not [record for record in caplog.records if record.levelname == "ERROR"]

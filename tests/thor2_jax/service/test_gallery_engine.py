@@ -8,7 +8,6 @@ import pytest
 from helpers import SMALL_CONFIG, assert_same_answers, small_embedding, untrained_embedding_run, untrained_run
 
 import thor2_jax as thor2
-from thor2_jax.explanation.explain import explain_instance
 from thor2_jax.frames.prepared_instance import PreparedInstance, prepare_instance
 from thor2_jax.model.confidence import Calibration
 from thor2_jax.model.run_directory import EMBEDDING_FILE, save_run
@@ -16,6 +15,7 @@ from thor2_jax.service.engine import CloudResult, InferenceEngine
 from thor2_jax.service.settings import Settings
 
 pytestmark = pytest.mark.usefixtures("small_buckets")
+SLOW = pytest.mark.slow
 
 
 def inferred(engine: InferenceEngine, frame: thor2.RGBDFrame) -> tuple[list[PreparedInstance], list[CloudResult]]:
@@ -26,11 +26,7 @@ def inferred(engine: InferenceEngine, frame: thor2.RGBDFrame) -> tuple[list[Prep
 
 @pytest.mark.parametrize(
     ("trained", "answer_by"),
-    [
-        (("a", "b"), None),
-        pytest.param((), None, marks=pytest.mark.slow),
-        pytest.param(("a", "b"), "classifiers", marks=pytest.mark.slow),
-    ],
+    [(("a", "b"), None), pytest.param((), None, marks=SLOW), pytest.param(("a", "b"), "classifiers", marks=SLOW)],
 )
 def test_the_engine_answers_as_the_recognizer(
     trained: tuple[str, ...], answer_by: str | None, frame: thor2.RGBDFrame, tmp_path: Path
@@ -69,14 +65,3 @@ def test_an_embedding_alone_answers(calibration: Calibration | None, frame: thor
     )
     assert results[0].aligned.shape == (len(results[0].aligned), 3)
     assert jax.tree.map(len, results[0].inference.probabilities) == {"embedding": 3}
-
-
-@pytest.mark.slow  # quick ones are test_adaptation.py, and of explanations test_an_embedding_alone_is_explained
-def test_an_embedding_alone_adapts_and_is_explained(frame: thor2.RGBDFrame, tmp_path: Path) -> None:
-    save_run(untrained_embedding_run(("a", "b", "c")), tmp_path / "run")
-    engine = InferenceEngine(Settings(tmp_path / "run", max_batch=8, adapt=True))
-    engine.compile_adaptation()
-    instance = prepare_instance(frame, frame.instances[-1], engine.run.config.sigma_s)
-    (result,) = engine.infer(engine.correct([instance], observe=True))
-    (answer,) = engine.recognize([instance], [result])
-    assert explain_instance(engine.model, instance).name == max(answer.top["embedding"], key=lambda pair: pair[1])[0]

@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from page_actions import answered, changed_answers, upload, wait_for_answer
+from page_actions import assert_fits, changed_answers, upload, wait_for_answer
 from PIL import Image
 from playwright.sync_api import Page, Route, expect
 
@@ -77,6 +77,8 @@ def test_pieces_are_dropped_restored_and_merged(open_page: Open, unlabelled: Fil
     page.get_by_role("button", name="Merge").click()
     select(page, 2)  # The list is reached by keyboard, too.
     count(page, 1)
+    page.get_by_role("button", name="Split").click()
+    assert_fits(page, 360)
 
 
 def test_a_piece_is_split_along_a_cut(open_page: Open, unlabelled: Files, labels: np.ndarray) -> None:
@@ -110,24 +112,3 @@ def test_labels_are_required_where_the_service_does_not_segment(open_page: Open,
     upload(page, unlabelled)
     expect(page.locator("#labels-error")).to_have_text("Choose a file.")
     expect(page.locator("#labels-hint")).not_to_contain_text("segmented")
-
-
-def test_a_failing_segmenter_is_reported_beside_the_labels(open_page: Open, unlabelled: Files) -> None:
-    message = "segmenter sam failed on the frame (RuntimeError: no weights); check its package, or send labels."
-    page = open_page(answered("/v1/explain", status=500, json={"field": "labels", "message": message}))
-    upload(page, unlabelled)
-    expect(page.locator("#labels-error")).to_have_text(message)
-
-
-@pytest.mark.slow
-def test_the_tools_fit_a_phone(open_page: Open, unlabelled: Files) -> None:
-    page = open_page(size=(390, 800), phone=True)
-    upload(page, unlabelled)
-    count(page, 3)
-    assert page.evaluate("document.documentElement.scrollWidth") <= 390
-    page.locator('#objects button[data-label="2"]').tap()
-    page.get_by_role("button", name="Split").tap()
-    expect(page.locator("#overlay")).to_be_in_viewport()
-    for name in ("merge", "split", "drop", "undo-mask"):
-        box = page.locator(f"#{name}").bounding_box()
-        assert box is not None and box["x"] >= 0 and box["x"] + box["width"] <= 390 and box["height"] >= 24

@@ -5,7 +5,7 @@ from typing import Any
 
 import httpx
 import pytest
-from page_actions import answered, changed_answers, upload
+from page_actions import answered, assert_fits, changed_answers, upload
 from playwright.sync_api import Page, Route, expect
 
 Open = Callable[..., Page]
@@ -40,7 +40,7 @@ def name_object(page: Page, label: int, name: str) -> None:
     page.get_by_role("button", name="Save name").click()
 
 
-def test_a_named_object_is_known_until_undo(open_teaching: Open, files: Files, teaching_url: str) -> None:
+def test_names_and_further_views_are_known_until_undo(open_teaching: Open, files: Files, teaching_url: str) -> None:
     page = open_teaching(without_trained_classes, size=(1280, 900))
     recognize(page, files)
     invitations = page.locator("#objects .facts").filter(has_text="Name this object")
@@ -66,30 +66,13 @@ def test_a_named_object_is_known_until_undo(open_teaching: Open, files: Files, t
     expect(invitations).to_have_count(3)
     expect(page.locator("#classes li")).to_have_count(2)
 
-
-@pytest.mark.slow  # quick ones are the test above, and of the next frame one in test_teaching.py
-def test_the_next_frame_knows_a_named_object(open_teaching: Open, files: Files) -> None:
-    page = open_teaching(without_trained_classes)
-    recognize(page, files)
-    name_object(page, 200, "teapot")
-    expect(page.locator("#notice-text")).to_be_visible()
-    second = open_teaching(without_trained_classes)
-    recognize(second, files)
-    expect(second.locator('#objects button[data-label="200"] .name')).to_have_text("teapot")
-    expect(second.locator("#notice")).to_be_hidden()
-
-
-def test_a_known_name_gets_another_view_until_undo(open_teaching: Open, files: Files, teaching_url: str) -> None:
-    page = open_teaching()
-    recognize(page, files)
-    name_object(page, 200, "teapot")
-    expect(page.locator("#notice-text")).to_contain_text("is enrolled")
-    name_object(page, 7, "teapot")
-    expect(page.locator("#notice-text")).to_contain_text("“teapot” has 2 views")
+    for label, message in ((200, "is enrolled"), (7, "“teapot” has 2 views")):
+        name_object(page, label, "teapot")
+        expect(page.locator("#notice-text")).to_contain_text(message)
     page.get_by_role("button", name="Undo").click()
     expect(page.locator("#notice-text")).to_contain_text("taken back")
     listed = httpx.get(f"{teaching_url}/v1/objects").json()["objects"]
-    assert [each["views"] for each in listed if each["name"] == "teapot"] == [1]
+    assert [(each["name"], each["views"]) for each in listed][2:] == [("teapot", 1)]
     name_object(page, 7, "teapot")
     expect(page.locator("#notice-text")).to_contain_text("“teapot” has 2 views")
     httpx.delete(f"{teaching_url}/v1/objects/teapot")
@@ -122,9 +105,11 @@ def test_problems_of_a_name_appear_beside_it(open_teaching: Open, files: Files) 
         expect(page.locator("#name")).to_have_attribute("aria-invalid", "true")
         expect(page.locator("#name")).to_be_focused()
         expect(page.locator("#notice")).to_be_hidden()
-    name_object(page, 200, "mug")
-    expect(page.locator("#notice-text")).to_contain_text("“mug” is enrolled")
+    long = "an_object_with_a_long_name_that_has_no_spaces_and_does_not_end_soon_" + "x" * 60
+    name_object(page, 200, long)
+    expect(page.locator("#notice-text")).to_contain_text(f"“{long}” is enrolled")
     expect(page.locator("#name-error")).to_be_empty()
+    assert_fits(page, 360)
 
 
 def test_errors_of_the_gallery_are_shown(open_teaching: Open, files: Files) -> None:
@@ -134,15 +119,3 @@ def test_errors_of_the_gallery_are_shown(open_teaching: Open, files: Files) -> N
     name_object(page, 200, "mug")
     expect(page.locator("#name-error")).to_have_text("The gallery cannot be written; it is as before.")
     expect(page.locator("#objects button").first).to_be_visible()
-
-
-@pytest.mark.slow
-def test_the_form_fits_a_phone(open_teaching: Open, files: Files) -> None:
-    page = open_teaching(without_trained_classes, size=(360, 740))
-    recognize(page, files)
-    name_object(page, 200, "an_object_with_a_long_name_that_has_no_spaces_and_does_not_end_soon_" + "x" * 60)
-    expect(page.locator("#notice-text")).to_be_visible()
-    assert page.evaluate("document.documentElement.scrollWidth") <= 360
-    for selector in ("#name", "#naming button", "#undo", "#notice"):
-        box = page.locator(selector).bounding_box()
-        assert box is not None and box["x"] >= 0 and box["x"] + box["width"] <= 360 and box["height"] >= 24

@@ -39,11 +39,6 @@ def test_missing_run_directory(workers: int, tmp_path: Path, serve: Command, cap
     assert workers == 1 or "listening at" not in caplog.text  # that is logged after the model is loaded
 
 
-def test_cache_that_is_a_file(run_dir: Path, tmp_path: Path, serve: Command) -> None:
-    (tmp_path / "cache").touch()
-    assert "cache" in serve("--model", str(run_dir), "--port", "0", "--cache", str(tmp_path / "cache"))
-
-
 def test_xla_log_is_silenced_before_jax_is_imported() -> None:
     environment = {name: value for name, value in os.environ.items() if name != "TF_CPP_MIN_LOG_LEVEL"}
     code = "import sys, training; print('jax' in sys.modules); import os, training.cli; print(os.environ[sys.argv[1]])"
@@ -58,22 +53,32 @@ def test_port_in_use(run_dir: Path, serve: Command) -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "named"),
+    ("options", "message"),
     [
-        (["--max-batch", "7"], "max_batch is 7"),
-        (["--unknown-below", "2"], "unknown_below is 2.0"),
-        (["--token", ""], "token"),
-        (["--deadline", "inf"], "deadline is inf"),
-        (["--deadline", "1e300"], "deadline is 1e+300"),
-        (["--allow-host", "http://robot.local"], "allow_host is 'http://robot.local'"),
+        ("--max-batch 7", "max_batch is 7"),
+        ("--unknown-below 2", "unknown_below is 2.0"),
+        ("--token é", "token"),
+        ("--deadline 0", "deadline is 0.0"),
+        ("--deadline nan", "deadline is nan"),
+        ("--deadline inf", "deadline is inf"),
+        ("--allow-host http://robot.local", "allow_host is 'http://robot.local'"),
+        (f"--cache {__file__}", "cache is"),
     ],
 )
-def test_invalid_settings(run_dir: Path, serve: Command, options: list[str], named: str) -> None:
-    assert named in serve("--model", run_dir, *options)
+def test_invalid_settings(run_dir: Path, serve: Command, options: str, message: str) -> None:
+    assert message in serve("--model", run_dir, *options.split())
 
 
-def test_empty_token_in_the_environment(run_dir: Path, serve: Command, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It would otherwise switch authentication off."""
+@pytest.mark.parametrize("name", ["queue", "processes"])
+def test_settings_that_only_the_library_can_have(name: str, run_dir: Path) -> None:
+    with pytest.raises(InputError, match=f"{name} is 0"):
+        Settings(run_dir, **{name: 0})
+
+
+def test_an_empty_token_does_not_switch_authentication_off(
+    run_dir: Path, serve: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert "--token" in serve("--model", run_dir, "--token", "")
     monkeypatch.setenv("THOR2_TOKEN", "")
     assert "THOR2_TOKEN" in serve("--model", run_dir)
 

@@ -4,15 +4,17 @@ import base64
 import io
 import threading
 from collections.abc import Callable
-from typing import Any
 
 import httpx
+import numpy as np
 import pytest
 from fastapi import FastAPI
-from page_actions import upload, wait_until
+from helpers import encode_image
+from page_actions import assert_fits, upload, wait_until
 from PIL import Image
 from playwright.sync_api import Page, Route, expect
 from processes import HANG
+from service_requests import check_refused
 
 from thor2_jax.errors import InputError
 from thor2_jax.explanation import class_scores
@@ -29,9 +31,7 @@ def small_clouds(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def picture(width: int) -> str:
-    stream = io.BytesIO()
-    Image.new("RGB", (width, 200), "white").save(stream, format="PNG")
-    return base64.b64encode(stream.getvalue()).decode()
+    return base64.b64encode(encode_image(np.zeros((200, width), np.uint8))).decode()
 
 
 ANSWER = {
@@ -51,7 +51,7 @@ ANSWER = {
 }
 
 
-def ask(url: str, files: Files, instance: int) -> httpx.Response:
+def ask(url: str, files: Files, instance: object) -> httpx.Response:
     return httpx.post(f"{url}/v1/why", files=files, data={"instance": str(instance)}, timeout=HANG)
 
 
@@ -72,14 +72,13 @@ def test_why_is_503_until_explanations_are_compiled(
     monkeypatch.setattr(pipeline, "explain_instance", explain)
     for _ in range(2):
         response = ask(teaching_url, files, 3)
-        assert response.status_code == 503 and int(response.headers["retry-after"]) >= 1
-        assert "compiled" in response.json()["message"]
+        check_refused(response, 503, None, "compiled")
+        assert int(response.headers["retry-after"]) >= 1
     assert httpx.post(f"{teaching_url}/v1/recognize", files=files, timeout=60).status_code == 200
     is_compiled.set()
     (future,) = service._compiled.values()
     future.result(300)
-    response = ask(teaching_url, files, 3)
-    assert response.status_code == 422 and "is explained" in response.json()["message"]
+    check_refused(ask(teaching_url, files, 3), 422, "instance", "is explained")
     assert compiled == service.engine.explanation_programs()
 
 
@@ -94,8 +93,7 @@ def test_failed_compilation_leaves_the_error_to_requests(
     monkeypatch.setattr(pipeline, "compile_explanations", fail)
     monkeypatch.setattr(pipeline, "explain_instance", fail)
     service._compile_explanations(*service.engine.explanation_programs()).result(300)
-    response = ask(teaching_url, files, 3)
-    assert response.status_code == 422 and "convention" in response.json()["message"]
+    check_refused(ask(teaching_url, files, 3), 422, "instance", "convention")
 
 
 @pytest.mark.slow
@@ -119,53 +117,21 @@ def test_why_returns_pictures(teaching_url: str, teaching_app: FastAPI, files: F
 
 def test_why_errors_name_the_field(teaching_url: str, files: Files) -> None:
     damaged = files | {"depth": b"damaged"}
-    for sent, instance, field in ((files, 4, "instance"), (files, 5, "instance"), (damaged, 3, "depth")):
-        response = ask(teaching_url, sent, instance)
-        assert response.status_code == 422 and response.json()["field"] == field
-    response = httpx.post(f"{teaching_url}/v1/why", files=files, data={"instance": "x"}, timeout=HANG)
-    assert response.status_code == 422 and response.json()["field"] == "instance"
+    for sent, instance, field in ((files, 4, "instance"), (files, "x", "instance"), (damaged, 3, "depth")):
+        check_refused(ask(teaching_url, sent, instance), 422, field)
 
 
-def ask_why(open_page: Open, url: str, files: Files, answer: Callable[[Route], None], **options: Any) -> Page:
+def ask_why(open_page: Open, url: str, files: Files, answer: Callable[[Route], None]) -> Page:
     """Open the page, whose requests for explanations `answer` answers, and click on "Why?" for object 3."""
-
-    def route_all(route: Route) -> None:
-        if route.request.url.endswith("/v1/why"):
-            answer(route)
-        else:
-            route.continue_()
-
-    page = open_page(route_all, url=url, **options)
+    page = open_page(url=url)
+    page.route("**/v1/why", answer)
     upload(page, files)
     page.locator('#objects button[data-label="3"]').click()
     page.get_by_role("button", name="Why?").click()
     return page
 
 
-def test_page_shows_why(open_page: Open, teaching_url: str, files: Files) -> None:
-    forms = []
-
-    def answer_why(route: Route) -> None:
-        forms.append(route.request.post_data_buffer)
-        route.fulfill(json=ANSWER)
-
-    page = ask_why(open_page, teaching_url, files, answer_why)
-    expect(page.locator("#why-status")).to_contain_text("2.5")
-    expect(page.locator("#why-status")).to_contain_text("red +20")
-    shown = page.locator("#why-pictures canvas")
-    expect(shown).to_have_count(2)
-    assert [shown.nth(k).evaluate("canvas => canvas.width") for k in (0, 1)] == [600, 300]
-    expect(shown.first).to_have_attribute("aria-label", "What decided, on the photo. Orange speaks for a.")
-    assert b'name="instance"\r\n\r\n3\r\n' in forms[0]
-    assert page.evaluate("document.documentElement.scrollWidth") <= 1280
-    page.set_viewport_size({"width": 390, "height": 900})
-    assert page.evaluate("document.documentElement.scrollWidth") <= 390
-    page.locator('#objects button[data-label="7"]').click()  # the explanation belonged to the other object
-    expect(shown).to_have_count(0)
-    expect(page.locator("#why-status")).to_have_text("")
-
-
-def test_page_waits_while_explanations_are_compiled(open_page: Open, teaching_url: str, files: Files) -> None:
+def test_page_waits_for_an_explanation_and_shows_it(open_page: Open, teaching_url: str, files: Files) -> None:
     requests: list[Route] = []
 
     def compile_first(route: Route) -> None:
@@ -178,9 +144,19 @@ def test_page_waits_while_explanations_are_compiled(open_page: Open, teaching_ur
     expect(page.locator("#why-status")).to_contain_text("still being compiled")
     expect(page.get_by_role("button", name="Why?")).to_be_disabled()
     wait_until(page, lambda: len(requests) == 2)  # the message stays until it is answered
+    assert b'name="instance"\r\n\r\n3\r\n' in (requests[1].request.post_data_buffer or b"")
     requests[1].fulfill(json=ANSWER)
-    expect(page.locator("#why-status")).to_contain_text("2.5")
-    expect(page.locator("#why-pictures canvas")).to_have_count(2)
+    for text in ("2.5", "red +20"):
+        expect(page.locator("#why-status")).to_contain_text(text)
+    shown = page.locator("#why-pictures canvas")
+    expect(shown).to_have_count(2)
+    assert [shown.nth(k).evaluate("canvas => canvas.width") for k in (0, 1)] == [600, 300]
+    expect(shown.first).to_have_attribute("aria-label", "What decided, on the photo. Orange speaks for a.")
+    for width in (1280, 390):
+        assert_fits(page, width)
+    page.locator('#objects button[data-label="7"]').click()  # the explanation belonged to the other object
+    expect(shown).to_have_count(0)
+    expect(page.locator("#why-status")).to_have_text("")
 
 
 def test_page_shows_why_there_is_no_explanation(open_page: Open, teaching_url: str, files: Files) -> None:
