@@ -20,12 +20,6 @@ def color_shares(mesh: TexturedMesh, n: int = 40_000) -> dict[tuple[int, ...], f
     return {tuple(color): count / n for color, count in zip(colors.tolist(), counts, strict=True) if count > n / 1000}
 
 
-def test_names_and_pairs() -> None:
-    assert len(OBJECTS) >= 12
-    assert {name for pair in COLOR_PAIRS + SHAPE_PAIRS for name in pair} <= set(OBJECTS)
-    assert len(COLOR_PAIRS) >= 3 and len(SHAPE_PAIRS) >= 3
-
-
 @pytest.mark.parametrize("name", OBJECTS)
 def test_objects_have_plausible_sizes_and_stand_on_the_ground(name: str) -> None:
     mesh = OBJECTS[name]
