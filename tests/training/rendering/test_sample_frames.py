@@ -30,5 +30,3 @@ def test_packaged_samples_are_up_to_date(tmp_path: Path) -> None:
         for name, tolerance in (("labels", 0), ("depth", 1), ("color", 4)):
             difference = np.abs(getattr(rendered, name).astype(int) - getattr(packaged, name))
             assert (difference <= tolerance).mean() > 0.999, (one, name)
-
-
