@@ -23,8 +23,6 @@ from helpers import (
 from PIL import Image
 from recording_files import table_frame
 
-CAMERA = {"fx": 120.0, "fy": 120.0, "cx": 60.0, "cy": 45.0}
-
 
 def test_json_of_one_frame(recognize: Recognize, tmp_path: Path) -> None:
     folder = write_frame_files(tmp_path / "one", small_frame())
@@ -37,26 +35,17 @@ def test_json_of_one_frame(recognize: Recognize, tmp_path: Path) -> None:
 
 
 def test_other_formats_give_the_same_answers(recognize: Recognize, tmp_path: Path) -> None:
+    """One of each kind; the tests of `read_frame` have the others."""
     folder = write_frame_files(tmp_path / "one", small_frame())
-    matrix = np.array([[120, 0, 60], [0, 120, 45], [0, 0, 1.0]])
-    np.savetxt(tmp_path / "K.txt", matrix)
-    (tmp_path / "camera_info.yaml").write_text(
-        f"image_width: 120\nimage_height: 90\ncamera_matrix: {{data: {matrix.ravel().tolist()}}}\n"
-    )
-    units = np.asarray(Image.open(folder / "depth.png"))
+    np.savetxt(tmp_path / "K.txt", [[120, 0, 60], [0, 120, 45], [0, 0, 1.0]])
+    units = small_frame().depth
     np.save(tmp_path / "metres.npy", units / np.float32(1000))
     (tmp_path / "tenths.png").write_bytes(encode_image((units * 10).astype(np.uint16)))
-    answers = []
-    for changes, options in (
-        ({}, []),
-        ({"intrinsics": tmp_path / "K.txt"}, []),
-        ({"intrinsics": tmp_path / "camera_info.yaml", "depth": tmp_path / "metres.npy"}, []),
-        ({"depth": tmp_path / "tenths.png"}, ["--depth-scale", 10_000]),
-    ):
-        (answer,) = recognize(*frame_options(folder, **changes), *options, "--json")
-        answers.append(answer["instances"])
-    for other in answers[1:]:
-        for one, expected in zip(other, answers[0], strict=True):
+    in_metres = frame_options(folder, intrinsics=tmp_path / "K.txt", depth=tmp_path / "metres.npy")
+    in_tenths = (*frame_options(folder, depth=tmp_path / "tenths.png"), "--depth-scale", 10_000)
+    first, *others = (recognize(*each, "--json")[0] for each in (frame_options(folder), in_metres, in_tenths))
+    for other in others:
+        for one, expected in zip(other["instances"], first["instances"], strict=True):
             assert one["name"] == expected["name"] and one["points_used"] == expected["points_used"]
             assert one["confidence"] == pytest.approx(expected["confidence"], abs=1e-4)
 
@@ -117,30 +106,43 @@ def test_several_folders_and_tables(model: Path, tmp_path: Path, capfd: pytest.C
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
-        ([], "give either"),
-        (["{frames}", "--color", "{frames}/one/color.png"], "give either"),
-        (["--color", "{frames}/one/color.png"], "--depth, --labels, --intrinsics is missing"),
-        (["{frames}/absent"], "not a directory"),
-        (["{empty}"], "has no color.png"),
-        (["{frames}", "{frames}"], "one is given twice"),
-        (["{frames}", "--names", "{frames}/names.json"], "it belongs to --coco"),
-        (["{frames}", "--coco", "{empty}/c.json", "--names", "{frames}/one/intrinsics.json"], "expected an obj_id"),
-        (["{frames}", "--out", "{frames}"], "expected a new or empty directory"),
-        (["{frames}", "--depth-scale", "1e-300"], "depth_scale is 1e-300"),
-        (["{frames}", "--unknown-below", "1.5"], "unknown_below is 1.5"),
-        (["{files}", "--segment", "table", "--out", "{out}"], "error: labels is "),
-        (["{frames}", "--segment", "sam", "--out", "{out}"], "error: segmenter is 'sam'"),
+        ("", "give either"),
+        ("frames --color frames/one/color.png", "give either"),
+        ("--color frames/one/color.png", "--depth, --labels, --intrinsics is missing"),
+        ("frames/absent", "not a directory"),
+        ("empty", "has no color.png"),
+        ("frames frames", "one is given twice"),
+        ("frames --names frames/names.json", "it belongs to --coco"),
+        ("frames --coco empty/c.json --names frames/one/intrinsics.json", "expected an obj_id"),
+        ("frames --out frames", "expected a new or empty directory"),
+        ("frames --depth-scale 1e-300", "depth_scale is 1e-300"),
+        ("frames --unknown-below 1.5", "unknown_below is 1.5"),
+        ("frames --segment sam --out out", "error: segmenter is 'sam'"),
+        ("FILES --segment table --out out", "error: labels is "),
+        ("FILES --out out --color absent.png", "absent.png"),
+        ("FILES --out out --depth cut.png", "cut.png"),
+        ("FILES --out out --labels half.png", "(45, 60)"),
+        ("FILES --out out --intrinsics word.json", "'left'"),
+        ("FILES --out out --model absent", "absent"),
+        ("FILES --out out --model empty", "run.json"),
+        ("FILES --out out --model damaged", "tops"),
     ],
 )
-def test_invalid_arguments(model: Path, tmp_path: Path, refused: Command, arguments: list[str], expected: str) -> None:
-    (tmp_path / "empty").mkdir()
-    write_frame_files(tmp_path / "frames" / "one", small_frame())
-    (tmp_path / "frames" / "names.json").write_text("{}")
-    if arguments[:1] == ["{files}"]:
-        arguments = [*map(str, frame_options(tmp_path / "frames" / "one")), *arguments[1:]]
-    places = {name: tmp_path / name for name in ("frames", "empty", "out")}
-    assert expected in refused("recognize", "--model", model, *(text.format(**places) for text in arguments))
-    assert not (tmp_path / "out").exists()
+def test_invalid_arguments(
+    model: Path, tmp_path: Path, refused: Command, monkeypatch: pytest.MonkeyPatch, arguments: str, expected: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("empty").mkdir()
+    frame = write_frame_files(Path("frames/one"), small_frame())
+    Path("frames/names.json").write_text("{}")
+    Path("cut.png").write_bytes((frame / "depth.png").read_bytes()[:-60])
+    Path("half.png").write_bytes(encode_image(np.zeros((45, 60), np.uint8)))
+    Path("word.json").write_text('{"fx": 1, "fy": 1, "cx": "left", "cy": 1}')
+    shutil.copytree(model, "damaged")
+    Path("damaged/weights/tops.safetensors").unlink()
+    command = arguments.replace("FILES", " ".join(map(str, frame_options(frame)))).split()
+    assert expected in refused("recognize", "--model", model, *command)
+    assert not Path("out").exists()
 
 
 @pytest.mark.parametrize(
@@ -179,7 +181,8 @@ def test_frames_without_labels_are_segmented(
     folder = write_frame_files(tmp_path / "frames" / "a", table_frame())
     files = frame_options(folder)
     del files[files.index("--labels") : files.index("--labels") + 2]
-    for given in (files, [tmp_path / "frames"]):
+    write_frame_files(tmp_path / "labelled" / "a", dataclasses.replace(table_frame(), labels=np.full((240, 320), 9)))
+    for given in (files, [tmp_path / "frames"], [tmp_path / "labelled"]):  # labels of a folder are replaced
         (answer,) = recognize(*given, "--segment", segmenter, "--json")
         assert [one["label"] for one in answer["instances"]] == [1, 2]
     assert "--segment" in refused("recognize", "--model", model, *files)
@@ -215,13 +218,6 @@ def test_a_wrong_unit_of_depth(model: Path, tmp_path: Path, refused: Command) ->
     assert json.loads((tmp_path / "coco.json").read_text()) == []
     write_frame_files(tmp_path / "b", dataclasses.replace(frame, depth=frame.depth * 0))
     assert run_thor2("recognize", "--model", model, tmp_path / "a", tmp_path / "b", "--segment", "table") == 0
-
-
-def test_labels_are_replaced_where_a_folder_is_segmented(recognize: Recognize, tmp_path: Path) -> None:
-    folder = write_frame_files(tmp_path / "one", table_frame())
-    (folder / "mask.png").write_bytes(encode_image(np.full((240, 320), 9, np.uint8)))
-    (answer,) = recognize(folder, "--segment", "table", "--json")
-    assert [one["label"] for one in answer["instances"]] == [1, 2]
 
 
 def test_track_gives_an_object_one_name(model: Path, recognize: Recognize, tmp_path: Path, printed: Command) -> None:

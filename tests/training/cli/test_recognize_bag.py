@@ -20,11 +20,7 @@ from recording_files import (
 )
 from rosbags.highlevel import AnyReader
 
-from thor2_jax.frames.frames import read_frame
-from thor2_jax.segmentation.segmenters import segment
-
 FRAMES = [table_frame(shift) for shift in (0, 3, 6)]
-REAL = Path(__file__).parents[4] / "shared" / "data" / "frames" / "ycbv_real_0000"
 
 
 def messages_of(path: Path) -> dict[str, list[tuple[int, Any]]]:
@@ -197,26 +193,3 @@ def test_options_of_bags_need_a_bag(model: Path, tmp_path: Path, refused: Comman
     for option, value in (("depth_topic", "/d"), ("max_gap", 0.1), ("every", 2), ("out_bag", "a.mcap")):
         error = refused("recognize", "--model", model, tmp_path, f"--{option.replace('_', '-')}", value)
         assert f"{option} is {value}; it belongs to --bag" in error
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not REAL.is_dir(), reason="no real frames beside the repository (shared/data/frames)")
-@pytest.mark.parametrize("name", ["a.mcap", "a.bag", "folder"])
-def test_recordings_of_real_frames(recognize: Recognize, tmp_path: Path, name: str) -> None:
-    folders = sorted(one for one in REAL.iterdir() if one.is_dir())[:2]
-    files = [
-        dict(color=one / "color.png", depth=one / "depth.png", intrinsics=one / "intrinsics.json") for one in folders
-    ]
-    frames = [read_frame(**one) for one in files]
-    path = write_recording(tmp_path / name, frames)
-    from_bag = [line["instances"] for line in recognize("--bag", path, "--out-bag", tmp_path / "out.mcap")]
-    from_files = [line["instances"] for line in recognize(*folders, "--segment", "table", "--json")]
-    assert [[one["label"] for one in answer] for answer in from_bag] == [
-        sorted(set(np.unique(segment(frame)).tolist()) - {0}) for frame in frames
-    ]
-    places = ("box", "position")
-    assert [[{k: v for k, v in one.items() if k not in places} for one in line] for line in from_bag] == from_files
-    arrays = messages_of(tmp_path / "out.mcap")["/thor2/detections"]
-    assert [[d.results[0].hypothesis.class_id for d in array.detections] for _, array in arrays] == [
-        [one["name"] or "" for one in answer] for answer in from_bag
-    ]
