@@ -161,7 +161,6 @@ def test_arguments_are_checked_before_anything_is_loaded(
         (("unknown", "--mesh", tmp_path / "one.ply"), "reserved"),
         (("mug",), "--mesh"),
         (("mug", "--frames", frames, "--mesh", tmp_path / "one.ply"), "--mesh"),
-        (("", *one_frame(frames / "000", 5)), "the argument after enroll is empty"),
         (("mug\u200b", "--frames", frames), "visible"),
         (("--mesh", tmp_path / "one.ply"), "name is missing"),
         (("mug", "--mesh", tmp_path / "none.ply"), "no such file"),
