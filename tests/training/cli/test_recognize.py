@@ -24,7 +24,7 @@ from PIL import Image
 from recording_files import table_frame
 
 
-def test_json_of_one_frame(recognize: Recognize, tmp_path: Path) -> None:
+def test_json_of_one_frame(model: Path, recognize: Recognize, tmp_path: Path, printed: Command) -> None:
     folder = write_frame_files(tmp_path / "one", small_frame())
     (answer,) = recognize(*frame_options(folder), "--json", "--out", tmp_path / "out")
     assert [one["label"] for one in answer["instances"]] == [1, 4]
@@ -32,6 +32,8 @@ def test_json_of_one_frame(recognize: Recognize, tmp_path: Path) -> None:
     assert answer["instances"] == json.loads((tmp_path / "out" / "recognition.json").read_text())
     (answer,) = recognize(*frame_options(folder), "--json", "--unknown-below", 1)
     assert [one["name"] for one in answer["instances"]] == [None, None]
+    table = printed("recognize", "--model", model, *frame_options(folder), "--unknown-below", 1)
+    assert table.count("unrecognized") == 2
 
 
 def test_other_formats_give_the_same_answers(recognize: Recognize, tmp_path: Path) -> None:
