@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import Command, json_lines, run_thor2, untrained_embedding_run, untrained_run, write_frame
+from helpers import Command, json_lines, run_thor2, untrained_run, write_frame
 
 from thor2_jax import recognizer as module
 from thor2_jax.adaptation.color_transform import ColorTransform
@@ -72,28 +72,6 @@ def test_recognize_corrects_the_colors(model: Path, adapted: Path, video: Path, 
     assert np.abs(np.subtract(*confidences)).max() > 1e-4
     with pytest.raises(InputError, match="adapted to different cameras"):
         load_runs([model, adapted])
-
-
-@pytest.mark.slow
-def test_commands_use_a_run_whose_embedding_alone_answers(video: Path, tmp_path: Path, printed: Command) -> None:
-    model, out, names = tmp_path / "run", tmp_path / "adapted", tuple(OBJECTS.values())
-    save_run(untrained_embedding_run(names), model)
-    assert run_thor2("adapt", "--model", model, video, "--out", out, "--quiet") == 0
-    recognizer = Recognizer.load(out)
-    assert recognizer.model.color_transform is not None and set(recognizer.model.classifiers) == {"embedding"}
-    for options in ((), ("--track",)):
-        lines = json_lines(printed("recognize", "--model", out, video, "--json", *options))
-        frames = [line["instances"] for line in lines]
-        assert len(frames) == 4 and all(set(one["top"]) == {"embedding"} for frame in frames for one in frame)
-        if options:  # one answer for the objects of all frames
-            assert [one["confidence"] for one in frames[0]] == [one["confidence"] for one in frames[3]]
-            continue
-        for one, expected in zip(frames[0], recognizer.recognize(frame_files(video / "0").read()), strict=True):
-            assert one["name"] == expected.name and one["confidence"] == pytest.approx(expected.confidence, abs=1e-4)
-    write_frame(tmp_path / "labelled" / "0", OBJECTS)
-    assert run_thor2("evaluate", "frames", tmp_path / "labelled", "--model", out, "--out", tmp_path / "report") == 0
-    report = json.loads((tmp_path / "report" / "report.json").read_text())
-    assert report["main"] == "embedding" and report["instances"]["scored"] == 3
 
 
 @pytest.mark.slow

@@ -89,6 +89,7 @@ def test_version(printed: Command) -> None:
 def test_short_help(printed: Command) -> None:
     for arguments in ((), ("-h",), ("evaluate",), ("train", "-h")):
         assert "Usage:" in printed(*arguments)
+    assert "--install-completion" in printed("--help")
 
 
 def test_help_objects_and_preparation_import_no_jax(tmp_path: Path) -> None:

@@ -312,7 +312,9 @@ def test_paper_protocol(meshes: Path, views: Path, tmp_path: Path) -> None:
     assert of["default"]["samples"] == 2 * of["default"]["dataset"]["views"]
 
 
-def test_missing_datasets_are_refused(model: Path, tmp_path: Path, refused: Command) -> None:
+def test_invalid_arguments_of_evaluate(model: Path, images: Path, tmp_path: Path, refused: Command) -> None:
+    command = ("evaluate", "frames", images, "--model", model, "--address", "head:6379")
+    assert "address is head:6379" in refused(*command)
     for kind in ("uwis", "frames"):
         for path in (tmp_path / "absent", tmp_path):
             assert str(path) in refused("evaluate", kind, path, "--model", model)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import Command, run_thor2, small_frame, write_frame_files
+from helpers import run_thor2, small_frame, write_frame_files
 from recording_files import table_frame
 
 from thor2_jax.errors import InputError
@@ -79,12 +79,6 @@ def test_answers_before_an_unreadable_frame_are_kept(
     for (_, one), other in zip(expected, answers, strict=False):
         for instance, again in zip(one.instances, other.instances, strict=True):
             np.testing.assert_array_equal(instance.probabilities, again.probabilities)
-
-
-def test_options_that_have_no_effect_are_refused(model: Path, folder: Path, refused: Command) -> None:
-    assert "workers is 2" in refused("recognize", "--model", model, folder, "--track", "--workers", 2)
-    assert "address is head:6379" in refused("recognize", "--model", model, folder, "--address", "head:6379")
-    assert "address is head:6379" in refused("evaluate", "frames", folder, "--model", model, "--address", "head:6379")
 
 
 def results(model: Path, folder: Path, out: Path, *options: object) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -120,6 +120,11 @@ def test_several_folders_and_tables(model: Path, tmp_path: Path, capfd: pytest.C
         ("frames --depth-scale 1e-300", "depth_scale is 1e-300"),
         ("frames --unknown-below 1.5", "unknown_below is 1.5"),
         ("frames --segment sam --out out", "error: segmenter is 'sam'"),
+        ("frames --track --workers 2", "workers is 2"),
+        ("frames --address head:6379", "address is head:6379"),
+        ("frames --depth-topic /d", "depth_topic is /d; it belongs to --bag"),
+        ("frames --max-gap 0.1", "max_gap is 0.1; it belongs to --bag"),
+        ("frames --out-bag a.mcap", "out_bag is a.mcap; it belongs to --bag"),
         ("FILES --segment table --out out", "error: labels is "),
         ("FILES --out out --color absent.png", "absent.png"),
         ("FILES --out out --depth cut.png", "cut.png"),
@@ -147,28 +152,26 @@ def test_invalid_arguments(
     assert not Path("out").exists()
 
 
+BOP_ROWS = "scene_id,im_id,obj_id,score,R,t,time\n1,1,1,.5,0 1 0 1 0 0 0 0 -1,0 0 9,1\n"
+
+
 @pytest.mark.parametrize(
-    ("name", "content", "options"),
+    ("name", "content", "option"),
     [
-        ("f/recognition.json", '{"a": "user\'s"}', ("--out", "")),
-        ("f/overlay.png", "a user's", ("--out", "")),
-        ("instances.json", '[{"image_id": 1, "category_id": 2}]', ("--coco", "instances.json")),
-        (
-            "poses.csv",
-            "scene_id,im_id,obj_id,score,R,t,time\n1,1,1,.5,0 1 0 1 0 0 0 0 -1,0 0 9,1\n",
-            ("--bop", "poses.csv"),
-        ),
+        ("f/recognition.json", '{"a": "user\'s"}', "--out"),
+        ("f/overlay.png", "a user's", "--out"),
+        ("instances.json", '[{"image_id": 1, "category_id": 2}]', "--coco"),
+        ("poses.csv", BOP_ROWS, "--bop"),
     ],
 )
 def test_no_file_of_the_user_is_replaced(
-    model: Path, tmp_path: Path, refused: Command, name: str, content: str, options: tuple[str, str]
+    model: Path, tmp_path: Path, refused: Command, name: str, content: str, option: str
 ) -> None:
-    frames = tmp_path / "frames"
-    write_frame_files(frames / "f", small_frame())
-    (frames / name).write_text(content)
-    before = files_of(frames)
-    assert Path(name).name in refused("recognize", "--model", model, frames, options[0], frames / options[1])
-    assert files_of(frames) == before
+    write_frame_files(tmp_path / "f", small_frame())
+    (tmp_path / name).write_text(content)
+    before, given = files_of(tmp_path), tmp_path if option == "--out" else tmp_path / name
+    assert Path(name).name in refused("recognize", "--model", model, tmp_path, option, given)
+    assert files_of(tmp_path) == before
 
 
 @pytest.mark.parametrize("segmenter", ["table", pytest.param("model", marks=pytest.mark.slow)])

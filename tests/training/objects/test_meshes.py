@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from helpers import input_error
+from helpers import input_error, write_box
 from PIL import Image
 from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
@@ -267,23 +267,17 @@ def test_scans_against_trimesh(shared: Path) -> None:
 
 
 def test_meshes_in_other_units(tmp_path: Path) -> None:
-    metres = trimesh.creation.box((0.2, 0.1, 0.05))
-    metres.visual = trimesh.visual.ColorVisuals(metres, vertex_colors=np.full((8, 4), 200, np.uint8))
-    metres.export(tmp_path / "box.glb")
-    millimetres = metres.copy()
-    millimetres.apply_scale(1000)
-    millimetres.export(tmp_path / "large.glb")
-    expected, scaled = load_mesh(tmp_path / "box.glb"), load_mesh(tmp_path / "large.glb", 0.001)
+    box, large = (write_box(tmp_path / f"{side:g}.glb", (side, side / 2, side / 4)) for side in (0.2, 200))
+    expected, scaled = load_mesh(box), load_mesh(large, 0.001)
     np.testing.assert_allclose(scaled.vertices, expected.vertices, atol=1e-6)
     np.testing.assert_array_equal(scaled.corner_colors, expected.corner_colors)
-    assert longest_side(tmp_path / "large.glb") == pytest.approx(200)
-    with pytest.raises(InputError, match=r"large\.glb: longest side 200 .*--mesh-scale 0\.001"):
-        load_mesh(tmp_path / "large.glb")
-    paths = {"box": tmp_path / "box.glb"}
-    assert scaled_meshes(paths, 1.0) == paths
-    doubled = scaled_meshes(paths, 2.0)["box"]
+    assert longest_side(large) == pytest.approx(200)
+    with input_error(f"{large}: longest side 200", "--mesh-scale 0.001"):
+        load_mesh(large)
+    assert scaled_meshes({"box": box}, 1.0) == {"box": box}
+    doubled = scaled_meshes({"box": box}, 2.0)["box"]
     assert isinstance(doubled, TexturedMesh)
     np.testing.assert_allclose(doubled.vertices, 2 * expected.vertices)
     for scale in (0.0, -1.0, np.nan, np.inf):
-        with pytest.raises(InputError, match="^mesh_scale is "):
-            load_mesh(tmp_path / "box.glb", scale)
+        with input_error(match="^mesh_scale is "):
+            load_mesh(box, scale)
