@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import Command, files_of, frame_options, full_disk, run_thor2, untrained_run, write_box, write_frame
+from helpers import Command, files_of, frame_options, full_disk, run_thor2, write_box, write_frame
 from PIL import Image
 from recording_files import table_frame, write_recording
 
 from thor2_jax.gallery import objects as gallery_objects
 from thor2_jax.gallery import store
-from thor2_jax.model.run_directory import load_run, save_run
+from thor2_jax.model.run_directory import load_run
 from thor2_jax.recognizer import Recognizer
 
 pytestmark = pytest.mark.usefixtures("small_classifiers", "small_embedding")
@@ -74,21 +74,6 @@ def test_evaluation_has_a_gallery_column(model: Path, tmp_path: Path) -> None:
     page = (tmp_path / "report" / "report.html").read_text()
     assert run_thor2("evaluate", "frames", *frame_options(frames / "a"), "--model", model) == 0
     assert "<td>" in page and "<tbody></tbody>" not in page and "THOR2 is the fusion" not in page
-
-
-@pytest.mark.slow
-def test_a_trained_run_answers_by_both(frames: Path, tmp_path: Path, refused: Command) -> None:
-    model = tmp_path / "run"
-    save_run(untrained_run(("brick", "mug"), ("tops", "tops2")), model)
-    assert "'brick' is a trained class" in refused("enroll", "--frames", frames, "--model", model)
-    assert run_thor2("enroll", "book", "--model", model, "--frames", frames) == 0
-    assert run_thor2("evaluate", "frames", frames, "--model", model, "--out", tmp_path / "report") == 0
-    report = json.loads((tmp_path / "report" / "report.json").read_text())
-    assert report["main"] == "both" and {"THOR2", "gallery", "both"} <= set(report["fusions"])
-    assert report["classes"] == ["brick", "mug", "book"]
-    assert run_thor2("forget", "mug", "--model", model) == 0
-    assert Recognizer.load(model).classes == ("brick", "book")
-    assert "'mug'" in refused("forget", "mug", "--model", model)
 
 
 def test_a_named_object_comes_from_its_label_name(model: Path, frames: Path) -> None:

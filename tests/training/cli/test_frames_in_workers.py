@@ -42,14 +42,12 @@ def test_folders_may_hold_links_to_frames(folder: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("is_segmented", [False, True])
-def test_chunks_of_frames_have_the_same_answers(model: Path, folder: Path, tmp_path: Path, is_segmented: bool) -> None:
-    arguments, sources = RecognizerArguments(model), find_frames([folder])
-    if is_segmented:  # frames of the size that other tests of this folder segment
-        for number in range(2):
-            write_frame_files(tmp_path / f"{number}", table_frame(3 * number))
-        function = pickle.loads(pickle.dumps(arguments.segment))
-        sources = [segmented_source(source, function) for source in find_frames([tmp_path])]
+def test_chunks_of_segmented_frames_have_the_same_answers(model: Path, tmp_path: Path) -> None:
+    arguments = RecognizerArguments(model)
+    for number in range(2):
+        write_frame_files(tmp_path / f"{number}", table_frame(3 * number))
+    segment = pickle.loads(pickle.dumps(arguments.segment))
+    sources = [segmented_source(source, segment) for source in find_frames([tmp_path])]
     expected = list(recognize_frames(arguments.load(), sources))
     answers = list(recognize_frames_in_pool(arguments, sources, IN_PROCESS))
     assert [answer.as_json() for answer in answers] == [answer.as_json() for answer in expected]

@@ -4,7 +4,6 @@ import io
 import shutil
 import tarfile
 from collections.abc import Iterator
-from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from threading import Thread
@@ -38,52 +37,45 @@ def mesh_files(folder: str = f"{NAME}/google_16k/") -> dict[str, bytes]:
     return {folder + name: data for name, data in files.items()}
 
 
-class Server:
-    """What the server sends, and the values of Range that it was asked for."""
+class Server(ThreadingHTTPServer):
+    """Sends files, and keeps the values of Range that it was asked for."""
 
     def __init__(self) -> None:
-        self.files: dict[str, bytes] = {}
+        super().__init__(("127.0.0.1", 0), Handler)
+        self.files = {f"/google/{NAME}_google_16k.tgz": archive(mesh_files())}
         self.break_after: int | None = None
         self.ranges = True
         self.requests: list[str | None] = []
-        self.url = ""
+        self.url = f"http://127.0.0.1:{self.server_port}/google"
 
 
 class Handler(BaseHTTPRequestHandler):
-    def __init__(self, server: Server, *arguments: object) -> None:
-        self.state = server
-        super().__init__(*arguments)  # type: ignore[arg-type]
+    server: Server
 
     def log_message(self, *arguments: object) -> None:
         pass
 
     def do_GET(self) -> None:
-        requested = self.headers.get("Range")
-        self.state.requests.append(requested)
-        data = self.state.files.get(self.path)
-        if data is None:
-            self.send_error(404)
+        requested, data = self.headers.get("Range"), self.server.files.get(self.path)
+        self.server.requests.append(requested)
+        is_part = requested is not None and self.server.ranges
+        start = int(requested.removeprefix("bytes=").rstrip("-")) if requested and is_part else 0
+        if data is None or start >= len(data):
+            self.send_error(404 if data is None else 416)
             return
-        start = int(requested.removeprefix("bytes=").rstrip("-")) if requested and self.state.ranges else 0
-        if start >= len(data):
-            self.send_error(416)
-            return
-        self.send_response(206 if requested and self.state.ranges else 200)
+        self.send_response(206 if is_part else 200)
         self.send_header("Content-Length", str(len(data) - start))
         self.end_headers()
-        self.wfile.write(data[start : self.state.break_after])
+        self.wfile.write(data[start : self.server.break_after])
 
 
 @pytest.fixture
 def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
     monkeypatch.setenv("no_proxy", "*")
-    state = Server()
-    state.files = {f"/google/{NAME}_google_16k.tgz": archive(mesh_files())}
-    with ThreadingHTTPServer(("127.0.0.1", 0), partial(Handler, state)) as http:
-        state.url = f"http://127.0.0.1:{http.server_port}/google"
-        thread = Thread(target=partial(http.serve_forever, 0.01))
+    with Server() as http:
+        thread = Thread(target=http.serve_forever, args=(0.01,))
         thread.start()
-        yield state
+        yield http
         http.shutdown()
         thread.join()
 

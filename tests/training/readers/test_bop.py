@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 import yaml
 from dataset_files import TWO, K, band, color_and_depth, write_bop
-from helpers import Command, NamesInOrder, input_error
-from PIL import Image
+from helpers import Command, NamesInOrder
 
 from thor2_jax.frames.frames import RGBDFrame
 from training.evaluation.runs import Run as EvaluatedRun
@@ -84,13 +83,6 @@ def test_names(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_text(json.dumps(table) if name.endswith("json") else yaml.safe_dump(table))
     (item,) = BOP(tmp_path / "test", tmp_path / name)
     assert item.truth == {1: "gelatin_box", 2: "mug", 3: "gelatin_box"}
-
-
-def test_color_images_as_masks_are_refused(tmp_path: Path) -> None:
-    path = write_bop(tmp_path / "000048") / "mask_visib" / "000001_000000.png"
-    Image.fromarray(color_and_depth()[0]).save(path)
-    with input_error(f"{path} has shape (6, 9, 3)"):
-        BOP(tmp_path)[0]
 
 
 class LastIsSmall(NamesInOrder):
