@@ -90,6 +90,7 @@ def test_short_help(printed: Command) -> None:
     for arguments in ((), ("-h",), ("evaluate",), ("train", "-h")):
         assert "Usage:" in printed(*arguments)
     assert "--install-completion" in printed("--help")
+    assert "{" not in printed("train", "--help")  # values of the protocols are filled in
 
 
 def test_help_objects_and_preparation_import_no_jax(tmp_path: Path) -> None:
