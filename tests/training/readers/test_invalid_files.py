@@ -1,6 +1,7 @@
 """What the dataset readers have in common: frames are read one at a time, and files that are invalid are named."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -44,19 +45,19 @@ def write_dataset(kind: str, root: Path) -> None:
             write_folder(root / name, {"labels": {"1": "mug"}})
 
 
-def read(kind: str, root: Path) -> LabelledFrames:
-    if kind == "bop":
-        return BOP(root, root / "names.yaml")
-    if kind == "ocid":
-        return OCID(root, root / "names.json")
-    return UWISOccluded(root) if kind == "uwis" else FrameFolder(root)
+READERS: dict[str, Callable[[Path], LabelledFrames]] = {
+    "bop": lambda root: BOP(root, root / "names.yaml"),
+    "ocid": lambda root: OCID(root, root / "names.json"),
+    "uwis": UWISOccluded,
+    "folder": FrameFolder,
+}
 
 
 @pytest.mark.parametrize("damage", ["missing", "empty", "cut off"])
 @pytest.mark.parametrize(("kind", "file"), EACH_FILE)
 def test_frames_before_a_damaged_file_are_read(kind: str, file: str, damage: str, tmp_path: Path) -> None:
     write_dataset(kind, tmp_path)
-    path, whole = tmp_path / file, read(kind, tmp_path)
+    path, whole = tmp_path / file, READERS[kind](tmp_path)
     assert path in whole.files(1) and all(each.is_file() for each in whole.files(1))
     content = path.read_bytes()
     path.unlink()
@@ -64,7 +65,7 @@ def test_frames_before_a_damaged_file_are_read(kind: str, file: str, damage: str
         path.write_bytes(content[: 0 if damage == "empty" else int(0.4 * len(content))])
     elif any(part in file for part in OPTIONAL):
         return
-    frames = iter(read(kind, tmp_path))
+    frames = iter(READERS[kind](tmp_path))
     assert next(frames).identifier == whole.identifiers[0]
     name = file.partition("/")[0]
     with input_error(path, match=rf"^{name}.* is missing$" if damage == "missing" else f"^{name}"):
@@ -84,19 +85,16 @@ def test_images_of_different_sizes(kind: str, file: str, tmp_path: Path) -> None
     write_dataset(kind, tmp_path)
     Image.fromarray(np.zeros((5, 9), np.uint16 if "depth" in file else np.uint8)).save(tmp_path / file)
     with input_error("(5, 9)", "(6, 9)"):
-        read(kind, tmp_path)[1]
+        READERS[kind](tmp_path)[1]
 
 
 @pytest.mark.parametrize("kind", FILES)
 def test_paths_that_are_not_a_dataset(kind: str, tmp_path: Path) -> None:
     (tmp_path / "empty" / "41" / "images").mkdir(parents=True)
-    for name in ("names.yaml", "names.json"):
-        (tmp_path / "empty" / name).write_text("{}")
-    for path, expected in (("absent", "is not a directory"), ("empty/names.json", "is not a directory"), ("empty", "")):
-        with input_error(f"{tmp_path / path} {expected or 'has no '}", match="^(dataset|frames): "):
-            {"bop": BOP, "uwis": UWISOccluded, "folder": FrameFolder}.get(kind, lambda path: OCID(path, path))(
-                tmp_path / path
-            )
+    (tmp_path / "file").touch()
+    for name, expected in (("absent", "is not a directory"), ("file", "is not a directory"), ("empty", "has no ")):
+        with input_error(f"{tmp_path / name} {expected}", match="^(dataset|frames): "):
+            READERS[kind](tmp_path / name)
 
 
 def camera(**changes: Any) -> dict[str, Any]:
@@ -161,4 +159,4 @@ def test_invalid_tables(kind: str, file: str, content: Any, expected: str, tmp_p
     write_dataset(kind, tmp_path)
     (tmp_path / file).write_text(content if isinstance(content, str) else json.dumps(content))
     with input_error(tmp_path / file, expected):
-        list(read(kind, tmp_path))
+        list(READERS[kind](tmp_path))
