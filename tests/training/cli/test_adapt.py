@@ -5,22 +5,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import Command, json_lines, run_thor2, untrained_embedding_run, untrained_run, write_frame
+from helpers import Command, json_lines, run_thor2, untrained_run, write_frame
 
 from thor2_jax import recognizer as module
 from thor2_jax.adaptation.color_transform import ColorTransform
 from thor2_jax.adaptation.estimate import Adaptation
 from thor2_jax.errors import InputError
-from thor2_jax.frames.frames import read_frame
 from thor2_jax.model.run_directory import load_run, save_run
 from thor2_jax.recognizer import Recognizer
 from training.camera_adaptation import write_adapted_run
 from training.evaluation.runs import load_runs
+from training.readers.frame_files import frame_files
 
 pytestmark = pytest.mark.usefixtures("small_classifiers", "small_embedding")
 
 OBJECTS = {1: "brick", 2: "book", 3: "leaf"}
-FILES = {"color": "color.png", "depth": "depth.png", "labels": "mask.png", "intrinsics": "intrinsics.json"}
 
 
 @pytest.fixture(scope="module")
@@ -66,52 +65,21 @@ def test_the_copy_differs_in_its_record_only(model: Path, adapted: Path) -> None
 
 
 def test_recognize_corrects_the_colors(model: Path, adapted: Path, video: Path, printed: Command) -> None:
-    answers = {}
+    confidences = []
     for run in (model, adapted):
-        answers[run] = json.loads(printed("recognize", "--model", run, video / "0", "--json"))["instances"]
-    confidences = [[one["confidence"] for one in answers[run]] for run in (model, adapted)]
+        (answer,) = json_lines(printed("recognize", "--model", run, video / "0", "--json"))
+        confidences.append([one["confidence"] for one in answer["instances"]])
     assert np.abs(np.subtract(*confidences)).max() > 1e-4
-
-
-def test_runs_of_different_cameras_are_not_evaluated_together(model: Path, adapted: Path) -> None:
     with pytest.raises(InputError, match="adapted to different cameras"):
         load_runs([model, adapted])
 
 
 @pytest.mark.slow
-def test_commands_use_a_run_whose_embedding_alone_answers(video: Path, tmp_path: Path, printed: Command) -> None:
-    model, out, names = tmp_path / "run", tmp_path / "adapted", tuple(OBJECTS.values())
-    save_run(untrained_embedding_run(names), model)
-    assert run_thor2("adapt", "--model", model, video, "--out", out, "--quiet") == 0
-    recognizer = Recognizer.load(out)
-    assert recognizer.model.color_transform is not None and set(recognizer.model.classifiers) == {"embedding"}
-    for options in ((), ("--track",)):
-        lines = json_lines(printed("recognize", "--model", out, video, "--json", *options))
-        frames = [line["instances"] for line in lines]
-        assert len(frames) == 4 and all(set(one["top"]) == {"embedding"} for frame in frames for one in frame)
-        if options:  # one answer for the objects of all frames
-            assert [one["confidence"] for one in frames[0]] == [one["confidence"] for one in frames[3]]
-            continue
-        frame = read_frame(**{name: video / "0" / file for name, file in FILES.items()})  # type: ignore[arg-type]
-        for one, expected in zip(frames[0], recognizer.recognize(frame), strict=True):
-            assert one["name"] == expected.name and one["confidence"] == pytest.approx(expected.confidence, abs=1e-4)
-    write_frame(tmp_path / "labelled" / "0", OBJECTS)
-    assert run_thor2("evaluate", "frames", tmp_path / "labelled", "--model", out, "--out", tmp_path / "report") == 0
-    report = json.loads((tmp_path / "report" / "report.json").read_text())
-    assert report["main"] == "embedding" and report["instances"]["scored"] == 3
-
-
-@pytest.mark.slow
 def test_enrolled_frames_are_corrected(adapted: Path, tmp_path: Path) -> None:
     folder = write_frame(tmp_path / "labelled", {1: "brick"})
-    frame = read_frame(**{name: folder / file for name, file in FILES.items()})  # type: ignore[arg-type]
-    gallery = tmp_path / "gallery"
-    assert (
-        run_thor2(
-            "enroll", "mug", "--label-name", "brick", "--model", adapted, "--gallery", gallery, "--frames", folder
-        )
-        == 0
-    )
+    frame, gallery = frame_files(folder).read(), tmp_path / "gallery"
+    run = ("--model", adapted, "--gallery", gallery)
+    assert run_thor2("enroll", "mug", "--label-name", "brick", *run, "--frames", folder) == 0
     recognizer = Recognizer.load(adapted, gallery=gallery)
     stored = next(iter(recognizer.gallery.objects["mug"].clouds.views()))
     transform = recognizer.model.color_transform
@@ -125,9 +93,8 @@ def test_bad_input_writes_nothing(model: Path, video: Path, tmp_path: Path, refu
     write_frame(few, OBJECTS)
     for number in range(4):
         (write_frame(unlabelled / f"{number}", OBJECTS, number) / "mask.png").unlink()
-    cases = [((few,), "3 usable instances; expected at least 10"), ((unlabelled,), "0: labels is None")]
-    for arguments, message in cases:
-        assert message in refused("adapt", "--model", model, *arguments, "--out", tmp_path / "out", "--quiet")
+    for folder, message in ((few, "3 usable instances; expected at least 10"), (unlabelled, "0: labels is None")):
+        assert message in refused("adapt", "--model", model, folder, "--out", tmp_path / "out", "--quiet")
     assert "already contains" in refused("adapt", "--model", model, video, "--out", model)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["few", "unlabelled"]
 

@@ -14,13 +14,6 @@ from training.cli.compilation_cache import enable_compilation_cache
 
 ROOT = Path(__file__).parents[3]
 
-COMPILES = """
-from training.cli.compilation_cache import enable_compilation_cache
-enable_compilation_cache()
-import jax, jax.numpy as jnp
-jax.jit(lambda x: jnp.sin(x) @ x.T + 1)(jnp.ones((5, 5))).block_until_ready()
-"""
-
 
 @pytest.fixture
 def environment(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
@@ -33,21 +26,6 @@ def environment(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     return tmp_path / "home" / "thor2-jax" / "xla"
 
 
-def run(cache: Path, *arguments: object) -> tuple[set[str], str]:
-    """Run Python in a process, and return the names of the cached programs and what it printed."""
-    variables = os.environ | {"PYTHONPATH": str(ROOT), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
-    command = [sys.executable, *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, env=variables)
-    assert done.returncode == 0 and done.stderr == ""
-    return {path.name for path in cache.glob("*/*-cache")}, done.stdout
-
-
-@pytest.mark.slow
-def test_programs_are_kept_for_the_next_process(environment: Path) -> None:
-    first = run(environment, "-c", COMPILES)
-    assert first[0] and run(environment, "-c", COMPILES) == first
-
-
 def test_the_cache_can_be_moved_or_disabled(environment: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("THOR2_CACHE", "off")
     enable_compilation_cache()
@@ -57,10 +35,7 @@ def test_the_cache_can_be_moved_or_disabled(environment: Path, tmp_path: Path, m
         patch.setenv("JAX_COMPILATION_CACHE_DIR", "")
         enable_compilation_cache()
         assert Path(os.environ["JAX_COMPILATION_CACHE_DIR"]).parent == tmp_path / "elsewhere"
-
-
-def test_a_cache_of_the_environment_is_left_alone(environment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "/mine")
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "/mine")  # one of the environment is left alone
     enable_compilation_cache()
     assert os.environ["JAX_COMPILATION_CACHE_DIR"] == "/mine" and not environment.exists()
 
@@ -80,6 +55,14 @@ def test_an_unusable_cache_directory(environment: Path, tmp_path: Path, monkeypa
 def test_a_second_recognition_compiles_nothing(environment: Path, tmp_path: Path) -> None:
     frame = write_frame(tmp_path / "frame", {1: "brick"})
     save_run(untrained_run(("brick", "stick"), ("tops", "tops2")), tmp_path / "run")
-    command = ("-m", "training.cli", "recognize", "--model", tmp_path / "run", frame)
-    first = run(environment, *command)
-    assert len(first[0]) > 5 and run(environment, *command) == first
+    variables = os.environ | {"PYTHONPATH": str(ROOT), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
+    command = [sys.executable, "-m", "training.cli", "recognize", "--model", str(tmp_path / "run"), str(frame)]
+
+    def recognize() -> tuple[set[str], str]:
+        """Return the names of the cached programs, and what was printed."""
+        done = subprocess.run(command, capture_output=True, text=True, env=variables)
+        assert done.returncode == 0 and done.stderr == ""
+        return {path.name for path in environment.glob("*/*-cache")}, done.stdout
+
+    first = recognize()
+    assert len(first[0]) > 5 and recognize() == first

@@ -69,17 +69,13 @@ def test_folders_of_the_user_are_not_replaced(
     explanation = SimpleNamespace(title="mug", as_json=lambda: values)
     monkeypatch.setattr("thor2_jax.explanation.explain.explain", lambda *_: explanation)
     monkeypatch.setattr(explanation_page, "write_page", write)
-    monkeypatch.setattr(explanation_page, "pictures", lambda *_: [])
-    monkeypatch.setattr(explanation_page, "_lead", lambda *_: "")
-    monkeypatch.setattr(explanation_page, "_page_sections", lambda *_: [])
+    for name, nothing in (("pictures", []), ("_lead", ""), ("_page_sections", [])):
+        monkeypatch.setattr(explanation_page, name, lambda *_, nothing=nothing: nothing)
     command = ("explain", "--model", model, frame.parent, "--out", frame.parent, "--instance")
     for _ in range(2):  # The second explanation replaces the first one.
         assert run_thor2(*command, 1) == 0
-        assert sorted(path.name for path in (frame / "1").iterdir()) == [
-            "explanation.html",
-            "explanation.json",
-            "scan.ply",
-        ]
+        names = sorted(path.name for path in (frame / "1").iterdir())
+        assert names == ["explanation.html", "explanation.json", "scan.ply"]
     assert "photo.png" in refused(*command, 4)
     assert {(frame / name).read_text() for name in ("1/scan.ply", "4/photo.png")} == {"a user's"}
 

@@ -23,10 +23,8 @@ from helpers import (
 from PIL import Image
 from recording_files import table_frame
 
-CAMERA = {"fx": 120.0, "fy": 120.0, "cx": 60.0, "cy": 45.0}
 
-
-def test_json_of_one_frame(recognize: Recognize, tmp_path: Path) -> None:
+def test_json_of_one_frame(model: Path, recognize: Recognize, tmp_path: Path, printed: Command) -> None:
     folder = write_frame_files(tmp_path / "one", small_frame())
     (answer,) = recognize(*frame_options(folder), "--json", "--out", tmp_path / "out")
     assert [one["label"] for one in answer["instances"]] == [1, 4]
@@ -34,29 +32,22 @@ def test_json_of_one_frame(recognize: Recognize, tmp_path: Path) -> None:
     assert answer["instances"] == json.loads((tmp_path / "out" / "recognition.json").read_text())
     (answer,) = recognize(*frame_options(folder), "--json", "--unknown-below", 1)
     assert [one["name"] for one in answer["instances"]] == [None, None]
+    table = printed("recognize", "--model", model, *frame_options(folder), "--unknown-below", 1)
+    assert table.count("unrecognized") == 2
 
 
 def test_other_formats_give_the_same_answers(recognize: Recognize, tmp_path: Path) -> None:
+    """One of each kind; the tests of `read_frame` have the others."""
     folder = write_frame_files(tmp_path / "one", small_frame())
-    matrix = np.array([[120, 0, 60], [0, 120, 45], [0, 0, 1.0]])
-    np.savetxt(tmp_path / "K.txt", matrix)
-    (tmp_path / "camera_info.yaml").write_text(
-        f"image_width: 120\nimage_height: 90\ncamera_matrix: {{data: {matrix.ravel().tolist()}}}\n"
-    )
-    units = np.asarray(Image.open(folder / "depth.png"))
+    np.savetxt(tmp_path / "K.txt", [[120, 0, 60], [0, 120, 45], [0, 0, 1.0]])
+    units = small_frame().depth
     np.save(tmp_path / "metres.npy", units / np.float32(1000))
     (tmp_path / "tenths.png").write_bytes(encode_image((units * 10).astype(np.uint16)))
-    answers = []
-    for changes, options in (
-        ({}, []),
-        ({"intrinsics": tmp_path / "K.txt"}, []),
-        ({"intrinsics": tmp_path / "camera_info.yaml", "depth": tmp_path / "metres.npy"}, []),
-        ({"depth": tmp_path / "tenths.png"}, ["--depth-scale", 10_000]),
-    ):
-        (answer,) = recognize(*frame_options(folder, **changes), *options, "--json")
-        answers.append(answer["instances"])
-    for other in answers[1:]:
-        for one, expected in zip(other, answers[0], strict=True):
+    in_metres = frame_options(folder, intrinsics=tmp_path / "K.txt", depth=tmp_path / "metres.npy")
+    in_tenths = (*frame_options(folder, depth=tmp_path / "tenths.png"), "--depth-scale", 10_000)
+    first, *others = (recognize(*each, "--json")[0] for each in (frame_options(folder), in_metres, in_tenths))
+    for other in others:
+        for one, expected in zip(other["instances"], first["instances"], strict=True):
             assert one["name"] == expected["name"] and one["points_used"] == expected["points_used"]
             assert one["confidence"] == pytest.approx(expected["confidence"], abs=1e-4)
 
@@ -69,8 +60,8 @@ def test_one_failing_frame_does_not_lose_the_others(
     (tmp_path / "frames" / "000002" / "depth.png").write_bytes(b"damaged")
     (tmp_path / "frames" / "000003" / "intrinsics.json").unlink()
     (tmp_path / "frames" / "000005" / "color.png").unlink()
-    coco_file, bop_file = tmp_path / "new" / "a" / "coco.json", tmp_path / "new" / "b" / "bop.csv"
-    outputs = ("--out", tmp_path / "out", "--coco", coco_file, "--bop", bop_file)
+    coco_file = tmp_path / "new" / "a" / "coco.json"
+    outputs = ("--out", tmp_path / "out", "--coco", coco_file)
     command = ("recognize", "--model", model, tmp_path / "frames", "--json", *outputs)
     for _ in range(2):  # it may be repeated
         assert run_thor2(*command) == 2
@@ -86,85 +77,101 @@ def test_one_failing_frame_does_not_lose_the_others(
     assert sorted((entry["image_id"], entry["bbox"]) for entry in coco) == [
         (image, box) for image in (1, 4) for box in ([10, 10, 40, 40], [60, 30, 50, 50])
     ]
-    with bop_file.open() as stream:
-        rows = list(csv.DictReader(stream))
-    assert [(row["scene_id"], row["im_id"]) for row in rows] == [("1", "1")] * 2 + [("1", "4")] * 2
-    numbers = {"bowl": 1, "mug": 2, "plate": 3}
-    names = [one["name"] for n in ("000001", "000004") for one in answers[n]["instances"]]
-    assert [int(row["obj_id"]) for row in rows] == [numbers[name] for name in names]
 
 
 def test_several_folders_and_tables(model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     one = write_frame_files(tmp_path / "one", small_frame())
     two = write_frame_files(tmp_path / "more" / "deep" / "two", small_frame(1))
     shutil.move(two / "mask.png", two / "labels.png")
-    (tmp_path / "names.json").write_text(json.dumps({"14": "mug"}))
-    outputs = ("--coco", tmp_path / "coco.json", "--names", tmp_path / "names.json", "--out", tmp_path / "out")
-    assert run_thor2("recognize", "--model", model, one, tmp_path / "more", *outputs) == 0
+    (tmp_path / "names.json").write_text(json.dumps({"14": "mug", "21": "bowl", "5": "plate"}))
+    tables = ("--coco", tmp_path / "coco.json", "--bop", tmp_path / "bop.csv", "--names", tmp_path / "names.json")
+    outputs = (*tables, "--out", tmp_path / "out")
+    command = ("recognize", "--model", model, one, tmp_path / "more", *outputs)
+    assert run_thor2(*command) == 0
     out, err = capfd.readouterr()
+    assert "instances have a name" not in err
     assert out.index("one:") < out.index("deep/two:") and out.count("confidence") == 2
     with Image.open(tmp_path / "out" / "deep" / "two" / "overlay.png") as overlay:
         assert overlay.size == (120, 90)
     results = [tmp_path / "out" / name / "recognition.json" for name in ("one", "deep/two")]
-    answers = [{"instances": json.loads(path.read_text())} for path in results]
+    names = [one["name"] for path in results for one in json.loads(path.read_text())]
     coco = json.loads((tmp_path / "coco.json").read_text())
-    names = [one["name"] for line in answers for one in line["instances"]]
-    assert [entry["category_id"] for entry in coco] == [14] * names.count("mug")
-    others = len(names) - names.count("mug")
-    assert (f"{others} instances have a name" in err) == (others > 0)
+    with (tmp_path / "bop.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    expected = [{"mug": 14, "bowl": 21, "plate": 5}[name] for name in names]
+    assert [entry["category_id"] for entry in coco] == [int(row["obj_id"]) for row in rows] == expected
+    (tmp_path / "names.json").write_text(json.dumps({"14": "another"}))
+    assert run_thor2(*command) == 0
+    assert f"{len(names)} instances have a name" in capfd.readouterr().err
 
 
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
-        ([], "give either"),
-        (["{frames}", "--color", "{frames}/one/color.png"], "give either"),
-        (["--color", "{frames}/one/color.png"], "--depth, --labels, --intrinsics is missing"),
-        (["{frames}/absent"], "not a directory"),
-        (["{empty}"], "has no color.png"),
-        (["{frames}", "{frames}"], "one is given twice"),
-        (["{frames}", "--names", "{frames}/names.json"], "it belongs to --coco"),
-        (["{frames}", "--coco", "{empty}/c.json", "--names", "{frames}/one/intrinsics.json"], "expected an obj_id"),
-        (["{frames}", "--out", "{frames}"], "expected a new or empty directory"),
-        (["{frames}", "--depth-scale", "1e-300"], "depth_scale is 1e-300"),
-        (["{frames}", "--unknown-below", "1.5"], "unknown_below is 1.5"),
-        (["{files}", "--segment", "table", "--out", "{out}"], "error: labels is "),
-        (["{frames}", "--segment", "sam", "--out", "{out}"], "error: segmenter is 'sam'"),
+        ("", "give either"),
+        ("frames --color frames/one/color.png", "give either"),
+        ("--color frames/one/color.png", "--depth, --labels, --intrinsics is missing"),
+        ("frames/absent", "not a directory"),
+        ("empty", "has no color.png"),
+        ("frames frames", "one is given twice"),
+        ("frames --names frames/names.json", "it belongs to --coco"),
+        ("frames --coco empty/c.json --names frames/one/intrinsics.json", "expected an obj_id"),
+        ("frames --out frames", "expected a new or empty directory"),
+        ("frames --depth-scale 1e-300", "depth_scale is 1e-300"),
+        ("frames --unknown-below 1.5", "unknown_below is 1.5"),
+        ("frames --segment sam --out out", "error: segmenter is 'sam'"),
+        ("frames --track --workers 2", "workers is 2"),
+        ("frames --address head:6379", "address is head:6379"),
+        ("frames --depth-topic /d", "depth_topic is /d; it belongs to --bag"),
+        ("frames --max-gap 0.1", "max_gap is 0.1; it belongs to --bag"),
+        ("frames --out-bag a.mcap", "out_bag is a.mcap; it belongs to --bag"),
+        ("FILES --segment table --out out", "error: labels is "),
+        ("FILES --out out --color absent.png", "absent.png"),
+        ("FILES --out out --depth cut.png", "cut.png"),
+        ("FILES --out out --labels half.png", "(45, 60)"),
+        ("FILES --out out --intrinsics word.json", "'left'"),
+        ("FILES --out out --model absent", "absent"),
+        ("FILES --out out --model empty", "run.json"),
+        ("FILES --out out --model damaged", "tops"),
     ],
 )
-def test_invalid_arguments(model: Path, tmp_path: Path, refused: Command, arguments: list[str], expected: str) -> None:
-    (tmp_path / "empty").mkdir()
-    write_frame_files(tmp_path / "frames" / "one", small_frame())
-    (tmp_path / "frames" / "names.json").write_text("{}")
-    if arguments[:1] == ["{files}"]:
-        arguments = [*map(str, frame_options(tmp_path / "frames" / "one")), *arguments[1:]]
-    places = {name: tmp_path / name for name in ("frames", "empty", "out")}
-    assert expected in refused("recognize", "--model", model, *(text.format(**places) for text in arguments))
-    assert not (tmp_path / "out").exists()
+def test_invalid_arguments(
+    model: Path, tmp_path: Path, refused: Command, monkeypatch: pytest.MonkeyPatch, arguments: str, expected: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("empty").mkdir()
+    frame = write_frame_files(Path("frames/one"), small_frame())
+    Path("frames/names.json").write_text("{}")
+    Path("cut.png").write_bytes((frame / "depth.png").read_bytes()[:-60])
+    Path("half.png").write_bytes(encode_image(np.zeros((45, 60), np.uint8)))
+    Path("word.json").write_text('{"fx": 1, "fy": 1, "cx": "left", "cy": 1}')
+    shutil.copytree(model, "damaged")
+    Path("damaged/weights/tops.safetensors").unlink()
+    command = arguments.replace("FILES", " ".join(map(str, frame_options(frame)))).split()
+    assert expected in refused("recognize", "--model", model, *command)
+    assert not Path("out").exists()
+
+
+BOP_ROWS = "scene_id,im_id,obj_id,score,R,t,time\n1,1,1,.5,0 1 0 1 0 0 0 0 -1,0 0 9,1\n"
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "options"),
+    ("name", "content", "option"),
     [
-        ("f/recognition.json", '{"a": "user\'s"}', ("--out", "")),
-        ("f/overlay.png", "a user's", ("--out", "")),
-        ("instances.json", '[{"image_id": 1, "category_id": 2}]', ("--coco", "instances.json")),
-        (
-            "poses.csv",
-            "scene_id,im_id,obj_id,score,R,t,time\n1,1,1,.5,0 1 0 1 0 0 0 0 -1,0 0 9,1\n",
-            ("--bop", "poses.csv"),
-        ),
+        ("f/recognition.json", '{"a": "user\'s"}', "--out"),
+        ("f/overlay.png", "a user's", "--out"),
+        ("instances.json", '[{"image_id": 1, "category_id": 2}]', "--coco"),
+        ("poses.csv", BOP_ROWS, "--bop"),
     ],
 )
 def test_no_file_of_the_user_is_replaced(
-    model: Path, tmp_path: Path, refused: Command, name: str, content: str, options: tuple[str, str]
+    model: Path, tmp_path: Path, refused: Command, name: str, content: str, option: str
 ) -> None:
-    frames = tmp_path / "frames"
-    write_frame_files(frames / "f", small_frame())
-    (frames / name).write_text(content)
-    before = files_of(frames)
-    assert Path(name).name in refused("recognize", "--model", model, frames, options[0], frames / options[1])
-    assert files_of(frames) == before
+    write_frame_files(tmp_path / "f", small_frame())
+    (tmp_path / name).write_text(content)
+    before, given = files_of(tmp_path), tmp_path if option == "--out" else tmp_path / name
+    assert Path(name).name in refused("recognize", "--model", model, tmp_path, option, given)
+    assert files_of(tmp_path) == before
 
 
 @pytest.mark.parametrize("segmenter", ["table", pytest.param("model", marks=pytest.mark.slow)])
@@ -179,7 +186,8 @@ def test_frames_without_labels_are_segmented(
     folder = write_frame_files(tmp_path / "frames" / "a", table_frame())
     files = frame_options(folder)
     del files[files.index("--labels") : files.index("--labels") + 2]
-    for given in (files, [tmp_path / "frames"]):
+    write_frame_files(tmp_path / "labelled" / "a", dataclasses.replace(table_frame(), labels=np.full((240, 320), 9)))
+    for given in (files, [tmp_path / "frames"], [tmp_path / "labelled"]):  # labels of a folder are replaced
         (answer,) = recognize(*given, "--segment", segmenter, "--json")
         assert [one["label"] for one in answer["instances"]] == [1, 2]
     assert "--segment" in refused("recognize", "--model", model, *files)
@@ -215,13 +223,6 @@ def test_a_wrong_unit_of_depth(model: Path, tmp_path: Path, refused: Command) ->
     assert json.loads((tmp_path / "coco.json").read_text()) == []
     write_frame_files(tmp_path / "b", dataclasses.replace(frame, depth=frame.depth * 0))
     assert run_thor2("recognize", "--model", model, tmp_path / "a", tmp_path / "b", "--segment", "table") == 0
-
-
-def test_labels_are_replaced_where_a_folder_is_segmented(recognize: Recognize, tmp_path: Path) -> None:
-    folder = write_frame_files(tmp_path / "one", table_frame())
-    (folder / "mask.png").write_bytes(encode_image(np.full((240, 320), 9, np.uint8)))
-    (answer,) = recognize(folder, "--segment", "table", "--json")
-    assert [one["label"] for one in answer["instances"]] == [1, 2]
 
 
 def test_track_gives_an_object_one_name(model: Path, recognize: Recognize, tmp_path: Path, printed: Command) -> None:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -10,22 +11,23 @@ from typing import Any
 
 import numpy as np
 import pytest
+from dataset_files import write_bop
 from helpers import Command, encode_image, json_lines, run_thor2, write_box
 from PIL import Image
 
 import thor2_jax
-from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, backproject
 from thor2_jax.model.recognition import Recognition
-from training.diagnosis import registration
 from training.diagnosis.checks import Diagnosis, check_camera, check_labels, check_meshes
 from training.diagnosis.colors import check_channel_order, check_light
 from training.diagnosis.depth import check_depth, instance_extents
+from training.diagnosis.registration import check_labels_alignment, check_registration
 from training.diagnosis.setup import diagnose
 from training.readers.frame_files import FrameFiles, frame_files
 
 SAMPLES = Path(thor2_jax.__file__).parent / "service" / "page" / "samples"
-NAMES = ("breakfast", "clutter", "crockery", "tools")
+
+Damage = Callable[[Any], Any]
 
 
 @pytest.fixture(scope="module")
@@ -33,102 +35,89 @@ def frame() -> RGBDFrame:
     return frame_files(SAMPLES / "breakfast").read()
 
 
-def codes(check: Callable[[Diagnosis], Any]) -> list[str]:
-    """Return the codes of what a check finds."""
+def assert_found(expected: str, check: Callable[..., Any], *arguments: Any, **options: Any) -> None:
+    """Assert that the only finding of a check begins with a pattern, as the command prints it; "" expects none."""
     diagnosis = Diagnosis()
-    check(diagnosis)
-    assert all(finding.message.endswith(".") and finding.advice.endswith(".") for finding in diagnosis.findings)
-    return [finding.code for finding in diagnosis.findings]
+    check(diagnosis, *arguments, **options)
+    found = " ".join(f"{each.code}: {each.message} {each.advice}" for each in diagnosis.findings)
+    assert re.match(expected or "$", found), found
+    assert len(diagnosis.findings) <= 1
+    assert all(each.message.endswith(".") and each.advice.endswith(".") for each in diagnosis.findings)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", ["breakfast", "clutter", "crockery", "tools"])
 def test_sound_frames_have_no_findings(name: str) -> None:
-    diagnosis = diagnose(frame_files(SAMPLES / name))
+    files = frame_files(SAMPLES / name)
+    diagnosis = diagnose(files)
     assert diagnosis.findings == [] and any("--model" in note for note in diagnosis.notes)
-
-
-def test_sound_frames_without_labels_have_no_findings() -> None:
-    assert diagnose(dataclasses.replace(frame_files(SAMPLES / "tools"), labels=None)).findings == []
-
-
-# Intrinsics
+    assert diagnose(dataclasses.replace(files, labels=None)).findings == []
 
 
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
-        ({}, []),
-        ({"cx": 330, "cy": 225}, []),
-        ({"width": 640, "height": 480}, []),
-        ({"width": 1280, "height": 720}, ["intrinsics-size"]),
-        ({"cx": 640, "cy": 480}, ["intrinsics-size"]),
-        ({"cx": 160, "cy": 120}, ["intrinsics-size"]),
-        ({"cx": 240, "cy": 320}, ["intrinsics-size"]),
-        ({"fx": 900}, ["intrinsics-aspect"]),
-        ({"fx": 3.6, "fy": 3.6}, ["intrinsics-focal"]),
-        ({"fx": 6000, "fy": 6000}, ["intrinsics-focal"]),
+        ({"cx": 330, "cy": 225}, ""),
+        ({"width": 640, "height": 480}, ""),
+        ({"width": 1280, "height": 720}, "intrinsics-size"),
+        ({"cx": 640, "cy": 480}, "intrinsics-size"),
+        ({"cx": 160, "cy": 120}, "intrinsics-size"),
+        ({"cx": 240, "cy": 320}, "intrinsics-size: .*exchanged"),
+        ({"fx": 900}, "intrinsics-aspect"),
+        ({"fx": 3.6, "fy": 3.6}, "intrinsics-focal"),
+        ({"fx": 6000, "fy": 6000}, "intrinsics-focal"),
     ],
 )
-def test_intrinsics(changes: dict[str, float], expected: list[str]) -> None:
+def test_intrinsics(changes: dict[str, float], expected: str) -> None:
     camera = Intrinsics(**{"fx": 570, "fy": 575, "cx": 319.5, "cy": 239.5, **changes})
-    assert codes(lambda diagnosis: check_camera(diagnosis, camera, 640, 480)) == expected
+    assert_found(expected, check_camera, camera, 640, 480)
 
 
-def test_exchanged_principal_points_are_named() -> None:
-    diagnosis = Diagnosis()
-    check_camera(diagnosis, Intrinsics(570, 570, 239.5, 319.5), 640, 480)
-    assert "exchanged" in diagnosis.findings[0].message
-
-
-# Depth
-
-
-def change(frame: RGBDFrame, **changes: Any) -> RGBDFrame:
-    return dataclasses.replace(frame, **changes)
+change = dataclasses.replace
 
 
 def with_scale(frame: RGBDFrame, scale: float) -> RGBDFrame:
-    return change(frame, intrinsics=dataclasses.replace(frame.intrinsics, depth_scale=scale))
+    return change(frame, intrinsics=change(frame.intrinsics, depth_scale=scale))
 
 
-def without_instances(frame: RGBDFrame) -> RGBDFrame:
-    return change(frame, labels=None)
+def with_focal_factor(frame: RGBDFrame, factor: float) -> RGBDFrame:
+    k = frame.intrinsics
+    return change(frame, intrinsics=change(k, fx=k.fx * factor, fy=k.fy * factor))
 
 
-DEPTH: dict[str, tuple[Callable[[RGBDFrame], RGBDFrame], list[str], str]] = {
-    "sound": (lambda f: f, [], ""),
-    "0.1 mm": (lambda f: with_scale(change(f, depth=(f.depth * 10).astype(np.uint16)), 1000), ["depth-unit"], "10000"),
-    "mm as units of 0.2 mm": (lambda f: with_scale(f, 5000), ["distance"], "depth_scale is wrong"),
-    "metres per unit": (lambda f: with_scale(f, 0.001), ["depth-unit"], "1000"),
-    "floats in mm": (lambda f: change(f, depth=f.depth.astype(np.float32)), ["depth-unit"], "Divide it by 1000"),
-    "floats in metres": (lambda f: change(f, depth=f.depth_m), [], ""),
-    "no labels, metres per unit": (lambda f: without_instances(with_scale(f, 0.001)), ["depth-unit"], "1000"),
-    "no labels, sound": (without_instances, [], ""),
-    "no depth": (lambda f: change(f, depth=f.depth * 0), ["depth-missing"], ""),
-    "little depth": (
-        lambda f: change(f, depth=f.depth * (np.random.default_rng(0).random(f.depth.shape) < 0.1)),
-        ["depth-missing"],
-        "",
-    ),
-    "far": (
-        lambda f: change(
-            f,
-            depth=(f.depth * 5).astype(np.uint16),
-            intrinsics=dataclasses.replace(f.intrinsics, fx=f.intrinsics.fx * 5, fy=f.intrinsics.fy * 5),
-        ),
-        ["distance"],
-        "0.5 to 1.5 m",
-    ),
+def far(frame: RGBDFrame) -> RGBDFrame:
+    return with_focal_factor(change(frame, depth=(frame.depth * 5).astype(np.uint16)), 5)
+
+
+def with_little_depth(frame: RGBDFrame) -> RGBDFrame:
+    return change(frame, depth=frame.depth * (np.random.default_rng(0).random(frame.depth.shape) < 0.1))
+
+
+def with_one_mask_of_two_thirds(frame: RGBDFrame) -> RGBDFrame:
+    labels = np.zeros(frame.depth.shape, np.uint8)
+    labels[: labels.shape[0] * 2 // 3] = 255
+    return change(frame, labels=labels, depth=np.full(frame.depth.shape, 1000, np.uint16))
+
+
+DEPTH: dict[str, tuple[Damage, str]] = {
+    "sound": (lambda f: f, ""),
+    "0.1 mm": (lambda f: with_scale(change(f, depth=(f.depth * 10).astype(np.uint16)), 1000), "depth-unit: .*10000"),
+    "mm as units of 0.2 mm": (lambda f: with_scale(f, 5000), "distance: .*depth_scale is wrong"),
+    "metres per unit": (lambda f: with_scale(f, 0.001), "depth-unit: .*1000"),
+    "floats in mm": (lambda f: change(f, depth=f.depth.astype(np.float32)), "depth-unit: .*Divide it by 1000"),
+    "floats in metres": (lambda f: change(f, depth=f.depth_m), ""),
+    "no labels, metres per unit": (lambda f: change(with_scale(f, 0.001), labels=None), "depth-unit: .*1000"),
+    "no labels": (lambda f: change(f, labels=None), ""),
+    "no depth": (lambda f: change(f, depth=f.depth * 0), "depth-missing"),
+    "little depth": (with_little_depth, "depth-missing"),
+    "far": (far, "distance: .*0.5 to 1.5 m"),
+    "a mask of touching objects": (with_one_mask_of_two_thirds, "labels-foreground"),
 }
 
 
 @pytest.mark.parametrize("name", DEPTH)
 def test_depth(frame: RGBDFrame, name: str) -> None:
-    damage, expected, advice = DEPTH[name]
-    diagnosis = Diagnosis()
-    check_depth(diagnosis, damage(frame))
-    assert [finding.code for finding in diagnosis.findings] == expected
-    assert all(advice in finding.advice for finding in diagnosis.findings)
+    damage, expected = DEPTH[name]
+    assert_found(expected, check_depth, damage(frame))
 
 
 def test_extents_of_a_tilted_plate() -> None:
@@ -145,38 +134,15 @@ def test_extents_of_a_tilted_plate() -> None:
 
 def test_objects_are_compared_with_the_meshes(frame: RGBDFrame) -> None:
     sides = {str(label): extent for label, extent in instance_extents(frame).items()}
-    tenths = {name: side / 10 for name, side in sides.items()}
-    assert codes(lambda diagnosis: check_depth(diagnosis, frame, sides)) == []
-    assert codes(lambda diagnosis: check_depth(diagnosis, frame, tenths)) == ["depth-unit"]
-    untrusted = codes(lambda diagnosis: check_depth(diagnosis, frame, {"pin": 0.01}, trust_camera=False))
-    assert untrusted == []
-
-
-@pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("factor", [0.5, 0.6, 1.0])
-def test_sizes_of_named_meshes_tell_the_focal_length(name: str, factor: float) -> None:
-    sound = frame_files(SAMPLES / name).read()
-    k = sound.intrinsics
-    scaled = change(sound, intrinsics=dataclasses.replace(k, fx=k.fx * factor, fy=k.fy * factor))
-    names = {label: str(label) for label in sound.instances}
-    sides = {names[label]: 1.1 * extent for label, extent in instance_extents(sound).items()}
-    diagnosis = Diagnosis()
-    check_depth(diagnosis, scaled, {**sides, "a large object": 0.6}, names)
-    assert [finding.code for finding in diagnosis.findings] == ([] if factor == 1 else ["intrinsics-focal"])
-
-
-def test_sizes_without_names_tell_a_halved_focal_length(frame: RGBDFrame) -> None:
-    k = frame.intrinsics
-    halved = change(frame, intrinsics=dataclasses.replace(k, fx=k.fx / 2, fy=k.fy / 2))
-    sides = {str(label): extent for label, extent in instance_extents(frame).items()}
     side = float(np.median(list(sides.values())))
+    halved, longer = with_focal_factor(frame, 0.5), {name: 1.1 * side for name, side in sides.items()}
     for meshes in (sides, {"median": side, "small": side / 3}):
-        assert codes(lambda diagnosis, meshes=meshes: check_depth(diagnosis, frame, meshes)) == []
-        halved_codes = codes(lambda diagnosis, meshes=meshes: check_depth(diagnosis, halved, meshes))
-        assert halved_codes == ["intrinsics-focal"]
-
-
-# Labels
+        assert_found("", check_depth, frame, meshes)
+        assert_found("intrinsics-focal", check_depth, halved, meshes)
+    names = {label: str(label) for label in frame.instances}
+    assert_found("intrinsics-focal", check_depth, with_focal_factor(frame, 0.6), longer | {"large": 0.6}, names)
+    assert_found("depth-unit", check_depth, frame, {name: side / 10 for name, side in sides.items()})
+    assert_found("", check_depth, frame, {"pin": 0.01}, trust_camera=False)
 
 
 def interpolated(labels: np.ndarray) -> np.ndarray:
@@ -194,32 +160,17 @@ def blobs(n: int) -> np.ndarray:
 @pytest.mark.parametrize(
     ("make", "expected"),
     [
-        (lambda labels: labels, []),
-        (lambda labels: labels.astype(np.int32) * 1000, []),
-        (lambda labels: labels * 0, ["labels-empty"]),
-        (lambda labels: labels + 1, ["labels-background"]),
-        (interpolated, ["labels-thin"]),
-        (lambda labels: np.random.default_rng(0).integers(0, 256, labels.shape).astype(np.uint8), ["labels-many"]),
-        (lambda labels: blobs(1), []),
-        (lambda labels: blobs(2), []),
-        (lambda labels: blobs(3) * 255, ["labels-foreground"]),
+        (lambda labels: labels.astype(np.int32) * 1000, ""),
+        (lambda labels: labels * 0, "labels-empty"),
+        (lambda labels: labels + 1, "labels-background"),
+        (interpolated, "labels-(thin|many)"),
+        (lambda labels: np.random.default_rng(0).integers(0, 256, labels.shape).astype(np.uint8), "labels-many"),
+        (lambda labels: blobs(2), ""),
+        (lambda labels: blobs(3) * 255, "labels-foreground"),
     ],
 )
-def test_labels(frame: RGBDFrame, make: Callable[[np.ndarray], np.ndarray], expected: list[str]) -> None:
-    labels = make(frame.label_image)
-    actual = codes(lambda diagnosis: check_labels(diagnosis, labels))
-    assert actual == expected or (make is interpolated and actual == ["labels-many"])
-
-
-def test_a_mask_of_touching_objects(frame: RGBDFrame) -> None:
-    """Their extents show that it is not one object."""
-    labels = np.zeros(frame.depth.shape, np.uint8)
-    labels[: labels.shape[0] * 2 // 3] = 255
-    one = change(frame, labels=labels, depth=np.full(frame.depth.shape, 1000, np.uint16))
-    assert codes(lambda diagnosis: check_depth(diagnosis, one)) == ["labels-foreground"]
-
-
-# Registration
+def test_labels(frame: RGBDFrame, make: Damage, expected: str) -> None:
+    assert_found(expected, check_labels, make(frame.label_image))
 
 
 def zoomed(image: np.ndarray, factor: float) -> np.ndarray:
@@ -234,57 +185,42 @@ def zoomed(image: np.ndarray, factor: float) -> np.ndarray:
     ("damage", "expected"),
     [
         (lambda depth: np.roll(depth, (0, 3), (0, 1)), ""),
-        (lambda depth: np.roll(depth, (0, 20), (0, 1)), "pixels left"),
-        (lambda depth: np.roll(depth, (-16, 0), (0, 1)), "pixels down"),
-        (lambda depth: np.ascontiguousarray(depth[:, ::-1]), "mirrored"),
-        (lambda depth: zoomed(depth, 1.15), "enlarged by a factor of 1.1"),
+        (lambda depth: np.roll(depth, (0, 20), (0, 1)), "registration: .*moved (19|20|21) pixels left"),
+        (lambda depth: np.roll(depth, (-16, 0), (0, 1)), "registration: .*moved (15|16|17) pixels down"),
+        (lambda depth: np.ascontiguousarray(depth[:, ::-1]), "registration: .*mirrored"),
+        (lambda depth: zoomed(depth, 1.15), "registration: .*enlarged by a factor of 1.1"),
+        (np.ones_like, ""),
+        (np.zeros_like, ""),
     ],
 )
-def test_registration(frame: RGBDFrame, damage: Callable[[np.ndarray], np.ndarray], expected: str) -> None:
-    diagnosis = Diagnosis()
-    registration.check_registration(diagnosis, frame.color, damage(frame.depth_m))
-    assert [finding.code for finding in diagnosis.findings] == (["registration"] if expected else [])
-    assert all(expected in finding.message for finding in diagnosis.findings)
-
-
-@pytest.mark.parametrize(("right", "down"), [(0, 0), (11, -5), (-48, 48)])
-def test_alignment_finds_a_known_shift(right: int, down: int) -> None:
-    rng = np.random.default_rng(0)
-    field = np.where(rng.random((130, 170)) < 0.05, np.exp(2j * rng.uniform(0, np.pi, (130, 170))), 0)
-    field[:50], field[-50:], field[:, :50], field[:, -50:] = 0, 0, 0, 0
-    alignment = registration.align_edges(field, np.roll(field, (down, right), (0, 1)))
-    assert (alignment.right, alignment.down) == (right, down) and alignment.height > 10
+def test_registration(frame: RGBDFrame, damage: Damage, expected: str) -> None:
+    assert_found(expected, check_registration, frame.color, damage(frame.depth_m))
 
 
 def test_frames_without_edges_are_not_judged() -> None:
     diagnosis = Diagnosis()
-    registration.check_registration(diagnosis, np.zeros((90, 120, 3), np.uint8), np.ones((90, 120)))
+    check_registration(diagnosis, np.zeros((90, 120, 3), np.uint8), np.ones((90, 120)))
     assert diagnosis.findings == [] and "registration" in diagnosis.notes[0]
-    registration.check_registration(diagnosis, np.zeros((90, 120, 3), np.uint8), np.zeros((90, 120)))
-    assert diagnosis.findings == []
 
 
 def test_labels_of_another_place(frame: RGBDFrame) -> None:
+    assert_found("", check_labels_alignment, frame.color, frame.label_image)
     moved = np.roll(frame.label_image, 25, axis=1)
-    assert codes(lambda d: registration.check_labels_alignment(d, frame.color, frame.label_image)) == []
-    assert codes(lambda d: registration.check_labels_alignment(d, frame.color, moved)) == ["labels-shifted"]
-
-
-# Colours
+    assert_found("labels-shifted: .*moved (24|25|26) pixels left", check_labels_alignment, frame.color, moved)
 
 
 @pytest.mark.parametrize(
     ("damage", "expected"),
     [
-        (lambda color: color, []),
-        (lambda color: color // 8, ["color-dark"]),
-        (lambda color: np.minimum(color.astype(int) * 8, 255).astype(np.uint8), ["color-bright"]),
-        (lambda color: np.repeat(color[..., :1], 3, axis=2), ["color-gray"]),
-        (lambda color: (color * [1.0, 0.7, 0.25]).astype(np.uint8), ["color-cast"]),
+        (lambda color: color, ""),
+        (lambda color: color // 8, "color-dark"),
+        (lambda color: np.minimum(color.astype(int) * 8, 255).astype(np.uint8), "color-bright"),
+        (lambda color: np.repeat(color[..., :1], 3, axis=2), "color-gray"),
+        (lambda color: (color * [1.0, 0.7, 0.25]).astype(np.uint8), "color-cast"),
     ],
 )
-def test_light(frame: RGBDFrame, damage: Callable[[np.ndarray], np.ndarray], expected: list[str]) -> None:
-    assert codes(lambda diagnosis: check_light(diagnosis, damage(frame.color), frame.labels)) == expected
+def test_light(frame: RGBDFrame, damage: Damage, expected: str) -> None:
+    assert_found(expected, check_light, damage(frame.color), frame.labels)
 
 
 def recognizer_that_prefers(color: np.ndarray, classes: tuple[str, ...] = ("mug",), n: int = 3) -> Any:
@@ -302,44 +238,32 @@ def test_exchanged_channels_are_found_by_a_model(frame: RGBDFrame) -> None:
     color = (frame.color * [1.0, 0.8, 0.4]).astype(np.uint8)
     right, wrong = change(frame, color=color), change(frame, color=np.ascontiguousarray(color[..., ::-1]))
     recognizer = recognizer_that_prefers(color)
-    assert codes(lambda diagnosis: check_channel_order(diagnosis, right, recognizer)) == []
-    assert codes(lambda diagnosis: check_channel_order(diagnosis, wrong, recognizer)) == ["bgr"]
-    dark = change(frame, color=color // 2)
-    assert codes(lambda diagnosis: check_channel_order(diagnosis, dark, recognizer)) in ([], ["color-light"])
+    assert_found("", check_channel_order, right, recognizer)
+    assert_found("bgr", check_channel_order, wrong, recognizer)
+    assert_found("$|color-light", check_channel_order, change(frame, color=color // 2), recognizer)
     for few in (recognizer_that_prefers(color, n=1), recognizer_that_prefers(color, ())):
         diagnosis = Diagnosis()
         check_channel_order(diagnosis, wrong, few)
         assert diagnosis.findings == [] and "not checked" in diagnosis.notes[0]
 
 
-# Meshes
-
-
 @pytest.mark.parametrize(
-    ("side", "scale", "expected", "factor"),
+    ("side", "scale", "expected"),
     [
-        (0.2, 1.0, [], ""),
-        (200.0, 1.0, ["mesh-unit"], "--mesh-scale 0.001"),
-        (200.0, 0.001, [], ""),
-        (20.0, 1.0, ["mesh-unit"], "--mesh-scale 0.01"),
-        (0.0002, 1.0, ["mesh-unit"], "--mesh-scale 1000"),
-        (1e9, 1.0, ["mesh-unit"], "--mesh-scale"),
+        (0.2, 1.0, ""),
+        (200.0, 1.0, "mesh-unit: .*--mesh-scale 0.001"),
+        (200.0, 0.001, ""),
+        (20.0, 1.0, "mesh-unit: .*--mesh-scale 0.01"),
+        (0.0002, 1.0, "mesh-unit: .*--mesh-scale 1000"),
+        (1e9, 1.0, "mesh-unit: .*--mesh-scale"),
     ],
 )
-def test_units_of_meshes(tmp_path: Path, side: float, scale: float, expected: list[str], factor: str) -> None:
-    diagnosis, path = Diagnosis(), write_box(tmp_path / "box.ply", (side, side / 2, side / 3))
-    sides = check_meshes(diagnosis, {"box": path}, scale)
-    assert [finding.code for finding in diagnosis.findings] == expected
-    assert all(factor in finding.advice for finding in diagnosis.findings)
-    assert sides == ({} if expected else {"box": pytest.approx(0.2)})
-
-
-def test_meshes_that_cannot_be_read(tmp_path: Path) -> None:
-    (tmp_path / "bad.ply").write_text("no mesh")
-    assert codes(lambda diagnosis: check_meshes(diagnosis, {"bad": tmp_path / "bad.ply"})) == ["mesh"]
-
-
-# Whole set-ups
+def test_units_of_meshes(tmp_path: Path, side: float, scale: float, expected: str) -> None:
+    meshes = {"box": write_box(tmp_path / "box.ply", (side, side / 2, side / 3))}
+    assert_found(expected, check_meshes, meshes, scale)
+    assert check_meshes(Diagnosis(), meshes, scale) == ({} if expected else {"box": pytest.approx(0.2)})
+    meshes["box"].write_text("no mesh")
+    assert_found("mesh: ", check_meshes, meshes, scale)
 
 
 def copy_of(folder: Path, **contents: bytes) -> FrameFiles:
@@ -364,29 +288,19 @@ def test_files_of_the_wrong_kind_are_findings(tmp_path: Path) -> None:
     assert "size" in {f.code for f in diagnose(copy_of(tmp_path, depth=half)).findings}
 
 
-def test_missing_files_are_errors(tmp_path: Path) -> None:
-    files = copy_of(tmp_path)
-    files.depth.unlink()
-    with pytest.raises(InputError, match=r"depth\.png is missing"):
-        diagnose(files)
-
-
-def options(files: FrameFiles) -> list[object]:
-    return [part for name, path in dataclasses.asdict(files).items() for part in (f"--{name}", path)]
-
-
 def test_the_command(tmp_path: Path, capfd: pytest.CaptureFixture[str], printed: Command, refused: Command) -> None:
     files = copy_of(tmp_path)
-    assert "nothing found" in printed("doctor", *options(files))
-    assert run_thor2("doctor", *options(files), "--depth-scale", 100, "--json") == 1
+    command = ("doctor", *(part for name, path in vars(files).items() for part in (f"--{name}", path)))
+    assert "nothing found" in printed(*command)
+    assert run_thor2(*command, "--depth-scale", 100, "--json") == 1
     report = json.loads(capfd.readouterr().out)
     assert [finding["code"] for finding in report["findings"]] == ["depth-unit"]
     assert "1000" in report["findings"][0]["advice"] and report["notes"]
-    assert run_thor2("doctor", *options(files), "--depth-scale", 100) == 1
+    assert run_thor2(*command, "--depth-scale", 100) == 1
     assert capfd.readouterr().out.startswith("depth-unit: ")
+    assert "mesh_scale is 0.001" in refused(*command, "--mesh-scale", 0.001)
     files.color.unlink()
-    refused("doctor", *options(files), "--json")
-    refused("doctor", *options(files), "--mesh-scale", 0.001)
+    assert f"{files.color} is missing" in refused(*command, "--json")
 
 
 def test_folders_of_frames(tmp_path: Path, capfd: pytest.CaptureFixture[str], printed: Command) -> None:
@@ -415,26 +329,6 @@ def test_folders_of_frames(tmp_path: Path, capfd: pytest.CaptureFixture[str], pr
     assert "failed: breakfast: " in err and "error: 1 of 2 frames" in err
 
 
-def test_scenes_of_bop(tmp_path: Path, printed: Command) -> None:
-    scene, frame = tmp_path / "000001", frame_files(SAMPLES / "breakfast").read()
-    k, label = frame.intrinsics, frame.instances[0]
-    for folder, name, pixels in (
-        ("rgb", "000000.png", frame.color),
-        ("depth", "000000.png", frame.depth),
-        ("mask_visib", "000000_000000.png", (frame.labels == label).astype(np.uint8)),
-    ):
-        (scene / folder).mkdir(parents=True)
-        (scene / folder / name).write_bytes(encode_image(pixels))
-    camera = {"cam_K": [k.fx, 0, k.cx, 0, k.fy, k.cy, 0, 0, 1], "depth_scale": 1000 / k.depth_scale}
-    (scene / "scene_camera.json").write_text(json.dumps({"0": camera}))
-    (scene / "scene_gt.json").write_text(json.dumps({"0": [{"obj_id": 1}]}))
-    assert [line["frame"] for line in json_lines(printed("doctor", scene, "--json"))] == ["000001/000000"]
-
-
-def test_frames_and_files_exclude_each_other(refused: Command) -> None:
-    for arguments, expected in (
-        ((), "give either FRAME"),
-        ((SAMPLES, "--color", "c.png"), "give either FRAME"),
-        (("--color", "c.png"), "--depth, --intrinsics is missing"),
-    ):
-        assert expected in refused("doctor", *arguments)
+def test_scenes_of_bop(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    assert run_thor2("doctor", write_bop(tmp_path / "000001"), "--json") == 1  # its images have few pixels
+    assert [line["frame"] for line in json_lines(capfd.readouterr().out)] == ["000001/000001"]

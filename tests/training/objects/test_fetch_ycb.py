@@ -2,18 +2,15 @@
 
 import io
 import shutil
-import socket
 import tarfile
 from collections.abc import Iterator
-from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from threading import Thread
 
 import numpy as np
 import pytest
-from helpers import run_thor2
-from PIL import Image
+from helpers import encode_image, free_port, run_thor2
 
 from thor2_jax.errors import InputError
 from training.objects.fetch_ycb import fetch_ycb
@@ -34,59 +31,51 @@ def archive(files: dict[str, bytes]) -> bytes:
 
 
 def mesh_files(folder: str = f"{NAME}/google_16k/") -> dict[str, bytes]:
-    texture = io.BytesIO()
-    Image.fromarray(np.random.default_rng(0).integers(0, 256, (64, 64, 3), np.uint8)).save(texture, "PNG")
+    texture = encode_image(np.random.default_rng(0).integers(0, 256, (64, 64, 3), np.uint8))
     material = b"newmtl m\nmap_Kd texture_map.png\n"
-    files = {"textured.mtl": material, "texture_map.png": texture.getvalue(), "textured.obj": OBJ}
+    files = {"textured.mtl": material, "texture_map.png": texture, "textured.obj": OBJ}
     return {folder + name: data for name, data in files.items()}
 
 
-class Server:
-    """What the server sends, and the values of Range that it was asked for."""
+class Server(ThreadingHTTPServer):
+    """Sends files, and keeps the values of Range that it was asked for."""
 
     def __init__(self) -> None:
-        self.files: dict[str, bytes] = {}
+        super().__init__(("127.0.0.1", 0), Handler)
+        self.files = {f"/google/{NAME}_google_16k.tgz": archive(mesh_files())}
         self.break_after: int | None = None
         self.ranges = True
         self.requests: list[str | None] = []
-        self.url = ""
+        self.url = f"http://127.0.0.1:{self.server_port}/google"
 
 
 class Handler(BaseHTTPRequestHandler):
-    def __init__(self, server: Server, *arguments: object) -> None:
-        self.state = server
-        super().__init__(*arguments)  # type: ignore[arg-type]
+    server: Server
 
     def log_message(self, *arguments: object) -> None:
         pass
 
     def do_GET(self) -> None:
-        requested = self.headers.get("Range")
-        self.state.requests.append(requested)
-        data = self.state.files.get(self.path)
-        if data is None:
-            self.send_error(404)
+        requested, data = self.headers.get("Range"), self.server.files.get(self.path)
+        self.server.requests.append(requested)
+        is_part = requested is not None and self.server.ranges
+        start = int(requested.removeprefix("bytes=").rstrip("-")) if requested and is_part else 0
+        if data is None or start >= len(data):
+            self.send_error(404 if data is None else 416)
             return
-        start = int(requested.removeprefix("bytes=").rstrip("-")) if requested and self.state.ranges else 0
-        if start >= len(data):
-            self.send_error(416)
-            return
-        self.send_response(206 if requested and self.state.ranges else 200)
+        self.send_response(206 if is_part else 200)
         self.send_header("Content-Length", str(len(data) - start))
         self.end_headers()
-        self.wfile.write(data[start : self.state.break_after])
+        self.wfile.write(data[start : self.server.break_after])
 
 
 @pytest.fixture
 def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
     monkeypatch.setenv("no_proxy", "*")
-    state = Server()
-    state.files = {f"/google/{NAME}_google_16k.tgz": archive(mesh_files())}
-    with ThreadingHTTPServer(("127.0.0.1", 0), partial(Handler, state)) as http:
-        state.url = f"http://127.0.0.1:{http.server_port}/google"
-        thread = Thread(target=partial(http.serve_forever, 0.01))
+    with Server() as http:
+        thread = Thread(target=http.serve_forever, args=(0.01,))
         thread.start()
-        yield state
+        yield http
         http.shutdown()
         thread.join()
 
@@ -121,20 +110,19 @@ def test_complete_archive_is_not_sent_again(server: Server, tmp_path: Path) -> N
     assert (tmp_path / NAME / "textured.obj").read_bytes() == OBJ
 
 
-@pytest.mark.parametrize(
-    "data",
-    [
-        archive(mesh_files())[:5000],
-        archive(mesh_files())[:-4],
-        archive(mesh_files())[:-8] + bytes(8),
-        b"<html>a page</html>",
-        archive({f"{NAME}/google_16k/nontextured.ply": b"ply"}),
-        archive(mesh_files() | {f"{NAME}/google_16k/textured.obj": b"v nonsense"}),
-    ],
-    ids=["half", "without the end", "other checksum", "a page", "no mesh", "damaged mesh"],
-)
-def test_damaged_archives_leave_nothing(server: Server, tmp_path: Path, data: bytes) -> None:
-    server.files = {f"/google/{NAME}_google_16k.tgz": data}
+DAMAGED = {
+    "half": archive(mesh_files())[:5000],
+    "without the end": archive(mesh_files())[:-4],
+    "other checksum": archive(mesh_files())[:-8] + bytes(8),
+    "a page": b"<html>a page</html>",
+    "no mesh": archive({f"{NAME}/google_16k/nontextured.ply": b"ply"}),
+    "damaged mesh": archive(mesh_files() | {f"{NAME}/google_16k/textured.obj": b"v nonsense"}),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGED)
+def test_damaged_archives_leave_nothing(server: Server, tmp_path: Path, damage: str) -> None:
+    server.files = {f"/google/{NAME}_google_16k.tgz": DAMAGED[damage]}
     with pytest.raises(InputError, match=NAME) as error:
         fetch_ycb([NAME], tmp_path, url=server.url)
     assert ".thor2" not in str(error.value)
@@ -149,19 +137,19 @@ def test_files_of_the_user_stay(server: Server, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=f"{NAME}.tgz"):
         fetch_ycb([NAME], tmp_path, url=server.url)
     assert (tmp_path / f".{NAME}.tgz").read_text() == "a user's" and (tmp_path / ".extracting-mine").is_dir()
+    (tmp_path / f".{NAME}.tgz").unlink()
+    (tmp_path / NAME).mkdir()
+    with pytest.raises(InputError, match="exists without"):
+        fetch_ycb([NAME], tmp_path, url=server.url)
 
 
 def test_archive_writes_only_into_its_folder(server: Server, tmp_path: Path) -> None:
-    evil = {
-        "../../google_16k/evil.txt": b"1",
-        "/google_16k/absolute.txt": b"2",
-        "evil.txt": b"3",
-        "google_16k/..": b"4",
-    }
+    names = ("../../google_16k/evil.txt", "/google_16k/absolute.txt", "evil.txt", "google_16k/..")
+    evil = dict.fromkeys(names, b"1")
     server.files = {f"/google/{NAME}_google_16k.tgz": archive(mesh_files() | evil)}
     fetch_ycb([NAME], tmp_path / "meshes", url=server.url)
-    names = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.txt")}
-    assert names <= {f"meshes/{NAME}/evil.txt", f"meshes/{NAME}/absolute.txt"}
+    written = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.txt")}
+    assert written <= {f"meshes/{NAME}/evil.txt", f"meshes/{NAME}/absolute.txt"}
     assert [path.name for path in tmp_path.iterdir()] == ["meshes"]
 
 
@@ -171,37 +159,14 @@ def test_unknown_objects_are_errors(server: Server, tmp_path: Path, names: list[
         fetch_ycb(names, tmp_path, url=server.url)
 
 
-@pytest.mark.parametrize(
-    "url",
-    [
-        "ftp://a",
-        "http://",
-        "http://[::1",
-        "http://a:b",
-        "http://a b",
-        "http://a..b",
-        "http://\u2100.com",
-        "http://\uff0e",
-    ],
-)
-def test_malformed_addresses_are_errors(tmp_path: Path, url: str) -> None:
-    with pytest.raises(InputError, match="expected"):
-        fetch_ycb([NAME], tmp_path, url=url)
-
-
-def test_foreign_folder_is_not_replaced(server: Server, tmp_path: Path) -> None:
-    (tmp_path / NAME).mkdir()
-    with pytest.raises(InputError, match="out"):
-        fetch_ycb([NAME], tmp_path, url=server.url)
+def test_addresses_that_cannot_be_read(tmp_path: Path) -> None:
+    for url in ("ftp://a", "http://", "http://[::1", "http://a:b", "http://a b", "http://a..b", "http://\u2100.com"):
+        with pytest.raises(InputError, match="expected"):
+            fetch_ycb([NAME], tmp_path, url=url)
+    with pytest.raises(InputError, match="network"):
+        fetch_ycb([NAME], tmp_path, url=f"http://127.0.0.1:{free_port()}")
 
 
 def test_command_shows_the_licence(server: Server, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run_thor2("fetch", "ycb", "--objects", NAME, "--out", tmp_path, "--url", server.url, "--quiet") == 0
     assert "CC BY 4.0" in capsys.readouterr().out and (tmp_path / NAME / "textured.obj").is_file()
-
-
-def test_no_network_is_an_error(tmp_path: Path) -> None:
-    with socket.socket() as closed:
-        closed.bind(("127.0.0.1", 0))
-        with pytest.raises(InputError, match="network"):
-            fetch_ycb([NAME], tmp_path, url=f"http://127.0.0.1:{closed.getsockname()[1]}")

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from helpers import input_error
 
-from thor2_jax.errors import InputError
 from training.readers.ocid import read_organized_points
 
 HEADER = (
@@ -17,7 +16,10 @@ HEADER = (
 ROWS = [(0.5 * k, -0.25 * k, float("nan") if k == 4 else 1.0 + k, 0xFF102030, k) for k in range(6)]
 POINTS = np.array([row[:3] for row in ROWS]).reshape(2, 3, 3)
 DATA = {
-    "binary": b"".join(struct.pack("<fffII", *row) for row in ROWS),
+    "binary": b"".join(struct.pack("<fffII", *row) for row in ROWS).replace(
+        struct.pack("<f", float("nan")),
+        struct.pack("<I", 0x7F800001),  # a signalling NaN
+    ),
     "ascii": "".join("{} {} {} {} {}\n".format(*row) for row in ROWS).encode(),
 }
 
@@ -58,26 +60,18 @@ def test_points_among_other_fields(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new"),
     [
-        ("DATA", "DATA any"),
         ("DATA", "DATE"),
         ("FIELDS x y z", "FIELDS x y w"),
-        ("FIELDS x y z rgba label", "FIELDS x y z"),
         ("SIZE 4", "SIZE 3"),
-        ("SIZE 4", "SIZE -4"),
         ("SIZE 4", "SIZE four"),
         ("TYPE F", "TYPE X"),
         ("TYPE F F F U U\n", ""),
         ("COUNT 1", "COUNT 2"),
         ("COUNT 1", "COUNT 0"),
-        ("COUNT 1", "COUNT -1"),
         ("COUNT 1 1 1 1 1", "COUNT 1 1 1 1 9999999999999999999999"),
-        ("COUNT 1 1 1 1 1", "COUNT 1 1 1 1 2000000000"),
         ("WIDTH 3", "WIDTH 0"),
-        ("WIDTH 3", "WIDTH -3"),
-        ("WIDTH 3", "WIDTH 3.0"),
         ("WIDTH 3", "WIDTH"),
         ("HEIGHT 2", "HEIGHT 3"),
-        ("HEIGHT 2", "HEIGHT 99999999999999999999"),
         ("HEIGHT 2\n", ""),
     ],
 )
@@ -88,25 +82,19 @@ def test_damaged_headers(tmp_path: Path, data: str, old: str, new: str) -> None:
         read_organized_points(path)
 
 
-def test_compressed_clouds_are_refused(tmp_path: Path) -> None:
-    path = write(tmp_path / "cloud.pcd", "binary", "DATA binary", "DATA binary_compressed")
-    with pytest.raises(InputError, match=r"DATA binary_compressed"):
-        read_organized_points(path)
-
-
-@pytest.mark.parametrize("data", DATA)
-@pytest.mark.parametrize("lacking", [1, 30, 10_000])
-def test_files_that_are_cut_off(tmp_path: Path, data: str, lacking: int) -> None:
+@pytest.mark.parametrize(
+    ("data", "old", "new", "expected"),
+    [
+        ("binary", b"DATA binary", b"DATA binary_compressed", "DATA binary_compressed"),
+        ("binary", b"\x05\0\0\0", b"\x05\0\0", "is cut off"),
+        ("ascii", b" 5\n", b"\n", "6 lines of 5 numbers"),
+        ("ascii", b"2.5 ", b"x ", "6 lines of 5 numbers"),
+        ("ascii", b"2.5 ", b"1 2 ", "6 lines of 5 numbers"),
+    ],
+)
+def test_damaged_data(tmp_path: Path, data: str, old: bytes, new: bytes, expected: str) -> None:
     path = write(tmp_path / "cloud.pcd", data)
-    lacking += data == "ascii"  # a missing last line break is accepted
-    path.write_bytes(path.read_bytes()[:-lacking])
-    with pytest.raises(InputError, match=r"cloud\.pcd "):
-        read_organized_points(path)
-
-
-@pytest.mark.parametrize("word", ["", "x", "1,5", "1 2"])
-def test_damaged_numbers(tmp_path: Path, word: str) -> None:
-    path = tmp_path / "cloud.pcd"
-    path.write_bytes(HEADER.format("ascii").encode() + DATA["ascii"].replace(b"2.5 ", f"{word} ".encode()))
-    with pytest.raises(InputError, match=r"cloud\.pcd .*6 lines of 5 numbers"):
+    assert path.read_bytes().count(old) == 1
+    path.write_bytes(path.read_bytes().replace(old, new))
+    with input_error(path, expected):
         read_organized_points(path)

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 import trimesh
+from helpers import input_error
 
-from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import Intrinsics, backproject
 from training.objects.builtin_objects import builtin_objects
 from training.objects.mesh import TexturedMesh
@@ -46,21 +46,15 @@ def test_frame_and_truth_agree() -> None:
 
 
 def test_seeded() -> None:
-    one, same, other = (compose_scene(OBJECTS, np.random.default_rng(seed), camera=SMALL) for seed in (3, 3, 4))
+    all_objects = {"n_objects": len(OBJECTS), "camera": SMALL}
+    one, same, other = (compose_scene(OBJECTS, np.random.default_rng(seed), **all_objects) for seed in (3, 3, 4))
     assert np.array_equal(one.frame.color, same.frame.color) and np.array_equal(one.frame.depth, same.frame.depth)
     assert one.truth == same.truth and not np.array_equal(one.frame.color, other.frame.color)
+    assert len(one.truth) > len(OBJECTS) / 2
 
 
-def test_instances_have_their_objects_colours_without_noise() -> None:
-    for scene in scenes(2, noise=0, light=0):
-        for label, name in scene.truth.items():
-            painted = {tuple(c) for texture in OBJECTS[name].textures for c in texture.reshape(-1, 3).tolist()}
-            seen = {tuple(c) for c in scene.frame.color[scene.frame.labels == label].tolist()}
-            assert seen <= painted
-
-
-def test_objects_lie_on_a_plane_in_front_of_the_camera() -> None:
-    for scene in scenes(3, noise=0):
+def test_objects_lie_on_a_plane_in_their_own_colours() -> None:
+    for scene in scenes(3, noise=0, light=0):
         depth = scene.frame.depth_m.astype(np.float64)
         points = backproject(depth, scene.frame.intrinsics)
         table = points[(scene.frame.labels == 0) & (depth > 0)]
@@ -72,19 +66,17 @@ def test_objects_lie_on_a_plane_in_front_of_the_camera() -> None:
         pitch = np.degrees(np.arcsin(-normal[2]))
         assert 24.5 < pitch < 50.5
         assert 0.5 < depth[scene.frame.labels > 0].min() < 1.3
-        for label in scene.truth:
+        for label, name in scene.truth.items():
             height = (points[scene.frame.labels == label] - middle) @ normal
             assert height.min() > -0.002 and 0.01 < height.max() < 0.25
-
-
-def test_visible_share_is_that_of_the_object_alone() -> None:
-    for seed in range(10):
-        scene = compose_scene(OBJECTS, np.random.default_rng(seed), n_objects=1, camera=SMALL)
-        assert scene.visible == {1: 1.0} and scene.occlusion(1) == "none"
+            painted = {tuple(c) for texture in OBJECTS[name].textures for c in texture.reshape(-1, 3).tolist()}
+            assert {tuple(c) for c in scene.frame.color[scene.frame.labels == label].tolist()} <= painted
 
 
 def test_degrees_of_occlusion() -> None:
-    scene = scenes(1)[0]
+    for seed in range(10):  # an object alone is not occluded
+        scene = compose_scene(OBJECTS, np.random.default_rng(seed), n_objects=1, camera=SMALL)
+        assert scene.visible == {1: 1.0} and scene.occlusion(1) == "none"
     shares = {1: 1.0, 2: 0.96, 3: 0.95, 4: 0.71, 5: 0.7, 6: 0.01}
     graded = Scene(scene.frame, scene.truth, shares)
     assert [graded.occlusion(k) for k in shares] == ["none", "none", "low", "low", "high", "high"]
@@ -159,26 +151,18 @@ def test_light_changes_colours_by_a_gain() -> None:
     assert np.ptp(gain, axis=0).max() < 0.02 and 0.6 < gain.min() <= gain.max() < 1.45
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
+def test_numbers_out_of_range_are_refused() -> None:
+    for options, message in (
         ({"n_objects": 0}, "n_objects is 0"),
         ({"n_objects": 99}, "n_objects is 99;"),
         ({"clutter": 1.5}, "clutter is 1.5"),
         ({"noise": -1.0}, "noise is -1.0"),
         ({"light": float("nan")}, "light is nan"),
-    ],
-)
-def test_numbers_out_of_range_are_refused(options: dict[str, float], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        compose_scene(OBJECTS, np.random.default_rng(0), **options)
-    with pytest.raises(InputError, match="n_objects"):
+    ):
+        with input_error(message):
+            compose_scene(OBJECTS, np.random.default_rng(0), **options)
+    with input_error("n_objects"):
         compose_scene({}, np.random.default_rng(0))
-
-
-def test_all_objects_at_once() -> None:
-    scene = compose_scene(OBJECTS, np.random.default_rng(0), n_objects=len(OBJECTS), camera=SMALL)
-    assert len(scene.truth) > len(OBJECTS) / 2
 
 
 def test_views_of_a_scene_agree_in_space() -> None:
@@ -194,5 +178,5 @@ def test_views_of_a_scene_agree_in_space() -> None:
                 middles.setdefault(name, []).append((seen.min(axis=0) + seen.max(axis=0)) / 2)
     distances = [np.linalg.norm(a - b) for of_object in middles.values() for a in of_object for b in of_object]
     assert len(distances) > len(middles) and max(distances) < 0.06
-    with pytest.raises(InputError, match="n_objects"):
+    with input_error("n_objects"):
         compose_views(OBJECTS, np.random.default_rng(2), 99)

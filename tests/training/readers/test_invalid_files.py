@@ -1,0 +1,162 @@
+"""What the dataset readers have in common: frames are read one at a time, and files that are invalid are named."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from dataset_files import K, write_bop, write_folder, write_ocid, write_uwis
+from helpers import input_error
+from PIL import Image
+
+from training.readers import BOP, OCID, FrameFolder, UWISOccluded
+from training.readers.labelled import LabelledFrames
+
+FILES = {
+    "bop": ("000049", "rgb/000001.png depth/000001.png mask_visib/000001_000000.png scene_camera.json scene_gt.json"),
+    "ocid": ("table/top/mixed/seq36", "rgb/b.png depth/b.png label/b.png pcd/b.pcd"),
+    "uwis": ("42/images", "000000_rgb.png 000000_depth.png 000000_labels.png 000000_poses.yaml"),
+    "folder": ("b", "color.png depth.png mask.png intrinsics.json labels.json"),
+}
+"""Folder and files of the second of two frames."""
+EACH_FILE = [(kind, f"{folder}/{file}") for kind, (folder, files) in FILES.items() for file in files.split()]
+OPTIONAL = ("rgb", "camera", "labels.json")
+"""Parts of the names of files without which there is no frame."""
+
+
+def write_dataset(kind: str, root: Path) -> None:
+    """Write a dataset of two frames."""
+    if kind == "bop":
+        for scene in ("000048", "000049"):
+            write_bop(root / scene, visible=[1.0, 1.0])
+        (root / "names.yaml").write_text("8: mug\n14: bowl\n")
+    elif kind == "ocid":
+        write_ocid(root, "table/bottom/mixed/seq35", "a")
+        write_ocid(root, "table/top/mixed/seq36", "b")
+        names = ["mug", "bowl", "banana"]
+        (root / "names.json").write_text(json.dumps({"seq35": names, "seq36": names}))
+    elif kind == "uwis":
+        for video in ("41", "42"):
+            write_uwis(root, video, "000000", "mug:\n  label: 1\n  pose: [1, 0, 0]\n")
+    else:
+        for name in "ab":
+            write_folder(root / name, {"labels": {"1": "mug"}})
+
+
+READERS: dict[str, Callable[[Path], LabelledFrames]] = {
+    "bop": lambda root: BOP(root, root / "names.yaml"),
+    "ocid": lambda root: OCID(root, root / "names.json"),
+    "uwis": UWISOccluded,
+    "folder": FrameFolder,
+}
+
+
+@pytest.mark.parametrize("damage", ["missing", "empty", "cut off"])
+@pytest.mark.parametrize(("kind", "file"), EACH_FILE)
+def test_frames_before_a_damaged_file_are_read(kind: str, file: str, damage: str, tmp_path: Path) -> None:
+    write_dataset(kind, tmp_path)
+    path, whole = tmp_path / file, READERS[kind](tmp_path)
+    assert path in whole.files(1) and all(each.is_file() for each in whole.files(1))
+    content = path.read_bytes()
+    path.unlink()
+    if damage != "missing":
+        path.write_bytes(content[: 0 if damage == "empty" else int(0.4 * len(content))])
+    elif any(part in file for part in OPTIONAL):
+        return
+    frames = iter(READERS[kind](tmp_path))
+    assert next(frames).identifier == whole.identifiers[0]
+    name = file.partition("/")[0]
+    with input_error(path, match=rf"^{name}.* is missing$" if damage == "missing" else f"^{name}"):
+        next(frames)
+
+
+@pytest.mark.parametrize(
+    ("kind", "file"),
+    [
+        ("bop", "000049/depth/000001.png"),
+        ("bop", "000049/mask_visib/000001_000000.png"),
+        ("ocid", "table/top/mixed/seq36/depth/b.png"),
+        ("uwis", "42/images/000000_depth.png"),
+    ],
+)
+def test_images_of_different_sizes(kind: str, file: str, tmp_path: Path) -> None:
+    write_dataset(kind, tmp_path)
+    Image.fromarray(np.zeros((5, 9), np.uint16 if "depth" in file else np.uint8)).save(tmp_path / file)
+    with input_error("(5, 9)", "(6, 9)"):
+        READERS[kind](tmp_path)[1]
+
+
+@pytest.mark.parametrize("kind", FILES)
+def test_paths_that_are_not_a_dataset(kind: str, tmp_path: Path) -> None:
+    (tmp_path / "empty" / "41" / "images").mkdir(parents=True)
+    (tmp_path / "file").touch()
+    for name, expected in (("absent", "is not a directory"), ("file", "is not a directory"), ("empty", "has no ")):
+        with input_error(f"{tmp_path / name} {expected}", match="^(dataset|frames): "):
+            READERS[kind](tmp_path / name)
+
+
+def camera(**changes: Any) -> dict[str, Any]:
+    return {"1": {"cam_K": K, "depth_scale": 0.1, **changes}}
+
+
+def vlg_item(answer: Any = 3, target: str = "mug", file: str = "seq36,b.png") -> dict[str, Any]:
+    return {"image_filename": file, "answer": answer, "target": target}
+
+
+@pytest.mark.parametrize(
+    ("kind", "file", "content", "expected"),
+    [
+        ("bop", "names.yaml", "8: mug\n", "obj_id 14"),
+        ("bop", "names.yaml", "[mug]", ""),
+        ("bop", "names.yaml", "8.0: mug", "8.0 is 'mug'"),
+        ("bop", "names.yaml", "8: 7", "8 is 7"),
+        ("bop", "names.yaml", "8: ''", "8 is ''"),
+        *(("bop", f"000049/scene_{name}.json", "[]", "") for name in ("camera", "gt", "gt_info")),
+        *(("bop", f"000049/scene_{name}.json", {"2": []}, "no image 1") for name in ("camera", "gt", "gt_info")),
+        *(("bop", f"000049/scene_{name}.json", {"1": 7}, "entry is not") for name in ("camera", "gt", "gt_info")),
+        *(("bop", f"000049/scene_{name}.json", {"1": [{}]}, "entry is not") for name in ("camera", "gt", "gt_info")),
+        ("bop", "000049/scene_camera.json", camera(cam_K=K[:8]), "intrinsics is ["),
+        ("bop", "000049/scene_camera.json", camera(depth_scale=0), "depth_scale is 0"),
+        ("bop", "000049/scene_camera.json", camera(depth_scale="0.1"), "depth_scale is '0.1'"),
+        ("bop", "000049/scene_gt.json", {"1": [{"obj_id": 14.0}, {"obj_id": 8}]}, "obj_id is 14.0"),
+        ("bop", "000049/scene_gt.json", {"1": [{"obj_id": True}, {"obj_id": 8}]}, "obj_id is True"),
+        ("bop", "000049/scene_gt_info.json", {"1": [{"visib_fract": None}] * 2}, "visib_fract is None"),
+        ("bop", "000049/scene_gt_info.json", {"1": [{"visib_fract": 1}]}, "1 instances in image 1"),
+        ("ocid", "names.json", "[", "is damaged"),
+        ("ocid", "names.json", "7", "holds a int"),
+        ("ocid", "names.json", {}, "lacks the sequences table/bottom/mixed/seq35, table/top/mixed/seq36"),
+        ("ocid", "names.json", {"seq35": "mug"}, "seq35 is 'mug';"),
+        ("ocid", "names.json", {"seq35": ["mug", 7]}, "seq35 is ['mug', 7];"),
+        ("ocid", "names.json", {"seq35": [""]}, "seq35 is [''];"),
+        ("ocid", "names.json", [], "lists no frame"),
+        ("ocid", "names.json", [vlg_item(file="seq99,b.png")], "lists no frame"),
+        ("ocid", "names.json", [{"image_filename": "seq36,b.png", "answer": 3}], "item 0 is"),
+        ("ocid", "names.json", [vlg_item(), vlg_item(target="")], "item 1 is"),
+        ("ocid", "names.json", [vlg_item("mug")], "item 0 is"),
+        ("ocid", "names.json", [vlg_item(True)], "item 0 is"),
+        ("ocid", "names.json", [vlg_item(file="seq36")], "item 0 is"),
+        ("ocid", "names.json", [7], "item 0 is 7"),
+        ("ocid", "names.json", [vlg_item(), vlg_item(target="bowl")], "the names 'mug' and 'bowl'"),
+        ("uwis", "42/images/000000_poses.yaml", "mug: {label: 1", "does not hold"),
+        ("uwis", "42/images/000000_poses.yaml", "- mug\n", "does not hold"),
+        ("uwis", "42/images/000000_poses.yaml", "mug: 1\n", "does not hold"),
+        ("uwis", "42/images/000000_poses.yaml", "mug: {pose: [1, 2, 3]}\n", "does not hold"),
+        ("uwis", "42/images/000000_poses.yaml", "mug: {label: [1]}\n", "'mug' has the label [1]"),
+        ("uwis", "42/images/000000_poses.yaml", "mug: {label: true}\n", "'mug' has the label True"),
+        ("uwis", "42/images/000000_poses.yaml", "12: {label: 1}\n", "12 has the label 1"),
+        ("uwis", "42/images/000000_poses.yaml", "a: {label: 1}\nb: {label: 1}\n", "'a' and 'b'"),
+        ("folder", "b/labels.json", {}, "is invalid"),
+        ("folder", "b/labels.json", {"labels": ["mug"]}, "is invalid"),
+        ("folder", "b/labels.json", {"labels": {"1.0": "mug"}}, "is invalid"),
+        ("folder", "b/labels.json", {"labels": {"1": None}}, "name None"),
+        ("folder", "b/labels.json", {"labels": {"1": "mug", "01": "bowl"}}, "'mug' and 'bowl'"),
+        ("folder", "b/labels.json", {"labels": {"7": "mug", "200": "can"}}, "has the labels 7, 200, but"),
+    ],
+)
+def test_invalid_tables(kind: str, file: str, content: Any, expected: str, tmp_path: Path) -> None:
+    write_dataset(kind, tmp_path)
+    (tmp_path / file).write_text(content if isinstance(content, str) else json.dumps(content))
+    with input_error(tmp_path / file, expected):
+        list(READERS[kind](tmp_path))
