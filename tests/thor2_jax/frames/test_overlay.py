@@ -155,6 +155,16 @@ def test_long_names_shrink_to_fit(tmp_path: Path, boxes: list) -> None:
     assert text.startswith("an_object_of_long_name 0.76") and 0 <= left < right < 160
 
 
+def test_sizes_scale_with_the_image(tmp_path: Path, boxes: list) -> None:
+    for scale in (1, 3):
+        labels = discs([(240 * scale, 320 * scale)], 60 * scale, (480 * scale, 640 * scale))
+        picture = drawn(photo(*labels.shape), labels, [named(1)], tmp_path / f"{scale}.png")
+        line = (picture[240 * scale] == COLORS[0]).all(axis=1)[200 * scale : 290 * scale]
+        assert line.sum() == round(800 * scale / 350)
+    heights = [bottom - top for (_, top, _, bottom), _ in boxes]
+    assert heights[1] > 1.8 * heights[0]
+
+
 def test_no_answers_give_the_photo(tmp_path: Path) -> None:
     color = np.random.default_rng(0).integers(0, 256, (31, 17, 3), dtype=np.uint8)
     assert np.array_equal(drawn(color, np.ones((31, 17), np.int64), [], tmp_path / "a.png"), color)
