@@ -80,12 +80,6 @@ def test_aligned_clouds_against_numpy(name: str) -> None:
     assert descriptors.tops2.dtype == jnp.float32
 
 
-def test_persistence_beyond_the_image_is_counted() -> None:
-    points = np.array([[0.01, 0, 0.05], [0.01, 0.7, 0.05], [0.03, 0, 0.05], [0.03, 0.8, 0.05]], np.float32)
-    clouds = thor2.PointClouds.pack([(points, np.zeros((4, 3), np.uint8))])
-    assert thor2.describe_aligned(clouds, NETWORK, CLOSED).overflow.tolist() == [1]
-
-
 def test_describe_equals_its_steps() -> None:
     clouds = thor2.PointClouds.pack([camera_cloud(k) for k in range(3)])
     whole = thor2.describe(clouds, NETWORK, CLOSED)
@@ -95,18 +89,6 @@ def test_describe_equals_its_steps() -> None:
         thor2.describe_strips(thor2.strips(aligned, NETWORK, CLOSED), NETWORK, CLOSED),
     ):
         np.testing.assert_array_equal(whole.tops2, by_steps.tops2)
-
-
-def test_empty_clouds_give_zeros_and_do_not_affect_others() -> None:
-    empty, cloud = (np.zeros((0, 3)), np.zeros((0, 3))), camera_cloud(0)
-    config = thor2.DescriptorConfig()
-    with_empty = thor2.describe(thor2.PointClouds.pack([empty, cloud, empty]), NETWORK, config)
-    without_empty = thor2.describe(thor2.PointClouds.pack([cloud, cloud, camera_cloud(1)]), NETWORK, config)
-    np.testing.assert_array_equal(with_empty.tops2[0], 0)
-    np.testing.assert_array_equal(with_empty.tops2[2], 0)
-    assert with_empty.overflow.tolist()[::2] == [0, 0]
-    np.testing.assert_array_equal(with_empty.tops2[1], without_empty.tops2[0])
-    np.testing.assert_array_equal(with_empty.tops2[1], without_empty.tops2[1])
 
 
 def test_batches_in_chunks(monkeypatch: pytest.MonkeyPatch) -> None:

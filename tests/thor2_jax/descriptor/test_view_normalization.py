@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
-from helpers import DEGENERATE, slow
+from helpers import DEGENERATE
 from scipy.spatial.transform import Rotation
 
 import thor2_jax as thor2
@@ -63,31 +63,6 @@ def test_a_rotation_and_a_shift_of_cloud_and_camera(seed: int) -> None:
     assert after[:, 0].mean() <= sides[0] / 2  # sign rule
 
 
-@pytest.mark.parametrize("seed", range(8))
-def test_a_rigid_motion_of_cloud_and_camera_changes_nothing(seed: int) -> None:
-    points, camera = object_cloud(seed), np.array([0.3, -0.1, 0.05])
-    motion, shift = Rotation.random(random_state=100 + seed).as_matrix(), np.array([-0.3, 0.2, 0.6])
-    moved = normalized(points @ motion.T + shift, camera=camera @ motion.T + shift)
-    np.testing.assert_allclose(moved, normalized(points, camera=camera), atol=5e-6)
-
-
-@pytest.mark.parametrize("seed", [0, *slow(1, 2, 3)])
-def test_order_duplicates_and_other_clouds_change_nothing(seed: int) -> None:
-    points = object_cloud(seed)
-    expected = normalized(points)
-    order = np.random.default_rng(seed).permutation(len(points))
-    np.testing.assert_allclose(normalized(points[order]), expected[order], atol=5e-6)
-    doubled = np.concatenate([points, points])
-    np.testing.assert_allclose(normalized(doubled)[: len(points)], expected, atol=5e-6)
-    batch = thor2.view_normalize(pack(*among_others(points)), CONFIG)
-    np.testing.assert_allclose(batch.points[2, : len(points)], expected, atol=5e-6)
-
-
-def test_padding_changes_nothing() -> None:
-    points = object_cloud(0)
-    np.testing.assert_allclose(normalized(points, capacity=1024), normalized(points), atol=5e-6)
-
-
 def test_padding_stays_zero_and_an_empty_cloud_stays_empty() -> None:
     points = object_cloud(0)
     for step in (thor2.view_normalize, thor2.align):
@@ -119,19 +94,6 @@ def test_the_camera_side_is_relative_to_the_middle_of_the_box(height: float, hea
     points[:400, 2] = 0 if heavy == "below" else 0.1
     normal = thor2.view_normalize(pack(points, camera=np.array([1, 0.15, height])), CONFIG)
     assert float(normal.camera[0, 2]) <= float(normal.points[0, : len(points), 2].max()) / 2
-
-
-def test_the_camera_is_on_the_near_side() -> None:
-    """One cloud with the camera on opposite sides differs by a rotation by pi about x."""
-    points = object_cloud(3)
-    normal = thor2.view_normalize(pack(points), CONFIG)
-    after = np.asarray(normal.points[0, : len(points)], np.float64)
-    rotation, shift, _ = rigid_motion(points * 2.5, after)
-    sides = after.max(axis=0)
-    opposite = np.array([sides[0] / 2, sides[1] / 2, 3.0])  # far out along +z of the normalized cloud
-    other = normalized(points, camera=(opposite - shift) @ rotation.T / 2.5)
-    expected = np.stack([after[:, 0], sides[1] - after[:, 1], sides[2] - after[:, 2]], axis=1)
-    np.testing.assert_allclose(other, expected, atol=1e-5)
 
 
 @pytest.mark.parametrize(("at_start", "at_end"), [(3, 2), (1, 0), (2, 2), (0, 0), (2, 3), (0, 5)])
@@ -191,27 +153,9 @@ def test_mirror_keeps_the_box(axes: str) -> None:
         np.testing.assert_array_equal(after[:, k], expected)
     np.testing.assert_array_equal(np.asarray(mirrored.points[2])[~mask], 0)
     np.testing.assert_array_equal(mirrored.points[1], 0)
-    np.testing.assert_array_equal(thor2.mirror(mirrored, axes).mask, normal.mask)
-
-
-def test_mirror_refuses_another_axis() -> None:
-    with pytest.raises(thor2.InputError, match="axes is 'xw'"):
-        thor2.mirror(thor2.view_normalize(pack(object_cloud(1)), CONFIG), "xw")
-
-
-def test_gradients_are_those_of_the_fixed_frame() -> None:
-    """No gradient goes through the frame: that of a point is the rotation, which is finite for a cube as well."""
-
-    @jax.jit
-    @jax.grad
-    def gradient_of_height(x: jax.Array, clouds: thor2.PointClouds) -> jax.Array:
-        return thor2.view_normalize(dataclasses.replace(clouds, points=x), CONFIG).points[0, :, 2].sum()
-
-    for points in (object_cloud(4, 60), DEGENERATE["cube"]):
-        clouds = pack(points)
-        gradient = np.asarray(gradient_of_height(clouds.points, clouds))
-        assert np.isfinite(gradient).all() and np.abs(gradient).max() > 0
-        np.testing.assert_allclose(gradient[0, : len(points)].sum(axis=0), 0, atol=1e-3)  # invariant to shifts
+    np.testing.assert_array_equal(mirrored.mask, normal.mask)
+    with pytest.raises(thor2.InputError, match=f"axes is '{axes}w'"):
+        thor2.mirror(normal, f"{axes}w")
 
 
 def test_large_batches_of_small_rotations_are_exact() -> None:
