@@ -49,8 +49,6 @@ def test_the_expected_entropy_is_a_mean_over_classes() -> None:
     np.testing.assert_allclose(chosen.expected, p @ [entropy(row) for row in posteriors], rtol=1e-6)
     views = ViewTable(np.zeros(1, int), rotation[None], np.array([[0.6, 0.4]]))
     without = next_view([0.0, 1.0], CENTRE, np.eye(4), [np.eye(4)], views)
-        [0.0, 1.0], CENTRE, np.eye(4), [np.eye(4)], ViewTable(np.zeros(1, int), rotation[None], p[None])
-    )
     np.testing.assert_allclose(without.expected, without.entropy)  # no view of the only plausible class
 
 
