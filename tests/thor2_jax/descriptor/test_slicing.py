@@ -96,12 +96,3 @@ def test_levels_past_twice_the_slices_overflow_if_released() -> None:
     for far, number in ((1.3, 1), (1.4, 14)):
         i, _ = released_indices(np.array([[0.1, 0.1, 0], [0.1, 0.1, far]], np.float32), np.ones(2, bool))
         np.testing.assert_array_equal(i, [0, number])
-
-
-def test_points_outside_on_every_side_are_counted() -> None:
-    far = [[1e12, 0, 0], [0, 0, 1e12], [3e38, 3e38, 3e38], [-0.5, 0, 0], [0, 0, -0.5], [0.7751, 0, 0], [0, 0, 0.7001]]
-    points = np.array([[0.01, 0.2, 0.01], *far], np.float32)
-    strips = thor2.strips(thor2.PointClouds.pack([(points, np.zeros(points.shape))]), NETWORK, PAPER)
-    assert int(strips.overflow[0]) == len(far)
-    np.testing.assert_array_equal(np.argwhere(np.asarray(strips.occupied)), [[0, 0, 0]])
-    assert float(strips.color.sum()) == pytest.approx(1)

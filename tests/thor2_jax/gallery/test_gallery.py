@@ -12,7 +12,6 @@ from thor2_jax.gallery.clouds import CompactClouds
 from thor2_jax.gallery.gallery import Gallery, GalleryObject
 from thor2_jax.gallery.references import BACKGROUND, References
 from thor2_jax.gallery.search import CHUNK, ExactSearch, IndexSearch
-from thor2_jax.gallery.union import ClassUnion
 
 
 def unit(values: np.ndarray) -> np.ndarray:
@@ -102,34 +101,6 @@ def test_views_of_classes_count_against_objects_and_for_their_own(gallery: Galle
     background = dataclasses.replace(other, references=relabelled)
     # The mean of the counts regularizes each class and the background alike.
     np.testing.assert_allclose(forgotten.scores(queries), background.scores(queries), atol=1e-6)
-
-
-@pytest.mark.parametrize("count", [1, 10, 100])
-def test_other_names_keep_their_confidence_after_enrolments(count: int) -> None:
-    """Objects of a trained class lose at most .02, and enrolled ones are recognized, look-alikes among them."""
-    size, classes = 128, (("a", 0), ("b", 1), ("c", 2))
-    rng = np.random.default_rng(0)
-
-    def near(center: int, n: int, seed: int) -> np.ndarray:
-        return views_around(center, n, size=size, seed=seed)
-
-    label = np.repeat([0, 1, 2, BACKGROUND], [12, 12, 12, 40]).astype(np.int32)
-    views = [near(k, 12, 2) for _, k in classes] + [unit(rng.normal(size=(40, size))).astype(np.float16)]
-    gallery = Gallery("f", references=References(np.concatenate(views), label, tuple(name for name, _ in classes)))
-    for number in range(count):
-        # Each third object resembles a class: half of its direction is that of the class.
-        shared = near(number % 3, 6, 3) if number % 3 == 0 else 0
-        embeddings = unit(shared + near(10 + number, 6, 3)).astype(np.float16)
-        gallery = gallery.with_object(f"{number}", dataclasses.replace(enrolled(0), embeddings=embeddings))
-    union = ClassUnion(tuple(name for name, _ in classes), gallery.names)
-    trained = np.concatenate([near(k, 5, 7) for _, k in classes]).astype(np.float32)
-    confident = np.repeat(np.eye(3) * 0.95 + 0.01, 5, axis=0)
-    after = union.combine(confident, gallery.scores(trained))
-    np.testing.assert_allclose(after[:, :3].max(axis=1), confident.max(axis=1), atol=0.02)
-    shared = near(0, 5, 8)
-    queries = unit(shared + near(10, 5, 8)).astype(np.float32)
-    unsure = union.combine(np.full((5, 3), 0.2), gallery.scores(queries))
-    assert (unsure.argmax(axis=1) == union.names.index("0")).all()
 
 
 def test_scores_use_one_thread_of_linear_algebra(gallery: Gallery, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -55,17 +55,3 @@ def test_jax_arrays_are_fused_as_numpy_arrays(rule: FusionRule, n: int) -> None:
     # Compiled functions get the classifiers in the order of their names.
     expected = fused_probabilities(dict(sorted(rows.items())), rule)
     np.testing.assert_allclose(fused, expected, rtol=1e-5, atol=1e-7)
-
-
-@pytest.mark.parametrize("rule", FUSION_RULES)
-def test_fusion_has_gradients(rule: FusionRule) -> None:
-    first, second = np.array([[0.2, 0.5, 0.3]], np.float32), np.array([[0.1, 0.3, 0.6]], np.float32)
-
-    def value(change: np.ndarray) -> float:
-        return float(np.log(fused_probabilities({"a": first + change, "b": second}, rule))[0, 1])
-
-    fused = lambda p: jnp.log(fused_probabilities({"a": p, "b": jnp.asarray(second)}, rule))[0, 1]  # noqa: E731
-    gradient = jax.jit(jax.grad(fused))
-    steps = 1e-3 * np.eye(3)[:, None]
-    differences = [(value(step) - value(-step)) / 2e-3 for step in steps]
-    np.testing.assert_allclose(gradient(first)[0], differences, atol=1e-2)
