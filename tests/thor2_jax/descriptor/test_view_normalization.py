@@ -114,6 +114,17 @@ def test_large_batches_of_small_rotations_are_exact() -> None:
     np.testing.assert_allclose(jax.jit(kernel)(rows[:32_769])[-1], 32_768.0**2, rtol=0)
 
 
-def test_mirror_refuses_another_axis() -> None:
-    with pytest.raises(thor2.InputError, match="axes is 'xw'"):
-        thor2.mirror(thor2.view_normalize(pack(object_cloud(1)), CONFIG), "xw")
+@pytest.mark.parametrize("axes", ["", "x", "y", "xy", "xyz"])
+def test_mirror_keeps_the_box(axes: str) -> None:
+    normal = thor2.view_normalize(pack(*among_others(object_cloud(1))), CONFIG)
+    mirrored = thor2.mirror(normal, axes)
+    mask = np.asarray(normal.mask[2])
+    before, after = np.asarray(normal.points[2])[mask], np.asarray(mirrored.points[2])[mask]
+    for k, letter in enumerate("xyz"):
+        expected = before[:, k].max() - before[:, k] if letter in axes else before[:, k]
+        np.testing.assert_array_equal(after[:, k], expected)
+    np.testing.assert_array_equal(np.asarray(mirrored.points[2])[~mask], 0)
+    np.testing.assert_array_equal(mirrored.points[1], 0)
+    np.testing.assert_array_equal(mirrored.mask, normal.mask)
+    with pytest.raises(thor2.InputError, match=f"axes is '{axes}w'"):
+        thor2.mirror(normal, f"{axes}w")

@@ -236,6 +236,23 @@ def test_attributions_are_complete(
     assert gradients.mean(axis=0).sum() == pytest.approx(slope, rel=0.1, abs=0.02)
 
 
+def test_weightless_points_are_left_out(instance: PreparedInstance) -> None:
+    config = dataclasses.replace(SMALL_CONFIG, relaxation=RELAXATION)
+    aligned = thor2.align(pack_instances([instance], 1), config)
+    cloud = jax.tree.map(lambda a: a[0], aligned)
+    some = jnp.arange(len(cloud.mask)) % 3 > 0
+    sets, overflow = region_sets(NETWORK), jnp.zeros((), jnp.int32)
+
+    @jax.jit
+    def both(some: jax.Array) -> tuple[thor2.Strips, thor2.Strips]:
+        arguments = cloud.points.T, cloud.colors
+        weighted = relaxed_strips(*arguments, cloud.mask, sets, config, overflow, some.astype(jnp.float32))
+        return weighted, relaxed_strips(*arguments, cloud.mask & some, sets, config, overflow)
+
+    weighted, masked = both(some)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), weighted, masked)
+
+
 def test_points_of_the_decisive_color_are_found(instance: PreparedInstance, red: ClassScores) -> None:
     cloud = red.orient(instance)
     attributions = attribute_points(red, cloud, instance, 1)
