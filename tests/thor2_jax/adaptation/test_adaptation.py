@@ -15,6 +15,7 @@ from thor2_jax.adaptation.color_transform import ColorTransform, transform_color
 from thor2_jax.adaptation.estimate import (
     EVIDENCE,
     GRID,
+    MIN_INSTANCES,
     PRIOR,
     adaptation_criterion,
     estimate_transform,
@@ -110,6 +111,13 @@ def test_the_posterior_mean_weighs_evidence_and_prior() -> None:
     totals = np.random.default_rng(0).uniform(0, 3, len(GRID))
     weights = np.exp(-EVIDENCE * totals) * np.exp(-0.5 * (GRID[:, 3] / PRIOR) ** 2)
     np.testing.assert_allclose(posterior_mean(totals), (weights[:, None] * GRID).sum(axis=0) / weights.sum())
+
+
+def test_too_few_instances_are_refused_with_their_number() -> None:
+    unusable = PreparedInstance(1, *(getattr(instances(1)[0], n)[:0] for n in ("points", "colors", "boundary")))
+    few = [*instances(MIN_INSTANCES - 1), dataclasses.replace(unusable, reason="too few points")]
+    with pytest.raises(thor2.InputError, match=f"9 usable instances; expected at least {MIN_INSTANCES}"):
+        estimate_transform(few, Criterion(run().network, run().config, none_is_known))
 
 
 def test_instances_are_spread_evenly() -> None:
