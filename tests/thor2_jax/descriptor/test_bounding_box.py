@@ -1,11 +1,9 @@
 """Bounding boxes against rectangles (OpenCV), hulls (SciPy), an exhaustive search (trimesh) and known boxes."""
 
 import itertools
-from collections.abc import Callable
 
 import cv2
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
@@ -13,7 +11,7 @@ from helpers import DEGENERATE
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from thor2_jax.descriptor.bounding_box import ROWS, _minimum_area_angle, argmax, fold, minimal_box, support_points
+from thor2_jax.descriptor.bounding_box import _minimum_area_angle, argmax, minimal_box, support_points
 
 compiled_box, compiled_support = jax.jit(minimal_box), jax.jit(support_points)
 
@@ -63,13 +61,9 @@ def test_axes_of_degenerate_clouds_are_orthonormal(name: str) -> None:
     axes, sides = box_of(CLOUDS[name])
     np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-5)
     assert sides[0] >= sides[1] - 1e-5 and sides[1] >= sides[2] - 1e-5
-
-
-def test_the_boxes_of_a_line_a_plane_and_a_cube() -> None:
-    np.testing.assert_allclose(box_of(DEGENERATE["line"])[1], [0.2 * np.sqrt(6), 0, 0], atol=1e-5)
-    assert box_of(DEGENERATE["plane"])[1][2] < 1e-5
-    turned = DEGENERATE["cube"] @ Rotation.from_euler("xyz", [0.3, 0.5, 0.7]).as_matrix().T
-    assert np.prod(box_of(turned)[1]) <= 0.2**3 * 1.05
+    if len(CLOUDS[name]):
+        rank = np.linalg.matrix_rank(CLOUDS[name] - CLOUDS[name].mean(axis=0), tol=1e-6)
+        np.testing.assert_allclose(sides[rank:], 0, atol=1e-5)
 
 
 @pytest.mark.parametrize("seed", range(10))
@@ -116,18 +110,6 @@ def test_support_points_are_vertices_of_the_hull() -> None:
             assert {tuple(cloud[k].tolist()) for k in (cloud[:, axis].argmin(), cloud[:, axis].argmax())} <= chosen
 
 
-def test_support_points_of_an_empty_cloud() -> None:
-    np.testing.assert_array_equal(compiled_support(np.zeros((3, 16), np.float32)), np.zeros((3, 66)))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("capacity", [528, 1024])
-def test_padding_does_not_change_the_box(capacity: int) -> None:
-    points = shapes()[1]
-    axes = np.asarray(compiled_box(padded(points, capacity))[0], np.float64)
-    np.testing.assert_allclose(np.abs(axes @ box_of(points)[0].T), np.eye(3), atol=1e-4)
-
-
 def test_a_mirrored_projection_has_the_opposite_angle() -> None:
     """The signs of the initial frame of the search therefore do not matter."""
     minimum_area_angle = jax.jit(_minimum_area_angle)
@@ -138,66 +120,14 @@ def test_a_mirrored_projection_has_the_opposite_angle() -> None:
         assert float(minimum_area_angle(xy * np.array([[1], [-1]], np.float32))) == pytest.approx(-angle, abs=1e-6)
 
 
-def numbers(*shape: int, seed: int = 0) -> np.ndarray:
-    return np.random.default_rng(seed).normal(size=shape).astype(np.float32)
-
-
-@pytest.mark.parametrize("length", [16, 48])
-def test_fold_combines_entries_a_row_apart(length: int) -> None:
-    values = numbers(2, length)
-    expected = values.astype(np.float64).reshape(2, ROWS, length // ROWS)
-    for op, oracle in ((jnp.add, np.sum), (jnp.minimum, np.min)):
-        folded = jax.jit(fold, static_argnums=1)(values, op)
-        assert folded.shape == (2, length // ROWS)
-        np.testing.assert_allclose(folded, oracle(expected, axis=1), atol=1e-5)
-
-
-@pytest.mark.parametrize("length", [1, 15, 17, 47])
-def test_lengths_that_are_not_multiples_are_rejected(length: int) -> None:
-    with pytest.raises(TypeError):
-        fold(jnp.zeros((2, length)), jnp.add)
-
-
-FEW = (*range(1, 21), 24, 32, 33, 40, 48, 64, 66, 80, 96, 112, 127, 128, 130)
-"""Lengths that can be halved 0 to 4 times, to odd and to even ones."""
-
-
-@pytest.fixture(scope="module", params=[FEW, pytest.param(range(1, 131), marks=pytest.mark.slow)], ids=["few", "all"])
-def argmaxes(request: pytest.FixtureRequest) -> Callable[[np.ndarray], dict[int, np.ndarray]]:
-    """Map a length to `argmax` over that many first entries of each row of an [8, 130] array, compiled together."""
-    compiled = jax.jit(lambda values: {length: argmax(values[:, :length]) for length in request.param})
-    return lambda values: {length: np.asarray(index) for length, index in compiled(values).items()}
-
-
-def test_argmax_of_any_length(argmaxes: Callable[[np.ndarray], dict[int, np.ndarray]]) -> None:
-    values = numbers(8, 130)
-    for length, index in argmaxes(values).items():
-        assert index.shape == (8,) and index.dtype == np.int32
-        np.testing.assert_array_equal(index, values[:, :length].argmax(axis=1))
-
-
-def test_argmax_in_every_place(argmaxes: Callable[[np.ndarray], dict[int, np.ndarray]]) -> None:
-    for start in range(0, 123, 8):
-        values, place = np.full((8, 130), -np.inf, np.float32), start + np.arange(8)
-        values[np.arange(8), place] = -3.0
-        for length, index in argmaxes(values).items():
-            np.testing.assert_array_equal(index[place < length], place[place < length])
-            assert (0 <= index).all() and (index < length).all()
-
-
-def test_argmax_of_ties_is_one_of_them(argmaxes: Callable[[np.ndarray], dict[int, np.ndarray]]) -> None:
-    values = np.random.default_rng(1).integers(0, 3, (8, 130)).astype(np.float32)
-    values[0], values[1] = 0, -np.inf
-    for length, index in argmaxes(values).items():
+def test_argmax_of_any_length() -> None:
+    """The lengths can be halved 0 to 4 times, to odd and to even ones; entries differ, or are equal but for one."""
+    lengths = (*range(1, 21), 24, 32, 33, 40, 48, 64, 66, 80, 96, 112, 127, 128, 130)
+    rng = np.random.default_rng(0)
+    rows = rng.normal(size=(8, 130)), rng.integers(0, 3, (8, 130)), np.full((1, 130), -np.inf), np.eye(130)
+    values = np.concatenate(rows).astype(np.float32)
+    indices = jax.jit(lambda values: {length: argmax(values[:, :length]) for length in lengths})(values)
+    for length, index in indices.items():
+        assert index.shape == (len(values),) and index.dtype == np.int32
         assert (0 <= index).all() and (index < length).all()
-        np.testing.assert_array_equal(values[np.arange(8), index], values[:, :length].max(axis=1))
-
-
-def test_argmax_under_vmap_and_without_other_axes() -> None:
-    values = numbers(2, 3, 66)
-    compiled = jax.jit(lambda x: (argmax(x), jax.vmap(argmax)(x), jax.vmap(jax.vmap(argmax))(x), argmax(x[1, 2])))
-    *indices, last = compiled(values)
-    for index in indices:
-        np.testing.assert_array_equal(index, values.argmax(axis=-1))
-    assert last.shape == () and int(last) == values[1, 2].argmax()
-    assert int(argmax(jnp.asarray([3.0, 5.0, 4.0]))) == 1  # not compiled
+        np.testing.assert_array_equal(values[np.arange(len(values)), index], values[:, :length].max(axis=1))

@@ -16,11 +16,10 @@ def clouds_of(count: int, capacity: int) -> thor2.PointClouds:
 
 
 @pytest.mark.parametrize(("capacity", "size"), [(1, 64), (512, 64), (2048, 64), (4096, 32), (8192, 16), (2**18, 1)])
-def test_chunks_have_few_points(capacity: int, size: int) -> None:
+def test_chunks_have_few_points_except_on_accelerators(
+    capacity: int, size: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert chunk_size(clouds_of(2, capacity)) == size
-
-
-def test_accelerators_use_a_single_chunk(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert chunk_size(clouds_of(300, 1)) == 300
 

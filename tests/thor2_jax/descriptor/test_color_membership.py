@@ -2,7 +2,6 @@
 
 import jax
 import numpy as np
-import pytest
 from helpers import as_8_bit
 
 import colornet
@@ -14,13 +13,6 @@ NETWORK = colornet.load_default()
 def weights(colors: np.ndarray) -> np.ndarray:
     sets = region_sets(NETWORK)
     return np.asarray(sets.weights[jax.jit(color_sets)(colors, sets)])
-
-
-@pytest.mark.parametrize("n", [0, 1, 2, 9999])
-def test_eight_bit_colours(n: int) -> None:
-    rgb = np.random.default_rng(n).integers(0, 256, (n, 3), dtype=np.uint8)
-    region_weights = weights(rgb.astype(np.float32) / np.float32(255))
-    np.testing.assert_array_equal(region_weights, NETWORK.membership(rgb))
 
 
 def test_every_level_of_a_channel_and_every_half_between_two() -> None:

@@ -41,14 +41,7 @@ many = describe_sharded(shard_clouds(packed, batch_mesh()), network, config)
 assert len(many.images.sharding.device_set) == 8
 worst = max(float(abs(np.asarray(a) - np.asarray(b)).max()) for a, b in
             zip(jax.tree.leaves(one), jax.tree.leaves(many), strict=True))
-errors = []
-for bad in (lambda: shard_clouds(thor2.PointClouds.pack(list(clouds(6)), 512), batch_mesh()),
-            lambda: describe_sharded(packed, network, config)):
-    try:
-        bad()
-    except thor2.InputError as error:
-        errors.append(str(error))
-print(json.dumps({"worst": worst, "errors": errors}))
+print(json.dumps(worst))
 """
 
 _PROCESS = """
@@ -85,10 +78,8 @@ def test_each_device_describes_its_clouds(monkeypatch: pytest.MonkeyPatch) -> No
 @pytest.mark.slow
 @pytest.mark.parametrize("homology", ["gudhi", "closed_form"])
 def test_eight_devices_equal_one(homology: str) -> None:
-    output = json.loads(finish_programs(start_program(_CLOUDS + _DEVICES, homology, devices=8))[0].splitlines()[-1])
-    assert output["worst"] <= 1e-6
-    assert len(output["errors"]) == 2
-    assert "multiple of 8" in output["errors"][0] and "shard_clouds" in output["errors"][1]
+    (output,) = finish_programs(start_program(_CLOUDS + _DEVICES, homology, devices=8))
+    assert json.loads(output.splitlines()[-1]) <= 1e-6
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ from helpers import aligned_cloud
 
 import colornet
 import thor2_jax as thor2
-from thor2_jax.descriptor.slicing import slices_and_strips, strip_births
+from thor2_jax.descriptor.slicing import slices_and_strips
 
 NETWORK = colornet.load_default()
 PAPER, RELEASED = thor2.DescriptorConfig(), thor2.DescriptorConfig.released()
@@ -50,27 +50,25 @@ def expected_strips(points: np.ndarray, rgb: np.ndarray, released: bool) -> dict
 
 
 @pytest.mark.parametrize("config", [PAPER, RELEASED], ids=["paper", "released"])
-@pytest.mark.parametrize("sizes", [(0,), (1, 2), (333, 0, 512), (0, 0)])
-def test_strips_against_numpy(sizes: tuple[int, ...], config: thor2.DescriptorConfig) -> None:
-    clouds = [aligned_cloud(k, n) for k, n in enumerate(sizes)]
+@pytest.mark.parametrize(
+    ("sizes", "extent"),
+    [
+        ((1, 2), (0.76, 0.4, 0.68)),
+        ((333, 0, 512), (0.76, 0.4, 0.68)),
+        *(((500, 77), extent) for extent in ((0.7, 0.4, 1.2), (1.3, 0.4, 0.6), (1.6, 0.4, 1.3))),  # points are left out
+    ],
+)
+def test_strips_against_numpy(
+    sizes: tuple[int, ...], extent: tuple[float, float, float], config: thor2.DescriptorConfig
+) -> None:
+    clouds = [aligned_cloud(k, n, extent) for k, n in enumerate(sizes)]
     strips = thor2.strips(thor2.PointClouds.pack(clouds), NETWORK, config)
     for b, (points, rgb) in enumerate(clouds):
         expected = expected_strips(points.astype(np.float64), rgb, config.convention == "released")
         for field in dataclasses.fields(strips):
             actual = np.asarray(getattr(strips, field.name)[b])
             np.testing.assert_allclose(actual, expected[field.name], atol=1e-5, err_msg=f"{b} {field.name}")
-
-
-def test_the_released_rule_on_many_random_clouds() -> None:
-    """Compares hundreds of thousands of coordinates, which single precision must round like double precision."""
-    rng = np.random.default_rng(0)
-    points = (rng.random((300, 512, 3)) * [0.8, 0.4, 1.2]).astype(np.float32)
-    mask = np.ones((300, 512), bool)
-    i, j = jax.jit(jax.vmap(released_indices))(points, mask)
-    for b in range(300):
-        slices, strips = released_rule(points[b].astype(np.float64))
-        np.testing.assert_array_equal(i[b], slices)
-        np.testing.assert_array_equal(np.minimum(j[b], 31), strips)  # digitize returns 31 for all larger values
+        assert max(extent) < 1 or int(strips.overflow[b]) > 0
 
 
 def test_the_released_rounding_at_every_half() -> None:
@@ -98,48 +96,3 @@ def test_levels_past_twice_the_slices_overflow_if_released() -> None:
     for far, number in ((1.3, 1), (1.4, 14)):
         i, _ = released_indices(np.array([[0.1, 0.1, 0], [0.1, 0.1, far]], np.float32), np.ones(2, bool))
         np.testing.assert_array_equal(i, [0, number])
-
-
-@pytest.mark.parametrize("config", [PAPER, RELEASED], ids=["paper", "released"])
-@pytest.mark.parametrize("size", [(0.7, 0.4, 1.2), (1.3, 0.4, 0.6), (1.6, 0.4, 1.3)])
-def test_overflow_is_the_number_of_points_left_out(
-    size: tuple[float, float, float], config: thor2.DescriptorConfig
-) -> None:
-    clouds = [aligned_cloud(k, n, size) for k, n in enumerate((500, 77))]
-    strips = thor2.strips(thor2.PointClouds.pack(clouds), NETWORK, config)
-    for b, (points, rgb) in enumerate(clouds):
-        expected = expected_strips(points.astype(np.float64), rgb, config.convention == "released")
-        assert int(strips.overflow[b]) == expected["overflow"] > 0
-        np.testing.assert_array_equal(strips.occupied[b], expected["occupied"])
-        np.testing.assert_allclose(strips.color[b], expected["color"], atol=1e-5)
-
-
-def test_points_outside_on_every_side_are_counted() -> None:
-    far = [[1e12, 0, 0], [0, 0, 1e12], [3e38, 3e38, 3e38], [-0.5, 0, 0], [0, 0, -0.5], [0.7751, 0, 0], [0, 0, 0.7001]]
-    points = np.array([[0.01, 0.2, 0.01], *far], np.float32)
-    strips = thor2.strips(thor2.PointClouds.pack([(points, np.zeros(points.shape))]), NETWORK, PAPER)
-    assert int(strips.overflow[0]) == len(far)
-    np.testing.assert_array_equal(np.argwhere(np.asarray(strips.occupied)), [[0, 0, 0]])
-    assert float(strips.color.sum()) == pytest.approx(1)
-
-
-def test_gradients_reach_one_point_per_extreme() -> None:
-    points, rgb = aligned_cloud(1, 333)
-    clouds = thor2.PointClouds.pack([(points, rgb)], capacity=400)
-
-    def span(x: jax.Array) -> jax.Array:
-        strips = thor2.strips(dataclasses.replace(clouds, points=x), NETWORK, PAPER)
-        return (strips.high - strips.low).sum()
-
-    gradient = np.asarray(jax.jit(jax.grad(span))(clouds.points))[0]
-    expected = np.zeros((400, 3))
-    i, j = paper_rule(points.astype(np.float64))
-    for strip in set(zip(i.tolist(), j.tolist(), strict=True)):
-        here = np.flatnonzero((i == strip[0]) & (j == strip[1]))
-        expected[here[points[here, 1].argmax()], 1] += 1
-        expected[here[points[here, 1].argmin()], 1] -= 1
-    np.testing.assert_array_equal(gradient, expected)
-
-
-def test_strips_are_born_at_their_lower_edge() -> None:
-    np.testing.assert_array_equal(strip_births(PAPER), np.array([j * 0.025 for j in range(31)], np.float32))

@@ -30,10 +30,6 @@ def test_against_one_batch(count: int) -> None:
     np.testing.assert_array_equal(np.concatenate([p.overflow for p in batches]), whole.overflow)
 
 
-def test_an_empty_stream() -> None:
-    assert list(describe_stream(iter(()), NETWORK, CONFIG)) == []
-
-
 def test_clouds_are_read_two_batches_ahead_at_most() -> None:
     read = 0
 

@@ -96,9 +96,27 @@ def test_margin_is_the_log_odds_of_the_answer(
     (answer,) = [one for one in recognizer.recognize(frame) if one.label == 3]
     scores = classifier_scores(recognizer.model)
     values = scores.of_instances([instance])
+    of_masks = scores.of_masks(scores.orient(instance), np.ones((9, len(instance.points)), bool))
+    np.testing.assert_allclose(of_masks, values.repeat(9, axis=0), atol=1e-4)  # in more than one batch
     index = CLASSES.index(str(answer.name))
     assert values[0].argmax() == index
     assert float(scores.margin(jnp.asarray(values), index)[0]) == pytest.approx(logit(answer.confidence), abs=1e-3)
+
+
+@pytest.mark.slow
+def test_the_margin_of_a_calibrated_answer_is_that_among_the_classes(
+    frame: thor2.RGBDFrame, instance: PreparedInstance
+) -> None:
+    record = {"calibration": dataclasses.asdict(Calibration(0.0, 1.0, 1.0, 0.5, 0.0))}
+    recognizer = Recognizer(untrained_embedding_run(CLASSES, config=FOUR, record=record))
+    explanation = explain(recognizer, frame, 3)
+    (answer,) = [one for one in recognizer.recognize(frame) if one.label == 3]
+    assert explanation.name == answer.name and set(explanation.recognition.top) == {"embedding"}
+    assert explanation.recognition.confidence == pytest.approx(answer.confidence, abs=1e-5)
+    described = describe_looks(pack_instances([instance], 1), NETWORK, FOUR)
+    probabilities = class_probabilities(recognizer, described)["embedding"][0]
+    share = float(probabilities.max() / probabilities.sum())
+    assert explanation.attributions.faithfulness.margin == pytest.approx(logit(share), abs=1e-3)
 
 
 @pytest.mark.parametrize("looks", [*slow(1, 2), 4])
@@ -122,13 +140,6 @@ def test_forgotten_classes_have_no_score(instance: PreparedInstance) -> None:
     scores = classifier_scores(recognizer.model)
     assert scores.names == ("a", "c")
     np.testing.assert_allclose(scores.of_instances([instance]), whole[:, [0, 2]], rtol=1e-5)
-
-
-def test_all_points_have_the_score_of_the_cloud(recognizer: Recognizer, instance: PreparedInstance) -> None:
-    scores = classifier_scores(recognizer.model)
-    masks = np.ones((9, len(instance.points)), bool)  # more than one batch
-    of_masks = scores.of_masks(scores.orient(instance), masks)
-    np.testing.assert_allclose(of_masks, scores.of_instances([instance] * 9), atol=1e-4)
 
 
 def test_parts_keep_the_mask_of_each_look(instance: PreparedInstance) -> None:
@@ -289,25 +300,6 @@ def test_changed_extents_keep_the_other_sides(instance: PreparedInstance) -> Non
     shifted = changed_instance(instance, "color", np.array([0.1, 0, -1]), axes)
     np.testing.assert_allclose(shifted.colors[:, 0], np.minimum(instance.colors[:, 0] + 25.5, 255), atol=0.51)
     assert not shifted.colors[:, 2].any()
-
-
-@pytest.mark.slow
-def test_an_embedding_alone_is_explained(frame: thor2.RGBDFrame) -> None:
-    calibration = Calibration(0.0, 1.0, 1.0, 0.5, 0.0)
-    run = untrained_embedding_run(CLASSES, config=FOUR, record={"calibration": dataclasses.asdict(calibration)})
-    recognizer = Recognizer(run)
-    explanation = explain(recognizer, frame, 3)
-    (answer,) = [one for one in recognizer.recognize(frame) if one.label == 3]
-    assert explanation.name == answer.name and set(explanation.recognition.top) == {"embedding"}
-    assert explanation.recognition.confidence == pytest.approx(answer.confidence, abs=1e-5)
-    assert explanation.scores.names == CLASSES and explanation.scores.count == 4
-    assert np.isfinite(explanation.attributions.values).all() and explanation.attributions.values.any()
-    # The confidence is calibrated, the margin is that of the probabilities among the classes.
-    prepared = prepare_instance(frame, 3, FOUR.sigma_s)
-    described = describe_looks(pack_instances([prepared], 1), NETWORK, FOUR)
-    probabilities = class_probabilities(recognizer, described)["embedding"][0]
-    share = float(probabilities.max() / probabilities.sum())
-    assert explanation.attributions.faithfulness.margin == pytest.approx(logit(share), abs=1e-3)
 
 
 @pytest.mark.slow

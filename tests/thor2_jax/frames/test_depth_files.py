@@ -3,7 +3,6 @@
 import io
 import sys
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -26,54 +25,50 @@ def write_exr(path: Path, **channels: np.ndarray) -> None:
         file.write(str(path))
 
 
-@pytest.mark.parametrize("name", ["d.png", "d.tiff"])
-def test_integers_written_by_opencv(tmp_path: Path, name: str) -> None:
-    assert cv2.imwrite(str(tmp_path / name), UNITS)
-    depth = read_depth(tmp_path / name)
-    assert depth.dtype == np.uint16
-    np.testing.assert_array_equal(depth, UNITS)
+def assert_depth(path: Path, expected: np.ndarray) -> None:
+    np.testing.assert_array_equal(read_depth(path), expected, strict=True)
 
 
-def test_floats_in_tiff(tmp_path: Path) -> None:
-    Image.fromarray(METRES).save(tmp_path / "pillow.tiff")
-    assert cv2.imwrite(str(tmp_path / "opencv.tif"), METRES)
-    for name in ("pillow.tiff", "opencv.tif"):
-        depth = read_depth(tmp_path / name)
-        assert depth.dtype == np.float32
-        np.testing.assert_array_equal(depth, METRES)
+@pytest.mark.parametrize(("name", "values"), [("d.png", UNITS), ("d.tiff", UNITS), ("d.tif", METRES)])
+def test_images_written_by_opencv(tmp_path: Path, name: str, values: np.ndarray) -> None:
+    assert cv2.imwrite(str(tmp_path / name), values)
+    assert_depth(tmp_path / name, values)
 
 
-@pytest.mark.parametrize("kind", [np.float16, np.float32, np.float64, ">f4"])
-@pytest.mark.parametrize("shape", [(5, 7), (5, 7, 1)])
-def test_floats_in_npy(tmp_path: Path, kind: Any, shape: tuple[int, ...]) -> None:
-    np.save(tmp_path / "d.npy", METRES.astype(kind).reshape(shape))
-    depth = read_depth(tmp_path / "d.npy")
-    assert depth.dtype.kind == "f" and depth.dtype.isnative
-    np.testing.assert_array_equal(depth, METRES.astype(kind))
+def test_floats_in_tiff_written_by_pillow(tmp_path: Path) -> None:
+    Image.fromarray(METRES).save(tmp_path / "d.tiff")
+    assert_depth(tmp_path / "d.tiff", METRES)
 
 
-@pytest.mark.parametrize(("kind", "expected"), [(np.uint16, np.uint16), (np.int32, np.uint16), (np.int64, np.uint16)])
-def test_integers_in_npy(tmp_path: Path, kind: Any, expected: Any) -> None:
-    np.save(tmp_path / "d.npy", UNITS.astype(kind))
-    depth = read_depth(tmp_path / "d.npy")
-    assert depth.dtype == expected
-    np.testing.assert_array_equal(depth, UNITS)
-    np.save(tmp_path / "d.npy", np.asfortranarray(UNITS.astype(np.uint32) + 70_000))
-    assert read_depth(tmp_path / "d.npy").dtype == np.uint32
-    np.testing.assert_array_equal(read_depth(tmp_path / "d.npy"), UNITS.astype(np.uint32) + 70_000)
+@pytest.mark.parametrize(
+    ("written", "expected"),
+    [
+        (METRES.astype(np.float16), METRES.astype(np.float16)),
+        (METRES[:, :, None], METRES),
+        (METRES.astype(">f4"), METRES),
+        (UNITS, UNITS),
+        (UNITS.astype(np.int64), UNITS),
+        (np.asfortranarray(UNITS.astype(np.int64) + 70_000), UNITS.astype(np.uint32) + 70_000),
+    ],
+)
+def test_arrays_in_npy(tmp_path: Path, written: np.ndarray, expected: np.ndarray) -> None:
+    np.save(tmp_path / "d.npy", written)
+    assert_depth(tmp_path / "d.npy", expected)
 
 
-def test_floats_in_exr(tmp_path: Path) -> None:
-    """The files are written by OpenEXR itself."""
-    write_exr(tmp_path / "one.exr", Y=METRES)
-    write_exr(tmp_path / "half.exr", V=METRES.astype(np.float16))
-    write_exr(tmp_path / "several.exr", R=METRES * 0, A=METRES * 0, Z=METRES)
-    write_exr(tmp_path / "gray.exr", R=METRES, G=METRES, B=METRES)
-    for name in ("one", "several", "gray"):
-        depth = read_depth(tmp_path / f"{name}.exr")
-        assert depth.dtype == np.float32
-        np.testing.assert_array_equal(depth, METRES)
-    np.testing.assert_array_equal(read_depth(tmp_path / "half.exr"), METRES.astype(np.float16))
+@pytest.mark.parametrize(
+    ("channels", "expected"),
+    [
+        ({"Y": METRES}, METRES),
+        ({"V": METRES.astype(np.float16)}, METRES.astype(np.float16)),
+        ({"R": METRES * 0, "A": METRES * 0, "Z": METRES}, METRES),
+        ({"R": METRES, "G": METRES, "B": METRES}, METRES),
+    ],
+    ids=["one", "half", "several", "gray"],
+)
+def test_floats_in_exr(tmp_path: Path, channels: dict[str, np.ndarray], expected: np.ndarray) -> None:
+    write_exr(tmp_path / "d.exr", **channels)
+    np.testing.assert_array_equal(read_depth(tmp_path / "d.exr"), expected)
 
 
 def test_invalid_exr_files(tmp_path: Path) -> None:
@@ -85,8 +80,6 @@ def test_invalid_exr_files(tmp_path: Path) -> None:
         (tmp_path / "bad.exr").write_bytes(content)
         with pytest.raises(InputError, match=r"^depth: .*bad\.exr is a damaged EXR file"):
             read_depth(tmp_path / "bad.exr")
-    with pytest.raises(FileNotFoundError):
-        read_depth(tmp_path / "absent.exr")
 
 
 def test_exr_without_its_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -100,9 +93,7 @@ def test_exr_without_its_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     "array",
     [
         np.zeros((5, 7), np.uint8),
-        np.zeros((5, 7), bool),
         np.zeros((5, 7), np.complex64),
-        np.zeros((5, 7), "S2"),
         np.zeros((5, 7, 3), np.float32),
         np.zeros(35, np.uint16),
         np.zeros((0, 7), np.float32),
@@ -116,22 +107,20 @@ def test_arrays_that_are_no_depth(tmp_path: Path, array: np.ndarray) -> None:
         read_depth(tmp_path / "d.npy")
 
 
-def test_damaged_npy_files(tmp_path: Path) -> None:
+def npy_file(array: np.ndarray) -> bytes:
     stream = io.BytesIO()
-    np.save(stream, METRES)
-    whole = stream.getvalue()
-    objects = io.BytesIO()
-    np.save(objects, np.array([[{}]], object))
-    huge = whole.replace(b"(5, 7), }  ", b"(65536, 65536), }"[:11].ljust(11))
-    for content in (b"", b"text", whole[:20], whole[:-3], objects.getvalue(), huge):
+    np.save(stream, array)
+    return stream.getvalue()
+
+
+def test_damaged_npy_files(tmp_path: Path) -> None:
+    whole = npy_file(METRES)
+    huge = whole.replace(b"(5, 7), }" + b" " * 12, b"(1048576, 1048576), }")
+    for content in (b"", b"text", whole[:20], whole[:-3], npy_file(np.array([[{}]], object))):
         (tmp_path / "d.npy").write_bytes(content)
         with pytest.raises(InputError, match=r"^depth: .*d\.npy "):
             read_depth(tmp_path / "d.npy")
-
-
-def test_an_array_that_would_fill_memory(tmp_path: Path) -> None:
-    header = str({"descr": "<f4", "fortran_order": False, "shape": (2**20, 2**20)}).encode().ljust(117) + b"\n"
-    (tmp_path / "d.npy").write_bytes(b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header)
+    (tmp_path / "d.npy").write_bytes(huge)
     with pytest.raises(InputError, match="expected at most"):
         read_depth(tmp_path / "d.npy")
 
@@ -146,16 +135,11 @@ def test_depth_in_another_unit_is_asked_about() -> None:
     millimetres = np.full((40, 40), 700, np.uint16)
     right = frame(millimetres)
     assert right.has_usable_depth and instance_cloud(right, 1).reason is None
-    for wrong in (frame(millimetres, 1.0), frame(millimetres, 1e6)):
-        for label in (1, 2):
-            assert not wrong.has_usable_depth
-            assert "is depth_scale right? It is 1" in (instance_cloud(wrong, label).reason or "")
-    floats = frame(millimetres.astype(np.float32))
-    assert "in metres?" in (instance_cloud(floats, 1).reason or "")
-
-
-def test_the_unit_is_right_if_one_instance_has_depth() -> None:
-    depth = np.full((40, 40), 700, np.uint16)
-    depth[30:38, 30:38] = 0
-    reason = instance_cloud(frame(depth), 2).reason
+    for scale in (1.0, 1e6):
+        wrong = frame(millimetres, scale)
+        assert not wrong.has_usable_depth
+        assert "is depth_scale right? It is 1" in (instance_cloud(wrong, 2).reason or "")
+    assert "in metres?" in (instance_cloud(frame(millimetres.astype(np.float32)), 1).reason or "")
+    millimetres[30:38, 30:38] = 0  # the other instance has depth
+    reason = instance_cloud(frame(millimetres), 2).reason
     assert reason is not None and "depth_scale" not in reason

@@ -1,5 +1,6 @@
 """Intrinsics: each format as other software writes it, sizes, lens distortion, and invalid files."""
 
+import dataclasses
 import io
 import json
 import types
@@ -10,18 +11,15 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from helpers import encode_image, input_error
+from helpers import input_error
 
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import (
     Intrinsics,
     RGBDFrame,
     backproject,
-    distort,
     frame_intrinsics,
     pixel_rays,
-    read_frame,
-    undistort,
 )
 from thor2_jax.frames.intrinsics import parse_intrinsics, read_intrinsics
 
@@ -36,30 +34,13 @@ DISTORTIONS = {
 ROS1_YAML = """\
 image_width: 640
 image_height: 480
-camera_name: rgb
-camera_matrix:
-  rows: 3
-  cols: 3
-  data: [615.5, 0, 318.25, 0, 616.75, 241.5, 0, 0, 1]
+camera_matrix: {rows: 3, cols: 3, data: [615.5, 0, 318.25, 0, 616.75, 241.5, 0, 0, 1]}
 distortion_model: plumb_bob
-distortion_coefficients:
-  rows: 1
-  cols: 5
-  data: [0, 0, 0, 0, 0]
-rectification_matrix:
-  rows: 3
-  cols: 3
-  data: [1, 0, 0, 0, 1, 0, 0, 0, 1]
-projection_matrix:
-  rows: 3
-  cols: 4
-  data: [600, 0, 318, 0, 0, 600, 241, 0, 0, 0, 1, 0]
+distortion_coefficients: {rows: 1, cols: 5, data: [0, 0, 0, 0, 0]}
+projection_matrix: {rows: 3, cols: 4, data: [600, 0, 318, 0, 0, 600, 241, 0, 0, 0, 1, 0]}
 """
 
 ROS1_ECHO = """\
-header:
-  seq: 0
-  frame_id: "camera_color_optical_frame"
 height: 480
 width: 640
 distortion_model: "plumb_bob"
@@ -67,7 +48,6 @@ D: [0.0, 0.0, 0.0, 0.0, 0.0]
 K: [615.5, 0.0, 318.25, 0.0, 616.75, 241.5, 0.0, 0.0, 1.0]
 R: [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
 P: [615.5, 0.0, 318.25, 0.0, 0.0, 616.75, 241.5, 0.0, 0.0, 0.0, 1.0, 0.0]
-binning_x: 0
 roi: {x_offset: 0, y_offset: 0, height: 0, width: 0, do_rectify: false}
 ---
 """
@@ -87,55 +67,44 @@ def as_npy(array: np.ndarray, **options: Any) -> bytes:
     return stream.getvalue()
 
 
-def opencv_yaml(path: Path) -> bytes:
-    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
-    storage.write("image_width", 640)
-    storage.write("image_height", 480)
-    storage.write("camera_matrix", MATRIX)
-    storage.write("distortion_coefficients", np.zeros((1, 5)))
-    storage.release()
-    return path.read_bytes()
-
-
 BOP_ENTRY = {"cam_K": MATRIX.ravel().tolist(), "depth_scale": 0.1, "cam_R_w2c": [1.0] * 9}
 REALSENSE = {"width": 640, "height": 480, "ppx": 318.25, "ppy": 241.5, "fx": 615.5, "fy": 616.75}
 OPEN3D = {"width": 640, "height": 480, "intrinsic_matrix": [615.5, 0, 0, 0, 616.75, 0, 318.25, 241.5, 1]}
 SIZED = Intrinsics(**PINHOLE, width=640, height=480)
 
+
+def as_json(values: object) -> bytes:
+    return json.dumps(values).encode()
+
+
 FORMATS: dict[str, tuple[bytes, Intrinsics]] = {
-    "THOR2": (json.dumps({**PINHOLE, "depth_scale": 5000.0}).encode(), Intrinsics(**PINHOLE, depth_scale=5000.0)),
-    "THOR2 with a size": (json.dumps({**PINHOLE, "width": 640, "height": 480}).encode(), SIZED),
+    "THOR2": (as_json({**PINHOLE, "depth_scale": 5000.0}), Intrinsics(**PINHOLE, depth_scale=5000.0)),
+    "THOR2 with a size": (as_json({**PINHOLE, "width": 640, "height": 480}), SIZED),
     "THOR2 in YAML": (yaml.safe_dump(PINHOLE).encode(), Intrinsics(**PINHOLE)),
     "ROS 1 calibration": (ROS1_YAML.encode(), SIZED),
     "ROS 1 message": (ROS1_ECHO.encode(), SIZED),
     "ROS 2 messages": (ROS2_ECHO.encode(), SIZED),
-    "ROS 2 message in JSON": (json.dumps(next(yaml.safe_load_all(ROS2_ECHO))).encode(), SIZED),
-    "K": (json.dumps({"K": MATRIX.tolist(), "depth_scale": 4000}).encode(), Intrinsics(**PINHOLE, depth_scale=4000)),
-    "K, nine numbers": (json.dumps({"K": MATRIX.ravel().tolist()}).encode(), Intrinsics(**PINHOLE)),
-    "camera_matrix": (json.dumps({"camera_matrix": MATRIX.tolist()}).encode(), Intrinsics(**PINHOLE)),
-    "matrix in JSON": (json.dumps(MATRIX.tolist()).encode(), Intrinsics(**PINHOLE)),
-    "nine numbers in JSON": (json.dumps(MATRIX.ravel().tolist()).encode(), Intrinsics(**PINHOLE)),
+    "ROS 2 message in JSON": (as_json(next(yaml.safe_load_all(ROS2_ECHO))), SIZED),
+    "K": (as_json({"K": MATRIX.tolist(), "depth_scale": 4000}), Intrinsics(**PINHOLE, depth_scale=4000)),
+    "camera_matrix": (as_json({"camera_matrix": MATRIX.tolist()}), Intrinsics(**PINHOLE)),
+    "matrix in JSON": (as_json(MATRIX.tolist()), Intrinsics(**PINHOLE)),
+    "nine numbers in JSON": (as_json(MATRIX.ravel().tolist()), Intrinsics(**PINHOLE)),
     "matrix in text": (as_text(MATRIX), Intrinsics(**PINHOLE)),
     "matrix in CSV": (b"615.5, 0, 318.25\n0, 616.75, 241.5\n0, 0, 1\n", Intrinsics(**PINHOLE)),
-    "matrix in NPY": (as_npy(MATRIX), Intrinsics(**PINHOLE)),
-    "matrix in NPY, float32": (as_npy(MATRIX.astype(np.float32)), Intrinsics(**PINHOLE)),
-    "matrix in NPY, Fortran order": (as_npy(np.asfortranarray(MATRIX)), Intrinsics(**PINHOLE)),
-    "BOP entry": (json.dumps(BOP_ENTRY).encode(), Intrinsics(**PINHOLE, depth_scale=10_000)),
-    "BOP scene": (json.dumps({"7": BOP_ENTRY}).encode(), Intrinsics(**PINHOLE, depth_scale=10_000)),
+    "matrix in NPY": (as_npy(np.asfortranarray(MATRIX.astype(np.float32))), Intrinsics(**PINHOLE)),
+    "BOP entry": (as_json(BOP_ENTRY), Intrinsics(**PINHOLE, depth_scale=10_000)),
+    "BOP scene": (as_json({"7": BOP_ENTRY}), Intrinsics(**PINHOLE, depth_scale=10_000)),
     "BOP camera.json": (
-        json.dumps({**PINHOLE, "width": 640, "height": 480, "depth_scale": 0.1}).encode(),
-        Intrinsics(**PINHOLE, depth_scale=10_000, width=640, height=480),
+        as_json({**PINHOLE, "width": 640, "height": 480, "depth_scale": 0.1}),
+        dataclasses.replace(SIZED, depth_scale=10_000),
     ),
-    "RealSense": (
-        json.dumps({**REALSENSE, "model": "distortion.inverse_brown_conrady", "coeffs": [0.0] * 5}).encode(),
-        SIZED,
-    ),
+    "RealSense": (as_json({**REALSENSE, "model": "distortion.inverse_brown_conrady", "coeffs": [0.0] * 5}), SIZED),
     "RealSense with a scale": (
-        json.dumps({**REALSENSE, "depth_scale": 0.00025}).encode(),
-        Intrinsics(**PINHOLE, depth_scale=4000, width=640, height=480),
+        as_json({**REALSENSE, "depth_scale": 0.00025}),
+        dataclasses.replace(SIZED, depth_scale=4000),
     ),
-    "Open3D": (json.dumps(OPEN3D).encode(), SIZED),
-    "Open3D camera": (json.dumps({"intrinsic": OPEN3D, "extrinsic": [1.0] * 16}).encode(), SIZED),
+    "Open3D": (as_json(OPEN3D), SIZED),
+    "Open3D camera": (as_json({"intrinsic": OPEN3D, "extrinsic": [1.0] * 16}), SIZED),
 }
 
 
@@ -147,7 +116,13 @@ def test_formats(name: str, tmp_path: Path) -> None:
 
 
 def test_a_file_of_opencv(tmp_path: Path) -> None:
-    assert parse_intrinsics(opencv_yaml(tmp_path / "k.yml")) == SIZED
+    storage = cv2.FileStorage(str(tmp_path / "k.yml"), cv2.FILE_STORAGE_WRITE)
+    storage.write("image_width", 640)
+    storage.write("image_height", 480)
+    storage.write("camera_matrix", MATRIX)
+    storage.write("distortion_coefficients", np.zeros((1, 5)))
+    storage.release()
+    assert read_intrinsics(tmp_path / "k.yml") == SIZED
 
 
 def test_a_file_of_open3d(tmp_path: Path) -> None:
@@ -179,23 +154,17 @@ def test_the_entry_of_a_bop_scene_is_that_of_the_image(tmp_path: Path) -> None:
     ("text", "expected"),
     [
         ("", "intrinsics is a NoneType"),
-        ("null", "intrinsics is a NoneType"),
         ("{", "is not valid JSON"),
         ("[" * 70_000, "is not valid JSON"),
         ("\xff", "is neither JSON, YAML"),
         ("[500, 500, 3, 2]", "intrinsics is a list of shape (4,)"),
         ("fx: 500", "intrinsics lacks fy, cx, cy"),
-        ('{"fx": NaN, "fy": 500, "cx": 3, "cy": 2}', "intrinsics.fx is nan"),
-        ('{"fx": 500, "fy": Infinity, "cx": 3, "cy": 2}', "intrinsics.fy is inf"),
-        ('{"fx": 500, "fy": true, "cx": 3, "cy": 2}', "intrinsics.fy is True"),
         ('{"fx": 1' + "0" * 400 + ', "fy": 500, "cx": 3, "cy": 2}', "intrinsics.fx is 1000"),
-        ("camera_matrix: {data: [1, 2]}", "expected fx, 0, cx"),
         ("K: [1, 0, 3, 0, 2, 2, 0, 0]", "expected fx, 0, cx"),
         ('{"K": "one"}', "expected fx, 0, cx"),
         ("615 0 318 0 616 241 0 0", "shape (8,)"),
         ("615 0 318 7 616 241 0 0 1", "expected fx, 0, cx"),
         ("615 0 318 0 616 241 0 0 one", "is a str"),
-        ("- 3\n- 4\n", "shape (2,)"),
         ("a: [", "neither JSON, YAML"),
         ('{"ppx": 3, "ppy": 2}', "lacks fx, fy"),
         ('{"ppx": 3, "ppy": 2, "fx": 5, "fy": 5, "depth_scale": 1000}', "metres per depth unit"),
@@ -209,7 +178,6 @@ def test_the_entry_of_a_bop_scene_is_that_of_the_image(tmp_path: Path) -> None:
         ('{"fx": 5, "fy": 5, "cx": 3, "cy": 2, "distortion": "none"}', "distortion is 'none'"),
         ("{}", "has no entry"),
         ('{"focal": 500}', "has focal"),
-        (ROS1_ECHO.replace("615.5", "0.0"), "intrinsics.fx is 0.0"),
         ('{"fx": 5, "fy": 5, "cx": 3, "cy": 2, "depth_scale": 1e-300}', "intrinsics.depth_scale is 1e-300"),
         ('{"fx": 5e-324, "fy": 5, "cx": 3, "cy": 2}', "intrinsics.fx is 5e-324"),
         ("x" * 100_000, "100000 bytes"),
@@ -222,21 +190,17 @@ def test_invalid_files(text: str, expected: str, tmp_path: Path) -> None:
         read_intrinsics(tmp_path / "k")
 
 
-@pytest.mark.parametrize(
-    "content",
-    [
+def test_invalid_npy_files() -> None:
+    for content in (
         as_npy(MATRIX)[:100],
         as_npy(MATRIX)[:40],
         as_npy(MATRIX[:2]),
         as_npy(np.array([{}] * 9, object)),
         as_npy(MATRIX + 0j),
         as_npy(np.zeros(9, "V0")).replace(b"(9,), }" + b" " * 13, b"(99999999999999,), }"),
-    ],
-    ids=["truncated", "header", "2 x 3", "pickled", "complex", "no bytes"],
-)
-def test_invalid_npy_files(content: bytes) -> None:
-    with pytest.raises(InputError, match=r"^intrinsics[ .]"):
-        parse_intrinsics(content)
+    ):
+        with pytest.raises(InputError, match=r"^intrinsics[ .]"):
+            parse_intrinsics(content)
 
 
 def test_the_size_of_the_images_is_checked() -> None:
@@ -270,14 +234,6 @@ def test_points_of_pixels_project_to_them(distortion: tuple[float, ...]) -> None
     assert pixel_rays(some[:0], 64, camera).shape == (0, 3)
 
 
-@pytest.mark.parametrize("name", DISTORTIONS)
-def test_undistort_is_the_inverse_of_distort(name: str) -> None:
-    x, y = np.random.default_rng(0).uniform(-0.45, 0.45, (2, 1000))
-    np.testing.assert_allclose(undistort(*distort(x, y, DISTORTIONS[name]), DISTORTIONS[name]), (x, y), atol=1e-8)
-    empty = undistort(x[:0], y[:0], DISTORTIONS[name])
-    assert empty[0].shape == empty[1].shape == (0,)
-
-
 def test_zero_coefficients_are_no_distortion() -> None:
     assert Intrinsics(**PINHOLE, distortion=[0.0] * 14).distortion == ()
     longer = [*DISTORTIONS["rational_polynomial"], 0, 0, 0, 0]
@@ -302,15 +258,3 @@ def test_distortion_without_an_inverse_is_refused(distortion: tuple[float, ...])
     images = np.zeros((48, 64, 3), np.uint8), np.zeros((48, 64), np.uint16), np.zeros((48, 64), np.uint8)
     with pytest.raises(InputError, match="^intrinsics has the distortion .*no inverse"):
         RGBDFrame(*images, Intrinsics(40, 40, 32, 24, distortion=distortion))
-
-
-def test_a_frame_of_files_with_a_depth_scale_of_its_own(tmp_path: Path) -> None:
-    depth = np.full((4, 6), 5000, np.uint16)
-    images = {"color": np.zeros((4, 6, 3), np.uint8), "depth": depth, "labels": np.ones((4, 6), np.uint8)}
-    files = {name: tmp_path / f"{name}.png" for name in images}
-    for name, path in files.items():
-        path.write_bytes(encode_image(images[name]))
-    (tmp_path / "K.txt").write_bytes(as_text(MATRIX))
-    frame = read_frame(**files, intrinsics=tmp_path / "K.txt", depth_scale=5000)
-    assert frame.intrinsics == Intrinsics(**PINHOLE, depth_scale=5000)
-    np.testing.assert_array_equal(frame.depth_m, 1)

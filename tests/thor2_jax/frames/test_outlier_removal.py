@@ -48,38 +48,6 @@ def test_flying_pixels_against_a_loop(shape: tuple[int, int], spread: int) -> No
         np.testing.assert_array_equal(flying, flying_by_loop(depth, labels, label).ravel()[pixels])
 
 
-@pytest.mark.parametrize("turns", range(4))
-@pytest.mark.parametrize(("slope", "flies"), [(14.5, False), (15.5, True)])
-def test_the_steepest_slope(slope: float, flies: bool, turns: int) -> None:
-    """Depth grows by `slope` pixel widths per pixel; all pixels except the nearest row or column fly, or none does."""
-    depth = np.broadcast_to(0.6 * (1 - slope / CAMERA.fx) ** -np.arange(12.0), (7, 12))
-    depth = np.rot90(depth, turns).astype(np.float32).copy()
-    frame = frame_of(depth, np.ones(depth.shape, np.uint8))
-    flying = flying_pixels(frame, np.arange(depth.size))
-    np.testing.assert_array_equal(flying, flies & (depth.ravel() > depth.min() * 1.001))
-
-
-def test_other_instances_make_no_flying_pixels() -> None:
-    labels = np.zeros((9, 20), np.uint8)
-    labels[:, 5:10], labels[:, 10:15] = 1, 2
-    frame = frame_of(np.where(labels == 1, 1200, 700).astype(np.uint16), labels)
-    for pixels in frame.instance_pixels.values():
-        assert not flying_pixels(frame, pixels).any()
-
-
-def test_the_image_does_not_wrap_around() -> None:
-    """The last pixel of a row and the first of the next are adjacent in memory, but not neighbours."""
-    depth = np.array([[1000, 1000, 1000], [500, 500, 500]], np.uint16)
-    labels = np.array([[0, 0, 1], [1, 0, 0]], np.uint8)
-    frame = frame_of(depth, labels)
-    assert not flying_pixels(frame, frame.instance_pixels[1]).any()
-
-
-def test_no_pixels() -> None:
-    frame = frame_of(np.full((3, 3), 800, np.uint16), np.zeros((3, 3), np.uint8))
-    assert flying_pixels(frame, np.zeros(0, np.intp)).shape == (0,)
-
-
 # Isolated points and connected components
 
 
@@ -99,13 +67,11 @@ def kept_by_loops(points: np.ndarray) -> tuple[np.ndarray, bool]:
     return index[[int((piece == k).sum()) * 10 >= largest for k in piece]], bool(relaxed)
 
 
-def assert_equals_loops(points: np.ndarray) -> int:
-    """Assert that outlier removal equals the loops, and return the number of points that are kept."""
+def assert_equals_loops(points: np.ndarray) -> None:
     kept, relaxed = remove_outliers(points)
     expected, expected_relaxed = kept_by_loops(points)
     np.testing.assert_array_equal(kept, expected)
     assert relaxed is expected_relaxed
-    return len(kept)
 
 
 @pytest.mark.parametrize("count", [1, 2, 30, 31, 32, 101, 400])
@@ -116,7 +82,7 @@ def test_outliers_against_loops(count: int, side: float, kind: Any) -> None:
     rng = np.random.default_rng(count)
     points = (rng.normal(size=(count, 3)) * side * rng.uniform(0.1, 1, (count, 1))).astype(kind)
     before = points.copy()
-    assert assert_equals_loops(points) > 0
+    assert_equals_loops(points)
     np.testing.assert_array_equal(points, before)
 
 
@@ -137,15 +103,6 @@ def grid(rows: int, columns: int, spacing: float = 0.003) -> np.ndarray:
     return np.stack([column, row, np.zeros_like(row)], axis=-1).reshape(-1, 3) * spacing
 
 
-@pytest.mark.parametrize("start", [0.0, 0.0017, 0.0031, 0.0052])
-def test_a_point_that_leaves_a_block_along_its_diagonal(start: float) -> None:
-    """31 points in adjacent cells are not enough if they are too far away."""
-    block = np.argwhere(np.ones((4, 4, 4))) * 0.003
-    away = np.arange(0.001, 0.02, 0.0005)
-    counts = [assert_equals_loops(np.concatenate([block, [[-d] * 3]]) + start) for d in away]
-    assert counts[0] == 65 and counts[-1] == 64
-
-
 @pytest.mark.parametrize(("size", "stays"), [(99, False), (100, True), (101, True)])
 def test_pieces_stay_from_a_tenth_of_the_largest(size: int, stays: bool) -> None:
     plane = grid(25, 40) + 0.001
@@ -155,20 +112,6 @@ def test_pieces_stay_from_a_tenth_of_the_largest(size: int, stays: bool) -> None
     np.testing.assert_array_equal(kept, np.arange(1000 + size * stays))
 
 
-@pytest.mark.parametrize(("gap", "joined"), [(0.009, True), (0.021, False)])
-@pytest.mark.parametrize("direction", [[1, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0], [0, -1, 0], [0, 0, -1]])
-@pytest.mark.parametrize("start", [0.0, 0.0042, -0.7])
-def test_a_gap_of_two_cells_separates_components(gap: float, joined: bool, direction: list[int], start: float) -> None:
-    """A small square lies beside one of the sides of a large block."""
-    z, y, x = np.mgrid[:10, :10, :10]
-    block = np.stack([x, y, z], axis=-1).reshape(-1, 3) * 0.003
-    small = block[(block <= 0.0121).all(axis=1)][:90]
-    shift = np.where(np.array(direction) < 0, -small.max(axis=0) - gap, block.max(axis=0) + gap) * np.abs(direction)
-    kept, relaxed = remove_outliers(np.concatenate([block, small + shift]) + start)
-    assert not relaxed
-    np.testing.assert_array_equal(kept, np.arange(1090 if joined else 1000))
-
-
 @pytest.mark.parametrize(("strays", "relaxed"), [(1599, False), (1600, False), (1601, True)])
 def test_the_neighbour_rule_is_skipped_if_it_drops_most(strays: int, relaxed: bool) -> None:
     plane = grid(40, 40)
@@ -176,19 +119,6 @@ def test_the_neighbour_rule_is_skipped_if_it_drops_most(strays: int, relaxed: bo
     kept, skipped = remove_outliers(np.concatenate([plane, scattered]))
     assert skipped is relaxed
     np.testing.assert_array_equal(kept, np.arange(1600))  # each scattered point is a component
-
-
-@pytest.mark.parametrize("count", [1, 29, 30])
-def test_clouds_of_at_most_30_points_are_kept(count: int) -> None:
-    kept, relaxed = remove_outliers(grid(1, count))
-    np.testing.assert_array_equal(kept, np.arange(count))
-    assert relaxed
-
-
-def test_points_that_coincide() -> None:
-    kept, relaxed = remove_outliers(np.concatenate([np.full((64, 3), 0.7), np.full((6, 3), 0.2)]))
-    np.testing.assert_array_equal(kept, np.arange(64))
-    assert not relaxed
 
 
 def test_no_points() -> None:

@@ -22,22 +22,18 @@ def test_references_are_read_as_written(tmp_path: Path) -> None:
     assert loaded.classes == ("mug", "bowl")
 
 
-@pytest.mark.parametrize(
-    "fingerprint, size, message", [("other", 4, "of another embedding"), ("print", 5, "damaged"), ("cut", 4, "damaged")]
-)
-def test_references_that_do_not_fit_are_refused(fingerprint: str, size: int, message: str, tmp_path: Path) -> None:
+def test_references_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "r"
     REFERENCES.save(path, "print")
-    if fingerprint == "cut":
-        path.write_bytes(path.read_bytes()[:-3])
-    with pytest.raises(InputError, match=message):
-        References.load(path, fingerprint, size)
-
-
-def test_labels_out_of_range_are_refused(tmp_path: Path) -> None:
-    References(VIEWS, np.array([0, 1, 2], np.int32), ("mug", "bowl")).save(tmp_path / "r", "print")
+    for fingerprint, size, message in (("other", 4, "of another embedding"), ("print", 5, "damaged")):
+        with pytest.raises(InputError, match=message):
+            References.load(path, fingerprint, size)
+    path.write_bytes(path.read_bytes()[:-3])
+    with pytest.raises(InputError, match="damaged"):
+        References.load(path, "print", 4)
+    References(VIEWS, np.array([0, 1, 2], np.int32), ("mug", "bowl")).save(path, "print")
     with pytest.raises(InputError, match="out of range"):
-        References.load(tmp_path / "r", "print", 4)
+        References.load(path, "print", 4)
 
 
 def test_an_embedding_keeps_its_references_beside_it(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from helpers import small_embedding, untrained_run
 import thor2_jax as thor2
 from thor2_jax.gallery.augment import augmented_copies
 from thor2_jax.gallery.embedding import Embedding
-from thor2_jax.gallery.enrollment import LOOKS, instance_view
+from thor2_jax.gallery.enrollment import instance_view
 from thor2_jax.gallery.objects import ObjectGallery
 from thor2_jax.gallery.union import ClassUnion
 from thor2_jax.model.confidence import Calibration
@@ -74,23 +74,18 @@ def test_a_model_says_what_it_knows(run: TrainedRun, embedding: Embedding, monke
     assert objects.union.summary.startswith("17 toy objects")
     objects = taught(run, embedding).objects
     assert objects.union.summary == "5 objects: a, b, c, brick, book"
+    assert not ObjectGallery(()).weak_rejection
     alone = taught(untrained_run((), ()), embedding).objects
-    assert alone.union.summary == "2 objects: brick, book" and "2 of 2 enrolled objects" in alone.weak_rejection
-    for few, warning in ((2, "1 of 2"), (1, "")):
-        monkeypatch.setattr("thor2_jax.gallery.objects.FEW", few)
-        assert alone.weak_rejection.startswith(warning) and bool(alone.weak_rejection) is (few > 1)
-    assert not objects.weak_rejection and not ObjectGallery(()).weak_rejection
+    assert "2 of 2 enrolled objects" in alone.weak_rejection
+    monkeypatch.setattr("thor2_jax.gallery.objects.FEW", 2)
+    assert alone.weak_rejection.startswith("1 of 2")
+    monkeypatch.setattr("thor2_jax.gallery.objects.FEW", 1)
+    assert not alone.weak_rejection
     assert ObjectGallery(()).union.summary == "no object yet"
     assert ObjectGallery(tuple("abcdefg")).union.summary.endswith("f, ...")
 
 
 def test_forgetting_restores_every_answer(run: TrainedRun, embedding: Embedding) -> None:
-    plain = thor2.Recognizer(dataclasses.replace(run, embedding=embedding))
-    before = plain.recognize(CLUTTER)
-    plain.enroll("brick", [frame(RED)])
-    assert plain.recognize(CLUTTER) != before
-    plain.forget("brick")
-    assert plain.recognize(CLUTTER) == before
     recognizer = taught(run, embedding)
     before = recognizer.recognize(CLUTTER)
     recognizer.enroll("pen", [(CLUTTER, 3)])
@@ -217,10 +212,8 @@ def test_views_get_augmented_copies(embedding: Embedding) -> None:
         assert len(copy.points) == len(copy.colors) == len(copy.boundary) >= 30
     recognizer.objects.enroll("mesh", views, "mesh")
     recognizer.objects.enroll("frames", views, "frames")
-    sizes = {name: len(views.embeddings) for name, views in recognizer.gallery.objects.items()}
-    assert (sizes["mesh"], sizes["frames"]) == (8, 20) and recognizer.gallery.objects["frames"].embeddings.shape[
-        1
-    ] <= 256
+    objects = recognizer.gallery.objects
+    assert [len(objects[name].embeddings) for name in ("mesh", "frames")] == [8, 20]
 
 
 def test_a_run_directory_keeps_its_gallery(embedding: Embedding, tmp_path: Path) -> None:
@@ -254,13 +247,6 @@ def test_another_embedding_embeds_the_views_again(embedding: Embedding, tmp_path
     embeddings = thor2.Recognizer.load(path).gallery.objects["brick"].embeddings
     np.testing.assert_array_equal(embeddings, expected.gallery.objects["brick"].embeddings)
     assert json.loads((path / "gallery" / "index.json").read_text())["embedding"] == other.fingerprint
-
-
-def test_embeddings_of_a_query_have_one_row_per_orientation(embedding: Embedding) -> None:
-    recognizer = thor2.Recognizer(dataclasses.replace(untrained_run((), ()), embedding=embedding))
-    _, inference = recognizer.infer(recognizer.prepare(CLUTTER), answer_by="gallery")
-    embeddings, weights = inference.embeddings, inference.weights
-    assert embeddings.shape == (4, LOOKS, embedding.size) and weights.shape == (4, LOOKS)
 
 
 def test_combined_values_of_classes_and_objects() -> None:

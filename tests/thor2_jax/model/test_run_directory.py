@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 import safetensors.numpy
 from flax import nnx
-from helpers import class_probabilities, untrained_embedding_run, untrained_run
+from helpers import class_probabilities, full_disk, untrained_embedding_run, untrained_run
 
 import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.looks import LookDescriptors
 from thor2_jax.gallery.references import BACKGROUND, REFERENCES_FILE, References
-from thor2_jax.model.classifier import FEATURES, MLP
+from thor2_jax.model.classifier import MLP
 from thor2_jax.model.run_directory import TrainedRun, input_size, load_run, save_run
 from thor2_jax.recognizer import Recognizer
 
@@ -51,11 +51,6 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def copied(saved: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(saved, tmp_path / "run"))
-
-
-def test_input_sizes() -> None:
-    sizes = {name: input_size(name, thor2.DescriptorConfig(), 22) for name in FEATURES}
-    assert sizes == {"ce": 4774, "tops": 7168, "tops2": 11942}
 
 
 def test_saving_and_loading_round_trips(saved: Path) -> None:
@@ -101,14 +96,11 @@ def test_an_empty_directory_may_be_filled(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("broken", ["network", "weights", "json"])
 def test_nothing_is_left_behind_when_saving_fails(broken: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(*_: Any, **__: Any) -> None:
-        raise OSError("no space left on device")
-
     run = make_run()
     if broken == "network":
-        monkeypatch.setattr(colornet, "save", fail)
+        monkeypatch.setattr(colornet, "save", full_disk)
     elif broken == "weights":
-        monkeypatch.setattr(safetensors.numpy, "save", fail)
+        monkeypatch.setattr(safetensors.numpy, "save", full_disk)
     else:
         run = dataclasses.replace(run, record={"not JSON": object()})
     with pytest.raises(TypeError if broken == "json" else OSError):
@@ -119,12 +111,7 @@ def test_nothing_is_left_behind_when_saving_fails(broken: str, tmp_path: Path, m
 def edited(**changes: Any) -> Callable[[Path], None]:
     def edit(path: Path) -> None:
         description = json.loads((path / "run.json").read_text())
-        for key, value in changes.items():
-            if value is None:
-                del description[key]
-            else:
-                description[key] = value
-        (path / "run.json").write_text(json.dumps(description))
+        (path / "run.json").write_text(json.dumps(description | changes))
 
     return edit
 
@@ -179,20 +166,14 @@ DAMAGES: dict[str, tuple[Callable[[Path], Any], str]] = {
     "binary run.json": (lambda path: (path / "run.json").write_bytes(b"\xff\xfe\x00"), "run.json cannot be read"),
     "a list": (lambda path: (path / "run.json").write_text("[1]"), "run.json has format 'list'"),
     "other format": (edited(format=3), "run.json has format 3"),
-    "earlier format": (edited(format=1), "run.json has format 1; expected 2"),
     "other version": (edited(descriptor_version=99), "descriptor version 99"),
     "no record": (edited(record=[1]), "run.json: TypeError"),
-    "no classes": (edited(classes=None), "classes is None"),
     "empty classes": (edited(classes=[]), "classes is []"),
-    "numbered classes": (edited(classes=[1, 2, 3]), "classes is [1, 2, 3]"),
     "one string": (edited(classes="abc"), "classes is 'abc'"),
-    "more classes": (edited(classes=["a", "b", "c", "d"]), "weights/ce.safetensors does not fit"),
     "unknown classifier": (edited(classifiers=["shape"]), "classifiers is ['shape']"),
     "missing classifier": (edited(classifiers=["ce", "tops", "tops2"]), "run.json: KeyError: 'tops2'"),
     "unknown constant": (edited(descriptor_config={**CONSTANTS, "beta": 1}), "beta"),
     "bad relaxation": (edited(descriptor_config={**CONSTANTS, "relaxation": {"slice": 0}}), "Relaxation.slice is 0"),
-    "no relaxation": (edited(descriptor_config={**CONSTANTS, "relaxation": 5}), "run.json: TypeError"),
-    "list of constants": (edited(descriptor_config=[1]), "run.json: TypeError"),
     "bad constant": (edited(descriptor_config={**CONSTANTS, "sigma_s": -1}), "DescriptorConfig.sigma_s is -1"),
     "other constant": (edited(descriptor_config={**CONSTANTS, "n_slices": 3}), "weights/ce.safetensors does not fit"),
     "no network": (lambda path: (path / "network.npz").unlink(), "network.npz cannot be read"),

@@ -48,12 +48,9 @@ def test_frames_of_recordings(tmp_path: Path, name: str, is_compressed: bool) ->
         np.testing.assert_array_equal(frame.depth, expected.depth)
         difference = np.abs(frame.color.astype(int) - expected.color)
         assert difference.mean() < 2 if is_compressed else difference.max() == 0
-
-
-def test_a_single_database_file(tmp_path: Path) -> None:
-    path = write_recording(tmp_path / "folder", FRAMES)
-    with Bag(next(path.glob("*.db3"))) as bag:
-        assert len(list(bag.frames())) == 3
+    if path.is_dir():
+        with Bag(next(path.glob("*.db3"))) as bag:
+            assert len(list(bag.frames())) == 3
 
 
 def test_the_file_of_intrinsics_replaces_the_topic(tmp_path: Path) -> None:
@@ -176,10 +173,38 @@ def test_the_largest_overlap_of_chunks() -> None:
     assert overlap((0, 5, 7, 1), (9, 1, 50, 2), (3, 4, 1, 1), (0, 20, 100, 3)) == 50
 
 
-def test_chunks_of_the_same_time_have_a_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("limit", "value", "message"),
+    [("MAX_OVERLAPPING", 1000, "chunks of the same time; expected at most 1000"), ("MAX_TOPICS", 2, "3 topics of")],
+)
+def test_chunks_of_the_same_time_and_topics_have_a_limit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: str, value: int, message: str
+) -> None:
     path = write_recording(tmp_path / "a.mcap", FRAMES[:1])
-    monkeypatch.setattr(bags, "MAX_OVERLAPPING", 1000)
-    with pytest.raises(InputError, match="chunks of the same time; expected at most 1000"), Bag(path):
+    monkeypatch.setattr(bags, limit, value)
+    with pytest.raises(InputError, match=message), Bag(path):
+        pass
+
+
+MANY_ALIASES = [f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 8)}]" for k in range(1, 12)]
+
+
+@pytest.mark.parametrize(
+    ("pattern", "replacement", "message"),
+    [
+        (f"name: {COLOR}", "name: [x]", "damaged"),
+        (f"name: {COLOR}", "name: 5", "damaged"),
+        (f"name: {COLOR}", "name: *a11", "damaged"),
+        (r"(?s)  files:.*?(?=\n  \w)", "  files: x", "no list"),
+    ],
+    ids=["list", "number", "aliases", "files"],
+)
+def test_damaged_metadata(tmp_path: Path, pattern: str, replacement: str, message: str) -> None:
+    path = write_recording(tmp_path / "folder", FRAMES[:1])
+    text, count = re.subn(pattern, replacement, (path / "metadata.yaml").read_text())
+    assert count
+    (path / "metadata.yaml").write_text("\n".join(["a0: &a0 [x]", *MANY_ALIASES, text]) if "*" in replacement else text)
+    with pytest.raises(InputError, match=message), Bag(path):
         pass
 
 
@@ -192,34 +217,6 @@ def test_definitions_of_messages_are_not_compiled(tmp_path: Path, name: str) -> 
     file.write_bytes(content.replace(b"uint32 height", b"import height"))
     with Bag(path) as bag:
         np.testing.assert_array_equal(next(bag.frames()).read().depth, FRAMES[0].depth)
-
-
-@pytest.mark.parametrize("value", ["[x]", "5", "*many"], ids=["list", "number", "aliases"])
-def test_damaged_metadata(tmp_path: Path, value: str) -> None:
-    path = write_recording(tmp_path / "folder", FRAMES[:1])
-    metadata = (path / "metadata.yaml").read_text()
-    aliases = [f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 8)}]" for k in range(1, 12)]
-    text = metadata.replace(f"name: {COLOR}", f"name: {value}").replace("*many", "*a11")
-    assert text != metadata
-    (path / "metadata.yaml").write_text("\n".join(["a0: &a0 [x]", *aliases, text]) if "*" in value else text)
-    with pytest.raises(InputError, match="damaged"), Bag(path):
-        pass
-
-
-def test_topics_have_a_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = write_recording(tmp_path / "a.mcap", FRAMES[:1])
-    monkeypatch.setattr(bags, "MAX_TOPICS", 2)
-    with pytest.raises(InputError, match="3 topics of images"), Bag(path):
-        pass
-
-
-def test_files_of_metadata_are_a_list(tmp_path: Path) -> None:
-    path = write_recording(tmp_path / "folder", FRAMES[:1])
-    metadata = (path / "metadata.yaml").read_text()
-    (path / "metadata.yaml").write_text(re.sub(r"(?s)  files:.*?(?=\n  \w)", "  files: x", metadata))
-    assert "files: x" in (path / "metadata.yaml").read_text()
-    with pytest.raises(InputError, match="no list"), Bag(path):
-        pass
 
 
 @pytest.mark.parametrize("change", ["timestamp = 'x'", "timestamp = NULL", "data = 'x'"])

@@ -41,6 +41,18 @@ def test_a_piece_with_two_known_objects_is_divided() -> None:
     np.testing.assert_array_equal(labels > 0, ONE_PIECE > 0)
 
 
+def test_pieces_of_one_known_object_are_merged_and_those_of_two_remain() -> None:
+    np.testing.assert_array_equal(segment_known(FRAME, TRUTH, knows(TRUTH > 0)), ONE_PIECE)
+    np.testing.assert_array_equal(segment_known(FRAME, TRUTH, knows(TRUTH == 1, TRUTH == 2)), TRUTH)
+
+
+def test_frames_without_pieces_or_without_depth_remain() -> None:
+    unknown: Recognize = lambda frames: [(None, 0.0)] * len(frames)  # noqa: E731
+    assert not segment_known(FRAME, np.zeros_like(TRUTH), unknown).any()
+    frame = RGBDFrame(FRAME.color, np.zeros_like(FRAME.depth), None, FRAME.intrinsics)
+    np.testing.assert_array_equal(segment_known(frame, ONE_PIECE, unknown), ONE_PIECE)
+
+
 @pytest.mark.parametrize(
     "recognize",
     [
@@ -53,14 +65,6 @@ def test_a_piece_with_two_known_objects_is_divided() -> None:
 )
 def test_a_piece_without_two_known_objects_remains(recognize: Recognize) -> None:
     np.testing.assert_array_equal(segment_known(FRAME, ONE_PIECE, recognize), ONE_PIECE)
-
-
-def test_pieces_of_one_known_object_are_merged() -> None:
-    np.testing.assert_array_equal(segment_known(FRAME, TRUTH, knows(TRUTH > 0)), ONE_PIECE)
-
-
-def test_pieces_of_two_known_objects_remain() -> None:
-    np.testing.assert_array_equal(segment_known(FRAME, TRUTH, knows(TRUTH == 1, TRUTH == 2)), TRUTH)
 
 
 def test_candidates_are_shown_where_they_are() -> None:
@@ -76,17 +80,3 @@ def test_candidates_are_shown_where_they_are() -> None:
     assert len(whole) == 1 and (whole[0].label_image > 1).any()
     seen = backproject(whole[0].depth_m, whole[0].intrinsics)[whole[0].label_image == 1]
     np.testing.assert_allclose(seen, points, atol=1e-5)
-
-
-def test_a_frame_without_pieces_has_no_candidates() -> None:
-    def recognize(frames: Sequence[RGBDFrame]) -> list[Answer]:
-        assert not frames
-        return []
-
-    assert not segment_known(FRAME, np.zeros_like(TRUTH), recognize).any()
-
-
-def test_pieces_without_depth_remain() -> None:
-    frame = RGBDFrame(FRAME.color, np.zeros_like(FRAME.depth), None, FRAME.intrinsics)
-    labels = segment_known(frame, ONE_PIECE, lambda frames: [(None, 0.0)] * len(frames))
-    np.testing.assert_array_equal(labels, ONE_PIECE)

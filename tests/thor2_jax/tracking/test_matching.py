@@ -7,7 +7,7 @@ import pytest
 
 from thor2_jax.errors import InputError
 from thor2_jax.tracking.matching import MIN_OVERLAP, VOXELS, match, occupied_voxels, overlap
-from thor2_jax.tracking.poses import check_pose, transform
+from thor2_jax.tracking.poses import check_pose
 
 
 def patch(x: float, y: float = 0.0, size: float = 0.08, step: float = 0.004) -> np.ndarray:
@@ -40,18 +40,7 @@ def test_a_match_has_the_largest_total_overlap() -> None:
     pairs = match(first, second)
     assert total(pairs) == pytest.approx(best) and best > 0.5
     assert len({i for i, _ in pairs}) == len({j for _, j in pairs}) == len(pairs)
-
-
-def test_objects_that_moved_a_little_keep_their_match() -> None:
-    before, after = [patch(x) for x in (0.0, 0.1, 0.2)], [patch(x + 0.02) for x in (0.2, 0.0, 0.1, 0.6)]
-    pairs = match([occupied_voxels(p) for p in before], [occupied_voxels(p) for p in after])
-    assert sorted(pairs) == [(0, 1), (1, 2), (2, 0)]
-    assert match([], [occupied_voxels(before[0])]) == match([occupied_voxels(before[0])], []) == []
-
-
-def test_poses_move_points() -> None:
-    pose = np.array([[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]])
-    np.testing.assert_allclose(transform(check_pose(pose), np.array([[1.0, 0, 0], [0, 1, 5]])), [[1, 3, 3], [0, 2, 8]])
+    assert match([], second) == match(first, []) == []
 
 
 @pytest.mark.parametrize(
