@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers import random_clouds, untrained_run
-from safetensors.numpy import load_file, save_file
+from safetensors.numpy import load, save
 from typer.testing import CliRunner
 
 import colornet
@@ -94,9 +94,7 @@ def test_baselines_learn_and_are_calibrated(
 
 
 def test_held_out_set_is_that_of_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    label = np.repeat([0, 1], 20)
-    view = np.tile(np.arange(20), 2)
-    marks: list[Any] = []
+    label, view, marks = np.repeat([0, 1], 20), np.tile(np.arange(20), 2), list[Any]()
 
     def interrupted(task: Any) -> Any:
         marks.append(task.held_out(label, view))
@@ -126,22 +124,17 @@ def test_invalid_arguments_are_refused(trained: Path, tmp_path: Path) -> None:
         train_baselines(write_run(tmp_path / "run"), without_angles, ["thor"])
 
 
-@pytest.mark.parametrize("damage", ["cut", "changed", "classes", "lacking"])
-def test_damaged_files_are_refused(trained: Path, tmp_path: Path, damage: str) -> None:
+def test_damaged_files_are_refused(trained: Path, tmp_path: Path) -> None:
     folder = write_run(tmp_path / "run")
     (folder / "baselines").mkdir()
     file = folder / "baselines" / "forest.safetensors"
     content = (trained / "baselines" / "forest.safetensors").read_bytes()
-    if damage == "cut":
-        file.write_bytes(content[:-9])
-    elif damage == "changed":
-        file.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
-    else:
-        file.write_bytes(content)
-        about = {"format": 1, "classes": ["a", "b"], "temperature": None, "seconds": 1.0, "digest": ""}
-        save_file({} if damage == "lacking" else load_file(file), file, {"about": json.dumps(about)})
-    with pytest.raises(InputError, match="forest.safetensors"):
-        load_baselines(folder, load_run(folder))
+    about = {"format": 1, "classes": ["a", "b"], "temperature": None, "seconds": 1.0, "digest": ""}
+    lacking, others = (save(tensors, {"about": json.dumps(about)}) for tensors in ({}, load(content)))
+    for damaged in (content[:-9], content[:-1] + bytes([content[-1] ^ 1]), lacking, others):
+        file.write_bytes(damaged)
+        with pytest.raises(InputError, match="forest.safetensors"):
+            load_baselines(folder, load_run(folder))
 
 
 def test_left_out_classes_are_not_in_the_views() -> None:
