@@ -94,6 +94,7 @@ def test_the_record_is_json_and_nothing_is_changed_without_augmentations() -> No
         (lambda: Sensor(lateral="1"), r"sensor\.lateral is '1'"),  # type: ignore[arg-type]
         (lambda: Segmentation(pixels=[-3, 3]), r"segmentation\.pixels is \[-3, 3\]"),  # type: ignore[arg-type]
         (lambda: Registration(shift=-1), r"registration\.shift is -1"),
+        (lambda: Augmentations(copies=0), r"augmentations\.copies is 0"),
         (lambda: Augmentations(copies=True), r"augmentations\.copies is True"),
         (lambda: Augmentations(sensor=Occlusion()), r"augmentations\.sensor is Occlusion\("),  # type: ignore[arg-type]
     ],

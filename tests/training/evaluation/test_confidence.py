@@ -1,7 +1,5 @@
 """Confidence metrics against values computed by hand."""
 
-import math
-
 import numpy as np
 import pytest
 
@@ -26,15 +24,13 @@ def test_calibration_error_matches_hand_calculation() -> None:
     assert np.isnan(result.accuracy[1])
     by_hand = (1 * 0 + 2 * abs(0.5 - 0.51) + 3 * abs(2 / 3 - 2.92 / 3)) / 6
     assert expected_calibration_error(confidence, correct) == pytest.approx(by_hand)
-
-
-def test_bins_include_their_upper_edge() -> None:
+    # Bins include their upper edge.
     assert reliability([0.5, 0.5000001, 1.0], [True] * 3, bins=2).answers.tolist() == [1, 2]
 
 
 def test_metrics_without_answers_are_nan() -> None:
-    assert math.isnan(expected_calibration_error([], []))
-    assert all(math.isnan(value) for value in accuracy_at_coverage([], []))
+    values = [expected_calibration_error([], []), *accuracy_at_coverage([], []), auroc([0.1, 0.2], [True, True])]
+    assert np.isnan([*values, unknown_named([], [0.5]), *unknown_named([0.5], [], [0.1, 0.2])]).all()
 
 
 def test_auroc_is_the_fraction_of_ordered_pairs() -> None:
@@ -42,7 +38,6 @@ def test_auroc_is_the_fraction_of_ordered_pairs() -> None:
     confidence, positive = rng.integers(0, 6, 40) / 5, rng.random(40) < 0.4
     pairs = [(0.5 if p == n else float(p > n)) for p in confidence[positive] for n in confidence[~positive]]
     assert auroc(confidence, positive) == pytest.approx(np.mean(pairs))
-    assert math.isnan(auroc([0.1, 0.2], [True, True]))
 
 
 def test_coverage_matches_hand_calculation() -> None:
@@ -63,6 +58,8 @@ def test_invalid_arguments_are_refused() -> None:
         auroc([1.5, 0.2], [True, False])
     with pytest.raises(InputError, match="coverage is 0"):
         accuracy_at_coverage([0.5], [True], 0)
+    with pytest.raises(InputError, match="kept"):
+        unknown_named([0.5], [0.5], 1.5)
 
 
 def test_unknown_named_matches_a_search_of_thresholds() -> None:
@@ -77,9 +74,3 @@ def test_unknown_named_matches_a_search_of_thresholds() -> None:
     assert unknown_named(correct, unknown, kept).tolist() == pytest.approx(by_search)
     assert unknown_named([0.9, 0.8, 0.7], [0.95, 0.75, 0.1], 2 / 3) == pytest.approx(1 / 3)
     assert unknown_named([0.5], [0.9], 0.0) == 0
-
-
-def test_unknown_named_without_answers_is_nan() -> None:
-    assert np.isnan(unknown_named([], [0.5])) and np.isnan(unknown_named([0.5], [], [0.1, 0.2])).all()
-    with pytest.raises(InputError, match="kept"):
-        unknown_named([0.5], [0.5], 1.5)
