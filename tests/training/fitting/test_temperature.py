@@ -38,12 +38,9 @@ def test_likelihood_matches_scipy_and_sklearn() -> None:
     assert negative_log_likelihood(probabilities, truth, best) <= min(grid) + 1e-9
 
 
-def test_zero_probabilities_are_accepted() -> None:
+def test_probabilities_of_zero_and_invalid_arguments() -> None:
     probabilities = np.array([[1.0, 0.0], [1.0, 0.0], [0.0, 1.0]], np.float32)
     assert 1 < fit_temperature(probabilities, np.array([0, 1, 1])) <= 100
-
-
-def test_invalid_arguments_are_refused() -> None:
     with pytest.raises(InputError, match="shapes"):
         fit_temperature(np.zeros((0, 3)), np.zeros(0, int))
     with pytest.raises(InputError, match=r"truth.* 3; expected 0 to 2"):

@@ -1,13 +1,12 @@
 """Crops of the views of a dataset: written beside it, resumed, reduced, and refused where they do not fit."""
 
-import hashlib
 import json
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import run_thor2, write_box
+from helpers import files_of, run_thor2, write_box
 
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import RGBDFrame
@@ -32,15 +31,21 @@ def meshes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def render_command(meshes: Path, out: Path) -> list[object]:
+    """Return the command that renders them, but for the size of the crops."""
+    options = ("--azimuth-step", 180, "--polar-step", 90, "--workers", 1, "--illumination", "--copies", 1, "--quiet")
+    return ["render", "--meshes", meshes, "--out", out, *options, "--crops"]
+
+
 @pytest.fixture(scope="module")
 def dataset(meshes: Path, tmp_path_factory: pytest.TempPathFactory) -> ViewDataset:
     out = tmp_path_factory.mktemp("views") / "views"
-    command = ("--meshes", meshes, "--out", out, "--azimuth-step", 180, "--polar-step", 90, "--workers", 1)
-    assert run_thor2("render", *command, "--illumination", "--copies", 1, "--crops", SIZE, "--quiet") == 0
+    assert run_thor2(*render_command(meshes, out), SIZE) == 0
     return ViewDataset.open(out)
 
 
 def test_crops_are_those_of_the_rendered_views(meshes: Path, dataset: ViewDataset) -> None:
+    """A source without the brick has those of the box."""
     mesh: TexturedMesh = load_mesh(meshes / "brick.ply")
     index = dataset.classes.index("brick")
     views, crops = dataset.read(index), dataset.read_crops(index, SIZE)
@@ -52,6 +57,8 @@ def test_crops_are_those_of_the_rendered_views(meshes: Path, dataset: ViewDatase
         color, normals = quantized(rgbd_crop(frame, 1, SIZE))
         np.testing.assert_array_equal(crops.color[row], color)
         np.testing.assert_array_equal(crops.normals[row], normals)
+    box = WithoutClasses(dataset, ["brick"]).read_crops(0, SIZE)
+    np.testing.assert_array_equal(box.color, dataset.read_crops(1 - index, SIZE).color)
 
 
 def test_crops_of_the_user_are_not_replaced(meshes: Path, dataset: ViewDataset, tmp_path: Path) -> None:
@@ -69,20 +76,18 @@ def test_interrupted_crops_resume_with_the_same_bytes(
 ) -> None:
     """The damaged file alone is written again; the dataset keeps its digest."""
     directory = dataset.directory / "crops"
-    files = sorted(directory.glob("*.npz"))
-    before = {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
-    files[0].write_bytes(files[0].read_bytes()[:-1])
+    before, first = {**files_of(directory), "manifest.json": None}, min(directory.glob("*.npz"))
+    first.write_bytes(first.read_bytes()[:-1])
     with pytest.raises(InputError, match="is missing or damaged"):
         dataset.read_crops(0, SIZE)
     written = []
     encode = render_job.crops.encode_crops
     monkeypatch.setattr(render_job.crops, "encode_crops", lambda crops: written.append(len(crops)) or encode(crops))
-    command = ("--meshes", meshes, "--out", dataset.directory, "--azimuth-step", 180, "--polar-step", 90)
-    again = (*command, "--workers", 1, "--illumination", "--copies", 1, "--quiet", "--crops")
-    assert run_thor2("render", *again, SIZE) == 0
+    again = render_command(meshes, dataset.directory)
+    assert run_thor2(*again, SIZE) == 0
     assert len(written) == 1 and ViewDataset.open(dataset.directory).digest == dataset.digest
-    assert {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in files} == before
-    assert run_thor2("render", *again, 0) == 2 and run_thor2("render", *again, 2 * SIZE) == 2
+    assert {**files_of(directory), "manifest.json": None} == before
+    assert run_thor2(*again, 0) == 2 and run_thor2(*again, 2 * SIZE) == 2
 
 
 def test_crops_that_do_not_fit_are_refused(meshes: Path, dataset: ViewDataset, tmp_path: Path) -> None:
@@ -100,11 +105,6 @@ def test_crops_that_do_not_fit_are_refused(meshes: Path, dataset: ViewDataset, t
     manifest.write_text("[]")
     with pytest.raises(InputError, match="manifest.json is damaged"):
         plain.read_crops(0, 8)
-
-
-def test_left_out_classes_have_no_crops(dataset: ViewDataset) -> None:
-    remaining = WithoutClasses(dataset, [dataset.classes[0]])
-    np.testing.assert_array_equal(remaining.read_crops(0, SIZE).color, dataset.read_crops(1, SIZE).color)
 
 
 def test_reduced_crops_are_means_of_areas() -> None:

@@ -1,5 +1,7 @@
 """Crops of colour and surface normals, against planes, spheres, SciPy and OpenCV."""
 
+import dataclasses
+
 import cv2
 import numpy as np
 import pytest
@@ -27,24 +29,41 @@ def box(top: int, left: int, height: int, width: int) -> np.ndarray:
     return mask
 
 
-@pytest.mark.parametrize("size", [1, 7, 40, 224])
+@pytest.mark.parametrize("size", [1, 7, CROP_SIZE])
 def test_crop_of_a_plane(size: int) -> None:
-    """A tilted plane has its normal everywhere, up to the rim, and no colour of the background."""
+    """A tilted plane has its normal everywhere, up to the rim, and no colour of the background.
+
+    Neither the depth unit nor the neighbours of an instance matter: rendered views are cropped alike.
+    """
     normal = np.array([0.48, -0.36, -0.8])
-    crop = rgbd_crop(plane_frame(tuple(normal), box(4, 10, 30, 18)), 3, size)
+    frame = plane_frame(tuple(normal), box(4, 10, 30, 18))
+    crop = rgbd_crop(frame, 3, size)
     assert crop.color.shape == crop.normals.shape == (size, size, 3)
     assert crop.color.dtype == crop.normals.dtype == np.float32
     np.testing.assert_allclose(crop.color[crop.mask], np.tile([1, 0.2, 0], (crop.mask.sum(), 1)), atol=1e-5)
     np.testing.assert_allclose(crop.normals[crop.mask], np.tile(normal, (crop.mask.sum(), 1)), atol=1e-3)
     assert not crop.color[~crop.mask].any() and not crop.normals[~crop.mask].any()
+    depth = np.rint(100_000 * np.where(box(4, 10, 30, 18), frame.depth, 0)).astype(np.uint32)
+    labels, scaled = (depth > 0).astype(np.uint8), dataclasses.replace(CAMERA, depth_scale=100_000)
+    view = rgbd_crop(thor2.RGBDFrame(frame.color, depth, labels, scaled), 1, size)
+    np.testing.assert_array_equal(view.color, crop.color)
+    np.testing.assert_allclose(view.normals, crop.normals, atol=1e-3)
 
 
 def test_crop_is_centred_and_fills_the_square() -> None:
-    """A box of 30 x 18 pixels fills the height, with margins of 6 pixels; the frame's border is no limit."""
+    """A box of 30 x 18 pixels fills the height, with margins of 6 pixels; the frame's border is no limit.
+
+    Holes do not change the normals of the plane, and a single pixel looks at the camera.
+    """
     for mask in (box(4, 10, 30, 18), box(0, 0, 30, 18), box(18, 46, 30, 18)):
-        crop = rgbd_crop(plane_frame((0, 0, -1), mask), 3, 30)
+        frame = plane_frame((0, 0, -1), mask)
+        frame.depth[20:30, 12:20] = 0
+        crop = rgbd_crop(frame, 3, 30)
         np.testing.assert_array_equal(crop.mask, np.pad(np.ones((30, 18), bool), ((0, 0), (6, 6))))
-    assert rgbd_crop(plane_frame((0, 0, -1), box(4, 10, 30, 17)), 3).mask.shape == (CROP_SIZE, CROP_SIZE)
+        np.testing.assert_allclose(crop.normals[crop.mask], np.tile([0, 0, -1], (30 * 18, 1)), atol=1e-6)
+    crop = rgbd_crop(plane_frame((0, 0, -1), box(3, 60, 1, 1)), 3, 2)
+    ray = np.array([(60 - CAMERA.cx) / CAMERA.fx, (3 - CAMERA.cy) / CAMERA.fy, 1])
+    np.testing.assert_allclose(crop.normals[0, 0], -ray / np.linalg.norm(ray), atol=1e-6)
 
 
 def test_enlarged_mask_matches_opencv() -> None:
@@ -70,12 +89,6 @@ def test_normals_of_a_sphere() -> None:
     assert (surface_normals(points, mask)[mask] * rays[mask]).sum(axis=-1).max() < 0
 
 
-def test_single_pixels_look_at_the_camera() -> None:
-    crop = rgbd_crop(plane_frame((0, 0, -1), box(3, 60, 1, 1)), 3, 2)
-    ray = np.array([(60 - CAMERA.cx) / CAMERA.fx, (3 - CAMERA.cy) / CAMERA.fy, 1])
-    np.testing.assert_allclose(crop.normals[0, 0], -ray / np.linalg.norm(ray), atol=1e-6)
-
-
 def test_filling_matches_scipy() -> None:
     """Holes of one pass have the median of their window; known depths and the background stay."""
     rng = np.random.default_rng(0)
@@ -87,31 +100,9 @@ def test_filling_matches_scipy() -> None:
     medians = generic_filter(known, np.nanmedian, size=5, mode="constant", cval=np.nan)
     filled = fill_depth(np.where(holes, 0, depth), mask)
     np.testing.assert_allclose(filled, np.where(mask, np.where(holes, medians, depth), 0), rtol=1e-6)
-
-
-def test_large_holes_and_separate_parts_are_filled() -> None:
-    mask = box(0, 0, 40, 20) | box(0, 40, 10, 10)
-    depth = np.zeros(mask.shape, np.float32)
-    depth[0, :20] = 0.7
-    filled = fill_depth(depth, mask)
-    assert (filled[mask] == np.float32(0.7)).all() and not filled[~mask].any()
-
-
-def test_holes_do_not_change_the_normals_of_a_plane() -> None:
-    frame = plane_frame((0, 0, -1), box(4, 10, 30, 18))
-    depth = frame.depth.copy()
-    depth[10:20, 12:20] = 0
-    holed = thor2.RGBDFrame(frame.color, depth, frame.labels, CAMERA)
-    np.testing.assert_allclose(rgbd_crop(holed, 3).normals, rgbd_crop(frame, 3).normals, atol=1e-6)
-
-
-def test_rendered_views_are_cropped_alike() -> None:
-    """The depth unit and the neighbours of an instance do not matter."""
-    frame = plane_frame((0, 0, -1), box(4, 10, 30, 18))
-    millimetres = np.where(frame.labels == 3, 800, 0).astype(np.uint16)  # type: ignore[operator]
-    view = thor2.RGBDFrame(frame.color, millimetres, (millimetres > 0).astype(np.uint8), CAMERA)
-    np.testing.assert_allclose(rgbd_crop(view, 1).normals, rgbd_crop(frame, 3).normals, atol=1e-6)
-    np.testing.assert_array_equal(rgbd_crop(view, 1).color, rgbd_crop(frame, 3).color)
+    # A part in which only one row is known, and another one without any depth.
+    mask, depth = box(0, 0, 40, 20) | box(0, 40, 10, 10), np.where(box(0, 0, 1, 20), np.float32(0.7), 0)
+    np.testing.assert_array_equal(fill_depth(depth, mask), np.where(mask, np.float32(0.7), 0))
 
 
 def test_instances_that_cannot_be_cropped_are_refused() -> None:
