@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from helpers import ToyDescriptors, UntaughtRecognizer, small_frame
 
+import thor2_jax as thor2
 from training.evaluation.answering import answer_frames
 from training.evaluation.runs import Run
 from training.readers.labelled import LabelledFrame
@@ -14,9 +15,7 @@ from training.readers.labelled import LabelledFrame
 class ToyRecognizer(UntaughtRecognizer):
     """Stand-in for a recognizer: the k-th usable instance of a frame has row k of the given probabilities."""
 
-    def __init__(
-        self, labels: list[int], unusable: dict[int, str], probabilities: dict[str, list[list[float]]]
-    ) -> None:
+    def __init__(self, labels: list[int], unusable: dict[int, str], probabilities: dict[str, Any]) -> None:
         super().__init__(("mug", "bowl", "can"), ("tops", "tops2"))
         self.instances = [
             SimpleNamespace(label=label, reason=unusable.get(label), occluded=label == 4) for label in labels
@@ -54,3 +53,15 @@ def test_every_labelled_instance_gets_an_answer() -> None:
             np.testing.assert_allclose(instance.probabilities, expected, rtol=1e-6)
         else:
             assert instance.probabilities is None
+
+
+def test_position_is_the_median_of_the_points() -> None:
+    """Two pixels at 2 m and one at 9 m, which belongs to the background; one without depth does not count."""
+    depth, labels = np.zeros((2, 3, 5), np.uint16)
+    depth[1, 1:4] = 2000, 2000, 9000
+    labels[1], labels[2, 0] = [0, 1, 1, 1, 1], 2
+    frame = thor2.RGBDFrame(np.zeros((3, 5, 3), np.uint8), depth, labels, thor2.Intrinsics(10.0, 10.0, 0.0, 0.0))
+    recognizer: Any = ToyRecognizer([], {}, {"tops": np.zeros((0, 3)), "tops2": np.zeros((0, 3))})
+    truth = dict.fromkeys((1, 2, 3), "mug")
+    ((_, answers),) = answer_frames([Run("run", "", recognizer)], [LabelledFrame("f", frame, truth, {})])
+    assert [instance.position for instance in answers.instances] == [(0.4, 0.2, 2.0), None, None]

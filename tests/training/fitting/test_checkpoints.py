@@ -1,4 +1,4 @@
-"""Checkpoints: which epochs are kept, what they restore, and what remains after a failure."""
+"""Checkpoints and run directories: which epochs are kept, what they restore, and what remains after a failure."""
 
 import errno
 import sys
@@ -12,7 +12,8 @@ import pytest
 from helpers import full_disk
 
 import thor2_jax as thor2
-from training.fitting.checkpoints import Checkpoints, _quiet_orbax
+from thor2_jax.errors import InputError
+from training.fitting.checkpoints import Checkpoints, _quiet_orbax, find_run_directories
 
 
 class State(NamedTuple):
@@ -115,3 +116,27 @@ def test_threads_of_a_failed_save_print_no_traceback(monkeypatch: pytest.MonkeyP
     sys.excepthook(RuntimeError, RuntimeError("Event loop is closed"), None)
     sys.excepthook(RuntimeError, RuntimeError("another"), None)
     assert printed == ["another"]
+
+
+def test_folds_are_listed_in_numeric_order(tmp_path: Path) -> None:
+    for name in ("single", "five/fold-10", "five/fold-2", "five/fold-0"):
+        (tmp_path / name).mkdir(parents=True)
+        (tmp_path / name / "run.json").touch()
+    directories = find_run_directories([tmp_path / "single", tmp_path / "five"])
+    assert [path.relative_to(tmp_path).as_posix() for path in directories] == [
+        "single",
+        "five/fold-0",
+        "five/fold-2",
+        "five/fold-10",
+    ]
+
+
+def test_unfinished_training_is_refused_but_not_its_folds(tmp_path: Path) -> None:
+    fold = tmp_path / "run" / "fold-0"
+    fold.mkdir(parents=True)
+    (fold / "run.json").touch()
+    (tmp_path / "run" / "checkpoints").mkdir()
+    (tmp_path / "run" / "checkpoints" / "begun.json").touch()
+    with pytest.raises(InputError, match="model: "):
+        find_run_directories([tmp_path / "run"])
+    assert find_run_directories([fold]) == [fold]

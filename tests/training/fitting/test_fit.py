@@ -1,7 +1,8 @@
-"""Fitting: separable classes are learned, results are reproducible, and invalid input is refused."""
+"""Fitting: separable classes are learned, results are reproducible, metrics are logged, invalid input is refused."""
 
 import copy
 import dataclasses
+import itertools
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -10,7 +11,7 @@ import jax
 import numpy as np
 import pytest
 from flax import nnx
-from helpers import Interrupted, input_error
+from helpers import input_error, json_lines
 
 import colornet
 import thor2_jax as thor2
@@ -18,7 +19,7 @@ from thor2_jax.descriptor.color_membership import region_sets
 from thor2_jax.model.classifier import MLP, Feature, feature_of
 from training.fitting.checkpoints import Checkpoints
 from training.fitting.fit import fit
-from training.fitting.options import EpochMetrics, FitOptions
+from training.fitting.options import EpochMetrics, FitOptions, append_metrics, discard_later_epochs, read_metrics
 from training.fitting.samples import Batch, Samples, expand
 from training.fitting.steps import FitContext
 
@@ -105,33 +106,6 @@ def test_the_held_out_set_is_evaluated_but_not_trained_on(separable: Samples, fi
     assert final.accuracy > 0.8 and final.held_out_accuracy == pytest.approx((separable.label[held_out] == 0).mean())
 
 
-@pytest.mark.slow
-def test_a_resumed_fit_gives_bit_identical_weights(separable: Samples, fitted: Fit, tmp_path: Path) -> None:
-    held_out = np.arange(48) % 4 == 0
-    expected: list[EpochMetrics] = []
-    model, best = fitted(held_out=held_out, epoch_done=expected.append)
-    curve: list[EpochMetrics] = []
-
-    def stop_at(step: int) -> Callable[[int, int, EpochMetrics], None]:
-        def progress(done: int, total: int, metrics: EpochMetrics) -> None:
-            if done == step:
-                raise Interrupted
-
-        return progress
-
-    for step in (3, 4, 9, None):  # in the first, second and third epoch
-        with Checkpoints(tmp_path / "stopped") as checkpoints:
-            progress = stop_at(step) if step else lambda *_: None
-            try:
-                again = fit(separable, TOPS2, QUICK, checkpoints, held_out, progress, curve.append)
-            except Interrupted:
-                continue
-    same_bits(again[0], model)
-    assert again[1] == best
-    without_rate = [dataclasses.replace(metrics, samples_per_second=0) for metrics in expected]
-    assert [dataclasses.replace(metrics, samples_per_second=0) for metrics in curve] == without_rate
-
-
 def test_a_finished_fit_returns_its_classifier_without_steps(separable: Samples, fitted: Fit, tmp_path: Path) -> None:
     """Another fit with the same seed gives the same weights, one with another seed does not."""
     refuse = lambda *_: pytest.fail("the fit made a step")  # noqa: E731
@@ -190,3 +164,35 @@ def test_infinite_loss_is_refused_and_the_last_checkpoint_stays(separable: Sampl
 def test_invalid_options_are_refused_by_name(name: str, value: object) -> None:
     with input_error(f"{name} is {value!r};", match=f"^{name} "):
         FitOptions(**{name: value})
+
+
+def metrics(epoch: int) -> EpochMetrics:
+    return EpochMetrics(epoch, 1 / epoch, 0.5, 1000.0)
+
+
+def test_metrics_are_appended_and_discarded(tmp_path: Path) -> None:
+    path = tmp_path / "metrics.jsonl"
+    assert read_metrics(path) == []
+    keys = list(itertools.product((0, 1), ("ce", "tops"), (1, 2, 3)))
+    for fold, name, epoch in keys:
+        append_metrics(path, fold, name, metrics(epoch))
+    rows = json_lines(path.read_text())
+    assert rows == read_metrics(path) and len(rows) == 12
+    assert rows[4] == {"fold": 0, "classifier": "tops", **dataclasses.asdict(metrics(2))}
+    discard_later_epochs(path, 1, "ce", 1)
+    kept = [(row["fold"], row["classifier"], row["epoch"]) for row in read_metrics(path)]
+    assert kept == [key for key in keys if key[:2] != (1, "ce") or key[2] == 1]
+
+
+def test_an_incomplete_last_line_is_ignored(tmp_path: Path) -> None:
+    path = tmp_path / "metrics.jsonl"
+    append_metrics(path, 0, "ce", metrics(1))
+    with path.open("a") as file:
+        file.write('{"fold": 0, "cl')
+    assert [row["epoch"] for row in read_metrics(path)] == [1]
+    discard_later_epochs(path, 0, "ce", 1)
+    append_metrics(path, 0, "ce", metrics(2))
+    assert [row["epoch"] for row in read_metrics(path)] == [1, 2]
+    path.write_text("no json\n{}\n")
+    with pytest.raises(thor2.InputError, match=r"out: .*metrics\.jsonl"):
+        read_metrics(path)

@@ -1,12 +1,7 @@
 """Trainings: uninterrupted, interrupted and resumed, and with several folds."""
 
 import dataclasses
-import json
 import os
-import signal
-import subprocess
-import sys
-import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -18,7 +13,6 @@ from helpers import Interrupted, brick_and_stick, files_of, full_disk, random_cl
 from PIL import Image
 
 import thor2_jax as thor2
-from thor2_jax.model import classifier
 from thor2_jax.model.run_directory import TrainedRun, load_run
 from thor2_jax.types import Cloud
 from training.evaluation.runs import load_runs
@@ -305,37 +299,3 @@ def test_folds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         same_weights(runs[0], runs[1])
     with pytest.raises(thor2.InputError, match="out: .* already contains"):
         run()
-
-
-_PROGRAM = """
-import sys
-import test_job
-from thor2_jax.model import classifier
-classifier.HIDDEN = tuple(map(int, sys.argv[2].split(",")))
-test_job.train(test_job.Path(sys.argv[1]), ("tops", "ce"))
-"""
-
-
-@pytest.mark.slow
-def test_a_killed_training_resumes_to_the_same_bytes(whole: tuple[Path, TrainedRun], tmp_path: Path) -> None:
-    out = tmp_path / "run"
-    command = [sys.executable, "-c", _PROGRAM, str(out), ",".join(map(str, classifier.HIDDEN))]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
-    killed = 0
-    # At once after lines appear: while a checkpoint is being written, or the next epoch is under way.
-    for lines in (1, 5):
-        with subprocess.Popen(command, env=environment) as process:
-            while process.poll() is None:
-                if (out / "metrics.jsonl").exists() and len((out / "metrics.jsonl").read_text().splitlines()) >= lines:
-                    process.kill()
-                    break
-                time.sleep(0.001)
-        killed += process.returncode == -signal.SIGKILL
-    assert killed == 2
-    assert json.loads((out / "checkpoints" / "begun.json").read_text())["epochs"] == 3
-    subprocess.run(command, env=environment, check=True)
-    same_weights(load_run(out), whole[1])
-    assert (out / "weights").is_dir() and logged_rows(out) == logged_rows(whole[0])
-    first, second = (json.loads((folder / "run.json").read_text()) for folder in (out, whole[0]))
-    assert first["record"] == second["record"]
-    assert names(out) == FINISHED

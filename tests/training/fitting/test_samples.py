@@ -1,6 +1,7 @@
-"""Training samples against descriptors of the same views, computed one by one."""
+"""Training samples against descriptors of the same views, computed one by one, and folds by view."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import jax
@@ -13,7 +14,7 @@ import thor2_jax as thor2
 from thor2_jax.descriptor.color_membership import region_sets
 from thor2_jax.types import Cloud
 from training.fitting import samples as module
-from training.fitting.samples import PAPER_MIRRORS, Samples, build_samples, expand
+from training.fitting.samples import PAPER_MIRRORS, Samples, build_samples, expand, fold_of_views
 from training.views.normalized_views import MemoryViews, NormalizedViews, SourceShard
 
 NETWORK = colornet.load_default()
@@ -121,3 +122,24 @@ def test_the_digest_is_that_of_the_views() -> None:
     digests = [digest(a=one, b=two), digest(b=one, a=two), digest(a=two, b=one), digest(a=other, b=two)]
     assert len(set(digests)) == 4
     assert digest(a=views(0, (3, 4)), b=two) == digests[0]
+
+
+def fold_of(label: Sequence[int], view: Sequence[int], folds: int, seed: int) -> np.ndarray:
+    return fold_of_views(np.array(label), np.array(view), ("a", "b"), folds, seed)
+
+
+def test_samples_of_a_view_stay_together_and_folds_are_even() -> None:
+    label = np.repeat([0, 1, 0], [52, 60, 52])
+    view = np.concatenate([np.repeat(np.arange(n, m, s), 4) for n, m, s in ((0, 13, 1), (100, 130, 2), (0, 13, 1))])
+    fold_numbers = fold_of(label, view, 5, 0)
+    for name in (0, 1):
+        folds = {v: set(fold_numbers[(label == name) & (view == v)]) for v in view[label == name]}
+        assert all(len(fold) == 1 for fold in folds.values())
+        counts = np.bincount([fold.pop() for fold in folds.values()], minlength=5)
+        assert len(counts) == 5 and counts.max() - counts.min() <= 1
+    np.testing.assert_array_equal(fold_numbers, fold_of(label, view, 5, 0))
+    assert (fold_numbers != fold_of(label, view, 5, 1)).any()
+    assert not fold_of(label, view, 1, 0).any()
+    for folds in (14, 0):
+        with pytest.raises(thor2.InputError, match=f"folds is {folds}"):
+            fold_of(label, view, folds, 0)

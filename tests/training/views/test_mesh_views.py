@@ -73,12 +73,6 @@ def test_all_views_of_all_objects_in_order(monkeypatch: pytest.MonkeyPatch) -> N
     check_same(clouds, expected)
 
 
-@pytest.mark.slow
-def test_workers_give_the_same_views(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(views, "VIEWS_PER_TASK", 50)
-    check_same(*(render_views({"a": ball(), "b": ball(0.03)}, 20, 15, workers) for workers in (1, 2)))
-
-
 def test_mesh_files_and_meshes_give_equal_views(tmp_path: Path) -> None:
     colors = np.full((4, 3), 99, np.uint8)
     corners = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]])

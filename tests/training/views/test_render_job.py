@@ -7,7 +7,6 @@ import os
 import resource
 import shutil
 import signal
-import subprocess
 import sys
 import threading
 import time
@@ -18,7 +17,6 @@ import numpy as np
 import pytest
 import trimesh
 from helpers import Command, Interrupted, input_error, write_box
-from processes import HANG
 
 from thor2_jax.errors import InputError
 from training.augmentation.augmentations import Augmentations
@@ -119,45 +117,6 @@ def test_rendering_interrupted_at_any_write_resumes(
         listed = json.loads(before[MANIFEST])["views"] if MANIFEST in before else 0
         assert seen == [(done, 12) for done in (0, 4, 6, 10, 12) if done >= listed]
         assert left == -2 * (2 * (len(seen) - 1) + (MANIFEST not in before))
-
-
-KILLED = """
-import os, signal, sys
-from training.views import render_job
-from training.objects.builtin_objects import builtin_objects
-from training.storage.workers import local_workers
-
-render_job.CLOUDS_PER_SHARD = 4
-replace, left = os.replace, int(sys.argv[2])
-
-def killing(source, target):
-    global left
-    for step in (lambda: None, lambda: replace(source, target)):
-        step()
-        left -= 1
-        if left == 0:
-            os.kill(os.getpid(), signal.SIGKILL)
-
-os.replace = killing
-objects = {name: builtin_objects()[name] for name in ("screwdriver", "tennis_ball")}
-render_job.render_dataset(objects, sys.argv[1], 180, 90, local_workers(int(sys.argv[3])))
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "kills",
-    # Odd steps leave a temporary file, and even ones a complete file.
-    [[(4, 1)], [(1, 1), (5, 2), (3, 2), (2, 1)]],
-)
-def test_repeatedly_killed_rendering_resumes(whole: Path, tmp_path: Path, kills: list[tuple[int, int]]) -> None:
-    out = tmp_path / "views"
-    for step, workers in kills:
-        command = [sys.executable, "-c", KILLED, str(out), str(step), str(workers)]
-        assert subprocess.run(command, capture_output=True, timeout=HANG).returncode == -signal.SIGKILL
-    assert set(contents(out)) != set(contents(whole))
-    render_dataset(OBJECTS, out, *STEPS)
-    assert contents(out) == contents(whole)
 
 
 def changed(folder: Path) -> dict[str, int]:
