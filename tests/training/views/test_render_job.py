@@ -6,12 +6,10 @@ import json
 import os
 import resource
 import shutil
-import signal
 import sys
-import threading
-import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -82,6 +80,27 @@ def test_workers_give_equal_files(whole: Path, tmp_path: Path) -> None:
     assert contents(tmp_path / "views") == contents(whole)
 
 
+@pytest.mark.slow
+def test_on_a_ray_cluster_that_loses_a_worker(whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The task is repeated, and the cluster ends with the job."""
+    ray = pytest.importorskip("ray", reason="the extra [cluster] is not installed")
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    died = tmp_path / "died"
+
+    def pool(function: Any, tasks: Any) -> Any:
+        def dying(task: Any) -> Any:
+            if not died.exists():
+                died.touch()
+                os._exit(3)
+            return function(task)
+
+        return ray_workers(2)(dying, tasks)
+
+    render_dataset(OBJECTS, tmp_path / "views", *STEPS, pool)
+    assert died.exists() and not ray.is_initialized()
+    assert contents(tmp_path / "views") == contents(whole)
+
+
 @pytest.mark.parametrize("stops", [(1, 4, 18), pytest.param((2, 3, *range(5, 18)), marks=pytest.mark.slow)], ids=str)
 def test_rendering_interrupted_at_any_write_resumes(
     stops: Sequence[int], whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -149,11 +168,9 @@ def test_another_job_is_refused(copied: Path) -> None:
     light = Augmentations(illumination=Illumination())
     for meshes, steps, options, message in [
         (OBJECTS, (90, 90), {}, "azimuth_step 180.0, not 90.0"),
-        (OBJECTS, (180, 45), {}, "polar_step 90.0, not 45.0"),
         (OBJECTS, STEPS, {"augmentations": light}, "variations null, not {"),
         (OBJECTS | {"tennis_ball": moved}, STEPS, {}, r"objects\[\d\].mesh "),
         (OBJECTS | {"screwdriver": painted}, STEPS, {}, r"objects\[\d\].mesh "),
-        ({"tennis_ball": moved}, STEPS, {}, r"objects\[\d\]"),
         (OBJECTS | {"apple": moved}, STEPS, {}, r"objects\[2\] null, not \{"),
         (dict(reversed(OBJECTS.items())), STEPS, {}, r"objects\[0\].name "),
     ]:
@@ -255,41 +272,3 @@ def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: Comma
     assert "'.[cluster]'" in refused(*command, "--azimuth-step", 180, "--engine", "ray")
     refused(*command, "--engine", "cloud")
     refused(*command, "--address", "head:6379")
-
-
-def children() -> set[int]:
-    """Return the descendants of this process."""
-    parents = {}
-    for path in Path("/proc").glob("[0-9]*/stat"):
-        with contextlib.suppress(OSError):
-            state, parent = path.read_text().rpartition(")")[2].split()[:2]
-            if state != "Z":
-                parents[int(path.parent.name)] = int(parent)
-    descendants, new = set(), {os.getpid()}
-    while new := {pid for pid, parent in parents.items() if parent in new}:
-        descendants |= new
-    return descendants
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")
-def test_on_a_ray_cluster_that_loses_a_worker(whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("ray", reason="the extra [cluster] is not installed")
-    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
-    before, killed = children(), []
-
-    def kill_one() -> None:
-        while not killed:
-            time.sleep(0.02)
-            for pid in children() - before:
-                with contextlib.suppress(OSError):
-                    if Path(f"/proc/{pid}/cmdline").read_bytes().startswith(b"ray::render_task"):
-                        os.kill(pid, signal.SIGKILL)
-                        killed.append(pid)
-                        return
-
-    threading.Thread(target=kill_one, daemon=True).start()
-    render_dataset(OBJECTS, tmp_path / "views", *STEPS, ray_workers(2))
-    assert len(killed) == 1
-    assert contents(tmp_path / "views") == contents(whole)
-    assert children() == before
