@@ -24,8 +24,7 @@ from training.baselines.names import CLOUD_BASELINES, check_baselines
 from training.cli import app
 from training.evaluation.runs import load_runs
 from training.fitting.samples import fold_of_views
-from training.views.left_out import WithoutClasses
-from training.views.normalized_views import MemoryViews, normalize_views
+from training.views.normalized_views import MemoryViews
 
 pytestmark = pytest.mark.usefixtures("small_classifiers")
 
@@ -135,13 +134,3 @@ def test_damaged_files_are_refused(trained: Path, tmp_path: Path) -> None:
         file.write_bytes(damaged)
         with pytest.raises(InputError, match="forest.safetensors"):
             load_baselines(folder, load_run(folder))
-
-
-def test_left_out_classes_are_not_in_the_views() -> None:
-    source = MemoryViews({"a": clouds()["plank"][:2], "b": clouds()["cube"][:3], "c": clouds()["cube"][3:4]}, CONFIG)
-    remaining = WithoutClasses(source, ["b"])
-    assert remaining.classes == ("a", "c") and [(s.label, s.views) for s in remaining.shards] == [(0, 2), (1, 1)]
-    assert remaining.record["views"] == 3 and remaining.record["digest"] == remaining.digest != source.digest
-    views = remaining.read(1)
-    assert views.label == 1
-    np.testing.assert_array_equal(views.xyz, normalize_views(clouds()["cube"][3:4], 1, [0], [0], CONFIG).xyz)

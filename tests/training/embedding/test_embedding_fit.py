@@ -45,8 +45,7 @@ def test_views_depend_on_seed_and_object_only() -> None:
     one = render_clouds(ViewTask({3: 15, 4: 20}, 2, 0))
     again = render_clouds(ViewTask({4: 20}, 2, 0))
     assert [index for index, _ in one] == [3, 3, 4, 4]
-    for (_, expected), (_, actual) in zip(one[2:], again, strict=True):
-        assert all(np.array_equal(a, b) for a, b in zip(expected, actual, strict=True))
+    np.testing.assert_equal(again, one[2:])
     other = render_clouds(ViewTask({4: 20}, 2, 1))
     assert not np.array_equal(other[0][1][0], again[0][1][0])
 
@@ -100,8 +99,7 @@ def test_an_interrupted_sampling_resumes(monkeypatch: pytest.MonkeyPatch, tmp_pa
     resumed = build_samples(OBJECTS, tmp_path / "one", *arguments, progress=lambda *numbers: done.append(numbers))
     assert done == [(6, 8), (8, 8)]
     whole = build_samples(OBJECTS, tmp_path / "two", *arguments, pool=IN_PROCESS)
-    for field in dataclasses.fields(Samples):
-        assert np.array_equal(getattr(resumed, field.name), getattr(whole, field.name))
+    np.testing.assert_equal(vars(resumed), vars(whole))
     with pytest.raises(thor2.InputError, match="views"):
         build_samples(OBJECTS, tmp_path / "one", NETWORK, SMALL_CONFIG, 3)
 
@@ -139,8 +137,7 @@ def test_further_networks_leave_the_first_as_it_is(views: Samples, fitted: tuple
     assert done == [(3 * epoch, 36) for epoch in range(1, 13)]
     (second,) = two.further
     assert dataclasses.replace(two, further=()).fingerprint == fitted[0].fingerprint
-    first, same = model_arrays(fitted[0].model), model_arrays(two.model)
-    assert first.keys() == same.keys() and all(np.array_equal(first[name], same[name]) for name in first)
+    np.testing.assert_equal(model_arrays(two.model), model_arrays(fitted[0].model))
     assert second.proxies[...].shape == two.model.proxies[...].shape
     assert np.abs(second.proxies[...] - two.model.proxies[...]).max() > 0.1
 

@@ -49,7 +49,7 @@ def test_sample_probabilities_equal_those_of_the_clouds(feature: Feature, monkey
     views = source(2)
     samples = build_samples(views, NETWORK, CONFIG)
     model = MLP(input_size(feature, CONFIG, NETWORK.n_regions), 2, rngs=nnx.Rngs(0))
-    rows = np.array([7, 0, 3, 5])
+    rows = np.array([7, 0, 7, 3, 5])
     context = FitContext(feature, NETWORK, CONFIG)
     probabilities = sample_probabilities(model, samples, rows, context)
     probabilities_of = jax.jit(lambda described: class_probabilities(model, described, feature))

@@ -12,7 +12,6 @@ import pytest
 from helpers import full_disk
 
 import thor2_jax as thor2
-from thor2_jax.errors import InputError
 from training.fitting.checkpoints import Checkpoints, _quiet_orbax, find_run_directories
 
 
@@ -118,25 +117,14 @@ def test_threads_of_a_failed_save_print_no_traceback(monkeypatch: pytest.MonkeyP
     assert printed == ["another"]
 
 
-def test_folds_are_listed_in_numeric_order(tmp_path: Path) -> None:
-    for name in ("single", "five/fold-10", "five/fold-2", "five/fold-0"):
-        (tmp_path / name).mkdir(parents=True)
-        (tmp_path / name / "run.json").touch()
-    directories = find_run_directories([tmp_path / "single", tmp_path / "five"])
-    assert [path.relative_to(tmp_path).as_posix() for path in directories] == [
-        "single",
-        "five/fold-0",
-        "five/fold-2",
-        "five/fold-10",
-    ]
-
-
-def test_unfinished_training_is_refused_but_not_its_folds(tmp_path: Path) -> None:
-    fold = tmp_path / "run" / "fold-0"
-    fold.mkdir(parents=True)
-    (fold / "run.json").touch()
-    (tmp_path / "run" / "checkpoints").mkdir()
-    (tmp_path / "run" / "checkpoints" / "begun.json").touch()
-    with pytest.raises(InputError, match="model: "):
-        find_run_directories([tmp_path / "run"])
-    assert find_run_directories([fold]) == [fold]
+def test_run_directories_are_those_of_finished_folds_in_order(tmp_path: Path) -> None:
+    expected = [tmp_path / name for name in ("single", "five/fold-0", "five/fold-2", "five/fold-10")]
+    for path in expected:
+        path.mkdir(parents=True)
+        (path / "run.json").touch()
+    assert find_run_directories([tmp_path / "single", tmp_path / "five"]) == expected
+    (tmp_path / "five" / "checkpoints").mkdir()
+    (tmp_path / "five" / "checkpoints" / "begun.json").touch()
+    with pytest.raises(thor2.InputError, match="model: "):
+        find_run_directories([tmp_path / "five"])
+    assert find_run_directories(expected[1:2]) == expected[1:2]

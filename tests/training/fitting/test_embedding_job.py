@@ -33,8 +33,7 @@ CLOUDS = brick_and_stick(8)
 CLASSES = tuple(CLOUDS)
 
 
-def source() -> MemoryViews:
-    return MemoryViews(CLOUDS, SMALL_CONFIG)
+SOURCE = MemoryViews(CLOUDS, SMALL_CONFIG)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -52,7 +51,7 @@ SETTINGS = RunSettings((), FitOptions(), SMALL_CONFIG, distractors=DISTRACTORS)
 
 
 def train(out: Path, settings: RunSettings = SETTINGS, **more: Any) -> list[TrainedRun]:
-    return train_run(source(), out, settings, **more)
+    return train_run(SOURCE, out, settings, **more)
 
 
 class Whole(NamedTuple):
@@ -148,10 +147,10 @@ def test_an_interrupted_joint_fit_resumes_to_the_same_bytes(
 def test_invalid_distractors_and_others_than_those_of_a_run_are_refused(
     other: dict[str, int], invalid: dict[str, int], whole: Whole
 ) -> None:
-    check_trained(source().digest, whole.out, SETTINGS)
+    check_trained(SOURCE.digest, whole.out, SETTINGS)
     settings = dataclasses.replace(SETTINGS, distractors=dataclasses.replace(DISTRACTORS, **other))
     with pytest.raises(InputError, match=next(iter(other))):
-        check_trained(source().digest, whole.out, settings)
+        check_trained(SOURCE.digest, whole.out, settings)
     with pytest.raises(InputError, match="distractors"):
         dataclasses.replace(DISTRACTORS, **invalid)
 

@@ -67,18 +67,6 @@ def test_every_view_is_used_mirrored_in_four_ways(
                 np.testing.assert_allclose(descriptors.embeddings[row], expected.embeddings[0], rtol=1e-5, atol=1e-3)
 
 
-def test_any_rows_in_any_order_and_none() -> None:
-    samples = build_samples(MemoryViews({"a": views(0, (300, 20)), "b": views(1, (5,))}, CONFIG), NETWORK, CONFIG)
-    everything = expanded(samples, np.arange(6))
-    for rows in ([5, 0, 5, 2], []):
-        batch = samples.take(np.array(rows, int))
-        assert [a.shape[1:] for a in batch] == [a.shape[1:] for a in samples.take(np.array([0]))]
-        np.testing.assert_array_equal(batch.label, samples.label[rows])
-        some = jax.tree.leaves(expanded(samples, np.array(rows, int)))
-        for one, every in zip(some, jax.tree.leaves(everything), strict=True):
-            np.testing.assert_array_equal(one, np.asarray(every)[rows])
-
-
 @dataclasses.dataclass
 class Shards:
     """A source of chunks of views."""

@@ -49,6 +49,8 @@ def test_labelled_instances_join_the_rendered_views() -> None:
     assert mugs.copy.tolist() == list(range(7)) * 4
     np.testing.assert_array_equal(source.read(1).xyz, rendered().read(1).xyz)
     only = WithoutClasses(source, ["bowl", "pen"])
+    assert only.classes == ("mug", "box") and only.record["views"] == 3 + 28 + 18
+    assert only.record["digest"] == only.digest != WithoutClasses(source, ["bowl"]).digest
     assert [only.read(k).label for k in range(3)] == [0, 0, 1] and only.read(1).view.tolist() == mugs.view.tolist()
 
 

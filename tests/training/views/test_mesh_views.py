@@ -73,16 +73,6 @@ def test_all_views_of_all_objects_in_order(monkeypatch: pytest.MonkeyPatch) -> N
     check_same(clouds, expected)
 
 
-def test_mesh_files_and_meshes_give_equal_views(tmp_path: Path) -> None:
-    colors = np.full((4, 3), 99, np.uint8)
-    corners = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]])
-    faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
-    trimesh.Trimesh(corners, faces, vertex_colors=colors, process=False).export(tmp_path / "corner.ply")
-    corners = corners.astype(np.float32).astype(np.float64)
-    mesh = TexturedMesh(corners, faces.astype(np.int32), corner_colors=colors[faces])
-    check_same(render_views({"a": tmp_path / "corner.ply"}, 180, 90), render_views({"a": mesh}, 180, 90))
-
-
 def test_bad_requests(tmp_path: Path) -> None:
     for meshes, steps, workers, message in [
         ({"ball": ball()}, (60, -45), 1, "polar_step"),
