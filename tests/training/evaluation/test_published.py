@@ -37,20 +37,14 @@ def test_every_figure_equals_the_transcription(shared: Path) -> None:
         assert table["title"].startswith("OCID" if name.startswith("ocid") else "UW-IS Occluded")
 
 
-def test_published_figures_are_complete_and_consistent() -> None:
-    """Figures known by heart, in every table a standard deviation, and one figure for each method and condition."""
+def test_published_figures_are_complete() -> None:
+    """Figures known by heart, and in every table a standard deviation."""
     figures = [figure for table in thor2_tables() for cell in table["cells"] for figure in cell["accuracy"].values()]
     assert len(figures) == 5 * (75 + 17) + 7 * 7 + 5 * 6 + 4 * 7
     assert all(0 <= mean <= 100 and std is not None and 0 <= std < 10 for mean, std in figures)
     assert published_means("uwis", {}, own_objects=False)["THOR2"] == pytest.approx(0.6258)
     own, every = (published_means("ocid", {"camera": "lower"}, own) for own in (True, False))
     assert (own["THOR2"], every["THOR2"]) == (pytest.approx(0.7507), pytest.approx(0.5996))
-    seen: dict[Any, float] = {}
-    for table in (*published_tables("uwis"), *published_tables("ocid")):
-        for cell in table["cells"]:
-            for method, (mean, _) in cell["accuracy"].items():
-                key = (table["title"][:4], table["own_objects"], *sorted(cell["where"].items()), method)
-                assert seen.setdefault(key, mean) == mean, key
 
 
 def test_other_datasets_have_no_published_tables() -> None:

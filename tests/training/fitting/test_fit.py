@@ -155,7 +155,8 @@ def metrics(epoch: int) -> EpochMetrics:
     return EpochMetrics(epoch, 1 / epoch, 0.5, 1000.0)
 
 
-def test_an_incomplete_last_line_is_ignored(tmp_path: Path) -> None:
+def test_later_epochs_and_an_incomplete_last_line_are_discarded(tmp_path: Path) -> None:
+    """Those of one classifier of one fold."""
     path = tmp_path / "metrics.jsonl"
     append_metrics(path, 0, "ce", metrics(1))
     with path.open("a") as file:
@@ -163,7 +164,12 @@ def test_an_incomplete_last_line_is_ignored(tmp_path: Path) -> None:
     assert [row["epoch"] for row in read_metrics(path)] == [1]
     discard_later_epochs(path, 0, "ce", 1)
     append_metrics(path, 0, "ce", metrics(2))
-    assert [row["epoch"] for row in read_metrics(path)] == [1, 2]
+    append_metrics(path, 0, "tops", metrics(2))
+    append_metrics(path, 1, "ce", metrics(2))
+    assert [row["epoch"] for row in read_metrics(path)] == [1, 2, 2, 2]
+    discard_later_epochs(path, 0, "ce", 1)
+    kept = [(row["fold"], row["classifier"], row["epoch"]) for row in read_metrics(path)]
+    assert kept == [(0, "ce", 1), (0, "tops", 2), (1, "ce", 2)]
     path.write_text("no json\n{}\n")
     with pytest.raises(thor2.InputError, match=r"out: .*metrics\.jsonl"):
         read_metrics(path)
