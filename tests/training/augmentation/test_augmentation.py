@@ -13,7 +13,7 @@ from scipy.ndimage import binary_dilation, binary_erosion, distance_transform_cd
 
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import Intrinsics, backproject
-from training.augmentation.augmentations import Augmentations, augment
+from training.augmentation.augmentations import KINDS, Augmentations, augment
 from training.augmentation.illumination import Illumination, Registration
 from training.augmentation.occlusion import Occlusion, _silhouettes
 from training.augmentation.segmentation import Base, Segmentation
@@ -25,14 +25,7 @@ from training.rendering.view_sphere import camera_pose
 from training.views.mesh_views import cloud_of
 
 OBJECTS = builtin_objects()
-AUGMENTATIONS: dict[str, Any] = {
-    "illumination": Illumination(),
-    "sensor": Sensor(),
-    "occlusion": Occlusion(),
-    "segmentation": Segmentation(),
-    "registration": Registration(),
-    "base": Base(missing=1),
-}
+AUGMENTATIONS: dict[str, Any] = {name: kind() for name, (kind, _) in KINDS.items()} | {"base": Base(missing=1)}
 ALL = Augmentations(**AUGMENTATIONS)
 NO_LIGHT = Illumination(gamma=(1, 1), gain=(1, 1), cast=0, shading=(0, 0), saturation=(1, 1), veil=(0, 0), noise=(0, 0))
 NO_SENSOR = Sensor(axial=(0, 0), lateral=0, missing=0, flying=0)

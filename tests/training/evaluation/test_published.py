@@ -54,7 +54,6 @@ def test_other_datasets_have_no_published_tables() -> None:
 
 
 def test_attributes_have_the_names_of_the_paper() -> None:
-    assert published_attributes("uwis", {"light": "1"}) == {"light": "bright"}
     assert published_attributes("uwis", {"light": "2", "occlusion": "low"}) == {"light": "dim", "occlusion": "low"}
     assert published_attributes("frames", {"light": "2"}) == {"light": "2"}
     sequence = {"camera": "lower", "sequence": "table/bottom/curved/seq05"}

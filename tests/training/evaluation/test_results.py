@@ -108,11 +108,8 @@ def test_temperatures_reduce_the_calibration_error() -> None:
     unknown = [InstancePrediction(99, "dragon", probabilities=np.array([[0.6, 0.4]] * 2, np.float32))]
     frame = FrameAnswers("f", {}, 1.0, instances + unknown)
     temperature = np.log(99) / np.log(3)
-    runs = [
-        ToyRun("a", ("tops",), ("bowl", "can"), {"tops": temperature}),
-        ToyRun("b", ("tops",), ("bowl", "can")),
-    ]
-    report = compute_results("frames", runs, [frame])
+    run = ToyRun("a", ("tops",), ("bowl", "can"))
+    report = compute_results("frames", [run._replace(temperatures={"tops": temperature}), run], [frame])
     before, after = report["confidence"]["TOPS"], report["calibrated_confidence"]["TOPS"]
     assert before["expected_calibration_error"]["mean"] == pytest.approx(0.24, abs=1e-6)
     assert before["expected_calibration_error"]["runs"] == 2
@@ -160,16 +157,10 @@ def test_results_match_numpy_and_sklearn() -> None:
     assert [cell["where"]["occlusion"] for cell in tables[2]["cells"]] == ["none", "low", "high"] * 2
 
     described = [i for i, _ in scored if i.probabilities is not None]
-    truth = [i.truth for i in described]
-    pairs = [(0, 1), (3, 4)]
-    answers = [
-        CLASSES[np.prod(i.probabilities[list(pair)], axis=0, dtype=np.float64).argmax()]  # type: ignore[index]
-        for pair in pairs
-        for i in described
-    ]
-    np.testing.assert_array_equal(
-        np.array(report["confusion"])[:, :-1], confusion_matrix(truth * 2, answers, labels=CLASSES)
-    )
+    table = np.array([i.probabilities for i in described], np.float64)
+    answers = [CLASSES[k] for pair in ([0, 1], [3, 4]) for k in table[:, pair].prod(axis=1).argmax(axis=1)]
+    expected = confusion_matrix([i.truth for i in described] * 2, answers, labels=CLASSES)
+    np.testing.assert_array_equal(np.array(report["confusion"])[:, :-1], expected)
     assert np.sum(report["confusion"]) == 2 * len(scored)
     assert sum(report["reliability"]["answers"]) == 2 * len(described)
     assert 0 < report["confidence"]["THOR2"]["auroc_known"]["mean"] < 1
@@ -183,11 +174,8 @@ def test_named_answers_are_those_of_the_main_fusion_and_the_threshold() -> None:
     sure = np.array([[0, 0, 1], [0, 0, 1], [1, 0, 0], [1, 0, 0], [0.9, 0.1, 0]], np.float32)
     instances = [InstancePrediction(1, "mug", probabilities=sure), InstancePrediction(2, "dragon")]
     runs = [RUNS[0]._replace(thresholds=np.full(3, 1.1)), RUNS[1]]
-    named = list(named_answers(instances, runs))
-    assert [(run, i.label, name, confidence) for run, i, name, confidence in named] == [
-        (0, 1, None, 1.0),
-        (1, 1, "bowl", 1.0),
-    ]
+    named = [(run, instance.label, *answer) for run, instance, *answer in named_answers(instances, runs)]
+    assert named == [(0, 1, None, 1.0), (1, 1, "bowl", 1.0)]
 
 
 def sure_of(name: str, confidence: float) -> np.ndarray:
@@ -208,9 +196,8 @@ def test_rejection_and_placements_match_hand_calculation() -> None:
     frames.append(FrameAnswers("g", {}, 1.0, [InstancePrediction(1, "can", False, None, sure_of("can", 0.95))]))
     frames += [FrameAnswers("h", {}, 1.0, [InstancePrediction(1, "dragon", False, None, sure_of(*d))]) for d in dragons]
     frames.append(FrameAnswers("i", {}, 1.0, [InstancePrediction(1, "can", reason="too few points")]))
-    report = compute_results(
-        "frames", [ToyRun("a", ("tops", "tops2"), thresholds=np.array([0.61, 0.75, 0.75]))], frames
-    )
+    run = RUNS[0]._replace(thresholds=np.array([0.61, 0.75, 0.75]))
+    report = compute_results("frames", [run], frames)
     placements = report["placements"]
     assert placements["count"] == 3
     assert placements["accuracy"]["THOR2"]["mean"] == pytest.approx((2 / 4 + 1 + 0) / 3)

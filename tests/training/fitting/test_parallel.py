@@ -1,23 +1,22 @@
 """Training on eight devices and in two processes against one device, each in separate processes."""
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from helpers import finish_programs, free_port, start_program
+from helpers import finish_programs, free_port, json_lines, start_program
 
 _PROGRAM = """
-import json, sys
+import sys
 from pathlib import Path
 out, port, rank = Path(sys.argv[1]), sys.argv[2], int(sys.argv[3])
 import jax
 if port != "0":
     jax.distributed.initialize(f"localhost:{port}", 2, rank)
 import numpy as np
-from flax import nnx
 import thor2_jax as thor2
+from thor2_jax.model.classifier import model_arrays
 from training.fitting.options import FitOptions
 from training.fitting.job import RunSettings, train_run
 from training.views.normalized_views import MemoryViews
@@ -29,19 +28,16 @@ def clouds(size, low, high):
 
 config = thor2.DescriptorConfig(homology="closed_form", n_slices=3, n_strips=8, image_size=8)
 views = {"brick": clouds((0.1, 0.05, 0.03), 0, 99), "stick": clouds((0.2, 0.02, 0.02), 99, 255)}
-stages = []
 settings = RunSettings(["tops2"], FitOptions(epochs=4, batch_size=16), config, 2)
-runs = train_run(MemoryViews(views, config), out, settings, lambda *stage: stages.append(stage))
+runs = train_run(MemoryViews(views, config), out, settings)
 assert len(jax.devices()) == int(sys.argv[4])
 for fold, run in enumerate(runs):
-    state = nnx.to_flat_state(nnx.state(run.classifiers["tops2"]))
-    arrays = {"/".join(map(str, path)): value[...] for path, value in state}
-    np.savez(out.parent / f"{out.name}-{rank}-{fold}.npz", **arrays)
+    np.savez(out.parent / f"{out.name}-{rank}-{fold}.npz", **model_arrays(run.classifiers["tops2"]))
 """
 
 
 def curve(out: Path) -> list[tuple[Any, ...]]:
-    rows = [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
+    rows = json_lines((out / "metrics.jsonl").read_text())
     assert [(row["fold"], row["epoch"]) for row in rows] == [(fold, epoch) for fold in (0, 1) for epoch in range(1, 5)]
     return [(row["loss"], row["accuracy"], row["held_out_accuracy"]) for row in rows]
 

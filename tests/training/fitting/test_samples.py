@@ -2,7 +2,8 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from types import SimpleNamespace
+from typing import Any
 
 import jax
 import numpy as np
@@ -15,7 +16,7 @@ from thor2_jax.descriptor.color_membership import region_sets
 from thor2_jax.types import Cloud
 from training.fitting import samples as module
 from training.fitting.samples import PAPER_MIRRORS, Samples, build_samples, expand, fold_of_views
-from training.views.normalized_views import MemoryViews, NormalizedViews, SourceShard
+from training.views.normalized_views import MemoryViews, SourceShard
 
 NETWORK = colornet.load_default()
 CONFIG = thor2.DescriptorConfig(homology="closed_form")
@@ -67,23 +68,6 @@ def test_every_view_is_used_mirrored_in_four_ways(
                 np.testing.assert_allclose(descriptors.embeddings[row], expected.embeddings[0], rtol=1e-5, atol=1e-3)
 
 
-@dataclasses.dataclass
-class Shards:
-    """A source of chunks of views."""
-
-    chunks: list[NormalizedViews]
-    classes = ("mug", "box")
-    digest = "d"
-    record: ClassVar[dict[str, Any]] = {}
-
-    @property
-    def shards(self) -> list[SourceShard]:
-        return [SourceShard(views.label, len(views)) for views in self.chunks]
-
-    def read(self, index: int) -> NormalizedViews:
-        return self.chunks[index]
-
-
 def test_shards_of_a_class_and_copies_of_a_view() -> None:
     """Two shards of a mug, the first with two copies of view 7, and one of a box; a sample is small."""
     mugs, boxes = views(0, (300, 310, 320)), views(1, (330,))
@@ -91,7 +75,10 @@ def test_shards_of_a_class_and_copies_of_a_view() -> None:
     first, second = (MemoryViews({"mug": some}, CONFIG).read(0) for some in (mugs[:2], mugs[2:]))
     first = dataclasses.replace(first, view=np.array([7, 7], np.int32), copy=np.array([0, 1], np.int32))
     second = dataclasses.replace(second, view=np.array([9], np.int32))
-    samples = build_samples(Shards([first, second, whole.read(1)]), NETWORK, CONFIG)
+    chunks = [first, second, whole.read(1)]
+    shards = [SourceShard(each.label, len(each)) for each in chunks]
+    source: Any = SimpleNamespace(classes=whole.classes, shards=shards, read=chunks.__getitem__)
+    samples = build_samples(source, NETWORK, CONFIG)
     keys = zip(samples.label.tolist(), samples.view.tolist(), strict=True)
     assert sorted(keys) == sorted([(0, 7)] * 4 + [(0, 9)] * 2 + [(1, 0)] * 2)
     expected = build_samples(whole, NETWORK, CONFIG)

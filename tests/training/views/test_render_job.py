@@ -164,17 +164,15 @@ def test_another_job_is_refused(copied: Path) -> None:
     ball, screwdriver = OBJECTS["tennis_ball"], OBJECTS["screwdriver"]
     moved = dataclasses.replace(ball, vertices=ball.vertices + 1e-3)
     painted = dataclasses.replace(screwdriver, textures=tuple(texture ^ 1 for texture in screwdriver.textures))
-    light = Augmentations(illumination=Illumination())
-    for meshes, steps, options, message in [
-        (OBJECTS, (90, 90), {}, "azimuth_step 180.0, not 90.0"),
-        (OBJECTS, STEPS, {"augmentations": light}, "variations null, not {"),
-        (OBJECTS | {"tennis_ball": moved}, STEPS, {}, r"objects\[\d\].mesh "),
-        (OBJECTS | {"screwdriver": painted}, STEPS, {}, r"objects\[\d\].mesh "),
-        (OBJECTS | {"apple": moved}, STEPS, {}, r"objects\[2\] null, not \{"),
-        (dict(reversed(OBJECTS.items())), STEPS, {}, r"objects\[0\].name "),
+    for meshes, steps, message in [
+        (OBJECTS, (90, 90), "azimuth_step 180.0, not 90.0"),
+        (OBJECTS | {"tennis_ball": moved}, STEPS, r"objects\[\d\].mesh "),
+        (OBJECTS | {"screwdriver": painted}, STEPS, r"objects\[\d\].mesh "),
+        (OBJECTS | {"apple": moved}, STEPS, r"objects\[2\] null, not \{"),
+        (dict(reversed(OBJECTS.items())), STEPS, r"objects\[0\].name "),
     ]:
         with input_error(copied, match=message):
-            render_dataset(meshes, copied, *steps, **options)
+            render_dataset(meshes, copied, *steps)
         assert contents(copied) == before
 
 
@@ -191,6 +189,8 @@ def test_augmentations_are_part_of_the_job(tmp_path: Path, monkeypatch: pytest.M
             render_dataset({"ball": sphere(0.03)}, out, 90, 90, **options)
     off = render_dataset({"ball": sphere(0.03)}, tmp_path / "off", 90, 90, augmentations=Augmentations(), seed=2)
     assert len(off) == 12 and off.record["job"]["variations"] is None
+    with pytest.raises(InputError, match="variations null, not {"):
+        render_dataset({"ball": sphere(0.03)}, tmp_path / "off", 90, 90, augmentations=light)
 
 
 def test_views_of_few_points_are_left_out_and_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
