@@ -180,7 +180,7 @@ def test_an_embedding_alone_is_evaluated(tmp_path: Path, calibrated: bool) -> No
 def test_page_for_datasets_of_any_size(tmp_path: Path, n: int) -> None:
     directory, stages = tmp_path / "report", list[tuple[str, int, int, str]]()
     runs, progress = toys(tmp_path / "log"), lambda *stage: stages.append(stage)
-    report = evaluate_dataset(runs, ToyDataset(n), DESCRIPTION, directory, progress)
+    report = evaluate_dataset(runs, ToyDataset(n), {"kind": "uwis", "path": "toys"}, directory, progress)
     assert [done for _, done, _, _ in stages] == list(range(n + 1)) and "frames/s" in stages[-1][3]
     assert report == json.loads((directory / "report.json").read_text())
     page = ParsedPage((directory / "report.html").read_text())
@@ -195,23 +195,16 @@ def test_page_for_datasets_of_any_size(tmp_path: Path, n: int) -> None:
     assert "Placements" not in page.text  # every toy is arranged anew
     whole = report["accuracy"][report["rule"]][0]["cells"][0]["accuracy"]["THOR2"]
     assert f"{whole['mean']:.3f} ±\u00a0{whole['std']:.3f}" in page.text
-    for picture in page.pictures:
-        with Image.open(directory / str(picture["src"])) as image:
-            image.load()
-            assert max(image.size) <= 2000
-
-
-def test_page_shows_published_tables(tmp_path: Path) -> None:
-    """The toys have no environment, so only rows on the whole dataset match: of tables 4, 7, 9 and of THOR's paper."""
-    runs, description = toys(tmp_path / "log"), {"kind": "uwis", "path": "toys"}
-    report = evaluate_dataset(runs, ToyDataset(2), description, tmp_path / "report")
+    # The toys have no environment, so only rows on the whole dataset match: of tables 4, 7, 9 and of THOR's paper.
     assert [table["number"] for table in report["published_tables"]] == [4, 7, 9, None]
-    page = ParsedPage((tmp_path / "report" / "report.html").read_text())
-    assert page.open == []
     headings = [text.split(":")[0] for text in page.text if text.startswith("Published")]
     assert headings == [*(f"Published table {n}" for n in (4, 7, 9)), "Published"]
     assert {"THOR2, published", "62.58 ±\u00a00.36", "CE+TOPS, published", "57.68 ±\u00a00.25"} <= set(page.text)
     assert any("2408.01579" in text and "8,456 frames" in text for text in page.text)
+    for picture in page.pictures:
+        with Image.open(directory / str(picture["src"])) as image:
+            image.load()
+            assert max(image.size) <= 2000
 
 
 def test_a_dataset_whose_only_object_has_no_pixels(tmp_path: Path) -> None:

@@ -27,7 +27,6 @@ NETWORK = colornet.load_default()
 CONFIG = thor2.DescriptorConfig(n_slices=2, n_strips=5, image_size=12)  # small, to compile quickly
 TOPS2 = FitContext("tops2", NETWORK, CONFIG)
 QUICK = FitOptions(epochs=8, batch_size=16, seed=3)
-LONGER = dataclasses.replace(QUICK, epochs=12)
 
 Fit = Callable[..., tuple[MLP, int]]
 
@@ -68,14 +67,6 @@ def test_separable_classes_are_learned(separable: Samples, fitted: Fit) -> None:
     assert best == min(curve, key=lambda metrics: metrics.loss).epoch
     assert all(math.isfinite(metrics.loss) and metrics.held_out_accuracy is None for metrics in curve)
     assert steps == [(3 * epoch, 24, epoch) for epoch in range(1, 9)]
-
-
-@pytest.mark.slow
-def test_a_feature_uses_only_its_part_of_the_descriptor(separable: Samples, fitted: Fit) -> None:
-    """Shape does not distinguish classes 1 and 2, and colour does not distinguish classes 0 and 1."""
-    tops, ce = (answers(fitted(name, LONGER)[0], separable, name) for name in ("tops", "ce"))
-    np.testing.assert_array_equal(tops == 0, separable.label == 0)
-    np.testing.assert_array_equal(ce == 2, separable.label == 2)
 
 
 def test_the_held_out_set_is_evaluated_but_not_trained_on(separable: Samples, fitted: Fit) -> None:

@@ -73,17 +73,6 @@ def test_all_views_of_all_objects_in_order(monkeypatch: pytest.MonkeyPatch) -> N
     check_same(clouds, expected)
 
 
-def test_bad_requests(tmp_path: Path) -> None:
-    for meshes, steps, workers, message in [
-        ({"ball": ball()}, (60, -45), 1, "polar_step"),
-        ({"ball": ball()}, (60, 45), 0, "workers is 0"),
-        ({"z": tmp_path / "absent.ply"}, (60, 45), 1, "absent.ply"),
-        ({"speck": ball(0.003)}, (180, 90), 1, "object 'speck': none of its 6 views"),
-    ]:
-        with pytest.raises(InputError, match=message):
-            render_views(meshes, *steps, workers)
-
-
 def test_copies_depend_only_on_name_view_and_seed() -> None:
     """Copies do not depend on the angles of the task, and the view itself is not augmented."""
     angles, augmentations = view_angles(90, 90), Augmentations(illumination=Illumination(), copies=2)

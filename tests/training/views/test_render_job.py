@@ -211,8 +211,10 @@ def test_bad_requests_write_nothing(tmp_path: Path) -> None:
     for meshes, steps, options, message in [
         ({}, STEPS, {}, "meshes is empty"),
         (OBJECTS, (0, 45), {}, "azimuth_step"),
+        (OBJECTS, (60, -45), {}, "polar_step"),
         (OBJECTS, STEPS, {"seed": -1}, "seed is -1"),
         ({**OBJECTS, "z": tmp_path / "bad.ply"}, STEPS, {}, "bad.ply"),
+        ({"z": tmp_path / "absent.ply"}, STEPS, {}, "absent.ply"),
         ({"speck": sphere(0.003)}, (180, 90), {}, "object 'speck'"),
         ({"door": sphere(0.6)}, (180, 90), {}, "object 'door' .*2.08 m"),
     ]:
