@@ -14,7 +14,7 @@ from helpers import input_error
 import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.color_membership import region_sets
-from thor2_jax.model.classifier import MLP, Feature, feature_of, model_arrays
+from thor2_jax.model.classifier import MLP, model_arrays
 from training.fitting.checkpoints import Checkpoints
 from training.fitting.fit import fit
 from training.fitting.options import EpochMetrics, FitOptions, append_metrics, discard_later_epochs, read_metrics
@@ -36,11 +36,9 @@ def fitted(tmp_path: Path, separable: Samples) -> Fit:
     """Return `fit` on the separable samples, with a new checkpoint directory for each call."""
     folders = (tmp_path / str(number) for number in range(99))
 
-    def run(
-        feature: Feature = "tops2", options: FitOptions = QUICK, samples: Samples = separable, **arguments: object
-    ) -> tuple[MLP, int]:
+    def run(options: FitOptions = QUICK, samples: Samples = separable, **arguments: object) -> tuple[MLP, int]:
         with Checkpoints(next(folders)) as checkpoints:
-            return fit(samples, FitContext(feature, NETWORK, CONFIG), options, checkpoints, **arguments)
+            return fit(samples, TOPS2, options, checkpoints, **arguments)
 
     return run
 
@@ -50,9 +48,8 @@ def describe_batch(batch: Batch) -> thor2.Descriptors:
     return thor2.describe_strips(expand(batch, region_sets(NETWORK).weights, CONFIG), NETWORK, CONFIG)
 
 
-def answers(model: MLP, samples: Samples, feature: Feature) -> np.ndarray:
-    described = describe_batch(samples.take(np.arange(len(samples))))
-    return np.asarray(jax.jit(model)(feature_of(described, feature)).argmax(axis=1))
+def answers(model: MLP, samples: Samples) -> np.ndarray:
+    return np.asarray(jax.jit(model)(describe_batch(samples.take(np.arange(len(samples)))).tops2).argmax(axis=1))
 
 
 def test_separable_classes_are_learned(separable: Samples, fitted: Fit) -> None:
@@ -61,7 +58,7 @@ def test_separable_classes_are_learned(separable: Samples, fitted: Fit) -> None:
     model, best = fitted(
         epoch_done=curve.append, progress=lambda done, total, metrics: steps.append((done, total, metrics.epoch))
     )
-    assert (answers(model, separable, "tops2") == separable.label).all()
+    assert (answers(model, separable) == separable.label).all()
     assert [metrics.epoch for metrics in curve] == list(range(1, 9))
     assert curve[-1].loss < curve[0].loss / 3 and curve[-1].accuracy > 0.8
     assert best == min(curve, key=lambda metrics: metrics.loss).epoch
@@ -75,7 +72,7 @@ def test_the_held_out_set_is_evaluated_but_not_trained_on(separable: Samples, fi
     mislabelled = dataclasses.replace(separable, label=np.where(held_out, 0, separable.label).astype(np.int32))
     curve: list[EpochMetrics] = []
     model, best = fitted(samples=mislabelled, held_out=held_out, epoch_done=curve.append)
-    correct = answers(model, separable, "tops2")[held_out] == 0
+    correct = answers(model, separable)[held_out] == 0
     assert max(metrics.held_out_accuracy or 0 for metrics in curve) == curve[best - 1].held_out_accuracy
     assert curve[best - 1].held_out_accuracy == pytest.approx(correct.mean())
     final = curve[-1]
@@ -108,7 +105,7 @@ def test_few_samples_make_one_batch_and_one_is_refused(separable: Samples, fitte
     """The samples are not modified."""
     steps, before = list[int](), copy.deepcopy(separable)
     first_five = np.arange(48) > 4
-    fitted("tops", FitOptions(epochs=1), held_out=first_five, progress=lambda done, *others: steps.append(done))
+    fitted(FitOptions(epochs=1), held_out=first_five, progress=lambda done, *others: steps.append(done))
     assert steps == [1]
     for field in dataclasses.fields(separable):
         np.testing.assert_array_equal(getattr(separable, field.name), getattr(before, field.name))
