@@ -1,6 +1,7 @@
 """Fitting of embeddings: samples, orientations, resumption, determinism, and what a short fit achieves."""
 
 import dataclasses
+import itertools
 from collections.abc import Generator
 from pathlib import Path
 from typing import Any
@@ -86,10 +87,8 @@ def test_an_interrupted_sampling_resumes(monkeypatch: pytest.MonkeyPatch, tmp_pa
     monkeypatch.setattr(sampling, "OBJECTS_PER_SHARD", 3)
 
     def interrupted(function, items) -> Generator:
-        for number, item in enumerate(items):
-            if number == 2:
-                raise KeyboardInterrupt
-            yield function(item)
+        yield from map(function, itertools.islice(items, 2))
+        raise KeyboardInterrupt
 
     arguments = NETWORK, SMALL_CONFIG, 2
     with pytest.raises(KeyboardInterrupt):

@@ -5,6 +5,7 @@ import functools
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from helpers import SMALL_CONFIG, Interrupted, brick_and_stick, stop_when
 
 from thor2_jax.descriptor.looks import describe_looks
 from thor2_jax.errors import InputError
-from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes
+from thor2_jax.gallery.embedding import EmbeddingSizes
 from thor2_jax.model.run_directory import TrainedRun, load_run
 from thor2_jax.recognizer import Recognizer
 from thor2_jax.types import Cloud, PointClouds
@@ -27,12 +28,8 @@ from training.fitting.options import FitOptions, read_metrics
 from training.views.normalized_views import MemoryViews
 
 DISTRACTORS = Distractors(procedural=10, views=4, epochs=3, networks=2)
-
-
 CLOUDS = brick_and_stick(8)
 CLASSES = tuple(CLOUDS)
-
-
 SOURCE = MemoryViews(CLOUDS, SMALL_CONFIG)
 
 
@@ -64,17 +61,11 @@ class Whole(NamedTuple):
 @pytest.fixture(scope="module")
 def whole(cache: Path, tmp_path_factory: pytest.TempPathFactory) -> Whole:
     """An uninterrupted training."""
-    out, stages, views = tmp_path_factory.mktemp("whole") / "run", dict[str, int](), list[tuple[int, Cloud]]()
-
-    def fit(run: TrainedRun, embedding: Embedding, held_out: list[tuple[int, Cloud]]) -> Any:
-        views.extend(held_out)
-        return fit_calibration(run, embedding, held_out)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(job, "fit_calibration", fit)
+    out, stages = tmp_path_factory.mktemp("whole") / "run", dict[str, int]()
+    with mock.patch.object(job, "fit_calibration", wraps=fit_calibration) as fit:
         (run,) = train(out, progress=lambda stage, done, total, note: stages.__setitem__(stage, done - total))
     assert set(stages.values()) == {0}
-    return Whole(out, run, list(stages), views)
+    return Whole(out, run, list(stages), fit.call_args.args[2])
 
 
 def rows(out: Path) -> list[dict[str, Any]]:
