@@ -51,9 +51,10 @@ def test_every_view_is_used_mirrored_in_four_ways(
     assert progress == [(2, 4), (3, 4), (4, 4)]
     keys = list(zip(samples.label.tolist(), samples.view.tolist(), strict=True))
     assert sorted(keys) == sorted([(0, v) for v in range(3)] * 4 + [(1, 0)] * 4)
-    assert samples.color_count.dtype == np.float32 and (samples.color_count % 1 == 0).all()
-    points = np.add.reduceat(samples.color_count, samples.color_start[:-1])
-    assert points.tolist() == [{(0, 0): 300, (0, 1): 299, (0, 2): 1, (1, 0): 40}[key] for key in keys]
+    if config is CONFIG:
+        points = np.add.reduceat(samples.color_count, samples.color_start[:-1])
+        assert points.tolist() == [{(0, 0): 300, (0, 1): 299, (0, 2): 1, (1, 0): 40}[key] for key in keys]
+        assert samples.color_count.dtype == np.float32 and (samples.color_count % 1 == 0).all()
     descriptors = thor2.describe_strips(expanded(samples, np.arange(16), config), NETWORK, config)
     for label in range(2):
         for number, cloud in enumerate(source.read(label).clouds()):
