@@ -1,7 +1,7 @@
 """Image networks and templates: fitting on crops, resuming, pretrained weights, and bad input."""
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -9,14 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 from flax import nnx
-from helpers import random_clouds
+from helpers import random_clouds, untrained_run
 from safetensors.numpy import load_file, save_file
 
-import colornet
 import thor2_jax as thor2
 from thor2_jax.errors import InputError
-from thor2_jax.model.classifier import MLP
-from thor2_jax.model.run_directory import TrainedRun, load_run, save_run
+from thor2_jax.model.run_directory import load_run, save_run
 from training.baselines import baseline as module
 from training.baselines import templates
 from training.baselines.baseline import BaselineInputs
@@ -28,6 +26,7 @@ from training.baselines.networks.vit import VIT_DINOV2_SMALL, VIT_TINY, RGBDViT
 from training.baselines.networks.weights import tensor_shapes
 from training.baselines.templates import BACKBONES, Templates, create_backbone
 from training.fitting.options import FitOptions
+from training.fitting.protocol import DEFAULT
 from training.train_job import TrainJob, run_train_job
 from training.views.crops import ViewCrops
 from training.views.normalized_views import MemoryViews
@@ -66,8 +65,7 @@ def write_run(folder: Path, folds: int = 4) -> Path:
         "dataset": dict(SOURCE.record), "epochs": 3, "learning_rates": [1e-2, 1e-3], "batch_size": 8, "seed": 0,
         "folds": folds, "fold": 0, "temperatures": {},
     }  # fmt: skip
-    network = colornet.load_default()
-    save_run(TrainedRun(CONFIG, network, NAMES, {"tops": MLP(64, 2, rngs=nnx.Rngs(0))}, record), folder)
+    save_run(untrained_run(NAMES, ("tops",), CONFIG, record), folder)
     return folder
 
 
@@ -177,58 +175,44 @@ def test_weights_of_another_architecture_are_refused(tmp_path: Path) -> None:
     """By the name and the shape of the tensor, in one line, and nothing is left."""
     weights, folder = write_weights(tmp_path / "weights"), write_run(tmp_path / "run")
     path = weights / f"{pretrained_files(SMALL)[0]}.safetensors"
-    tensors = load_file(path)
-    cases = [
-        ({**tensors, "norm.weight": np.zeros(384, np.float32)}, r"norm\.weight in .* has the shape \(384,\).*\(96,\)"),
-        (
-            {k: a for k, a in tensors.items() if k != "blocks.0.attn.qkv.weight"},
-            r"no tensor blocks\.0\.attn\.qkv\.weight",
-        ),
-        ({**tensors, "pos_embed": np.zeros((1, 38, 192), np.float32)}, r"pos_embed .* \(1, 38, 192\)"),
+    tensors, qkv = load_file(path), "blocks.0.attn.qkv.weight"
+    wide, long = np.zeros(384, np.float32), np.zeros((1, 38, 192), np.float32)
+    cases: list[tuple[Callable[[], Any], str]] = [
+        (lambda: save_file(tensors | {"norm.weight": wide}, path), r"norm\.weight in .* the shape \(384,\).*\(96,\)"),
+        (lambda: save_file({k: a for k, a in tensors.items() if k != qkv}, path), f"no tensor {qkv}"),
+        (lambda: save_file(tensors | {"pos_embed": long}, path), r"pos_embed .* \(1, 38, 192\)"),
+        (lambda: path.write_bytes(b"no tensors"), "cannot be read"),
+        (path.unlink, "does not exist"),
     ]
-    for changed, message in cases:
-        save_file(changed, path)
+    for damage, message in cases:
+        damage()
         with pytest.raises(InputError, match=f"^weights: .*{message}"):
             train_baselines(folder, SOURCE, [SMALL], options=OPTIONS, weights=weights)
-    path.write_bytes(b"no tensors")
-    with pytest.raises(InputError, match="^weights: .* cannot be read"):
-        train_baselines(folder, SOURCE, [SMALL], options=OPTIONS, weights=weights)
-    path.unlink()
-    with pytest.raises(InputError, match="^weights: .* does not exist"):
-        train_baselines(folder, SOURCE, [SMALL], options=OPTIONS, weights=weights)
     assert not (folder / "baselines").exists()
 
 
+def test_baselines_without_their_inputs_are_refused(tmp_path: Path) -> None:
+    folder, source = write_run(tmp_path / "run"), MemoryViews(dict.fromkeys(NAMES, CLOUDS), CONFIG)
+    with pytest.raises(InputError, match="^baselines: templates needs a backbone"):
+        train_baselines(folder, SOURCE, ["templates"])
+    with pytest.raises(InputError, match="no crops"):
+        train_baselines(folder, source, [SMALL], options=OPTIONS)
+    inputs = BaselineInputs(thor2.PointClouds.pack(CLOUDS[:1]), np.zeros((1, 1), np.float32))
+    with pytest.raises(InputError, match="^frame is missing"):
+        inputs.crops(96)
+
+
 def test_command_checks_weights_before_any_work(tmp_path: Path) -> None:
-    def job(**options: Any) -> Any:
-        from training.fitting.protocol import DEFAULT
-
-        return TrainJob(tmp_path / "run", DEFAULT, dataset=tmp_path, weights=tmp_path, **options)
-
     save_file({"conv1.weight": np.zeros((64, 3, 3, 3), np.float32)}, tmp_path / "vit_small_patch14_dinov2.safetensors")
     for names, message in (
         (["forest"], "none of the baselines"),
         (["rcfusion"], "resnet18.safetensors does not exist"),
         (["templates"], r"vit_small_patch14_dinov2\.safetensors has no tensor"),
     ):
+        job = TrainJob(tmp_path / "run", DEFAULT, dataset=tmp_path, weights=tmp_path, baselines=names)
         with pytest.raises(InputError, match=f"^weights.*{message}"):
-            run_train_job(job(baselines=names), lambda: pytest.fail("work began"))
+            run_train_job(job, lambda: pytest.fail("work began"))
     assert not (tmp_path / "run").exists()
-
-
-def test_templates_need_a_backbone(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="^baselines: templates needs a backbone"):
-        train_baselines(write_run(tmp_path / "run"), SOURCE, ["templates"])
-
-
-def test_clouds_without_images_are_refused(tmp_path: Path) -> None:
-    source = MemoryViews(dict.fromkeys(NAMES, CLOUDS), CONFIG)
-    assert source.digest == SOURCE.digest
-    with pytest.raises(InputError, match="no crops"):
-        train_baselines(write_run(tmp_path / "run"), source, [SMALL], options=OPTIONS)
-    inputs = BaselineInputs(thor2.PointClouds.pack(CLOUDS[:1]), np.zeros((1, 1), np.float32))
-    with pytest.raises(InputError, match="^frame is missing"):
-        inputs.crops(96)
 
 
 def test_nearest_template_has_the_largest_cosine() -> None:

@@ -1,6 +1,5 @@
 """Training, storing and loading the baselines of a run directory."""
 
-import dataclasses
 import json
 from pathlib import Path
 from types import SimpleNamespace
@@ -8,17 +7,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from flax import nnx
-from helpers import random_clouds
-from safetensors.numpy import load_file, save_file
+from helpers import random_clouds, untrained_run
+from safetensors.numpy import load, save
 from typer.testing import CliRunner
 
 import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.describe import describe
 from thor2_jax.errors import InputError
-from thor2_jax.model.classifier import MLP
-from thor2_jax.model.run_directory import TrainedRun, load_run, save_run
+from thor2_jax.model.run_directory import load_run, save_run
 from thor2_jax.types import Cloud
 from training.baselines import forest, job
 from training.baselines.baseline import baseline_inputs
@@ -26,10 +23,8 @@ from training.baselines.job import load_baselines, train_baselines
 from training.baselines.names import CLOUD_BASELINES, check_baselines
 from training.cli import app
 from training.evaluation.runs import load_runs
-from training.fitting.job import is_finished
 from training.fitting.samples import fold_of_views
-from training.views.left_out import WithoutClasses
-from training.views.normalized_views import MemoryViews, normalize_views
+from training.views.normalized_views import MemoryViews
 
 pytestmark = pytest.mark.usefixtures("small_classifiers")
 
@@ -56,12 +51,11 @@ SOURCE = Views(clouds(), CONFIG)
 
 
 def write_run(folder: Path, folds: int = 2, fold: int = 1) -> Path:
-    network = colornet.load_default()
     record = {
         "dataset": dict(SOURCE.record), "epochs": 4, "learning_rates": [1e-2, 1e-3], "batch_size": 8, "seed": 0,
         "folds": folds, "fold": fold, "temperatures": {"tops": 1.5},
     }  # fmt: skip
-    save_run(TrainedRun(CONFIG, network, NAMES, {"tops": MLP(64, 2, rngs=nnx.Rngs(0))}, record), folder)
+    save_run(untrained_run(NAMES, ("tops",), CONFIG, record), folder)
     return folder
 
 
@@ -81,7 +75,11 @@ def described(seed: int) -> Any:
 
 
 @pytest.mark.parametrize("names", [("forest",), pytest.param(CLOUD_BASELINES, marks=pytest.mark.slow)])
-def test_baselines_learn_and_are_calibrated(trained: Path, names: tuple[str, ...]) -> None:
+def test_baselines_learn_and_are_calibrated(
+    trained: Path, names: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Baselines that a run has are not trained again."""
+    monkeypatch.setitem(job._FIT, "forest", lambda task: pytest.fail("trained again"))
     train_baselines(trained, SOURCE, names)
     assert {path.name for path in (trained / "baselines").iterdir()} == {f"{name}.safetensors" for name in names}
     (run,) = load_runs([trained])
@@ -94,17 +92,8 @@ def test_baselines_learn_and_are_calibrated(trained: Path, names: tuple[str, ...
         assert (probabilities.argmax(axis=1) == np.repeat([0, 1], 4)).mean() == 1, name
 
 
-def test_existing_baselines_are_not_trained_again(trained: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    before = {path: path.read_bytes() for path in (trained / "baselines").iterdir()}
-    monkeypatch.setattr(job, "_FIT", dict.fromkeys(CLOUD_BASELINES, lambda task: pytest.fail("trained again")))
-    train_baselines(trained, SOURCE, [path.stem for path in before])
-    assert before == {path: path.read_bytes() for path in (trained / "baselines").iterdir()}
-
-
 def test_held_out_set_is_that_of_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    label = np.repeat([0, 1], 20)
-    view = np.tile(np.arange(20), 2)
-    marks: list[Any] = []
+    label, view, marks = np.repeat([0, 1], 20), np.tile(np.arange(20), 2), list[Any]()
 
     def interrupted(task: Any) -> Any:
         marks.append(task.held_out(label, view))
@@ -120,69 +109,28 @@ def test_held_out_set_is_that_of_the_run(tmp_path: Path, monkeypatch: pytest.Mon
     assert marks[0].sum() == 8 and not marks[1].any()
 
 
-def test_no_held_out_set_gives_no_temperatures(tmp_path: Path) -> None:
-    folder = write_run(tmp_path / "run", 1, 0)
-    train_baselines(folder, SOURCE, ["forest"])
-    loaded = load_baselines(folder, load_run(folder))
-    assert list(loaded) == ["forest"] and loaded["forest"].temperature is None
-
-
 def test_invalid_arguments_are_refused(trained: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="^dataset: "):
         train_baselines(trained, Views(clouds(1), CONFIG))
-    with pytest.raises(InputError, match="^baselines is forest, tree; "):
-        check_baselines(["forest", "tree"])
     assert check_baselines(["pointnet", "thor"]) == ("thor", "pointnet") and check_baselines([]) == ()
-    original = load_run(write_run(tmp_path / "original"))
-    record = {**original.record, "dataset": dict(MEMORY.record)}
-    folder = tmp_path / "run"
-    save_run(dataclasses.replace(original, record=record), folder)
+    arguments = ["train", "--dataset", str(tmp_path), "--out", str(tmp_path / "run"), "--baselines", "forest, tree"]
+    result = CliRunner().invoke(app, arguments)
+    assert isinstance(result.exception, InputError) and str(result.exception).startswith("baselines is forest, tree; ")
+    assert not (tmp_path / "run").exists()
+    without_angles = MemoryViews(clouds(), CONFIG)
+    assert without_angles.digest == SOURCE.digest
     with pytest.raises(InputError, match="^baselines: thor"):
-        train_baselines(folder, MEMORY, ["thor"])
+        train_baselines(write_run(tmp_path / "run"), without_angles, ["thor"])
 
 
-MEMORY = MemoryViews(clouds(), CONFIG)
-
-
-@pytest.mark.parametrize("damage", ["cut", "changed", "classes", "lacking"])
-def test_damaged_files_are_refused(trained: Path, tmp_path: Path, damage: str) -> None:
+def test_damaged_files_are_refused(trained: Path, tmp_path: Path) -> None:
     folder = write_run(tmp_path / "run")
     (folder / "baselines").mkdir()
     file = folder / "baselines" / "forest.safetensors"
     content = (trained / "baselines" / "forest.safetensors").read_bytes()
-    if damage == "cut":
-        file.write_bytes(content[:-9])
-    elif damage == "changed":
-        file.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
-    else:
-        file.write_bytes(content)
-        about = {"format": 1, "classes": ["a", "b"], "temperature": None, "seconds": 1.0, "digest": ""}
-        save_file({} if damage == "lacking" else load_file(file), file, {"about": json.dumps(about)})
-    with pytest.raises(InputError, match="forest.safetensors"):
-        load_baselines(folder, load_run(folder))
-
-
-def test_run_with_checkpoints_is_not_finished(tmp_path: Path) -> None:
-    assert not is_finished(tmp_path / "none")
-    folder = write_run(tmp_path / "run" / "fold-0").parent
-    assert is_finished(folder) and is_finished(folder / "fold-0")
-    (folder / "checkpoints").mkdir()
-    (folder / "checkpoints" / "begun.json").touch()
-    assert not is_finished(folder)
-
-
-def test_left_out_classes_are_not_in_the_views() -> None:
-    source = MemoryViews({"a": clouds()["plank"][:2], "b": clouds()["cube"][:3], "c": clouds()["cube"][3:4]}, CONFIG)
-    remaining = WithoutClasses(source, ["b"])
-    assert remaining.classes == ("a", "c") and [(s.label, s.views) for s in remaining.shards] == [(0, 2), (1, 1)]
-    assert remaining.record["views"] == 3 and remaining.record["digest"] == remaining.digest != source.digest
-    views = remaining.read(1)
-    assert views.label == 1
-    np.testing.assert_array_equal(views.xyz, normalize_views(clouds()["cube"][3:4], 1, [0], [0], CONFIG).xyz)
-
-
-def test_command_refuses_unknown_baseline_before_any_work(tmp_path: Path) -> None:
-    arguments = ["train", "--dataset", str(tmp_path), "--out", str(tmp_path / "run"), "--baselines", "forest, tree"]
-    result = CliRunner().invoke(app, arguments)
-    assert isinstance(result.exception, InputError) and "forest, tree" in str(result.exception)
-    assert not (tmp_path / "run").exists()
+    about = {"format": 1, "classes": ["a", "b"], "temperature": None, "seconds": 1.0, "digest": ""}
+    lacking, others = (save(tensors, {"about": json.dumps(about)}) for tensors in ({}, load(content)))
+    for damaged in (content[:-9], content[:-1] + bytes([content[-1] ^ 1]), lacking, others):
+        file.write_bytes(damaged)
+        with pytest.raises(InputError, match="forest.safetensors"):
+            load_baselines(folder, load_run(folder))

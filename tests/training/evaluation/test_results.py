@@ -1,5 +1,6 @@
 """Results computed from synthetic answers, against scikit-learn, NumPy and hand calculation."""
 
+import json
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -28,6 +29,7 @@ class ToyRun(NamedTuple):
 
 RUNS = [ToyRun("a", ("tops", "tops2")), ToyRun("b", ("ce", "tops", "tops2"))]
 N_PREDICTORS = 5
+EYE = np.eye(3, dtype=np.float32)
 
 
 def synthetic_frames(n: int = 60) -> list[FrameAnswers]:
@@ -40,10 +42,8 @@ def synthetic_frames(n: int = 60) -> list[FrameAnswers]:
             number = 2 * k + label
             truth = "dragon" if number % 11 == 0 else CLASSES[rng.integers(3)]
             table = rng.dirichlet(np.ones(3), N_PREDICTORS).astype(np.float32)
-            gone = number % 7 == 0
-            instances.append(
-                InstancePrediction(label, truth, False, "too few points" if gone else None, None if gone else table)
-            )
+            described = (None, table) if number % 7 else ("too few points", None)
+            instances.append(InstancePrediction(label, truth, False, *described))
         attributes = {"environment": "lounge" if k % 2 else "warehouse", "occlusion": ("none", "low", "high")[k % 3]}
         frames.append(FrameAnswers(f"{k}/0", attributes, 0.5, instances))
     return frames
@@ -51,45 +51,37 @@ def synthetic_frames(n: int = 60) -> list[FrameAnswers]:
 
 def test_fusions_have_the_titles_of_the_paper() -> None:
     assert fusions(name for name in ("tops2", "ce", "tops")) == {
-        "CE": ("ce",),
-        "TOPS": ("tops",),
-        "TOPS2": ("tops2",),
-        "CE+TOPS": ("ce", "tops"),
-        "CE+TOPS2": ("ce", "tops2"),
-        "THOR2": ("tops", "tops2"),
-        "CE+TOPS+TOPS2": ("ce", "tops", "tops2"),
-    }
-    assert fusions(["tops"]) == {"TOPS": ("tops",)}
-    assert list(fusions(["thor", "tops", "pointnet", "tops2", "forest"])) == [
-        "forest", "PointNet", "THOR", "TOPS", "TOPS2", "THOR2",
-    ]  # fmt: skip
-    assert fusions(["thor", "ce"])["THOR"] == ("thor",)
-    assert main_fusion(fusions(["thor", "ce"])) == "CE"
+        "CE": ("ce",), "TOPS": ("tops",), "TOPS2": ("tops2",), "CE+TOPS": ("ce", "tops"), "CE+TOPS2": ("ce", "tops2"),
+        "THOR2": ("tops", "tops2"), "CE+TOPS+TOPS2": ("ce", "tops", "tops2"),
+    }  # fmt: skip
     assert fusions([]) == {}
-    assert main_fusion(fusions(["ce", "tops", "tops2"])) == "THOR2"
-    assert main_fusion(fusions(["ce", "tops"])) == "CE+TOPS"
-    titles = fusions(["ce", "tops", "tops2", "gallery", "both"])
-    assert list(titles)[-2:] == ["gallery", "both"]
-    assert [main_fusion(titles, source) for source in ("classifiers", "gallery", "both")] == [
-        "THOR2",
-        "gallery",
-        "both",
-    ]
-    alone = fusions(["embedding"])
-    assert alone == {"embedding": ("embedding",)} and main_fusion(alone) == "embedding"
-    assert main_fusion(fusions(["forest", "embedding", "gallery", "both"]), "both") == "both"
-    assert main_fusion(fusions(["forest", "embedding"])) == "embedding"
-    assert main_fusion(fusions(["tops", "tops2", "embedding", "THOR2+embedding"])) == "THOR2+embedding"
-    assert main_fusion(fusions(["ce", "gallery"])) == "CE" and main_fusion(["gallery"], "gallery") == "gallery"
+    titles = ["forest", "PointNet", "THOR", "TOPS", "TOPS2", "THOR2", "gallery", "both"]
+    assert list(fusions(["thor", "tops", "pointnet", "tops2", "forest", "gallery", "both"])) == titles
 
 
-def test_scores_of_the_gallery_are_not_normalized() -> None:
-    index, confidence = fuse_by("log-mean", {"gallery": np.array([[0.2, 0.1], [0.0, 0.7]])})
-    assert list(index) == [0, 1] and list(confidence) == [0.2, 0.7]
+@pytest.mark.parametrize(
+    ("predictors", "answer_by", "expected"),
+    [
+        (["thor", "ce"], "classifiers", "CE"),
+        (["ce", "tops"], "classifiers", "CE+TOPS"),
+        (["ce", "tops", "tops2", "gallery", "both"], "classifiers", "THOR2"),
+        (["ce", "tops", "tops2", "gallery", "both"], "gallery", "gallery"),
+        (["forest", "embedding", "gallery", "both"], "both", "both"),
+        (["forest", "embedding"], "classifiers", "embedding"),
+        (["tops", "tops2", "embedding", "THOR2+embedding"], "classifiers", "THOR2+embedding"),
+    ],
+)
+def test_main_fusion_is_that_of_what_answers(predictors: list[str], answer_by: str, expected: str) -> None:
+    assert main_fusion(fusions(predictors), answer_by) == expected
 
 
 def test_fusion_rules_match_hand_calculation() -> None:
-    """The maximum is 0.7, the means are 0.31, 0.34 and 0.35, and only the second class is above 0 in both."""
+    """The maximum is 0.7, the means are 0.31, 0.34 and 0.35, and only the second class is above 0 in both.
+
+    Scores of the gallery are not normalized.
+    """
+    index, confidence = fuse_by("log-mean", {"gallery": np.array([[0.2, 0.1], [0.0, 0.7]])})
+    assert list(index) == [0, 1] and list(confidence) == [0.2, 0.7]
     both = {"tops": np.array([[0.0, 0.3, 0.7]]), "tops2": np.array([[0.62, 0.38, 0.0]])}
     index, confidence = fuse_by("max", both)
     assert (index[0], confidence[0]) == (2, 0.7)
@@ -101,13 +93,10 @@ def test_fusion_rules_match_hand_calculation() -> None:
     roots = np.sqrt([0.2 * 0.6, 0.8 * 0.4])
     assert fuse_by("log-mean", equal)[1] == pytest.approx(roots[1] / roots.sum())
 
-
-def test_calibrated_fusion_uses_the_temperatures() -> None:
-    """A temperature of 4 turns 0.9 into 9 ** 0.25 / (9 ** 0.25 + 1) = 0.634, which is less than 0.8."""
+    # A temperature of 4 turns 0.9 into 0.634, which is less than 0.8.
     both = {"tops": np.array([[0.9, 0.1]]), "tops2": np.array([[0.2, 0.8]])}
-    assert fuse_by("max", both)[0][0] == 0
     index, confidence = fuse_by("calibrated", both, {"tops": 4.0, "tops2": 1.0})
-    assert (index[0], confidence[0]) == (1, pytest.approx(0.8))
+    assert (index[0], confidence[0]) == (1, pytest.approx(0.8)) and fuse_by("max", both)[0][0] == 0
     index, confidence = fuse_by("calibrated", {"tops": both["tops"]}, {"tops": 4.0})
     assert confidence[0] == pytest.approx(9**0.25 / (9**0.25 + 1))
 
@@ -119,11 +108,8 @@ def test_temperatures_reduce_the_calibration_error() -> None:
     unknown = [InstancePrediction(99, "dragon", probabilities=np.array([[0.6, 0.4]] * 2, np.float32))]
     frame = FrameAnswers("f", {}, 1.0, instances + unknown)
     temperature = np.log(99) / np.log(3)
-    runs = [
-        ToyRun("a", ("tops",), ("bowl", "can"), {"tops": temperature}),
-        ToyRun("b", ("tops",), ("bowl", "can")),
-    ]
-    report = compute_results("frames", runs, [frame])
+    run = ToyRun("a", ("tops",), ("bowl", "can"))
+    report = compute_results("frames", [run._replace(temperatures={"tops": temperature}), run], [frame])
     before, after = report["confidence"]["TOPS"], report["calibrated_confidence"]["TOPS"]
     assert before["expected_calibration_error"]["mean"] == pytest.approx(0.24, abs=1e-6)
     assert before["expected_calibration_error"]["runs"] == 2
@@ -133,12 +119,6 @@ def test_temperatures_reduce_the_calibration_error() -> None:
     assert before["unknown_refused"]["mean"] == 1 and before["accuracy_at_coverage"]["mean"] == 0.75
     assert report["temperatures"]["tops"] == {"mean": pytest.approx(temperature), "std": None, "runs": 1}
     assert report["accuracy"]["calibrated"][0]["cells"][0]["accuracy"]["TOPS"]["mean"] == 0.75
-
-
-def test_runs_without_temperatures_have_no_calibrated_values() -> None:
-    report = compute_results("uwis", RUNS, synthetic_frames())
-    assert report["accuracy"]["calibrated"][0]["cells"][0]["accuracy"] == {}
-    assert report["calibrated_confidence"] == {} and report["temperatures"]["ce"]["runs"] == 0
 
 
 def test_results_match_numpy_and_sklearn() -> None:
@@ -172,41 +152,30 @@ def test_results_match_numpy_and_sklearn() -> None:
                 std = pytest.approx(np.std(accuracies, ddof=1)) if len(accuracies) > 1 else None
                 assert cell["accuracy"][name]["std"] == std
                 assert cell["accuracy"][name]["runs"] == len(accuracies)
-    assert [table["by"] for table in report["accuracy"]["max"]] == [
-        [], ["environment"], ["environment", "occlusion"],
-    ]  # fmt: skip
-    assert [cell["where"]["occlusion"] for cell in report["accuracy"]["mean"][2]["cells"]] == [
-        "none",
-        "low",
-        "high",
-    ] * 2
+    tables = report["accuracy"]["mean"]
+    assert [table["by"] for table in tables] == [[], ["environment"], ["environment", "occlusion"]]
+    assert [cell["where"]["occlusion"] for cell in tables[2]["cells"]] == ["none", "low", "high"] * 2
 
     described = [i for i, _ in scored if i.probabilities is not None]
-    truth = [i.truth for i in described]
-    pairs = [(0, 1), (3, 4)]
-    answers = [
-        CLASSES[np.prod(i.probabilities[list(pair)], axis=0, dtype=np.float64).argmax()]  # type: ignore[index]
-        for pair in pairs
-        for i in described
-    ]
-    np.testing.assert_array_equal(
-        np.array(report["confusion"])[:, :-1], confusion_matrix(truth * 2, answers, labels=CLASSES)
-    )
+    table = np.array([i.probabilities for i in described], np.float64)
+    answers = [CLASSES[k] for pair in ([0, 1], [3, 4]) for k in table[:, pair].prod(axis=1).argmax(axis=1)]
+    expected = confusion_matrix([i.truth for i in described] * 2, answers, labels=CLASSES)
+    np.testing.assert_array_equal(np.array(report["confusion"])[:, :-1], expected)
     assert np.sum(report["confusion"]) == 2 * len(scored)
     assert sum(report["reliability"]["answers"]) == 2 * len(described)
     assert 0 < report["confidence"]["THOR2"]["auroc_known"]["mean"] < 1
     assert report["speed"]["frames_per_second"] == pytest.approx(2)
+    # These runs have no temperatures.
+    assert report["accuracy"]["calibrated"][0]["cells"][0]["accuracy"] == {}
+    assert report["calibrated_confidence"] == {} and report["temperatures"]["ce"]["runs"] == 0
 
 
 def test_named_answers_are_those_of_the_main_fusion_and_the_threshold() -> None:
     sure = np.array([[0, 0, 1], [0, 0, 1], [1, 0, 0], [1, 0, 0], [0.9, 0.1, 0]], np.float32)
     instances = [InstancePrediction(1, "mug", probabilities=sure), InstancePrediction(2, "dragon")]
     runs = [RUNS[0]._replace(thresholds=np.full(3, 1.1)), RUNS[1]]
-    named = list(named_answers(instances, runs))
-    assert [(run, i.label, name, confidence) for run, i, name, confidence in named] == [
-        (0, 1, None, 1.0),
-        (1, 1, "bowl", 1.0),
-    ]
+    named = [(run, instance.label, *answer) for run, instance, *answer in named_answers(instances, runs)]
+    assert named == [(0, 1, None, 1.0), (1, 1, "bowl", 1.0)]
 
 
 def sure_of(name: str, confidence: float) -> np.ndarray:
@@ -227,9 +196,8 @@ def test_rejection_and_placements_match_hand_calculation() -> None:
     frames.append(FrameAnswers("g", {}, 1.0, [InstancePrediction(1, "can", False, None, sure_of("can", 0.95))]))
     frames += [FrameAnswers("h", {}, 1.0, [InstancePrediction(1, "dragon", False, None, sure_of(*d))]) for d in dragons]
     frames.append(FrameAnswers("i", {}, 1.0, [InstancePrediction(1, "can", reason="too few points")]))
-    report = compute_results(
-        "frames", [ToyRun("a", ("tops", "tops2"), thresholds=np.array([0.61, 0.75, 0.75]))], frames
-    )
+    run = RUNS[0]._replace(thresholds=np.array([0.61, 0.75, 0.75]))
+    report = compute_results("frames", [run], frames)
     placements = report["placements"]
     assert placements["count"] == 3
     assert placements["accuracy"]["THOR2"]["mean"] == pytest.approx((2 / 4 + 1 + 0) / 3)
@@ -255,33 +223,23 @@ def test_rejection_and_placements_match_hand_calculation() -> None:
     assert report["confidence"]["THOR2"]["unknown_named"]["mean"] == pytest.approx(1 / 3)
 
 
-def test_runs_without_threshold_or_unknown_objects() -> None:
-    frames = [FrameAnswers("f", {}, 1.0, [InstancePrediction(1, "mug", False, None, sure_of("mug", 0.9))])]
-    report = compute_results("frames", RUNS[:1], frames)
-    assert report["known_unknown"] is None
-    assert report["rejection"]["threshold"]["runs"] == report["rejection"]["unknown_named_at_threshold"]["runs"] == 0
-
-
-@pytest.mark.parametrize("kept", [0, 1])
-def test_results_of_no_or_one_instance(kept: int) -> None:
-    frame = FrameAnswers(
-        "f", {}, 0.0, [InstancePrediction(1, "mug", probabilities=np.eye(3, dtype=np.float32)[:2])][:kept]
-    )
-    report = compute_results("frames", RUNS[:1], [frame])
-    assert report["instances"]["scored"] == kept and report["speed"]["frames_per_second"] is None
-    assert report["fusions"] == (["TOPS", "TOPS2", "THOR2"] if kept else [])
-    if kept:
-        assert report["accuracy"]["max"][0]["cells"][0]["accuracy"]["THOR2"]["mean"] == 0.0
+@pytest.mark.parametrize(
+    "instances",
+    [[], [InstancePrediction(1, "mug", False, None, EYE[:2])], [InstancePrediction(1, "mug", False, "too few points")]],
+    ids=["none", "incorrect", "not described"],
+)
+def test_results_of_no_or_one_instance(instances: list[InstancePrediction]) -> None:
+    report = compute_results("frames", RUNS[:1], [FrameAnswers("f", {}, 0.0, instances)])
+    assert report["instances"]["scored"] == len(instances) and report["speed"]["frames_per_second"] is None
+    assert report["fusions"] == (["TOPS", "TOPS2", "THOR2"] if instances else [])
+    if instances:
+        assert report["known_unknown"] is None
+        accuracy = report["accuracy"]["log-mean"][0]["cells"][0]["accuracy"]
+        assert accuracy["THOR2"] == {"mean": 0.0, "std": None, "runs": 1} and np.sum(report["confusion"]) == 1
+        assert report["confusion"][2][3] == (instances[0].reason is not None)
         assert report["confidence"]["THOR2"]["auroc_right"] == {"mean": None, "std": None, "runs": 0}
-
-
-def test_instances_not_described_are_incorrect() -> None:
-    frame = FrameAnswers("f", {}, 1.0, [InstancePrediction(1, "mug", reason="too few points")])
-    report = compute_results("frames", RUNS, [frame])
-    accuracy = report["accuracy"]["log-mean"][0]["cells"][0]["accuracy"]
-    assert accuracy["THOR2"] == {"mean": 0.0, "std": 0.0, "runs": 2}
-    assert report["confusion"] == [[0] * 4, [0] * 4, [0, 0, 0, 2]]
-    assert report["confidence"]["THOR2"]["expected_calibration_error"]["mean"] is None
+        assert report["rejection"]["threshold"]["runs"] == 0
+        assert report["rejection"]["unknown_named_at_threshold"]["runs"] == 0
 
 
 def test_grouping_by_attributes() -> None:
@@ -295,11 +253,18 @@ def test_grouping_by_attributes() -> None:
     assert summarize_runs([0.5, float("nan"), 0.7])["runs"] == 2
 
 
-def test_ocid_has_a_table_by_sequence() -> None:
-    answer = InstancePrediction(1, "mug", probabilities=np.eye(3, dtype=np.float32)[:2])
-    names = ["table/bottom/mixed/seq1", "table/bottom/mixed/seq2"]
-    frames = [FrameAnswers(f"{name}/{k}", {"camera": "lower"}, 1.0, [answer]) for name in names for k in range(2)]
-    tables = compute_results("ocid", RUNS[:1], frames, own_objects=True)["accuracy"]["max"]
-    assert tables[-1]["by"] == ["sequence"]
-    assert [cell["where"]["sequence"] for cell in tables[-1]["cells"]] == names
-    assert tables[1]["cells"][0]["published"]["SimpleView"] == pytest.approx(0.6254)
+@pytest.mark.parametrize("own", [True, False])
+def test_ocid_has_a_table_by_sequence_and_published_ones(own: bool) -> None:
+    """Those of the protocol: the models of a sequence know the objects of the sequence, or those of all sequences."""
+    answer = InstancePrediction(1, "mug", probabilities=EYE[:2])
+    names = ["table/bottom/mixed/seq21", "table/bottom/mixed/seq22"]
+    attributes = {"camera": "lower", "place": "table", "type": "mixed"}
+    frames = [FrameAnswers(f"{name}/{k}", attributes, 1.0, [answer]) for name in names for k in range(2)]
+    report = compute_results("ocid", RUNS[:1], frames, own_objects=own)
+    tables = report["accuracy"]["max"]
+    assert tables[-1]["by"] == ["sequence"] and [cell["where"]["sequence"] for cell in tables[-1]["cells"]] == names
+    (lower,) = next(table for table in tables if table["by"] == ["camera"])["cells"]
+    assert lower["published"]["THOR2"] == pytest.approx(0.7507 if own else 0.5996)
+    published = json.loads(json.dumps(report))["published_tables"]
+    assert [table["number"] for table in published] == ([1, 8, None] if own else [3])
+    assert compute_results("ocid", RUNS[:1], [])["published_tables"] == []

@@ -1,20 +1,36 @@
-"""Temperatures of the classifiers of a fold, and the samples that they are fitted to."""
+"""Calibration: temperatures against SciPy, scikit-learn and known ones, and the confidence of a run."""
+
+import dataclasses
 
 import jax
 import numpy as np
 import pytest
 from flax import nnx
-from helpers import random_clouds
+from helpers import SMALL_CONFIG, random_clouds, untrained_embedding_run
+from scipy.special import softmax
+from sklearn.metrics import log_loss
 
 import colornet
 import thor2_jax as thor2
+from thor2_jax.descriptor.looks import describe_looks
+from thor2_jax.errors import InputError
 from thor2_jax.model.classifier import MLP, Feature, class_probabilities
+from thor2_jax.model.confidence import Calibration
+from thor2_jax.model.fusion import with_temperature
+from thor2_jax.model.inference import Inference
 from thor2_jax.model.run_directory import input_size
+from thor2_jax.types import Cloud
 from training.fitting import calibration
-from training.fitting.calibration import fit_temperature, sample_probabilities, temperatures
+from training.fitting.calibration import (
+    fit_calibration,
+    fit_temperature,
+    negative_log_likelihood,
+    sample_probabilities,
+    temperatures,
+)
 from training.fitting.samples import MIRRORS, build_samples
 from training.fitting.steps import FitContext
-from training.views.normalized_views import MemoryViews, padded_batches
+from training.views.normalized_views import CLOUDS_PER_BATCH, MemoryViews, padded_batches
 
 pytestmark = pytest.mark.usefixtures("small_classifiers")
 
@@ -32,7 +48,7 @@ def test_sample_probabilities_equal_those_of_the_clouds(feature: Feature, monkey
     views = source(2)
     samples = build_samples(views, NETWORK, CONFIG)
     model = MLP(input_size(feature, CONFIG, NETWORK.n_regions), 2, rngs=nnx.Rngs(0))
-    rows = np.array([7, 0, 3, 5])
+    rows = np.array([7, 0, 7, 3, 5])
     context = FitContext(feature, NETWORK, CONFIG)
     probabilities = sample_probabilities(model, samples, rows, context)
     probabilities_of = jax.jit(lambda described: class_probabilities(model, described, feature))
@@ -55,3 +71,106 @@ def test_temperatures_are_fitted_to_the_held_out_set() -> None:
     probabilities = sample_probabilities(model, samples, np.flatnonzero(held_out), FitContext("tops", NETWORK, CONFIG))
     assert fitted == {"tops": fit_temperature(probabilities, samples.label[held_out])}
     assert temperatures({"tops": model}, samples, None, NETWORK, CONFIG) == {}
+
+
+@pytest.mark.parametrize("temperature", [0.4, 1.0, 3.0])
+def test_known_temperature_is_recovered(temperature: float) -> None:
+    rng = np.random.default_rng(0)
+    logits = rng.normal(0, 2, (20_000, 5))
+    truth = (softmax(logits, axis=1).cumsum(axis=1) < rng.random((20_000, 1))).sum(axis=1)
+    scaled = softmax(logits * temperature, axis=1)
+    assert fit_temperature(scaled, truth) == pytest.approx(temperature, rel=0.05)
+
+
+def test_likelihood_matches_scipy_and_sklearn() -> None:
+    rng = np.random.default_rng(1)
+    logits, truth = rng.normal(0, 3, (50, 4)), rng.integers(0, 4, 50)
+    probabilities = softmax(logits, axis=1)
+    np.testing.assert_allclose(with_temperature(probabilities, 2.5), softmax(logits / 2.5, axis=1), rtol=1e-6)
+    expected = log_loss(truth, softmax(logits / 2.5, axis=1), labels=range(4))
+    assert negative_log_likelihood(probabilities, truth, 2.5) == pytest.approx(expected)
+    best = fit_temperature(probabilities, truth)
+    grid = [negative_log_likelihood(probabilities, truth, t) for t in np.geomspace(0.01, 100, 400)]
+    assert negative_log_likelihood(probabilities, truth, best) <= min(grid) + 1e-9
+
+
+def test_probabilities_of_zero_and_invalid_arguments() -> None:
+    probabilities = np.array([[1.0, 0.0], [1.0, 0.0], [0.0, 1.0]], np.float32)
+    assert 1 < fit_temperature(probabilities, np.array([0, 1, 1])) <= 100
+    with pytest.raises(InputError, match="shapes"):
+        fit_temperature(np.zeros((0, 3)), np.zeros(0, int))
+    with pytest.raises(InputError, match=r"truth.* 3; expected 0 to 2"):
+        fit_temperature(np.full((2, 3), 1 / 3), np.array([0, 3]))
+
+
+Views = list[tuple[int, Cloud]]
+
+LABEL = np.arange(40) % 4
+
+
+@pytest.fixture(scope="module")
+def held_out() -> Views:
+    return list(zip(LABEL.tolist(), random_clouds(0, [200] * 40), strict=True))
+
+
+def fit(fused: np.ndarray, embedded: np.ndarray, held_out: Views) -> tuple[Calibration | None, float]:
+    """Fit the confidence of a run whose classifiers and embedding answer with these probabilities."""
+    run = untrained_embedding_run(("a", "b"), ("tops", "tops2"))
+    values = {"tops": fused, "tops2": fused, "embedding": embedded}
+    inference = Inference(0, {k: np.resize(v, (128, 2)) for k, v in values.items()})
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(calibration, "infer_clouds", lambda *_: inference)
+        return fit_calibration(run, run.embedding, held_out)
+
+
+def test_confidence_separates_and_keeps_its_share(held_out: Views) -> None:
+    """Known objects (labels 0 and 1) with high odds, unknown ones with low odds; a tenth of the known are wrong."""
+    known = LABEL < 2
+    right = np.where(known, LABEL, 0)
+    rng = np.random.default_rng(1)
+    top = np.where(known, rng.uniform(0.8, 0.99, 40), rng.uniform(0.5, 0.9, 40))
+    wrong = known & (np.arange(40) % 10 == 1)
+    top, answer = np.where(wrong, 0.55, top), np.where(wrong, 1 - right, right)
+    fused = np.stack([np.where(answer == k, top, 1 - top) for k in (0, 1)], axis=1)
+    embedded = fused * np.where(known, 0.9, 0.1)[:, None]
+    fitted, accuracy = fit(fused, embedded, held_out)
+    assert fitted is not None and min(fitted.known_factor, fitted.correct_factor, fitted.score_factor) > 0
+    scores, correct = fitted.confidence(fused, embedded), answer == LABEL
+    assert np.min(scores[known & ~wrong]) > 0.7 > np.max(scores[~known])
+    assert accuracy == correct[known].mean() < 1
+    assert np.mean(scores[known]) == pytest.approx(correct[known].mean(), abs=0.05)  # most instances are known
+    assert fitted.unknown_below == pytest.approx(np.quantile(scores[correct], 1 - calibration.KEPT))
+    unknown = [(label + 2, cloud) for label, cloud in held_out]  # without correct answers, there is no confidence
+    assert fit(fused, embedded, unknown)[0] is None
+
+
+def test_unknown_objects_are_told_apart_without_incorrect_answers(held_out: Views) -> None:
+    known = LABEL < 2
+    fused = np.stack([np.where(np.where(known, LABEL, 0) == k, 0.9, 0.1) for k in (0, 1)], axis=1)
+    embedded = fused * np.where(known, 0.9, 0.1)[:, None]
+    fitted, accuracy = fit(fused, embedded, held_out)
+    assert fitted is not None and accuracy == 1
+    scores = fitted.confidence(fused, embedded)
+    assert np.max(scores[~known]) < fitted.unknown_below <= np.min(scores[known]) + 1e-9
+
+
+def test_held_out_views_are_recognized_in_the_looks_of_the_run(held_out: Views) -> None:
+    """The threshold is that of the answers to all clouds in one batch, in their own order."""
+    run = untrained_embedding_run(("a", "b"), config=dataclasses.replace(SMALL_CONFIG, looks=4))
+    assert run.embedding is not None
+    sizes = np.random.default_rng(2).permutation(np.arange(100, 140))
+    views = [(label, (xyz[:n], rgb[:n])) for n, (label, (xyz, rgb)) in zip(sizes, held_out, strict=True)]
+    fitted, accuracy = fit_calibration(run, run.embedding, views)
+    assert fitted is not None
+    ((_, clouds),) = padded_batches([cloud for _, cloud in views], CLOUDS_PER_BATCH)
+    thresholds = []
+    for looks in (4, 1):
+        described = describe_looks(clouds, NETWORK, SMALL_CONFIG, looks)
+        embedded = np.asarray(run.embedding.class_probabilities(described))[:40]
+        fused = embedded.astype(np.float64) / embedded.sum(axis=1, keepdims=True, dtype=np.float64)
+        correct = fused.argmax(axis=1) == LABEL
+        thresholds.append(np.quantile(fitted.confidence(fused, embedded)[correct], 1 - calibration.KEPT))
+        if looks == 4:
+            assert accuracy == correct.sum() / (LABEL < 2).sum()
+    assert fitted.unknown_below == pytest.approx(thresholds[0], abs=1e-6)
+    assert abs(thresholds[0] - thresholds[1]) > 1e-5

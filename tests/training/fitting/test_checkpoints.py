@@ -1,4 +1,4 @@
-"""Checkpoints: which epochs are kept, what they restore, and what remains after a failure."""
+"""Checkpoints and run directories: which epochs are kept, what they restore, and what remains after a failure."""
 
 import errno
 import sys
@@ -12,7 +12,7 @@ import pytest
 from helpers import full_disk
 
 import thor2_jax as thor2
-from training.fitting.checkpoints import Checkpoints, _quiet_orbax
+from training.fitting.checkpoints import Checkpoints, _quiet_orbax, find_run_directories
 
 
 class State(NamedTuple):
@@ -38,26 +38,21 @@ def epochs(folder: Path) -> set[str]:
     return {path.name for path in folder.iterdir()}
 
 
-def test_the_last_and_the_best_are_kept(tmp_path: Path) -> None:
+def test_the_last_and_the_latest_of_the_best_are_kept(tmp_path: Path) -> None:
     with Checkpoints(tmp_path / "c") as checkpoints:
         assert checkpoints.last_epoch == checkpoints.best_epoch == 0
-        for epoch, score in enumerate((0.1, 0.9, 0.5, 0.3), 1):
+        for epoch, score in enumerate((-3.0, 0.9, 0.9, -0.3), 1):
             checkpoints.save(epoch, state(epoch), score)
-    assert epochs(tmp_path / "c") == {"2", "4"}
+    assert epochs(tmp_path / "c") == {"3", "4"}
     with Checkpoints(tmp_path / "c") as checkpoints:
-        assert (checkpoints.last_epoch, checkpoints.best_epoch) == (4, 2)
+        assert (checkpoints.last_epoch, checkpoints.best_epoch) == (4, 3)
         assert_equal(checkpoints.last(state(0)), state(4))
-        assert_equal(checkpoints.best(state(0)), state(2))
+        assert_equal(checkpoints.best(state(0)), state(3))
+        with pytest.raises(thor2.InputError, match="checkpoint: "):
+            checkpoints.last(state(0, 99))  # has another shape
         checkpoints.save(5, state(5), 0.95)
         assert (checkpoints.last_epoch, checkpoints.best_epoch) == (5, 5)
     assert epochs(tmp_path / "c") == {"5"}
-
-
-def test_the_latest_of_the_highest_scores_is_the_best(tmp_path: Path) -> None:
-    with Checkpoints(tmp_path) as checkpoints:
-        for epoch, score in enumerate((-3.0, -2.0, -2.0, -2.5), 1):
-            checkpoints.save(epoch, state(epoch), score)
-        assert (checkpoints.last_epoch, checkpoints.best_epoch) == (4, 3)
 
 
 def test_incomplete_checkpoints_are_removed(tmp_path: Path) -> None:
@@ -89,12 +84,6 @@ def test_the_last_checkpoint_survives_a_full_disk(fail: Any, tmp_path: Path, mon
         assert_equal(checkpoints.last(state(0)), state(1))
 
 
-def test_a_directory_that_cannot_be_created_is_an_error(tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    with pytest.raises(OSError):
-        Checkpoints(tmp_path / "file" / "c")
-
-
 def test_a_damaged_checkpoint_is_refused(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     with Checkpoints(tmp_path) as checkpoints:
         checkpoints.save(1, state(1), 0.0)
@@ -112,13 +101,6 @@ def test_a_damaged_checkpoint_is_refused(tmp_path: Path, capfd: pytest.CaptureFi
     assert "Traceback" not in capfd.readouterr().err
 
 
-def test_another_structure_is_refused(tmp_path: Path) -> None:
-    with Checkpoints(tmp_path) as checkpoints:
-        checkpoints.save(1, state(1), 0.0)
-        with pytest.raises(thor2.InputError, match="checkpoint: "):
-            checkpoints.last(state(0, 99))
-
-
 def test_threads_of_a_failed_save_print_no_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
     """They find their event loop closed, while the error is raised and after it; other errors are printed."""
     printed = []
@@ -133,3 +115,16 @@ def test_threads_of_a_failed_save_print_no_traceback(monkeypatch: pytest.MonkeyP
     sys.excepthook(RuntimeError, RuntimeError("Event loop is closed"), None)
     sys.excepthook(RuntimeError, RuntimeError("another"), None)
     assert printed == ["another"]
+
+
+def test_run_directories_are_those_of_finished_folds_in_order(tmp_path: Path) -> None:
+    expected = [tmp_path / name for name in ("single", "five/fold-0", "five/fold-2", "five/fold-10")]
+    for path in expected:
+        path.mkdir(parents=True)
+        (path / "run.json").touch()
+    assert find_run_directories([tmp_path / "single", tmp_path / "five"]) == expected
+    (tmp_path / "five" / "checkpoints").mkdir()
+    (tmp_path / "five" / "checkpoints" / "begun.json").touch()
+    with pytest.raises(thor2.InputError, match="model: "):
+        find_run_directories([tmp_path / "five"])
+    assert find_run_directories(expected[1:2]) == expected[1:2]

@@ -1,6 +1,8 @@
-"""Training samples against descriptors of the same views, computed one by one."""
+"""Training samples against descriptors of the same views, computed one by one, and folds by view."""
 
 import dataclasses
+from collections.abc import Sequence
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -13,8 +15,8 @@ import thor2_jax as thor2
 from thor2_jax.descriptor.color_membership import region_sets
 from thor2_jax.types import Cloud
 from training.fitting import samples as module
-from training.fitting.samples import PAPER_MIRRORS, Samples, build_samples, expand
-from training.views.normalized_views import MemoryViews, NormalizedViews
+from training.fitting.samples import PAPER_MIRRORS, Samples, build_samples, expand, fold_of_views
+from training.views.normalized_views import MemoryViews, SourceShard
 
 NETWORK = colornet.load_default()
 CONFIG = thor2.DescriptorConfig(homology="closed_form")
@@ -47,9 +49,12 @@ def test_every_view_is_used_mirrored_in_four_ways(
     samples = build_samples(source, NETWORK, config, lambda *done: progress.append(done), PAPER_MIRRORS)
     assert samples.classes == ("mug", "box") and len(samples) == 16
     assert progress == [(2, 4), (3, 4), (4, 4)]
-    assert sorted(zip(samples.label.tolist(), samples.view.tolist(), strict=True)) == sorted(
-        [(0, v) for v in range(3)] * 4 + [(1, 0)] * 4
-    )
+    keys = list(zip(samples.label.tolist(), samples.view.tolist(), strict=True))
+    assert sorted(keys) == sorted([(0, v) for v in range(3)] * 4 + [(1, 0)] * 4)
+    if config is CONFIG:
+        points = np.add.reduceat(samples.color_count, samples.color_start[:-1])
+        assert points.tolist() == [{(0, 0): 300, (0, 1): 299, (0, 2): 1, (1, 0): 40}[key] for key in keys]
+        assert samples.color_count.dtype == np.float32 and (samples.color_count % 1 == 0).all()
     descriptors = thor2.describe_strips(expanded(samples, np.arange(16), config), NETWORK, config)
     for label in range(2):
         for number, cloud in enumerate(source.read(label).clouds()):
@@ -64,69 +69,24 @@ def test_every_view_is_used_mirrored_in_four_ways(
                 np.testing.assert_allclose(descriptors.embeddings[row], expected.embeddings[0], rtol=1e-5, atol=1e-3)
 
 
-def test_counts_are_integers_that_sum_to_the_points() -> None:
-    sizes = (300, 40, 1)
-    samples = build_samples(MemoryViews({"a": views(0, sizes), "b": views(1, (5,))}, CONFIG), NETWORK, CONFIG)
-    assert samples.color_count.dtype == np.float32 and (samples.color_count % 1 == 0).all()
-    points = np.add.reduceat(samples.color_count, samples.color_start[:-1])
-    assert points.tolist() == [*sizes * 2, *[5] * 2]
-
-
-def test_any_rows_in_any_order_and_none() -> None:
-    samples = build_samples(MemoryViews({"a": views(0, (300, 20)), "b": views(1, (5,))}, CONFIG), NETWORK, CONFIG)
-    everything = expanded(samples, np.arange(6))
-    for rows in ([5, 0, 5, 2], []):
-        batch = samples.take(np.array(rows, int))
-        assert [a.shape[1:] for a in batch] == [a.shape[1:] for a in samples.take(np.array([0]))]
-        np.testing.assert_array_equal(batch.label, samples.label[rows])
-        some = jax.tree.leaves(expanded(samples, np.array(rows, int)))
-        for one, every in zip(some, jax.tree.leaves(everything), strict=True):
-            np.testing.assert_array_equal(one, np.asarray(every)[rows])
-
-
-def test_a_sample_is_small() -> None:
-    """A sample takes less than a fifteenth of its TOPS2 descriptor."""
-    samples = build_samples(MemoryViews({"a": views(0, (300,)), "b": views(1, (300,))}, CONFIG), NETWORK, CONFIG)
-    fields = [getattr(samples, f.name) for f in dataclasses.fields(samples) if f.name != "classes"]
-    assert sum(a.nbytes for a in fields) / len(samples) < 4 * 11942 / 15
-
-
-@dataclasses.dataclass
-class Shard:
-    label: int
-    views: int
-
-
-class Shards:
-    """A source with two shards of one class, the first with two copies of one view, and one shard of another class."""
-
-    classes = ("mug", "box")
-    digest = "d"
-    record: dict[str, Any] = {}
-
-    def __init__(self, whole: MemoryViews) -> None:
-        mug, box = whole.read(0), whole.read(1)
-        cut = int(mug.counts[:2].sum())
-        numbers = {"view": np.array([7, 7], np.int32), "copy": np.array([0, 1], np.int32)}
-        first = dataclasses.replace(mug, xyz=mug.xyz[:cut], rgb=mug.rgb[:cut], counts=mug.counts[:2], **numbers)
-        numbers = {"view": np.array([9], np.int32), "copy": np.array([0], np.int32)}
-        second = dataclasses.replace(mug, xyz=mug.xyz[cut:], rgb=mug.rgb[cut:], counts=mug.counts[2:], **numbers)
-        self._chunks = [first, second, box]
-        self.shards = [Shard(views.label, len(views)) for views in self._chunks]
-
-    def read(self, index: int) -> NormalizedViews:
-        return self._chunks[index]
-
-
 def test_shards_of_a_class_and_copies_of_a_view() -> None:
-    whole = MemoryViews({"mug": views(0, (30, 31, 32)), "box": views(1, (33,))}, CONFIG)
-    samples = build_samples(Shards(whole), NETWORK, CONFIG)
-    assert sorted(zip(samples.label.tolist(), samples.view.tolist(), strict=True)) == sorted(
-        [(0, 7)] * 4 + [(0, 9)] * 2 + [(1, 0)] * 2
-    )
+    """Two shards of a mug, the first with two copies of view 7, and one of a box; a sample is small."""
+    mugs, boxes = views(0, (300, 310, 320)), views(1, (330,))
+    whole = MemoryViews({"mug": mugs, "box": boxes}, CONFIG)
+    first, second = (MemoryViews({"mug": some}, CONFIG).read(0) for some in (mugs[:2], mugs[2:]))
+    first = dataclasses.replace(first, view=np.array([7, 7], np.int32), copy=np.array([0, 1], np.int32))
+    second = dataclasses.replace(second, view=np.array([9], np.int32))
+    chunks = [first, second, whole.read(1)]
+    shards = [SourceShard(each.label, len(each)) for each in chunks]
+    source: Any = SimpleNamespace(classes=whole.classes, shards=shards, read=chunks.__getitem__)
+    samples = build_samples(source, NETWORK, CONFIG)
+    keys = zip(samples.label.tolist(), samples.view.tolist(), strict=True)
+    assert sorted(keys) == sorted([(0, 7)] * 4 + [(0, 9)] * 2 + [(1, 0)] * 2)
     expected = build_samples(whole, NETWORK, CONFIG)
     np.testing.assert_array_equal(np.sort(samples.color_count), np.sort(expected.color_count))
     np.testing.assert_allclose(np.sort(samples.length), np.sort(expected.length), atol=1e-6)
+    fields = [getattr(samples, f.name) for f in dataclasses.fields(samples) if f.name != "classes"]
+    assert sum(a.nbytes for a in fields) / len(samples) < 4 * 11942 / 15  # a fifteenth of the TOPS2 descriptor
 
 
 def test_the_digest_is_that_of_the_views() -> None:
@@ -140,15 +100,22 @@ def test_the_digest_is_that_of_the_views() -> None:
     assert digest(a=views(0, (3, 4)), b=two) == digests[0]
 
 
-def test_bad_views_are_refused() -> None:
-    def build(clouds: dict[str, list[Cloud]]) -> Samples:
-        return build_samples(MemoryViews(clouds, CONFIG), NETWORK, CONFIG)
+def fold_of(label: Sequence[int], view: Sequence[int], folds: int, seed: int) -> np.ndarray:
+    return fold_of_views(np.array(label), np.array(view), ("a", "b"), folds, seed)
 
-    with pytest.raises(thor2.InputError, match="views of 0 classes"):
-        build({})
-    with pytest.raises(thor2.InputError, match="views of 1 classes"):
-        build({"mug": views(0, (5,))})
-    with pytest.raises(thor2.InputError, match="class 'mug' has no views"):
-        build({"box": views(0, (5,)), "mug": []})
-    with pytest.raises(thor2.InputError, match="9000 points"):
-        build({"a": [(np.zeros((9000, 3), np.float32), np.zeros((9000, 3), np.uint8))], "b": views(0, (5,))})
+
+def test_samples_of_a_view_stay_together_and_folds_are_even() -> None:
+    label = np.repeat([0, 1, 0], [52, 60, 52])
+    view = np.concatenate([np.repeat(np.arange(n, m, s), 4) for n, m, s in ((0, 13, 1), (100, 130, 2), (0, 13, 1))])
+    fold_numbers = fold_of(label, view, 5, 0)
+    for name in (0, 1):
+        folds = {v: set(fold_numbers[(label == name) & (view == v)]) for v in view[label == name]}
+        assert all(len(fold) == 1 for fold in folds.values())
+        counts = np.bincount([fold.pop() for fold in folds.values()], minlength=5)
+        assert len(counts) == 5 and counts.max() - counts.min() <= 1
+    np.testing.assert_array_equal(fold_numbers, fold_of(label, view, 5, 0))
+    assert (fold_numbers != fold_of(label, view, 5, 1)).any()
+    assert not fold_of(label, view, 1, 0).any()
+    for folds in (14, 0):
+        with pytest.raises(thor2.InputError, match=f"folds is {folds}"):
+            fold_of(label, view, folds, 0)

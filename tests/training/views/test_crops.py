@@ -1,13 +1,26 @@
-"""Crops of colour and surface normals, against planes, spheres, SciPy and OpenCV."""
+"""Crops of colour and normals, against planes, spheres, SciPy and OpenCV, and those of the views of a dataset."""
+
+import dataclasses
+import json
+import shutil
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from helpers import files_of, run_thor2, write_box
 from scipy.ndimage import generic_filter
 
 import thor2_jax as thor2
 from thor2_jax.errors import InputError
-from training.views.crops import CROP_SIZE, fill_depth, rgbd_crop, surface_normals
+from training.objects.meshes import find_meshes, load_mesh
+from training.rendering.ray_caster import RayCaster, render_view
+from training.rendering.view_sphere import camera_pose, view_angles
+from training.views import render_job
+from training.views.crops import CROP_SIZE, ViewCrops, fill_depth, quantized, rgbd_crop, stacked, surface_normals
+from training.views.dataset import ViewDataset
+from training.views.left_out import WithoutClasses
+from training.views.render_job import render_crops, render_dataset
 
 CAMERA = thor2.Intrinsics(100.0, 110.0, 31.5, 23.5)
 
@@ -27,24 +40,41 @@ def box(top: int, left: int, height: int, width: int) -> np.ndarray:
     return mask
 
 
-@pytest.mark.parametrize("size", [1, 7, 40, 224])
+@pytest.mark.parametrize("size", [1, 7, CROP_SIZE])
 def test_crop_of_a_plane(size: int) -> None:
-    """A tilted plane has its normal everywhere, up to the rim, and no colour of the background."""
+    """A tilted plane has its normal everywhere, up to the rim, and no colour of the background.
+
+    Neither the depth unit nor the neighbours of an instance matter: rendered views are cropped alike.
+    """
     normal = np.array([0.48, -0.36, -0.8])
-    crop = rgbd_crop(plane_frame(tuple(normal), box(4, 10, 30, 18)), 3, size)
+    frame = plane_frame(tuple(normal), box(4, 10, 30, 18))
+    crop = rgbd_crop(frame, 3, size)
     assert crop.color.shape == crop.normals.shape == (size, size, 3)
     assert crop.color.dtype == crop.normals.dtype == np.float32
     np.testing.assert_allclose(crop.color[crop.mask], np.tile([1, 0.2, 0], (crop.mask.sum(), 1)), atol=1e-5)
     np.testing.assert_allclose(crop.normals[crop.mask], np.tile(normal, (crop.mask.sum(), 1)), atol=1e-3)
     assert not crop.color[~crop.mask].any() and not crop.normals[~crop.mask].any()
+    depth = np.rint(100_000 * np.where(box(4, 10, 30, 18), frame.depth, 0)).astype(np.uint32)
+    labels, scaled = (depth > 0).astype(np.uint8), dataclasses.replace(CAMERA, depth_scale=100_000)
+    view = rgbd_crop(thor2.RGBDFrame(frame.color, depth, labels, scaled), 1, size)
+    np.testing.assert_array_equal(view.color, crop.color)
+    np.testing.assert_allclose(view.normals, crop.normals, atol=1e-3)
 
 
 def test_crop_is_centred_and_fills_the_square() -> None:
-    """A box of 30 x 18 pixels fills the height, with margins of 6 pixels; the frame's border is no limit."""
+    """A box of 30 x 18 pixels fills the height, with margins of 6 pixels; the frame's border is no limit.
+
+    Holes do not change the normals of the plane, and a single pixel looks at the camera.
+    """
     for mask in (box(4, 10, 30, 18), box(0, 0, 30, 18), box(18, 46, 30, 18)):
-        crop = rgbd_crop(plane_frame((0, 0, -1), mask), 3, 30)
+        frame = plane_frame((0, 0, -1), mask)
+        frame.depth[20:30, 12:20] = 0
+        crop = rgbd_crop(frame, 3, 30)
         np.testing.assert_array_equal(crop.mask, np.pad(np.ones((30, 18), bool), ((0, 0), (6, 6))))
-    assert rgbd_crop(plane_frame((0, 0, -1), box(4, 10, 30, 17)), 3).mask.shape == (CROP_SIZE, CROP_SIZE)
+        np.testing.assert_allclose(crop.normals[crop.mask], np.tile([0, 0, -1], (30 * 18, 1)), atol=1e-6)
+    crop = rgbd_crop(plane_frame((0, 0, -1), box(3, 60, 1, 1)), 3, 2)
+    ray = np.array([(60 - CAMERA.cx) / CAMERA.fx, (3 - CAMERA.cy) / CAMERA.fy, 1])
+    np.testing.assert_allclose(crop.normals[0, 0], -ray / np.linalg.norm(ray), atol=1e-6)
 
 
 def test_enlarged_mask_matches_opencv() -> None:
@@ -70,12 +100,6 @@ def test_normals_of_a_sphere() -> None:
     assert (surface_normals(points, mask)[mask] * rays[mask]).sum(axis=-1).max() < 0
 
 
-def test_single_pixels_look_at_the_camera() -> None:
-    crop = rgbd_crop(plane_frame((0, 0, -1), box(3, 60, 1, 1)), 3, 2)
-    ray = np.array([(60 - CAMERA.cx) / CAMERA.fx, (3 - CAMERA.cy) / CAMERA.fy, 1])
-    np.testing.assert_allclose(crop.normals[0, 0], -ray / np.linalg.norm(ray), atol=1e-6)
-
-
 def test_filling_matches_scipy() -> None:
     """Holes of one pass have the median of their window; known depths and the background stay."""
     rng = np.random.default_rng(0)
@@ -87,31 +111,9 @@ def test_filling_matches_scipy() -> None:
     medians = generic_filter(known, np.nanmedian, size=5, mode="constant", cval=np.nan)
     filled = fill_depth(np.where(holes, 0, depth), mask)
     np.testing.assert_allclose(filled, np.where(mask, np.where(holes, medians, depth), 0), rtol=1e-6)
-
-
-def test_large_holes_and_separate_parts_are_filled() -> None:
-    mask = box(0, 0, 40, 20) | box(0, 40, 10, 10)
-    depth = np.zeros(mask.shape, np.float32)
-    depth[0, :20] = 0.7
-    filled = fill_depth(depth, mask)
-    assert (filled[mask] == np.float32(0.7)).all() and not filled[~mask].any()
-
-
-def test_holes_do_not_change_the_normals_of_a_plane() -> None:
-    frame = plane_frame((0, 0, -1), box(4, 10, 30, 18))
-    depth = frame.depth.copy()
-    depth[10:20, 12:20] = 0
-    holed = thor2.RGBDFrame(frame.color, depth, frame.labels, CAMERA)
-    np.testing.assert_allclose(rgbd_crop(holed, 3).normals, rgbd_crop(frame, 3).normals, atol=1e-6)
-
-
-def test_rendered_views_are_cropped_alike() -> None:
-    """The depth unit and the neighbours of an instance do not matter."""
-    frame = plane_frame((0, 0, -1), box(4, 10, 30, 18))
-    millimetres = np.where(frame.labels == 3, 800, 0).astype(np.uint16)  # type: ignore[operator]
-    view = thor2.RGBDFrame(frame.color, millimetres, (millimetres > 0).astype(np.uint8), CAMERA)
-    np.testing.assert_allclose(rgbd_crop(view, 1).normals, rgbd_crop(frame, 3).normals, atol=1e-6)
-    np.testing.assert_array_equal(rgbd_crop(view, 1).color, rgbd_crop(frame, 3).color)
+    # A part in which only one row is known, and another one without any depth.
+    mask, depth = box(0, 0, 40, 20) | box(0, 40, 10, 10), np.where(box(0, 0, 1, 20), np.float32(0.7), 0)
+    np.testing.assert_array_equal(fill_depth(depth, mask), np.where(mask, np.float32(0.7), 0))
 
 
 def test_instances_that_cannot_be_cropped_are_refused() -> None:
@@ -122,3 +124,102 @@ def test_instances_that_cannot_be_cropped_are_refused() -> None:
             rgbd_crop(bad, label, size)
     with pytest.raises(InputError, match="^label 3 has no depth"):
         rgbd_crop(empty, 3)
+
+
+SIZE = 24
+
+
+@pytest.fixture(scope="module")
+def meshes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("meshes")
+    for name, size, color in (("brick", (0.1, 0.06, 0.2), (200, 40, 40)), ("box", (0.1, 0.1, 0.1), (40, 200, 90))):
+        write_box(folder / f"{name}.ply", size, color)
+    return folder
+
+
+def render_command(meshes: Path, out: Path) -> list[object]:
+    """Return the command that renders them, but for the size of the crops."""
+    options = ("--azimuth-step", 180, "--polar-step", 90, "--workers", 1, "--illumination", "--copies", 1, "--quiet")
+    return ["render", "--meshes", meshes, "--out", out, *options, "--crops"]
+
+
+@pytest.fixture(scope="module")
+def dataset(meshes: Path, tmp_path_factory: pytest.TempPathFactory) -> ViewDataset:
+    out = tmp_path_factory.mktemp("views") / "views"
+    assert run_thor2(*render_command(meshes, out), SIZE) == 0
+    return ViewDataset.open(out)
+
+
+def test_crops_are_those_of_the_rendered_views(meshes: Path, dataset: ViewDataset) -> None:
+    """A source without the brick has those of the box."""
+    mesh = load_mesh(meshes / "brick.ply")
+    index = dataset.classes.index("brick")
+    views, crops = dataset.read(index), dataset.read_crops(index, SIZE)
+    assert len(views) == len(crops) and (views.copy == 1).sum() == (views.copy == 0).sum() > 0
+    for row in np.flatnonzero(views.copy == 0):
+        azimuth, polar = view_angles(180, 90)[views.view[row]]
+        view = render_view(RayCaster([mesh]), camera_pose(azimuth, polar, mesh.centre))
+        frame = thor2.RGBDFrame(view.color, view.depth, (view.depth > 0).astype(np.uint8), view.intrinsics)
+        color, normals = quantized(rgbd_crop(frame, 1, SIZE))
+        np.testing.assert_array_equal(crops.color[row], color)
+        np.testing.assert_array_equal(crops.normals[row], normals)
+    box = WithoutClasses(dataset, ["brick"]).read_crops(0, SIZE)
+    np.testing.assert_array_equal(box.color, dataset.read_crops(1 - index, SIZE).color)
+
+
+def test_crops_of_the_user_are_not_replaced(meshes: Path, dataset: ViewDataset, tmp_path: Path) -> None:
+    copied = shutil.copytree(dataset.directory, tmp_path / "views", ignore=shutil.ignore_patterns("crops"))
+    (copied / "crops").mkdir()
+    for file in (dataset.directory / "crops").glob("*.npz"):
+        (copied / "crops" / file.name).write_text("a user's")
+    with pytest.raises(InputError, match="already contains"):
+        render_crops(find_meshes(meshes), ViewDataset.open(copied), SIZE)
+    assert all(file.read_text() == "a user's" for file in (copied / "crops").glob("*.npz"))
+
+
+def test_interrupted_crops_resume_with_the_same_bytes(
+    meshes: Path, dataset: ViewDataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The damaged file alone is written again; the dataset keeps its digest."""
+    directory = dataset.directory / "crops"
+    before, first = {**files_of(directory), "manifest.json": None}, min(directory.glob("*.npz"))
+    first.write_bytes(first.read_bytes()[:-1])
+    with pytest.raises(InputError, match="is missing or damaged"):
+        dataset.read_crops(0, SIZE)
+    written = []
+    encode = render_job.crops.encode_crops
+    monkeypatch.setattr(render_job.crops, "encode_crops", lambda crops: written.append(len(crops)) or encode(crops))
+    again = render_command(meshes, dataset.directory)
+    assert run_thor2(*again, SIZE) == 0
+    assert len(written) == 1 and ViewDataset.open(dataset.directory).digest == dataset.digest
+    assert {**files_of(directory), "manifest.json": None} == before
+    assert run_thor2(*again, 0) == 2 and run_thor2(*again, 2 * SIZE) == 2
+
+
+def test_crops_that_do_not_fit_are_refused(meshes: Path, dataset: ViewDataset, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=f"crops of {SIZE} pixels; expected at least 25"):
+        dataset.read_crops(0, SIZE + 1)
+    plain = render_dataset(find_meshes(meshes), tmp_path / "plain", 180, 90)
+    with pytest.raises(InputError, match="has no crops.*--crops"):
+        plain.read_crops(0, SIZE)
+    render_crops(find_meshes(meshes), plain, 8)
+    manifest = plain.directory / "crops" / "manifest.json"
+    content = json.loads(manifest.read_text())
+    manifest.write_text(json.dumps({**content, "dataset": "0"}))
+    with pytest.raises(InputError, match="crops of other views"):
+        plain.read_crops(0, 8)
+    manifest.write_text("[]")
+    with pytest.raises(InputError, match="manifest.json is damaged"):
+        plain.read_crops(0, 8)
+
+
+def test_reduced_crops_are_means_of_areas() -> None:
+    """Up to the rounding of two passes, along rows and columns."""
+    rng = np.random.default_rng(0)
+    normals = rng.integers(-127, 128, (2, 8, 8, 3)).astype(np.int8)
+    crops = ViewCrops(rng.integers(0, 256, (2, 8, 8, 3)).astype(np.uint8), normals)
+    assert crops.reduced(8) is crops
+    for values, reduced in ((crops.color, crops.reduced(4).color), (crops.normals, crops.reduced(4).normals)):
+        means = values.reshape(2, 4, 2, 4, 2, 3).mean(axis=(2, 4))
+        assert reduced.dtype == values.dtype and np.abs(reduced - means).max() <= 1
+    assert len(stacked([], 5)) == 0 and stacked([], 5).size == 5

@@ -4,21 +4,16 @@ import contextlib
 import dataclasses
 import json
 import os
-import resource
 import shutil
-import signal
-import subprocess
 import sys
-import threading
-import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
-from helpers import Command, Interrupted, input_error
-from processes import HANG
+from helpers import Command, Interrupted, full_disk, input_error, write_box
 
 from thor2_jax.errors import InputError
 from training.augmentation.augmentations import Augmentations
@@ -58,7 +53,7 @@ def copied(whole: Path, tmp_path: Path) -> Path:
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() if path.is_file() else b"" for path in folder.iterdir()}
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
 def sphere(radius: float) -> TexturedMesh:
@@ -68,21 +63,12 @@ def sphere(radius: float) -> TexturedMesh:
 
 
 def test_files_of_a_dataset(whole: Path) -> None:
-    assert sorted(contents(whole)) == [
-        ".lock",
-        "0000-0000.safetensors",
-        "0000-0001.safetensors",
-        "0001-0000.safetensors",
-        "0001-0001.safetensors",
-        "manifest.json",
-    ]
     dataset = ViewDataset.open(whole)
-    assert [(shard.file[:9], shard.label, shard.views, shard.left_out) for shard in dataset.shards] == [
-        ("0000-0000", 0, 4, 0),
-        ("0000-0001", 0, 2, 0),
-        ("0001-0000", 1, 4, 0),
-        ("0001-0001", 1, 2, 0),
-    ]
+    names = [f"{label:04}-{number:04}.safetensors" for label in (0, 1) for number in (0, 1)]
+    assert [shard.file for shard in dataset.shards] == names
+    shards = [(shard.label, shard.views, shard.left_out) for shard in dataset.shards]
+    assert shards == [(0, 4, 0), (0, 2, 0), (1, 4, 0), (1, 2, 0)]
+    assert set(contents(whole)) == {".lock", MANIFEST, *names}
     assert np.array_equal(np.concatenate([dataset.read(k).view for k in (0, 1)]), np.arange(6))
     assert "time" not in (whole / MANIFEST).read_text()
 
@@ -90,6 +76,27 @@ def test_files_of_a_dataset(whole: Path) -> None:
 @pytest.mark.slow
 def test_workers_give_equal_files(whole: Path, tmp_path: Path) -> None:
     render_dataset(OBJECTS, tmp_path / "views", *STEPS, local_workers(2))
+    assert contents(tmp_path / "views") == contents(whole)
+
+
+@pytest.mark.slow
+def test_on_a_ray_cluster_that_loses_a_worker(whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The task is repeated, and the cluster ends with the job."""
+    ray = pytest.importorskip("ray", reason="the extra [cluster] is not installed")
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    died = tmp_path / "died"
+
+    def pool(function: Any, tasks: Any) -> Any:
+        def dying(task: Any) -> Any:
+            if not died.exists():
+                died.touch()
+                os._exit(3)
+            return function(task)
+
+        return ray_workers(2)(dying, tasks)
+
+    render_dataset(OBJECTS, tmp_path / "views", *STEPS, pool)
+    assert died.exists() and not ray.is_initialized()
     assert contents(tmp_path / "views") == contents(whole)
 
 
@@ -130,66 +137,8 @@ def test_rendering_interrupted_at_any_write_resumes(
         assert left == -2 * (2 * (len(seen) - 1) + (MANIFEST not in before))
 
 
-KILLED = """
-import os, signal, sys
-from training.views import render_job
-from training.objects.builtin_objects import builtin_objects
-from training.storage.workers import local_workers
-
-render_job.CLOUDS_PER_SHARD = 4
-replace, left = os.replace, int(sys.argv[2])
-
-def killing(source, target):
-    global left
-    for step in (lambda: None, lambda: replace(source, target)):
-        step()
-        left -= 1
-        if left == 0:
-            os.kill(os.getpid(), signal.SIGKILL)
-
-os.replace = killing
-objects = {name: builtin_objects()[name] for name in ("screwdriver", "tennis_ball")}
-render_job.render_dataset(objects, sys.argv[1], 180, 90, local_workers(int(sys.argv[3])))
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "kills",
-    # Odd steps leave a temporary file, and even ones a complete file.
-    [[(4, 1)], [(1, 1), (5, 2), (3, 2), (2, 1)]],
-)
-def test_repeatedly_killed_rendering_resumes(whole: Path, tmp_path: Path, kills: list[tuple[int, int]]) -> None:
-    out = tmp_path / "views"
-    for step, workers in kills:
-        command = [sys.executable, "-c", KILLED, str(out), str(step), str(workers)]
-        assert subprocess.run(command, capture_output=True, timeout=HANG).returncode == -signal.SIGKILL
-    assert set(contents(out)) != set(contents(whole))
-    render_dataset(OBJECTS, out, *STEPS)
-    assert contents(out) == contents(whole)
-
-
-def test_interrupted_by_the_keyboard(whole: Path, tmp_path: Path) -> None:
-    def interrupt(done: int, total: int) -> None:
-        if done > total / 2:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        render_dataset(OBJECTS, tmp_path / "views", *STEPS, progress=interrupt)
-    with pytest.raises(InputError, match="3 of 4 shards"):
-        ViewDataset.open(tmp_path / "views")
-    render_dataset(OBJECTS, tmp_path / "views", *STEPS)
-    assert contents(tmp_path / "views") == contents(whole)
-
-
 def changed(folder: Path) -> dict[str, int]:
     return {path.name: path.stat().st_mtime_ns for path in folder.iterdir()}
-
-
-def test_a_finished_dataset_is_not_changed(copied: Path) -> None:
-    before = changed(copied)
-    assert len(render_dataset(OBJECTS, copied, *STEPS)) == 12
-    assert changed(copied) == before | {".lock": changed(copied)[".lock"]}
 
 
 def test_only_damaged_and_missing_shards_are_rendered_again(whole: Path, copied: Path) -> None:
@@ -203,26 +152,27 @@ def test_only_damaged_and_missing_shards_are_rendered_again(whole: Path, copied:
     assert contents(copied) == contents(whole)
     same = {name for name, time in changed(copied).items() if before.get(name) == time}
     assert same - {".lock"} == {"0000-0000.safetensors", "0001-0001.safetensors"}
+    before = changed(copied)
+    with locked(copied), pytest.raises(InputError, match=str(copied)):
+        render_dataset(OBJECTS, copied, *STEPS)
+    assert len(render_dataset(OBJECTS, copied, *STEPS)) == 12
+    assert changed(copied) == before | {".lock": changed(copied)[".lock"]}
 
 
 def test_another_job_is_refused(copied: Path) -> None:
     before = contents(copied)
-    moved = dataclasses.replace(OBJECTS["tennis_ball"], vertices=OBJECTS["tennis_ball"].vertices + 1e-3)
-    screwdriver = OBJECTS["screwdriver"]
+    ball, screwdriver = OBJECTS["tennis_ball"], OBJECTS["screwdriver"]
+    moved = dataclasses.replace(ball, vertices=ball.vertices + 1e-3)
     painted = dataclasses.replace(screwdriver, textures=tuple(texture ^ 1 for texture in screwdriver.textures))
-    light = Augmentations(illumination=Illumination())
-    for meshes, steps, options, message in [
-        (OBJECTS, (90, 90), {}, "azimuth_step 180.0, not 90.0"),
-        (OBJECTS, (180, 45), {}, "polar_step 90.0, not 45.0"),
-        (OBJECTS, STEPS, {"augmentations": light}, "variations null, not {"),
-        (OBJECTS | {"tennis_ball": moved}, STEPS, {}, r"objects\[\d\].mesh "),
-        (OBJECTS | {"screwdriver": painted}, STEPS, {}, r"objects\[\d\].mesh "),
-        ({"tennis_ball": moved}, STEPS, {}, r"objects\[\d\]"),
-        (OBJECTS | {"apple": moved}, STEPS, {}, r"objects\[2\] null, not \{"),
-        (dict(reversed(OBJECTS.items())), STEPS, {}, r"objects\[0\].name "),
+    for meshes, steps, message in [
+        (OBJECTS, (90, 90), "azimuth_step 180.0, not 90.0"),
+        (OBJECTS | {"tennis_ball": moved}, STEPS, r"objects\[\d\].mesh "),
+        (OBJECTS | {"screwdriver": painted}, STEPS, r"objects\[\d\].mesh "),
+        (OBJECTS | {"apple": moved}, STEPS, r"objects\[2\] null, not \{"),
+        (dict(reversed(OBJECTS.items())), STEPS, r"objects\[0\].name "),
     ]:
         with input_error(copied, match=message):
-            render_dataset(meshes, copied, *steps, **options)
+            render_dataset(meshes, copied, *steps)
         assert contents(copied) == before
 
 
@@ -239,28 +189,19 @@ def test_augmentations_are_part_of_the_job(tmp_path: Path, monkeypatch: pytest.M
             render_dataset({"ball": sphere(0.03)}, out, 90, 90, **options)
     off = render_dataset({"ball": sphere(0.03)}, tmp_path / "off", 90, 90, augmentations=Augmentations(), seed=2)
     assert len(off) == 12 and off.record["job"]["variations"] is None
+    with pytest.raises(InputError, match="variations null, not {"):
+        render_dataset({"ball": sphere(0.03)}, tmp_path / "off", 90, 90, augmentations=light)
 
 
-def test_views_of_few_points_are_left_out_and_counted(tmp_path: Path) -> None:
-    sheet = sphere(0.03)
-    sheet.vertices[:, 2] *= 0.005  # seen edge on from the side
-    dataset = render_dataset({"sheet": sheet}, tmp_path / "views", 180, 90)
-    assert len(dataset) == 4 and dataset.record["left_out"] == 2
-    assert [dataset.read(k).view.tolist() for k in (0, 1)] == [[0, 1], [4, 5]]
-
-
-def test_a_shard_without_views(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_views_of_few_points_are_left_out_and_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Here all of a shard; objects may have any name."""
     monkeypatch.setattr(render_job, "CLOUDS_PER_SHARD", 2)
-    sheet = sphere(0.03)
-    sheet.vertices[:, 2] *= 0.005
-    dataset = render_dataset({"sheet": sheet}, tmp_path / "views", 180, 90)
+    sheet, name = sphere(0.03), "../a b/ü"
+    sheet.vertices[:, 2] *= 0.005  # seen edge on from the side
+    dataset = render_dataset({name: sheet}, tmp_path / "views", 180, 90)
     assert [(shard.views, shard.left_out) for shard in dataset.shards] == [(2, 0), (0, 2), (2, 0)]
-    assert len(dataset.read(1)) == 0 and dataset.read(1).xyz.shape == (0, 3)
-
-
-def test_unusual_object_names(tmp_path: Path) -> None:
-    name = "../a b/ü"
-    dataset = render_dataset({name: sphere(0.03)}, tmp_path / "views", 180, 90)
+    assert [dataset.read(k).view.tolist() for k in range(3)] == [[0, 1], [], [4, 5]]
+    assert dataset.record["left_out"] == 2 and dataset.read(1).xyz.shape == (0, 3)
     assert dataset.classes == (name,) and [path.name for path in tmp_path.iterdir()] == ["views"]
 
 
@@ -270,8 +211,10 @@ def test_bad_requests_write_nothing(tmp_path: Path) -> None:
     for meshes, steps, options, message in [
         ({}, STEPS, {}, "meshes is empty"),
         (OBJECTS, (0, 45), {}, "azimuth_step"),
+        (OBJECTS, (60, -45), {}, "polar_step"),
         (OBJECTS, STEPS, {"seed": -1}, "seed is -1"),
         ({**OBJECTS, "z": tmp_path / "bad.ply"}, STEPS, {}, "bad.ply"),
+        ({"z": tmp_path / "absent.ply"}, STEPS, {}, "absent.ply"),
         ({"speck": sphere(0.003)}, (180, 90), {}, "object 'speck'"),
         ({"door": sphere(0.6)}, (180, 90), {}, "object 'door' .*2.08 m"),
     ]:
@@ -284,37 +227,29 @@ def test_other_files_are_kept(tmp_path: Path) -> None:
     out = tmp_path / "views"
     out.mkdir()
     (out / "notes.txt").write_text("text")
-    with pytest.raises(InputError, match=f"out: {out} already contains notes.txt"):
-        render_dataset(OBJECTS, out, 180, 90)
-    with pytest.raises(InputError, match="out: .*notes.txt "):
-        render_dataset(OBJECTS, out / "notes.txt", 180, 90)
+    for path, message in (
+        (out, f"{out} already contains notes.txt"),
+        (out / "notes.txt", ".*notes.txt "),
+        (out / "notes.txt" / "views", ""),
+    ):
+        with pytest.raises(InputError, match=f"^out: {message}"):
+            render_dataset(OBJECTS, path, *STEPS)
     (out / MANIFEST).write_text('{"format": 1}')
     with pytest.raises(InputError, match="manifest.json has format 1; expected 2"):
-        render_dataset(OBJECTS, out, 180, 90)
+        render_dataset(OBJECTS, out, *STEPS)
     assert (out / MANIFEST).read_text() == '{"format": 1}' and (out / "notes.txt").read_text() == "text"
 
 
-def test_two_processes_in_one_directory(whole: Path, copied: Path) -> None:
-    with locked(copied), pytest.raises(InputError, match=str(copied)):
-        render_dataset(OBJECTS, copied, *STEPS)
-    render_dataset(OBJECTS, copied, *STEPS)
-    assert contents(copied) == contents(whole)
+def test_rendering_resumes_after_a_full_disk(whole: Path, copied: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """There is room for a manifest, but not for a shard."""
+    replace = os.replace
 
+    def full_for_shards(source: Path, target: Path) -> None:
+        full_disk() if target.suffix == ".safetensors" else replace(source, target)
 
-@contextlib.contextmanager
-def full_disk() -> Iterator[None]:
-    """Limit files of this process to 10 kB, which suffices for a manifest but not for a shard."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-
-
-def test_rendering_resumes_after_a_full_disk(whole: Path, copied: Path) -> None:
     (copied / "0001-0000.safetensors").unlink()
-    with full_disk(), pytest.raises(OSError, match="File too large"):
+    with monkeypatch.context() as patch, pytest.raises(OSError, match="No space left"):
+        patch.setattr(os, "replace", full_for_shards)
         render_dataset(OBJECTS, copied, *STEPS)
     assert set(contents(whole)) - set(contents(copied)) == {"0001-0000.safetensors"}
     with pytest.raises(InputError, match="3 of 4 shards"):
@@ -323,74 +258,15 @@ def test_rendering_resumes_after_a_full_disk(whole: Path, copied: Path) -> None:
     assert contents(copied) == contents(whole)
 
 
-def test_an_unwritable_output_path_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    with pytest.raises(InputError, match="^out: "):
-        render_dataset(OBJECTS, tmp_path / "file" / "views", *STEPS)
-
-
 def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: Command, refused: Command) -> None:
     """Repeats a job, changes its steps, and selects a cluster that is not available."""
-    mesh = sphere(0.03)
-    (tmp_path / "meshes").mkdir()
-    colors = np.full((len(mesh.faces), 4), 99, np.uint8)
-    trimesh.Trimesh(mesh.vertices, mesh.faces, face_colors=colors).export(tmp_path / "meshes" / "ball.ply")
-
-    command = (
-        "render",
-        "--meshes",
-        tmp_path / "meshes",
-        "--out",
-        tmp_path / "views",
-        "--workers",
-        1,
-        "--polar-step",
-        90,
-    )
+    write_box(tmp_path / "meshes" / "box.ply", (0.06, 0.06, 0.06))
+    out = tmp_path / "views"
+    command = ("render", "--meshes", tmp_path / "meshes", "--out", out, "--workers", 1, "--polar-step", 90)
     for _ in range(2):
         assert "6 views of 1 objects (0 left out)" in printed(*command, "--azimuth-step", 180)
-    before = contents(tmp_path / "views")
     assert "azimuth_step 180.0, not 90.0" in refused(*command, "--azimuth-step", 90)
-    assert contents(tmp_path / "views") == before
     monkeypatch.setitem(sys.modules, "ray", None)
     assert "'.[cluster]'" in refused(*command, "--azimuth-step", 180, "--engine", "ray")
     refused(*command, "--engine", "cloud")
     refused(*command, "--address", "head:6379")
-
-
-def children() -> set[int]:
-    """Return the descendants of this process."""
-    parents = {}
-    for path in Path("/proc").glob("[0-9]*/stat"):
-        with contextlib.suppress(OSError):
-            state, parent = path.read_text().rpartition(")")[2].split()[:2]
-            if state != "Z":
-                parents[int(path.parent.name)] = int(parent)
-    descendants, new = set(), {os.getpid()}
-    while new := {pid for pid, parent in parents.items() if parent in new}:
-        descendants |= new
-    return descendants
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")
-def test_on_a_ray_cluster_that_loses_a_worker(whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("ray", reason="the extra [cluster] is not installed")
-    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
-    before, killed = children(), []
-
-    def kill_one() -> None:
-        while not killed:
-            time.sleep(0.02)
-            for pid in children() - before:
-                with contextlib.suppress(OSError):
-                    if Path(f"/proc/{pid}/cmdline").read_bytes().startswith(b"ray::render_task"):
-                        os.kill(pid, signal.SIGKILL)
-                        killed.append(pid)
-                        return
-
-    threading.Thread(target=kill_one, daemon=True).start()
-    render_dataset(OBJECTS, tmp_path / "views", *STEPS, ray_workers(2))
-    assert len(killed) == 1
-    assert contents(tmp_path / "views") == contents(whole)
-    assert children() == before
