@@ -5,11 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 import threadpoolctl
+from sklearn.gaussian_process import GaussianProcessRegressor
+from sklearn.gaussian_process.kernels import RBF
 
 from thor2_jax.errors import InputError
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.gallery.clouds import CompactClouds
-from thor2_jax.gallery.gallery import Gallery, GalleryObject
+from thor2_jax.gallery.gallery import GAMMA, NEAREST, RIDGE, Gallery, GalleryObject
 from thor2_jax.gallery.references import BACKGROUND, References
 from thor2_jax.gallery.search import CHUNK, ExactSearch, IndexSearch
 
@@ -101,6 +103,25 @@ def test_views_of_classes_count_against_objects_and_for_their_own(gallery: Galle
     background = dataclasses.replace(other, references=relabelled)
     # The mean of the counts regularizes each class and the background alike.
     np.testing.assert_allclose(forgotten.scores(queries), background.scores(queries), atol=1e-6)
+
+
+def test_scores_against_a_gaussian_process() -> None:
+    """All views are neighbours here, so that the regression is the mean of a Gaussian process of scikit-learn."""
+    gallery = Gallery("f", references=references(("class", 5), ("mug", 0), ("forgotten", 6)), hidden=("forgotten",))
+    for name, center, count in (("mug", 0, 4), ("bowl", 1, 24)):
+        gallery = gallery.with_object(name, enrolled(center, count))
+    views = np.concatenate([*(each.embeddings for each in gallery.objects.values()), gallery.references.embeddings])
+    owner = np.repeat([0, 1, 2, 0, 4, 4], [4, 24, 12, 12, 12, 40])  # mug, bowl, class, forgotten class, background
+    counts = np.array([4, 24, 14, 14, 14])[owner]  # of an owner that is not enrolled, the mean of those that are
+    process = GaussianProcessRegressor(
+        RBF(GAMMA**-0.5, "fixed"), alpha=RIDGE * counts / counts.mean(), optimizer=None
+    ).fit(views, np.eye(5)[owner])
+    queries = np.concatenate([unit(views_around(k, 5, seed=1) + views_around(5, 5, seed=3)) for k in (0, 1, 9)])
+    values = process.predict(queries).clip(0)
+    scores = values[:, :2].clip(0, 1)
+    expected = scores * scores / (scores + values[:, 2:3])
+    assert len(views) <= NEAREST and (expected.max(axis=1) > 0.05).sum() >= 10
+    np.testing.assert_allclose(gallery.scores(queries), expected, atol=2e-3)
 
 
 def test_scores_use_one_thread_of_linear_algebra(gallery: Gallery, monkeypatch: pytest.MonkeyPatch) -> None:
