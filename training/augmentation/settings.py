@@ -1,7 +1,6 @@
 """Settings of the augmentations: numbers and ranges with the limits of their values."""
 
 import dataclasses
-import math
 from typing import Any
 
 from thor2_jax.errors import InputError
@@ -33,7 +32,7 @@ class Settings:
             if (
                 not isinstance(numbers, tuple)
                 or len(numbers) != 1 + is_range
-                or not all(isinstance(x, int | float) and math.isfinite(x) and low <= x <= high for x in numbers)
+                or not all(isinstance(x, int | float) and low <= x <= high for x in numbers)
                 or numbers[0] > numbers[-1]
             ):
                 name = f"{type(self).__name__.lower()}.{field.name}"
