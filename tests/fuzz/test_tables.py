@@ -177,30 +177,27 @@ def test_a_damaged_manifest_with_a_valid_checksum(data: st.DataObject, views: Pa
         (views / MANIFEST).write_bytes(content)
 
 
+NETWORK_FILE = (Path(colornet.__file__).parent / "data" / "network.npz").read_bytes()
+
+
 @given(data=st.data())
 def test_networks(data: st.DataObject, attempt: Any, tmp_path_factory: Any) -> None:
     """Damages the whole file, or one of its arrays in an archive with valid checksums."""
     path = tmp_path_factory.getbasetemp() / "network.npz"
-    content = NETWORK_FILE
-    if data.draw(st.booleans()):
-        content = data.draw(damaged(content))
+    whole = data.draw(st.booleans())
+    if whole:
+        path.write_bytes(data.draw(damaged(NETWORK_FILE)))
     else:
-        stream = io.BytesIO()
-        with zipfile.ZipFile(io.BytesIO(content)) as source, zipfile.ZipFile(stream, "w") as target:
+        with zipfile.ZipFile(io.BytesIO(NETWORK_FILE)) as source, zipfile.ZipFile(path, "w") as target:
             name = data.draw(st.sampled_from(source.namelist()))
             for member in source.namelist():
                 part = source.read(member)
-                head = part[:256]
-                target.writestr(member, data.draw(damaged(head, 1)) + part[256:] if member == name else part)
-        content = stream.getvalue()
-    path.write_bytes(content)
+                target.writestr(member, data.draw(damaged(part[:256], 1)) + part[256:] if member == name else part)
     network = attempt(lambda: colornet.load(path), (ValueError, OSError))
     if network is not None:
+        assert not whole or network == colornet.load_default()  # some bytes are not read, as of a time stamp
         weights = network.membership(np.arange(300, dtype=np.uint16).astype(np.uint8).reshape(-1, 3))
         np.testing.assert_allclose(weights.sum(axis=1), 1, rtol=1e-6)
-
-
-NETWORK_FILE = (Path(colornet.__file__).parent / "data" / "network.npz").read_bytes()
 
 
 @pytest.mark.parametrize("times", [400, 4000])
