@@ -36,6 +36,11 @@ def test_commands_parse() -> None:
     assert parsed >= 60
 
 
+def test_every_page_is_in_the_navigation() -> None:
+    listed = re.findall(r"- ([\w/-]+\.md)$", (ROOT / "mkdocs.yml").read_text(encoding="utf-8"), re.MULTILINE)
+    assert {path.relative_to(ROOT / "docs").as_posix() for path in (ROOT / "docs").rglob("*.md")} <= set(listed)
+
+
 def test_every_page_is_two_links_from_the_landing_page() -> None:
     """Links in the text alone; the navigation comes on top."""
     docs = ROOT / "docs"
