@@ -45,17 +45,6 @@ def run_command(monkeypatch: pytest.MonkeyPatch, *arguments: Any) -> None:
     levers.main()
 
 
-@pytest.mark.parametrize("arguments", [["--levers", "none"], ["--seeds", "0"], []])
-def test_bad_arguments_write_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], arguments: list[str]
-) -> None:
-    """Without arguments, the directory of meshes is what is missing."""
-    given = "--meshes", tmp_path / "absent", "--frames", tmp_path, "--out", tmp_path / "out"
-    with pytest.raises(SystemExit):
-        run_command(monkeypatch, *given, *arguments)
-    assert "error: " in capsys.readouterr().err.splitlines()[-1] and list(tmp_path.iterdir()) == []
-
-
 @pytest.fixture
 def given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """Return options with the meshes and two frames of two built-in objects, and a training of a few seconds."""
