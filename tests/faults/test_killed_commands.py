@@ -15,7 +15,6 @@ from helpers import Command, frame_options, run_thor2, small_frame, untrained_ru
 from processes import HANG
 
 import colornet
-import thor2_jax as thor2
 from thor2_jax.model.run_directory import TrainedRun, load_run, save_run
 from training.baselines.files import baseline_file, read_baseline
 from training.fitting.options import read_metrics
@@ -91,9 +90,8 @@ def frames(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Run directory with random weights."""
-    config = thor2.DescriptorConfig(homology="closed_form", n_slices=3, n_strips=8, image_size=8)
     out = tmp_path_factory.mktemp("model") / "run"
-    save_run(untrained_run(("brick", "stick"), ("tops", "tops2"), config), out)
+    save_run(untrained_run(("brick", "stick"), ("tops", "tops2")), out)
     return out
 
 
