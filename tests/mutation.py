@@ -1,15 +1,14 @@
 """Mutation testing: small changes to the sources, one at a time, each of which should make a test fail.
 
     python tests/mutation.py --results mutants.jsonl --sample 10     # ten mutants for each module; resumes
-    python tests/mutation.py --results mutants.jsonl --survivors     # survivors again, after adding tests
-    python tests/mutation.py --results mutants.jsonl --sample 0      # table and survivors of the results so far
+    python tests/mutation.py --results mutants.jsonl --sample 0      # counts and survivors of the results so far
 
 Requires the extra `mutation`. The checkout is not changed: mutants are tested in a copy in a temporary folder, each in
 its own process. Cosmic Ray generates them. A place in the source is drawn first and one of its mutants second, so that
 operators with many replacements have no larger share. Annotations are excluded, because they have no effect at run
 time, and so are replacements between families of operators (+ by <<), which are nearly always type errors.
 
-Of ten mutants for each module (seed 0), 248 of 271 are killed. Those that survive are equal to the original: no
+Of ten mutants for each module (seed 0), 248 of 271 were killed. Those that survive are equal to the original: no
 `jax.jit` or another cache size (the same values, more slowly), `strict=False` for lists of equal length, bounds that no
 value reaches (`>=` for `==` on names of devices, `row != height - 1`, 81 for an exponent of 80, indices JAX clips),
 another `DESCRIPTOR_VERSION`, and searches whose results are filtered or compared again (the ball of `mapper.py`, one
@@ -20,17 +19,18 @@ import argparse
 import ast
 import dataclasses
 import difflib
+import functools
 import hashlib
 import json
 import os
 import random
+import re
 import shutil
-import signal
 import subprocess
 import sys
 import tempfile
 import time
-from collections import defaultdict
+from collections import Counter, defaultdict
 from pathlib import Path
 from typing import Any
 
@@ -43,40 +43,27 @@ ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = ("colornet", "thor2_jax", "thor2_jax/descriptor", "thor2_jax/frames", "thor2_jax/model")
 """Directories whose modules are mutated."""
 
+
 MORE_TESTS = {
-    "colornet/__init__.py": ("colornet/test_files.py", "colornet/test_build.py"),
-    "colornet/builder.py": ("colornet/test_build.py", "colornet/test_regions.py"),
-    "colornet/grid.py": ("colornet/test_color_math.py", "colornet/test_membership.py"),
-    "colornet/lab.py": ("colornet/test_color_math.py", "colornet/test_build.py"),
-    "colornet/mapper.py": ("colornet/test_color_math.py", "colornet/test_build.py"),
-    "colornet/network.py": ("colornet/test_files.py", "colornet/test_membership.py"),
-    "thor2_jax/descriptor/bounding_box.py": ("thor2_jax/descriptor/test_view_normalization.py",),
-    "thor2_jax/descriptor/color_membership.py": ("thor2_jax/test_types.py",),
-    "thor2_jax/descriptor/relaxation.py": ("properties/test_relaxation.py",),
-    "thor2_jax/parameters.py": ("thor2_jax/test_types.py", "properties/test_reproducibility.py"),
-    "thor2_jax/frames/frames.py": ("thor2_jax/test_types.py",),
-    "thor2_jax/frames/instance_clouds.py": ("thor2_jax/test_types.py",),
-    "thor2_jax/frames/occlusion.py": ("thor2_jax/test_types.py",),
-    "thor2_jax/frames/outlier_removal.py": ("thor2_jax/frames/test_instance_clouds.py",),
-    "thor2_jax/types.py": ("thor2_jax/descriptor/test_persistence.py",),
+    "colornet/network.py": ["tests/colornet/test_files.py", "tests/colornet/test_membership.py"],
+    "thor2_jax/parameters.py": ["tests/thor2_jax/test_types.py"],
 }
-"""Module -> test files below tests/ that check it in addition to its own one."""
+"""Module -> test files that do not import it by its name."""
 
 
-def tests_of(module: str) -> tuple[str, ...]:
-    """Return the test files of a module below tests/: tests/FOLDER/test_MODULE.py if it exists, and `MORE_TESTS`."""
+def tests_of(module: str) -> list[str]:
+    """Return the test files of a module: test_MODULE.py, what imports it in its folder or the properties, and more."""
     path = Path(module)
-    own = f"{path.parent}/test_{path.name}"
-    return ((own,) if (ROOT / "tests" / own).exists() else ()) + MORE_TESTS.get(module, ())
+    name = ".".join(path.with_suffix("").parts)
+    imports = re.compile(rf"^from {re.escape(name)} import ", re.MULTILINE)
+    files = [file for folder in (path.parent, "properties") for file in (ROOT / "tests" / folder).glob("test_*.py")]
+    chosen = [file for file in sorted(files) if file.name == f"test_{path.name}" or imports.search(file.read_text())]
+    return [str(file.relative_to(ROOT)) for file in chosen] + MORE_TESTS.get(module, [])
 
 
-def tested_modules() -> dict[str, tuple[str, ...]]:
-    """Return the modules of `FOLDERS` that have tests, with their test files."""
-    modules = [f"{folder}/{path.name}" for folder in FOLDERS for path in sorted((ROOT / folder).glob("*.py"))]
-    return {module: tests_of(module) for module in modules if tests_of(module)}
-
-
-TESTS = tested_modules()
+MODULES = [f"{folder}/{path.name}" for folder in FOLDERS for path in sorted((ROOT / folder).glob("*.py"))]
+TESTS = {module: tests_of(module) for module in MODULES if tests_of(module)}
+"""Module -> its test files."""
 
 FAMILIES = ({"Add", "Sub", "Mul", "Div", "FloorDiv", "Mod", "Pow"}, {"RShift", "LShift"}, {"BitOr", "BitAnd", "BitXor"})
 """Families of binary operators."""
@@ -91,6 +78,10 @@ class Mutant:
     operator: str
     occurrence: int
     line: int
+
+
+def digest_of(module: str) -> str:
+    return hashlib.sha256((ROOT / module).read_bytes()).hexdigest()[:12]
 
 
 def within_a_family(operator: str) -> bool:
@@ -113,8 +104,7 @@ def annotations(source: str) -> list[tuple[tuple[int, int], tuple[int, int]]]:
 
 def mutants_by_place(module: str) -> list[list[Mutant]]:
     """Return all mutants of a module, grouped by their place in the source, in source order."""
-    source = (ROOT / module).read_text()
-    digest = hashlib.sha256(source.encode()).hexdigest()[:12]
+    source, digest = (ROOT / module).read_text(), digest_of(module)
     excluded, tree = annotations(source), get_ast(source)
     places: dict[tuple[tuple[int, int], tuple[int, int]], list[Mutant]] = defaultdict(list)
     for name in sorted(filter(within_a_family, operator_names())):
@@ -154,35 +144,25 @@ class Sandbox:
             "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
             "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
         }
-        self._limits: dict[str, float] = {}
 
-    def test(self, module: str, limit: float | None = None) -> tuple[str, float]:
-        """Run the tests of a module; return "killed", "survived" or "timeout", and the seconds that it took."""
-        options = ["-x", "-q", "-p", "no:cacheprovider", "-m", "not slow"]
-        command = [sys.executable, "-m", "pytest", *options, *(f"tests/{name}" for name in TESTS[module])]
-        start = time.monotonic()
-        with open(self.tree.with_name("output.txt"), "w") as output:
-            child = subprocess.Popen(
-                command, cwd=self.tree, env=self.environment, stdout=output, stderr=output, start_new_session=True
-            )
-            try:
-                outcome = "killed" if child.wait(limit) else "survived"
-            except subprocess.TimeoutExpired:
-                outcome = "timeout"
-            finally:
-                if child.poll() is None:
-                    os.killpg(child.pid, signal.SIGKILL)
-                    child.wait()
-        return outcome, time.monotonic() - start
-
+    @functools.cache  # noqa: B019
     def limit(self, module: str) -> float:
         """Return the time limit for a mutant of the module in seconds; its tests must pass without a mutant."""
-        if module not in self._limits:
-            outcome, seconds = self.test(module)
-            if outcome != "survived":
-                sys.exit(f"{module}: its tests fail without a mutant\n{self.tree.with_name('output.txt').read_text()}")
-            self._limits[module] = 3 * seconds + 30
-        return self._limits[module]
+        start = time.monotonic()
+        if self.test(module, None) != "survived":
+            sys.exit(f"{module}: its tests fail without a mutant: {' '.join(TESTS[module])}")
+        return 3 * (time.monotonic() - start) + 30
+
+    def test(self, module: str, limit: float | None) -> str:
+        """Run the tests of a module; return "killed", "survived" or "timeout"."""
+        command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "-m", "not slow"]
+        try:  # what the tests start ends with them, see tests/conftest.py
+            done = subprocess.run(
+                [*command, *TESTS[module]], cwd=self.tree, env=self.environment, capture_output=True, timeout=limit
+            )
+        except subprocess.TimeoutExpired:
+            return "timeout"
+        return "killed" if done.returncode else "survived"
 
     def run(self, mutant: Mutant) -> dict[str, Any]:
         """Test a mutant and return its record for the results file."""
@@ -191,75 +171,44 @@ class Sandbox:
         changed = mutate_code(source, get_operator(mutant.operator)(), mutant.occurrence)
         try:
             path.write_text(changed)
-            outcome, seconds = self.test(mutant.module, limit)
+            outcome = self.test(mutant.module, limit)
         finally:
             path.write_text(source)
         diff = list(difflib.unified_diff(source.splitlines(), changed.splitlines(), n=0, lineterm=""))[3:]
-        return {**dataclasses.asdict(mutant), "outcome": outcome, "seconds": round(seconds, 1), "diff": diff}
+        return {**dataclasses.asdict(mutant), "outcome": outcome, "diff": diff}
 
 
 def read_results(path: Path) -> dict[Mutant, dict[str, Any]]:
-    """Read the last record of each mutant of the current sources."""
-    digests = {module: hashlib.sha256((ROOT / module).read_bytes()).hexdigest()[:12] for module in TESTS}
-    fields = [field.name for field in dataclasses.fields(Mutant)]
+    """Read the records of the mutants of the current sources."""
     records = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
-    return {
-        Mutant(*(record[name] for name in fields)): record
-        for record in records
-        if digests.get(record["module"]) == record["source"]
-    }
-
-
-def print_report(results: dict[Mutant, dict[str, Any]]) -> None:
-    """Print the table by module, and the survivors with their changes."""
-    outcomes = ("killed", "survived", "timeout")
-    rows = {module: [r["outcome"] for r in results.values() if r["module"] == module] for module in TESTS}
-    rows["all"] = [record["outcome"] for record in results.values()]
-    print("\n| module | mutants | killed | survived | timed out |\n|---|--:|--:|--:|--:|")
-    for module, observed in rows.items():
-        print(f"| {module} | {len(observed)} | {' | '.join(str(observed.count(name)) for name in outcomes)} |")
-    noticed = len(rows["all"]) - rows["all"].count("survived")
-    print(f"\nkilled or timed out: {noticed / max(len(rows['all']), 1):.1%}")
-    for mutant, record in results.items():
-        if record["outcome"] == "survived":
-            print(f"\n{mutant.module}:{mutant.line} {mutant.operator} {mutant.occurrence}", *record["diff"], sep="\n")
+    fields = [field.name for field in dataclasses.fields(Mutant)]
+    results = {Mutant(*(record[name] for name in fields)): record for record in records}
+    return {mutant: record for mutant, record in results.items() if mutant.source == digest_of(mutant.module)}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="Mutation testing; see the docstring of this file.")
-    parser.add_argument(
-        "modules", nargs="*", metavar="MODULE", help="for example thor2_jax/descriptor/slicing.py; default: all"
-    )
-    parser.add_argument(
-        "--results",
-        type=Path,
-        required=True,
-        help="file of JSON lines, one for each mutant; resumes",
-    )
+    parser.add_argument("modules", nargs="*", metavar="MODULE", help="such as colornet/lab.py; default: all")
+    parser.add_argument("--results", type=Path, required=True, help="JSON lines, one for each mutant; resumes")
     parser.add_argument("--sample", type=int, help="number of mutants for each module; default: all")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--survivors", action="store_true", help="run only the survivors again")
     options = parser.parse_args()
     modules = options.modules or list(TESTS)
     if unknown := set(modules) - set(TESTS):
         parser.error(f"MODULE is {', '.join(sorted(unknown))}; expected a module that has tests")
 
     results = read_results(options.results)
-    if options.survivors:
-        todo = [m for m, record in results.items() if record["outcome"] == "survived" and m.module in modules]
-    else:
-        todo = [m for name in modules for m in draw_mutants(name, options.sample, options.seed) if m not in results]
-    with tempfile.TemporaryDirectory() as folder:
+    todo = [m for name in modules for m in draw_mutants(name, options.sample, options.seed) if m not in results]
+    with tempfile.TemporaryDirectory() as folder, open(options.results, "a") as stream:
         sandbox = Sandbox(Path(folder))
         for k, mutant in enumerate(todo, 1):
-            record = sandbox.run(mutant)
-            results[mutant] = record
-            with open(options.results, "a") as stream:
-                print(json.dumps(record), file=stream)
-            print(
-                f"{k}/{len(todo)} {mutant.module}:{mutant.line} {record['outcome']} {record['seconds']} s", flush=True
-            )
-    print_report(results)
+            results[mutant] = sandbox.run(mutant)
+            print(json.dumps(results[mutant]), file=stream, flush=True)
+            print(f"{k}/{len(todo)} {mutant.module}:{mutant.line} {results[mutant]['outcome']}", flush=True)
+    for mutant, record in results.items():
+        if record["outcome"] == "survived":
+            print(f"\n{mutant.module}:{mutant.line} {mutant.operator} {mutant.occurrence}", *record["diff"], sep="\n")
+    print(dict(Counter(record["outcome"] for record in results.values())))
 
 
 if __name__ == "__main__":

@@ -15,19 +15,16 @@ from processes import end_descendants_with_this_process
 end_descendants_with_this_process()
 server = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(10_000)"], start_new_session=True)
 print(server.pid, flush=True)
-if sys.argv[1] == "wait":
-    sys.stdin.read()
+sys.stdin.read()
 """
 
 
 @pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="looks for processes in /proc")
-@pytest.mark.parametrize("end", ["wait", "exit"])
-def test_a_server_ends_with_the_tests_that_started_it(end: str) -> None:
+def test_a_server_ends_with_the_tests_that_started_it() -> None:
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parent)}
-    command = [sys.executable, "-c", PROGRAM, end]
+    command = [sys.executable, "-c", PROGRAM]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment) as tests:
         assert tests.stdout is not None
         server = int(tests.stdout.readline())
-        if end == "wait":
-            tests.send_signal(signal.SIGKILL)
+        tests.send_signal(signal.SIGKILL)
     wait_until(lambda: not is_running(server))

@@ -7,13 +7,11 @@ import sys
 import tomllib
 from pathlib import Path
 
-import numpy as np
 import pytest
-from helpers import encode_image, untrained_run
+from helpers import random_clouds, small_frame, untrained_run, write_frame_files
 
 import colornet
 import thor2_jax as thor2
-from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
 from thor2_jax.model.run_directory import save_run
 from training.cli.app import TRAINING_PACKAGES
@@ -58,15 +56,10 @@ def test_recognition_and_the_service_import_no_package_of_training(model: Path) 
 
 @pytest.mark.slow
 def test_recognition_needs_no_package_of_training(model: Path, tmp_path: Path) -> None:
-    labels = np.zeros((90, 120), np.uint8)
-    labels[10:50, 10:50] = 1
-    (tmp_path / "color.png").write_bytes(encode_image(np.full((90, 120, 3), 99, np.uint8)))
-    (tmp_path / "depth.png").write_bytes(encode_image(np.full((90, 120), 700, np.uint16)))
-    (tmp_path / "mask.png").write_bytes(encode_image(labels))
-    (tmp_path / "intrinsics.json").write_text(json.dumps({"fx": 120.0, "fy": 120.0, "cx": 60.0, "cy": 45.0}))
+    write_frame_files(tmp_path, small_frame())
     ended = run_without("recognize", "--model", model, tmp_path, "--json")
     assert ended.returncode == 0, ended.stderr
-    assert [one["label"] for one in json.loads(ended.stdout)["instances"]] == [1]
+    assert [one["label"] for one in json.loads(ended.stdout)["instances"]] == [1, 4]
 
 
 def test_a_command_that_needs_training_says_so(tmp_path: Path) -> None:
@@ -77,11 +70,10 @@ def test_a_command_that_needs_training_says_so(tmp_path: Path) -> None:
 
 
 def test_gudhi_is_needed_only_where_it_is_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
-    clouds = thor2.PointClouds.pack([(np.ones((9, 3), np.float32), np.zeros((9, 3), np.uint8))])
-    config = DescriptorConfig(homology="gudhi", n_slices=2, n_strips=4, image_size=8)
+    clouds = thor2.PointClouds.pack(random_clouds(0, [9]))
     monkeypatch.setitem(sys.modules, "gudhi", None)
     with pytest.raises(InputError, match="homology is .*closed_form"):
-        thor2.describe(clouds, colornet.load_default(), config)
+        thor2.describe(clouds, colornet.load_default(), thor2.DescriptorConfig(homology="gudhi", n_slices=2))
 
 
 def names(requirements: list[str]) -> dict[str, str]:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import thor2_jax
-from benchmarks.doctor import DAMAGES, run, sound
+from benchmarks.doctor import DAMAGES, run
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.model.recognition import Recognition
 from training.readers.frame_files import frame_files
@@ -33,7 +33,3 @@ def test_damaged_set_ups_are_diagnosed() -> None:
     report = run(SAMPLES, recognizer_of("clutter"), ["clutter"])
     wrong = {name: entry["found"] for name, entry in report["damaged"].items() if not entry["right"]}
     assert report["right_by_frame"]["clutter"] == 20 - len(wrong) and len(wrong) <= 2, wrong
-
-
-def test_sound_frames_are_counted(tmp_path: Path) -> None:
-    assert sound([tmp_path], None) == {"frames": 0, "with_findings": {}}

@@ -7,10 +7,8 @@ from scipy.spatial.distance import cdist
 from sklearn.cluster import DBSCAN
 
 from colornet.grid import grid_colors
-from colornet.lab import GRID_WHITE, MEAN_WHITE, hyab, to_lab
+from colornet.lab import GRID_WHITE, MEAN_WHITE, to_lab
 from colornet.mapper import EPS, MIN_SAMPLES, HyabDBSCAN, _cube_number, hyab_neighbors, lens
-
-WHITES = (GRID_WHITE, MEAN_WHITE)
 
 
 def reference_lab(rgb: NDArray[np.generic], white: tuple[float, float]) -> NDArray[np.float64]:
@@ -28,41 +26,24 @@ def reference_hyab(one: NDArray[np.float64], other: NDArray[np.float64]) -> floa
     return float(abs(one[0] - other[0]) + ((one[1] - other[1]) ** 2 + (one[2] - other[2]) ** 2) ** 0.5)
 
 
-def some_colors(n: int) -> NDArray[np.float64]:
-    """Return two blocks of similar colours and some random ones, in CIELAB."""
+@pytest.fixture(scope="module")
+def lab() -> NDArray[np.float64]:
+    """Two blocks of similar colours and some random ones, in CIELAB."""
     colors = grid_colors()
-    rows = np.random.default_rng(0).choice(len(colors), n // 3, replace=False)
+    rows = np.random.default_rng(0).choice(len(colors), 200, replace=False)
     for center in ([180, 90, 60], [40, 60, 200]):
-        near = np.flatnonzero((np.abs(colors.astype(int) - center) <= 15).all(axis=1))[: n // 3]
+        near = np.flatnonzero((np.abs(colors.astype(int) - center) <= 15).all(axis=1))[:200]
         rows = np.union1d(rows, near)
     return to_lab(colors[rows], GRID_WHITE)
 
 
-@pytest.mark.parametrize("white", WHITES)
-def test_lab_of_the_whole_grid(white: tuple[float, float]) -> None:
-    colors = grid_colors()
-    np.testing.assert_allclose(to_lab(colors, white), reference_lab(colors, white), atol=1e-9)
+@pytest.mark.parametrize("white", [GRID_WHITE, MEAN_WHITE])
+def test_lab(white: tuple[float, float]) -> None:
+    for colors in (grid_colors(), np.array([12.25, 200.5, 99.125]), np.zeros((0, 3))):
+        np.testing.assert_allclose(to_lab(colors, white), reference_lab(colors, white), atol=1e-9)
 
 
-def test_lab_of_means_and_of_one_color() -> None:
-    mean = np.array([12.25, 200.5, 99.125])
-    np.testing.assert_allclose(to_lab(mean, MEAN_WHITE), reference_lab(mean, MEAN_WHITE), atol=1e-9)
-    assert to_lab(np.zeros((0, 3)), MEAN_WHITE).shape == (0, 3)
-
-
-def test_white_and_black() -> None:
-    lab = to_lab(np.array([[255, 255, 255], [0, 0, 0]], np.uint8), GRID_WHITE)
-    np.testing.assert_allclose(lab, [[100, 0, 0], [0, 0, 0]], atol=0.02)
-
-
-def test_hyab() -> None:
-    lab = some_colors(40)
-    expected = [[reference_hyab(one, other) for other in lab] for one in lab]
-    np.testing.assert_allclose(hyab(lab[:, None], lab[None]), expected, atol=1e-12)
-
-
-def test_neighborhoods_equal_those_of_brute_force() -> None:
-    lab = some_colors(600)
+def test_neighborhoods_equal_those_of_brute_force(lab: NDArray[np.float64]) -> None:
     distances = cdist(lab, lab, reference_hyab)
     near = (distances <= EPS) & ~np.eye(len(lab), dtype=bool)
     neighbors = hyab_neighbors(lab, EPS).toarray()
@@ -79,8 +60,7 @@ def test_neighborhoods_on_the_border_of_the_ball() -> None:
     np.testing.assert_array_equal(neighbors, expected & ~np.eye(4, dtype=bool))
 
 
-def test_clusters_equal_those_of_a_dense_matrix() -> None:
-    lab = some_colors(600)
+def test_clusters_equal_those_of_a_dense_matrix(lab: NDArray[np.float64]) -> None:
     dense = DBSCAN(eps=EPS, min_samples=MIN_SAMPLES, metric="precomputed").fit_predict(cdist(lab, lab, reference_hyab))
     labels = HyabDBSCAN().fit_predict(lab)
     assert labels.max() >= 1 and labels.min() == -1

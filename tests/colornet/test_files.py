@@ -1,6 +1,7 @@
 """The record of the network and its file: read-only arrays, atomic writes, and one-line errors for damage."""
 
 import dataclasses
+import io
 import os
 import subprocess
 import sys
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 
 import colornet
-from colornet.files import MAX_ARRAY_BYTES, read_arrays, read_file, write_arrays
+from colornet.files import read_arrays, read_file, write_arrays
 
 # Changes with the contents of the network, and with nothing else.
 FINGERPRINT = "96981396ff3bc1ce0b440c5b781da4d2a5784b271f72967140e5b4b1bb6c593c"
@@ -33,44 +34,27 @@ def test_round_trip(network: colornet.ColorNetwork, tmp_path: Path) -> None:
     assert sorted(os.listdir(tmp_path)) == ["again.npz", "network.npz"]
 
 
-def test_packaged_file_is_small() -> None:
-    assert (Path(colornet.__file__).parent / "data" / "network.npz").stat().st_size < 300_000
-
-
 def test_arrays_are_read_only_copies(network: colornet.ColorNetwork) -> None:
-    arrays = {
-        name: np.array(value) if isinstance(value, np.ndarray) else value for name, value in contents(network).items()
-    }
-    copy = colornet.ColorNetwork(**arrays)
-    arrays["mean_rgb"][0] = 0
-    arrays["similarity"][0] = 0
+    arrays = {name: np.array(value) for name, value in contents(network).items() if isinstance(value, np.ndarray)}
+    copy = dataclasses.replace(network, **arrays)
+    for name, array in arrays.items():
+        array[0] = 0
+        with pytest.raises(ValueError, match="read-only"):
+            getattr(copy, name)[0] = 0
     assert copy.fingerprint == network.fingerprint
-    for name, value in contents(copy).items():
-        if isinstance(value, np.ndarray):
-            with pytest.raises(ValueError, match="read-only"):
-                value[0] = 0
-        with pytest.raises(dataclasses.FrozenInstanceError):
-            setattr(copy, name, value)
 
 
 def test_fingerprint_distinguishes_networks(network: colornet.ColorNetwork) -> None:
     assert network.fingerprint == FINGERPRINT
     again = dataclasses.replace(network)
     assert again is not network and again == network and hash(again) == hash(network) and network != "network"
-    assert dataclasses.replace(network, n_raw_nodes=24) != network
-    fingerprints = {network.fingerprint}
-    for name in ("mean_rgb", "edge_weights", "similarity"):
-        changed = np.array(getattr(network, name))
-        changed.flat[-1] += 1e-6
-        fingerprints.add(dataclasses.replace(network, **{name: changed}).fingerprint)
-    fingerprints.add(dataclasses.replace(network, cyclic=~network.cyclic).fingerprint)
-    fingerprints.add(dataclasses.replace(network, edges=network.edges[:, ::-1]).fingerprint)
-    fingerprints.add(dataclasses.replace(network, n_raw_nodes=24).fingerprint)
-    swapped = np.array(network.region_bits)
-    first, other = 0, int(np.flatnonzero(swapped != swapped[0])[0])
-    swapped[[first, other]] = swapped[[other, first]]
-    fingerprints.add(dataclasses.replace(network, region_bits=swapped).fingerprint)
-    assert len(fingerprints) == 8
+    changed = {name: np.array(getattr(network, name)) for name in ("mean_rgb", "edge_weights", "similarity")}
+    for values in changed.values():
+        values.flat[-1] += 1e-6
+    changed |= {"cyclic": ~network.cyclic, "edges": network.edges[:, ::-1], "n_raw_nodes": 24}
+    changed["region_bits"] = np.roll(network.region_bits, 1)
+    others = [network, *(dataclasses.replace(network, **{name: value}) for name, value in changed.items())]
+    assert len({other.fingerprint for other in others}) == len(set(others)) == 8
 
 
 @pytest.mark.parametrize(
@@ -108,27 +92,15 @@ def test_inconsistent_contents_are_rejected(
     assert str(loaded.value).startswith(str(path)) and str(loaded.value).endswith(str(direct.value))
 
 
-def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(OSError, match="nothing-here.npz"):
-        colornet.load(tmp_path / "nothing-here.npz")
-    with pytest.raises(OSError):
-        colornet.load(tmp_path)
-
-
 def test_damaged_and_foreign_files_raise_one_line(network: colornet.ColorNetwork, tmp_path: Path) -> None:
     path = tmp_path / "network.npz"
     network.save(path)
-    good = path.read_bytes()
-    bad = {"empty": b"", "text": b"not a network\n" * 9, "half": good[: len(good) // 2], "end cut": good[:-1]}
-    for name, data in bad.items():
-        path.write_bytes(data)
-        with pytest.raises(ValueError, match="damaged") as error:
+    good, array = path.read_bytes(), io.BytesIO()
+    np.save(array, network.similarity)
+    for content in (b"", b"not a network\n" * 9, good[: len(good) // 2], good[:-1], array.getvalue()):
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=rf"^{path} is damaged.*$"):
             colornet.load(path)
-        assert str(path) in str(error.value) and "\n" not in str(error.value), name
-    with open(path, "wb") as stream:
-        np.save(stream, network.similarity)
-    with pytest.raises(ValueError, match="damaged"):
-        colornet.load(path)
     write_arrays(path, {"something": np.zeros(3)})
     with pytest.raises(ValueError, match=r"\['something'\]"):
         colornet.load(path)
@@ -146,57 +118,23 @@ def test_pickled_objects_are_not_loaded(tmp_path: Path) -> None:
 
 
 def test_arrays_up_to_the_limit_are_read(tmp_path: Path) -> None:
-    assert MAX_ARRAY_BYTES == 64 * 1024**2
-    header = 128  # bytes of an array's header
-    for size, is_read in ((MAX_ARRAY_BYTES - header, True), (MAX_ARRAY_BYTES - header + 1, False)):
-        write_arrays(tmp_path / "file.npz", {"zeros": np.zeros(size, np.uint8)})
-        if is_read:
-            assert read_arrays(tmp_path / "file.npz")["zeros"].shape == (size,)
-        else:
-            with pytest.raises(ValueError, match="damaged"):
-                read_arrays(tmp_path / "file.npz")
+    size = 2**26 - 128  # an array's header takes 128 bytes
+    write_arrays(tmp_path / "file.npz", {"zeros": np.zeros(size, np.uint8)})
+    assert read_arrays(tmp_path / "file.npz")["zeros"].shape == (size,)
+    write_arrays(tmp_path / "file.npz", {"zeros": np.zeros(size + 1, np.uint8)})
+    with pytest.raises(ValueError, match="damaged"):
+        read_arrays(tmp_path / "file.npz")
 
 
-def test_the_packaged_network_is_read_once() -> None:
-    assert colornet.load_default() is colornet.load_default()
-
-
-def test_flipped_bytes_are_refused_or_have_no_effect(network: colornet.ColorNetwork, tmp_path: Path) -> None:
-    path = tmp_path / "network.npz"
-    network.save(path)
-    good = path.read_bytes()
-    places = np.random.default_rng(0).choice(len(good), 150, replace=False).tolist() + list(range(-150, 0))
-    refused = 0
-    for place in places:
-        data = bytearray(good)
-        data[place] ^= 0x55
-        path.write_bytes(data)
-        try:
-            assert colornet.load(path).fingerprint == network.fingerprint  # bytes that are not read, as of a time stamp
-        except ValueError as error:
-            assert str(path) in str(error) and "\n" not in str(error)
-            refused += 1
-    assert refused > 150
-
-
-def test_pipes_and_devices_are_not_replaced(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "pipe")
-    with pytest.raises(OSError, match="pipe"):
-        write_arrays(tmp_path / "pipe", {"a": np.zeros(1)})
-    assert (tmp_path / "pipe").is_fifo() and len(os.listdir(tmp_path)) == 1
-
-
-def test_pipes_and_devices_are_not_read(tmp_path: Path) -> None:
+def test_pipes_and_devices_are_neither_read_nor_replaced(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "link").symlink_to("/dev/zero")
     for name in ("pipe", "link"):
         with pytest.raises(OSError, match=name):
             read_file(tmp_path / name)
-
-
-def test_saving_to_a_missing_directory_is_an_error(network: colornet.ColorNetwork, tmp_path: Path) -> None:
-    with pytest.raises(OSError):
-        network.save(tmp_path / "nowhere" / "network.npz")
+        with pytest.raises(OSError, match=name):
+            write_arrays(tmp_path / name, {"a": np.zeros(1)})
+    assert (tmp_path / "pipe").is_fifo() and len(os.listdir(tmp_path)) == 2
 
 
 def test_loading_imports_neither_kmapper_nor_other_packages() -> None:

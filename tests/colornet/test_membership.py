@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 
 import colornet
-from colornet.grid import GRID_SIZE, grid_colors
+from colornet.grid import grid_colors
 
-COLORS = hnp.arrays(np.uint8, hnp.array_shapes(min_dims=1, max_dims=3, min_side=0, max_side=5).map(lambda s: (*s, 3)))
+COLORS = hnp.arrays(np.uint8, hnp.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=5).map(lambda s: (*s, 3)))
 
 
 def reference_weights(network: colornet.ColorNetwork, color: list[int]) -> list[float]:
@@ -18,57 +18,35 @@ def reference_weights(network: colornet.ColorNetwork, color: list[int]) -> list[
     return [1 / len(regions) if k in regions else 0.0 for k in range(22)]
 
 
-def test_grid() -> None:
-    colors = grid_colors()
-    assert colors.shape == (GRID_SIZE, 3) == (140608, 3)
-    assert colors.dtype == np.uint8
-    assert set(colors[:, 1].tolist()) == set(range(0, 256, 5))
-    np.testing.assert_array_equal(colornet.grid_index(colors), np.arange(GRID_SIZE))
-
-
-def test_nearest_grid_color_of_every_level() -> None:
-    levels = np.arange(256, dtype=np.uint8)
-    index = colornet.grid_index(np.stack([levels] * 3, axis=-1))
-    nearest = grid_colors()[index][:, 0].astype(int)
-    distance = np.abs(levels.astype(int)[:, None] - np.arange(0, 256, 5))
-    np.testing.assert_array_equal(np.abs(nearest - levels), distance.min(axis=1))
-
-
 @given(COLORS)
 def test_weights(rgb: np.ndarray) -> None:
     network = colornet.load_default()
     before = rgb.copy()
     weights = network.membership(rgb)
-    assert weights.shape == (*rgb.shape[:-1], 22)
-    assert weights.dtype == np.float32
+    assert weights.shape == (*rgb.shape[:-1], 22) and weights.dtype == np.float32
     np.testing.assert_array_equal(rgb, before)
-    np.testing.assert_allclose(weights.sum(axis=-1), 1, atol=1e-6)
     expected = [reference_weights(network, color) for color in rgb.reshape(-1, 3).tolist()]
     np.testing.assert_allclose(weights.reshape(-1, 22), np.reshape(expected, (-1, 22)), rtol=1e-7)
 
 
 def test_every_grid_color_has_a_region(network: colornet.ColorNetwork) -> None:
-    weights = network.membership(grid_colors())
+    colors = grid_colors()
+    assert colors.dtype == np.uint8
+    np.testing.assert_array_equal(colors, 5 * np.array(list(np.ndindex(52, 52, 52))))
+    np.testing.assert_array_equal(colornet.grid_index(colors), np.arange(52**3))
+    weights = network.membership(colors)
     np.testing.assert_allclose(weights.sum(axis=-1), 1, atol=1e-6)
     np.testing.assert_array_equal((weights > 0).sum(axis=0), network.member_counts)
 
 
-def test_one_color(network: colornet.ColorNetwork) -> None:
-    assert network.membership(np.array([255, 0, 0], np.uint8)).shape == (22,)
-    assert network.membership(np.zeros((0, 3), np.uint8)).shape == (0, 22)
+def test_nearest_grid_color_of_every_level() -> None:
+    levels = np.arange(256)
+    index = colornet.grid_index(np.stack([levels.astype(np.uint8)] * 3, axis=-1))
+    np.testing.assert_array_equal(index, np.round(levels / 5).astype(int) * (52**2 + 52 + 1))
 
 
 @pytest.mark.parametrize(
-    "rgb",
-    [
-        np.zeros((4, 3), np.float32),
-        np.zeros((4, 3), np.int64),
-        np.zeros((4, 3), bool),
-        np.zeros((4, 4), np.uint8),
-        np.zeros((3, 4), np.uint8),
-        np.uint8(3),
-        [[1, 2, 3]],
-    ],
+    "rgb", [np.zeros((4, 3)), np.zeros((4, 3), bool), np.zeros((4, 4), np.uint8), np.uint8(3), [[1, 2, 3]]]
 )
 def test_invalid_input_is_rejected(network: colornet.ColorNetwork, rgb: object) -> None:
     with pytest.raises(ValueError, match=r"^rgb is .*; expected uint8 \[\.\.\., 3\]$"):

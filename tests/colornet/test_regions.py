@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import colornet
-from colornet.builder import mean_color, merge_redundant, relabel, similarity
+from colornet.builder import merge_redundant, relabel, similarity
 from colornet.grid import grid_colors
 from colornet.lab import MEAN_WHITE, hyab, to_lab
 
@@ -14,12 +14,9 @@ from .test_color_math import reference_hyab, reference_lab
 def floyd_warshall(n: int, edges: NDArray[np.int64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
     length = np.full((n, n), np.inf)
     np.fill_diagonal(length, 0)
-    for (i, j), weight in zip(edges, weights, strict=True):
-        length[i, j] = length[j, i] = weight
+    length[tuple(edges.T)] = length[tuple(edges.T[::-1])] = weights
     for via in range(n):
-        for i in range(n):
-            for j in range(n):
-                length[i, j] = min(length[i, j], length[i, via] + length[via, j])
+        length = np.minimum(length, length[:, via, None] + length[via])
     return length
 
 
@@ -47,16 +44,6 @@ def test_similarity_of_random_graphs() -> None:
         np.testing.assert_array_equal(delta, delta.T)
 
 
-def test_regions_without_a_path_are_not_similar() -> None:
-    delta = similarity(3, np.array([[0, 2]]), np.array([4.0]))
-    np.testing.assert_array_equal(delta, [[1, 0, 0.2], [0, 1, 0], [0.2, 0, 1]])
-
-
-def test_mean_color() -> None:
-    colors = np.array([[0, 0, 0], [255, 0, 10], [254, 1, 0]], np.uint8)
-    np.testing.assert_array_equal(mean_color(colors, np.array([1, 2])), [254.5, 0.5, 5.0])
-
-
 def test_only_nodes_with_shared_members_and_color_merge() -> None:
     """Use 40 greys and node sizes around the threshold of 95 % of the smaller node."""
     colors = np.repeat(np.arange(100, 140, dtype=np.uint8)[:, None], 3, axis=1)
@@ -74,12 +61,6 @@ def test_only_nodes_with_shared_members_and_color_merge() -> None:
         for k, rows in enumerate(merged):
             union = set().union(*(m.tolist() for m, r in zip(members, expected, strict=True) if r == k))
             assert rows.tolist() == sorted(union), name
-
-
-def test_nodes_with_another_mean_color_do_not_merge() -> None:
-    colors = np.repeat(np.array([0, 250, 251], np.uint8)[:, None], 3, axis=1)
-    _, region = merge_redundant(colors, [np.array([0]), np.array([0, 1, 2])], eps=7.0)
-    assert region.tolist() == [0, 1]
 
 
 def test_nodes_with_mean_colors_at_the_limit_merge() -> None:

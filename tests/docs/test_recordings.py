@@ -17,11 +17,11 @@ from thor2_jax.recordings.topics import Topics
 from thor2_jax.watch.server import Broadcast
 from training.rendering.sample_recording import FRAMES, write_sample_recording
 
-COMMANDS = [words for words in shell_commands("docs/recordings.md") if words[0] in ("thor2", "python")]
+COMMANDS = [words for words in shell_commands("docs/recordings.md") if words[0] == "thor2"]
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the run and the recording of the page."""
     folder = tmp_path_factory.mktemp("recordings")
     save_run(untrained_run(("apple", "mug")), folder / "run")
@@ -31,18 +31,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(autouse=True)
-def inside(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(folder)
+def inside(recorded: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(recorded)
 
 
-def test_every_command_of_the_page_is_known() -> None:
-    first = [words[1] if words[1] != "-m" else words[2] for words in COMMANDS]
-    assert first == ["training.rendering.sample_recording", *["recognize"] * 2, *["watch"] * 3]
-    assert COMMANDS[0][3] == "table.mcap" and COMMANDS[-1][-1] == "--realsense"  # run by test_watch.py
-
-
-def test_the_recording_shows_four_objects_apart(folder: Path) -> None:
-    assert (folder / "table.mcap").stat().st_size < 500_000
+def test_the_recording_shows_four_objects_apart() -> None:
     with Bag(Path("table.mcap"), Topics()) as bag:
         frames = [recorded.read() for recorded in bag.frames()]
     assert len(frames) == FRAMES
@@ -51,17 +44,17 @@ def test_the_recording_shows_four_objects_apart(folder: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [1, 2])
+@pytest.mark.parametrize("number", [0, 1])
 def test_recordings_are_recognized(number: int, capfd: pytest.CaptureFixture[str]) -> None:
     words = COMMANDS[number]
     assert run_thor2(*words[1:]) == 0, shlex.join(words)
     lines = [json.loads(line) for line in capfd.readouterr().out.splitlines()]
-    assert len(lines) == (FRAMES if number == 1 else 2) and all(len(line["instances"]) >= 4 for line in lines)
-    assert Path("answers.mcap").is_file() == (number == 2)
+    assert len(lines) == (FRAMES if number == 0 else 2) and all(len(line["instances"]) >= 4 for line in lines)
+    assert Path("answers.mcap").is_file() == (number == 1)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [3, 4])
+@pytest.mark.parametrize("number", [2, 3])
 def test_recordings_and_folders_are_watched(number: int, monkeypatch: pytest.MonkeyPatch) -> None:
     published: list[dict[str, Any]] = []
 

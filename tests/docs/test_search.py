@@ -6,7 +6,7 @@ import os
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from doc_pages import ROOT
@@ -28,34 +28,22 @@ QUESTIONS = {
 """What a user types -> page that is found first."""
 
 
-class _Quiet(http.server.SimpleHTTPRequestHandler):
-    def log_message(self, *_: object) -> None:
-        pass
-
-
-@pytest.fixture(scope="module")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """Build the site as CI does and serve it; yield its address."""
+@pytest.mark.slow
+def test_questions_find_their_page_first(browser: Browser, tmp_path: Path) -> None:
     pytest.importorskip("mkdocs", reason="mkdocs is not installed (extra docs)")
-    folder = tmp_path_factory.mktemp("site")
-    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(folder)]
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(tmp_path)]
     environment = {**os.environ, "NO_MKDOCS_2_WARNING": "1", "PYTHONPATH": str(ROOT)}
     subprocess.run(command, cwd=ROOT, env=environment, check=True, timeout=HANG)
-    handler = functools.partial(_Quiet, directory=str(folder))
+    handler = functools.partial(http.server.SimpleHTTPRequestHandler, directory=str(tmp_path))
+    page, first = browser.new_page(), {}
+    page.set_default_timeout(1000 * HANG)
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
         threading.Thread(target=server.serve_forever).start()
-        yield f"http://127.0.0.1:{server.server_port}"
+        site = f"http://127.0.0.1:{server.server_port}/"
+        for question in QUESTIONS:
+            page.goto(f"{site}index.html?q={question}")
+            link = page.locator(".md-search-result__item a.md-search-result__link").first.get_attribute("href") or ""
+            first[question] = link.partition("?")[0].partition("#")[0].removeprefix(site).removesuffix(".html")
         server.shutdown()
-
-
-@pytest.mark.slow
-def test_questions_find_their_page_first(site: str, browser: Browser) -> None:
-    page = browser.new_page()
-    page.set_default_timeout(1000 * HANG)
-    first = {}
-    for question in QUESTIONS:
-        page.goto(f"{site}/index.html?q={question}")
-        link = page.locator(".md-search-result__item a.md-search-result__link").first.get_attribute("href") or ""
-        first[question] = link.partition("?")[0].partition("#")[0].removeprefix(f"{site}/").removesuffix(".html")
     page.close()
     assert first == QUESTIONS

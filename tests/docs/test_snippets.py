@@ -1,10 +1,13 @@
-"""Every Python block of the pages is executed by a test, and every command is run by one or has a reason.
+"""Every Python block of the pages is executed, with the names that its page has explained before.
 
-The blocks of pages with a test file of their own are only counted here. Services, cameras and other packages are
-replaced by objects of the same interface: what a block calls must exist and take these arguments.
+Services, cameras and other packages are replaced by objects of the same interface: what a block calls must exist and
+take these arguments.
 """
 
+import doctest
+import json
 import re
+import shlex
 import sys
 import types
 from pathlib import Path
@@ -13,12 +16,14 @@ from unittest.mock import MagicMock, create_autospec
 
 import numpy as np
 import pytest
-from doc_pages import PAGES, ROOT, python_blocks, shell_commands
-from helpers import SMALL_CONFIG, untrained_run, write_frame
+from doc_pages import PAGES, ROOT, python_blocks
+from helpers import patches, random_clouds, run_thor2, tilted, untrained_run, write_frame_files
 from recording_files import table_frame
 
 import thor2_jax as thor2
+from thor2_jax import recognizer as recognizer_module
 from thor2_jax.client import Client
+from thor2_jax.explanation import class_scores
 from thor2_jax.frames.frames import backproject
 from thor2_jax.model.run_directory import save_run
 from thor2_jax.recordings import realsense
@@ -27,55 +32,32 @@ from thor2_jax.tracking.tracker import Tracker
 BLOCKS = {
     "README.md": 1,
     "docs/cameras.md": 2,
-    "docs/explain.md": 1,  # test_explanations.py
-    "docs/index.md": 1,  # test_tutorials.py
-    "docs/library.md": 10,  # test_library.py
-    "docs/objects.md": 1,  # test_library.py
+    "docs/explain.md": 1,
+    "docs/index.md": 1,
+    "docs/library.md": 10,
+    "docs/objects.md": 1,
     "docs/recordings.md": 1,
     "docs/segmentation.md": 3,
     "docs/service.md": 2,
-    "docs/tutorials/first-table.md": 1,  # test_tutorials.py
+    "docs/tutorials/first-table.md": 1,
 }
 """Page -> number of its Python blocks; each one is executed by a test."""
 
-RUN_BY = {
-    "adapt": "training/cli/test_adapt.py",
-    "demo": "training/cli/test_cli.py",
-    "doctor": "training/diagnosis/test_diagnosis.py",
-    "enroll": "training/cli/test_enroll.py",
-    "evaluate": "training/cli/test_cli.py",
-    "explain": "training/cli/test_explain.py",
-    "fetch": "training/objects/test_fetch_ycb.py",  # from a local server
-    "forget": "training/cli/test_enroll.py",
-    "objects": "training/cli/test_enroll.py",
-    "recognize": "training/cli/test_cli.py",
-    "render": "training/cli/test_cli.py",
-    "serve": "thor2_jax/service/test_serve_command.py",
-    "train": "training/cli/test_cli.py",
-    "watch": "training/cli/test_watch.py",  # bags and folders; a camera only without one
-}
-"""Command -> test file that runs it. All options of the pages are parsed in test_commands.py."""
+LIBRARY = "docs/library.md"
+FRAME = tilted(np.where(patches() == 7, 2, patches()))
+"""A frame with the labels of the examples, 2 and 3."""
 
-NOT_RUN = {
-    "pip": "installs packages: .ci/run runs the README's line and the extras `test` and `docs`",
-    "python3": "makes an environment, in the same line of .ci/run",
-    "pytest": "the tests",
-    "curl": "needs a running service: tests/thor2_jax/service sends the same requests",
-    "python": "benchmarks, of hours: tests/benchmarks runs their parts; the ROS 2 node: tests/examples",
-    "source": "the environment of ROS 2",
-    "sudo": "installs messages of ROS 2",
-    "samples=$(python": "names a directory: the next command is run by test_tutorials.py",
-}
-"""First word of other commands -> why they are not run as they stand."""
+((XYZ, RGB),) = random_clouds(0, [400])
 
 
 def blocks_of(page: str) -> list[str]:
     return python_blocks((ROOT / page).read_text(encoding="utf-8"))
 
 
-def run_block(page: str, number: int = 0, **names: Any) -> dict[str, Any]:
-    """Execute a Python block of a page, in which `names` are defined, and return all names."""
-    exec(compile(blocks_of(page)[number], page, "exec"), names)
+def run_blocks(page: str, *numbers: int, **names: Any) -> dict[str, Any]:
+    """Execute Python blocks of a page, in which `names` are defined, and return all names."""
+    for number in numbers:
+        exec(compile(blocks_of(page)[number], page, "exec"), names)
     return names
 
 
@@ -83,31 +65,95 @@ def test_every_python_block_is_executed() -> None:
     assert {page: len(blocks_of(page)) for page in PAGES if blocks_of(page)} == BLOCKS
 
 
-def test_every_command_is_run_or_has_a_reason() -> None:
-    first = set()
-    for page in PAGES:
-        for words in shell_commands(page):
-            if re.match(r"THOR2_\w+=", words[0]):
-                words = words[words.index(next(word for word in words if word.endswith("thor2"))) :]
-            name = re.sub(r"[\w.-]+/bin/", "", words[0])
-            first.add(words[1] if name == "thor2" else name)
-    assert first == {*RUN_BY, *NOT_RUN}
-    for command, path in RUN_BY.items():
-        assert f'"{command}"' in (ROOT / "tests" / path).read_text(encoding="utf-8"), command
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Change to a folder with an untrained run, also where the demo writes its own."""
+    monkeypatch.chdir(tmp_path)
+    save_run(untrained_run(("mug", "bowl")), "run")
+    Path("demo-report").symlink_to(".")
+    return tmp_path
 
 
 @pytest.mark.slow
-def test_readme_and_tracks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.chdir(tmp_path)
-    save_run(untrained_run(("ball", "brick"), config=SMALL_CONFIG), "run")
-    folder = write_frame(tmp_path / "frame", {3: "brick"})
-    for source, target in {"color": "c", "depth": "d", "mask": "l"}.items():
-        (folder / f"{source}.png").rename(f"{target}.png")
+def test_recognition(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The blocks of README and of tracks, objects and the recognizer's docstring."""
+    folder = write_frame_files(run / "frame", FRAME)
+    for source, target in {"color.png": "c.png", "depth.png": "d.png", "mask.png": "l.png"}.items():
+        (folder / source).rename(target)
     (folder / "intrinsics.json").rename("k.json")
-    names = run_block("README.md")
-    assert capsys.readouterr().out.startswith("3 ")
-    run_block("docs/cameras.md", recognizer=names["recognizer"], frames=[names["frame"]] * 2)
-    assert [line.split()[-1] for line in capsys.readouterr().out.splitlines()] == ["1", "2"]
+    names = run_blocks("README.md", 0)
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == ["2", "3", "5", "200"]
+    run_blocks("docs/cameras.md", 0, recognizer=names["recognizer"], frames=[names["frame"]] * 2)
+    assert [line.split()[-1] for line in capsys.readouterr().out.splitlines()] == [*"11012202"]
+    run_blocks("docs/objects.md", 0, frame=FRAME, thor2=thor2)
+    assert (run / "run" / "gallery").is_dir()
+    names = {"Recognizer": thor2.Recognizer, "read_frame": thor2.read_frame}
+    for example in doctest.DocTestParser().get_examples(str(recognizer_module.__doc__)):
+        exec(compile(example.source, "thor2_jax.recognizer", "exec"), names)
+
+
+@pytest.mark.slow
+def test_landing_page_and_first_tutorial(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run_blocks("docs/index.md", 0)
+    assert len(capsys.readouterr().out.splitlines()) == 5
+    page = "docs/tutorials/first-table.md"
+    (command,) = re.findall(r"thor2 (recognize .*?)^```$", (ROOT / page).read_text(), re.DOTALL | re.MULTILINE)
+    samples = str(Path(thor2.__path__[0], "service/page/samples"))
+    assert run_thor2(*shlex.split(command.replace("$samples", samples).replace("\\\n", " "))) == 0
+    answers = json.loads(Path("answer/recognition.json").read_text())
+    names = run_blocks(page, 0)["names"]
+    assert len(names) == 5 and str(min(names)) in json.dumps(answers)
+    assert Path("answer/overlay.png").is_file()
+
+
+@pytest.mark.slow
+def test_explanation(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(class_scores, "MIN_CAPACITY", 512)
+    recognizer = thor2.Recognizer(untrained_run(("bowl", "mug")))
+    names = run_blocks("docs/explain.md", 0, recognizer=recognizer, frame=FRAME)
+    assert {names["explanation"].name, names["explanation"].runner_up} == {"bowl", "mug"}
+    assert names["picture"].name == "network"
+
+
+def test_descriptors_and_plots(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    names = run_blocks(LIBRARY, 0, 7, xyz=XYZ, rgb=RGB)
+    result = names["descriptors"]
+    assert result.tops.shape == (1, 7168) and result.tops2.shape == (1, 11942) and result.overflow.shape == (1,)
+    assert all(axes.collections for axes in names["figure"].axes)
+    names["plt"].close(names["figure"])
+
+
+@pytest.mark.slow
+def test_gradients_of_colours() -> None:
+    names = run_blocks(LIBRARY, 0, 8, xyz=XYZ, rgb=RGB)
+    gradient, colors = names["jax"].grad(names["largest"]), names["clouds"].colors
+    assert np.abs(gradient(colors, names["soft"])).max() > 0.01
+    assert not np.any(gradient(colors, names["config"]))
+
+
+@pytest.mark.slow
+def test_scikit_learn() -> None:
+    cubes, bricks = random_clouds(0, [400] * 4, (0.05, 0.05, 0.05)), random_clouds(1, [400] * 4)
+    clouds = [cloud for pair in zip(cubes, bricks, strict=True) for cloud in pair]
+    names = run_blocks(LIBRARY, 1, 2, clouds=clouds, labels=["cube", "brick"] * 4)
+    assert names["search"].predict(clouds[:2]).tolist() == ["cube", "brick"]
+    assert names["frame"].shape == (8, 7168)
+
+
+@pytest.mark.slow
+def test_persistence() -> None:
+    names = run_blocks(LIBRARY, 3, 4, 5, 6)
+    assert names["images"].shape == (2, 16, 16) and len(names["pairs"]) == int(names["diagrams"].mask[0].sum()) > 0
+    shallow, noisy, smooth = names["shallow"], names["noisy"], names["smooth"]
+    assert shallow(smooth) < 0.2 * shallow(noisy)
+    assert float(smooth.min()) == pytest.approx(float(noisy.min()), abs=0.01)
+
+
+@pytest.mark.slow
+def test_export(run: Path) -> None:
+    run_blocks(LIBRARY, 9)
+    assert (run / "recognizer.export").stat().st_size > 10_000
 
 
 def test_next_view(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -116,27 +162,16 @@ def test_next_view(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(view_table, "view_table", create_autospec(view_table.view_table))
     tracker = create_autospec(Tracker, instance=True)
     tracker.next_view.return_value = types.SimpleNamespace(index=1, expected=[0.2, 0.1])
-    reachable = [np.eye(4)] * 2
-    names = run_block(
-        "docs/cameras.md",
-        1,
-        tracker=tracker,
-        answer=MagicMock(),
-        recognizer=MagicMock(),
-        meshes={},
-        reachable=reachable,
-    )
-    assert tracker.next_view.call_args.args[1:] == (reachable, names["table"])
+    given: Any = {"recognizer": MagicMock(), "answer": MagicMock(), "meshes": {}, "reachable": [np.eye(4)] * 2}
+    names = run_blocks("docs/cameras.md", 1, tracker=tracker, **given)
+    assert tracker.next_view.call_args.args[1:] == (given["reachable"], names["table"])
 
 
 def test_segmented_frame(monkeypatch: pytest.MonkeyPatch) -> None:
-    frame = table_frame()
-    monkeypatch.setattr(thor2, "read_frame", create_autospec(thor2.read_frame, return_value=frame))
-    monkeypatch.setattr(thor2, "segmented", create_autospec(thor2.segmented, return_value=frame))
+    monkeypatch.setattr(thor2, "read_frame", create_autospec(thor2.read_frame, return_value=table_frame()))
     recognizer = create_autospec(thor2.Recognizer, instance=True)
-    names = run_block("docs/segmentation.md", recognizer=recognizer)
-    recognizer.recognize.assert_called_once_with(frame)
-    assert names["answers"] is recognizer.recognize.return_value
+    run_blocks("docs/segmentation.md", 0, recognizer=recognizer)
+    assert recognizer.recognize.call_args.args[0].instances == (1, 2)
 
 
 def test_wrapped_segmenters(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -144,41 +179,35 @@ def test_wrapped_segmenters(monkeypatch: pytest.MonkeyPatch) -> None:
     frame = table_frame()
     mask = np.zeros(frame.depth.shape, bool)
     mask[:10, :10] = True
-    package = types.ModuleType("segment_anything")
+    package: Any = types.ModuleType("segment_anything")
     generator = types.SimpleNamespace(generate=lambda color: [{"area": mask.sum(), "segmentation": mask}])
-    package.SamAutomaticMaskGenerator = lambda model: generator  # type: ignore[attr-defined]
-    package.sam_model_registry = {"vit_b": lambda checkpoint: checkpoint}  # type: ignore[attr-defined]
+    package.SamAutomaticMaskGenerator = lambda model: generator
+    package.sam_model_registry = {"vit_b": lambda checkpoint: checkpoint}
     monkeypatch.setitem(sys.modules, "segment_anything", package)
     monkeypatch.setenv("SAM_CHECKPOINT", "weights")
-    labels = run_block("docs/segmentation.md", 1)["segment"](frame)
-    np.testing.assert_array_equal(labels, mask)
+    np.testing.assert_array_equal(run_blocks("docs/segmentation.md", 1)["segment"](frame), mask)
 
     network = types.SimpleNamespace(run_on_batch=lambda color, points: points[..., 2] > 0)
-    names = run_block("docs/segmentation.md", 2, network=lambda: network, backproject=backproject, np=np)
+    names = run_blocks("docs/segmentation.md", 2, network=lambda: network, backproject=backproject, np=np)
     assert names["segment"](frame).shape == frame.depth.shape
 
 
 def test_camera(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    camera, recognizer = create_autospec(realsense.RealSenseCamera), create_autospec(thor2.Recognizer)
     recorded = types.SimpleNamespace(name="1.0", read=table_frame)
-    camera = create_autospec(realsense.RealSenseCamera)
     camera.return_value.__enter__.return_value.frames.return_value = [recorded]
+    recognizer.load.return_value.recognize.return_value = [thor2.Recognition(1, "mug", 0.9)]
     monkeypatch.setattr(realsense, "RealSenseCamera", camera)
-    recognizer = create_autospec(thor2.Recognizer)
-    answer = types.SimpleNamespace(label=1, name="mug", confidence=0.9)
-    recognizer.load.return_value.recognize.return_value = [answer]
     monkeypatch.setattr(thor2, "Recognizer", recognizer)
-    monkeypatch.setattr(thor2, "segmented", lambda frame: frame)
-    run_block("docs/recordings.md")
+    run_blocks("docs/recordings.md", 0)
     assert capsys.readouterr().out == "1.0 1 mug 0.9\n"
 
 
 def test_client(monkeypatch: pytest.MonkeyPatch) -> None:
-    client = create_autospec(Client, instance=True)
-    client.recognize_frame.return_value = [], np.zeros((2, 2), np.int32)
-    run_block("docs/service.md", client=client)
-    assert client.enroll.call_args.kwargs["instance"] == 3
-
-    made = create_autospec(Client)
-    monkeypatch.setattr("thor2_jax.client.Client", made)
-    run_block("docs/service.md", 1)
-    made.return_value.undo.assert_called_once_with(made.return_value.forget.return_value)
+    client = create_autospec(Client)
+    client.return_value.recognize_frame.return_value = [], np.zeros((2, 2), np.int32)
+    monkeypatch.setattr("thor2_jax.client.Client", client)
+    run_blocks("docs/service.md", 0, client=client.return_value)
+    assert client.return_value.enroll.call_args.kwargs["instance"] == 3
+    run_blocks("docs/service.md", 1)
+    client.return_value.undo.assert_called_once_with(client.return_value.forget.return_value)

@@ -1,7 +1,5 @@
 """examples/ros2: the node in ROS 2 where that is installed, and without it on messages of rosbags."""
 
-import collections
-import functools
 import importlib
 import io
 import sys
@@ -9,6 +7,7 @@ import time
 import types
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -16,14 +15,12 @@ from helpers import encode_image
 from PIL import Image
 from processes import HANG
 from recording_files import START, camera_info, compressed, image, table_frame
-from rosbags.interfaces import Nodetype
 
 import thor2_jax as thor2
 from thor2_jax.client import Client, ServiceError
 from thor2_jax.errors import InputError
 from thor2_jax.model.recognition import Recognition
 from thor2_jax.recordings.bag_writer import DETECTION_ARRAY, detection_types, ros_message
-from thor2_jax.recordings.messages import stamp_of
 from thor2_jax.segmentation.segmenters import segment
 
 FRAME = table_frame()
@@ -46,9 +43,11 @@ class LocalClient(Client):
 
 @pytest.fixture
 def conversion(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """The module with the conversions; the node can be imported, too."""
     monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "examples" / "ros2"))
     yield importlib.import_module("frame_messages")
-    sys.modules.pop("frame_messages", None)
+    for name in ("frame_messages", "detection_node"):
+        sys.modules.pop(name, None)
 
 
 @pytest.mark.parametrize("step", [1, 2])
@@ -89,186 +88,108 @@ def test_a_service_that_does_not_segment(conversion: Any, monkeypatch: pytest.Mo
         conversion.detect(client, FRAME)
 
 
-class Bus:
-    """Stands for ROS 2 in one process: what the node and this test use of rclpy and message_filters.
+class Node:
+    """Stands for rclpy's Node: what the node uses of it."""
 
-    Messages have the classes of rosbags and pass through their serialization, as between two processes.
-    """
+    def __init__(self, name: str) -> None:
+        self.parameters: dict[str, Any] = {}
+        self.callbacks: dict[str, Any] = {}
+        self.published: list[Any] = []
+        self.warnings: list[str] = []
 
-    def __init__(self) -> None:
-        self.types, self.warnings = detection_types(), []
-        self.callbacks: dict[str, list[Any]] = {}
-        self.queue: collections.deque[tuple[str, str, bytes]] = collections.deque()
+    def declare_parameter(self, name: str, default: Any) -> None:
+        self.parameters[name] = default
 
-    def kind(self, name: str) -> type:
-        """Return a class whose instances are default messages, like those of rosidl."""
-        types = self.types
+    def get_parameter(self, name: str) -> Any:
+        return types.SimpleNamespace(value=self.parameters[name])
 
-        def default(description: Any) -> Any:
-            node, details = description
-            if node == Nodetype.NAME:
-                return {field: default(inner) for field, inner in types.fielddefs[details][1]}
-            if node == Nodetype.BASE:
-                return "" if details[0] == "string" else False if details[0] == "bool" else 0
-            (element, base), count = details
-            return [] if element == Nodetype.NAME else np.zeros(count or 0, base[0])
+    def create_publisher(self, kind: Any, topic: str, qos: Any) -> Any:
+        return types.SimpleNamespace(publish=lambda message: self.published.append((topic, message)))
 
-        fields = default((Nodetype.NAME, name))
-        return type(name, (), {"__new__": lambda _: ros_message(types, name, fields), "name": name})
+    def create_subscription(self, kind: Any, topic: str, callback: Any, qos: Any) -> None:
+        self.callbacks[topic] = callback
 
-    def publish(self, topic: str, message: Any, kind: str) -> None:
-        self.queue.append((topic, kind, bytes(self.types.serialize_cdr(message, kind))))
+    def get_logger(self) -> Any:
+        return types.SimpleNamespace(warning=lambda text, throttle_duration_sec: self.warnings.append(text))
 
-    def spin_once(self, node: Any, timeout_sec: float | None = None) -> None:
-        if self.queue:
-            topic, kind, content = self.queue.popleft()
-            for callback in self.callbacks.get(topic, []):
-                callback(self.types.deserialize_cdr(content, kind))
+    def destroy_node(self) -> None:
+        self.callbacks.clear()
 
-    def spin(self, node: Any) -> None:
-        while self.queue:
-            self.spin_once(node)
+
+def test_the_node_warns_and_goes_on(conversion: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without camera_info, and if the service fails, there is a warning; the next pair is published."""
+    rclpy, filters, client, nodes = MagicMock(), MagicMock(), LocalClient(), []
+    contents = {
+        "rclpy": {name: getattr(rclpy, name) for name in ("init", "spin", "try_shutdown")},
+        "rclpy.node": {"Node": Node},
+        "rclpy.qos": {"qos_profile_sensor_data": 10},
+        "message_filters": {name: getattr(filters, name) for name in ("ApproximateTimeSynchronizer", "Subscriber")},
+        "rosidl_runtime_py.set_message": {"set_message_fields": lambda message, fields: vars(message).update(fields)},
+        "sensor_msgs.msg": {"CameraInfo": "CameraInfo", "Image": "Image"},
+        "vision_msgs.msg": {"Detection2DArray": types.SimpleNamespace},
+    }
+    for name, values in contents.items():
+        module = types.ModuleType(name)
+        vars(module).update(values)
+        monkeypatch.setitem(sys.modules, name, module)
+
+    def spin(node: Any) -> None:
+        nodes.append(node)
+        topics = [call.args[2] for call in filters.Subscriber.call_args_list]
+        assert topics == ["/camera/color/image_raw", "/camera/aligned_depth_to_color/image_raw"]
+        (publish,) = filters.ApproximateTimeSynchronizer.return_value.registerCallback.call_args.args
+        pair = image(FRAME.color, "rgb8"), image(FRAME.depth, "16UC1")
+        publish(*pair)
+        node.callbacks["/camera/color/camera_info"](CAMERA)
+        with monkeypatch.context() as patch:
+            patch.setattr(client, "recognize_frame", MagicMock(side_effect=ServiceError(503, None, "starting", 1.0)))
+            publish(*pair)
+        publish(*pair)
         raise KeyboardInterrupt
 
-    def modules(self) -> dict[str, dict[str, Any]]:
-        bus = self
-
-        class Node:
-            def __init__(self, name: str) -> None:
-                self.parameters: dict[str, Any] = {}
-
-            def declare_parameter(self, name: str, default: Any) -> None:
-                self.parameters[name] = default
-
-            def get_parameter(self, name: str) -> Any:
-                return types.SimpleNamespace(value=self.parameters[name])
-
-            def create_publisher(self, kind: Any, topic: str, qos: Any) -> Any:
-                return types.SimpleNamespace(publish=lambda message: bus.publish(topic, message, kind.name))
-
-            def create_subscription(self, kind: Any, topic: str, callback: Any, qos: Any) -> None:
-                bus.callbacks.setdefault(topic, []).append(callback)
-
-            def get_logger(self) -> Any:
-                return types.SimpleNamespace(warning=lambda text, throttle_duration_sec: bus.warnings.append(text))
-
-            def destroy_node(self) -> None:
-                bus.callbacks.clear()
-
-        class Subscriber:
-            def __init__(self, node: Node, kind: Any, topic: str, qos_profile: Any) -> None:
-                self.subscribe = lambda callback: node.create_subscription(kind, topic, callback, qos_profile)
-
-        class Synchronizer:
-            def __init__(self, subscribers: list[Subscriber], queue_size: int, slop: float) -> None:
-                self.latest, self.slop = [None] * len(subscribers), slop
-                for number, subscriber in enumerate(subscribers):
-                    subscriber.subscribe(functools.partial(self.add, number))
-
-            def registerCallback(self, callback: Any) -> None:  # noqa: N802
-                self.callback = callback
-
-            def add(self, number: int, message: Any) -> None:
-                self.latest[number] = message
-                if None not in self.latest and abs(np.diff([stamp_of(one) for one in self.latest])) < 1e9 * self.slop:
-                    self.callback(*self.latest)
-
-        def set_fields(message: Any, fields: Any) -> None:
-            vars(message).update(vars(ros_message(bus.types, message.__msgtype__, fields)))
-
-        nothing = {"init": lambda: None, "try_shutdown": lambda: None}
-        images = {name: self.kind(f"sensor_msgs/msg/{name}") for name in ("CameraInfo", "Image")}
-        return {
-            "rclpy": {**nothing, "spin": self.spin, "spin_once": self.spin_once, "create_node": Node},
-            "rclpy.node": {"Node": Node},
-            "rclpy.qos": {"qos_profile_sensor_data": 10},
-            "message_filters": {"ApproximateTimeSynchronizer": Synchronizer, "Subscriber": Subscriber},
-            "rosidl_runtime_py": {},
-            "rosidl_runtime_py.set_message": {"set_message_fields": set_fields},
-            "sensor_msgs": {},
-            "sensor_msgs.msg": images,
-            "vision_msgs": {},
-            "vision_msgs.msg": {"Detection2DArray": self.kind(DETECTION_ARRAY)},
-        }
+    rclpy.spin.side_effect = spin
+    node_module = importlib.import_module("detection_node")
+    monkeypatch.setattr(node_module, "Client", lambda *arguments: client)
+    node_module.main()
+    (node,) = nodes
+    assert "camera_info" in node.warnings[0] and "503" in node.warnings[1] and len(node.warnings) == 2
+    ((topic, message),) = node.published
+    assert topic == "/thor2/detections" and message.header["stamp"]["sec"] == START // 10**9
+    assert [one["results"][0]["hypothesis"]["class_id"] for one in message.detections] == ["mug", "mug"]
+    assert client.frames[0].intrinsics.fx == 290 and not node.callbacks
+    rclpy.try_shutdown.assert_called_once_with()
 
 
-@pytest.fixture(params=["stand-ins", pytest.param("rclpy", marks=pytest.mark.slow)])
-def ros(request: pytest.FixtureRequest, conversion: Any, monkeypatch: pytest.MonkeyPatch) -> Any:
-    """ROS 2 where it is installed, and stand-ins for it: the module of the node and the bus, None for ROS 2."""
-    bus = Bus() if request.param == "stand-ins" else None
-    if bus is None:
-        pytest.importorskip("rclpy", reason="ROS 2 is not installed")
-    else:
-        for name, contents in bus.modules().items():
-            module = types.ModuleType(name)
-            vars(module).update(contents)
-            monkeypatch.setitem(sys.modules, name, module)
-    node = importlib.import_module("detection_node")
-    client = LocalClient()
-    monkeypatch.setattr(node, "Client", lambda *arguments: client)
-    yield types.SimpleNamespace(node=node, bus=bus, client=client)
-    sys.modules.pop("detection_node", None)
-
-
-def camera_publishers(camera: Any) -> Any:
-    """Return functions that publish the intrinsics, and a pair of images, as the driver of a camera does."""
+@pytest.mark.slow
+def test_the_node_publishes_detections_in_ros2(conversion: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    rclpy = pytest.importorskip("rclpy", reason="ROS 2 is not installed")
     from sensor_msgs.msg import CameraInfo, Image
-
-    height, width = FRAME.depth.shape
-    info, (color, depth) = CameraInfo(), (Image(), Image())
-    info.height, info.width, info.k, info.distortion_model = height, width, CAMERA.k, "plumb_bob"
-    for message, pixels, encoding in ((color, FRAME.color, "rgb8"), (depth, FRAME.depth, "16UC1")):
-        message.header.stamp.sec = START // 10**9
-        message.height, message.width, message.encoding = height, width, encoding
-        message.step, message.data = pixels[0].nbytes, np.frombuffer(pixels.tobytes(), np.uint8)
-    topics = {"/camera/color/image_raw": color, "/camera/aligned_depth_to_color/image_raw": depth}
-    images = [(camera.create_publisher(Image, topic, 10), message) for topic, message in topics.items()]
-    publisher = camera.create_publisher(CameraInfo, "/camera/color/camera_info", 10)
-    return lambda: publisher.publish(info), lambda: [one.publish(message) for one, message in images]
-
-
-def test_the_node_publishes_detections(ros: Any) -> None:
-    import rclpy
     from vision_msgs.msg import Detection2DArray
 
+    node_module = importlib.import_module("detection_node")
+    monkeypatch.setattr(node_module, "Client", lambda *arguments: LocalClient())
     rclpy.init()
-    node, camera, received = ros.node.DetectionNode(), rclpy.create_node("camera"), []
+    node, camera, received = node_module.DetectionNode(), rclpy.create_node("camera"), []
     camera.create_subscription(Detection2DArray, "/thor2/detections", received.append, 1)
-    publish_camera, publish_images = camera_publishers(camera)
+    height, width = FRAME.depth.shape
+    info = CameraInfo(height=height, width=width, k=CAMERA.k, distortion_model="plumb_bob")
+    sent = [(camera.create_publisher(CameraInfo, "/camera/color/camera_info", 10), info)]
+    for topic, pixels, encoding in (
+        ("/camera/color/image_raw", FRAME.color, "rgb8"),
+        ("/camera/aligned_depth_to_color/image_raw", FRAME.depth, "16UC1"),
+    ):
+        message = Image(height=height, width=width, encoding=encoding, step=pixels[0].nbytes)
+        message.header.stamp.sec, message.data = START // 10**9, np.frombuffer(pixels.tobytes(), np.uint8)
+        sent.append((camera.create_publisher(Image, topic, 10), message))
     start = time.monotonic()
     while not received:
         assert time.monotonic() - start < HANG
-        publish_camera()
-        publish_images()
+        for publisher, message in sent:
+            publisher.publish(message)
         for _ in range(4):
             rclpy.spin_once(node, timeout_sec=0.1)
             rclpy.spin_once(camera, timeout_sec=0.1)
     assert received[0].header.stamp.sec == START // 10**9
     assert [one.results[0].hypothesis.class_id for one in received[0].detections] == ["mug", "mug"]
-    assert ros.client.frames[0].intrinsics.fx == 290
     node.destroy_node()
     rclpy.try_shutdown()
-
-
-@pytest.mark.parametrize("ros", ["stand-ins"], indirect=True)
-def test_main_warns_and_goes_on(ros: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without camera_info, and if the service fails, there is a warning, and the next pair follows."""
-    import rclpy
-
-    publish_camera, publish_images = camera_publishers(rclpy.create_node("camera"))
-    answers = iter([ServiceError(503, None, "starting", 1.0), None])
-    recognize = ros.client.recognize_frame
-
-    def fail_first(**files: Any) -> Any:
-        error = next(answers)
-        if error is not None:
-            raise error
-        return recognize(**files)
-
-    monkeypatch.setattr(ros.client, "recognize_frame", fail_first)
-    publish_images()
-    publish_camera()
-    publish_images()
-    ros.node.main()
-    assert "camera_info" in ros.bus.warnings[0] and "503" in ros.bus.warnings[-1]
-    assert ros.client.frames and not ros.bus.callbacks

@@ -14,8 +14,6 @@ from flax import nnx
 from helpers import Command, frame_options, run_thor2, small_frame, untrained_run, write_box, write_frame_files
 from processes import HANG
 
-import colornet
-import thor2_jax as thor2
 from thor2_jax.model.run_directory import TrainedRun, load_run, save_run
 from training.baselines.files import baseline_file, read_baseline
 from training.fitting.options import read_metrics
@@ -39,8 +37,6 @@ def killing(function):
     return called
 
 os.replace, os.rename = killing(os.replace), killing(os.rename)
-import colornet
-colornet.build = colornet.load_default
 from training.cli import main
 main()
 """
@@ -91,29 +87,10 @@ def frames(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Run directory with random weights."""
-    config = thor2.DescriptorConfig(homology="closed_form", n_slices=3, n_strips=8, image_size=8)
     out = tmp_path_factory.mktemp("model") / "run"
-    save_run(untrained_run(("brick", "stick"), ("tops", "tops2"), config), out)
+    save_run(untrained_run(("brick", "stick"), ("tops", "tops2")), out)
     return out
 
-
-# Colour network
-
-
-def test_colornet(environment: Any, refused: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The command does not resume: a partial output is refused."""
-    monkeypatch.setattr(colornet, "build", colornet.load_default)
-    command, whole = ("colornet", "--out"), tmp_path / "whole"
-    assert run_thor2(*command, whole) == 0
-    assert files(whole).keys() == {"network.npz", "network.png", "similarity.png"}
-    for place, left in (("before network.npz", []), ("after network.png", ["network.npz", "network.png"])):
-        out = tmp_path / place
-        kill(place, (*command, out), environment)
-        assert files(out) == {name: files(whole)[name] for name in left}
-        assert f"out: {out} already contains" in refused(*command, out)
-
-
-# Views and training
 
 STEPS = ("--azimuth-step", 90, "--polar-step", 90, "--workers", 1)
 
@@ -173,9 +150,6 @@ def test_train(meshes: Path, frames: Path, environment: Any, refused: Command, t
     assert different <= {"metrics.jsonl", "baselines/forest.safetensors"}
     first, second = (read_baseline(baseline_file(folder, "forest"), run.classes) for folder in (out, whole))
     assert all(np.array_equal(second.arrays[name], array) for name, array in first.arrays.items())
-
-
-# Frames
 
 
 def without_times(contents: dict[str, bytes]) -> dict[str, Any]:

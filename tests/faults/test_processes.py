@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers import brick_and_stick, files_of
+from helpers import Interrupted, brick_and_stick, files_of
 
 import thor2_jax as thor2
 from thor2_jax.model.run_directory import TrainedRun, load_run
@@ -13,17 +13,13 @@ from training.fitting.options import FitOptions
 from training.views.normalized_views import MemoryViews
 
 CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=3, n_strips=8, image_size=8)
-OPTIONS = FitOptions(epochs=2, batch_size=4)
 
 pytestmark = pytest.mark.usefixtures("small_classifiers")
 
 
-def source() -> MemoryViews:
-    return MemoryViews(brick_and_stick(3), CONFIG)
-
-
 def train(out: Path, **more: Any) -> TrainedRun:
-    (run,) = train_run(source(), out, RunSettings(("tops",), OPTIONS, CONFIG), **more)
+    views = MemoryViews(brick_and_stick(3), CONFIG)
+    (run,) = train_run(views, out, RunSettings(("tops",), FitOptions(epochs=2, batch_size=4), CONFIG), **more)
     return run
 
 
@@ -60,17 +56,14 @@ def test_a_training_that_another_one_overtakes(tmp_path: Path) -> None:
 
     other, begun = tmp_path / "other", []
 
-    class Stopped(BaseException):
-        pass
-
-    def stopped(stage: str, count: int, total: int, note: str) -> None:
+    def stop(stage: str, count: int, total: int, note: str) -> None:
         if stage == "fit tops":
-            raise Stopped
+            raise Interrupted
 
     def dies(stage: str, count: int, total: int, note: str) -> None:
         if stage == "describe" and not begun:
             begun.append(1)
-            with pytest.raises(Stopped):
-                train(other, progress=stopped)
+            with pytest.raises(Interrupted):
+                train(other, progress=stop)
 
     assert train(other, progress=dies).record == done[0].record  # resumes the other training

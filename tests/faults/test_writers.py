@@ -22,19 +22,15 @@ from training.evaluation.answers import AnswerFile, FrameAnswers
 from training.fitting.options import EpochMetrics, append_metrics, discard_later_epochs, read_metrics
 from training.views.dataset import MANIFEST, Manifest
 
-CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=2, n_strips=5, image_size=8)
 NETWORK = colornet.load_default()
 PHOTO = np.zeros((40, 50, 3), np.uint8)
-LABELS = np.ones((40, 50), np.uint8)
 
 
 WRITERS: dict[str, Callable[[Path], Any]] = {
     "network.npz": NETWORK.save,
     "similarity.png": lambda path: draw_similarity(NETWORK, path),
     "text.json": lambda path: write_text(path, "new" * 1000),
-    "overlay.png": lambda path: draw_overlay(
-        PHOTO, LABELS, [thor2.Recognition(label=1, name="mug", confidence=1.0)], path
-    ),
+    "overlay.png": lambda path: draw_overlay(PHOTO, PHOTO[..., 0] + 1, [thor2.Recognition(1, "mug", 1.0)], path),
     MANIFEST: lambda path: Manifest({"shards": 0, "objects": []}).write(path.parent),
 }
 
@@ -75,44 +71,38 @@ def test_a_run_directory_is_written_atomically(number: int, tmp_path: Path, disk
     assert load_run(tmp_path / "run").classes == ("a", "b")
 
 
-def answers(k: int) -> FrameAnswers:
-    return FrameAnswers(f"frame{k}", {"light": "1"}, 0.5, [])
-
-
 def test_answers_resume_after_a_full_disk(tmp_path: Path, disk: Any) -> None:
     path, job = tmp_path / "report" / "answers.jsonl", {"runs": ["digest"]}
-    AnswerFile(path, job).append(answers(0))
+    answers = [FrameAnswers(f"frame{k}", {"light": "1"}, 0.5, []) for k in range(3)]
+    AnswerFile(path, job).append(answers[0])
     kept = 1
     for step in range(1, 4):
         file = AnswerFile(path, job)
-        assert [answer.frame for answer in file.frames] == [f"frame{k}" for k in range(kept)]
+        assert [answer.frame for answer in file.frames] == [answer.frame for answer in answers[:kept]]
         disk.reset(step, errno.ENOSPC)
         try:
-            file.append(answers(kept))
+            file.append(answers[kept])
         except OSError as error:
             assert error.filename == str(path)
         else:
             kept += 1
         disk.reset(0, 0)
     assert kept == 2
-    AnswerFile(path, job).append(answers(kept))
+    AnswerFile(path, job).append(answers[kept])
     assert len(AnswerFile(path, job).frames) == 3
 
 
 def test_metrics_resume_after_a_full_disk(tmp_path: Path, disk: Any) -> None:
     path = tmp_path / "metrics.jsonl"
-    append_metrics(path, 0, "ce", _metrics(1))
+    values: dict[str, Any] = {field.name: 0.5 for field in dataclasses.fields(EpochMetrics)}
+    first, second = (EpochMetrics(**(values | {"epoch": epoch})) for epoch in (1, 2))
+    append_metrics(path, 0, "ce", first)
     for step in (1, 2):
         disk.reset(step, errno.ENOSPC)
         with pytest.raises(OSError, match="metrics.jsonl"):
-            append_metrics(path, 0, "ce", _metrics(2))
+            append_metrics(path, 0, "ce", second)
         disk.reset(0, 0)
         assert [row["epoch"] for row in read_metrics(path)] == [1]
         discard_later_epochs(path, 0, "ce", 1)  # as a resumed training does
-    append_metrics(path, 0, "ce", _metrics(2))
+    append_metrics(path, 0, "ce", second)
     assert [row["epoch"] for row in read_metrics(path)] == [1, 2]
-
-
-def _metrics(epoch: int) -> EpochMetrics:
-    values: dict[str, Any] = {field.name: 0.5 for field in dataclasses.fields(EpochMetrics)}
-    return EpochMetrics(**(values | {"epoch": epoch}))

@@ -1,5 +1,6 @@
 """Readers in a process of their own, where a hang and the memory they take are noticed."""
 
+import contextlib
 import multiprocessing
 import re
 import signal
@@ -13,6 +14,17 @@ import pytest
 from processes import HANG, call_pickled
 
 from thor2_jax.errors import InputError
+
+
+@contextlib.contextmanager
+def other_content(path: Path, content: bytes) -> Iterator[None]:
+    """Let a file have another content for a while."""
+    whole = path.read_bytes()
+    path.write_bytes(content)
+    try:
+        yield
+    finally:
+        path.write_bytes(whole)
 
 
 def measured(read: Callable[[], Any], refusals: Any) -> tuple[Any, str | None, int]:

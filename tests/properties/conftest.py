@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import itertools
 from typing import Any
 
 import jax
@@ -56,29 +57,14 @@ def _compiled(function: Any, config: thor2.DescriptorConfig, mode: str) -> Any:
 QUICK = {("gudhi", "jit", 512), ("closed_form", "vmap", 1024)}
 """Each backend and bucket once; other tests call the functions directly."""
 
-
-def ways(*capacities: int) -> list[Any]:
-    """Return all combinations of backend, mode and bucket; those that are not in QUICK are marked slow."""
-    parameters = []
-    for n in capacities:
-        for mode in ("plain", "jit", "vmap"):
-            for homology in ("closed_form", "gudhi"):
-                marks = () if (homology, mode, n) in QUICK else pytest.mark.slow
-                parameters.append(pytest.param((homology, mode, n), marks=marks, id=f"{homology}-{mode}-{n}"))
-    return parameters
+WAYS = [
+    pytest.param(way, marks=() if way in QUICK else pytest.mark.slow, id="-".join(map(str, way)))
+    for way in itertools.product(("closed_form", "gudhi"), ("plain", "jit", "vmap"), (512, 1024))
+]
 
 
-def pipeline_of(way: tuple[Any, str, int]) -> Pipeline:
-    return Pipeline(thor2.DescriptorConfig(homology=way[0]), way[1], way[2])
-
-
-@pytest.fixture(scope="session", params=ways(512, 1024))
+@pytest.fixture(scope="session", params=WAYS)
 def pipeline(request: pytest.FixtureRequest) -> Pipeline:
     """Backend, mode and bucket."""
-    return pipeline_of(request.param)
-
-
-@pytest.fixture(scope="session", params=ways(512))
-def small_pipeline(request: pytest.FixtureRequest) -> Pipeline:
-    """Backend and mode, in the smallest bucket."""
-    return pipeline_of(request.param)
+    homology, mode, capacity = request.param
+    return Pipeline(thor2.DescriptorConfig(homology=homology), mode, capacity)

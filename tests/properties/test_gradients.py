@@ -134,20 +134,6 @@ def test_describe_against_finite_differences(name: str, monkeypatch: pytest.Monk
         assert (value != 0) == (config.relaxation is not None)
 
 
-@pytest.mark.slow
-@pytest.mark.usefixtures("x64")
-def test_points_and_scale_agree_on_scaling() -> None:
-    """Scaling all points about the camera keeps the frame and has the same effect as scaling sigma_s."""
-    clouds, parameters = clouds_of(in_metres), parameters_of(CLOSED)
-    loss = loss_of(thor2.describe, clouds, CLOSED)
-    points, gradients = jax.jit(jax.grad(loss, argnums=(0, 2)))(clouds.points, clouds.colors, parameters)
-    by_scale = float(gradients.sigma_s * parameters.sigma_s)
-    assert float((points * clouds.points).sum()) == pytest.approx(by_scale, rel=1e-9)
-    value = jax.jit(lambda s: loss(clouds.points, clouds.colors, dataclasses.replace(parameters, sigma_s=s)))
-    ends = [float(value(parameters.sigma_s * (1 + step))) for step in (1e-6, -1e-6)]
-    assert by_scale == pytest.approx((ends[0] - ends[1]) / 2e-6, rel=1e-5)
-
-
 RELAXED = pytest.param(("relaxed", "relaxed-gudhi"), marks=pytest.mark.slow, id="relaxed")
 
 

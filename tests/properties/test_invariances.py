@@ -22,32 +22,25 @@ def draw(data: st.DataObject, clouds: Any, capacity: int) -> thor2.PointClouds:
 
 
 @given(data=st.data(), seed=laws.seeds())
-def test_order_of_points(pipeline: Any, data: st.DataObject, seed: int) -> None:
-    aligned = draw(data, laws.aligned_clouds(CONFIG), pipeline.capacity)
-    laws.assert_permutation_invariant(pipeline.describe_aligned, aligned, seed, CONFIG)
-    clouds = draw(data, laws.decided_clouds(CONFIG), pipeline.capacity)
-    drift = laws.alignment_drift(clouds, CONFIG)
-    laws.assert_permutation_invariant(pipeline.describe, clouds, seed, CONFIG, drift)
-
-
-@given(data=st.data())
-def test_padding(small_pipeline: Any, data: st.DataObject) -> None:
-    aligned = draw(data, laws.aligned_clouds(CONFIG), 512)
-    laws.assert_padding_invariant(small_pipeline.describe_aligned, aligned, 1024, CONFIG)
-    clouds = draw(data, laws.decided_clouds(CONFIG), 512)
-    drift = laws.alignment_drift(clouds, CONFIG)
-    laws.assert_padding_invariant(small_pipeline.describe, clouds, 1024, CONFIG, drift)
-
-
-@given(data=st.data())
-def test_company(pipeline: Any, data: st.DataObject) -> None:
-    for strategy, describe in (
-        (laws.camera_clouds(), pipeline.describe),
-        (laws.aligned_clouds(CONFIG, reach=1.5), pipeline.describe_aligned),
+def test_order_padding_and_duplicates(pipeline: Any, data: st.DataObject, seed: int) -> None:
+    aligned = draw(data, laws.aligned_clouds(CONFIG, max_points=256), pipeline.capacity)
+    clouds = draw(data, laws.decided_clouds(CONFIG, max_points=256), pipeline.capacity)
+    for describe, batch, drift in (
+        (pipeline.describe_aligned, aligned, None),
+        (pipeline.describe, clouds, laws.alignment_drift(clouds, CONFIG)),
     ):
-        laws.assert_company_invariant(
-            describe, draw(data, strategy, pipeline.capacity), draw(data, strategy, pipeline.capacity)
-        )
+        laws.assert_permutation_invariant(describe, batch, seed, CONFIG, drift)
+        laws.assert_padding_invariant(describe, batch, 2 * pipeline.capacity, CONFIG, drift or 0.0)
+        laws.assert_duplicates_count_twice(describe, batch, CONFIG, drift)
+
+
+@given(data=st.data(), seed=laws.seeds())
+def test_company_and_colours_of_the_same_regions(pipeline: Any, data: st.DataObject, seed: int) -> None:
+    clouds, others = (draw(data, laws.camera_clouds(), pipeline.capacity) for _ in range(2))
+    laws.assert_company_invariant(pipeline.describe, clouds, others)
+    laws.assert_same_regions_alike(pipeline.describe, clouds, NETWORK, seed)
+    aligned = (draw(data, laws.aligned_clouds(CONFIG, reach=1.5), pipeline.capacity) for _ in range(2))
+    laws.assert_company_invariant(pipeline.describe_aligned, *aligned)
 
 
 @given(data=st.data(), steps=st.tuples(*[st.integers(-2048, 2048)] * 3))
@@ -73,21 +66,6 @@ def test_metric_scale(pipeline: Any, data: st.DataObject, exponent: int, sigma_s
 
     clouds = draw(data, laws.camera_clouds(), pipeline.capacity)
     laws.assert_scale_invariant(describe_at, clouds, sigma_s, exponent)
-
-
-@given(data=st.data())
-def test_duplicates(pipeline: Any, data: st.DataObject) -> None:
-    aligned = draw(data, laws.aligned_clouds(CONFIG, max_points=256), pipeline.capacity)
-    laws.assert_duplicates_count_twice(pipeline.describe_aligned, aligned, CONFIG)
-    clouds = draw(data, laws.decided_clouds(CONFIG, max_points=256), pipeline.capacity)
-    drift = laws.alignment_drift(clouds, CONFIG)
-    laws.assert_duplicates_count_twice(pipeline.describe, clouds, CONFIG, drift)
-
-
-@given(data=st.data(), seed=laws.seeds())
-def test_colours_of_the_same_regions(pipeline: Any, data: st.DataObject, seed: int) -> None:
-    clouds = draw(data, laws.camera_clouds(), pipeline.capacity)
-    laws.assert_same_regions_alike(pipeline.describe, clouds, NETWORK, seed)
 
 
 @given(data=st.data(), m=st.integers(0, 7))

@@ -33,56 +33,42 @@ def test_gudhi_is_the_closed_form(clouds: thor2.PointClouds, aligned: thor2.Poin
             laws.assert_backends_agree(first, second, batch)
 
 
-@given(data=st.data())
-def test_image_mass(pipeline: Any, data: st.DataObject) -> None:
-    aligned = data.draw(laws.packed(laws.aligned_clouds(CONFIG, reach=1.5), SIZE, pipeline.capacity))
+@given(data=st.data(), reach=st.sampled_from([1.0, 1.6]))
+def test_equations(pipeline: Any, data: st.DataObject, reach: float) -> None:
+    """Both conventions follow the equations, and overflow is the same count."""
+    aligned = data.draw(laws.packed(laws.aligned_clouds(CONFIG, reach=reach), SIZE, pipeline.capacity))
+    for config in (pipeline.config, dataclasses.replace(pipeline.config, convention="released")):
+        ways = dataclasses.replace(pipeline, config=config)
+        laws.assert_follows_equations(ways.describe_aligned, aligned, NETWORK, config)
     images = pipeline.describe_aligned(aligned).images
     laws.assert_image_mass(images, thor2.diagrams(aligned, pipeline.config), CONFIG)
 
 
-@given(aligned=aligned_batches(reach=1.5), network=laws.networks())
-def test_colour_mass(aligned: thor2.PointClouds, network: colornet.ColorNetwork) -> None:
-    for of_colors in (NETWORK, network):
-        laws.assert_color_mass(thor2.strips(aligned, of_colors, CONFIG), aligned)
-
-
 @given(data=st.data(), seed=laws.seeds(), factors=st.tuples(*[st.integers(-8, 8).map(lambda k: k / 4)] * 2))
-def test_embedding_is_linear_in_similarity(
-    pipeline: Any, data: st.DataObject, seed: int, factors: tuple[float, float]
-) -> None:
+def test_embedding_is_linear(pipeline: Any, data: st.DataObject, seed: int, factors: tuple[float, float]) -> None:
     parameters = thor2.Parameters.of(NETWORK, CONFIG)
 
     def describe_with(clouds: thor2.PointClouds, similarity: np.ndarray) -> thor2.Descriptors:
         return pipeline.describe_aligned(clouds, dataclasses.replace(parameters, similarity=jnp.asarray(similarity)))
 
-    rng = np.random.default_rng(seed)
-    pair = tuple(rng.normal(size=(22, 22)).astype(np.float32) for _ in range(2))
-    aligned = data.draw(laws.packed(laws.aligned_clouds(CONFIG), SIZE, pipeline.capacity))
-    laws.assert_embedding_linear(describe_with, aligned, pair, factors)
-
-
-@given(data=st.data())
-def test_embedding_is_linear_in_counts(pipeline: Any, data: st.DataObject) -> None:
     strategy = laws.packed(laws.aligned_clouds(CONFIG, max_points=256), SIZE, pipeline.capacity)
-    laws.assert_embedding_additive(pipeline.describe_aligned, data.draw(strategy), data.draw(strategy))
+    first, second = data.draw(strategy), data.draw(strategy)
+    laws.assert_embedding_additive(pipeline.describe_aligned, first, second)
+    pair = tuple(np.random.default_rng(seed).normal(size=(2, 22, 22)).astype(np.float32))
+    laws.assert_embedding_linear(describe_with, first, pair, factors)
 
 
-@given(aligned=aligned_batches(), network=laws.networks(), seed=laws.seeds())
-def test_other_networks(aligned: thor2.PointClouds, network: colornet.ColorNetwork, seed: int) -> None:
+@given(aligned=aligned_batches(), network=laws.networks(), seed=laws.seeds(), axis=st.sampled_from("xyz"))
+def test_strips_and_other_networks(
+    aligned: thor2.PointClouds, network: colornet.ColorNetwork, seed: int, axis: str
+) -> None:
     def describe(clouds: thor2.PointClouds) -> thor2.Descriptors:
         return thor2.describe_aligned(clouds, network, CONFIG)
 
     laws.assert_same_regions_alike(describe, aligned, network, seed)
     laws.assert_follows_equations(describe, aligned, network, CONFIG)
-
-
-@pytest.mark.parametrize("convention", ["paper", "released"])
-@given(data=st.data(), reach=st.sampled_from([1.0, 1.6]))
-def test_equations(convention: Any, pipeline: Any, data: st.DataObject, reach: float) -> None:
-    """Both conventions follow the equations, and overflow is the same count."""
-    ways = dataclasses.replace(pipeline, config=dataclasses.replace(pipeline.config, convention=convention))
-    aligned = data.draw(laws.packed(laws.aligned_clouds(CONFIG, reach=reach), SIZE, pipeline.capacity))
-    laws.assert_follows_equations(ways.describe_aligned, aligned, NETWORK, ways.config)
+    laws.assert_color_mass(thor2.strips(aligned, network, CONFIG), aligned)
+    laws.assert_mirrored_strips(lambda clouds: thor2.strips(clouds, NETWORK, CONFIG), aligned, CONFIG, axis)
 
 
 @given(aligned=aligned_batches(), exponent=st.integers(1, 37), seed=laws.seeds())
@@ -91,11 +77,11 @@ def test_overflow_is_never_silent(aligned: thor2.PointClouds, exponent: int, see
     rng = np.random.default_rng(seed)
     points = np.asarray(aligned.points, np.float64)
     stray = rng.random(points.shape[:2]) < 0.05
-    points[stray] = (
-        rng.choice([-1, 1], (int(stray.sum()), 3)) * rng.uniform(1, 9.9, (int(stray.sum()), 3)) * 10.0**exponent
-    )
+    signs, sizes = rng.choice([-1, 1], (stray.sum(), 3)), rng.uniform(1, 9.9, (stray.sum(), 3))
+    points[stray] = signs * sizes * 10.0**exponent
     clouds = dataclasses.replace(aligned, points=jnp.asarray(points * np.asarray(aligned.mask)[..., None], jnp.float32))
     laws.assert_overflow_told(lambda clouds: thor2.describe_aligned(clouds, NETWORK, CONFIG), clouds, NETWORK, CONFIG)
+    laws.assert_color_mass(thor2.strips(clouds, NETWORK, CONFIG), clouds)
 
 
 @pytest.mark.parametrize("far", [1e7, 1e8, 1e37])
@@ -109,11 +95,6 @@ def test_points_too_far_to_be_sliced_are_counted_in_overflow(far: float) -> None
         assert int(descriptors.overflow[0]) == 3 and np.isfinite(np.asarray(descriptors.tops2)).all()
         moved = thor2.describe(thor2.PointClouds.pack([(whole, np.zeros((40, 3)))], 512), NETWORK, config)
         assert int(moved.overflow[0]) == 40 and not np.asarray(moved.tops2).any()
-
-
-@given(aligned=aligned_batches(), axis=st.sampled_from("xyz"))
-def test_mirrored_strips(aligned: thor2.PointClouds, axis: str) -> None:
-    laws.assert_mirrored_strips(lambda clouds: thor2.strips(clouds, NETWORK, CONFIG), aligned, CONFIG, axis)
 
 
 def test_an_occluded_end_flips_the_cloud() -> None:

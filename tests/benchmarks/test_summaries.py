@@ -1,0 +1,66 @@
+"""Summaries of the benchmarks of explanations, adaptation, tracks and segmentation: values written by hand."""
+
+import numpy as np
+import pytest
+
+import thor2_jax as thor2
+from benchmarks import adaptation, explanation, segmentation
+from benchmarks.tracking import METHODS, VIEWS, summarize_scenes
+from thor2_jax.explanation.attributions import Faithfulness
+from training.readers.labelled import LabelledFrame
+
+
+def test_faithful_instances_are_counted() -> None:
+    checks = [Faithfulness(5.0, 2.0, 0.5), Faithfulness(5.0, 0.1, 0.5), Faithfulness(1.0, -0.1, -0.4)]
+    assert explanation.summary(checks) == {
+        "instances": 3,
+        "faithful": 2 / 3,
+        "loss_without_most_attributed_tenth": 0.1,
+        "loss_without_random_tenth": 0.5,
+    }
+
+
+def test_affected_cameras_are_those_that_lost_enough() -> None:
+    rows = {"original": (0.9, 0.9), "dim": (0.86, 0.8), "pale": (0.8, 0.9), "worn": (0.7, 0.74)}
+    results = adaptation.summary({name: {"before": before, "after": after} for name, (before, after) in rows.items()})
+    assert results["number of affected cameras"] == 2
+    assert results["affected cameras"] == pytest.approx(0.07)
+    assert results["all cameras"] == pytest.approx((-0.06 + 0.1 + 0.04) / 3)
+    assert results["worst"] == pytest.approx(-0.06) and results["original"] == 0
+
+
+def test_an_object_keeps_the_answer_of_its_last_view() -> None:
+    correct = {method: [False, True] for method in METHODS}
+    rows = [
+        {"occlusion": "high", "correct": correct},
+        {"occlusion": "none", "correct": {method: [True] * VIEWS for method in METHODS}},
+    ]
+    results = summarize_scenes(rows)
+    assert results["all"]["fused"] == {"accuracy": [0.5, *[1.0] * (VIEWS - 1)], "views needed": 2}
+    assert results["high"]["objects"] == 1 and results["high"]["merged"]["accuracy"][0] == 0
+
+
+def test_pieces_are_compared_with_instances() -> None:
+    """Three instances of 20 pixels: exact, in two pieces, and in one piece with a fourth one; the last is thin."""
+    truth, pieces = np.zeros((10, 12), np.uint8), np.zeros((10, 12), np.int32)
+    truth[0:2, 0:10], truth[3:5, 0:10], truth[6:8, 0:10], truth[8:10, 0:10] = 1, 2, 3, 7
+    pieces[0:2, 0:10], pieces[3:5, 0:5], pieces[3:5, 5:10], pieces[6:10, 0:10], pieces[0:10, 11] = 1, 2, 3, 4, 5
+    images = np.zeros((10, 12, 3), np.uint8), np.full((10, 12), 800, np.uint16), truth
+    frame = thor2.RGBDFrame(*images, thor2.Intrinsics(50.0, 50.0, 5.0, 5.0))
+    item = LabelledFrame("a", frame, {1: "can", 2: "pen_red", 3: "mug"}, {})
+
+    rows, on_background = segmentation.compare(pieces, item)
+    columns = {name: [row[name] for row in rows] for name in ("iou", "piece", "over", "under")}
+    assert columns == {
+        "iou": [1.0, 0.5, 0.5],
+        "piece": [1, 2, 4],
+        "over": [False, True, False],
+        "under": [False, False, True],
+    }
+    assert on_background == 1
+    rows, on_background = segmentation.compare(np.zeros_like(pieces), item)
+    assert [row["iou"] for row in rows] == [0.0, 0.0, 0.0] and on_background == 0
+
+    report = segmentation.measure([item], lambda frame: pieces, None)
+    assert (report["instances"], report["thick"], report["thick found"]) == (3, 2, 0.5)
+    assert [report[name] for name in ("found", "over-segmented", "under-segmented")] == pytest.approx([1 / 3] * 3)

@@ -1,0 +1,163 @@
+"""Damaged files that are read alone: images, intrinsics, tables, point clouds, answers, metrics and baselines."""
+
+import io
+import json
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from dataset_files import ocid_scene, pack_pcd, points_of
+from helpers import encode_image
+from hypothesis import given
+from hypothesis import strategies as st
+
+from thor2_jax.frames.frames import Intrinsics, read_color, read_depth, read_intrinsics, read_labels
+from thor2_jax.tables import read_table
+from thor2_jax.testing import damaged
+from training.baselines.files import StoredBaseline, read_baseline, write_baseline
+from training.evaluation.answers import AnswerFile, FrameAnswers, InstancePrediction
+from training.fitting.options import read_metrics
+from training.objects.meshes import read_names
+from training.readers.ocid import read_organized_points
+
+RNG = np.random.default_rng(0)
+SHAPE = (24, 17)
+COLOR = RNG.integers(0, 256, (*SHAPE, 3), dtype=np.uint8)
+DEPTH = RNG.integers(0, 2**16, SHAPE).astype(np.uint16)
+METRES = RNG.random(SHAPE, dtype=np.float32)
+
+CAMERA_INFO = b"""\
+image_width: 640
+image_height: 480
+camera_matrix: {rows: 3, cols: 3, data: [600.5, 0, 320, 0, 601.0, 240.25, 0, 0, 1]}
+distortion_model: plumb_bob
+distortion_coefficients: {rows: 1, cols: 5, data: [0.1, -0.2, 0.001, 0, 0]}
+"""
+CAMERA = json.dumps({"fx": 600.5, "fy": 601.0, "cx": 320, "cy": 240.25, "depth_scale": 1000.0}).encode()
+MATRIX = np.array([[600.5, 0, 320], [0, 601, 240.25], [0, 0, 1]])
+
+EVALUATION = {"runs": ["a"], "classes": ["mug", "bowl"]}
+BASELINE = StoredBaseline({"a": np.arange(6.0).reshape(2, 3), "b": np.array([1], np.int32)}, 1.5, 2.0)
+ROWS = [{"fold": 0, "classifier": "ce", "epoch": k, "loss": 0.5, "accuracy": 0.75} for k in range(3)]
+
+
+def npy_file(array: np.ndarray) -> bytes:
+    stream = io.BytesIO()
+    np.save(stream, array)
+    return stream.getvalue()
+
+
+def written(write: Callable[[Path], Any]) -> bytes:
+    """Return the content of the file that a function writes."""
+    with tempfile.TemporaryDirectory() as folder:
+        write(Path(folder) / "file")
+        return (Path(folder) / "file").read_bytes()
+
+
+def write_answers(path: Path) -> None:
+    file = AnswerFile(path, EVALUATION)
+    prediction = InstancePrediction(1, "mug", probabilities=np.array([[0.25, 0.75]], np.float32))
+    for number in range(2):
+        instances = [prediction, InstancePrediction(2, "can", reason="few")]
+        file.append(FrameAnswers(f"frame {number}", {"light": "1"}, 0.5, instances))
+
+
+def is_image(image: np.ndarray) -> bool:
+    return image.ndim in (2, 3) and image.dtype.kind in "uf" and image.size > 0
+
+
+def is_camera(k: Intrinsics) -> bool:
+    return k.fx > 0 and bool(np.isfinite([k.fx, k.fy, k.cx, k.cy, k.depth_scale]).all())
+
+
+def are_names(names: dict[Any, Any]) -> bool:
+    return all(type(a) is type(b) is str for a, b in names.items())
+
+
+def are_points(points: np.ndarray) -> bool:
+    return points.ndim == 3 and points.shape[2] == 3
+
+
+def are_answers(file: AnswerFile) -> bool:
+    tables = [instance.probabilities for frame in file.frames for instance in frame.instances]
+    return all(table is None or (table.dtype, table.ndim) == (np.float32, 2) for table in tables)
+
+
+def are_metrics(rows: list[dict[str, Any]]) -> bool:
+    return all({"fold", "classifier", "epoch"} <= row.keys() for row in rows)
+
+
+def is_the_baseline(read: StoredBaseline) -> bool:
+    same = (read.temperature, read.seconds, read.arrays.keys()) == (1.5, 2.0, BASELINE.arrays.keys())
+    return same and all(np.array_equal(read.arrays[name], array) for name, array in BASELINE.arrays.items())
+
+
+READERS: dict[str, tuple[bytes, Callable[[Path], Any], Callable[[Any], bool]]] = {
+    "color.png": (encode_image(COLOR), read_color, is_image),
+    "alpha.png": (encode_image(np.dstack([COLOR, COLOR[..., 0]])), read_color, is_image),
+    "color.jpg": (encode_image(COLOR, "JPEG"), read_color, is_image),
+    "depth.png": (encode_image(DEPTH), read_depth, is_image),
+    "depth.tiff": (encode_image(DEPTH, "TIFF"), read_depth, is_image),
+    "metres.tiff": (encode_image(METRES, "TIFF"), read_depth, is_image),
+    "depth.npy": (npy_file(METRES), read_depth, is_image),
+    "labels.png": (encode_image(RNG.integers(0, 9, SHAPE, dtype=np.uint8)), read_labels, is_image),
+    "camera.json": (CAMERA, read_intrinsics, is_camera),
+    "camera.yaml": (CAMERA_INFO, read_intrinsics, is_camera),
+    "camera.txt": (b"600.5 0 320\n0 601 240.25\n0 0 1\n", read_intrinsics, is_camera),
+    "camera.npy": (npy_file(MATRIX), read_intrinsics, is_camera),
+    "names.json": (b'{"mug": "025_mug", "bowl": "024_bowl"}', read_names, are_names),
+    "names.yaml": (b"mug: 025_mug\nbowl: 024_bowl\n", read_names, are_names),
+    "answers.jsonl": (written(write_answers), lambda path: AnswerFile(path, EVALUATION), are_answers),
+    "metrics.jsonl": ("".join(json.dumps(row) + "\n" for row in ROWS).encode(), read_metrics, are_metrics),
+    "baseline.safetensors": (
+        written(lambda path: write_baseline(path, BASELINE, ["mug"])),
+        lambda path: read_baseline(path, ["mug"]),
+        is_the_baseline,
+    ),
+}
+color, depth, labels = ocid_scene()
+for kind in ("ascii", "binary"):
+    cloud = pack_pcd(points_of(depth), color, labels, kind)
+    READERS[f"{kind}.pcd"] = cloud, read_organized_points, are_points
+
+
+@pytest.mark.parametrize("name", READERS)
+@given(data=st.data())
+def test_damaged_files(name: str, data: st.DataObject, attempt: Any, tmp_path: Path) -> None:
+    content, read, is_valid = READERS[name]
+    path = tmp_path / name
+    path.write_bytes(data.draw(damaged(content)))
+    result = attempt(lambda: read(path))
+    assert result is None or is_valid(result)
+
+
+YAML_BOMB = "\n".join(
+    ["a0: &a0 [x, x, x, x, x, x, x, x]"] + [f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 8)}]" for k in range(1, 12)]
+).encode()
+"""A few hundred bytes of YAML that expand to 8^12 words."""
+
+ODD = [
+    ("camera.json", read_table, b"[" * 10**6),
+    ("camera.json", read_table, b"1" * 10**5),
+    ("camera.json", read_table, b'{"fx": ' * 10**5),
+    ("camera.json", read_intrinsics, CAMERA.replace(b"600.5", b"9" * 400)),
+    ("camera.json", read_intrinsics, CAMERA.replace(b"1000.0", b"1" + b"9" * 30)),
+    ("names.yaml", read_table, YAML_BOMB),
+    ("names.yaml", read_table, b"a: " + b"[" * 5000),
+    ("names.yaml", read_table, b"!!int ''"),
+    ("names.yaml", read_table, b"a: &b [*b]"),
+    ("names.yaml", read_table, b"a: !!float ''"),
+    ("names.yaml", read_table, b"!!timestamp 2020-99-99"),
+    ("names.yaml", read_table, b"? [a]\n: b"),
+]
+"""Content that is too deep, too large, recursive or of a type without the value."""
+
+
+@pytest.mark.parametrize(("name", "read", "content"), ODD)
+def test_odd_content_is_refused(name: str, read: Any, content: bytes, attempt: Any, tmp_path: Path) -> None:
+    path = tmp_path / name
+    path.write_bytes(content)
+    assert attempt(lambda: read(path)) is None
