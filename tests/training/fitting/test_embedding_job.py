@@ -155,3 +155,9 @@ def test_folds_of_embeddings(tmp_path: Path) -> None:
     assert [run.record["fold"] for run in runs] == [0, 1]
     assert all(list(run.record["held_out_accuracy"]) == ["embedding"] for run in runs)
     assert [(row["fold"], row["classifier"]) for row in rows(tmp_path / "run")] == [(0, "embedding"), (1, "embedding")]
+
+
+@pytest.mark.parametrize("change", [{"procedural": 9}, {"views": 0}, {"epochs": 0}, {"networks": 0}], ids=str)
+def test_distractors_out_of_range_are_refused(change: dict[str, int]) -> None:
+    with pytest.raises(InputError, match="distractors"):
+        dataclasses.replace(DISTRACTORS, **change)
