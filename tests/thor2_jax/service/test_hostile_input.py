@@ -1,5 +1,6 @@
 """Invalid requests receive a 4xx status whose JSON names the field, and the next valid request is answered."""
 
+import contextlib
 import dataclasses
 import io
 import json
@@ -70,6 +71,11 @@ def test_images_of_other_kinds_and_sizes(http: httpx.Client, files: Files, frame
     check_refused(post(http, files, labels=encode_image(many)), 422, "labels", "65535 instances")
 
 
+def test_errors_of_all_fields_are_returned(http: httpx.Client, files: Files) -> None:
+    problem = post(http, files, **dict.fromkeys(("color", "labels", "intrinsics"), b"damaged")).json()
+    assert [problem["field"], *(other["field"] for other in problem["further"])] == ["color", "labels", "intrinsics"]
+
+
 def test_invalid_intrinsics(http: httpx.Client, files: Files) -> None:
     good = json.loads(files["intrinsics"])
     values = (float("nan"), float("inf"), 0, -1, "600", None, 10**400, 10**3000)
@@ -106,6 +112,15 @@ def test_bodies_over_the_size_limit(http: httpx.Client, files: Files) -> None:
     check_refused(post(http, files, color=bytes(MAX_BODY)), 413, "body")
     endless = (bytes(2**16) for _ in range(MAX_BODY // 2**16 + 1))  # Sent in chunks without a declared length.
     check_refused(http.post("/v1/describe", content=endless, headers=NPZ), 413, "body")
+
+
+def test_a_request_head_that_is_too_large_ends_its_connection(server: Any) -> None:
+    """The command serves with the limits that test_connections.py tests."""
+    url = httpx.URL(server.url)
+    with socket.create_connection((url.host, url.port), timeout=HANG) as connection:
+        with contextlib.suppress(ConnectionError):
+            connection.sendall(b"GET / HTTP/1.1\r\nX: " + b"x" * 2**23)
+            assert connection.recv(1) == b""
 
 
 def test_body_that_never_arrives(teaching_app: FastAPI, teaching_url: str, monkeypatch: pytest.MonkeyPatch) -> None:
