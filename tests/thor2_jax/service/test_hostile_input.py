@@ -120,7 +120,7 @@ def test_a_request_head_that_is_too_large_ends_its_connection(server: Any) -> No
     url = httpx.URL(server.url)
     with socket.create_connection((url.host, url.port), timeout=HANG) as connection:
         with contextlib.suppress(ConnectionError):
-            connection.sendall(b"GET / HTTP/1.1\r\nX: " + b"x" * 2**23)
+            connection.sendall(b"GET /healthz HTTP/1.1\r\nHost: localhost\r\nX: " + b"x" * 2**23 + b"\r\n\r\n")
             assert connection.recv(1) == b""
 
 

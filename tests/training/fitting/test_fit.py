@@ -150,7 +150,7 @@ def metrics(epoch: int) -> EpochMetrics:
 
 
 def test_later_epochs_and_an_incomplete_last_line_are_discarded(tmp_path: Path) -> None:
-    """Those of one classifier of one fold."""
+    """Only the epochs of one classifier and fold are discarded."""
     path = tmp_path / "metrics.jsonl"
     append_metrics(path, 0, "ce", metrics(1))
     with path.open("a") as file:

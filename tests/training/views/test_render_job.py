@@ -194,7 +194,7 @@ def test_augmentations_are_part_of_the_job(tmp_path: Path, monkeypatch: pytest.M
 
 
 def test_views_of_few_points_are_left_out_and_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Here all of a shard; objects may have any name."""
+    """One shard keeps none of its views; objects may have any name."""
     monkeypatch.setattr(render_job, "CLOUDS_PER_SHARD", 2)
     sheet, name = sphere(0.03), "../a b/ü"
     sheet.vertices[:, 2] *= 0.005  # seen edge on from the side
