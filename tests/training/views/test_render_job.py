@@ -166,6 +166,7 @@ def test_another_job_is_refused(copied: Path) -> None:
     painted = dataclasses.replace(screwdriver, textures=tuple(texture ^ 1 for texture in screwdriver.textures))
     for meshes, steps, message in [
         (OBJECTS, (90, 90), "azimuth_step 180.0, not 90.0"),
+        (OBJECTS, (180, 45), "polar_step 90.0, not 45.0"),
         (OBJECTS | {"tennis_ball": moved}, STEPS, r"objects\[\d\].mesh "),
         (OBJECTS | {"screwdriver": painted}, STEPS, r"objects\[\d\].mesh "),
         (OBJECTS | {"apple": moved}, STEPS, r"objects\[2\] null, not \{"),
