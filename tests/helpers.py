@@ -248,6 +248,13 @@ def input_error(*words: object, match: str | None = None) -> Iterator[None]:
     assert [word for word in words if str(word) not in str(caught.value)] == [], caught.value
 
 
+class Pickled:
+    """Ends the process that unpickles it, with an exception that readers do not catch."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return sys.exit, ("an object was unpickled",)
+
+
 class Interrupted(BaseException):
     """Like KeyboardInterrupt, not an Exception."""
 

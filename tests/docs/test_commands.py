@@ -36,6 +36,14 @@ def test_commands_parse() -> None:
     assert parsed >= 60
 
 
+def test_every_documented_command_is_run_by_a_test() -> None:
+    """A test names it as a word of its own, as in `run_thor2("train", ...)`."""
+    names = {words[1] for page in PAGES for words in shell_commands(page) if words[0].rpartition("/")[2] == "thor2"}
+    paths = [path for path in (ROOT / "tests").rglob("*.py") if path.parent.name != "docs"]
+    tests = "".join(path.read_text(encoding="utf-8") for path in paths)
+    assert len(names) >= 12 and {name for name in names if f'"{name}",' not in tests} == set()
+
+
 def test_every_page_is_in_the_navigation() -> None:
     listed = re.findall(r"- ([\w/-]+\.md)$", (ROOT / "mkdocs.yml").read_text(encoding="utf-8"), re.MULTILINE)
     assert {path.relative_to(ROOT / "docs").as_posix() for path in (ROOT / "docs").rglob("*.md")} <= set(listed)

@@ -11,7 +11,7 @@ from doc_pages import ROOT
 from nbclient import NotebookClient
 from processes import HANG
 
-NAMES = ("descriptors", "persistence")
+NAMES = sorted(path.stem for path in (ROOT / "docs" / "tutorials").glob("*.ipynb"))
 
 
 def read(name: str) -> Any:

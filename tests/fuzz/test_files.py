@@ -150,10 +150,11 @@ ODD = [
     ("names.yaml", read_table, b"!!int ''"),
     ("names.yaml", read_table, b"a: &b [*b]"),
     ("names.yaml", read_table, b"a: !!float ''"),
+    ("names.yaml", read_table, b"a: !!python/object/apply:os.getpid []"),
     ("names.yaml", read_table, b"!!timestamp 2020-99-99"),
     ("names.yaml", read_table, b"? [a]\n: b"),
 ]
-"""Content that is too deep, too large, recursive or of a type without the value."""
+"""Content that is too deep, too large, recursive, of a type without the value, or that would run code."""
 
 
 @pytest.mark.parametrize(("name", "read", "content"), ODD)

@@ -86,6 +86,20 @@ def test_the_camera_side_is_relative_to_the_middle_of_the_box(height: float, hea
     assert float(normal.camera[0, 2]) <= float(normal.points[0, : len(points), 2].max()) / 2
 
 
+@pytest.mark.parametrize(("at_start", "at_end"), [(3, 2), (1, 0), (2, 2), (2, 3)])
+def test_the_occluded_end_does_not_come_first(at_start: int, at_end: int) -> None:
+    """A rotation by pi about z exactly if the first two bins of 0.01 hold more boundary points than the last two."""
+    points = object_cloud(5, 1200)
+    plain = normalized(points)
+    bins = np.floor(plain[:, 0] / 0.01)
+    first, last = np.flatnonzero(bins == 1), np.flatnonzero(bins == bins.max() - 1)
+    between = np.flatnonzero((bins > 1) & (bins < bins.max() - 1))
+    boundary = np.isin(np.arange(len(points)), [*first[:at_start], *last[:at_end], *between[:40]])
+    turned = plain * [-1, -1, 1] + plain.max(axis=0) * [1, 1, 0]
+    expected = turned if at_start > at_end else plain
+    np.testing.assert_allclose(normalized(points, boundary=[boundary]), expected, atol=1e-5)
+
+
 @pytest.mark.parametrize("alpha", [np.pi / 4, -0.3])
 def test_turn_is_the_rotation_matrix_about_y_by_minus_alpha(alpha: float) -> None:
     config = dataclasses.replace(CONFIG, alpha=float(alpha))

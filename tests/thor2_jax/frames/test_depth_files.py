@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from helpers import Pickled
 from PIL import Image
 
 from thor2_jax.errors import InputError
@@ -116,7 +117,7 @@ def npy_file(array: np.ndarray) -> bytes:
 def test_damaged_npy_files(tmp_path: Path) -> None:
     whole = npy_file(METRES)
     huge = whole.replace(b"(5, 7), }" + b" " * 12, b"(1048576, 1048576), }")
-    for content in (b"", b"text", whole[:20], whole[:-3], npy_file(np.array([[{}]], object))):
+    for content in (b"", b"text", whole[:20], whole[:-3], npy_file(np.array([[Pickled()]], object))):
         (tmp_path / "d.npy").write_bytes(content)
         with pytest.raises(InputError, match=r"^depth: .*d\.npy "):
             read_depth(tmp_path / "d.npy")

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from helpers import input_error
+from helpers import Pickled, input_error
 
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import (
@@ -195,7 +195,7 @@ def test_invalid_npy_files() -> None:
         as_npy(MATRIX)[:100],
         as_npy(MATRIX)[:40],
         as_npy(MATRIX[:2]),
-        as_npy(np.array([{}] * 9, object)),
+        as_npy(np.array([Pickled()] * 9, object)),
         as_npy(MATRIX + 0j),
         as_npy(np.zeros(9, "V0")).replace(b"(9,), }" + b" " * 13, b"(99999999999999,), }"),
     ):

@@ -64,6 +64,10 @@ def test_what_is_loaded_is_what_was_stored(directory: Path) -> None:
     assert {**first, "file": ""} == {"name": "mug", "file": "", "views": 2, "source": "frames", "date": "2026-01-02"}
 
 
+def test_a_missing_gallery_is_empty_and_not_created(tmp_path: Path) -> None:
+    assert load_gallery(tmp_path / "none", FINGERPRINT).gallery.names == () and list(tmp_path.iterdir()) == []
+
+
 def test_a_file_is_no_gallery(tmp_path: Path) -> None:
     (tmp_path / "gallery").write_text("mine")
     with pytest.raises(GalleryError, match="is no directory"):

@@ -170,7 +170,7 @@ def frame_request(files: dict[str, bytes], *then: Callable[[httpx.Response], Non
 
 @pytest.fixture
 def recognize(app: FastAPI, monkeypatch: pytest.MonkeyPatch) -> AsyncMock:
-    """What recognizes the frames of the application, which is ready."""
+    """Stand-in for the recognition of frames in an application that is ready."""
     mock = AsyncMock(return_value=([], None))
     monkeypatch.setattr(app.state.service, "state", "ready")
     monkeypatch.setattr(app.state.service, "recognize", mock)

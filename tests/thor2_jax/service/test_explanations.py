@@ -77,7 +77,7 @@ EMPTY = np.zeros(0, np.float32)
 
 
 def test_calibrated_confidences(run_dir: Path) -> None:
-    """They have the temperatures of both classifiers, or are those of a run that is calibrated."""
+    """Confidences use the temperatures of both classifiers, or the calibration of the run."""
     rng = np.random.default_rng(0)
     engine = InferenceEngine(Settings(run_dir))
     alpha = np.full(len(engine.run.classes), 0.1)

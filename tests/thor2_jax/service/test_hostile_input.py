@@ -1,5 +1,6 @@
 """Invalid requests receive a 4xx status whose JSON names the field, and the next valid request is answered."""
 
+import contextlib
 import dataclasses
 import io
 import json
@@ -14,7 +15,7 @@ import httpx
 import numpy as np
 import pytest
 from fastapi import FastAPI
-from helpers import deep_png, encode_image, png_file, with_checksums
+from helpers import Pickled, deep_png, encode_image, png_file, with_checksums
 from processes import HANG
 from service_requests import check_refused
 
@@ -66,8 +67,14 @@ def test_images_of_other_kinds_and_sizes(http: httpx.Client, files: Files, frame
     for field, kind in (("depth", np.uint16), ("labels", np.uint8)):
         small = encode_image(np.ones((120, 160), kind))
         check_refused(post(http, files, **{field: small}), 422, field, "(120, 160)", "(240, 320)")
-    many = np.arange(240 * 320).astype(np.uint16).reshape(240, 320)  # 65,535 labels and background.
-    check_refused(post(http, files, labels=encode_image(many)), 422, "labels", "65535 instances")
+    for count in (257, 65_535):
+        many = np.minimum(np.arange(240 * 320), count).astype(np.uint16).reshape(240, 320)
+        check_refused(post(http, files, labels=encode_image(many)), 422, "labels", f"{count} instances")
+
+
+def test_errors_of_all_fields_are_returned(http: httpx.Client, files: Files) -> None:
+    problem = post(http, files, **dict.fromkeys(("color", "labels", "intrinsics"), b"damaged")).json()
+    assert [problem["field"], *(other["field"] for other in problem["further"])] == ["color", "labels", "intrinsics"]
 
 
 def test_invalid_intrinsics(http: httpx.Client, files: Files) -> None:
@@ -108,6 +115,15 @@ def test_bodies_over_the_size_limit(http: httpx.Client, files: Files) -> None:
     check_refused(http.post("/v1/describe", content=endless, headers=NPZ), 413, "body")
 
 
+def test_a_request_head_that_is_too_large_ends_its_connection(server: Any) -> None:
+    """The command serves with the limits that test_connections.py tests."""
+    url = httpx.URL(server.url)
+    with socket.create_connection((url.host, url.port), timeout=HANG) as connection:
+        with contextlib.suppress(ConnectionError):
+            connection.sendall(b"GET /healthz HTTP/1.1\r\nHost: localhost\r\nX: " + b"x" * 2**23 + b"\r\n\r\n")
+            assert connection.recv(1) == b""
+
+
 def test_body_that_never_arrives(teaching_app: FastAPI, teaching_url: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The connection times out without affecting others."""
     service = teaching_app.state.service
@@ -136,7 +152,7 @@ INVALID_ARRAYS = [
     ("points", np.zeros((4, 2), np.float32)),
     ("points", np.full((4, 3), np.nan, np.float32)),
     ("points", np.full((4, 3), 1e30, np.float32)),
-    ("points", np.array([object()] * 4)),
+    ("points", np.array([Pickled()] * 4)),
     ("points", np.array(["a", "b"])),
     ("points", np.zeros(4, [("x", "f4")])),
     ("colors", np.zeros((5, 3), np.uint8)),

@@ -217,6 +217,7 @@ def test_options_replace_values_of_the_protocols(
     assert job("--classifiers", "ce").protocol == replace(default, classifiers=("ce",))
     assert job("--embedding", 0).protocol == replace(DEFAULT, classifiers=FEATURES, distractors=None)
     assert job("--paper").protocol == PAPER and PAPER.classifiers == FEATURES and PAPER.distractors is None
+    assert (PAPER.fit.epochs, *PAPER.fit.learning_rates, PAPER.azimuth_step) == (100, 0.01, 0.001, 5)
     paper = job("--paper", "--embedding", 20, "--epochs", 3).protocol
     assert paper.distractors == replace(distractors, procedural=20, epochs=3) and paper.classifiers == FEATURES
     assert job("--folds", 3).protocol == replace(default, folds=3)

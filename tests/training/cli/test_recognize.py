@@ -37,7 +37,7 @@ def test_json_of_one_frame(model: Path, recognize: Recognize, tmp_path: Path, pr
 
 
 def test_other_formats_give_the_same_answers(recognize: Recognize, tmp_path: Path) -> None:
-    """One of each kind; the tests of `read_frame` have the others."""
+    """Each kind of file has one format here; the tests of `read_frame` have the others."""
     folder = write_frame_files(tmp_path / "one", small_frame())
     np.savetxt(tmp_path / "K.txt", [[120, 0, 60], [0, 120, 45], [0, 0, 1.0]])
     units = small_frame().depth

@@ -59,7 +59,7 @@ def files(cache: Path) -> list[Path]:
 def test_samples_are_built_once(
     cache: Path, counted: Callable[..., int], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """For each job and each version of the code that builds them; not where the user wants no cache, or another one."""
+    """Each job and each version of the code has its own samples. The user can move the cache, or switch it off."""
     with locked(cache):
         assert counted() == 1  # does not wait for another process
     assert [counted(), counted(), counted({"seed": 1}), counted(), counted({"seed": 1})] == [1, 0, 1, 0, 0]

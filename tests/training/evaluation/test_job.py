@@ -208,7 +208,7 @@ def test_page_for_datasets_of_any_size(tmp_path: Path, n: int) -> None:
 
 
 def test_a_dataset_whose_only_object_has_no_pixels(tmp_path: Path) -> None:
-    """It has a page; an unknown object has none, and the message has the names of the dataset and of the runs."""
+    """A known object has a page; an unknown one is refused, with the names of the dataset and of the runs."""
     frame = dataclasses.replace(small_frame(), labels=np.zeros((90, 120), np.uint8))
     evaluate_toys(tmp_path / "known", Frames([LabelledFrame("f", frame, {1: "mug"}, {})]))
     assert ParsedPage((tmp_path / "known" / "report" / "report.html").read_text()).open == []
@@ -287,7 +287,7 @@ def test_answers_of_another_evaluation_are_refused(tmp_path: Path) -> None:
 
 
 def test_directories_of_others_are_refused(tmp_path: Path) -> None:
-    """Those with files of the user, and those into which another process evaluates."""
+    """These have files of the user, or another process is evaluating into them."""
     (tmp_path / "report").mkdir()
     with locked(tmp_path / "report"), pytest.raises(InputError, match="^out: "):
         evaluate_toys(tmp_path, 1)

@@ -255,7 +255,7 @@ def test_grouping_by_attributes() -> None:
 
 @pytest.mark.parametrize("own", [True, False])
 def test_ocid_has_a_table_by_sequence_and_published_ones(own: bool) -> None:
-    """Those of the protocol: the models of a sequence know the objects of the sequence, or those of all sequences."""
+    """The protocol decides which: the models know the objects of one sequence, or those of all sequences."""
     answer = InstancePrediction(1, "mug", probabilities=EYE[:2])
     names = ["table/bottom/mixed/seq21", "table/bottom/mixed/seq22"]
     attributes = {"camera": "lower", "place": "table", "type": "mixed"}

@@ -23,6 +23,7 @@ from training.embedding.run_embedding import Distractors
 from training.embedding.sampling import ViewTask, render_clouds
 from training.fitting import job
 from training.fitting.calibration import fit_calibration
+from training.fitting.checkpoints import Checkpoints
 from training.fitting.job import RunSettings, check_trained, train_run
 from training.fitting.options import FitOptions, read_metrics
 from training.views.normalized_views import MemoryViews
@@ -121,10 +122,13 @@ def test_an_interrupted_joint_fit_resumes_to_the_same_bytes(
             train(out, progress=stop_when(stage, step))
         with pytest.raises(InputError, match=r"run\.json"):
             load_run(out)
+    with monkeypatch.context() as patch, pytest.raises(Interrupted):  # an epoch is logged and has no checkpoint yet
+        patch.setattr(Checkpoints, "save", mock.Mock(side_effect=Interrupted))
+        train(out)
     with pytest.raises(InputError, match="networks"):
         train(out, dataclasses.replace(SETTINGS, distractors=dataclasses.replace(DISTRACTORS, networks=3)))
     (run,) = train(out)
-    assert rendered == [0, 1, 1]
+    assert rendered == [0, 1, 1, 1]
     assert (out / "embedding.safetensors").read_bytes() == (whole[0] / "embedding.safetensors").read_bytes()
     assert run.record == whole[1].record and rows(out) == rows(whole[0])
     assert not (out / "checkpoints").exists()

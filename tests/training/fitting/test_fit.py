@@ -94,6 +94,12 @@ def test_a_finished_fit_returns_its_classifier_without_steps(separable: Samples,
     assert np.abs(other[0].head.kernel[...] - first[0].head.kernel[...]).max() > 1e-3
 
 
+def test_the_second_half_of_a_fit_has_the_second_learning_rate(fitted: Fit) -> None:
+    options = FitOptions(epochs=1, batch_size=16, learning_rates=(1e-2, 1e-12))
+    first, both = (fitted(dataclasses.replace(options, epochs=epochs))[0] for epochs in (1, 2))
+    np.testing.assert_allclose(both.head.kernel[...], first.head.kernel[...], atol=1e-6)
+
+
 def test_inputs_are_scaled_per_block_to_unit_root_mean_square(separable: Samples, fitted: Fit) -> None:
     model, _ = fitted(options=FitOptions(epochs=1))
     blocks = np.asarray(model.input_scale[...]) * np.asarray(describe_batch(separable.take(np.arange(48))).tops2)
@@ -144,7 +150,7 @@ def metrics(epoch: int) -> EpochMetrics:
 
 
 def test_later_epochs_and_an_incomplete_last_line_are_discarded(tmp_path: Path) -> None:
-    """Those of one classifier of one fold."""
+    """Only the epochs of one classifier and fold are discarded."""
     path = tmp_path / "metrics.jsonl"
     append_metrics(path, 0, "ce", metrics(1))
     with path.open("a") as file:

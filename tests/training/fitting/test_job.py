@@ -5,6 +5,7 @@ import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -125,8 +126,15 @@ def test_nothing_is_written_for_bad_views(
     assert names(tmp_path) == []
 
 
-def test_an_interrupted_run_resumes_to_the_same_result(whole: tuple[Path, TrainedRun], tmp_path: Path) -> None:
+def test_an_interrupted_run_resumes_to_the_same_result(
+    whole: tuple[Path, TrainedRun], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is interrupted first where an epoch is logged and has no checkpoint yet."""
     out = tmp_path / "run"
+    with monkeypatch.context() as patch, pytest.raises(Interrupted):
+        patch.setattr(Checkpoints, "save", mock.Mock(side_effect=Interrupted))
+        train(out, ("tops", "ce"))
+    assert len(logged_rows(out)) == 1
     for stage, step in (("fit ce", 2), ("fit ce", 8), ("fit tops", 9)):
         with pytest.raises(Interrupted):
             train(out, ("tops", "ce"), progress=stop_when(stage, step))

@@ -151,7 +151,7 @@ def dataset(meshes: Path, tmp_path_factory: pytest.TempPathFactory) -> ViewDatas
 
 
 def test_crops_are_those_of_the_rendered_views(meshes: Path, dataset: ViewDataset) -> None:
-    """A source without the brick has those of the box."""
+    """A dataset without the brick has the crops of the box."""
     mesh = load_mesh(meshes / "brick.ply")
     index = dataset.classes.index("brick")
     views, crops = dataset.read(index), dataset.read_crops(index, SIZE)

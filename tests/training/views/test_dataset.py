@@ -108,7 +108,7 @@ def check_refused(directory: Path, message: str) -> None:
 
 
 def test_incomplete_and_other_datasets_are_refused(copied: Path) -> None:
-    """By the name of the file and the reason; tests/fuzz/test_tables.py has all kinds of damage."""
+    """The message has the name of the file and the reason; tests/fuzz/test_tables.py has all kinds of damage."""
     path = copied / "0001-0000.safetensors"
     shutil.copy(copied / "0000-0000.safetensors", path)
     check_refused(copied, "0001-0000.safetensors is damaged")

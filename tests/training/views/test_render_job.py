@@ -166,6 +166,7 @@ def test_another_job_is_refused(copied: Path) -> None:
     painted = dataclasses.replace(screwdriver, textures=tuple(texture ^ 1 for texture in screwdriver.textures))
     for meshes, steps, message in [
         (OBJECTS, (90, 90), "azimuth_step 180.0, not 90.0"),
+        (OBJECTS, (180, 45), "polar_step 90.0, not 45.0"),
         (OBJECTS | {"tennis_ball": moved}, STEPS, r"objects\[\d\].mesh "),
         (OBJECTS | {"screwdriver": painted}, STEPS, r"objects\[\d\].mesh "),
         (OBJECTS | {"apple": moved}, STEPS, r"objects\[2\] null, not \{"),
@@ -194,7 +195,7 @@ def test_augmentations_are_part_of_the_job(tmp_path: Path, monkeypatch: pytest.M
 
 
 def test_views_of_few_points_are_left_out_and_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Here all of a shard; objects may have any name."""
+    """One shard keeps none of its views; objects may have any name."""
     monkeypatch.setattr(render_job, "CLOUDS_PER_SHARD", 2)
     sheet, name = sphere(0.03), "../a b/ü"
     sheet.vertices[:, 2] *= 0.005  # seen edge on from the side
