@@ -8,11 +8,11 @@ its own process. Cosmic Ray generates them. A place in the source is drawn first
 operators with many replacements have no larger share. Annotations are excluded, because they have no effect at run
 time, and so are replacements between families of operators (+ by <<), which are nearly always type errors.
 
-Of ten mutants for each module (seed 0), an earlier version of the tests killed 248 of 271. Those that survived are equal to the original: no
-`jax.jit` or another cache size (the same values, more slowly), `strict=False` for lists of equal length, bounds that no
-value reaches (`>=` for `==` on names of devices, `row != height - 1`, 81 for an exponent of 80, indices JAX clips),
-another `DESCRIPTOR_VERSION`, and searches whose results are filtered or compared again (the ball of `mapper.py`, one
-rectangle fewer in `bounding_box.py`, its halving loop).
+Of ten mutants for each module (seed 0), an earlier version of the tests killed 248 of 271. Those that survived are
+equal to the original: no `jax.jit` or another cache size (the same values, more slowly), `strict=False` for lists of
+equal length, bounds that no value reaches (`>=` for `==` on names of devices, `row != height - 1`, 81 for an exponent
+of 80, indices JAX clips), another `DESCRIPTOR_VERSION`, and searches whose results are filtered or compared again
+(the ball of `mapper.py`, one rectangle fewer in `bounding_box.py`, its halving loop).
 """
 
 import argparse
