@@ -43,6 +43,7 @@ def enroll(
     extend: Annotated[bool, typer.Option("--extend", help="Add views to an object that exists.")] = False,
     replace: Annotated[bool, typer.Option("--replace", help="Discard the views of an object that exists.")] = False,
     gallery: options.GalleryOption = None,
+    processes: options.RenderWorkers,
     quiet: options.QuietOption = False,
 ) -> None:
     """Enroll an object from a mesh or from frames; it is recognized at once.
@@ -68,12 +69,15 @@ def enroll(
             raise InputError(f"{option} is {value}; it belongs to frames")
     if mesh is None and mesh_scale != 1:
         raise InputError(f"mesh_scale is {mesh_scale:g}; it belongs to --mesh")
+    for field in dataclasses.fields(processes):
+        if mesh is None and (value := getattr(processes, field.name)) != field.default:
+            raise InputError(f"{field.name} is {value}; it belongs to --mesh")
     from training.objects.meshes import find_object_meshes, load_mesh
     from training.readers.frames import FrameFolder
 
     meshes = {} if mesh is None else find_object_meshes(mesh, name)
     skipped: list[str] = []
-    with _rendered(meshes, mesh_scale) as views_of_meshes:
+    with _rendered(meshes, mesh_scale, processes) as views_of_meshes:
         for file in meshes.values():
             load_mesh(file, mesh_scale)
         for path in (given.color, given.depth, given.labels, given.intrinsics):
@@ -114,20 +118,21 @@ def enroll(
 
 @contextlib.contextmanager
 def _rendered(
-    meshes: Mapping[str, Path], mesh_scale: float
+    meshes: Mapping[str, Path], mesh_scale: float, processes: options.WorkerOptions
 ) -> Iterator[Mapping[str, Callable[[], Sequence["PreparedInstance"]]]]:
     """Yield object -> function that returns its views, to be called in this order; the first ones are rendered now.
 
-    Several meshes are rendered by two processes, which start while this one imports JAX.
+    Several meshes are rendered by other processes, which start while this one imports JAX.
     """
     if not meshes:
         yield {}
         return
-    from training.storage.workers import local_workers
+    from training.storage.workers import IN_PROCESS
     from training.views import enrolled_meshes
 
     render = partial(enrolled_meshes.mesh_views, mesh_scale=mesh_scale, cameras=enrolled_meshes.MESH_VIEWS)
-    views = local_workers(2 if len(meshes) > 1 else 1)(render, meshes.values())
+    pool = processes.pool() if len(meshes) > 1 else None
+    views = (pool or IN_PROCESS)(render, meshes.values())
     with contextlib.closing(views), ThreadPoolExecutor(1) as thread:
         first = thread.submit(next, views)
         yield {name: partial(next, views) if number else first.result for number, name in enumerate(meshes)}

@@ -284,3 +284,10 @@ class WorkerOptions:
         if self.address is not None:
             raise InputError(f"address is {self.address}; it is only used with --engine ray")
         return local_workers(self.workers) if self.workers > 1 else None
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RenderWorkers(WorkerOptions):
+    """Where views are rendered; by default, in two processes."""
+
+    workers: WorkersOption = 2

@@ -15,13 +15,6 @@ MAX_CROP = 2048
 """Largest side of a crop, pixels."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class RenderWorkers(options.WorkerOptions):
-    """Where views are rendered; by default, in two processes."""
-
-    workers: options.WorkersOption = 2
-
-
 @dataclasses.dataclass(frozen=True)
 class AugmentationOptions:
     """The augmentations of the copies."""
@@ -40,7 +33,7 @@ class AugmentationOptions:
 @options.grouped_options
 def render(
     *,
-    processes: RenderWorkers,
+    processes: options.RenderWorkers,
     meshes: Annotated[Path, typer.Option(help="Directory of meshes (GLB, OBJ, PLY), one per file or subdirectory.")],
     out: Annotated[Path, typer.Option(help="Directory for the views: new, or begun by this command.")],
     names: Annotated[

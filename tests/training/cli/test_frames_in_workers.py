@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import run_thor2, small_frame, write_frame_files
+from helpers import run_thor2, small_frame, write_frame_files, write_meshes
 from recording_files import table_frame
 
 from thor2_jax.errors import InputError
+from thor2_jax.gallery.store import GALLERY_DIRECTORY, load_gallery
 from training.evaluation.answering import RunArguments, answer_frames, answer_frames_in_pool
 from training.frame_recognition import (
     FRAMES_PER_CHUNK,
@@ -102,16 +103,25 @@ def test_two_workers_have_the_results_of_one_process(model: Path, folder: Path, 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings(r"ignore:os\.fork\(\) was called:RuntimeWarning")  # Ray's forks execute another program.
-def test_two_ray_nodes_one_of_which_is_killed(
+def test_two_ray_nodes_enroll_and_recognize_and_one_is_killed(
     model: Path, folder: Path, tmp_path: Path, expected: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("ray", reason="the extra [cluster] is not installed")
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
     from ray.cluster_utils import Cluster
 
+    meshes = write_meshes(tmp_path / "meshes", ("mug_white", "soup_can_red"))
+
+    def enrolled(out: Path, *options: object) -> dict[str, bytes]:
+        assert run_thor2("enroll", "--mesh", meshes, "--model", out, *options) == 0
+        objects = load_gallery(out / GALLERY_DIRECTORY).gallery.objects
+        return {name: views.embeddings.tobytes() for name, views in objects.items()}
+
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
     try:
         node = cluster.add_node(num_cpus=1)
+        on_nodes = "--workers", 2, "--engine", "ray", "--address", cluster.address
+        assert enrolled(tmp_path / "on-nodes", *on_nodes) == enrolled(tmp_path / "here", "--workers", 1)
         lost = threading.Event()
 
         def lose_node() -> None:
@@ -122,7 +132,7 @@ def test_two_ray_nodes_one_of_which_is_killed(
 
         thread = threading.Thread(target=lose_node)
         thread.start()
-        answers = results(model, folder, tmp_path, "--workers", 2, "--engine", "ray", "--address", cluster.address)
+        answers = results(model, folder, tmp_path, *on_nodes)
         thread.join()
         assert lost.is_set() and answers == expected
     finally:
