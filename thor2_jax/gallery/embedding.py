@@ -15,6 +15,7 @@ import functools
 import itertools
 import json
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -189,22 +190,29 @@ def _embed_oriented(graph: Any, state: Any, oriented: LookDescriptors) -> jax.Ar
     return embeddings.reshape(*oriented.weights.shape, -1)
 
 
-@functools.partial(jax.jit, static_argnums=(0, 3))
-def _classify(
-    graphs: tuple[Any, ...], states: tuple[Any, ...], oriented: LookDescriptors, n_classes: int | None
-) -> jax.Array:
-    """Return the probabilities [B, proxies]; with `n_classes`, all proxies after those of the classes are one column.
+@functools.lru_cache(maxsize=16)
+def _classifier(
+    graphs: tuple[Any, ...], structure: Any, n_classes: int, nearest: bool
+) -> Callable[[list[jax.Array], LookDescriptors], jax.Array]:
+    """Return the function of the networks' weights, which embeddings of these sizes share, with the programs.
 
-    It has the sum that they would have if each had the logit of the nearest one.
+    It returns the probabilities [B, n_classes] of the first proxies; with `nearest`, all others are one column, with
+    the sum that they would have if each had the logit of the nearest one.
     """
-    models = [nnx.merge(graph, state) for graph, state in zip(graphs, states, strict=True)]
-    logits = jnp.stack([model.class_logits(*oriented.flat) for model in models])
-    if n_classes is not None:
-        n_distractors = logits.shape[-1] - n_classes
-        nearest = logits[..., n_classes:].max(axis=-1, keepdims=True) + math.log(n_distractors)
-        logits = jnp.concatenate([logits[..., :n_classes], nearest], axis=-1)
-    # `fuse` normalizes: the mean logits give the geometric mean of the networks' probabilities.
-    return oriented.fuse(logits.mean(axis=0))
+
+    # The weights are a flat list, and the graphs no argument: JAX would take a state apart and hash each graph, in
+    # Python, at every call, which is a tenth of the time of a frame.
+    @jax.jit
+    def classify(leaves: list[jax.Array], oriented: LookDescriptors) -> jax.Array:
+        models = itertools.starmap(nnx.merge, zip(graphs, jax.tree.unflatten(structure, leaves), strict=True))
+        logits = jnp.stack([model.class_logits(*oriented.flat) for model in models])
+        if nearest:
+            largest = logits[..., n_classes:].max(axis=-1, keepdims=True) + math.log(logits.shape[-1] - n_classes)
+            logits = jnp.concatenate([logits[..., :n_classes], largest], axis=-1)
+        # `fuse` normalizes: the mean logits give the geometric mean of the networks' probabilities.
+        return oriented.fuse(logits.mean(axis=0))[:, :n_classes]
+
+    return classify
 
 
 def _split(model: EmbeddingNetwork) -> tuple[Any, Any]:
@@ -305,9 +313,11 @@ class Embedding:
         return _split(self.model)
 
     @functools.cached_property
-    def _classifiers(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+    def _classify(self) -> Callable[[LookDescriptors], jax.Array]:
         graphs, states = zip(self._embedder, *map(_split, self.further), strict=True)
-        return graphs, states
+        leaves, structure = jax.tree.flatten(states)
+        nearest = self.sizes.nearest and self.distractors > 0
+        return functools.partial(_classifier(graphs, structure, len(self.classes), nearest), leaves)
 
     def embed(self, clouds: PointClouds) -> jax.Array:
         """Return the embeddings [B, D] float32 of clouds in metres, each of unit length.
@@ -336,9 +346,7 @@ class Embedding:
         Args:
             oriented: K looks at clouds, described by this embedding's descriptor.
         """
-        n_classes = len(self.classes)
-        nearest = self.sizes.nearest and self.distractors > 0
-        return _classify(*self._classifiers, oriented, n_classes if nearest else None)[:, :n_classes]
+        return self._classify(oriented)
 
     @functools.cached_property
     def _content(self) -> bytes:
