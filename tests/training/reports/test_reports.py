@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import SMALL_CONFIG, Interrupted, ParsedPage
+from helpers import SMALL_CONFIG, Interrupted, ParsedPage, run_thor2
 from PIL import Image
 
 import colornet
@@ -86,7 +86,9 @@ def test_pictures_of_the_user_are_not_those_of_a_demo(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_small_demo_is_interrupted_and_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_small_demo_is_interrupted_and_resumes_by_its_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     names = ("mug_blue", "soup_can_red", "cereal_box_yellow", "sponge", "white_bowl")
     everything = builtin_objects()
     monkeypatch.setattr(demo, "builtin_objects", lambda: {name: everything[name] for name in names})
@@ -115,10 +117,21 @@ def test_small_demo_is_interrupted_and_resumes(tmp_path: Path, monkeypatch: pyte
     with pytest.raises(thor2.InputError, match="^out: .*seed 1, not 2"):
         demo.run_demo(tmp_path, 2)
     stages: dict[str, tuple[int, int]] = {}
-    summary = demo.run_demo(tmp_path, 1, lambda stage, done, total, note: stages.update({stage: (done, total)}))
+    summaries, run_demo = [], demo.run_demo
+
+    def resumed(out: Path, seed: int, *_: object, workers: int) -> demo.DemoSummary:
+        show = lambda stage, done, total, note: stages.update({stage: (done, total)})  # noqa: E731
+        summaries.append(run_demo(out, seed, show, workers))
+        return summaries[0]
+
+    monkeypatch.setattr(demo, "run_demo", resumed)
+    assert run_thor2("demo", "--out", tmp_path, "--seed", 1) == 0
+    (summary,) = summaries
+    printed = capsys.readouterr().out
+    assert f"{summary.accuracy['all'][3]:.3f}" in printed and "report.html" in printed
     assert stages == {"compose scenes": (6, 6), "recognize scenes": (6, 6)}
     with pytest.raises(thor2.InputError, match="^out: "):
-        demo.run_demo(tmp_path, 1)
+        run_demo(tmp_path, 1)
     assert summary.names == ("CE", "TOPS", "TOPS2", "THOR2")
     subsets = {name: count for name, count in summary.instances.items() if name != "all"}
     assert summary.instances["all"] == sum(subsets.values()) > 6
