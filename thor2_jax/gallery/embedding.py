@@ -201,7 +201,7 @@ def _classifier(
     """
 
     # The weights are a flat list, and the graphs no argument: JAX would take a state apart and hash each graph, in
-    # Python, at every call, which is a tenth of the time of a frame.
+    # Python, at every call, which takes 4 % of the time of a frame.
     @jax.jit
     def classify(leaves: list[jax.Array], oriented: LookDescriptors) -> jax.Array:
         models = itertools.starmap(nnx.merge, zip(graphs, jax.tree.unflatten(structure, leaves), strict=True))

@@ -131,8 +131,8 @@ def _rendered(
     from training.views import enrolled_meshes
 
     render = partial(enrolled_meshes.mesh_views, mesh_scale=mesh_scale, cameras=enrolled_meshes.MESH_VIEWS)
-    pool = processes.pool() if len(meshes) > 1 else None
-    views = (pool or IN_PROCESS)(render, meshes.values())
+    pool = dataclasses.replace(processes, workers=min(processes.workers, len(meshes))).pool() or IN_PROCESS
+    views = pool(render, meshes.values())
     with contextlib.closing(views), ThreadPoolExecutor(1) as thread:
         first = thread.submit(next, views)
         yield {name: partial(next, views) if number else first.result for number, name in enumerate(meshes)}

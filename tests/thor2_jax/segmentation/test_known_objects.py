@@ -41,7 +41,7 @@ def test_a_piece_with_two_known_objects_is_divided() -> None:
     np.testing.assert_array_equal(labels > 0, ONE_PIECE > 0)
 
 
-def test_pieces_of_one_known_object_are_merged_and_those_of_two_remain() -> None:
+def test_only_pieces_of_one_known_object_are_merged() -> None:
     np.testing.assert_array_equal(segment_known(FRAME, TRUTH, knows(TRUTH > 0)), ONE_PIECE)
     np.testing.assert_array_equal(segment_known(FRAME, TRUTH, knows(TRUTH == 1, TRUTH == 2)), TRUTH)
 

@@ -68,7 +68,7 @@ def same(one: RenderedView, other: RenderedView) -> bool:
 # Options.
 
 
-def test_the_record_is_json_and_nothing_is_changed_without_augmentations() -> None:
+def test_the_record_is_json_and_no_augmentation_changes_nothing() -> None:
     off, on = Augmentations(), Augmentations(illumination=Illumination(), copies=3)
     assert on and not off and same(augment(MUG, off, np.random.default_rng(0)), MUG)
     record = on.record()

@@ -39,8 +39,8 @@ def assert_found(expected: str, check: Callable[..., Any], *arguments: Any, **op
     """Assert that the only finding of a check begins with a pattern, as the command prints it; "" expects none."""
     diagnosis = Diagnosis()
     check(diagnosis, *arguments, **options)
-    found = " ".join(f"{each.code}: {each.message} {each.advice}" for each in diagnosis.findings)
-    assert re.match(expected or "$", found), found
+    finding = " ".join(f"{each.code}: {each.message} {each.advice}" for each in diagnosis.findings)
+    assert re.match(expected or "$", finding), finding
     assert len(diagnosis.findings) <= 1
     assert all(each.message.endswith(".") and each.advice.endswith(".") for each in diagnosis.findings)
 

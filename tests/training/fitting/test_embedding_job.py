@@ -139,7 +139,7 @@ def test_an_interrupted_joint_fit_resumes_to_the_same_bytes(
     [({"networks": 3}, {"networks": 0}), ({"epochs": 4}, {"epochs": 0}), ({"procedural": 11}, {"procedural": 9})],
     ids=str,
 )
-def test_invalid_distractors_and_others_than_those_of_a_run_are_refused(
+def test_invalid_and_changed_distractors_are_refused(
     other: dict[str, int], invalid: dict[str, int], whole: Whole
 ) -> None:
     check_trained(SOURCE.digest, whole.out, SETTINGS)
