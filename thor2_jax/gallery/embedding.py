@@ -15,7 +15,7 @@ import functools
 import itertools
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +33,7 @@ from thor2_jax.descriptor.looks import LookDescriptors, describe_looks
 from thor2_jax.errors import InputError
 from thor2_jax.files import atomic_write, content_digest, read_file, safetensors_metadata
 from thor2_jax.gallery.references import REFERENCES_FILE, References
-from thor2_jax.model.classifier import model_arrays, model_from_arrays
+from thor2_jax.model.classifier import compiled, model_arrays, model_from_arrays
 from thor2_jax.types import Descriptors, PointClouds
 
 __all__ = ["MAX_EMBEDDING_SIZE", "Embedding", "EmbeddingNetwork", "EmbeddingSizes", "class_cosines", "load_default"]
@@ -184,35 +184,24 @@ def color_features(embeddings: jax.Array, statistics: jax.Array | None) -> jax.A
     return strips if statistics is None else jnp.concatenate([strips, statistics[:, -N_BALANCED:]], axis=1)
 
 
-@functools.partial(jax.jit, static_argnums=0)
-def _embed_oriented(graph: Any, state: Any, oriented: LookDescriptors) -> jax.Array:
-    embeddings = nnx.merge(graph, state)(*oriented.flat)
-    return embeddings.reshape(*oriented.weights.shape, -1)
+def _embed_looks(models: Sequence[EmbeddingNetwork], oriented: LookDescriptors) -> jax.Array:
+    return models[0](*oriented.flat).reshape(*oriented.weights.shape, -1)
 
 
-@functools.lru_cache(maxsize=16)
-def _classifier(
-    graphs: tuple[Any, ...], structure: Any, n_classes: int, nearest: bool
-) -> Callable[[list[jax.Array], LookDescriptors], jax.Array]:
-    """Return the function of the networks' weights, which embeddings of these sizes share, with the programs.
+def _class_probabilities(
+    models: Sequence[EmbeddingNetwork], oriented: LookDescriptors, n_classes: int, nearest: bool
+) -> jax.Array:
+    """Return the probabilities [B, n_classes] of the first proxies.
 
-    It returns the probabilities [B, n_classes] of the first proxies; with `nearest`, all others are one column, with
-    the sum that they would have if each had the logit of the nearest one.
+    With `nearest`, all others are one column, with the sum that they would have if each had the logit of the nearest
+    one.
     """
-
-    # The weights are a flat list, and the graphs no argument: JAX would take a state apart and hash each graph, in
-    # Python, at every call, which takes 4 % of the time of a frame.
-    @jax.jit
-    def classify(leaves: list[jax.Array], oriented: LookDescriptors) -> jax.Array:
-        models = itertools.starmap(nnx.merge, zip(graphs, jax.tree.unflatten(structure, leaves), strict=True))
-        logits = jnp.stack([model.class_logits(*oriented.flat) for model in models])
-        if nearest:
-            largest = logits[..., n_classes:].max(axis=-1, keepdims=True) + math.log(logits.shape[-1] - n_classes)
-            logits = jnp.concatenate([logits[..., :n_classes], largest], axis=-1)
-        # `fuse` normalizes: the mean logits give the geometric mean of the networks' probabilities.
-        return oriented.fuse(logits.mean(axis=0))[:, :n_classes]
-
-    return classify
+    logits = jnp.stack([model.class_logits(*oriented.flat) for model in models])
+    if nearest:
+        largest = logits[..., n_classes:].max(axis=-1, keepdims=True) + math.log(logits.shape[-1] - n_classes)
+        logits = jnp.concatenate([logits[..., :n_classes], largest], axis=-1)
+    # `fuse` normalizes: the mean logits give the geometric mean of the networks' probabilities.
+    return oriented.fuse(logits.mean(axis=0))[:, :n_classes]
 
 
 def _split(model: EmbeddingNetwork) -> tuple[Any, Any]:
@@ -313,11 +302,13 @@ class Embedding:
         return _split(self.model)
 
     @functools.cached_property
-    def _classify(self) -> Callable[[LookDescriptors], jax.Array]:
-        graphs, states = zip(self._embedder, *map(_split, self.further), strict=True)
-        leaves, structure = jax.tree.flatten(states)
-        nearest = self.sizes.nearest and self.distractors > 0
-        return functools.partial(_classifier(graphs, structure, len(self.classes), nearest), leaves)
+    def _embed_looks(self) -> Callable[[LookDescriptors], jax.Array]:
+        return compiled(_embed_looks, [self._embedder])
+
+    @functools.cached_property
+    def _class_probabilities(self) -> Callable[[LookDescriptors], jax.Array]:
+        models = [self._embedder, *map(_split, self.further)]
+        return compiled(_class_probabilities, models, len(self.classes), self.sizes.nearest and self.distractors > 0)
 
     def embed(self, clouds: PointClouds) -> jax.Array:
         """Return the embeddings [B, D] float32 of clouds in metres, each of unit length.
@@ -335,7 +326,7 @@ class Embedding:
         """
         if self.sizes.balanced and clouds is not None:
             oriented = oriented.with_balanced(clouds)
-        return _embed_oriented(*self._embedder, oriented)
+        return self._embed_looks(oriented)
 
     def class_probabilities(self, oriented: LookDescriptors) -> jax.Array:
         """Return the probabilities [B, C] of the classes; what they lack to 1 is that of the distractors.
@@ -346,7 +337,7 @@ class Embedding:
         Args:
             oriented: K looks at clouds, described by this embedding's descriptor.
         """
-        return self._classify(oriented)
+        return self._class_probabilities(oriented)
 
     @functools.cached_property
     def _content(self) -> bytes:

@@ -30,6 +30,7 @@ __all__ = [
     "RunClassifiers",
     "check_features",
     "class_probabilities",
+    "compiled",
     "feature_of",
     "model_arrays",
     "model_from_arrays",
@@ -137,6 +138,11 @@ def class_probabilities(model: MLP, descriptors: Descriptors, name: Feature) -> 
     return jax.nn.softmax(model(feature_of(descriptors, name)))
 
 
+def _fused_probabilities(models: Sequence[MLP], oriented: LookDescriptors, name: Feature) -> jax.Array:
+    (model,) = models
+    return oriented.fuse(model(feature_of(oriented.flat[0], name)))
+
+
 class RunClassifiers(dict[str, Classifier]):
     """The classifiers of a run by name: the MLPs, and the embedding if it was fitted on the classes."""
 
@@ -145,10 +151,7 @@ class RunClassifiers(dict[str, Classifier]):
         """Return compiled classifiers of MLPs, and the one of the embedding; None if it does not know the classes."""
         classifiers = cls()
         for name, model in models.items():
-            graph, state = nnx.split(model)
-            # As a flat list: JAX would take an nnx state apart, in Python, at every call.
-            leaves, structure = jax.tree.flatten(state)
-            classifiers[name] = partial(_forward(graph, structure, name), leaves)
+            classifiers[name] = compiled(_fused_probabilities, [nnx.split(model)], name)
         if embedding is not None:
             classifiers[EMBEDDING] = embedding
         return classifiers
@@ -170,16 +173,33 @@ class RunClassifiers(dict[str, Classifier]):
         return tuple(dict.fromkeys(names))
 
 
-@lru_cache(maxsize=16)
-def _forward(graph: Any, structure: Any, name: Feature) -> Callable[[list[jax.Array], LookDescriptors], jax.Array]:
-    """Return the function of a classifier's weights, which classifiers of its sizes share, with the programs."""
+def compiled(
+    function: Callable[..., jax.Array], models: Sequence[tuple[Any, Any]], *static: Any
+) -> Callable[[LookDescriptors], jax.Array]:
+    """Return the compiled `function(modules, descriptors, *static)` as a function of the descriptors of looks.
 
+    Models of the same sizes share the programs. JAX would take a state apart and hash each graph, in Python, at every
+    call, which takes 4 % of the time of a frame: the weights are a flat list, and the graphs no argument.
+
+    Args:
+        function: of a module.
+        models: graph and state of each module, from `nnx.split`.
+        static: hashable.
+    """
+    graphs, states = zip(*models, strict=True)
+    leaves, structure = jax.tree.flatten(states)
+    return partial(_compiled(function, graphs, structure, static), leaves)
+
+
+@lru_cache(maxsize=32)
+def _compiled(
+    function: Callable[..., jax.Array], graphs: tuple[Any, ...], structure: Any, static: tuple[Any, ...]
+) -> Callable[[list[jax.Array], LookDescriptors], jax.Array]:
     @jax.jit
-    def forward(leaves: list[jax.Array], oriented: LookDescriptors) -> jax.Array:
-        model: MLP = nnx.merge(graph, jax.tree.unflatten(structure, leaves))
-        return oriented.fuse(model(feature_of(oriented.flat[0], name)))
+    def call(leaves: list[jax.Array], oriented: LookDescriptors) -> jax.Array:
+        return function([*map(nnx.merge, graphs, jax.tree.unflatten(structure, leaves))], oriented, *static)
 
-    return forward
+    return call
 
 
 def _state(model: nnx.Module) -> tuple[Any, dict[tuple[Any, ...], Any]]:
