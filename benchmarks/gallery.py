@@ -29,7 +29,7 @@ from thor2_jax.model.run_directory import EMBEDDING_FILE, TrainedRun, save_run
 from thor2_jax.recognizer import Recognizer
 from training.objects.builtin_objects import builtin_objects
 from training.rendering.scenes import compose_scene
-from training.views.enrolled_meshes import mesh_views
+from training.views.mesh_views import mesh_views
 
 SIZE = 256
 QUERIES = 16

@@ -46,7 +46,7 @@ from training.evaluation.runs import Run, load_runs
 from training.objects.meshes import find_meshes, read_names
 from training.readers.labelled import LabelledFrame
 from training.storage.jobs import begin_job
-from training.views.enrolled_meshes import mesh_views
+from training.views.mesh_views import mesh_views
 
 RENDER = "--azimuth-step 20 --polar-step 15 --copies 2 --illumination --occlusion --sensor --segmentation"
 """Default options of all renderings: the cameras and the first four augmentations of the default protocol."""

@@ -27,7 +27,7 @@ import colornet
 import thor2_jax as thor2
 from benchmarks.clouds import sample_clouds
 from benchmarks.timing import time_calls
-from thor2_jax.descriptor.streaming import describe_stream
+from thor2_jax.descriptor.describe import describe_stream
 from thor2_jax.model.classifier import FEATURES, MLP
 from thor2_jax.model.run_directory import TrainedRun, input_size
 from training.objects.builtin_objects import builtin_objects

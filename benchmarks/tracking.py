@@ -8,7 +8,7 @@ With --meshes DIR, scenes of these objects are rendered from six cameras as well
 so many degrees apart, as a robot may reach them. For objects that are in the first view, and for those that are highly
 occluded there, the file has the accuracy by the number of views when
 
-fused      the answers for the views are fused (`thor2_jax.tracking.fusion`), the views in the order around the table
+fused      the answers for the views are fused (`thor2_jax.tracking.tracker`), the views in the order around the table
 merged     fused, and each view is also described as one cloud with those before it (`merge_views`)
 random     fused, the further views in random order
 next_view  fused, each further view chosen by `thor2_jax.tracking.next_view`
@@ -36,16 +36,15 @@ from thor2_jax.frames.frames import Intrinsics, RGBDFrame
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances, prepare_instance
 from thor2_jax.model.inference import Inference, answers, infer_clouds
 from thor2_jax.recognizer import Recognizer
-from thor2_jax.tracking.fusion import FusedEvidence, view_weight
 from thor2_jax.tracking.next_view import ViewTable, next_view
 from thor2_jax.tracking.poses import merge_views, transform
-from thor2_jax.tracking.tracker import Tracker
+from thor2_jax.tracking.tracker import FusedEvidence, Tracker, view_weight
 from training.evaluation.scores import placement_accuracy, steadiness
 from training.objects.mesh import TexturedMesh
 from training.objects.meshes import find_meshes, load_mesh, read_names
 from training.readers.labelled import LabelledFrame, sequence_of
-from training.rendering.camera import Camera
 from training.rendering.scenes import Scene, compose_views
+from training.rendering.view_sphere import Camera
 from training.storage.jobs import check_same_job
 from training.view_table import view_table
 

@@ -37,8 +37,8 @@ from thor2_jax.model.model import Model
 from thor2_jax.model.run_directory import TrainedRun, input_size
 from thor2_jax.types import Cloud
 from training.objects.builtin_objects import builtin_objects
-from training.rendering.camera import Camera, RenderedView
 from training.rendering.scenes import compose_scene
+from training.rendering.view_sphere import Camera, RenderedView
 
 Command = Callable[..., str]
 """Type of the fixtures `printed` and `refused`, which run the command line."""

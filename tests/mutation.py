@@ -46,7 +46,7 @@ FOLDERS = ("colornet", "thor2_jax", "thor2_jax/descriptor", "thor2_jax/frames", 
 
 MORE_TESTS = {
     "colornet/network.py": ["tests/colornet/test_files.py", "tests/colornet/test_membership.py"],
-    "thor2_jax/parameters.py": ["tests/thor2_jax/test_types.py"],
+    "thor2_jax/types.py": ["tests/thor2_jax/test_types.py"],
 }
 """Module -> test files that do not import it by its name."""
 

@@ -17,12 +17,11 @@ if TYPE_CHECKING:
     from thor2_jax.explanation.explain import Explanation, explain
     from thor2_jax.frames.frames import Intrinsics, RGBDFrame, read_frame
     from thor2_jax.model.recognition import Recognition
-    from thor2_jax.parameters import Parameters
     from thor2_jax.recognizer import Recognizer
     from thor2_jax.segmentation.segmenters import segment, segmented
     from thor2_jax.tracking.tracker import TrackedRecognition, Tracker
     from thor2_jax.transformers import Tops2Transformer, TopsTransformer
-    from thor2_jax.types import Descriptors, Diagrams, PointClouds, Strips
+    from thor2_jax.types import Descriptors, Diagrams, Parameters, PointClouds, Strips
 else:
     _MODULES = {
         "adaptation.color_transform": ("ColorTransform",),

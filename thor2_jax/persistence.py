@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 
-from thor2_jax.descriptor.persistence_images import cumulative_at_edges, persistence_power
+from thor2_jax.descriptor.persistence import cumulative_at_edges, persistence_power
 from thor2_jax.errors import InputError
 from thor2_jax.types import Diagrams
 

@@ -34,10 +34,9 @@ from thor2_jax.gallery.enrollment import instance_views
 from thor2_jax.gallery.gallery import Gallery
 from thor2_jax.gallery.objects import ObjectGallery
 from thor2_jax.gallery.store import GALLERY_DIRECTORY
-from thor2_jax.model.chunks import compute_by_chunks, padded_rows
 from thor2_jax.model.classifier import THOR2
 from thor2_jax.model.fusion import DEFAULT_RULE, FusionRule
-from thor2_jax.model.inference import Inference, answers, infer_clouds
+from thor2_jax.model.inference import Inference, answers, compute_by_chunks, infer_clouds, padded_rows
 from thor2_jax.model.model import Model
 from thor2_jax.model.recognition import AnswerBy, DescribedFrame, Recognition
 from thor2_jax.model.run_directory import TrainedRun, load_run

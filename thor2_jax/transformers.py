@@ -19,7 +19,7 @@ import colornet
 from colornet import ColorNetwork
 from thor2_jax.capacity import BATCH_BUCKETS, POINT_BUCKETS, batch_bucket
 from thor2_jax.config import DescriptorConfig
-from thor2_jax.descriptor.streaming import describe_stream
+from thor2_jax.descriptor.describe import describe_stream
 from thor2_jax.errors import InputError
 from thor2_jax.types import as_array, check_cloud
 

@@ -1,7 +1,12 @@
-"""The records that are passed between the stages of the pipeline: frozen pytrees of arrays.
+"""The records that are passed between the stages of the pipeline, and learnable parameters: frozen pytrees of arrays.
 
 Shapes use these letters: B clouds, N points of a cloud after padding, S slices, J strips of a slice, R colour regions,
-P pixels along the side of an image.
+P pixels along the side of an image. Compiled functions take parameters as arguments, so that other values need no
+compilation:
+
+>>> parameters = Parameters.of(network, config)                               # doctest: +SKIP
+>>> loss = lambda p: (describe(clouds, network, config, p).tops2**2).sum()    # doctest: +SKIP
+>>> jax.grad(loss)(parameters).image_variance                                 # doctest: +SKIP
 """
 
 import dataclasses
@@ -13,10 +18,12 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from colornet import ColorNetwork
 from thor2_jax.capacity import POINT_BUCKETS, point_bucket
+from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
 
-__all__ = ["Cloud", "Descriptors", "Diagrams", "PointClouds", "Strips", "as_array", "check_cloud"]
+__all__ = ["Cloud", "Descriptors", "Diagrams", "Parameters", "PointClouds", "Strips", "as_array", "check_cloud"]
 
 Cloud = tuple[NDArray[np.float32], NDArray[np.uint8]]
 """One point cloud of any size: xyz [n, 3] and sRGB [n, 3]."""
@@ -252,3 +259,33 @@ class Descriptors:
         It has one block [image | embedding] for each slice.
         """
         return _interleave(self.images, self.embeddings)
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Parameters:
+    """Learnable parameters of a descriptor, which replace the same numbers of the network and the config.
+
+    Attributes:
+        similarity: [R, R] float32, the similarity matrix Delta.
+        alpha: [] float32, angle of the turn about y, radians. The hard descriptor depends on it only through the choice
+            of slices and strips, so that its gradient is zero; the gradient of a relaxed descriptor is not.
+        sigma_s: [] float32, scaled units per metre.
+        image_variance: [] float32, positive; variance of the Gaussian at each point of a diagram.
+        persistence_weight: [] float32, exponent n of the weight persistence**n.
+    """
+
+    similarity: jax.Array
+    alpha: jax.Array
+    sigma_s: jax.Array
+    image_variance: jax.Array
+    persistence_weight: jax.Array
+
+    @classmethod
+    def of(cls, network: ColorNetwork, config: DescriptorConfig) -> "Parameters":
+        """Return the values of a network and a config."""
+        # Concrete arrays even while a caller's function is traced, so that they can be cached.
+        with jax.ensure_compile_time_eval():
+            values = config.alpha, config.sigma_s, config.image_variance, config.persistence_weight
+            # By NumPy: JAX would compile a program for each conversion.
+            return cls(*(jax.device_put(np.asarray(value, np.float32)) for value in (network.similarity, *values)))

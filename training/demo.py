@@ -34,8 +34,7 @@ from training.rendering.view_sphere import camera_pose
 from training.reports.html import Picture, Section, write_page
 from training.reports.object_plots import draw_descriptor, draw_objects
 from training.reports.plots import draw_accuracy, draw_confusion, draw_curves
-from training.storage.jobs import check_same_job
-from training.storage.progress import Progress, of_stage
+from training.storage.jobs import Progress, check_same_job, of_stage
 from training.storage.workers import local_workers
 from training.views.dataset import remove_views
 from training.views.mesh_views import view_cloud

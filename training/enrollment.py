@@ -1,6 +1,6 @@
 """Enrolling objects in the gallery of a run directory: from meshes, and from folders of labelled frames.
 
-from training.views.enrolled_meshes import mesh_views
+from training.views.mesh_views import mesh_views
 enroll_objects(Path("run"), lambda sigma_s: {"mug": lambda: mesh_views(Path("mug.glb"))}, "mesh")
 """
 
@@ -21,7 +21,7 @@ from thor2_jax.model.run_directory import TrainedRun, save_run
 from thor2_jax.printable import check_name, normal_name
 from thor2_jax.recognizer import Recognizer
 from training.readers.frames import FrameFolder
-from training.storage.progress import Display
+from training.storage.jobs import Display
 
 __all__ = ["enroll_objects", "labelled_views"]
 

@@ -19,12 +19,11 @@ from numpy.typing import NDArray
 from thor2_jax.capacity import BATCH_BUCKETS
 from thor2_jax.errors import InputError, with_context
 from thor2_jax.files import write_text
-from thor2_jax.frames.frames import MAX_DEPTH, MIN_DEPTH, RGBDFrame
+from thor2_jax.frames.frames import MAX_DEPTH, MIN_DEPTH, RecordedFrame, RGBDFrame
 from thor2_jax.frames.instance_clouds import unit_question
 from thor2_jax.model import result_files
 from thor2_jax.model.recognition import Recognition
 from thor2_jax.recognizer import Recognizer
-from thor2_jax.recordings.recorded_frames import RecordedFrame
 from thor2_jax.segmentation.segmenters import Segmenter, segmented
 from thor2_jax.tracking.tracker import TrackedRecognition
 from training.readers.frame_files import FrameSource

@@ -14,8 +14,8 @@ from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.printable import normal_name
+from training.baselines.files import check_baselines, crop_size
 from training.baselines.job import check_weights, pretrained_files, train_baselines
-from training.baselines.names import check_baselines, crop_size
 from training.enrollment import labelled_views
 from training.fitting.job import VIEWS, check_out, check_trained, finished_record, is_finished, train_run
 from training.fitting.protocol import DEFAULT, PAPER, Protocol
@@ -23,14 +23,12 @@ from training.objects.mesh import TexturedMesh
 from training.objects.meshes import find_meshes, read_names, scaled_meshes
 from training.readers.frame_files import find_frames
 from training.readers.frames import FrameFolder
-from training.storage.jobs import check_same_job
-from training.storage.progress import Display, numbered, of_stage
+from training.storage.jobs import Display, check_same_job, numbered, of_stage
 from training.storage.workers import local_workers
 from training.views.crops import QuantizedCrop, quantized, rgbd_crop
 from training.views.dataset import ViewDataset, remove_views
 from training.views.labelled_views import WithLabelledViews, digest_of_instances
-from training.views.left_out import WithoutClasses, sequence_sources
-from training.views.normalized_views import ViewSource
+from training.views.normalized_views import ViewSource, WithoutClasses, sequence_sources
 from training.views.render_job import dataset_job, render_crops, render_dataset
 
 __all__ = ["TrainJob", "run_train_job"]

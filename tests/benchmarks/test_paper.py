@@ -13,7 +13,7 @@ from safetensors.numpy import save_file
 from benchmarks import paper
 from benchmarks.paper_measurement import CLAIMS
 from benchmarks.paper_report import report_text
-from training.baselines.names import TITLES
+from training.baselines.files import TITLES
 from training.evaluation.answers import fusions
 
 NAMES = ("soup_can_red", "cereal_box_blue")

@@ -16,7 +16,7 @@ from processes import HANG
 
 from thor2_jax.model.run_directory import TrainedRun, load_run, save_run
 from training.baselines.files import baseline_file, read_baseline
-from training.fitting.options import read_metrics
+from training.fitting.loop import read_metrics
 from training.views.dataset import MANIFEST, Manifest
 
 pytestmark = pytest.mark.slow

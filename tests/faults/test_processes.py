@@ -9,7 +9,7 @@ from helpers import Interrupted, brick_and_stick, files_of
 import thor2_jax as thor2
 from thor2_jax.model.run_directory import TrainedRun, load_run
 from training.fitting.job import RunSettings, train_run
-from training.fitting.options import FitOptions
+from training.fitting.loop import FitOptions
 from training.views.normalized_views import MemoryViews
 
 CONFIG = thor2.DescriptorConfig(homology="closed_form", n_slices=3, n_strips=8, image_size=8)

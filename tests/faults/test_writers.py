@@ -19,7 +19,7 @@ from thor2_jax.files import write_text
 from thor2_jax.frames.overlay import draw_overlay
 from thor2_jax.model.run_directory import load_run, save_run
 from training.evaluation.answers import AnswerFile, FrameAnswers
-from training.fitting.options import EpochMetrics, append_metrics, discard_later_epochs, read_metrics
+from training.fitting.loop import EpochMetrics, append_metrics, discard_later_epochs, read_metrics
 from training.views.dataset import MANIFEST, Manifest
 
 NETWORK = colornet.load_default()

@@ -14,12 +14,12 @@ from helpers import encode_image
 from hypothesis import given
 from hypothesis import strategies as st
 
+from thor2_jax.files import read_table
 from thor2_jax.frames.frames import Intrinsics, read_color, read_depth, read_intrinsics, read_labels
-from thor2_jax.tables import read_table
 from thor2_jax.testing import damaged
 from training.baselines.files import StoredBaseline, read_baseline, write_baseline
 from training.evaluation.answers import AnswerFile, FrameAnswers, InstancePrediction
-from training.fitting.options import read_metrics
+from training.fitting.loop import read_metrics
 from training.objects.meshes import read_names
 from training.readers.ocid import read_organized_points
 

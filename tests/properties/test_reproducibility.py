@@ -32,7 +32,7 @@ from flax import nnx
 sys.path.append(sys.argv[1])
 from helpers import SMALL_CONFIG, brick_and_stick
 import colornet, thor2_jax as thor2
-from training.fitting.options import FitOptions
+from training.fitting.loop import FitOptions
 from training.fitting.job import RunSettings, train_run
 from training.views.normalized_views import MemoryViews
 

@@ -13,7 +13,7 @@ from helpers import input_error, random_clouds
 import colornet
 import thor2_jax as thor2
 from thor2_jax.frames.instance_clouds import InstanceCloud
-from thor2_jax.frames.occlusion import OcclusionBoundary
+from thor2_jax.frames.prepared_instance import OcclusionBoundary
 
 RNG = np.random.default_rng(0)
 

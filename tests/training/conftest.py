@@ -21,7 +21,7 @@ from thor2_jax.model.classifier import MLP
 from thor2_jax.model.run_directory import input_size
 from training.embedding import run_embedding
 from training.fitting import job
-from training.fitting.options import EpochMetrics
+from training.fitting.loop import EpochMetrics
 from training.fitting.samples import Samples
 from training.fitting.steps import FitContext
 

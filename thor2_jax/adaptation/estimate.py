@@ -1,12 +1,23 @@
 """The colour transform of a camera from unlabelled instances: the mean of its posterior.
 
 The prior is a normal distribution around no change. The likelihood of an instance is exp(-`EVIDENCE` u), where u is the
-uncertainty of its answer (see `objective`). With few instances, or where colours do not matter, the estimate therefore
-stays near no change.
+uncertainty of its answer. With few instances, or where colours do not matter, the estimate therefore stays near no
+change.
+
+The uncertainty is the entropy over the classes and over "none of them", whose probability is what the classes lack to
+1. An unknown object that is surely none of the classes is therefore no reason to change the colours. So that it is no
+way out to make all objects unknown, -log of the probability of being known is added, with the weight of that
+probability before any change.
+
+While frames arrive, `OnlineAdaptation` estimates the transform again, in a thread, from the latest instances.
 """
 
 import dataclasses
+import logging
+import threading
+from collections import deque
 from collections.abc import Callable, Iterable, Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,27 +25,110 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import softmax
 
-from thor2_jax.adaptation.color_transform import ColorTransform
-from thor2_jax.adaptation.objective import Criterion, Objective
-from thor2_jax.descriptor.looks import LookDescriptors
+from colornet import ColorNetwork
+from thor2_jax.adaptation.color_transform import ColorTransform, transform_colors
+from thor2_jax.capacity import point_bucket
+from thor2_jax.config import DescriptorConfig
+from thor2_jax.descriptor.looks import LookDescriptors, describe_looks
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import RGBDFrame
-from thor2_jax.frames.prepared_instance import PreparedInstance, prepare_instance
+from thor2_jax.frames.prepared_instance import EMPTY_INSTANCE, PreparedInstance, pack_instances, prepare_instance
 from thor2_jax.gallery.embedding import Embedding
 from thor2_jax.gallery.gallery import GAMMA, Gallery
 from thor2_jax.model.classifier import EMBEDDING, Classifier
 from thor2_jax.model.fusion import fused_probabilities
 from thor2_jax.model.inference import infer
 from thor2_jax.model.model import Model
+from thor2_jax.types import PointClouds
 
 __all__ = [
+    "Adaptation",
+    "CAPACITY",
+    "Criterion",
     "MAX_INSTANCES",
     "MIN_INSTANCES",
-    "Adaptation",
+    "Objective",
+    "OnlineAdaptation",
     "adaptation_criterion",
     "camera_instances",
+    "entropy",
     "estimate_transform",
 ]
+
+ROWS = 8
+"""Instances that are described in one call."""
+
+LOOKS = 2
+"""Looks at an instance; the colours of further ones differ."""
+
+MIN_KNOWN = 1e-3
+"""Smallest probability of being known that is distinguished from 0."""
+
+
+class Criterion(NamedTuple):
+    """The colour network, the descriptor and the classifier whose certainty an estimate increases."""
+
+    network: ColorNetwork
+    config: DescriptorConfig
+    classify: Classifier
+
+
+def entropy(probabilities: jax.Array) -> jax.Array:
+    """Return the entropy [B] of probabilities [B, C] and of what they lack to 1, in nats."""
+    rest = jnp.clip(1 - probabilities.sum(axis=-1, keepdims=True), 0, 1)
+    every = jnp.clip(jnp.concatenate([probabilities, rest], axis=-1), 1e-12, 1)
+    return -(every * jnp.log(every)).sum(axis=-1)
+
+
+@jax.jit
+def _transformed(clouds: PointClouds, parameters: jax.Array) -> PointClouds:
+    return dataclasses.replace(clouds, colors=transform_colors(parameters, clouds.colors))
+
+
+@jax.jit
+def _uncertainties(probabilities: jax.Array, known_before: jax.Array) -> jax.Array:
+    known = jnp.clip(probabilities.sum(axis=1), MIN_KNOWN, 1)
+    return entropy(probabilities) - known_before * jnp.log(known)
+
+
+class Objective:
+    """The uncertainties of instances under colour transforms."""
+
+    def __init__(
+        self, instances: Sequence[PreparedInstance], criterion: Criterion, capacity: int | None = None
+    ) -> None:
+        """Pack the instances, and classify them without a transform.
+
+        Args:
+            instances: usable instances with the camera's colours.
+            criterion: what computes the answers.
+            capacity: N, points in a row, so that only one shape is compiled; larger clouds are left out. By default
+                each chunk has the point bucket of its largest cloud.
+        """
+        config = dataclasses.replace(criterion.config, homology="closed_form", relaxation=None)
+        self._criterion = criterion._replace(config=config)
+        fitting = [each for each in instances if capacity is None or len(each.points) <= capacity]
+        ordered = sorted(fitting, key=lambda each: len(each.points))
+        self._chunks = []
+        for start in range(0, len(ordered), ROWS):
+            part = ordered[start : start + ROWS]
+            clouds = pack_instances(part, ROWS, capacity or point_bucket(len(part[-1].points)))
+            known = jnp.minimum(self._probabilities(clouds).sum(axis=1), 1)
+            self._chunks.append((len(part), clouds, known))
+
+    def _probabilities(self, clouds: PointClouds) -> jax.Array:
+        network, config, classify = self._criterion
+        return classify(describe_looks(clouds, network, config, LOOKS).with_balanced(clouds))
+
+    def total(self, parameters: NDArray[np.floating]) -> float:
+        """Return the sum of the uncertainties for parameters [4] of a colour transform."""
+        transform = jnp.asarray(parameters, jnp.float32)
+        values = [
+            (count, _uncertainties(self._probabilities(_transformed(clouds, transform)), known))
+            for count, clouds, known in self._chunks
+        ]
+        return float(sum(np.asarray(value)[:count].sum() for count, value in values))
+
 
 PRIOR = 0.085
 """Standard deviation of the warmth."""
@@ -193,3 +287,62 @@ def posterior_mean(totals: NDArray[np.floating]) -> NDArray[np.float64]:
     """Return the mean [4] of the posterior from the sums of uncertainties [25] of the transforms of `GRID`."""
     negative_log = EVIDENCE * totals + (GRID[:, 3] / PRIOR) ** 2 / 2
     return np.asarray(softmax(-negative_log) @ GRID)
+
+
+log = logging.getLogger(__name__)
+
+CAPACITY = 2048
+"""Most points of an instance that is used, so that one shape is compiled."""
+
+EVERY = 20
+"""New instances after which the transform is estimated again."""
+
+
+class OnlineAdaptation:
+    """The colour transform of one camera, from the instances of its latest frames.
+
+    The estimate runs in one thread at a time; instances that arrive meanwhile are kept for the next one.
+    """
+
+    def __init__(self, criterion: Criterion, adapted: Callable[[Adaptation], None] = lambda adaptation: None) -> None:
+        """Start without instances.
+
+        Args:
+            criterion: see `estimate_transform`.
+            adapted: called with each new estimate, in the thread that made it.
+        """
+        self._criterion, self._adapted = criterion, adapted
+        self._recent: deque[PreparedInstance] = deque(maxlen=MAX_INSTANCES)
+        self._new = 0
+        self._thread: threading.Thread | None = None
+        self.latest: Adaptation | None = None
+
+    def compile(self) -> None:
+        """Compile everything that an estimate needs, by evaluating an instance."""
+        Objective([EMPTY_INSTANCE], self._criterion, CAPACITY).total(np.zeros(4))
+
+    def observe(self, instances: Sequence[PreparedInstance]) -> None:
+        """Add the instances of a frame, with the camera's colours, and start an estimate if there are enough."""
+        usable = [each for each in instances if each.reason is None and len(each.points) <= CAPACITY]
+        self._recent.extend(usable)
+        self._new += len(usable)
+        is_busy = self._thread is not None and self._thread.is_alive()
+        if is_busy or self._new < EVERY or len(self._recent) < MIN_INSTANCES:
+            return
+        self._new = 0
+        self._thread = threading.Thread(target=self._estimate, args=(list(self._recent),), name="adapt", daemon=True)
+        self._thread.start()
+
+    def join(self) -> None:
+        """Return when no estimate is running."""
+        if self._thread is not None:
+            self._thread.join()
+
+    def _estimate(self, instances: Sequence[PreparedInstance]) -> None:
+        try:
+            adaptation = estimate_transform(instances, self._criterion, capacity=CAPACITY)
+        except Exception:
+            log.exception("adaptation failed; the colours are corrected as before")
+            return
+        self.latest = adaptation
+        self._adapted(adaptation)

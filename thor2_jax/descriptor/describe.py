@@ -5,28 +5,114 @@
 >>> clouds = thor2.PointClouds.pack([(np.random.rand(1000, 3) / 10, np.random.rand(1000, 3))])
 >>> thor2.describe(clouds, network, config).tops2.shape
 (1, 11942)
+
+On CPUs, large batches are computed a chunk of clouds at a time so that intermediate tables stay in the caches:
+`map_chunks(function, clouds)` equals `function(clouds)`, the plain version, for any function that treats each cloud by
+itself. `map_large_chunks` does the same outside `jax.jit`, with larger chunks. On accelerators both are the plain
+version. `describe_stream` describes more clouds than fit into memory.
 """
 
 import functools
+import itertools
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from colornet import ColorNetwork
 from colornet.grid import GRID_SIZE
+from thor2_jax.capacity import BATCH_BUCKETS
 from thor2_jax.config import DescriptorConfig
-from thor2_jax.descriptor.chunking import chunk_size, map_chunks
 from thor2_jax.descriptor.color_membership import RegionSets, color_sets, region_sets
-from thor2_jax.descriptor.persistence import diagrams_of_strips
-from thor2_jax.descriptor.persistence_images import count_past_window, persistence_images
+from thor2_jax.descriptor.persistence import count_past_window, diagrams_of_strips, persistence_images
 from thor2_jax.descriptor.slicing import strips_of_cloud
 from thor2_jax.descriptor.view_normalization import align
 from thor2_jax.errors import InputError
-from thor2_jax.parameters import Parameters
-from thor2_jax.types import Descriptors, Diagrams, PointClouds, Strips
+from thor2_jax.types import Descriptors, Diagrams, Parameters, PointClouds, Strips
 
-__all__ = ["describe", "describe_aligned", "describe_strips", "diagrams", "strips", "strips_by_sets"]
+__all__ = [
+    "chunk_size",
+    "describe",
+    "describe_aligned",
+    "describe_stream",
+    "describe_strips",
+    "diagrams",
+    "map_chunks",
+    "map_large_chunks",
+    "strips",
+    "strips_by_sets",
+]
+
+T = TypeVar("T")
+
+MAX_CHUNK_CLOUDS = 64
+"""Largest number of clouds in a chunk."""
+
+MAX_CHUNK_POINTS = 2**17
+"""Largest number of points in a chunk, padding included."""
+
+CHUNKS_PER_STEP = 4
+"""Chunks in one step of the loop; XLA can run them concurrently."""
+
+MAX_LARGE_CHUNK_POINTS = 2**19
+"""Largest number of points in a large chunk, padding and all looks included."""
+
+
+def chunk_size(clouds: PointClouds) -> int:
+    """Return the number of clouds in a chunk. On an accelerator the whole batch is one chunk."""
+    n_clouds, capacity = clouds.mask.shape
+    if jax.default_backend() != "cpu":
+        return n_clouds
+    return max(1, min(MAX_CHUNK_CLOUDS, MAX_CHUNK_POINTS // max(capacity, 1)))
+
+
+def map_chunks(function: Callable[[PointClouds], T], clouds: PointClouds) -> T:
+    """Return `function(clouds)`, computed `CHUNKS_PER_STEP` chunks at a time. Call it under `jax.jit`.
+
+    Args:
+        function: maps clouds [B, N] to arrays [B, ...] and treats each cloud by itself.
+        clouds: [B, N].
+    """
+    n_clouds, size = len(clouds.mask), chunk_size(clouds)
+    clouds_per_step = size * CHUNKS_PER_STEP
+    if n_clouds <= clouds_per_step:
+        return _map_slices(function, clouds, size)
+    n_steps, rest = divmod(n_clouds, clouds_per_step)
+    head = jax.tree.map(lambda a: a[: n_clouds - rest].reshape(n_steps, clouds_per_step, *a.shape[1:]), clouds)
+    results = jax.lax.map(lambda step: _map_slices(function, step, size), head)
+    results = jax.tree.map(lambda a: a.reshape(n_clouds - rest, *a.shape[2:]), results)
+    if rest == 0:
+        return results
+    tail = jax.tree.map(lambda a: a[n_clouds - rest :], clouds)
+    return _concatenate([results, _map_slices(function, tail, size)])
+
+
+def map_large_chunks(function: Callable[[PointClouds], T], clouds: PointClouds, looks: int) -> T:
+    """Return `function(clouds)`, computed for one large chunk after the other.
+
+    Args:
+        function: maps clouds [B, N] to arrays [B, ...] and treats each cloud by itself.
+        clouds: [B, N].
+        looks: number of looks at each cloud that the function describes.
+    """
+    n_clouds, capacity = clouds.mask.shape
+    size = max(1, MAX_LARGE_CHUNK_POINTS // (max(capacity, 1) * looks))
+    if jax.default_backend() != "cpu" or n_clouds <= size:
+        return function(clouds)
+    return _map_slices(function, clouds, size)
+
+
+def _map_slices(function: Callable[[PointClouds], T], clouds: PointClouds, size: int) -> T:
+    starts = range(0, max(len(clouds.mask), 1), size)
+    return _concatenate([function(jax.tree.map(lambda a, k=k: a[k : k + size], clouds)) for k in starts])
+
+
+def _concatenate(results: Sequence[T]) -> T:
+    concatenated: T = jax.tree.map(lambda *arrays: jnp.concatenate(arrays), *results)
+    return concatenated
 
 
 @functools.lru_cache(maxsize=8)
@@ -157,3 +243,50 @@ def _describe_in_chunks(
     clouds: PointClouds, network: ColorNetwork, config: DescriptorConfig, parameters: Parameters | None
 ) -> Descriptors:
     return map_chunks(lambda chunk: describe(chunk, network, config, parameters), clouds)
+
+
+def describe_stream(
+    clouds: Iterable[tuple[Any, Any]],
+    network: ColorNetwork,
+    config: DescriptorConfig,
+    capacity: int | None = None,
+    batch: int = BATCH_BUCKETS[-1],
+) -> Iterator[Descriptors]:
+    """Describe clouds batch by batch, in order; memory use does not grow with their number.
+
+    The next batch is packed while the previous one is computed.
+
+    Args:
+        clouds: pairs (xyz, rgb) as `PointClouds.pack` takes them, read lazily.
+        network: the colour network.
+        config: static.
+        capacity: padded number of points; by default the bucket of each batch's largest cloud.
+        batch: number of clouds described together. Each number compiles once.
+
+    Yields:
+        Descriptors of up to `batch` clouds, as NumPy arrays.
+
+    Raises:
+        InputError: `batch` is not positive, or `PointClouds.pack` rejects a cloud; the message gives the index of the
+            cloud in its batch.
+    """
+    if batch < 1:
+        raise InputError(f"batch is {batch}; expected at least 1")
+    return _stream(iter(clouds), network, config, capacity, batch)
+
+
+def _stream(
+    clouds: Iterator[tuple[Any, Any]], network: ColorNetwork, config: DescriptorConfig, capacity: int | None, batch: int
+) -> Iterator[Descriptors]:
+    empty_cloud = (np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
+    running: list[tuple[int, Descriptors]] = []
+    while chunk := list(itertools.islice(clouds, batch)):
+        packed = PointClouds.pack(chunk + [empty_cloud] * (batch - len(chunk)), capacity)
+        running.append((len(chunk), describe(packed, network, config)))
+        if len(running) > 1:
+            yield _fetch(*running.pop(0))
+    yield from (_fetch(*last) for last in running)
+
+
+def _fetch(count: int, descriptors: Descriptors) -> Descriptors:
+    return jax.tree.map(lambda a: np.asarray(a)[:count], descriptors)

@@ -19,9 +19,8 @@ from jax.typing import ArrayLike
 
 from colornet import ColorNetwork
 from thor2_jax.config import LOOK_COUNTS, DescriptorConfig
-from thor2_jax.descriptor.chunking import map_chunks, map_large_chunks
 from thor2_jax.descriptor.cloud_statistics import N_BALANCED, balanced_histogram, cloud_statistics, side_lengths
-from thor2_jax.descriptor.describe import describe_strips, strips
+from thor2_jax.descriptor.describe import describe_strips, map_chunks, map_large_chunks, strips
 from thor2_jax.descriptor.view_normalization import align, boxed, oriented, place_aligned
 from thor2_jax.errors import InputError
 from thor2_jax.types import Descriptors, PointClouds, Strips

@@ -19,8 +19,7 @@ import numpy as np
 from colornet.grid import GRID_LEVELS, GRID_STEP, grid_colors
 from thor2_jax.config import DescriptorConfig, Relaxation
 from thor2_jax.descriptor.bounding_box import HIGHEST
-from thor2_jax.descriptor.cielab import to_lab
-from thor2_jax.descriptor.cloud_statistics import square_root
+from thor2_jax.descriptor.cloud_statistics import square_root, to_lab
 from thor2_jax.descriptor.color_membership import RegionSets
 from thor2_jax.types import Strips
 

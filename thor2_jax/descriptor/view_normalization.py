@@ -19,8 +19,7 @@ from jax.typing import ArrayLike
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.descriptor.bounding_box import HIGHEST, ROWS, fold, minimal_box, rotate
 from thor2_jax.errors import InputError
-from thor2_jax.parameters import Parameters
-from thor2_jax.types import PointClouds
+from thor2_jax.types import Parameters, PointClouds
 
 __all__ = ["Normalization", "align", "boxed", "mirror", "oriented", "place_aligned", "turn", "view_normalize"]
 

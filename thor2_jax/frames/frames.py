@@ -6,7 +6,7 @@ points = backproject(frame.depth_m, frame.intrinsics)      # [H, W, 3] metres, O
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -19,10 +19,11 @@ from thor2_jax.frames.image_files import read_depth, read_image
 from thor2_jax.frames.intrinsics import Intrinsics, read_intrinsics
 
 __all__ = [
+    "Intrinsics",
     "MAX_DEPTH",
     "MIN_DEPTH",
-    "Intrinsics",
     "RGBDFrame",
+    "RecordedFrame",
     "backproject",
     "check_images",
     "distort",
@@ -34,9 +35,9 @@ __all__ = [
     "read_frame",
     "read_intrinsics",
     "read_labels",
+    "stamp_name",
     "undistort",
 ]
-
 
 MIN_DEPTH, MAX_DEPTH = 0.26, 2.5
 """Range of valid depth, metres."""
@@ -290,3 +291,28 @@ def frame_intrinsics(path: str | Path, color: str | Path, depth_scale: float | N
     name = Path(color).stem
     intrinsics = read_intrinsics(path, int(name) if name.isdecimal() else None)
     return intrinsics if depth_scale is None else dataclasses.replace(intrinsics, depth_scale=depth_scale)
+
+
+def stamp_name(stamp: int) -> str:
+    """Return a time stamp in nanoseconds as text in seconds: the name of a recorded frame."""
+    seconds, nanoseconds = divmod(abs(stamp), 10**9)
+    return f"{'-' if stamp < 0 else ''}{seconds}.{nanoseconds:09d}"
+
+
+@dataclasses.dataclass(frozen=True)
+class RecordedFrame:
+    """A frame that can be read.
+
+    Attributes:
+        name: unique: time stamp in seconds, with a number if several frames have it, or name of the folder.
+        read: function that returns the frame, without labels in recordings; raises InputError and OSError.
+        stamp: time of the colour image, nanoseconds.
+        gap: time from the colour image to the depth image, nanoseconds.
+        frame_id: coordinate frame of the colour camera in ROS.
+    """
+
+    name: str
+    read: Callable[[], RGBDFrame]
+    stamp: int
+    gap: int = 0
+    frame_id: str = ""

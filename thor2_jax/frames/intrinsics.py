@@ -22,8 +22,7 @@ from typing import Any
 import numpy as np
 
 from thor2_jax.errors import InputError, with_context
-from thor2_jax.files import read_file
-from thor2_jax.tables import parse_json, parse_yaml
+from thor2_jax.files import parse_json, parse_yaml, read_file
 
 __all__ = ["DEFAULT_DEPTH_SCALE", "Intrinsics", "parse_intrinsics", "read_intrinsics"]
 

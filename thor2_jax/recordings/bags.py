@@ -17,16 +17,28 @@ from typing import Any
 import numpy as np
 
 from thor2_jax.errors import InputError, needs_extra, with_context
-from thor2_jax.files import read_file
-from thor2_jax.frames.frames import RGBDFrame
+from thor2_jax.files import parse_yaml, read_file
+from thor2_jax.frames.frames import RecordedFrame, RGBDFrame, stamp_name
 from thor2_jax.frames.intrinsics import Intrinsics
-from thor2_jax.recordings.decompression import MAX_OVERLAPPING, largest_overlap, limit_decompression
 from thor2_jax.recordings.messages import color_image, depth_image, image_kind, stamp_of
-from thor2_jax.recordings.pairs import DEFAULT_MAX_GAP, ImagePair, PairCounts, StampedImage, nearest_pairs
-from thor2_jax.recordings.recorded_frames import RecordedFrame, stamp_name
-from thor2_jax.recordings.topics import CAMERA_TYPE, IMAGE_TYPES, Topics, choose_topics
-from thor2_jax.recordings.truncated_mcap import CompleteRecords, is_truncated
-from thor2_jax.tables import parse_yaml
+from thor2_jax.recordings.topics import (
+    CAMERA_TYPE,
+    DEFAULT_MAX_GAP,
+    IMAGE_TYPES,
+    ImagePair,
+    PairCounts,
+    StampedImage,
+    Topics,
+    choose_topics,
+    nearest_pairs,
+)
+from thor2_jax.recordings.untrusted_bags import (
+    MAX_OVERLAPPING,
+    CompleteRecords,
+    is_truncated,
+    largest_overlap,
+    limit_decompression,
+)
 
 __all__ = ["Bag"]
 

@@ -13,9 +13,8 @@ from typing import Any
 import numpy as np
 
 from thor2_jax.errors import InputError, needs_extra
-from thor2_jax.frames.frames import RGBDFrame
+from thor2_jax.frames.frames import RecordedFrame, RGBDFrame, stamp_name
 from thor2_jax.frames.intrinsics import Intrinsics
-from thor2_jax.recordings.recorded_frames import RecordedFrame, stamp_name
 
 __all__ = ["RealSenseCamera"]
 

@@ -24,8 +24,7 @@ from thor2_jax.gallery.objects import ObjectGallery
 from thor2_jax.gallery.store import GalleryBusyError, GalleryError
 from thor2_jax.model.recognition import Recognition
 from thor2_jax.service.answers import explained_frame, why_answer
-from thor2_jax.service.batching import Batcher
-from thor2_jax.service.engine import CloudResult, ExplanationPrograms, InferenceEngine
+from thor2_jax.service.engine import Batcher, CloudResult, ExplanationPrograms, InferenceEngine
 from thor2_jax.service.metrics import COMPILER_THREAD, CompilationCounter, Metrics
 from thor2_jax.service.preparation import (
     PreparationPool,

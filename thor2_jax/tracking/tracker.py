@@ -6,16 +6,25 @@
 ...         print(answer.track, answer.name, answer.confidence)
 >>> [(track.track, track.name, track.frames) for track in tracker.tracks()]        # doctest: +SKIP
 [(1, 'mug', 5), (2, 'bowl', 4)]
+
+The clouds of two frames that overlap most show the same object. The overlap is the share of the smaller one's voxels
+that the other one also occupies, averaged over the voxel sizes `VOXELS`. Small voxels distinguish neighbouring objects;
+large ones allow for motion between the frames.
+
+The log-probabilities of each classifier and the scores of the gallery are averaged, with the weights of the views.
+Successive frames are nearly the same, so their probabilities are not multiplied as those of independent observations
+would be: a track whose frames all have the same probabilities has the confidence of a single frame.
 """
 
 import dataclasses
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Protocol, Self
 
 import jax
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import softmax
 
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import RGBDFrame
@@ -23,12 +32,131 @@ from thor2_jax.frames.prepared_instance import EMPTY_INSTANCE, PreparedInstance
 from thor2_jax.model.inference import Inference, answers, gallery_scores
 from thor2_jax.model.model import Model
 from thor2_jax.model.recognition import MAX_OVERFLOW, Recognition
-from thor2_jax.tracking.fusion import FusedEvidence, view_weight
-from thor2_jax.tracking.matching import OccupiedVoxels, match, occupied_voxels
 from thor2_jax.tracking.next_view import NextView, ViewTable, next_view
 from thor2_jax.tracking.poses import PosedInstance, check_pose, merge_views, transform
 
-__all__ = ["TrackedRecognition", "Tracker"]
+__all__ = [
+    "FusedEvidence",
+    "MIN_OVERLAP",
+    "TrackedRecognition",
+    "Tracker",
+    "match",
+    "occupied_voxels",
+    "overlap",
+    "view_weight",
+]
+
+VOXELS = (0.01, 0.02, 0.04)
+"""Voxel sides, metres."""
+
+MIN_OVERLAP = 0.2
+"""Least overlap of two clouds of one object."""
+
+_OFFSET = 2**20
+"""Half the number of voxels along each axis that get a number of their own."""
+
+OccupiedVoxels = tuple[NDArray[np.int64], ...]
+"""Numbers of the voxels that a cloud occupies, in increasing order, for each of `VOXELS`."""
+
+
+def occupied_voxels(points: NDArray[np.floating]) -> OccupiedVoxels:
+    """Return the voxels that points [n, 3] in metres occupy, for each of `VOXELS`."""
+    numbers = []
+    for size in VOXELS:
+        x, y, z = np.floor(points / size).astype(np.int64).T + _OFFSET
+        numbers.append(np.unique((x * 2 * _OFFSET + y) * 2 * _OFFSET + z))
+    return tuple(numbers)
+
+
+def overlap(first: OccupiedVoxels, second: OccupiedVoxels) -> float:
+    """Return the overlap of two clouds, from 0 to 1."""
+    shares = [
+        len(np.intersect1d(a, b, assume_unique=True)) / max(min(len(a), len(b)), 1)
+        for a, b in zip(first, second, strict=True)
+    ]
+    return float(np.mean(shares))
+
+
+def match(first: Sequence[OccupiedVoxels], second: Sequence[OccupiedVoxels]) -> list[tuple[int, int]]:
+    """Return pairs of indices, one of each sequence, with the largest total overlap; each index occurs at most once.
+
+    Pairs with an overlap below `MIN_OVERLAP` are left out.
+    """
+    from scipy.optimize import linear_sum_assignment  # takes .1 s to import, and one frame needs no matches
+
+    overlaps = np.array([[overlap(a, b) for b in second] for a in first]).reshape(len(first), len(second))
+    overlaps[overlaps < MIN_OVERLAP] = 0
+    rows, columns = linear_sum_assignment(overlaps, maximize=True)
+    return [(int(i), int(j)) for i, j in zip(rows, columns, strict=True) if overlaps[i, j] > 0]
+
+
+OCCLUDED_WEIGHT = 0.5
+"""Weight of a point of an occluded instance; other points weigh 1."""
+
+HALF_LIFE = 30
+"""Views of an object after which the weight of an older one has halved, so that a track can change its mind."""
+
+
+def view_weight(instance: PreparedInstance) -> float:
+    """Return the weight of a view: its number of points, which is its visible surface, less if it is occluded."""
+    return len(instance.points) * (OCCLUDED_WEIGHT if instance.occluded else 1.0)
+
+
+def _log_with_rest(probabilities: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return the logarithms [C + 1] of probabilities [C] and of what they lack to 1."""
+    rest = max(1 - float(probabilities.sum(dtype=np.float64)), 0.0)
+    return np.log(np.maximum(np.append(probabilities.astype(np.float64), rest), np.finfo(np.float32).tiny))
+
+
+class FusedEvidence:
+    """The evidence of the views of one object.
+
+    Attributes:
+        weight: total weight of the views.
+        logs: classifier -> weighted sum [C + 1] of log-probabilities, the last one that of no class.
+        score_weight: total weight of the views with gallery scores.
+        scores: weighted sum of the gallery's scores, by name of the object; None if the classifiers alone answer.
+    """
+
+    def __init__(self) -> None:
+        self.weight = 0.0
+        self.logs: dict[str, NDArray[np.float64]] = {}
+        self.score_weight = 0.0
+        self.scores: Mapping[str, float] | None = None
+
+    def add(
+        self, weight: float, probabilities: Mapping[str, NDArray[np.floating]], scores: Mapping[str, float] | None
+    ) -> None:
+        """Add a view.
+
+        Args:
+            weight: its weight, see `view_weight`.
+            probabilities: classifier -> class probabilities [C], which may sum to less than 1.
+            scores: object -> score of the gallery. Objects that were enrolled or forgotten since the last view start
+                the sums again.
+        """
+        decay = 0.5 ** (1 / HALF_LIFE)
+        self.weight = decay * self.weight + weight
+        self.logs = {
+            name: decay * self.logs.get(name, np.zeros(len(p) + 1)) + weight * _log_with_rest(p)
+            for name, p in probabilities.items()
+        }
+        earlier = self.scores or {}
+        if set(scores or {}) != set(earlier):
+            self.score_weight, earlier = 0.0, dict.fromkeys(scores or {}, 0.0)
+        self.score_weight = decay * self.score_weight + weight
+        if scores is not None:
+            scores = {name: decay * earlier[name] + weight * value for name, value in scores.items()}
+        self.scores = scores
+
+    def fused(self) -> tuple[dict[str, NDArray[np.float64]], dict[str, float] | None]:
+        """Return classifier -> fused class probabilities [C], and object -> fused score; None without a gallery."""
+        tiny = np.finfo(np.float64).tiny
+        probabilities = {name: softmax(logs / max(self.weight, tiny))[:-1] for name, logs in self.logs.items()}
+        if self.scores is None:
+            return probabilities, None
+        return probabilities, {name: value / max(self.score_weight, tiny) for name, value in self.scores.items()}
+
 
 MAX_MISSED = 10
 """Frames without a view of an object after which its track ends."""

@@ -14,11 +14,10 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 from thor2_jax.errors import InputError
-from thor2_jax.frames.frames import RGBDFrame
+from thor2_jax.frames.frames import RecordedFrame, RGBDFrame
 from thor2_jax.frames.overlay import COLORS, UNRECOGNIZED, Annotation, Paint, draw_instances
 from thor2_jax.model.detections import Detection, detections_of
 from thor2_jax.model.recognition import Recognition
-from thor2_jax.recordings.recorded_frames import RecordedFrame
 from thor2_jax.segmentation.segmenters import Segmenter, segmented
 from thor2_jax.watch.server import Broadcast
 

@@ -17,13 +17,13 @@ import numpy as np
 
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import RGBDFrame
-from thor2_jax.frames.outlier_removal import flying_pixels
+from thor2_jax.frames.instance_clouds import flying_pixels
 from training.augmentation.illumination import Illumination, Registration, misregistered, relit
 from training.augmentation.occlusion import Occlusion, occluded
-from training.augmentation.pixels import without
 from training.augmentation.segmentation import Base, Segmentation, resegmented, without_base
 from training.augmentation.sensor import Sensor, sensed
-from training.rendering.camera import RenderedView
+from training.augmentation.settings import without
+from training.rendering.view_sphere import RenderedView
 
 __all__ = ["KINDS", "Augmentations", "augment"]
 

@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, uniform_filter
 
-from training.augmentation.pixels import FRAME_PIXEL, pixel_width
-from training.augmentation.settings import Range, Settings, limited
-from training.rendering.camera import RenderedView
+from training.augmentation.settings import FRAME_PIXEL, Range, Settings, limited, pixel_width
+from training.rendering.view_sphere import RenderedView
 
 __all__ = ["Illumination", "Registration", "misregistered", "relit"]
 

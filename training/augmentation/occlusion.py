@@ -6,12 +6,10 @@ import functools
 import numpy as np
 from numpy.typing import NDArray
 
-from training.augmentation.pixels import pixel_width, without
-from training.augmentation.settings import Range, Settings, limited
+from training.augmentation.settings import Range, Settings, limited, pixel_width, without
 from training.objects.builtin_objects import builtin_objects
-from training.rendering.camera import Camera, RenderedView
 from training.rendering.ray_caster import RayCaster, render_view
-from training.rendering.view_sphere import DISTANCE, camera_pose
+from training.rendering.view_sphere import DISTANCE, Camera, RenderedView, camera_pose
 
 __all__ = ["Occlusion", "occluded"]
 

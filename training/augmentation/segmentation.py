@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, binary_erosion, maximum_filter
 
 from thor2_jax.frames.frames import Intrinsics, pixel_points
-from thor2_jax.frames.outlier_removal import PIECE_CELL
-from training.augmentation.pixels import FRAME_PIXEL, pixel_width, without
-from training.augmentation.settings import Range, Settings, limited
-from training.rendering.camera import TRAINING_CAMERA, RenderedView
+from thor2_jax.frames.instance_clouds import PIECE_CELL
+from training.augmentation.settings import FRAME_PIXEL, Range, Settings, limited, pixel_width, without
+from training.rendering.view_sphere import TRAINING_CAMERA, RenderedView
 
 __all__ = ["Base", "Segmentation", "resegmented", "without_base"]
 

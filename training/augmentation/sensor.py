@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from training.augmentation.pixels import FRAME_PIXEL, pixel_width, without
-from training.augmentation.settings import Range, Settings, limited
-from training.rendering.camera import RenderedView
+from training.augmentation.settings import FRAME_PIXEL, Range, Settings, limited, pixel_width, without
+from training.rendering.view_sphere import RenderedView
 
 __all__ = ["Sensor", "axial_deviation", "depth_edges", "sensed"]
 

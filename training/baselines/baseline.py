@@ -21,9 +21,7 @@ from thor2_jax.model.recognition import DescribedFrame
 from thor2_jax.model.run_directory import TrainedRun
 from thor2_jax.types import PointClouds
 from training.fitting.calibration import fit_temperature
-from training.fitting.checkpoints import Checkpoints
-from training.fitting.loop import Steps, run_epochs
-from training.fitting.options import EpochMetrics, FitOptions
+from training.fitting.loop import Checkpoints, EpochMetrics, FitOptions, Steps, run_epochs
 from training.fitting.samples import fold_of_views
 from training.fitting.steps import FitState
 from training.views.crops import ViewCrops, quantized, rgbd_crop, stacked

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from thor2_jax.files import file_digest
 from thor2_jax.model.classifier import model_arrays, model_from_arrays
 from training.baselines.baseline import BaselineInputs, FitTask, FittedBaseline, NetworkFit, fit_network, in_batches
-from training.baselines.networks.architectures import ARCHITECTURES, network_inputs
-from training.baselines.networks.weights import load_weights
+from training.baselines.networks.architectures import ARCHITECTURES, load_weights, network_inputs
 from training.views.crops import ViewCrops
 
 __all__ = ["ImageNetwork", "fit_image_network", "read_samples"]

@@ -12,18 +12,24 @@ from thor2_jax.errors import InputError
 from thor2_jax.files import file_digest, remove_leftovers, remove_written
 from thor2_jax.model.run_directory import TrainedRun, load_run
 from training.baselines.baseline import Baseline, FitTask, FittedBaseline
-from training.baselines.files import StoredBaseline, baseline_file, read_baseline, write_baseline
+from training.baselines.files import (
+    BASELINES,
+    CLOUD_BASELINES,
+    NETWORKS,
+    TEMPLATES,
+    StoredBaseline,
+    baseline_file,
+    read_baseline,
+    write_baseline,
+)
 from training.baselines.forest import Forest, fit_forest
 from training.baselines.image_network import ImageNetwork, fit_image_network
-from training.baselines.names import BASELINES, CLOUD_BASELINES, NETWORKS, TEMPLATES
-from training.baselines.networks.architectures import ARCHITECTURES
-from training.baselines.networks.weights import load_weights, weights_file
+from training.baselines.networks.architectures import ARCHITECTURES, load_weights, weights_file
 from training.baselines.pointnet import ColoredPointNet, fit_pointnet
 from training.baselines.templates import DINOV2, Templates, create_backbone, fit_templates
 from training.baselines.thor import THOR, fit_thor
-from training.fitting.checkpoints import find_run_directories
-from training.fitting.options import FitOptions
-from training.storage.progress import Progress
+from training.fitting.loop import FitOptions, find_run_directories
+from training.storage.jobs import Progress
 from training.views.normalized_views import ViewSource
 
 __all__ = ["check_weights", "load_baselines", "pretrained_files", "train_baselines"]

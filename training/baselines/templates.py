@@ -20,9 +20,8 @@ from thor2_jax.model.classifier import model_arrays, model_from_arrays
 from training.baselines.baseline import BaselineInputs, FitTask, FittedBaseline, in_batches
 from training.baselines.files import baseline_file, read_baseline
 from training.baselines.image_network import INFERENCE_BATCH, ImageNetwork, read_samples
-from training.baselines.networks.architectures import ARCHITECTURES, network_inputs
+from training.baselines.networks.architectures import ARCHITECTURES, load_weights, network_inputs
 from training.baselines.networks.vit import VIT_DINOV2_SMALL, ViT
-from training.baselines.networks.weights import load_weights
 from training.views.crops import ViewCrops
 
 __all__ = ["BACKBONES", "DINOV2", "Templates", "create_backbone", "fit_templates"]

@@ -6,8 +6,7 @@ from typing import Annotated
 import typer
 
 from training.cli import options
-from training.cli.app import app, console, finish
-from training.cli.progress import show_progress
+from training.cli.app import app, console, finish, show_progress
 
 
 @app.command()
@@ -26,7 +25,7 @@ def adapt(
     model is most certain of its answers.
     """
     from training.camera_adaptation import adapt_run
-    from training.storage.progress import of_stage
+    from training.storage.jobs import of_stage
 
     sources = given.sources(segment)
     with show_progress(quiet) as progress:

@@ -1,8 +1,11 @@
-"""The typer application and what its commands share: the console and the last line of their output.
+"""The typer application and what its commands share: console, progress, and the cache of compiled programs.
 
-Invalid input ends a command with one line on standard error and exit code 2.
+Invalid input ends a command with one line on standard error and exit code 2. Progress is drawn as bars on a terminal,
+otherwise printed as plain lines every few seconds. Compiled programs are kept in the user's cache directory, so that
+only the first run of a command compiles; JAX_COMPILATION_CACHE_DIR takes precedence.
 """
 
+import contextlib
 import gc
 import itertools
 import os
@@ -10,18 +13,100 @@ import shlex
 import signal
 import sys
 import threading
+import time
+import warnings
+from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from types import FrameType
 from typing import Annotated, NoReturn, TextIO
 
 import typer
+from rich import progress
 from rich.console import Console
 
 from thor2_jax import __version__
 from thor2_jax.errors import InputError
 from thor2_jax.printable import escape_characters
-from training.cli.compilation_cache import enable_compilation_cache
+from training.storage.jobs import Progress, cache_directory, processor
 
-__all__ = ["app", "console", "finish", "main", "show_help"]
+__all__ = ["app", "console", "enable_compilation_cache", "finish", "main", "show_help", "show_progress"]
+
+MAX_BYTES = 2**30
+
+
+def enable_compilation_cache() -> None:
+    """Set the environment variables that JAX reads when it is imported; without a writable directory, set none.
+
+    Raises:
+        InputError: THOR2_CACHE names a file.
+    """
+    root = cache_directory("xla")
+    if root is None or os.environ.get("JAX_COMPILATION_CACHE_DIR"):
+        return
+    directory = root / processor()
+    try:
+        directory.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except OSError:
+        return
+    if os.access(directory, os.W_OK):
+        os.environ["JAX_COMPILATION_CACHE_DIR"] = str(directory)
+        os.environ.setdefault("JAX_COMPILATION_CACHE_MAX_SIZE", str(MAX_BYTES))
+        os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+        # A damaged entry, or a full disk, costs a compilation and nothing else.
+        warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache")
+
+
+SECONDS_PER_LINE = 5.0
+
+
+def show_progress(quiet: bool = False) -> AbstractContextManager[Progress]:
+    """Return a context whose callback shows the progress of each stage; with `quiet`, it shows nothing."""
+    if quiet:
+        return contextlib.nullcontext(lambda stage, done, total, note: None)
+    return _bars() if sys.stderr.isatty() else contextlib.nullcontext(_Lines())
+
+
+@contextlib.contextmanager
+def _bars() -> Iterator[Progress]:
+    tasks: dict[str, progress.TaskID] = {}
+    name = progress.TextColumn("{task.description}", markup=False)
+    note = progress.TextColumn("{task.fields[note]}", markup=False)
+    times = progress.TimeElapsedColumn(), progress.TimeRemainingColumn()
+    columns = name, progress.BarColumn(), progress.MofNCompleteColumn(), *times, note
+    with progress.Progress(*columns, console=Console(stderr=True)) as bars:
+
+        def show(stage: str, done: int, total: int, note: str) -> None:
+            if stage not in tasks:
+                # A resumed stage starts at what is already done, so that the remaining time is estimated correctly.
+                tasks[stage] = bars.add_task(stage, total=total, completed=done, note=note)
+            bars.update(tasks[stage], completed=done, total=total, note=note)
+
+        yield show
+
+
+class _Lines:
+    """Print a line when a stage begins, every few seconds, and when it ends."""
+
+    def __init__(self) -> None:
+        self._begun: dict[str, tuple[float, int]] = {}
+        self._printed: tuple[str, int] | None = None
+        self._next = 0.0
+
+    def __call__(self, stage: str, done: int, total: int, note: str) -> None:
+        now = time.monotonic()
+        begins = stage not in self._begun
+        start, first = self._begun.setdefault(stage, (now, done))
+        if (stage, done) == self._printed or not (begins or done >= total or now >= self._next):
+            return
+        self._printed, self._next = (stage, done), now + SECONDS_PER_LINE
+        elapsed = now - start
+        parts = [f"{done:,} of {total:,}", note]
+        if elapsed >= 1:
+            parts.append(f"{elapsed:.0f} s")
+            if first < done < total:
+                parts.append(f"about {elapsed * (total - done) / (done - first):.0f} s left")
+        print(f"{stage}: {', '.join(filter(None, parts))}", file=sys.stderr, flush=True)
+
 
 app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},

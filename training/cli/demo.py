@@ -7,8 +7,7 @@ import typer
 from rich.table import Table
 
 from training.cli import options
-from training.cli.app import app, console, finish
-from training.cli.progress import show_progress
+from training.cli.app import app, console, finish, show_progress
 
 
 @app.command()

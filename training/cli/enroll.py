@@ -13,8 +13,7 @@ import typer
 from thor2_jax.errors import InputError
 from thor2_jax.printable import check_name
 from training.cli import options
-from training.cli.app import app, console, finish
-from training.cli.progress import show_progress
+from training.cli.app import app, console, finish, show_progress
 
 if TYPE_CHECKING:
     from thor2_jax.frames.prepared_instance import PreparedInstance
@@ -128,9 +127,9 @@ def _rendered(
         yield {}
         return
     from training.storage.workers import IN_PROCESS
-    from training.views import enrolled_meshes
+    from training.views import mesh_views
 
-    render = partial(enrolled_meshes.mesh_views, mesh_scale=mesh_scale, cameras=enrolled_meshes.MESH_VIEWS)
+    render = partial(mesh_views.mesh_views, mesh_scale=mesh_scale, cameras=mesh_views.MESH_VIEWS)
     pool = dataclasses.replace(processes, workers=min(processes.workers, len(meshes))).pool() or IN_PROCESS
     views = pool(render, meshes.values())
     with contextlib.closing(views), ThreadPoolExecutor(1) as thread:

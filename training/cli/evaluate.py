@@ -13,8 +13,7 @@ from rich.table import Table
 
 from thor2_jax.printable import escape_characters
 from training.cli import options
-from training.cli.app import app, console, finish, show_help
-from training.cli.progress import show_progress
+from training.cli.app import app, console, finish, show_help, show_progress
 
 evaluate_app = typer.Typer(
     callback=show_help, invoke_without_command=True, help="Measure the accuracy of trained runs on a labelled dataset."

@@ -6,8 +6,7 @@ from typing import Annotated
 import typer
 
 from training.cli import options
-from training.cli.app import app, console, finish, show_help
-from training.cli.progress import show_progress
+from training.cli.app import app, console, finish, show_help, show_progress
 
 fetch_app = typer.Typer(callback=show_help, invoke_without_command=True, help="Download public meshes.")
 app.add_typer(fetch_app, name="fetch")

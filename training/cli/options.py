@@ -13,8 +13,7 @@ from typer.core import TyperCommand
 
 from thor2_jax.errors import InputError
 from thor2_jax.printable import escape_characters
-from thor2_jax.recordings.pairs import DEFAULT_MAX_GAP
-from thor2_jax.recordings.topics import Topics
+from thor2_jax.recordings.topics import DEFAULT_MAX_GAP, Topics
 
 __all__ = [
     "AnswerByOption",
@@ -171,8 +170,7 @@ class FrameOptions:
             OSError: a recording cannot be opened.
         """
         from thor2_jax.segmentation.segmenters import MODEL, TABLE, load_segmenter
-        from training.readers.frame_files import FrameFiles, find_frames, segmented_source
-        from training.readers.recording import recorded_sources
+        from training.readers.frame_files import FrameFiles, find_frames, recorded_sources, segmented_source
 
         self.check()
         if self.labels is not None and segment is not None:

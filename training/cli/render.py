@@ -8,8 +8,7 @@ import typer
 
 from thor2_jax.errors import InputError
 from training.cli import options
-from training.cli.app import app, finish
-from training.cli.progress import show_progress
+from training.cli.app import app, finish, show_progress
 
 MAX_CROP = 2048
 """Largest side of a crop, pixels."""
@@ -58,7 +57,7 @@ def render(
     """
     from training.augmentation.augmentations import Augmentations
     from training.objects.meshes import find_meshes, read_names, scaled_meshes
-    from training.storage.progress import of_stage
+    from training.storage.jobs import of_stage
     from training.storage.workers import IN_PROCESS
     from training.views.render_job import render_crops, render_dataset
 

@@ -9,8 +9,7 @@ import typer
 
 from thor2_jax.errors import InputError
 from training.cli import options
-from training.cli.app import app, console, finish
-from training.cli.progress import show_progress
+from training.cli.app import app, console, finish, show_progress
 
 if TYPE_CHECKING:
     from training.embedding.run_embedding import Distractors

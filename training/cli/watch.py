@@ -18,7 +18,7 @@ from training.cli import options
 from training.cli.app import app, finish
 
 if TYPE_CHECKING:
-    from thor2_jax.recordings.recorded_frames import RecordedFrame
+    from thor2_jax.frames.frames import RecordedFrame
 
 NOTICE_SECONDS = 1.0
 """Time that pages have to show an error before the server ends."""
@@ -132,8 +132,7 @@ def _folder_frames(folder: Path, relabel: bool) -> Iterator["RecordedFrame"]:
     import dataclasses
     import functools
 
-    from thor2_jax.frames.frames import RGBDFrame
-    from thor2_jax.recordings.recorded_frames import RecordedFrame
+    from thor2_jax.frames.frames import RecordedFrame, RGBDFrame
     from training.readers.frame_files import FrameSource, find_frames
 
     def read(source: FrameSource) -> RGBDFrame:

@@ -20,10 +20,9 @@ from thor2_jax.files import check_output_directory, check_output_file, remove_wr
 from thor2_jax.gallery.embedding import Embedding
 from training.embedding.fit import EmbeddingFit, fit_embedding, reference_views
 from training.embedding.sampling import ObjectSource, build_samples
-from training.fitting.options import EpochMetrics
+from training.fitting.loop import EpochMetrics
 from training.objects.meshes import find_meshes
-from training.storage.jobs import JOB_FILE
-from training.storage.progress import Progress, of_stage
+from training.storage.jobs import JOB_FILE, Progress, of_stage
 from training.storage.workers import local_workers
 
 __all__ = ["build_embedding", "main"]

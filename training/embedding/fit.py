@@ -30,9 +30,7 @@ from thor2_jax.gallery.embedding import Embedding, EmbeddingSizes, class_cosines
 from thor2_jax.gallery.references import BACKGROUND, References
 from thor2_jax.types import Descriptors, Strips
 from training.embedding.samples import Batch, Samples
-from training.fitting.checkpoints import Checkpoints
-from training.fitting.loop import Steps, run_epochs
-from training.fitting.options import EpochMetrics
+from training.fitting.loop import Checkpoints, EpochMetrics, Steps, run_epochs
 
 __all__ = ["EmbeddingFit", "batch_descriptors", "fit_embedding", "reference_views"]
 

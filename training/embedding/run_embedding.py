@@ -28,11 +28,9 @@ from training.embedding.sampling import (
     render_clouds,
     sampling_job,
 )
-from training.fitting.checkpoints import Checkpoints
-from training.fitting.options import EpochMetrics
+from training.fitting.loop import Checkpoints, EpochMetrics
 from training.objects.meshes import load_mesh
-from training.storage.jobs import JOB_FILE
-from training.storage.progress import Progress, of_stage
+from training.storage.jobs import JOB_FILE, Progress, of_stage
 from training.storage.workers import local_workers
 from training.views.normalized_views import ViewSource
 from training.views.render_job import mesh_digest

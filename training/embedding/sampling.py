@@ -36,11 +36,9 @@ from training.augmentation.augmentations import KINDS, Augmentations, augment
 from training.embedding.samples import Samples, joined_samples, sample_clouds
 from training.objects.meshes import load_mesh
 from training.objects.procedural import procedural_object
-from training.rendering.camera import Camera
 from training.rendering.ray_caster import RayCaster, render_view
-from training.rendering.view_sphere import camera_pose, random_angles
-from training.storage.jobs import begin_job, locked
-from training.storage.user_cache import cache_directory, processor
+from training.rendering.view_sphere import Camera, camera_pose, random_angles
+from training.storage.jobs import begin_job, cache_directory, locked, processor
 from training.storage.workers import IN_PROCESS, WorkerPool
 from training.views.mesh_views import MIN_VIEW_POINTS, cloud_of
 

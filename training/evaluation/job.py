@@ -22,8 +22,7 @@ from training.evaluation.page import write_report_page
 from training.evaluation.results import compute_results
 from training.evaluation.runs import Run, SequenceRun, all_predictors, has_real_views, scratch_networks
 from training.readers.labelled import LabelledFrame, LabelledFrames
-from training.storage.jobs import locked
-from training.storage.progress import Progress
+from training.storage.jobs import Progress, locked
 
 __all__ = ["Answering", "evaluate_dataset"]
 

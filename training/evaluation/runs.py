@@ -25,11 +25,10 @@ from thor2_jax.model.run_directory import EMBEDDING_FILE
 from thor2_jax.model.run_record import RUN_FILE
 from thor2_jax.recognizer import Recognizer
 from training.baselines.baseline import BaselineInputs, FittedBaseline
-from training.baselines.files import baseline_file
+from training.baselines.files import NETWORKS, TEMPLATES, TITLES, baseline_file
 from training.baselines.job import load_baselines
-from training.baselines.names import NETWORKS, TEMPLATES, TITLES
 from training.evaluation.answers import ALL_CLASSIFIERS, BOTH, EMBEDDED, GALLERY
-from training.fitting.checkpoints import find_run_directories
+from training.fitting.loop import find_run_directories
 from training.readers.labelled import named_path, path_ends, sequence_of
 
 __all__ = [

@@ -19,9 +19,7 @@ from numpy.typing import NDArray
 from thor2_jax.errors import InputError
 from thor2_jax.model.classifier import MLP
 from thor2_jax.model.run_directory import input_size
-from training.fitting.checkpoints import Checkpoints
-from training.fitting.loop import Steps, run_epochs
-from training.fitting.options import EpochMetrics, FitOptions
+from training.fitting.loop import Checkpoints, EpochMetrics, FitOptions, Steps, run_epochs
 from training.fitting.samples import Batch, Samples
 from training.fitting.steps import (
     FitContext,

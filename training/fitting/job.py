@@ -34,15 +34,21 @@ from thor2_jax.model.run_directory import EMBEDDING_FILE, TrainedRun, load_run, 
 from thor2_jax.model.run_record import RUN_FILE
 from training.embedding.run_embedding import fit_run_embedding
 from training.fitting.calibration import fit_calibration, temperatures
-from training.fitting.checkpoints import BEGUN, CHECKPOINTS, Checkpoints
 from training.fitting.fit import check_batch_size, fit
-from training.fitting.options import EpochMetrics, append_metrics, discard_later_epochs, read_metrics
+from training.fitting.loop import (
+    BEGUN,
+    CHECKPOINTS,
+    Checkpoints,
+    EpochMetrics,
+    append_metrics,
+    discard_later_epochs,
+    read_metrics,
+)
 from training.fitting.protocol import CALIBRATE, DESCRIBE, RunSettings
 from training.fitting.samples import Samples, build_samples, fold_of_views
 from training.fitting.steps import FitContext
 from training.reports.plots import draw_curves
-from training.storage.jobs import begin_job, check_begun, check_same_job, locked
-from training.storage.progress import Progress, of_stage
+from training.storage.jobs import Progress, begin_job, check_begun, check_same_job, locked, of_stage
 from training.views.normalized_views import ViewSource
 
 __all__ = ["VIEWS", "RunSettings", "check_out", "check_trained", "finished_record", "is_finished", "train_run"]

@@ -10,7 +10,7 @@ from thor2_jax.model.classifier import EMBEDDING, FEATURES, Feature, check_featu
 from training.augmentation.augmentations import Augmentations
 from training.embedding.run_embedding import STAGES, Distractors
 from training.embedding.sampling import AUGMENTATIONS
-from training.fitting.options import FitOptions
+from training.fitting.loop import FitOptions
 from training.fitting.samples import MIRRORS, PAPER_MIRRORS
 
 __all__ = ["CALIBRATE", "DEFAULT", "DESCRIBE", "PAPER", "QUICK", "Protocol", "RunSettings"]

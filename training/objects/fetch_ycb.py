@@ -18,8 +18,7 @@ from pathlib import Path, PurePosixPath
 from thor2_jax.errors import InputError
 from thor2_jax.files import remove_leftovers, temporary_directory
 from training.objects.meshes import load_mesh
-from training.storage.jobs import locked
-from training.storage.progress import Progress
+from training.storage.jobs import Progress, locked
 
 __all__ = ["LICENCE", "YCB_URL", "fetch_ycb"]
 

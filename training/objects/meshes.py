@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from thor2_jax.errors import InputError, with_context
-from thor2_jax.files import read_file
+from thor2_jax.files import read_file, read_table
 from thor2_jax.frames.image_files import MAX_IMAGE_PIXELS
 from thor2_jax.printable import check_name
-from thor2_jax.tables import read_table
 from training.objects.mesh import TexturedMesh, merge_meshes
 
 if TYPE_CHECKING:  # takes .2 s to import, and is needed where meshes are read

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError, with_context
+from thor2_jax.files import read_table
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, read_color, read_depth, read_labels
-from thor2_jax.tables import read_table
 from training.readers.labelled import LabelledFrame, LabelledFrames, dataset_folder, named_path
 
 __all__ = ["BOP", "SMALLEST_VISIBLE", "read_object_names"]

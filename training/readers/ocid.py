@@ -24,9 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError, with_context
-from thor2_jax.files import read_file
+from thor2_jax.files import parse_json, read_file, read_table
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, read_color, read_depth, read_labels
-from thor2_jax.tables import parse_json, read_table
 from training.readers.labelled import LabelledFrame, LabelledFrames, dataset_folder, path_ends
 
 __all__ = ["OCID", "fit_intrinsics", "read_organized_points"]

@@ -6,9 +6,8 @@
 from pathlib import Path
 
 from thor2_jax.errors import InputError, with_context
-from thor2_jax.files import read_file
+from thor2_jax.files import parse_yaml, read_file
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame, read_color, read_depth, read_labels
-from thor2_jax.tables import parse_yaml
 from training.readers.labelled import LabelledFrame, LabelledFrames, dataset_folder
 
 __all__ = ["INTRINSICS", "NOT_SCORED", "UWISOccluded", "video_attributes"]

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from thor2_jax.frames.frames import Intrinsics
 from training.objects.mesh import TexturedMesh
-from training.rendering.camera import TRAINING_CAMERA, Camera, RenderedView
+from training.rendering.view_sphere import TRAINING_CAMERA, Camera, RenderedView
 
 __all__ = ["Hits", "RayCaster", "pixel_rays", "render_view"]
 

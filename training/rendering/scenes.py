@@ -17,9 +17,8 @@ from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame
 from training.augmentation.sensor import axial_deviation, depth_edges
 from training.objects.mesh import TexturedMesh, moved
-from training.rendering.camera import Camera
 from training.rendering.ray_caster import RayCaster, pixel_rays, render_view
-from training.rendering.view_sphere import camera_pose
+from training.rendering.view_sphere import Camera, camera_pose
 
 __all__ = ["SCENE_CAMERA", "Scene", "compose_scene", "compose_views"]
 

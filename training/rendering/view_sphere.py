@@ -1,18 +1,65 @@
-"""Camera poses on the view sphere around an object (paper, section "Training"), in equal steps of two angles.
+"""Cameras of training views: intrinsics, rendered views, and poses on the view sphere (paper, section "Training").
 
     poses = [camera_pose(azimuth, polar, mesh.centre) for azimuth, polar in view_angles()]   # 2,664 poses
 
 The object's frame is that of the scan, with z up. The polar angle is 0 from above, pi/2 from the side, pi from below.
 """
 
+import dataclasses
 import math
 
 import numpy as np
 from numpy.typing import NDArray
 
 from thor2_jax.errors import InputError
+from thor2_jax.frames.frames import Intrinsics
 
-__all__ = ["DISTANCE", "camera_pose", "random_angles", "view_angles"]
+__all__ = ["Camera", "DISTANCE", "RenderedView", "TRAINING_CAMERA", "camera_pose", "random_angles", "view_angles"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Camera:
+    """A pinhole camera; pixel centres have integer coordinates.
+
+    Attributes:
+        width: image width, pixels.
+        height: image height, pixels.
+        intrinsics: focal lengths and principal point, pixels.
+    """
+
+    width: int
+    height: int
+    intrinsics: Intrinsics
+
+    @classmethod
+    def from_field_of_view(cls, width: int, height: int, degrees: float) -> "Camera":
+        """Return a camera with square pixels, a central principal point and a horizontal field of view in degrees."""
+        f = width / 2 / math.tan(math.radians(degrees) / 2)
+        return cls(width, height, Intrinsics(f, f, (width - 1) / 2, (height - 1) / 2))
+
+
+TRAINING_CAMERA = Camera.from_field_of_view(800, 600, 40.0)
+"""The camera of the training views (paper, section "Training")."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RenderedView:
+    """A rendered view, cropped to the part of the camera's image that the object can cover; the rest is empty.
+
+    Attributes:
+        color: [h, w, 3] uint8 sRGB, 0 where nothing is visible.
+        depth: [h, w] uint16, depth along the camera's z axis, millimetres, rounded; 0 where nothing is visible.
+        intrinsics: intrinsics of the cropped image.
+        pose: [4, 4] float64, camera to object frame.
+        corner: row and column of the cropped image's first pixel in the camera's image.
+    """
+
+    color: NDArray[np.uint8]
+    depth: NDArray[np.uint16]
+    intrinsics: Intrinsics
+    pose: NDArray[np.float64]
+    corner: tuple[int, int]
+
 
 DISTANCE = 1.5
 """Distance between the camera and the centre of the object's bounding box, metres."""

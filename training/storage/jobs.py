@@ -1,18 +1,119 @@
-"""Job records, which tell whether an output directory is that of the requested job, and exclusive locks on it."""
+"""Long jobs: their records and locks on output directories, their progress, and the user's cache directory.
 
+The cache directory may be deleted at any time. The environment variable THOR2_CACHE names another one, or is `off`.
+"""
+
+import hashlib
 import itertools
 import json
-from collections.abc import Mapping
+import os
+import platform
+import time
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 import filelock
+import platformdirs
 
 from thor2_jax.errors import InputError
 from thor2_jax.files import write_text
 
-__all__ = ["JOB_FILE", "LOCK", "begin_job", "check_begun", "check_same_job", "locked"]
+__all__ = [
+    "Display",
+    "JOB_FILE",
+    "LOCK",
+    "Progress",
+    "begin_job",
+    "cache_directory",
+    "check_begun",
+    "check_same_job",
+    "locked",
+    "numbered",
+    "of_stage",
+    "processor",
+]
+
+VARIABLE = "THOR2_CACHE"
+
+
+def cache_directory(kind: str) -> Path | None:
+    """Return the directory for files of a kind, which may be missing; None if there is no cache.
+
+    THOR2_CACHE holds the files of all kinds, which have different names.
+
+    Raises:
+        InputError: THOR2_CACHE names a file.
+    """
+    value = os.environ.get(VARIABLE, "")
+    if value == "off":
+        return None
+    directory = Path(value) if value else platformdirs.user_cache_path("thor2-jax") / kind
+    if directory.exists() and not directory.is_dir():
+        raise InputError(f"{VARIABLE} is {directory}, a file; expected a directory, or off")
+    return directory
+
+
+def processor() -> str:
+    """Return a name for the kind of processor: a program compiled for another one may crash or round otherwise."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        features = next(line for line in lines if line.lower().startswith(("flags", "features")))
+    except (OSError, StopIteration):
+        features = platform.processor()
+    return f"{platform.machine()}-{hashlib.sha256(features.encode()).hexdigest()[:12]}"
+
+
+Progress = Callable[[str, int, int, str], object]
+"""Called with (stage, done, total, note)."""
+
+Display = Callable[[], AbstractContextManager[Progress]]
+"""Opens a progress display, such as `training.cli.app.show_progress`."""
+
+
+def of_stage(progress: Progress, stage: str, note: str = "") -> Callable[[int, int], None]:
+    """Return the callback of a stage whose note is always the same, called with (done, total)."""
+
+    def show(done: int, total: int) -> None:
+        progress(stage, done, total, note)
+
+    return show
+
+
+def numbered(progress: Progress, stages: Mapping[str, float]) -> Progress:
+    """Return a callback that adds to each stage which one of how many it is, and the time left of all to its note.
+
+    The present stage keeps its own pace, and later stages take their shares at the pace of all progress seen so far.
+    What a resumed stage has done before does not count.
+
+    Args:
+        progress: the callback that is called with both.
+        stages: name -> share of the time of all stages, in any unit, in the order of the stages; 0 if it is not known.
+            Stages that are not among them stay as they are.
+    """
+    names = {stage: f"stage {number} of {len(stages)}: {stage}" for number, stage in enumerate(stages, 1)}
+    earlier = dict(zip(stages, itertools.accumulate(stages.values(), initial=0.0), strict=False))
+    seconds, made, first, last = 0.0, 0.0, (0.0, 0.0), ("", 0.0, 0.0)
+
+    def show(stage: str, done: int, total: int, note: str) -> None:
+        nonlocal seconds, made, first, last
+        if stages.get(stage):
+            now, part = time.monotonic(), earlier[stage] + stages[stage] * done / max(total, 1)
+            if stage == last[0]:
+                seconds, made = seconds + now - last[1], made + part - last[2]
+            else:
+                first = now, part
+            last, end = (stage, now, part), earlier[stage] + stages[stage]
+            pace = seconds / made if made > 0 else 0.0
+            own = (now - first[0]) / (part - first[1]) if part > first[1] else pace
+            left = own * (end - part) + pace * (sum(stages.values()) - end)
+            if seconds >= 1 and left >= 1:
+                note = ", ".join(filter(None, (note, f"about {left:.0f} s left of all stages")))
+        progress(names.get(stage, stage), done, total, note)
+
+    return show
+
 
 JOB_FILE = "job.json"
 

@@ -2,7 +2,8 @@
 
     views = render_views(find_meshes("meshes"), azimuth_step=5, polar_step=5, workers=2)     # name -> clouds
 
-`render_dataset` writes more views than memory holds to disk.
+`render_dataset` writes more views than memory holds to disk. Nothing here imports JAX, so that processes that render
+start quickly.
 """
 
 import dataclasses
@@ -20,28 +21,29 @@ from numpy.typing import NDArray
 from thor2_jax.config import DescriptorConfig
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import pixel_points
-from thor2_jax.frames.prepared_instance import DESCRIPTOR_VOXEL
-from thor2_jax.frames.voxel_grid import downsample_to_fit
-from training.augmentation.augmentations import Augmentations, augment
+from thor2_jax.frames.instance_clouds import downsample_to_fit
+from thor2_jax.frames.prepared_instance import DESCRIPTOR_VOXEL, PreparedInstance
+from training.augmentation.augmentations import KINDS, Augmentations, augment
 from training.objects.mesh import TexturedMesh
 from training.objects.meshes import load_mesh
-from training.rendering.camera import RenderedView
 from training.rendering.ray_caster import RayCaster, render_view
-from training.rendering.view_sphere import camera_pose, random_angles, view_angles
+from training.rendering.view_sphere import RenderedView, camera_pose, random_angles, view_angles
 from training.storage.workers import local_workers
 
 if TYPE_CHECKING:  # imports JAX, which rendering processes do not need
     from thor2_jax.types import Cloud
 
 __all__ = [
+    "MESH_VIEWS",
     "MIN_VIEW_POINTS",
     "RenderProgress",
     "ViewCloud",
     "ViewTask",
     "all_views",
     "checked_meshes",
-    "clouds_per_view",
     "cloud_of",
+    "clouds_per_view",
+    "mesh_views",
     "render_task",
     "render_views",
     "view_cloud",
@@ -242,4 +244,32 @@ def render_views(
             views[name] += [(cloud.xyz, cloud.rgb) for cloud in clouds]
             done += len(angles[first : first + VIEWS_PER_TASK])
             progress(done, total)
+    return views
+
+
+MESH_VIEWS = 60
+"""Cameras around a mesh. Each gives two views: the mesh as rendered, and an augmented rendering from another camera."""
+
+
+def _evenly_spread(count: int) -> NDArray[np.float64]:
+    """Return azimuth and polar angle [count, 2] of directions that cover the sphere evenly (a Fibonacci spiral)."""
+    index = np.arange(count)
+    golden_angle = np.pi * (3 - np.sqrt(5))
+    return np.stack([index * golden_angle % (2 * np.pi), np.arccos(1 - (2 * index + 1) / count)], axis=1)
+
+
+def mesh_views(mesh: Path | TexturedMesh, mesh_scale: float = 1.0, cameras: int = MESH_VIEWS) -> list[PreparedInstance]:
+    """Render a mesh from all sides: two views for each of `cameras`. `mesh_scale` converts a file's unit to metres.
+
+    Raises:
+        InputError: the mesh cannot be read, is too large or too small to be in metres, or has no usable view.
+        OSError: the file cannot be opened.
+    """
+    name, loaded = (mesh.name, load_mesh(mesh, mesh_scale)) if isinstance(mesh, Path) else ("mesh", mesh)
+    augmentations = Augmentations.of_names(KINDS, copies=1)
+    task = ViewTask(name, loaded, _evenly_spread(cameras), augmentations=augmentations)
+    clouds = enumerate(render_task(task))
+    views = [PreparedInstance(k, cloud.xyz, cloud.rgb, np.zeros(len(cloud.xyz), bool)) for k, cloud in clouds]
+    if not views:
+        raise InputError(f"mesh: {name} has too few points in every view; expected an object of a few centimetres")
     return views

@@ -30,8 +30,7 @@ from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.prepared_instance import DESCRIPTOR_VOXEL
 from training.augmentation.augmentations import Augmentations
 from training.objects.mesh import TexturedMesh
-from training.rendering.camera import TRAINING_CAMERA
-from training.rendering.view_sphere import DISTANCE, view_angles
+from training.rendering.view_sphere import DISTANCE, TRAINING_CAMERA, view_angles
 from training.storage.jobs import check_same_job, locked
 from training.storage.workers import IN_PROCESS, WorkerPool
 from training.views import crops, mesh_views

@@ -17,13 +17,15 @@ from thor2_jax.adaptation.estimate import (
     GRID,
     MIN_INSTANCES,
     PRIOR,
+    Criterion,
+    Objective,
     adaptation_criterion,
+    entropy,
     estimate_transform,
     gallery_classifier,
     posterior_mean,
     spread,
 )
-from thor2_jax.adaptation.objective import Criterion, Objective, entropy
 from thor2_jax.descriptor.looks import LookDescriptors, describe_looks
 from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.model.fusion import FusionRule, fused_probabilities

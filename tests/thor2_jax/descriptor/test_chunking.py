@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import thor2_jax as thor2
-from thor2_jax.descriptor.chunking import CHUNKS_PER_STEP, chunk_size, map_chunks, map_large_chunks
+from thor2_jax.descriptor.describe import CHUNKS_PER_STEP, chunk_size, map_chunks, map_large_chunks
 
 
 def clouds_of(count: int, capacity: int) -> thor2.PointClouds:

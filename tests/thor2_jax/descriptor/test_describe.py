@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 import colornet
 import thor2_jax as thor2
-from thor2_jax.descriptor import chunking
+from thor2_jax.descriptor import describe
 
 NETWORK = colornet.load_default()
 CLOSED = thor2.DescriptorConfig(homology="closed_form")
@@ -42,8 +42,8 @@ def test_describe_equals_its_steps() -> None:
 
 def test_batches_in_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Values and gradients equal those of a small batch, with callbacks and with a last, smaller chunk."""
-    monkeypatch.setattr(chunking, "MAX_CHUNK_CLOUDS", 2)
-    monkeypatch.setattr(chunking, "CHUNKS_PER_STEP", 2)
+    monkeypatch.setattr(describe, "MAX_CHUNK_CLOUDS", 2)
+    monkeypatch.setattr(describe, "CHUNKS_PER_STEP", 2)
     config, count = dataclasses.replace(SMALL_CONFIG, homology="gudhi"), 7
     few = thor2.PointClouds.pack([aligned_cloud(seed, 300) for seed in range(2)], 512)
     order = np.arange(count) % 2

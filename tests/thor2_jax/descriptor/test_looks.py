@@ -10,7 +10,7 @@ import pytest
 
 import colornet
 import thor2_jax as thor2
-from thor2_jax.descriptor import chunking, looks
+from thor2_jax.descriptor import describe, looks
 from thor2_jax.descriptor.cloud_statistics import cloud_statistics, side_lengths
 from thor2_jax.descriptor.describe import strips
 from thor2_jax.descriptor.looks import aligned_looks, describe_looks
@@ -118,7 +118,7 @@ def test_chunks_have_the_descriptors_of_the_batch(backend: str, calls: int, monk
         sizes.append(len(chunk.mask))
         return aligned_looks(chunk, config, count)
 
-    monkeypatch.setattr(chunking, "MAX_LARGE_CHUNK_POINTS", 4 * PACKED.mask.shape[1])
+    monkeypatch.setattr(describe, "MAX_LARGE_CHUNK_POINTS", 4 * PACKED.mask.shape[1])
     monkeypatch.setattr(looks, "aligned_looks", record)
     monkeypatch.setattr(jax, "default_backend", lambda: backend)
     chunked = describe_looks(PACKED, NETWORK, CONFIG, 4)

@@ -10,7 +10,7 @@ import pytest
 from scipy.special import ndtr
 
 import thor2_jax as thor2
-from thor2_jax.descriptor.persistence_images import persistence_images
+from thor2_jax.descriptor.persistence import persistence_images
 
 CONFIG = thor2.DescriptorConfig()
 TOLERANCE = 1e-6

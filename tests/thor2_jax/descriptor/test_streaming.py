@@ -8,7 +8,7 @@ from helpers import slow
 
 import colornet
 import thor2_jax as thor2
-from thor2_jax.descriptor.streaming import describe_stream
+from thor2_jax.descriptor.describe import describe_stream
 
 NETWORK = colornet.load_default()
 CONFIG = thor2.DescriptorConfig(homology="closed_form")

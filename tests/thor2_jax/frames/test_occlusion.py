@@ -7,7 +7,7 @@ from scipy.spatial.distance import cdist
 
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame
 from thor2_jax.frames.instance_clouds import InstanceCloud, instance_clouds
-from thor2_jax.frames.occlusion import OcclusionBoundary, find_occlusion
+from thor2_jax.frames.prepared_instance import OcclusionBoundary, find_occlusion
 
 HEIGHT, WIDTH = 120, 160
 CAMERA = Intrinsics(300.0, 300.0, 79.5, 59.5)

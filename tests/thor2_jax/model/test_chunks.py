@@ -7,7 +7,7 @@ import pytest
 
 from thor2_jax.capacity import BATCH_BUCKETS
 from thor2_jax.frames.prepared_instance import PreparedInstance
-from thor2_jax.model.chunks import compute_by_chunks, padded_rows
+from thor2_jax.model.inference import compute_by_chunks, padded_rows
 from thor2_jax.types import PointClouds
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from thor2_jax.recordings.pairs import LONGEST_WAIT, PairCounts, StampedImage, nearest_pairs
+from thor2_jax.recordings.topics import LONGEST_WAIT, PairCounts, StampedImage, nearest_pairs
 
 MS = 10**6
 

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 from helpers import slow
 
-from thor2_jax.adaptation import online
+from thor2_jax.adaptation import estimate
 from thor2_jax.adaptation.color_transform import ColorTransform
-from thor2_jax.adaptation.estimate import Adaptation, estimate_transform
-from thor2_jax.adaptation.online import EVERY
+from thor2_jax.adaptation.estimate import EVERY, Adaptation, estimate_transform
 from thor2_jax.frames.prepared_instance import PreparedInstance
 from thor2_jax.service.answers import adaptation_answer
 from thor2_jax.service.engine import InferenceEngine
@@ -40,8 +39,8 @@ def test_the_service_adapts_after_enough_instances(
     teaching_run: Path, is_estimated: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if not is_estimated:  # The tests of thor2_jax.adaptation estimate transforms.
-        monkeypatch.setattr(online, "Objective", create_autospec(online.Objective))
-        monkeypatch.setattr(online, "estimate_transform", create_autospec(estimate_transform, side_effect=estimated))
+        monkeypatch.setattr(estimate, "Objective", create_autospec(estimate.Objective))
+        monkeypatch.setattr(estimate, "estimate_transform", create_autospec(estimate_transform, side_effect=estimated))
     engine = InferenceEngine(Settings(teaching_run, adapt=True))
     engine.compile_adaptation()
     first, second = views(EVERY - 1), views(3)

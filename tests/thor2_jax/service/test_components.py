@@ -27,7 +27,7 @@ from service_requests import calls, check_refused
 from thor2_jax.client import multipart
 from thor2_jax.service import pipeline, preparation
 from thor2_jax.service.app import create_app
-from thor2_jax.service.batching import Batcher
+from thor2_jax.service.engine import Batcher
 from thor2_jax.service.metrics import CompilationCounter
 from thor2_jax.service.pipeline import Service
 from thor2_jax.service.preparation import PreparationPool, prepare_clouds

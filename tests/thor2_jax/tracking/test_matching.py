@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from thor2_jax.errors import InputError
-from thor2_jax.tracking.matching import MIN_OVERLAP, VOXELS, match, occupied_voxels, overlap
 from thor2_jax.tracking.poses import check_pose
+from thor2_jax.tracking.tracker import MIN_OVERLAP, VOXELS, match, occupied_voxels, overlap
 
 
 def patch(x: float, y: float = 0.0, size: float = 0.08, step: float = 0.004) -> np.ndarray:

@@ -18,8 +18,8 @@ from recording_files import table_frame
 
 import thor2_jax as thor2
 from thor2_jax.errors import InputError
+from thor2_jax.frames.frames import RecordedFrame
 from thor2_jax.model.recognition import Recognition
-from thor2_jax.recordings.recorded_frames import RecordedFrame
 from thor2_jax.segmentation.table import segment_table
 from thor2_jax.watch import server
 from thor2_jax.watch.live import LONGEST_PAUSE, LiveView, paced

@@ -19,9 +19,8 @@ from training.augmentation.occlusion import Occlusion, _silhouettes
 from training.augmentation.segmentation import Base, Segmentation
 from training.augmentation.sensor import Sensor, sensed
 from training.objects.builtin_objects import builtin_objects
-from training.rendering.camera import TRAINING_CAMERA, RenderedView
 from training.rendering.ray_caster import RayCaster, render_view
-from training.rendering.view_sphere import camera_pose
+from training.rendering.view_sphere import TRAINING_CAMERA, RenderedView, camera_pose
 from training.views.mesh_views import cloud_of
 
 OBJECTS = builtin_objects()

@@ -18,14 +18,12 @@ from thor2_jax.model.run_directory import load_run, save_run
 from training.baselines import baseline as module
 from training.baselines import templates
 from training.baselines.baseline import BaselineInputs
-from training.baselines.files import read_baseline
+from training.baselines.files import NETWORKS, crop_size, read_baseline
 from training.baselines.job import load_baselines, pretrained_files, train_baselines
-from training.baselines.names import NETWORKS, crop_size
-from training.baselines.networks.architectures import ARCHITECTURES, Architecture, network_inputs
+from training.baselines.networks.architectures import ARCHITECTURES, Architecture, network_inputs, tensor_shapes
 from training.baselines.networks.vit import VIT_DINOV2_SMALL, VIT_TINY, RGBDViT
-from training.baselines.networks.weights import tensor_shapes
 from training.baselines.templates import BACKBONES, Templates, create_backbone
-from training.fitting.options import FitOptions
+from training.fitting.loop import FitOptions
 from training.fitting.protocol import DEFAULT
 from training.train_job import TrainJob, run_train_job
 from training.views.crops import ViewCrops

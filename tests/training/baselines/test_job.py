@@ -19,8 +19,8 @@ from thor2_jax.model.run_directory import load_run, save_run
 from thor2_jax.types import Cloud
 from training.baselines import forest, job
 from training.baselines.baseline import baseline_inputs
+from training.baselines.files import CLOUD_BASELINES, check_baselines
 from training.baselines.job import load_baselines, train_baselines
-from training.baselines.names import CLOUD_BASELINES, check_baselines
 from training.cli import app
 from training.evaluation.runs import load_runs
 from training.fitting.samples import fold_of_views

@@ -17,7 +17,7 @@ from training.embedding import run_embedding
 from training.embedding.fit import EmbeddingFit
 from training.fitting import protocol
 from training.fitting.protocol import DEFAULT, PAPER
-from training.views import enrolled_meshes
+from training.views import mesh_views
 
 COVERING = dataclasses.replace(SMALL_CONFIG, sigma_1=0.4, sigma_2=0.2)
 """A small descriptor whose grid covers the objects: if it overflowed, nothing would have a name."""
@@ -56,5 +56,5 @@ def small_embedding() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         for module in (embedding, objects, models):
             patch.setattr(module, "load_default", lambda: small)
-        patch.setattr(enrolled_meshes, "MESH_VIEWS", 1)
+        patch.setattr(mesh_views, "MESH_VIEWS", 1)
         yield

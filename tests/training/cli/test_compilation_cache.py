@@ -10,7 +10,7 @@ from helpers import untrained_run, write_frame
 
 from thor2_jax.errors import InputError
 from thor2_jax.model.run_directory import save_run
-from training.cli.compilation_cache import enable_compilation_cache
+from training.cli.app import enable_compilation_cache
 
 ROOT = Path(__file__).parents[3]
 

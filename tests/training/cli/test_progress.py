@@ -5,14 +5,14 @@ from typing import Any
 
 import pytest
 
-from training.cli import progress
-from training.cli.progress import show_progress
-from training.storage.progress import numbered
+from training.cli import app
+from training.cli.app import show_progress
+from training.storage.jobs import numbered
 
 
 def test_lines_come_every_few_seconds(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     now = [100.0]
-    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(app.time, "monotonic", lambda: now[0])
     with show_progress() as show:
         for done in range(41):
             show("describe", done, 40, "views")
@@ -29,7 +29,7 @@ def test_lines_come_every_few_seconds(capsys: pytest.CaptureFixture[str], monkey
 
 def test_stages_are_numbered_and_the_time_left_is_that_of_all(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [100.0]
-    monkeypatch.setattr("training.storage.progress.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("training.storage.jobs.time.monotonic", lambda: now[0])
     shown: list[tuple[str, int, int, str]] = []
     show = numbered(lambda *values: shown.append(values), {"render": 1.0, "cached": 0.0, "fit": 4.0})
     calls = [("render", 0, 0), ("render", 2, 10), ("cached", 1, 50), ("fit", 1, 20), ("fit thor", 1, 9), ("fit", 2, 10)]

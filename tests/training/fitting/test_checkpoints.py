@@ -12,7 +12,7 @@ import pytest
 from helpers import full_disk
 
 import thor2_jax as thor2
-from training.fitting.checkpoints import Checkpoints, _quiet_orbax, find_run_directories
+from training.fitting.loop import Checkpoints, _quiet_orbax, find_run_directories
 
 
 class State(NamedTuple):

@@ -23,9 +23,8 @@ from training.embedding.run_embedding import Distractors
 from training.embedding.sampling import ViewTask, render_clouds
 from training.fitting import job
 from training.fitting.calibration import fit_calibration
-from training.fitting.checkpoints import Checkpoints
 from training.fitting.job import RunSettings, check_trained, train_run
-from training.fitting.options import FitOptions, read_metrics
+from training.fitting.loop import Checkpoints, FitOptions, read_metrics
 from training.views.normalized_views import MemoryViews
 
 DISTRACTORS = Distractors(procedural=10, views=4, epochs=3, networks=2)

@@ -15,9 +15,15 @@ import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.color_membership import region_sets
 from thor2_jax.model.classifier import MLP, model_arrays
-from training.fitting.checkpoints import Checkpoints
 from training.fitting.fit import fit
-from training.fitting.options import EpochMetrics, FitOptions, append_metrics, discard_later_epochs, read_metrics
+from training.fitting.loop import (
+    Checkpoints,
+    EpochMetrics,
+    FitOptions,
+    append_metrics,
+    discard_later_epochs,
+    read_metrics,
+)
 from training.fitting.samples import Batch, Samples, expand
 from training.fitting.steps import FitContext
 

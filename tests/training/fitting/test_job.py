@@ -19,10 +19,8 @@ from thor2_jax.types import Cloud
 from training.evaluation.runs import load_runs
 from training.fitting import job as module
 from training.fitting import loop
-from training.fitting import options as metrics
-from training.fitting.checkpoints import Checkpoints, find_run_directories
 from training.fitting.job import RunSettings, train_run
-from training.fitting.options import FitOptions
+from training.fitting.loop import Checkpoints, FitOptions, find_run_directories
 from training.views.normalized_views import MemoryViews
 
 pytestmark = pytest.mark.usefixtures("small_classifiers")
@@ -50,7 +48,7 @@ def names(folder: Path) -> list[str]:
 
 
 def logged_rows(path: Path) -> list[tuple[Any, ...]]:
-    rows = metrics.read_metrics(path / "metrics.jsonl")
+    rows = loop.read_metrics(path / "metrics.jsonl")
     return [(row["fold"], row["classifier"], row["epoch"], row["loss"], row["accuracy"]) for row in rows]
 
 

@@ -17,7 +17,7 @@ if port != "0":
 import numpy as np
 import thor2_jax as thor2
 from thor2_jax.model.classifier import model_arrays
-from training.fitting.options import FitOptions
+from training.fitting.loop import FitOptions
 from training.fitting.job import RunSettings, train_run
 from training.views.normalized_views import MemoryViews
 

@@ -10,7 +10,7 @@ from recording_files import table_frame, write_recording
 
 from thor2_jax.errors import InputError
 from thor2_jax.recordings.bags import Bag
-from training.readers.recording import recorded_sources
+from training.readers.frame_files import recorded_sources
 
 FRAMES = [table_frame(k) for k in range(3)]
 

@@ -7,9 +7,8 @@ from helpers import full_image
 
 from thor2_jax.frames.frames import Intrinsics
 from training.objects.mesh import TexturedMesh
-from training.rendering.camera import Camera
 from training.rendering.ray_caster import RayCaster, pixel_rays, render_view
-from training.rendering.view_sphere import camera_pose
+from training.rendering.view_sphere import Camera, camera_pose
 
 CAMERA = Camera.from_field_of_view(161, 121, 30.0)
 

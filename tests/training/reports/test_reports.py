@@ -12,7 +12,7 @@ import colornet
 import thor2_jax as thor2
 from thor2_jax.figures import plain_text
 from training import demo
-from training.fitting.options import FitOptions
+from training.fitting.loop import FitOptions
 from training.objects.builtin_objects import builtin_objects
 from training.reports.html import Picture, Section, write_page
 from training.reports.object_plots import draw_descriptor, draw_objects

@@ -19,7 +19,7 @@ from training.rendering.view_sphere import camera_pose, view_angles
 from training.views import render_job
 from training.views.crops import CROP_SIZE, ViewCrops, fill_depth, quantized, rgbd_crop, stacked, surface_normals
 from training.views.dataset import ViewDataset
-from training.views.left_out import WithoutClasses
+from training.views.normalized_views import WithoutClasses
 from training.views.render_job import render_crops, render_dataset
 
 CAMERA = thor2.Intrinsics(100.0, 110.0, 31.5, 23.5)

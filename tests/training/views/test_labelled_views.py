@@ -12,8 +12,7 @@ from thor2_jax.frames.prepared_instance import PreparedInstance, pack_instances
 from thor2_jax.gallery.augment import augmented_view
 from training.views import labelled_views
 from training.views.labelled_views import FIRST_VIEW, WithLabelledViews
-from training.views.left_out import WithoutClasses
-from training.views.normalized_views import COORDINATE_STEP, MemoryViews
+from training.views.normalized_views import COORDINATE_STEP, MemoryViews, WithoutClasses
 
 CONFIG = DescriptorConfig(homology="closed_form")
 
