@@ -28,14 +28,13 @@ else:
         "descriptor.describe": ("describe", "describe_aligned", "describe_strips", "diagrams", "strips"),
         "descriptor.view_normalization": ("align", "mirror", "turn", "view_normalize"),
         "explanation.explain": ("Explanation", "explain"),
-        "parameters": ("Parameters",),
         "frames.frames": ("Intrinsics", "RGBDFrame", "read_frame"),
         "model.recognition": ("Recognition",),
         "recognizer": ("Recognizer",),
         "segmentation.segmenters": ("segment", "segmented"),
         "tracking.tracker": ("TrackedRecognition", "Tracker"),
         "transformers": ("Tops2Transformer", "TopsTransformer"),
-        "types": ("Descriptors", "Diagrams", "PointClouds", "Strips"),
+        "types": ("Descriptors", "Diagrams", "Parameters", "PointClouds", "Strips"),
     }
     _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
     _SUBMODULES = {name.partition(".")[0] for name in _MODULES}

@@ -24,7 +24,7 @@ from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import Intrinsics, RGBDFrame
 from thor2_jax.frames.prepared_instance import PreparedInstance, prepare_instance
 from thor2_jax.segmentation.segmenters import load_segmenter, segmented
-from thor2_jax.service.bodies import check_instances, decode_frame, decode_json_clouds, decode_npz_clouds
+from thor2_jax.service.decoding import check_instances, decode_frame, decode_json_clouds, decode_npz_clouds
 from thor2_jax.service.problem import RequestError, deadline_exceeded
 from thor2_jax.service.schemas import LabelMap
 from thor2_jax.signals import signals_blocked

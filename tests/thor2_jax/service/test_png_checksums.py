@@ -10,7 +10,7 @@ from helpers import encode_image, png_file, with_checksums
 
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import read_frame
-from thor2_jax.service.bodies import decode_frame
+from thor2_jax.service.decoding import decode_frame
 from thor2_jax.service.problem import RequestError
 
 PIXELS = np.indices((12, 16)).sum(axis=0, dtype=np.uint8) % 2

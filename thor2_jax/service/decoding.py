@@ -1,149 +1,28 @@
-"""Bodies of requests: read into memory with a size limit, without temporary files, and decoded to frames and clouds.
+"""Decoding of request bodies into frames and clouds.
 
 Sizes are checked before anything is decompressed, and every error names the field.
 """
 
 import io
-import re
 import zipfile
-from collections.abc import AsyncGenerator, Callable
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from fastapi import Request
 from numpy.typing import NDArray
 from PIL import Image
 from pydantic import ValidationError
-from python_multipart.multipart import parse_options_header
-from starlette.datastructures import UploadFile
-from starlette.formparsers import MultiPartException, MultiPartParser
 
 from thor2_jax.capacity import POINT_BUCKETS
 from thor2_jax.errors import InputError
 from thor2_jax.frames.frames import RGBDFrame
 from thor2_jax.frames.image_files import has_16_bit_channels, read_npy
 from thor2_jax.frames.intrinsics import Intrinsics, parse_intrinsics
-from thor2_jax.printable import check_name
 from thor2_jax.service.problem import RequestError
-from thor2_jax.service.schemas import FORM, CloudsBody
+from thor2_jax.service.schemas import CloudsBody
 from thor2_jax.service.settings import MAX_BODY, MAX_CLOUD_COORDINATE, MAX_CLOUDS
 
-__all__ = [
-    "check_instances",
-    "decode_frame",
-    "decode_json_clouds",
-    "decode_npz_clouds",
-    "parse_enrolment",
-    "parse_number",
-    "read_body",
-    "read_form",
-]
-
-MAX_NAME_BYTES = 1000
-"""Length in bytes up to which a name is checked, and named in an error."""
-
-
-async def _limited_stream(request: Request) -> AsyncGenerator[bytes, None]:
-    declared = request.headers.get("content-length", "")
-    if declared.isdecimal() and (len(declared) >= 20 or int(declared) > MAX_BODY):
-        raise RequestError(413, "body", f"The body has {declared[:20]} bytes; expected at most {MAX_BODY}.")
-    received = 0
-    async for data in request.stream():
-        received += len(data)
-        if received > MAX_BODY:
-            raise RequestError(413, "body", f"The body has more than {MAX_BODY} bytes.")
-        yield data
-
-
-async def read_body(request: Request) -> bytes:
-    """Return the whole body. Raises RequestError (413) if it is larger than `MAX_BODY`."""
-    return b"".join([data async for data in _limited_stream(request)])
-
-
-async def read_form(request: Request, form: dict[str, Any]) -> dict[str, bytes]:
-    """Return the fields of a multipart form; those that `form`, an OpenAPI request body, does not have are ignored.
-
-    Raises:
-        RequestError: 413 if the body is larger than `MAX_BODY`, 415 for another content type or charset, 400 if the
-            form cannot be parsed, 422 if a field is missing or repeated.
-    """
-    schema = form["content"][FORM]["schema"]
-    content_type, options = parse_options_header(request.headers.get("content-type"))
-    if content_type != FORM.encode():
-        raise RequestError(415, "body", f"The body must be {FORM}.")
-    # Some Python codecs raise on undecodable input, and some take quadratic time.
-    if options.get(b"charset", b"utf-8").lower() not in (b"utf-8", b"iso-8859-1", b"us-ascii"):
-        raise RequestError(415, "body", "The charset must be utf-8, iso-8859-1 or us-ascii.")
-    parser = MultiPartParser(
-        request.headers, _limited_stream(request), max_files=8, max_fields=8, max_part_size=MAX_BODY
-    )
-    parser.spool_max_size = MAX_BODY + 1  # Larger files would be written to a temporary file.
-    try:
-        received = await parser.parse()
-    except MultiPartException as error:
-        raise RequestError(400, "body", error.message) from None
-    try:
-        fields = {}
-        for name in schema["properties"]:
-            values = received.getlist(name)
-            if not values and name not in schema["required"]:
-                continue
-            if len(values) != 1:
-                raise RequestError(422, name, f"{name} is {'given more than once' if values else 'missing'}.")
-            fields[name] = await values[0].read() if isinstance(values[0], UploadFile) else values[0].encode()
-        return fields
-    finally:
-        await received.close()
-
-
-def parse_enrolment(fields: dict[str, bytes]) -> tuple[str, int, dict[str, bool]]:
-    """Take the fields name, instance, extend and replace, of which the last two may be absent, out of a form.
-
-    Returns:
-        The name of the object, its number in the label image, and the flags extend and replace.
-
-    Raises:
-        RequestError: 422, with the errors of all fields.
-    """
-    errors: list[RequestError] = []
-
-    def error(field: str, message: str) -> None:
-        errors.append(RequestError(422, field, message))
-
-    content, name, instance = fields.pop("name"), "", 0
-    if len(content) > MAX_NAME_BYTES:
-        error("name", f"name has {len(content)} bytes; expected a printable text of 1 to 200 characters.")
-    else:
-        try:
-            name = check_name(content.decode())
-        except UnicodeDecodeError:
-            error("name", "name is not valid UTF-8; expected a printable text of 1 to 200 characters.")
-        except InputError as problem:
-            error("name", f"{problem}.")
-    try:
-        instance = parse_number(fields, "instance")
-    except RequestError as problem:
-        errors.append(problem)
-    flags = {}
-    for field in ("extend", "replace"):
-        value = fields.pop(field, b"false").lower()
-        if value not in (b"true", b"1", b"false", b"0"):
-            error(field, f"{field} must be true or false.")
-        flags[field] = value in (b"true", b"1")
-    if all(flags.values()):
-        error("replace", "extend and replace are both true; choose one.")
-    if errors:
-        raise RequestError.merge(errors)
-    return name, instance, flags
-
-
-def parse_number(fields: dict[str, bytes], name: str) -> int:
-    """Take the number in a field out of a form. Raises RequestError (422)."""
-    content = fields.pop(name)
-    if not re.fullmatch(rb"[0-9]{1,18}", content):
-        raise RequestError(422, name, f"{name} is not a number; expected a whole number of at most 18 digits.")
-    return int(content)
-
+__all__ = ["CloudArrays", "check_instances", "decode_frame", "decode_json_clouds", "decode_npz_clouds"]
 
 MAX_UPLOAD_PIXELS = 1920 * 1080
 """Maximum number of pixels of an image."""
