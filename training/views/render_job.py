@@ -317,6 +317,6 @@ def render_crops(
                 with atomic_write(directory / name) as temporary:
                     temporary.write_bytes(content)
                 done[name] = hashlib.sha256(content).hexdigest()
-                CropManifest(size, dataset.digest, done).write(directory)
+                CropManifest(size, dataset.digest, dict(sorted(done.items()))).write(directory)
                 n_done += dataset.shards[index].views
                 progress(n_done, total)
