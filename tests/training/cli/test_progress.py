@@ -5,14 +5,13 @@ from typing import Any
 
 import pytest
 
-from training.cli import app
 from training.cli.app import show_progress
 from training.storage.jobs import numbered
 
 
 def test_lines_come_every_few_seconds(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     now = [100.0]
-    monkeypatch.setattr(app.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr("training.storage.jobs.time.monotonic", lambda: now[0])
     with show_progress() as show:
         for done in range(41):
             show("describe", done, 40, "views")
