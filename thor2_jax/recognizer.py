@@ -57,8 +57,8 @@ class Recognizer:
         chunk: instances described and classified in one call. While the device computes a chunk, the host prepares the
             next. A large chunk starts sooner, since fewer functions are compiled, and takes longer for each frame.
 
-    Its functions compile once for each point bucket and number of rows (`inference.padded_rows`); `warm_up` compiles them
-    in advance. Enrolling and forgetting objects compiles nothing.
+    Its functions compile once for each point bucket and number of rows (`inference.padded_rows`); `warm_up` compiles
+    them in advance. Enrolling and forgetting objects compiles nothing.
     """
 
     def __init__(

@@ -160,7 +160,7 @@ class Adaptation:
     Attributes:
         transform: the colour transform.
         instances: number of instances that it was estimated from.
-        uncertainty_before: mean uncertainty of their answers without it, nats, see above.
+        uncertainty_before: mean uncertainty of their answers without it, nats, as in `Objective`.
         uncertainty_after: mean uncertainty with it.
     """
 
