@@ -10,11 +10,12 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
 import safetensors.numpy
-from helpers import files_of, full_disk
+from helpers import files_of
 
 from thor2_jax.errors import InputError
 from thor2_jax.frames.prepared_instance import PreparedInstance
@@ -137,13 +138,14 @@ def test_another_writers_change_is_kept(directory: Path) -> None:
     assert update_gallery(directory, add("box", 6), FINGERPRINT, stale).gallery.names == ("mug", "bowl", "new", "box")
 
 
+@pytest.mark.parametrize("error", [OSError, KeyboardInterrupt])
 @pytest.mark.parametrize("failing", ["_object_content", "write_text", "_write_durably"])
 def test_a_failed_change_leaves_the_gallery_as_it_was(
-    failing: str, directory: Path, monkeypatch: pytest.MonkeyPatch
+    failing: str, error: type[BaseException], directory: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = files_of(directory)
-    monkeypatch.setattr(store, failing, full_disk)
-    with pytest.raises(OSError, match="No space"):
+    monkeypatch.setattr(store, failing, mock.Mock(side_effect=error))
+    with pytest.raises(error):
         update_gallery(directory, add("new", 5), FINGERPRINT)
     assert files_of(directory) == before
 
