@@ -22,9 +22,7 @@ def test_without_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def rs() -> Any:
     return pytest.importorskip(
-        "pyrealsense2",
-        reason="pyrealsense2, or the system library libusb-1.0, is not installed",
-        exc_type=ImportError,
+        "pyrealsense2", reason="pyrealsense2, or the system library libusb-1.0, is not installed", exc_type=ImportError
     )
 
 
