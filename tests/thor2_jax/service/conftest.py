@@ -45,6 +45,10 @@ expect.set_options(timeout=1000 * HANG)
 Files = dict[str, bytes]
 SAMPLE_INDEX = Path(thor2.__file__).parent / "service" / "page" / "samples" / "index.json"
 CLASSES = tuple(sorted({name for sample in json.loads(SAMPLE_INDEX.read_text()) for name in sample["objects"]}))
+"""The classes of the run: the objects of the page's sample frames."""
+
+CHECKS = [not_a_server_error, status_code_conformance, content_type_conformance, response_schema_conformance]
+"""What an answer is compared with the OpenAPI document by."""
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -78,12 +82,6 @@ def teaching_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     save_run(untrained_run(("a", "b"), ("tops", "tops2")), folder)
     small_embedding().save(folder / EMBEDDING_FILE)
     return folder
-
-
-@pytest.fixture(scope="session")
-def classes() -> tuple[str, ...]:
-    """The classes of the run: the objects of the page's sample frames."""
-    return CLASSES
 
 
 @pytest.fixture(scope="session")
@@ -207,22 +205,16 @@ def teaching_url(teaching_app: FastAPI) -> Iterator[str]:
         thread.join()
 
 
-@pytest.fixture(scope="session")
-def assert_conforms() -> Callable[..., None]:
-    """Return a function that sends generated requests for an operation and checks the answers against the document."""
-    checks = [not_a_server_error, status_code_conformance, content_type_conformance, response_schema_conformance]
+def assert_conforms(document: Any, path: str, method: str, examples: int) -> None:
+    """Send generated requests for an operation and check the answers against the document."""
+    everything = list(HealthCheck)
 
-    def assert_operation_conforms(document: Any, path: str, method: str, examples: int) -> None:
-        everything = list(HealthCheck)
+    @hypothesis.settings(max_examples=examples, deadline=None, derandomize=True, suppress_health_check=everything)
+    @hypothesis.given(case=document[path][method].as_strategy())
+    def call(case: schemathesis.Case) -> None:
+        case.call_and_validate(checks=CHECKS)
 
-        @hypothesis.settings(max_examples=examples, deadline=None, derandomize=True, suppress_health_check=everything)
-        @hypothesis.given(case=document[path][method].as_strategy())
-        def call(case: schemathesis.Case) -> None:
-            case.call_and_validate(checks=checks)
-
-        call()
-
-    return assert_operation_conforms
+    call()
 
 
 @pytest.fixture

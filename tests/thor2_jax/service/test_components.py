@@ -5,8 +5,6 @@ import dataclasses
 import math
 import os
 import queue
-import subprocess
-import sys
 import tempfile
 import threading
 import time
@@ -20,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 from fastapi import FastAPI
+from helpers import finish_programs, start_program
 from processes import HANG
 from prometheus_client import CollectorRegistry, Counter
 from service_requests import calls, check_refused
@@ -286,7 +285,7 @@ def test_large_files_stay_in_memory(
     assert recognize.await_args is not None and recognize.await_args.args[0] == large
 
 
-def test_dead_worker_has_no_requests_in_progress(tmp_path: Path) -> None:
+def test_dead_worker_has_no_requests_in_progress(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its other counts are kept."""
     code = """if True:
         import os
@@ -301,9 +300,6 @@ def test_dead_worker_has_no_requests_in_progress(tmp_path: Path) -> None:
         metrics.in_progress.inc(1)
         print(metrics.text().decode())
     """
-    environment = os.environ | {"PROMETHEUS_MULTIPROC_DIR": str(tmp_path)}
-    text = subprocess.run(
-        [sys.executable, "-c", code],
-        cwd=Path(__file__).parents[3], env=environment, check=True, capture_output=True, text=True,
-    ).stdout  # fmt: skip
+    monkeypatch.setenv("PROMETHEUS_MULTIPROC_DIR", str(tmp_path))
+    (text,) = finish_programs(start_program(code))
     assert "thor2_requests_waiting 1.0" in text and "thor2_compilations_after_warm_up_total 2.0" in text

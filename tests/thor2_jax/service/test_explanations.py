@@ -1,6 +1,5 @@
 """The evidence of /v1/explain, compared with the library on the same run."""
 
-import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -14,14 +13,12 @@ import colornet
 import thor2_jax as thor2
 from thor2_jax.descriptor.describe import strips
 from thor2_jax.frames.prepared_instance import PreparedInstance
-from thor2_jax.model.classifier import RunClassifiers
-from thor2_jax.model.confidence import Calibration
 from thor2_jax.model.inference import Inference
 from thor2_jax.service.answers import explained_frame
-from thor2_jax.service.engine import CloudResult, InferenceEngine
+from thor2_jax.service.engine import CloudResult
 from thor2_jax.service.preparation import MAX_LABEL_RUNS, PreparedRequest, prepare_frame
 from thor2_jax.service.schemas import LabelMap
-from thor2_jax.service.settings import MAX_EXPLAINED, Settings
+from thor2_jax.service.settings import MAX_EXPLAINED
 
 Files = dict[str, bytes]
 
@@ -71,33 +68,6 @@ def test_explain_returns_the_answers_and_the_details_behind_them(
         assert (rgb == instance.colors[distance.argmin(axis=1)]).all(axis=1).mean() > 0.99
         borders = np.array(details["slice_borders"])
         np.testing.assert_allclose(borders, 0.1 * np.column_stack([np.arange(7), np.arange(1, 8)]), atol=1e-9)
-
-
-EMPTY = np.zeros(0, np.float32)
-
-
-def test_calibrated_confidences(run_dir: Path) -> None:
-    """Confidences use the temperatures of both classifiers, or the calibration of the run."""
-    rng = np.random.default_rng(0)
-    engine = InferenceEngine(Settings(run_dir))
-    alpha = np.full(len(engine.run.classes), 0.1)
-    probabilities = {name: rng.dirichlet(alpha).astype(np.float32) for name in ("tops", "tops2", "embedding")}
-    result = CloudResult(EMPTY, EMPTY, EMPTY, EMPTY, Inference(0, probabilities))
-    assert engine.calibrated_confidences([result]) == [None] and engine.calibrated_confidences([]) == []
-    engine.run.record["temperatures"] = {"tops": 2.0, "tops2": 3.0}
-    (confidence,) = engine.calibrated_confidences([result])
-    logits = np.log(probabilities["tops"]) / 2 + np.log(probabilities["tops2"]) / 3
-    expected = np.exp(logits / 2) / np.exp(logits / 2).sum()
-    best = (probabilities["tops"] * probabilities["tops2"]).argmax()
-    assert confidence == pytest.approx(expected[best], rel=1e-4)
-
-    record = {"calibration": dataclasses.asdict(Calibration(0.0, 1.0, 1.0, 0.5, 0.2))}
-    run = dataclasses.replace(engine.run, record=record)
-    classifiers = RunClassifiers({**engine.model.classifiers, "embedding": lambda oriented: oriented})
-    engine._recognizer.model = dataclasses.replace(engine.model, run=run, classifiers=classifiers)
-    (confidence,) = engine.calibrated_confidences([result])
-    fused = engine.model.fused({name: values[None] for name, values in probabilities.items()})
-    assert confidence == pytest.approx(float(fused.max()))
 
 
 def test_label_map_with_many_runs_is_subsampled(files: Files) -> None:
