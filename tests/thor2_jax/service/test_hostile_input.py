@@ -9,6 +9,7 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import httpx
@@ -19,6 +20,10 @@ from helpers import Pickled, deep_png, encode_image, png_file, with_checksums
 from processes import HANG
 from service_requests import check_refused
 
+from thor2_jax.errors import InputError
+from thor2_jax.frames.frames import read_frame
+from thor2_jax.service.decoding import decode_frame
+from thor2_jax.service.problem import RequestError
 from thor2_jax.service.settings import MAX_BODY
 
 Files = dict[str, bytes]
@@ -38,6 +43,43 @@ def png_bomb(width: int, height: int) -> bytes:
     """PNG whose header declares a large image, with a deflated run of zeros."""
     header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
     return png_file(with_checksums((b"IHDR", header), (b"IDAT", zlib.compress(bytes(10**7), 9)), (b"IEND", b"")))
+
+
+PIXELS = np.indices((12, 16)).sum(axis=0, dtype=np.uint8) % 2
+DATA = zlib.compress(np.pad(PIXELS, ((0, 0), (1, 0))).tobytes(), 0)
+CHUNKS = with_checksums(
+    (b"IHDR", struct.pack(">IIBBBBB", 16, 12, 8, 3, 0, 0, 0)),
+    (b"PLTE", bytes(6)),
+    (b"tEXt", b"Title\0scene"),
+    *((b"IDAT", part) for part in (DATA[:50], DATA[50:90], DATA[90:])),
+    (b"tIME", bytes(7)),
+    (b"IEND", b""),
+)
+"""An indexed image of zeros and ones, with its pixels in three chunks."""
+
+
+def test_png_with_an_invalid_checksum(tmp_path: Path) -> None:
+    """The service and the library refuse it, even if its pixels can be decoded."""
+    contents = {
+        "color": encode_image(np.zeros((12, 16, 3), np.uint8)),
+        "depth": encode_image(np.ones((12, 16), np.uint16)),
+        "intrinsics": b'{"fx": 9, "fy": 9, "cx": 8, "cy": 6}',
+        "labels": png_file(CHUNKS),
+    }
+    paths = {name: tmp_path / name for name in contents}
+    for name, path in paths.items():
+        path.write_bytes(contents[name])
+    for frame in (decode_frame(**contents), read_frame(**paths)):
+        np.testing.assert_array_equal(frame.labels, PIXELS)
+    for k, (kind, content, crc) in enumerate(CHUNKS[:-1]):
+        for changed in ((kind, content, crc ^ 1), (kind, bytes([*content[:-1], content[-1] ^ 1]), crc)):
+            labels = png_file([*CHUNKS[:k], changed, *CHUNKS[k + 1 :]])
+            with pytest.raises(RequestError) as error:
+                decode_frame(**contents | {"labels": labels})
+            assert (error.value.status, error.value.field) == (422, "labels")
+            paths["labels"].write_bytes(labels)
+            with pytest.raises(InputError, match="^labels: .* is damaged"):
+                read_frame(**paths)
 
 
 @pytest.mark.parametrize("field", ["color", "depth", "labels"])
