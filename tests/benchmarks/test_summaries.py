@@ -1,12 +1,22 @@
-"""Summaries of the benchmarks of explanations, adaptation, tracks and segmentation: values written by hand."""
+"""Summaries of the benchmarks against values by hand, their bad arguments, and the benchmark of `thor2 doctor`."""
+
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
+import thor2_jax
 import thor2_jax as thor2
-from benchmarks import adaptation, explanation, segmentation
+from benchmarks import adaptation, cameras, explanation, levers, paper, segmentation
+from benchmarks.doctor import DAMAGES, run
 from benchmarks.tracking import METHODS, VIEWS, summarize_scenes
 from thor2_jax.explanation.attributions import Faithfulness
+from thor2_jax.frames.frames import RGBDFrame
+from thor2_jax.model.recognition import Recognition
+from training.readers.frame_files import frame_files
 from training.readers.labelled import LabelledFrame
 
 
@@ -64,3 +74,57 @@ def test_pieces_are_compared_with_instances() -> None:
     report = segmentation.measure([item], lambda frame: pieces, None)
     assert (report["instances"], report["thick"], report["thick found"]) == (3, 2, 0.5)
     assert [report[name] for name in ("found", "over-segmented", "under-segmented")] == pytest.approx([1 / 3] * 3)
+
+
+@pytest.mark.parametrize(
+    ("benchmark", "arguments", "message"),
+    [
+        (cameras, "", "give --model, --frames and --out"),
+        (cameras, "--model x", "give --model, --frames and --out"),
+        (cameras, "--model x --frames y --out z", "y"),
+        (levers, "--meshes . --frames . --out out --levers none", "none"),
+        (levers, "--meshes . --frames . --out out --seeds 0", "seeds"),
+        (levers, "--meshes absent --frames . --out out", "absent"),
+        (paper, "--meshes . --out out", "scenes and frames are missing"),
+        (paper, "--meshes . --out out --frames absent --folds 0", "folds is 0"),
+        (paper, "--meshes . --out out --frames absent", "absent"),
+        (paper, "--meshes . --out out --frames . --baselines tree", "baselines is tree"),
+    ],
+)
+def test_bad_arguments_write_nothing(
+    benchmark: Any,
+    arguments: str,
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["benchmark", *arguments.split()])
+    with pytest.raises(SystemExit) as caught:
+        benchmark.main()
+    error = capsys.readouterr().err if isinstance(caught.value.code, int) else f"error: {caught.value.code}"
+    assert "error: " in error.splitlines()[-1] and message in error.splitlines()[-1]
+    assert list(tmp_path.iterdir()) == []
+
+
+SAMPLES = Path(thor2_jax.__file__).parent / "service" / "page" / "samples"
+
+
+def recognizer_of(name: str) -> Any:
+    """Return a recognizer that is the less sure the more the colours differ from those of a sample."""
+    color = frame_files(SAMPLES / name).read().color.astype(float)
+
+    def recognize(frame: RGBDFrame) -> list[Recognition]:
+        confidence = float(np.exp(-20 * np.abs(frame.color - color).mean() / 255))
+        return [Recognition(label, "known", confidence) for label in frame.instances]
+
+    return SimpleNamespace(recognize=recognize, classes=("known",))
+
+
+@pytest.mark.slow
+def test_damaged_set_ups_are_diagnosed() -> None:
+    assert len(DAMAGES) == 20
+    report = run(SAMPLES, recognizer_of("clutter"), ["clutter"])
+    wrong = {name: entry["found"] for name, entry in report["damaged"].items() if not entry["right"]}
+    assert report["right_by_frame"]["clutter"] == 20 - len(wrong) and len(wrong) <= 2, wrong
